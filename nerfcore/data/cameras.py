@@ -1,0 +1,157 @@
+"""Camera models: pixels to rays and points to pixels.
+
+Conventions, used everywhere in `nerfcore`:
+- Pixel coordinates have their origin at the top-left corner of the image; the centre of the first pixel is (0.5, 0.5).
+- Camera axes are OpenCV's: x right, y down, z forward. Blender's and OpenGL's cameras look along −z with y up:
+  `flip_camera_axes` turns one into the other.
+- Poses are camera-to-world 4×4 matrices.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+CameraModel = Literal["PINHOLE", "OPENCV", "OPENCV_FISHEYE", "EQUIRECTANGULAR"]
+
+
+class Camera(BaseModel):
+    """Intrinsics of one camera. Focal lengths and principal point in pixels.
+
+    `distortion` is (k1, k2, p1, p2) for OPENCV (SIMPLE_RADIAL and RADIAL are its cases with zeros),
+    (k1, k2, k3, k4) for OPENCV_FISHEYE, empty for PINHOLE and EQUIRECTANGULAR.
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    model: CameraModel = "PINHOLE"
+    width: int = Field(gt=0)
+    height: int = Field(gt=0)
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...] = ()
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same lens on an image resampled to width × height."""
+        sx, sy = width / self.width, height / self.height
+        return self.model_copy(
+            update={"width": width, "height": height, "fx": self.fx * sx, "fy": self.fy * sy, "cx": self.cx * sx, "cy": self.cy * sy}
+        )
+
+    def undistorted(self) -> Camera:
+        """The pinhole camera with the same focal lengths and principal point."""
+        return self.model_copy(update={"model": "PINHOLE", "distortion": ()})
+
+
+def pixel_centers(width: int, height: int) -> np.ndarray:
+    """Coordinates (height, width, 2) of all pixel centres, x first."""
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    return np.stack([x, y], -1)
+
+
+def _opencv_distort(uv: np.ndarray, k: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Distorted normalised coordinates (N, 2) and their Jacobian (N, 2, 2). Source: OpenCV calib3d, COLMAP OPENCV."""
+    k1, k2, p1, p2 = k
+    u, v = uv[:, 0], uv[:, 1]
+    r2 = u * u + v * v
+    radial = 1 + r2 * (k1 + r2 * k2)
+    slope = 2 * (k1 + 2 * k2 * r2)  # d radial / d(r²) · 2
+    out = np.stack([u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u), v * radial + p1 * (r2 + 2 * v * v) + 2 * p2 * u * v], -1)
+    jacobian = np.empty((len(uv), 2, 2))
+    jacobian[:, 0, 0] = radial + u * u * slope + 2 * p1 * v + 6 * p2 * u
+    jacobian[:, 0, 1] = u * v * slope + 2 * p1 * u + 2 * p2 * v
+    jacobian[:, 1, 0] = jacobian[:, 0, 1]
+    jacobian[:, 1, 1] = radial + v * v * slope + 6 * p1 * v + 2 * p2 * u
+    return out, jacobian
+
+
+def _opencv_undistort(target: np.ndarray, k: tuple[float, ...], steps: int = 25) -> tuple[np.ndarray, np.ndarray]:
+    """Newton inverse of `_opencv_distort`: (N, 2) undistorted coordinates and a convergence mask (N,)."""
+    uv = target.copy()
+    for _ in range(steps):
+        value, jacobian = _opencv_distort(uv, k)
+        determinant = jacobian[:, 0, 0] * jacobian[:, 1, 1] - jacobian[:, 0, 1] * jacobian[:, 1, 0]
+        determinant = np.where(np.abs(determinant) < 1e-9, 1e-9, determinant)
+        error = value - target
+        step_u = (jacobian[:, 1, 1] * error[:, 0] - jacobian[:, 0, 1] * error[:, 1]) / determinant
+        step_v = (jacobian[:, 0, 0] * error[:, 1] - jacobian[:, 1, 0] * error[:, 0]) / determinant
+        # A step longer than half the image plane means the lens polynomial has folded over: keep it damped.
+        length = np.maximum(np.hypot(step_u, step_v) / 0.5, 1.0)
+        uv = uv - np.stack([step_u / length, step_v / length], -1)
+    value, jacobian = _opencv_distort(uv, k)
+    determinant = jacobian[:, 0, 0] * jacobian[:, 1, 1] - jacobian[:, 0, 1] * jacobian[:, 1, 0]
+    return uv, (np.abs(value - target).max(-1) < 1e-9) & (determinant > 0)
+
+
+def _fisheye_theta(radius: np.ndarray, k: tuple[float, ...], steps: int = 25) -> tuple[np.ndarray, np.ndarray]:
+    """Invert r = θ(1 + k1θ² + k2θ⁴ + k3θ⁶ + k4θ⁸) by Newton: θ (N,) and a convergence mask (N,)."""
+    theta = np.clip(radius, 0, np.pi)
+    powers = np.arange(1, 5)
+
+    def value(t: np.ndarray) -> np.ndarray:
+        return t * (1 + sum(c * t ** (2 * n) for c, n in zip(k, powers)))
+
+    for _ in range(steps):
+        slope = 1 + sum(c * (2 * n + 1) * theta ** (2 * n) for c, n in zip(k, powers))
+        theta = np.clip(theta - (value(theta) - radius) / np.where(np.abs(slope) < 1e-9, 1e-9, slope), 0, np.pi)
+    slope = 1 + sum(c * (2 * n + 1) * theta ** (2 * n) for c, n in zip(k, powers))
+    return theta, (np.abs(value(theta) - radius) < 1e-9) & (slope > 0)
+
+
+def rays(camera: Camera, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Unit viewing directions in camera axes for pixel coordinates.
+
+    Args:
+        camera: intrinsics.
+        pixels: (N, 2) x, y in pixels.
+    Returns:
+        directions (N, 3) of unit length, and valid (N,) bool: false where the distortion cannot be inverted.
+    """
+    pixels = np.asarray(pixels, np.float64)
+    if camera.model == "EQUIRECTANGULAR":
+        longitude = (pixels[:, 0] / camera.width - 0.5) * 2 * np.pi
+        latitude = (0.5 - pixels[:, 1] / camera.height) * np.pi
+        direction = np.stack(
+            [np.cos(latitude) * np.sin(longitude), -np.sin(latitude), np.cos(latitude) * np.cos(longitude)], -1
+        )
+        return direction, np.ones(len(pixels), bool)
+    uv = (pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    valid = np.ones(len(uv), bool)
+    if camera.model == "OPENCV_FISHEYE":
+        radius = np.linalg.norm(uv, axis=-1)
+        theta, valid = _fisheye_theta(radius, camera.distortion)
+        scale = np.where(radius > 1e-12, np.sin(theta) / np.maximum(radius, 1e-12), 1.0)
+        return np.concatenate([uv * scale[:, None], np.cos(theta)[:, None]], -1), valid
+    if camera.model == "OPENCV" and any(camera.distortion):
+        uv, valid = _opencv_undistort(uv, camera.distortion)
+    direction = np.concatenate([uv, np.ones((len(uv), 1))], -1)
+    return direction / np.linalg.norm(direction, axis=-1, keepdims=True), valid
+
+
+def project(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """Pixel coordinates (N, 2) of points (N, 3) in camera axes; NaN behind a perspective camera."""
+    points = np.asarray(points, np.float64)
+    x, y, z = points.T
+    if camera.model == "EQUIRECTANGULAR":
+        longitude = np.arctan2(x, z)
+        latitude = np.arctan2(-y, np.hypot(x, z))
+        return np.stack([(longitude / (2 * np.pi) + 0.5) * camera.width, (0.5 - latitude / np.pi) * camera.height], -1)
+    if camera.model == "OPENCV_FISHEYE":
+        radius = np.hypot(x, y)
+        theta = np.arctan2(radius, z)
+        distorted = theta * (1 + sum(c * theta ** (2 * n) for n, c in enumerate(camera.distortion, 1)))
+        uv = np.stack([x, y], -1) * np.where(radius > 1e-12, distorted / np.maximum(radius, 1e-12), 1.0)[:, None]
+    else:
+        uv = np.stack([x, y], -1) / np.where(z > 0, z, np.nan)[:, None]
+        if camera.model == "OPENCV" and any(camera.distortion):
+            uv, _ = _opencv_distort(uv, camera.distortion)
+    return uv * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+
+
+def flip_camera_axes(camera_to_world: np.ndarray) -> np.ndarray:
+    """Turn OpenCV camera axes into OpenGL/Blender ones, or back: (..., 4, 4) → (..., 4, 4)."""
+    return camera_to_world @ np.diag([1.0, -1.0, -1.0, 1.0])

@@ -1,0 +1,92 @@
+"""The one form in which photos, poses, labels and masks reach training, whatever they came from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from .cameras import Camera
+from .similarity import similarity_scale, transform_points
+
+
+@dataclass(frozen=True)
+class View:
+    """One posed photo. Paths are absolute; `None` where there is no such file."""
+
+    name: str
+    camera: Camera
+    camera_to_world: np.ndarray  # (4, 4), OpenCV axes
+    image: Path
+    label: Path | None = None
+    mask: Path | None = None
+    depth: Path | None = None
+
+
+@dataclass(frozen=True)
+class Points:
+    """A sparse point cloud: positions (N, 3), colours (N, 3) uint8 sRGB, reprojection error (N,) pixels."""
+
+    xyz: np.ndarray
+    rgb: np.ndarray
+    error: np.ndarray
+
+    @staticmethod
+    def empty() -> Points:
+        return Points(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0))
+
+    def __len__(self) -> int:
+        return len(self.xyz)
+
+
+@dataclass(frozen=True)
+class ClassInfo:
+    """One semantic class. `color` is sRGB in [0, 1]; `priority` ≥ 0 steers samples (see sampling)."""
+
+    id: int
+    name: str
+    color: tuple[float, float, float]
+    priority: float = 1.0
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Posed views of one place in one frame.
+
+    `frame` says which: "sfm" (as estimated or imported) or "world" (Blender's: z up, metres when scaled).
+    `train` and `test` index `views`. `bounds` (2, 3) is the region of interest when the capture names one.
+    `white_background`: transparent pixels of the photos are white in evaluation.
+    """
+
+    views: list[View]
+    train: list[int]
+    test: list[int]
+    classes: list[ClassInfo] = field(default_factory=list)
+    ignore_id: int = 0
+    points: Points = field(default_factory=Points.empty)
+    bounds: np.ndarray | None = None
+    mask_mode: str = "ignore"
+    frame: str = "sfm"
+
+    def transformed(self, similarity: np.ndarray, frame: str) -> Scene:
+        """The same scene seen from another frame; `similarity` (4, 4) maps this frame to the new one."""
+        views = [
+            View(**{**vars(view), "camera_to_world": transform_pose(similarity, view.camera_to_world)}) for view in self.views
+        ]
+        points = Points(transform_points(similarity, self.points.xyz), self.points.rgb, self.points.error)
+        bounds = self.bounds
+        if bounds is not None:
+            corners = np.stack(np.meshgrid(*bounds.T, indexing="ij"), -1).reshape(-1, 3)
+            moved = transform_points(similarity, corners)
+            bounds = np.stack([moved.min(0), moved.max(0)])
+        return Scene(
+            views, self.train, self.test, self.classes, self.ignore_id, points, bounds, self.mask_mode, frame
+        )
+
+
+def transform_pose(similarity: np.ndarray, camera_to_world: np.ndarray) -> np.ndarray:
+    """Move a pose (4, 4) by a similarity (4, 4); its rotation stays a rotation, only its centre is scaled."""
+    moved = similarity @ camera_to_world
+    moved[:3, :3] /= similarity_scale(similarity)
+    return moved

@@ -1,0 +1,66 @@
+"""Errors a user is meant to read: what is wrong, and what to do about it."""
+
+from __future__ import annotations
+
+
+class FieldworkError(Exception):
+    """A failure with a sentence for the user.
+
+    `code` names the kind of failure in JSON-RPC and `--json` output (stable, snake_case); `hint` says what to do.
+    """
+
+    code = "failed"
+
+    def __init__(self, message: str, hint: str = "") -> None:
+        super().__init__(message)
+        self.message = message
+        self.hint = hint
+
+    def __str__(self) -> str:
+        return f"{self.message} {self.hint}".strip()
+
+
+class ProjectError(FieldworkError):
+    """The capture project is missing, foreign, truncated, newer or locked."""
+
+    code = "project"
+
+
+class InputError(FieldworkError):
+    """The user's photos, labels, masks or data set cannot be used."""
+
+    code = "input"
+
+
+class PosesError(FieldworkError):
+    """Camera poses could not be estimated."""
+
+    code = "poses"
+
+
+class SettingError(FieldworkError):
+    """A setting has an impossible value."""
+
+    code = "setting"
+
+
+class TrainingError(FieldworkError):
+    """Training cannot go on."""
+
+    code = "training"
+
+
+class DiskError(FieldworkError):
+    """A file cannot be written: no room, no permission."""
+
+    code = "disk"
+
+
+class BlenderError(FieldworkError):
+    """A Blender is missing, or a script inside it failed."""
+
+    code = "blender"
+
+
+class Cancelled(Exception):
+    """Raised inside a long computation when its caller asked it to stop."""

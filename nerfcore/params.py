@@ -1,0 +1,118 @@
+"""The parameters of every verb: one typed model each, shared by the command line, JSON-RPC and the panels.
+
+Imports nothing heavy. The verbs themselves are listed in `verbs.py`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Preset = Literal["draft", "standard", "high"]
+Pass = Literal["rgb", "depth", "semantic", "confidence", "normal"]
+
+
+class Params(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class DoctorParams(Params):
+    pass
+
+
+class SimulateParams(Params):
+    out: Path = Field(description="folder to write the simulated capture to")
+    scene: str = Field("museum", description="name of the built-in scene")
+    views: int = Field(48, ge=4, description="number of photos")
+    size: tuple[int, int] = Field((720, 480), description="photo width and height in pixels")
+    seed: int = Field(0, description="seed of the scene and of the camera path")
+    samples: int = Field(24, ge=1, description="Cycles samples per pixel")
+
+
+class NewParams(Params):
+    project: Path
+    photos: Path = Field(description="folder of photos, or a video file")
+    labels: Path | None = Field(None, description="folder of label maps named like the photos")
+    masks: Path | None = Field(None, description="folder of foreground masks named like the photos")
+    classes: Path | None = Field(None, description="classes.json: names of the label ids")
+    mask_mode: Literal["ignore", "empty"] = Field("ignore", description="what black mask pixels mean")
+    max_size: int = Field(1600, ge=64, description="long side of the working copies in pixels")
+    frames: int = Field(80, ge=4, description="number of frames taken from a video")
+
+
+class ImportParams(Params):
+    dataset: Path
+    project: Path
+    format: Literal[
+        "auto", "transforms", "colmap", "llff", "scannet", "replica", "dtu", "strecha", "middlebury", "metashape", "realityscan",
+        "meshroom",
+    ] = "auto"
+
+
+class PosesParams(Params):
+    project: Path
+    preset: Literal["fast", "standard", "robust"] = "standard"
+
+
+class AlignParams(Params):
+    project: Path
+    up: str | None = Field(None, description="direction that points up: x, -x, …, or three numbers a,b,c")
+    scale: tuple[str, str, float] | None = Field(None, description="two points (x,y,z) or camera names, and their distance in metres")
+
+
+class TrainParams(Params):
+    project: Path
+    preset: Preset = "standard"
+    run: str = Field("main", pattern=r"^[\w.-]+$", description="name of the run")
+    time_limit: float | None = Field(None, gt=0, description="seconds of training")
+    steps: int | None = Field(None, gt=0, description="optimisation steps")
+    set: dict[str, str] = Field(default_factory=dict, description="settings by name, e.g. loss.semantic=0.1")
+    resume: bool = False
+
+
+class EvaluateParams(Params):
+    project: Path
+    run: str = "main"
+    split: Literal["test", "train"] = "test"
+
+
+class RenderParams(Params):
+    project: Path
+    out: Path
+    run: str = "main"
+    test: bool = False
+    camera: Path | None = None
+    orbit: int | None = Field(None, gt=0)
+    size: tuple[int, int] | None = None
+    passes: list[Pass] = ["rgb", "depth", "semantic"]
+
+
+class MeshParams(Params):
+    project: Path
+    run: str = "main"
+    out: Path | None = None
+    faces: int | None = Field(None, gt=0, description="target number of triangles")
+    resolution: int = Field(256, ge=16, le=1024, description="cells along the longest side of the box")
+    texture: int | None = Field(None, ge=64, description="texture size in pixels; none: vertex colours only")
+    split: Literal["none", "classes"] = "none"
+
+
+class BlendParams(Params):
+    project: Path
+    out: Path
+    run: str = "main"
+
+
+class ReconstructParams(Params):
+    photos: Path
+    out: Path
+    preset: Preset = "standard"
+    labels: Path | None = None
+    masks: Path | None = None
+    classes: Path | None = None
+    blend: Path | None = None
+    time_limit: float | None = Field(None, gt=0, description="seconds of training")
+    set: dict[str, str] = Field(default_factory=dict)
+    report: Path | None = Field(None, description="HTML report to write")

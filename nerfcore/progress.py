@@ -1,0 +1,49 @@
+"""How a long computation reports to its caller, and how the caller stops it."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from typing import Any
+
+from .errors import Cancelled
+
+log = logging.getLogger("fieldwork")
+
+
+class Reporter:
+    """Receives progress and answers "go on?". This base class keeps quiet; the CLI and the engine subclass it.
+
+    A computation calls `check()` at least every second or so, which raises `Cancelled` once `cancel()` was called
+    (from any thread, or a signal handler).
+    """
+
+    def __init__(self) -> None:
+        self._cancelled = threading.Event()
+        self.warnings: list[str] = []
+
+    def stage(self, name: str) -> None:
+        """A named part of the work begins ("Matching features"); progress restarts at 0."""
+
+    def progress(self, fraction: float, message: str = "") -> None:
+        """`fraction` in [0, 1] of the current stage is done."""
+        self.check()
+
+    def event(self, kind: str, **data: Any) -> None:
+        """A measured value or artefact: kind "train" (step, loss, psnr), "preview" (path), …"""
+
+    def warn(self, message: str) -> None:
+        """Something the user should know of; the work goes on."""
+        self.warnings.append(message)
+        log.warning(message)
+
+    def cancel(self) -> None:
+        self._cancelled.set()
+
+    @property
+    def cancelled(self) -> bool:
+        return self._cancelled.is_set()
+
+    def check(self) -> None:
+        if self._cancelled.is_set():
+            raise Cancelled

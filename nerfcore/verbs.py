@@ -1,0 +1,44 @@
+"""The verbs: what Fieldwork can do. The command line, the engine and the panels all go through `run_verb`."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any, NamedTuple
+
+from . import params as p
+from .progress import Reporter
+
+
+class Verb(NamedTuple):
+    """`function` is "module:name" below this package, called as function(params, report) → JSON-ready dict."""
+
+    params: type[p.Params]
+    function: str
+    summary: str
+
+
+VERBS = {
+    "doctor": Verb(p.DoctorParams, "doctor:doctor", "Check the engine, the device and the disk."),
+    "simulate": Verb(p.SimulateParams, "capture.simulate:simulate", "Build a scene and photograph it with Cycles."),
+    "new": Verb(p.NewParams, "capture.ingest:new", "Make a project from photos or a video."),
+    "import": Verb(p.ImportParams, "data.importer:import_dataset", "Make a project from a posed data set."),
+    "poses": Verb(p.PosesParams, "poses.estimate:estimate_poses", "Estimate the camera poses."),
+    "align": Verb(p.AlignParams, "poses.align:align", "Set the up direction and the metric scale."),
+    "train": Verb(p.TrainParams, "train.verb:train", "Train the field."),
+    "evaluate": Verb(p.EvaluateParams, "evaluate.verb:evaluate", "Measure the held-out images."),
+    "render": Verb(p.RenderParams, "render.verb:render", "Render images from the field."),
+    "mesh": Verb(p.MeshParams, "mesh.verb:mesh", "Extract the labelled surface."),
+    "blend": Verb(p.BlendParams, "blend:blend", "Write a .blend with cameras, points, mesh and materials."),
+    "reconstruct": Verb(p.ReconstructParams, "reconstruct:reconstruct", "Photos in, a labelled .blend out."),
+}
+
+
+def run_verb(name: str, params: p.Params, report: Reporter) -> dict[str, Any]:
+    """Run one verb in this process and return its JSON-ready result (keys as documented in docs/cli.md).
+
+    Raises:
+        FieldworkError: a failure the user can act on.
+        Cancelled: the reporter was asked to stop; the project is left resumable.
+    """
+    module, function = VERBS[name].function.split(":")
+    return getattr(importlib.import_module(f".{module}", __package__), function)(params, report)

@@ -21,9 +21,13 @@ def disk_errors(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            raise DiskError(f"No space left on the disk while writing {path}.", "Free some space and run it again.") from error
+            raise DiskError(
+                f"No space left on the disk while writing {path}.", "Free some space and run it again."
+            ) from error
         if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
-            raise DiskError(f"{path} cannot be written: {os.strerror(error.errno)}.", "Choose a folder you may write to.") from error
+            raise DiskError(
+                f"{path} cannot be written: {os.strerror(error.errno)}.", "Choose a folder you may write to."
+            ) from error
         raise
 
 

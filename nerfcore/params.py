@@ -46,7 +46,17 @@ class ImportParams(Params):
     dataset: Path
     project: Path
     format: Literal[
-        "auto", "transforms", "colmap", "llff", "scannet", "replica", "dtu", "strecha", "middlebury", "metashape", "realityscan",
+        "auto",
+        "transforms",
+        "colmap",
+        "llff",
+        "scannet",
+        "replica",
+        "dtu",
+        "strecha",
+        "middlebury",
+        "metashape",
+        "realityscan",
         "meshroom",
     ] = "auto"
 
@@ -59,7 +69,9 @@ class PosesParams(Params):
 class AlignParams(Params):
     project: Path
     up: str | None = Field(None, description="direction that points up: x, -x, …, or three numbers a,b,c")
-    scale: tuple[str, str, float] | None = Field(None, description="two points (x,y,z) or camera names, and their distance in metres")
+    scale: tuple[str, str, float] | None = Field(
+        None, description="two points (x,y,z) or camera names, and their distance in metres"
+    )
 
 
 class TrainParams(Params):

@@ -140,10 +140,13 @@ def load_project(folder: Path) -> Project:
     path = Path(folder) / PROJECT_FILE
     value = _read_json(path, f"{folder} is not a capture project: it has no {PROJECT_FILE}.")
     if not isinstance(value, dict) or value.get("format") != FORMAT:
-        raise ProjectError(f"{path} was not written by Fieldwork.", "Choose a folder made by `fieldwork new` or `import`.")
+        raise ProjectError(
+            f"{path} was not written by Fieldwork.", "Choose a folder made by `fieldwork new` or `import`."
+        )
     if isinstance(value.get("version"), int) and value["version"] > VERSION:
         raise ProjectError(
-            f"{path} has version {value['version']}; this Fieldwork reads up to {VERSION}.", "Update Fieldwork to open it."
+            f"{path} has version {value['version']}; this Fieldwork reads up to {VERSION}.",
+            "Update Fieldwork to open it.",
         )
     return _validated(Project, value, path)
 

@@ -39,7 +39,14 @@ class Camera(BaseModel):
         """The same lens on an image resampled to width × height."""
         sx, sy = width / self.width, height / self.height
         return self.model_copy(
-            update={"width": width, "height": height, "fx": self.fx * sx, "fy": self.fy * sy, "cx": self.cx * sx, "cy": self.cy * sy}
+            update={
+                "width": width,
+                "height": height,
+                "fx": self.fx * sx,
+                "fy": self.fy * sy,
+                "cx": self.cx * sx,
+                "cy": self.cy * sy,
+            }
         )
 
     def undistorted(self) -> Camera:
@@ -60,7 +67,9 @@ def _opencv_distort(uv: np.ndarray, k: tuple[float, ...]) -> tuple[np.ndarray, n
     r2 = u * u + v * v
     radial = 1 + r2 * (k1 + r2 * k2)
     slope = 2 * (k1 + 2 * k2 * r2)  # d radial / d(r²) · 2
-    out = np.stack([u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u), v * radial + p1 * (r2 + 2 * v * v) + 2 * p2 * u * v], -1)
+    out = np.stack(
+        [u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u), v * radial + p1 * (r2 + 2 * v * v) + 2 * p2 * u * v], -1
+    )
     jacobian = np.empty((len(uv), 2, 2))
     jacobian[:, 0, 0] = radial + u * u * slope + 2 * p1 * v + 6 * p2 * u
     jacobian[:, 0, 1] = u * v * slope + 2 * p1 * u + 2 * p2 * v

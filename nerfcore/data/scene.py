@@ -72,7 +72,8 @@ class Scene:
     def transformed(self, similarity: np.ndarray, frame: str) -> Scene:
         """The same scene seen from another frame; `similarity` (4, 4) maps this frame to the new one."""
         views = [
-            View(**{**vars(view), "camera_to_world": transform_pose(similarity, view.camera_to_world)}) for view in self.views
+            View(**{**vars(view), "camera_to_world": transform_pose(similarity, view.camera_to_world)})
+            for view in self.views
         ]
         points = Points(transform_points(similarity, self.points.xyz), self.points.rgb, self.points.error)
         bounds = self.bounds
@@ -80,9 +81,7 @@ class Scene:
             corners = np.stack(np.meshgrid(*bounds.T, indexing="ij"), -1).reshape(-1, 3)
             moved = transform_points(similarity, corners)
             bounds = np.stack([moved.min(0), moved.max(0)])
-        return Scene(
-            views, self.train, self.test, self.classes, self.ignore_id, points, bounds, self.mask_mode, frame
-        )
+        return Scene(views, self.train, self.test, self.classes, self.ignore_id, points, bounds, self.mask_mode, frame)
 
 
 def transform_pose(similarity: np.ndarray, camera_to_world: np.ndarray) -> np.ndarray:

@@ -1,0 +1,1 @@
+"""`blender -c fieldwork VERB …`."""

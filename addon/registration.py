@@ -1,0 +1,48 @@
+"""Registers what Fieldwork adds to Blender, and takes all of it away again.
+
+A module listed in `MODULES` may have a list `CLASSES` of Blender types and functions `register()` and `unregister()`
+for anything else (pointer properties, handlers, timers, menus). Order matters: property groups before what points
+at them, panels before their sub-panels. Nothing here may be slow: no file is read and no process started.
+"""
+
+from __future__ import annotations
+
+import importlib
+from types import ModuleType
+
+import bpy
+
+# Relative to the root package.
+MODULES = ("addon.commands",)
+
+# The package Blender knows the extension by, "bl_ext.<repository>.fieldwork": `AddonPreferences.bl_idname` and
+# `bpy.utils.extension_path_user` need exactly this one. "fieldwork" where it is imported outside an extension.
+ROOT_PACKAGE = __package__.rpartition(".")[0]
+
+_registered: list[ModuleType] = []
+
+
+def register(root_package: str) -> None:
+    """Import and register all modules; on an error, what was registered so far is taken back."""
+    try:
+        for name in MODULES:
+            module = importlib.import_module(f"{root_package}.{name}")
+            _registered.append(module)
+            for cls in getattr(module, "CLASSES", ()):
+                bpy.utils.register_class(cls)
+            if hasattr(module, "register"):
+                module.register()
+    except Exception:
+        unregister()
+        raise
+
+
+def unregister() -> None:
+    """Undo `register`, in reverse order."""
+    while _registered:
+        module = _registered.pop()
+        if hasattr(module, "unregister"):
+            module.unregister()
+        for cls in reversed(getattr(module, "CLASSES", ())):
+            if cls.is_registered:
+                bpy.utils.unregister_class(cls)

@@ -20,8 +20,8 @@ CameraModel = Literal["PINHOLE", "OPENCV", "OPENCV_FISHEYE", "EQUIRECTANGULAR"]
 class Camera(BaseModel):
     """Intrinsics of one camera. Focal lengths and principal point in pixels.
 
-    `distortion` is (k1, k2, p1, p2) for OPENCV (SIMPLE_RADIAL and RADIAL are its cases with zeros),
-    (k1, k2, k3, k4) for OPENCV_FISHEYE, empty for PINHOLE and EQUIRECTANGULAR.
+    `distortion` is (k1, k2, p1, p2) for OPENCV (SIMPLE_RADIAL and RADIAL are its cases with zeros), in OpenCV's order
+    optionally followed by k3, k4, k5, k6; (k1, k2, k3, k4) for OPENCV_FISHEYE; empty for PINHOLE and EQUIRECTANGULAR.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -61,12 +61,18 @@ def pixel_centers(width: int, height: int) -> np.ndarray:
 
 
 def _opencv_distort(uv: np.ndarray, k: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Distorted normalised coordinates (N, 2) and their Jacobian (N, 2, 2). Source: OpenCV calib3d, COLMAP OPENCV."""
-    k1, k2, p1, p2 = k
+    """Distorted normalised coordinates (N, 2) and their Jacobian (N, 2, 2).
+
+    `k` is (k1, k2, p1, p2[, k3[, k4, k5, k6]]), the radial factor (1 + k1 r² + k2 r⁴ + k3 r⁶) / (1 + k4 r² + k5 r⁴ +
+    k6 r⁶). Source: OpenCV calib3d; COLMAP's OPENCV and FULL_OPENCV.
+    """
+    k1, k2, p1, p2, k3, k4, k5, k6 = (*k, *(0.0,) * (8 - len(k)))
     u, v = uv[:, 0], uv[:, 1]
     r2 = u * u + v * v
-    radial = 1 + r2 * (k1 + r2 * k2)
-    slope = 2 * (k1 + 2 * k2 * r2)  # d radial / d(r²) · 2
+    top, bottom = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+    radial = top / bottom
+    # Twice the derivative of the radial factor by r².
+    slope = 2 * (k1 + r2 * (2 * k2 + 3 * k3 * r2) - radial * (k4 + r2 * (2 * k5 + 3 * k6 * r2))) / bottom
     out = np.stack(
         [u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u), v * radial + p1 * (r2 + 2 * v * v) + 2 * p2 * u * v], -1
     )

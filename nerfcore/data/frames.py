@@ -1,0 +1,110 @@
+"""The world frame of a capture: which way is up, where the ground is, how large things are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from .similarity import make_similarity, transform_points
+
+
+def up_direction(camera_to_world: Sequence[np.ndarray]) -> tuple[np.ndarray, float]:
+    """The up direction of a capture taken with a level camera, and how certain it is.
+
+    People hold cameras level, so the cameras' right axes lie in the horizontal plane: up is the eigenvector of the
+    smallest eigenvalue of Σ x xᵀ over the right axes x; its sign is that of the mean camera up. Where the right axes
+    all agree (a single stand point) that plane is undetermined, and the mean camera up itself is taken.
+
+    Args:
+        camera_to_world: (4, 4) poses with OpenCV axes.
+    Returns:
+        up (3,), of unit length, in the frame of the poses; confidence in [0, 1]: 1 − λ₀/λ₁ of the eigenvalues, times
+        the agreement of the cameras about the sign.
+    """
+    poses = np.stack(camera_to_world)
+    right, up = poses[:, :3, 0], -poses[:, :3, 1]
+    values, vectors = np.linalg.eigh(right.T @ right / len(right))
+    mean_up = up.mean(0)
+    if len(poses) < 2 or values[1] < 1e-3:
+        # Level in one direction only: take the mean up, made square to the common right axis.
+        side = vectors[:, 2]
+        flat = mean_up - side * (side @ mean_up)
+        length = np.linalg.norm(flat)
+        return (flat / length if length > 1e-9 else up[0]), 0.0
+    axis = vectors[:, 0]
+    agreement = float(up @ axis @ np.ones(len(up)) / len(up))
+    axis = axis if agreement >= 0 else -axis
+    votes = abs(float(np.sign(up @ axis).mean()))
+    return axis, float(np.clip((1 - values[0] / values[1]) * votes, 0, 1))
+
+
+def rotation_to_z(up: np.ndarray, forward: np.ndarray | None = None) -> np.ndarray:
+    """Rotation (3, 3) that turns `up` (3,) into +z, and, as far as that leaves room, `forward` (3,) into +y."""
+    z = up / np.linalg.norm(up)
+    hint = np.array([0.0, 1.0, 0.0]) if forward is None else np.asarray(forward, np.float64)
+    y = hint - z * (z @ hint)
+    if np.linalg.norm(y) < 1e-6:
+        hint = np.eye(3)[np.argmin(np.abs(z))]
+        y = hint - z * (z @ hint)
+    y = y / np.linalg.norm(y)
+    return np.stack([np.cross(y, z), y, z])
+
+
+def focus_point(camera_to_world: Sequence[np.ndarray]) -> np.ndarray:
+    """The point (3,) closest, in the least-squares sense, to all viewing axes of the cameras."""
+    poses = np.stack(camera_to_world)
+    direction, center = poses[:, :3, 2], poses[:, :3, 3]
+    projector = np.eye(3) - direction[:, :, None] * direction[:, None, :]
+    return np.linalg.lstsq(projector.sum(0), (projector @ center[:, :, None]).sum(0)[:, 0], rcond=None)[0]
+
+
+def upright(
+    camera_to_world: Sequence[np.ndarray], points: np.ndarray | None = None, camera_distance: float = 3.0
+) -> tuple[np.ndarray, float]:
+    """A world frame for a capture of unknown scale: z up, the subject over the origin, the ground near z = 0.
+
+    Args:
+        camera_to_world: (4, 4) poses with OpenCV axes.
+        points: sparse points (N, 3) in the same frame.
+        camera_distance: the median distance of the cameras from the subject becomes this many units.
+    Returns:
+        world_from_sfm, a similarity (4, 4), and the confidence of the up direction.
+    """
+    poses = np.stack(camera_to_world)
+    up, confidence = up_direction(camera_to_world)
+    rotation = rotation_to_z(up, poses[:, :3, 2].mean(0))
+    centers = poses[:, :3, 3]
+    if points is not None and len(points) >= 20:
+        center = np.median(points, axis=0)
+    else:
+        center = focus_point(camera_to_world)
+    distance = float(np.median(np.linalg.norm(centers - center, axis=1)))
+    extent = float(np.linalg.norm(np.ptp(centers, axis=0)))
+    if not np.isfinite(distance) or distance > 100 * max(extent, 1e-12) or distance < 1e-9:
+        # Parallel viewing axes have no focus: stay with the cameras.
+        center, distance = centers.mean(0), max(extent, 1e-6)
+    scale = camera_distance / distance
+    frame = make_similarity(scale, rotation, -scale * rotation @ center)
+    if points is not None and (height := ground_height(transform_points(frame, points))) is not None:
+        frame[2, 3] -= height
+    return frame, confidence
+
+
+def ground_height(points: np.ndarray, tolerance: float = 0.02) -> float | None:
+    """The z of a horizontal ground plane under the points (N, 3), or None when there is no evident one.
+
+    The ground is where the lower third of the points piles up: a layer of thickness `tolerance` of the points'
+    extent that holds at least 8 % of them, with at most 5 % below it.
+    """
+    if len(points) < 50:
+        return None
+    z = np.sort(points[:, 2])
+    low, high = np.quantile(z, [0.01, 0.99])
+    thickness = max((high - low) * tolerance, 1e-9)
+    counts = np.searchsorted(z, z + thickness) - np.arange(len(z))
+    candidates = np.flatnonzero(np.arange(len(z)) <= 0.05 * len(z))
+    best = candidates[np.argmax(counts[candidates])]
+    if counts[best] < 0.08 * len(z):
+        return None
+    return float(np.median(z[best : best + counts[best]]))

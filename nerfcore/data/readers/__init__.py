@@ -1,0 +1,1 @@
+"""Readers of posed data sets. Each module has `read(folder) -> Dataset` and `matches(folder) -> bool`."""

@@ -1,0 +1,210 @@
+"""transforms.json: NeRF's Blender scenes, Instant-NGP and nerfstudio.
+
+Poses are camera-to-world with OpenGL camera axes (x right, y up, looking along −z); the world has z up unless the
+file says otherwise. Intrinsics stand at the top or in each frame.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from ...capture.images import image_size
+from ...errors import InputError
+from ..cameras import Camera, flip_camera_axes
+from ..classes import read_classes
+from ..dataset import Y_UP, Dataset, DatasetView, beside, find_image, require, unique_names
+from ..scene import Points
+
+SPLIT_FILES = {"transforms_train.json": "train", "transforms_test.json": "test", "transforms_val.json": "val"}
+Split = Literal["train", "test", "auto"]
+
+
+def matches(folder: Path) -> bool:
+    """Whether `folder` is such a data set (or the JSON file of one)."""
+    if folder.is_file():
+        return folder.suffix == ".json"
+    return (folder / "transforms.json").is_file() or (folder / "transforms_train.json").is_file()
+
+
+def read(folder: Path) -> Dataset:
+    """Read `folder` (or one transforms file).
+
+    Raises:
+        InputError: a file is missing, is not JSON or lacks what is needed; the message names it.
+    """
+    if folder.is_file():
+        files: list[tuple[Path, Split]] = [(folder, "auto")]
+        folder = folder.parent
+    elif (folder / "transforms.json").is_file():
+        files = [(folder / "transforms.json", "auto")]
+    else:
+        found = {split: folder / name for name, split in SPLIT_FILES.items() if (folder / name).is_file()}
+        if not found:
+            raise InputError(f"{folder} has no transforms.json.", "Choose the folder that holds it.")
+        # Validation images are the held-out ones only where there are no test images.
+        held_out = found.get("test") or found.get("val")
+        files = [(found["train"], "train")] if "train" in found else []
+        if held_out:
+            files.append((held_out, "test"))
+    frames: list[tuple[Path, dict[str, Any], dict[str, Any], Split]] = []
+    missing: list[str] = []
+    heads: list[dict[str, Any]] = []
+    for file, split in files:
+        head = _load(file)
+        heads.append(head)
+        splits = _named_splits(head)
+        for frame in head["frames"]:
+            try:
+                image = find_image(folder / frame["file_path"])
+                frame_split = splits.get(Path(frame["file_path"]).as_posix(), split)
+            except (KeyError, TypeError) as error:
+                raise InputError(f"{file} has a frame without file_path.", "Export the data set again.") from error
+            if image is None:
+                missing.append(str(frame["file_path"]))
+            else:
+                frames.append((image, {**head, **frame}, frame, frame_split))
+    names = unique_names([image for image, *_ in frames], folder)
+    views = [_view(folder, name, image, merged, split) for name, (image, merged, _, split) in zip(names, frames)]
+    require(views, folder, missing)
+    warnings = [f"{len(missing)} images named in the data set are missing (first: {missing[0]})."] if missing else []
+    class_names, ignore_id = {}, 0
+    if (folder / "classes.json").is_file():
+        class_names, ignore_id, _ = read_classes(folder / "classes.json")
+    convention = str(heads[0].get("camera_convention", "")).lower()
+    return Dataset(
+        format="transforms",
+        views=views,
+        world_from_sfm=Y_UP.copy() if "y up" in convention or "y-up" in convention else np.eye(4),
+        scale_known="metres" in convention or "meters" in convention,
+        class_names=class_names,
+        ignore_id=ignore_id,
+        points=_points(folder, heads[0]),
+        warnings=warnings,
+    )
+
+
+def _load(file: Path) -> dict[str, Any]:
+    try:
+        value = json.loads(file.read_text(encoding="utf-8-sig"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{file} cannot be read: {error}.", "Export the data set again.") from error
+    if not isinstance(value, dict) or not isinstance(value.get("frames"), list):
+        raise InputError(f"{file} is not a transforms.json: it has no frames.", "Choose another data set.")
+    return value
+
+
+def _named_splits(head: dict[str, Any]) -> dict[str, Split]:
+    """Splits by file path from nerfstudio's train_filenames, val_filenames and test_filenames."""
+    test = head.get("test_filenames") or head.get("val_filenames")
+    if not test:
+        return {}
+    splits: dict[str, Split] = {Path(name).as_posix(): "train" for name in head.get("train_filenames", [])}
+    return {**splits, **{Path(name).as_posix(): "test" for name in test}}
+
+
+def _view(folder: Path, name: str, image: Path, frame: dict[str, Any], split: Split) -> DatasetView:
+    width, height = image_size(image)
+    matrix = np.array(frame.get("transform_matrix"), np.float64)
+    if matrix.shape == (3, 4):
+        matrix = np.vstack([matrix, [0, 0, 0, 1]])
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise InputError(f"The pose of {image.name} in {folder} is not a 4×4 matrix.", "Export the data set again.")
+    label_path = frame.get("semantic_path") or frame.get("label_path")
+    depth_path = frame.get("depth_file_path") or frame.get("depth_path")
+    label = _optional(folder, label_path) or beside(folder / "labels", image.stem)
+    mask = _optional(folder, frame.get("mask_path")) or beside(folder / "masks", image.stem, exact=False)
+    return DatasetView(
+        name=name,
+        image=image,
+        camera=frame_camera(frame, width, height),
+        camera_to_world=flip_camera_axes(_rigid(matrix)),
+        label=label,
+        mask=mask,
+        depth=_optional(folder, depth_path),
+        depth_scale=_depth_scale(frame),
+        split=split,
+    )
+
+
+def _rigid(matrix: np.ndarray) -> np.ndarray:
+    """The pose with its rotation made exactly orthonormal (JSON files round, some carry a scale)."""
+    u, _, vt = np.linalg.svd(matrix[:3, :3])
+    rigid = matrix.copy()
+    rigid[:3, :3] = u @ vt
+    return rigid
+
+
+def _depth_scale(frame: dict[str, Any]) -> float:
+    # nerfstudio: depth files in millimetres unless the file says otherwise; Instant-NGP: integer_depth_scale.
+    for key in ("depth_unit_scale_factor", "integer_depth_scale"):
+        if key in frame:
+            return float(frame[key])
+    return 1e-3
+
+
+def _optional(folder: Path, value: Any) -> Path | None:
+    return find_image(folder / value) if isinstance(value, str) and value else None
+
+
+def frame_camera(frame: dict[str, Any], width: int, height: int) -> Camera:
+    """Intrinsics of a frame (its own keys over those of the file) for an image of width × height pixels.
+
+    Raises:
+        InputError: neither a focal length nor a field of view is given, or the lens model is unknown.
+    """
+    w, h = int(frame.get("w", width)), int(frame.get("h", height))
+    k = [float(frame.get(f"k{i}", 0.0)) for i in range(1, 5)]
+    p1, p2 = float(frame.get("p1", 0.0)), float(frame.get("p2", 0.0))
+    model = str(frame.get("camera_model", "OPENCV")).upper()
+    if model in ("EQUIRECTANGULAR", "SPHERICAL") or frame.get("is_equirectangular"):
+        return Camera(model="EQUIRECTANGULAR", width=width, height=height, fx=w / 2, fy=w / 2, cx=w / 2, cy=h / 2)
+    if "fl_x" in frame:
+        fx = float(frame["fl_x"])
+        fy = float(frame.get("fl_y", fx))
+    elif "camera_angle_x" in frame:
+        fx = 0.5 * w / math.tan(0.5 * float(frame["camera_angle_x"]))
+        angle_y = frame.get("camera_angle_y")
+        fy = 0.5 * h / math.tan(0.5 * float(angle_y)) if angle_y else fx
+    else:
+        raise InputError("The transforms file gives no focal length.", "It needs fl_x or camera_angle_x.")
+    center = {"cx": float(frame.get("cx", w / 2)), "cy": float(frame.get("cy", h / 2))}
+    if model in ("OPENCV_FISHEYE", "FISHEYE") or frame.get("is_fisheye"):
+        camera = Camera(
+            model="OPENCV_FISHEYE", width=w, height=h, fx=fx, fy=fy, distortion=(k[0], k[1], k[2], k[3]), **center
+        )
+    elif model in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"):
+        if k[3]:
+            raise InputError("A perspective lens with four radial terms is not supported.", "Undistort the images.")
+        distortion = (k[0], k[1], p1, p2) + ((k[2],) if k[2] else ())
+        distorted = any(distortion) and "PINHOLE" not in model
+        camera = Camera(
+            model="OPENCV" if distorted else "PINHOLE",
+            width=w,
+            height=h,
+            fx=fx,
+            fy=fy,
+            distortion=distortion if distorted else (),
+            **center,
+        )
+    else:
+        raise InputError(f"The lens model {model} is not supported.", "Undistort the images and export again.")
+    return camera if (w, h) == (width, height) else camera.resized(width, height)
+
+
+def _points(folder: Path, head: dict[str, Any]) -> Points:
+    """nerfstudio's sparse point cloud, which lies in the frame of the poses."""
+    name = head.get("ply_file_path")
+    if not isinstance(name, str) or not (folder / name).is_file():
+        return Points.empty()
+    import trimesh
+
+    cloud = trimesh.load(folder / name)
+    xyz = np.asarray(getattr(cloud, "vertices", np.zeros((0, 3))), np.float64)
+    colors = getattr(cloud, "colors", None)
+    rgb = np.asarray(colors)[:, :3].astype(np.uint8) if colors is not None and len(colors) == len(xyz) else None
+    return Points(xyz, rgb if rgb is not None else np.full((len(xyz), 3), 128, np.uint8), np.zeros(len(xyz)))

@@ -1,0 +1,1 @@
+"""The engine process: JSON-RPC over stdio, jobs with their state on disk."""

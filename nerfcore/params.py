@@ -40,6 +40,8 @@ class NewParams(Params):
     mask_mode: Literal["ignore", "empty"] = Field("ignore", description="what black mask pixels mean")
     max_size: int = Field(1600, ge=64, description="long side of the working copies in pixels")
     frames: int = Field(80, ge=4, description="number of frames taken from a video")
+    keep_blurry: bool = Field(False, description="use photos that look blurred too")
+    add: bool = Field(False, description="add the photos to an existing project")
 
 
 class ImportParams(Params):

@@ -1,0 +1,382 @@
+"""The verb `new`: photos or a video become a capture project with upright, shrunk, labelled working copies."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import time
+from collections.abc import Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from ..data.classes import make_classes, read_classes
+from ..data.dataset import beside, unique_names
+from ..errors import InputError, ProjectError
+from ..files import atomic_path, write_json
+from ..params import NewParams
+from ..progress import Reporter
+from ..project import PROJECT_FILE, ImageRecord, Project, create_folder, load_project, save_project
+from .images import FLOAT_SUFFIXES, PHOTO_SUFFIXES, float_exposure, read_photo
+from .labels import Colors, fit_to_photo, read_labels, read_mask
+from .select import reject_blurred, reject_duplicates
+from .sharpness import sharpness, thumbnail
+from .video import VIDEO_SUFFIXES, extract_frames
+
+CACHE_FILE = "jobs/ingested.json"
+FRAMES_FOLDER = "frames"
+# Files that lie beside photos and are none.
+SIDECARS = {".json", ".txt", ".md", ".xmp", ".aae", ".csv", ".npy", ".npz", ".db", ".ini", ".xml", ".thm", ".log", ""}
+MAX_ASPECT = 3.0
+
+
+@dataclass(frozen=True)
+class Source:
+    """One candidate photo with the label and mask found for it."""
+
+    name: str
+    path: Path
+    label: Path | None
+    mask: Path | None
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What decides how a working copy looks."""
+
+    folder: Path
+    max_size: int
+    exposure: float
+    colors: Colors | None
+    ignore_id: int
+
+
+def new(params: NewParams, report: Reporter) -> dict[str, Any]:
+    """Ingest a folder of photos, or a video, into a project.
+
+    Running it again over the same photos only does what is missing; with `add` it puts further photos into an
+    existing project.
+
+    Returns:
+        {"images": count, "rejected": [{"file", "reason"}], "labelled", "masked", "classes": [names]}
+    Raises:
+        InputError: there is no usable photo, or the classes file is unusable.
+        ProjectError: the folder holds another capture.
+        DiskError: it cannot be written.
+    """
+    folder, photos = Path(params.project), Path(params.photos)
+    previous = _previous_project(params)
+    names, ignore_id, colors = {}, 0, {}
+    classes_file = params.classes or _beside_labels(params.labels)
+    if classes_file:
+        names, ignore_id, colors = read_classes(classes_file)
+    create_folder(folder)
+    if photos.is_file() and photos.suffix.lower() in VIDEO_SUFFIXES:
+        report.stage("Choosing frames of the video")
+        paths = extract_frames(photos, folder / FRAMES_FOLDER, params.frames, report)
+        skipped: list[dict[str, str]] = []
+        root = folder / FRAMES_FOLDER
+    else:
+        paths, skipped, root = list_photos(photos, exclude=[params.labels, params.masks])
+    labels_folder = params.labels or _folder_in(photos, "labels")
+    masks_folder = params.masks or _folder_in(photos, "masks")
+    kept = [record for record in previous.images if record.file] if previous and params.add else []
+    sources = _sources(paths, root, labels_folder, masks_folder, {record.name for record in kept})
+    floats = [path for path in paths if path.suffix.lower() in FLOAT_SUFFIXES]
+    settings = Settings(folder, params.max_size, float_exposure(floats), colors or None, ignore_id)
+
+    report.stage("Reading photos")
+    records, pictures = _ingest_all(sources, settings, report)
+    # Video frames were chosen for sharpness, and a still camera on a tripod may well repeat itself there.
+    reject_duplicates(records, pictures, kept)
+    if not params.keep_blurry:
+        reject_blurred(records)
+    records = kept + records
+    _check_usable(records, photos, skipped)
+    project = _assemble(params, previous, records, names, ignore_id, report)
+    rejected = skipped + [
+        {"file": Path(record.source).name, "reason": record.reason} for record in records if record.status == "rejected"
+    ]
+    used = [record for record in records if record.status != "rejected"]
+    if len(used) < 3:
+        report.warn(f"Only {len(used)} usable photos: camera poses need at least three, better twenty.")
+    result = {
+        "images": len(used),
+        "rejected": rejected,
+        "labelled": sum(record.label is not None for record in used),
+        "masked": sum(record.mask is not None for record in used),
+        "classes": [c.name for c in project.classes],
+    }
+    project.record("new", params.model_dump(mode="json"), result)
+    save_project(folder, project)
+    return result
+
+
+def list_photos(folder: Path, exclude: Iterable[Path | None] = ()) -> tuple[list[Path], list[dict[str, str]], Path]:
+    """Photos below `folder` (subfolders are cameras of one capture), files skipped with reasons, and the root.
+
+    Raises:
+        InputError: the folder is missing, unreadable or has no photos.
+    """
+    if not folder.exists():
+        raise InputError(f"{folder} does not exist.", "Choose a folder of photos or a video file.")
+    if folder.is_file():
+        raise InputError(f"{folder} is neither a folder of photos nor a video that Fieldwork reads.", "Choose another.")
+    root = folder / "images" if (folder / "images").is_dir() else folder
+    skip_folders = {Path(p).resolve() for p in exclude if p} | {
+        (folder / name).resolve() for name in ("labels", "masks", "depth")
+    }
+    photos, skipped = [], []
+    problems: list[OSError] = []
+    for place, folders, files in os.walk(root, onerror=problems.append):
+        here = Path(place)
+        folders[:] = sorted(f for f in folders if not f.startswith(".") and (here / f).resolve() not in skip_folders)
+        for name in sorted(files):
+            suffix = Path(name).suffix.lower()
+            if name.startswith(".") or suffix in SIDECARS:
+                continue
+            if suffix in PHOTO_SUFFIXES:
+                photos.append(here / name)
+            elif suffix in VIDEO_SUFFIXES:
+                skipped.append({"file": name, "reason": "a video among photos: give it alone as --photos"})
+            else:
+                skipped.append({"file": name, "reason": f"{suffix} is not a photo format that Fieldwork reads"})
+    for problem in problems:
+        if Path(str(problem.filename)) == root:
+            raise InputError(f"{root} cannot be read: {problem.strerror}.", "Check its permissions.")
+        skipped.append({"file": str(problem.filename), "reason": f"folder cannot be read: {problem.strerror}"})
+    if not photos:
+        raise InputError(
+            f"There are no photos in {folder}.", "Choose a folder with JPEG, PNG, TIFF, HEIC or raw files."
+        )
+    return photos, skipped, root
+
+
+def file_hash(path: Path) -> str:
+    """SHA-256 of a file, in hex."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _previous_project(params: NewParams) -> Project | None:
+    """The project that is there already, if these photos may go into it."""
+    folder = Path(params.project)
+    if not (folder / PROJECT_FILE).exists():
+        if params.add:
+            raise ProjectError(f"{folder} has no project to add photos to.", "Leave out --add to make a new one.")
+        return None
+    project = load_project(folder)
+    if params.add:
+        return project
+    first = project.provenance[0] if project.provenance else None
+    if first is None or first.verb != "new" or Path(str(first.settings.get("photos"))) != Path(params.photos):
+        raise ProjectError(
+            f"{folder} already holds another capture.", "Choose a new folder, or --add to put these photos into it."
+        )
+    return project
+
+
+def _beside_labels(labels: Path | None) -> Path | None:
+    """classes.json in the labels folder or next to it, when none is given."""
+    if labels is None:
+        return None
+    return next((p for p in (labels / "classes.json", labels.parent / "classes.json") if p.is_file()), None)
+
+
+def _folder_in(photos: Path, name: str) -> Path | None:
+    return photos / name if (photos / name).is_dir() else None
+
+
+def _sources(paths: list[Path], root: Path, labels: Path | None, masks: Path | None, taken: set[str]) -> list[Source]:
+    for folder, what in ((labels, "labels"), (masks, "masks")):
+        if folder is not None and not folder.is_dir():
+            raise InputError(f"The {what} folder {folder} does not exist.", f"Choose the folder that holds the {what}.")
+    names = unique_names(paths, root)
+    sources = []
+    for path, name in zip(paths, names):
+        unique = name
+        while unique in taken:
+            unique += "_b"
+        taken.add(unique)
+        label = (beside(labels, name, False) or beside(labels, path.stem, False)) if labels else None
+        mask = (beside(masks, name, False) or beside(masks, path.stem, False)) if masks else None
+        sources.append(Source(unique, path, label, mask))
+    return sources
+
+
+def _ingest_all(
+    sources: list[Source], settings: Settings, report: Reporter
+) -> tuple[list[ImageRecord], dict[str, np.ndarray]]:
+    """Ingest every photo on a few threads; finished ones are remembered in the project, so a rerun skips them."""
+    cache = _load_cache(settings.folder)
+    done: dict[str, tuple[ImageRecord, np.ndarray | None]] = {}
+    workers = max(1, min(4, os.cpu_count() or 1))
+    saved = time.monotonic()
+    try:
+        with ThreadPoolExecutor(workers) as pool:
+            queue: Iterator[Source] = iter(sources)
+            running: set[Future[tuple[Source, ImageRecord, np.ndarray | None]]] = set()
+            while len(done) < len(sources):
+                report.progress(len(done) / len(sources), f"{len(done)} of {len(sources)} photos")
+                while len(running) < workers and (source := next(queue, None)) is not None:
+                    running.add(pool.submit(_ingest_cached, source, settings, cache.get(source.name)))
+                finished, running = wait(running, timeout=0.3, return_when=FIRST_COMPLETED)
+                for future in finished:
+                    source, record, picture = future.result()
+                    done[source.name] = record, picture
+                    cache[source.name] = _cache_entry(source, settings, record, picture)
+                if time.monotonic() - saved > 3:
+                    write_json(settings.folder / CACHE_FILE, cache)
+                    saved = time.monotonic()
+    finally:
+        if done:
+            write_json(settings.folder / CACHE_FILE, cache)
+    records = [done[source.name][0] for source in sources]
+    return records, {name: picture for name, (_, picture) in done.items() if picture is not None}
+
+
+def _cache_key(source: Source, settings: Settings) -> list[Any]:
+    stamps = []
+    for path in (source.path, source.label, source.mask):
+        stat = path.stat() if path else None
+        stamps.append([str(path), stat.st_size, stat.st_mtime] if stat else None)
+    colors = {str(i): list(color) for i, color in sorted((settings.colors or {}).items())}
+    return [stamps, settings.max_size, settings.exposure, colors, settings.ignore_id]
+
+
+def _cache_entry(source: Source, settings: Settings, record: ImageRecord, picture: np.ndarray | None) -> dict[str, Any]:
+    small = None if picture is None else np.round(picture).astype(np.uint8).tobytes().hex()
+    return {"key": _cache_key(source, settings), "record": record.model_dump(mode="json"), "thumbnail": small}
+
+
+def _load_cache(folder: Path) -> dict[str, Any]:
+    """What an earlier run finished. Anything unreadable only costs doing it again."""
+    try:
+        cache = json.loads((folder / CACHE_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return cache if isinstance(cache, dict) else {}
+
+
+def _ingest_cached(
+    source: Source, settings: Settings, entry: dict[str, Any] | None
+) -> tuple[Source, ImageRecord, np.ndarray | None]:
+    if entry and entry.get("key") == json.loads(json.dumps(_cache_key(source, settings))):
+        record = ImageRecord.model_validate(entry["record"])
+        files = [file for file in (record.file, record.label, record.mask) if file]
+        if all((settings.folder / file).is_file() for file in files):
+            small = entry.get("thumbnail")
+            picture = (
+                np.frombuffer(bytes.fromhex(small), np.uint8).reshape(64, 64).astype(np.float32) if small else None
+            )
+            return source, record, picture
+    return source, *_ingest_one(source, settings)
+
+
+def _ingest_one(source: Source, settings: Settings) -> tuple[ImageRecord, np.ndarray | None]:
+    """Decode one photo, write its working copy, label and mask. A bad photo becomes a rejected record."""
+    record = ImageRecord(name=source.name, source=str(source.path))
+    try:
+        photo = read_photo(source.path, settings.max_size, settings.exposure)
+        width, height = photo.full_size
+        aspect = max(width, height) / min(width, height)
+        if photo.facts.get("panorama") or aspect > MAX_ASPECT:
+            raise InputError(f"a panorama ({width}×{height}): poses need single photos, not stitched ones")
+        if min(width, height) < 64:
+            raise InputError(f"too small ({width}×{height} pixels)")
+    except InputError as error:
+        record.status, record.reason = "rejected", str(error)
+        return record, None
+    record.sha256 = file_hash(source.path)
+    image = photo.image
+    record.width, record.height = image.size
+    record.exif = {key: value for key, value in photo.facts.items() if key != "focal_px"}
+    focal = photo.facts.get("focal_px")
+    record.focal_px = focal * max(image.size) / max(photo.full_size) if focal else None
+    record.camera_group = camera_group(photo.facts, image.size)
+    record.sharpness = sharpness(image)
+    suffix = ".jpg" if photo.lossy and image.mode == "RGB" else ".png"
+    record.file = f"images/{source.name}{suffix}"
+    with atomic_path(settings.folder / record.file) as path:
+        image.save(path, quality=95, subsampling=0) if suffix == ".jpg" else image.save(path, compress_level=2)
+    problems = []
+    for kind, given in (("label", source.label), ("mask", source.mask)):
+        if given is None:
+            continue
+        try:
+            values = read_labels(given, settings.colors, settings.ignore_id) if kind == "label" else read_mask(given)
+            fitted = fit_to_photo(values, photo.orientation, photo.full_size, image.size, f"{kind} {given.name}")
+        except InputError as error:
+            problems.append(str(error))
+            continue
+        file = f"{kind}s/{source.name}.png"
+        with atomic_path(settings.folder / file) as path:
+            small = fitted.astype(np.uint8) if fitted.max(initial=0) < 256 else fitted
+            Image.fromarray(small).save(path, compress_level=2)
+        setattr(record, kind, file)
+    record.reason = "; ".join(problems)
+    return record, thumbnail(image)
+
+
+def camera_group(facts: dict[str, Any], size: tuple[int, int]) -> str:
+    """Photos with equal groups share one camera model: same make, model, focal length and picture size."""
+    parts = [str(facts.get("make", "")), str(facts.get("model", ""))]
+    focal = facts.get("focal_mm")
+    parts.append(f"{focal:.1f}mm" if focal else "")
+    return " ".join([part for part in parts if part] + [f"{size[0]}x{size[1]}"])
+
+
+def _check_usable(records: list[ImageRecord], photos: Path, skipped: list[dict[str, str]]) -> None:
+    if any(record.status != "rejected" for record in records):
+        return
+    first = next((record for record in records if record.reason), None)
+    why = f" ({Path(first.source).name}: {first.reason})" if first else ""
+    raise InputError(
+        f"None of the {len(records) + len(skipped)} files in {photos} is a usable photo{why}.", "Choose other photos."
+    )
+
+
+def _assemble(
+    params: NewParams,
+    previous: Project | None,
+    records: list[ImageRecord],
+    names: dict[int, str],
+    ignore_id: int,
+    report: Reporter,
+) -> Project:
+    """The project with its classes: those named, and those that occur in the label maps without a name."""
+    project = previous.model_copy() if previous else Project(mask_mode=params.mask_mode)
+    if previous is not None and not params.add and previous.images:
+        # A rerun keeps what was decided about the same photos later (splits, poses).
+        old = {record.name: record for record in previous.images}
+        for record in records:
+            before = old.get(record.name)
+            if before and before.sha256 == record.sha256:
+                record.split = before.split
+    project.images = records
+    project.mask_mode = params.mask_mode if params.masks or not previous else project.mask_mode
+    for record in records:
+        if record.status != "rejected" and record.reason:
+            report.warn(f"{record.name}: {record.reason}")
+    present: set[int] = set()
+    for record in records:
+        if record.label:
+            report.check()
+            with Image.open(Path(params.project) / record.label) as image:
+                present |= set(np.unique(np.asarray(image)).tolist())
+    known = {c.id: c for c in project.classes}
+    if names or not known:
+        project.ignore_id = ignore_id
+        named = {**{i: f"class {i}" for i in present}, **names}
+    else:
+        named = {**{i: f"class {i}" for i in present}, **{c.id: c.name for c in project.classes}}
+    project.classes = [
+        known[c.id].model_copy(update={"name": c.name}) if c.id in known else c
+        for c in make_classes(named, project.ignore_id)
+    ]
+    return project

@@ -1,0 +1,59 @@
+"""Which photos of a capture to leave out: duplicates and blurred ones, each with its reason."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ..project import ImageRecord
+from .sharpness import same_picture
+
+# A photo is left out when its sharpness is below this share of the median of its neighbours in the capture.
+BLUR_SHARE = 0.1
+MIN_PHOTOS_TO_JUDGE = 8
+
+
+def reject_duplicates(
+    records: Sequence[ImageRecord], pictures: dict[str, np.ndarray], earlier: Sequence[ImageRecord] = ()
+) -> None:
+    """Mark photos that repeat another one, byte for byte or saved again, as rejected (the later one of the two)."""
+    first_with: dict[str, ImageRecord] = {record.sha256: record for record in earlier if record.sha256}
+    kept: list[ImageRecord] = []
+    for record in records:
+        if record.status == "rejected":
+            continue
+        twin = first_with.get(record.sha256)
+        if twin is None:
+            twin = next((k for k in kept if _same(k, record, pictures)), None)
+        if twin is not None:
+            record.status, record.reason = "rejected", f"the same picture as {Path(twin.source).name}"
+        else:
+            first_with[record.sha256] = record
+            kept.append(record)
+
+
+def _same(a: ImageRecord, b: ImageRecord, pictures: dict[str, np.ndarray]) -> bool:
+    if (a.width, a.height) != (b.width, b.height) or a.name not in pictures or b.name not in pictures:
+        return False
+    return same_picture(pictures[a.name], pictures[b.name])
+
+
+def reject_blurred(records: Sequence[ImageRecord]) -> None:
+    """Mark photos far less sharp than the rest of the capture as rejected.
+
+    Each is compared with the median of the photos of its own camera, because lenses and subjects differ.
+    """
+    groups: dict[str, list[ImageRecord]] = {}
+    for record in records:
+        if record.status == "ok" and record.sharpness is not None:
+            groups.setdefault(record.camera_group, []).append(record)
+    for group in groups.values():
+        if len(group) < MIN_PHOTOS_TO_JUDGE:
+            continue
+        median = float(np.median([record.sharpness or 0.0 for record in group]))
+        for record in group:
+            if (record.sharpness or 0.0) < BLUR_SHARE * median:
+                record.status = "rejected"
+                record.reason = f"blurred: sharpness {record.sharpness:.0f}, the others have about {median:.0f}"

@@ -1,0 +1,118 @@
+"""Frames of a video: the sharpest of each stretch of time, upright."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+from PIL import Image
+from scipy import ndimage
+
+from ..errors import InputError
+from ..files import atomic_path, write_json
+from ..progress import Reporter
+
+VIDEO_SUFFIXES = {".mp4", ".mov", ".m4v", ".webm", ".mkv", ".avi", ".mts", ".m2ts", ".3gp", ".mpg", ".mpeg"}
+INDEX_FILE = "frames.json"
+GREY_WIDTH = 640
+
+
+def extract_frames(video: Path, folder: Path, count: int, report: Reporter) -> list[Path]:
+    """Save the sharpest frame of each of `count` equal stretches of a video as PNG files in `folder`.
+
+    The rotation stored with the video (phones) is applied. A finished extraction of the same file is reused.
+
+    Returns:
+        the frame files, in time order: `<video name>_<frame number>.png`.
+    Raises:
+        InputError: the file is no video, has no picture, or is damaged from the start.
+    """
+    stat = video.stat()
+    key = [str(video), stat.st_size, stat.st_mtime, count]
+    finished = _finished(folder, key)
+    if finished:
+        return finished
+    chosen: list[Path] = []
+    best: tuple[float, int, Image.Image] | None = None
+    current = 0
+    try:
+        with av.open(str(video)) as container:
+            if not container.streams.video:
+                raise InputError(f"{video} has no pictures, only sound.", "Choose another video.")
+            stream = container.streams.video[0]
+            stream.thread_type = "AUTO"
+            duration = _duration(container, stream)
+            for number, seconds, frame in _frames(container, stream):
+                if number % 10 == 0:
+                    report.progress(min(seconds / duration, 1.0), f"{len(chosen)} frames chosen")
+                window = min(int(seconds / duration * count), count - 1)
+                if window != current and best is not None:
+                    chosen.append(_save(best, video, folder))
+                    best = None
+                current = window
+                value = frame_sharpness(frame)
+                if best is None or value > best[0]:
+                    best = value, number, _upright(frame)
+    except av.FFmpegError as error:
+        if len(chosen) < 4:
+            raise InputError(
+                f"{video} cannot be decoded: {error}.", "Convert it to MP4 (H.264) and try again."
+            ) from error
+        report.warn(f"{video.name} is damaged after {len(chosen)} chosen frames: {error}. The rest is left out.")
+    if best is not None:
+        chosen.append(_save(best, video, folder))
+    if not chosen:
+        raise InputError(f"{video} has no pictures.", "Choose another video.")
+    write_json(folder / INDEX_FILE, {"key": key, "files": [path.name for path in chosen]})
+    return chosen
+
+
+def _save(best: tuple[float, int, Image.Image], video: Path, folder: Path) -> Path:
+    path = folder / f"{video.stem}_{best[1]:06d}.png"
+    with atomic_path(path) as temporary:
+        best[2].save(temporary, compress_level=1)
+    return path
+
+
+def _finished(folder: Path, key: list[Any]) -> list[Path]:
+    try:
+        index = json.loads((folder / INDEX_FILE).read_text(encoding="utf-8"))
+        paths = [folder / name for name in index["files"]]
+        return paths if index["key"] == json.loads(json.dumps(key)) and all(p.is_file() for p in paths) else []
+    except (OSError, ValueError, KeyError, TypeError):
+        return []
+
+
+def _duration(container: Any, stream: Any) -> float:
+    """Seconds of video, estimated from the number of frames where the container does not say."""
+    if stream.duration and stream.time_base:
+        return max(float(stream.duration * stream.time_base), 1e-3)
+    if container.duration:
+        return max(container.duration / av.time_base, 1e-3)
+    rate = float(stream.average_rate or 30)
+    return max((stream.frames or 300) / rate, 1e-3)
+
+
+def _frames(container: Any, stream: Any) -> Iterator[tuple[int, float, Any]]:
+    start: float | None = None
+    for number, frame in enumerate(container.decode(stream)):
+        seconds = float(frame.time) if frame.time is not None else number / float(stream.average_rate or 30)
+        start = seconds if start is None else start
+        yield number, max(seconds - start, 0.0), frame
+
+
+def frame_sharpness(frame: Any) -> float:
+    """Variance of the Laplacian of a frame's grey values at a width of 640 pixels."""
+    height = max(2, round(frame.height * GREY_WIDTH / frame.width))
+    grey = frame.reformat(GREY_WIDTH, height, "gray").to_ndarray()
+    return float(ndimage.laplace(grey.astype(np.float32)).var())
+
+
+def _upright(frame: Any) -> Image.Image:
+    image = frame.to_image()
+    turns = round(frame.rotation / 90) % 4  # counter-clockwise quarter turns that make it upright
+    return image.rotate(90 * turns, expand=True) if turns else image

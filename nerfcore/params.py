@@ -66,6 +66,7 @@ class ImportParams(Params):
 class PosesParams(Params):
     project: Path
     preset: Literal["fast", "standard", "robust"] = "standard"
+    restart: bool = Field(False, description="place all photos anew, also those that have a pose")
 
 
 class AlignParams(Params):

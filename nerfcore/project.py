@@ -167,10 +167,16 @@ def load_poses(folder: Path) -> Poses:
     return _validated(Poses, value, path)
 
 
-def save_poses(folder: Path, poses: Poses, points: Points) -> None:
-    """Atomically write poses and sparse points (SfM frame)."""
+def save_poses(
+    folder: Path, poses: Poses, points: Points, visibility: tuple[np.ndarray, np.ndarray] | None = None
+) -> None:
+    """Atomically write poses and sparse points (SfM frame).
+
+    `visibility` says which image saw which point: two int arrays (M,), indices into `poses.images` and into points.
+    """
+    view, point = visibility if visibility is not None else (np.zeros(0, np.int32), np.zeros(0, np.int32))
     with atomic_path(Path(folder) / POINTS_FILE) as temporary, open(temporary, "wb") as file:
-        np.savez_compressed(file, xyz=points.xyz, rgb=points.rgb, error=points.error)
+        np.savez_compressed(file, xyz=points.xyz, rgb=points.rgb, error=points.error, view=view, point=point)
     write_json(Path(folder) / POSES_FILE, poses.model_dump(mode="json"))
 
 
@@ -184,6 +190,21 @@ def load_points(folder: Path) -> Points:
             return Points(data["xyz"], data["rgb"], data["error"])
     except (ValueError, OSError, KeyError) as error:
         raise ProjectError(f"{path} is damaged: {error}.", "Run `fieldwork poses` again.") from error
+
+
+def load_visibility(folder: Path) -> dict[str, np.ndarray]:
+    """For each image name, the indices (M,) of the sparse points it saw; empty when that is not known."""
+    path = Path(folder) / POINTS_FILE
+    if not path.is_file():
+        return {}
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            if "view" not in data:
+                return {}
+            view, point = data["view"], data["point"]
+    except (ValueError, OSError, KeyError) as error:
+        raise ProjectError(f"{path} is damaged: {error}.", "Run `fieldwork poses` again.") from error
+    return {image.name: point[view == i] for i, image in enumerate(load_poses(folder).images)}
 
 
 def world_from_sfm(project: Project) -> np.ndarray:

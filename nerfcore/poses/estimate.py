@@ -1,0 +1,250 @@
+"""The verb `poses`: camera poses, lenses and sparse points of a capture by structure from motion."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from ..data.cameras import Camera
+from ..data.frames import upright
+from ..data.scene import Points
+from ..errors import PosesError
+from ..files import atomic_path, disk_errors, write_json
+from ..params import PosesParams
+from ..progress import Reporter
+from ..project import (
+    POSES_FILE,
+    Frame,
+    ImageRecord,
+    PosedImage,
+    Poses,
+    Project,
+    load_poses,
+    load_project,
+    save_poses,
+    save_project,
+)
+from .process import run_worker
+
+WORK_FOLDER = "poses/sfm"
+SPARSE_FOLDER = "poses/sparse"
+REPORT_FILE = "poses/report.json"
+PICTURE_FILE = "poses/report.png"
+STATE_FILE = "state.json"
+MIN_PHOTOS = 3
+PHOTO_NEIGHBOURS, VIDEO_NEIGHBOURS = 3, 10
+
+
+def estimate_poses(params: PosesParams, report: Reporter) -> dict[str, Any]:
+    """Estimate the poses of all usable photos of a project.
+
+    A run that was stopped goes on with the features and matches it has. When photos were added to a project with
+    poses, only they are placed and everything else stays where it is, unless `restart`.
+
+    Returns:
+        {"registered", "total", "reprojection_px", "up_confidence", "images": [{"name", "status", "reason"}]}
+    Raises:
+        ProjectError, PosesError, DiskError, Cancelled.
+    """
+    folder = Path(params.project)
+    project = load_project(folder)
+    records = [record for record in project.images if record.status != "rejected"]
+    if len(records) < MIN_PHOTOS:
+        rejected = len(project.images) - len(records)
+        raise PosesError(
+            f"{folder} has {len(records)} usable photos ({rejected} rejected); poses need at least {MIN_PHOTOS}.",
+            "Add photos with `fieldwork new --add`; twenty to a hundred around the subject work well.",
+        )
+    previous = None if params.restart else _extendable(folder, records)
+    work = folder / WORK_FOLDER
+    with disk_errors(work):
+        work.mkdir(parents=True, exist_ok=True)
+        _forget_changed(work, records)
+        masks = _prepare_masks(folder, work, records, report)
+    result = run_worker(_job(folder, project, records, masks, params, extend=previous is not None), work, report)
+    poses, points, visibility = _poses(result, records)
+    _update_project(project, records, poses, points, result, keep_frame=previous is not None)
+    save_poses(folder, poses, points, visibility)
+    answer = {
+        "registered": len(poses.images),
+        "total": len(records),
+        "reprojection_px": result["reprojection_px"],
+        "up_confidence": project.frame.up_confidence,
+        "level": result["level"],
+        "groups": result["groups"],
+        "images": [
+            {"name": record.name, "status": image["status"], "reason": image["reason"]}
+            for record, image in zip(records, result["images"])
+        ],
+    }
+    project.record("poses", params.model_dump(mode="json"), {k: v for k, v in answer.items() if k != "images"})
+    save_project(folder, project)
+    _write_report(folder, project, poses, points, records, result, report)
+    missing = answer["total"] - answer["registered"]
+    if missing:
+        report.warn(f"{missing} of {answer['total']} photos have no pose; {folder / REPORT_FILE} says why.")
+    return answer
+
+
+def _extendable(folder: Path, records: list[ImageRecord]) -> Poses | None:
+    """The earlier poses, if they came from here and there are photos that were not part of that run."""
+    if not (folder / POSES_FILE).is_file() or not (folder / SPARSE_FOLDER).is_dir():
+        return None
+    poses = load_poses(folder)
+    placed = {image.name for image in poses.images}
+    fresh = [record for record in records if record.name not in placed and record.status == "ok"]
+    kept = [record for record in records if record.name in placed]
+    return poses if poses.source == "sfm" and fresh and len(kept) >= MIN_PHOTOS else None
+
+
+def _forget_changed(work: Path, records: list[ImageRecord]) -> None:
+    """Throw away features of photos whose working copy or mask is another one than when they were found."""
+    now = {
+        record.name: [record.file, record.sha256, record.width, record.height, record.camera_group, record.mask]
+        for record in records
+    }
+    state = work / STATE_FILE
+    try:
+        before = json.loads(state.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        before = None
+    if before is not None and any(before.get(name, value) != value for name, value in now.items()):
+        shutil.rmtree(work)
+        work.mkdir(parents=True)
+        before = None
+    write_json(state, {**(before or {}), **now})
+
+
+def _prepare_masks(folder: Path, work: Path, records: list[ImageRecord], report: Reporter) -> Path | None:
+    """Masks under the names COLMAP looks for: those of the project, and the alpha of photos with transparency."""
+    target = work / "masks"
+    found = False
+    for record in records:
+        report.check()
+        source = folder / record.mask if record.mask else None
+        if source is None and record.file.endswith(".png"):
+            with Image.open(folder / record.file) as image:
+                alpha = image.getchannel("A") if "A" in image.getbands() else None
+        elif source is not None:
+            alpha = None
+        else:
+            continue
+        if source is None and alpha is None:
+            continue
+        found = True
+        path = target / f"{_database_name(record)}.png"
+        if path.is_file():
+            continue
+        with atomic_path(path) as temporary:
+            if source is not None:
+                shutil.copyfile(source, temporary)
+            elif alpha is not None:
+                alpha.point(lambda value: 255 if value > 127 else 0).save(temporary)
+    return target if found else None
+
+
+def _database_name(record: ImageRecord) -> str:
+    """The photo's name in COLMAP's files: relative to images/."""
+    return record.file.removeprefix("images/")
+
+
+def _job(
+    folder: Path, project: Project, records: list[ImageRecord], masks: Path | None, params: PosesParams, extend: bool
+) -> dict[str, Any]:
+    from_video = any(Path(record.source).parent.name == "frames" for record in records)
+    return {
+        "image_folder": str((folder / "images").resolve()),
+        "masks": str(masks.resolve()) if masks else None,
+        "work": str((folder / WORK_FOLDER).resolve()),
+        "sparse": str((folder / SPARSE_FOLDER).resolve()),
+        "start": str((folder / SPARSE_FOLDER).resolve()) if extend else None,
+        "preset": params.preset,
+        "neighbours": VIDEO_NEIGHBOURS if from_video else PHOTO_NEIGHBOURS,
+        "images": [
+            {
+                "file": _database_name(record),
+                "group": record.camera_group or f"{record.width}x{record.height}",
+                "width": record.width,
+                "height": record.height,
+                "focal_px": record.focal_px,
+            }
+            for record in records
+        ],
+    }
+
+
+def _poses(result: dict[str, Any], records: list[ImageRecord]) -> tuple[Poses, Points, tuple[np.ndarray, np.ndarray]]:
+    names = {_database_name(record): record.name for record in records}
+    images = [
+        PosedImage(name=names[image["file"]], camera=image["camera"], camera_to_world=image["camera_to_world"])
+        for image in result["images"]
+        if image["status"] == "ok"
+    ]
+    poses = Poses(
+        source="sfm",
+        cameras=[Camera.model_validate(camera) for camera in result["cameras"]],
+        images=images,
+        reprojection_px=result["reprojection_px"],
+    )
+    with np.load(result["points_file"], allow_pickle=False) as data:
+        points = Points(data["xyz"], data["rgb"], data["error"])
+        return poses, points, (data["view"], data["point"])
+
+
+def _update_project(
+    project: Project,
+    records: list[ImageRecord],
+    poses: Poses,
+    points: Points,
+    result: dict[str, Any],
+    keep_frame: bool,
+) -> None:
+    """Write statuses, and unless earlier cameras were kept the world frame, into the project."""
+    for record, image in zip(records, result["images"]):
+        record.status = image["status"]
+        record.reason = image["reason"]
+    if keep_frame:
+        return
+    matrices = [np.array(image.camera_to_world) for image in poses.images]
+    world_from_sfm, confidence = upright(matrices, points.xyz)
+    project.frame = Frame(world_from_sfm=world_from_sfm.tolist(), up_confidence=confidence)
+
+
+def _write_report(
+    folder: Path,
+    project: Project,
+    poses: Poses,
+    points: Points,
+    records: list[ImageRecord],
+    result: dict[str, Any],
+    report: Reporter,
+) -> None:
+    """What is known about every photo, as JSON and as a picture."""
+    names = {_database_name(record): record.name for record in records}
+    write_json(
+        folder / REPORT_FILE,
+        {
+            "level": result["level"],
+            "groups": result["groups"],
+            "reprojection_px": result["reprojection_px"],
+            "points": len(points),
+            "up_confidence": project.frame.up_confidence,
+            "images": [
+                {
+                    "name": names[image["file"]],
+                    **{k: v for k, v in image.items() if k not in ("file", "camera_to_world")},
+                }
+                for image in result["images"]
+            ],
+            "links": [[names[a], names[b], count] for a, b, count in result["links"]],
+        },
+    )
+    from .report import draw_report
+
+    report.stage("Drawing the report")
+    draw_report(folder / PICTURE_FILE, project, poses, points, records, result["links"], names)

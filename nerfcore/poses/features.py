@@ -1,0 +1,207 @@
+"""Features and matches in COLMAP's database, with progress read from it. Runs in the pose process."""
+
+from __future__ import annotations
+
+import sqlite3
+import threading
+import zlib  # noqa: F401  (must be loaded before pycolmap, which exports a static zlib)
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+from .presets import Level
+
+FULL_MODEL_FROM = 15  # photos of one camera at which its lens is given all of OPENCV's parameters
+FOCAL_GUESS = 0.85  # of the long side, where EXIF says nothing
+RETRIEVAL_FEATURES = 256
+PAIRS_PER_IMAGE = 16
+
+
+@contextmanager
+def database(path: Path) -> Iterator[Any]:
+    """An open pycolmap database, closed afterwards."""
+    opened = pycolmap.Database.open(str(path))
+    try:
+        yield opened
+    finally:
+        opened.close()
+
+
+@contextmanager
+def polled(path: Path, query: str, total: int, tell: Callable[[float, str], None], noun: str) -> Iterator[None]:
+    """While the block runs, ask the database twice a second how many rows there are, and tell the progress."""
+    stop = threading.Event()
+
+    def poll() -> None:
+        while not stop.wait(0.5):
+            try:
+                with sqlite3.connect(f"file:{path}?mode=ro", uri=True, timeout=1) as connection:
+                    count = connection.execute(query).fetchone()[0]
+            except sqlite3.Error:
+                continue  # busy: the next poll will tell
+            tell(count / max(total, 1), f"{count} of {total} {noun}")
+
+    thread = threading.Thread(target=poll, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+
+
+def add_images(path: Path, image_folder: Path, images: list[dict[str, Any]]) -> None:
+    """Enter images into the database, one camera per group. Those already in it stay as they are.
+
+    `images` have file, group, width, height and focal_px (or None).
+    """
+    with database(path) as db:
+        known = {image.name: image.camera_id for image in db.read_all_images()}
+    groups: dict[str, list[dict[str, Any]]] = {}
+    for image in images:
+        groups.setdefault(image["group"], []).append(image)
+    for group in groups.values():
+        missing = [image["file"] for image in group if image["file"] not in known]
+        if not missing:
+            continue
+        options = pycolmap.ImageReaderOptions()
+        model, params = start_camera(group)
+        options.camera_model = model
+        options.camera_params = ",".join(repr(p) for p in params)
+        present = [known[image["file"]] for image in group if image["file"] in known]
+        if present:
+            options.existing_camera_id = present[0]
+        pycolmap.import_images(path, image_folder, pycolmap.CameraMode.SINGLE, missing, options)
+        if not present and not any(image["focal_px"] for image in group):
+            # import_images takes given parameters for measured ones; a guess must not count as that.
+            with database(path) as db:
+                camera = db.read_camera(db.read_image_with_name(missing[0]).camera_id)
+                camera.has_prior_focal_length = False
+                db.update_camera(camera)
+
+
+def start_camera(group: list[dict[str, Any]]) -> tuple[str, list[float]]:
+    """COLMAP model and first parameters for the photos of one camera."""
+    width, height = group[0]["width"], group[0]["height"]
+    known = [image["focal_px"] for image in group if image["focal_px"]]
+    focal = float(np.median(known)) if known else FOCAL_GUESS * max(width, height)
+    if len(group) >= FULL_MODEL_FROM:
+        return "OPENCV", [focal, focal, width / 2, height / 2, 0.0, 0.0, 0.0, 0.0]
+    return "SIMPLE_RADIAL", [focal, width / 2, height / 2, 0.0]
+
+
+def extract(path: Path, image_folder: Path, masks: Path | None, names: list[str], level: Level, tell: Any) -> None:
+    """Find the features of all images that have none yet."""
+    with database(path) as db:
+        missing = [image.name for image in db.read_all_images() if not db.exists_keypoints(image.image_id)]
+    missing = [name for name in missing if name in set(names)]
+    if not missing:
+        return
+    options = pycolmap.FeatureExtractionOptions()
+    options.max_image_size = level.size
+    options.use_gpu = False
+    options.sift.max_num_features = level.features
+    options.sift.first_octave = level.octave
+    options.sift.estimate_affine_shape = level.affine
+    options.sift.domain_size_pooling = level.affine
+    reader = pycolmap.ImageReaderOptions()
+    if masks is not None:
+        reader.mask_path = str(masks)
+    tell.stage("Finding features")
+    query = "SELECT COUNT(*) FROM keypoints"
+    with polled(path, query, len(names), tell.progress, "photos"):
+        pycolmap.extract_features(
+            path, image_folder, missing, reader_options=reader, extraction_options=options, device=pycolmap.Device.cpu
+        )
+
+
+def match(path: Path, pairs: list[tuple[str, str]], list_file: Path, tell: Any) -> None:
+    """Match and verify the pairs; those in the database already are not matched again."""
+    if not pairs:
+        return
+    with database(path) as db:
+        ids = {image.name: image.image_id for image in db.read_all_images()}
+        todo = [(a, b) for a, b in pairs if a in ids and b in ids and not db.exists_two_view_geometry(ids[a], ids[b])]
+        before = count_pairs(path)
+    if not todo:
+        return
+    list_file.write_text("".join(f"{a} {b}\n" for a, b in todo), encoding="utf-8")
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = str(list_file)
+    pairing.block_size = 40  # finished blocks survive a kill
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.use_gpu = False
+    tell.stage("Matching features")
+
+    def tell_new(fraction: float, _: str) -> None:
+        done = round(fraction * len(todo)) - before
+        tell.progress(done / len(todo), f"{done} of {len(todo)} pairs")
+
+    with polled(path, "SELECT COUNT(*) FROM two_view_geometries", len(todo), tell_new, "pairs"):
+        pycolmap.match_image_pairs(path, matching, pairing, device=pycolmap.Device.cpu)
+
+
+def count_pairs(path: Path) -> int:
+    with sqlite3.connect(f"file:{path}?mode=ro", uri=True) as connection:
+        return connection.execute("SELECT COUNT(*) FROM two_view_geometries").fetchone()[0]
+
+
+def all_pairs(names: list[str]) -> list[tuple[str, str]]:
+    return list(combinations(sorted(names), 2))
+
+
+def likely_pairs(path: Path, names: list[str], neighbours: int, tell: Any) -> list[tuple[str, str]]:
+    """Pairs worth matching in a large capture: each image's best mates by retrieval, and its neighbours by name.
+
+    Retrieval matches the largest features of every two images by mutual nearest neighbours with a ratio test.
+    """
+    tell.stage("Looking for overlapping photos")
+    ordered = sorted(names)
+    count = max(64, min(RETRIEVAL_FEATURES, round(RETRIEVAL_FEATURES * (400 / len(ordered)) ** 0.5)))
+    with database(path) as db:
+        ids = {image.name: image.image_id for image in db.read_all_images()}
+        descriptors = [_largest_features(db, ids[name], count) for name in ordered]
+    pairs = {
+        (ordered[i], ordered[j])
+        for i in range(len(ordered))
+        for j in range(i + 1, min(i + 1 + neighbours, len(ordered)))
+    }
+    scores = np.zeros((len(ordered), len(ordered)))
+    for i in range(len(ordered)):
+        tell.progress(i / len(ordered), f"{i} of {len(ordered)} photos")
+        for j in range(i):
+            scores[i, j] = scores[j, i] = mutual_matches(descriptors[i], descriptors[j])
+    for i in range(len(ordered)):
+        for j in np.argsort(-scores[i], kind="stable")[:PAIRS_PER_IMAGE]:
+            if scores[i, j] > 0 and i != j:
+                pairs.add((ordered[min(i, j)], ordered[max(i, j)]))
+    return sorted(pairs)
+
+
+def _largest_features(db: Any, image_id: int, count: int) -> np.ndarray:
+    """Unit descriptors (≤ count, 128) of the features of largest scale."""
+    keypoints = np.asarray(db.read_keypoints(image_id))
+    stored = db.read_descriptors(image_id)
+    descriptors = np.asarray(getattr(stored, "data", stored), np.float32)
+    if len(keypoints) == 0:
+        return np.zeros((0, 128), np.float32)
+    scale = keypoints[:, 2] if keypoints.shape[1] == 4 else np.hypot(keypoints[:, 2], keypoints[:, 4])
+    picked = descriptors[np.argsort(-scale, kind="stable")[:count]]
+    return picked / np.maximum(np.linalg.norm(picked, axis=1, keepdims=True), 1e-6)
+
+
+def mutual_matches(a: np.ndarray, b: np.ndarray, ratio: float = 0.85) -> int:
+    """Number of mutual nearest neighbours between unit descriptors (N, D) and (M, D) that pass a ratio test."""
+    if len(a) < 2 or len(b) < 2:
+        return 0
+    similarity = a @ b.T
+    best = similarity.argmax(1)
+    mutual = similarity.argmax(0)[best] == np.arange(len(a))
+    top = np.partition(similarity, -2, axis=1)[:, -2:]
+    distance = np.sqrt(np.maximum(2 - 2 * top, 0))
+    return int((mutual & (distance[:, 1] < ratio * distance[:, 0])).sum())

@@ -1,0 +1,118 @@
+"""Incremental mapping, repair and final adjustment. Runs in the pose process."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pycolmap
+
+from .features import FULL_MODEL_FROM
+from .presets import Level
+from .validate import ImageCheck, check_images
+
+REPAIR_ROUNDS = 2
+SEED = 1
+
+
+def mapper_options(level: Level, count: int, names: list[str]) -> Any:
+    options = pycolmap.IncrementalPipelineOptions()
+    options.image_names = names
+    options.random_seed = SEED
+    options.min_model_size = min(10, max(3, count // 4))
+    if level.relaxed:
+        options.min_num_matches = 10
+        options.mapper.init_min_num_inliers = 40
+        options.mapper.init_min_tri_angle = 6.0
+        options.mapper.abs_pose_min_num_inliers = 15
+        options.mapper.abs_pose_min_inlier_ratio = 0.15
+    return options
+
+
+def build(
+    path: Path, image_folder: Path, output: Path, level: Level, names: list[str], tell: Any, start: Path | None = None
+) -> list[Any]:
+    """Reconstruct, from nothing or from the model in `start`; models with most images first.
+
+    With `start` the poses and lenses in it are kept as they are, and images are added to them.
+    """
+    shutil.rmtree(output, ignore_errors=True)
+    output.mkdir(parents=True)
+    options = mapper_options(level, len(names), names)
+    done = 0
+    if start is not None:
+        options.fix_existing_frames = True
+        options.multiple_models = False
+        before = pycolmap.Reconstruction(str(start))
+        options.constant_cameras = set(before.cameras)
+        done = before.num_reg_images()
+    registered = done
+
+    def next_image() -> None:
+        nonlocal registered
+        registered += 1
+        tell.progress(registered / len(names), f"{registered} of {len(names)} photos placed")
+
+    def first_pair() -> None:
+        nonlocal registered
+        registered = max(registered, done) + 2
+        tell.progress(registered / len(names), "first two photos placed")
+
+    tell.stage("Placing cameras")
+    models = pycolmap.incremental_mapping(
+        path,
+        image_folder,
+        output,
+        options,
+        input_path=str(start) if start else "",
+        initial_image_pair_callback=first_pair,
+        next_image_callback=next_image,
+    )
+    return sorted(models.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
+
+
+def repair(
+    model: Any, path: Path, image_folder: Path, work: Path, level: Level, names: list[str], tell: Any
+) -> tuple[Any, dict[int, ImageCheck], dict[tuple[int, int], int], dict[int, ImageCheck]]:
+    """Take out images whose pose contradicts their matches, and try to place them again.
+
+    Returns:
+        the model, checks of its images, links between them, and the checks of those that had to stay out.
+    """
+    dropped: dict[int, ImageCheck] = {}
+    for round_ in range(REPAIR_ROUNDS + 1):
+        checks, links = check_images(model, path)
+        bad = {i: check for i, check in checks.items() if check.bad}
+        if not bad:
+            return model, checks, links, {i: c for i, c in dropped.items() if i not in checks}
+        if len(checks) - len(bad) < 3:
+            return model, checks, links, {}
+        for image_id, check in bad.items():
+            dropped[image_id] = check
+            if model.exists_image(image_id) and model.image(image_id).has_pose:
+                model.deregister_frame(model.image(image_id).frame_id)
+        if round_ == REPAIR_ROUNDS:
+            break
+        folder = work / "repair_in"
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        model.write(str(folder))
+        models = build(path, image_folder, work / "repair_out", level, names, tell, start=folder)
+        if models and models[0].num_reg_images() >= model.num_reg_images():
+            model = models[0]
+    checks, links = check_images(model, path)
+    return model, checks, links, {i: c for i, c in dropped.items() if i not in checks}
+
+
+def adjust(model: Any, keep_cameras: bool) -> None:
+    """Final bundle adjustment; with the principal point where one lens took at least fifteen photos."""
+    if keep_cameras:
+        return
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.refine_principal_point = len(model.cameras) == 1 and model.num_reg_images() >= FULL_MODEL_FROM
+    pycolmap.bundle_adjustment(model, options)
+    model.update_point_3d_errors()
+    for point_id in [i for i, point in model.points3D.items() if point.error > 4.0]:
+        model.delete_point3D(point_id)

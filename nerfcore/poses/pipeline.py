@@ -1,0 +1,240 @@
+"""The stages of pose estimation, climbing the ladder of presets. Runs in the pose process."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..data.colmap_cameras import camera_from_colmap
+from ..errors import PosesError
+from . import features, mapping
+from .presets import ENOUGH, EXHAUSTIVE_AT_MOST, EXHAUSTIVE_UP_TO, LADDERS, Level
+from .validate import ImageCheck, pair_images
+
+MIN_FEATURES = 100
+
+
+@dataclass
+class Attempt:
+    """The outcome of one level: its models (largest first), and what validation says of the first one."""
+
+    level: Level
+    database: Path
+    models: list[Any]
+    checks: dict[int, ImageCheck]
+    links: dict[tuple[int, int], int]
+    dropped: dict[int, ImageCheck]
+
+    @property
+    def registered(self) -> int:
+        return self.models[0].num_reg_images() if self.models else 0
+
+
+def run(job: dict[str, Any], tell: Any) -> dict[str, Any]:
+    """Estimate poses for a job and write the sparse model.
+
+    Job: image_folder, masks (or null), work and sparse (folders), preset, neighbours, start (a model to extend, or
+    null), images [{file, group, width, height, focal_px}].
+
+    Returns:
+        {cameras, images [{file, status, reason, camera, camera_to_world, agreement, points, error_px, mates}], links,
+        groups, reprojection_px, level, points_file}; points_file has xyz, rgb, error, view and point.
+    Raises:
+        PosesError: no two photos could be placed; the message says why.
+    """
+    work = Path(job["work"])
+    work.mkdir(parents=True, exist_ok=True)
+    names = [image["file"] for image in job["images"]]
+    best: Attempt | None = None
+    levels = LADDERS[job["preset"]]
+    tried: set[tuple[str, bool, bool]] = set()
+    for level in levels:
+        exhaustive = len(names) <= EXHAUSTIVE_UP_TO or (level.exhaustive and len(names) <= EXHAUSTIVE_AT_MOST)
+        signature = (level.database, exhaustive, level.relaxed)
+        if signature in tried:
+            continue
+        tried.add(signature)
+        if best is not None:
+            tell.warn(f"{best.registered} of {len(names)} photos placed: trying again ({level.name}).")
+        attempt = _attempt(job, level, names, exhaustive, tell)
+        if best is None or attempt.registered > best.registered:
+            best = attempt
+        if best.registered >= ENOUGH * len(names):
+            break
+    assert best is not None
+    if best.registered < 2:
+        raise PosesError(
+            _why_nothing(best, names), "Take more photos that overlap by two thirds, with texture in view."
+        )
+    model = best.models[0]
+    tell.stage("Final adjustment")
+    mapping.adjust(model, keep_cameras=job["start"] is not None)
+    sparse = Path(job["sparse"])
+    temporary = sparse.with_name(sparse.name + ".new")
+    shutil.rmtree(temporary, ignore_errors=True)
+    temporary.mkdir(parents=True)
+    model.write(str(temporary))
+    shutil.rmtree(sparse, ignore_errors=True)
+    temporary.rename(sparse)
+    return _result(best, names, work / "points.npz")
+
+
+def _attempt(job: dict[str, Any], level: Level, names: list[str], exhaustive: bool, tell: Any) -> Attempt:
+    work, image_folder = Path(job["work"]), Path(job["image_folder"])
+    path = work / level.database
+    masks = Path(job["masks"]) if job["masks"] else None
+    features.add_images(path, image_folder, job["images"])
+    features.extract(path, image_folder, masks, names, level, tell)
+    if exhaustive:
+        pairs = features.all_pairs(names)
+    else:
+        pairs = features.likely_pairs(path, names, job["neighbours"], tell)
+    features.match(path, pairs, work / "pairs.txt", tell)
+    start = _start_model(job, path, work)
+    models = mapping.build(path, image_folder, work / "models", level, names, tell, start)
+    if not models:
+        return Attempt(level, path, [], {}, {}, {})
+    tell.stage("Checking poses")
+    model, checks, links, dropped = mapping.repair(models[0], path, image_folder, work, level, names, tell)
+    return Attempt(level, path, [model, *models[1:]], checks, links, dropped)
+
+
+def _start_model(job: dict[str, Any], path: Path, work: Path) -> Path | None:
+    """The model to extend, with its image ids brought to those of this database."""
+    if job["start"] is None:
+        return None
+    import pycolmap
+
+    model = pycolmap.Reconstruction(job["start"])
+    folder = work / "start"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    with features.database(path) as db:
+        model.transcribe_image_ids_to_database(db)
+    model.write(str(folder))
+    return folder
+
+
+def _result(best: Attempt, names: list[str], points_file: Path) -> dict[str, Any]:
+    model = best.models[0]
+    camera_ids = sorted(model.cameras)
+    cameras = []
+    for camera_id in camera_ids:
+        camera = model.camera(camera_id)
+        ours = camera_from_colmap(camera.model_name, camera.width, camera.height, list(camera.params))
+        cameras.append(ours.model_dump(mode="json"))
+    by_name = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}
+    reasons = _reasons(best, names, set(by_name))
+    images, views = [], {}
+    for name in names:
+        image = by_name.get(name)
+        if image is None:
+            images.append({"file": name, "status": "unregistered", "reason": reasons[name]})
+            continue
+        check = best.checks.get(image.image_id)
+        views[image.image_id] = len(views)
+        pose = np.eye(4)
+        pose[:3] = image.cam_from_world().inverse().matrix()
+        images.append(
+            {
+                "file": name,
+                "status": "ok",
+                "reason": "",
+                "camera": camera_ids.index(image.camera_id),
+                "camera_to_world": pose.tolist(),
+                "agreement": check.agreement if check else None,
+                "points": check.points if check else image.num_points3D,
+                "error_px": check.error_px if check else 0.0,
+                "mates": check.mates if check else 0,
+            }
+        )
+    _write_points(model, views, points_file)
+    name_of = {i: model.image(i).name for i in model.reg_image_ids()}
+    return {
+        "cameras": cameras,
+        "images": images,
+        "links": [[name_of[a], name_of[b], n] for (a, b), n in best.links.items() if a in name_of and b in name_of],
+        "groups": [m.num_reg_images() for m in best.models],
+        "reprojection_px": model.compute_mean_reprojection_error(),
+        "level": best.level.name,
+        "points_file": str(points_file),
+    }
+
+
+def _write_points(model: Any, views: dict[int, int], path: Path) -> None:
+    """Sparse points with, for each observation, the number of the view (in result order) and of the point."""
+    points = model.points3D
+    count = len(points)
+    xyz, rgb, error = np.zeros((count, 3)), np.zeros((count, 3), np.uint8), np.zeros(count, np.float32)
+    view_of, point_of = [], []
+    for n, point in enumerate(points.values()):
+        xyz[n], rgb[n], error[n] = point.xyz, point.color, point.error
+        for element in point.track.elements:
+            if element.image_id in views:
+                view_of.append(views[element.image_id])
+                point_of.append(n)
+    with open(path, "wb") as file:
+        np.savez(
+            file, xyz=xyz, rgb=rgb, error=error, view=np.array(view_of, np.int32), point=np.array(point_of, np.int32)
+        )
+
+
+def _reasons(best: Attempt, names: list[str], registered: set[str]) -> dict[str, str]:
+    """Why each of the images without a pose has none."""
+    with features.database(best.database) as db:
+        ids = {image.name: image.image_id for image in db.read_all_images()}
+        counts = {name: db.num_keypoints_for_image(i) for name, i in ids.items() if db.exists_keypoints(i)}
+        pair_ids, geometries = db.read_two_view_geometries()
+    name_of = {i: name for name, i in ids.items()}
+    mates: dict[str, dict[str, int]] = {name: {} for name in names}
+    for pair_id, geometry in zip(pair_ids, geometries):
+        a, b = (name_of[i] for i in pair_images(pair_id))
+        inliers = len(geometry.inlier_matches)
+        if inliers >= 15 and a in mates and b in mates:
+            mates[a][b] = mates[b][a] = inliers
+    elsewhere = {}
+    for model in best.models[1:]:
+        for i in model.reg_image_ids():
+            elsewhere.setdefault(model.image(i).name, model.num_reg_images())
+    dropped = {name_of[i]: check for i, check in best.dropped.items() if i in name_of}
+    reasons = {}
+    for name in names:
+        if name in registered:
+            continue
+        placed = {mate: n for mate, n in mates[name].items() if mate in registered}
+        if name not in counts:
+            reasons[name] = "its file could not be read for features"
+        elif counts[name] < MIN_FEATURES:
+            reasons[name] = f"only {counts[name]} features: blurred, dark, masked out or without texture"
+        elif name in dropped:
+            agreement = dropped[name].agreement
+            seen = f"{agreement:.0%} of its matches agree" if agreement is not None else "it sees too few points"
+            reasons[name] = f"its pose contradicted the other photos ({seen})"
+        elif name in elsewhere:
+            reasons[name] = (
+                f"belongs to a separate group of {elsewhere[name]} photos that shares too little with the others"
+            )
+        elif not mates[name]:
+            reasons[name] = "matches no other photo"
+        elif not placed:
+            reasons[name] = f"matches only photos without a pose ({', '.join(sorted(mates[name])[:3])})"
+        else:
+            reasons[name] = f"too little overlap: at most {max(placed.values())} common features with a placed photo"
+    return reasons
+
+
+def _why_nothing(best: Attempt, names: list[str]) -> str:
+    reasons = list(_reasons(best, names, set()).values())
+    few = sum("features: blurred" in reason for reason in reasons)
+    alone = sum(reason == "matches no other photo" for reason in reasons)
+    if few > len(names) / 2:
+        why = f"{few} of them have too little texture"
+    elif alone > len(names) / 2:
+        why = f"{alone} of them match no other photo"
+    else:
+        why = "they match, but from too few different positions, so no depth can be seen"
+    return f"No camera pose could be found for the {len(names)} photos: {why}."

@@ -1,0 +1,85 @@
+"""The picture of a pose estimate: cameras and points from above and from the side, and the graph of matches."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from ..data.scene import Points, transform_pose
+from ..data.similarity import transform_points
+from ..files import atomic_path
+from ..project import ImageRecord, Poses, Project, world_from_sfm
+
+MAX_POINTS = 20000
+
+
+def draw_report(
+    path: Path,
+    project: Project,
+    poses: Poses,
+    points: Points,
+    records: list[ImageRecord],
+    links: list[list],
+    names: dict[str, str],
+) -> None:
+    """Write the picture as PNG. `links` are [file, file, matches]; `names` photo names by file."""
+    frame = world_from_sfm(project)
+    cameras = np.stack([transform_pose(frame, np.array(image.camera_to_world)) for image in poses.images])
+    cloud = transform_points(frame, points.xyz)
+    shown = np.linspace(0, len(cloud) - 1, min(MAX_POINTS, len(cloud))).astype(int) if len(cloud) else []
+    figure = Figure(figsize=(15, 5.4), layout="constrained")
+    top, side, graph = figure.subplots(1, 3)
+    reach = _reach(cameras[:, :3, 3], cloud)
+    for axes, (a, b), title in ((top, (0, 1), "from above (x, y)"), (side, (0, 2), "from the side (x, z)")):
+        axes.scatter(cloud[shown, a], cloud[shown, b], s=1, c=points.rgb[shown] / 255, linewidths=0)
+        centers, ahead = cameras[:, :3, 3], cameras[:, :3, 2] * 0.12 * reach
+        axes.quiver(
+            centers[:, a], centers[:, b], ahead[:, a], ahead[:, b],
+            angles="xy", scale_units="xy", scale=1, width=0.004, color="#d55e00",
+        )  # fmt: skip
+        middle = np.median(centers, axis=0)
+        axes.set(title=title, xlim=(middle[a] - reach, middle[a] + reach), ylim=(middle[b] - reach, middle[b] + reach))
+        axes.set_aspect("equal")
+    _draw_graph(graph, records, links, names)
+    confidence = project.frame.up_confidence
+    up = f", up certain to {confidence:.2f}" if confidence is not None else ""
+    error = f", {poses.reprojection_px:.2f} px" if poses.reprojection_px is not None else ""
+    figure.suptitle(f"{len(poses.images)} of {len(records)} photos placed, {len(points)} points{error}{up}")
+    with atomic_path(path) as temporary:
+        FigureCanvasAgg(figure).print_png(str(temporary))
+
+
+def _reach(centers: np.ndarray, cloud: np.ndarray) -> float:
+    """Half the width of the drawn square: all cameras and the bulk of the points."""
+    middle = np.median(centers, axis=0)
+    reach = float(np.abs(centers - middle).max())
+    if len(cloud):
+        reach = max(reach, float(np.quantile(np.abs(cloud - middle).max(1), 0.9)))
+    return 1.1 * max(reach, 1e-6)
+
+
+def _draw_graph(axes, records: list[ImageRecord], links: list[list], names: dict[str, str]) -> None:
+    """Photos on a circle in name order; a line for every verified pair, darker with more matches."""
+    order = {record.name: i for i, record in enumerate(records)}
+    angle = np.arange(len(records)) / max(len(records), 1) * 2 * np.pi
+    place = np.stack([np.sin(angle), np.cos(angle)], -1)
+    strongest = max((count for *_, count in links), default=1)
+    for a, b, count in sorted(links, key=lambda link: link[2]):
+        ends = place[[order[names[a]], order[names[b]]]]
+        axes.plot(ends[:, 0], ends[:, 1], color="#0072b2", alpha=min(1.0, 0.08 + 0.9 * count / strongest), lw=0.8)
+    good = np.array([record.status == "ok" for record in records])
+    axes.scatter(*place[good].T, s=18, c="#009e73", zorder=3, label="placed")
+    if (~good).any():
+        axes.scatter(*place[~good].T, s=28, c="#d55e00", marker="x", zorder=3, label="without a pose")
+    step = max(1, len(records) // 40)
+    for i, record in enumerate(records):
+        if i % step == 0 or not good[i]:
+            x, y = place[i] * 1.08
+            axes.text(x, y, record.name, fontsize=6, ha="left" if x >= 0 else "right", va="center")
+    axes.set(title="matches between photos", xlim=(-1.5, 1.5), ylim=(-1.3, 1.3))
+    axes.set_aspect("equal")
+    axes.axis("off")
+    axes.legend(loc="lower left", fontsize=7, frameon=False)

@@ -1,0 +1,114 @@
+"""Do estimated poses agree with the matches they came from? Runs in the pose process."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .features import database
+
+GOOD_AGREEMENT = 0.5  # wrong poses measure ≤ 0.02, right ones ≥ 0.83
+MIN_POINTS = 20
+TOLERANCE_PX = 4.0
+MATCHES_PER_PAIR = 300
+
+
+@dataclass
+class ImageCheck:
+    """What speaks for the pose of one image.
+
+    `agreement`: share of its verified matches within 4 px of the epipolar lines (None without matches to judge by);
+    `points`: 3D points it sees; `error_px`: their mean reprojection error; `mates`: registered images it matches.
+    """
+
+    agreement: float | None
+    points: int
+    error_px: float
+    mates: int
+
+    @property
+    def bad(self) -> bool:
+        return self.points < MIN_POINTS or (self.agreement is not None and self.agreement < GOOD_AGREEMENT)
+
+
+def check_images(reconstruction: Any, path: Path) -> tuple[dict[int, ImageCheck], dict[tuple[int, int], int]]:
+    """Check every registered image against all verified matches in the database.
+
+    Returns:
+        checks by image id, and the number of inlier matches of each verified pair of registered images.
+    """
+    registered = set(reconstruction.reg_image_ids())
+    with database(path) as db:
+        pair_ids, geometries = db.read_two_view_geometries()
+        keypoints = {i: np.asarray(db.read_keypoints(i))[:, :2] for i in registered}
+    images = {i: reconstruction.image(i) for i in registered}
+    normalised = {i: _normalised(images[i].camera, keypoints[i]) for i in registered}
+    focal = {i: images[i].camera.mean_focal_length() for i in registered}
+    poses = {i: images[i].cam_from_world().matrix() for i in registered}
+    good = dict.fromkeys(registered, 0.0)
+    total = dict.fromkeys(registered, 0.0)
+    mates = dict.fromkeys(registered, 0)
+    links: dict[tuple[int, int], int] = {}
+    for pair_id, geometry in zip(pair_ids, geometries):
+        a, b = pair_images(pair_id)
+        matches = np.asarray(geometry.inlier_matches)
+        if a not in registered or b not in registered or len(matches) < 15:
+            continue
+        links[a, b] = len(matches)
+        if len(matches) > MATCHES_PER_PAIR:
+            picked = matches[np.linspace(0, len(matches) - 1, MATCHES_PER_PAIR).astype(int)]
+        else:
+            picked = matches
+        distance = sampson_distance(poses[a], poses[b], normalised[a][picked[:, 0]], normalised[b][picked[:, 1]])
+        share = float((distance * (focal[a] + focal[b]) / 2 <= TOLERANCE_PX).mean())
+        for image in (a, b):
+            good[image] += share * len(matches)
+            total[image] += len(matches)
+            mates[image] += 1
+    checks = {}
+    for i in registered:
+        observed = [point.point3D_id for point in images[i].get_observation_points2D()]
+        errors = [reconstruction.point3D(point).error for point in observed]
+        checks[i] = ImageCheck(
+            agreement=good[i] / total[i] if total[i] else None,
+            points=len(observed),
+            error_px=float(np.mean(errors)) if errors else 0.0,
+            mates=mates[i],
+        )
+    return checks, links
+
+
+def pair_images(pair_id: int) -> tuple[int, int]:
+    """The two image ids of COLMAP's pair id."""
+    return pair_id // 2147483647, pair_id % 2147483647
+
+
+def _normalised(camera: Any, keypoints: np.ndarray) -> np.ndarray:
+    """Undistorted normalised coordinates (N, 2); NaN where the lens cannot be inverted."""
+    if len(keypoints) == 0:
+        return np.zeros((0, 2))
+    return np.asarray(camera.cam_from_img(keypoints.astype(np.float64)), np.float64).reshape(-1, 2)
+
+
+def sampson_distance(pose_a: np.ndarray, pose_b: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Distance (N,) of matches from their epipolar geometry, to first order, in normalised units.
+
+    Args:
+        pose_a, pose_b: camera-from-world (3, 4).
+        a, b: undistorted normalised coordinates (N, 2). NaN gives infinity.
+    Source: Hartley and Zisserman, Multiple View Geometry, 2nd ed., eq. 11.9.
+    """
+    rotation = pose_b[:, :3] @ pose_a[:, :3].T
+    translation = pose_b[:, 3] - rotation @ pose_a[:, 3]
+    x, y, z = translation
+    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ rotation
+    first = np.concatenate([a, np.ones((len(a), 1))], 1)
+    second = np.concatenate([b, np.ones((len(b), 1))], 1)
+    lines_b, lines_a = first @ essential.T, second @ essential
+    residual = (second * lines_b).sum(1)
+    weight = (lines_b[:, :2] ** 2).sum(1) + (lines_a[:, :2] ** 2).sum(1)
+    distance = np.abs(residual) / np.sqrt(np.maximum(weight, 1e-30))
+    return np.where(np.isfinite(distance), distance, np.inf)

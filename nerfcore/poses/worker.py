@@ -1,0 +1,82 @@
+"""The pose process: `python -m …poses.worker` reads a job (one line of JSON) and answers with lines of JSON.
+
+Its parent's death closes stdin, upon which it ends at once. What native libraries print goes to stderr.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sqlite3
+import sys
+import threading
+import traceback
+from pathlib import Path
+from typing import IO, Any
+
+from ..errors import FieldworkError
+
+
+class Channel:
+    """Messages to the parent process."""
+
+    def __init__(self, stream: IO[str]) -> None:
+        self._stream = stream
+        self._lock = threading.Lock()
+
+    def send(self, kind: str, **data: Any) -> None:
+        with self._lock:
+            self._stream.write(json.dumps({"kind": kind, **data}) + "\n")
+            self._stream.flush()
+
+    def stage(self, name: str) -> None:
+        self.send("stage", name=name)
+
+    def progress(self, fraction: float, message: str = "") -> None:
+        self.send("progress", fraction=min(max(fraction, 0.0), 1.0), message=message)
+
+    def warn(self, message: str) -> None:
+        self.send("warn", message=message)
+
+    def event(self, name: str, **data: Any) -> None:
+        self.send("event", name=name, data=data)
+
+
+def _private_stdout() -> IO[str]:
+    """Keep the real stdout for messages; file descriptor 1 becomes stderr for everything else."""
+    messages = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)
+    return messages
+
+
+def _end_with_parent() -> None:
+    while sys.stdin.buffer.read(4096):
+        continue
+    os._exit(0)
+
+
+def main() -> None:
+    channel = Channel(_private_stdout())
+    line = sys.stdin.buffer.readline()
+    if not line:
+        return
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    job = json.loads(line)
+    try:
+        from .pipeline import run
+
+        channel.send("result", value=run(job, channel))
+    except FieldworkError as error:
+        channel.send("error", code=error.code, message=error.message, hint=error.hint)
+    except (sqlite3.OperationalError, OSError, RuntimeError) as error:
+        traceback.print_exc()
+        full = "full" in str(error).lower() or "no space" in str(error).lower()
+        message = f"No space left on the disk in {Path(job['work'])}." if full else f"Pose estimation failed: {error}."
+        hint = "Free some space and run it again: finished work is kept." if full else "Run it again."
+        channel.send("error", code="disk" if full else "poses", message=message, hint=hint)
+    # The thread that watches stdin must not keep the process.
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,242 @@
+"""Photographs any Blender scene: one colour picture, one exact label map and one depth map per camera pose.
+
+The scene's own render settings are put back afterwards.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import bpy
+import numpy as np
+from mathutils import Matrix
+
+from .pixels import read_exr, write_index_png
+
+LabelSource = Literal["material", "object", "collection", "none"]
+FAR = 1e9  # Cycles writes 1e10 where a ray meets nothing
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One picture to take. `camera_to_world` (4, 4): OpenGL axes, scene units; file names without a suffix."""
+
+    name: str
+    camera_to_world: np.ndarray
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Pinhole camera: image size and focal length in pixels; the principal point is the image's centre."""
+
+    width: int
+    height: int
+    focal_px: float
+
+    @property
+    def angle_x(self) -> float:
+        return float(2 * np.arctan(self.width / (2 * self.focal_px)))
+
+
+def class_ids(scene: bpy.types.Scene, source: LabelSource) -> dict[str, int]:
+    """Names and ids (1 …) of the classes that `source` distinguishes in the scene, in a stable order.
+
+    "material" and "object": what has a pass index set keeps it (several may share one: the first name wins);
+    if none has, they are numbered by name. "collection": the scene's top-level collections.
+    """
+    if source == "none":
+        return {}
+    if source == "collection":
+        return {c.name: number for number, c in enumerate(sorted(scene.collection.children, key=lambda c: c.name), 1)}
+    visible = [o for o in scene.objects if o.type in {"MESH", "CURVE", "SURFACE", "META", "FONT"} and not o.hide_render]
+    items: list[Any] = visible
+    if source == "material":
+        items = [slot.material for o in visible for slot in o.material_slots if slot.material]
+    unique = sorted({item.name: item for item in items}.items())
+    if any(item.pass_index for _, item in unique):
+        found: dict[int, str] = {}
+        for name, item in unique:
+            if item.pass_index:
+                found.setdefault(item.pass_index, name)
+        return {name: number for number, name in sorted(found.items())}
+    return {name: number for number, (name, _) in enumerate(unique, 1)}
+
+
+def photograph(
+    scene: bpy.types.Scene,
+    shots: list[Shot],
+    lens: Lens,
+    out: Path,
+    *,
+    samples: int = 24,
+    labels: LabelSource = "material",
+    depth: bool = True,
+    progress: Callable[[int, Shot], None] = lambda index, shot: None,
+) -> None:
+    """Render `shots` into out/NAME.png (8-bit sRGB), out/NAME.label.png (uint8 ids) and out/NAME.depth.npy.
+
+    Depth is the float32 distance along the viewing axis in scene units, 0 where there is nothing. Labels and depth
+    are taken at pixel centres, one ray each, so that ids are never mixed. `progress` hears of each finished shot.
+    """
+    out = Path(out)
+    out.mkdir(parents=True, exist_ok=True)
+    with _settings_kept(scene), _indexed(scene, labels), _camera(scene, lens):
+        render = scene.render
+        render.engine = "CYCLES"
+        render.resolution_x, render.resolution_y, render.resolution_percentage = lens.width, lens.height, 100
+        render.use_persistent_data = True
+        render.use_compositing = render.use_sequencer = False
+        # One change of the camera per shot and two passes over the list would lose the finished shots of a
+        # cancelled run, so both renders of a shot are made in turn.
+        for index, shot in enumerate(shots):
+            scene.camera.matrix_world = Matrix(np.asarray(shot.camera_to_world).tolist())
+            _render_colour(scene, out / f"{shot.name}.png", samples)
+            if labels != "none" or depth:
+                _render_data(scene, out, shot.name, labels, depth)
+            progress(index, shot)
+
+
+def _render_colour(scene: bpy.types.Scene, path: Path, samples: int) -> None:
+    _set_format(scene, "PNG")
+    scene.render.image_settings.color_mode = "RGB"
+    scene.render.image_settings.color_depth = "8"
+    scene.render.image_settings.compression = 15
+    cycles = scene.cycles
+    cycles.samples, cycles.use_adaptive_sampling = samples, samples > 16
+    cycles.adaptive_threshold = 0.05
+    cycles.filter_width, cycles.pixel_filter_type = 1.5, "BLACKMAN_HARRIS"
+    cycles.use_denoising = has_denoiser()
+    if cycles.use_denoising:
+        cycles.denoiser = "OPENIMAGEDENOISE"
+        cycles.denoising_input_passes = "RGB_ALBEDO_NORMAL"
+        cycles.denoising_prefilter = "FAST"
+    for layer in scene.view_layers:
+        layer.use_pass_combined = True
+        layer.use_pass_z = layer.use_pass_material_index = layer.use_pass_object_index = False
+    _render(scene, path)
+
+
+def _render_data(scene: bpy.types.Scene, out: Path, name: str, labels: LabelSource, depth: bool) -> None:
+    _set_format(scene, "OPEN_EXR_MULTILAYER")
+    scene.render.image_settings.exr_codec = "NONE"
+    scene.render.image_settings.color_depth = "32"
+    cycles = scene.cycles
+    cycles.samples, cycles.use_adaptive_sampling, cycles.use_denoising = 1, False, False
+    cycles.pixel_filter_type, cycles.filter_width = "BLACKMAN_HARRIS", 0.01
+    for layer in scene.view_layers:
+        layer.use_pass_z = True
+        layer.use_pass_material_index = labels == "material"
+        layer.use_pass_object_index = labels in {"object", "collection"}
+    path = out / f"{name}.data.exr"
+    _render(scene, path)
+    channels = read_exr(path)
+    path.unlink()
+    z = np.minimum.reduce([_pass(channels, c, ("Depth", "Z")) for c in _layers(channels)]).astype(np.float32)
+    empty = z > FAR
+    if depth:
+        np.save(out / f"{name}.depth.npy", np.where(empty, 0, z))
+    if labels != "none":
+        passes = ("IndexMA", "Material Index") if labels == "material" else ("IndexOB", "Object Index")
+        index = np.maximum.reduce([_pass(channels, c, passes) for c in _layers(channels)])
+        write_index_png(out / f"{name}.label.png", np.where(empty, 0, np.rint(index)).astype(np.uint8))
+
+
+def _layers(channels: dict[str, np.ndarray]) -> list[str]:
+    """View layers that have a depth channel; the names look like "ViewLayer.Depth.V"."""
+    return sorted({name.split(".")[0] for name in channels if name.split(".")[1:2] in (["Depth"], ["Z"])})
+
+
+def _pass(channels: dict[str, np.ndarray], layer: str, names: tuple[str, ...]) -> np.ndarray:
+    for name, values in channels.items():
+        parts = name.split(".")
+        if parts[0] == layer and len(parts) > 1 and parts[1] in names:
+            return values
+    raise RuntimeError(f"Cycles wrote no {names[0]} pass; it wrote {', '.join(sorted(channels))}.")
+
+
+def _render(scene: bpy.types.Scene, path: Path) -> None:
+    temporary = path.with_name("writing" + path.suffix)
+    scene.render.use_file_extension = False
+    scene.render.filepath = str(temporary)
+    bpy.ops.render.render(write_still=True, scene=scene.name)
+    os.replace(temporary, path)
+
+
+def _set_format(scene: bpy.types.Scene, file_format: str) -> None:
+    """Blender 5 sorts formats by medium and refuses the format of another one."""
+    settings = scene.render.image_settings
+    if hasattr(settings, "media_type"):
+        settings.media_type = "MULTI_LAYER_IMAGE" if file_format == "OPEN_EXR_MULTILAYER" else "IMAGE"
+    settings.file_format = file_format
+
+
+def has_denoiser() -> bool:
+    """Whether this Blender was built with OpenImageDenoise (Debian's is not)."""
+    import _cycles
+
+    return bool(getattr(_cycles, "with_openimagedenoise", False))
+
+
+@contextmanager
+def _camera(scene: bpy.types.Scene, lens: Lens) -> Iterator[None]:
+    data = bpy.data.cameras.new("Fieldwork photographer")
+    data.sensor_fit, data.sensor_width = "HORIZONTAL", 36.0
+    data.lens = lens.focal_px * data.sensor_width / lens.width
+    data.clip_start, data.clip_end = 0.01, 1000.0
+    camera = bpy.data.objects.new(data.name, data)
+    scene.collection.objects.link(camera)
+    before, scene.camera = scene.camera, camera
+    try:
+        yield
+    finally:
+        scene.camera = before
+        bpy.data.objects.remove(camera)
+        bpy.data.cameras.remove(data)
+
+
+@contextmanager
+def _indexed(scene: bpy.types.Scene, source: LabelSource) -> Iterator[None]:
+    """Give materials or objects the pass index of their class while the block runs."""
+    ids = class_ids(scene, source)
+    items: list[tuple[Any, int]] = []
+    if source == "collection":
+        items = [(o, ids[c.name]) for c in scene.collection.children for o in c.all_objects]
+    elif source in {"material", "object"}:
+        pool = bpy.data.materials if source == "material" else scene.objects
+        if not any(item.pass_index for item in pool):
+            items = [(item, ids[item.name]) for item in pool if item.name in ids]
+    before = [(item, item.pass_index) for item, _ in items]
+    for item, number in items:
+        item.pass_index = number
+    try:
+        yield
+    finally:
+        for item, number in before:
+            item.pass_index = number
+
+
+@contextmanager
+def _settings_kept(scene: bpy.types.Scene) -> Iterator[None]:
+    """Put the render settings that `photograph` touches back to what they were."""
+    targets = [
+        (scene.render, ("engine", "resolution_x", "resolution_y", "resolution_percentage", "use_persistent_data")),
+        (scene.render, ("use_compositing", "use_sequencer", "use_file_extension", "filepath")),
+        (scene.cycles, ("samples", "use_adaptive_sampling", "adaptive_threshold", "filter_width")),
+        (scene.cycles, ("pixel_filter_type", "use_denoising")),
+        (scene.render.image_settings, ("media_type", "file_format", "color_mode", "color_depth", "exr_codec")),
+    ]
+    names = ("use_pass_combined", "use_pass_z", "use_pass_material_index", "use_pass_object_index")
+    targets += [(layer, names) for layer in scene.view_layers]
+    before = [
+        (target, name, getattr(target, name)) for target, names in targets for name in names if hasattr(target, name)
+    ]
+    try:
+        yield
+    finally:
+        for target, name, value in before:
+            setattr(target, name, value)

@@ -1,0 +1,50 @@
+"""The child process of `fieldwork simulate`: builds the scene, photographs it, writes the surface."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from . import museum
+from .photograph import Lens, Shot, has_denoiser, photograph
+from .truth import write_truth
+
+SCENES = {"museum": museum}
+ANGLE_OF_VIEW_FOCAL = 28 / 36  # focal length over sensor width: a 28 mm lens on full frame
+
+
+def simulate(request: dict[str, Any], emit: Callable[..., None]) -> dict[str, Any]:
+    """Render the views of `request["pending"]` (indices) into `request["folder"]`.
+
+    Request: scene, seed, views, size [w, h], samples, folder, truth (folder of the mesh), pending. Each finished view
+    is told as {"kind": "view", "index": i}. The result holds everything that describes the capture.
+    """
+    module = SCENES[request["scene"]]
+    emit(kind="stage", name="Building the scene")
+    scene = module.build(request["seed"])
+    poses = module.poses(request["views"], request["seed"])
+    width, height = request["size"]
+    lens = Lens(width, height, ANGLE_OF_VIEW_FOCAL * max(width, height))
+    truth = Path(request["truth"])
+    if not (truth / "mesh.ply").is_file():
+        truth.mkdir(parents=True, exist_ok=True)
+        write_truth(scene, truth)
+    emit(kind="stage", name="Photographing")
+    pending = request["pending"]
+    photograph(
+        scene,
+        [Shot(f"{index:04d}", poses[index]) for index in pending],
+        lens,
+        Path(request["folder"]),
+        samples=request["samples"],
+        progress=lambda order, shot: emit(kind="view", index=pending[order]),
+    )
+    return {
+        "camera_to_world": [pose.tolist() for pose in poses],
+        "focal_px": lens.focal_px,
+        "classes": {
+            str(number): {"name": name, "color": module.COLORS[number]} for number, name in module.CLASSES.items()
+        },
+        "denoised": has_denoiser(),
+    }

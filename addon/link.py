@@ -120,10 +120,11 @@ class Link:
         reader.start()
         self.last_used = time.monotonic()
 
-    def close(self, detach: bool = False, timeout: float = 10.0) -> None:
+    def close(self, detach: bool = False, timeout: float | None = 10.0) -> None:
         """Let go of the engine. A running job is cancelled (it leaves a checkpoint) or, with `detach`, goes on.
 
-        Without `detach` this waits up to `timeout` seconds for the end of the process, then kills it.
+        Without `detach` this waits up to `timeout` seconds for the end of the process, then kills it; with
+        `timeout=None` it does not wait: the engine ends by itself.
         """
         process, self.process = self.process, None
         self._waiting.clear()
@@ -134,7 +135,7 @@ class Link:
             if detach:
                 process.stdin.write(_line({"method": "detach"}))
             process.stdin.close()
-        if detach:
+        if detach or timeout is None:
             return
         try:
             process.wait(timeout)

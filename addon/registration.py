@@ -13,7 +13,24 @@ from types import ModuleType
 import bpy
 
 # Relative to the root package.
-MODULES = ("addon.commands",)
+MODULES = (
+    "addon.properties",
+    "addon.preferences",
+    "addon.jobs",
+    "addon.commands",
+    "operators.job",
+    "operators.capture",
+    "operators.poses",
+    "operators.train",
+    "operators.mesh",
+    "operators.export",
+    "panels.main",
+    "panels.capture",
+    "panels.poses",
+    "panels.train",
+    "panels.mesh",
+    "panels.engine",
+)
 
 # The package Blender knows the extension by, "bl_ext.<repository>.fieldwork": `AddonPreferences.bl_idname` and
 # `bpy.utils.extension_path_user` need exactly this one. "fieldwork" where it is imported outside an extension.

@@ -8,7 +8,6 @@ import queue
 import signal
 import subprocess
 import sys
-import textwrap
 import threading
 import time
 from pathlib import Path
@@ -18,66 +17,15 @@ from fieldwork.nerfcore.engine import status as st
 
 ROOT = Path(__file__).resolve().parents[2]
 
-# An engine with verbs that are quick to know: they count, fail, print.
-ENGINE = textwrap.dedent(
-    """
-    import ctypes, os, subprocess, sys, time, types
-    from pathlib import Path
-    from nerfcore import params, verbs
-    from nerfcore.errors import InputError
-    from nerfcore.files import write_text
-    from nerfcore.engine.server import main
-
-    class CountParams(params.Params):
-        project: Path
-        steps: int = 100
-        deaf: bool = False
-        native: bool = False
-        fail: str = ""
-
-    def count(p, report):
-        report.stage("Counting")
-        if p.fail == "input":
-            raise InputError("photo.jpg is not an image.", "Remove it.")
-        if p.fail == "bug":
-            raise KeyError("no such thing")
-        if p.native:
-            ctypes.CDLL(None).puts(b"native text")
-            ctypes.CDLL(None).fflush(None)
-            print("python text", flush=True)
-            subprocess.run([sys.executable, "-c", "import sys; print('child text'); sys.stdin.read()"], check=True)
-        for step in range(p.steps):
-            time.sleep(0.02)
-            if not p.deaf:
-                try:
-                    report.progress(step / p.steps, f"step {step}")
-                finally:
-                    if report.cancelled:
-                        write_text(p.project / "checkpoint", str(step))
-            if step % 10 == 0:
-                report.event("train", step=step, loss=float("nan"), where=p.project)
-        return {"steps": p.steps, "project": p.project}
-
-    module = types.ModuleType("nerfcore.counting")
-    module.count = count
-    sys.modules["nerfcore.counting"] = module
-    verbs.VERBS["count"] = verbs.Verb(CountParams, "counting:count", "Count.")
-    if len(sys.argv) > 1:
-        from nerfcore.engine import server
-        server.GRACE = float(sys.argv[1])
-    main()
-    """
-)
+ENGINE = ROOT / "tests" / "counting_engine.py"
 
 
 class Client:
     """The other end of the engine's pipes."""
 
     def __init__(self, folder: Path, *arguments: str) -> None:
-        script = folder / "engine.py"
-        script.write_text(ENGINE)
         self.process = subprocess.Popen(
-            [sys.executable, script, *arguments],
+            [sys.executable, ENGINE, *arguments],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=open(folder / "stderr.txt", "ab"),  # noqa: SIM115 - the child writes it

@@ -1,0 +1,374 @@
+"""The queue of jobs on Blender's side: one engine, one timer, one job at a time.
+
+The timer is persistent, so jobs survive loading another file, undo, and the operator that started them. Where
+there are no timers (`blender -b`, the `bpy` module) operators call `Queue.run` instead, which blocks.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ..nerfcore.engine import status as st
+from . import preferences, state
+from .link import EngineError, Link, tail
+
+log = logging.getLogger("fieldwork.addon")
+
+BUSY_PERIOD = 0.1  # seconds between two looks at the engine while something goes on
+IDLE_PERIOD = 0.5
+FOLLOW_PERIOD = 0.5  # seconds between two looks at the files of a job in another process
+CURVE_POINTS = 2000
+KEPT = 8  # finished jobs the panel remembers
+Done = Callable[["Job"], None]
+
+TITLES = {
+    "new": "Reading Photos",
+    "import": "Importing Data Set",
+    "poses": "Estimating Poses",
+    "align": "Aligning",
+    "train": "Training",
+    "evaluate": "Measuring",
+    "render": "Rendering",
+    "mesh": "Extracting Mesh",
+    "blend": "Writing .blend",
+    "reconstruct": "Reconstructing",
+    "doctor": "Checking the Engine",
+}
+
+
+@dataclass
+class Job:
+    """One piece of work. `state`: queued, running, cancelling, done, failed, cancelled."""
+
+    verb: str
+    params: dict[str, Any]
+    id: str
+    project: Path | None = None
+    on_done: Done | None = None
+    state: str = "queued"
+    stage: str = ""
+    fraction: float | None = None
+    message: str = ""
+    eta: float | None = None
+    started: float | None = None
+    seconds: float = 0.0
+    result: dict[str, Any] | None = None
+    error: EngineError | None = None
+    warnings: list[str] = field(default_factory=list)
+    curve: list[tuple[int, float, float]] = field(default_factory=list)  # step, loss, PSNR in dB
+    latest: dict[str, Any] = field(default_factory=dict)  # last "train" event
+    preview: str = ""  # picture of a held-out photo
+    preview_count: int = 0
+    followed: bool = False  # runs in an engine that another Blender started
+    events_read: int = 0
+
+    @property
+    def title(self) -> str:
+        return TITLES.get(self.verb, self.verb.capitalize())
+
+    @property
+    def active(self) -> bool:
+        return self.state in ("queued", "running", "cancelling")
+
+    def take(self, method: str, data: dict[str, Any]) -> None:
+        """A notification of the engine."""
+        if method == "progress":
+            self.stage, self.fraction = data.get("stage") or "", data.get("fraction")
+            self.message, self.eta = data.get("message") or "", data.get("eta_s")
+        elif method == "event":
+            self.take_event(data)
+        elif method == "log" and data.get("level") == "warning":
+            self.warnings.append(str(data.get("text")))
+
+    def take_event(self, data: dict[str, Any]) -> None:
+        if data.get("kind") == "train":
+            self.latest = data
+            loss, psnr = data.get("loss"), data.get("psnr")
+            nan = float("nan")
+            self.curve.append((data.get("step", 0), nan if loss is None else loss, nan if psnr is None else psnr))
+            if len(self.curve) > CURVE_POINTS:
+                # Every other one of the older half: the shape stays, the length is bounded.
+                half = CURVE_POINTS // 2
+                self.curve[:half] = self.curve[:half:2]
+        elif data.get("kind") == "preview" and data.get("path"):
+            self.preview = str(data["path"])
+            self.preview_count += 1
+
+    def report(self) -> str:
+        """Text for a bug report."""
+        lines = [f"Fieldwork job {self.id}: {self.state}", f"verb: {self.verb}", f"parameters: {self.params}"]
+        lines.append(f"Blender {bpy.app.version_string}, stage “{self.stage}”, {self.seconds:.0f} s")
+        if self.error:
+            lines += [f"error: {self.error.message}", f"advice: {self.error.hint}", self.error.detail]
+        lines += [f"warning: {text}" for text in self.warnings]
+        if self.project:
+            lines += ["--- log of the job", *tail(self.project / st.FOLDER / f"{self.verb}.log", 40)]
+        lines += ["--- log of the engine", *tail(engine_log(), 40)]
+        return "\n".join(line for line in lines if line)
+
+
+def engine_log() -> Path:
+    return preferences.user_folder("logs") / "engine.log"
+
+
+class Queue:
+    """All jobs of this Blender."""
+
+    def __init__(self) -> None:
+        self.link: Link | None = None
+        self.running: Job | None = None
+        self.waiting: list[Job] = []
+        self.followed: Job | None = None
+        self.finished: list[Job] = []
+        self.facts: dict[str, Any] = {}  # what the engine last said of itself
+        self.slowest_tick = 0.0
+        self._number = 0
+        self._looked = 0.0
+        self._asked = 0.0
+
+    # For operators
+
+    @property
+    def current(self) -> Job | None:
+        """The job the panels show."""
+        return self.running or self.followed or (self.waiting[0] if self.waiting else None)
+
+    @property
+    def last(self) -> Job | None:
+        return self.finished[-1] if self.finished else None
+
+    def make(self, verb: str, params: dict[str, Any], on_done: Done | None = None) -> Job:
+        self._number += 1
+        folder = params.get("project")
+        return Job(
+            verb,
+            params,
+            id=f"{verb}-{time.strftime('%Y%m%d-%H%M%S')}-{self._number}",
+            project=Path(folder) if folder else None,
+            on_done=on_done,
+        )
+
+    def submit(self, job: Job) -> None:
+        """Put a job at the end of the queue; it starts at once when nothing runs."""
+        self.waiting.append(job)
+        self._start_next()
+        self.redraw()
+
+    def run(self, job: Job) -> dict[str, Any]:
+        """Run a job and wait for it. Raises EngineError."""
+        job.state, job.started = "running", time.monotonic()
+        self.running = job
+        try:
+            result = self._engine().run_blocking(job.verb, {**job.params, "job": job.id}, job.take)
+        except EngineError as error:
+            self._finish(job, None, error)
+            raise
+        self._finish(job, result, None)
+        return result
+
+    def cancel(self, job: Job | None = None) -> None:
+        job = job or self.current
+        if job is None:
+            return
+        if job in self.waiting:
+            self.waiting.remove(job)
+            self._finish(job, None, EngineError("cancelled", "Cancelled."))
+        elif job.active:
+            job.state = "cancelling"
+            if job.followed and job.project:
+                st.request_cancel(job.project, job.id)
+            elif self.link:
+                self.link.cancel(job.id)
+        self.redraw()
+
+    def stop_engine(self, detach: bool = False, timeout: float | None = None) -> None:
+        """End the engine and free its memory. A running job is cancelled, or goes on with `detach`."""
+        link, self.link = self.link, None
+        self.facts = {}
+        if link is None:
+            return
+        link.close(detach, timeout)
+        job, self.running = self.running, None
+        if job and not detach:
+            self._finish(job, None, EngineError("cancelled", "The engine was stopped.", "Run it again to resume."))
+
+    def reattach(self, project: Path) -> None:
+        """Follow a job that another process runs on the project, and tell of one that died."""
+        if self.running and self.running.project == project:
+            return
+        self.followed = None
+        for status in reversed(st.list_jobs(project)):
+            if status.state == "running":
+                self.followed = Job(
+                    status.verb, status.params, status.id, project, state="running", followed=True,
+                    started=time.monotonic() - max(0.0, time.time() - (status.started or time.time())),
+                )  # fmt: skip
+                self._follow()
+                break
+            if status.state == "died" and all(job.id != status.id for job in self.finished):
+                job = Job(status.verb, status.params, status.id, project, state="failed", stage=status.stage)
+                error = status.error or {}
+                job.error = EngineError("died", error.get("message", ""), error.get("hint", ""))
+                self._remember(job)
+                break
+        self.redraw()
+
+    # The timer
+
+    def tick(self) -> float:
+        """One look at the engine. Returns the seconds until the next."""
+        begin = time.perf_counter()
+        try:
+            state.write_classes()
+            if self.link:
+                self.link.pump()
+            if self.running:
+                self.running.seconds = time.monotonic() - (self.running.started or time.monotonic())
+            self._start_next()
+            self._follow()
+            self._look_after_engine()
+        except Exception:
+            # A timer that raises is dropped by Blender, and all jobs with it.
+            log.exception("Fieldwork's timer failed")
+        busy = self.current is not None or (self.link is not None and self.link.busy)
+        if busy:
+            self.redraw()
+        self.slowest_tick = max(self.slowest_tick, time.perf_counter() - begin)
+        return BUSY_PERIOD if busy else IDLE_PERIOD
+
+    def _start_next(self) -> None:
+        if self.running is not None or not self.waiting:
+            return
+        job = self.waiting.pop(0)
+        self.running = job
+        job.state, job.started = "running", time.monotonic()
+        detach = {"detach": True} if preferences.preferences().on_close == "continue" else {}
+        try:
+            self._engine().request(
+                job.verb,
+                {**job.params, **detach, "job": job.id},
+                lambda result, error: self._finish(job, result, error),
+                job.take,
+            )
+        except EngineError as error:
+            self._finish(job, None, error)
+
+    def _engine(self) -> Link:
+        if self.link is not None and not self.link.alive:
+            self.link.pump()
+            if not self.link.alive:
+                self.link = None
+        if self.link is None:
+            python = preferences.engine_python()
+            if python is None:
+                raise EngineError(
+                    "missing", "The engine is not installed.", "Install it in the preferences of Fieldwork."
+                )
+            self.link = Link(python, engine_log())
+        return self.link
+
+    def _finish(self, job: Job, result: dict[str, Any] | None, error: EngineError | None) -> None:
+        if self.running is job:
+            self.running = None
+        job.result, job.error, job.eta = result, error, None
+        if job.started:
+            job.seconds = time.monotonic() - job.started
+        job.state = "done" if error is None else "cancelled" if error.kind == "cancelled" else "failed"
+        self._remember(job)
+        if job.on_done:
+            job.on_done(job)
+        self.redraw()
+
+    def _remember(self, job: Job) -> None:
+        self.finished = [*self.finished, job][-KEPT:]
+
+    def _follow(self) -> None:
+        """Bring the job of another process up to date from its files."""
+        job = self.followed
+        if job is None or job.project is None or time.monotonic() - self._looked < FOLLOW_PERIOD:
+            return
+        self._looked = time.monotonic()
+        status = st.read_job(st.job_path(job.project, job.id))
+        events, job.events_read = st.read_events(job.project, job.id, job.events_read)
+        for event in events:
+            job.take_event(event)
+        job.seconds = time.monotonic() - (job.started or time.monotonic())
+        if status is not None and not status.finished:
+            job.stage, job.fraction = status.stage, status.fraction
+            job.message, job.eta = status.message, status.eta_s
+            return
+        self.followed = None
+        if status is not None and status.state == "done":
+            self._finish(job, status.result, None)
+            return
+        error = (status.error if status else None) or {"code": "died", "message": "The job is gone."}
+        kind = "cancelled" if status and status.state == "cancelled" else error.get("code", "died")
+        self._finish(job, None, EngineError(kind, error.get("message", ""), error.get("hint", "")))
+
+    def _look_after_engine(self) -> None:
+        """Ask a living engine for its memory now and then; end one that was idle for long."""
+        link = self.link
+        if link is None or not link.alive:
+            return
+        minutes = preferences.preferences().idle_minutes
+        if minutes and not link.busy and time.monotonic() - link.last_used > 60 * minutes:
+            self.stop_engine()
+            self.redraw()
+        elif self.running and time.monotonic() - self._asked > 2.0:
+            self._asked = time.monotonic()
+            link.request("status", on_done=self._take_facts)
+
+    def _take_facts(self, result: dict[str, Any] | None, error: EngineError | None) -> None:
+        self.facts = result or self.facts
+
+    # Drawing
+
+    def redraw(self) -> None:
+        """Redraw what shows jobs: sidebars, preferences, the status bar."""
+        if bpy.app.background:
+            return
+        for window in bpy.context.window_manager.windows:
+            for area in window.screen.areas:
+                if area.type in ("VIEW_3D", "PREFERENCES"):
+                    for region in area.regions:
+                        if region.type in ("UI", "WINDOW") and (area.type != "VIEW_3D" or region.type == "UI"):
+                            region.tag_redraw()
+
+
+queue = Queue()
+
+
+def _tick() -> float:
+    return queue.tick()
+
+
+@bpy.app.handlers.persistent
+def _file_loaded(*_: Any) -> None:
+    """Another file: its project may have a job that runs elsewhere."""
+    settings = getattr(bpy.context.scene, "fieldwork", None)
+    folder = state.folder_of(settings) if settings else None
+    if folder is not None:
+        state.refresh(settings)
+        if not bpy.app.background:
+            queue.reattach(folder)
+
+
+def register() -> None:
+    bpy.app.handlers.load_post.append(_file_loaded)
+    if not bpy.app.background:
+        bpy.app.timers.register(_tick, first_interval=IDLE_PERIOD, persistent=True)
+
+
+def unregister() -> None:
+    if bpy.app.timers.is_registered(_tick):
+        bpy.app.timers.unregister(_tick)
+    bpy.app.handlers.load_post.remove(_file_loaded)
+    queue.stop_engine(detach=queue.running is not None and preferences.preferences().on_close == "continue")
+    queue.__init__()

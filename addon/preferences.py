@@ -1,0 +1,104 @@
+"""Preferences of the extension: where the engine is, and how it behaves."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import bpy
+from bpy.props import EnumProperty, IntProperty, StringProperty
+from bpy.types import AddonPreferences, Context, UILayout
+
+from . import engine_install
+from .link import ROOT
+from .registration import ROOT_PACKAGE
+
+AS_EXTENSION = ROOT_PACKAGE.startswith("bl_ext.")
+
+
+def user_folder(*parts: str) -> Path:
+    """A folder that outlives updates of the extension; outside an extension (tests, scripts), a temporary one."""
+    if AS_EXTENSION:
+        return Path(bpy.utils.extension_path_user(ROOT_PACKAGE, path="/".join(parts), create=True))
+    folder = Path(tempfile.gettempdir(), "fieldwork-user", *parts)
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+class FIELDWORK_AP_preferences(AddonPreferences):
+    bl_idname = ROOT_PACKAGE
+
+    engine_python: StringProperty(
+        name="Environment",
+        description="Python of an existing environment that has the engine's packages; empty: the installed engine",
+        subtype="FILE_PATH",
+    )
+    device: EnumProperty(
+        name="Device",
+        description="Which build of PyTorch the installer fetches",
+        items=[
+            ("auto", "Automatic", "The build that fits this machine"),
+            ("cuda", "NVIDIA GPU (CUDA)", "For NVIDIA graphics cards"),
+            ("rocm", "AMD GPU (ROCm)", "For AMD graphics cards on Linux"),
+            ("mps", "Apple GPU (MPS)", "For Macs with Apple silicon"),
+            ("cpu", "CPU", "No graphics card; the smallest download"),
+        ],
+    )
+    base_python: StringProperty(
+        name="Base Python",
+        description="Python 3.11 or newer that the engine's environment is made from; empty: Blender's own",
+        subtype="FILE_PATH",
+    )
+    on_close: EnumProperty(
+        name="When Blender Closes",
+        description="What becomes of a running job",
+        items=[
+            ("stop", "Stop with a Checkpoint", "The job stops and can be resumed later"),
+            ("continue", "Keep Running", "The job goes on; Blender finds it again with its project"),
+        ],
+    )
+    idle_minutes: IntProperty(
+        name="Release After",
+        description="Minutes without a job after which the engine ends and frees its memory; 0: never",
+        default=5,
+        min=0,
+        soft_max=60,
+    )
+
+    def draw(self, context: Context) -> None:
+        draw_preferences(self, self.layout)
+
+
+def draw_preferences(preferences: FIELDWORK_AP_preferences, layout: UILayout) -> None:
+    layout.use_property_split = True
+    layout.prop(preferences, "engine_python")
+    layout.prop(preferences, "on_close")
+    layout.prop(preferences, "idle_minutes")
+
+
+class _Defaults:
+    """What the preferences say where the extension is not enabled as one (tests, scripts)."""
+
+    engine_python = ""
+    device = "auto"
+    base_python = ""
+    on_close = "stop"
+    idle_minutes = 5
+
+
+def preferences() -> Any:
+    addon = bpy.context.preferences.addons.get(ROOT_PACKAGE)
+    return addon.preferences if addon and addon.preferences else _Defaults
+
+
+def engine_folder() -> Path:
+    return user_folder("engine")
+
+
+def engine_python() -> Path | None:
+    """The Python that runs the engine, None when it is not installed."""
+    return engine_install.find_python(bpy.path.abspath(preferences().engine_python), engine_folder(), ROOT)
+
+
+CLASSES = [FIELDWORK_AP_preferences]

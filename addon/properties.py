@@ -1,0 +1,251 @@
+"""What a scene remembers of its capture: `Scene.fieldwork`. The capture itself lives in the project folder."""
+
+import bpy
+from bpy.props import (
+    BoolProperty,
+    CollectionProperty,
+    EnumProperty,
+    FloatProperty,
+    FloatVectorProperty,
+    IntProperty,
+    IntVectorProperty,
+    PointerProperty,
+    StringProperty,
+)
+from bpy.types import Context, PropertyGroup
+
+PRESETS = [
+    ("draft", "Draft", "A first look in a minute or two"),
+    ("standard", "Standard", "Good quality in reasonable time"),
+    ("high", "High", "Best quality; takes several times longer"),
+]
+POSE_PRESETS = [
+    ("fast", "Fast", "Smaller images and fewer features; for overlapping, sharp photos"),
+    ("standard", "Standard", "For most captures"),
+    ("robust", "Robust", "Tries harder where photos are not registered"),
+]
+UP = [
+    ("auto", "Estimated", "Up as the photos were held"),
+    ("x", "X", "The positive X axis of the scene becomes up"),
+    ("-x", "-X", "The negative X axis of the scene becomes up"),
+    ("y", "Y", "The positive Y axis of the scene becomes up"),
+    ("-y", "-Y", "The negative Y axis of the scene becomes up"),
+    ("z", "Z", "The positive Z axis of the scene becomes up"),
+    ("-z", "-Z", "The negative Z axis of the scene becomes up"),
+]
+PASSES = [
+    ("rgb", "Color", "The photographed colors"),
+    ("depth", "Depth", "Distance along the ray in meters"),
+    ("semantic", "Labels", "The class of each pixel"),
+    ("confidence", "Confidence", "How certain the class is"),
+    ("normal", "Normal", "Surface direction"),
+]
+
+
+def _project_changed(self: "FieldworkScene", context: Context) -> None:
+    from . import state
+
+    state.project_changed(self)
+
+
+def _classes_changed(self: PropertyGroup, context: Context) -> None:
+    from . import state
+
+    state.classes_changed(context.scene.fieldwork)
+
+
+def _class_visibility(self: "FieldworkClass", context: Context) -> None:
+    from . import state
+
+    state.show_class(self.name, self.visible)
+
+
+class FieldworkImage(PropertyGroup):
+    """One photo of the project. `name` is its name there."""
+
+    file: StringProperty()
+    status: StringProperty()
+    reason: StringProperty()
+    width: IntProperty()
+    height: IntProperty()
+    sharpness: FloatProperty()
+
+
+class FieldworkClass(PropertyGroup):
+    """One class of the label maps."""
+
+    id: IntProperty(name="Id", description="Value of the class in the label maps")
+    name: StringProperty(name="Name", description="Name of the class", update=_classes_changed)
+    color: FloatVectorProperty(
+        name="Color",
+        description="Color of the class in label images and on the mesh",
+        subtype="COLOR_GAMMA",
+        min=0.0,
+        max=1.0,
+        update=_classes_changed,
+    )
+    priority: FloatProperty(
+        name="Priority",
+        description="How strongly training samples are drawn to the class; 1 is normal, 0 is not at all",
+        default=1.0,
+        min=0.0,
+        soft_max=10.0,
+        update=_classes_changed,
+    )
+    visible: BoolProperty(
+        name="Visible", description="Show the objects of the class in the scene", default=True, update=_class_visibility
+    )
+    area: FloatProperty(name="Area", description="Area of the class on the mesh", unit="AREA")
+
+
+class FieldworkScene(PropertyGroup):
+    project: StringProperty(
+        name="Project",
+        description="Folder that holds everything known about the capture",
+        subtype="DIR_PATH",
+        update=_project_changed,
+    )
+
+    # Capture
+    photos: StringProperty(name="Photos", description="Folder of photos, or a video file", subtype="FILE_PATH")
+    labels: StringProperty(
+        name="Labels", description="Folder of label maps named like the photos; may be empty", subtype="DIR_PATH"
+    )
+    masks: StringProperty(
+        name="Masks", description="Folder of masks named like the photos; may be empty", subtype="DIR_PATH"
+    )
+    class_file: StringProperty(
+        name="Class Names", description="classes.json with the names of the label values", subtype="FILE_PATH"
+    )
+    mask_mode: EnumProperty(
+        name="Black in Masks",
+        description="What black pixels of a mask mean",
+        items=[
+            ("ignore", "Unknown", "Nothing is learned from these pixels"),
+            ("empty", "Empty Space", "There is nothing along these rays"),
+        ],
+    )
+    max_size: IntProperty(
+        name="Working Size",
+        description="Long side of the working copies of the photos in pixels",
+        default=1600,
+        min=64,
+        soft_max=4096,
+        subtype="PIXEL",
+    )
+    frames: IntProperty(
+        name="Video Frames", description="How many frames are taken from a video", default=80, min=4, soft_max=400
+    )
+    keep_blurry: BoolProperty(name="Keep Blurry Photos", description="Use photos that look blurred too")
+    images: CollectionProperty(type=FieldworkImage)
+    image_index: IntProperty(name="Image", description="Selected photo")
+
+    # Poses
+    pose_preset: EnumProperty(name="Preset", description="How hard to try", items=POSE_PRESETS, default="standard")
+    up: EnumProperty(name="Up", description="Which direction of the scene is up", items=UP)
+    point_a: FloatVectorProperty(name="Point A", description="One end of a known distance", subtype="TRANSLATION")
+    point_b: FloatVectorProperty(name="Point B", description="Other end of a known distance", subtype="TRANSLATION")
+    distance: FloatProperty(
+        name="Distance", description="True distance of the two points", default=1.0, min=1e-4, unit="LENGTH"
+    )
+
+    # Classes
+    classes: CollectionProperty(type=FieldworkClass)
+    class_index: IntProperty(name="Class", description="Selected class")
+
+    # Training
+    preset: EnumProperty(name="Preset", description="Trade quality for time", items=PRESETS, default="standard")
+    run: StringProperty(
+        name="Run", description="Name of the training run; several runs may stand side by side", default="main"
+    )
+    time_limit: FloatProperty(
+        name="Time Limit",
+        description="Training ends after so many seconds; 0: when the preset is done",
+        default=0.0,
+        min=0.0,
+        soft_max=7200.0,
+        step=1000,
+        subtype="TIME_ABSOLUTE",
+    )
+    steps: IntProperty(name="Steps", description="Optimization steps; 0: as many as the preset says", default=0, min=0)
+    settings: StringProperty(name="Settings", description="More settings of the run: name=value, separated by spaces")
+
+    # Rendering
+    render_from: EnumProperty(
+        name="From",
+        description="Which cameras to render from",
+        items=[
+            ("camera", "Scene Camera", "The active camera of the scene at the current frame"),
+            ("animation", "Animation", "The active camera of the scene over its frame range"),
+            ("photos", "Held-Out Photos", "The photos that training did not see"),
+            ("orbit", "Orbit", "Once around the scene"),
+        ],
+    )
+    orbit: IntProperty(name="Frames", description="Images once around the scene", default=24, min=2, soft_max=360)
+    size: IntVectorProperty(
+        name="Size",
+        description="Width and height in pixels; 0: that of the camera",
+        size=2,
+        default=(0, 0),
+        min=0,
+        soft_max=4096,
+    )
+    passes: EnumProperty(
+        name="Passes",
+        description="What to render",
+        items=PASSES,
+        options={"ENUM_FLAG"},
+        default={"rgb", "depth", "semantic"},
+    )
+    show_as: EnumProperty(
+        name="Show As",
+        description="What becomes of the rendered images in the scene",
+        items=[
+            ("none", "Images", "Image datablocks only"),
+            ("background", "Camera Background", "Behind the camera they were rendered from"),
+            ("plane", "Image Planes", "On planes in front of the cameras"),
+        ],
+    )
+
+    # Mesh
+    resolution: IntProperty(
+        name="Resolution",
+        description="Cells along the longest side of the capture; memory grows with the third power",
+        default=256,
+        min=16,
+        max=1024,
+    )
+    faces: IntProperty(
+        name="Faces", description="Target number of triangles; 0: keep all", default=0, min=0, soft_max=2_000_000
+    )
+    texture: EnumProperty(
+        name="Texture",
+        description="Size of the baked texture in pixels",
+        items=[
+            ("0", "None", "Vertex colors only"),
+            ("1024", "1024", "1024 × 1024 pixels"),
+            ("2048", "2048", "2048 × 2048 pixels"),
+            ("4096", "4096", "4096 × 4096 pixels"),
+        ],
+    )
+    split: EnumProperty(
+        name="Objects",
+        description="One object, or one for each class",
+        items=[("none", "One", "One object"), ("classes", "One per Class", "One object for each class")],
+    )
+
+    # Export
+    export_path: StringProperty(
+        name="File", description="File to write", default="//fieldwork.blend", subtype="FILE_PATH"
+    )
+
+
+CLASSES = [FieldworkImage, FieldworkClass, FieldworkScene]
+
+
+def register() -> None:
+    bpy.types.Scene.fieldwork = PointerProperty(type=FieldworkScene)
+
+
+def unregister() -> None:
+    del bpy.types.Scene.fieldwork

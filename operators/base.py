@@ -1,0 +1,165 @@
+"""What the operators of the verbs have in common: settings in, a job out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, ClassVar
+
+import bpy
+from bpy.props import StringProperty
+from bpy.types import Context, Operator
+
+from ..addon import jobs, preferences, state
+from ..addon.link import EngineError
+from ..addon.properties import FieldworkScene
+
+
+def scene_settings(**names: str) -> Callable[[type], type]:
+    """Give an operator the scene's settings as properties of its own: operator name = scene name.
+
+    What the caller does not set is taken from the scene.
+    """
+
+    def decorate(cls: type) -> type:
+        own = dict(cls.__dict__.get("__annotations__", {}))
+        cls.__annotations__ = own | {name: FieldworkScene.__annotations__[scene] for name, scene in names.items()}
+        cls.scene_names = names
+        return cls
+
+    return decorate
+
+
+def engine_reason() -> str | None:
+    """Why no engine can be started, None when one can."""
+    if preferences.engine_python() is None:
+        return "Install the engine in the preferences of Fieldwork first"
+    return None
+
+
+def need_photos(context: Context) -> str | None:
+    return None if context.scene.fieldwork.photos else "Choose a folder of photos, or a video, first"
+
+
+def need_project_folder(context: Context) -> str | None:
+    return None if context.scene.fieldwork.project else "Choose a project folder first"
+
+
+def need_project(context: Context) -> str | None:
+    folder = state.folder_of(context.scene.fieldwork)
+    return None if state.has_project(folder) else "Read photos into a project first"
+
+
+def need_poses(context: Context) -> str | None:
+    folder = state.folder_of(context.scene.fieldwork)
+    return need_project(context) or (None if state.has_poses(folder) else "Estimate the camera poses first")
+
+
+def need_run(context: Context) -> str | None:
+    settings = context.scene.fieldwork
+    missing = (
+        None if state.has_run(state.folder_of(settings), settings.run) else f"Train the run “{settings.run}” first"
+    )
+    return need_poses(context) or missing
+
+
+def same_verb_active(verb: str, context: Context) -> str | None:
+    folder = state.folder_of(context.scene.fieldwork)
+    for job in (jobs.queue.running, jobs.queue.followed, *jobs.queue.waiting):
+        if job is not None and job.verb == verb and (job.project is None or job.project == folder):
+            return f"{job.title} is under way"
+    return None
+
+
+class VerbOperator(Operator):
+    """An operator that runs a verb in the engine: queued in a window, blocking without one."""
+
+    verb: ClassVar[str]
+    needs: ClassVar[tuple[Callable[[Context], str | None], ...]] = ()
+    scene_names: ClassVar[dict[str, str]] = {}
+
+    @classmethod
+    def poll(cls, context: Context) -> bool:
+        # Without a window the caller may give the project as an argument, which poll cannot see.
+        if bpy.app.background:
+            return True
+        reason = cls.reason(context)
+        if reason:
+            cls.poll_message_set(reason)
+        return reason is None
+
+    @classmethod
+    def reason(cls, context: Context) -> str | None:
+        """Why the operator cannot run now, None when it can."""
+        for need in cls.needs:
+            if reason := need(context):
+                return reason
+        return engine_reason() or same_verb_active(cls.verb, context)
+
+    def value(self, context: Context, name: str) -> Any:
+        """A setting: the operator's own where the caller set it, else the scene's."""
+        if self.properties.is_property_set(name):
+            return getattr(self, name)
+        return getattr(context.scene.fieldwork, self.scene_names[name])
+
+    def path(self, context: Context, name: str) -> str | None:
+        """A setting that is a path, absolute; None when it is empty."""
+        value = self.value(context, name)
+        return str(Path(bpy.path.abspath(value)).absolute()) if value else None
+
+    def parameters(self, context: Context) -> dict[str, Any]:
+        """Parameters of the verb. Raises ValueError with a sentence for the user."""
+        raise NotImplementedError
+
+    def execute(self, context: Context) -> set[str]:
+        try:
+            params = self.parameters(context)
+        except ValueError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        job = jobs.queue.make(self.verb, {k: v for k, v in params.items() if v is not None}, self.after())
+        if not bpy.app.background:
+            jobs.queue.submit(job)
+            return {"FINISHED"}
+        try:
+            jobs.queue.run(job)
+        except EngineError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        for warning in job.warnings:
+            self.report({"WARNING"}, warning)
+        return {"FINISHED"}
+
+    def after(self) -> Callable[[jobs.Job], None]:
+        """What is called when the job has ended. The operator itself is gone by then."""
+        return refresh_scenes
+
+
+class ProjectOperator(VerbOperator):
+    """A verb that works on a project."""
+
+    project: StringProperty(
+        name="Project", description="Project folder; empty: that of the scene", subtype="DIR_PATH",
+        options={"SKIP_SAVE", "HIDDEN"},
+    )  # fmt: skip
+
+    def project_path(self, context: Context) -> str:
+        if self.properties.is_property_set("project") and self.project:
+            return str(Path(bpy.path.abspath(self.project)).absolute())
+        folder = state.folder_of(context.scene.fieldwork)
+        if folder is None:
+            raise ValueError("Choose a project folder first.")
+        return str(folder)
+
+
+def refresh_scenes(job: jobs.Job) -> None:
+    """Bring what the job changed in the project into the scenes that show it."""
+    for scene in bpy.data.scenes:
+        if job.project is not None and state.folder_of(scene.fieldwork) == job.project:
+            state.refresh(scene.fieldwork)
+
+
+def set_if_empty(scene: bpy.types.Scene, folder: str) -> None:
+    """Let the scene show the project it was just given."""
+    if not scene.fieldwork.project:
+        scene.fieldwork.project = folder

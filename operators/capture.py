@@ -1,0 +1,172 @@
+"""Capture: photos, a video or a posed data set become a project."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import bpy
+from bpy.props import EnumProperty, StringProperty
+from bpy.types import Context, FileHandler, Operator, OperatorFileListElement
+
+from ..addon import state
+from .base import ProjectOperator, need_photos, need_project_folder, scene_settings, set_if_empty
+
+PHOTOS = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".heic", ".heif", ".webp", ".exr", ".dng", ".bmp"}
+VIDEOS = {".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v"}
+FORMATS = [
+    ("auto", "Automatic", "Find out"),
+    ("transforms", "transforms.json", "NeRF and nerfstudio captures"),
+    ("colmap", "COLMAP", "A COLMAP model with its images"),
+    ("llff", "LLFF", "poses_bounds.npy with images"),
+    ("scannet", "ScanNet", "A ScanNet scene"),
+    ("replica", "Replica", "A Replica sequence"),
+    ("dtu", "DTU", "A DTU scan"),
+    ("strecha", "Strecha", "A Strecha multi-view scene"),
+    ("middlebury", "Middlebury", "A Middlebury multi-view set"),
+    ("metashape", "Metashape", "Cameras exported from Metashape"),
+    ("realityscan", "RealityScan", "Cameras exported from RealityScan"),
+    ("meshroom", "Meshroom", "A Meshroom cameras.sfm"),
+]
+
+
+def project_for(source: Path) -> Path:
+    """Where the project of a capture goes when the user names no place: beside it."""
+    return source.with_name(f"{source.stem if source.suffix.lower() in VIDEOS else source.name}_fieldwork")
+
+
+def choose_source(scene: bpy.types.Scene, source: Path) -> None:
+    """Let the scene show a folder of photos, a video, or a project."""
+    settings = scene.fieldwork
+    if state.has_project(source):
+        settings.project = str(source)
+        return
+    settings.photos = str(source)
+    for name, prop in (("labels", "labels"), ("masks", "masks")):
+        setattr(settings, prop, str(source / name) if (source / name).is_dir() else "")
+    settings.class_file = str(source / "classes.json") if (source / "classes.json").is_file() else ""
+    settings.project = str(project_for(source))
+
+
+@scene_settings(
+    photos="photos", labels="labels", masks="masks", classes="class_file", mask_mode="mask_mode", max_size="max_size",
+    frames="frames", keep_blurry="keep_blurry",
+)  # fmt: skip
+class FIELDWORK_OT_new(ProjectOperator):
+    """Read the photos, or frames of the video, into the project"""
+
+    bl_idname = "fieldwork.new"
+    bl_label = "Read Photos"
+    verb = "new"
+    needs = (need_photos, need_project_folder)
+
+    def parameters(self, context: Context) -> dict[str, Any]:
+        photos = self.path(context, "photos")
+        if photos is None:
+            raise ValueError("Choose a folder of photos, or a video, first.")
+        project = self.project_path(context)
+        set_if_empty(context.scene, project)
+        plain = ("mask_mode", "max_size", "frames", "keep_blurry")
+        return {
+            "project": project,
+            "photos": photos,
+            **{name: self.path(context, name) for name in ("labels", "masks", "classes")},
+            **{name: self.value(context, name) for name in plain},
+        }
+
+
+class FIELDWORK_OT_import_dataset(ProjectOperator):
+    """Make a project from photos whose camera poses are known"""
+
+    bl_idname = "fieldwork.import_dataset"
+    bl_label = "Import Posed Data Set"
+    verb = "import"
+
+    directory: StringProperty(
+        name="Data Set", description="Folder of the data set", subtype="DIR_PATH", options={"SKIP_SAVE"}
+    )
+    format: EnumProperty(name="Format", description="Kind of the data set", items=FORMATS, options={"SKIP_SAVE"})
+
+    def invoke(self, context: Context, event: bpy.types.Event) -> set[str]:
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def parameters(self, context: Context) -> dict[str, Any]:
+        if not self.directory:
+            raise ValueError("Choose the folder of a data set first.")
+        source = Path(bpy.path.abspath(self.directory)).absolute()
+        # A scene that shows another capture gets a new project, not that capture's.
+        given = self.properties.is_property_set("project") and bool(self.project)
+        project = Path(self.project_path(context)) if given else project_for(source)
+        context.scene.fieldwork.project = str(project)
+        return {"dataset": str(source), "project": str(project), "format": self.format}
+
+
+class FIELDWORK_OT_open(Operator):
+    """Choose a folder of photos, a video, or an existing project"""
+
+    bl_idname = "fieldwork.open"
+    bl_label = "Open Photos or Project"
+    bl_options = {"REGISTER", "UNDO"}
+
+    filepath: StringProperty(subtype="FILE_PATH", options={"SKIP_SAVE"})
+    directory: StringProperty(subtype="DIR_PATH", options={"SKIP_SAVE"})
+    files: bpy.props.CollectionProperty(type=OperatorFileListElement, options={"SKIP_SAVE", "HIDDEN"})
+    filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
+    filter_image: bpy.props.BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
+    filter_movie: bpy.props.BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
+
+    def invoke(self, context: Context, event: bpy.types.Event) -> set[str]:
+        # Dropped onto the viewport: the path is known already.
+        if self.directory or self.filepath:
+            return self.execute(context)
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def execute(self, context: Context) -> set[str]:
+        source = self.source()
+        if source is None or not source.exists():
+            self.report({"ERROR"}, f"There is nothing at {source}.")
+            return {"CANCELLED"}
+        choose_source(context.scene, source)
+        show_sidebar(context)
+        return {"FINISHED"}
+
+    def source(self) -> Path | None:
+        """The folder or video meant: a photo stands for its folder, project.json for its project."""
+        names = [file.name for file in self.files if file.name]
+        if self.directory and names:
+            path = Path(bpy.path.abspath(self.directory), names[0])
+        elif self.filepath:
+            path = Path(bpy.path.abspath(self.filepath))
+        elif self.directory:
+            path = Path(bpy.path.abspath(self.directory))
+        else:
+            return None
+        return path if path.is_dir() or path.suffix.lower() in VIDEOS else path.parent
+
+
+def show_sidebar(context: Context) -> None:
+    """Open the sidebar at Fieldwork's tab, where there is a 3D viewport."""
+    area = context.area
+    if area is not None and area.type == "VIEW_3D":
+        area.spaces.active.show_region_ui = True
+        for region in area.regions:
+            # The tab can only be set once the sidebar has been drawn.
+            if region.type == "UI" and region.active_panel_category not in ("", "UNSUPPORTED"):
+                region.active_panel_category = "Fieldwork"
+
+
+class FIELDWORK_FH_capture(FileHandler):
+    bl_idname = "FIELDWORK_FH_capture"
+    bl_label = "Fieldwork Photos, Video or Project"
+    bl_import_operator = "fieldwork.open"
+    # project.json stands for a project; a photo stands for its folder.
+    bl_file_extensions = ";".join([*sorted(PHOTOS | VIDEOS), ".json"])
+
+    @classmethod
+    def poll_drop(cls, context: Context) -> bool:
+        return context.area is not None and context.area.type == "VIEW_3D"
+
+
+CLASSES = [FIELDWORK_OT_new, FIELDWORK_OT_import_dataset, FIELDWORK_OT_open, FIELDWORK_FH_capture]

@@ -1,0 +1,28 @@
+"""Export: the capture as a .blend of its own."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from bpy.types import Context
+
+from .base import ProjectOperator, need_run, scene_settings
+
+
+@scene_settings(run="run", out="export_path")
+class FIELDWORK_OT_blend(ProjectOperator):
+    """Write a .blend with the cameras, points, mesh and materials of the capture"""
+
+    bl_idname = "fieldwork.blend"
+    bl_label = "Write .blend"
+    verb = "blend"
+    needs = (need_run,)
+
+    def parameters(self, context: Context) -> dict[str, Any]:
+        out = self.path(context, "out")
+        if not out or not out.endswith(".blend"):
+            raise ValueError("Name a file that ends in .blend.")
+        return {"project": self.project_path(context), "run": self.value(context, "run"), "out": out}
+
+
+CLASSES = [FIELDWORK_OT_blend]

@@ -1,0 +1,160 @@
+"""Running jobs and the engine: cancel, report, stop, check."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+from bpy.types import Context, Operator
+
+from ..addon import jobs, preferences
+from .base import VerbOperator
+
+
+class FIELDWORK_OT_cancel(Operator):
+    """Stop the running job; training leaves a checkpoint to resume from"""
+
+    bl_idname = "fieldwork.cancel"
+    bl_label = "Cancel"
+
+    job: bpy.props.StringProperty(options={"SKIP_SAVE", "HIDDEN"})
+
+    @classmethod
+    def poll(cls, context: Context) -> bool:
+        current = jobs.queue.current
+        if current is None:
+            cls.poll_message_set("Nothing is running")
+        elif current.state == "cancelling" and not jobs.queue.waiting:
+            cls.poll_message_set("The job is stopping already")
+        else:
+            return True
+        return False
+
+    def execute(self, context: Context) -> set[str]:
+        named = [job for job in jobs.queue.waiting if job.id == self.job]
+        jobs.queue.cancel(named[0] if named else None)
+        return {"FINISHED"}
+
+
+class FIELDWORK_OT_copy_report(Operator):
+    """Copy what happened to the clipboard, for a bug report"""
+
+    bl_idname = "fieldwork.copy_report"
+    bl_label = "Copy Report"
+
+    @classmethod
+    def poll(cls, context: Context) -> bool:
+        if jobs.queue.last is None and jobs.queue.current is None:
+            cls.poll_message_set("Nothing has run yet")
+            return False
+        return True
+
+    def execute(self, context: Context) -> set[str]:
+        job = jobs.queue.last or jobs.queue.current
+        context.window_manager.clipboard = job.report()
+        self.report({"INFO"}, "The report is on the clipboard")
+        return {"FINISHED"}
+
+
+class FIELDWORK_OT_dismiss(Operator):
+    """Put the message away"""
+
+    bl_idname = "fieldwork.dismiss"
+    bl_label = "Dismiss"
+
+    def execute(self, context: Context) -> set[str]:
+        jobs.queue.finished.clear()
+        return {"FINISHED"}
+
+
+class FIELDWORK_OT_stop_engine(Operator):
+    """End the engine and free its memory; a running job stops and can be resumed"""
+
+    bl_idname = "fieldwork.stop_engine"
+    bl_label = "Stop Engine"
+
+    @classmethod
+    def poll(cls, context: Context) -> bool:
+        if jobs.queue.link is None or not jobs.queue.link.alive:
+            cls.poll_message_set("The engine is not running")
+            return False
+        return True
+
+    def execute(self, context: Context) -> set[str]:
+        jobs.queue.stop_engine()
+        return {"FINISHED"}
+
+
+class FIELDWORK_OT_detach(Operator):
+    """Let the running job go on by itself, also when Blender is closed; the panel follows it from its files"""
+
+    bl_idname = "fieldwork.detach"
+    bl_label = "Keep Running Without Blender"
+
+    @classmethod
+    def poll(cls, context: Context) -> bool:
+        job = jobs.queue.running
+        if job is None or job.project is None:
+            cls.poll_message_set("No job of a project is running")
+            return False
+        return True
+
+    def execute(self, context: Context) -> set[str]:
+        job = jobs.queue.running
+        jobs.queue.stop_engine(detach=True)
+        jobs.queue.reattach(job.project)
+        return {"FINISHED"}
+
+
+class FIELDWORK_OT_doctor(VerbOperator):
+    """Check that the engine, the device and the disk are in order"""
+
+    bl_idname = "fieldwork.doctor"
+    bl_label = "Check Engine"
+    verb = "doctor"
+
+    def parameters(self, context: Context) -> dict[str, Any]:
+        return {}
+
+
+class FIELDWORK_OT_open_log(Operator):
+    """Show the engine's log in the text editor"""
+
+    bl_idname = "fieldwork.open_log"
+    bl_label = "Open Log"
+
+    @classmethod
+    def poll(cls, context: Context) -> bool:
+        if not jobs.engine_log().is_file():
+            cls.poll_message_set("The engine has not run yet")
+            return False
+        return True
+
+    def execute(self, context: Context) -> set[str]:
+        text = bpy.data.texts.get("Fieldwork Engine Log") or bpy.data.texts.new("Fieldwork Engine Log")
+        text.from_string(jobs.engine_log().read_text(encoding="utf-8", errors="replace"))
+        self.report({"INFO"}, f"See “{text.name}” in the text editor")
+        return {"FINISHED"}
+
+
+class FIELDWORK_OT_open_preferences(Operator):
+    """Open the preferences of Fieldwork"""
+
+    bl_idname = "fieldwork.open_preferences"
+    bl_label = "Preferences"
+
+    def execute(self, context: Context) -> set[str]:
+        bpy.ops.preferences.addon_show(module=preferences.ROOT_PACKAGE)
+        return {"FINISHED"}
+
+
+CLASSES = [
+    FIELDWORK_OT_cancel,
+    FIELDWORK_OT_copy_report,
+    FIELDWORK_OT_dismiss,
+    FIELDWORK_OT_stop_engine,
+    FIELDWORK_OT_detach,
+    FIELDWORK_OT_doctor,
+    FIELDWORK_OT_open_log,
+    FIELDWORK_OT_open_preferences,
+]

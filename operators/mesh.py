@@ -1,0 +1,32 @@
+"""Mesh: the labelled surface of the field."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from bpy.types import Context
+
+from .base import ProjectOperator, need_run, scene_settings
+
+
+@scene_settings(run="run", resolution="resolution", faces="faces", texture="texture", split="split")
+class FIELDWORK_OT_mesh(ProjectOperator):
+    """Extract the surface with its colors and labels"""
+
+    bl_idname = "fieldwork.mesh"
+    bl_label = "Extract Mesh"
+    verb = "mesh"
+    needs = (need_run,)
+
+    def parameters(self, context: Context) -> dict[str, Any]:
+        return {
+            "project": self.project_path(context),
+            "run": self.value(context, "run"),
+            "resolution": self.value(context, "resolution"),
+            "faces": self.value(context, "faces") or None,
+            "texture": int(self.value(context, "texture")) or None,
+            "split": self.value(context, "split"),
+        }
+
+
+CLASSES = [FIELDWORK_OT_mesh]

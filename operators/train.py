@@ -1,0 +1,116 @@
+"""Train: the field of the capture, in one or several runs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from bl_operators.presets import AddPresetBase
+from bpy.props import BoolProperty, EnumProperty, StringProperty
+from bpy.types import Context, Menu, Operator
+
+from ..addon import state
+from .base import ProjectOperator, need_poses, need_run, scene_settings
+
+
+def parse_settings(text: str) -> dict[str, str]:
+    """`name=value` pairs separated by blanks. Raises ValueError for a word without “=”."""
+    pairs = {}
+    for word in text.split():
+        name, equals, value = word.partition("=")
+        if not (name and equals and value):
+            raise ValueError(f"“{word}” is not a setting: write name=value, e.g. loss.semantic=0.1.")
+        pairs[name] = value
+    return pairs
+
+
+@scene_settings(preset="preset", run="run", time_limit="time_limit", steps="steps", settings="settings")
+class FIELDWORK_OT_train(ProjectOperator):
+    """Train the field on the posed photos"""
+
+    bl_idname = "fieldwork.train"
+    bl_label = "Train"
+    verb = "train"
+    needs = (need_poses,)
+
+    resume: BoolProperty(name="Resume", description="Go on from the last checkpoint of the run", options={"SKIP_SAVE"})
+
+    @classmethod
+    def description(cls, context: Context, properties: Any) -> str:
+        return "Go on from the last checkpoint of the run" if properties.resume else cls.__doc__ or ""
+
+    def parameters(self, context: Context) -> dict[str, Any]:
+        run = self.value(context, "run")
+        if not run:
+            raise ValueError("Give the run a name.")
+        seconds, steps = self.value(context, "time_limit"), self.value(context, "steps")
+        state.write_classes()
+        return {
+            "project": self.project_path(context),
+            "preset": self.value(context, "preset"),
+            "run": run,
+            "time_limit": seconds if seconds > 0 else None,
+            "steps": steps if steps > 0 else None,
+            "set": parse_settings(self.value(context, "settings")),
+            "resume": self.resume,
+        }
+
+
+@scene_settings(run="run")
+class FIELDWORK_OT_evaluate(ProjectOperator):
+    """Compare renders of the run with photos that training did not see"""
+
+    bl_idname = "fieldwork.evaluate"
+    bl_label = "Measure Quality"
+    verb = "evaluate"
+    needs = (need_run,)
+
+    split: EnumProperty(
+        name="Photos",
+        description="Photos to compare with",
+        items=[("test", "Held Out", "Photos that training did not see"), ("train", "Training", "Training photos")],
+        options={"SKIP_SAVE"},
+    )
+
+    def parameters(self, context: Context) -> dict[str, Any]:
+        return {"project": self.project_path(context), "run": self.value(context, "run"), "split": self.split}
+
+
+class FIELDWORK_OT_use_run(Operator):
+    """Make this the run that is trained, rendered and meshed"""
+
+    bl_idname = "fieldwork.use_run"
+    bl_label = "Use Run"
+    bl_options = {"REGISTER", "UNDO"}
+
+    run: StringProperty(name="Run", description="Name of the run", options={"SKIP_SAVE"})
+
+    def execute(self, context: Context) -> set[str]:
+        context.scene.fieldwork.run = self.run
+        return {"FINISHED"}
+
+
+class FIELDWORK_MT_train_presets(Menu):
+    bl_label = "Training Presets"
+    preset_subdir = "fieldwork/train"
+    preset_operator = "script.execute_preset"
+    draw = Menu.draw_preset
+
+
+class FIELDWORK_OT_train_preset_add(AddPresetBase, Operator):
+    """Add or remove a preset of the training settings"""
+
+    bl_idname = "fieldwork.train_preset_add"
+    bl_label = "Add Training Preset"
+    preset_menu = "FIELDWORK_MT_train_presets"
+    preset_subdir = "fieldwork/train"
+    preset_defines = ["fieldwork = bpy.context.scene.fieldwork"]
+    preset_values = ["fieldwork.preset", "fieldwork.time_limit", "fieldwork.steps", "fieldwork.settings"]
+
+
+CLASSES = [
+    FIELDWORK_OT_train,
+    FIELDWORK_OT_evaluate,
+    FIELDWORK_OT_use_run,
+    FIELDWORK_MT_train_presets,
+    FIELDWORK_OT_train_preset_add,
+]

@@ -1,0 +1,114 @@
+"""What the panels share: the tab, and the look of a job."""
+
+from __future__ import annotations
+
+from bpy.types import Context, Panel, UILayout
+
+from ..addon import jobs, state
+
+
+class FieldworkPanel(Panel):
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = "Fieldwork"
+
+
+class StepPanel(FieldworkPanel):
+    """A step of the way from photos to a model, below the main panel."""
+
+    bl_parent_id = "FIELDWORK_PT_main"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    def draw_state(self, done: bool, text: str) -> None:
+        row = self.layout.row()
+        row.active = done
+        row.label(text=text, icon="CHECKMARK" if done else "RADIOBUT_OFF")
+
+
+def columns(layout: UILayout) -> UILayout:
+    """A column with names left and values right."""
+    column = layout.column()
+    column.use_property_split = True
+    column.use_property_decorate = False
+    return column
+
+
+def duration(seconds: float | None) -> str:
+    """Seconds as people say them: 8 s, 3:05 min, 2:10 h."""
+    if seconds is None:
+        return ""
+    seconds = max(0, round(seconds))
+    if seconds < 60:
+        return f"{seconds} s"
+    if seconds < 3600:
+        return f"{seconds // 60}:{seconds % 60:02} min"
+    return f"{seconds // 3600}:{seconds % 3600 // 60:02} h"
+
+
+def progress_text(job: jobs.Job) -> str:
+    """What the job is at, in one line."""
+    if job.state == "cancelling":
+        return "Stopping…"
+    parts = [job.stage or job.title]
+    if job.fraction is not None and job.state == "running":
+        parts.append(f"{job.fraction:.0%}")
+    if job.eta is not None:
+        parts.append(f"{duration(job.eta)} left")
+    return " · ".join(parts)
+
+
+def draw_job(layout: UILayout, job: jobs.Job) -> None:
+    """A running or waiting job: a bar with its estimate, and a button that stops it."""
+    row = layout.row(align=True)
+    row.progress(factor=job.fraction or 0.0, text=progress_text(job), type="BAR")
+    row.operator("fieldwork.cancel", text="", icon="X").job = job.id
+    if job.message:
+        small = layout.row()
+        small.active = False
+        small.label(text=job.message)
+
+
+def draw_wrapped(layout: UILayout, text: str, width: int, icon: str = "NONE") -> None:
+    """A text over several lines: labels do not wrap."""
+    column = layout.column(align=True)
+    column.scale_y = 0.8
+    for number, line in enumerate(wrap(text, width)):
+        column.label(text=line, icon=icon if number == 0 else "BLANK1" if icon != "NONE" else "NONE")
+
+
+def wrap(text: str, width: int) -> list[str]:
+    """Lines of at most about `width` characters; a long word such as a path is broken after a separator."""
+    lines = [""]
+    for word in text.split():
+        while len(word) > width:
+            cut = max(word.rfind(mark, 1, width) for mark in "/\\-_.") + 1 or width
+            lines.append(word[:cut])
+            word = word[cut:]
+        if lines[-1] and len(lines[-1]) + 1 + len(word) > width:
+            lines.append(word)
+        else:
+            lines[-1] = f"{lines[-1]} {word}".strip()
+    return [line for line in lines if line]
+
+
+def text_width(context: Context) -> int:
+    """Characters that fit into the sidebar beside an icon."""
+    scale = context.preferences.system.ui_scale
+    return max(20, int((context.region.width / scale - 60) / 6.3)) if context.region else 40
+
+
+def draw_error(layout: UILayout, context: Context, job: jobs.Job) -> None:
+    """A job that failed: what happened, what to do, and the report."""
+    if job.error is None:
+        return
+    box = layout.box()
+    draw_wrapped(box, job.error.message, text_width(context) - 4, icon="ERROR")
+    if job.error.hint:
+        draw_wrapped(box, job.error.hint, text_width(context) - 4, icon="INFO")
+    row = box.row()
+    row.operator("fieldwork.copy_report", icon="COPYDOWN")
+    row.operator("fieldwork.dismiss")
+
+
+def project_folder(context: Context):
+    return state.folder_of(context.scene.fieldwork)

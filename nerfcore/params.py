@@ -28,7 +28,7 @@ class SimulateParams(Params):
     views: int = Field(48, ge=4, description="number of photos")
     size: tuple[int, int] = Field((720, 480), description="photo width and height in pixels")
     seed: int = Field(0, description="seed of the scene and of the camera path")
-    samples: int = Field(24, ge=1, description="Cycles samples per pixel")
+    samples: int = Field(4, ge=1, description="Cycles samples per pixel")
 
 
 class NewParams(Params):

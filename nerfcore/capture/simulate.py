@@ -123,7 +123,7 @@ def _develop(out: Path, raw: Path, index: int) -> None:
         spec = oiio.ImageSpec(depth.shape[1], depth.shape[0], 1, "float")
         spec.channelnames = ("Z",)
         spec.attribute("compression", "zip")
-        if image is None or not (image.open(str(temporary), spec) and image.write_image(depth) and image.close()):
+        if image is None or not (image.open(str(temporary), spec) and image.write_image(depth[..., None]) and image.close()):
             raise InputError(f"{temporary} cannot be written: {oiio.geterror()}")
     with atomic_path(out / "labels" / f"{_stem(index)}.png") as temporary:
         shutil.copyfile(source.with_suffix(".label.png"), temporary)

@@ -1,0 +1,75 @@
+"""The materials of a labelled mesh: photo colour or class colour, unlit, switched by one property of the parent."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+
+SWITCH = "show_labels"  # custom property of the parent empty: 0 photo colour, 1 class colour
+COLOR_ATTRIBUTE = "Color"
+
+
+def srgb_to_linear(value: float) -> float:
+    """One sRGB channel in [0, 1] as linear light (IEC 61966-2-1)."""
+    return value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4
+
+
+def make_group(name: str, root: bpy.types.Object) -> Any:
+    """The node group shared by all classes: class colour in, the colour to show out, switched by `root`."""
+    tree = bpy.data.node_groups.get(name)
+    if tree is None:
+        tree = bpy.data.node_groups.new(name, "ShaderNodeTree")
+        tree.interface.new_socket("Class Color", in_out="INPUT", socket_type="NodeSocketColor")
+        tree.interface.new_socket("Color", in_out="OUTPUT", socket_type="NodeSocketColor")
+        nodes = tree.nodes
+        given, result = nodes.new("NodeGroupInput"), nodes.new("NodeGroupOutput")
+        photo = nodes.new("ShaderNodeAttribute")
+        photo.attribute_name = COLOR_ATTRIBUTE
+        switch = nodes.new("ShaderNodeValue")
+        mix = nodes.new("ShaderNodeMix")
+        mix.data_type = "RGBA"
+        # The Mix node has sockets for every data type; the colour ones are inputs 6 and 7 and output 2.
+        for start, end in (
+            (switch.outputs[0], mix.inputs[0]),
+            (photo.outputs["Color"], mix.inputs[6]),
+            (given.outputs[0], mix.inputs[7]),
+            (mix.outputs[2], result.inputs[0]),
+        ):
+            tree.links.new(start, end)
+        for column, node in enumerate((given, photo, switch, mix, result)):
+            node.location = (200 * column, 0)
+    switch = next(node for node in tree.nodes if node.type == "VALUE")
+    switch.outputs[0].driver_remove("default_value")
+    driver = switch.outputs[0].driver_add("default_value").driver
+    driver.type = "AVERAGE"  # a plain copy: needs no script execution
+    variable = driver.variables.new()
+    variable.type = "SINGLE_PROP"
+    variable.targets[0].id = root
+    variable.targets[0].data_path = f'["{SWITCH}"]'
+    return tree
+
+
+def make_material(name: str, color: list[float], group: Any) -> bpy.types.Material:
+    """A class's material: `color` is sRGB in [0, 1]. An existing one of that name is given the colour anew."""
+    material = bpy.data.materials.get(name)
+    linear = (*(srgb_to_linear(channel) for channel in color), 1.0)
+    if material is None:
+        material = bpy.data.materials.new(name)
+        material.use_nodes = True
+        tree = material.node_tree
+        tree.nodes.clear()
+        chooser = tree.nodes.new("ShaderNodeGroup")
+        chooser.node_tree = group
+        # Light is in the photos already: an unlit surface looks as they do.
+        emission = tree.nodes.new("ShaderNodeEmission")
+        output = tree.nodes.new("ShaderNodeOutputMaterial")
+        tree.links.new(chooser.outputs[0], emission.inputs[0])
+        tree.links.new(emission.outputs[0], output.inputs[0])
+        for column, node in enumerate((chooser, emission, output)):
+            node.location = (220 * column, 0)
+    chooser = next(node for node in material.node_tree.nodes if node.type == "GROUP")
+    chooser.node_tree = group
+    chooser.inputs[0].default_value = linear
+    material.diffuse_color = linear
+    return material

@@ -1,0 +1,71 @@
+"""The child process of `fieldwork blend`: a package as a .blend of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import bpy
+
+from .package import read_package
+from .scene_import import Imported, import_package
+
+PACKED_LIMIT = 256 * 2**20  # bytes of photos above which they stay outside the .blend
+
+
+def write_blend(request: dict[str, Any], emit: Callable[..., None]) -> dict[str, Any]:
+    """Build the package folder `request["package"]` in a new file and save it as `request["out"]`."""
+    emit(kind="stage", name="Building the Blender file")
+    bpy.ops.wm.read_factory_settings()
+    bpy.context.preferences.filepaths.save_version = 0
+    for item in list(bpy.data.objects):
+        bpy.data.objects.remove(item)
+    for collection in list(bpy.data.collections):
+        bpy.data.collections.remove(collection)
+    scene = bpy.context.scene
+    scene.name = "Fieldwork"
+    package = read_package(request["package"])
+    imported = import_package(
+        scene, package, progress=lambda fraction, message: emit(kind="progress", fraction=fraction, message=message)
+    )
+    prepare_scene(scene, len(package.cameras))
+    _show_colors(imported)
+    warnings = imported.warnings if package.mesh is not None else []
+    size = sum((package.folder / camera["image"]).stat().st_size for camera in package.cameras)
+    if size <= PACKED_LIMIT:
+        for image in bpy.data.images:
+            if image.source == "FILE":
+                image.pack()
+    else:
+        warnings = [*warnings, f"The photos ({size >> 20} MiB) are not packed: the .blend reads {package.folder}."]
+    bpy.data.orphans_purge(do_recursive=True)
+    bpy.ops.wm.save_as_mainfile(filepath=request["out"], compress=True, relative_remap=True, copy=True)
+    return {
+        "objects": [item.name for item in imported.objects()],
+        "cameras": len(imported.cameras),
+        "points": len(package.xyz),
+        "mesh": len(package.mesh["faces"]) if package.mesh is not None else None,
+        "warnings": warnings,
+    }
+
+
+def prepare_scene(scene: bpy.types.Scene, frames: int) -> None:
+    """Settings under which a render has the colours of the photos."""
+    scene.render.engine = "CYCLES"
+    scene.cycles.samples, scene.cycles.use_denoising = 16, False
+    scene.view_settings.view_transform = "Standard"
+    scene.view_settings.look = "None"
+    scene.frame_start, scene.frame_end = 1, max(frames, 1)
+    scene.unit_settings.system = "METRIC"
+
+
+def _show_colors(imported: Imported) -> None:
+    """Let every 3D viewport show the colours of the photos, flat, through the first camera."""
+    for screen in bpy.data.screens:
+        for area in screen.areas:
+            for space in area.spaces:
+                if space.type == "VIEW_3D":
+                    space.shading.type, space.shading.light, space.shading.color_type = "SOLID", "FLAT", "VERTEX"
+                    space.clip_end = 1000.0
+                    if imported.cameras:
+                        space.region_3d.view_perspective = "CAMERA"

@@ -1,0 +1,62 @@
+"""The verb `blend`: a capture as a .blend, by a package for Blender and a Blender that reads it."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+from .blend_package import write_package
+from .blender import run_in_blender
+from .errors import SettingError
+from .files import atomic_path
+from .params import BlendParams
+from .progress import Reporter
+from .project import load_project, load_scene, save_project
+
+
+def blend(params: BlendParams, report: Reporter) -> dict[str, Any]:
+    """Write the cameras, points and mesh of a project into `params.out`.
+
+    Returns:
+        {"file", "objects": [names], "cameras", "points", "mesh": faces or null, "seconds", "warnings"}.
+    Raises:
+        SettingError: the output is not named *.blend.
+        ProjectError: there are no poses.
+        BlenderError: Blender is missing or failed.
+    """
+    started = time.monotonic()
+    out = params.out.absolute()
+    if out.suffix != ".blend":
+        raise SettingError(f"{out} is no Blender file.", "Name a file that ends in .blend.")
+    folder = params.project.absolute()
+    scene = load_scene(folder)
+    package = write_package(folder, params.run, scene, folder.name, report)
+    warnings = []
+    if not (package / "mesh.npz").is_file():
+        warnings.append("There is no mesh yet: the .blend holds cameras and points only. Run `fieldwork mesh` first.")
+    if not len(scene.points):
+        warnings.append("The project has no sparse points.")
+    with atomic_path(out) as temporary:
+        # Blender writes beside its target and renames; the two names must stay on one disk.
+        result = run_in_blender(
+            "blend",
+            {"package": str(package), "out": str(temporary)},
+            report,
+            lambda event: report.progress(event["fraction"], event.get("message", "")),
+        )
+    for warning in [*warnings, *result.pop("warnings")]:
+        report.warn(warning)
+    _record(folder, params, out)
+    return {
+        "file": str(out),
+        **result,
+        "seconds": round(time.monotonic() - started, 1),
+        "warnings": report.warnings,
+    }
+
+
+def _record(folder: Path, params: BlendParams, out: Path) -> None:
+    project = load_project(folder)
+    project.record("blend", params.model_dump(mode="json"), {"file": str(out)})
+    save_project(folder, project)

@@ -1,0 +1,181 @@
+"""The package: what Blender needs of a capture, readable with numpy and JSON alone.
+
+package.json        name, classes, cameras (camera-to-world in the world frame, OpenGL axes), settings
+images/             the photos without lens distortion, in the size of their camera
+points.npz          xyz (N, 3) float32 world, rgb (N, 3) uint8 sRGB
+lenses.json         which lens each photo was undistorted for
+mesh.npz            only when there is a mesh: vertices, faces, normals, colors, class_id, face_class
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+
+from .data.cameras import Camera, flip_camera_axes, pixel_centers, project, rays
+from .data.scene import Scene, View
+from .errors import InputError, ProjectError
+from .files import atomic_path, disk_errors, write_json
+from .progress import Reporter
+
+FORMAT, VERSION = "fieldwork-package", 1
+MESH_ARRAYS = ("vertices", "faces", "colors", "class_id", "face_class")
+
+
+def package_folder(project: Path, run: str) -> Path:
+    return project / "exports" / run / "package"
+
+
+def write_package(project: Path, run: str, scene: Scene, name: str, report: Reporter) -> Path:
+    """Write the package of a run; photos that are already there and newer than their source are kept.
+
+    Args:
+        project: the project's folder; the mesh is read from exports/<run>/mesh.npz there, if it exists.
+        scene: its views and points in the world frame.
+        name: what Blender calls it.
+    Returns:
+        the folder.
+    Raises:
+        InputError: a photo is missing or unreadable.
+        ProjectError: the mesh file is damaged.
+    """
+    folder = package_folder(project, run)
+    with disk_errors(folder):
+        (folder / "images").mkdir(parents=True, exist_ok=True)
+    cameras = []
+    report.stage("Undistorting the photos")
+    grids: dict[str, torch.Tensor] = {}
+    lenses = _lenses(folder)
+    test = set(scene.test)
+    for index, view in enumerate(scene.views):
+        report.progress(index / len(scene.views), view.name)
+        file = _write_photo(view, folder, grids, lenses)
+        cameras.append(camera_entry(view, f"images/{file.name}", "test" if index in test else "train"))
+    write_json(folder / "lenses.json", lenses)
+    kept = {Path(camera["image"]).name for camera in cameras}
+    for stale in (folder / "images").iterdir():
+        if stale.name not in kept:
+            stale.unlink()
+    points = scene.points
+    with atomic_path(folder / "points.npz") as temporary, open(temporary, "wb") as out:
+        np.savez_compressed(out, xyz=points.xyz.astype(np.float32), rgb=points.rgb.astype(np.uint8))
+    has_mesh = _copy_mesh(project / "exports" / run / "mesh.npz", folder / "mesh.npz")
+    write_json(
+        folder / "package.json",
+        {
+            "format": FORMAT,
+            "version": VERSION,
+            "name": name,
+            "run": run,
+            "frame": "world",
+            "ignore_id": scene.ignore_id,
+            "classes": [{"id": c.id, "name": c.name, "color": list(c.color)} for c in scene.classes],
+            "cameras": cameras,
+            "mesh": has_mesh,
+        },
+    )
+    return folder
+
+
+def camera_entry(view: View, image: str, split: str) -> dict[str, Any]:
+    """One camera of package.json: pinhole in pixels, or a panorama; `camera_to_world` has OpenGL axes."""
+    camera = view.camera
+    return {
+        "name": view.name,
+        "model": "EQUIRECTANGULAR" if camera.model == "EQUIRECTANGULAR" else "PINHOLE",
+        "width": camera.width,
+        "height": camera.height,
+        "fx": camera.fx,
+        "fy": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        "camera_to_world": flip_camera_axes(view.camera_to_world).tolist(),
+        "image": image,
+        "split": split,
+    }
+
+
+def undistortion_grid(camera: Camera) -> torch.Tensor:
+    """Where each pixel of the distortion-free picture lies in the photo: (1, H, W, 2) in torch's −1 … 1.
+
+    The distortion-free camera has the same size, focal lengths and principal point. Pixels that the lens never
+    imaged lie outside.
+    """
+    directions, _ = rays(camera.undistorted(), pixel_centers(camera.width, camera.height).reshape(-1, 2))
+    found = project(camera, directions)
+    inside = np.isfinite(found).all(-1)
+    # Beyond the angle where the lens polynomial turns back, a projection is a mirage: it must lead back to its ray.
+    back, valid = rays(camera, np.where(inside[:, None], found, 0))
+    inside &= valid & ((back * directions).sum(-1) > 1 - 1e-6)
+    grid = np.where(inside[:, None], found / [camera.width, camera.height] * 2 - 1, 9.0)
+    return torch.from_numpy(grid.astype(np.float32)).reshape(1, camera.height, camera.width, 2)
+
+
+def undistort(pixels: np.ndarray, grid: torch.Tensor) -> np.ndarray:
+    """Resample a photo (H, W, C) uint8 along `undistortion_grid`; black where the lens saw nothing."""
+    photo = torch.from_numpy(pixels).permute(2, 0, 1)[None].float()
+    out = torch.nn.functional.grid_sample(photo, grid, mode="bicubic", padding_mode="zeros", align_corners=False)
+    return out[0].clamp(0, 255).round().byte().permute(1, 2, 0).numpy()
+
+
+def _write_photo(view: View, folder: Path, grids: dict[str, torch.Tensor], lenses: dict[str, str]) -> Path:
+    camera = view.camera
+    plain = camera.model in {"PINHOLE", "EQUIRECTANGULAR"} or (not any(camera.distortion) and camera.model == "OPENCV")
+    suffix = view.image.suffix.lower()
+    keep = plain and suffix in {".jpg", ".jpeg", ".png"}
+    target = folder / "images" / (view.name.replace("/", "_") + (suffix if keep else ".jpg"))
+    if not view.image.is_file():
+        raise InputError(f"The photo {view.image} is missing.", "Restore it, or make the project again.")
+    key = json.dumps(camera.model_dump(mode="json"))
+    if target.is_file() and target.stat().st_mtime >= view.image.stat().st_mtime and lenses.get(view.name) == key:
+        return target
+    lenses[view.name] = key
+    with atomic_path(target) as temporary:
+        if keep:
+            shutil.copyfile(view.image, temporary)
+        else:
+            _develop(view, temporary, None if plain else grids.setdefault(key, undistortion_grid(camera)))
+    return target
+
+
+def _lenses(folder: Path) -> dict[str, str]:
+    """The lens each photo of the package was undistorted for: it may have been estimated anew since."""
+    try:
+        value = json.loads((folder / "lenses.json").read_text("utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return value if isinstance(value, dict) else {}
+
+
+def _develop(view: View, target: Path, grid: torch.Tensor | None) -> None:
+    try:
+        with Image.open(view.image) as picture:
+            pixels = np.array(picture.convert("RGB"))
+    except OSError as error:
+        raise InputError(f"The photo {view.image} cannot be read: {error}.", "Restore it.") from error
+    if grid is not None:
+        pixels = undistort(pixels, grid)
+    Image.fromarray(pixels).save(target, "JPEG", quality=92, subsampling=0)
+
+
+def _copy_mesh(source: Path, target: Path) -> bool:
+    """Copy the mesh into the package; false when there is none yet."""
+    if not source.is_file():
+        target.unlink(missing_ok=True)
+        return False
+    try:
+        with np.load(source, allow_pickle=False) as data:
+            missing = [name for name in MESH_ARRAYS if name not in data]
+    except (OSError, ValueError) as error:
+        raise ProjectError(f"{source} is damaged: {error}.", "Run `fieldwork mesh` again.") from error
+    if missing:
+        raise ProjectError(f"{source} lacks {', '.join(missing)}.", "Run `fieldwork mesh` again.")
+    with atomic_path(target) as temporary:
+        shutil.copyfile(source, temporary)
+    return True

@@ -120,6 +120,11 @@ class BlendParams(Params):
     run: str = "main"
 
 
+class PackageParams(Params):
+    project: Path
+    run: str = "main"
+
+
 class ReconstructParams(Params):
     photos: Path
     out: Path

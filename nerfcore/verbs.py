@@ -29,6 +29,7 @@ VERBS = {
     "render": Verb(p.RenderParams, "render.verb:render", "Render images from the field."),
     "mesh": Verb(p.MeshParams, "mesh.verb:mesh", "Extract the labelled surface."),
     "blend": Verb(p.BlendParams, "blend:blend", "Write a .blend with cameras, points, mesh and materials."),
+    "package": Verb(p.PackageParams, "package:package", "Prepare cameras, points and mesh for Blender."),
     "reconstruct": Verb(p.ReconstructParams, "reconstruct:reconstruct", "Photos in, a labelled .blend out."),
 }
 

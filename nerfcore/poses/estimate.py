@@ -144,7 +144,7 @@ def _prepare_masks(folder: Path, work: Path, records: list[ImageRecord], report:
             if source is not None:
                 shutil.copyfile(source, temporary)
             elif alpha is not None:
-                alpha.point(lambda value: 255 if value > 127 else 0).save(temporary)
+                Image.fromarray(np.where(np.asarray(alpha) > 127, 255, 0).astype(np.uint8)).save(temporary)
     return target if found else None
 
 

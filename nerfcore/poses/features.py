@@ -16,7 +16,8 @@ import pycolmap
 
 from .presets import Level
 
-FULL_MODEL_FROM = 15  # photos of one camera at which its lens is given all of OPENCV's parameters
+FULL_MODEL_FROM = 15  # photos of one camera at which its lens is given all of OPENCV's parameters in the end
+LONG_LENS = 1.5  # focal length in long sides from which a lens counts as long (view narrower than 37°)
 FOCAL_GUESS = 0.85  # of the long side, where EXIF says nothing
 RETRIEVAL_FEATURES = 256
 PAIRS_PER_IMAGE = 16
@@ -85,14 +86,45 @@ def add_images(path: Path, image_folder: Path, images: list[dict[str, Any]]) -> 
                 db.update_camera(camera)
 
 
-def start_camera(group: list[dict[str, Any]]) -> tuple[str, list[float]]:
+def start_camera(group: list[dict[str, Any]], full: bool = False) -> tuple[str, list[float]]:
     """COLMAP model and first parameters for the photos of one camera."""
     width, height = group[0]["width"], group[0]["height"]
     known = [image["focal_px"] for image in group if image["focal_px"]]
     focal = float(np.median(known)) if known else FOCAL_GUESS * max(width, height)
-    if len(group) >= FULL_MODEL_FROM:
+    if full:
         return "OPENCV", [focal, focal, width / 2, height / 2, 0.0, 0.0, 0.0, 0.0]
     return "SIMPLE_RADIAL", [focal, width / 2, height / 2, 0.0]
+
+
+def wants_full_model(group: list[dict[str, Any]]) -> bool:
+    """Whether a lens may have all parameters from the start: many photos, and no narrow view.
+
+    On narrow views of few points (an object shot with a long lens) the extra parameters run away.
+    """
+    _, params = start_camera(group)
+    return len(group) >= FULL_MODEL_FROM and params[0] < LONG_LENS * max(group[0]["width"], group[0]["height"])
+
+
+def set_lenses(path: Path, images: list[dict[str, Any]], full: bool) -> bool:
+    """Reset every lens in the database to its first parameters, in the full or in the simple model.
+
+    Returns:
+        whether any lens has the full model.
+    """
+    groups: dict[str, list[dict[str, Any]]] = {}
+    for image in images:
+        groups.setdefault(image["group"], []).append(image)
+    any_full = False
+    with database(path) as db:
+        for group in groups.values():
+            chosen = full and wants_full_model(group)
+            any_full |= chosen
+            model, params = start_camera(group, chosen)
+            camera = db.read_camera(db.read_image_with_name(group[0]["file"]).camera_id)
+            camera.model = getattr(pycolmap.CameraModelId, model)
+            camera.params = params
+            db.update_camera(camera)
+    return any_full
 
 
 def extract(path: Path, image_folder: Path, masks: Path | None, names: list[str], level: Level, tell: Any) -> None:

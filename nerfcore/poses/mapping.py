@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import shutil
 from pathlib import Path
 from typing import Any
@@ -9,19 +10,19 @@ from typing import Any
 import pycolmap
 
 from .features import FULL_MODEL_FROM
-from .presets import Level
 from .validate import ImageCheck, check_images
 
 REPAIR_ROUNDS = 2
+MAX_POINT_ERROR = 4.0  # pixels
 SEED = 1
 
 
-def mapper_options(level: Level, count: int, names: list[str]) -> Any:
+def mapper_options(relaxed: bool, count: int, names: list[str]) -> Any:
     options = pycolmap.IncrementalPipelineOptions()
     options.image_names = names
     options.random_seed = SEED
     options.min_model_size = min(10, max(3, count // 4))
-    if level.relaxed:
+    if relaxed:
         options.min_num_matches = 10
         options.mapper.init_min_num_inliers = 40
         options.mapper.init_min_tri_angle = 6.0
@@ -31,7 +32,7 @@ def mapper_options(level: Level, count: int, names: list[str]) -> Any:
 
 
 def build(
-    path: Path, image_folder: Path, output: Path, level: Level, names: list[str], tell: Any, start: Path | None = None
+    path: Path, image_folder: Path, output: Path, relaxed: bool, names: list[str], tell: Any, start: Path | None = None
 ) -> list[Any]:
     """Reconstruct, from nothing or from the model in `start`; models with most images first.
 
@@ -39,7 +40,7 @@ def build(
     """
     shutil.rmtree(output, ignore_errors=True)
     output.mkdir(parents=True)
-    options = mapper_options(level, len(names), names)
+    options = mapper_options(relaxed, len(names), names)
     done = 0
     if start is not None:
         options.fix_existing_frames = True
@@ -73,7 +74,7 @@ def build(
 
 
 def repair(
-    model: Any, path: Path, image_folder: Path, work: Path, level: Level, names: list[str], tell: Any
+    model: Any, path: Path, image_folder: Path, work: Path, relaxed: bool, names: list[str], tell: Any
 ) -> tuple[Any, dict[int, ImageCheck], dict[tuple[int, int], int], dict[int, ImageCheck]]:
     """Take out images whose pose contradicts their matches, and try to place them again.
 
@@ -98,7 +99,7 @@ def repair(
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
         model.write(str(folder))
-        models = build(path, image_folder, work / "repair_out", level, names, tell, start=folder)
+        models = build(path, image_folder, work / "repair_out", relaxed, names, tell, start=folder)
         if models and models[0].num_reg_images() >= model.num_reg_images():
             model = models[0]
     checks, links = check_images(model, path)
@@ -106,13 +107,24 @@ def repair(
 
 
 def adjust(model: Any, keep_cameras: bool) -> None:
-    """Final bundle adjustment; with the principal point where one lens took at least fifteen photos."""
+    """Final bundle adjustment.
+
+    A lens that took at least fifteen photos is given all of OPENCV's parameters (during mapping they run away on
+    narrow views of few points), and its principal point where there is no other lens.
+    """
     if keep_cameras:
         return
+    taken = collections.Counter(model.image(i).camera_id for i in model.reg_image_ids())
+    for camera_id, count in taken.items():
+        camera = model.camera(camera_id)
+        if count >= FULL_MODEL_FROM and camera.model_name == "SIMPLE_RADIAL":
+            focal, cx, cy, k = camera.params
+            camera.model = pycolmap.CameraModelId.OPENCV
+            camera.params = [focal, focal, cx, cy, k, 0.0, 0.0, 0.0]
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
-    options.refine_principal_point = len(model.cameras) == 1 and model.num_reg_images() >= FULL_MODEL_FROM
+    options.refine_principal_point = len(taken) == 1 and model.num_reg_images() >= FULL_MODEL_FROM
     pycolmap.bundle_adjustment(model, options)
     model.update_point_3d_errors()
-    for point_id in [i for i, point in model.points3D.items() if point.error > 4.0]:
+    for point_id in [i for i, point in model.points3D.items() if point.error > MAX_POINT_ERROR]:
         model.delete_point3D(point_id)

@@ -16,6 +16,8 @@ from .presets import ENOUGH, EXHAUSTIVE_AT_MOST, EXHAUSTIVE_UP_TO, LADDERS, Leve
 from .validate import ImageCheck, pair_images
 
 MIN_FEATURES = 100
+MIN_COMMON = 40
+MIN_REGISTERED = 3
 
 
 @dataclass
@@ -51,10 +53,10 @@ def run(job: dict[str, Any], tell: Any) -> dict[str, Any]:
     names = [image["file"] for image in job["images"]]
     best: Attempt | None = None
     levels = LADDERS[job["preset"]]
-    tried: set[tuple[str, bool, bool]] = set()
+    tried: set[tuple[str, bool]] = set()
     for level in levels:
         exhaustive = len(names) <= EXHAUSTIVE_UP_TO or (level.exhaustive and len(names) <= EXHAUSTIVE_AT_MOST)
-        signature = (level.database, exhaustive, level.relaxed)
+        signature = (level.database, exhaustive)
         if signature in tried:
             continue
         tried.add(signature)
@@ -66,7 +68,7 @@ def run(job: dict[str, Any], tell: Any) -> dict[str, Any]:
         if best.registered >= ENOUGH * len(names):
             break
     assert best is not None
-    if best.registered < 2:
+    if best.registered < MIN_REGISTERED:
         raise PosesError(
             _why_nothing(best, names), "Take more photos that overlap by two thirds, with texture in view."
         )
@@ -95,12 +97,23 @@ def _attempt(job: dict[str, Any], level: Level, names: list[str], exhaustive: bo
         pairs = features.likely_pairs(path, names, job["neighbours"], tell)
     features.match(path, pairs, work / "pairs.txt", tell)
     start = _start_model(job, path, work)
-    models = mapping.build(path, image_folder, work / "models", level, names, tell, start)
-    if not models:
-        return Attempt(level, path, [], {}, {}, {})
-    tell.stage("Checking poses")
-    model, checks, links, dropped = mapping.repair(models[0], path, image_folder, work, level, names, tell)
-    return Attempt(level, path, [model, *models[1:]], checks, links, dropped)
+    best = Attempt(level, path, [], {}, {}, {})
+    # Placing cameras is quick beside finding features: try lower demands before harder features.
+    for full, relaxed in ((True, False), (False, False), (False, True)):
+        if start is None and features.set_lenses(path, job["images"], full) != full:
+            continue  # no lens may have the full model: the next variant is this one
+        if start is not None and full:
+            continue  # lenses are those of the model that is extended
+        models = mapping.build(path, image_folder, work / "models", relaxed, names, tell, start)
+        if not models:
+            continue
+        tell.stage("Checking poses")
+        model, checks, links, dropped = mapping.repair(models[0], path, image_folder, work, relaxed, names, tell)
+        if model.num_reg_images() > best.registered:
+            best = Attempt(level, path, [model, *models[1:]], checks, links, dropped)
+        if best.registered >= ENOUGH * len(names):
+            break
+    return best
 
 
 def _start_model(job: dict[str, Any], path: Path, work: Path) -> Path | None:
@@ -222,8 +235,10 @@ def _reasons(best: Attempt, names: list[str], registered: set[str]) -> dict[str,
             reasons[name] = "matches no other photo"
         elif not placed:
             reasons[name] = f"matches only photos without a pose ({', '.join(sorted(mates[name])[:3])})"
-        else:
+        elif max(placed.values()) < MIN_COMMON:
             reasons[name] = f"too little overlap: at most {max(placed.values())} common features with a placed photo"
+        else:
+            reasons[name] = f"matches {len(placed)} placed photos, but too few of those features have a known depth"
     return reasons
 
 

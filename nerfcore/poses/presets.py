@@ -10,8 +10,7 @@ class Level:
     """Settings of one attempt.
 
     `size` is the long side at which features are found, `features` their number, `octave` SIFT's first octave (−1
-    doubles the picture), `affine` adds affine shape and domain-size pooling, `exhaustive` matches all pairs,
-    `relaxed` accepts weaker starts and registrations.
+    doubles the picture), `affine` adds affine shape and domain-size pooling, `exhaustive` matches all pairs.
     """
 
     name: str
@@ -20,7 +19,6 @@ class Level:
     octave: int = 0
     affine: bool = False
     exhaustive: bool = False
-    relaxed: bool = False
 
     @property
     def database(self) -> str:
@@ -33,13 +31,12 @@ STANDARD = Level("standard")
 MORE_PAIRS = Level("all pairs", exhaustive=True)
 MORE_FEATURES = Level("more features", features=8192, octave=-1, exhaustive=True)
 AFFINE = replace(MORE_FEATURES, name="affine features", affine=True)
-RELAXED = replace(AFFINE, name="relaxed", relaxed=True)
 
 # The first entry always runs; the next ones only while too few photos have a pose.
 LADDERS: dict[str, tuple[Level, ...]] = {
     "fast": (FAST, replace(FAST, name="all pairs", exhaustive=True), MORE_FEATURES),
-    "standard": (STANDARD, MORE_PAIRS, MORE_FEATURES, AFFINE, RELAXED),
-    "robust": (MORE_FEATURES, AFFINE, RELAXED),
+    "standard": (STANDARD, MORE_PAIRS, MORE_FEATURES, AFFINE),
+    "robust": (MORE_FEATURES, AFFINE),
 }
 ENOUGH = 0.9  # share of photos with a pose at which the climbing stops
 EXHAUSTIVE_UP_TO = 40  # photos; beyond, pairs are chosen by retrieval

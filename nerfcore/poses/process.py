@@ -42,7 +42,7 @@ def run_worker(job: dict[str, Any], work: Path, report: Reporter) -> dict[str, A
         start_new_session=True,  # Ctrl-C reaches us first; we decide how the worker ends
     )
     messages: queue.Queue[dict[str, Any] | None] = queue.Queue()
-    tail: collections.deque[str] = collections.deque(maxlen=40)
+    tail: collections.deque[str] = collections.deque(maxlen=60)
     threads = [
         threading.Thread(target=_read_messages, args=(process.stdout, messages, tail), daemon=True),
         threading.Thread(target=_read_log, args=(process.stderr, tail), daemon=True),
@@ -136,7 +136,8 @@ def _death(returncode: int, work: Path, tail: collections.deque[str]) -> Fieldwo
             "The pose process was killed, probably because memory ran out.",
             "Close other programs or use --preset fast, then run it again: finished work is kept.",
         )
-    last = next((line for line in reversed(tail) if line.strip()), "")
+    fatal = [line for line in tail if line.startswith("F2") or "Check failed" in line or "Error" in line]
+    last = (fatal or [line for line in tail if line.strip()] or [""])[-1]
     return PosesError(
         f"The pose process ended unexpectedly (exit status {returncode}). Its last words: {last or 'none'}.",
         "Run it again: finished work is kept. If it ends the same way, use --preset robust.",

@@ -103,7 +103,7 @@ def sampson_distance(pose_a: np.ndarray, pose_b: np.ndarray, a: np.ndarray, b: n
     """
     rotation = pose_b[:, :3] @ pose_a[:, :3].T
     translation = pose_b[:, 3] - rotation @ pose_a[:, 3]
-    x, y, z = translation
+    x, y, z = translation[0], translation[1], translation[2]
     essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ rotation
     first = np.concatenate([a, np.ones((len(a), 1))], 1)
     second = np.concatenate([b, np.ones((len(b), 1))], 1)

@@ -128,6 +128,7 @@ class Queue:
         self.followed: Job | None = None
         self.finished: list[Job] = []
         self.facts: dict[str, Any] = {}  # what the engine last said of itself
+        self.doctor: dict[str, Any] = {}  # what the doctor last found
         self.slowest_tick = 0.0
         self._number = 0
         self._looked = 0.0
@@ -282,6 +283,8 @@ class Queue:
             job.seconds = time.monotonic() - job.started
         job.state = "done" if error is None else "cancelled" if error.kind == "cancelled" else "failed"
         self._remember(job)
+        if job.verb == "doctor" and result:
+            self.doctor = result
         if job.on_done:
             job.on_done(job)
         self.redraw()

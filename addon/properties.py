@@ -57,7 +57,7 @@ def _classes_changed(self: PropertyGroup, context: Context) -> None:
 def _class_visibility(self: "FieldworkClass", context: Context) -> None:
     from . import state
 
-    state.show_class(self.name, self.visible)
+    state.show_classes(context.scene.fieldwork)
 
 
 class FieldworkImage(PropertyGroup):
@@ -69,6 +69,10 @@ class FieldworkImage(PropertyGroup):
     width: IntProperty()
     height: IntProperty()
     sharpness: FloatProperty()
+    points: IntProperty()
+    error_px: FloatProperty()
+    labelled: BoolProperty()
+    masked: BoolProperty()
 
 
 class FieldworkClass(PropertyGroup):
@@ -93,7 +97,7 @@ class FieldworkClass(PropertyGroup):
         update=_classes_changed,
     )
     visible: BoolProperty(
-        name="Visible", description="Show the objects of the class in the scene", default=True, update=_class_visibility
+        name="Visible", description="Show the class on the mesh in the scene", default=True, update=_class_visibility
     )
     area: FloatProperty(name="Area", description="Area of the class on the mesh", unit="AREA")
 

@@ -12,10 +12,12 @@ from typing import Any
 
 import bpy
 
+from ..nerfcore.engine.status import list_jobs
 from ..nerfcore.files import write_json
 
 PROJECT_FILE = "project.json"
 POSES_FILE = "poses/poses.json"
+POSES_REPORT = "poses/report.json"
 
 _loading = False
 _changed_classes: dict[str, list[dict[str, Any]]] = {}  # project folder → classes to be written
@@ -59,6 +61,20 @@ def has_run(folder: Path | None, run: str) -> bool:
     return folder is not None and any((folder / "runs" / run).glob("*.safetensors"))
 
 
+def last_result(project: dict[str, Any] | None, verb: str) -> dict[str, Any]:
+    """What the last run of a verb returned, as the project recorded it."""
+    steps = [step for step in (project or {}).get("provenance", []) if step.get("verb") == verb]
+    return steps[-1].get("result") or {} if steps else {}
+
+
+def can_resume(folder: Path | None, run: str) -> bool:
+    """Whether a training of the run was stopped before its end and left a checkpoint."""
+    if folder is None or not has_run(folder, run):
+        return False
+    jobs = [job for job in list_jobs(folder) if job.verb == "train" and job.params.get("run", "main") == run]
+    return bool(jobs) and jobs[-1].state in ("cancelled", "died", "failed")
+
+
 @contextmanager
 def _quiet():
     global _loading
@@ -73,8 +89,11 @@ def refresh(settings: Any) -> None:
     """Bring images and classes of the project into the scene's lists."""
     folder = folder_of(settings)
     project = read_project(folder) if folder else None
-    # Areas are known from the mesh, not from the project: keep them.
-    areas = {entry.id: (entry.area, entry.visible) for entry in settings.classes}
+    agreement = (
+        {image["name"]: image for image in (read_json(folder / POSES_REPORT) or {}).get("images", [])} if folder else {}
+    )
+    areas = last_result(project, "mesh").get("classes") or {}
+    hidden = {entry.name for entry in settings.classes if not entry.visible}
     with _quiet():
         settings.images.clear()
         settings.classes.clear()
@@ -85,11 +104,16 @@ def refresh(settings: Any) -> None:
             entry.status, entry.reason = image.get("status", "ok"), image.get("reason", "")
             entry.width, entry.height = image.get("width", 0), image.get("height", 0)
             entry.sharpness = image.get("sharpness") or 0.0
+            checked = agreement.get(entry.name, {})
+            entry.points = checked.get("points") or 0
+            entry.error_px = checked.get("error_px") or 0.0
+            entry.labelled, entry.masked = bool(image.get("label")), bool(image.get("mask"))
         for value in (project or {}).get("classes", []):
             entry = settings.classes.add()
             entry.id, entry.name, entry.color = value["id"], value["name"], value["color"]
             entry.priority = value.get("priority", 1.0)
-            entry.area, entry.visible = areas.get(value["id"], (0.0, True))
+            entry.area = (areas.get(value["name"]) or {}).get("area") or 0.0
+            entry.visible = value["name"] not in hidden
         settings.image_index = min(settings.image_index, max(0, len(settings.images) - 1))
         settings.class_index = min(settings.class_index, max(0, len(settings.classes) - 1))
 
@@ -125,11 +149,54 @@ def write_classes() -> None:
             write_json(Path(folder) / PROJECT_FILE, project)
 
 
-def show_class(name: str, visible: bool) -> None:
-    """Show or hide the objects of a class."""
-    if _loading:
+def show_classes(settings: Any) -> None:
+    """Show and hide the classes on the meshes of the project as the list says."""
+    folder = folder_of(settings)
+    if _loading or folder is None:
         return
-    for obj in bpy.data.objects:
-        if obj.get("fieldwork_class") == name:
-            obj.hide_set(not visible)
-            obj.hide_render = not visible
+    from . import visibility
+
+    hidden = [entry.id for entry in settings.classes if not entry.visible]
+    for obj in visibility.meshes(folder.name):
+        visibility.hide_classes(obj, hidden)
+
+
+_cache: dict[Path, tuple[float, Any]] = {}
+
+
+def cached_json(path: Path) -> Any:
+    """`read_json` for drawing: the file is read again only when it changed."""
+    try:
+        changed = path.stat().st_mtime
+    except OSError:
+        return None
+    if path not in _cache or _cache[path][0] != changed:
+        _cache[path] = (changed, read_json(path))
+    return _cache[path][1]
+
+
+def cached_project(folder: Path | None) -> dict[str, Any] | None:
+    return cached_json(folder / PROJECT_FILE) if folder else None
+
+
+def quality(folder: Path | None, run: str) -> str:
+    """Measured quality of a run in a few words; empty when it was not measured."""
+    metrics = cached_json(folder / "runs" / run / "metrics.json") if folder else None
+    if not isinstance(metrics, dict):
+        return ""
+    psnr, miou = metrics.get("psnr"), metrics.get("miou")
+    words = [f"{psnr:.1f} dB" if psnr is not None else "", f"mIoU {miou:.2f}" if miou is not None else ""]
+    return ", ".join(word for word in words if word)
+
+
+def time_estimate(folder: Path | None, settings: Any) -> float | None:
+    """Seconds a training will take: the time limit, else what the same preset took here the last time."""
+    if settings.time_limit > 0:
+        return settings.time_limit
+    if settings.steps > 0:
+        return None
+    for step in reversed((cached_project(folder) or {}).get("provenance", [])):
+        same = step.get("verb") == "train" and step.get("settings", {}).get("preset") == settings.preset
+        if same and not step["settings"].get("time_limit") and not step["settings"].get("steps"):
+            return step.get("result", {}).get("seconds")
+    return None

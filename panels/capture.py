@@ -1,22 +1,31 @@
-"""The Capture panel."""
+"""The Capture panel: where the photos come from, and what was made of each."""
 
 from __future__ import annotations
 
-from bpy.types import Context, UIList
+from bpy.types import Context, Panel, UIList
 
-from ..addon import state
-from .base import StepPanel, columns, project_folder
+from ..addon import pictures, state
+from .base import FieldworkPanel, StepPanel, columns, draw_wrapped, project_folder, text_width
 
 STATUS_ICONS = {"ok": "CHECKMARK", "rejected": "CANCEL", "unregistered": "ERROR"}
 
 
 class FIELDWORK_UL_images(UIList):
+    """Photos with their thumbnail and, where one is not used, why."""
+
     def draw_item(self, context, layout, data, item, icon, active_data, active_property, index=0, flt_flag=0):
+        folder = project_folder(context)
+        thumbnail = pictures.picture(folder / item.file) if folder and item.file else 0
         row = layout.row(align=True)
         row.active = item.status == "ok"
-        row.label(text=item.name, icon=STATUS_ICONS.get(item.status, "QUESTION"))
-        if item.reason:
-            row.label(text=item.reason)
+        row.label(text=item.name, icon_value=thumbnail or 0) if thumbnail else row.label(text=item.name)
+        marks = row.row(align=True)
+        marks.alignment = "RIGHT"
+        if item.labelled:
+            marks.label(text="", icon="COLOR")
+        if item.masked:
+            marks.label(text="", icon="MOD_MASK")
+        marks.label(text="", icon=STATUS_ICONS.get(item.status, "QUESTION"))
 
 
 class FIELDWORK_PT_capture(StepPanel):
@@ -25,19 +34,45 @@ class FIELDWORK_PT_capture(StepPanel):
     def draw(self, context: Context) -> None:
         layout, settings = self.layout, context.scene.fieldwork
         folder = project_folder(context)
-        count = sum(image.status != "rejected" for image in settings.images)
-        rejected = len(settings.images) - count
+        rejected = sum(image.status == "rejected" for image in settings.images)
         if state.has_project(folder):
-            text = f"{count} photos" + (f", {rejected} rejected" if rejected else "")
-            self.draw_state(True, text)
+            count = len(settings.images) - rejected
+            self.draw_state(True, f"{count} photos" + (f", {rejected} rejected" if rejected else ""))
         else:
             self.draw_state(False, "No photos yet")
+        row = layout.row(align=True)
+        row.operator("fieldwork.open", text="Open…", icon="FILE_FOLDER")
+        row.operator("fieldwork.import_dataset", text="Import Posed…", icon="IMPORT")
         column = columns(layout)
-        column.prop(settings, "photos")
-        column.prop(settings, "labels")
-        column.prop(settings, "masks")
+        for name in ("photos", "labels", "masks", "class_file"):
+            column.prop(settings, name)
         layout.operator("fieldwork.new", icon="IMAGE_DATA")
-        layout.operator("fieldwork.import_dataset", icon="IMPORT")
+        if settings.images:
+            draw_images(layout, context)
 
 
-CLASSES = [FIELDWORK_UL_images, FIELDWORK_PT_capture]
+class FIELDWORK_PT_capture_options(FieldworkPanel, Panel):
+    bl_label = "Options"
+    bl_parent_id = "FIELDWORK_PT_capture"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    def draw(self, context: Context) -> None:
+        column = columns(self.layout)
+        for name in ("max_size", "frames", "mask_mode", "keep_blurry"):
+            column.prop(context.scene.fieldwork, name)
+
+
+def draw_images(layout, context: Context) -> None:
+    settings, folder = context.scene.fieldwork, project_folder(context)
+    layout.template_list("FIELDWORK_UL_images", "capture", settings, "images", settings, "image_index", rows=4)
+    if not 0 <= settings.image_index < len(settings.images):
+        return
+    image = settings.images[settings.image_index]
+    icon = pictures.picture(folder / image.file) if folder and image.file else 0
+    if icon:
+        layout.template_icon(icon_value=icon, scale=6.0)
+    if image.reason:
+        draw_wrapped(layout, image.reason, text_width(context), icon=STATUS_ICONS.get(image.status, "INFO"))
+
+
+CLASSES = [FIELDWORK_UL_images, FIELDWORK_PT_capture, FIELDWORK_PT_capture_options]

@@ -1,23 +1,41 @@
-"""The Engine panel."""
+"""The Engine panel: what it runs on, what it uses, stopping it, its log."""
 
 from __future__ import annotations
 
 from bpy.types import Context
 
-from ..addon import jobs
-from .base import StepPanel
+from ..addon import jobs, preferences
+from .base import StepPanel, draw_wrapped, text_width
 
 
 class FIELDWORK_PT_engine(StepPanel):
     bl_label = "Engine"
 
     def draw(self, context: Context) -> None:
-        link = jobs.queue.link
-        running = link is not None and link.alive
-        self.draw_state(running, "Running" if running else "Not running; starts when needed")
-        row = self.layout.row()
-        row.operator("fieldwork.doctor")
-        row.operator("fieldwork.stop_engine")
+        layout, queue = self.layout, jobs.queue
+        running = queue.link is not None and queue.link.alive
+        if preferences.engine_python() is None:
+            self.draw_state(False, "Not installed")
+        else:
+            self.draw_state(running, "Running" if running else "Starts when needed")
+        if running and queue.facts:
+            memory = f"Memory {queue.facts.get('memory_mb', 0) / 1000:.1f} GB"
+            gpu = queue.facts.get("gpu_memory_mb")
+            layout.label(text=memory + (f", GPU {gpu / 1000:.1f} GB" if gpu is not None else ""), icon="MEMORY")
+        report = queue.doctor
+        if report:
+            name = report.get("device_name") or ""
+            layout.label(text=f"Device: {report.get('device', '?')} {name}".strip(), icon="DESKTOP")
+            layout.label(text=f"{report.get('free_disk_gb', 0):.0f} GB free on disk", icon="DISK_DRIVE")
+            for problem in report.get("problems", []):
+                draw_wrapped(layout, problem, text_width(context), icon="ERROR")
+        grid = layout.grid_flow(columns=2, align=True, even_columns=True)
+        grid.operator("fieldwork.doctor", text="Check")
+        grid.operator("fieldwork.stop_engine", text="Stop")
+        grid.operator("fieldwork.open_log", text="Log")
+        grid.operator("fieldwork.copy_report")
+        layout.operator("fieldwork.detach", text="Keep Running Without Blender", icon="UNLINKED")
+        layout.operator("fieldwork.open_preferences", text="Preferences…", icon="PREFERENCES")
 
 
 CLASSES = [FIELDWORK_PT_engine]

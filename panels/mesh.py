@@ -4,18 +4,29 @@ from __future__ import annotations
 
 from bpy.types import Context
 
-from .base import StepPanel, columns
+from ..addon import state
+from .base import StepPanel, columns, project_folder
 
 
 class FIELDWORK_PT_mesh(StepPanel):
     bl_label = "Mesh"
 
     def draw(self, context: Context) -> None:
-        settings = context.scene.fieldwork
-        column = columns(self.layout)
+        layout, settings = self.layout, context.scene.fieldwork
+        folder = project_folder(context)
+        result = state.last_result(state.cached_project(folder), "mesh")
+        if result:
+            closed = "closed" if result.get("watertight") else "open"
+            self.draw_state(True, f"{result.get('faces', 0):,} triangles, {closed}")
+        elif state.has_run(folder, settings.run):
+            self.draw_state(False, "Ready to extract")
+        else:
+            self.draw_state(False, f"Run “{settings.run}” is not trained yet")
+        column = columns(layout)
         for name in ("resolution", "faces", "texture", "split"):
             column.prop(settings, name)
-        self.layout.operator("fieldwork.mesh", icon="MESH_DATA")
+        layout.operator("fieldwork.mesh", icon="MESH_DATA")
+        layout.operator("fieldwork.import_scene", icon="SCENE_DATA")
 
 
 CLASSES = [FIELDWORK_PT_mesh]

@@ -1,23 +1,89 @@
-"""The Poses panel."""
+"""The Poses panel: estimating the cameras, checking them photo by photo, up and scale, the training region."""
 
 from __future__ import annotations
 
-from bpy.types import Context
+from bpy.types import Context, UIList
 
-from ..addon import state
-from .base import StepPanel, columns, project_folder
+from ..addon import crop, state
+from .base import FieldworkPanel, StepPanel, columns, draw_wrapped, project_folder, text_width
+from .capture import STATUS_ICONS
+
+
+class FIELDWORK_UL_poses(UIList):
+    """One line for each photo: placed or not, points it sees, error in pixels."""
+
+    def draw_item(self, context, layout, data, item, icon, active_data, active_property, index=0, flt_flag=0):
+        row = layout.row()
+        row.active = item.status == "ok"
+        row.label(text=item.name, icon=STATUS_ICONS.get(item.status, "QUESTION"))
+        numbers = row.row()
+        numbers.alignment = "RIGHT"
+        if item.status == "ok" and item.points:
+            numbers.label(text=f"{item.points} pts, {item.error_px:.2f} px")
+        elif item.status != "ok":
+            numbers.label(text="Not used" if item.status == "rejected" else "Not placed")
 
 
 class FIELDWORK_PT_poses(StepPanel):
     bl_label = "Poses"
 
     def draw(self, context: Context) -> None:
-        settings = context.scene.fieldwork
-        done = state.has_poses(project_folder(context))
-        registered = sum(image.status == "ok" for image in settings.images)
-        self.draw_state(done, f"{registered} of {len(settings.images)} photos placed" if done else "No poses yet")
-        columns(self.layout).prop(settings, "pose_preset")
-        self.layout.operator("fieldwork.poses", icon="CAMERA_DATA")
+        layout, settings = self.layout, context.scene.fieldwork
+        folder = project_folder(context)
+        done = state.has_poses(folder)
+        placed = sum(image.status == "ok" for image in settings.images)
+        usable = sum(image.status != "rejected" for image in settings.images)
+        self.draw_state(done, f"{placed} of {usable} photos placed" if done else "No poses yet")
+        columns(layout).prop(settings, "pose_preset")
+        layout.operator("fieldwork.poses", icon="CAMERA_DATA")
+        if not (done and folder):
+            return
+        layout.template_list("FIELDWORK_UL_poses", "poses", settings, "images", settings, "image_index", rows=4)
+        if 0 <= settings.image_index < len(settings.images) and settings.images[settings.image_index].reason:
+            draw_wrapped(layout, settings.images[settings.image_index].reason, text_width(context), icon="INFO")
+        layout.operator("fieldwork.import_scene", text="Show in Scene", icon="OUTLINER_OB_CAMERA")
 
 
-CLASSES = [FIELDWORK_PT_poses]
+class FIELDWORK_PT_align(FieldworkPanel):
+    bl_label = "Up and Scale"
+    bl_parent_id = "FIELDWORK_PT_poses"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    def draw(self, context: Context) -> None:
+        layout, settings = self.layout, context.scene.fieldwork
+        frame = (state.cached_project(project_folder(context)) or {}).get("frame", {})
+        if frame:
+            known = "Scale is set" if frame.get("scale_known") else "Scale is unknown"
+            layout.label(text=known, icon="CHECKMARK" if frame.get("scale_known") else "INFO")
+        columns(layout).prop(settings, "up")
+        for end in "ab":
+            row = layout.row(align=True)
+            row.prop(settings, f"point_{end}", text="")
+            row.operator("fieldwork.pick_point", text="", icon="EYEDROPPER").end = end.upper()
+        columns(layout).prop(settings, "distance")
+        layout.operator("fieldwork.align", icon="ORIENTATION_GLOBAL")
+
+
+class FIELDWORK_PT_region(FieldworkPanel):
+    bl_label = "Training Region"
+    bl_parent_id = "FIELDWORK_PT_poses"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    def draw(self, context: Context) -> None:
+        layout = self.layout
+        box = crop.find(context.scene)
+        draw_wrapped(
+            layout,
+            "Move and scale the box in the viewport: what lies outside is not trained."
+            if box
+            else "Everything the photos show is trained.",
+            text_width(context),
+            icon="CUBE",
+        )
+        layout.operator("fieldwork.crop_add", icon="ADD")
+        row = layout.row(align=True)
+        row.operator("fieldwork.crop_apply", icon="CHECKMARK")
+        row.operator("fieldwork.crop_remove", icon="X")
+
+
+CLASSES = [FIELDWORK_UL_poses, FIELDWORK_PT_poses, FIELDWORK_PT_align, FIELDWORK_PT_region]

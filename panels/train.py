@@ -1,23 +1,108 @@
-"""The Train panel."""
+"""The Train panel: preset and time, the curve and the preview while it runs, the runs there are."""
 
 from __future__ import annotations
 
-from bpy.types import Context
+from bpy.types import Context, UILayout
 
-from ..addon import state
-from .base import StepPanel, columns, project_folder
+from ..addon import jobs, pictures, state
+from .base import FieldworkPanel, StepPanel, columns, duration, project_folder
+
+
+def training_job(context: Context) -> jobs.Job | None:
+    """The training of this scene's project: the one under way, else the last that ended."""
+    folder = project_folder(context)
+    queue = jobs.queue
+    candidates = [queue.running, queue.followed, *reversed(queue.finished)]
+    return next((j for j in candidates if j and j.verb in ("train", "reconstruct") and j.project == folder), None)
 
 
 class FIELDWORK_PT_train(StepPanel):
     bl_label = "Train"
 
     def draw(self, context: Context) -> None:
-        settings = context.scene.fieldwork
-        done = state.has_run(project_folder(context), settings.run)
-        self.draw_state(done, f"Run “{settings.run}” is trained" if done else "Not trained yet")
-        column = columns(self.layout)
+        layout, settings = self.layout, context.scene.fieldwork
+        folder = project_folder(context)
+        job = training_job(context)
+        active = job is not None and job.active
+        checkpoint = state.can_resume(folder, settings.run)
+        if active:
+            self.draw_state(True, f"Run “{settings.run}” is training")
+        elif checkpoint:
+            self.draw_state(False, f"Run “{settings.run}” is paused")
+        elif state.has_run(folder, settings.run):
+            self.draw_state(True, f"Run “{settings.run}” is trained")
+        else:
+            self.draw_state(False, f"Run “{settings.run}” is not trained yet")
+        row = layout.row(align=True)
+        row.menu("FIELDWORK_MT_train_presets", text="My Presets")
+        row.operator("fieldwork.train_preset_add", text="", icon="ADD")
+        row.operator("fieldwork.train_preset_add", text="", icon="REMOVE").remove_active = True
+        column = columns(layout)
         column.prop(settings, "preset")
-        self.layout.operator("fieldwork.train", icon="PLAY")
+        column.prop(settings, "run")
+        estimate = state.time_estimate(folder, settings)
+        if estimate and not active:
+            note = layout.row()
+            note.active = False
+            note.label(text=f"About {duration(estimate)}, as the last time here", icon="TIME")
+        if active:
+            layout.operator("fieldwork.cancel", text="Pause", icon="PAUSE").job = job.id
+        else:
+            row = layout.row(align=True)
+            row.operator("fieldwork.train", text="Restart" if checkpoint else "Train", icon="PLAY").resume = False
+            if checkpoint:
+                row.operator("fieldwork.train", text="Resume", icon="PLAY").resume = True
+        if job is not None:
+            draw_curve(layout, job)
 
 
-CLASSES = [FIELDWORK_PT_train]
+class FIELDWORK_PT_train_options(FieldworkPanel):
+    bl_label = "Options"
+    bl_parent_id = "FIELDWORK_PT_train"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    def draw(self, context: Context) -> None:
+        column = columns(self.layout)
+        for name in ("time_limit", "steps", "settings"):
+            column.prop(context.scene.fieldwork, name)
+
+
+class FIELDWORK_PT_runs(FieldworkPanel):
+    bl_label = "Runs"
+    bl_parent_id = "FIELDWORK_PT_train"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    def draw(self, context: Context) -> None:
+        layout, settings = self.layout, context.scene.fieldwork
+        folder = project_folder(context)
+        names = state.runs(folder)
+        if not names:
+            layout.label(text="No runs yet")
+        for name in names:
+            row = layout.row(align=True)
+            chosen = name == settings.run
+            row.operator("fieldwork.use_run", text=name, icon="RADIOBUT_ON" if chosen else "RADIOBUT_OFF").run = name
+            row.label(text=state.quality(folder, name))
+        layout.operator("fieldwork.evaluate", icon="VIEWZOOM")
+
+
+def draw_curve(layout: UILayout, job: jobs.Job) -> None:
+    """Loss and PSNR so far, and the newest picture of a held-out photo."""
+    icon = pictures.curve_icon(job.id, job.curve)
+    if icon:
+        layout.template_icon(icon_value=icon, scale=5.0)
+    if job.latest:
+        row = layout.row()
+        row.label(text=f"Step {job.latest.get('step', 0)}")
+        loss, psnr = job.latest.get("loss"), job.latest.get("psnr")
+        # The colors are those of the two lines.
+        row.label(text="PSNR –" if psnr is None else f"PSNR {psnr:.1f} dB", icon="COLLECTION_COLOR_05")
+        row.label(text="Loss –" if loss is None else f"Loss {loss:.4f}", icon="COLLECTION_COLOR_02")
+    if job.preview:
+        preview = pictures.picture(job.preview, job.preview_count)
+        if preview:
+            layout.label(text="Held-out photo and its render")
+            layout.template_icon(icon_value=preview, scale=8.0)
+
+
+CLASSES = [FIELDWORK_PT_train, FIELDWORK_PT_train_options, FIELDWORK_PT_runs]

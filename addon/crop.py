@@ -1,0 +1,58 @@
+"""The training region: an empty in the scene, a cube, whose bounds go to the project."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import bpy
+from mathutils import Matrix, Vector
+
+from ..nerfcore.files import write_json
+from . import state
+
+MARK = "fieldwork_crop"
+CORNERS = [Vector((x, y, z)) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
+
+
+def find(scene: bpy.types.Scene) -> bpy.types.Object | None:
+    """The crop box of the scene."""
+    return next((obj for obj in scene.objects if obj.get(MARK)), None)
+
+
+def add(scene: bpy.types.Scene, bounds: list[list[float]]) -> bpy.types.Object:
+    """Put a box with the bounds [min, max] (world, metres) into the scene, or move the one that is there."""
+    box = find(scene)
+    if box is None:
+        box = bpy.data.objects.new("Fieldwork Training Region", None)
+        box.empty_display_type, box.empty_display_size = "CUBE", 1.0
+        box[MARK] = True
+        scene.collection.objects.link(box)
+    low, high = Vector(bounds[0]), Vector(bounds[1])
+    box.matrix_world = Matrix.LocRotScale((low + high) / 2, None, (high - low) / 2)
+    return box
+
+
+def bounds_of(box: bpy.types.Object) -> list[list[float]]:
+    """Axis-aligned bounds [min, max] of the box in the world, also of a rotated one."""
+    corners = [box.matrix_world @ (corner * box.empty_display_size) for corner in CORNERS]
+    return [[float(pick(c[i] for c in corners)) for i in range(3)] for pick in (min, max)]
+
+
+def read_bounds(folder: Path) -> list[list[float]] | None:
+    return ((state.read_project(folder) or {}).get("frame") or {}).get("bounds")
+
+
+def write_bounds(folder: Path, bounds: list[list[float]] | None) -> None:
+    """Set or clear the training region of the project.
+
+    Raises:
+        ValueError: there is no project, or the box is flat.
+    """
+    project: dict[str, Any] | None = state.read_project(folder)
+    if project is None:
+        raise ValueError(f"There is no project at {folder}.")
+    if bounds is not None and any(high - low < 1e-6 for low, high in zip(*bounds)):
+        raise ValueError("The training region is flat: scale its box.")
+    project.setdefault("frame", {})["bounds"] = bounds
+    write_json(folder / state.PROJECT_FILE, project)

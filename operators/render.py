@@ -1,0 +1,136 @@
+"""Render: images of the field from the scene's camera, its animation, or the photo cameras."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import bpy
+from bpy.types import Context
+
+from ..addon import jobs, state
+from ..nerfcore.files import write_json
+from .base import ProjectOperator, need_run, refresh_scenes, scene_settings
+
+
+def camera_frames(scene: bpy.types.Scene, animated: bool, size: tuple[int, int]) -> dict[str, Any]:
+    """The scene's camera as transforms.json: intrinsics in pixels, camera-to-world with Blender's axes.
+
+    Raises:
+        ValueError: there is no camera, or it is not a perspective one.
+    """
+    camera = scene.camera
+    if camera is None:
+        raise ValueError("The scene has no active camera.")
+    if camera.data.type != "PERSP":
+        raise ValueError(f"“{camera.name}” is not a perspective camera.")
+    percent = scene.render.resolution_percentage / 100
+    width = size[0] or round(scene.render.resolution_x * percent)
+    height = size[1] or round(scene.render.resolution_y * percent)
+    current = scene.frame_current
+    numbers = range(scene.frame_start, scene.frame_end + 1, scene.frame_step) if animated else [current]
+    frames = []
+    for number in numbers:
+        if number != scene.frame_current:
+            scene.frame_set(number)
+        evaluated = camera.evaluated_get(bpy.context.evaluated_depsgraph_get())
+        # A scaled parent must not scale the camera's axes.
+        location, rotation, _ = evaluated.matrix_world.decompose()
+        matrix = rotation.to_matrix().to_4x4()
+        matrix.translation = location
+        frames.append(
+            {"file_path": f"frame_{number:04}", "transform_matrix": [list(row) for row in matrix]}
+            | intrinsics(evaluated.data, width, height)
+        )
+    if scene.frame_current != current:
+        scene.frame_set(current)
+    return {"frames": frames}
+
+
+def intrinsics(camera: bpy.types.Camera, width: int, height: int) -> dict[str, float]:
+    """Pinhole intrinsics in pixels of a Blender camera at a picture size (square pixels).
+
+    Blender measures the field of view and the shift along the longer side (or along the side `sensor_fit` names).
+    """
+    fit = camera.sensor_fit
+    if fit == "AUTO":
+        fit = "HORIZONTAL" if width >= height else "VERTICAL"
+        sensor = camera.sensor_width
+    else:
+        sensor = camera.sensor_width if fit == "HORIZONTAL" else camera.sensor_height
+    side = width if fit == "HORIZONTAL" else height
+    focal = camera.lens / sensor * side
+    return {
+        "w": width,
+        "h": height,
+        "fl_x": focal,
+        "fl_y": focal,
+        "cx": width / 2 - camera.shift_x * side,
+        "cy": height / 2 + camera.shift_y * side,
+        "camera_angle_x": 2 * math.atan(width / 2 / focal),
+    }
+
+
+@scene_settings(run="run", source="render_from", orbit="orbit", size="size", passes="passes")
+class FIELDWORK_OT_render(ProjectOperator):
+    """Render images of the trained field"""
+
+    bl_idname = "fieldwork.render"
+    bl_label = "Render Field"
+    verb = "render"
+    needs = (need_run,)
+
+    out: bpy.props.StringProperty(
+        name="Output", description="Folder for the images; empty: exports/renders of the project", subtype="DIR_PATH",
+        options={"SKIP_SAVE"},
+    )  # fmt: skip
+
+    @classmethod
+    def reason(cls, context: Context) -> str | None:
+        settings = context.scene.fieldwork
+        if settings.render_from in ("camera", "animation") and context.scene.camera is None:
+            return "The scene has no active camera"
+        return super().reason(context)
+
+    def parameters(self, context: Context) -> dict[str, Any]:
+        project, run = self.project_path(context), self.value(context, "run")
+        source, size = self.value(context, "source"), tuple(self.value(context, "size"))
+        folder = Path(bpy.path.abspath(self.out)) if self.out else Path(project) / "exports" / "renders" / source
+        passes = self.value(context, "passes")
+        if not passes:
+            raise ValueError("Choose at least one pass.")
+        order = ("rgb", "depth", "semantic", "confidence", "normal")
+        params: dict[str, Any] = {
+            "project": project,
+            "run": run,
+            "out": str(folder),
+            "passes": [name for name in order if name in passes],
+            "size": list(size) if all(size) else None,
+        }
+        if source == "photos":
+            return {**params, "test": True}
+        if source == "orbit":
+            return {**params, "orbit": self.value(context, "orbit")}
+        folder.mkdir(parents=True, exist_ok=True)
+        cameras = camera_frames(context.scene, source == "animation", size)
+        write_json(folder / "cameras.json", cameras)
+        return {**params, "camera": str(folder / "cameras.json"), "size": None}
+
+    def after(self) -> Callable[[jobs.Job], None]:
+        return show_result
+
+
+def show_result(job: jobs.Job) -> None:
+    """Bring the rendered images into Blender as image datablocks, and into the scene as its settings say."""
+    refresh_scenes(job)
+    if job.state != "done":
+        return
+    from ..addon import render_result
+
+    scene = next((s for s in bpy.data.scenes if state.folder_of(s.fieldwork) == job.project), bpy.context.scene)
+    render_result.show(scene, Path(job.params["out"]), scene.fieldwork.show_as)
+
+
+CLASSES = [FIELDWORK_OT_render]

@@ -1,0 +1,35 @@
+"""The Render panel."""
+
+from __future__ import annotations
+
+from bpy.types import Context
+
+from ..addon import jobs, state
+from .base import StepPanel, columns, project_folder
+
+
+class FIELDWORK_PT_render(StepPanel):
+    bl_label = "Render"
+
+    def draw(self, context: Context) -> None:
+        layout, settings = self.layout, context.scene.fieldwork
+        folder = project_folder(context)
+        last = next((j for j in reversed(jobs.queue.finished) if j.verb == "render" and j.state == "done"), None)
+        if last is not None:
+            self.draw_state(True, f"{(last.result or {}).get('frames', 0)} images rendered")
+        elif state.has_run(folder, settings.run):
+            self.draw_state(False, "Ready to render")
+        else:
+            self.draw_state(False, f"Run “{settings.run}” is not trained yet")
+        column = columns(layout)
+        column.prop(settings, "render_from")
+        if settings.render_from == "orbit":
+            column.prop(settings, "orbit")
+        column.prop(settings, "size")
+        row = layout.row(align=True)
+        row.prop(settings, "passes")
+        columns(layout).prop(settings, "show_as")
+        layout.operator("fieldwork.render", icon="RENDER_STILL")
+
+
+CLASSES = [FIELDWORK_PT_render]

@@ -1,0 +1,191 @@
+"""The queue of jobs, pumped by hand: what the timer does in a window."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+bpy = pytest.importorskip("bpy")
+
+from fieldwork.addon import jobs, preferences  # noqa: E402
+from fieldwork.addon.link import EngineError, Link  # noqa: E402
+from fieldwork.nerfcore.engine import status as st  # noqa: E402
+
+ENGINE = [sys.executable, str(Path(__file__).resolve().parents[1] / "counting_engine.py")]
+
+
+@pytest.fixture
+def settings(monkeypatch, tmp_path):
+    """Preferences of the test, and an engine that counts."""
+
+    class Settings(preferences._Defaults):
+        pass
+
+    monkeypatch.setattr(preferences, "preferences", lambda: Settings)
+    monkeypatch.setattr(preferences, "user_folder", lambda *parts: Path(tmp_path, "user", *parts))
+    monkeypatch.setattr(preferences, "engine_python", lambda: Path(sys.executable))
+    monkeypatch.setattr(jobs, "Link", lambda python, log, **more: Link(python, log, ENGINE))
+    return Settings
+
+
+@pytest.fixture
+def queue(settings):
+    queue = jobs.Queue()
+    yield queue
+    queue.stop_engine(timeout=2.0)
+
+
+@pytest.fixture
+def project(tmp_path):
+    folder = tmp_path / "project"
+    folder.mkdir()
+    return folder
+
+
+def tick_until(queue, condition, timeout=20.0):
+    end = time.monotonic() + timeout
+    while not condition():
+        assert time.monotonic() < end, "nothing happened"
+        queue.tick()
+        time.sleep(0.02)
+
+
+def count(queue, project, **params):
+    return queue.make("count", {"project": str(project), **params})
+
+
+def test_jobs_run_one_after_the_other(queue, project):
+    order = []
+    first, second = (
+        queue.make("count", {"project": str(project), "steps": 20}, lambda job: order.append(job)) for _ in range(2)
+    )
+    queue.submit(first)
+    queue.submit(second)
+    assert (first.state, second.state) == ("running", "queued")
+    tick_until(queue, lambda: second.state == "done")
+    assert order == [first, second]
+    assert first.result == {"steps": 20, "project": str(project)}
+    assert [step for step, _, _ in first.curve] == [0, 10]
+    assert queue.current is None
+    assert queue.last is second
+
+
+def test_tick_does_not_block(queue, project):
+    queue.submit(count(queue, project, steps=60))
+    tick_until(queue, lambda: queue.last is not None)
+    assert queue.slowest_tick < 0.1
+
+
+def test_cancel_running_and_waiting_jobs(queue, project):
+    running, waiting = count(queue, project, steps=100_000), count(queue, project)
+    queue.submit(running)
+    queue.submit(waiting)
+    tick_until(queue, lambda: running.fraction)
+    queue.cancel(waiting)
+    assert waiting.state == "cancelled"
+    begin = time.monotonic()
+    queue.cancel()
+    assert running.state == "cancelling"
+    tick_until(queue, lambda: running.state == "cancelled")
+    assert time.monotonic() - begin < 2.0
+
+
+def test_killed_engine_fails_the_job_and_the_next_one_gets_a_new_engine(queue, project):
+    job = count(queue, project, steps=100_000)
+    queue.submit(job)
+    tick_until(queue, lambda: job.fraction)
+    queue.link.process.kill()
+    tick_until(queue, lambda: job.state == "failed")
+    assert job.error.kind == "died"
+    report = job.report()
+    assert "stopped unexpectedly" in report
+    assert str(project) in report
+    again = count(queue, project, steps=2)
+    queue.submit(again)
+    tick_until(queue, lambda: again.state == "done")
+
+
+def test_missing_engine_is_told(queue, project, monkeypatch):
+    monkeypatch.setattr(preferences, "engine_python", lambda: None)
+    job = count(queue, project)
+    queue.submit(job)
+    assert job.state == "failed"
+    assert job.error.kind == "missing"
+    with pytest.raises(EngineError, match="not installed"):
+        queue.run(count(queue, project))
+
+
+def test_reattach_follows_a_detached_job_to_its_end(queue, settings, project):
+    job = count(queue, project, steps=150)
+    queue.submit(job)
+    tick_until(queue, lambda: job.fraction)
+    queue.stop_engine(detach=True)
+    assert queue.link is None
+
+    # Another Blender opens the project.
+    other = jobs.Queue()
+    other.reattach(project)
+    assert other.followed is not None
+    assert other.followed.state == "running"
+    followed = other.followed
+    tick_until(other, lambda: followed.state == "done")
+    assert followed.result["steps"] == 150
+    assert [step for step, _, _ in followed.curve] == list(range(0, 150, 10))
+
+
+def test_followed_job_can_be_cancelled(queue, settings, project):
+    settings.on_close = "continue"
+    queue.submit(count(queue, project, steps=100_000))
+    tick_until(queue, lambda: queue.running.fraction)
+    queue.stop_engine(detach=True)
+    other = jobs.Queue()
+    other.reattach(project)
+    followed = other.followed
+    begin = time.monotonic()
+    other.cancel()
+    tick_until(other, lambda: followed.state == "cancelled")
+    assert time.monotonic() - begin < 3.0
+
+
+def test_reattach_tells_of_a_job_whose_engine_died(queue, project):
+    queue.submit(count(queue, project, steps=100_000))
+    tick_until(queue, lambda: queue.running.fraction)
+    time.sleep(0.7)
+    queue.link.process.kill()
+    queue.link.process.wait()
+    other = jobs.Queue()
+    other.reattach(project)
+    assert other.last.state == "failed"
+    assert "unexpectedly" in other.last.error.message
+    other.reattach(project)
+    assert len(other.finished) == 1, "it is told once"
+
+
+def test_idle_engine_is_released(queue, settings, project):
+    queue.submit(count(queue, project, steps=1))
+    tick_until(queue, lambda: queue.last is not None)
+    process = queue.link.process
+    queue.link.last_used -= 60 * settings.idle_minutes + 1
+    queue.tick()
+    assert queue.link is None
+    assert process.wait(timeout=10) == 0
+
+
+def test_curve_stays_bounded_and_keeps_its_ends(queue, project):
+    job = count(queue, project)
+    for step in range(5 * jobs.CURVE_POINTS):
+        job.take("event", {"kind": "train", "step": step, "loss": 1.0, "psnr": None})
+    assert len(job.curve) <= jobs.CURVE_POINTS
+    assert (job.curve[0][0], job.curve[-1][0]) == (0, 5 * jobs.CURVE_POINTS - 1)
+    steps = [step for step, _, _ in job.curve]
+    assert steps == sorted(steps)
+
+
+def test_job_file_of_another_project_is_left_alone(queue, project, tmp_path):
+    st.write_job(project, st.JobStatus("x", "count", {}, state="done"))
+    queue.reattach(project)
+    assert queue.current is None
+    assert queue.last is None

@@ -1,0 +1,164 @@
+"""Runs inside the windowed Blender: drives one scenario of `scenarios.py` by simulated events.
+
+    blender --enable-event-simulate --python driver.py -- SCENARIO OUTPUT_FOLDER
+
+A scenario is a generator; each `yield` lets Blender handle events and draw. Screenshots go to the output folder,
+`result.json` says how it ended.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import bpy
+
+Steps = Iterator[float | None]
+TICK = 0.03
+PANELS = ["capture", "poses", "classes", "train", "render", "mesh", "export", "engine"]
+PACKAGE = "bl_ext.user_default.fieldwork"
+
+
+class Screen:
+    """The window as an artist has it: a mouse, keys, and eyes."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.facts: dict = {}
+
+    @property
+    def window(self):
+        return bpy.context.window_manager.windows[0]
+
+    @property
+    def area(self):
+        return max((a for a in self.window.screen.areas if a.type == "VIEW_3D"), key=lambda a: a.width * a.height)
+
+    @property
+    def sidebar(self):
+        return next(region for region in self.area.regions if region.type == "UI")
+
+    @property
+    def queue(self):
+        return sys.modules[f"{PACKAGE}.addon.jobs"].queue
+
+    def move(self, x: float, y: float) -> None:
+        self.window.event_simulate(type="MOUSEMOVE", value="NOTHING", x=int(x), y=int(y))
+
+    def press(self, kind: str, x: float, y: float) -> None:
+        for value in ("PRESS", "RELEASE"):
+            self.window.event_simulate(type=kind, value=value, x=int(x), y=int(y))
+
+    def click(self, x: float, y: float) -> Steps:
+        self.move(x, y)
+        yield
+        self.move(x + 1, y)
+        yield 0.1
+        self.press("LEFTMOUSE", x + 1, y)
+        yield 0.2
+
+    def shot(self, name: str) -> None:
+        bpy.ops.wm.redraw_timer(type="DRAW_WIN_SWAP", iterations=1)
+        subprocess.run(["import", "-window", "root", str(self.folder / f"{name}.png")], check=True)
+
+    def show_sidebar(self) -> Steps:
+        """Open the sidebar at Fieldwork's tab and make it wide."""
+        self.area.spaces.active.show_region_ui = True
+        yield 0.3
+        self.sidebar.active_panel_category = "Fieldwork"
+        self.sidebar.tag_redraw()
+        yield 0.3
+
+    def toggle(self, panel: str) -> Steps:
+        """Click the header of a sub-panel while those above it are closed and no job runs."""
+        found = yield from self.buttons(depth=260)
+        main = [place for place in found if place[0].startswith("bpy.ops.fieldwork.")]
+        assert main, "the main panel has no button"
+        # Below the big button of the next step come the headers, one each line.
+        top = max(y for _, _, y in main) - 24 - self.unit / 2
+        yield from self.click(self.sidebar.x + 60, top - PANELS.index(panel) * self.unit)
+
+    @property
+    def unit(self) -> float:
+        """Distance of two headers of closed panels in pixels."""
+        return 26 * bpy.context.preferences.system.ui_scale
+
+    def buttons(self, depth: float = 2000) -> Iterator[float | None]:
+        """Sweep the mouse down the sidebar; returns [(python command, x, y)] of all operator buttons seen."""
+        found, region = [], self.sidebar
+        top = region.y + region.height
+        for y in range(top - 8, int(max(region.y + 4, top - depth)), -9):
+            for share in (0.25, 0.72):
+                x = region.x + region.width * share
+                self.move(x, y)
+                yield
+                with bpy.context.temp_override(window=self.window, area=self.area, region=region):
+                    if not bpy.ops.ui.copy_python_command_button.poll():
+                        continue
+                    bpy.context.window_manager.clipboard = ""
+                    bpy.ops.ui.copy_python_command_button()
+                command = bpy.context.window_manager.clipboard
+                # The same button is met in several lines; another one with the same command lies further down.
+                if command and not any(c == command and abs(py - y) < 20 for c, _, py in found):
+                    found.append((command, x, y - 4))
+        return found
+
+    def press_button(self, operator: str) -> Steps:
+        """Click the button of an operator in the sidebar, found as a hand with eyes closed would."""
+        buttons = yield from self.buttons()
+        self.facts.setdefault("buttons", {})[operator] = [command for command, _, _ in buttons]
+        places = [(x, y) for command, x, y in buttons if command.startswith(f"bpy.ops.{operator}(")]
+        assert places, f"there is no button {operator} among {[command for command, _, _ in buttons]}"
+        yield from self.click(*places[0])
+
+    def wait(self, condition: Callable[[], object], seconds: float, what: str) -> Steps:
+        end = time.monotonic() + seconds
+        while not condition():
+            assert time.monotonic() < end, f"{what}: nothing after {seconds} s"
+            yield 0.1
+
+
+def run(steps: Steps, screen: Screen) -> None:
+    def finish(code: int, error: str = "") -> None:
+        (screen.folder / "result.json").write_text(json.dumps({"error": error, **screen.facts}, default=str))
+        # Leave as an artist does, so that the extension is unregistered.
+        if code == 0:
+            bpy.ops.wm.quit_blender()
+        os._exit(code)
+
+    def step() -> float | None:
+        try:
+            return next(steps) or TICK
+        except StopIteration:
+            finish(0)
+        except BaseException:  # noqa: BLE001 - whatever it is, it goes into the result
+            error = traceback.format_exc()
+            try:
+                screen.shot("failure")
+            finally:
+                finish(1, error)
+        return None
+
+    bpy.app.timers.register(step, first_interval=1.0, persistent=True)
+
+
+def main() -> None:
+    name, folder = sys.argv[sys.argv.index("--") + 1 :][:2]
+    bpy.context.preferences.view.show_splash = False
+    bpy.context.preferences.use_preferences_save = False
+    spec = importlib.util.spec_from_file_location("scenarios", Path(__file__).with_name("scenarios.py"))
+    scenarios = importlib.util.module_from_spec(spec)
+    sys.modules["driver"] = sys.modules["__main__"]
+    spec.loader.exec_module(scenarios)
+    screen = Screen(Path(folder))
+    run(getattr(scenarios, name)(screen), screen)
+
+
+main()

@@ -1,0 +1,91 @@
+"""Starts the windowed Blender of a test in its own root folder (see ../shared/blender-gui)."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+TOOLS = ROOT.parent / "shared" / "blender-gui"
+BLENDER_ROOT = Path(os.environ.get("FIELDWORK_GUI_ROOT", "/var/tmp/blender-sid"))
+BUILD = ROOT / "build" / "gui"
+
+
+def missing() -> str | None:
+    """Why there can be no windowed Blender here."""
+    if not TOOLS.is_dir():
+        return f"the scripts that make a windowed Blender are not at {TOOLS}"
+    if os.geteuid() != 0:
+        return "a windowed Blender in its own root folder needs root"
+    if not (BLENDER_ROOT / ".complete").exists():
+        return f"there is no Blender root at {BLENDER_ROOT}: {TOOLS / 'make-root'} sid {BLENDER_ROOT}"
+    return None
+
+
+def enter(command: list[str], environment: dict[str, str], timeout: float) -> subprocess.CompletedProcess[str]:
+    """Run a command inside the root, with the project, the shared data and the engine's Python at their places."""
+    variables = " ".join(f"{name}={value}" for name, value in environment.items())
+    binds = f"{ROOT.parent / 'shared'} {sys.base_prefix}"
+    return subprocess.run(
+        ["timeout", "-k", "10", str(timeout), TOOLS / "enter", BLENDER_ROOT, ROOT, *command],
+        env={**os.environ, "BIND": binds, "ENTER_ENV": variables},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+class Window:
+    """One Blender with the extension installed from its built archive, with preferences of its own."""
+
+    def __init__(self, name: str) -> None:
+        self.folder = BUILD / name
+        shutil.rmtree(self.folder, ignore_errors=True)
+        self.folder.mkdir(parents=True)
+        self.environment = {
+            "BLENDER_USER_RESOURCES": str(self.folder / "user"),
+            "FIELDWORK_ENGINE_PYTHON": str(Path(sys.prefix) / "bin" / "python"),
+        }
+        build, out = BUILD / "zip", ""
+        build.mkdir(parents=True, exist_ok=True)
+        for arguments in (
+            ["build", "--source-dir", str(ROOT), "--output-filepath", str(build / f"{name}.zip")],
+            ["install-file", "-r", "user_default", "-e", str(build / f"{name}.zip")],
+        ):
+            done = enter(["blender", "--command", "extension", *arguments], self.environment, 120)
+            out += done.stdout + done.stderr
+            assert done.returncode == 0, out
+
+    def play(self, scenario: str, timeout: float = 300) -> dict:
+        """Drive a scenario; returns its facts. Fails with its traceback and Blender's output."""
+        result = self.folder / "result.json"
+        result.unlink(missing_ok=True)
+        done = enter(
+            [
+                *[str(TOOLS / "with-display"), "blender", "--factory-startup", "-noaudio", "--gpu-backend", "opengl"],
+                *["--addons", "bl_ext.user_default.fieldwork", "--enable-event-simulate"],
+                *[
+                    "--window-geometry",
+                    "0",
+                    "0",
+                    "1920",
+                    "1080",
+                    "--python",
+                    str(Path(__file__).with_name("driver.py")),
+                ],
+                *["--", scenario, str(self.folder)],
+            ],
+            self.environment,
+            timeout,
+        )
+        (self.folder / "blender.log").write_text(done.stdout + done.stderr)
+        assert result.is_file(), (
+            f"{scenario} did not end (status {done.returncode}): {(done.stdout + done.stderr)[-3000:]}"
+        )
+        facts = json.loads(result.read_text())
+        assert not facts["error"], f"{facts['error']}\nscreenshots: {self.folder}"
+        return facts

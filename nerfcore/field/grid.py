@@ -1,0 +1,86 @@
+"""The explicit branch: features on the vertices of a multi-resolution grid."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import nn
+
+from ..kernels import encode
+from ..kernels.encode import BLOCK, FEATURES
+
+Levels = list[tuple[int, int, int]]
+
+
+def level_layout(levels: int, coarsest: int, finest: int, table_log2: int) -> Levels:
+    """(resolution, first row, rows) of each level; resolutions grow geometrically.
+
+    A level with more than 2^table_log2 vertices is hashed into that many rows. First rows are multiples of the
+    optimiser's block, so that no two levels share a block.
+    """
+    layout, row = [], 0
+    for resolution in np.round(np.geomspace(coarsest, finest, levels)).astype(int):
+        rows = min(int(resolution) ** 3, 1 << table_log2)
+        layout.append((int(resolution), row, rows))
+        row += -(-rows // BLOCK) * BLOCK
+    return layout
+
+
+class _Encode(torch.autograd.Function):
+    """Gradients go straight into the grid's own buffers: a dense gradient of the table never exists twice."""
+
+    @staticmethod
+    def forward(ctx, points: torch.Tensor, anchor: torch.Tensor, grid: VertexGrid, gains: list[float]) -> torch.Tensor:
+        ctx.grid, ctx.gains = grid, gains
+        ctx.save_for_backward(points)
+        return encode.forward(grid.table, grid.levels, gains, points)
+
+    @staticmethod
+    def backward(ctx, *grads):
+        (points,) = ctx.saved_tensors
+        grid: VertexGrid = ctx.grid
+        encode.backward(grid.gradient, grid.touched, grid.levels, ctx.gains, points, grads[0].float().contiguous())
+        return None, None, None, None
+
+
+class VertexGrid(nn.Module):
+    """Vertex features of all levels in one table, with their optimiser state.
+
+    The state (Adam moments) belongs to the grid because only touched rows are ever updated.
+    """
+
+    def __init__(self, levels: Levels, initial: float = 1e-2) -> None:
+        super().__init__()
+        self.levels = levels
+        rows = levels[-1][1] + -(-levels[-1][2] // BLOCK) * BLOCK
+        self.register_buffer("table", torch.empty(rows, FEATURES).uniform_(-initial, initial))
+        self.register_buffer("mean", torch.zeros(rows, FEATURES))
+        self.register_buffer("square", torch.zeros(rows, FEATURES))
+        self.register_buffer("gradient", torch.zeros(rows, FEATURES), persistent=False)
+        self.register_buffer("touched", torch.zeros(rows // BLOCK, dtype=torch.uint8), persistent=False)
+        self.register_buffer("anchor", torch.zeros(1), persistent=False)
+        self.table: torch.Tensor
+        self.mean: torch.Tensor
+        self.square: torch.Tensor
+        self.gradient: torch.Tensor
+        self.touched: torch.Tensor
+        self.anchor: torch.Tensor
+
+    @property
+    def width(self) -> int:
+        """Features of an encoded point."""
+        return len(self.levels) * FEATURES
+
+    def parameter_count(self) -> int:
+        return sum(rows for _, _, rows in self.levels) * FEATURES
+
+    def forward(self, points: torch.Tensor, gains: list[float]) -> torch.Tensor:
+        """Encode points (N, 3) in [0, 1]³ → (N, width) float32; `gains` (one per level) fade levels in."""
+        if not torch.is_grad_enabled():
+            return encode.forward(self.table, self.levels, gains, points)
+        # The anchor only tells autograd that the result depends on something trainable.
+        return _Encode.apply(points, self.anchor.requires_grad_(), self, gains)  # type: ignore[no-any-return]
+
+    def step(self, rate: float, betas: tuple[float, float] = (0.9, 0.99)) -> None:
+        """Adam on the rows touched since the last step; clears the gradient."""
+        encode.adam(self.table, self.gradient, self.mean, self.square, self.touched, rate, betas)

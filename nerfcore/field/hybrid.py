@@ -1,0 +1,148 @@
+"""The hybrid implicit–explicit semantic field: position and direction → density, colour, class logits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import nn
+
+from ..config import FieldConfig
+from ..kernels.encode import FEATURES
+from .blend import BlendWeight
+from .encoding import frequency_encoding
+from .grid import VertexGrid, level_layout
+from .mlp import MLP, compute_dtype
+
+DIRECTION_FEATURES = 16
+
+
+class _TruncatedExp(torch.autograd.Function):
+    """exp whose value and gradient stay finite (Müller et al., 2022, use the same trick)."""
+
+    @staticmethod
+    def forward(ctx, x: torch.Tensor) -> torch.Tensor:
+        y = torch.exp(x.clamp(-15.0, 11.0))
+        ctx.save_for_backward(y)
+        return y
+
+    @staticmethod
+    def backward(ctx, *grads):
+        return grads[0] * ctx.saved_tensors[0]
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """What the density head knows of N points: density (N,) float32, features (N, G), implicit features (N, F) or None."""
+
+    density: torch.Tensor
+    features: torch.Tensor
+    implicit: torch.Tensor | None
+
+    def __getitem__(self, kept: torch.Tensor) -> Geometry:
+        implicit = None if self.implicit is None else self.implicit[kept]
+        return Geometry(self.density[kept], self.features[kept], implicit)
+
+
+class HybridField(nn.Module):
+    """Explicit grid and implicit network, blended by evidence, read by one decoder.
+
+    Args:
+        config: settings of the field.
+        classes: number of class logits; 0 leaves the semantic head out.
+        images: number of training images (for appearance codes).
+    """
+
+    def __init__(self, config: FieldConfig, classes: int, images: int = 0) -> None:
+        super().__init__()
+        self.config, self.classes = config, classes
+        self.features = config.levels * FEATURES
+        self.grid = (
+            VertexGrid(level_layout(config.levels, config.coarsest, config.finest, config.table_log2))
+            if config.branch != "implicit"
+            else None
+        )
+        self.implicit = (
+            MLP(3 + 6 * config.octaves, self.features, config.width, config.implicit_layers)
+            if config.branch != "explicit"
+            else None
+        )
+        self.blend = BlendWeight(config) if config.branch == "hybrid" else None
+        hybrid_concat = config.branch == "hybrid" and config.fusion == "concat"
+        decoder_inputs = self.features * (2 if hybrid_concat else 1)
+        outputs = 1 + config.geometry_features
+        self.density_head = MLP(decoder_inputs, outputs, config.width, 2)
+        self.color_head = MLP(
+            outputs + DIRECTION_FEATURES + config.appearance, 3, config.width, config.color_layers, output_gain=0.5
+        )
+        semantic_inputs = outputs + (self.features if self.implicit is not None else 0)
+        self.semantic_head = (
+            MLP(semantic_inputs, classes, config.width, config.semantic_layers) if classes > 0 else None
+        )
+        self.appearance = (
+            nn.Parameter(torch.zeros(images, config.appearance)) if config.appearance and images else None
+        )
+        self.gains = [1.0] * config.levels
+        self.register_buffer("_device", torch.zeros(0), persistent=False)
+        self._device: torch.Tensor
+
+    @property
+    def dtype(self) -> torch.dtype:
+        return compute_dtype(self.config.precision, self._device.device)
+
+    def parameter_count(self) -> int:
+        """Trainable numbers: grid rows and network weights."""
+        networks = sum(p.numel() for p in self.parameters())
+        return networks + (self.grid.parameter_count() if self.grid is not None else 0)
+
+    def set_progress(self, progress: float, fade: float, step: int) -> None:
+        """Coarse-to-fine: level l fades in over `fade` of training; the blend is held at 1 while it warms up."""
+        levels = self.config.levels
+        # Half of the levels are there from the start; the rest appear one after the other.
+        position = levels if fade <= 0 else levels / 2 + levels / 2 * min(1.0, progress / fade)
+        self.gains = [float(min(1.0, max(0.0, position - index))) for index in range(levels)]
+        if self.blend is not None:
+            self.blend.warming_up = step < self.config.blend_warmup
+
+    def geometry(self, points: torch.Tensor) -> Geometry:
+        """Density and features of points (N, 3) in grid coordinates [0, 1]³; density per normalised unit length."""
+        explicit = self.grid(points, self.gains) if self.grid is not None else None
+        implicit = None
+        if self.implicit is not None:
+            implicit = self.implicit(frequency_encoding(points, self.config.octaves).to(self.dtype), self.dtype)
+        if explicit is None:
+            hidden = implicit
+        elif implicit is None:
+            hidden = explicit
+        else:
+            assert self.blend is not None
+            w = self.blend(points)[:, None]
+            if self.config.fusion == "concat":
+                hidden = torch.cat([w * explicit, (1 - w) * implicit], 1)
+            else:
+                hidden = w * explicit + (1 - w) * implicit
+        out = self.density_head(hidden, self.dtype)
+        density = _TruncatedExp.apply(out[:, 0].float() + self.config.density_shift)
+        return Geometry(density, out, implicit)  # type: ignore[arg-type]
+
+    def density(self, points: torch.Tensor) -> torch.Tensor:
+        """Density (N,) alone."""
+        return self.geometry(points).density
+
+    def color(self, geometry: Geometry, directions: torch.Tensor, codes: torch.Tensor | None = None) -> torch.Tensor:
+        """Colour (N, 3) in [0, 1]; `directions` (N, 16) spherical harmonics, `codes` (N, A) appearance."""
+        parts = [geometry.features, directions.to(self.dtype)]
+        if self.config.appearance:
+            if codes is None:
+                mean = self.appearance.mean(0) if self.appearance is not None else self._device.new_zeros(self.config.appearance)
+                codes = mean.expand(len(directions), -1)
+            parts.append(codes.to(self.dtype))
+        return torch.sigmoid(self.color_head(torch.cat(parts, 1), self.dtype).float())
+
+    def logits(self, geometry: Geometry) -> torch.Tensor:
+        """Class logits (N, K). The viewing direction has no say, the smooth implicit branch has a strong one."""
+        assert self.semantic_head is not None
+        features = geometry.features
+        if geometry.implicit is not None:
+            features = torch.cat([features, geometry.implicit], 1)
+        return self.semantic_head(features, self.dtype).float()

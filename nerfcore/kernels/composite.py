@@ -1,0 +1,162 @@
+"""Volume rendering weights and sums over packed samples, with hand-written gradients.
+
+α_j = 1 − exp(−σ_j δ_j), T_j = Π_{k<j} (1 − α_k), w_j = T_j α_j (Max, "Optical models for direct volume rendering",
+1995). Rays are independent, each is one thread, so no sums race. The torch twins are in `composite_torch.py`.
+"""
+
+from __future__ import annotations
+
+import torch
+import warp as wp
+
+from .packing import Packing
+from .runtime import array, init, launch
+
+
+@wp.kernel(module="fieldwork_composite")
+def weights_forward(
+    density: wp.array(dtype=float),
+    delta: wp.array(dtype=float),
+    start: wp.array(dtype=int),
+    count: wp.array(dtype=int),
+    weights: wp.array(dtype=float),
+    offset: int,
+):
+    r = wp.tid() + offset
+    base = start[r]
+    depth = float(0.0)
+    before = float(1.0)
+    for k in range(base, base + count[r]):
+        depth += density[k] * delta[k]
+        after = wp.exp(-depth)
+        weights[k] = before - after
+        before = after
+
+
+@wp.kernel(module="fieldwork_composite")
+def weights_backward(
+    density: wp.array(dtype=float),
+    delta: wp.array(dtype=float),
+    start: wp.array(dtype=int),
+    count: wp.array(dtype=int),
+    weights: wp.array(dtype=float),
+    grad_weights: wp.array(dtype=float),
+    grad_density: wp.array(dtype=float),
+    offset: int,
+):
+    r = wp.tid() + offset
+    base = start[r]
+    total = float(0.0)
+    for k in range(base, base + count[r]):
+        total += grad_weights[k] * weights[k]
+    depth = float(0.0)
+    behind = total
+    for k in range(base, base + count[r]):
+        depth += density[k] * delta[k]
+        behind -= grad_weights[k] * weights[k]
+        grad_density[k] = delta[k] * (grad_weights[k] * wp.exp(-depth) - behind)
+
+
+@wp.kernel(module="fieldwork_composite")
+def sum_forward(
+    values: wp.array(dtype=float, ndim=2),
+    weights: wp.array(dtype=float),
+    start: wp.array(dtype=int),
+    count: wp.array(dtype=int),
+    channels: int,
+    out: wp.array(dtype=float, ndim=2),
+    offset: int,
+):
+    r = wp.tid() + offset
+    base = start[r]
+    for c in range(channels):
+        out[r, c] = 0.0
+    if base < 0:
+        return
+    for k in range(base, base + count[r]):
+        w = weights[k]
+        for c in range(channels):
+            out[r, c] = out[r, c] + w * values[k, c]
+
+
+@wp.kernel(module="fieldwork_composite")
+def sum_backward(
+    values: wp.array(dtype=float, ndim=2),
+    weights: wp.array(dtype=float),
+    ray: wp.array(dtype=int),
+    channels: int,
+    grad_out: wp.array(dtype=float, ndim=2),
+    grad_values: wp.array(dtype=float, ndim=2),
+    grad_weights: wp.array(dtype=float),
+    offset: int,
+):
+    k = wp.tid() + offset
+    r = ray[k]
+    if r < 0:
+        for c in range(channels):
+            grad_values[k, c] = 0.0
+        grad_weights[k] = 0.0
+        return
+    w = weights[k]
+    g = float(0.0)
+    for c in range(channels):
+        grad_values[k, c] = w * grad_out[r, c]
+        g += values[k, c] * grad_out[r, c]
+    grad_weights[k] = g
+
+
+class _Weights(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, density: torch.Tensor, delta: torch.Tensor, packing: Packing) -> torch.Tensor:
+        init()
+        density = density.contiguous()
+        weights = torch.zeros_like(density)
+        inputs = [array(density), array(delta), array(packing.start), array(packing.count), array(weights)]
+        launch(weights_forward, len(packing.start), inputs, density.device)
+        ctx.packing = packing
+        ctx.save_for_backward(density, delta, weights)
+        return weights
+
+    @staticmethod
+    def backward(ctx, *grads):
+        density, delta, weights = ctx.saved_tensors
+        packing: Packing = ctx.packing
+        grad_density = torch.zeros_like(density)
+        inputs = [array(density), array(delta), array(packing.start), array(packing.count)]
+        inputs += [array(weights), array(grads[0].contiguous()), array(grad_density)]
+        launch(weights_backward, len(packing.start), inputs, density.device)
+        return grad_density, None, None
+
+
+class _Sum(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, values: torch.Tensor, weights: torch.Tensor, packing: Packing) -> torch.Tensor:
+        init()
+        ctx.dtype = values.dtype
+        values, weights = values.float().contiguous(), weights.contiguous()
+        channels = values.shape[1]
+        out = torch.empty(len(packing.start), channels, device=values.device)
+        inputs = [array(values), array(weights), array(packing.start), array(packing.count), channels, array(out)]
+        launch(sum_forward, len(packing.start), inputs, values.device)
+        ctx.packing = packing
+        ctx.save_for_backward(values, weights)
+        return out
+
+    @staticmethod
+    def backward(ctx, *grads):
+        values, weights = ctx.saved_tensors
+        grad_values, grad_weights = torch.empty_like(values), torch.empty_like(weights)
+        inputs = [array(values), array(weights), array(ctx.packing.ray), values.shape[1]]
+        inputs += [array(grads[0].contiguous()), array(grad_values), array(grad_weights)]
+        launch(sum_backward, len(weights), inputs, values.device)
+        return grad_values.to(ctx.dtype), grad_weights, None
+
+
+def render_weights(density: torch.Tensor, delta: torch.Tensor, packing: Packing) -> torch.Tensor:
+    """Rendering weights (N,) of packed samples from their densities and lengths (N,); differentiable in `density`."""
+    return _Weights.apply(density, delta, packing)  # type: ignore[no-any-return]
+
+
+def weighted_sum(values: torch.Tensor, weights: torch.Tensor, packing: Packing) -> torch.Tensor:
+    """Σ_j w_j v_j per ray: values (N, C), weights (N,) → (R, C) float32, zero for rays without samples."""
+    return _Sum.apply(values, weights, packing)  # type: ignore[no-any-return]

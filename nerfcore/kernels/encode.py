@@ -1,0 +1,213 @@
+"""Trilinear encoding of points on a multi-resolution vertex grid, its gradient, and Adam on touched entries.
+
+One table holds all levels, `FEATURES` float32 a vertex. A level is *dense* when its (resolution)³ vertices fit its
+share of the table, else *hashed* (Müller et al., "Instant Neural Graphics Primitives", 2022, eq. 4).
+The torch twins are in `encode_torch.py`.
+"""
+
+from __future__ import annotations
+
+import torch
+import warp as wp
+
+from .runtime import array, init, launch, load, run_parallel
+
+FEATURES = 4
+BLOCK = 64  # vertices that share one "touched" flag of the optimiser
+feature = wp.types.vector(length=FEATURES, dtype=wp.float32)
+
+# Primes of the spatial hash; the first is 1 so that neighbours along x share cache lines.
+P1 = wp.constant(wp.uint32(2654435761))
+P2 = wp.constant(wp.uint32(805459861))
+
+
+@wp.func
+def vertex(ix: int, iy: int, iz: int, resolution: int, size: int):
+    """Table row of a vertex within its level; `size` rows. x is the fastest axis."""
+    if resolution * resolution * resolution <= size:
+        return (iz * resolution + iy) * resolution + ix
+    h = wp.uint32(ix) ^ (wp.uint32(iy) * P1) ^ (wp.uint32(iz) * P2)
+    return int(h & wp.uint32(size - 1))
+
+
+@wp.kernel(module="fieldwork_encode")
+def encode_forward(
+    table: wp.array(dtype=feature),
+    points: wp.array(dtype=wp.vec3),
+    level: int,
+    resolution: int,
+    base: int,
+    size: int,
+    gain: float,
+    out: wp.array(dtype=feature, ndim=2),
+    offset: int,
+):
+    i = wp.tid() + offset
+    p = points[i] * float(resolution - 1)
+    ix = wp.clamp(int(p[0]), 0, resolution - 2)
+    iy = wp.clamp(int(p[1]), 0, resolution - 2)
+    iz = wp.clamp(int(p[2]), 0, resolution - 2)
+    fx = p[0] - float(ix)
+    fy = p[1] - float(iy)
+    fz = p[2] - float(iz)
+    total = feature()
+    for corner in range(4):
+        dy = corner & 1
+        dz = corner >> 1
+        wyz = wp.where(dy == 1, fy, 1.0 - fy) * wp.where(dz == 1, fz, 1.0 - fz)
+        a = table[base + vertex(ix, iy + dy, iz + dz, resolution, size)]
+        b = table[base + vertex(ix + 1, iy + dy, iz + dz, resolution, size)]
+        total += a * (wyz * (1.0 - fx)) + b * (wyz * fx)
+    out[i, level] = total * gain
+
+
+@wp.func
+def add(target: wp.array(dtype=feature), touched: wp.array(dtype=wp.uint8), row: int, value: feature):
+    wp.atomic_add(target, row, value)
+    touched[row / BLOCK] = wp.uint8(1)
+
+
+@wp.kernel(module="fieldwork_encode")
+def encode_backward(
+    points: wp.array(dtype=wp.vec3),
+    grad_out: wp.array(dtype=feature, ndim=2),
+    level: int,
+    resolution: int,
+    base: int,
+    size: int,
+    gain: float,
+    grad_table: wp.array(dtype=feature),
+    touched: wp.array(dtype=wp.uint8),
+    offset: int,
+):
+    i = wp.tid() + offset
+    p = points[i] * float(resolution - 1)
+    ix = wp.clamp(int(p[0]), 0, resolution - 2)
+    iy = wp.clamp(int(p[1]), 0, resolution - 2)
+    iz = wp.clamp(int(p[2]), 0, resolution - 2)
+    fx = p[0] - float(ix)
+    fy = p[1] - float(iy)
+    fz = p[2] - float(iz)
+    g = grad_out[i, level] * gain
+    for corner in range(4):
+        dy = corner & 1
+        dz = corner >> 1
+        wyz = wp.where(dy == 1, fy, 1.0 - fy) * wp.where(dz == 1, fz, 1.0 - fz)
+        add(grad_table, touched, base + vertex(ix, iy + dy, iz + dz, resolution, size), g * (wyz * (1.0 - fx)))
+        add(grad_table, touched, base + vertex(ix + 1, iy + dy, iz + dz, resolution, size), g * (wyz * fx))
+
+
+@wp.kernel(module="fieldwork_encode")
+def adam_touched(
+    table: wp.array(dtype=feature),
+    grad: wp.array(dtype=feature),
+    mean: wp.array(dtype=feature),
+    square: wp.array(dtype=feature),
+    touched: wp.array(dtype=wp.uint8),
+    rate: float,
+    beta1: float,
+    beta2: float,
+    epsilon: float,
+    offset: int,
+):
+    block = wp.tid() + offset
+    if touched[block] == wp.uint8(0):
+        return
+    touched[block] = wp.uint8(0)
+    begin = block * BLOCK
+    for row in range(begin, wp.min(begin + BLOCK, table.shape[0])):
+        g = grad[row]
+        if wp.dot(g, g) > 0.0:
+            m = mean[row] * beta1 + g * (1.0 - beta1)
+            v = square[row] * beta2 + wp.cw_mul(g, g) * (1.0 - beta2)
+            value = table[row]
+            for k in range(FEATURES):
+                value[k] = value[k] - rate * m[k] / (wp.sqrt(v[k]) + epsilon)
+            mean[row] = m
+            square[row] = v
+            table[row] = value
+            grad[row] = feature()
+
+
+def forward(table: torch.Tensor, levels: list[tuple[int, int, int]], gains: list[float], points: torch.Tensor) -> torch.Tensor:
+    """Encode `points` (N, 3) in [0, 1]³ → features (N, levels · FEATURES) float32.
+
+    Args:
+        table: (rows, FEATURES) float32.
+        levels: (resolution, first row, rows) of each level.
+        gains: factor of each level's features (coarse-to-fine fading).
+    """
+    init()
+    out = torch.empty(len(points), len(levels), FEATURES, device=points.device)
+    rows, where, target = array(table, feature), array(points, wp.vec3), array(out, feature)
+    for index, (resolution, base, size) in enumerate(levels):
+        if gains[index] == 0.0:
+            out[:, index] = 0
+            continue
+        launch(
+            encode_forward,
+            len(points),
+            [rows, where, index, resolution, base, size, gains[index], target],
+            points.device,
+        )
+    return out.flatten(1)
+
+
+def backward(
+    grad_table: torch.Tensor,
+    touched: torch.Tensor,
+    levels: list[tuple[int, int, int]],
+    gains: list[float],
+    points: torch.Tensor,
+    grad_out: torch.Tensor,
+) -> None:
+    """Add the gradient of `forward` to `grad_table` (rows, FEATURES) and mark touched blocks (uint8).
+
+    On the CPU each level is one task, so no two threads write the same row and the sum has a fixed order.
+    On CUDA rows are summed with atomics.
+    """
+    init()
+    grad = array(grad_out.reshape(len(points), len(levels), FEATURES), feature)
+    where, rows, flags = array(points, wp.vec3), array(grad_table, feature), array(touched)
+
+    def arguments(index: int) -> list:
+        resolution, base, size = levels[index]
+        return [where, grad, index, resolution, base, size, gains[index], rows, flags]
+
+    active = [index for index in range(len(levels)) if gains[index] != 0.0]
+    if points.device.type == "cuda":
+        for index in active:
+            launch(encode_backward, len(points), arguments(index), points.device)
+        return
+    load(encode_backward, points.device)
+    # Levels share no block (rows are padded to BLOCK), so their flags do not race either.
+    run_parallel(
+        [
+            lambda k=index: wp.launch(encode_backward, dim=len(points), inputs=[*arguments(k), 0], device="cpu")
+            for index in reversed(active)
+        ]
+    )
+
+
+def adam(
+    table: torch.Tensor,
+    grad: torch.Tensor,
+    mean: torch.Tensor,
+    square: torch.Tensor,
+    touched: torch.Tensor,
+    rate: float,
+    betas: tuple[float, float] = (0.9, 0.99),
+    epsilon: float = 1e-15,
+) -> None:
+    """One Adam step on the rows whose gradient is not zero; gradients and flags are cleared.
+
+    `rate` already holds the bias correction. Rows never touched keep their value and moments ("lazy" Adam).
+    """
+    init()
+    launch(
+        adam_touched,
+        len(touched),
+        [array(table, feature), array(grad, feature), array(mean, feature), array(square, feature), array(touched)]
+        + [rate, betas[0], betas[1], epsilon],
+        table.device,
+    )

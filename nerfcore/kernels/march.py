@@ -1,0 +1,334 @@
+"""Two-stage ray sampling on the occupancy grid: a coarse walk that reads the grid, then samples from its PDF.
+
+Positions are in the *normalised* frame, whose unit cube [−1, 1]³ is the region of interest. `contracted` maps all of
+space into the grid (Barron et al., "Mip-NeRF 360", 2022, eq. 10, with the infinity norm); otherwise the grid covers
+just the cube. A ray is walked in bins of about half a grid cell; bins in closed cells are skipped.
+
+Bin weights (`mode`):
+  PDF_DEFAULT  T·α·(1 + β·interest) + ε        transmittance-weighted, ε keeps every open bin alive
+  PDF_UNIFORM  1                               the same number of samples spread over the open bins
+  PDF_LITERAL  σ·max softmax(s)                the original formulation: no transmittance
+The torch twins are in `march_torch.py`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import warp as wp
+
+from .packing import Packing
+from .runtime import array, init, launch
+
+PDF_DEFAULT, PDF_UNIFORM, PDF_LITERAL = 0, 1, 2
+_DEFAULT, _UNIFORM, _LITERAL = wp.constant(PDF_DEFAULT), wp.constant(PDF_UNIFORM), wp.constant(PDF_LITERAL)
+MAX_BINS = wp.constant(4096)
+STOP = wp.constant(1.0e-4)  # transmittance below which the walk ends
+
+
+@dataclass(frozen=True)
+class MarchSettings:
+    """How rays are walked. `step` is the bin length inside the cube; `near`, `far` clip the ray (normalised units)."""
+
+    resolution: int
+    step: float
+    near: float = 0.02
+    far: float = 1000.0
+    contracted: bool = False
+    mode: int = PDF_DEFAULT
+    beta: float = 1.0
+    epsilon: float = 0.01
+
+
+@wp.func
+def grid_position(p: wp.vec3, contracted: int):
+    """Normalised position → grid coordinates in [0, 1]³."""
+    if contracted == 0:
+        return p * 0.5 + wp.vec3(0.5, 0.5, 0.5)
+    r = wp.max(wp.abs(p[0]), wp.max(wp.abs(p[1]), wp.abs(p[2])))
+    q = p
+    if r > 1.0:
+        q = p * ((2.0 - 1.0 / r) / r)
+    return q * 0.25 + wp.vec3(0.5, 0.5, 0.5)
+
+
+@wp.func
+def cell_index(u: wp.vec3, n: int):
+    ix = wp.clamp(int(u[0] * float(n)), 0, n - 1)
+    iy = wp.clamp(int(u[1] * float(n)), 0, n - 1)
+    iz = wp.clamp(int(u[2] * float(n)), 0, n - 1)
+    return (iz * n + iy) * n + ix
+
+
+@wp.func
+def ray_interval(o: wp.vec3, d: wp.vec3, near: float, far: float, contracted: int):
+    """Entry and exit distance of the walk."""
+    lo = near
+    hi = far
+    if contracted == 0:
+        for a in range(3):
+            da = wp.where(wp.abs(d[a]) < 1.0e-9, 1.0e-9, d[a])
+            t0 = (-1.0 - o[a]) / da
+            t1 = (1.0 - o[a]) / da
+            lo = wp.max(lo, wp.min(t0, t1))
+            hi = wp.min(hi, wp.max(t0, t1))
+    return lo, hi
+
+
+@wp.func
+def bin_length(p: wp.vec3, step: float, contracted: int):
+    """Bins grow outside the cube, where the grid's cells do."""
+    if contracted == 0:
+        return step
+    r = wp.max(wp.abs(p[0]), wp.max(wp.abs(p[1]), wp.abs(p[2])))
+    if r <= 1.0:
+        return step
+    return step * r * wp.sqrt(r)
+
+
+@wp.func
+def empty_skip(p: wp.vec3, d: wp.vec3, n: int, step: float):
+    """Whole steps until the ray leaves its (closed) cell; bounded grid only."""
+    leave = float(1.0e6)
+    for a in range(3):
+        q = (p[a] * 0.5 + 0.5) * float(n)
+        if d[a] > 1.0e-9:
+            leave = wp.min(leave, (wp.floor(q) + 1.0 - q) * 2.0 / (float(n) * d[a]))
+        elif d[a] < -1.0e-9:
+            leave = wp.min(leave, (wp.floor(q) - q) * 2.0 / (float(n) * d[a]))
+    return wp.max(1.0, wp.floor(leave / step + 0.5)) * step
+
+
+@wp.func
+def bin_weight(
+    cell: wp.vec2, transmittance: float, length: float, mode: int, beta: float, epsilon: float
+):
+    """Weight of one open bin; `cell` holds (density, interest)."""
+    if mode == _UNIFORM:
+        return 1.0
+    if mode == _LITERAL:
+        return cell[0] * cell[1] + 1.0e-6
+    alpha = 1.0 - wp.exp(-cell[0] * length)
+    return transmittance * alpha * (1.0 + beta * cell[1]) + epsilon
+
+
+@wp.kernel(module="fieldwork_march")
+def march_weight(
+    origins: wp.array(dtype=wp.vec3),
+    directions: wp.array(dtype=wp.vec3),
+    jitter: wp.array(dtype=float),
+    cells: wp.array(dtype=wp.vec2),
+    n: int,
+    step: float,
+    near: float,
+    far: float,
+    contracted: int,
+    mode: int,
+    beta: float,
+    epsilon: float,
+    total: wp.array(dtype=float),
+    first: wp.array(dtype=float),
+    last: wp.array(dtype=float),
+    offset: int,
+):
+    r = wp.tid() + offset
+    o = origins[r]
+    d = directions[r]
+    lo, hi = ray_interval(o, d, near, far, contracted)
+    t = lo + jitter[r] * step
+    transmittance = float(1.0)
+    weight = float(0.0)
+    t_first = float(-1.0)
+    t_last = float(-1.0)
+    for _ in range(MAX_BINS):
+        if t >= hi:
+            break
+        p = o + d * t
+        length = bin_length(p, step, contracted)
+        cell = cells[cell_index(grid_position(p, contracted), n)]
+        if cell[0] > 0.0:
+            weight += bin_weight(cell, transmittance, length, mode, beta, epsilon)
+            if t_first < 0.0:
+                t_first = t
+            t_last = t
+            if mode == _DEFAULT:
+                transmittance *= wp.exp(-cell[0] * length)
+                if transmittance < STOP:
+                    break
+            t += length
+        elif contracted == 0:
+            t += empty_skip(p, d, n, step)
+        else:
+            t += length
+    total[r] = weight
+    first[r] = t_first
+    last[r] = t_last
+
+
+@wp.kernel(module="fieldwork_march")
+def march_sample(
+    origins: wp.array(dtype=wp.vec3),
+    directions: wp.array(dtype=wp.vec3),
+    jitter: wp.array(dtype=float),
+    shift: wp.array(dtype=float),
+    cells: wp.array(dtype=wp.vec2),
+    n: int,
+    step: float,
+    near: float,
+    far: float,
+    contracted: int,
+    mode: int,
+    beta: float,
+    epsilon: float,
+    total: wp.array(dtype=float),
+    first: wp.array(dtype=float),
+    start: wp.array(dtype=int),
+    count: int,
+    points: wp.array(dtype=wp.vec3),
+    depth: wp.array(dtype=float),
+    delta: wp.array(dtype=float),
+    ray: wp.array(dtype=int),
+    offset: int,
+):
+    r = wp.tid() + offset
+    base = start[r]
+    if base < 0:
+        return
+    o = origins[r]
+    d = directions[r]
+    lo, hi = ray_interval(o, d, near, far, contracted)
+    t = first[r]
+    transmittance = float(1.0)
+    below = float(0.0)  # weight of the bins behind us
+    share = total[r] / float(count)
+    k = int(0)  # the sample being looked for
+    target = shift[base] * share
+    edge = share  # weight at which sample k's interval ends
+    open_length = float(0.0)  # open length gathered for sample k's interval so far
+    k_edge = int(0)
+    t_end = t
+    for _ in range(MAX_BINS):
+        if t >= hi or k_edge >= count:
+            break
+        p = o + d * t
+        length = bin_length(p, step, contracted)
+        cell = cells[cell_index(grid_position(p, contracted), n)]
+        if cell[0] > 0.0:
+            weight = bin_weight(cell, transmittance, length, mode, beta, epsilon)
+            above = below + weight
+            while k < count and target <= above:
+                tk = t + ((target - below) / weight - 0.5) * length
+                depth[base + k] = tk
+                points[base + k] = grid_position(o + d * tk, contracted)
+                ray[base + k] = r
+                k += 1
+                if k < count:
+                    target = (float(k) + shift[base + k]) * share
+            used = float(0.0)  # part of this bin already given to intervals
+            while k_edge < count and edge <= above:
+                upto = (edge - below) / weight
+                delta[base + k_edge] = open_length + (upto - used) * length
+                open_length = 0.0
+                used = upto
+                k_edge += 1
+                edge = float(k_edge + 1) * share
+            open_length += (1.0 - used) * length
+            t_end = t
+            below = above
+            if mode == _DEFAULT:
+                transmittance *= wp.exp(-cell[0] * length)
+                if transmittance < STOP:
+                    break
+            t += length
+        elif contracted == 0:
+            t += empty_skip(p, d, n, step)
+        else:
+            t += length
+    # Rounding can leave the last interval or sample just short of the total.
+    while k < count:
+        depth[base + k] = t_end
+        points[base + k] = grid_position(o + d * t_end, contracted)
+        ray[base + k] = r
+        k += 1
+    while k_edge < count:
+        delta[base + k_edge] = open_length
+        open_length = 0.0
+        k_edge += 1
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Packed samples of a batch of rays; sample order along each ray is front to back.
+
+    points (N, 3) grid coordinates; depth (N,) distance; delta (N,) length the sample stands for;
+    packing: which samples belong to which ray; first, last (R,): distance of the first and last open bin, −1 where
+    there is none.
+    """
+
+    points: torch.Tensor
+    depth: torch.Tensor
+    delta: torch.Tensor
+    packing: Packing
+    first: torch.Tensor
+    last: torch.Tensor
+
+    def __len__(self) -> int:
+        return len(self.depth)
+
+
+def _arguments(settings: MarchSettings) -> list:
+    s = settings
+    return [s.resolution, s.step, s.near, s.far, int(s.contracted), s.mode, s.beta, s.epsilon]
+
+
+def sample(
+    origins: torch.Tensor,
+    directions: torch.Tensor,
+    cells: torch.Tensor,
+    settings: MarchSettings,
+    count: int,
+    jitter: torch.Tensor | None = None,
+    shift: torch.Tensor | None = None,
+    capacity: int | None = None,
+) -> Samples:
+    """Draw `count` samples on every ray that meets an open cell.
+
+    Args:
+        origins, directions: (R, 3) float32 normalised frame; directions of unit length.
+        cells: (resolution³, 2) float32: density per normalised unit length (0 = closed) and interest in [0, 1].
+        jitter: (R,) in [0, 1) shift of the walk in bins; 0.5 when None.
+        shift: (R · count,) in [0, 1) place of each sample within its share of the PDF; 0.5 when None.
+        capacity: on CUDA, the fixed number of rays that may get samples, so that no count is read back; rays
+            beyond it get none, unused places have ray −1 and delta 0.
+    """
+    init()
+    device, rays = origins.device, len(origins)
+    jitter = torch.full((rays,), 0.5, device=device) if jitter is None else jitter
+    total, first, last = (torch.empty(rays, device=device) for _ in range(3))
+    o, d, j, c = array(origins, wp.vec3), array(directions, wp.vec3), array(jitter), array(cells, wp.vec2)
+    fixed = _arguments(settings)
+    launch(march_weight, rays, [o, d, j, c, *fixed, array(total), array(first), array(last)], device)
+    hit = total > 0
+    slot = torch.cumsum(hit, 0, dtype=torch.int32) - 1
+    if capacity is None:
+        places = int(slot[-1]) + 1 if rays else 0
+        start = torch.where(hit, slot * count, -1).to(torch.int32)
+        ray = torch.empty(places * count, dtype=torch.int32, device=device)
+    else:
+        places = capacity
+        start = torch.where(hit & (slot < capacity), slot * count, -1).to(torch.int32)
+        ray = torch.full((places * count,), -1, dtype=torch.int32, device=device)
+    n = places * count
+    shift = torch.full((n,), 0.5, device=device) if shift is None else shift[:n]
+    fill = torch.empty if capacity is None else torch.zeros
+    points, depth, delta = fill(n, 3, device=device), fill(n, device=device), fill(n, device=device)
+    launch(
+        march_sample,
+        rays,
+        [o, d, j, array(shift), c, *fixed, array(total), array(first), array(start), count]
+        + [array(points, wp.vec3), array(depth), array(delta), array(ray)],
+        device,
+    )
+    counts = torch.where(start >= 0, count, 0).to(torch.int32)
+    return Samples(points, depth, delta, Packing(start, counts, ray), first, last)

@@ -1,0 +1,104 @@
+"""Launching Warp kernels on CPU and CUDA from one source.
+
+A CPU launch runs its threads one after the other, but releases the interpreter lock: `launch` cuts the range into
+chunks and runs them in a small thread pool. Kernels therefore take the first index of their chunk as last argument
+and begin with `i = wp.tid() + offset`. On CUDA the whole range is one launch on torch's current stream.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from typing import Any
+
+import torch
+import warp as wp
+
+wp.config.quiet = True
+# The adjoints are written by hand (`torch.autograd.Function`), so that nothing is compiled that is never called.
+wp.config.enable_backward = False
+
+_MINIMUM_CHUNK = 256
+
+
+def worker_count() -> int:
+    """Threads for CPU kernels: what torch uses, so that one setting rules both."""
+    return max(1, torch.get_num_threads())
+
+
+@cache
+def _pool(workers: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(workers, thread_name_prefix="kernel")
+
+
+@cache
+def init() -> None:
+    """Start Warp once (a fraction of a second)."""
+    wp.init()
+
+
+def array(tensor: torch.Tensor, dtype: Any = None) -> wp.array:
+    """View a contiguous torch tensor as a Warp array without copying; vector types take the last dimension."""
+    return wp.from_torch(tensor.detach(), dtype=dtype) if dtype is not None else wp.from_torch(tensor.detach())
+
+
+_loaded: dict[tuple[str, str], float] = {}
+_load_lock = threading.Lock()
+
+
+def load(kernel: wp.Kernel, device: torch.device) -> None:
+    """Compile the kernel's module (seconds, the first time ever) or take it from Warp's cache, once for all threads."""
+    key = (kernel.module.name, str(device))
+    if key in _loaded:
+        return
+    with _load_lock:
+        if key not in _loaded:
+            begin = time.perf_counter()
+            kernel.module.load("cpu" if device.type == "cpu" else wp.device_from_torch(device))
+            _loaded[key] = time.perf_counter() - begin
+
+
+def compile_seconds() -> float:
+    """Time spent so far on compiling and loading kernels in this process."""
+    return sum(_loaded.values())
+
+
+def launch(kernel: wp.Kernel, count: int, inputs: list[Any], device: torch.device, serial: bool = False) -> None:
+    """Run `kernel` for indices 0 … count−1 with `inputs` followed by the chunk's offset.
+
+    `serial` keeps a CPU launch in one thread, for kernels that write places which indices share.
+    """
+    if count <= 0:
+        return
+    load(kernel, device)
+    if device.type == "cuda":
+        stream = wp.stream_from_torch(torch.cuda.current_stream(device))
+        wp.launch(kernel, dim=count, inputs=[*inputs, 0], device=wp.device_from_torch(device), stream=stream)
+        return
+    workers = worker_count()
+    chunk = max(-(-count // workers), _MINIMUM_CHUNK)
+    spans = [(begin, min(chunk, count - begin)) for begin in range(0, count, chunk)]
+    if serial or len(spans) == 1:
+        wp.launch(kernel, dim=count, inputs=[*inputs, 0], device="cpu")
+        return
+    run_parallel(
+        [lambda s=span: wp.launch(kernel, dim=s[1], inputs=[*inputs, s[0]], device="cpu") for span in spans]
+    )
+
+
+def run_parallel(tasks: list[Any]) -> None:
+    """Run callables in the kernel pool and wait for all; the first exception is raised."""
+    for future in [_pool(worker_count()).submit(task) for task in tasks]:
+        future.result()
+
+
+def default_threads() -> int:
+    """Threads the engine may use: all cores but one, so that Blender stays responsive.
+
+    FIELDWORK_THREADS overrides it.
+    """
+    available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
+    return int(os.environ.get("FIELDWORK_THREADS", 0)) or max(1, available - 1)

@@ -1,0 +1,133 @@
+"""The occupancy grid: which cells are worth sampling, how dense they are, and how interesting their classes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import nn
+
+from ..config import SamplingConfig
+from ..kernels.march import PDF_DEFAULT, PDF_LITERAL, PDF_UNIFORM, MarchSettings
+
+MODES = {"default": PDF_DEFAULT, "uniform": PDF_UNIFORM, "literal": PDF_LITERAL}
+CHUNK = 1 << 16
+WARM_DECAY = 0.7
+
+
+class OccupancyGrid(nn.Module):
+    """Moving maximum of the field's density in each cell of a resolution³ grid over the field's domain.
+
+    `cells` (resolution³, 2) is what rays read: density per normalised unit length, 0 where the cell is closed, and
+    interest in [0, 1]. Cells that no camera sees are never open.
+
+    Args:
+        config: sampling settings.
+        contracted: the grid covers all of space instead of the cube [−1, 1]³.
+        seen: (resolution³,) bool, cells in some camera's view; None: all.
+    """
+
+    def __init__(self, config: SamplingConfig, contracted: bool, seen: torch.Tensor | None = None) -> None:
+        super().__init__()
+        self.config, self.contracted = config, contracted
+        n = config.resolution
+        self.step = (4.0 if contracted else 2.0) / (n * config.bins_per_cell)
+        seen = torch.ones(n**3, dtype=torch.bool) if seen is None else seen
+        # Every seen cell starts half-open: opacity 1 − e^−1 over a sixth of the domain.
+        self.register_buffer("density", torch.where(seen, 3.0, 0.0))
+        self.register_buffer("interest", torch.zeros(n**3))
+        self.register_buffer("seen", seen)
+        self.register_buffer("cells", torch.stack([self.density, self.interest], 1), persistent=False)
+        self.density: torch.Tensor
+        self.interest: torch.Tensor
+        self.seen: torch.Tensor
+        self.cells: torch.Tensor
+
+    def march_settings(self, near: float = 0.02) -> MarchSettings:
+        c = self.config
+        beta = c.beta if c.interest != "none" else 0.0
+        return MarchSettings(
+            c.resolution, self.step, near, 1000.0, self.contracted, MODES[c.pdf], beta, c.epsilon
+        )
+
+    def rebuild(self) -> None:
+        """Recompute what rays read from densities and interest (also after loading a checkpoint)."""
+        opacity = self.density * self.step
+        threshold = min(float(opacity[self.seen].mean()), self.config.threshold) if bool(self.seen.any()) else 1.0
+        opened = (opacity > threshold) & self.seen
+        self.cells[:, 0] = torch.where(opened, self.density, 0.0)
+        self.cells[:, 1] = self.interest
+
+    def open_share(self) -> float:
+        """Share of the cells that are open."""
+        return float((self.cells[:, 0] > 0).float().mean())
+
+    def positions(self, cells: torch.Tensor, generator: torch.Generator | None = None) -> torch.Tensor:
+        """A random point (N, 3) in [0, 1]³ inside each of the cells (N,)."""
+        n = self.config.resolution
+        corner = torch.stack([cells % n, cells // n % n, cells // (n * n)], 1)
+        return (corner + torch.rand(len(cells), 3, device=cells.device, generator=generator)) / n
+
+    def _chosen(self, generator: torch.Generator | None) -> torch.Tensor:
+        n3, device = self.config.resolution**3, self.density.device
+        anywhere = torch.randint(0, n3, (n3 // 32,), device=device, generator=generator)
+        opened = (self.cells[:, 0] > 0).nonzero()[:, 0]
+        if len(opened) > n3 // 32:
+            opened = opened[torch.randint(0, len(opened), (n3 // 32,), device=device, generator=generator)]
+        return torch.cat([anywhere, opened])
+
+    def _warm_up(self, density: Callable[[torch.Tensor], torch.Tensor], generator: torch.Generator | None) -> None:
+        """All cells at once, from one point in each block of 2³ cells, with quick forgetting of the initial guess."""
+        n, half = self.config.resolution, self.config.resolution // 2
+        axis = torch.arange(half, device=self.density.device)
+        z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
+        corner = torch.stack([x, y, z], -1).reshape(-1, 3)
+        points = (corner + torch.rand(corner.shape, device=corner.device, generator=generator)) / half
+        fresh = torch.cat([density(part) for part in points.split(CHUNK)])
+        blocks = fresh.view(half, 1, half, 1, half, 1).expand(half, 2, half, 2, half, 2).reshape(-1)
+        torch.maximum(self.density * WARM_DECAY, blocks, out=self.density)
+        self.density[~self.seen] = 0
+
+    @torch.no_grad()
+    def update(
+        self,
+        step: int,
+        density: Callable[[torch.Tensor], torch.Tensor],
+        interest: Callable[[torch.Tensor], torch.Tensor] | None = None,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        """Read the field in some cells and rebuild the grid.
+
+        Args:
+            density: points (N, 3) → (N,), per normalised unit length.
+            interest: points (N, 3) → (N,) in [0, 1], asked for open cells only.
+        """
+        if step < self.config.warmup:
+            self._warm_up(density, generator)
+            self.rebuild()
+            return
+        cells = self._chosen(generator)
+        cells = cells[self.seen[cells]]
+        points = self.positions(cells, generator)
+        fresh = torch.cat([density(part) for part in points.split(CHUNK)]) if len(points) else points[:, 0]
+        self.density[cells] = torch.maximum(self.density[cells] * self.config.decay, fresh)
+        if interest is not None:
+            dense = fresh * self.step > self.config.threshold
+            if bool(dense.any()):
+                value = torch.cat([interest(part) for part in points[dense].split(CHUNK)])
+                self.interest[cells[dense]] += 0.2 * (value - self.interest[cells[dense]])
+        self.rebuild()
+
+
+def class_interest(probabilities: torch.Tensor, kind: str, priorities: torch.Tensor) -> torch.Tensor:
+    """Interest r (N,) in [0, 1] of points from class probabilities (N, K).
+
+    "priority": Σ_k π_k p_k with priorities scaled to a maximum of 1; "boundary": H(p) / log K.
+    """
+    if kind == "boundary":
+        entropy = -(probabilities * probabilities.clamp(min=1e-8).log()).sum(1)
+        return entropy / math.log(max(probabilities.shape[1], 2))
+    if kind == "literal":
+        return probabilities.max(1).values
+    return probabilities @ (priorities / priorities.max().clamp(min=1e-8))

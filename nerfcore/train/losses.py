@@ -1,0 +1,81 @@
+"""The terms of the training loss (method: composite loss). All return scalars."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F
+
+from ..config import LossConfig
+from ..kernels.packing import Packing
+
+
+def color_loss(predicted: torch.Tensor, target: torch.Tensor, config: LossConfig) -> torch.Tensor:
+    """Huber (δ as configured, scaled to its quadratic part's slope 1/δ) or squared error of colours (R, 3)."""
+    if config.rgb == "mse":
+        return F.mse_loss(predicted, target)
+    return F.huber_loss(predicted, target, delta=config.huber_delta) / config.huber_delta
+
+
+def semantic_loss(probabilities: torch.Tensor, target: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
+    """Cross-entropy in image space: −log Ŝ_y summed over labelled rays / max(their number, 1).
+
+    Args:
+        probabilities: (R, K) rendered class probabilities; the rest to 1 is void.
+        target: (R,) class index, or (R, K) soft labels.
+        valid: (R,) bool, labelled rays; none gives 0, not NaN.
+    """
+    log = probabilities.clamp(min=1e-6).log()
+    if target.dim() == 1:
+        picked = log.gather(1, torch.where(valid, target, 0)[:, None])[:, 0]
+    else:
+        picked = (log * target).sum(1)
+    return -(picked * valid).sum() / valid.sum().clamp(min=1)
+
+
+def sparsity_loss(density: torch.Tensor, config: LossConfig) -> torch.Tensor:
+    """Mean price of density (N,) at random points: 1 − exp(−ℓσ), log(1 + σ²/½) (Cauchy) or σ."""
+    if config.sparsity == "exponential":
+        return (1 - torch.exp(-config.sparsity_scale * density)).mean()
+    if config.sparsity == "cauchy":
+        return torch.log1p(2 * density * density).mean()
+    return density.abs().mean()
+
+
+def entropy_loss(probabilities: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
+    """−H(Ŝ) of labelled rays: minimising it raises the entropy, so that labels do not become overconfident."""
+    entropy = -(probabilities * probabilities.clamp(min=1e-6).log()).sum(1)
+    return -(entropy * valid).sum() / valid.sum().clamp(min=1)
+
+
+def opacity_entropy(opacity: torch.Tensor) -> torch.Tensor:
+    """Mean binary entropy of ray opacities (R,): small when rays are either empty or opaque."""
+    o = opacity.clamp(1e-4, 1 - 1e-4)
+    return -(o * o.log() + (1 - o) * (1 - o).log()).mean()
+
+
+def distortion_loss(
+    weights: torch.Tensor, place: torch.Tensor, delta: torch.Tensor, packing: Packing
+) -> torch.Tensor:
+    """Σ_ij w_i w_j |s_i − s_j| + ⅓ Σ w_i² δ_i, mean over rays (Barron et al., "Mip-NeRF 360", 2022, eq. 15).
+
+    Args:
+        weights (N,), place (N,): normalised distance of each sample along its ray, delta (N,): its extent.
+    All rays that have samples have the same number of them.
+    """
+    hit = packing.count > 0
+    if not bool(hit.any()):
+        return weights.sum() * 0
+    count = int(packing.count.max())
+    w, s, d = (x.view(-1, count) for x in (weights, place, delta))
+    # Σ_i w_i (s_i W_<i − S_<i), twice, with running sums: linear in the samples.
+    before = torch.cumsum(w, 1) - w
+    moment = torch.cumsum(w * s, 1) - w * s
+    pairs = 2 * (w * (s * before - moment)).sum(1)
+    return (pairs + (w * w * d).sum(1) / 3).mean()
+
+
+def psnr(mse: float) -> float:
+    """Peak signal-to-noise ratio in dB of a mean squared error of values in [0, 1]."""
+    return -10 * math.log10(max(mse, 1e-12))

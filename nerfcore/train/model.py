@@ -1,0 +1,118 @@
+"""Everything that is learned about one scene, and how rays are rendered with it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import nn
+
+from ..config import RunConfig
+from ..field.encoding import spherical_harmonics
+from ..field.hybrid import HybridField
+from ..kernels.composite import render_weights, weighted_sum
+from ..kernels.march import Samples, sample
+from ..sampling.occupancy import OccupancyGrid, class_interest
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """Of R rays: color (R, 3) without background, opacity (R,), depth (R,) expected distance (normalised units, not
+    divided by opacity), probabilities (R, K) or None; and of the samples: weights (N,), density (N,)."""
+
+    color: torch.Tensor
+    opacity: torch.Tensor
+    depth: torch.Tensor
+    probabilities: torch.Tensor | None
+    weights: torch.Tensor
+    density: torch.Tensor
+    samples: Samples
+
+
+class Model(nn.Module):
+    """The hybrid field with its occupancy grid.
+
+    Args:
+        config: all settings of the run.
+        classes: number of classes; 0 without semantics.
+        images: number of training images.
+        contracted: the grid covers all of space.
+        seen: (resolution³,) bool or None, see OccupancyGrid.
+        priorities: (K,) class priorities for the sampling PDF.
+    """
+
+    def __init__(
+        self,
+        config: RunConfig,
+        classes: int,
+        images: int,
+        contracted: bool,
+        seen: torch.Tensor | None = None,
+        priorities: torch.Tensor | None = None,
+    ) -> None:
+        super().__init__()
+        self.config = config
+        self.field = HybridField(config.field, classes, images)
+        self.occupancy = OccupancyGrid(config.sampling, contracted, seen)
+        self.register_buffer("priorities", torch.ones(max(classes, 1)) if priorities is None else priorities)
+        self.priorities: torch.Tensor
+
+    @property
+    def contracted(self) -> bool:
+        return self.occupancy.contracted
+
+    def interest(self, points: torch.Tensor) -> torch.Tensor:
+        """Interest (N,) of points (N, 3) for the sampling PDF."""
+        kind = "literal" if self.config.sampling.pdf == "literal" else self.config.sampling.interest
+        logits = self.field.logits(self.field.geometry(points))
+        return class_interest(torch.softmax(logits, 1), kind, self.priorities)
+
+    def wants_interest(self) -> bool:
+        """Whether reading classes would change where samples go."""
+        s = self.config.sampling
+        if self.field.semantic_head is None or s.pdf == "uniform":
+            return False
+        if s.pdf == "literal":
+            return True
+        flat = bool((self.priorities == self.priorities[0]).all())
+        return s.beta > 0 and (s.interest == "boundary" or (s.interest == "priority" and not flat))
+
+    def render(
+        self,
+        origins: torch.Tensor,
+        directions: torch.Tensor,
+        samples_per_ray: int,
+        jitter: torch.Tensor | None = None,
+        shift: torch.Tensor | None = None,
+        codes: torch.Tensor | None = None,
+        semantics: bool = True,
+    ) -> Rendered:
+        """Render rays (R, 3) of the normalised frame; differentiable in the field.
+
+        `jitter`, `shift`: see kernels.march.sample; `codes` (R, A): appearance code of each ray.
+        """
+        settings = self.occupancy.march_settings()
+        s = sample(origins, directions, self.occupancy.cells, settings, samples_per_ray, jitter, shift)
+        geometry = self.field.geometry(s.points)
+        weights = render_weights(geometry.density, s.delta, s.packing)
+        visible = weights.detach() > self.config.render.cull
+        kept, packing = visible.nonzero()[:, 0], s.packing.subset(visible)
+        weight, shown = weights[kept], geometry[kept]
+        ray = packing.ray.long()
+        # Per ray first: a ray's samples share direction and code.
+        directional = spherical_harmonics(directions).to(self.field.dtype)
+        color = self.field.color(shown, directional[ray], None if codes is None else codes[ray])
+        values = torch.cat([color, torch.ones_like(weight)[:, None], s.depth[kept, None]], 1)
+        summed = weighted_sum(values, weight, packing)
+        probabilities = None
+        if semantics and self.field.semantic_head is not None:
+            probabilities = self._probabilities(self.field.logits(shown), weight, packing)
+        return Rendered(summed[:, :3], summed[:, 3], summed[:, 4], probabilities, weights, geometry.density, s)
+
+    def _probabilities(self, logits: torch.Tensor, weight: torch.Tensor, packing) -> torch.Tensor:
+        if self.config.loss.detach_weights:
+            weight = weight.detach()
+        if self.config.render.accumulate == "probabilities":
+            return weighted_sum(torch.softmax(logits, 1), weight, packing)
+        total = weighted_sum(torch.cat([logits, torch.ones_like(weight)[:, None]], 1), weight, packing)
+        return torch.softmax(total[:, :-1], 1) * total[:, -1:]

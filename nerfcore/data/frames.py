@@ -108,3 +108,19 @@ def ground_height(points: np.ndarray, tolerance: float = 0.02) -> float | None:
     if counts[best] < 0.08 * len(z):
         return None
     return float(np.median(z[best : best + counts[best]]))
+
+
+def axis_upright(camera_to_world: Sequence[np.ndarray]) -> np.ndarray:
+    """Rotation (4, 4) for a data set whose frame has a level axis: the axis nearest to up becomes +z.
+
+    Scale and origin stay those of the data set, as metric sets want it.
+    """
+    up, _ = up_direction(camera_to_world)
+    axis = int(np.argmax(np.abs(up)))
+    snapped = np.zeros(3)
+    snapped[axis] = np.sign(up[axis])
+    frame = np.eye(4)
+    if axis == 2 and snapped[2] > 0:
+        return frame
+    frame[:3, :3] = rotation_to_z(snapped, np.eye(3)[(axis + 1) % 3])
+    return frame

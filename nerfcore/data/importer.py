@@ -32,7 +32,10 @@ from .classes import make_classes
 from .dataset import Dataset, DatasetView
 
 # In the order in which "auto" asks them: the more specific layouts first.
-FORMATS = ("transforms", "llff")
+FORMATS = (
+    "transforms", "colmap", "llff", "dtu", "middlebury", "strecha", "scannet", "replica", "metashape", "realityscan",
+    "meshroom",
+)  # fmt: skip
 
 
 def import_dataset(params: ImportParams, report: Reporter) -> dict[str, Any]:

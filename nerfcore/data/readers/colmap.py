@@ -1,0 +1,222 @@
+"""COLMAP models, text or binary, with or without rigs: `sparse/0`, `sparse` or the folder itself, and `images/`.
+
+Poses are world-to-camera quaternions (w, x, y, z) and translations. In models with rigs every image still carries its
+own pose, so that rigs.bin and frames.bin need not be read. Format source: COLMAP's documentation.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...capture.images import image_size
+from ...errors import InputError
+from ..cameras import Camera
+from ..colmap_cameras import MODELS, camera_from_colmap
+from ..dataset import Dataset, DatasetView, beside, find_image, require, unique_names
+from ..frames import upright
+from ..scene import Points
+
+PLACES = ("sparse/0", "sparse", "colmap/sparse/0", "dense/sparse", ".")
+
+
+@dataclass(frozen=True)
+class ColmapImage:
+    name: str
+    camera: int
+    camera_to_world: np.ndarray
+
+
+def matches(folder: Path) -> bool:
+    return _model_folder(folder) is not None
+
+
+def _model_folder(folder: Path) -> Path | None:
+    if not folder.is_dir():
+        return None
+    for place in PLACES:
+        found = folder / place
+        for suffix in (".bin", ".txt"):
+            if (found / f"cameras{suffix}").is_file() and (found / f"images{suffix}").is_file():
+                return found
+    return None
+
+
+def read(folder: Path) -> Dataset:
+    """Read `folder`. Raises InputError naming the file that is missing or damaged."""
+    model = _model_folder(folder)
+    if model is None:
+        raise InputError(f"{folder} has no COLMAP model.", "It needs cameras and images (.bin or .txt) in sparse/0.")
+    cameras, images, points = read_model(model)
+    found: list[tuple[Path, ColmapImage]] = []
+    missing = []
+    places = [folder / "images", folder, model / "images", model.parent / "images", model.parent.parent / "images"]
+    for image in images:
+        path = next((p for place in places if (p := find_image(place / image.name))), None)
+        if path is None:
+            missing.append(image.name)
+        else:
+            found.append((path, image))
+    names = unique_names([path for path, _ in found], folder / "images")
+    views = []
+    for name, (path, image) in zip(names, found):
+        camera = cameras[image.camera]
+        size = image_size(path)
+        views.append(
+            DatasetView(
+                name=name,
+                image=path,
+                camera=camera if size == (camera.width, camera.height) else camera.resized(*size),
+                camera_to_world=image.camera_to_world,
+                label=beside(folder / "labels", path.stem),
+                mask=beside(folder / "masks", path.stem, exact=False),
+            )
+        )
+    require(views, folder, missing)
+    frame, confidence = upright([view.camera_to_world for view in views], points.xyz)
+    warnings = [f"{len(missing)} images of the model are missing (first: {missing[0]})."] if missing else []
+    return Dataset(
+        format="colmap",
+        views=views,
+        world_from_sfm=frame,
+        up_confidence=confidence,
+        points=points,
+        warnings=warnings,
+    )
+
+
+def read_model(model: Path) -> tuple[dict[int, Camera], list[ColmapImage], Points]:
+    """Cameras by id, images by name, and points of a model folder. Raises InputError naming a damaged file."""
+    binary = (model / "cameras.bin").is_file()
+    suffix = ".bin" if binary else ".txt"
+    parsers: list[Callable[[Path], Any]] = (
+        [_cameras_binary, _images_binary, _points_binary] if binary else [_cameras_text, _images_text, _points_text]
+    )
+    parts = []
+    for name, parse in zip(("cameras", "images", "points3D"), parsers):
+        path = model / f"{name}{suffix}"
+        if name == "points3D" and not path.is_file():
+            parts.append(Points.empty())
+            continue
+        try:
+            parts.append(parse(path))
+        except (OSError, ValueError, IndexError, KeyError, struct.error) as error:
+            raise InputError(f"{path} is damaged: {error}.", "Export the model from COLMAP again.") from error
+    cameras, images, points = parts
+    return cameras, sorted(images, key=lambda image: image.name), points
+
+
+def pose_from_quaternion(w: float, x: float, y: float, z: float, translation: np.ndarray) -> np.ndarray:
+    """Camera-to-world (4, 4) from COLMAP's world-to-camera quaternion and translation."""
+    norm = (w * w + x * x + y * y + z * z) ** 0.5
+    w, x, y, z = w / norm, x / norm, y / norm, z / norm
+    rotation = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    pose = np.eye(4)
+    pose[:3, :3] = rotation.T
+    pose[:3, 3] = -rotation.T @ translation
+    return pose
+
+
+def _rows(path: Path) -> Iterator[list[str]]:
+    for line in path.read_text(encoding="utf-8").splitlines():
+        if not line.startswith("#"):
+            yield line.split()
+
+
+def _cameras_text(path: Path) -> dict[int, Camera]:
+    return {
+        int(row[0]): camera_from_colmap(row[1], int(row[2]), int(row[3]), [float(p) for p in row[4:]])
+        for row in _rows(path)
+        if row
+    }
+
+
+def _images_text(path: Path) -> list[ColmapImage]:
+    images = []
+    rows = list(_rows(path))
+    # Every second line lists the image's points, and may be empty.
+    for row in rows[::2]:
+        if not row:
+            continue
+        numbers = [float(value) for value in row[1:8]]
+        pose = pose_from_quaternion(*numbers[:4], np.array(numbers[4:]))
+        images.append(ColmapImage(" ".join(row[9:]), int(row[8]), pose))
+    return images
+
+
+def _points_text(path: Path) -> Points:
+    rows = [[float(value) for value in row[1:8]] for row in _rows(path) if row]
+    if not rows:
+        return Points.empty()
+    values = np.array(rows)
+    return Points(values[:, :3], values[:, 3:6].astype(np.uint8), values[:, 6])
+
+
+class _Reader:
+    """Little-endian values from a file read whole."""
+
+    def __init__(self, path: Path) -> None:
+        self.data, self.at = path.read_bytes(), 0
+
+    def take(self, format: str) -> tuple[Any, ...]:
+        values = struct.unpack_from("<" + format, self.data, self.at)
+        self.at += struct.calcsize("<" + format)
+        return values
+
+    def text(self) -> str:
+        end = self.data.index(b"\0", self.at)
+        value = self.data[self.at : end].decode("utf-8")
+        self.at = end + 1
+        return value
+
+    def skip(self, size: int) -> None:
+        if self.at + size > len(self.data):
+            raise ValueError("it ends early")
+        self.at += size
+
+
+def _cameras_binary(path: Path) -> dict[int, Camera]:
+    reader = _Reader(path)
+    cameras = {}
+    for _ in range(reader.take("Q")[0]):
+        number, model, width, height = reader.take("iiQQ")
+        if model not in MODELS:
+            raise InputError(f"{path} has the unknown camera model {model}.", "Undistort the images with COLMAP first.")
+        name, count = MODELS[model]
+        cameras[number] = camera_from_colmap(name, width, height, reader.take(f"{count}d"))
+    return cameras
+
+
+def _images_binary(path: Path) -> list[ColmapImage]:
+    reader = _Reader(path)
+    images = []
+    for _ in range(reader.take("Q")[0]):
+        reader.take("i")
+        values = reader.take("7d")
+        camera = reader.take("i")[0]
+        name = reader.text()
+        reader.skip(24 * reader.take("Q")[0])
+        images.append(ColmapImage(name, camera, pose_from_quaternion(*values[:4], np.array(values[4:]))))
+    return images
+
+
+def _points_binary(path: Path) -> Points:
+    reader = _Reader(path)
+    count = reader.take("Q")[0]
+    xyz, rgb, error = np.zeros((count, 3)), np.zeros((count, 3), np.uint8), np.zeros(count)
+    for i in range(count):
+        _, *values = reader.take("Q3d3Bd")
+        xyz[i], rgb[i], error[i] = values[:3], values[3:6], values[6]
+        reader.skip(8 * reader.take("Q")[0])
+    return Points(xyz, rgb, error)

@@ -1,0 +1,119 @@
+"""Meshroom (AliceVision): `cameras.sfm`, `sfm.json` or any `*.sfm` in JSON.
+
+Rotations are stored column by column as world-to-camera matrices, OpenCV axes; centres in the world. The focal length
+is in millimetres of a sensor whose width goes with the image's longer side; the principal point is an offset from the
+middle in pixels (in old files: absolute).
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...capture.images import image_size
+from ...errors import InputError
+from ..cameras import Camera
+from ..dataset import Dataset, DatasetView, beside, find_image, require, unique_names
+from ..frames import upright
+
+RADIAL = {"radial1": 1, "radial3": 3, "radialk1": 1, "radialk3": 3}
+
+
+def matches(folder: Path) -> bool:
+    return _file(folder) is not None
+
+
+def _file(folder: Path) -> Path | None:
+    candidates = [folder] if folder.is_file() else [*sorted(folder.glob("*.sfm")), folder / "sfm.json"]
+    for path in candidates:
+        if path.suffix in (".sfm", ".json") and path.is_file():
+            head = path.read_bytes()[:20000]
+            if b'"views"' in head and b'"viewId"' in head:
+                return path
+    return None
+
+
+def read(folder: Path) -> Dataset:
+    """Read `folder` or the file. Raises InputError naming the file that is missing or damaged."""
+    path = _file(folder)
+    if path is None:
+        raise InputError(f"{folder} has no Meshroom cameras.", "Use the node ConvertSfMFormat to write a .sfm file.")
+    folder = path.parent
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+        intrinsics = {entry["intrinsicId"]: entry for entry in value["intrinsics"]}
+        poses = {entry["poseId"]: entry["pose"]["transform"] for entry in value.get("poses", [])}
+        entries = [
+            (Path(view["path"]), intrinsics[view["intrinsicId"]], poses[view["poseId"]])
+            for view in value["views"]
+            if view.get("poseId") in poses
+        ]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path} is damaged: {error!r}.", "Export the cameras from Meshroom again.") from error
+    found, missing = [], []
+    for source, intrinsic, pose in entries:
+        places = (source, folder / source.name, folder / "images" / source.name)
+        image = next((p for place in places if (p := find_image(place))), None)
+        if image is None:
+            missing.append(str(source))
+        else:
+            found.append((image, intrinsic, pose))
+    found.sort(key=lambda entry: entry[0])
+    names = unique_names([image for image, *_ in found], folder)
+    views = []
+    for name, (image, intrinsic, transform) in zip(names, found):
+        pose = np.eye(4)
+        try:
+            pose[:3, :3] = np.array([float(v) for v in transform["rotation"]]).reshape(3, 3)
+            pose[:3, 3] = [float(v) for v in transform["center"]]
+            camera = _camera(intrinsic, image_size(image), path)
+        except (KeyError, ValueError, TypeError) as error:
+            raise InputError(f"{path} is damaged at {image.name}: {error!r}.", "Export the cameras again.") from error
+        views.append(
+            DatasetView(
+                name=name,
+                image=image,
+                camera=camera,
+                camera_to_world=pose,
+                label=beside(folder / "labels", image.stem),
+                mask=beside(folder / "masks", image.stem, exact=False),
+            )
+        )
+    require(views, path, missing)
+    frame, confidence = upright([view.camera_to_world for view in views])
+    warnings = [f"{len(missing)} photos of the export are missing (first: {missing[0]})."] if missing else []
+    return Dataset("meshroom", views, frame, confidence, warnings=warnings)
+
+
+def _camera(value: dict[str, Any], size: tuple[int, int], path: Path) -> Camera:
+    width, height = int(value["width"]), int(value["height"])
+    if "pxFocalLength" in value:
+        focal = value["pxFocalLength"]
+        fx, fy = (float(f) for f in focal) if isinstance(focal, list) else (float(focal), float(focal))
+    else:
+        fx = fy = float(value["focalLength"]) / float(value["sensorWidth"]) * max(width, height)
+        fy *= float(value.get("pixelRatio", 1.0))
+    cx, cy = (float(v) for v in value.get("principalPoint", (0, 0)))
+    if abs(cx) < 0.25 * width and abs(cy) < 0.25 * height:
+        cx, cy = cx + width / 2, cy + height / 2
+    kind = str(value.get("distortionType") or value.get("type", "pinhole")).lower()
+    raw = value.get("distortionParams") or []
+    params = [float(v) for v in raw] if isinstance(raw, list) else []
+    placed = {"width": width, "height": height, "fx": fx, "fy": fy, "cx": cx, "cy": cy}
+    if not any(params) and kind not in ("fisheye4", "equidistant"):
+        camera = Camera(**placed)
+    elif kind in RADIAL:
+        k1, k2, k3 = (params + [0.0] * 3)[:3]
+        camera = Camera(model="OPENCV", distortion=(k1, k2, 0.0, 0.0) + ((k3,) if k3 else ()), **placed)
+    elif kind == "brown":
+        k1, k2, k3, t1, t2 = (params + [0.0] * 5)[:5]
+        camera = Camera(model="OPENCV", distortion=(k1, k2, t1, t2) + ((k3,) if k3 else ()), **placed)
+    elif kind == "fisheye4":
+        k1, k2, k3, k4 = (params + [0.0] * 4)[:4]
+        camera = Camera(model="OPENCV_FISHEYE", distortion=(k1, k2, k3, k4), **placed)
+    else:
+        raise InputError(f"{path} uses the lens model {kind}.", "Undistort the photos in Meshroom and export again.")
+    return camera if size == (width, height) else camera.resized(*size)

@@ -1,0 +1,162 @@
+"""Agisoft Metashape's camera export (XML): one file, with the photos beside it or in `images/`.
+
+Poses are camera-to-world with OpenCV axes in the chunk's own frame; the chunk's transform, where there is one, leads
+to metres, and for geographic projects to geocentric coordinates, which are turned into a local frame with z up.
+Lens source: appendix "Camera models" of the Metashape manual.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...capture.images import image_size
+from ...errors import InputError
+from ..cameras import Camera
+from ..dataset import Dataset, DatasetView, beside, find_image, require
+from ..frames import rotation_to_z, upright
+from ..similarity import make_similarity
+
+EARTH = 5_000_000.0  # metres from the centre of the earth beyond which coordinates are geocentric
+
+
+def matches(folder: Path) -> bool:
+    return _file(folder) is not None
+
+
+def _file(folder: Path) -> Path | None:
+    candidates = [folder] if folder.is_file() else sorted(folder.glob("*.xml"))
+    for path in candidates:
+        if path.suffix.lower() != ".xml":
+            continue
+        with open(path, "rb") as file:
+            head = file.read(2000)
+        if b"<document" in head and b"<chunk" in head:
+            return path
+    return None
+
+
+def read(folder: Path) -> Dataset:
+    """Read `folder` or the XML file. Raises InputError naming the file that is missing or damaged."""
+    path = _file(folder)
+    if path is None:
+        raise InputError(f"{folder} has no Metashape camera export.", "Export cameras as Agisoft XML.")
+    folder = path.parent
+    try:
+        chunk = ElementTree.parse(path).getroot().find("chunk")
+        if chunk is None:
+            raise ValueError("it has no chunk")
+        sensors = {sensor.get("id"): sensor for sensor in chunk.iter("sensor")}
+        components = {c.get("id"): _similarity(c.find("transform")) for c in chunk.iter("component")}
+        entries = []
+        for camera in chunk.iter("camera"):
+            transform = camera.find("transform")
+            if transform is None or not transform.text or camera.get("enabled") in ("0", "false"):
+                continue
+            pose = np.array(transform.text.split(), np.float64).reshape(4, 4)
+            component = components.get(camera.get("component_id"))
+            if component is not None and chunk.find("transform") is None:
+                chunk_transform = component
+            else:
+                chunk_transform = _similarity(chunk.find("transform"))
+            entries.append((camera.get("label", ""), sensors[camera.get("sensor_id")], pose, chunk_transform))
+    except (OSError, ElementTree.ParseError, ValueError, KeyError) as error:
+        raise InputError(f"{path} is damaged: {error}.", "Export the cameras from Metashape again.") from error
+    views, missing = [], []
+    for label, sensor, pose, _ in entries:
+        image = next((p for d in (folder, folder / "images") if (p := find_image(d / label))), None)
+        if image is None:
+            missing.append(label)
+            continue
+        views.append(
+            DatasetView(
+                name=image.stem,
+                image=image,
+                camera=_camera(sensor, image_size(image), path),
+                camera_to_world=pose,
+                label=beside(folder / "labels", image.stem),
+                mask=beside(folder / "masks", image.stem, exact=False),
+            )
+        )
+    require(views, path, missing)
+    warnings = [f"{len(missing)} photos of the export are missing (first: {missing[0]})."] if missing else []
+    georeferenced = entries[0][3]
+    if georeferenced is None:
+        frame, confidence = upright([view.camera_to_world for view in views])
+        return Dataset("metashape", views, frame, confidence, warnings=warnings)
+    return Dataset("metashape", views, _local(georeferenced, views), scale_known=True, warnings=warnings)
+
+
+def _similarity(element: ElementTree.Element | None) -> np.ndarray | None:
+    """The chunk's or component's transform (4, 4), or None when it has none."""
+    if element is None:
+        return None
+    rotation, translation, scale = (element.find(name) for name in ("rotation", "translation", "scale"))
+    if rotation is None or not rotation.text or translation is None or not translation.text:
+        return None
+    factor = float(scale.text) if scale is not None and scale.text else 1.0
+    matrix = np.array(rotation.text.split(), np.float64).reshape(3, 3)
+    return make_similarity(factor, matrix, np.array(translation.text.split(), np.float64))
+
+
+def _local(chunk: np.ndarray, views: list[DatasetView]) -> np.ndarray:
+    """The chunk's transform; geocentric ones go on to a frame at the cameras with z up."""
+    center = (chunk @ np.mean([view.camera_to_world[:, 3] for view in views], axis=0))[:3]
+    if np.linalg.norm(center) < EARTH:
+        return chunk
+    to_local = np.eye(4)
+    north = np.array([0.0, 0.0, 1.0])
+    to_local[:3, :3] = rotation_to_z(center, north)
+    to_local[:3, 3] = -to_local[:3, :3] @ center
+    return to_local @ chunk
+
+
+def _camera(sensor: ElementTree.Element, size: tuple[int, int], path: Path) -> Camera:
+    calibration = next(
+        (c for c in sensor.findall("calibration") if c.get("class") != "initial"), sensor.find("calibration")
+    )
+    resolution = sensor.find("resolution")
+    if resolution is None:
+        raise InputError(f"{path}: a sensor has no resolution.", "Export the cameras from Metashape again.")
+    width, height = int(resolution.get("width", 0)), int(resolution.get("height", 0))
+    kind = sensor.get("type", "frame")
+    if kind == "spherical":
+        return Camera(
+            model="EQUIRECTANGULAR", width=size[0], height=size[1], fx=1, fy=1, cx=size[0] / 2, cy=size[1] / 2
+        )
+    if calibration is None:
+        raise InputError(f"{path}: a sensor has no calibration.", "Align the photos in Metashape and export again.")
+    values = {child.tag: float(child.text) for child in calibration if child.text and child.tag != "resolution"}
+    if "f" not in values:
+        raise InputError(f"{path}: a calibration has no focal length.", "Export the cameras from Metashape again.")
+    f, k1, k2, k3, k4 = (values.get(name, 0.0) for name in ("f", "k1", "k2", "k3", "k4"))
+    p1, p2, b1, b2 = (values.get(name, 0.0) for name in ("p1", "p2", "b1", "b2"))
+    if abs(b2) * max(width, height) / f > 1.0:
+        raise InputError(f"{path} has a skewed lens (b2 = {b2:g}).", "Align in Metashape without fitting b2.")
+    placed: dict[str, Any] = {
+        "fx": f + b1,
+        "fy": f,
+        "cx": width / 2 + values.get("cx", 0.0),
+        "cy": height / 2 + values.get("cy", 0.0),
+    }
+    if kind == "fisheye":
+        camera = Camera(model="OPENCV_FISHEYE", width=width, height=height, distortion=(k1, k2, k3, k4), **placed)
+    elif kind == "frame":
+        if k4 or any(values.get(name) for name in ("p3", "p4")):
+            raise InputError(f"{path} fits k4, p3 or p4.", "Align in Metashape without them, or undistort the photos.")
+        # Metashape's p1 and p2 are OpenCV's p2 and p1.
+        distortion = (k1, k2, p2, p1) + ((k3,) if k3 else ())
+        distorted = any(distortion)
+        camera = Camera(
+            model="OPENCV" if distorted else "PINHOLE",
+            width=width,
+            height=height,
+            distortion=distortion if distorted else (),
+            **placed,
+        )
+    else:
+        raise InputError(f"{path} has the lens type {kind}.", "Undistort the photos in Metashape and export again.")
+    return camera if size == (width, height) else camera.resized(*size)

@@ -1,0 +1,106 @@
+"""RealityScan (RealityCapture): XMP files beside the photos, written by "Export metadata (XMP)".
+
+xcr:Rotation is world-to-camera, row by row, with OpenCV axes; xcr:Position the camera's centre. Lengths on the image
+are in units of its longer side: focal length as 35 mm equivalent, principal point from the middle. Brown lenses act
+on normalised coordinates. Source: RealityCapture's "XMP camera math". Its worlds have z up.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...capture.images import image_size
+from ...errors import InputError
+from ..cameras import Camera
+from ..dataset import Dataset, DatasetView, beside, find_image, require
+from ..frames import upright
+
+METRIC = ("absolute",)
+
+
+def matches(folder: Path) -> bool:
+    return folder.is_dir() and bool(_files(folder))
+
+
+def _files(folder: Path) -> list[Path]:
+    found = []
+    for place in (folder, folder / "images"):
+        for path in sorted(place.glob("*.xmp")):
+            if "xcr:Rotation" in path.read_text(encoding="utf-8", errors="replace"):
+                found.append(path)
+    return found
+
+
+def read(folder: Path) -> Dataset:
+    """Read `folder`. Raises InputError naming the file that is missing or damaged."""
+    views, missing, coordinates = [], [], set()
+    for file in _files(folder):
+        image = next((p for d in (file.parent, folder / "images") if (p := find_image(d / file.stem))), None)
+        if image is None:
+            missing.append(file.stem)
+            continue
+        text = file.read_text(encoding="utf-8", errors="replace")
+        coordinates.add(_text(text, "Coordinates"))
+        rotation, position = _numbers(file, text, "Rotation", 9), _numbers(file, text, "Position", 3)
+        pose = np.eye(4)
+        pose[:3, :3] = np.array(rotation).reshape(3, 3).T
+        pose[:3, 3] = position
+        views.append(
+            DatasetView(
+                name=image.stem,
+                image=image,
+                camera=_camera(file, text, image_size(image)),
+                camera_to_world=pose,
+                label=beside(folder / "labels", image.stem),
+                mask=beside(folder / "masks", image.stem, exact=False),
+            )
+        )
+    require(views, folder, missing)
+    metric = coordinates <= set(METRIC)
+    frame, confidence = (np.eye(4), None) if metric else upright([view.camera_to_world for view in views])
+    if metric:
+        # Geographic coordinates are far from the origin: bring the cameras near it, keeping metres.
+        frame[:3, 3] = -np.mean([view.camera_to_world[:3, 3] for view in views], axis=0)
+    return Dataset("realityscan", views, frame, confidence, scale_known=metric)
+
+
+def _text(text: str, name: str) -> str | None:
+    """The value of xcr:<name>, an element or an attribute."""
+    found = re.search(rf"<xcr:{name}>([^<]*)</xcr:{name}>", text) or re.search(rf'xcr:{name}="([^"]*)"', text)
+    return found.group(1).strip() if found else None
+
+
+def _numbers(file: Path, text: str, name: str, count: int) -> list[float]:
+    value = _text(text, name)
+    try:
+        numbers = [float(part) for part in (value or "").split()]
+    except ValueError as error:
+        raise InputError(f"{file} is damaged at xcr:{name}: {error}.", "Export the metadata again.") from error
+    if len(numbers) != count:
+        raise InputError(f"{file} has no xcr:{name} of {count} numbers.", "Export the metadata again.")
+    return numbers
+
+
+def _camera(file: Path, text: str, size: tuple[int, int]) -> Camera:
+    width, height = size
+    side = max(size)
+    (focal,) = _numbers(file, text, "FocalLength35mm", 1)
+    u, v = (float(_text(text, f"PrincipalPoint{axis}") or 0.0) for axis in "UV")
+    aspect = float(_text(text, "AspectRatio") or 1.0)
+    model = (_text(text, "DistortionModel") or "perspective").lower()
+    f = focal / 36.0 * side
+    placed: dict[str, Any] = {"fx": f, "fy": f * aspect, "cx": width / 2 + u * side, "cy": height / 2 + v * side}
+    value = _text(text, "DistortionCoeficients") or _text(text, "DistortionCoefficients") or ""
+    k1, k2, k3, k4, t1, t2 = ([float(part) for part in value.split()] + [0.0] * 6)[:6]
+    if not any((k1, k2, k3, k4, t1, t2)) or model == "perspective":
+        return Camera(width=width, height=height, **placed)
+    if not model.startswith("brown"):
+        raise InputError(f"{file} uses the distortion model {model}.", "Choose a Brown model, or export undistorted.")
+    if k4:
+        raise InputError(f"{file} uses a fourth radial term.", "Choose the model Brown3, or export undistorted.")
+    distortion = (k1, k2, t1, t2) + ((k3,) if k3 else ())
+    return Camera(model="OPENCV", width=width, height=height, distortion=distortion, **placed)

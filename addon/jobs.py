@@ -17,6 +17,7 @@ import bpy
 
 from ..nerfcore.engine import status as st
 from . import preferences, state
+from .engine_install import Installer
 from .link import EngineError, Link, tail
 
 log = logging.getLogger("fieldwork.addon")
@@ -129,6 +130,7 @@ class Queue:
         self.finished: list[Job] = []
         self.facts: dict[str, Any] = {}  # what the engine last said of itself
         self.doctor: dict[str, Any] = {}  # what the doctor last found
+        self.installer: Installer | None = None
         self.slowest_tick = 0.0
         self._number = 0
         self._looked = 0.0
@@ -238,7 +240,8 @@ class Queue:
         except Exception:
             # A timer that raises is dropped by Blender, and all jobs with it.
             log.exception("Fieldwork's timer failed")
-        busy = self.current is not None or (self.link is not None and self.link.busy)
+        installing = self.installer is not None and self.installer.is_alive()
+        busy = self.current is not None or installing or (self.link is not None and self.link.busy)
         if busy:
             self.redraw()
         self.slowest_tick = max(self.slowest_tick, time.perf_counter() - begin)

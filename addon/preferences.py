@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from bpy.props import EnumProperty, IntProperty, StringProperty
 from bpy.types import AddonPreferences, Context, UILayout
 
 from . import engine_install
-from .link import ROOT
+from .link import ROOT, tail
 from .registration import ROOT_PACKAGE
 
 AS_EXTENSION = ROOT_PACKAGE.startswith("bl_ext.")
@@ -50,6 +51,11 @@ class FIELDWORK_AP_preferences(AddonPreferences):
         description="Python 3.11 or newer that the engine's environment is made from; empty: Blender's own",
         subtype="FILE_PATH",
     )
+    wheels: StringProperty(
+        name="Package Folder",
+        description="Folder of package files (wheels) for a machine without network; empty: download",
+        subtype="DIR_PATH",
+    )
     on_close: EnumProperty(
         name="When Blender Closes",
         description="What becomes of a running job",
@@ -71,10 +77,55 @@ class FIELDWORK_AP_preferences(AddonPreferences):
 
 
 def draw_preferences(preferences: FIELDWORK_AP_preferences, layout: UILayout) -> None:
+    from . import jobs
+
     layout.use_property_split = True
+    layout.use_property_decorate = False
+    box = layout.box()
+    draw_engine(box, jobs.queue.installer)
+    column = box.column()
+    column.prop(preferences, "device")
+    column.prop(preferences, "base_python")
+    column.prop(preferences, "wheels")
     layout.prop(preferences, "engine_python")
     layout.prop(preferences, "on_close")
     layout.prop(preferences, "idle_minutes")
+
+
+def draw_engine(layout: UILayout, installer: engine_install.Installer | None) -> None:
+    """State of the installed engine, and the one button that changes it."""
+    folder = engine_folder()
+    known = engine_install.installed(folder)
+    if installer is not None and installer.is_alive():
+        row = layout.row(align=True)
+        row.progress(factor=installer.fraction, text=installer.message, type="BAR")
+        row.operator("fieldwork.engine_install_cancel", text="", icon="X")
+        column = layout.column(align=True)
+        column.active, column.scale_y = False, 0.7
+        for line in tail(folder / engine_install.LOG, 5):
+            column.label(text=line[:120])
+        return
+    if known:
+        doctor = known.get("doctor", {})
+        text = f"Engine installed: PyTorch {doctor.get('torch')} on {doctor.get('device')}"
+        layout.label(text=text, icon="CHECKMARK")
+        if not engine_install.up_to_date(folder):
+            layout.label(text="This version of Fieldwork needs other packages: press Update", icon="INFO")
+    elif engine_python() is not None:
+        layout.label(text=f"Using the environment of {engine_python()}", icon="CHECKMARK")
+    else:
+        layout.label(text="The engine is not installed", icon="INFO")
+        layout.label(text="About 1 GB is loaded for the CPU, 4 GB for an NVIDIA card", icon="BLANK1")
+    if not bpy.app.online_access:
+        layout.label(text="Online access is off: allow it under System > Network", icon="INTERNET_OFFLINE")
+    if installer is not None and installer.error:
+        for line in textwrap.wrap(installer.error, 100):
+            layout.label(text=line, icon="ERROR")
+    row = layout.row(align=True)
+    action = "Install Engine" if not known else "Repair" if engine_install.up_to_date(folder) else "Update"
+    row.operator("fieldwork.engine_install", text=action, icon="IMPORT")
+    row.operator("fieldwork.engine_remove", text="Remove", icon="TRASH")
+    row.operator("fieldwork.engine_install_log", text="Log", icon="TEXT")
 
 
 class _Defaults:
@@ -83,6 +134,7 @@ class _Defaults:
     engine_python = ""
     device = "auto"
     base_python = ""
+    wheels = ""
     on_close = "stop"
     idle_minutes = 5
 

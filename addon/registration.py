@@ -19,6 +19,7 @@ MODULES = (
     "addon.pictures",
     "addon.jobs",
     "addon.commands",
+    "operators.engine",
     "operators.job",
     "operators.capture",
     "operators.poses",

@@ -1,0 +1,134 @@
+"""Installing, repairing and removing the engine."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import bpy
+from bpy.types import Context, Event, Operator
+
+from ..addon import engine_install, jobs, preferences
+
+
+def options() -> engine_install.Options:
+    chosen = preferences.preferences()
+    base, wheels = bpy.path.abspath(chosen.base_python), bpy.path.abspath(chosen.wheels)
+    return engine_install.Options(
+        folder=preferences.engine_folder(),
+        base=Path(base) if base else engine_install.default_base(),
+        device=chosen.device,
+        wheels=wheels,
+        online=bpy.app.online_access,
+    )
+
+
+def installing() -> bool:
+    return jobs.queue.installer is not None and jobs.queue.installer.is_alive()
+
+
+class FIELDWORK_OT_engine_install(Operator):
+    """Download the engine's packages into an environment of their own; Blender's Python stays as it is"""
+
+    bl_idname = "fieldwork.engine_install"
+    bl_label = "Install Engine"
+
+    @classmethod
+    def poll(cls, context: Context) -> bool:
+        if installing():
+            cls.poll_message_set("The installation is under way")
+        elif not bpy.app.online_access and not preferences.preferences().wheels:
+            cls.poll_message_set("Allow Online Access in the System preferences, or choose a folder of packages")
+        else:
+            return True
+        return False
+
+    def execute(self, context: Context) -> set[str]:
+        jobs.queue.stop_engine()
+        if not bpy.app.background:
+            jobs.queue.installer = engine_install.Installer(options())
+            jobs.queue.installer.start()
+            return {"FINISHED"}
+        try:
+            engine_install.install(
+                options(), lambda fraction, text: print(f"{fraction:4.0%} {text}"), threading.Event()
+            )
+        except engine_install.InstallError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        return {"FINISHED"}
+
+
+class FIELDWORK_OT_engine_install_cancel(Operator):
+    """Stop the installation; it can go on later"""
+
+    bl_idname = "fieldwork.engine_install_cancel"
+    bl_label = "Stop"
+
+    @classmethod
+    def poll(cls, context: Context) -> bool:
+        if not installing():
+            cls.poll_message_set("Nothing is being installed")
+            return False
+        return True
+
+    def execute(self, context: Context) -> set[str]:
+        jobs.queue.installer.cancelled.set()
+        return {"FINISHED"}
+
+
+class FIELDWORK_OT_engine_remove(Operator):
+    """Remove the engine and its downloads from the disk; projects stay"""
+
+    bl_idname = "fieldwork.engine_remove"
+    bl_label = "Remove Engine"
+
+    @classmethod
+    def poll(cls, context: Context) -> bool:
+        folder = preferences.engine_folder()
+        if installing():
+            cls.poll_message_set("The installation is under way")
+        elif not (folder / "venv").exists() and not (folder / "cache").exists():
+            cls.poll_message_set("There is no engine to remove")
+        else:
+            return True
+        return False
+
+    def invoke(self, context: Context, event: Event) -> set[str]:
+        return context.window_manager.invoke_confirm(self, event)
+
+    def execute(self, context: Context) -> set[str]:
+        jobs.queue.stop_engine(timeout=5.0)
+        engine_install.remove(preferences.engine_folder())
+        jobs.queue.installer = None
+        return {"FINISHED"}
+
+
+class FIELDWORK_OT_engine_install_log(Operator):
+    """Show the log of the installation in the text editor"""
+
+    bl_idname = "fieldwork.engine_install_log"
+    bl_label = "Open Log"
+
+    @classmethod
+    def poll(cls, context: Context) -> bool:
+        if not (preferences.engine_folder() / engine_install.LOG).is_file():
+            cls.poll_message_set("Nothing has been installed yet")
+            return False
+        return True
+
+    def execute(self, context: Context) -> set[str]:
+        name = "Fieldwork Installation Log"
+        text = bpy.data.texts.get(name) or bpy.data.texts.new(name)
+        path = preferences.engine_folder() / engine_install.LOG
+        text.from_string(path.read_text(encoding="utf-8", errors="replace"))
+        self.report({"INFO"}, f"See “{name}” in the text editor")
+        return {"FINISHED"}
+
+
+CLASSES = [
+    FIELDWORK_OT_engine_install,
+    FIELDWORK_OT_engine_install_cancel,
+    FIELDWORK_OT_engine_remove,
+    FIELDWORK_OT_engine_install_log,
+]

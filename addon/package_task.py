@@ -30,7 +30,7 @@ def write_blend(request: dict[str, Any], emit: Callable[..., None]) -> dict[str,
     )
     prepare_scene(scene, len(package.cameras))
     _show_colors(imported)
-    warnings = imported.warnings if package.mesh is not None else []
+    warnings = imported.warnings
     size = sum((package.folder / camera["image"]).stat().st_size for camera in package.cameras)
     if size <= PACKED_LIMIT:
         for image in bpy.data.images:

@@ -25,7 +25,7 @@ Cameras = Literal["many", "animated", "both"]
 
 @dataclass
 class Imported:
-    """What is in the scene now. `warnings` are sentences for the user."""
+    """What is in the scene now. `warnings` are sentences for the user; `mesh` is None when the package has none."""
 
     root: bpy.types.Object
     cameras: list[bpy.types.Object] = field(default_factory=list)
@@ -66,8 +66,6 @@ def import_package(
     progress(0.8, "mesh")
     if package.mesh is not None:
         result.mesh = _mesh(place, package, root)
-    else:
-        result.warnings.append("The package has no mesh.")
     place.remove_unused()
     if package.cameras:
         _frame_scene(scene, package, result)

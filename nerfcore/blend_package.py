@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -172,7 +173,7 @@ def _copy_mesh(source: Path, target: Path) -> bool:
     try:
         with np.load(source, allow_pickle=False) as data:
             missing = [name for name in MESH_ARRAYS if name not in data]
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, zipfile.BadZipFile) as error:
         raise ProjectError(f"{source} is damaged: {error}.", "Run `fieldwork mesh` again.") from error
     if missing:
         raise ProjectError(f"{source} lacks {', '.join(missing)}.", "Run `fieldwork mesh` again.")

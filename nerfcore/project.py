@@ -16,6 +16,7 @@ import json
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal, TypeVar
+from zipfile import BadZipFile
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -188,7 +189,7 @@ def load_points(folder: Path) -> Points:
     try:
         with np.load(path, allow_pickle=False) as data:
             return Points(data["xyz"], data["rgb"], data["error"])
-    except (ValueError, OSError, KeyError) as error:
+    except (ValueError, OSError, KeyError, BadZipFile) as error:
         raise ProjectError(f"{path} is damaged: {error}.", "Run `fieldwork poses` again.") from error
 
 
@@ -202,7 +203,7 @@ def load_visibility(folder: Path) -> dict[str, np.ndarray]:
             if "view" not in data:
                 return {}
             view, point = data["view"], data["point"]
-    except (ValueError, OSError, KeyError) as error:
+    except (ValueError, OSError, KeyError, BadZipFile) as error:
         raise ProjectError(f"{path} is damaged: {error}.", "Run `fieldwork poses` again.") from error
     return {image.name: point[view == i] for i, image in enumerate(load_poses(folder).images)}
 

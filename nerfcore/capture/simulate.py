@@ -123,7 +123,9 @@ def _develop(out: Path, raw: Path, index: int) -> None:
         spec = oiio.ImageSpec(depth.shape[1], depth.shape[0], 1, "float")
         spec.channelnames = ("Z",)
         spec.attribute("compression", "zip")
-        if image is None or not (image.open(str(temporary), spec) and image.write_image(depth[..., None]) and image.close()):
+        if image is None or not (
+            image.open(str(temporary), spec) and image.write_image(depth[..., None]) and image.close()
+        ):
             raise InputError(f"{temporary} cannot be written: {oiio.geterror()}")
     with atomic_path(out / "labels" / f"{_stem(index)}.png") as temporary:
         shutil.copyfile(source.with_suffix(".label.png"), temporary)
@@ -161,4 +163,5 @@ def _describe(out: Path, params: SimulateParams, described: dict[str, Any]) -> N
     intrinsics = {"camera_model": "OPENCV", "w": width, "h": height, "fl_x": focal, "fl_y": focal}
     intrinsics |= {"cx": width / 2, "cy": height / 2, "camera_angle_x": 2 * float(np.arctan(width / 2 / focal))}
     write_json(out / "ground_truth" / "transforms.json", {**intrinsics, "frames": frames})
-    write_json(out / "classes.json", {"ignore_id": 0, "classes": described["classes"]})
+    for folder in (out, out / "ground_truth"):  # beside the photos, and beside the posed data set
+        write_json(folder / "classes.json", {"ignore_id": 0, "classes": described["classes"]})

@@ -8,35 +8,63 @@ import numpy as np
 
 from .similarity import make_similarity, transform_points
 
+UNCERTAIN = 0.5  # confidence below which a level group of cameras is looked for
+LEVEL_SHARE = 0.3  # of the cameras that such a group must have
+
 
 def up_direction(camera_to_world: Sequence[np.ndarray]) -> tuple[np.ndarray, float]:
     """The up direction of a capture taken with a level camera, and how certain it is.
 
     People hold cameras level, so the cameras' right axes lie in the horizontal plane: up is the eigenvector of the
     smallest eigenvalue of Σ x xᵀ over the right axes x; its sign is that of the mean camera up. Where the right axes
-    all agree (a single stand point) that plane is undetermined, and the mean camera up itself is taken.
+    all agree (a single stand point) that plane is undetermined, and the mean camera up itself is taken. Where they
+    fill no plane (an object that was laid on its side for some of the photos), it is the plane of most of them.
 
     Args:
         camera_to_world: (4, 4) poses with OpenCV axes.
     Returns:
         up (3,), of unit length, in the frame of the poses; confidence in [0, 1]: 1 − λ₀/λ₁ of the eigenvalues, times
-        the agreement of the cameras about the sign.
+        the agreement of the cameras about the sign (and times the share of cameras in the plane, if not all).
     """
     poses = np.stack(camera_to_world)
     right, up = poses[:, :3, 0], -poses[:, :3, 1]
+    axis, confidence = _plane_normal(right, up)
+    if confidence < UNCERTAIN and len(poses) >= 8:
+        level = _largest_level_group(right, up)
+        if LEVEL_SHARE * len(poses) <= len(level) < len(poses):
+            axis, certain = _plane_normal(right[level], up[level])
+            confidence = max(confidence, certain * len(level) / len(poses))
+    return axis, confidence
+
+
+def _plane_normal(right: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, float]:
     values, vectors = np.linalg.eigh(right.T @ right / len(right))
     mean_up = up.mean(0)
-    if len(poses) < 2 or values[1] < 1e-3:
+    if len(right) < 2 or values[1] < 1e-3:
         # Level in one direction only: take the mean up, made square to the common right axis.
         side = vectors[:, 2]
         flat = mean_up - side * (side @ mean_up)
         length = np.linalg.norm(flat)
         return (flat / length if length > 1e-9 else up[0]), 0.0
-    axis = vectors[:, 0]
-    agreement = float(up @ axis @ np.ones(len(up)) / len(up))
-    axis = axis if agreement >= 0 else -axis
+    axis = vectors[:, 0] if vectors[:, 0] @ mean_up >= 0 else -vectors[:, 0]
     votes = abs(float(np.sign(up @ axis).mean()))
     return axis, float(np.clip((1 - values[0] / values[1]) * votes, 0, 1))
+
+
+def _largest_level_group(right: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Indices of the largest group of cameras that are level about one common up (within 5°)."""
+    best = np.zeros(0, int)
+    for i in range(len(right)):
+        for j in range(i + 1, len(right)):
+            axis = np.cross(right[i], right[j])
+            length = np.linalg.norm(axis)
+            if length < 0.3:
+                continue
+            axis = axis / length * (1 if up[i] @ axis >= 0 else -1)
+            group = np.flatnonzero((np.abs(right @ axis) < np.sin(np.radians(5))) & (up @ axis > 0))
+            if len(group) > len(best):
+                best = group
+    return best
 
 
 def rotation_to_z(up: np.ndarray, forward: np.ndarray | None = None) -> np.ndarray:

@@ -9,10 +9,11 @@ from typing import Any
 
 import pycolmap
 
-from .features import FULL_MODEL_FROM
+from .features import FULL_MODEL_FROM, LONG_LENS
 from .validate import ImageCheck, check_images
 
 REPAIR_ROUNDS = 2
+PRINCIPAL_POINT_FROM = 10  # photos through one lens
 MAX_POINT_ERROR = 4.0  # pixels
 SEED = 1
 
@@ -110,20 +111,24 @@ def adjust(model: Any, keep_cameras: bool) -> None:
     """Final bundle adjustment.
 
     A lens that took at least fifteen photos is given all of OPENCV's parameters (during mapping they run away on
-    narrow views of few points), and its principal point where there is no other lens.
+    narrow views of few points), and its principal point is refined where
+    there is no other lens and its view is not narrow.
     """
     if keep_cameras:
         return
     taken = collections.Counter(model.image(i).camera_id for i in model.reg_image_ids())
+    wide = True
     for camera_id, count in taken.items():
         camera = model.camera(camera_id)
+        wide &= camera.mean_focal_length() < LONG_LENS * max(camera.width, camera.height)
         if count >= FULL_MODEL_FROM and camera.model_name == "SIMPLE_RADIAL":
             focal, cx, cy, k = camera.params
             camera.model = pycolmap.CameraModelId.OPENCV
             camera.params = [focal, focal, cx, cy, k, 0.0, 0.0, 0.0]
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
-    options.refine_principal_point = len(taken) == 1 and model.num_reg_images() >= FULL_MODEL_FROM
+    # Through a long lens a shifted principal point looks like a turned camera.
+    options.refine_principal_point = len(taken) == 1 and wide and model.num_reg_images() >= PRINCIPAL_POINT_FROM
     pycolmap.bundle_adjustment(model, options)
     model.update_point_3d_errors()
     for point_id in [i for i, point in model.points3D.items() if point.error > MAX_POINT_ERROR]:

@@ -7,7 +7,7 @@ own pose, so that rigs.bin and frames.bin need not be read. Format source: COLMA
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -111,10 +111,9 @@ def read_model(model: Path) -> tuple[dict[int, Camera], list[ColmapImage], Point
     return cameras, sorted(images, key=lambda image: image.name), points
 
 
-def pose_from_quaternion(w: float, x: float, y: float, z: float, translation: np.ndarray) -> np.ndarray:
-    """Camera-to-world (4, 4) from COLMAP's world-to-camera quaternion and translation."""
-    norm = (w * w + x * x + y * y + z * z) ** 0.5
-    w, x, y, z = w / norm, x / norm, y / norm, z / norm
+def pose_from_quaternion(quaternion: Sequence[float], translation: Sequence[float]) -> np.ndarray:
+    """Camera-to-world (4, 4) from COLMAP's world-to-camera quaternion (w, x, y, z) and translation."""
+    w, x, y, z = np.array(quaternion) / np.linalg.norm(quaternion)
     rotation = np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
@@ -124,7 +123,7 @@ def pose_from_quaternion(w: float, x: float, y: float, z: float, translation: np
     )
     pose = np.eye(4)
     pose[:3, :3] = rotation.T
-    pose[:3, 3] = -rotation.T @ translation
+    pose[:3, 3] = -rotation.T @ np.array(translation)
     return pose
 
 
@@ -150,7 +149,7 @@ def _images_text(path: Path) -> list[ColmapImage]:
         if not row:
             continue
         numbers = [float(value) for value in row[1:8]]
-        pose = pose_from_quaternion(*numbers[:4], np.array(numbers[4:]))
+        pose = pose_from_quaternion(numbers[:4], numbers[4:])
         images.append(ColmapImage(" ".join(row[9:]), int(row[8]), pose))
     return images
 
@@ -207,7 +206,7 @@ def _images_binary(path: Path) -> list[ColmapImage]:
         camera = reader.take("i")[0]
         name = reader.text()
         reader.skip(24 * reader.take("Q")[0])
-        images.append(ColmapImage(name, camera, pose_from_quaternion(*values[:4], np.array(values[4:]))))
+        images.append(ColmapImage(name, camera, pose_from_quaternion(values[:4], values[4:])))
     return images
 
 

@@ -42,11 +42,10 @@ def decompose_projection(projection: np.ndarray) -> tuple[np.ndarray, np.ndarray
     Source: Hartley and Zisserman, Multiple View Geometry, 2nd ed., section 6.2.4.
     """
     k, rotation = (np.asarray(part) for part in scipy.linalg.rq(projection[:, :3]))
-    signs = np.diag(np.sign(np.diag(k)))
+    signs = np.diag(np.where(np.diag(k) < 0, -1.0, 1.0))
     k, rotation = k @ signs, signs @ rotation
     if np.linalg.det(rotation) < 0:
-        rotation = -rotation
-        projection = -projection
+        rotation, projection = -1.0 * rotation, -1.0 * projection
     center = -np.linalg.solve(projection[:, :3], projection[:, 3])
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation.T, center

@@ -45,6 +45,9 @@ def engine_environment(base: dict[str, str] | None = None) -> dict[str, str]:
     # Nothing may be written into the extension's folder.
     env["PYTHONDONTWRITEBYTECODE"] = "1"
     env["PYTHONUTF8"] = "1"
+    # What the engine cannot do without Blender it does in a background copy of the one that runs here.
+    if "bpy" in sys.modules:
+        env.setdefault("FIELDWORK_BLENDER", sys.modules["bpy"].app.binary_path or sys.executable)
     env["OMP_WAIT_POLICY"] = "passive"
     threads = max(1, (os.cpu_count() or 2) - 1)
     env["OMP_NUM_THREADS"] = str(min(threads, _positive(env.get("OMP_NUM_THREADS")) or threads))

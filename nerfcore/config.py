@@ -36,23 +36,29 @@ class SceneConfig(Stage):
 class FieldConfig(Stage):
     """The hybrid field."""
 
-    branch: Literal["hybrid", "explicit", "implicit"] = Field("hybrid", description="explicit: grid only; implicit: network only")
+    branch: Literal["hybrid", "explicit", "implicit"] = Field(
+        "hybrid", description="explicit: grid only; implicit: network only"
+    )
     fusion: Literal["blend", "concat"] = Field("blend", description="how the two branches join")
     levels: int = Field(8, ge=1, le=16, description="levels of the vertex grid, 4 features each")
     coarsest: int = Field(16, ge=2, description="vertices along a side of the coarsest level")
     finest: int = Field(1024, ge=2, description="vertices along a side of the finest level")
     table_log2: int = Field(19, ge=10, le=24, description="at most 2^this vertices a level; larger levels are hashed")
-    voxel_init: Literal["rgb_stats", "cnn", "none"] = Field("rgb_stats", description="what the coarse levels start from")
+    voxel_init: Literal["rgb_stats", "cnn", "none"] = Field(
+        "rgb_stats", description="what the coarse levels start from"
+    )
     octaves: int = Field(8, ge=1, le=16, description="octaves of the implicit branch's frequency encoding")
     width: int = Field(64, ge=8, description="width of the hidden layers")
     implicit_layers: int = Field(2, ge=1, description="matrix products of the implicit branch")
     color_layers: int = Field(3, ge=1, description="matrix products of the colour head")
     semantic_layers: int = Field(2, ge=1, description="matrix products of the semantic head")
     geometry_features: int = Field(15, ge=1, description="features the density head hands to the other heads")
-    blend_by: Literal["evidence", "density"] = Field("evidence", description="density: the original, literal blend weight")
+    blend_by: Literal["evidence", "density"] = Field(
+        "evidence", description="density: the original, literal blend weight"
+    )
     blend_floor: float = Field(0.5, ge=0, le=1, description="share of the grid where nothing was seen (w0)")
     blend_rate: float = Field(8.0, gt=0, description="how fast evidence raises the grid's share (κ)")
-    blend_warmup: int = Field(256, ge=0, description="steps with the grid alone")
+    blend_warmup: int = Field(0, ge=0, description="steps with the grid alone")
     appearance: int = Field(0, ge=0, description="length of the per-image appearance code; 0: none")
     density_shift: float = Field(-1.0, description="added to the raw density before exp")
     precision: Literal["auto", "float32", "bfloat16", "float16"] = Field("auto", description="of matrix products")
@@ -61,16 +67,18 @@ class FieldConfig(Stage):
 class SamplingConfig(Stage):
     """Where the field is evaluated along a ray."""
 
-    resolution: int = Field(128, ge=8, le=512, multiple_of=2, description="cells along a side of the occupancy grid")
+    resolution: int = Field(128, ge=8, le=512, multiple_of=4, description="cells along a side of the occupancy grid")
     samples: int = Field(16, ge=1, le=512, description="samples a ray (M_f)")
-    bins_per_cell: float = Field(2.0, gt=0, description="bins of the coarse walk per grid cell")
+    bins_per_cell: float = Field(1.0, gt=0, description="bins of the coarse walk per grid cell")
     pdf: Literal["default", "uniform", "literal"] = Field("default", description="distribution of the samples")
-    interest: Literal["priority", "boundary", "none"] = Field("priority", description="what draws samples besides density")
+    interest: Literal["priority", "boundary", "none"] = Field(
+        "priority", description="what draws samples besides density"
+    )
     beta: float = Field(1.0, ge=0, description="strength of the interest")
     epsilon: float = Field(0.01, gt=0, description="weight every open bin keeps")
     update_every: int = Field(16, ge=1, description="steps between updates of the occupancy grid")
     decay: float = Field(0.95, gt=0, lt=1, description="of the occupancy grid at each update")
-    threshold: float = Field(0.01, gt=0, description="opacity of a bin below which its cell is closed")
+    threshold: float = Field(0.03, gt=0, description="opacity of a bin below which its cell is closed")
     warmup: int = Field(256, ge=0, description="steps in which all cells are updated at once")
     coarse_cache: bool = Field(True, description="choose training rays by which image tiles met the field")
     cache_every: int = Field(1000, ge=1, description="steps between updates of the coarse cache")
@@ -80,7 +88,9 @@ class SamplingConfig(Stage):
 class RenderConfig(Stage):
     """Compositing."""
 
-    accumulate: Literal["probabilities", "logits"] = Field("probabilities", description="what is summed along a ray for classes")
+    accumulate: Literal["probabilities", "logits"] = Field(
+        "probabilities", description="what is summed along a ray for classes"
+    )
     cull: float = Field(1e-4, ge=0, description="rendering weight below which colour and classes are not computed")
     samples: int | None = Field(None, description="samples a ray when rendering; none: as in training")
 
@@ -92,7 +102,9 @@ class LossConfig(Stage):
     semantic_weight: float = Field(0.04, ge=0, description="λ_sem; 0 trains without semantics")
     detach_weights: bool = Field(True, description="labels do not move the geometry")
     regularization: float = Field(1.0, ge=0, description="λ_reg, factor of sparsity, distortion and entropy")
-    sparsity: Literal["exponential", "cauchy", "l1"] = Field("exponential", description="l1: the original, literal form")
+    sparsity: Literal["exponential", "cauchy", "l1"] = Field(
+        "exponential", description="l1: the original, literal form"
+    )
     sparsity_weight: float = Field(1e-4, ge=0)
     sparsity_scale: float = Field(0.05, gt=0, description="ℓ of 1−exp(−ℓσ)")
     distortion_weight: float = Field(0.0, ge=0, description="against floaters")
@@ -106,7 +118,7 @@ class TrainConfig(Stage):
     steps: int = Field(20000, gt=0, description="optimisation steps when there is no time limit")
     batch_samples: int = Field(1 << 17, ge=256, description="field samples a step")
     max_rays: int = Field(32768, ge=16)
-    grid_rate: float = Field(0.01, gt=0, description="learning rate of the grid")
+    grid_rate: float = Field(0.03, gt=0, description="learning rate of the grid")
     network_rate: float = Field(0.005, gt=0, description="learning rate of the networks")
     decay: float = Field(0.33, gt=0, le=1, description="of the rates at ½, ¾ and 9/10")
     fade: float = Field(0.2, ge=0, lt=1, description="share of training over which finer levels appear")
@@ -150,7 +162,9 @@ def make_config(preset: str, settings: dict[str, str] | None = None) -> RunConfi
         stage, _, key = name.partition(".")
         model = RunConfig.model_fields.get(stage)
         if model is None or key not in type(model.default).model_fields:
-            raise SettingError(f"There is no setting “{name}”.", "`fieldwork train --help` and docs/settings.md list them.")
+            raise SettingError(
+                f"There is no setting “{name}”.", "`fieldwork train --help` and docs/settings.md list them."
+            )
         try:
             value = json.loads(text)
         except json.JSONDecodeError:
@@ -161,4 +175,6 @@ def make_config(preset: str, settings: dict[str, str] | None = None) -> RunConfi
     except ValidationError as error:
         first = error.errors()[0]
         name = ".".join(str(part) for part in first["loc"])
-        raise SettingError(f"Setting {name} = {first.get('input')!r}: {first['msg']}.", "docs/settings.md lists what it takes.") from error
+        raise SettingError(
+            f"Setting {name} = {first.get('input')!r}: {first['msg']}.", "docs/settings.md lists what it takes."
+        ) from error

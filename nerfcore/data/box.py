@@ -8,7 +8,7 @@ import numpy as np
 
 from ..config import SceneConfig
 from .scene import Scene, View
-from .similarity import make_similarity
+from .similarity import make_similarity, similarity_scale
 
 
 @dataclass(frozen=True)
@@ -83,3 +83,11 @@ def _object_radius(scene: Scene, focus: np.ndarray, reach: np.ndarray) -> float:
 
 def _box(center: np.ndarray, half: float, contracted: bool) -> Box:
     return Box(make_similarity(half, np.eye(3), center), contracted)
+
+
+def box_poses(views: list[View], box_from_world: np.ndarray) -> np.ndarray:
+    """Camera-to-box poses (N, 4, 4), rotations kept orthonormal."""
+    poses = np.stack([view.camera_to_world for view in views])
+    moved = box_from_world @ poses
+    moved[:, :3, :3] /= similarity_scale(box_from_world)
+    return moved

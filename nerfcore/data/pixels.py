@@ -11,9 +11,9 @@ import torch
 
 from ..errors import InputError
 from ..progress import Reporter
+from .box import box_poses
 from .cameras import Camera, pixel_centers, rays
-from .scene import Scene, View
-from .similarity import similarity_scale
+from .scene import Scene
 
 VOID = 255  # class index of unlabelled pixels
 
@@ -133,14 +133,6 @@ class CameraRays:
         """Origins and unit directions (N, 3), normalised frame."""
         directions = torch.einsum("nij,nj->ni", self.rotation[image], self.camera_directions(image, pixel))
         return self.center[image].contiguous(), directions.contiguous()
-
-
-def box_poses(views: list[View], box_from_world: np.ndarray) -> np.ndarray:
-    """Camera-to-box poses (N, 4, 4), rotations kept orthonormal."""
-    poses = np.stack([view.camera_to_world for view in views])
-    moved = box_from_world @ poses
-    moved[:, :3, :3] /= similarity_scale(box_from_world)
-    return moved
 
 
 class PixelStore:

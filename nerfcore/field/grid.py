@@ -30,17 +30,24 @@ class _Encode(torch.autograd.Function):
     """Gradients go straight into the grid's own buffers: a dense gradient of the table never exists twice."""
 
     @staticmethod
-    def forward(ctx, points: torch.Tensor, anchor: torch.Tensor, grid: VertexGrid, gains: list[float]) -> torch.Tensor:
+    def forward(
+        ctx,
+        points: torch.Tensor,
+        known: torch.Tensor | None,
+        anchor: torch.Tensor,
+        grid: VertexGrid,
+        gains: list[float],
+    ):
         ctx.grid, ctx.gains = grid, gains
         ctx.save_for_backward(points)
-        return encode.forward(grid.table, grid.levels, gains, points)
+        return encode.forward(grid.table, grid.levels, gains, points) if known is None else known
 
     @staticmethod
     def backward(ctx, *grads):
         (points,) = ctx.saved_tensors
         grid: VertexGrid = ctx.grid
         encode.backward(grid.gradient, grid.touched, grid.levels, ctx.gains, points, grads[0].float().contiguous())
-        return None, None, None, None
+        return None, None, None, None, None
 
 
 class VertexGrid(nn.Module):
@@ -74,12 +81,15 @@ class VertexGrid(nn.Module):
     def parameter_count(self) -> int:
         return sum(rows for _, _, rows in self.levels) * FEATURES
 
-    def forward(self, points: torch.Tensor, gains: list[float]) -> torch.Tensor:
-        """Encode points (N, 3) in [0, 1]³ → (N, width) float32; `gains` (one per level) fade levels in."""
+    def forward(self, points: torch.Tensor, gains: list[float], known: torch.Tensor | None = None) -> torch.Tensor:
+        """Encode points (N, 3) in [0, 1]³ → (N, width) float32; `gains` (one per level) fade levels in.
+
+        `known`: the result, when a pass without gradients computed it already; only its gradient is added.
+        """
         if not torch.is_grad_enabled():
             return encode.forward(self.table, self.levels, gains, points)
         # The anchor only tells autograd that the result depends on something trainable.
-        return _Encode.apply(points, self.anchor.requires_grad_(), self, gains)  # type: ignore[no-any-return]
+        return _Encode.apply(points, known, self.anchor.requires_grad_(), self, gains)  # type: ignore[no-any-return]
 
     def step(self, rate: float, betas: tuple[float, float] = (0.9, 0.99)) -> None:
         """Adam on the rows touched since the last step; clears the gradient."""

@@ -33,15 +33,18 @@ class _TruncatedExp(torch.autograd.Function):
 
 @dataclass(frozen=True)
 class Geometry:
-    """What the density head knows of N points: density (N,) float32, features (N, G), implicit features (N, F) or None."""
+    """What the density head knows of N points: density (N,) float32, features (N, G), implicit and
+    explicit features (N, F) of the branches there are."""
 
     density: torch.Tensor
     features: torch.Tensor
     implicit: torch.Tensor | None
+    explicit: torch.Tensor | None
 
     def __getitem__(self, kept: torch.Tensor) -> Geometry:
         implicit = None if self.implicit is None else self.implicit[kept]
-        return Geometry(self.density[kept], self.features[kept], implicit)
+        explicit = None if self.explicit is None else self.explicit[kept]
+        return Geometry(self.density[kept], self.features[kept], implicit, explicit)
 
 
 class HybridField(nn.Module):
@@ -79,9 +82,7 @@ class HybridField(nn.Module):
         self.semantic_head = (
             MLP(semantic_inputs, classes, config.width, config.semantic_layers) if classes > 0 else None
         )
-        self.appearance = (
-            nn.Parameter(torch.zeros(images, config.appearance)) if config.appearance and images else None
-        )
+        self.appearance = nn.Parameter(torch.zeros(images, config.appearance)) if config.appearance and images else None
         self.gains = [1.0] * config.levels
         self.register_buffer("_device", torch.zeros(0), persistent=False)
         self._device: torch.Tensor
@@ -104,9 +105,12 @@ class HybridField(nn.Module):
         if self.blend is not None:
             self.blend.warming_up = step < self.config.blend_warmup
 
-    def geometry(self, points: torch.Tensor) -> Geometry:
-        """Density and features of points (N, 3) in grid coordinates [0, 1]³; density per normalised unit length."""
-        explicit = self.grid(points, self.gains) if self.grid is not None else None
+    def geometry(self, points: torch.Tensor, known: torch.Tensor | None = None) -> Geometry:
+        """Density and features of points (N, 3) in grid coordinates [0, 1]³; density per normalised unit length.
+
+        `known` (N, F): explicit features of these points from a pass without gradients.
+        """
+        explicit = self.grid(points, self.gains, known) if self.grid is not None else None
         implicit = None
         if self.implicit is not None:
             implicit = self.implicit(frequency_encoding(points, self.config.octaves).to(self.dtype), self.dtype)
@@ -123,7 +127,7 @@ class HybridField(nn.Module):
                 hidden = w * explicit + (1 - w) * implicit
         out = self.density_head(hidden, self.dtype)
         density = _TruncatedExp.apply(out[:, 0].float() + self.config.density_shift)
-        return Geometry(density, out, implicit)  # type: ignore[arg-type]
+        return Geometry(density, out, implicit, explicit)  # type: ignore[arg-type]
 
     def density(self, points: torch.Tensor) -> torch.Tensor:
         """Density (N,) alone."""
@@ -134,7 +138,11 @@ class HybridField(nn.Module):
         parts = [geometry.features, directions.to(self.dtype)]
         if self.config.appearance:
             if codes is None:
-                mean = self.appearance.mean(0) if self.appearance is not None else self._device.new_zeros(self.config.appearance)
+                mean = (
+                    self.appearance.mean(0)
+                    if self.appearance is not None
+                    else self._device.new_zeros(self.config.appearance)
+                )
                 codes = mean.expand(len(directions), -1)
             parts.append(codes.to(self.dtype))
         return torch.sigmoid(self.color_head(torch.cat(parts, 1), self.dtype).float())

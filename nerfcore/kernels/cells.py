@@ -24,7 +24,7 @@ def read_trilinear(
     fx = wp.clamp(p[0] - float(ix), 0.0, 1.0)
     fy = wp.clamp(p[1] - float(iy), 0.0, 1.0)
     fz = wp.clamp(p[2] - float(iz), 0.0, 1.0)
-    total = float(0.0)
+    total = 0.0
     for corner in range(4):
         dy = corner & 1
         dz = corner >> 1
@@ -46,9 +46,7 @@ def trilinear(grid: torch.Tensor, resolution: int, points: torch.Tensor) -> torc
     """Values (N,) at points (N, 3) in [0, 1]³; constant beyond the outermost cell centres."""
     init()
     out = torch.empty(len(points), device=points.device)
-    launch(
-        read_trilinear, len(points), [array(grid), resolution, array(points, wp.vec3), array(out)], points.device
-    )
+    launch(read_trilinear, len(points), [array(grid), resolution, array(points, wp.vec3), array(out)], points.device)
     return out
 
 

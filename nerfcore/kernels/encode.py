@@ -22,12 +22,37 @@ P2 = wp.constant(wp.uint32(805459861))
 
 
 @wp.func
-def vertex(ix: int, iy: int, iz: int, resolution: int, size: int):
-    """Table row of a vertex within its level; `size` rows. x is the fastest axis."""
+def corner_rows(ix: int, iy: int, iz: int, resolution: int, size: int, base: int):
+    """Table rows of the four corner pairs along x: (x0y0z0, x0y1z0, x0y0z1, x0y1z1) and the same with x1."""
     if resolution * resolution * resolution <= size:
-        return (iz * resolution + iy) * resolution + ix
-    h = wp.uint32(ix) ^ (wp.uint32(iy) * P1) ^ (wp.uint32(iz) * P2)
-    return int(h & wp.uint32(size - 1))
+        row = base + (iz * resolution + iy) * resolution + ix
+        plane = resolution * resolution
+        low = wp.vec4i(row, row + resolution, row + plane, row + plane + resolution)
+        return low, low + wp.vec4i(1, 1, 1, 1)
+    mask = wp.uint32(size - 1)
+    x0 = wp.uint32(ix)
+    x1 = wp.uint32(ix + 1)
+    y0 = wp.uint32(iy) * P1
+    y1 = wp.uint32(iy + 1) * P1
+    z0 = wp.uint32(iz) * P2
+    z1 = wp.uint32(iz + 1) * P2
+    h00 = y0 ^ z0
+    h10 = y1 ^ z0
+    h01 = y0 ^ z1
+    h11 = y1 ^ z1
+    low = wp.vec4i(
+        base + int((x0 ^ h00) & mask),
+        base + int((x0 ^ h10) & mask),
+        base + int((x0 ^ h01) & mask),
+        base + int((x0 ^ h11) & mask),
+    )
+    high = wp.vec4i(
+        base + int((x1 ^ h00) & mask),
+        base + int((x1 ^ h10) & mask),
+        base + int((x1 ^ h01) & mask),
+        base + int((x1 ^ h11) & mask),
+    )
+    return low, high
 
 
 @wp.kernel(module="fieldwork_encode")
@@ -50,15 +75,14 @@ def encode_forward(
     fx = p[0] - float(ix)
     fy = p[1] - float(iy)
     fz = p[2] - float(iz)
-    total = feature()
-    for corner in range(4):
-        dy = corner & 1
-        dz = corner >> 1
-        wyz = wp.where(dy == 1, fy, 1.0 - fy) * wp.where(dz == 1, fz, 1.0 - fz)
-        a = table[base + vertex(ix, iy + dy, iz + dz, resolution, size)]
-        b = table[base + vertex(ix + 1, iy + dy, iz + dz, resolution, size)]
-        total += a * (wyz * (1.0 - fx)) + b * (wyz * fx)
-    out[i, level] = total * gain
+    low, high = corner_rows(ix, iy, iz, resolution, size, base)
+    gx = 1.0 - fx
+    v00 = table[low[0]] * gx + table[high[0]] * fx
+    v10 = table[low[1]] * gx + table[high[1]] * fx
+    v01 = table[low[2]] * gx + table[high[2]] * fx
+    v11 = table[low[3]] * gx + table[high[3]] * fx
+    gy = 1.0 - fy
+    out[i, level] = (v00 * gy + v10 * fy) * ((1.0 - fz) * gain) + (v01 * gy + v11 * fy) * (fz * gain)
 
 
 @wp.func
@@ -88,13 +112,22 @@ def encode_backward(
     fx = p[0] - float(ix)
     fy = p[1] - float(iy)
     fz = p[2] - float(iz)
+    low, high = corner_rows(ix, iy, iz, resolution, size, base)
     g = grad_out[i, level] * gain
-    for corner in range(4):
-        dy = corner & 1
-        dz = corner >> 1
-        wyz = wp.where(dy == 1, fy, 1.0 - fy) * wp.where(dz == 1, fz, 1.0 - fz)
-        add(grad_table, touched, base + vertex(ix, iy + dy, iz + dz, resolution, size), g * (wyz * (1.0 - fx)))
-        add(grad_table, touched, base + vertex(ix + 1, iy + dy, iz + dz, resolution, size), g * (wyz * fx))
+    g0 = g * (1.0 - fx)
+    g1 = g * fx
+    w00 = (1.0 - fy) * (1.0 - fz)
+    w10 = fy * (1.0 - fz)
+    w01 = (1.0 - fy) * fz
+    w11 = fy * fz
+    add(grad_table, touched, low[0], g0 * w00)
+    add(grad_table, touched, high[0], g1 * w00)
+    add(grad_table, touched, low[1], g0 * w10)
+    add(grad_table, touched, high[1], g1 * w10)
+    add(grad_table, touched, low[2], g0 * w01)
+    add(grad_table, touched, high[2], g1 * w01)
+    add(grad_table, touched, low[3], g0 * w11)
+    add(grad_table, touched, high[3], g1 * w11)
 
 
 @wp.kernel(module="fieldwork_encode")
@@ -129,7 +162,9 @@ def adam_touched(
             grad[row] = feature()
 
 
-def forward(table: torch.Tensor, levels: list[tuple[int, int, int]], gains: list[float], points: torch.Tensor) -> torch.Tensor:
+def forward(
+    table: torch.Tensor, levels: list[tuple[int, int, int]], gains: list[float], points: torch.Tensor
+) -> torch.Tensor:
     """Encode `points` (N, 3) in [0, 1]³ → features (N, levels · FEATURES) float32.
 
     Args:

@@ -24,6 +24,7 @@ from .runtime import array, init, launch
 PDF_DEFAULT, PDF_UNIFORM, PDF_LITERAL = 0, 1, 2
 _DEFAULT, _UNIFORM, _LITERAL = wp.constant(PDF_DEFAULT), wp.constant(PDF_UNIFORM), wp.constant(PDF_LITERAL)
 MAX_BINS = wp.constant(4096)
+MACRO = wp.constant(4)  # cells along a side of a block that can be skipped at once
 STOP = wp.constant(1.0e-4)  # transmittance below which the walk ends
 
 
@@ -62,15 +63,14 @@ def cell_index(u: wp.vec3, n: int):
 
 
 @wp.func
-def ray_interval(o: wp.vec3, d: wp.vec3, near: float, far: float, contracted: int):
+def ray_interval(o: wp.vec3, inverse: wp.vec3, near: float, far: float, contracted: int):
     """Entry and exit distance of the walk."""
     lo = near
     hi = far
     if contracted == 0:
         for a in range(3):
-            da = wp.where(wp.abs(d[a]) < 1.0e-9, 1.0e-9, d[a])
-            t0 = (-1.0 - o[a]) / da
-            t1 = (1.0 - o[a]) / da
+            t0 = (-1.0 - o[a]) * inverse[a]
+            t1 = (1.0 - o[a]) * inverse[a]
             lo = wp.max(lo, wp.min(t0, t1))
             hi = wp.min(hi, wp.max(t0, t1))
     return lo, hi
@@ -88,22 +88,39 @@ def bin_length(p: wp.vec3, step: float, contracted: int):
 
 
 @wp.func
-def empty_skip(p: wp.vec3, d: wp.vec3, n: int, step: float):
-    """Whole steps until the ray leaves its (closed) cell; bounded grid only."""
-    leave = float(1.0e6)
-    for a in range(3):
-        q = (p[a] * 0.5 + 0.5) * float(n)
-        if d[a] > 1.0e-9:
-            leave = wp.min(leave, (wp.floor(q) + 1.0 - q) * 2.0 / (float(n) * d[a]))
-        elif d[a] < -1.0e-9:
-            leave = wp.min(leave, (wp.floor(q) - q) * 2.0 / (float(n) * d[a]))
+def leave_distance(u: wp.vec3, d: wp.vec3, inverse: wp.vec3, n: float):
+    """Distance until a ray at grid position u leaves its cell of an n³ grid over the cube."""
+    ux = u[0] * n
+    uy = u[1] * n
+    uz = u[2] * n
+    tx = (wp.floor(ux) + wp.where(d[0] > 0.0, 1.0, 0.0) - ux) * inverse[0]
+    ty = (wp.floor(uy) + wp.where(d[1] > 0.0, 1.0, 0.0) - uy) * inverse[1]
+    tz = (wp.floor(uz) + wp.where(d[2] > 0.0, 1.0, 0.0) - uz) * inverse[2]
+    return wp.max(wp.min(tx, wp.min(ty, tz)) * 2.0 / n, 0.0)
+
+
+@wp.func
+def empty_skip(u: wp.vec3, d: wp.vec3, inverse: wp.vec3, n: int, step: float, blocks: wp.array(dtype=wp.uint8)):
+    """Whole steps until the ray leaves its closed cell, or its block of closed cells; bounded grid only."""
+    leave = 0.0
+    if blocks[cell_index(u, n / MACRO)] == wp.uint8(0):
+        leave = leave_distance(u, d, inverse, float(n / MACRO))
+    else:
+        leave = leave_distance(u, d, inverse, float(n))
     return wp.max(1.0, wp.floor(leave / step + 0.5)) * step
 
 
 @wp.func
-def bin_weight(
-    cell: wp.vec2, transmittance: float, length: float, mode: int, beta: float, epsilon: float
-):
+def reciprocal(d: wp.vec3):
+    return wp.vec3(
+        1.0 / wp.where(wp.abs(d[0]) < 1.0e-9, 1.0e-9, d[0]),
+        1.0 / wp.where(wp.abs(d[1]) < 1.0e-9, 1.0e-9, d[1]),
+        1.0 / wp.where(wp.abs(d[2]) < 1.0e-9, 1.0e-9, d[2]),
+    )
+
+
+@wp.func
+def bin_weight(cell: wp.vec2, transmittance: float, length: float, mode: int, beta: float, epsilon: float):
     """Weight of one open bin; `cell` holds (density, interest)."""
     if mode == _UNIFORM:
         return 1.0
@@ -119,6 +136,7 @@ def march_weight(
     directions: wp.array(dtype=wp.vec3),
     jitter: wp.array(dtype=float),
     cells: wp.array(dtype=wp.vec2),
+    blocks: wp.array(dtype=wp.uint8),
     n: int,
     step: float,
     near: float,
@@ -135,18 +153,20 @@ def march_weight(
     r = wp.tid() + offset
     o = origins[r]
     d = directions[r]
-    lo, hi = ray_interval(o, d, near, far, contracted)
+    inverse = reciprocal(d)
+    lo, hi = ray_interval(o, inverse, near, far, contracted)
     t = lo + jitter[r] * step
-    transmittance = float(1.0)
-    weight = float(0.0)
-    t_first = float(-1.0)
-    t_last = float(-1.0)
+    transmittance = 1.0
+    weight = 0.0
+    t_first = -1.0
+    t_last = -1.0
     for _ in range(MAX_BINS):
         if t >= hi:
             break
         p = o + d * t
         length = bin_length(p, step, contracted)
-        cell = cells[cell_index(grid_position(p, contracted), n)]
+        u = grid_position(p, contracted)
+        cell = cells[cell_index(u, n)]
         if cell[0] > 0.0:
             weight += bin_weight(cell, transmittance, length, mode, beta, epsilon)
             if t_first < 0.0:
@@ -158,7 +178,7 @@ def march_weight(
                     break
             t += length
         elif contracted == 0:
-            t += empty_skip(p, d, n, step)
+            t += empty_skip(u, d, inverse, n, step, blocks)
         else:
             t += length
     total[r] = weight
@@ -173,6 +193,7 @@ def march_sample(
     jitter: wp.array(dtype=float),
     shift: wp.array(dtype=float),
     cells: wp.array(dtype=wp.vec2),
+    blocks: wp.array(dtype=wp.uint8),
     n: int,
     step: float,
     near: float,
@@ -197,23 +218,25 @@ def march_sample(
         return
     o = origins[r]
     d = directions[r]
-    lo, hi = ray_interval(o, d, near, far, contracted)
+    inverse = reciprocal(d)
+    lo, hi = ray_interval(o, inverse, near, far, contracted)
     t = first[r]
-    transmittance = float(1.0)
-    below = float(0.0)  # weight of the bins behind us
+    transmittance = 1.0
+    below = 0.0  # weight of the bins behind us
     share = total[r] / float(count)
-    k = int(0)  # the sample being looked for
+    k = 0  # the sample being looked for
     target = shift[base] * share
     edge = share  # weight at which sample k's interval ends
-    open_length = float(0.0)  # open length gathered for sample k's interval so far
-    k_edge = int(0)
+    open_length = 0.0  # open length gathered for sample k's interval so far
+    k_edge = 0
     t_end = t
     for _ in range(MAX_BINS):
         if t >= hi or k_edge >= count:
             break
         p = o + d * t
         length = bin_length(p, step, contracted)
-        cell = cells[cell_index(grid_position(p, contracted), n)]
+        u = grid_position(p, contracted)
+        cell = cells[cell_index(u, n)]
         if cell[0] > 0.0:
             weight = bin_weight(cell, transmittance, length, mode, beta, epsilon)
             above = below + weight
@@ -225,7 +248,7 @@ def march_sample(
                 k += 1
                 if k < count:
                     target = (float(k) + shift[base + k]) * share
-            used = float(0.0)  # part of this bin already given to intervals
+            used = 0.0  # part of this bin already given to intervals
             while k_edge < count and edge <= above:
                 upto = (edge - below) / weight
                 delta[base + k_edge] = open_length + (upto - used) * length
@@ -242,7 +265,7 @@ def march_sample(
                     break
             t += length
         elif contracted == 0:
-            t += empty_skip(p, d, n, step)
+            t += empty_skip(u, d, inverse, n, step, blocks)
         else:
             t += length
     # Rounding can leave the last interval or sample just short of the total.
@@ -286,6 +309,7 @@ def sample(
     origins: torch.Tensor,
     directions: torch.Tensor,
     cells: torch.Tensor,
+    blocks: torch.Tensor,
     settings: MarchSettings,
     count: int,
     jitter: torch.Tensor | None = None,
@@ -297,6 +321,7 @@ def sample(
     Args:
         origins, directions: (R, 3) float32 normalised frame; directions of unit length.
         cells: (resolution³, 2) float32: density per normalised unit length (0 = closed) and interest in [0, 1].
+        blocks: ((resolution / 4)³,) uint8: 0 where all 4³ cells are closed.
         jitter: (R,) in [0, 1) shift of the walk in bins; 0.5 when None.
         shift: (R · count,) in [0, 1) place of each sample within its share of the PDF; 0.5 when None.
         capacity: on CUDA, the fixed number of rays that may get samples, so that no count is read back; rays
@@ -306,9 +331,9 @@ def sample(
     device, rays = origins.device, len(origins)
     jitter = torch.full((rays,), 0.5, device=device) if jitter is None else jitter
     total, first, last = (torch.empty(rays, device=device) for _ in range(3))
-    o, d, j, c = array(origins, wp.vec3), array(directions, wp.vec3), array(jitter), array(cells, wp.vec2)
-    fixed = _arguments(settings)
-    launch(march_weight, rays, [o, d, j, c, *fixed, array(total), array(first), array(last)], device)
+    o, d, j = array(origins, wp.vec3), array(directions, wp.vec3), array(jitter)
+    fixed = [array(cells, wp.vec2), array(blocks), *_arguments(settings)]
+    launch(march_weight, rays, [o, d, j, *fixed, array(total), array(first), array(last)], device)
     hit = total > 0
     slot = torch.cumsum(hit, 0, dtype=torch.int32) - 1
     if capacity is None:
@@ -326,7 +351,7 @@ def sample(
     launch(
         march_sample,
         rays,
-        [o, d, j, array(shift), c, *fixed, array(total), array(first), array(start), count]
+        [o, d, j, array(shift), *fixed, array(total), array(first), array(start), count]
         + [array(points, wp.vec3), array(depth), array(delta), array(ray)],
         device,
     )

@@ -84,9 +84,7 @@ def launch(kernel: wp.Kernel, count: int, inputs: list[Any], device: torch.devic
     if serial or len(spans) == 1:
         wp.launch(kernel, dim=count, inputs=[*inputs, 0], device="cpu")
         return
-    run_parallel(
-        [lambda s=span: wp.launch(kernel, dim=s[1], inputs=[*inputs, s[0]], device="cpu") for span in spans]
-    )
+    run_parallel([lambda s=span: wp.launch(kernel, dim=s[1], inputs=[*inputs, s[0]], device="cpu") for span in spans])
 
 
 def run_parallel(tasks: list[Any]) -> None:

@@ -42,14 +42,14 @@ class OccupancyGrid(nn.Module):
         self.density: torch.Tensor
         self.interest: torch.Tensor
         self.seen: torch.Tensor
+        self.register_buffer("blocks", torch.ones((n // 4) ** 3, dtype=torch.uint8), persistent=False)
         self.cells: torch.Tensor
+        self.blocks: torch.Tensor
 
     def march_settings(self, near: float = 0.02) -> MarchSettings:
         c = self.config
         beta = c.beta if c.interest != "none" else 0.0
-        return MarchSettings(
-            c.resolution, self.step, near, 1000.0, self.contracted, MODES[c.pdf], beta, c.epsilon
-        )
+        return MarchSettings(c.resolution, self.step, near, 1000.0, self.contracted, MODES[c.pdf], beta, c.epsilon)
 
     def rebuild(self) -> None:
         """Recompute what rays read from densities and interest (also after loading a checkpoint)."""
@@ -58,6 +58,8 @@ class OccupancyGrid(nn.Module):
         opened = (opacity > threshold) & self.seen
         self.cells[:, 0] = torch.where(opened, self.density, 0.0)
         self.cells[:, 1] = self.interest
+        m = self.config.resolution // 4
+        self.blocks.copy_(opened.view(m, 4, m, 4, m, 4).any(5).any(3).any(1).reshape(-1))
 
     def open_share(self) -> float:
         """Share of the cells that are open."""

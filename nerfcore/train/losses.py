@@ -55,9 +55,7 @@ def opacity_entropy(opacity: torch.Tensor) -> torch.Tensor:
     return -(o * o.log() + (1 - o) * (1 - o).log()).mean()
 
 
-def distortion_loss(
-    weights: torch.Tensor, place: torch.Tensor, delta: torch.Tensor, packing: Packing
-) -> torch.Tensor:
+def distortion_loss(weights: torch.Tensor, place: torch.Tensor, delta: torch.Tensor, packing: Packing) -> torch.Tensor:
     """Σ_ij w_i w_j |s_i − s_j| + ⅓ Σ w_i² δ_i, mean over rays (Barron et al., "Mip-NeRF 360", 2022, eq. 15).
 
     Args:

@@ -18,7 +18,8 @@ from ..sampling.occupancy import OccupancyGrid, class_interest
 @dataclass(frozen=True)
 class Rendered:
     """Of R rays: color (R, 3) without background, opacity (R,), depth (R,) expected distance (normalised units, not
-    divided by opacity), probabilities (R, K) or None; and of the samples: weights (N,), density (N,)."""
+    divided by opacity), probabilities (R, K) or None; of the samples that show: weights (N,), density (N,), packed as
+    in `samples`; `evaluated`: number of samples the field was read at."""
 
     color: torch.Tensor
     opacity: torch.Tensor
@@ -27,6 +28,7 @@ class Rendered:
     weights: torch.Tensor
     density: torch.Tensor
     samples: Samples
+    evaluated: int
 
 
 class Model(nn.Module):
@@ -92,22 +94,33 @@ class Model(nn.Module):
         `jitter`, `shift`: see kernels.march.sample; `codes` (R, A): appearance code of each ray.
         """
         settings = self.occupancy.march_settings()
-        s = sample(origins, directions, self.occupancy.cells, settings, samples_per_ray, jitter, shift)
-        geometry = self.field.geometry(s.points)
-        weights = render_weights(geometry.density, s.delta, s.packing)
-        visible = weights.detach() > self.config.render.cull
-        kept, packing = visible.nonzero()[:, 0], s.packing.subset(visible)
-        weight, shown = weights[kept], geometry[kept]
+        s = sample(
+            origins, directions, self.occupancy.cells, self.occupancy.blocks, settings, samples_per_ray, jitter, shift
+        )
+        # A first pass without gradients finds the samples that show; only they are differentiated and coloured.
+        with torch.no_grad():
+            everywhere = self.field.geometry(s.points)
+            weights = render_weights(everywhere.density, s.delta, s.packing)
+            visible = weights > self.config.render.cull
+            kept, packing = visible.nonzero()[:, 0], s.packing.subset(visible)
+        shown = everywhere[kept]
+        if torch.is_grad_enabled():
+            shown = self.field.geometry(s.points[kept], shown.explicit)
+        weight = render_weights(shown.density, s.delta[kept], packing)
         ray = packing.ray.long()
         # Per ray first: a ray's samples share direction and code.
         directional = spherical_harmonics(directions).to(self.field.dtype)
         color = self.field.color(shown, directional[ray], None if codes is None else codes[ray])
-        values = torch.cat([color, torch.ones_like(weight)[:, None], s.depth[kept, None]], 1)
+        depth = s.depth[kept]
+        values = torch.cat([color, torch.ones_like(weight)[:, None], depth[:, None]], 1)
         summed = weighted_sum(values, weight, packing)
         probabilities = None
         if semantics and self.field.semantic_head is not None:
             probabilities = self._probabilities(self.field.logits(shown), weight, packing)
-        return Rendered(summed[:, :3], summed[:, 3], summed[:, 4], probabilities, weights, geometry.density, s)
+        shown_samples = Samples(s.points[kept], depth, s.delta[kept], packing, s.first, s.last)
+        return Rendered(
+            summed[:, :3], summed[:, 3], summed[:, 4], probabilities, weight, shown.density, shown_samples, len(s)
+        )
 
     def _probabilities(self, logits: torch.Tensor, weight: torch.Tensor, packing) -> torch.Tensor:
         if self.config.loss.detach_weights:

@@ -8,6 +8,7 @@ import torch
 
 from ..config import RunConfig
 from ..data.pixels import VOID, Batch, PixelStore
+from ..sampling.cache import CoarseCache
 from .losses import (
     color_loss,
     distortion_loss,
@@ -33,6 +34,7 @@ class Measured:
     rays: int = 0
     hits: int = 0
     samples: int = 0
+    shown: int = 0
     parts: dict[str, float] = field(default_factory=dict)
 
     @property
@@ -57,11 +59,15 @@ class Trainer:
         self.generator = torch.Generator(self.device).manual_seed(config.train.seed)
         self.steps = 0
         self.rays = max(16, min(config.train.max_rays, config.train.batch_samples // config.sampling.samples))
-        self.tiles: torch.Tensor | None = None
+        self.cache = CoarseCache(store)
         self.measured = Measured()
 
     def draw(self) -> Batch:
-        return self.store.batch(self.store.random_places(self.rays, self.generator))
+        """Rays of this step: from image tiles that met the field, and some from everywhere."""
+        s = self.config.sampling
+        if s.coarse_cache and self.steps >= s.warmup and (self.steps - s.warmup) % s.cache_every == 0:
+            self.cache.rebuild(self.model)
+        return self.store.batch(self.cache.places(self.rays, s.empty_rays, self.generator))
 
     def step(self, progress: float) -> None:
         """One optimisation step at `progress` in [0, 1] of the schedule."""
@@ -133,9 +139,10 @@ class Trainer:
         m, budget = self.measured, self.config.train.batch_samples
         m.steps += 1
         m.rays += rays
-        m.samples += len(rendered.samples)
+        m.samples += rendered.evaluated
+        m.shown += len(rendered.samples)
         if self.steps % 8 == 0:
-            wanted = rays * budget / max(len(rendered.samples), 1)
+            wanted = rays * budget / max(rendered.evaluated, 1)
             self.rays = int(min(max(wanted, rays * 0.5, 16), rays * 2, self.config.train.max_rays))
 
     def take_measured(self) -> Measured:

@@ -1,0 +1,124 @@
+"""Whole images from a trained model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+import torch
+
+from ..data.cameras import Camera
+from ..data.pixels import CameraRays
+from ..errors import DiskError
+from ..train.model import Model
+from ..train.run import RunInfo
+
+RAYS = 1 << 15  # rays rendered at once
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One rendered view, numpy, (H, W, …).
+
+    color (3) sRGB in [0, 1] on the background; opacity; depth: distance along the optical axis in normalised units,
+    NaN where nothing is; probabilities (K) or None; position (3) expected surface point in the normalised frame.
+    """
+
+    color: np.ndarray
+    opacity: np.ndarray
+    depth: np.ndarray
+    probabilities: np.ndarray | None
+    position: np.ndarray
+
+    def label(self, class_ids: list[int], void: int = 0) -> np.ndarray:
+        """Class id (H, W) of each pixel; `void` where more than half of the ray is void."""
+        if self.probabilities is None:
+            return np.full(self.opacity.shape, void)
+        best = self.probabilities.argmax(-1)
+        solid = self.probabilities.sum(-1) > 0.5
+        return np.where(solid, np.array(class_ids)[best], void)
+
+    def confidence(self) -> np.ndarray:
+        """Probability (H, W) of the winning class."""
+        return self.opacity * 0 if self.probabilities is None else self.probabilities.max(-1)
+
+    def normal(self) -> np.ndarray:
+        """Surface normal (H, W, 3) in the normalised frame from neighbouring surface points; 0 where nothing is."""
+        dy, dx = np.gradient(self.position, axis=(0, 1))
+        normal = np.cross(dx, dy)
+        length = np.linalg.norm(normal, axis=-1, keepdims=True)
+        normal = np.where(length > 1e-12, -normal / np.maximum(length, 1e-12), 0)
+        return np.where((self.opacity > 0.5)[..., None], normal, 0)
+
+
+def background_of(info: RunInfo) -> float:
+    """Grey value behind the field in pictures: white for transparent captures, as benchmarks expect, else black."""
+    choice = info.config.scene.background
+    if choice in ("white", "black"):
+        return 1.0 if choice == "white" else 0.0
+    return 1.0 if info.transparent else 0.0
+
+
+@torch.no_grad()
+def render_view(
+    model: Model,
+    camera: Camera,
+    camera_to_box: np.ndarray,
+    background: float,
+    semantics: bool = True,
+    check: Callable[[], None] | None = None,
+) -> Frame:
+    """Render what a camera (pose (4, 4) in the normalised frame, OpenCV axes) sees.
+
+    `check` is called between tiles and may raise to stop.
+    """
+    device = model.priorities.device
+    rays = CameraRays([camera], camera_to_box[None], device)
+    count = model.config.render.samples or model.config.sampling.samples
+    axis = rays.rotation[0, :, 2]
+    colors, opacities, depths, classes, points = [], [], [], [], []
+    for pixel in torch.arange(camera.width * camera.height, device=device).split(RAYS):
+        if check is not None:
+            check()
+        origins, directions = rays(torch.zeros_like(pixel), pixel)
+        valid = ~directions[:, 0].isnan()
+        directions = torch.where(valid[:, None], directions, axis.expand_as(directions)).contiguous()
+        out = model.render(origins, directions, count, semantics=semantics)
+        opacity = out.opacity * valid
+        distance = torch.where(opacity > 1e-3, out.depth / out.opacity.clamp(min=1e-3), torch.nan)
+        colors.append(out.color * valid[:, None] + background * (1 - opacity[:, None]))
+        opacities.append(opacity)
+        depths.append(distance * (directions @ axis))
+        points.append(origins + directions * distance[:, None])
+        if out.probabilities is not None:
+            classes.append(out.probabilities)
+    shape = (camera.height, camera.width)
+
+    def image(parts: list[torch.Tensor]) -> np.ndarray:
+        return torch.cat(parts).reshape(*shape, *parts[0].shape[1:]).cpu().numpy()
+
+    return Frame(
+        image(colors).clip(0, 1), image(opacities), image(depths), image(classes) if classes else None, image(points)
+    )
+
+
+def to_bytes(color: np.ndarray) -> np.ndarray:
+    """Values in [0, 1] → uint8, rounded."""
+    return (color.clip(0, 1) * 255 + 0.5).astype(np.uint8)
+
+
+def write_picture(path: Path, color: np.ndarray) -> None:
+    """Write (H, W, 3 or 1) values in [0, 1], or uint8/uint16 as they are, in the format of the suffix.
+
+    Raises:
+        DiskError: the file cannot be written.
+    """
+    pixels = to_bytes(color) if color.dtype.kind == "f" and path.suffix.lower() != ".exr" else color
+    buffer = oiio.ImageBuf(np.ascontiguousarray(pixels if pixels.ndim == 3 else pixels[..., None]))
+    if not buffer.write(str(path)):
+        raise DiskError(
+            f"{path} cannot be written: {buffer.geterror()}.", "Check the disk and the folder's permissions."
+        )

@@ -1,0 +1,82 @@
+"""Checkpoints: one safetensors file with every tensor of the trainer, its numbers as JSON in the header.
+
+One file, so that tensors and numbers can never be from different moments; written atomically.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+
+from ..errors import ProjectError
+from ..files import atomic_path
+from .trainer import Trainer
+
+
+def trainer_tensors(trainer: Trainer) -> dict[str, torch.Tensor]:
+    """Every tensor that training depends on."""
+    tensors = {f"model.{name}": value for name, value in trainer.model.state_dict().items()}
+    for index, parameter in enumerate(trainer.model.parameters()):
+        for name, value in trainer.optimizer.state.get(parameter, {}).items():
+            tensors[f"optimizer.{index}.{name}"] = value
+    tensors["generator"] = trainer.generator.get_state()
+    if trainer.cache.hit is not None:
+        tensors["cache.hit"] = trainer.cache.hit
+    return tensors
+
+
+def save_checkpoint(path: Path, trainer: Trainer, state: dict[str, Any]) -> None:
+    """Atomically write the trainer with `state` (progress, seconds, …).
+
+    Raises:
+        DiskError: the disk is full or the folder is not writable; an older checkpoint stays as it was.
+    """
+    tensors = {name: value.detach().cpu().contiguous() for name, value in trainer_tensors(trainer).items()}
+    state = {**state, "steps": trainer.steps, "rays": trainer.rays}
+    with atomic_path(path) as temporary:
+        try:
+            save_file(tensors, temporary, metadata={"fieldwork": json.dumps(state)})
+        except SafetensorError as error:
+            raise _disk_error(error) from error
+
+
+def _disk_error(error: Exception) -> OSError:
+    """safetensors reports a full disk as text; give it back its number."""
+    import errno
+    import re
+
+    found = re.search(r"os error (\d+)", str(error))
+    return OSError(int(found[1]) if found else errno.EIO, str(error))
+
+
+def read_checkpoint(path: Path, device: torch.device) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+    """Tensors and state of a checkpoint. Raises ProjectError when it is missing, truncated or foreign."""
+    if not path.is_file():
+        raise ProjectError(f"{path.parent} has no checkpoint.", "Run `fieldwork train` first.")
+    try:
+        with safe_open(path, "pt", device=str(device)) as file:
+            state = json.loads((file.metadata() or {})["fieldwork"])
+            return {name: file.get_tensor(name) for name in file.keys()}, state
+    except (SafetensorError, KeyError, json.JSONDecodeError, OSError) as error:
+        raise ProjectError(f"{path} is damaged: {error}.", "Train the run again.") from error
+
+
+def restore(trainer: Trainer, tensors: dict[str, torch.Tensor], state: dict[str, Any]) -> None:
+    """Put a checkpoint back into a trainer of the same configuration."""
+    model = {name.removeprefix("model."): value for name, value in tensors.items() if name.startswith("model.")}
+    trainer.model.load_state_dict(model)
+    trainer.model.occupancy.rebuild()
+    for index, parameter in enumerate(trainer.model.parameters()):
+        prefix = f"optimizer.{index}."
+        saved = {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
+        if saved:
+            # Adam keeps its step count on the CPU unless it is fused on a GPU.
+            trainer.optimizer.state[parameter] = saved
+    trainer.generator.set_state(tensors["generator"].cpu())
+    trainer.cache.hit = tensors.get("cache.hit")
+    trainer.steps, trainer.rays = state["steps"], state["rays"]

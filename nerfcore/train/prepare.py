@@ -1,0 +1,136 @@
+"""From a project to a trainer: classes, box, pixels, visibility."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ..config import RunConfig
+from ..data.box import box_poses, choose_box
+from ..data.pixels import PixelStore, read_label, read_photo
+from ..data.scene import Scene
+from ..errors import TrainingError
+from ..progress import Reporter
+from ..project import load_project, load_scene, world_from_sfm
+from ..sampling.visibility import view_counts
+from .run import RunInfo, new_model
+from .trainer import Trainer
+
+VIEWS_ENOUGH = 8  # cells seen by this many cameras count fully as evidence
+
+
+def present_classes(scene: Scene, indices: list[int]) -> list[int]:
+    """Ids of the classes that occur in the labels of some views, without void, ascending."""
+    found: set[int] = set()
+    for index in indices:
+        path = scene.views[index].label
+        if path is not None:
+            found.update(np.unique(read_label(path)).tolist())
+    found.discard(scene.ignore_id)
+    known = {c.id for c in scene.classes}
+    return sorted(found & known) if known else sorted(found)
+
+
+def has_transparency(scene: Scene) -> bool:
+    """Whether the photos have empty surroundings: an alpha channel in use, or masks that mean "empty"."""
+    view = scene.views[scene.train[0]]
+    if view.mask is not None and scene.mask_mode == "empty":
+        return True
+    return bool((read_photo(view.image)[..., 3] < 255).any())
+
+
+def plan_run(project_folder: Path, preset: str, config: RunConfig) -> tuple[RunInfo, Scene]:
+    """Decide what a run will be: its views, classes and box.
+
+    Raises:
+        TrainingError: fewer than two posed training images.
+    """
+    project, scene = load_project(project_folder), load_scene(project_folder)
+    train = training_views(scene, config)
+    if len(train) < 2:
+        raise TrainingError(
+            f"{project_folder} has {len(train)} posed training image.",
+            "At least two are needed: add photos and run poses.",
+        )
+    transparent = has_transparency(scene)
+    box = choose_box(scene, config.scene, transparent)
+    class_ids = present_classes(scene, train) if config.loss.semantic_weight > 0 else []
+    priority = {c.id: c.priority for c in scene.classes}
+    info = RunInfo(
+        preset=preset,
+        config=config,
+        class_ids=class_ids,
+        priorities=[priority.get(i, 1.0) for i in class_ids],
+        images=[scene.views[i].name for i in train],
+        sfm_from_box=(np.linalg.inv(world_from_sfm(project)) @ box.world_from_box).tolist(),
+        contracted=box.contracted,
+        transparent=transparent,
+    )
+    return info, scene
+
+
+def training_views(scene: Scene, config: RunConfig) -> list[int]:
+    """Indices of the views to train on; `view_share` keeps an evenly spread part of them."""
+    share = config.train.view_share
+    if share >= 1:
+        return scene.train
+    count = max(2, round(len(scene.train) * share))
+    return [scene.train[i] for i in np.linspace(0, len(scene.train) - 1, count).round().astype(int)]
+
+
+def make_trainer(project_folder: Path, info: RunInfo, scene: Scene, device: torch.device, report: Reporter) -> Trainer:
+    """Load the pixels and build the trainer of a run."""
+    config = info.config
+    names = {view.name: i for i, view in enumerate(scene.views)}
+    missing = [name for name in info.images if name not in names]
+    if missing:
+        raise TrainingError(
+            f"Image {missing[0]} of this run is gone from the project.", "Train a new run (--run NAME)."
+        )
+    box = info.box(load_project(project_folder))
+    report.stage("Loading photos")
+    store = PixelStore(
+        scene,
+        [names[name] for name in info.images],
+        info.class_ids,
+        box.box_from_world,
+        config.scene.image_size,
+        device,
+        report,
+    )
+    degrade(store, config)
+    poses = torch.from_numpy(box_poses(store.views, box.box_from_world)).float().to(device)
+    coarse = 64
+    counts = view_counts(store.cameras, poses, coarse, box.contracted)
+    resolution = config.sampling.resolution
+    index = (torch.arange(resolution, device=device) * coarse) // resolution
+    seen = (counts > 0).view(coarse, coarse, coarse)[index][:, index][:, :, index].reshape(-1)
+    model = new_model(info, device, seen.cpu())
+    if model.field.blend is not None:
+        model.field.blend.views.copy_((counts / VIEWS_ENOUGH).clamp(max=1))
+    background = config.scene.background
+    random = background == "random" or background == "auto"
+    return Trainer(model, store, config, random_background=random)
+
+
+def degrade(store: PixelStore, config: RunConfig) -> None:
+    """Input noise, label noise and missing labels of the robustness tests, the same for the same seed."""
+    t = config.train
+    generator = torch.Generator().manual_seed(t.seed + 1)
+    if t.noise > 0:
+        noise = torch.randn(len(store), 3, generator=generator) * (t.noise * 255)
+        noisy = (store.rgba[:, :3].float().cpu() + noise).round().clamp(0, 255)
+        store.rgba[:, :3] = noisy.to(torch.uint8).to(store.device)
+    if t.labelled_share < 1:
+        count = len(store.views)
+        keep = torch.randperm(count, generator=generator)[: max(1, round(count * t.labelled_share))].tolist()
+        for index in set(range(count)) - set(keep):
+            store.label[int(store.first[index]) : int(store.first[index + 1])] = 255
+    if t.label_noise > 0:
+        flip = torch.rand(len(store), generator=generator) < t.label_noise
+        classes = max(int(store.label[store.label != 255].max()) + 1, 1) if bool((store.label != 255).any()) else 1
+        wrong = torch.randint(0, classes, (len(store),), generator=generator).to(torch.uint8)
+        flip &= store.label.cpu() != 255
+        store.label[flip.to(store.device)] = wrong[flip].to(store.device)

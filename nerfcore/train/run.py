@@ -1,0 +1,102 @@
+"""A training run on disk: `runs/<name>/config.json`, its checkpoint, and the model they describe."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from ..config import RunConfig
+from ..data.box import Box
+from ..errors import ProjectError
+from ..files import write_json
+from ..kernels.runtime import default_threads
+from ..project import Project, world_from_sfm
+from .model import Model
+
+CHECKPOINT = "field.safetensors"
+
+
+class RunInfo(BaseModel):
+    """What a run was trained on and with. `sfm_from_box` (4, 4) carries the cube [−1, 1]³ into the SfM frame."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    version: int = 1
+    preset: str
+    config: RunConfig
+    class_ids: list[int]
+    priorities: list[float]
+    images: list[str]
+    sfm_from_box: list[list[float]]
+    contracted: bool
+    transparent: bool
+
+    def box(self, project: Project) -> Box:
+        """The cube in the project's present world frame."""
+        return Box(world_from_sfm(project) @ np.array(self.sfm_from_box), self.contracted)
+
+
+def run_folder(project: Path, run: str) -> Path:
+    return Path(project) / "runs" / run
+
+
+def save_info(project: Path, run: str, info: RunInfo) -> None:
+    write_json(run_folder(project, run) / "config.json", info.model_dump(mode="json"))
+
+
+def load_info(project: Path, run: str) -> RunInfo:
+    """Raises ProjectError when there is no such run or its config.json is damaged."""
+    path = run_folder(project, run) / "config.json"
+    try:
+        return RunInfo.model_validate(json.loads(path.read_text(encoding="utf-8")))
+    except FileNotFoundError as error:
+        raise ProjectError(f"{project} has no run “{run}”.", "Run `fieldwork train` first.") from error
+    except (json.JSONDecodeError, ValidationError) as error:
+        raise ProjectError(f"{path} is damaged or from another version.", "Train the run again.") from error
+
+
+def use_device() -> torch.device:
+    """The device to compute on: FIELDWORK_DEVICE when set, else CUDA when there is one, else the CPU."""
+    import os
+
+    torch.set_num_threads(default_threads())
+    wanted = os.environ.get("FIELDWORK_DEVICE")
+    return torch.device(wanted or ("cuda" if torch.cuda.is_available() else "cpu"))
+
+
+def new_model(info: RunInfo, device: torch.device, seen: torch.Tensor | None = None) -> Model:
+    """An untrained model of the run's shape."""
+    torch.manual_seed(info.config.train.seed)
+    classes = len(info.class_ids) if info.config.loss.semantic_weight > 0 else 0
+    priorities = torch.tensor(info.priorities) if classes else None
+    return Model(info.config, classes, len(info.images), info.contracted, seen, priorities).to(device)
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A trained model, ready to be read."""
+
+    model: Model
+    info: RunInfo
+    state: dict[str, Any]
+    device: torch.device
+
+
+def load_trained(project: Path, run: str) -> Trained:
+    """Raises ProjectError when the run has no usable checkpoint."""
+    from .checkpoint import read_checkpoint
+
+    info, device = load_info(project, run), use_device()
+    path = run_folder(project, run) / CHECKPOINT
+    tensors, state = read_checkpoint(path, device)
+    model = new_model(info, device)
+    model.load_state_dict({name.removeprefix("model."): t for name, t in tensors.items() if name.startswith("model.")})
+    model.occupancy.rebuild()
+    model.field.set_progress(state["progress"], info.config.train.fade, state["steps"])
+    return Trained(model.eval().requires_grad_(False), info, state, device)

@@ -34,7 +34,7 @@ RINGS = [(0.38, 1.75, 16.0), (0.37, 1.8, 33.0), (0.25, 1.7, 56.0)]
 
 def build(seed: int) -> bpy.types.Scene:
     """Replace everything in this Blender by the scene; `seed` moves the textures and the ornament."""
-    bpy.ops.wm.read_factory_settings(use_empty=True)
+    bpy.ops.wm.read_homefile(use_factory_startup=True, use_empty=True)  # unlike factory settings, keeps extensions
     scene = bpy.context.scene
     noise.seed_set(seed + 1)
     shift = Vector(np.random.default_rng(seed).uniform(-20, 20, 3).tolist())

@@ -141,7 +141,9 @@ def _write_photo(view: View, folder: Path, grids: dict[str, torch.Tensor], lense
         if keep:
             shutil.copyfile(view.image, temporary)
         else:
-            _develop(view, temporary, None if plain else grids.setdefault(key, undistortion_grid(camera)))
+            if not plain and key not in grids:
+                grids[key] = undistortion_grid(camera)
+            _develop(view, temporary, None if plain else grids[key])
     return target
 
 

@@ -75,6 +75,11 @@ class AlignParams(Params):
     scale: tuple[str, str, float] | None = Field(
         None, description="two points (x,y,z) or camera names, and their distance in metres"
     )
+    gps: bool = Field(False, description="take scale and north from the photos' GPS positions")
+    ground: bool = Field(False, description="level the ground and put it at z = 0")
+    crop: str | None = Field(
+        None, description="region of interest: auto, none, or x0,y0,z0,x1,y1,z1 in the aligned world"
+    )
 
 
 class TrainParams(Params):

@@ -9,6 +9,9 @@ import numpy as np
 from .similarity import make_similarity, transform_points
 
 UNCERTAIN = 0.5  # confidence below which a level group of cameras is looked for
+GROUND_THICKNESS = 0.015  # of the height of the points
+GROUND_TILT = 6.0  # degrees from level
+GROUND_SHARE = 0.1  # of the points near the subject
 LEVEL_SHARE = 0.3  # of the cameras that such a group must have
 
 
@@ -114,26 +117,68 @@ def upright(
         center, distance = centers.mean(0), max(extent, 1e-6)
     scale = camera_distance / distance
     frame = make_similarity(scale, rotation, -scale * rotation @ center)
-    if points is not None and (height := ground_height(transform_points(frame, points))) is not None:
-        frame[2, 3] -= height
+    if points is not None:
+        grounded = on_ground(points, frame)
+        frame = frame if grounded is None else grounded
     return frame, confidence
 
 
-def ground_height(points: np.ndarray, tolerance: float = 0.02) -> float | None:
-    """The z of a horizontal ground plane under the points (N, 3), or None when there is no evident one.
+def on_ground(points: np.ndarray, world_from_points: np.ndarray) -> np.ndarray | None:
+    """The frame put upon the ground, or None when no horizontal ground is evident.
 
-    The ground is where the lower third of the points piles up: a layer of thickness `tolerance` of the points'
-    extent that holds at least 8 % of them, with at most 5 % below it.
+    The ground is a plane through the lower points, at most 6° from level: a tenth of the points near the subject lie
+    in it, and hardly any below.
+
+    Args:
+        points: (N, 3) in any frame.
+        world_from_points: similarity (4, 4) into a frame whose z is roughly up.
     """
-    if len(points) < 50:
+    near = transform_points(world_from_points, points)
+    if len(near) < 100:
         return None
-    z = np.sort(points[:, 2])
-    low, high = np.quantile(z, [0.01, 0.99])
-    thickness = max((high - low) * tolerance, 1e-9)
+    distance = np.linalg.norm(near - np.median(near, axis=0), axis=1)
+    near = near[distance < 4 * np.median(distance)]
+    height = _lowest_layer(near[:, 2])
+    if height is None:
+        return None
+    thickness = GROUND_THICKNESS * np.ptp(np.quantile(near[:, 2], [0.02, 0.98]))
+    normal, offset = np.array([0.0, 0.0, 1.0]), height
+    for width in (4.0, 3.0, 2.0, 1.0, 1.0, 1.0):
+        layer = near[np.abs(near @ normal - offset) < width * thickness]
+        if len(layer) < 30:
+            return None
+        center = layer.mean(0)
+        _, vectors = np.linalg.eigh((layer - center).T @ (layer - center))
+        normal = vectors[:, 0] * (1.0 if vectors[2, 0] >= 0 else -1.0)
+        offset = float(normal @ center)
+    above = near @ normal - offset
+    share = float((np.abs(above) < thickness).mean())
+    below = float((above < -2 * thickness).mean())
+    if normal[2] < np.cos(np.radians(GROUND_TILT)) or share < GROUND_SHARE or below > 0.05:
+        return None
+    turn = np.eye(4)
+    # The smallest rotation that levels the ground, so that the heading stays.
+    turn[:3, :3] = _smallest_rotation(normal)
+    turn[2, 3] = -offset
+    return turn @ world_from_points
+
+
+def _smallest_rotation(normal: np.ndarray) -> np.ndarray:
+    """Rotation (3, 3) by the least angle that turns the unit vector `normal` (not −z) into +z (Rodrigues)."""
+    x, y, z = normal
+    cross = np.array([[0.0, 0.0, -x], [0.0, 0.0, -y], [x, y, 0.0]])
+    return np.eye(3) + cross + cross @ cross / (1 + z)
+
+
+def _lowest_layer(z: np.ndarray) -> float | None:
+    """Height of the layer in which the lower points pile up, with at most 5 % of the points below it."""
+    z = np.sort(z)
+    low, high = np.quantile(z, [0.02, 0.98])
+    thickness = max((high - low) * 2 * GROUND_THICKNESS, 1e-9)
     counts = np.searchsorted(z, z + thickness) - np.arange(len(z))
-    candidates = np.flatnonzero(np.arange(len(z)) <= 0.05 * len(z))
-    best = candidates[np.argmax(counts[candidates])]
-    if counts[best] < 0.08 * len(z):
+    candidates = np.arange(max(1, int(0.05 * len(z))))
+    best = int(candidates[np.argmax(counts[candidates])])
+    if counts[best] < 0.5 * GROUND_SHARE * len(z):
         return None
     return float(np.median(z[best : best + counts[best]]))
 

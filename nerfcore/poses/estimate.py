@@ -29,6 +29,7 @@ from ..project import (
     save_poses,
     save_project,
 )
+from .align import gps_frame
 from .process import run_worker
 
 WORK_FOLDER = "poses/sfm"
@@ -212,7 +213,12 @@ def _update_project(
         return
     matrices = [np.array(image.camera_to_world) for image in poses.images]
     world_from_sfm, confidence = upright(matrices, points.xyz)
-    project.frame = Frame(world_from_sfm=world_from_sfm.tolist(), up_confidence=confidence)
+    measured = gps_frame(world_from_sfm, project, poses)
+    project.frame = Frame(
+        world_from_sfm=(world_from_sfm if measured is None else measured).tolist(),
+        up_confidence=confidence,
+        scale_known=measured is not None,
+    )
 
 
 def _write_report(

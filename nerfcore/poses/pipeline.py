@@ -72,9 +72,8 @@ def run(job: dict[str, Any], tell: Any) -> dict[str, Any]:
         raise PosesError(
             _why_nothing(best, names), "Take more photos that overlap by two thirds, with texture in view."
         )
-    model = best.models[0]
     tell.stage("Final adjustment")
-    mapping.adjust(model, keep_cameras=job["start"] is not None)
+    model = best.models[0] = mapping.adjust(best.models[0], keep_cameras=job["start"] is not None)
     sparse = Path(job["sparse"])
     temporary = sparse.with_name(sparse.name + ".new")
     shutil.rmtree(temporary, ignore_errors=True)
@@ -97,7 +96,7 @@ def _attempt(job: dict[str, Any], level: Level, names: list[str], exhaustive: bo
         pairs = features.likely_pairs(path, names, job["neighbours"], tell)
     features.match(path, pairs, work / "pairs.txt", tell)
     start = _start_model(job, path, work)
-    best = Attempt(level, path, [], {}, {}, {})
+    best, best_doubtful = Attempt(level, path, [], {}, {}, {}), False
     # Placing cameras is quick beside finding features: try lower demands before harder features.
     for full, relaxed in ((True, False), (False, False), (False, True)):
         if start is None and features.set_lenses(path, job["images"], full) != full:
@@ -109,8 +108,13 @@ def _attempt(job: dict[str, Any], level: Level, names: list[str], exhaustive: bo
             continue
         tell.stage("Checking poses")
         model, checks, links, dropped = mapping.repair(models[0], path, image_folder, work, relaxed, names, tell)
-        if model.num_reg_images() > best.registered:
-            best = Attempt(level, path, [model, *models[1:]], checks, links, dropped)
+        # Self-calibration may run away, and a lens of unknown focal length turn out to be long: then the full model
+        # is worth no more than the simple one that follows.
+        doubtful = full and (mapping.has_long_lens(model) or mapping.has_odd_lens(model))
+        if model.num_reg_images() > best.registered or (best_doubtful and model.num_reg_images() >= MIN_REGISTERED):
+            best, best_doubtful = Attempt(level, path, [model, *models[1:]], checks, links, dropped), doubtful
+        if best_doubtful:
+            continue
         if best.registered >= ENOUGH * len(names):
             break
     return best

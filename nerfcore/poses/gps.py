@@ -1,0 +1,77 @@
+"""Scale and north from the GPS positions of the photos, when they mean something."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..errors import PosesError
+
+GPS_NOISE = 5.0  # metres, of a phone under open sky
+EXTENT_OVER_NOISE = 5.0  # how far the photos must be spread for GPS to say anything
+EARTH_RADIUS = 6_378_137.0  # metres, WGS 84 equatorial
+
+
+@dataclass(frozen=True)
+class GpsFit:
+    """`turn` (4, 4) is the rotation about z and the scale that bring the world to metres with +y to the north.
+
+    `origin` is where the world's origin lies (degrees), `residual` the median misfit in metres.
+    """
+
+    turn: np.ndarray
+    origin: tuple[float, float]
+    residual: float
+
+
+def local_metres(latitude: np.ndarray, longitude: np.ndarray) -> np.ndarray:
+    """East and north (N, 2) in metres from the mean position; a sphere is exact enough over a capture."""
+    north = np.radians(latitude - latitude.mean()) * EARTH_RADIUS
+    east = np.radians(longitude - longitude.mean()) * EARTH_RADIUS * np.cos(np.radians(latitude.mean()))
+    return np.stack([east, north], -1)
+
+
+def fit_gps(centers: np.ndarray, latitude: np.ndarray, longitude: np.ndarray) -> GpsFit:
+    """Fit heading and scale of cameras to their GPS positions; up is kept as it is.
+
+    Args:
+        centers: (N, 3) camera centres in a world with z up.
+        latitude, longitude: (N,) degrees.
+    Raises:
+        PosesError: too few positions, too close together for their noise, or they contradict the poses.
+    """
+    if len(centers) < 4:
+        raise PosesError(f"Only {len(centers)} placed photos have a GPS position.", "Give the scale with --scale.")
+    target = local_metres(latitude, longitude)
+    extent = float(np.linalg.norm(np.ptp(target, axis=0)))
+    if extent < EXTENT_OVER_NOISE * GPS_NOISE:
+        raise PosesError(
+            f"The GPS positions lie within {extent:.0f} m, which is too little for their error of about "
+            f"{GPS_NOISE:.0f} m.",
+            "Give the scale with --scale.",
+        )
+    z, w = centers[:, 0] + 1j * centers[:, 1], target[:, 0] + 1j * target[:, 1]
+    keep = np.ones(len(z), bool)
+    factor, shift = 1.0 + 0j, 0j
+    for _ in range(5):
+        mean_z, mean_w = z[keep].mean(), w[keep].mean()
+        a, b = z[keep] - mean_z, w[keep] - mean_w
+        # Least squares for w = factor · z + shift over complex numbers: a plane similarity without reflection.
+        factor = (np.conj(a) @ b) / max(float((np.abs(a) ** 2).sum()), 1e-30)
+        shift = mean_w - factor * mean_z
+        misfit = np.abs(factor * z + shift - w)
+        keep = misfit <= max(3 * float(np.median(misfit)), 1e-6)
+    residual = float(np.median(np.abs(factor * z + shift - w)))
+    if residual > extent / 5 or abs(factor) < 1e-9:
+        raise PosesError(
+            f"The GPS positions do not fit the camera positions (misfit {residual:.0f} m of {extent:.0f} m).",
+            "Give the scale with --scale.",
+        )
+    turn = np.diag([abs(factor), abs(factor), abs(factor), 1.0])
+    turn[:2, :2] = [[factor.real, -factor.imag], [factor.imag, factor.real]]
+    north = float(latitude.mean() + np.degrees(shift.imag / EARTH_RADIUS))
+    east = float(
+        longitude.mean() + np.degrees(shift.real / (EARTH_RADIUS * np.cos(np.radians(float(latitude.mean())))))
+    )
+    return GpsFit(turn, (north, east), residual)

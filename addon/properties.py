@@ -240,7 +240,7 @@ class FieldworkScene(PropertyGroup):
 
     # Export
     export_path: StringProperty(
-        name="File", description="File to write", default="//fieldwork.blend", subtype="FILE_PATH"
+        name="File", description="File to write; empty: in the exports of the project", subtype="FILE_PATH"
     )
 
 

@@ -12,7 +12,6 @@ from typing import Any
 
 import bpy
 
-from ..nerfcore.engine.status import list_jobs
 from ..nerfcore.files import write_json
 
 PROJECT_FILE = "project.json"
@@ -68,11 +67,11 @@ def last_result(project: dict[str, Any] | None, verb: str) -> dict[str, Any]:
 
 
 def can_resume(folder: Path | None, run: str) -> bool:
-    """Whether a training of the run was stopped before its end and left a checkpoint."""
+    """Whether a training of the run stopped before its end and left a checkpoint."""
     if folder is None or not has_run(folder, run):
         return False
-    jobs = [job for job in list_jobs(folder) if job.verb == "train" and job.params.get("run", "main") == run]
-    return bool(jobs) and jobs[-1].state in ("cancelled", "died", "failed")
+    # Training writes its metrics at the end, and removes those of before at the start.
+    return "train" not in (cached_json(folder / "runs" / run / "metrics.json") or {})
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 from bpy.types import Context
@@ -19,10 +20,11 @@ class FIELDWORK_OT_blend(ProjectOperator):
     needs = (need_run,)
 
     def parameters(self, context: Context) -> dict[str, Any]:
-        out = self.path(context, "out")
-        if not out or not out.endswith(".blend"):
+        project, run = self.project_path(context), self.value(context, "run")
+        out = self.path(context, "out") or str(Path(project, "exports", run, f"{Path(project).name}.blend"))
+        if not out.endswith(".blend"):
             raise ValueError("Name a file that ends in .blend.")
-        return {"project": self.project_path(context), "run": self.value(context, "run"), "out": out}
+        return {"project": project, "run": run, "out": out}
 
 
 CLASSES = [FIELDWORK_OT_blend]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from bpy.types import Context
 
 from ..addon import jobs
@@ -15,7 +17,7 @@ class FIELDWORK_PT_export(StepPanel):
         layout = self.layout
         last = next((j for j in reversed(jobs.queue.finished) if j.verb == "blend" and j.state == "done"), None)
         if last is not None:
-            self.draw_state(True, f"{len((last.result or {}).get('objects', []))} objects written")
+            self.draw_state(True, f"Written: {Path((last.result or {}).get('file', '')).name}")
         columns(layout).prop(context.scene.fieldwork, "export_path")
         layout.operator("fieldwork.blend", icon="FILE_BLEND")
 

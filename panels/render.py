@@ -26,8 +26,7 @@ class FIELDWORK_PT_render(StepPanel):
         if settings.render_from == "orbit":
             column.prop(settings, "orbit")
         column.prop(settings, "size")
-        row = layout.row(align=True)
-        row.prop(settings, "passes")
+        layout.column_flow(columns=3, align=True).prop(settings, "passes")
         columns(layout).prop(settings, "show_as")
         layout.operator("fieldwork.render", icon="RENDER_STILL")
 

@@ -121,6 +121,12 @@ class Job(Reporter):
     def log_path(self) -> Path | None:
         return self.project / st.FOLDER / f"{self.verb}.log" if self.project else None
 
+    @property
+    def lockable(self) -> Path | None:
+        """The project folder, None when it is not there and the verb would not make it: that is the verb's to tell."""
+        makes_it = {"photos", "dataset"} & type(self.params).model_fields.keys()
+        return self.project if self.project and (makes_it or self.project.is_dir()) else None
+
     # What the verb calls.
 
     def stage(self, name: str) -> None:

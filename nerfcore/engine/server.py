@@ -169,7 +169,7 @@ class Server:
     def _run(self, job: Job) -> None:
         try:
             job.check()
-            with project_lock(job.project, job.verb):
+            with project_lock(job.lockable, job.verb):
                 job.begin()
                 with _logged(job):
                     self._answer(job, "done", result=run_verb(job.verb, job.params, job))
@@ -251,7 +251,7 @@ def gpu_memory_mb() -> int | None:
 def _logged(job: Job) -> Iterator[None]:
     """Let everything that is logged while the job runs, and how it ends, go to PROJECT/jobs/<verb>.log as well."""
     path = job.log_path
-    if path is None:
+    if path is None or job.lockable is None:
         yield
         return
     handler = logging.FileHandler(path, mode="w", encoding="utf-8")

@@ -32,6 +32,7 @@ class Screen:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.facts: dict = {}
+        self.headers: tuple = (None, 0.0)
 
     @property
     def window(self):
@@ -78,12 +79,14 @@ class Screen:
 
     def toggle(self, panel: str) -> Steps:
         """Click the header of a sub-panel while those above it are closed and no job runs."""
-        found = yield from self.buttons(depth=260)
-        main = [place for place in found if place[0].startswith("bpy.ops.fieldwork.")]
-        assert main, "the main panel has no button"
-        # Below the big button of the next step come the headers, one each line.
-        top = max(y for _, _, y in main) - 24 - self.unit / 2
-        yield from self.click(self.sidebar.x + 60, top - PANELS.index(panel) * self.unit)
+        state = [(job.id, job.state) for job in self.queue.finished]
+        if self.headers[0] != state:
+            found = yield from self.buttons(depth=260)
+            main = [place for place in found if place[0].startswith("bpy.ops.fieldwork.")]
+            assert main, "the main panel has no button"
+            # Below the big button of the next step come the headers, one each line.
+            self.headers = (state, max(y for _, _, y in main) - 24 - self.unit / 2)
+        yield from self.click(self.sidebar.x + 60, self.headers[1] - PANELS.index(panel) * self.unit)
 
     @property
     def unit(self) -> float:
@@ -127,7 +130,7 @@ class Screen:
 
 def run(steps: Steps, screen: Screen) -> None:
     def finish(code: int, error: str = "") -> None:
-        (screen.folder / "result.json").write_text(json.dumps({"error": error, **screen.facts}, default=str))
+        (screen.folder / "result.json").write_text(json.dumps({**screen.facts, "error": error}, default=str))
         # Leave as an artist does, so that the extension is unregistered.
         if code == 0:
             bpy.ops.wm.quit_blender()

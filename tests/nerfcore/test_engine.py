@@ -342,6 +342,13 @@ def test_damaged_job_files_are_no_jobs(project):
     assert st.list_jobs(project) == []
 
 
+def test_a_project_that_is_not_there_is_not_made(start, tmp_path):
+    client = start()
+    error = client.answer(client.send("poses", project=tmp_path / "nowhere"))["error"]
+    assert error["data"]["code"] == "project"
+    assert not (tmp_path / "nowhere").exists()
+
+
 def test_unwritable_project_is_an_error_that_names_it(start, tmp_path):
     blocked = tmp_path / "blocked"
     blocked.mkdir()

@@ -16,6 +16,7 @@ from mathutils import Matrix
 
 from .label_material import COLOR_ATTRIBUTE, SWITCH, make_group, make_material
 from .package import SENSOR_MM, Package, blender_camera
+from .point_cloud import show_points
 
 ROLE, PROJECT = "fieldwork_role", "fieldwork_project"
 SIZE = "fieldwork_size"  # photo size in pixels, on camera objects
@@ -210,6 +211,7 @@ def _mesh_of(found: bpy.types.Object | None, name: str) -> bpy.types.Mesh:
 
 
 def _points(place: _Place, package: Package, root: bpy.types.Object) -> bpy.types.Object:
+    # Vertices with a colour attribute work in every version, in every exporter, and stay in the file.
     mesh = _mesh_of(place.existing("points"), "Sparse points")
     mesh.vertices.add(len(package.xyz))
     mesh.vertices.foreach_set("co", package.xyz.astype(np.float32).ravel())
@@ -218,6 +220,10 @@ def _points(place: _Place, package: Package, root: bpy.types.Object) -> bpy.type
     item = place.object("points", "Sparse points", mesh, root)
     item.matrix_parent_inverse = item.matrix_basis = Matrix.Identity(4)
     item.hide_render = True
+    centers = np.array([np.array(camera["camera_to_world"])[:3, 3] for camera in package.cameras]).reshape(-1, 3)
+    group = make_group(f"Fieldwork · {package.name}", root)
+    material = make_material(f"{package.name} · points", [0.8, 0.8, 0.8], group)
+    show_points(item, float(np.ptp(centers, axis=0).max(initial=0.0)) / 600 or 0.005, material)
     return item
 
 

@@ -1,0 +1,46 @@
+"""Makes loose vertices visible: a node group that draws each as a tiny coloured ball, in the viewport only."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+
+NAME = "Fieldwork Points"
+
+
+def show_points(item: bpy.types.Object, radius: float, material: bpy.types.Material) -> None:
+    """Give a mesh of vertices balls of `radius` (its own units) with the vertices' attributes, if it has none yet.
+
+    The object's data stay plain vertices with a colour attribute.
+    """
+    modifier = next((m for m in item.modifiers if m.type == "NODES"), None)
+    if modifier is None:
+        modifier = item.modifiers.new(NAME, "NODES")
+    modifier.node_group = _group(item.name, radius, material, modifier.node_group)
+    modifier.show_render = False
+
+
+def _group(name: str, radius: float, material: bpy.types.Material, tree: Any) -> Any:
+    if tree is None:
+        tree = bpy.data.node_groups.new(f"{NAME} · {name}", "GeometryNodeTree")
+        tree.interface.new_socket("Geometry", in_out="INPUT", socket_type="NodeSocketGeometry")
+        tree.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
+        kinds = ("NodeGroupInput", "GeometryNodeInstanceOnPoints", "GeometryNodeJoinGeometry")
+        kinds += ("GeometryNodeRealizeInstances", "GeometryNodeSetMaterial", "NodeGroupOutput")
+        nodes = [tree.nodes.new(kind) for kind in kinds]
+        for column, (node, following) in enumerate(zip(nodes, [*nodes[1:], None])):
+            node.location = (200 * column, 0)
+            if following is not None:
+                tree.links.new(node.outputs[0], following.inputs[0])
+        # The vertices themselves go along: from them the result learns which colour attribute is the active one.
+        tree.links.new(nodes[0].outputs[0], nodes[2].inputs[0])
+        ball = tree.nodes.new("GeometryNodeMeshIcoSphere")
+        ball.location = (0, -200)
+        tree.links.new(ball.outputs[0], nodes[1].inputs["Instance"])
+    for node in tree.nodes:
+        if node.type == "MESH_PRIMITIVE_ICO_SPHERE":
+            node.inputs["Radius"].default_value = radius
+        elif node.type == "SET_MATERIAL":
+            node.inputs["Material"].default_value = material
+    return tree

@@ -50,6 +50,7 @@ class Dataset:
     scale_known: bool = False
     class_names: dict[int, str] = field(default_factory=dict)
     ignore_id: int = 0
+    class_colors: dict[int, tuple[int, int, int]] = field(default_factory=dict)  # in RGB label maps
     points: Points = field(default_factory=Points.empty)
     bounds: np.ndarray | None = None
     warnings: list[str] = field(default_factory=list)

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 import importlib
-import shutil
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from PIL import Image
-
+from ..capture.ingest import file_hash
 from ..errors import InputError, ProjectError
-from ..files import atomic_path
 from ..params import ImportParams
 from ..progress import Reporter
 from ..project import (
@@ -22,6 +17,7 @@ from ..project import (
     PosedImage,
     Poses,
     Project,
+    SemanticClass,
     create_folder,
     load_project,
     save_poses,
@@ -29,6 +25,7 @@ from ..project import (
 )
 from .cameras import Camera
 from .classes import make_classes
+from .copying import copy_depth, copy_labels, copy_mask, copy_photo
 from .dataset import Dataset, DatasetView
 
 # In the order in which "auto" asks them: the more specific layouts first.
@@ -56,16 +53,18 @@ def import_dataset(params: ImportParams, report: Reporter) -> dict[str, Any]:
         report.warn(message)
     create_folder(folder)
     report.stage("Copying images")
-    records = []
+    records, present = [], set()
     for i, view in enumerate(dataset.views):
         report.progress(i / len(dataset.views), view.name)
-        records.append(_copy_view(view, folder))
-    classes, ignore_id = _classes(dataset, folder, records, report)
+        record, ids = _copy_view(view, folder, dataset)
+        records.append(record)
+        present |= ids
+    classes = _classes(dataset, present)
     cameras, images = _poses(dataset.views)
     project = Project(
         images=records,
         classes=classes,
-        ignore_id=ignore_id,
+        ignore_id=dataset.ignore_id,
         frame=Frame(
             world_from_sfm=dataset.world_from_sfm.tolist(),
             up_confidence=dataset.up_confidence,
@@ -120,64 +119,49 @@ def _require_free(folder: Path, source: Path) -> None:
         raise ProjectError(f"{folder} already holds another capture.", "Choose a new folder for the project.")
 
 
-def _copy_view(view: DatasetView, folder: Path) -> ImageRecord:
-    image = copy_image(view.image, folder / "images", view.name)
-    label = _copy(view.label, folder / "labels", view.name)
-    mask = _copy(view.mask, folder / "masks", view.name)
-    return ImageRecord(
+def _copy_view(view: DatasetView, folder: Path, dataset: Dataset) -> tuple[ImageRecord, set[int]]:
+    """Bring one view's files into the project; its record, and the class ids its labels use."""
+    size = view.camera.width, view.camera.height
+    image = copy_photo(view.image, folder / "images", view.name)
+    ids: set[int] = set()
+    label = mask = depth = None
+    try:
+        if view.label:
+            colors = dataset.class_colors or None
+            label, ids = copy_labels(view.label, folder / "labels", view.name, size, colors, dataset.ignore_id)
+        if view.mask:
+            mask = copy_mask(view.mask, folder / "masks", view.name, size)
+    except InputError as error:
+        hint = error.hint or "Replace or remove that file."
+        raise InputError(f"{view.name}: {error.message}.".replace("..", "."), hint) from error
+    if view.depth:
+        depth = copy_depth(view.depth, folder / "depth", view.name, view.depth_scale)
+    record = ImageRecord(
         name=view.name,
         file=_relative(image, folder) or "",
         source=str(view.image),
         sha256=file_hash(view.image),
-        width=view.camera.width,
-        height=view.camera.height,
+        width=size[0],
+        height=size[1],
         focal_px=view.camera.fx,
         label=_relative(label, folder),
         mask=_relative(mask, folder),
+        depth=_relative(depth, folder),
         split=view.split,
     )
-
-
-def copy_image(source: Path, folder: Path, name: str) -> Path:
-    """Copy a photo into `folder` as `name` with its own suffix, unless it is there already."""
-    target = folder / f"{name}{source.suffix.lower()}"
-    stat = source.stat()
-    if target.is_file() and (target.stat().st_size, target.stat().st_mtime) == (stat.st_size, stat.st_mtime):
-        return target
-    with atomic_path(target) as temporary:
-        shutil.copy2(source, temporary)
-    return target
-
-
-def _copy(source: Path | None, folder: Path, name: str) -> Path | None:
-    return copy_image(source, folder, name) if source else None
+    return record, ids
 
 
 def _relative(path: Path | None, folder: Path) -> str | None:
     return path.relative_to(folder).as_posix() if path else None
 
 
-def file_hash(path: Path) -> str:
-    """SHA-256 of a file, in hex."""
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _classes(dataset: Dataset, folder: Path, records: list[ImageRecord], report: Reporter) -> tuple[list, int]:
-    """The classes that occur in the labels, named by the data set where it does so."""
-    present: set[int] = set()
-    labelled = [record for record in records if record.label]
-    for record in labelled:
-        report.check()
-        with Image.open(folder / str(record.label)) as image:
-            labels = np.asarray(image)
-        if labels.ndim != 2:
-            raise InputError(
-                f"The label map {record.label} is an RGB picture.", "Import needs index PNGs (one class id a pixel)."
-            )
-        present |= set(np.unique(labels).tolist())
-    names = dataset.class_names if not labelled else {i: dataset.class_names.get(i, f"class {i}") for i in present}
-    return make_classes(names, dataset.ignore_id), dataset.ignore_id
+def _classes(dataset: Dataset, present: set[int]) -> list[SemanticClass]:
+    """The classes that occur in the labels, named by the data set where it does so; all it names without labels."""
+    if not present:
+        return make_classes(dataset.class_names, dataset.ignore_id)
+    names = {i: dataset.class_names.get(i, f"class {i}") for i in present}
+    return make_classes(names, dataset.ignore_id)
 
 
 def _poses(views: list[DatasetView]) -> tuple[list[Camera], list[PosedImage]]:

@@ -72,9 +72,9 @@ def read(folder: Path) -> Dataset:
     views = [_view(folder, name, image, merged, split) for name, (image, merged, _, split) in zip(names, frames)]
     require(views, folder, missing)
     warnings = [f"{len(missing)} images named in the data set are missing (first: {missing[0]})."] if missing else []
-    class_names, ignore_id = {}, 0
+    class_names, ignore_id, colors = {}, 0, {}
     if (folder / "classes.json").is_file():
-        class_names, ignore_id, _ = read_classes(folder / "classes.json")
+        class_names, ignore_id, colors = read_classes(folder / "classes.json")
     convention = str(heads[0].get("camera_convention", "")).lower()
     return Dataset(
         format="transforms",
@@ -83,6 +83,7 @@ def read(folder: Path) -> Dataset:
         scale_known="metres" in convention or "meters" in convention,
         class_names=class_names,
         ignore_id=ignore_id,
+        class_colors=colors,
         points=_points(folder, heads[0]),
         warnings=warnings,
     )

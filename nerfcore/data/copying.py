@@ -1,0 +1,138 @@
+"""Bringing the files of a posed data set into a project, unchanged where possible."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from ..capture.images import FLOAT_SUFFIXES, RAW_SUFFIXES, read_photo
+from ..capture.labels import Colors, read_labels, read_mask
+from ..errors import InputError
+from ..files import atomic_path
+
+PLAIN_SUFFIXES = {".png", ".jpg", ".jpeg", ".webp"}
+PLAIN_MODES = {"RGB", "RGBA", "L", "LA", "P"}
+
+
+def copy_photo(source: Path, folder: Path, name: str) -> Path:
+    """Put a photo into `folder` as `name`.
+
+    PNG, JPEG and WebP of 8 bits are copied as they are. Others become 8-bit PNG; so do photos with an EXIF
+    orientation, because poses are given for the pixels as stored: the tag is dropped, the pixels stay.
+
+    Raises:
+        InputError: it cannot be decoded.
+    """
+    suffix = source.suffix.lower()
+    if suffix in PLAIN_SUFFIXES:
+        with Image.open(source) as image:
+            plain = image.mode in PLAIN_MODES and image.getexif().get(0x0112, 1) in (0, 1)
+        if plain:
+            return copy_file(source, folder, name)
+    target = folder / f"{name}.png"
+    if target.is_file() and target.stat().st_mtime >= source.stat().st_mtime:
+        return target
+    with atomic_path(target) as temporary:
+        if suffix in PLAIN_SUFFIXES:
+            with Image.open(source) as image:
+                pixels = image if image.mode in PLAIN_MODES else read_photo(source).image
+                stripped = Image.fromarray(np.asarray(pixels.convert("RGBA" if "A" in pixels.getbands() else "RGB")))
+            stripped.save(temporary, compress_level=2)
+        else:
+            _decode(source, suffix).save(temporary, compress_level=2)
+    return target
+
+
+def _decode(source: Path, suffix: str) -> Image.Image:
+    try:
+        return read_photo(source).image
+    except InputError as error:
+        kind = "raw photo" if suffix in RAW_SUFFIXES else "float image" if suffix in FLOAT_SUFFIXES else "photo"
+        raise InputError(f"The {kind} {source} cannot be used: {error}.", "Replace or remove it.") from error
+
+
+def copy_file(source: Path, folder: Path, name: str) -> Path:
+    """Copy a file into `folder` as `name` with its own suffix, unless it is there already."""
+    target = folder / f"{name}{source.suffix.lower()}"
+    stat = source.stat()
+    if target.is_file() and (target.stat().st_size, target.stat().st_mtime) == (stat.st_size, stat.st_mtime):
+        return target
+    with atomic_path(target) as temporary:
+        shutil.copy2(source, temporary)
+    return target
+
+
+def copy_labels(
+    source: Path, folder: Path, name: str, size: tuple[int, int], colors: Colors | None, ignore_id: int
+) -> tuple[Path, set[int]]:
+    """Write a label map as an index PNG of the photo's size; returns its path and the ids in it.
+
+    Raises:
+        InputError: it is no label map, or not of the photo's shape.
+    """
+    values = read_labels(source, colors, ignore_id)
+    target = folder / f"{name}.png"
+    with atomic_path(target) as temporary:
+        _save_map(_fitted(values, size, source), temporary)
+    return target, set(np.unique(values).tolist())
+
+
+def copy_mask(source: Path, folder: Path, name: str, size: tuple[int, int]) -> Path:
+    """Write a mask as a black and white PNG of the photo's size. Raises InputError when it cannot."""
+    values = read_mask(source).astype(np.uint8) * 255
+    target = folder / f"{name}.png"
+    with atomic_path(target) as temporary:
+        _save_map(_fitted(values, size, source), temporary)
+    return target
+
+
+def copy_depth(source: Path, folder: Path, name: str, scale: float) -> Path:
+    """Write a depth map as float32 EXR: distance along the camera's z axis in units of the SfM frame, 0 = unknown.
+
+    Args:
+        scale: units of the frame per unit of the file.
+    Raises:
+        InputError: it cannot be read.
+    """
+    import OpenImageIO as oiio
+
+    if source.suffix.lower() == ".npy":
+        try:
+            values = np.load(source, allow_pickle=False)
+        except (OSError, ValueError) as error:
+            raise InputError(f"The depth map {source} cannot be read: {error}.", "Replace or remove it.") from error
+    else:
+        pixels = oiio.ImageBuf(str(source))
+        if pixels.has_error:
+            raise InputError(f"The depth map {source} cannot be read: {pixels.geterror()}.", "Replace or remove it.")
+        values = pixels.get_pixels(oiio.UINT16 if str(pixels.spec().format) in ("uint16", "uint8") else oiio.FLOAT)
+    values = np.squeeze(np.asarray(values))
+    depth = (values[..., 0] if values.ndim == 3 else values).astype(np.float32) * np.float32(scale)
+    depth = np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
+    target = folder / f"{name}.exr"
+    with atomic_path(target) as temporary:
+        spec = oiio.ImageSpec(depth.shape[1], depth.shape[0], 1, oiio.FLOAT)
+        spec.channelnames = ("Z",)
+        output = oiio.ImageBuf(spec)
+        output.set_pixels(oiio.ROI(), np.ascontiguousarray(depth)[..., None])
+        if not output.write(str(temporary)):
+            raise OSError(output.geterror())
+    return target
+
+
+def _fitted(values: np.ndarray, size: tuple[int, int], source: Path) -> np.ndarray:
+    height, width = values.shape
+    if abs(width / height / (size[0] / size[1]) - 1) > 0.02:
+        raise InputError(
+            f"{source} is {width}×{height}, its photo {size[0]}×{size[1]}.", "Both need the same proportions."
+        )
+    if (width, height) == size:
+        return values
+    return np.asarray(Image.fromarray(values).resize(size, Image.Resampling.NEAREST))
+
+
+def _save_map(values: np.ndarray, path: Path) -> None:
+    Image.fromarray(values.astype(np.uint8) if values.max(initial=0) < 256 else values).save(path, compress_level=2)

@@ -24,7 +24,7 @@ def read_trilinear(
     fx = wp.clamp(p[0] - float(ix), 0.0, 1.0)
     fy = wp.clamp(p[1] - float(iy), 0.0, 1.0)
     fz = wp.clamp(p[2] - float(iz), 0.0, 1.0)
-    total = 0.0
+    total = float(0.0)
     for corner in range(4):
         dy = corner & 1
         dz = corner >> 1

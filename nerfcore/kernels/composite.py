@@ -24,8 +24,8 @@ def weights_forward(
 ):
     r = wp.tid() + offset
     base = start[r]
-    depth = 0.0
-    before = 1.0
+    depth = float(0.0)
+    before = float(1.0)
     for k in range(base, base + count[r]):
         depth += density[k] * delta[k]
         after = wp.exp(-depth)
@@ -46,10 +46,10 @@ def weights_backward(
 ):
     r = wp.tid() + offset
     base = start[r]
-    total = 0.0
+    total = float(0.0)
     for k in range(base, base + count[r]):
         total += grad_weights[k] * weights[k]
-    depth = 0.0
+    depth = float(0.0)
     behind = total
     for k in range(base, base + count[r]):
         depth += density[k] * delta[k]
@@ -98,7 +98,7 @@ def sum_backward(
         grad_weights[k] = 0.0
         return
     w = weights[k]
-    g = 0.0
+    g = float(0.0)
     for c in range(channels):
         grad_values[k, c] = w * grad_out[r, c]
         g += values[k, c] * grad_out[r, c]

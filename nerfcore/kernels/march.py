@@ -102,7 +102,7 @@ def leave_distance(u: wp.vec3, d: wp.vec3, inverse: wp.vec3, n: float):
 @wp.func
 def empty_skip(u: wp.vec3, d: wp.vec3, inverse: wp.vec3, n: int, step: float, blocks: wp.array(dtype=wp.uint8)):
     """Whole steps until the ray leaves its closed cell, or its block of closed cells; bounded grid only."""
-    leave = 0.0
+    leave = float(0.0)
     if blocks[cell_index(u, n / MACRO)] == wp.uint8(0):
         leave = leave_distance(u, d, inverse, float(n / MACRO))
     else:
@@ -156,10 +156,10 @@ def march_weight(
     inverse = reciprocal(d)
     lo, hi = ray_interval(o, inverse, near, far, contracted)
     t = lo + jitter[r] * step
-    transmittance = 1.0
-    weight = 0.0
-    t_first = -1.0
-    t_last = -1.0
+    transmittance = float(1.0)
+    weight = float(0.0)
+    t_first = float(-1.0)
+    t_last = float(-1.0)
     for _ in range(MAX_BINS):
         if t >= hi:
             break
@@ -219,16 +219,16 @@ def march_sample(
     o = origins[r]
     d = directions[r]
     inverse = reciprocal(d)
-    lo, hi = ray_interval(o, inverse, near, far, contracted)
+    _, hi = ray_interval(o, inverse, near, far, contracted)
     t = first[r]
-    transmittance = 1.0
-    below = 0.0  # weight of the bins behind us
+    transmittance = float(1.0)
+    below = float(0.0)  # weight of the bins behind us
     share = total[r] / float(count)
-    k = 0  # the sample being looked for
+    k = int(0)  # the sample being looked for
     target = shift[base] * share
     edge = share  # weight at which sample k's interval ends
-    open_length = 0.0  # open length gathered for sample k's interval so far
-    k_edge = 0
+    open_length = float(0.0)  # open length gathered for sample k's interval so far
+    k_edge = int(0)
     t_end = t
     for _ in range(MAX_BINS):
         if t >= hi or k_edge >= count:
@@ -248,11 +248,11 @@ def march_sample(
                 k += 1
                 if k < count:
                     target = (float(k) + shift[base + k]) * share
-            used = 0.0  # part of this bin already given to intervals
+            used = float(0.0)  # part of this bin already given to intervals
             while k_edge < count and edge <= above:
                 upto = (edge - below) / weight
                 delta[base + k_edge] = open_length + (upto - used) * length
-                open_length = 0.0
+                open_length = float(0.0)
                 used = upto
                 k_edge += 1
                 edge = float(k_edge + 1) * share
@@ -276,7 +276,7 @@ def march_sample(
         k += 1
     while k_edge < count:
         delta[base + k_edge] = open_length
-        open_length = 0.0
+        open_length = float(0.0)
         k_edge += 1
 
 

@@ -81,7 +81,7 @@ class OccupancyGrid(nn.Module):
 
     def _warm_up(self, density: Callable[[torch.Tensor], torch.Tensor], generator: torch.Generator | None) -> None:
         """All cells at once, from one point in each block of 2³ cells, with quick forgetting of the initial guess."""
-        n, half = self.config.resolution, self.config.resolution // 2
+        half = self.config.resolution // 2
         axis = torch.arange(half, device=self.density.device)
         z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
         corner = torch.stack([x, y, z], -1).reshape(-1, 3)

@@ -61,7 +61,8 @@ def read_checkpoint(path: Path, device: torch.device) -> tuple[dict[str, torch.T
     try:
         with safe_open(path, "pt", device=str(device)) as file:
             state = json.loads((file.metadata() or {})["fieldwork"])
-            return {name: file.get_tensor(name) for name in file.keys()}, state
+            names = list(file.keys())
+            return {name: file.get_tensor(name) for name in names}, state
     except (SafetensorError, KeyError, json.JSONDecodeError, OSError) as error:
         raise ProjectError(f"{path} is damaged: {error}.", "Train the run again.") from error
 

@@ -1,0 +1,58 @@
+"""Image and label metrics. Images are uint8-quantised before they are compared."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from skimage.metrics import structural_similarity
+
+
+def psnr(image: np.ndarray, photo: np.ndarray, keep: np.ndarray | None = None) -> float:
+    """Peak signal-to-noise ratio in dB of two (H, W, 3) uint8 images, over pixels where `keep` (H, W) is true."""
+    error = ((image.astype(np.float64) - photo) / 255) ** 2
+    mse = float(error.mean() if keep is None else error[keep].mean())
+    return -10 * math.log10(max(mse, 1e-10))
+
+
+def ssim(image: np.ndarray, photo: np.ndarray) -> float:
+    """Structural similarity, 11×11 Gaussian window with σ 1.5 (Wang et al., 2004), of (H, W, 3) uint8 images."""
+    return float(
+        structural_similarity(
+            image, photo, data_range=255, channel_axis=2, gaussian_weights=True, sigma=1.5, use_sample_covariance=False
+        )
+    )
+
+
+@dataclass
+class Confusion:
+    """Counts of (true, predicted) class over the whole data set; void is never counted as truth."""
+
+    class_ids: list[int]
+    counts: np.ndarray = field(init=False)
+
+    def __post_init__(self) -> None:
+        # One more column: void or a class outside the list predicted.
+        self.counts = np.zeros((len(self.class_ids), len(self.class_ids) + 1), np.int64)
+
+    def add(self, truth: np.ndarray, predicted: np.ndarray) -> None:
+        """Count two label images of class ids; pixels whose truth is not in the list are skipped."""
+        n = len(self.class_ids)
+        lookup = np.full(max([*self.class_ids, int(truth.max()), int(predicted.max())]) + 1, n)
+        lookup[self.class_ids] = np.arange(n)
+        t, p = lookup[truth.ravel()], lookup[predicted.ravel()]
+        keep = t < n
+        np.add.at(self.counts, (t[keep], p[keep]), 1)
+
+    def iou(self) -> dict[int, float]:
+        """Intersection over union of each class that occurs in the truth."""
+        hit = np.diag(self.counts[:, :-1])
+        truth, predicted = self.counts.sum(1), self.counts[:, :-1].sum(0)
+        union = truth + predicted - hit
+        return {c: float(hit[i] / union[i]) for i, c in enumerate(self.class_ids) if truth[i] > 0}
+
+    def miou(self) -> float | None:
+        """Mean IoU over the classes in the truth; None without labels."""
+        values = list(self.iou().values())
+        return float(np.mean(values)) if values else None

@@ -1,0 +1,36 @@
+"""Pictures for people: colour maps for depth and labels, comparison strips."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib import colormaps
+
+VOID_COLOR = (0.0, 0.0, 0.0)
+
+
+def colorize_depth(depth: np.ndarray, opacity: np.ndarray) -> np.ndarray:
+    """Depth (H, W) → (H, W, 3) uint8, near bright and far dark (turbo over the 2–98 % range); empty is black."""
+    solid = np.isfinite(depth) & (opacity > 0.5)
+    if not solid.any():
+        return np.zeros((*depth.shape, 3), np.uint8)
+    near, far = np.percentile(depth[solid], [2, 98])
+    value = 1 - (np.nan_to_num(depth, nan=far) - near) / max(far - near, 1e-9)
+    picture = colormaps["turbo"](value.clip(0, 1))[..., :3]
+    return (np.where(solid[..., None], picture, 0) * 255 + 0.5).astype(np.uint8)
+
+
+def colorize_labels(label: np.ndarray, colors: dict[int, tuple[float, float, float]]) -> np.ndarray:
+    """Class ids (H, W) → (H, W, 3) uint8 in the classes' colours; unknown ids are black."""
+    table = np.zeros((int(max([*colors, int(label.max()), 0])) + 1, 3))
+    for index, color in colors.items():
+        table[index] = color
+    return (table[label] * 255 + 0.5).astype(np.uint8)
+
+
+def side_by_side(images: list[np.ndarray], gap: int = 4) -> np.ndarray:
+    """Images (H, W, 3) uint8 of one height in a row with white gaps."""
+    bar = np.full((images[0].shape[0], gap, 3), 255, np.uint8)
+    parts = [images[0]]
+    for image in images[1:]:
+        parts += [bar, image]
+    return np.concatenate(parts, 1)

@@ -1,0 +1,204 @@
+"""The verb `render`: images, depth, labels and multilayer EXR from held-out, given or orbiting cameras."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+
+from ..data.box import Box, box_poses, focus_point
+from ..data.cameras import Camera, flip_camera_axes
+from ..data.pixels import training_size
+from ..data.scene import Scene, View
+from ..data.similarity import similarity_scale
+from ..errors import DiskError, InputError
+from ..files import atomic_path, disk_errors
+from ..params import RenderParams
+from ..progress import Reporter
+from ..project import load_project, load_scene
+from ..train.run import load_trained
+from .image import Frame, background_of, render_view, write_picture
+from .pictures import colorize_depth, colorize_labels
+
+
+def render(params: RenderParams, report: Reporter) -> dict[str, Any]:
+    """Render a run from some cameras; existing frames are overwritten.
+
+    Depth PNGs are coloured for viewing; the EXR holds the values: depth in world units along the optical axis, class
+    ids, confidence, world-space normals.
+
+    Returns:
+        {"frames": [paths], "ms_per_frame"}
+    Raises:
+        InputError: no cameras were asked for, or the camera file is unusable. ProjectError, DiskError.
+    """
+    folder, out = Path(params.project), Path(params.out)
+    project, scene = load_project(folder), load_scene(folder)
+    trained = load_trained(folder, params.run)
+    box = trained.info.box(project)
+    cameras = chosen_cameras(params, scene)
+    with disk_errors(out):
+        out.mkdir(parents=True, exist_ok=True)
+    colors = {c.id: c.color for c in scene.classes}
+    frames, seconds = [], 0.0
+    report.stage("Rendering")
+    for number, (name, camera, pose) in enumerate(cameras):
+        report.progress(number / len(cameras), name)
+        if params.size is not None:
+            camera = camera.resized(*params.size)
+        view = View(name, camera, pose, Path())
+        begin = time.perf_counter()
+        frame = render_view(
+            trained.model,
+            camera,
+            box_poses([view], box.box_from_world)[0],
+            background_of(trained.info),
+            check=report.check,
+        )
+        seconds += time.perf_counter() - begin
+        frames += write_frame(out, name, frame, params.passes, trained.info.class_ids, scene.ignore_id, colors, box)
+    return {"frames": [str(path) for path in frames], "ms_per_frame": round(seconds / max(len(cameras), 1) * 1e3, 1)}
+
+
+def chosen_cameras(params: RenderParams, scene: Scene) -> list[tuple[str, Camera, np.ndarray]]:
+    """(name, camera, camera-to-world) of every frame asked for."""
+    if params.camera is not None:
+        return read_cameras(params.camera)
+    if params.orbit is not None:
+        return orbit_cameras(scene, params.orbit)
+    indices = scene.test if params.test else []
+    if not indices:
+        raise InputError("No cameras to render from.", "Use --test (with held-out photos), --camera FILE or --orbit N.")
+    size = 1600
+    return [
+        (Path(v.name).stem, v.camera.resized(*training_size(v.camera, size)), v.camera_to_world)
+        for v in (scene.views[i] for i in indices)
+    ]
+
+
+def read_cameras(path: Path) -> list[tuple[str, Camera, np.ndarray]]:
+    """Cameras of a transforms.json-like file in the world frame: OpenGL axes, intrinsics per file or per frame.
+
+    Raises:
+        InputError: the file is missing, not JSON, or lacks a key.
+    """
+    try:
+        data = json.loads(Path(path).read_text(encoding="utf-8"))
+        cameras = []
+        for number, frame in enumerate(data["frames"]):
+            lens = {**data, **frame}
+            width, height = int(lens["w"]), int(lens["h"])
+            fx = lens.get("fl_x") or width / 2 / np.tan(lens["camera_angle_x"] / 2)
+            camera = Camera(
+                width=width,
+                height=height,
+                fx=fx,
+                fy=lens.get("fl_y", fx),
+                cx=lens.get("cx", width / 2),
+                cy=lens.get("cy", height / 2),
+            )
+            name = Path(frame.get("file_path", f"{number:04d}")).stem
+            cameras.append((name, camera, flip_camera_axes(np.array(frame["transform_matrix"], np.float64))))
+        return cameras
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}.", "Give a cameras file.") from error
+    except (json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{path} is not a cameras file: {error!r}.", "It needs w, h, fl_x and frames with transform_matrix."
+        ) from error
+
+
+def orbit_cameras(scene: Scene, count: int) -> list[tuple[str, Camera, np.ndarray]]:
+    """`count` cameras on a circle around the focus of the training views, at their median distance and height."""
+    views = [scene.views[i] for i in scene.train]
+    focus = focus_point(views)
+    offsets = np.stack([v.camera_to_world[:3, 3] for v in views]) - focus
+    height, radius = float(np.median(offsets[:, 2])), float(np.median(np.linalg.norm(offsets[:, :2], axis=1)))
+    camera = views[0].camera.undistorted()
+    frames = []
+    for number in range(count):
+        angle = 2 * np.pi * number / count
+        center = focus + [radius * np.cos(angle), radius * np.sin(angle), height]
+        frames.append((f"orbit_{number:04d}", camera, look_at(center, focus)))
+    return frames
+
+
+def look_at(center: np.ndarray, target: np.ndarray, up: np.ndarray | None = None) -> np.ndarray:
+    """Camera-to-world pose (4, 4), OpenCV axes, at `center` looking at `target` with `up` (default +z) upwards."""
+    up = np.array([0.0, 0.0, 1.0]) if up is None else up
+    forward = (target - center) / np.linalg.norm(target - center)
+    right = np.cross(forward, up)
+    right = right / max(float(np.linalg.norm(right)), 1e-9)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
+    pose[:3, 3] = center
+    return pose
+
+
+def write_frame(
+    out: Path,
+    name: str,
+    frame: Frame,
+    passes: list,
+    class_ids: list[int],
+    void: int,
+    colors: dict[int, tuple[float, float, float]],
+    box: Box,
+) -> list[Path]:
+    """Write NAME.png, NAME_depth.png, … and NAME.exr with all asked passes. Returns the paths."""
+    scale = similarity_scale(box.world_from_box)
+    rotation = box.world_from_box[:3, :3] / scale
+    label = frame.label(class_ids, void)
+    world_normal = frame.normal() @ rotation.T
+    pictures = {
+        "rgb": ("", frame.color),
+        "depth": ("_depth", colorize_depth(frame.depth, frame.opacity)),
+        "semantic": ("_labels", colorize_labels(label, colors)),
+        "confidence": ("_confidence", frame.confidence()[..., None]),
+        "normal": ("_normal", world_normal * 0.5 + 0.5),
+    }
+    layers: dict[str, np.ndarray] = {}
+    values = {
+        "rgb": ("", ["R", "G", "B", "A"], np.concatenate([srgb_to_linear(frame.color), frame.opacity[..., None]], -1)),
+        "depth": ("Depth.", ["Z"], np.nan_to_num(frame.depth * scale, nan=1e10)[..., None]),
+        "semantic": ("Label.", ["ID"], label[..., None]),
+        "confidence": ("Confidence.", ["V"], frame.confidence()[..., None]),
+        "normal": ("Normal.", ["X", "Y", "Z"], world_normal),
+    }
+    written = []
+    for kind in passes:
+        suffix, picture = pictures[kind]
+        path = out / f"{name}{suffix}.png"
+        with atomic_path(path) as temporary:
+            write_picture(temporary, picture)
+        written.append(path)
+        prefix, channels, value = values[kind]
+        for index, channel in enumerate(channels):
+            layers[prefix + channel] = value[..., index]
+    path = out / f"{name}.exr"
+    with atomic_path(path) as temporary:
+        write_exr(temporary, layers)
+    return [*written, path]
+
+
+def srgb_to_linear(color: np.ndarray) -> np.ndarray:
+    """sRGB in [0, 1] → linear (IEC 61966-2-1)."""
+    return np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
+
+
+def write_exr(path: Path, layers: dict[str, np.ndarray]) -> None:
+    """One multilayer EXR with float channels named as the keys. Raises DiskError when it cannot be written."""
+    names = list(layers)
+    height, width = layers[names[0]].shape
+    spec = oiio.ImageSpec(width, height, len(names), oiio.FLOAT)
+    spec.channelnames = names
+    buffer = oiio.ImageBuf(spec)
+    buffer.set_pixels(spec.roi, np.ascontiguousarray(np.stack([layers[n] for n in names], -1), np.float32))
+    if not buffer.write(str(path)):
+        raise DiskError(
+            f"{path} cannot be written: {buffer.geterror()}.", "Check the disk and the folder's permissions."
+        )

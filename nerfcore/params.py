@@ -115,7 +115,6 @@ class MeshParams(Params):
     out: Path | None = None
     faces: int | None = Field(None, gt=0, description="target number of triangles")
     resolution: int = Field(256, ge=16, le=1024, description="cells along the longest side of the box")
-    texture: int | None = Field(None, ge=64, description="texture size in pixels; none: vertex colours only")
     split: Literal["none", "classes"] = "none"
 
 

@@ -1,0 +1,228 @@
+"""The command line: one command a verb, made from the verb's parameter model.
+
+Exit codes: 0 done · 1 failed · 2 wrong usage · 3 done with warnings under --strict · 130 cancelled.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin
+
+import click
+from pydantic import ValidationError
+from pydantic.fields import FieldInfo
+
+from . import __version__
+from .console import ConsoleReporter
+from .errors import Cancelled, FieldworkError
+from .verbs import VERBS, run_verb
+
+# Worker threads that spin while they wait take the cores other programs need; read when OpenMP starts.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+POSITIONAL = ("project", "dataset", "photos", "out")
+# Verbs in which one of the names above is an option.
+NAMED = {"new": {"photos"}, "render": {"out"}, "mesh": {"out"}, "reconstruct": {"out"}}
+ORDER = {"import": ["dataset", "project"]}
+
+
+class Size(click.ParamType):
+    name = "WxH"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
+        if isinstance(value, tuple):
+            return value
+        try:
+            width, height = (int(part) for part in str(value).lower().split("x"))
+        except ValueError:
+            self.fail(f"{value} is not a size like 800x600", param, ctx)
+        return width, height
+
+
+class CommaList(click.ParamType):
+    name = "A,B,…"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> list[str]:
+        return value if isinstance(value, list) else [part.strip() for part in str(value).split(",")]
+
+
+def _plain(annotation: Any) -> Any:
+    """The type without None."""
+    if get_origin(annotation) in (Union, UnionType):
+        return next(a for a in get_args(annotation) if a is not type(None))
+    return annotation
+
+
+def _option(name: str, info: FieldInfo) -> click.Option:
+    """The option of one field of a parameter model."""
+    kind = _plain(info.annotation)
+    flags = ["--" + name.replace("_", "-"), name]
+    shared: dict[str, Any] = {"help": info.description or "", "required": info.is_required()}
+    default = None if info.is_required() else info.get_default(call_default_factory=True)
+    if kind is bool:
+        return click.Option([*flags], is_flag=True, default=default, help=info.description or "")
+    if get_origin(kind) is dict:
+        return click.Option(flags, multiple=True, metavar="KEY=VALUE", **shared)
+    if get_origin(kind) is tuple and get_args(kind) == (int, int):
+        return click.Option(flags, type=Size(), default=default, show_default=default is not None, **shared)
+    if get_origin(kind) is tuple:
+        return click.Option(flags, nargs=len(get_args(kind)), type=tuple(get_args(kind)), default=default, **shared)
+    if get_origin(kind) is list:
+        return click.Option(flags, type=CommaList(), default=default, **shared)
+    if get_origin(kind) is Literal:
+        kind = click.Choice([str(choice) for choice in get_args(kind)])
+    elif kind is Path:
+        kind = click.Path(path_type=Path)
+    return click.Option(flags, type=kind, default=default, show_default=default is not None, **shared)
+
+
+def _command(name: str) -> click.Command:
+    """The click command of a verb."""
+    verb = VERBS[name]
+    fields = verb.params.model_fields
+    arguments = ORDER.get(name) or [n for n in POSITIONAL if n in fields and n not in NAMED.get(name, set())]
+    params: list[click.Parameter] = [
+        click.Argument([n], type=click.Path(path_type=Path), metavar=n.upper()) for n in arguments
+    ]
+    params += [_option(n, info) for n, info in fields.items() if n not in arguments]
+    params += [
+        click.Option(["--json", "as_json"], is_flag=True, help="print one JSON object on stdout and nothing else"),
+        click.Option(["--quiet"], is_flag=True, help="no progress"),
+        click.Option(["--strict"], is_flag=True, help="exit with 3 when there were warnings"),
+    ]
+
+    def callback(as_json: bool, quiet: bool, strict: bool, **values: Any) -> int:
+        return run_command(name, values, as_json, quiet, strict)
+
+    return click.Command(name, callback=callback, params=params, help=verb.summary, short_help=verb.summary)
+
+
+class _Commands(click.Group):
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return [*VERBS, "serve"]
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name == "serve":
+            return click.Command("serve", callback=_serve, help="Run the engine: JSON-RPC 2.0 on stdio.")
+        return _command(cmd_name) if cmd_name in VERBS else None
+
+
+def _serve() -> int:
+    from .engine.server import main as serve
+
+    return serve()
+
+
+def run_command(name: str, values: dict[str, Any], as_json: bool, quiet: bool, strict: bool) -> int:
+    """Run a verb for the command line; returns the exit code."""
+    values = {k: v for k, v in values.items() if v is not None}
+    try:
+        if isinstance(values.get("set"), tuple):
+            values["set"] = dict(_assignment(text) for text in values["set"])
+        params = VERBS[name].params.model_validate(values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise click.UsageError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from error
+    with _stdout_for_results() as stdout, ConsoleReporter(quiet or as_json) as report, _interruptible(report):
+        try:
+            result = run_verb(name, params, report)
+        except Cancelled:
+            click.echo("Cancelled. Run the same command again to go on.", err=True)
+            return 130
+        except FieldworkError as error:
+            if as_json:
+                value = {"error": {"code": error.code, "message": error.message, "hint": error.hint}}
+                print(json.dumps(value, ensure_ascii=False), file=stdout)
+            click.secho(f"{error.message}", fg="red", err=True)
+            if error.hint:
+                click.echo(error.hint, err=True)
+            return 1
+        warnings = list(report.warnings)
+        report.close()
+        if as_json:
+            print(json.dumps({**result, "warnings": warnings}, ensure_ascii=False), file=stdout)
+        else:
+            report.table(name, result, stdout)
+        return 3 if strict and warnings else 0
+
+
+def _assignment(text: str) -> tuple[str, str]:
+    key, equals, value = text.partition("=")
+    if not equals:
+        raise click.UsageError(f"--set {text}: write it as stage.name=value.")
+    return key.strip(), value.strip()
+
+
+@contextmanager
+def _stdout_for_results() -> Iterator[Any]:
+    """Keep stdout for results: everything else that prints there, native libraries too, goes to stderr."""
+    sys.stdout.flush()
+    kept = os.dup(1)
+    os.dup2(2, 1)
+    try:
+        with os.fdopen(kept, "w", encoding="utf-8", closefd=False) as stream:
+            yield stream
+    finally:
+        sys.stdout.flush()
+        os.dup2(kept, 1)
+        os.close(kept)
+
+
+@contextmanager
+def _interruptible(report: ConsoleReporter) -> Iterator[None]:
+    """The first Ctrl-C (or SIGTERM) asks the work to stop, the second one ends the process."""
+
+    def stop(number: int, frame: Any) -> None:
+        report.cancel()
+        signal.signal(number, signal.SIG_DFL)
+
+    before = {n: signal.signal(n, stop) for n in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line and return its exit code."""
+    logging.basicConfig(level=logging.ERROR, format="%(message)s", stream=sys.stderr)
+    group = _Commands("fieldwork", help="Photos to a semantic radiance field, and the field into labelled meshes.")
+    group.params.append(
+        click.Option(
+            ["--version"],
+            is_flag=True,
+            is_eager=True,
+            expose_value=False,
+            callback=_print_version,
+            help="print the version",
+        )
+    )
+    try:
+        code = group.main(arguments, prog_name="fieldwork", standalone_mode=False)
+    except click.exceptions.Exit as stop:
+        return stop.exit_code
+    except click.Abort:
+        return 130
+    except click.ClickException as error:
+        error.show()
+        return error.exit_code
+    return code if isinstance(code, int) else 0
+
+
+def _print_version(ctx: click.Context, param: click.Parameter, value: bool) -> None:
+    if value and not ctx.resilient_parsing:
+        click.echo(__version__)
+        ctx.exit()
+
+
+def entry_point() -> None:
+    sys.exit(main())

@@ -1,0 +1,95 @@
+"""Progress and results on a terminal; plain lines where there is none."""
+
+from __future__ import annotations
+
+import time
+from typing import Any, TextIO
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from .progress import Reporter
+
+PLAIN_EVERY = 10.0  # seconds between plain progress lines
+
+
+class ConsoleReporter(Reporter):
+    """Shows stages with a bar and a time estimate on stderr. Use as a context manager."""
+
+    def __init__(self, quiet: bool) -> None:
+        super().__init__()
+        self.quiet = quiet
+        self.console = Console(stderr=True, highlight=False)
+        self.bar: Progress | None = None
+        self.task: TaskID | None = None
+        self.name, self.begin, self.told = "", time.monotonic(), 0.0
+
+    def __enter__(self) -> ConsoleReporter:
+        if not self.quiet and self.console.is_terminal:
+            self.bar = Progress(
+                TextColumn("{task.description}"),
+                BarColumn(),
+                TextColumn("{task.percentage:>3.0f} %"),
+                TimeElapsedColumn(),
+                TimeRemainingColumn(),
+                TextColumn("{task.fields[message]}"),
+                console=self.console,
+            )
+            self.bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Take the bar off the screen."""
+        if self.bar is not None:
+            self.bar.stop()
+            self.bar = None
+
+    def stage(self, name: str) -> None:
+        super().stage(name)
+        self.name, self.begin, self.told = name, time.monotonic(), time.monotonic()
+        if self.bar is not None:
+            if self.task is not None:
+                self.bar.update(self.task, completed=1.0, message="")
+            self.task = self.bar.add_task(name, total=1.0, message="")
+        elif not self.quiet:
+            self.console.print(f"{name} …")
+
+    def progress(self, fraction: float, message: str = "") -> None:
+        super().progress(fraction, message)
+        if self.bar is not None and self.task is not None:
+            self.bar.update(self.task, completed=min(fraction, 1.0), message=message)
+        elif not self.quiet and time.monotonic() - self.told > PLAIN_EVERY:
+            self.told = time.monotonic()
+            elapsed = self.told - self.begin
+            left = f", about {elapsed / fraction - elapsed:.0f} s left" if fraction > 0.02 else ""
+            self.console.print(f"{self.name}: {fraction:.0%}{left}  {message}")
+
+    def warn(self, message: str) -> None:
+        self.warnings.append(message)
+        self.console.print(f"[yellow]Warning:[/yellow] {message}")
+
+    def table(self, verb: str, result: dict[str, Any], stream: TextIO) -> None:
+        """Print a result as one table."""
+        table = Table(title=f"fieldwork {verb}", show_header=False, title_justify="left")
+        for name, value in flattened(result):
+            table.add_row(name, value)
+        Console(file=stream, highlight=False, width=None if stream.isatty() else 120).print(table)
+
+
+def flattened(value: dict[str, Any], prefix: str = "") -> list[tuple[str, str]]:
+    """(name, text) rows of a result: nested objects get dotted names, long lists their length."""
+    rows: list[tuple[str, str]] = []
+    for key, item in value.items():
+        name = f"{prefix}{key}"
+        if isinstance(item, dict):
+            rows += flattened(item, f"{name}.") if item else [(name, "–")]
+        elif isinstance(item, list):
+            short = ", ".join(map(str, item)) if all(not isinstance(i, (dict, list)) for i in item) else ""
+            rows.append((name, short if short and len(short) < 90 else f"{len(item)} items"))
+        else:
+            rows.append((name, "not measured" if item is None else str(item)))
+    return rows

@@ -16,7 +16,7 @@ class FIELDWORK_PT_render(StepPanel):
         folder = project_folder(context)
         last = next((j for j in reversed(jobs.queue.finished) if j.verb == "render" and j.state == "done"), None)
         if last is not None:
-            self.draw_state(True, f"{(last.result or {}).get('frames', 0)} images rendered")
+            self.draw_state(True, f"{len((last.result or {}).get('frames', []))} images rendered")
         elif state.has_run(folder, settings.run):
             self.draw_state(False, "Ready to render")
         else:

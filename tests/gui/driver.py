@@ -33,6 +33,7 @@ class Screen:
         self.folder = folder
         self.facts: dict = {}
         self.headers: tuple = (None, 0.0)
+        self.places: dict = {}
 
     @property
     def window(self):
@@ -46,9 +47,12 @@ class Screen:
     def sidebar(self):
         return next(region for region in self.area.regions if region.type == "UI")
 
+    def module(self, name: str):
+        return sys.modules[f"{PACKAGE}.{name}"]
+
     @property
     def queue(self):
-        return sys.modules[f"{PACKAGE}.addon.jobs"].queue
+        return self.module("addon.jobs").queue
 
     def move(self, x: float, y: float) -> None:
         self.window.event_simulate(type="MOUSEMOVE", value="NOTHING", x=int(x), y=int(y))
@@ -79,13 +83,15 @@ class Screen:
 
     def toggle(self, panel: str) -> Steps:
         """Click the header of a sub-panel while those above it are closed and no job runs."""
-        state = [(job.id, job.state) for job in self.queue.finished]
+        state = [(job.id, job.state) for job in [*self.queue.finished, self.queue.current] if job]
         if self.headers[0] != state:
             found = yield from self.buttons(depth=260)
             main = [place for place in found if place[0].startswith("bpy.ops.fieldwork.")]
             assert main, "the main panel has no button"
-            # Below the big button of the next step come the headers, one each line.
-            self.headers = (state, max(y for _, _, y in main) - 24 - self.unit / 2)
+            # Below the big button of the next step, or the bar of the job and its message, come the headers.
+            job = self.queue.current
+            below = (self.unit * 1.8 if job.message else self.unit) if job else 24 + self.unit / 2
+            self.headers = (state, max(y for _, _, y in main) - below)
         yield from self.click(self.sidebar.x + 60, self.headers[1] - PANELS.index(panel) * self.unit)
 
     @property
@@ -113,13 +119,30 @@ class Screen:
                     found.append((command, x, y - 4))
         return found
 
-    def press_button(self, operator: str) -> Steps:
-        """Click the button of an operator in the sidebar, found as a hand with eyes closed would."""
-        buttons = yield from self.buttons()
-        self.facts.setdefault("buttons", {})[operator] = [command for command, _, _ in buttons]
-        places = [(x, y) for command, x, y in buttons if command.startswith(f"bpy.ops.{operator}(")]
-        assert places, f"there is no button {operator} among {[command for command, _, _ in buttons]}"
-        yield from self.click(*places[0])
+    def press_button(self, operator: str, depth: float = 260, sweep: bool = True) -> Steps:
+        """Click the button of an operator in the sidebar, found as a hand with eyes closed would.
+
+        `sweep=False` takes the place at which it was found the last time, or a job's bar has it.
+        """
+        if sweep or operator not in self.places:
+            buttons = yield from self.buttons(depth)
+            places = [(x, y) for command, x, y in buttons if command.startswith(f"bpy.ops.{operator}(")]
+            assert places, f"there is no button {operator} among {[command for command, _, _ in buttons]}"
+            self.places[operator] = places[0]
+        yield from self.click(*self.places[operator])
+
+    def run_operator(self, operator: str, seconds: float) -> Steps:
+        """Run a verb by its operator and wait for its end."""
+        module, name = operator.split(".")
+        getattr(getattr(bpy.ops, module), name)()
+        yield from self.idle(seconds)
+
+    def idle(self, seconds: float) -> Steps:
+        """Wait until no job runs; the last one must have succeeded."""
+        yield from self.wait(lambda: self.queue.current is None, seconds, "the job does not end")
+        last = self.queue.last
+        assert last.state == "done", last.report()
+        yield 0.3
 
     def wait(self, condition: Callable[[], object], seconds: float, what: str) -> Steps:
         end = time.monotonic() + seconds

@@ -30,7 +30,7 @@ def read_labels(path: Path, colors: Colors | None = None, ignore_id: int = 0) ->
             if mode in ("L", "I", "I;16", "I;16B", "I;16L", "1"):
                 values = np.asarray(image).astype(np.int64)
             elif mode == "P":
-                values = _from_palette(image, colors)
+                values = _from_palette(image, colors, ignore_id)
             elif mode in ("RGB", "RGBA", "LA"):
                 values = _from_colors(np.asarray(image.convert("RGBA")), colors, ignore_id, path.name)
             else:
@@ -42,13 +42,13 @@ def read_labels(path: Path, colors: Colors | None = None, ignore_id: int = 0) ->
     return values.astype(np.uint16)
 
 
-def _from_palette(image: Image.Image, colors: Colors | None) -> np.ndarray:
+def _from_palette(image: Image.Image, colors: Colors | None, ignore_id: int) -> np.ndarray:
     indices = np.asarray(image).astype(np.int64)
     palette = np.array(image.getpalette("RGB"), np.uint8).reshape(-1, 3)
     if not colors:
         return indices
     used = np.unique(indices)
-    by_color = {tuple(color): i for i, color in colors.items()}
+    by_color = {(0, 0, 0): ignore_id} | {tuple(color): i for i, color in colors.items()}
     ids = [by_color.get(tuple(palette[i].tolist())) if i < len(palette) else None for i in used]
     if any(i is None for i in ids):
         return indices

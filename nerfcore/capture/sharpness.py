@@ -38,4 +38,4 @@ def same_picture(a: np.ndarray, b: np.ndarray) -> bool:
     same place, moves edges. Pictures without structure are never called the same.
     """
     difference = np.abs(a - b)
-    return bool(difference.mean() < 0.5 and np.percentile(difference, 99) < 1.5 and min(a.std(), b.std()) > 4.0)
+    return bool(difference.mean() < 0.7 and difference.max() < 6 and min(a.std(), b.std()) > 4.0)

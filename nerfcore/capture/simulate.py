@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import OpenImageIO as oiio
 from PIL import Image
 from PIL.ExifTags import IFD, Base
 
@@ -27,6 +26,7 @@ from ..errors import BlenderError, InputError, SettingError
 from ..files import atomic_path, disk_errors, write_json
 from ..params import SimulateParams
 from ..progress import Reporter
+from .develop import write_depth
 
 SCENES = ("museum",)
 SETTINGS = "simulate.json"
@@ -71,7 +71,7 @@ def simulate(params: SimulateParams, report: Reporter) -> dict[str, Any]:
         missing = [index for index in range(params.views) if not _is_finished(out, index)]
         if missing:
             raise BlenderError(f"Blender did not deliver photo {missing[0]}.", "Run it again.")
-        _describe(out, params, described)
+        _describe(out, described)
         if not described["denoised"]:
             report.warn("This Blender has no OpenImageDenoise: the photos are noisier than they could be.")
     classes = json.loads((out / "classes.json").read_text("utf-8"))["classes"]
@@ -118,15 +118,7 @@ def _develop(out: Path, raw: Path, index: int) -> None:
     """Turn Blender's files of one view into the photographer's, and remove them."""
     source = raw / f"{index:04d}"
     depth = np.load(source.with_suffix(".depth.npy"), allow_pickle=False)
-    with atomic_path(out / "depth" / f"{_stem(index)}.exr") as temporary:
-        image = oiio.ImageOutput.create(str(temporary))
-        spec = oiio.ImageSpec(depth.shape[1], depth.shape[0], 1, "float")
-        spec.channelnames = ("Z",)
-        spec.attribute("compression", "zip")
-        if image is None or not (
-            image.open(str(temporary), spec) and image.write_image(depth[..., None]) and image.close()
-        ):
-            raise InputError(f"{temporary} cannot be written: {oiio.geterror()}")
+    write_depth(out / "depth" / f"{_stem(index)}.exr", depth)
     with atomic_path(out / "labels" / f"{_stem(index)}.png") as temporary:
         shutil.copyfile(source.with_suffix(".label.png"), temporary)
     with atomic_path(_photo(out, index)) as temporary, Image.open(source.with_suffix(".png")) as picture:
@@ -148,9 +140,7 @@ def exif(index: int) -> Image.Exif:
     return data
 
 
-def _describe(out: Path, params: SimulateParams, described: dict[str, Any]) -> None:
-    width, height = params.size
-    focal = described["focal_px"]
+def _describe(out: Path, described: dict[str, Any]) -> None:
     frames = [
         {
             "file_path": f"../photos/{_stem(index)}.jpg",
@@ -160,8 +150,7 @@ def _describe(out: Path, params: SimulateParams, described: dict[str, Any]) -> N
         }
         for index, pose in enumerate(described["camera_to_world"])
     ]
-    intrinsics = {"camera_model": "OPENCV", "w": width, "h": height, "fl_x": focal, "fl_y": focal}
-    intrinsics |= {"cx": width / 2, "cy": height / 2, "camera_angle_x": 2 * float(np.arctan(width / 2 / focal))}
+    intrinsics = {"camera_model": "OPENCV", **described["intrinsics"]}
     write_json(out / "ground_truth" / "transforms.json", {**intrinsics, "frames": frames})
     for folder in (out, out / "ground_truth"):  # beside the photos, and beside the posed data set
         write_json(folder / "classes.json", {"ignore_id": 0, "classes": described["classes"]})

@@ -1,0 +1,82 @@
+"""Atomic writes: the old file survives whatever goes wrong."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from fieldwork.nerfcore.errors import DiskError
+from fieldwork.nerfcore.files import atomic_path, write_json, write_text
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 256 kB."""
+    folder = tmp_path / "small disk ü"
+    folder.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", "size=256k", "tmpfs", str(folder)]
+    try:
+        mounted = subprocess.run(command, capture_output=True, text=True, check=False)
+    except FileNotFoundError:
+        pytest.skip("there is no mount command here")
+    if mounted.returncode:
+        pytest.skip(f"a small file system cannot be mounted here: {mounted.stderr.strip()}")
+    yield folder
+    subprocess.run(["umount", str(folder)], check=True)
+
+
+def test_replaces_and_leaves_nothing_behind(tmp_path: Path) -> None:
+    path = tmp_path / "Übung 1" / "a.json"
+    write_json(path, {"a": 1})
+    write_json(path, {"ä": 2})
+    assert path.read_text(encoding="utf-8") == '{\n "ä": 2\n}\n'
+    assert os.listdir(path.parent) == ["a.json"]
+
+
+def test_failure_inside_keeps_the_old_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    write_text(path, "old")
+
+    def fail() -> None:
+        with atomic_path(path) as temporary:
+            temporary.write_text("half")
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        fail()
+    assert path.read_text() == "old"
+    assert os.listdir(tmp_path) == ["a.txt"]
+
+
+def test_full_disk_keeps_the_old_file(small_disk: Path) -> None:
+    path = small_disk / "a.txt"
+    write_text(path, "old")
+    with pytest.raises(DiskError, match="No space left"):
+        write_text(path, "x" * 1_000_000)
+    assert path.read_text() == "old"
+    assert os.listdir(small_disk) == ["a.txt"]
+    write_text(path, "new")  # and there is room again
+    assert path.read_text() == "new"
+
+
+def test_read_only_folder_is_named(small_disk: Path) -> None:
+    path = small_disk / "a.txt"
+    write_text(path, "old")
+    subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
+    try:
+        with pytest.raises(DiskError, match="cannot be written") as caught:
+            write_text(path, "new")
+        assert str(path) in str(caught.value)
+        assert path.read_text() == "old"
+    finally:
+        subprocess.run(["mount", "-o", "remount,rw", str(small_disk)], check=True)
+
+
+def test_keeps_the_suffix_for_image_writers(tmp_path: Path) -> None:
+    with atomic_path(tmp_path / "a.exr") as temporary:
+        assert temporary.suffix == ".exr"
+        temporary.write_bytes(b"x")
+    assert (tmp_path / "a.exr").read_bytes() == b"x"

@@ -115,6 +115,7 @@ class MeshParams(Params):
     out: Path | None = None
     faces: int | None = Field(None, gt=0, description="target number of triangles")
     resolution: int = Field(256, ge=16, le=1024, description="cells along the longest side of the box")
+    texture: int | None = Field(None, ge=64, description="texture size in pixels; none: vertex colours only")
     split: Literal["none", "classes"] = "none"
 
 
@@ -140,3 +141,4 @@ class ReconstructParams(Params):
     time_limit: float | None = Field(None, gt=0, description="seconds of training")
     set: dict[str, str] = Field(default_factory=dict)
     report: Path | None = Field(None, description="HTML report to write")
+    renders: Path | None = Field(None, description="folder for renders of new views")

@@ -55,12 +55,12 @@ def reconstruct(params: p.ReconstructParams, report: Reporter) -> dict[str, Any]
     if results["new"]["images"] >= 8:
         do("evaluate", p.EvaluateParams(project=project, run=run))
     do("mesh", p.MeshParams(project=project, run=run))
-    renders = project / "exports" / run / "renders"
+    renders = params.renders or project / "exports" / run / "renders"
     do("render", p.RenderParams(project=project, run=run, out=renders, orbit=8, passes=["rgb", "depth", "semantic"]))
     if params.blend is not None:
         do("blend", p.BlendParams(project=project, out=params.blend, run=run))
     result = {"project": str(project), "stages": stages, **results}
     if params.report is not None:
-        write_report(params.report, project, run, result)
+        write_report(params.report, project, run, renders, result)
         result["report"] = str(params.report)
     return result

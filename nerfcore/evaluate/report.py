@@ -44,8 +44,8 @@ def training_curve(events: Path) -> str | None:
     return embedded(buffer.getvalue(), "svg+xml")
 
 
-def write_report(path: Path, project_folder: Path, run: str, result: dict[str, Any]) -> None:
-    """Render the report of a `reconstruct` result.
+def write_report(path: Path, project_folder: Path, run: str, renders: Path, result: dict[str, Any]) -> None:
+    """Write the report of a `reconstruct` result with the pictures of the folder `renders`.
 
     Raises:
         DiskError: `path` cannot be written.
@@ -58,7 +58,6 @@ def write_report(path: Path, project_folder: Path, run: str, result: dict[str, A
         if (project_folder / name).is_file()
     ]
     scores = {Path(s["name"]).stem: s for s in evaluation.get("per_image", [])}
-    renders = sorted((project_folder / "exports" / run / "renders").glob("*.png"))
     html = (
         jinja2.Environment(autoescape=True)
         .from_string(TEMPLATE.read_text(encoding="utf-8"))
@@ -68,7 +67,7 @@ def write_report(path: Path, project_folder: Path, run: str, result: dict[str, A
             evaluation=evaluation,
             pictures=pictures,
             scores=scores,
-            renders=[{"name": r.stem, "data": embedded(r.read_bytes())} for r in renders],
+            renders=[{"name": r.stem, "data": embedded(r.read_bytes())} for r in sorted(renders.glob("*.png"))],
             curve=training_curve(run_folder(project_folder, run) / "events.jsonl"),
             classes=project.classes,
             rejected=[i for i in project.images if i.status != "ok"],

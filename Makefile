@@ -1,0 +1,65 @@
+# `make demo` and `make test` are all a newcomer needs; both create .venv first.
+PYTHON ?= python3.11
+VENV := .venv
+BIN := $(VENV)/bin
+SHELL := /bin/bash
+export OMP_WAIT_POLICY := passive
+
+.PHONY: venv demo test test-all lint matrix gui gpu-compile gpu-check bench repository clean
+
+venv: $(VENV)/.ready
+
+# torch first: a looser pin of another package would pull gigabytes of CUDA libraries.
+$(VENV)/.ready: pyproject.toml
+	@command -v $(PYTHON) >/dev/null || { echo "$(PYTHON) is missing. Install it (apt install python3.11 python3.11-venv) or set PYTHON=…"; exit 1; }
+	$(PYTHON) -m venv $(VENV) || { echo "python3.11-venv is missing: apt install python3.11-venv"; exit 1; }
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --upgrade "setuptools>=77" wheel
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check "torch==2.13.0"
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[blender,dev]"
+	@$(BIN)/python tests/system_libraries.py
+	@touch $@
+
+# PHOTOS=folder reconstructs your own photos (LABELS, CLASSES, MASKS optional); without it a museum scene is
+# simulated and photographed first.
+DEMO := build/demo$(if $(PHOTOS),-$(notdir $(patsubst %/,%,$(PHOTOS))))
+OWN := $(if $(LABELS),--labels "$(LABELS)") $(if $(CLASSES),--classes "$(CLASSES)") $(if $(MASKS),--masks "$(MASKS)")
+SIMULATED := --labels $(DEMO)/capture/labels --classes $(DEMO)/capture/classes.json
+TRAIN_SECONDS ?= 180
+
+demo: venv
+ifndef PHOTOS
+	$(BIN)/fieldwork simulate $(DEMO)/capture
+endif
+	rm -rf $(DEMO)/project
+	$(BIN)/fieldwork reconstruct "$(or $(PHOTOS),$(DEMO)/capture/photos)" --out $(DEMO)/project $(if $(PHOTOS),$(OWN),$(SIMULATED)) \
+		--time-limit $(TRAIN_SECONDS) --blend $(DEMO)/scene.blend --report $(DEMO)/report.html --renders $(DEMO)/renders
+	@echo "Look at $(DEMO)/report.html, $(DEMO)/scene.blend and $(DEMO)/renders."
+
+test: venv
+	$(BIN)/python -m pytest -m "not slow and not gui and not gpu" $(PYTEST)
+
+test-all: venv
+	$(BIN)/python -m pytest $(PYTEST)
+
+lint: venv
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+
+matrix: venv
+	$(BIN)/python tests/addon/matrix.py
+
+gui: venv
+	$(BIN)/python -m pytest tests/gui $(PYTEST)
+
+gpu-compile: venv
+	$(BIN)/python -m fieldwork.nerfcore.kernels.compile_cuda build/cubins
+
+gpu-check: venv
+	$(BIN)/python -m pytest -m gpu $(PYTEST)
+
+repository: venv
+	$(BIN)/python tests/addon/make_repository.py dist/repository
+
+clean:
+	rm -rf build dist *.egg-info .pytest_cache .ruff_cache

@@ -57,22 +57,27 @@ class Dataset:
 
 
 def unique_names(paths: Sequence[Path], root: Path) -> list[str]:
-    """A name for each image: its stem, or its path below `root` with "_" for separators when stems repeat."""
-    stems = [path.stem for path in paths]
-    if len(set(stems)) == len(stems):
-        return stems
-    names = []
-    for path in paths:
-        try:
-            relative = path.relative_to(root)
-        except ValueError:
-            relative = Path(*path.parts[-2:])
-        names.append("_".join(relative.with_suffix("").parts))
+    """A name for each image: its stem, or its path below `root` with "_" for separators when stems repeat.
+
+    White space becomes "_": COLMAP's lists of names are split at it.
+    """
+    names = [path.stem for path in paths]
+    if len(set(map(_joined, names))) < len(names):
+        names = ["/".join(_below(path, root).with_suffix("").parts) for path in paths]
+    names = [_joined(name) for name in names]
     if len(set(names)) < len(names):  # a.jpg beside a.png
         names = [f"{name}_{path.suffix[1:].lower()}" for name, path in zip(names, paths)]
     if len(set(names)) < len(names):
         names = [f"{name}_{i}" for i, name in enumerate(names)]
     return names
+
+
+def _joined(name: str) -> str:
+    return "_".join(name.replace("/", "_").split()) or "photo"
+
+
+def _below(path: Path, root: Path) -> Path:
+    return path.relative_to(root) if path.is_relative_to(root) else Path(*path.parts[-2:])
 
 
 def find_image(path: Path) -> Path | None:
@@ -112,3 +117,8 @@ def require(views: Iterable[DatasetView], source: Path, missing: Sequence[str] =
         why = f"none of its images exists (for example {missing[0]})" if missing else "it has no images"
         raise InputError(f"{source} cannot be imported: {why}.", "Choose the folder that holds the images and poses.")
     return found
+
+
+def plain_name(image: Path) -> str:
+    """The name of an image in sets whose stems are unique."""
+    return _joined(image.stem)

@@ -12,7 +12,7 @@ import numpy as np
 
 from ...capture.images import image_size
 from ...errors import InputError
-from ..dataset import Dataset, DatasetView, list_images, require
+from ..dataset import Dataset, DatasetView, list_images, plain_name, require
 from ..frames import upright
 from ..similarity import transform_points
 from .matrices import camera_from_matrix, decompose_projection
@@ -46,7 +46,7 @@ def read(folder: Path) -> Dataset:
         k, pose = decompose_projection(matrices[f"world_mat_{i}"][:3, :4])
         camera = camera_from_matrix(k, image_size(image))
         mask = masks[i] if len(masks) == len(images) else None
-        views.append(DatasetView(name=image.stem, image=image, camera=camera, camera_to_world=pose, mask=mask))
+        views.append(DatasetView(name=plain_name(image), image=image, camera=camera, camera_to_world=pose, mask=mask))
     require(views, folder)
     frame, confidence = upright([view.camera_to_world for view in views])
     bounds = None

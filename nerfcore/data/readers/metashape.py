@@ -16,7 +16,7 @@ import numpy as np
 from ...capture.images import image_size
 from ...errors import InputError
 from ..cameras import Camera
-from ..dataset import Dataset, DatasetView, beside, find_image, require
+from ..dataset import Dataset, DatasetView, beside, find_image, plain_name, require
 from ..frames import rotation_to_z, upright
 from ..similarity import make_similarity
 
@@ -73,7 +73,7 @@ def read(folder: Path) -> Dataset:
             continue
         views.append(
             DatasetView(
-                name=image.stem,
+                name=plain_name(image),
                 image=image,
                 camera=_camera(sensor, image_size(image), path),
                 camera_to_world=pose,

@@ -10,7 +10,7 @@ import numpy as np
 from ...capture.images import image_size, read_photo
 from ...capture.sharpness import thumbnail
 from ...errors import InputError
-from ..dataset import Dataset, DatasetView, beside, find_image, require
+from ..dataset import Dataset, DatasetView, beside, find_image, plain_name, require
 from ..frames import axis_upright
 from .matrices import camera_from_matrix, pose_from_world_to_camera
 
@@ -41,7 +41,7 @@ def read(folder: Path) -> Dataset:
             continue
         views.append(
             DatasetView(
-                name=image.stem,
+                name=plain_name(image),
                 image=image,
                 camera=camera_from_matrix(values[:9].reshape(3, 3), image_size(image)),
                 camera_to_world=pose_from_world_to_camera(values[9:18].reshape(3, 3), values[18:]),

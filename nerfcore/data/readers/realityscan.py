@@ -16,7 +16,7 @@ import numpy as np
 from ...capture.images import image_size
 from ...errors import InputError
 from ..cameras import Camera
-from ..dataset import Dataset, DatasetView, beside, find_image, require
+from ..dataset import Dataset, DatasetView, beside, find_image, plain_name, require
 from ..frames import upright
 
 METRIC = ("absolute",)
@@ -51,7 +51,7 @@ def read(folder: Path) -> Dataset:
         pose[:3, 3] = position
         views.append(
             DatasetView(
-                name=image.stem,
+                name=plain_name(image),
                 image=image,
                 camera=_camera(file, text, image_size(image)),
                 camera_to_world=pose,

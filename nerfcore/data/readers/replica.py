@@ -16,7 +16,7 @@ from ...capture.images import image_size
 from ...errors import InputError
 from ..cameras import Camera
 from ..classes import read_classes
-from ..dataset import Dataset, DatasetView, list_images, require
+from ..dataset import Dataset, DatasetView, list_images, plain_name, require
 from ..frames import axis_upright
 from .matrices import read_numbers
 
@@ -55,7 +55,7 @@ def read(folder: Path) -> Dataset:
         )
         views.append(
             DatasetView(
-                name=image.stem,
+                name=plain_name(image),
                 image=image,
                 camera=own if size == (own.width, own.height) else own.resized(*size),
                 camera_to_world=poses[number],

@@ -13,7 +13,7 @@ import numpy as np
 from ...capture.images import image_size
 from ...errors import InputError
 from ..classes import read_classes
-from ..dataset import Dataset, DatasetView, beside, list_images, require
+from ..dataset import Dataset, DatasetView, beside, list_images, plain_name, require
 from ..frames import axis_upright
 from .matrices import camera_from_matrix, read_numbers
 
@@ -49,7 +49,7 @@ def read(folder: Path) -> Dataset:
         label = next((p for name in LABEL_FOLDERS if (p := beside(folder / name, image.stem))), None)
         views.append(
             DatasetView(
-                name=image.stem,
+                name=plain_name(image),
                 image=image,
                 camera=camera_from_matrix(k, image_size(image)),
                 camera_to_world=pose,

@@ -8,7 +8,7 @@ import numpy as np
 
 from ...capture.images import image_size
 from ...errors import InputError
-from ..dataset import Dataset, DatasetView, beside, find_image, require
+from ..dataset import Dataset, DatasetView, beside, find_image, plain_name, require
 from ..frames import axis_upright
 from .matrices import camera_from_matrix, read_numbers
 
@@ -40,7 +40,7 @@ def read(folder: Path) -> Dataset:
         stem = image.stem
         views.append(
             DatasetView(
-                name=stem,
+                name=plain_name(image),
                 image=image,
                 camera=camera_from_matrix(np.array(rows[:3]), image_size(image), full_size),
                 camera_to_world=pose,

@@ -22,6 +22,7 @@ from typing import Any
 
 TASKS = {
     "simulate": "addon.simulate.task:simulate",
+    "dataset": "addon.simulate.dataset:dataset",
     "blend": "addon.package_task:write_blend",
 }
 
@@ -41,7 +42,8 @@ def main() -> int:
         result = function(json.loads(Path(request).read_text("utf-8")), lambda **data: emit({"event": data}))
     except Exception as error:  # noqa: BLE001 - whatever it is, the parent must hear of it
         traceback.print_exc()
-        emit({"error": f"{type(error).__name__}: {error}"})
+        for_user = getattr(error, "for_user", False)
+        emit({"error": str(error) if for_user else f"{type(error).__name__}: {error}", "for_user": for_user})
         code = 1
     else:
         emit({"result": result})

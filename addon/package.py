@@ -10,11 +10,13 @@ from typing import Any
 
 import numpy as np
 
+from .errors import SceneError
+
 FORMAT, VERSION = "fieldwork-package", 1
 SENSOR_MM = 36.0
 
 
-class PackageError(Exception):
+class PackageError(SceneError):
     """The folder is no package, is damaged, or comes from a newer Fieldwork."""
 
 

@@ -112,7 +112,7 @@ def _follow(
     for reader in readers:
         reader.start()
     result: dict[str, Any] | None = None
-    error = ""
+    error, for_user = "", False
     while True:
         report.check()
         try:
@@ -131,10 +131,12 @@ def _follow(
         elif "result" in message:
             result = message["result"]
         elif "error" in message:
-            error = message["error"]
+            error, for_user = message["error"], message["for_user"]
     code = child.wait()
     if result is not None and not error:
         return result
+    if for_user:
+        raise BlenderError(error)
     readers[1].join(timeout=2)
     if error:
         raise BlenderError(f"Blender failed in {task}: {error}", "\n".join(list(tail)[-8:]))

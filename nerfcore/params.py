@@ -31,6 +31,28 @@ class SimulateParams(Params):
     samples: int = Field(4, ge=1, description="Cycles samples per pixel")
 
 
+class DatasetParams(Params):
+    blend: Path = Field(description=".blend file whose active scene is photographed")
+    out: Path = Field(description="folder to write the data set to")
+    path: Literal["sphere", "hemisphere", "camera", "curve"] = Field(
+        "hemisphere",
+        description="where the photos are taken from: around the scene, the scene's animated camera, a curve",
+    )
+    views: int = Field(100, ge=1, description="number of photos (camera: at most; spread over the frame range)")
+    center: tuple[float, float, float] | None = Field(
+        None, description="what is looked at; default: the scene's middle"
+    )
+    radius: float | None = Field(None, gt=0, description="distance from it; default: so that all is in the picture")
+    curve: str | None = Field(None, description="name of the curve object, for path=curve")
+    size: tuple[int, int] | None = Field(None, description="photo width and height in pixels; default: the scene's")
+    samples: int = Field(32, ge=1, description="Cycles samples per pixel")
+    labels: Literal["material", "object", "collection", "none"] = Field(
+        "material", description="what tells classes apart: pass index (or name) of materials or objects, or collections"
+    )
+    depth: bool = Field(True, description="write depth maps")
+    transparent: bool = Field(False, description="alpha 0 where there is nothing, instead of the world's background")
+
+
 class NewParams(Params):
     project: Path
     photos: Path = Field(description="folder of photos, or a video file")

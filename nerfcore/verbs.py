@@ -20,6 +20,7 @@ class Verb(NamedTuple):
 VERBS = {
     "doctor": Verb(p.DoctorParams, "doctor:doctor", "Check the engine, the device and the disk."),
     "simulate": Verb(p.SimulateParams, "capture.simulate:simulate", "Build a scene and photograph it with Cycles."),
+    "dataset": Verb(p.DatasetParams, "capture.dataset:dataset", "Photograph any .blend as a posed, labelled data set."),
     "new": Verb(p.NewParams, "capture.ingest:new", "Make a project from photos or a video."),
     "import": Verb(p.ImportParams, "data.importer:import_dataset", "Make a project from a posed data set."),
     "poses": Verb(p.PosesParams, "poses.estimate:estimate_poses", "Estimate the camera poses."),

@@ -16,10 +16,26 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
+from ..errors import SceneError
 from .pixels import read_exr, write_index_png
 
 LabelSource = Literal["material", "object", "collection", "none"]
 FAR = 1e9  # Cycles writes 1e10 where a ray meets nothing
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Pinhole camera with square pixels: image size, focal length and principal point in pixels (None: the centre)."""
+
+    width: int
+    height: int
+    focal_px: float
+    center_px: tuple[float, float] | None = None
+
+    def intrinsics(self) -> dict[str, Any]:
+        """The lens in the words of transforms.json."""
+        cx, cy = self.center_px or (self.width / 2, self.height / 2)
+        return {"w": self.width, "h": self.height, "fl_x": self.focal_px, "fl_y": self.focal_px, "cx": cx, "cy": cy}
 
 
 @dataclass(frozen=True)
@@ -28,19 +44,7 @@ class Shot:
 
     name: str
     camera_to_world: np.ndarray
-
-
-@dataclass(frozen=True)
-class Lens:
-    """Pinhole camera: image size and focal length in pixels; the principal point is the image's centre."""
-
-    width: int
-    height: int
-    focal_px: float
-
-    @property
-    def angle_x(self) -> float:
-        return float(2 * np.arctan(self.width / (2 * self.focal_px)))
+    lens: Lens
 
 
 def class_ids(scene: bpy.types.Scene, source: LabelSource) -> dict[str, int]:
@@ -70,40 +74,63 @@ def class_ids(scene: bpy.types.Scene, source: LabelSource) -> dict[str, int]:
 def photograph(
     scene: bpy.types.Scene,
     shots: list[Shot],
-    lens: Lens,
     out: Path,
     *,
     samples: int = 24,
     labels: LabelSource = "material",
     depth: bool = True,
+    transparent: bool = False,
     progress: Callable[[int, Shot], None] = lambda index, shot: None,
 ) -> None:
     """Render `shots` into out/NAME.png (8-bit sRGB), out/NAME.label.png (uint8 ids) and out/NAME.depth.npy.
 
     Depth is the float32 distance along the viewing axis in scene units, 0 where there is nothing. Labels and depth
     are taken at pixel centres, one ray each, so that ids are never mixed. `progress` hears of each finished shot.
+
+    Args:
+        samples: Cycles samples per pixel of the colour picture.
+        labels: what tells classes apart, see `class_ids`.
+        transparent: RGBA pictures, alpha 0 where there is nothing, instead of the world's background.
+    Raises:
+        SceneError: there are more classes than a uint8 label map can hold.
     """
+    if max(class_ids(scene, labels).values(), default=0) > 255:
+        raise SceneError(
+            f"The {labels}s of the scene make more than 255 classes: tell classes apart by something else."
+        )
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
-    with _settings_kept(scene), _indexed(scene, labels), _camera(scene, lens):
+    with _settings_kept(scene), _indexed(scene, labels), _camera(scene):
         render = scene.render
         render.engine = "CYCLES"
-        render.resolution_x, render.resolution_y, render.resolution_percentage = lens.width, lens.height, 100
+        render.resolution_percentage, render.pixel_aspect_x, render.pixel_aspect_y = 100, 1.0, 1.0
+        render.use_border = render.use_motion_blur = False
+        render.film_transparent = transparent
         render.use_persistent_data = True
         render.use_compositing = render.use_sequencer = False
         # One change of the camera per shot and two passes over the list would lose the finished shots of a
         # cancelled run, so both renders of a shot are made in turn.
         for index, shot in enumerate(shots):
-            scene.camera.matrix_world = Matrix(np.asarray(shot.camera_to_world).tolist())
-            _render_colour(scene, out / f"{shot.name}.png", samples)
+            _aim(scene, shot)
+            _render_colour(scene, out / f"{shot.name}.png", samples, transparent)
             if labels != "none" or depth:
                 _render_data(scene, out, shot.name, labels, depth)
             progress(index, shot)
 
 
-def _render_colour(scene: bpy.types.Scene, path: Path, samples: int) -> None:
+def _aim(scene: bpy.types.Scene, shot: Shot) -> None:
+    lens, data = shot.lens, scene.camera.data
+    scene.render.resolution_x, scene.render.resolution_y = lens.width, lens.height
+    data.lens = lens.focal_px * data.sensor_width / lens.width
+    intrinsics = lens.intrinsics()
+    data.shift_x = (lens.width / 2 - intrinsics["cx"]) / lens.width
+    data.shift_y = (intrinsics["cy"] - lens.height / 2) / lens.width
+    scene.camera.matrix_world = Matrix(np.asarray(shot.camera_to_world).tolist())
+
+
+def _render_colour(scene: bpy.types.Scene, path: Path, samples: int, transparent: bool) -> None:
     _set_format(scene, "PNG")
-    scene.render.image_settings.color_mode = "RGB"
+    scene.render.image_settings.color_mode = "RGBA" if transparent else "RGB"
     scene.render.image_settings.color_depth = "8"
     scene.render.image_settings.compression = 15
     cycles = scene.cycles
@@ -183,11 +210,10 @@ def has_denoiser() -> bool:
 
 
 @contextmanager
-def _camera(scene: bpy.types.Scene, lens: Lens) -> Iterator[None]:
+def _camera(scene: bpy.types.Scene) -> Iterator[None]:
     data = bpy.data.cameras.new("Fieldwork photographer")
     data.sensor_fit, data.sensor_width = "HORIZONTAL", 36.0
-    data.lens = lens.focal_px * data.sensor_width / lens.width
-    data.clip_start, data.clip_end = 0.01, 1000.0
+    data.clip_start, data.clip_end = 0.001, 1e6
     camera = bpy.data.objects.new(data.name, data)
     scene.collection.objects.link(camera)
     before, scene.camera = scene.camera, camera
@@ -226,9 +252,14 @@ def _settings_kept(scene: bpy.types.Scene) -> Iterator[None]:
     targets = [
         (scene.render, ("engine", "resolution_x", "resolution_y", "resolution_percentage", "use_persistent_data")),
         (scene.render, ("use_compositing", "use_sequencer", "use_file_extension", "filepath")),
+        (scene.render, ("pixel_aspect_x", "pixel_aspect_y", "use_border", "use_motion_blur", "film_transparent")),
         (scene.cycles, ("samples", "use_adaptive_sampling", "adaptive_threshold", "filter_width")),
-        (scene.cycles, ("pixel_filter_type", "use_denoising")),
-        (scene.render.image_settings, ("media_type", "file_format", "color_mode", "color_depth", "exr_codec")),
+        (scene.cycles, ("pixel_filter_type", "use_denoising", "denoiser")),
+        (scene.cycles, ("denoising_input_passes", "denoising_prefilter")),
+        (
+            scene.render.image_settings,
+            ("media_type", "file_format", "color_mode", "color_depth", "exr_codec", "compression"),
+        ),
     ]
     names = ("use_pass_combined", "use_pass_z", "use_pass_material_index", "use_pass_object_index")
     targets += [(layer, names) for layer in scene.view_layers]
@@ -239,4 +270,5 @@ def _settings_kept(scene: bpy.types.Scene) -> Iterator[None]:
         yield
     finally:
         for target, name, value in before:
-            setattr(target, name, value)
+            if value != "":  # a choice among none, such as the denoiser of a build without one
+                setattr(target, name, value)

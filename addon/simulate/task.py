@@ -34,15 +34,14 @@ def simulate(request: dict[str, Any], emit: Callable[..., None]) -> dict[str, An
     pending = request["pending"]
     photograph(
         scene,
-        [Shot(f"{index:04d}", poses[index]) for index in pending],
-        lens,
+        [Shot(f"{index:04d}", poses[index], lens) for index in pending],
         Path(request["folder"]),
         samples=request["samples"],
         progress=lambda order, shot: emit(kind="view", index=pending[order]),
     )
     return {
         "camera_to_world": [pose.tolist() for pose in poses],
-        "focal_px": lens.focal_px,
+        "intrinsics": lens.intrinsics(),
         "classes": {
             str(number): {"name": name, "color": module.COLORS[number]} for number, name in module.CLASSES.items()
         },

@@ -22,11 +22,11 @@ from PIL import Image
 from PIL.ExifTags import IFD, Base
 
 from ..blender import run_in_blender
-from ..errors import BlenderError, InputError, SettingError
-from ..files import atomic_path, disk_errors, write_json
+from ..errors import BlenderError, SettingError
+from ..files import atomic_path, write_json
 from ..params import SimulateParams
 from ..progress import Reporter
-from .develop import write_depth
+from .develop import claim_folder, write_depth
 
 SCENES = ("museum",)
 SETTINGS = "simulate.json"
@@ -49,7 +49,7 @@ def simulate(params: SimulateParams, report: Reporter) -> dict[str, Any]:
         raise SettingError(f"Photos of {params.size[0]}×{params.size[1]} pixels cannot be made.", "Use 16 to 8192.")
     out = params.out.absolute()
     settings = params.model_dump(mode="json", exclude={"out"})
-    _claim(out, settings)
+    claim_folder(out, SETTINGS, settings, ["photos", "labels", "depth", "ground_truth"])
     pending = [index for index in range(params.views) if not _is_finished(out, index)]
     raw = out / ".raw"
     done = params.views - len(pending)
@@ -93,25 +93,6 @@ def _photo(out: Path, index: int) -> Path:
 def _is_finished(out: Path, index: int) -> bool:
     """The photo is written last, so that its presence means that the view is complete."""
     return _photo(out, index).is_file()
-
-
-def _claim(out: Path, settings: dict[str, Any]) -> None:
-    path = out / SETTINGS
-    if path.is_file():
-        try:
-            there = json.loads(path.read_text("utf-8"))
-        except ValueError:
-            there = None
-        if there != settings:
-            raise InputError(
-                f"{out} holds a capture simulated with other settings.", "Choose another folder, or remove this one."
-            )
-    elif out.is_dir() and any(out.iterdir()):
-        raise InputError(f"{out} is not empty and was not simulated by Fieldwork.", "Choose another folder.")
-    with disk_errors(out):
-        for name in ("photos", "labels", "depth", "ground_truth"):
-            (out / name).mkdir(parents=True, exist_ok=True)
-    write_json(path, settings)
 
 
 def _develop(out: Path, raw: Path, index: int) -> None:

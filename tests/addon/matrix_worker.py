@@ -56,8 +56,8 @@ def run(request):
     photograph = importlib.import_module(MODULE + ".addon.simulate.photograph")
     begin = time.perf_counter()
     scene = museum.build(0)
-    shot = photograph.Shot("a", museum.poses(4, 0)[0])
-    photograph.photograph(scene, [shot], photograph.Lens(96, 64, 75.0), out, samples=1)
+    shot = photograph.Shot("a", museum.poses(4, 0)[0], photograph.Lens(96, 64, 75.0))
+    photograph.photograph(scene, [shot], out, samples=1)
     facts["photo_s"] = round(time.perf_counter() - begin, 1)
     facts["oidn"] = photograph.has_denoiser()
     for name in ("a.png", "a.label.png", "a.depth.npy"):

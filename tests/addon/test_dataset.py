@@ -1,0 +1,173 @@
+"""A data set from any .blend: poses, labels and depth must tell one story, whatever the path and the lens."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+from fieldwork.nerfcore.capture.dataset import dataset
+from fieldwork.nerfcore.data.cameras import Camera, flip_camera_axes, pixel_centers, rays
+from fieldwork.nerfcore.data.importer import import_dataset
+from fieldwork.nerfcore.errors import BlenderError, InputError
+from fieldwork.nerfcore.params import DatasetParams, ImportParams
+from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.project import load_scene
+from PIL import Image
+
+# A floor of 4 m at z = 0 and a cube of 1 m on it; a camera with a vertical sensor fit and a shift that moves for ten
+# frames under a scaled parent; a circle of 3 m to walk along.
+SCENE = """
+from math import pi
+bpy.ops.wm.read_homefile(use_factory_startup=True, use_empty=True)
+scene = bpy.context.scene
+def thing(make, name, color, collection, **arguments):
+    make(**arguments)
+    item = bpy.context.object
+    item.name = name
+    material = bpy.data.materials.new("paint of " + name)
+    material.diffuse_color = (*color, 1)
+    item.data.materials.append(material)
+    group = bpy.data.collections.new(collection)
+    scene.collection.children.link(group)
+    for old in item.users_collection:
+        old.objects.unlink(item)
+    group.objects.link(item)
+thing(bpy.ops.mesh.primitive_plane_add, "floor", (0.2, 0.5, 0.2), "ground", size=4)
+thing(bpy.ops.mesh.primitive_cube_add, "cube", (0.8, 0.1, 0.1), "things", size=1, location=(0, 0, 0.5))
+bpy.ops.object.light_add(type="SUN", rotation=(0.5, 0.3, 0))
+bpy.ops.curve.primitive_bezier_circle_add(radius=3, location=(0, 0, 2))
+bpy.context.object.name = "walk"
+bpy.ops.object.empty_add()
+parent = bpy.context.object
+parent.scale = (2, 2, 2)
+bpy.ops.object.camera_add(location=(2, 0, 1.2), rotation=(1.1, 0, pi / 2))
+camera = scene.camera = bpy.context.object
+camera.parent = parent
+camera.data.sensor_fit, camera.data.sensor_height, camera.data.lens = "VERTICAL", 30, 40
+camera.data.shift_x, camera.data.shift_y = 0.08, -0.05
+for frame, x in ((1, 2.0), (10, 2.6)):
+    camera.location.x = x
+    camera.keyframe_insert("location", frame=frame)
+scene.frame_start, scene.frame_end = 1, 10
+scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = 240, 160, 50
+bpy.ops.wm.save_as_mainfile(filepath=path)
+answer(True)
+"""
+
+
+@pytest.fixture(scope="module")
+def blend(tmp_path_factory, bpy_script) -> Path:
+    path = tmp_path_factory.mktemp("scene") / "Büro.blend"
+    bpy_script(SCENE, path=path)
+    return path
+
+
+def take(blend: Path, out: Path, **changes) -> dict:
+    return dataset(DatasetParams(**{"blend": blend, "out": out, "views": 4, "samples": 1, **changes}), Reporter())
+
+
+def surfaces(out: Path) -> dict[int, np.ndarray]:
+    """World points (N, 3) of all pixels, by class id."""
+    truth = json.loads((out / "transforms.json").read_text())
+    found: dict[int, list[np.ndarray]] = {}
+    for frame in truth["frames"]:
+        lens = {**truth, **frame}
+        camera = Camera(
+            width=lens["w"], height=lens["h"], fx=lens["fl_x"], fy=lens["fl_y"], cx=lens["cx"], cy=lens["cy"]
+        )
+        pose = flip_camera_axes(np.array(frame["transform_matrix"]))
+        label = np.array(Image.open(out / frame["label_path"]))
+        depth = oiio.ImageBuf(str(out / frame["depth_file_path"])).get_pixels(oiio.FLOAT)[..., 0]
+        assert label.shape == depth.shape == (camera.height, camera.width)
+        assert Image.open(out / frame["file_path"]).size == (camera.width, camera.height)
+        directions, _ = rays(camera, pixel_centers(camera.width, camera.height).reshape(-1, 2))
+        world = directions / directions[:, 2:] * depth.reshape(-1, 1) @ pose[:3, :3].T + pose[:3, 3]
+        for number in np.unique(label):
+            found.setdefault(int(number), []).append(world[label.reshape(-1) == number])
+    return {number: np.concatenate(parts) for number, parts in found.items()}
+
+
+CLASSES = {
+    "material": ["paint of cube", "paint of floor"],
+    "object": ["cube", "floor"],
+    "collection": ["ground", "things"],
+}
+
+
+@pytest.mark.parametrize(
+    ("path", "labels"),
+    [("hemisphere", "material"), ("camera", "object"), ("curve", "collection"), ("sphere", "material")],
+)
+def test_labels_depth_and_poses_agree(path, labels, blend, tmp_path):
+    result = take(blend, tmp_path / "out", path=path, labels=labels, curve="walk" if path == "curve" else None)
+    assert result["images"] == 4
+    named = json.loads((tmp_path / "out/classes.json").read_text())["classes"]
+    assert list(named.values()) == result["classes"]
+    assert set(CLASSES[labels]) <= set(result["classes"])
+    ids = {name: int(number) for number, name in named.items()}
+    cube, floor = (ids[name] for name in (CLASSES[labels] if labels != "collection" else ["things", "ground"]))
+    found = surfaces(tmp_path / "out")
+    assert np.abs(found[floor][:, 2]).max() < 2e-3
+    assert np.abs(found[floor][:, :2]).max() < 2.001
+    from_center = np.abs(found[cube] - [0, 0, 0.5])
+    np.testing.assert_allclose(from_center.max(-1), 0.5, atol=2e-3)
+    assert set(found) <= {0, cube, floor}
+
+
+def test_everything_is_in_the_picture_from_the_hemisphere(blend, tmp_path):
+    take(blend, tmp_path / "out", views=6)
+    for path in (tmp_path / "out/labels").iterdir():
+        label = np.asarray(Image.open(path))
+        border = np.concatenate([label[0], label[-1], label[:, 0], label[:, -1]])
+        assert (border == 0).all()
+        assert (label != 0).mean() > 0.02
+
+
+def test_transparent_photos_have_alpha_only_where_something_is(blend, tmp_path):
+    take(blend, tmp_path / "out", views=1, transparent=True, labels="none", depth=False, size=(60, 40))
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["dataset.json", "images", "transforms.json"]
+    pixels = np.asarray(Image.open(tmp_path / "out/images/0001.png"))
+    assert pixels.shape == (40, 60, 4)
+    assert pixels[0, 0, 3] == 0
+    assert pixels[20, 30, 3] == 255
+
+
+def test_the_data_set_becomes_a_project_in_the_scene_s_own_frame(blend, tmp_path):
+    take(blend, tmp_path / "out", path="camera", labels="object")
+    result = import_dataset(ImportParams(dataset=tmp_path / "out", project=tmp_path / "project"), Reporter())
+    assert result["images"] == result["labelled"] == 4
+    scene = load_scene(tmp_path / "project")
+    truth = json.loads((tmp_path / "out/transforms.json").read_text())["frames"]
+    for view, frame in zip(scene.views, truth):
+        np.testing.assert_allclose(flip_camera_axes(view.camera_to_world), frame["transform_matrix"], atol=1e-5)
+    assert {c.name for c in scene.classes} >= {"cube", "floor"}
+
+
+def test_a_second_run_takes_only_what_is_missing(blend, tmp_path):
+    take(blend, tmp_path / "out")
+    photos = sorted((tmp_path / "out/images").iterdir())
+    times = [p.stat().st_mtime_ns for p in photos]
+    photos[1].unlink()
+    take(blend, tmp_path / "out")
+    assert [p.stat().st_mtime_ns == t for p, t in zip(photos, times)] == [True, False, True, True]
+    with pytest.raises(InputError, match="other settings"):
+        take(blend, tmp_path / "out", samples=2)
+
+
+def test_what_cannot_be_photographed_is_said(blend, tmp_path, bpy_script):
+    with pytest.raises(InputError, match="does not exist"):
+        take(tmp_path / "none.blend", tmp_path / "a")
+    with pytest.raises(BlenderError, match="no curve “river”"):
+        take(blend, tmp_path / "b", path="curve", curve="river")
+    bpy_script(
+        "bpy.ops.wm.read_homefile(use_factory_startup=True, use_empty=True)\n"
+        "bpy.ops.wm.save_as_mainfile(filepath=path)\nanswer(1)",
+        path=tmp_path / "empty.blend",
+    )
+    with pytest.raises(BlenderError, match="shows nothing"):
+        take(tmp_path / "empty.blend", tmp_path / "c")
+    with pytest.raises(BlenderError, match="no perspective camera"):
+        take(tmp_path / "empty.blend", tmp_path / "d", path="camera")

@@ -55,6 +55,12 @@ def grid_position(p: wp.vec3, contracted: int):
 
 
 @wp.func
+def inside(u: wp.vec3):
+    """Bins at the border reach out of the grid by half their length."""
+    return wp.vec3(wp.clamp(u[0], 0.0, 1.0), wp.clamp(u[1], 0.0, 1.0), wp.clamp(u[2], 0.0, 1.0))
+
+
+@wp.func
 def cell_index(u: wp.vec3, n: int):
     ix = wp.clamp(int(u[0] * float(n)), 0, n - 1)
     iy = wp.clamp(int(u[1] * float(n)), 0, n - 1)
@@ -243,7 +249,7 @@ def march_sample(
             while k < count and target <= above:
                 tk = t + ((target - below) / weight - 0.5) * length
                 depth[base + k] = tk
-                points[base + k] = grid_position(o + d * tk, contracted)
+                points[base + k] = inside(grid_position(o + d * tk, contracted))
                 ray[base + k] = r
                 k += 1
                 if k < count:
@@ -271,7 +277,7 @@ def march_sample(
     # Rounding can leave the last interval or sample just short of the total.
     while k < count:
         depth[base + k] = t_end
-        points[base + k] = grid_position(o + d * t_end, contracted)
+        points[base + k] = inside(grid_position(o + d * t_end, contracted))
         ray[base + k] = r
         k += 1
     while k_edge < count:

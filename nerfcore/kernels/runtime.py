@@ -17,7 +17,7 @@ from typing import Any
 import torch
 import warp as wp
 
-wp.config.quiet = True
+wp.config.log_level = 30  # warnings; stdout belongs to results
 # The adjoints are written by hand (`torch.autograd.Function`), so that nothing is compiled that is never called.
 wp.config.enable_backward = False
 

@@ -87,8 +87,8 @@ def extract(
     class_ids: list[int],
     report: Reporter,
     faces: int | None = None,
-) -> Surface:
-    """Surface in the normalised frame.
+) -> tuple[Surface, float]:
+    """Surface in the normalised frame, and the spacing of the grid it was found on.
 
     Args:
         low, high: corners (3,) of the region within [−1, 1]³.
@@ -120,8 +120,8 @@ def extract(
     if mesh.volume < 0:
         mesh.invert()
     report.stage("Reading colours and classes")
-    colors, classes = shade(model, mesh, class_ids, spacing, report)
-    return with_face_classes(
+    colors, classes = shade(model, mesh.vertices, mesh.vertex_normals, class_ids, spacing, report)
+    surface = with_face_classes(
         Surface(
             np.asarray(mesh.vertices, np.float32),
             np.asarray(mesh.faces, np.int32),
@@ -131,6 +131,7 @@ def extract(
             np.zeros(len(mesh.faces), np.int32),
         )
     )
+    return surface, spacing
 
 
 def drop_specks(mesh: trimesh.Trimesh, share: float = 0.01) -> trimesh.Trimesh:
@@ -146,21 +147,21 @@ def drop_specks(mesh: trimesh.Trimesh, share: float = 0.01) -> trimesh.Trimesh:
 
 @torch.no_grad()
 def shade(
-    model: Model, mesh: trimesh.Trimesh, class_ids: list[int], spacing: float, report: Reporter
+    model: Model, points: np.ndarray, normals: np.ndarray, class_ids: list[int], spacing: float, report: Reporter
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Colour (V, 3) uint8 and class id (V,) of each vertex.
+    """Colour (V, 3) uint8 and class id (V,) of surface points (V, 3) of the normalised frame with normals (V, 3).
 
-    A vertex is seen from outside along its normal: the values are those of a short ray through the surface, so that
+    A point is seen from outside along its normal: the values are those of a short ray through the surface, so that
     they are the ones a camera would see.
     """
     device = model.priorities.device
-    normals = torch.from_numpy(np.array(mesh.vertex_normals, np.float32)).to(device)
-    points = torch.from_numpy(np.array(mesh.vertices, np.float32)).to(device)
+    where = torch.from_numpy(np.array(points, np.float32)).to(device)
+    outward = torch.from_numpy(np.array(normals, np.float32)).to(device)
     colors, classes = [], []
     offsets = torch.linspace(1.5, -2.5, 9, device=device) * spacing
     step = float(offsets[0] - offsets[1])
-    for index, (p, n) in enumerate(zip(points.split(CHUNK // 8), normals.split(CHUNK // 8))):
-        report.progress(index * CHUNK / 8 / max(len(points), 1))
+    for index, (p, n) in enumerate(zip(where.split(CHUNK // 8), outward.split(CHUNK // 8))):
+        report.progress(min(index * CHUNK / 8 / max(len(where), 1), 1.0))
         places = p[:, None] + n[:, None] * offsets[:, None]
         u = grid_from_normalised(places.reshape(-1, 3), model.contracted).clamp(0, 1).contiguous()
         geometry = model.field.geometry(u)
@@ -176,7 +177,7 @@ def shade(
             classes.append((probabilities * weight).sum(1).argmax(1))
     rgb = (torch.cat(colors).clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
     if not class_ids:
-        return rgb, np.zeros(len(points), np.int32)
+        return rgb, np.zeros(len(where), np.int32)
     return rgb, np.array(class_ids, np.int32)[torch.cat(classes).cpu().numpy()]
 
 

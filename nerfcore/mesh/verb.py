@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,10 @@ from ..files import atomic_path
 from ..params import MeshParams
 from ..progress import Reporter
 from ..project import load_project, load_scene, save_project
-from ..train.run import load_trained
-from .extract import Surface, extract
+from ..render.image import write_picture
+from ..train.run import Trained, load_trained
+from .extract import Surface, extract, shade
+from .texture import Unwrapped, bake, unwrap
 
 FORMATS = (".ply", ".obj", ".glb", ".stl")
 
@@ -33,7 +36,7 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
         raise SettingError(f"{params.out}: meshes are written as {', '.join(FORMATS)}.", "Choose one of these endings.")
     project, scene = load_project(folder), load_scene(folder)
     trained = load_trained(folder, params.run)
-    surface = extract(
+    surface, spacing = extract(
         trained.model,
         params.resolution,
         np.full(3, -1.0),
@@ -42,16 +45,26 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
         report,
         params.faces,
     )
-    surface = to_world(surface, trained.info.box(project).world_from_box)
     target = folder / "exports" / params.run
+    texture = None
+    if params.texture is not None:
+        texture = bake_texture(trained, surface, spacing, params.texture, report)
+    surface = to_world(surface, trained.info.box(project).world_from_box)
     with atomic_path(target / "mesh.npz") as temporary, open(temporary, "wb") as file:
-        np.savez(file, **vars(surface))
+        arrays = vars(surface) if texture is None else {**vars(surface), "uv": texture.corner_uv}
+        np.savez(file, **arrays)
     names = {c.id: c.name for c in scene.classes}
     colors = {c.id: c.color for c in scene.classes}
     files = [target / "mesh.npz"]
     report.stage("Writing")
+    if texture is None:
+        (target / "texture.png").unlink(missing_ok=True)
+    else:
+        with atomic_path(target / "texture.png") as temporary:
+            write_picture(temporary, texture.image)
+        files.append(target / "texture.png")
     for path in [target / "mesh.ply", *([params.out] if params.out else [])]:
-        files += write_surface(path, surface, names, colors, params.split == "classes" and path == params.out)
+        files += write_surface(path, surface, names, colors, params.split == "classes" and path == params.out, texture)
     result = {
         "vertices": len(surface.vertices),
         "faces": len(surface.faces),
@@ -62,6 +75,59 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
     project.record("mesh", params.model_dump(mode="json"), result)
     save_project(folder, project)
     return result
+
+
+@dataclass(frozen=True)
+class Texture:
+    """A baked texture: image (S, S, 3) uint8, unwrapped mesh, corner_uv (F, 3, 2): UV of every face's corners."""
+
+    image: np.ndarray
+    unwrapped: Unwrapped
+
+    @property
+    def corner_uv(self) -> np.ndarray:
+        return self.unwrapped.uv[self.unwrapped.faces]
+
+
+def bake_texture(trained: Trained, surface: Surface, spacing: float, size: int, report: Reporter) -> Texture:
+    """UVs and colours for a surface in the normalised frame."""
+    report.stage("Unwrapping")
+    unwrapped = unwrap(surface.vertices, surface.faces, size)
+    report.stage("Baking the texture")
+
+    def color(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        return shade(trained.model, points, normals, [], spacing, Reporter())[0]
+
+    return Texture(bake(surface.vertices, surface.normals, unwrapped, size, color, report), unwrapped)
+
+
+def write_textured(path: Path, surface: Surface, texture: Texture, names: dict[int, str], split: bool) -> list[Path]:
+    """GLB or OBJ with UVs and the picture; an OBJ's material and picture lie beside it."""
+    from PIL import Image
+
+    u = texture.unwrapped
+    picture = Image.fromarray(texture.image)
+    parts = {}
+    for c in np.unique(surface.face_class) if split else [None]:
+        chosen = u.faces if c is None else u.faces[surface.face_class == c]
+        used, inverse = np.unique(chosen, return_inverse=True)
+        parts["mesh" if c is None else names.get(int(c), str(c))] = trimesh.Trimesh(
+            surface.vertices[u.source[used]],
+            inverse.reshape(-1, 3),
+            vertex_normals=surface.normals[u.source[used]],
+            visual=trimesh.visual.TextureVisuals(uv=u.uv[used], image=picture),
+            process=False,
+        )
+    kind = path.suffix[1:].lower()
+    data, extra = trimesh.exchange.export.export_scene(trimesh.Scene(parts), None, file_type="glb"), {}
+    if kind == "obj":
+        data, extra = trimesh.exchange.obj.export_obj(
+            trimesh.Scene(parts), return_texture=True, mtl_name=f"{path.stem}.mtl"
+        )
+    for target, content in {path: data, **{path.parent / name: value for name, value in extra.items()}}.items():
+        with atomic_path(target) as temporary:
+            temporary.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return [path, *(path.parent / name for name in extra)]
 
 
 def to_world(surface: Surface, world_from_box: np.ndarray) -> Surface:
@@ -101,8 +167,14 @@ def write_surface(
     names: dict[int, str],
     colors: dict[int, tuple[float, float, float]],
     split: bool,
+    texture: Texture | None = None,
 ) -> list[Path]:
-    """Write a mesh file in the format of its suffix; `split` writes one object a class (GLB) or one file a class."""
+    """Write a mesh file in the format of its suffix; `split` writes one object a class (GLB) or one file a class.
+
+    GLB and OBJ carry the texture when there is one; PLY and STL have none.
+    """
+    if texture is not None and path.suffix.lower() in (".glb", ".obj"):
+        return write_textured(path, surface, texture, names, split)
     if not split:
         with atomic_path(path) as temporary:
             if path.suffix.lower() == ".ply":

@@ -1,0 +1,89 @@
+"""Slow torch twin of `march.py`, one ray at a time."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from .march import MAX_BINS, PDF_DEFAULT, PDF_UNIFORM, MarchSettings
+
+STOP = 1e-4
+MACRO = 4
+
+
+def grid_position(p: torch.Tensor, contracted: bool) -> torch.Tensor:
+    """Normalised positions (..., 3) → grid coordinates in [0, 1]³."""
+    if not contracted:
+        return p * 0.5 + 0.5
+    r = p.abs().amax(-1, keepdim=True)
+    return torch.where(r > 1, p * ((2 - 1 / r.clamp(min=1)) / r.clamp(min=1)), p) * 0.25 + 0.5
+
+
+def walk(
+    origin: torch.Tensor, direction: torch.Tensor, jitter: float, cells: torch.Tensor, s: MarchSettings
+) -> list[tuple[float, float, float]]:
+    """The open bins of one ray: (middle, length, weight), front to back."""
+    n = s.resolution
+    opened = (cells[:, 0] > 0).view(n, n, n)
+    low, high = s.near, s.far
+    inverse = 1 / torch.where(direction.abs() < 1e-9, 1e-9, direction)
+    if not s.contracted:
+        a, b = (-1 - origin) * inverse, (1 - origin) * inverse
+        low = max(low, float(torch.minimum(a, b).max()))
+        high = min(high, float(torch.maximum(a, b).min()))
+    t, transmittance, bins = low + jitter * s.step, 1.0, []
+    for _ in range(int(MAX_BINS)):
+        if t >= high:
+            break
+        p = origin + direction * t
+        r = float(p.abs().max())
+        length = s.step * r * math.sqrt(r) if s.contracted and r > 1 else s.step
+        u = grid_position(p, s.contracted)
+        x, y, z = (u * n).long().clamp(0, n - 1).tolist()
+        density, interest = cells[(z * n + y) * n + x].tolist()
+        if density > 0:
+            if s.mode == PDF_UNIFORM:
+                weight = 1.0
+            elif s.mode == PDF_DEFAULT:
+                alpha = 1 - math.exp(-density * length)
+                weight = transmittance * alpha * (1 + s.beta * interest) + s.epsilon
+            else:
+                weight = density * interest + 1e-6
+            bins.append((t, length, weight))
+            if s.mode == PDF_DEFAULT:
+                transmittance *= math.exp(-density * length)
+                if transmittance < STOP:
+                    break
+            t += length
+        elif s.contracted:
+            t += length
+        else:
+            bx, by, bz = x // MACRO * MACRO, y // MACRO * MACRO, z // MACRO * MACRO
+            closed = not bool(opened[bz : bz + MACRO, by : by + MACRO, bx : bx + MACRO].any())
+            m = n / MACRO if closed else float(n)
+            scaled = u * m
+            ahead = (scaled.floor() + (direction > 0).float() - scaled) * inverse
+            leave = max(float(ahead.min()) * 2 / m, 0.0)
+            t += max(1.0, math.floor(leave / s.step + 0.5)) * s.step
+    return bins
+
+
+def sample_ray(
+    bins: list[tuple[float, float, float]], count: int, shift: list[float]
+) -> tuple[list[float], list[float]]:
+    """Distances and lengths of `count` samples on one ray by inverting the bins' cumulative weight."""
+    total = sum(weight for _, _, weight in bins)
+    share = total / count
+    depth, delta = [], [0.0] * count
+    below = 0.0
+    for middle, length, weight in bins:
+        above = below + weight
+        for k in range(count):
+            target = (k + shift[k]) * share
+            if len(depth) == k and target <= above:
+                depth.append(middle + ((target - below) / weight - 0.5) * length)
+            overlap = max(0.0, min((k + 1) * share, above) - max(k * share, below))
+            delta[k] += overlap / weight * length
+        below = above
+    return depth + [bins[-1][0]] * (count - len(depth)), delta

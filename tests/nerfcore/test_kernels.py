@@ -1,0 +1,244 @@
+"""Every kernel against its torch twin, gradients against autograd and finite differences, and their invariants."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from fieldwork.nerfcore.kernels import (
+    cells,
+    cells_torch,
+    composite,
+    composite_torch,
+    encode,
+    encode_torch,
+    march,
+    march_torch,
+)
+from fieldwork.nerfcore.kernels.march import PDF_DEFAULT, PDF_LITERAL, PDF_UNIFORM, MarchSettings
+from fieldwork.nerfcore.kernels.packing import Packing
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+DEVICES = [
+    "cpu",
+    pytest.param(
+        "cuda", marks=[pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="no NVIDIA GPU")]
+    ),
+]
+LEVELS = [(5, 0, 125), (17, 128, 4913), (64, 5056, 1 << 12)]  # two dense, one hashed
+GAINS = [1.0, 0.5, 1.0]
+ROWS = 5056 + (1 << 12)
+
+
+def relative(a: torch.Tensor, b: torch.Tensor) -> float:
+    return float((a - b).detach().abs().max() / b.detach().abs().max().clamp(min=1e-12))
+
+
+def random_packing(rays: int, generator: torch.Generator, device: str) -> Packing:
+    count = torch.randint(0, 9, (rays,), generator=generator, dtype=torch.int32)
+    count[0] = 0
+    start = torch.cumsum(count, 0, dtype=torch.int32) - count
+    ray = torch.repeat_interleave(torch.arange(rays, dtype=torch.int32), count.long())
+    return Packing(start.to(device), count.to(device), ray.to(device))
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_encode_equals_its_twin_and_so_does_its_gradient(device: str) -> None:
+    generator = torch.Generator().manual_seed(1)
+    table = torch.randn(ROWS, encode.FEATURES, generator=generator).to(device)
+    points = torch.rand(3000, 3, generator=generator).to(device)
+    points[:8] = torch.tensor([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)], device=device)
+    expected_table = table.clone().requires_grad_()
+    expected = encode_torch.forward(expected_table, LEVELS, GAINS, points)
+    assert relative(encode.forward(table, LEVELS, GAINS, points), expected) <= 1e-5
+    upstream = torch.randn(expected.shape, generator=generator).to(device)
+    expected.backward(upstream)
+    gradient, touched = torch.zeros_like(table), torch.zeros(ROWS // encode.BLOCK, dtype=torch.uint8, device=device)
+    encode.backward(gradient, touched, LEVELS, GAINS, points, upstream)
+    assert expected_table.grad is not None
+    assert relative(gradient, expected_table.grad) <= 1e-4
+    blocks = (expected_table.grad.abs().sum(1) > 0).view(-1, encode.BLOCK).any(1)
+    assert torch.equal(touched.bool() & blocks, blocks)
+
+
+def test_the_gradient_scatter_gives_the_same_bits_every_time() -> None:
+    generator = torch.Generator().manual_seed(2)
+    points = torch.rand(20000, 3, generator=generator)
+    upstream = torch.randn(20000, len(LEVELS) * encode.FEATURES, generator=generator)
+
+    def gradient() -> torch.Tensor:
+        total = torch.zeros(ROWS, encode.FEATURES)
+        encode.backward(total, torch.zeros(ROWS // encode.BLOCK, dtype=torch.uint8), LEVELS, GAINS, points, upstream)
+        return total
+
+    first = gradient()
+    assert all(torch.equal(first, gradient()) for _ in range(3))
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_adam_moves_touched_rows_only(device: str) -> None:
+    generator = torch.Generator().manual_seed(3)
+    values = [torch.randn(ROWS, encode.FEATURES, generator=generator).to(device) for _ in range(3)]
+    table, mean, square = values[0], values[1], values[2].abs()
+    gradient = torch.randn(ROWS, encode.FEATURES, generator=generator).to(device)
+    gradient[::3] = 0
+    expected = [x.clone() for x in (table, gradient, mean, square)]
+    encode_torch.adam(*expected, rate=0.01)
+    before = table.clone()
+    touched = torch.ones(ROWS // encode.BLOCK, dtype=torch.uint8, device=device)
+    encode.adam(table, gradient, mean, square, touched, 0.01)
+    for ours, theirs in zip((table, gradient, mean, square), expected):
+        assert torch.allclose(ours, theirs, rtol=1e-5, atol=1e-7)
+    assert torch.equal(table[::3], before[::3])
+    assert not touched.any()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_weights_and_sums_equal_their_twins_and_so_do_their_gradients(device: str) -> None:
+    generator = torch.Generator().manual_seed(4)
+    packing = random_packing(60, generator, device)
+    n = len(packing.ray)
+    density = (torch.rand(n, generator=generator) * 5).to(device).requires_grad_()
+    delta = torch.rand(n, generator=generator).to(device)
+    values = torch.randn(n, 7, generator=generator).to(device).requires_grad_()
+    upstream = torch.randn(60, 7, generator=generator).to(device)
+    results = []
+    for module in (composite, composite_torch):
+        weights = module.render_weights(density, delta, packing)
+        total = module.weighted_sum(values, weights, packing)
+        results.append((weights, total, *torch.autograd.grad((total * upstream).sum(), (density, values))))
+    for ours, theirs in zip(*results):
+        assert relative(ours, theirs) <= 1e-5 if ours.shape != density.shape else relative(ours, theirs) <= 1e-4
+
+
+def test_weight_gradient_agrees_with_finite_differences() -> None:
+    packing = Packing(
+        torch.tensor([0], dtype=torch.int32), torch.tensor([6], dtype=torch.int32), torch.zeros(6, dtype=torch.int32)
+    )
+    density = torch.tensor([0.1, 2.0, 0.5, 3.0, 0.0, 1.0], requires_grad=True)
+    delta = torch.tensor([0.3, 0.1, 0.4, 0.2, 0.5, 0.2])
+    upstream = torch.tensor([1.0, -2.0, 0.5, 3.0, 1.0, -1.0])
+
+    def value(d: torch.Tensor) -> torch.Tensor:
+        return (composite.render_weights(d, delta, packing) * upstream).sum()
+
+    (gradient,) = torch.autograd.grad(value(density), density)
+    for k in range(6):
+        step = torch.zeros(6)
+        step[k] = 1e-2
+        difference = (value(density.detach() + step) - value(density.detach() - step)) / 2e-2
+        assert abs(float(gradient[k] - difference)) < 2e-3
+
+
+@given(st.integers(0, 10**6))
+@settings(max_examples=25, deadline=None)
+def test_weights_never_exceed_one_and_transmittance_falls(seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    packing = random_packing(20, generator, "cpu")
+    density = torch.rand(len(packing.ray), generator=generator) * 10 ** float(
+        torch.randint(-3, 4, (1,), generator=generator)
+    )
+    weights = composite.render_weights(density, torch.rand(len(density), generator=generator), packing)
+    assert bool((weights >= 0).all())
+    total = composite.weighted_sum(torch.ones(len(weights), 1), weights, packing)
+    assert bool((total <= 1 + 1e-5).all())
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_cell_reading_and_maxima_equal_their_twins(device: str) -> None:
+    generator = torch.Generator().manual_seed(5)
+    grid = torch.rand(16**3, generator=generator).to(device)
+    points = torch.rand(4000, 3, generator=generator).to(device)
+    values = torch.rand(4000, generator=generator).to(device)
+    assert relative(cells.trilinear(grid, 16, points), cells_torch.trilinear(grid, 16, points)) <= 1e-5
+    assert torch.equal(cells.scatter_max(16, points, values), cells_torch.scatter_max(16, points, values))
+
+
+def random_cells(n: int, share: float, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
+    opened = torch.rand(n, n, n, generator=generator) < share
+    opened[: n // 2] = False  # whole blocks to skip
+    density = torch.where(opened, torch.rand(n, n, n, generator=generator) * 20, 0.0)
+    grid = torch.stack([density.reshape(-1), torch.rand(n**3, generator=generator)], 1).contiguous()
+    m = n // 4
+    return grid, opened.view(m, 4, m, 4, m, 4).any(5).any(3).any(1).reshape(-1).to(torch.uint8)
+
+
+def random_rays(count: int, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
+    origin = torch.randn(count, 3, generator=generator)
+    origin = origin / origin.norm(dim=1, keepdim=True) * 3
+    direction = torch.rand(count, 3, generator=generator) * 1.2 - 0.6 - origin
+    return origin, direction / direction.norm(dim=1, keepdim=True)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("mode", [PDF_DEFAULT, PDF_UNIFORM, PDF_LITERAL])
+@pytest.mark.parametrize("contracted", [False, True])
+def test_marching_equals_its_twin(device: str, mode: int, contracted: bool) -> None:
+    generator = torch.Generator().manual_seed(6)
+    n, count, rays = 16, 8, 40
+    grid, blocks = random_cells(n, 0.3, generator)
+    origin, direction = random_rays(rays, generator)
+    jitter, shift = torch.rand(rays, generator=generator), torch.rand(rays * count, generator=generator)
+    s = MarchSettings(n, 0.06, far=50.0, contracted=contracted, mode=mode)
+    on = [x.to(device) for x in (origin, direction, grid, blocks)]
+    samples = march.sample(*on, s, count, jitter.to(device), shift.to(device))
+    depth, delta = samples.depth.cpu(), samples.delta.cpu()
+    agreeing = hits = 0
+    for r in range(rays):
+        bins = march_torch.walk(origin[r], direction[r], float(jitter[r]), grid, s)
+        assert (int(samples.packing.count[r]) > 0) == bool(bins)
+        if not bins:
+            continue
+        hits += 1
+        base = int(samples.packing.start[r])
+        expected = march_torch.sample_ray(bins, count, shift[base : base + count].tolist())
+        ours = depth[base : base + count], delta[base : base + count]
+        agreeing += all(torch.allclose(o, torch.tensor(e), atol=2e-4, rtol=1e-3) for o, e in zip(ours, expected))
+    # A ray that passes within rounding of a cell's edge may see one bin more or less.
+    assert hits > 20
+    assert agreeing >= 0.9 * hits
+
+
+@given(st.integers(0, 10**6), st.sampled_from([PDF_DEFAULT, PDF_UNIFORM]), st.integers(1, 24))
+@settings(max_examples=25, deadline=None)
+def test_samples_are_sorted_inside_the_open_interval_and_their_lengths_add_up(seed: int, mode: int, count: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    grid, blocks = random_cells(16, 0.2, generator)
+    origin, direction = random_rays(50, generator)
+    s = MarchSettings(16, 0.0625, mode=mode)
+    samples = march.sample(origin, direction, grid, blocks, s, count, torch.rand(50), torch.rand(50 * count))
+    hit = samples.packing.count > 0
+    depth, delta = samples.depth.view(-1, count), samples.delta.view(-1, count)
+    assert bool((depth.diff(dim=1) >= -1e-5).all())
+    assert bool((depth >= samples.first[hit, None] - s.step).all())
+    assert bool((depth <= samples.last[hit, None] + s.step).all())
+    assert bool((delta >= -1e-6).all())
+    bins = (delta.sum(1) / s.step).round()
+    assert torch.allclose(delta.sum(1), bins * s.step, atol=1e-4)
+    assert bool(((samples.points >= 0) & (samples.points <= 1)).all())
+
+
+def test_an_empty_grid_gives_no_samples() -> None:
+    origin, direction = random_rays(10, torch.Generator().manual_seed(7))
+    samples = march.sample(
+        origin, direction, torch.zeros(16**3, 2), torch.zeros(4**3, dtype=torch.uint8), MarchSettings(16, 0.06), 8
+    )
+    assert len(samples) == 0
+    assert bool((samples.packing.count == 0).all())
+
+
+def test_interest_and_density_draw_samples() -> None:
+    n = 16
+    grid = torch.zeros(n, n, n, 2)
+    grid[:, :, 4:12, 0] = 0.5
+    grid[:, :, 8:10, 1] = 1.0  # an interesting slab
+    blocks = torch.ones((n // 4) ** 3, dtype=torch.uint8)
+    origin, direction = torch.tensor([[-3.0, 0.01, 0.01]]), torch.tensor([[1.0, 0.0, 0.0]])
+
+    def share(beta: float) -> float:
+        s = MarchSettings(n, 0.125, beta=beta, epsilon=1e-4)
+        samples = march.sample(origin, direction, grid.view(-1, 2).contiguous(), blocks, s, 64)
+        x = samples.points[:, 0] * n
+        return float(((x >= 8) & (x < 10)).float().mean())
+
+    assert share(4.0) > 1.5 * share(0.0)

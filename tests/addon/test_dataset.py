@@ -171,3 +171,33 @@ def test_what_cannot_be_photographed_is_said(blend, tmp_path, bpy_script):
         take(tmp_path / "empty.blend", tmp_path / "c")
     with pytest.raises(BlenderError, match="no perspective camera"):
         take(tmp_path / "empty.blend", tmp_path / "d", path="camera")
+
+
+OPERATOR = """
+import fieldwork
+fieldwork.register()
+from fieldwork.addon import preferences
+preferences.engine_python = lambda: Path(sys.executable)
+bpy.ops.wm.open_mainfile(filepath=blend)
+bpy.data.objects["cube"].location.x = 1.5  # not saved: the scene is photographed as it is now
+result = bpy.ops.fieldwork.dataset(out=out, views=3, samples=1, labels="object", path_kind="hemisphere")
+try:
+    bpy.ops.fieldwork.dataset(out=out, views=3)
+    refused = ""
+except RuntimeError as error:
+    refused = str(error)
+from fieldwork.addon import jobs
+jobs.queue.stop_engine()
+answer({"result": list(result), "refused": refused, "left": os.listdir(bpy.app.tempdir)})
+"""
+
+
+def test_the_operator_photographs_the_scene_as_it_is_and_makes_a_project(blend, tmp_path, bpy_script):
+    facts = bpy_script(OPERATOR, blend=blend, out=tmp_path / "set")
+    assert facts["result"] == ["FINISHED"]
+    assert "not empty" in facts["refused"]
+    assert not any(name.endswith(".blend") for name in facts["left"])
+    ids = json.loads((tmp_path / "set/classes.json").read_text())["classes"]
+    cube = surfaces(tmp_path / "set")[next(int(k) for k, name in ids.items() if name == "cube")]
+    np.testing.assert_allclose(np.abs(cube - [1.5, 0, 0.5]).max(-1), 0.5, atol=2e-3)
+    assert len(load_scene(tmp_path / "set_fieldwork").views) == 3

@@ -81,7 +81,8 @@ def repair(
     """Take out images whose pose contradicts their matches, and try to place them again.
 
     Returns:
-        the model, checks of its images, links between them, and the checks of those that had to stay out.
+        the model (None when fewer than three images would be left), checks of its images, links between them, and the
+        checks of those that had to stay out.
     """
     dropped: dict[int, ImageCheck] = {}
     for round_ in range(REPAIR_ROUNDS + 1):
@@ -90,7 +91,7 @@ def repair(
         if not bad:
             return model, checks, links, {i: c for i, c in dropped.items() if i not in checks}
         if len(checks) - len(bad) < 3:
-            return model, checks, links, {}
+            return None, {}, {}, {}
         for image_id, check in bad.items():
             dropped[image_id] = check
             if model.exists_image(image_id) and model.image(image_id).has_pose:

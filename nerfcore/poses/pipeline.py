@@ -13,7 +13,7 @@ from ..data.colmap_cameras import camera_from_colmap
 from ..errors import PosesError
 from . import features, mapping
 from .presets import ENOUGH, EXHAUSTIVE_AT_MOST, EXHAUSTIVE_UP_TO, LADDERS, Level
-from .validate import ImageCheck, pair_images
+from .validate import MIN_POINTS, ImageCheck, pair_images
 
 MIN_FEATURES = 100
 MIN_COMMON = 40
@@ -74,6 +74,11 @@ def run(job: dict[str, Any], tell: Any) -> dict[str, Any]:
         )
     tell.stage("Final adjustment")
     model = best.models[0] = mapping.adjust(best.models[0], keep_cameras=job["start"] is not None)
+    if model.num_points3D() < MIN_POINTS:
+        raise PosesError(
+            f"The {len(names)} photos were taken from too few different positions: no depth can be seen.",
+            "Walk around the subject while taking photos.",
+        )
     sparse = Path(job["sparse"])
     temporary = sparse.with_name(sparse.name + ".new")
     shutil.rmtree(temporary, ignore_errors=True)
@@ -108,6 +113,8 @@ def _attempt(job: dict[str, Any], level: Level, names: list[str], exhaustive: bo
             continue
         tell.stage("Checking poses")
         model, checks, links, dropped = mapping.repair(models[0], path, image_folder, work, relaxed, names, tell)
+        if model is None:
+            continue
         # Self-calibration may run away, and a lens of unknown focal length turn out to be long: then the full model
         # is worth no more than the simple one that follows.
         doubtful = full and (mapping.has_long_lens(model) or mapping.has_odd_lens(model))

@@ -86,3 +86,25 @@ def test_the_zipped_sources_stand_alone(archive, tmp_path):
     assert int(count) >= 12
     assert Path(child) == tmp_path / "ext/addon/child.py"
     assert Path(child).is_file()
+
+
+REMOTE = """
+bpy.context.preferences.system.use_online_access = True  # the operator asks for it, though the address is a file
+repo = bpy.context.preferences.extensions.repos.new(name="Fieldwork", module="fieldwork_site", remote_url=url)
+bpy.ops.extensions.repo_sync(repo_index=list(bpy.context.preferences.extensions.repos).index(repo))
+bpy.ops.extensions.package_install(
+    repo_index=list(bpy.context.preferences.extensions.repos).index(repo), pkg_id="fieldwork", enable_on_install=True
+)
+answer({"enabled": "bl_ext.fieldwork_site.fieldwork" in bpy.context.preferences.addons,
+        "operators": len(dir(bpy.ops.fieldwork))})
+"""
+
+
+def test_blender_installs_from_the_static_repository(tool, tmp_path, bpy_script, monkeypatch):
+    script = Path(__file__).with_name("make_repository.py")
+    run([sys.executable, str(script), str(tmp_path / "site")])
+    assert {p.suffix for p in (tmp_path / "site").iterdir()} == {".zip", ".json", ".html"}
+    monkeypatch.setenv("BLENDER_USER_RESOURCES", str(tmp_path / "user"))
+    facts = bpy_script(REMOTE, url=(tmp_path / "site/index.json").as_uri())
+    assert facts["enabled"]
+    assert facts["operators"] > 10

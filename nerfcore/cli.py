@@ -68,7 +68,8 @@ def _option(name: str, info: FieldInfo) -> click.Option:
     shared: dict[str, Any] = {"help": info.description or "", "required": info.is_required()}
     default = None if info.is_required() else info.get_default(call_default_factory=True)
     if kind is bool:
-        return click.Option([*flags], is_flag=True, default=default, help=info.description or "")
+        switch = f"--{flags[0][2:]}/--no-{flags[0][2:]}" if default else flags[0]
+        return click.Option([switch, name], is_flag=True, default=default, help=info.description or "")
     if get_origin(kind) is dict:
         return click.Option(flags, multiple=True, metavar="KEY=VALUE", **shared)
     if get_origin(kind) is tuple and get_args(kind) == (int, int):

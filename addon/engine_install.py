@@ -189,7 +189,7 @@ class Runner:
             told = [line for line in lines if line]
             reason = next((line for line in told if line.lower().startswith("error")), told[-1] if told else "")
             raise InstallError(
-                f"{failure}. {reason[:300]} Press Install again to go on; what was loaded is kept. "
+                f"{failure}. {reason[:300].rstrip('.')}. Press Install again to go on; what was loaded is kept. "
                 "If it fails again, see the log."
             )
         return "\n".join(lines)

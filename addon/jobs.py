@@ -25,6 +25,7 @@ log = logging.getLogger("fieldwork.addon")
 BUSY_PERIOD = 0.1  # seconds between two looks at the engine while something goes on
 IDLE_PERIOD = 0.5
 FOLLOW_PERIOD = 0.5  # seconds between two looks at the files of a job in another process
+STATUS_PERIOD = 0.4  # seconds between two drawings of the status bar
 CURVE_POINTS = 2000
 KEPT = 8  # finished jobs the panel remembers
 Done = Callable[["Job"], None]
@@ -40,6 +41,7 @@ TITLES = {
     "mesh": "Extracting Mesh",
     "blend": "Writing .blend",
     "reconstruct": "Reconstructing",
+    "dataset": "Photographing the Scene",
     "doctor": "Checking the Engine",
 }
 
@@ -135,6 +137,7 @@ class Queue:
         self._number = 0
         self._looked = 0.0
         self._asked = 0.0
+        self._status_drawn = 0.0
 
     # For operators
 
@@ -341,6 +344,11 @@ class Queue:
         if bpy.app.background:
             return
         for window in bpy.context.window_manager.windows:
+            # Nothing else redraws the status bar; a running tool's own text in it must stay.
+            if not window.modal_operators and time.monotonic() - self._status_drawn > STATUS_PERIOD:
+                self._status_drawn = time.monotonic()
+                with bpy.context.temp_override(window=window):
+                    window.workspace.status_text_set_internal(None)
             for area in window.screen.areas:
                 if area.type in ("VIEW_3D", "PREFERENCES"):
                     for region in area.regions:

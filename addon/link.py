@@ -10,6 +10,7 @@ import contextlib
 import json
 import os
 import queue
+import re
 import subprocess
 import sys
 import threading
@@ -19,6 +20,8 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
+# Lines of a log that say why a process ended.
+_TELLING = re.compile(r"error|exception|fatal|abort|terminat|assert|no module|cannot|out of memory", re.IGNORECASE)
 EVENT = Callable[[str, dict[str, Any]], None]
 DONE = Callable[[dict[str, Any] | None, "EngineError | None"], None]
 
@@ -237,7 +240,8 @@ class Link:
             status = _exit_status(process.returncode)
         waiting, self._waiting = list(self._waiting.values()), {}
         lines = self.tail()
-        last = f" It last said: {lines[-1]}" if lines else ""
+        telling = [line for line in lines if _TELLING.search(line)]
+        last = f" It last said: {telling[-1]}" if telling else ""
         for on_done, _, _ in waiting:
             if on_done is not None:
                 on_done(

@@ -8,7 +8,7 @@ import bpy
 import bpy.utils.previews
 import numpy as np
 
-WIDTH, HEIGHT = 256, 128  # of the curve, in pixels
+WIDTH, HEIGHT = 256, 176  # of the curve, in pixels
 PSNR_COLOR = (0.35, 0.75, 1.0)
 LOSS_COLOR = (1.0, 0.6, 0.25)
 
@@ -56,12 +56,12 @@ def curve_icon(key: str, curve: list[tuple[int, float, float]]) -> int:
 def draw_curve(curve: list[tuple[int, float, float]], width: int, height: int) -> np.ndarray:
     """The loss (logarithmic) and the PSNR over the steps, each scaled to its own range.
 
-    Returns float32 (height, width, 4), RGBA in [0, 1], first row at the bottom, transparent where nothing is drawn.
+    Returns float32 (height, width, 4), RGBA in [0, 1] with premultiplied alpha (as icons are drawn), first row at the
+    bottom, transparent where nothing is drawn, so that it goes with dark and light themes.
     """
     image = np.zeros((height, width, 4), np.float32)
-    image[:, :] = (0.5, 0.5, 0.5, 0.08)
     for row in np.linspace(0, height - 1, 5).astype(int):
-        image[row, :] = (0.5, 0.5, 0.5, 0.35)
+        image[row, :] = (0.15, 0.15, 0.15, 0.3)
     values = np.array(curve, np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
         loss = np.log(values[:, 1])

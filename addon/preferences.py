@@ -115,12 +115,13 @@ def draw_engine(layout: UILayout, installer: engine_install.Installer | None) ->
         layout.label(text=f"Using the environment of {engine_python()}", icon="CHECKMARK")
     else:
         layout.label(text="The engine is not installed", icon="INFO")
-        layout.label(text="About 1 GB is loaded for the CPU, 4 GB for an NVIDIA card", icon="BLANK1")
+        layout.label(text="It takes about 2 GB of disk for the CPU, more for a graphics card", icon="BLANK1")
     if not bpy.app.online_access:
         layout.label(text="Online access is off: allow it under System > Network", icon="INTERNET_OFFLINE")
     if installer is not None and installer.error:
-        for line in textwrap.wrap(installer.error, 100):
-            layout.label(text=line, icon="ERROR")
+        column = layout.column(align=True)
+        for number, line in enumerate(textwrap.wrap(installer.error, 80)):
+            column.label(text=line, icon="BLANK1" if number else "ERROR")
     row = layout.row(align=True)
     action = "Install Engine" if not known else "Repair" if engine_install.up_to_date(folder) else "Update"
     row.operator("fieldwork.engine_install", text=action, icon="IMPORT")

@@ -189,10 +189,8 @@ def quality(folder: Path | None, run: str) -> str:
 
 
 def time_estimate(folder: Path | None, settings: Any) -> float | None:
-    """Seconds a training will take: the time limit, else what the same preset took here the last time."""
-    if settings.time_limit > 0:
-        return settings.time_limit
-    if settings.steps > 0:
+    """Seconds that training with this preset took here the last time; None when that says nothing."""
+    if settings.time_limit > 0 or settings.steps > 0:
         return None
     for step in reversed((cached_project(folder) or {}).get("provenance", [])):
         same = step.get("verb") == "train" and step.get("settings", {}).get("preset") == settings.preset

@@ -126,6 +126,9 @@ class VerbOperator(Operator):
         except EngineError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
+        if job.error is not None:
+            self.report({"ERROR"}, str(job.error))
+            return {"CANCELLED"}
         for warning in job.warnings:
             self.report({"WARNING"}, warning)
         return {"FINISHED"}

@@ -9,8 +9,11 @@ import bpy
 from bpy.props import EnumProperty
 from bpy.types import Context
 
-from ..addon import jobs, state
-from .base import ProjectOperator, need_poses, refresh_scenes, scene_settings
+from ..addon import jobs, state, visibility
+from ..addon.link import EngineError
+from ..addon.package import PackageError, read_package
+from ..addon.scene_import import import_package
+from .base import ProjectOperator, need_poses, refresh_scenes, scene_settings, set_if_empty
 
 
 @scene_settings(run="run")
@@ -34,7 +37,9 @@ class FIELDWORK_OT_import_scene(ProjectOperator):
     )
 
     def parameters(self, context: Context) -> dict[str, Any]:
-        return {"project": self.project_path(context), "run": self.value(context, "run")}
+        project = self.project_path(context)
+        set_if_empty(context.scene, project)
+        return {"project": project, "run": self.value(context, "run")}
 
     def after(self) -> Callable[[jobs.Job], None]:
         cameras, name = self.cameras, bpy.context.scene.name
@@ -46,19 +51,31 @@ def import_result(job: jobs.Job, cameras: str, scene_name: str) -> None:
     refresh_scenes(job)
     if job.state != "done" or not job.result:
         return
-    from ..addon.package import read_package
-    from ..addon.scene_import import import_package
-
     # Another file may have been loaded meanwhile.
     scene = bpy.data.scenes.get(scene_name) or bpy.context.scene
-    if state.folder_of(scene.fieldwork) != job.project:
+    if state.folder_of(scene.fieldwork) != job.project and not bpy.app.background:
         job.warnings.append("The scene shows another project by now: press Update Scene there.")
         return
-    imported = import_package(scene, read_package(job.result["folder"]), cameras)
+    first = not visibility.meshes(job.project.name)
+    try:
+        imported = import_package(scene, read_package(job.result["folder"]), cameras)
+    except PackageError as error:
+        job.state, job.error = "failed", EngineError("package", str(error))
+        return
     job.warnings += imported.warnings
     state.show_classes(scene.fieldwork)
+    if first and imported.mesh is not None:
+        show_colors()
     if not bpy.app.background:
         bpy.ops.ed.undo_push(message="Update Scene from Fieldwork")
+
+
+def show_colors() -> None:
+    """Let solid viewports show the photographed colors of the mesh, where they show plain material colors."""
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type == "VIEW_3D" and area.spaces.active.shading.color_type == "MATERIAL":
+                area.spaces.active.shading.color_type = "VERTEX"
 
 
 CLASSES = [FIELDWORK_OT_import_scene]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import bpy
 from bpy.types import Context, STATUSBAR_HT_header
 
@@ -9,19 +11,32 @@ from ..addon import jobs, preferences, state
 from .base import FieldworkPanel, draw_error, draw_job, draw_wrapped, progress_text, project_folder, text_width
 
 
-def next_step(context: Context) -> tuple[str, str] | None:
-    """Operator and icon of the one obvious next thing to do; None when something runs or all is done."""
+class Step(NamedTuple):
+    """One thing to do: a button. `text` replaces the operator's own name; `resume` is handed to the training."""
+
+    operator: str
+    icon: str
+    text: str = ""
+    resume: bool = False
+
+
+def next_step(context: Context) -> Step | None:
+    """The one obvious next thing to do; None while something runs."""
     settings = context.scene.fieldwork
     folder = state.folder_of(settings)
     if jobs.queue.current is not None:
         return None
     if not state.has_project(folder):
-        return ("fieldwork.new", "IMAGE_DATA") if settings.photos else ("fieldwork.open", "FILE_FOLDER")
+        return Step("fieldwork.new", "IMAGE_DATA") if settings.photos else Step("fieldwork.open", "FILE_FOLDER")
     if not state.has_poses(folder):
-        return "fieldwork.poses", "CAMERA_DATA"
+        return Step("fieldwork.poses", "CAMERA_DATA")
+    if state.can_resume(folder, settings.run):
+        return Step("fieldwork.train", "PLAY", "Resume Training", resume=True)
     if not state.has_run(folder, settings.run):
-        return "fieldwork.train", "PLAY"
-    return "fieldwork.mesh", "MESH_DATA"
+        return Step("fieldwork.train", "PLAY")
+    if not state.last_result(state.cached_project(folder), "mesh"):
+        return Step("fieldwork.mesh", "MESH_DATA")
+    return Step("fieldwork.import_scene", "SCENE_DATA")
 
 
 class FIELDWORK_PT_main(FieldworkPanel):
@@ -42,6 +57,10 @@ class FIELDWORK_PT_main(FieldworkPanel):
         job = jobs.queue.current
         if job is not None:
             draw_job(layout, job)
+            if job.project is not None and job.project != project_folder(context):
+                note = layout.row()
+                note.active = False
+                note.label(text=f"for {job.project.name}")
             for waiting in jobs.queue.waiting:
                 if waiting is not job:
                     draw_job(layout, waiting)
@@ -52,7 +71,10 @@ class FIELDWORK_PT_main(FieldworkPanel):
         if step is not None:
             row = layout.row()
             row.scale_y = 1.5
-            row.operator(step[0], icon=step[1])
+            text = {"text": step.text} if step.text else {}
+            button = row.operator(step.operator, icon=step.icon, **text)
+            if step.resume:
+                button.resume = True
 
 
 def draw_status(self: STATUSBAR_HT_header, context: Context) -> None:

@@ -40,11 +40,15 @@ class FIELDWORK_PT_train(StepPanel):
         column = columns(layout)
         column.prop(settings, "preset")
         column.prop(settings, "run")
-        estimate = state.time_estimate(folder, settings)
-        if estimate and not active:
-            note = layout.row()
-            note.active = False
-            note.label(text=f"About {duration(estimate)}, as the last time here", icon="TIME")
+        if not active:
+            estimate = state.time_estimate(folder, settings)
+            text = f"About {duration(estimate)}, as the last time here" if estimate else ""
+            if settings.time_limit > 0:
+                text = f"Ends after {duration(settings.time_limit)}"
+            if text:
+                note = layout.row()
+                note.active = False
+                note.label(text=text, icon="TIME")
         if active:
             layout.operator("fieldwork.cancel", text="Pause", icon="PAUSE").job = job.id
         else:
@@ -90,10 +94,10 @@ def draw_curve(layout: UILayout, job: jobs.Job) -> None:
     """Loss and PSNR so far, and the newest picture of a held-out photo."""
     icon = pictures.curve_icon(job.id, job.curve)
     if icon:
-        layout.template_icon(icon_value=icon, scale=5.0)
+        layout.template_icon(icon_value=icon, scale=7.0)
     if job.latest:
+        layout.label(text=f"Step {job.latest.get('step', 0):,}")
         row = layout.row()
-        row.label(text=f"Step {job.latest.get('step', 0)}")
         loss, psnr = job.latest.get("loss"), job.latest.get("psnr")
         # The colors are those of the two lines.
         row.label(text="PSNR –" if psnr is None else f"PSNR {psnr:.1f} dB", icon="COLLECTION_COLOR_05")
@@ -102,7 +106,7 @@ def draw_curve(layout: UILayout, job: jobs.Job) -> None:
         preview = pictures.picture(job.preview, job.preview_count)
         if preview:
             layout.label(text="Held-out photo and its render")
-            layout.template_icon(icon_value=preview, scale=8.0)
+            layout.template_icon(icon_value=preview, scale=9.0)
 
 
 CLASSES = [FIELDWORK_PT_train, FIELDWORK_PT_train_options, FIELDWORK_PT_runs]

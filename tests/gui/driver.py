@@ -33,7 +33,7 @@ class Screen:
         self.folder = folder
         self.facts: dict = {}
         self.headers: tuple = (None, 0.0)
-        self.places: dict = {}
+        self.clicked = 0.0
 
     @property
     def window(self):
@@ -104,7 +104,8 @@ class Screen:
         found, region = [], self.sidebar
         top = region.y + region.height
         for y in range(top - 8, int(max(region.y + 4, top - depth)), -9):
-            for share in (0.25, 0.72):
+            # The small button that stops a job stands at the right edge.
+            for share in (0.83,) if self.queue.current else (0.25, 0.72):
                 x = region.x + region.width * share
                 self.move(x, y)
                 yield
@@ -119,17 +120,13 @@ class Screen:
                     found.append((command, x, y - 4))
         return found
 
-    def press_button(self, operator: str, depth: float = 260, sweep: bool = True) -> Steps:
-        """Click the button of an operator in the sidebar, found as a hand with eyes closed would.
-
-        `sweep=False` takes the place at which it was found the last time, or a job's bar has it.
-        """
-        if sweep or operator not in self.places:
-            buttons = yield from self.buttons(depth)
-            places = [(x, y) for command, x, y in buttons if command.startswith(f"bpy.ops.{operator}(")]
-            assert places, f"there is no button {operator} among {[command for command, _, _ in buttons]}"
-            self.places[operator] = places[0]
-        yield from self.click(*self.places[operator])
+    def press_button(self, operator: str, depth: float = 260) -> Steps:
+        """Click the button of an operator in the sidebar, found as a hand with eyes closed would."""
+        buttons = yield from self.buttons(depth)
+        places = [(x, y) for command, x, y in buttons if command.startswith(f"bpy.ops.{operator}(")]
+        assert places, f"there is no button {operator} among {[command for command, _, _ in buttons]}"
+        self.clicked = time.monotonic()
+        yield from self.click(*places[0])
 
     def run_operator(self, operator: str, seconds: float) -> Steps:
         """Run a verb by its operator and wait for its end."""
@@ -179,6 +176,7 @@ def main() -> None:
     name, folder = sys.argv[sys.argv.index("--") + 1 :][:2]
     bpy.context.preferences.view.show_splash = False
     bpy.context.preferences.use_preferences_save = False
+    bpy.ops.preferences.addon_enable(module=PACKAGE)
     spec = importlib.util.spec_from_file_location("scenarios", Path(__file__).with_name("scenarios.py"))
     scenarios = importlib.util.module_from_spec(spec)
     sys.modules["driver"] = sys.modules["__main__"]

@@ -49,6 +49,7 @@ class Window:
         self.environment = {
             "BLENDER_USER_RESOURCES": str(self.folder / "user"),
             "FIELDWORK_ENGINE_PYTHON": str(Path(sys.prefix) / "bin" / "python"),
+            "FIELDWORK_BASE_PYTHON": str(Path(sys.base_prefix) / "bin" / "python3"),
         }
         build, out = BUILD / "zip", ""
         build.mkdir(parents=True, exist_ok=True)
@@ -67,7 +68,7 @@ class Window:
         done = enter(
             [
                 *[str(TOOLS / "with-display"), "blender", "--factory-startup", "-noaudio", "--gpu-backend", "opengl"],
-                *["--addons", "bl_ext.user_default.fieldwork", "--enable-event-simulate"],
+                "--enable-event-simulate",
                 *[
                     "--window-geometry",
                     "0",

@@ -1,0 +1,99 @@
+"""The extension in a real window, driven by simulated events. The screenshots stay in build/gui/<scenario>/."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+
+HERE = Path(__file__).parent
+
+
+def _module(name: str):
+    spec = importlib.util.spec_from_file_location(name, HERE / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+window = _module("window")
+REASON = window.missing()
+pytestmark = [
+    pytest.mark.gui,
+    pytest.mark.slow,
+    pytest.mark.timeout(1200),
+    pytest.mark.skipif(REASON is not None, reason=str(REASON)),
+]
+WINDOW = window.Window
+
+
+@pytest.fixture(scope="module")
+def captured():
+    """The capture that all scenarios go on with: photos dropped, read and placed by the mouse."""
+    return WINDOW("capture").play("capture", 900)
+
+
+def shots(name: str) -> set[str]:
+    return {path.stem for path in (window.BUILD / name).glob("*.png")}
+
+
+def test_photos_are_dropped_read_placed_and_shown(captured):
+    photos, project = captured["dropped"]
+    assert photos.endswith("banana/images")
+    assert project.endswith("banana/images_fieldwork")
+    placed, total = captured["placed"]
+    assert placed >= total - 1
+    # One camera for each photo, the animated one, and the one of the default scene.
+    assert captured["cameras"] == placed + 2
+    assert captured["cameras again"] == captured["cameras"], "importing again piles up cameras"
+    assert captured["slowest_tick"] < 0.1
+    assert {"empty", "dropped", "reading", "posing", "scene", "posed-capture", "posed-poses"} <= shots("capture")
+
+
+def test_training_shows_its_curve_and_ends_as_a_mesh_in_the_scene(captured):
+    facts = WINDOW("train").play("train", 900)
+    assert facts["curve"] > 10
+    assert facts["preview"]
+    assert len(facts["faces"]) == 1
+    assert facts["faces"][0] > 100
+    assert {"training", "trained", "scene", "trained-train", "trained-mesh"} <= shots("train")
+
+
+def test_cancel_death_undo_and_another_file_in_the_middle(captured):
+    facts = WINDOW("interruptions").play("interruptions", 900)
+    assert facts["cancel"] < 2.0
+    assert facts["resumed at"] > 1, "the training began anew"
+    assert "signal 9" in facts["death"]
+    assert "signal 9" in facts["report"]
+    assert "log of the engine" in facts["report"]
+    assert facts["cancel detached"] < 3.0
+    assert facts["slowest_tick"] < 0.1
+
+
+def test_engine_is_installed_from_the_preferences():
+    """Without network, from a folder that lacks the packages: it must fail with advice, and nothing must hang."""
+    facts = WINDOW("preferences").play("preferences", 300)
+    assert "Press Install again" in facts["failure"]
+    assert {"no-engine", "preferences", "installing", "failed"} <= shots("preferences")
+
+
+def test_closing_blender_leaves_no_engine_and_no_half_project(captured):
+    """After the scenarios the project is whole: the command line can read it."""
+    project = window.BUILD / "capture" / "project"
+    assert (project / "project.json").is_file()
+    assert not list(project.rglob(".*.tmp"))
+    copy = window.BUILD / "copy"
+    shutil.rmtree(copy, ignore_errors=True)
+    shutil.copytree(project, copy)
+    code = f"from fieldwork.nerfcore.project import load_scene; print(len(load_scene({str(copy)!r}).views))"
+    done = window.subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, env=dict(os.environ)
+    )
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout) == captured["placed"][0]

@@ -1,18 +1,30 @@
-"""`blender -c fieldwork VERB …`."""
+"""`blender -c fieldwork VERB …`: the command line of the engine, for the Blender it was called in.
+
+Every verb runs in the engine's Python; what a verb needs of Blender it does in a background copy of this one.
+"""
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
 
 from . import preferences
 from .link import engine_environment
 
+NO_ENGINE = "The engine is not installed. Install it in the preferences of Fieldwork, or set FIELDWORK_ENGINE_PYTHON."
+
 
 def main(arguments: list[str]) -> int:
-    """Run the command line in the engine's Python; returns its exit status."""
+    """Run the command line in the engine's Python; returns its exit status (see docs/headless.md)."""
     python = preferences.engine_python()
     if python is None:
-        print("The engine is not installed. Install it in the preferences of Fieldwork.", file=sys.stderr)
+        print(NO_ENGINE, file=sys.stderr)
         return 1
-    return subprocess.call([str(python), "-s", "-m", "nerfcore", *arguments], env=engine_environment())
+    # Ctrl-C reaches both processes: the engine's ends its work in order, and this one must wait for it.
+    process = subprocess.Popen([str(python), "-s", "-m", "nerfcore", *arguments], env=engine_environment())
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        return process.wait()
+    finally:
+        signal.signal(signal.SIGINT, before if before is not None else signal.SIG_DFL)

@@ -30,6 +30,7 @@ MODULES = (
     "operators.mesh",
     "operators.scene",
     "operators.export",
+    "operators.reconstruct",
     "panels.main",
     "panels.capture",
     "panels.dataset",

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import importlib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from ..capture.ingest import file_hash
 from ..errors import InputError, ProjectError
@@ -95,15 +98,29 @@ def read_dataset(source: Path, format: str = "auto") -> Dataset:
     if format != "auto":
         if format not in FORMATS:
             raise InputError(f"The format {format} cannot be read.", f"Choose one of {', '.join(FORMATS)}.")
-        return _reader(format).read(source)
+        return _checked(_reader(format).read(source), source)
     for name in FORMATS:
         reader = _reader(name)
         if reader.matches(source):
-            return reader.read(source)
+            return _checked(reader.read(source), source)
     raise InputError(
         f"{source} is no posed data set that Fieldwork knows.",
         f"Known are {', '.join(FORMATS)}. Photos without poses go through `fieldwork new`.",
     )
+
+
+def _checked(dataset: Dataset, source: Path) -> Dataset:
+    """The data set with exactly orthonormal rotations: files round them to a few digits, some carry a scale."""
+    views = []
+    for view in dataset.views:
+        pose = np.array(view.camera_to_world, np.float64)
+        singular = np.linalg.svd(pose[:3, :3], compute_uv=False) if np.isfinite(pose).all() else np.zeros(3)
+        if singular.min() < 1e-6 or singular.max() / singular.min() > 1.05 or np.linalg.det(pose[:3, :3]) < 0:
+            raise InputError(f"The pose of {view.name} in {source} is no rotation and position.", "Export it again.")
+        u, _, vt = np.linalg.svd(pose[:3, :3])
+        pose[:3, :3] = u @ vt
+        views.append(replace(view, camera_to_world=pose))
+    return replace(dataset, views=views)
 
 
 def _reader(name: str) -> Any:

@@ -110,10 +110,13 @@ def _named_splits(head: dict[str, Any]) -> dict[str, Split]:
 
 def _view(folder: Path, name: str, image: Path, frame: dict[str, Any], split: Split) -> DatasetView:
     width, height = image_size(image)
-    matrix = np.array(frame.get("transform_matrix"), np.float64)
+    try:
+        matrix = np.array(frame.get("transform_matrix"), np.float64)
+    except (TypeError, ValueError):
+        matrix = np.zeros(0)
     if matrix.shape == (3, 4):
         matrix = np.vstack([matrix, [0, 0, 0, 1]])
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+    if matrix.shape != (4, 4):
         raise InputError(f"The pose of {image.name} in {folder} is not a 4×4 matrix.", "Export the data set again.")
     label_path = frame.get("semantic_path") or frame.get("label_path")
     depth_path = frame.get("depth_file_path") or frame.get("depth_path")
@@ -123,21 +126,13 @@ def _view(folder: Path, name: str, image: Path, frame: dict[str, Any], split: Sp
         name=name,
         image=image,
         camera=frame_camera(frame, width, height),
-        camera_to_world=flip_camera_axes(_rigid(matrix)),
+        camera_to_world=flip_camera_axes(matrix),
         label=label,
         mask=mask,
         depth=_optional(folder, depth_path),
         depth_scale=_depth_scale(frame),
         split=split,
     )
-
-
-def _rigid(matrix: np.ndarray) -> np.ndarray:
-    """The pose with its rotation made exactly orthonormal (JSON files round, some carry a scale)."""
-    u, _, vt = np.linalg.svd(matrix[:3, :3])
-    rigid = matrix.copy()
-    rigid[:3, :3] = u @ vt
-    return rigid
 
 
 def _depth_scale(frame: dict[str, Any]) -> float:

@@ -9,7 +9,8 @@ import numpy as np
 from ..errors import PosesError
 
 GPS_NOISE = 5.0  # metres, of a phone under open sky
-EXTENT_OVER_NOISE = 5.0  # how far the photos must be spread for GPS to say anything
+EXTENT_OVER_NOISE = 8.0  # how far the photos must be spread for GPS to say anything
+MAX_MISFIT = 0.4  # of the spread of the positions; unrelated ones reach about 1
 EARTH_RADIUS = 6_378_137.0  # metres, WGS 84 equatorial
 
 
@@ -63,9 +64,10 @@ def fit_gps(centers: np.ndarray, latitude: np.ndarray, longitude: np.ndarray) ->
         misfit = np.abs(factor * z + shift - w)
         keep = misfit <= max(3 * float(np.median(misfit)), 1e-6)
     residual = float(np.median(np.abs(factor * z + shift - w)))
-    if residual > extent / 5 or abs(factor) < 1e-9:
+    spread = float(np.median(np.abs(w - w.mean())))
+    if residual > MAX_MISFIT * spread or abs(factor) < 1e-9:
         raise PosesError(
-            f"The GPS positions do not fit the camera positions (misfit {residual:.0f} m of {extent:.0f} m).",
+            f"The GPS positions do not fit the camera positions (misfit {residual:.0f} m of a spread of {spread:.0f} m).",
             "Give the scale with --scale.",
         )
     turn = np.diag([abs(factor), abs(factor), abs(factor), 1.0])

@@ -152,7 +152,7 @@ class Queue:
 
     def make(self, verb: str, params: dict[str, Any], on_done: Done | None = None) -> Job:
         self._number += 1
-        folder = params.get("project")
+        folder = params.get("project") or (params.get("out") if verb == "reconstruct" else None)
         return Job(
             verb,
             params,

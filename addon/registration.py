@@ -41,6 +41,7 @@ MODULES = (
     "panels.mesh",
     "panels.export",
     "panels.engine",
+    "panels.menus",
 )
 
 # The package Blender knows the extension by, "bl_ext.<repository>.fieldwork": `AddonPreferences.bl_idname` and

@@ -1,4 +1,4 @@
-"""Rendered images in Blender: as image datablocks, behind cameras, or on planes."""
+"""Rendered images in Blender: as image datablocks, behind the cameras they were rendered from, or on planes."""
 
 from __future__ import annotations
 
@@ -6,55 +6,89 @@ from pathlib import Path
 
 import bpy
 
-SUFFIXES = (".png", ".jpg", ".exr")
+from .scene_import import PROJECT, ROLE
+
+OTHER_PASSES = ("_depth", "_labels", "_confidence", "_normal")
+MARK = "fieldwork_render"
 
 
-def load_images(folder: Path) -> list[bpy.types.Image]:
-    """Image datablocks of all pictures of a folder; those that are loaded already are read again."""
-    images = []
-    for path in sorted(p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES):
-        image = bpy.data.images.load(str(path), check_existing=True)
-        image.reload()
-        image["fieldwork_render"] = str(folder)
-        images.append(image)
-    return images
+def load(path: Path) -> bpy.types.Image:
+    """The image datablock of a file; one that is loaded already is read again."""
+    image = bpy.data.images.load(str(path), check_existing=True)
+    image.reload()
+    image[MARK] = True
+    return image
 
 
-def show(scene: bpy.types.Scene, folder: Path, show_as: str) -> list[bpy.types.Image]:
-    """Load the images of a render and show the colored ones as the user chose."""
-    images = load_images(folder)
-    camera = scene.camera
-    if not images or camera is None or show_as == "none":
-        return images
-    picture = next((image for image in images if "rgb" in Path(image.filepath).stem), images[0])
-    if show_as == "background":
-        background(camera, picture)
-    elif show_as == "plane":
-        plane(scene, camera, picture)
-    return images
+def show(
+    scene: bpy.types.Scene, files: list[Path], show_as: str, photos: bool, project: str
+) -> list[tuple[bpy.types.Object, bpy.types.Image]]:
+    """Load the rendered files, and put the colored ones where the user wants them.
+
+    Args:
+        files: what the engine wrote.
+        show_as: "none", "background" or "plane".
+        photos: whether they were rendered from the photos' cameras rather than the scene's.
+        project: name of the project whose cameras are meant.
+    Returns:
+        the cameras that got an image, with it.
+    """
+    images = {path: load(path) for path in files}
+    colored = [path for path in files if path.suffix == ".png" and not path.stem.endswith(OTHER_PASSES)]
+    if show_as == "none" or not colored:
+        return []
+    if photos:
+        cameras = {
+            Path(obj[ROLE].removeprefix("camera:")).stem: obj
+            for obj in scene.objects
+            if obj.type == "CAMERA" and obj.get(PROJECT) == project and str(obj.get(ROLE)).startswith("camera:")
+        }
+        pairs = [(cameras[path.stem], images[path]) for path in colored if path.stem in cameras]
+    else:
+        image = images[colored[0]]
+        if len(colored) > 1:
+            image.source = "SEQUENCE"
+        pairs = [(scene.camera, image)] if scene.camera else []
+    for camera, image in pairs:
+        if show_as == "background":
+            background(scene, camera, image, len(colored))
+        else:
+            plane(scene, camera, image, len(colored))
+    return pairs
 
 
-def background(camera: bpy.types.Object, image: bpy.types.Image) -> None:
-    """Put the image in front of the camera's view, in place of an earlier one."""
+def background(scene: bpy.types.Scene, camera: bpy.types.Object, image: bpy.types.Image, frames: int) -> None:
+    """Put the image over the camera's view, in place of an earlier one; photos behind it stay."""
     slots = camera.data.background_images
-    slot = next((s for s in slots if s.image and "fieldwork_render" in s.image), None) or slots.new()
-    slot.image, slot.alpha, slot.display_depth = image, 1.0, "FRONT"
+    slot = next((s for s in slots if s.image and MARK in s.image), None) or slots.new()
+    slot.image, slot.alpha, slot.display_depth, slot.frame_method = image, 1.0, "FRONT", "STRETCH"
+    _play(scene, slot.image_user, image, frames)
     camera.data.show_background_images = True
 
 
-def plane(scene: bpy.types.Scene, camera: bpy.types.Object, image: bpy.types.Image, distance: float = 1.0) -> None:
-    """An image empty that fills the camera's view at a distance in metres; an earlier one is moved."""
-    name = f"Fieldwork {Path(image.filepath).stem}"
-    empty = bpy.data.objects.get(name) or bpy.data.objects.new(name, None)
-    if empty.name not in scene.objects:
+def plane(scene: bpy.types.Scene, camera: bpy.types.Object, image: bpy.types.Image, frames: int) -> None:
+    """An image that fills the camera's view at the distance at which the camera itself is drawn; one for a camera."""
+    empty = next((child for child in camera.children if MARK in child), None)
+    if empty is None:
+        empty = bpy.data.objects.new(f"Render · {camera.name}", None)
+        empty[MARK] = True
         scene.collection.objects.link(empty)
-    empty.empty_display_type = "IMAGE"
-    empty.data = image
+        empty.parent = camera
+    empty.empty_display_type, empty.data = "IMAGE", image
+    _play(scene, empty.image_user, image, frames)
     corners = camera.data.view_frame(scene=scene)
-    width = abs(corners[0].x - corners[2].x) * distance / -corners[0].z
-    height = abs(corners[0].y - corners[2].y) * distance / -corners[0].z
+    depth = -corners[0].z
     # An image empty's longer side has the display size.
-    empty.empty_display_size = max(width, height)
-    empty.parent = camera
-    empty.location = (0.0, 0.0, -distance)
+    size = max(abs(corners[0].x - corners[2].x), abs(corners[0].y - corners[2].y))
+    middle = (corners[0] + corners[2]) / 2
+    distance = max(camera.data.display_size, 2 * camera.data.clip_start)
+    empty.empty_display_size = size / depth * distance
+    empty.location = (middle.x / depth * distance, middle.y / depth * distance, -distance)
     empty.rotation_euler = (0.0, 0.0, 0.0)
+
+
+def _play(scene: bpy.types.Scene, user: bpy.types.ImageUser, image: bpy.types.Image, frames: int) -> None:
+    if image.source == "SEQUENCE":
+        user.frame_start, user.frame_duration = scene.frame_start, frames
+        user.frame_offset = scene.frame_start - 1
+        user.use_auto_refresh = True

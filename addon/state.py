@@ -183,7 +183,8 @@ def quality(folder: Path | None, run: str) -> str:
     metrics = cached_json(folder / "runs" / run / "metrics.json") if folder else None
     if not isinstance(metrics, dict):
         return ""
-    psnr, miou = metrics.get("psnr"), metrics.get("miou")
+    measured = metrics.get("test") or {}
+    psnr, miou = measured.get("psnr"), measured.get("miou")
     words = [f"{psnr:.1f} dB" if psnr is not None else "", f"mIoU {miou:.2f}" if miou is not None else ""]
     return ", ".join(word for word in words if word)
 

@@ -116,7 +116,8 @@ class LossConfig(Stage):
 
 class TrainConfig(Stage):
     steps: int = Field(20000, gt=0, description="optimisation steps when there is no time limit")
-    batch_samples: int = Field(1 << 17, ge=256, description="field samples a step")
+    batch_start: int = Field(1 << 14, ge=256, description="field samples of the first steps")
+    batch_samples: int = Field(1 << 17, ge=256, description="field samples of the last steps; grows geometrically")
     max_rays: int = Field(32768, ge=16)
     grid_rate: float = Field(0.03, gt=0, description="learning rate of the grid")
     network_rate: float = Field(0.005, gt=0, description="learning rate of the networks")

@@ -10,7 +10,7 @@ from typing import Any
 import bpy
 from bpy.types import Context
 
-from ..addon import jobs, state
+from ..addon import jobs, render_result, state
 from ..nerfcore.files import write_json
 from .base import ProjectOperator, need_run, refresh_scenes, scene_settings
 
@@ -125,12 +125,13 @@ class FIELDWORK_OT_render(ProjectOperator):
 def show_result(job: jobs.Job) -> None:
     """Bring the rendered images into Blender as image datablocks, and into the scene as its settings say."""
     refresh_scenes(job)
-    if job.state != "done":
+    if job.state != "done" or job.result is None or job.project is None:
         return
-    from ..addon import render_result
-
     scene = next((s for s in bpy.data.scenes if state.folder_of(s.fieldwork) == job.project), bpy.context.scene)
-    render_result.show(scene, Path(job.params["out"]), scene.fieldwork.show_as)
+    files = [Path(path) for path in job.result["frames"]]
+    # An orbit has no camera in the scene.
+    show_as = scene.fieldwork.show_as if "orbit" not in job.params else "none"
+    render_result.show(scene, files, show_as, "test" in job.params, job.project.name)
 
 
 CLASSES = [FIELDWORK_OT_render]

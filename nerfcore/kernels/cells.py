@@ -42,6 +42,36 @@ def write_max(
     wp.atomic_max(grid, cell_index(points[i], n), values[i])
 
 
+@wp.kernel(module="fieldwork_cells")
+def take_max(
+    points: wp.array(dtype=wp.vec3),
+    n: int,
+    decay: float,
+    fresh: wp.array(dtype=float),
+    grid: wp.array(dtype=float),
+    offset: int,
+):
+    i = wp.tid() + offset
+    cell = cell_index(points[i], n)
+    value = fresh[cell]
+    if value >= 0.0:
+        grid[cell] = wp.max(grid[cell] * decay, value)
+        fresh[cell] = -1.0
+
+
+def observe(
+    grid: torch.Tensor, scratch: torch.Tensor, resolution: int, points: torch.Tensor, values: torch.Tensor, decay: float
+) -> None:
+    """Update the cells that hold points (N, 3) in place: grid ← max(decay · grid, largest value of the points in it).
+
+    `scratch` (resolution³,) must be −1 everywhere and is so again afterwards.
+    """
+    init()
+    where = array(points, wp.vec3)
+    launch(write_max, len(points), [where, array(values.contiguous()), resolution, array(scratch)], points.device, serial=True)
+    launch(take_max, len(points), [where, resolution, decay, array(scratch), array(grid)], points.device, serial=True)
+
+
 def trilinear(grid: torch.Tensor, resolution: int, points: torch.Tensor) -> torch.Tensor:
     """Values (N,) at points (N, 3) in [0, 1]³; constant beyond the outermost cell centres."""
     init()

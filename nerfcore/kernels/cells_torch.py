@@ -27,3 +27,14 @@ def scatter_max(resolution: int, points: torch.Tensor, values: torch.Tensor) -> 
     x, y, z = (points * n).long().clamp(0, n - 1).unbind(-1)
     grid = torch.zeros(n**3, device=points.device)
     return grid.scatter_reduce(0, (z * n + y) * n + x, values, "amax")
+
+
+def observe(
+    grid: torch.Tensor, scratch: torch.Tensor, resolution: int, points: torch.Tensor, values: torch.Tensor, decay: float
+) -> None:
+    """As `cells.observe`."""
+    n = resolution
+    x, y, z = (points * n).long().clamp(0, n - 1).unbind(-1)
+    fresh = scratch.scatter_reduce(0, (z * n + y) * n + x, values, "amax")
+    seen = fresh >= 0
+    grid[seen] = torch.maximum(grid[seen] * decay, fresh[seen])

@@ -9,11 +9,13 @@ import torch
 from torch import nn
 
 from ..config import SamplingConfig
+from ..kernels.cells import observe
 from ..kernels.march import PDF_DEFAULT, PDF_LITERAL, PDF_UNIFORM, MarchSettings
 
 MODES = {"default": PDF_DEFAULT, "uniform": PDF_UNIFORM, "literal": PDF_LITERAL}
 CHUNK = 1 << 16
 WARM_DECAY = 0.7
+PROBES = 64  # one cell in so many is read at an update, and as many open ones
 
 
 class OccupancyGrid(nn.Module):
@@ -42,6 +44,8 @@ class OccupancyGrid(nn.Module):
         self.density: torch.Tensor
         self.interest: torch.Tensor
         self.seen: torch.Tensor
+        self.register_buffer("scratch", torch.full((n**3,), -1.0), persistent=False)
+        self.scratch: torch.Tensor
         self.register_buffer("blocks", torch.ones((n // 4) ** 3, dtype=torch.uint8), persistent=False)
         self.cells: torch.Tensor
         self.blocks: torch.Tensor
@@ -73,23 +77,16 @@ class OccupancyGrid(nn.Module):
 
     def _chosen(self, generator: torch.Generator | None) -> torch.Tensor:
         n3, device = self.config.resolution**3, self.density.device
-        anywhere = torch.randint(0, n3, (n3 // 32,), device=device, generator=generator)
+        anywhere = torch.randint(0, n3, (n3 // PROBES,), device=device, generator=generator)
         opened = (self.cells[:, 0] > 0).nonzero()[:, 0]
-        if len(opened) > n3 // 32:
-            opened = opened[torch.randint(0, len(opened), (n3 // 32,), device=device, generator=generator)]
+        if len(opened) > n3 // PROBES:
+            opened = opened[torch.randint(0, len(opened), (n3 // PROBES,), device=device, generator=generator)]
         return torch.cat([anywhere, opened])
 
-    def _warm_up(self, density: Callable[[torch.Tensor], torch.Tensor], generator: torch.Generator | None) -> None:
-        """All cells at once, from one point in each block of 2³ cells, with quick forgetting of the initial guess."""
-        half = self.config.resolution // 2
-        axis = torch.arange(half, device=self.density.device)
-        z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
-        corner = torch.stack([x, y, z], -1).reshape(-1, 3)
-        points = (corner + torch.rand(corner.shape, device=corner.device, generator=generator)) / half
-        fresh = torch.cat([density(part) for part in points.split(CHUNK)])
-        blocks = fresh.view(half, 1, half, 1, half, 1).expand(half, 2, half, 2, half, 2).reshape(-1)
-        torch.maximum(self.density * WARM_DECAY, blocks, out=self.density)
-        self.density[~self.seen] = 0
+    @torch.no_grad()
+    def observe(self, points: torch.Tensor, density: torch.Tensor) -> None:
+        """Take in the densities (N,) that a training step read anyway at points (N, 3); rays see it at the next update."""
+        observe(self.density, self.scratch, self.config.resolution, points, density, self.config.decay)
 
     @torch.no_grad()
     def update(
@@ -106,9 +103,8 @@ class OccupancyGrid(nn.Module):
             interest: points (N, 3) → (N,) in [0, 1], asked for open cells only.
         """
         if step < self.config.warmup:
-            self._warm_up(density, generator)
-            self.rebuild()
-            return
+            # The initial guess is soon forgotten where nobody looks.
+            self.density *= WARM_DECAY
         cells = self._chosen(generator)
         cells = cells[self.seen[cells]]
         points = self.positions(cells, generator)

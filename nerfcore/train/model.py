@@ -101,6 +101,8 @@ class Model(nn.Module):
         with torch.no_grad():
             everywhere = self.field.geometry(s.points)
             weights = render_weights(everywhere.density, s.delta, s.packing)
+            if self.training:
+                self.occupancy.observe(s.points, everywhere.density)
             visible = weights > self.config.render.cull
             kept, packing = visible.nonzero()[:, 0], s.packing.subset(visible)
         shown = everywhere[kept]

@@ -58,7 +58,7 @@ class Trainer:
         )
         self.generator = torch.Generator(self.device).manual_seed(config.train.seed)
         self.steps = 0
-        self.rays = max(16, min(config.train.max_rays, config.train.batch_samples // config.sampling.samples))
+        self.rays = max(16, min(config.train.max_rays, config.train.batch_start // config.sampling.samples))
         self.cache = CoarseCache(store)
         self.measured = Measured()
 
@@ -96,7 +96,7 @@ class Trainer:
         if model.field.blend is not None and self.steps % config.sampling.update_every == 0:
             s = rendered.samples
             model.field.blend.update(s.points, rendered.weights.detach(), rendered.density.detach())
-        self._adapt(rays, rendered)
+        self._adapt(rays, rendered, progress)
 
     def loss(self, batch: Batch, rendered: Rendered, progress: float) -> torch.Tensor:
         """The composite loss of a batch."""
@@ -134,16 +134,18 @@ class Trainer:
             total = total + c.opacity_weight * opacity_entropy(rendered.opacity)
         return total
 
-    def _adapt(self, rays: int, rendered: Rendered) -> None:
-        """Keep the number of field samples a step near its budget."""
-        m, budget = self.measured, self.config.train.batch_samples
+    def _adapt(self, rays: int, rendered: Rendered, progress: float) -> None:
+        """Keep the number of field samples a step near its budget, which grows with progress: early on many small
+        steps learn faster, later large batches average out the noise."""
+        m, train = self.measured, self.config.train
+        budget = round(train.batch_start * (train.batch_samples / train.batch_start) ** progress)
         m.steps += 1
         m.rays += rays
         m.samples += rendered.evaluated
         m.shown += len(rendered.samples)
         if self.steps % 8 == 0:
             wanted = rays * budget / max(rendered.evaluated, 1)
-            self.rays = int(min(max(wanted, rays * 0.5, 16), rays * 2, self.config.train.max_rays))
+            self.rays = int(min(max(wanted, rays * 0.5, 16), rays * 2, train.max_rays))
 
     def take_measured(self) -> Measured:
         """Averages since the last call."""

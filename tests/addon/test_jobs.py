@@ -73,8 +73,10 @@ def test_jobs_run_one_after_the_other(queue, project):
     assert queue.last is second
 
 
-def test_tick_does_not_block(queue, project):
+def test_neither_starting_nor_watching_a_job_blocks(queue, project):
+    begin = time.perf_counter()
     queue.submit(count(queue, project, steps=60))
+    assert time.perf_counter() - begin < 0.1
     tick_until(queue, lambda: queue.last is not None)
     assert queue.slowest_tick < 0.1
 

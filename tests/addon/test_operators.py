@@ -333,3 +333,60 @@ def test_curve_picture_shows_both_lines():
         left, right = rows[columns < 8].mean(), rows[columns >= 56].mean()
         assert (right - left) * slope > 10
     assert draw_curve([(0, 1.0, float("nan")), (1, 1.0, float("nan"))], 8, 8).shape == (8, 8, 4)
+
+
+def test_renders_appear_behind_their_cameras_or_on_planes_once(bpy_script, tmp_path):
+    facts = bpy_script(
+        SETUP
+        + """
+from fieldwork.addon import render_result
+settings.project = project
+files = []
+for name in ("a", "a_depth", "b"):
+    image = bpy.data.images.new(name, 64, 48)
+    image.filepath_raw, image.file_format = f"{project}/{name}.png", "PNG"
+    image.save()
+    bpy.data.images.remove(image)
+    files.append(Path(project) / f"{name}.png")
+cameras = {}
+for name in "ab":
+    cameras[name] = bpy.data.objects.new(name, bpy.data.cameras.new(name))
+    cameras[name]["fieldwork_role"], cameras[name]["fieldwork_project"] = f"camera:{name}.jpg", "capture"
+    scene.collection.objects.link(cameras[name])
+for _ in range(2):
+    for kind in ("background", "plane", "none"):
+        pairs = render_result.show(scene, files, kind, True, "capture")
+answer({
+    "images": sorted(i.name for i in bpy.data.images if i.filepath),
+    "slots": {n: [s.image.name for s in c.data.background_images] for n, c in cameras.items()},
+    "planes": {n: [o.data.name for o in c.children] for n, c in cameras.items()},
+    "animation": [[c.name, i.source] for c, i in render_result.show(scene, files, "background", False, "capture")],
+})
+""",
+        project=make_project(tmp_path / "capture"),
+    )
+    assert facts["images"] == ["a.png", "a_depth.png", "b.png"]
+    assert facts["slots"] == {"a": ["a.png"], "b": ["b.png"]}
+    assert facts["planes"] == {"a": ["a.png"], "b": ["b.png"]}
+    assert facts["animation"] == [["Camera", "SEQUENCE"]]
+
+
+def test_image_plane_covers_exactly_what_the_camera_sees(bpy_script, tmp_path):
+    facts = bpy_script(
+        SETUP
+        + """
+from bpy_extras.object_utils import world_to_camera_view
+from mathutils import Vector
+from fieldwork.addon import render_result
+scene.render.resolution_x, scene.render.resolution_y = 200, 100
+scene.camera.data.shift_x = 0.2
+image = bpy.data.images.new("frame", 200, 100)
+render_result.plane(scene, scene.camera, image, 1)
+bpy.context.view_layer.update()
+(empty,) = scene.camera.children
+half = empty.empty_display_size / 2
+corners = [empty.matrix_world @ Vector((x * half, y * half / 2, 0)) for x in (-1, 1) for y in (-1, 1)]
+answer([[round(v, 4) for v in world_to_camera_view(scene, scene.camera, c)[:2]] for c in corners])
+"""
+    )
+    assert facts == [[0, 0], [0, 1], [1, 0], [1, 1]]

@@ -78,6 +78,71 @@ def train(screen):
     yield from finish(screen)
 
 
+def labelled(screen):
+    """A capture with labels, in a light theme and at high resolution too: classes, renders, visibility, presets."""
+    yield from screen.show_sidebar()
+    settings = bpy.context.scene.fieldwork
+    bpy.ops.fieldwork.open(filepath=os.environ["FIELDWORK_MUSEUM"])
+    settings.project = str(screen.folder / "project")
+    yield from screen.run_operator("fieldwork.new", 120)
+    yield from screen.run_operator("fieldwork.poses", 300)
+    settings.preset, settings.time_limit = "draft", 60.0
+    yield from screen.run_operator("fieldwork.train", 300)
+    yield from screen.run_operator("fieldwork.evaluate", 300)
+    settings.resolution = 128
+    yield from screen.run_operator("fieldwork.mesh", 300)
+    for obj in list(bpy.data.objects):
+        bpy.data.objects.remove(obj)
+    yield from screen.run_operator("fieldwork.import_scene", 120)
+    settings.show_as = "background"
+    yield from screen.run_operator("fieldwork.render", 300)
+    screen.facts["background"] = [s.image.name for s in bpy.context.scene.camera.data.background_images]
+    screen.facts["classes"] = [[c.name, c.area] for c in settings.classes]
+    space = screen.area.spaces.active
+    space.region_3d.view_perspective = "CAMERA"
+    yield from screen.toggle("classes")
+    yield 1.0
+    screen.shot("classes")
+    mesh = next(obj for obj in bpy.data.objects if obj.get("fieldwork_role") == "mesh")
+    whole = faces(mesh)
+    largest = max(settings.classes, key=lambda c: c.area)
+    largest.visible = False
+    yield 1.0
+    screen.facts["hidden"] = [largest.name, whole, faces(mesh)]
+    space.region_3d.view_perspective = "PERSP"
+    yield 0.5
+    screen.shot("hidden")
+    largest.visible = True
+    yield from screen.toggle("classes")
+
+    # The user's own presets.
+    settings.time_limit, settings.steps = 77.0, 5
+    bpy.ops.fieldwork.train_preset_add(name="Quick Look")
+    settings.time_limit, settings.steps = 0.0, 0
+    folder = next(path for path in bpy.utils.preset_paths("fieldwork/train"))
+    preset = next(Path(folder).glob("*.py"))
+    bpy.ops.script.execute_preset(filepath=str(preset), menu_idname="FIELDWORK_MT_train_presets")
+    screen.facts["preset"] = [preset.name, settings.time_limit, settings.steps]
+    yield from every_panel(screen, "labelled")
+
+    theme = next(Path(path) / "Blender_Light.xml" for path in bpy.utils.preset_paths("interface_theme"))
+    bpy.ops.script.execute_preset(filepath=str(theme), menu_idname="USERPREF_MT_interface_theme_presets")
+    yield from screen.toggle("train")
+    yield 1.0
+    screen.shot("light")
+    yield from screen.toggle("train")
+    bpy.context.preferences.view.ui_scale = 1.6
+    yield 1.0
+    yield from screen.toggle("train")
+    yield 1.0
+    screen.shot("large")
+    yield from finish(screen)
+
+
+def faces(obj):
+    return len(obj.evaluated_get(bpy.context.evaluated_depsgraph_get()).data.polygons)
+
+
 def interruptions(screen):
     """Cancel, kill the engine, undo and load another file, each in the middle of a training."""
     settings = yield from opened(screen)

@@ -76,6 +76,19 @@ def test_cancel_death_undo_and_another_file_in_the_middle(captured):
     assert facts["slowest_tick"] < 0.1
 
 
+def test_classes_renders_presets_and_themes_of_a_labelled_capture():
+    window.simulate()
+    facts = WINDOW("labelled").play("labelled", 1100)
+    assert len(facts["classes"]) >= 5
+    assert sum(area > 0 for _, area in facts["classes"]) >= 2
+    name, whole, left = facts["hidden"]
+    assert 0 < left < whole, name
+    assert any(image.endswith(".png") for image in facts["background"])
+    assert facts["preset"] == ["quick_look.py", 77.0, 5]
+    assert facts["slowest_tick"] < 0.1
+    assert {"classes", "hidden", "light", "large", "labelled-train", "labelled-classes"} <= shots("labelled")
+
+
 def test_engine_is_installed_from_the_preferences():
     """Without network, from a folder that lacks the packages: it must fail with advice, and nothing must hang."""
     facts = WINDOW("preferences").play("preferences", 300)

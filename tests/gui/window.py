@@ -13,6 +13,7 @@ ROOT = Path(__file__).resolve().parents[2]
 TOOLS = ROOT.parent / "shared" / "blender-gui"
 BLENDER_ROOT = Path(os.environ.get("FIELDWORK_GUI_ROOT", "/var/tmp/blender-sid"))
 BUILD = ROOT / "build" / "gui"
+MUSEUM = BUILD / "museum"  # a small simulated capture with labels
 
 
 def missing() -> str | None:
@@ -39,6 +40,14 @@ def enter(command: list[str], environment: dict[str, str], timeout: float) -> su
     )
 
 
+def simulate() -> None:
+    """Make the simulated capture unless it is there."""
+    if not (MUSEUM / "classes.json").is_file():
+        command = [sys.executable, "-m", "nerfcore", "simulate", MUSEUM, "--views", "24", "--size", "360x240"]
+        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        subprocess.run([*command, "--samples", "8"], env=environment, check=True)
+
+
 class Window:
     """One Blender with the extension installed from its built archive, with preferences of its own."""
 
@@ -49,6 +58,7 @@ class Window:
         self.environment = {
             "BLENDER_USER_RESOURCES": str(self.folder / "user"),
             "FIELDWORK_ENGINE_PYTHON": str(Path(sys.prefix) / "bin" / "python"),
+            "FIELDWORK_MUSEUM": str(MUSEUM),
             "FIELDWORK_BASE_PYTHON": str(Path(sys.base_prefix) / "bin" / "python3"),
         }
         build, out = BUILD / "zip", ""

@@ -242,3 +242,14 @@ def test_interest_and_density_draw_samples() -> None:
         return float(((x >= 8) & (x < 10)).float().mean())
 
     assert share(4.0) > 1.5 * share(0.0)
+
+
+def test_observing_samples_equals_its_twin() -> None:
+    generator = torch.Generator().manual_seed(8)
+    points, values = torch.rand(500, 3, generator=generator), torch.rand(500, generator=generator)
+    grids = [torch.rand(8**3, generator=torch.Generator().manual_seed(9)) * 2 for _ in range(2)]
+    scratch = torch.full((8**3,), -1.0)
+    cells.observe(grids[0], scratch, 8, points, values, 0.9)
+    cells_torch.observe(grids[1], torch.full((8**3,), -1.0), 8, points, values, 0.9)
+    assert torch.equal(*grids)
+    assert bool((scratch == -1).all())

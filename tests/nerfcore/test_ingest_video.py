@@ -1,0 +1,126 @@
+"""Frames of a video: codecs, sharpest of each stretch, stored rotation, damage."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from fieldwork.nerfcore.capture.ingest import new
+from fieldwork.nerfcore.capture.video import extract_frames
+from fieldwork.nerfcore.errors import Cancelled, InputError
+from fieldwork.nerfcore.params import NewParams
+from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.project import load_project
+from PIL import Image, ImageFilter
+
+COUNT, SHARP_EVERY = 48, 6
+
+
+def frame_picture(i: int) -> Image.Image:
+    """A picture that moves; only every sixth frame is sharp. The top-left corner is red."""
+    rng = np.random.default_rng(0)
+    coarse = Image.fromarray(rng.integers(0, 255, (30, 60, 3), np.uint8)).resize((480, 240), Image.Resampling.NEAREST)
+    view = coarse.crop((2 * i, i, 2 * i + 320, i + 192))
+    if i % SHARP_EVERY != 2:
+        view = view.filter(ImageFilter.GaussianBlur(3))
+    view.paste((255, 0, 0), (0, 0, 60, 40))
+    return view
+
+
+def encode(path: Path, codec: str, pixels: str = "yuv420p", rotation: int = 0) -> Path:
+    """A video of `COUNT` frames at 24 frames a second; `rotation` as a phone stores it (counter-clockwise)."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=24)
+        turned = rotation % 180 != 0
+        stream.width, stream.height = (192, 320) if turned else (320, 192)
+        stream.pix_fmt = pixels
+        if rotation:
+            stream.set_display_rotation(rotation)
+        for i in range(COUNT):
+            picture = frame_picture(i).rotate(-rotation, expand=True)
+            container.mux(stream.encode(av.VideoFrame.from_image(picture)))
+        container.mux(stream.encode())
+    return path
+
+
+def numbers(paths: list[Path]) -> list[int]:
+    return [int(path.stem.rsplit("_", 1)[1]) for path in paths]
+
+
+@pytest.mark.parametrize(
+    ("name", "codec", "pixels"),
+    [
+        ("a.mp4", "libx264", "yuv420p"),
+        ("a.mov", "libx265", "yuv420p"),
+        ("b.mov", "prores_ks", "yuv422p10le"),
+        ("a.webm", "libvpx-vp9", "yuv420p"),
+        ("b.mp4", "libsvtav1", "yuv420p"),
+    ],
+)
+def test_codecs_and_sharpest_frames(tmp_path: Path, name: str, codec: str, pixels: str) -> None:
+    video = encode(tmp_path / name, codec, pixels)
+    paths = extract_frames(video, tmp_path / "frames", COUNT // SHARP_EVERY, Reporter())
+    assert len(paths) == COUNT // SHARP_EVERY
+    assert numbers(paths) == list(range(2, COUNT, SHARP_EVERY))
+    with Image.open(paths[3]) as image:
+        difference = np.abs(np.asarray(image, float) - np.asarray(frame_picture(20), float))
+    assert image.size == (320, 192)
+    assert difference.mean() < 15
+
+
+@pytest.mark.parametrize("rotation", [90, -90, 180])
+def test_stored_rotation_is_applied(tmp_path: Path, rotation: int) -> None:
+    video = encode(tmp_path / "a.mp4", "libx264", rotation=rotation)
+    paths = extract_frames(video, tmp_path / "frames", 8, Reporter())
+    with Image.open(paths[0]) as image:
+        assert image.size == (320, 192)
+        red, green, _ = image.convert("RGB").getpixel((20, 15))
+    assert red > 200
+    assert green < 60
+
+
+def test_verb_and_reuse(tmp_path: Path) -> None:
+    video = encode(tmp_path / "Mein Video ü.mp4", "libx264")
+    result = new(NewParams(photos=video, project=tmp_path / "p", frames=8), Reporter())
+    assert result["images"] == 8
+    project = load_project(tmp_path / "p")
+    assert all(" " not in record.name for record in project.images)
+    before = [(p.name, p.stat().st_mtime_ns) for p in sorted((tmp_path / "p" / "frames").glob("*.png"))]
+    new(NewParams(photos=video, project=tmp_path / "p", frames=8), Reporter())
+    assert before == [(p.name, p.stat().st_mtime_ns) for p in sorted((tmp_path / "p" / "frames").glob("*.png"))]
+
+
+def test_truncated_and_foreign_files(tmp_path: Path) -> None:
+    whole = encode(tmp_path / "a.webm", "libvpx-vp9").read_bytes()
+    (tmp_path / "cut.webm").write_bytes(whole[: len(whole) // 2])
+    report = Reporter()
+    paths = extract_frames(tmp_path / "cut.webm", tmp_path / "frames", 12, report)
+    assert 3 <= len(paths) <= 12  # what is there is used
+    mp4 = encode(tmp_path / "a.mp4", "libx264").read_bytes()
+    for name, data in (("headless.mp4", mp4[: len(mp4) // 2]), ("text.mp4", b"hello" * 100), ("empty.mp4", b"")):
+        (tmp_path / name).write_bytes(data)
+        with pytest.raises(InputError, match=name):
+            extract_frames(tmp_path / name, tmp_path / "other", 12, Reporter())
+
+
+def test_sound_only(tmp_path: Path) -> None:
+    path = tmp_path / "sound.mp4"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("aac", rate=44100)
+        frame = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), format="fltp", layout="mono")
+        frame.sample_rate = 44100
+        for _ in range(10):
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    with pytest.raises(InputError, match="only sound"):
+        extract_frames(path, tmp_path / "frames", 12, Reporter())
+
+
+def test_cancel(tmp_path: Path) -> None:
+    video = encode(tmp_path / "a.mp4", "libx264")
+    report = Reporter()
+    report.cancel()
+    with pytest.raises(Cancelled):
+        extract_frames(video, tmp_path / "frames", 12, report)

@@ -1,0 +1,60 @@
+"""Fieldwork in Blender's menus, where operator search finds it too."""
+
+from __future__ import annotations
+
+import bpy
+from bpy.types import Context, Menu
+
+
+class FIELDWORK_MT_steps(Menu):
+    bl_label = "Fieldwork"
+
+    def draw(self, context: Context) -> None:
+        layout = self.layout
+        layout.operator("fieldwork.open", text="Open Photos or Project…", icon="FILE_FOLDER")
+        layout.operator("fieldwork.import_dataset", text="Import Posed Data Set…")
+        layout.separator()
+        layout.operator("fieldwork.new")
+        layout.operator("fieldwork.poses")
+        layout.operator("fieldwork.align")
+        layout.operator("fieldwork.train").resume = False
+        layout.operator("fieldwork.train", text="Resume Training").resume = True
+        layout.operator("fieldwork.evaluate")
+        layout.operator("fieldwork.render")
+        layout.operator("fieldwork.mesh")
+        layout.operator("fieldwork.import_scene")
+        layout.separator()
+        layout.operator("fieldwork.cancel")
+        layout.operator("fieldwork.doctor")
+        layout.operator("fieldwork.open_preferences", text="Preferences…")
+
+
+def draw_object_menu(self: Menu, context: Context) -> None:
+    self.layout.separator()
+    self.layout.menu("FIELDWORK_MT_steps")
+
+
+def draw_import(self: Menu, context: Context) -> None:
+    self.layout.operator("fieldwork.open", text="Photos, Video or Project (Fieldwork)")
+
+
+def draw_export(self: Menu, context: Context) -> None:
+    self.layout.operator("fieldwork.blend", text="Capture as .blend (Fieldwork)")
+
+
+CLASSES = [FIELDWORK_MT_steps]
+_ENTRIES = [
+    ("VIEW3D_MT_object", draw_object_menu),
+    ("TOPBAR_MT_file_import", draw_import),
+    ("TOPBAR_MT_file_export", draw_export),
+]
+
+
+def register() -> None:
+    for menu, draw in _ENTRIES:
+        getattr(bpy.types, menu).append(draw)
+
+
+def unregister() -> None:
+    for menu, draw in _ENTRIES:
+        getattr(bpy.types, menu).remove(draw)

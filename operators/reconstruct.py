@@ -13,7 +13,7 @@ from .base import VerbOperator, scene_settings
 
 
 @scene_settings(
-    photos="photos", out="project", labels="labels", masks="masks", classes="class_file", preset="preset",
+    photos="photos", labels="labels", masks="masks", classes="class_file", preset="preset",
     time_limit="time_limit",
 )  # fmt: skip
 class FIELDWORK_OT_reconstruct(VerbOperator):
@@ -23,19 +23,23 @@ class FIELDWORK_OT_reconstruct(VerbOperator):
     bl_label = "Reconstruct"
     verb = "reconstruct"
 
+    out: StringProperty(
+        name="Project", description="Project folder; empty: that of the scene", subtype="DIR_PATH",
+        options={"SKIP_SAVE"},
+    )  # fmt: skip
     blend: StringProperty(
         name="Blender File", description=".blend to write; empty: none", subtype="FILE_PATH", options={"SKIP_SAVE"}
     )
 
     def parameters(self, context: Context) -> dict[str, Any]:
-        photos, out = self.path(context, "photos"), self.path(context, "out")
+        photos, out = self.path(context, "photos"), self.out or context.scene.fieldwork.project
         if photos is None:
             raise ValueError("Choose a folder of photos, or a video, first.")
-        if out is None:
+        if not out:
             raise ValueError("Choose a project folder first.")
         return {
             "photos": photos,
-            "out": out,
+            "out": str(Path(bpy.path.abspath(out)).absolute()),
             **{name: self.path(context, name) for name in ("labels", "masks", "classes")},
             "preset": self.value(context, "preset"),
             "time_limit": self.value(context, "time_limit") or None,
@@ -53,7 +57,7 @@ class FIELDWORK_OT_simulate(VerbOperator):
     out: StringProperty(name="Folder", description="New or empty folder for the capture", subtype="DIR_PATH")
     views: IntProperty(name="Photos", description="Number of photos", default=48, min=4, soft_max=200)
     size: IntVectorProperty(
-        name="Size", description="Width and height of the photos", size=2, default=(720, 480), min=16, subtype="PIXEL"
+        name="Size", description="Width and height of the photos", size=2, default=(720, 480), min=16
     )
     seed: IntProperty(name="Seed", description="Another seed, another scene", min=0)
     samples: IntProperty(name="Samples", description="Cycles samples per pixel", default=4, min=1)

@@ -122,7 +122,32 @@ def run_window(root: Path, request: dict[str, Any], folder: Path) -> dict[str, A
         "ENTER_ENV": f"BLENDER_USER_RESOURCES={folder / 'user'}",
     }
     command = [str(GUI / "enter"), str(root), str(ROOT), "blender", "-noaudio", "--background", "--factory-startup"]
-    return _answer([*command, "--python", str(WORKER), "--"], request, folder, environment)
+    row = _answer([*command, "--python", str(WORKER), "--"], request, folder, environment)
+    if row["ok"]:
+        row |= _command_line(root, request, environment)
+    return row
+
+
+def _command_line(root: Path, request: dict[str, Any], environment: dict[str, str]) -> dict[str, Any]:
+    """`blender -c fieldwork doctor --json`, with this checkout's environment as the engine."""
+    base = subprocess.run(
+        [sys.executable, "-c", "import sys; print(sys.base_prefix)"], capture_output=True, text=True, check=True
+    ).stdout.strip()
+    environment = {
+        **environment,
+        "BIND": f"{environment['BIND']} {base}",
+        "ENTER_ENV": f"{environment['ENTER_ENV']} FIELDWORK_ENGINE_PYTHON={ROOT}/.venv/bin/python",
+    }
+    blender = [str(GUI / "enter"), str(root), str(ROOT), "blender", "--command"]
+    install = [*blender, "extension", "install-file", "-r", "user_default", "-e", request["zip"]]
+    done = subprocess.run(install, capture_output=True, text=True, env=environment, timeout=300)
+    if done.returncode == 0:
+        doctor = [*blender, "fieldwork", "doctor", "--json"]
+        done = subprocess.run(doctor, capture_output=True, text=True, env=environment, timeout=300)
+    answer = next((line for line in done.stdout.splitlines() if line.startswith("{")), None)
+    if answer is None or not json.loads(answer).get("torch"):
+        return {"ok": False, "error": "`blender -c fieldwork doctor` failed", "log": done.stdout + done.stderr}
+    return {"command": "ok"}
 
 
 def _answer(command: list[str], request: dict[str, Any], folder: Path, environment: dict[str, str]) -> dict[str, Any]:
@@ -181,14 +206,17 @@ def main() -> int:
 
 
 def report(rows: list[tuple[str, dict[str, Any]]]) -> int:
-    table = Table("Blender", "version", "Python", "operators", "enable ms", "photo s", "denoiser", "result")
+    table = Table("Blender", "version", "Python", "operators", "enable ms", "photo s", "denoiser", "-c", "result")
     failures = 0
     for name, row in rows:
         if "skipped" in row:
-            table.add_row(name, "", "", "", "", "", "", f"skipped: {row['skipped']}")
+            table.add_row(name, *[""] * 7, f"skipped: {row['skipped']}")
             continue
         failures += not row["ok"]
-        facts = [str(row.get(key, "")) for key in ("blender", "python", "operators", "enable_ms", "photo_s", "oidn")]
+        facts = [
+            str(row.get(key, ""))
+            for key in ("blender", "python", "operators", "enable_ms", "photo_s", "oidn", "command")
+        ]
         table.add_row(name, *facts, "ok" if row["ok"] else f"FAILED: {row['error']}")
         if not row["ok"]:
             print(f"--- {name} ---\n{row['log'][-3000:]}")

@@ -27,7 +27,7 @@ def test_every_example_is_python(block):
 
 
 def test_every_operator_named_exists(bpy_script):
-    names = sorted(set(re.findall(r"bpy\.ops\.fieldwork\.(\w+)\(", TEXT)))
+    names = sorted(set(re.findall(r"bpy\.ops\.fieldwork\.([a-z_]+)\(", TEXT)))
     found = bpy_script(PACKAGE + "\nanswer(dir(bpy.ops.fieldwork))")
     assert len(names) >= 4
     assert set(names) <= set(found)

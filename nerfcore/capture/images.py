@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import struct
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -257,11 +258,19 @@ def _read_raw(path: Path) -> Photo:
     except rawpy.LibRawError as error:
         raise InputError(f"the camera raw file cannot be developed: {error}") from error
     image = Image.fromarray(pixels)
-    facts: dict[str, Any] = {}
-    try:
-        # Most raw formats are TIFF inside, so that Pillow reads the EXIF block.
-        with Image.open(path) as container:
-            facts = photo_facts(container.getexif(), image.size)
-    except (OSError, UnidentifiedImageError, ValueError, SyntaxError):
-        facts = {}
-    return Photo(image, image.size, 1, False, facts)
+    return Photo(image, image.size, 1, False, _raw_facts(path, image.size))
+
+
+def _raw_facts(path: Path, size: tuple[int, int]) -> dict[str, Any]:
+    """EXIF of raw formats that are TIFF inside (most are); none of the others."""
+    with open(path, "rb") as file:
+        if file.read(2) not in (b"II", b"MM"):
+            return {}
+        file.seek(0)
+        exif = Image.Exif()
+        try:
+            exif.load_from_fp(file)
+            return photo_facts(exif, size)
+        except (OSError, ValueError, SyntaxError, KeyError, struct.error) as error:
+            log.info("no EXIF in %s: %s", path, error)
+            return {}

@@ -33,6 +33,7 @@ FRAMES_FOLDER = "frames"
 # Files that lie beside photos and are none.
 SIDECARS = {".json", ".txt", ".md", ".xmp", ".aae", ".csv", ".npy", ".npz", ".db", ".ini", ".xml", ".thm", ".log", ""}
 MAX_ASPECT = 3.0
+SPHERE_WIDTH = 5000
 
 
 @dataclass(frozen=True)
@@ -76,6 +77,7 @@ def new(params: NewParams, report: Reporter) -> dict[str, Any]:
     if classes_file:
         names, ignore_id, colors = read_classes(classes_file)
     create_folder(folder)
+    _remove_halves(folder)
     if photos.is_file() and photos.suffix.lower() in VIDEO_SUFFIXES:
         report.stage("Choosing frames of the video")
         paths = extract_frames(photos, folder / FRAMES_FOLDER, params.frames, report)
@@ -179,6 +181,13 @@ def _previous_project(params: NewParams) -> Project | None:
             f"{folder} already holds another capture.", "Choose a new folder, or --add to put these photos into it."
         )
     return project
+
+
+def _remove_halves(folder: Path) -> None:
+    """Delete what a run that was killed had half written: hidden files in the folders of working copies."""
+    for name in ("images", "labels", "masks"):
+        for path in (folder / name).glob(".*"):
+            path.unlink(missing_ok=True)
 
 
 def _beside_labels(labels: Path | None) -> Path | None:
@@ -285,7 +294,9 @@ def _ingest_one(source: Source, settings: Settings) -> tuple[ImageRecord, np.nda
         photo = read_photo(source.path, settings.max_size, settings.exposure)
         width, height = photo.full_size
         aspect = max(width, height) / min(width, height)
-        if photo.facts.get("panorama") or aspect > MAX_ASPECT:
+        # Exactly 2:1 and large is how full spheres are stored.
+        sphere = aspect == 2 and max(width, height) >= SPHERE_WIDTH
+        if photo.facts.get("panorama") or aspect > MAX_ASPECT or sphere:
             raise InputError(f"a panorama ({width}×{height}): poses need single photos, not stitched ones")
         if min(width, height) < 64:
             raise InputError(f"too small ({width}×{height} pixels)")

@@ -6,7 +6,11 @@ import io
 import json
 import os
 import shutil
+import signal
+import struct
 import subprocess
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -112,6 +116,61 @@ def test_grey_palette_cmyk_and_alpha(tmp_path: Path) -> None:
     assert read_photo(tmp_path / "opaque.png").image.mode == "RGB"
 
 
+def write_dng(path: Path, mosaic: np.ndarray, orientation: int) -> None:
+    """A minimal digital negative: one uncompressed 16-bit RGGB picture, a maker and a focal length in 35 mm terms."""
+    height, width = mosaic.shape
+    one = (10000, 10000)
+    matrix = [one if i % 4 == 0 else (0, 10000) for i in range(9)]
+    tags: list[tuple[int, str, list | bytes]] = [
+        (254, "I", [0]), (256, "I", [width]), (257, "I", [height]), (258, "H", [16]), (259, "H", [1]),
+        (262, "H", [32803]), (271, "s", b"Maker\0"), (272, "s", b"Model R\0"), (273, "I", [0]),
+        (274, "H", [orientation]), (277, "H", [1]), (278, "I", [height]), (279, "I", [width * height * 2]),
+        (284, "H", [1]), (33421, "H", [2, 2]), (33422, "B", [0, 1, 1, 2]), (34665, "I", [0]), (50706, "B", [1, 4, 0, 0]),
+        (50708, "s", b"Maker Model R\0"), (50714, "H", [0]), (50717, "I", [65535]), (50721, "ii", matrix),
+        (50728, "II", [(1, 1)] * 3), (50778, "H", [21]),
+    ]  # fmt: skip
+    kinds = {"B": 1, "s": 2, "H": 3, "I": 4, "II": 5, "ii": 10}
+
+    def packed(kind: str, values: list | bytes) -> bytes:
+        if isinstance(values, bytes):
+            return values
+        if len(kind) == 2:
+            return b"".join(struct.pack("<" + kind, *pair) for pair in values)
+        return struct.pack(f"<{len(values)}{kind}", *values)
+
+    sizes = [len(packed(kind, values)) for _, kind, values in tags]
+    place = 8 + 2 + 12 * len(tags) + 4
+    detail_at = place + sum(size + size % 2 for size in sizes if size > 4)
+    detail = struct.pack("<HHHII", 1, 41989, 3, 1, 45) + bytes(4)
+    directory, long_values = b"", b""
+    for tag, kind, values in tags:
+        if tag in (273, 34665):
+            values = [detail_at if tag == 34665 else detail_at + len(detail)]
+        data = packed(kind, values)
+        directory += struct.pack("<HHI", tag, kinds[kind], len(values))
+        if len(data) <= 4:
+            directory += data.ljust(4, b"\0")
+        else:
+            directory += struct.pack("<I", place + len(long_values))
+            long_values += data + b"\0" * (len(data) % 2)
+    head = b"II*\0" + struct.pack("<IH", 8, len(tags))
+    path.write_bytes(head + directory + bytes(4) + long_values + detail + mosaic.astype("<u2").tobytes())
+
+
+@pytest.mark.parametrize("orientation", [1, 6])
+def test_camera_raw(tmp_path: Path, orientation: int) -> None:
+    mosaic = np.full((200, 320), 20000, np.uint16)
+    mosaic[:40, :60] = 1000  # a dark top-left corner
+    write_dng(tmp_path / "a.dng", mosaic, orientation)
+    photo = read_photo(tmp_path / "a.dng")
+    assert photo.full_size == ((320, 200) if orientation == 1 else (200, 320))
+    dark, light = ((20, 20), (200, 150)) if orientation == 1 else ((180, 20), (50, 200))
+    assert max(photo.image.getpixel(dark)) < 60
+    assert max(photo.image.getpixel(light)) > 120
+    assert photo.facts["make"] == "Maker"
+    assert photo.facts["focal_px"] == pytest.approx(45 / 36 * 320)
+
+
 def test_raw_by_name_but_not_by_content(tmp_path: Path) -> None:
     (tmp_path / "a.nef").write_bytes(b"not a raw photo" * 100)
     with pytest.raises(InputError, match="camera raw"):
@@ -212,9 +271,11 @@ def test_bad_files_have_reasons(tmp_path: Path) -> None:
 def test_huge_panorama_is_refused_without_much_memory(tmp_path: Path) -> None:
     photos = folder_of(tmp_path / "photos")
     Image.new("RGB", (20000, 4000), (90, 120, 30)).save(photos / "pano.jpg", quality=60)
+    Image.new("RGB", (20000, 10000), (90, 120, 30)).save(photos / "sphere.jpg", quality=60)
     result = new(photos, tmp_path / "p")
     assert result["rejected"] == [
-        {"file": "pano.jpg", "reason": "a panorama (20000×4000): poses need single photos, not stitched ones"}
+        {"file": f"{name}.jpg", "reason": f"a panorama ({size}): poses need single photos, not stitched ones"}
+        for name, size in (("pano", "20000×4000"), ("sphere", "20000×10000"))
     ]
 
 
@@ -440,6 +501,32 @@ def test_cancelled_and_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     before = len(decoded)
     assert new(photos, tmp_path / "p")["images"] == 12
     assert len(decoded) == before
+
+
+def test_killed_and_run_again(tmp_path: Path) -> None:
+    """Cut off by SIGKILL at any moment: no half file, and the next run finishes."""
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for i in range(8):
+        picture(i, (1600, 1000)).save(photos / f"p{i}.png", compress_level=1)
+    code = (
+        "import sys; from pathlib import Path; from fieldwork.nerfcore.capture.ingest import new\n"
+        "from fieldwork.nerfcore.params import NewParams; from fieldwork.nerfcore.progress import Reporter\n"
+        f"new(NewParams(photos=Path({str(photos)!r}), project=Path({str(tmp_path / 'p')!r})), Reporter())\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code])
+    deadline = time.monotonic() + 30
+    while time.monotonic() < deadline and not list((tmp_path / "p").glob("images/p*.png")):
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert list((tmp_path / "p").glob("images/p*.png"))
+    assert new(photos, tmp_path / "p")["images"] == 8
+    files = {record.file for record in load_project(tmp_path / "p").images}
+    assert {f"images/{name}" for name in os.listdir(tmp_path / "p" / "images")} == files
+    for file in files:
+        with Image.open(tmp_path / "p" / file) as image:
+            image.load()
 
 
 def test_changed_photo_is_read_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

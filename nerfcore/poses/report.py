@@ -32,15 +32,14 @@ def draw_report(
     shown = np.linspace(0, len(cloud) - 1, min(MAX_POINTS, len(cloud))).astype(int) if len(cloud) else []
     figure = Figure(figsize=(15, 5.4), layout="constrained")
     top, side, graph = figure.subplots(1, 3)
-    reach = _reach(cameras[:, :3, 3], cloud)
+    middle, reach = _middle_and_reach(cameras[:, :3, 3], cloud)
     for axes, (a, b), title in ((top, (0, 1), "from above (x, y)"), (side, (0, 2), "from the side (x, z)")):
         axes.scatter(cloud[shown, a], cloud[shown, b], s=1, c=points.rgb[shown] / 255, linewidths=0)
-        centers, ahead = cameras[:, :3, 3], cameras[:, :3, 2] * 0.12 * reach
+        centers, ahead = cameras[:, :3, 3], cameras[:, :3, 2] * 0.1 * reach
         axes.quiver(
             centers[:, a], centers[:, b], ahead[:, a], ahead[:, b],
             angles="xy", scale_units="xy", scale=1, width=0.004, color="#d55e00",
         )  # fmt: skip
-        middle = np.median(centers, axis=0)
         axes.set(title=title, xlim=(middle[a] - reach, middle[a] + reach), ylim=(middle[b] - reach, middle[b] + reach))
         axes.set_aspect("equal")
     _draw_graph(graph, records, links, names)
@@ -52,13 +51,14 @@ def draw_report(
         FigureCanvasAgg(figure).print_png(str(temporary))
 
 
-def _reach(centers: np.ndarray, cloud: np.ndarray) -> float:
-    """Half the width of the drawn square: all cameras and the bulk of the points."""
-    middle = np.median(centers, axis=0)
-    reach = float(np.abs(centers - middle).max())
+def _middle_and_reach(centers: np.ndarray, cloud: np.ndarray) -> tuple[np.ndarray, float]:
+    """Middle (3,) and half the width of the drawn square: all cameras, and the bulk of the points near them."""
+    low, high = centers.min(0), centers.max(0)
     if len(cloud):
-        reach = max(reach, float(np.quantile(np.abs(cloud - middle).max(1), 0.9)))
-    return 1.1 * max(reach, 1e-6)
+        distance = np.linalg.norm(cloud - np.median(cloud, axis=0), axis=1)
+        near = cloud[distance <= 3 * np.median(distance)]
+        low, high = np.minimum(low, near.min(0)), np.maximum(high, near.max(0))
+    return (low + high) / 2, 0.55 * max(float((high - low).max()), 1e-6)
 
 
 def _draw_graph(axes, records: list[ImageRecord], links: list[list], names: dict[str, str]) -> None:

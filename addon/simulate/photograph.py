@@ -20,6 +20,7 @@ from ..errors import SceneError
 from .pixels import read_exr, write_index_png
 
 LabelSource = Literal["material", "object", "collection", "none"]
+SURFACES = {"MESH", "CURVE", "SURFACE", "META", "FONT"}
 FAR = 1e9  # Cycles writes 1e10 where a ray meets nothing
 
 
@@ -50,25 +51,37 @@ class Shot:
 def class_ids(scene: bpy.types.Scene, source: LabelSource) -> dict[str, int]:
     """Names and ids (1 …) of the classes that `source` distinguishes in the scene, in a stable order.
 
-    "material" and "object": what has a pass index set keeps it (several may share one: the first name wins);
-    if none has, they are numbered by name. "collection": the scene's top-level collections.
+    "material" and "object": what has a pass index set keeps it (several may share one: the first name wins); if none
+    has, they are numbered by name. "collection": the collections directly below the scene's; what lies in none of
+    them is void.
     """
     if source == "none":
         return {}
     if source == "collection":
         return {c.name: number for number, c in enumerate(sorted(scene.collection.children, key=lambda c: c.name), 1)}
-    visible = [o for o in scene.objects if o.type in {"MESH", "CURVE", "SURFACE", "META", "FONT"} and not o.hide_render]
-    items: list[Any] = visible
-    if source == "material":
-        items = [slot.material for o in visible for slot in o.material_slots if slot.material]
-    unique = sorted({item.name: item for item in items}.items())
-    if any(item.pass_index for _, item in unique):
+    items = _items(scene, source)
+    if any(item.pass_index for item in items):
         found: dict[int, str] = {}
-        for name, item in unique:
+        for item in items:
             if item.pass_index:
-                found.setdefault(item.pass_index, name)
+                found.setdefault(item.pass_index, item.name)
         return {name: number for number, name in sorted(found.items())}
-    return {name: number for number, (name, _) in enumerate(unique, 1)}
+    return {item.name: number for number, item in enumerate(items, 1)}
+
+
+def _items(scene: bpy.types.Scene, source: LabelSource) -> list[Any]:
+    """The objects that render, or their materials, by name; also those that come in by instancing."""
+    objects = {}
+    for instance in bpy.context.evaluated_depsgraph_get().object_instances:
+        item = instance.object.original
+        if item.type in SURFACES and not item.hide_render:
+            objects[item.name] = item
+    if source == "object":
+        return [item for _, item in sorted(objects.items())]
+    materials = {
+        slot.material.name: slot.material for o in objects.values() for slot in o.material_slots if slot.material
+    }
+    return [material for _, material in sorted(materials.items())]
 
 
 def photograph(
@@ -231,11 +244,12 @@ def _indexed(scene: bpy.types.Scene, source: LabelSource) -> Iterator[None]:
     ids = class_ids(scene, source)
     items: list[tuple[Any, int]] = []
     if source == "collection":
-        items = [(o, ids[c.name]) for c in scene.collection.children for o in c.all_objects]
+        number = {o: ids[c.name] for c in scene.collection.children for o in c.all_objects}
+        items = [(o, number.get(o, 0)) for o in bpy.data.objects if o.library is None]
     elif source in {"material", "object"}:
-        pool = bpy.data.materials if source == "material" else scene.objects
-        if not any(item.pass_index for item in pool):
-            items = [(item, ids[item.name]) for item in pool if item.name in ids]
+        found = _items(scene, source)
+        if not any(item.pass_index for item in found):
+            items = [(item, ids[item.name]) for item in found]
     before = [(item, item.pass_index) for item, _ in items]
     for item, number in items:
         item.pass_index = number

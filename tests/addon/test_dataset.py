@@ -37,6 +37,8 @@ def thing(make, name, color, collection, **arguments):
     group.objects.link(item)
 thing(bpy.ops.mesh.primitive_plane_add, "floor", (0.2, 0.5, 0.2), "ground", size=4)
 thing(bpy.ops.mesh.primitive_cube_add, "cube", (0.8, 0.1, 0.1), "things", size=1, location=(0, 0, 0.5))
+spare = bpy.data.materials.new("spare paint that nothing wears")
+spare.pass_index, spare.use_fake_user = 7, True
 bpy.ops.object.light_add(type="SUN", rotation=(0.5, 0.3, 0))
 bpy.ops.curve.primitive_bezier_circle_add(radius=3, location=(0, 0, 2))
 bpy.context.object.name = "walk"

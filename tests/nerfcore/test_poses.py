@@ -145,6 +145,38 @@ def test_masks_are_honoured(fountain: Path, shared_data: Data, tmp_path: Path) -
     assert min(x) >= 499
 
 
+def test_a_wrong_pose_is_found_and_repaired(fountain: Path, tmp_path: Path) -> None:
+    import zlib  # noqa: F401
+
+    import pycolmap
+    from fieldwork.nerfcore.poses import mapping
+    from fieldwork.nerfcore.poses.validate import check_images
+
+    class Quiet:
+        def stage(self, name: str) -> None: ...
+
+        def progress(self, fraction: float, message: str = "") -> None: ...
+
+    (database,) = (fountain / "poses" / "sfm").glob("*.db")
+    shutil.copy(database, tmp_path / "f.db")
+    model = pycolmap.Reconstruction(str(fountain / "poses" / "sparse"))
+    right, _ = check_images(model, tmp_path / "f.db")
+    assert min(check.agreement for check in right.values()) > 0.9
+    victim = sorted(model.reg_image_ids())[5]
+    frame = model.image(victim).frame
+    shift = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.0, 0.15, 0.05])), np.array([0.3, 0.0, 0.2]))
+    frame.rig_from_world = shift * frame.rig_from_world
+    wrong, _ = check_images(model, tmp_path / "f.db")
+    assert wrong[victim].agreement < 0.1
+    assert [i for i, check in wrong.items() if check.bad] == [victim]
+    names = sorted(image.name for image in model.images.values())
+    images = fountain / "images"
+    model, checks, _, dropped = mapping.repair(model, tmp_path / "f.db", images, tmp_path, False, names, Quiet())
+    assert model.num_reg_images() == 11
+    assert not dropped
+    assert min(check.agreement for check in checks.values()) > 0.9
+
+
 # --- bad captures ---------------------------------------------------------------------------------------------------
 
 

@@ -167,7 +167,7 @@ def test_a_wrong_pose_is_found_and_repaired(fountain: Path, tmp_path: Path) -> N
     shift = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.0, 0.15, 0.05])), np.array([0.3, 0.0, 0.2]))
     frame.rig_from_world = shift * frame.rig_from_world
     wrong, _ = check_images(model, tmp_path / "f.db")
-    assert wrong[victim].agreement < 0.1
+    assert wrong[victim].agreement < 0.4
     assert [i for i, check in wrong.items() if check.bad] == [victim]
     names = sorted(image.name for image in model.images.values())
     images = fountain / "images"

@@ -57,8 +57,10 @@ def dataset(params: DatasetParams, report: Reporter) -> dict[str, Any]:
             report.event("preview", path=str(out / "images" / f"{event['name']}.png"))
 
     request = {**params.model_dump(mode="json"), "blend": str(blend), "folder": str(raw), "done": done}
-    described = run_in_blender("dataset", request, report, on_event)
-    shutil.rmtree(raw, ignore_errors=True)
+    try:
+        described = run_in_blender("dataset", request, report, on_event)
+    finally:
+        shutil.rmtree(raw, ignore_errors=True)
     _describe(out, described, folders)
     if not described["denoised"]:
         report.warn("This Blender has no OpenImageDenoise: the photos are noisier than they could be.")

@@ -66,8 +66,10 @@ def simulate(params: SimulateParams, report: Reporter) -> dict[str, Any]:
     truth = out / "ground_truth"
     if pending or not (truth / "transforms.json").is_file():
         request = {**settings, "folder": str(raw), "truth": str(truth), "pending": pending}
-        described = run_in_blender("simulate", request, report, on_event)
-        shutil.rmtree(raw, ignore_errors=True)
+        try:
+            described = run_in_blender("simulate", request, report, on_event)
+        finally:
+            shutil.rmtree(raw, ignore_errors=True)
         missing = [index for index in range(params.views) if not _is_finished(out, index)]
         if missing:
             raise BlenderError(f"Blender did not deliver photo {missing[0]}.", "Run it again.")

@@ -152,6 +152,7 @@ def test_cancel_is_prompt_and_the_next_run_goes_on(tmp_path):
     assert time.monotonic() - report.cancelled_at < 2
     taken = len(list((tmp_path / "c/photos").iterdir()))
     assert taken == 1
+    assert not (tmp_path / "c/.raw").exists()
     report = Recorder()
     assert simulate(params(tmp_path / "c", views=4), report)["images"] == 4
     assert report.photos == 3

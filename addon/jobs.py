@@ -345,7 +345,7 @@ class Queue:
             return
         for window in bpy.context.window_manager.windows:
             # Nothing else redraws the status bar; a running tool's own text in it must stay.
-            if not window.modal_operators and time.monotonic() - self._status_drawn > STATUS_PERIOD:
+            if not getattr(window, "modal_operators", None) and time.monotonic() - self._status_drawn > STATUS_PERIOD:
                 self._status_drawn = time.monotonic()
                 with bpy.context.temp_override(window=window):
                     window.workspace.status_text_set_internal(None)

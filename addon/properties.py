@@ -232,9 +232,14 @@ class FieldworkScene(PropertyGroup):
             ("4096", "4096", "4096 × 4096 pixels"),
         ],
     )
+    mesh_file: StringProperty(
+        name="Also Write",
+        description="File for other programs: .ply, .obj, .glb or .stl; empty: none",
+        subtype="FILE_PATH",
+    )
     split: EnumProperty(
         name="Objects",
-        description="One object, or one for each class",
+        description="What the file holds: one object, or one for each class",
         items=[("none", "One", "One object"), ("classes", "One per Class", "One object for each class")],
     )
 

@@ -14,6 +14,7 @@ from .base import ProjectOperator, need_photos, need_project_folder, scene_setti
 
 PHOTOS = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".heic", ".heif", ".webp", ".exr", ".dng", ".bmp"}
 VIDEOS = {".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v"}
+PHOTO_FOLDERS = ("photos", "images", "rgb")
 FORMATS = [
     ("auto", "Automatic", "Find out"),
     ("transforms", "transforms.json", "NeRF and nerfstudio captures"),
@@ -32,7 +33,23 @@ FORMATS = [
 
 def project_for(source: Path) -> Path:
     """Where the project of a capture goes when the user names no place: beside it."""
-    return source.with_name(f"{source.stem if source.suffix.lower() in VIDEOS else source.name}_fieldwork")
+    if source.suffix.lower() in VIDEOS:
+        return source.with_name(f"{source.stem}_fieldwork")
+    whole = source.parent if source.name.lower() in PHOTO_FOLDERS else source
+    return whole.with_name(f"{whole.name}_fieldwork")
+
+
+def photo_folder(source: Path) -> Path:
+    """The folder of photos meant by a folder: one of its own named for photos where it has none itself."""
+    if not source.is_dir() or any(path.suffix.lower() in PHOTOS for path in source.iterdir()):
+        return source
+    return next((source / name for name in PHOTO_FOLDERS if (source / name).is_dir()), source)
+
+
+def beside(photos: Path, name: str) -> str:
+    """A folder or file of the capture inside the folder of photos, or beside it; empty when there is none."""
+    places = [photos, photos.parent] if photos.name.lower() in PHOTO_FOLDERS else [photos]
+    return next((str(place / name) for place in places if (place / name).exists()), "")
 
 
 def choose_source(scene: bpy.types.Scene, source: Path) -> None:
@@ -41,11 +58,11 @@ def choose_source(scene: bpy.types.Scene, source: Path) -> None:
     if state.has_project(source):
         settings.project = str(source)
         return
-    settings.photos = str(source)
-    for name, prop in (("labels", "labels"), ("masks", "masks")):
-        setattr(settings, prop, str(source / name) if (source / name).is_dir() else "")
-    settings.class_file = str(source / "classes.json") if (source / "classes.json").is_file() else ""
-    settings.project = str(project_for(source))
+    photos = photo_folder(source)
+    settings.photos = str(photos)
+    settings.labels, settings.masks = beside(photos, "labels"), beside(photos, "masks")
+    settings.class_file = beside(photos, "classes.json")
+    settings.project = str(project_for(photos))
 
 
 @scene_settings(

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from bpy.types import Context, UIList
 
-from .base import StepPanel, columns
+from ..addon import state
+from .base import StepPanel, columns, project_folder
 
 
 class FIELDWORK_UL_classes(UIList):
@@ -19,7 +20,8 @@ class FIELDWORK_UL_classes(UIList):
         side = row.row(align=True)
         side.alignment = "RIGHT"
         if item.area > 0:
-            side.label(text=f"{item.area:.3g} m²")
+            frame = (state.cached_project(project_folder(context)) or {}).get("frame", {})
+            side.label(text=f"{item.area:.3g} m²" if frame.get("scale_known") else f"{item.area:.3g}")
         weight = row.row()
         weight.ui_units_x = 2.4
         weight.prop(item, "priority", text="")

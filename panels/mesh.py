@@ -23,8 +23,10 @@ class FIELDWORK_PT_mesh(StepPanel):
         else:
             self.draw_state(False, f"Run “{settings.run}” is not trained yet")
         column = columns(layout)
-        for name in ("resolution", "faces", "texture", "split"):
+        for name in ("resolution", "faces", "texture", "mesh_file"):
             column.prop(settings, name)
+        if settings.mesh_file:
+            column.prop(settings, "split")
         layout.operator("fieldwork.mesh", icon="MESH_DATA")
         layout.operator("fieldwork.import_scene", icon="SCENE_DATA")
 

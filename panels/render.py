@@ -16,7 +16,8 @@ class FIELDWORK_PT_render(StepPanel):
         folder = project_folder(context)
         last = next((j for j in reversed(jobs.queue.finished) if j.verb == "render" and j.state == "done"), None)
         if last is not None:
-            self.draw_state(True, f"{len((last.result or {}).get('frames', []))} images rendered")
+            count = sum(str(path).endswith(".exr") for path in (last.result or {}).get("frames", []))
+            self.draw_state(True, f"{count} images rendered" if count != 1 else "1 image rendered")
         elif state.has_run(folder, settings.run):
             self.draw_state(False, "Ready to render")
         else:

@@ -105,7 +105,7 @@ def draw_curve(layout: UILayout, job: jobs.Job) -> None:
     if job.preview:
         preview = pictures.picture(job.preview, job.preview_count)
         if preview:
-            layout.label(text="Held-out photo and its render")
+            layout.label(text="Render of a held-out photo")
             layout.template_icon(icon_value=preview, scale=9.0)
 
 

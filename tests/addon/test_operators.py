@@ -133,9 +133,12 @@ answer({"rows": rows, "classes": classes, "left": len(settings.images)})
 
 def test_open_understands_folders_photos_videos_and_projects(bpy_script, tmp_path):
     project = make_project(tmp_path / "old")
-    photos = tmp_path / "photos"
+    photos = tmp_path / "day one"
     (photos / "labels").mkdir(parents=True)
     (photos / "a.jpg").touch()
+    (tmp_path / "museum" / "photos").mkdir(parents=True)
+    (tmp_path / "museum" / "labels").mkdir()
+    (tmp_path / "museum" / "classes.json").touch()
     (tmp_path / "walk.mp4").touch()
     facts = bpy_script(
         SETUP
@@ -143,8 +146,9 @@ def test_open_understands_folders_photos_videos_and_projects(bpy_script, tmp_pat
 seen = {}
 for name, arguments in {
     "project": {"filepath": folder + "/old/project.json"},
-    "folder": {"filepath": folder + "/photos"},
-    "photo": {"directory": folder + "/photos", "files": [{"name": "a.jpg"}]},
+    "folder": {"filepath": folder + "/day one"},
+    "capture": {"filepath": folder + "/museum"},
+    "photo": {"directory": folder + "/day one", "files": [{"name": "a.jpg"}]},
     "video": {"directory": folder, "files": [{"name": "walk.mp4"}]},
 }.items():
     bpy.ops.fieldwork.open(**arguments)
@@ -157,6 +161,8 @@ answer(seen)
     expected = [str(photos), f"{photos}_fieldwork", str(photos / "labels")]
     assert facts["folder"] == expected
     assert facts["photo"] == expected
+    museum = tmp_path / "museum"
+    assert facts["capture"] == [str(museum / "photos"), f"{museum}_fieldwork", str(museum / "labels")]
     assert facts["video"] == [str(tmp_path / "walk.mp4"), str(tmp_path / "walk_fieldwork"), ""]
 
 

@@ -46,7 +46,7 @@ def shots(name: str) -> set[str]:
 def test_photos_are_dropped_read_placed_and_shown(captured):
     photos, project = captured["dropped"]
     assert photos.endswith("banana/images")
-    assert project.endswith("banana/images_fieldwork")
+    assert project.endswith("/banana_fieldwork")
     placed, total = captured["placed"]
     assert placed >= total - 1
     # One camera for each photo, the animated one, and the one of the default scene.
@@ -84,7 +84,7 @@ def test_classes_renders_presets_and_themes_of_a_labelled_capture():
     name, whole, left = facts["hidden"]
     assert 0 < left < whole, name
     assert any(image.endswith(".png") for image in facts["background"])
-    assert facts["preset"] == ["quick_look.py", 77.0, 5]
+    assert facts["preset"] == ["Quick_Look.py", 77.0, 5]
     assert facts["slowest_tick"] < 0.1
     assert {"classes", "hidden", "light", "large", "labelled-train", "labelled-classes"} <= shots("labelled")
 

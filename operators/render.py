@@ -10,7 +10,7 @@ from typing import Any
 import bpy
 from bpy.types import Context
 
-from ..addon import jobs, render_result, state
+from ..addon import jobs, state
 from ..nerfcore.files import write_json
 from .base import ProjectOperator, need_run, refresh_scenes, scene_settings
 
@@ -127,6 +127,9 @@ def show_result(job: jobs.Job) -> None:
     refresh_scenes(job)
     if job.state != "done" or job.result is None or job.project is None:
         return
+    # Not at the top: enabling the extension must be quick.
+    from ..addon import render_result
+
     scene = next((s for s in bpy.data.scenes if state.folder_of(s.fieldwork) == job.project), bpy.context.scene)
     files = [Path(path) for path in job.result["frames"]]
     # An orbit has no camera in the scene.

@@ -9,10 +9,8 @@ import bpy
 from bpy.props import EnumProperty
 from bpy.types import Context
 
-from ..addon import jobs, state, visibility
+from ..addon import jobs, state
 from ..addon.link import EngineError
-from ..addon.package import PackageError, read_package
-from ..addon.scene_import import import_package
 from .base import ProjectOperator, need_poses, refresh_scenes, scene_settings, set_if_empty
 
 
@@ -51,6 +49,11 @@ def import_result(job: jobs.Job, cameras: str, scene_name: str) -> None:
     refresh_scenes(job)
     if job.state != "done" or not job.result:
         return
+    # Not at the top: enabling the extension must be quick.
+    from ..addon import visibility
+    from ..addon.package import PackageError, read_package
+    from ..addon.scene_import import import_package
+
     # Another file may have been loaded meanwhile.
     scene = bpy.data.scenes.get(scene_name) or bpy.context.scene
     if state.folder_of(scene.fieldwork) != job.project and not bpy.app.background:

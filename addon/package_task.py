@@ -67,5 +67,6 @@ def _show_colors(imported: Imported) -> None:
                 if space.type == "VIEW_3D":
                     space.shading.type, space.shading.light, space.shading.color_type = "SOLID", "FLAT", "VERTEX"
                     space.clip_end = 1000.0
+                    space.overlay.show_relationship_lines = False  # one from every camera to the parent
                     if imported.cameras:
                         space.region_3d.view_perspective = "CAMERA"

@@ -136,10 +136,10 @@ class _Place:
 
 
 def _camera_size(package: Package) -> float:
-    """Display size of the cameras: a twentieth of what they span, in metres."""
+    """Display size of the cameras: a fortieth of what they span, in metres."""
     centers = np.array([np.array(c["camera_to_world"])[:3, 3] for c in package.cameras])
     extent = float(np.linalg.norm(centers.max(0) - centers.min(0))) if len(centers) else 0.0
-    return extent / 20 or 0.2
+    return extent / 40 or 0.1
 
 
 def _set_lens(data: bpy.types.Camera, entry: dict[str, Any]) -> None:

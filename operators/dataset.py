@@ -11,7 +11,7 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, St
 from bpy.types import Context, Event
 
 from ..addon import jobs
-from .base import VerbOperator
+from .base import VerbOperator, refresh_scenes, set_if_empty
 from .capture import project_for
 
 PATHS = [
@@ -114,14 +114,20 @@ class FIELDWORK_OT_dataset(VerbOperator):
         }
 
     def after(self) -> Callable[[jobs.Job], None]:
-        copy, make_project = Path(self._copy), self.make_project
+        copy, make_project, name = Path(self._copy), self.make_project, bpy.context.scene.name
+
+        def show(job: jobs.Job) -> None:
+            scene = bpy.data.scenes.get(name)  # another file may have been loaded meanwhile
+            if scene is not None and job.state == "done":
+                set_if_empty(scene, job.params["project"])
+            refresh_scenes(job)
 
         def done(job: jobs.Job) -> None:
             copy.unlink(missing_ok=True)
             if job.state == "done" and make_project:
                 folder = Path(job.params["out"])
                 params = {"dataset": str(folder), "project": str(project_for(folder)), "format": "transforms"}
-                following = jobs.queue.make("import", params)
+                following = jobs.queue.make("import", params, show)
                 if bpy.app.background:
                     jobs.queue.run(following)
                 else:

@@ -190,13 +190,14 @@ except RuntimeError as error:
     refused = str(error)
 from fieldwork.addon import jobs
 jobs.queue.stop_engine()
-answer({"result": list(result), "refused": refused, "left": os.listdir(bpy.app.tempdir)})
+answer({"result": list(result), "project": bpy.context.scene.fieldwork.project, "refused": refused, "left": os.listdir(bpy.app.tempdir)})
 """
 
 
 def test_the_operator_photographs_the_scene_as_it_is_and_makes_a_project(blend, tmp_path, bpy_script):
     facts = bpy_script(OPERATOR, blend=blend, out=tmp_path / "set")
     assert facts["result"] == ["FINISHED"]
+    assert facts["project"] == str(tmp_path / "set_fieldwork")
     assert "not empty" in facts["refused"]
     assert not any(name.endswith(".blend") for name in facts["left"])
     ids = json.loads((tmp_path / "set/classes.json").read_text())["classes"]

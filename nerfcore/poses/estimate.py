@@ -165,6 +165,7 @@ def _job(
         "sparse": str((folder / SPARSE_FOLDER).resolve()),
         "start": str((folder / SPARSE_FOLDER).resolve()) if extend else None,
         "preset": params.preset,
+        "restart": params.restart,
         "neighbours": VIDEO_NEIGHBOURS if from_video else PHOTO_NEIGHBOURS,
         "images": [
             {
@@ -254,3 +255,4 @@ def _write_report(
 
     report.stage("Drawing the report")
     draw_report(folder / PICTURE_FILE, project, poses, points, records, result["links"], names)
+    report.event("preview", path=str(folder / PICTURE_FILE))

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import sqlite3
-import threading
 import zlib  # noqa: F401  (must be loaded before pycolmap, which exports a static zlib)
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import combinations
 from pathlib import Path
@@ -34,26 +32,16 @@ def database(path: Path) -> Iterator[Any]:
 
 
 @contextmanager
-def polled(path: Path, query: str, total: int, tell: Callable[[float, str], None], noun: str) -> Iterator[None]:
-    """While the block runs, ask the database twice a second how many rows there are, and tell the progress."""
-    stop = threading.Event()
+def watched(path: Path, table: str, total: int, tell: Any, noun: str) -> Iterator[None]:
+    """While the block runs, progress is the number of new rows in a table of the database.
 
-    def poll() -> None:
-        while not stop.wait(0.5):
-            try:
-                with sqlite3.connect(f"file:{path}?mode=ro", uri=True, timeout=1) as connection:
-                    count = connection.execute(query).fetchone()[0]
-            except sqlite3.Error:
-                continue  # busy: the next poll will tell
-            tell(count / max(total, 1), f"{count} of {total} {noun}")
-
-    thread = threading.Thread(target=poll, daemon=True)
-    thread.start()
+    The parent process counts them: two copies of SQLite (Python's and COLMAP's) in one process undo each other's locks.
+    """
+    tell.watch(str(path), table, total, noun)
     try:
         yield
     finally:
-        stop.set()
-        thread.join()
+        tell.watch_end()
 
 
 def add_images(path: Path, image_folder: Path, images: list[dict[str, Any]]) -> None:
@@ -145,8 +133,7 @@ def extract(path: Path, image_folder: Path, masks: Path | None, names: list[str]
     if masks is not None:
         reader.mask_path = str(masks)
     tell.stage("Finding features")
-    query = "SELECT COUNT(*) FROM keypoints"
-    with polled(path, query, len(names), tell.progress, "photos"):
+    with watched(path, "keypoints", len(missing), tell, "photos"):
         pycolmap.extract_features(
             path, image_folder, missing, reader_options=reader, extraction_options=options, device=pycolmap.Device.cpu
         )
@@ -159,7 +146,6 @@ def match(path: Path, pairs: list[tuple[str, str]], list_file: Path, tell: Any) 
     with database(path) as db:
         ids = {image.name: image.image_id for image in db.read_all_images()}
         todo = [(a, b) for a, b in pairs if a in ids and b in ids and not db.exists_two_view_geometry(ids[a], ids[b])]
-        before = count_pairs(path)
     if not todo:
         return
     list_file.write_text("".join(f"{a} {b}\n" for a, b in todo), encoding="utf-8")
@@ -170,17 +156,8 @@ def match(path: Path, pairs: list[tuple[str, str]], list_file: Path, tell: Any) 
     matching.use_gpu = False
     tell.stage("Matching features")
 
-    def tell_new(fraction: float, _: str) -> None:
-        done = round(fraction * len(todo)) - before
-        tell.progress(done / len(todo), f"{done} of {len(todo)} pairs")
-
-    with polled(path, "SELECT COUNT(*) FROM two_view_geometries", len(todo), tell_new, "pairs"):
+    with watched(path, "two_view_geometries", len(todo), tell, "pairs"):
         pycolmap.match_image_pairs(path, matching, pairing, device=pycolmap.Device.cpu)
-
-
-def count_pairs(path: Path) -> int:
-    with sqlite3.connect(f"file:{path}?mode=ro", uri=True) as connection:
-        return connection.execute("SELECT COUNT(*) FROM two_view_geometries").fetchone()[0]
 
 
 def all_pairs(names: list[str]) -> list[tuple[str, str]]:

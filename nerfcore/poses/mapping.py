@@ -10,12 +10,14 @@ from typing import Any
 
 import pycolmap
 
+from . import resume
 from .features import FULL_MODEL_FROM, LONG_LENS
 from .validate import ImageCheck, check_images
 
 REPAIR_ROUNDS = 2
 PRINCIPAL_POINT_FROM = 10  # photos through one lens
 MAX_POINT_ERROR = 4.0  # pixels
+SNAPSHOT_EVERY = 40  # photos
 SEED = 1
 
 
@@ -34,23 +36,42 @@ def mapper_options(relaxed: bool, count: int, names: list[str]) -> Any:
 
 
 def build(
-    path: Path, image_folder: Path, output: Path, relaxed: bool, names: list[str], tell: Any, start: Path | None = None
+    path: Path,
+    image_folder: Path,
+    output: Path,
+    relaxed: bool,
+    names: list[str],
+    tell: Any,
+    start: Path | None = None,
+    memory: Path | None = None,
 ) -> list[Any]:
     """Reconstruct, from nothing or from the model in `start`; models with most images first.
 
-    With `start` the poses and lenses in it are kept as they are, and images are added to them.
+    With `start` the poses and lenses in it are kept as they are, and images are added to them. `memory` is a folder
+    in which snapshots and the outcome are kept, so that a run that was killed goes on from there.
     """
+    if memory is not None and (finished := resume.finished_models(memory)) is not None:
+        return finished
     shutil.rmtree(output, ignore_errors=True)
     output.mkdir(parents=True)
     options = mapper_options(relaxed, len(names), names)
-    done = 0
+    registered = 0
+    first = start
     if start is not None:
         options.fix_existing_frames = True
         options.multiple_models = False
         before = pycolmap.Reconstruction(str(start))
         options.constant_cameras = set(before.cameras)
-        done = before.num_reg_images()
-    registered = done
+        registered = before.num_reg_images()
+    elif memory is not None:
+        snapshots = memory / resume.SNAPSHOTS
+        snapshots.mkdir(parents=True, exist_ok=True)
+        options.snapshot_path = str(snapshots)
+        options.snapshot_frames_freq = SNAPSHOT_EVERY
+        first = resume.latest_snapshot(memory)
+        if first is not None:
+            registered = pycolmap.Reconstruction(str(first)).num_reg_images()
+    placed_before = registered
 
     def next_image() -> None:
         nonlocal registered
@@ -59,20 +80,23 @@ def build(
 
     def first_pair() -> None:
         nonlocal registered
-        registered = max(registered, done) + 2
+        registered = max(registered, placed_before) + 2
         tell.progress(registered / len(names), "first two photos placed")
 
     tell.stage("Placing cameras")
-    models = pycolmap.incremental_mapping(
+    found = pycolmap.incremental_mapping(
         path,
         image_folder,
         output,
         options,
-        input_path=str(start) if start else "",
+        input_path=str(first) if first else "",
         initial_image_pair_callback=first_pair,
         next_image_callback=next_image,
     )
-    return sorted(models.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
+    models = sorted(found.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
+    if memory is not None:
+        resume.keep_models(memory, models)
+    return models
 
 
 def repair(

@@ -13,6 +13,7 @@ from ..data.colmap_cameras import camera_from_colmap
 from ..errors import PosesError
 from . import features, mapping
 from .presets import ENOUGH, EXHAUSTIVE_AT_MOST, EXHAUSTIVE_UP_TO, LADDERS, Level
+from .resume import mapping_folder
 from .validate import MIN_POINTS, ImageCheck, pair_images
 
 MIN_FEATURES = 100
@@ -39,8 +40,8 @@ class Attempt:
 def run(job: dict[str, Any], tell: Any) -> dict[str, Any]:
     """Estimate poses for a job and write the sparse model.
 
-    Job: image_folder, masks (or null), work and sparse (folders), preset, neighbours, start (a model to extend, or
-    null), images [{file, group, width, height, focal_px}].
+    Job: image_folder, masks (or null), work and sparse (folders), preset, neighbours, restart (forget earlier mappings),
+    start (a model to extend, or null), images [{file, group, width, height, focal_px}].
 
     Returns:
         {cameras, images [{file, status, reason, camera, camera_to_world, agreement, points, error_px, mates}], links,
@@ -50,6 +51,8 @@ def run(job: dict[str, Any], tell: Any) -> dict[str, Any]:
     """
     work = Path(job["work"])
     work.mkdir(parents=True, exist_ok=True)
+    if job["restart"]:
+        shutil.rmtree(work / "mapping", ignore_errors=True)
     names = [image["file"] for image in job["images"]]
     best: Attempt | None = None
     levels = LADDERS[job["preset"]]
@@ -108,7 +111,8 @@ def _attempt(job: dict[str, Any], level: Level, names: list[str], exhaustive: bo
             continue  # no lens may have the full model: the next variant is this one
         if start is not None and full:
             continue  # lenses are those of the model that is extended
-        models = mapping.build(path, image_folder, work / "models", relaxed, names, tell, start)
+        memory = mapping_folder(work, path, full, relaxed, names) if start is None else None
+        models = mapping.build(path, image_folder, work / "models", relaxed, names, tell, start, memory)
         if not models:
             continue
         tell.stage("Checking poses")

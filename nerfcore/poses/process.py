@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import collections
+import contextlib
 import json
 import os
 import queue
 import shutil
 import signal
+import sqlite3
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -73,10 +76,40 @@ def run_worker(job: dict[str, Any], work: Path, report: Reporter) -> dict[str, A
     return result
 
 
+class _Watch:
+    """Progress as the number of rows that another process adds to a table of a database."""
+
+    def __init__(self, database: str, table: str, total: int, noun: str) -> None:
+        self.address, self.total, self.noun = f"{Path(database).absolute().as_uri()}?mode=ro", total, noun
+        self.query = f"SELECT COUNT(*) FROM {table}"
+        self.before = self._count() or 0
+        self.asked = time.monotonic()
+
+    def _count(self) -> int | None:
+        try:
+            with contextlib.closing(sqlite3.connect(self.address, uri=True, timeout=0.2)) as connection:
+                return connection.execute(self.query).fetchone()[0]
+        except sqlite3.Error as error:
+            log.debug("the pose database is busy: %s", error)
+            return None
+
+    def tell(self, report: Reporter) -> None:
+        if time.monotonic() - self.asked < 0.5:
+            return
+        self.asked = time.monotonic()
+        count = self._count()
+        if count is not None:
+            done = min(count - self.before, self.total)
+            report.progress(done / max(self.total, 1), f"{done} of {self.total} {self.noun}")
+
+
 def _follow(messages: queue.Queue[dict[str, Any] | None], report: Reporter) -> dict[str, Any] | None:
     """Pass messages on until the result arrives; None when the worker ends without one."""
+    watch: _Watch | None = None
     while True:
         report.check()
+        if watch is not None:
+            watch.tell(report)
         try:
             message = messages.get(timeout=0.2)
         except queue.Empty:
@@ -88,8 +121,10 @@ def _follow(messages: queue.Queue[dict[str, Any] | None], report: Reporter) -> d
                 report.stage(message["name"])
             case "progress":
                 report.progress(message["fraction"], message["message"])
-            case "event":
-                report.event(message["name"], **message["data"])
+            case "watch":
+                watch = _Watch(message["database"], message["table"], message["total"], message["noun"])
+            case "watch_end":
+                watch = None
             case "warn":
                 report.warn(message["message"])
             case "error":

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import os
-import sqlite3
 import sys
 import threading
 import traceback
@@ -35,11 +34,15 @@ class Channel:
     def progress(self, fraction: float, message: str = "") -> None:
         self.send("progress", fraction=min(max(fraction, 0.0), 1.0), message=message)
 
+    def watch(self, database: str, table: str, total: int, noun: str) -> None:
+        """From now on progress is the number of rows added to a table, of `total`."""
+        self.send("watch", database=database, table=table, total=total, noun=noun)
+
+    def watch_end(self) -> None:
+        self.send("watch_end")
+
     def warn(self, message: str) -> None:
         self.send("warn", message=message)
-
-    def event(self, name: str, **data: Any) -> None:
-        self.send("event", name=name, data=data)
 
 
 def _private_stdout() -> IO[str]:
@@ -61,21 +64,34 @@ def main() -> None:
     if not line:
         return
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    job = json.loads(line)
+    try:
+        _answer(json.loads(line), channel)
+    finally:
+        # An orderly shutdown would wait for the thread that watches stdin.
+        sys.stderr.flush()
+        os._exit(0)
+
+
+def _answer(job: dict[str, Any], channel: Channel) -> None:
     try:
         from .pipeline import run
 
         channel.send("result", value=run(job, channel))
     except FieldworkError as error:
         channel.send("error", code=error.code, message=error.message, hint=error.hint)
-    except (sqlite3.OperationalError, OSError, RuntimeError) as error:
+    except Exception as error:  # noqa: BLE001  (the boundary of the process: everything must reach the user)
         traceback.print_exc()
-        full = "full" in str(error).lower() or "no space" in str(error).lower()
-        message = f"No space left on the disk in {Path(job['work'])}." if full else f"Pose estimation failed: {error}."
+        full = isinstance(error, (OSError, RuntimeError)) and _is_full(error)
+        message = (
+            f"No space left on the disk in {Path(job['work'])}." if full else f"Pose estimation failed: {error!r}."
+        )
         hint = "Free some space and run it again: finished work is kept." if full else "Run it again."
         channel.send("error", code="disk" if full else "poses", message=message, hint=hint)
-    # The thread that watches stdin must not keep the process.
-    os._exit(0)
+
+
+def _is_full(error: Exception) -> bool:
+    text = str(error).lower()
+    return "full" in text or "no space" in text
 
 
 if __name__ == "__main__":

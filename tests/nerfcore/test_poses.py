@@ -297,6 +297,47 @@ def test_killed_in_each_stage_then_run_again(
     assert poses(project)["registered"] == 11
 
 
+def test_mapping_goes_on_from_a_snapshot(fountain: Path, tmp_path: Path) -> None:
+    """What a killed mapping left: whole snapshots, and a newer half one that must not be touched."""
+    import zlib  # noqa: F401
+
+    import pycolmap
+    from fieldwork.nerfcore.poses import mapping
+
+    class Counts:
+        messages: list[str] = []
+
+        def stage(self, name: str) -> None: ...
+
+        def progress(self, fraction: float, message: str = "") -> None:
+            self.messages.append(message)
+
+    (database,) = (fountain / "poses" / "sfm").glob("*.db")
+    shutil.copy(database, tmp_path / "f.db")
+    names = sorted(path.name for path in (fountain / "images").iterdir())
+    six = pycolmap.Reconstruction(str(fountain / "poses" / "sparse"))
+    six.transcribe_image_ids_to_database(pycolmap.Database.open(str(tmp_path / "f.db")))
+    for image_id in sorted(six.reg_image_ids())[6:]:
+        six.deregister_frame(six.image(image_id).frame_id)
+    memory = tmp_path / "memory"
+    for name in ("1", "2"):
+        (memory / "snapshots" / name).mkdir(parents=True)
+        six.write(str(memory / "snapshots" / name))
+        time.sleep(0.02)
+    half = memory / "snapshots" / "2" / "points3D.bin"
+    half.write_bytes(half.read_bytes()[:1000])
+    tell = Counts()
+    models = mapping.build(tmp_path / "f.db", fountain / "images", tmp_path / "out", False, names, tell, memory=memory)
+    assert models[0].num_reg_images() == 11
+    assert tell.messages[0].startswith("7 of 11")
+    # The outcome is remembered, and the snapshots are gone.
+    tell.messages.clear()
+    again = mapping.build(tmp_path / "f.db", fountain / "images", tmp_path / "out", False, names, tell, memory=memory)
+    assert again[0].num_reg_images() == 11
+    assert not tell.messages
+    assert not (memory / "snapshots").exists()
+
+
 def test_worker_ends_with_its_parent(shared_data: Data, tmp_path: Path) -> None:
     project = ingest(shared_data("fountain_p11"), tmp_path / "p", max_size=1000)
     code = (

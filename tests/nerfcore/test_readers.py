@@ -45,6 +45,10 @@ class Quiet:
 
     def progress(self, fraction: float, message: str = "") -> None: ...
 
+    def watch(self, database: str, table: str, total: int, noun: str) -> None: ...
+
+    def watch_end(self) -> None: ...
+
 
 def find_matches(views: list[DatasetView], work: Path) -> Matches:
     """Verified feature matches between views, found without their poses: pixels (N, 2) in both images."""

@@ -71,17 +71,17 @@ def build(
         first = resume.latest_snapshot(memory)
         if first is not None:
             registered = pycolmap.Reconstruction(str(first)).num_reg_images()
-    placed_before = registered
+    begun = registered > 0
 
-    def next_image() -> None:
+    def place(count: int) -> None:
         nonlocal registered
-        registered += 1
+        registered = min(registered + count, len(names))  # a second model counts its photos again
         tell.progress(registered / len(names), f"{registered} of {len(names)} photos placed")
 
     def first_pair() -> None:
-        nonlocal registered
-        registered = max(registered, placed_before) + 2
-        tell.progress(registered / len(names), "first two photos placed")
+        nonlocal begun
+        place(0 if begun else 2)  # it is called too when a model is taken up again
+        begun = False
 
     tell.stage("Placing cameras")
     found = pycolmap.incremental_mapping(
@@ -91,7 +91,7 @@ def build(
         options,
         input_path=str(first) if first else "",
         initial_image_pair_callback=first_pair,
-        next_image_callback=next_image,
+        next_image_callback=lambda: place(1),
     )
     models = sorted(found.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
     if memory is not None:

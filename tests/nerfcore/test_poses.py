@@ -329,7 +329,7 @@ def test_mapping_goes_on_from_a_snapshot(fountain: Path, tmp_path: Path) -> None
     tell = Counts()
     models = mapping.build(tmp_path / "f.db", fountain / "images", tmp_path / "out", False, names, tell, memory=memory)
     assert models[0].num_reg_images() == 11
-    assert tell.messages[0].startswith("7 of 11")
+    assert [message.split()[0] for message in tell.messages] == ["6", "7", "8", "9", "10", "11"]
     # The outcome is remembered, and the snapshots are gone.
     tell.messages.clear()
     again = mapping.build(tmp_path / "f.db", fountain / "images", tmp_path / "out", False, names, tell, memory=memory)

@@ -15,32 +15,40 @@ def srgb_to_linear(value: float) -> float:
     return value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4
 
 
-def make_group(name: str, root: bpy.types.Object) -> Any:
-    """The node group shared by all classes: class colour in, the colour to show out, switched by `root`."""
+def make_group(name: str, root: bpy.types.Object, texture: bpy.types.Image | None = None) -> Any:
+    """The node group shared by all classes: class colour in, the colour to show out, switched by `root`.
+
+    The colour of the photos is that of `texture` by the mesh's UVs, or without one that of its colour attribute. A
+    group of that name is built anew.
+    """
     tree = bpy.data.node_groups.get(name)
     if tree is None:
         tree = bpy.data.node_groups.new(name, "ShaderNodeTree")
         tree.interface.new_socket("Class Color", in_out="INPUT", socket_type="NodeSocketColor")
         tree.interface.new_socket("Color", in_out="OUTPUT", socket_type="NodeSocketColor")
-        nodes = tree.nodes
-        given, result = nodes.new("NodeGroupInput"), nodes.new("NodeGroupOutput")
+    tree.animation_data_clear()
+    nodes = tree.nodes
+    nodes.clear()
+    given, result = nodes.new("NodeGroupInput"), nodes.new("NodeGroupOutput")
+    if texture is None:
         photo = nodes.new("ShaderNodeAttribute")
         photo.attribute_name = COLOR_ATTRIBUTE
-        switch = nodes.new("ShaderNodeValue")
-        mix = nodes.new("ShaderNodeMix")
-        mix.data_type = "RGBA"
-        # The Mix node has sockets for every data type; the colour ones are inputs 6 and 7 and output 2.
-        for start, end in (
-            (switch.outputs[0], mix.inputs[0]),
-            (photo.outputs["Color"], mix.inputs[6]),
-            (given.outputs[0], mix.inputs[7]),
-            (mix.outputs[2], result.inputs[0]),
-        ):
-            tree.links.new(start, end)
-        for column, node in enumerate((given, photo, switch, mix, result)):
-            node.location = (200 * column, 0)
-    switch = next(node for node in tree.nodes if node.type == "VALUE")
-    switch.outputs[0].driver_remove("default_value")
+    else:
+        photo = nodes.new("ShaderNodeTexImage")
+        photo.image = texture
+    switch = nodes.new("ShaderNodeValue")
+    mix = nodes.new("ShaderNodeMix")
+    mix.data_type = "RGBA"
+    # The Mix node has sockets for every data type; the colour ones are inputs 6 and 7 and output 2.
+    for start, end in (
+        (switch.outputs[0], mix.inputs[0]),
+        (photo.outputs["Color"], mix.inputs[6]),
+        (given.outputs[0], mix.inputs[7]),
+        (mix.outputs[2], result.inputs[0]),
+    ):
+        tree.links.new(start, end)
+    for column, node in enumerate((given, photo, switch, mix, result)):
+        node.location = (260 * column, 0)
     driver = switch.outputs[0].driver_add("default_value").driver
     driver.type = "AVERAGE"  # a plain copy: needs no script execution
     variable = driver.variables.new()

@@ -22,7 +22,10 @@ class PackageError(SceneError):
 
 @dataclass(frozen=True)
 class Package:
-    """One capture. Points: `xyz` (N, 3), `rgb` (N, 3) uint8. `mesh` holds the arrays of mesh.npz, or None."""
+    """One capture. Points: `xyz` (N, 3), `rgb` (N, 3) uint8. `mesh` holds the arrays of mesh.npz, or None.
+
+    `texture` is a picture for the mesh's "uv" (F, 3, 2), v upwards; None where colours are the vertices'.
+    """
 
     folder: Path
     name: str
@@ -32,6 +35,7 @@ class Package:
     xyz: np.ndarray
     rgb: np.ndarray
     mesh: dict[str, np.ndarray] | None
+    texture: Path | None
 
 
 @dataclass(frozen=True)
@@ -93,6 +97,7 @@ def read_package(folder: Path | str) -> Package:
         xyz=points["xyz"],
         rgb=points["rgb"],
         mesh=mesh,
+        texture=folder / value["texture"] if value.get("texture") else None,
     )
 
 

@@ -14,7 +14,10 @@ PACKED_LIMIT = 256 * 2**20  # bytes of photos above which they stay outside the 
 
 
 def write_blend(request: dict[str, Any], emit: Callable[..., None]) -> dict[str, Any]:
-    """Build the package folder `request["package"]` in a new file and save it as `request["out"]`."""
+    """Build the package folder `request["package"]` in a new file and save it as `request["out"]`.
+
+    `request["split"]`: one mesh object for each class.
+    """
     emit(kind="stage", name="Building the Blender file")
     bpy.ops.wm.read_factory_settings()
     bpy.context.preferences.filepaths.save_version = 0
@@ -26,7 +29,10 @@ def write_blend(request: dict[str, Any], emit: Callable[..., None]) -> dict[str,
     scene.name = "Fieldwork"
     package = read_package(request["package"])
     imported = import_package(
-        scene, package, progress=lambda fraction, message: emit(kind="progress", fraction=fraction, message=message)
+        scene,
+        package,
+        split=request["split"],
+        progress=lambda fraction, message: emit(kind="progress", fraction=fraction, message=message),
     )
     prepare_scene(scene, len(package.cameras))
     _show_colors(imported)

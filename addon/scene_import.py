@@ -21,32 +21,39 @@ from .point_cloud import show_points
 ROLE, PROJECT = "fieldwork_role", "fieldwork_project"
 SIZE = "fieldwork_size"  # photo size in pixels, on camera objects
 CLASS_ATTRIBUTE, VERTEX_CLASS_ATTRIBUTE = "class_id", "vertex_class_id"
+VOID_COLOR = [0.15, 0.15, 0.15]
 Cameras = Literal["many", "animated", "both"]
 
 
 @dataclass
 class Imported:
-    """What is in the scene now. `warnings` are sentences for the user; `mesh` is None when the package has none."""
+    """What is in the scene now. `warnings` are sentences for the user; `meshes` is empty when the package
+    has none."""
 
     root: bpy.types.Object
     cameras: list[bpy.types.Object] = field(default_factory=list)
     animated: bpy.types.Object | None = None
     points: bpy.types.Object | None = None
-    mesh: bpy.types.Object | None = None
+    meshes: list[bpy.types.Object] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
+    @property
+    def mesh(self) -> bpy.types.Object | None:
+        return self.meshes[0] if self.meshes else None
+
     def objects(self) -> list[bpy.types.Object]:
-        single = [item for item in (self.animated, self.points, self.mesh) if item is not None]
-        return [self.root, *self.cameras, *single]
+        single = [item for item in (self.animated, self.points) if item is not None]
+        return [self.root, *self.cameras, *single, *self.meshes]
 
 
 def import_package(
     scene: bpy.types.Scene,
     package: Package,
     cameras: Cameras = "both",
+    split: bool = False,
     progress: Callable[[float, str], None] = lambda fraction, message: None,
 ) -> Imported:
-    """Build or update everything of a package in a scene and return it."""
+    """Build or update everything of a package in a scene and return it; `split`: one mesh object for each class."""
     place = _Place(scene, package.name)
     root = place.object("root", f"Fieldwork · {package.name}", None)
     root.empty_display_size = 0.2
@@ -66,7 +73,7 @@ def import_package(
         result.points = _points(place, package, root)
     progress(0.8, "mesh")
     if package.mesh is not None:
-        result.mesh = _mesh(place, package, root)
+        result.meshes = _meshes(place, package, root, split)
     place.remove_unused()
     if package.cameras:
         _frame_scene(scene, package, result)
@@ -221,7 +228,7 @@ def _points(place: _Place, package: Package, root: bpy.types.Object) -> bpy.type
     item.matrix_parent_inverse = item.matrix_basis = Matrix.Identity(4)
     item.hide_render = True
     centers = np.array([np.array(camera["camera_to_world"])[:3, 3] for camera in package.cameras]).reshape(-1, 3)
-    group = make_group(f"Fieldwork · {package.name}", root)
+    group = make_group(f"Fieldwork · {package.name} · points", root)
     material = make_material(f"{package.name} · points", [0.8, 0.8, 0.8], group)
     show_points(item, float(np.ptp(centers, axis=0).max(initial=0.0)) / 600 or 0.005, material)
     return item
@@ -237,19 +244,55 @@ def set_colors(mesh: bpy.types.Mesh, rgb: np.ndarray) -> None:
     mesh.color_attributes.render_color_index = mesh.color_attributes.find(COLOR_ATTRIBUTE)
 
 
-def _mesh(place: _Place, package: Package, root: bpy.types.Object) -> bpy.types.Object:
+def _meshes(place: _Place, package: Package, root: bpy.types.Object, split: bool) -> list[bpy.types.Object]:
+    """The surface as one object, or as one for each class that occurs."""
     arrays = package.mesh
     assert arrays is not None
-    mesh = _mesh_of(place.existing("mesh"), "Surface")
+    texture = None
+    if package.texture is not None:
+        texture = bpy.data.images.load(str(package.texture), check_existing=True)
+        texture.reload()
+    group = make_group(f"Fieldwork · {package.name}", root, texture)
+    if not split:
+        return [_mesh(place, package, root, "mesh", "Surface", arrays, group)]
+    names = {entry["id"]: entry["name"] for entry in package.classes}
+    made = []
+    for number in np.unique(arrays["face_class"]).tolist():
+        name = names.get(number, "void" if number == package.ignore_id else f"class {number}")
+        part = part_of(arrays, arrays["face_class"] == number)
+        made.append(_mesh(place, package, root, f"class:{number}", f"Surface · {name}", part, group))
+    return made
+
+
+def part_of(arrays: dict[str, np.ndarray], chosen: np.ndarray) -> dict[str, np.ndarray]:
+    """The arrays of a mesh (see `Package.mesh`) for a mask (F,) of its faces, with the vertices these use."""
+    used, corners = np.unique(arrays["faces"][chosen], return_inverse=True)
+    per_face = {name: arrays[name][chosen] for name in ("face_class", "uv") if name in arrays}
+    per_vertex = {name: arrays[name][used] for name in ("vertices", "colors", "class_id")}
+    return {"faces": corners.reshape(-1, 3).astype(np.int32), **per_face, **per_vertex}
+
+
+def _mesh(
+    place: _Place,
+    package: Package,
+    root: bpy.types.Object,
+    role: str,
+    name: str,
+    arrays: dict[str, np.ndarray],
+    group: bpy.types.NodeTree,
+) -> bpy.types.Object:
+    mesh = _mesh_of(place.existing(role), name)
     fill_triangles(mesh, arrays["vertices"], arrays["faces"])
     set_colors(mesh, arrays["colors"])
-    for name, domain, values in (
+    for attribute, domain, values in (
         (CLASS_ATTRIBUTE, "FACE", arrays["face_class"]),
         (VERTEX_CLASS_ATTRIBUTE, "POINT", arrays["class_id"]),
     ):
-        mesh.attributes.new(name, "INT", domain).data.foreach_set("value", values.astype(np.int32))
-    group = make_group(f"Fieldwork · {package.name}", root)
-    classes = [{"id": package.ignore_id, "name": "void", "color": [0.15, 0.15, 0.15]}, *package.classes]
+        mesh.attributes.new(attribute, "INT", domain).data.foreach_set("value", values.astype(np.int32))
+    if "uv" in arrays:
+        layer = mesh.uv_layers.new(name="UVMap")
+        layer.data.foreach_set("uv", np.ascontiguousarray(arrays["uv"], np.float32).ravel())
+    classes = [{"id": package.ignore_id, "name": "void", "color": VOID_COLOR}, *package.classes]
     slots: dict[int, int] = {}
     mesh.materials.clear()
     for entry in classes:
@@ -260,7 +303,7 @@ def _mesh(place: _Place, package: Package, root: bpy.types.Object) -> bpy.types.
         slot_of[number] = slot
     mesh.polygons.foreach_set("material_index", slot_of[np.maximum(arrays["face_class"], 0)])
     mesh.update()
-    item = place.object("mesh", "Surface", mesh, root)
+    item = place.object(role, name, mesh, root)
     item.matrix_parent_inverse = item.matrix_basis = Matrix.Identity(4)
     return item
 

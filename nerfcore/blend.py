@@ -41,7 +41,7 @@ def blend(params: BlendParams, report: Reporter) -> dict[str, Any]:
         # Blender writes beside its target and renames; the two names must stay on one disk.
         result = run_in_blender(
             "blend",
-            {"package": str(package), "out": str(temporary)},
+            {"package": str(package), "out": str(temporary), "split": params.split == "classes"},
             report,
             lambda event: report.progress(event["fraction"], event.get("message", "")),
         )

@@ -66,7 +66,9 @@ def write_package(project: Path, run: str, scene: Scene, name: str, report: Repo
     points = scene.points
     with atomic_path(folder / "points.npz") as temporary, open(temporary, "wb") as out:
         np.savez_compressed(out, xyz=points.xyz.astype(np.float32), rgb=points.rgb.astype(np.uint8))
-    has_mesh = _copy_mesh(project / "exports" / run / "mesh.npz", folder / "mesh.npz")
+    source = project / "exports" / run
+    has_mesh = _copy_mesh(source / "mesh.npz", folder / "mesh.npz")
+    has_texture = has_mesh and _copy_texture(source / "texture.png", folder)
     write_json(
         folder / "package.json",
         {
@@ -79,6 +81,7 @@ def write_package(project: Path, run: str, scene: Scene, name: str, report: Repo
             "classes": [{"id": c.id, "name": c.name, "color": list(c.color)} for c in scene.classes],
             "cameras": cameras,
             "mesh": has_mesh,
+            "texture": "texture.png" if has_texture else None,
         },
     )
     return folder
@@ -180,5 +183,17 @@ def _copy_mesh(source: Path, target: Path) -> bool:
     if missing:
         raise ProjectError(f"{source} lacks {', '.join(missing)}.", "Run `fieldwork mesh` again.")
     with atomic_path(target) as temporary:
+        shutil.copyfile(source, temporary)
+    return True
+
+
+def _copy_texture(source: Path, folder: Path) -> bool:
+    """Copy the texture of the packaged mesh; false when it has no UVs."""
+    with np.load(folder / "mesh.npz", allow_pickle=False) as data:
+        wanted = "uv" in data and source.is_file()
+    if not wanted:
+        (folder / "texture.png").unlink(missing_ok=True)
+        return False
+    with atomic_path(folder / "texture.png") as temporary:
         shutil.copyfile(source, temporary)
     return True

@@ -89,6 +89,7 @@ class PosesParams(Params):
     project: Path
     preset: Literal["fast", "standard", "robust"] = "standard"
     restart: bool = Field(False, description="place all photos anew, also those that have a pose")
+    group: int = Field(0, ge=0, description="where photos fall into separate groups: which to use, 0 being the largest")
 
 
 class AlignParams(Params):
@@ -145,6 +146,7 @@ class BlendParams(Params):
     project: Path
     out: Path
     run: str = "main"
+    split: Literal["none", "classes"] = Field("none", description="classes: one mesh object for each class")
 
 
 class PackageParams(Params):

@@ -48,7 +48,7 @@ def run(request):
     package = importlib.import_module(MODULE + ".addon.package").read_package(request["package"])
     imported = importlib.import_module(MODULE + ".addon.scene_import").import_package(bpy.context.scene, package)
     assert len(imported.cameras) == 2
-    assert len(imported.mesh.data.polygons) == 12
+    assert len(imported.meshes[0].data.polygons) == 12
     bpy.ops.wm.save_as_mainfile(filepath=str(out / "scene.blend"), copy=True)
     assert (out / "scene.blend").stat().st_size > 10_000
 

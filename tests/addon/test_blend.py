@@ -202,6 +202,40 @@ def test_render_from_the_first_camera_lies_on_the_first_photo(kind, tmp_path, bp
         assert (np.abs(labels.astype(int) - color).max(-1) <= 1).mean() > 0.1
 
 
+def textured(arrays: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """The same surface with its colours in a texture (16, 16, 3) instead: black vertices, UVs at texel centres."""
+    colors, index = np.unique(arrays["colors"][arrays["faces"][:, 0]], axis=0, return_inverse=True)
+    index = index.reshape(-1)
+    texture = np.zeros((16, 16, 3), np.uint8)
+    texture.reshape(-1, 3)[: len(colors)] = colors
+    uv = np.stack([(index % 16 + 0.5) / 16, 1 - (index // 16 + 0.5) / 16], -1)
+    return {
+        **arrays,
+        "colors": np.zeros_like(arrays["colors"]),
+        "uv": np.repeat(uv[:, None], 3, axis=1).astype(np.float32),
+    }, texture
+
+
+@pytest.mark.parametrize("split", ["none", "classes"])
+def test_a_textured_mesh_and_class_objects_lie_on_the_photo_too(split, tmp_path, bpy_script):
+    make_project(tmp_path / "p", [CAMERAS["off-centre"]])
+    arrays, texture = textured(surface())
+    np.savez(tmp_path / "p/exports/main/mesh.npz", **arrays)
+    Image.fromarray(texture).save(tmp_path / "p/exports/main/texture.png")
+    result = blend(BlendParams(project=tmp_path / "p", out=tmp_path / "scene.blend", split=split), Reporter())
+    surfaces = [name for name in result["objects"] if name.startswith("Surface")]
+    assert surfaces == {"none": ["Surface"], "classes": ["Surface · floor", "Surface · ball"]}[split]
+    bpy_script(RENDER, blend=tmp_path / "scene.blend", out=tmp_path)
+    photo = np.asarray(Image.open(tmp_path / "p/images/view_0.png")).astype(int)
+    render = np.asarray(Image.open(tmp_path / "photo.png").convert("RGB"))
+    error = np.abs(render - photo)
+    assert error.mean() < 5
+    assert np.median(error) <= 1
+    labels = np.asarray(Image.open(tmp_path / "labels.png").convert("RGB")).reshape(-1, 3)
+    for color in ((51, 128, 230), (230, 153, 26)):
+        assert (np.abs(labels.astype(int) - color).max(-1) <= 1).mean() > 0.1
+
+
 INSPECT = """
 bpy.ops.wm.open_mainfile(filepath=blend)
 import numpy as np
@@ -263,9 +297,9 @@ first = import_package(scene, read_package(package))
 count = [len(bpy.data.objects), len(bpy.data.meshes), len(bpy.data.materials), len(bpy.data.cameras),
          len(bpy.data.node_groups), len(bpy.data.images), len(bpy.data.collections)]
 first.root.location = (5, 0, 0)
-first.mesh.name = "Renamed"
+first.meshes[0].name = "Renamed"
 first.cameras[0].location.x += 3
-faces = len(first.mesh.data.polygons)
+faces = len(first.meshes[0].data.polygons)
 value = json.loads((Path(package) / "package.json").read_text())
 del value["cameras"][2]
 (Path(package) / "package.json").write_text(json.dumps(value))
@@ -275,10 +309,10 @@ answer({
     "count": count,
     "after": [len(bpy.data.objects), len(bpy.data.meshes), len(bpy.data.materials), len(bpy.data.cameras),
               len(bpy.data.node_groups), len(bpy.data.images), len(bpy.data.collections)],
-    "same": first.root == second.root and first.mesh == second.mesh and second.mesh.name == "Renamed",
+    "same": first.root == second.root and first.meshes == second.meshes and second.meshes[0].name == "Renamed",
     "root": list(second.root.location),
     "moved": second.cameras[0].matrix_world.translation.x - value["cameras"][0]["camera_to_world"][0][3],
-    "faces": [faces, len(second.mesh.data.polygons)],
+    "faces": [faces, len(second.meshes[0].data.polygons)],
     "cameras": len(second.cameras),
 })
 """

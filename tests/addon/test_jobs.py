@@ -191,3 +191,15 @@ def test_job_file_of_another_project_is_left_alone(queue, project, tmp_path):
     queue.reattach(project)
     assert queue.current is None
     assert queue.last is None
+
+
+@pytest.mark.parametrize(("choice", "state"), [("continue", "done"), ("stop", "cancelled")])
+def test_what_becomes_of_a_job_when_blender_crashes_is_the_users_choice(queue, settings, project, choice, state):
+    settings.on_close = choice
+    job = count(queue, project, steps=100)
+    queue.submit(job)
+    tick_until(queue, lambda: job.fraction)
+    # What the operating system does with the pipes of a process that is gone.
+    queue.link.process.stdin.close()
+    queue.link.process.wait(timeout=20)
+    assert st.read_job(st.job_path(project, job.id)).state == state

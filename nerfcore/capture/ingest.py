@@ -114,7 +114,8 @@ def new(params: NewParams, report: Reporter) -> dict[str, Any]:
         "masked": sum(record.mask is not None for record in used),
         "classes": [c.name for c in project.classes],
     }
-    project.record("new", params.model_dump(mode="json"), result)
+    origin = {"video_sha256": file_hash(photos)} if photos.is_file() else {}
+    project.record("new", params.model_dump(mode="json"), result | origin)
     save_project(folder, project)
     return result
 

@@ -61,7 +61,7 @@ def estimate_poses(params: PosesParams, report: Reporter) -> dict[str, Any]:
             f"{folder} has {len(records)} usable photos ({rejected} rejected); poses need at least {MIN_PHOTOS}.",
             "Add photos with `fieldwork new --add`; twenty to a hundred around the subject work well.",
         )
-    previous = None if params.restart else _extendable(folder, records)
+    previous = None if params.restart or params.group else _extendable(folder, records)
     work = folder / WORK_FOLDER
     with disk_errors(work):
         work.mkdir(parents=True, exist_ok=True)
@@ -166,6 +166,7 @@ def _job(
         "start": str((folder / SPARSE_FOLDER).resolve()) if extend else None,
         "preset": params.preset,
         "restart": params.restart,
+        "group": params.group,
         "neighbours": VIDEO_NEIGHBOURS if from_video else PHOTO_NEIGHBOURS,
         "images": [
             {

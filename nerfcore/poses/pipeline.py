@@ -40,7 +40,8 @@ class Attempt:
 def run(job: dict[str, Any], tell: Any) -> dict[str, Any]:
     """Estimate poses for a job and write the sparse model.
 
-    Job: image_folder, masks (or null), work and sparse (folders), preset, neighbours, restart (forget earlier mappings),
+    Job: image_folder, masks (or null), work and sparse (folders), preset, neighbours, restart (forget earlier mappings), group
+    (which of several separate models),
     start (a model to extend, or null), images [{file, group, width, height, focal_px}].
 
     Returns:
@@ -68,9 +69,11 @@ def run(job: dict[str, Any], tell: Any) -> dict[str, Any]:
         attempt = _attempt(job, level, names, exhaustive, tell)
         if best is None or attempt.registered > best.registered:
             best = attempt
-        if best.registered >= ENOUGH * len(names):
+        if best.registered >= ENOUGH * len(names) or (job["group"] and best.registered):
             break
     assert best is not None
+    if job["group"] and not best.registered:
+        raise PosesError(f"The photos do not fall into {job['group'] + 1} groups.", "Choose a smaller --group.")
     if best.registered < MIN_REGISTERED:
         raise PosesError(
             _why_nothing(best, names), "Take more photos that overlap by two thirds, with texture in view."
@@ -113,8 +116,9 @@ def _attempt(job: dict[str, Any], level: Level, names: list[str], exhaustive: bo
             continue  # lenses are those of the model that is extended
         memory = mapping_folder(work, path, full, relaxed, names) if start is None else None
         models = mapping.build(path, image_folder, work / "models", relaxed, names, tell, start, memory)
-        if not models:
+        if len(models) <= job["group"]:
             continue
+        models.insert(0, models.pop(job["group"]))
         tell.stage("Checking poses")
         model, checks, links, dropped = mapping.repair(models[0], path, image_folder, work, relaxed, names, tell)
         if model is None:

@@ -133,7 +133,9 @@ class Queue:
         self.facts: dict[str, Any] = {}  # what the engine last said of itself
         self.doctor: dict[str, Any] = {}  # what the doctor last found
         self.installer: Installer | None = None
-        self.slowest_tick = 0.0
+        self.slowest_tick = 0.0  # seconds of the longest look at the engine
+        self.slowest_result = 0.0  # of bringing a result into the scene, which Blender allows on its main thread only
+        self._in_results = 0.0
         self._number = 0
         self._looked = 0.0
         self._asked = 0.0
@@ -230,7 +232,7 @@ class Queue:
 
     def tick(self) -> float:
         """One look at the engine. Returns the seconds until the next."""
-        begin = time.perf_counter()
+        begin, self._in_results = time.perf_counter(), 0.0
         try:
             state.write_classes()
             if self.link:
@@ -247,7 +249,7 @@ class Queue:
         busy = self.current is not None or installing or (self.link is not None and self.link.busy)
         if busy:
             self.redraw()
-        self.slowest_tick = max(self.slowest_tick, time.perf_counter() - begin)
+        self.slowest_tick = max(self.slowest_tick, time.perf_counter() - begin - self._in_results)
         return BUSY_PERIOD if busy else IDLE_PERIOD
 
     def _start_next(self) -> None:
@@ -292,7 +294,10 @@ class Queue:
         if job.verb == "doctor" and result:
             self.doctor = result
         if job.on_done:
+            begin = time.perf_counter()
             job.on_done(job)
+            self.slowest_result = max(self.slowest_result, time.perf_counter() - begin)
+            self._in_results += time.perf_counter() - begin
         self.redraw()
 
     def _remember(self, job: Job) -> None:

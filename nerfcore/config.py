@@ -78,7 +78,7 @@ class SamplingConfig(Stage):
     epsilon: float = Field(0.01, gt=0, description="weight every open bin keeps")
     update_every: int = Field(16, ge=1, description="steps between updates of the occupancy grid")
     decay: float = Field(0.95, gt=0, lt=1, description="of the occupancy grid at each update")
-    threshold: float = Field(0.03, gt=0, description="opacity of a bin below which its cell is closed")
+    threshold: float = Field(0.01, gt=0, description="opacity of a bin below which its cell is closed")
     warmup: int = Field(256, ge=0, description="steps in which all cells are updated at once")
     coarse_cache: bool = Field(True, description="choose training rays by which image tiles met the field")
     cache_every: int = Field(1000, ge=1, description="steps between updates of the coarse cache")

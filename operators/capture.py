@@ -124,7 +124,7 @@ class FIELDWORK_OT_open(Operator):
 
     bl_idname = "fieldwork.open"
     bl_label = "Open Photos or Project"
-    bl_options = {"REGISTER", "UNDO"}
+    bl_options = {"UNDO"}
 
     filepath: StringProperty(subtype="FILE_PATH", options={"SKIP_SAVE"})
     directory: StringProperty(subtype="DIR_PATH", options={"SKIP_SAVE"})

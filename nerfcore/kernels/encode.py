@@ -13,7 +13,7 @@ import warp as wp
 from .runtime import array, init, launch, load, run_parallel
 
 FEATURES = 4
-BLOCK = 64  # vertices that share one "touched" flag of the optimiser
+BLOCK = 16  # vertices that share one "touched" flag of the optimiser
 feature = wp.types.vector(length=FEATURES, dtype=wp.float32)
 
 # Primes of the spatial hash; the first is 1 so that neighbours along x share cache lines.

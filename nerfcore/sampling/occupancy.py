@@ -14,7 +14,9 @@ from ..kernels.march import PDF_DEFAULT, PDF_LITERAL, PDF_UNIFORM, MarchSettings
 
 MODES = {"default": PDF_DEFAULT, "uniform": PDF_UNIFORM, "literal": PDF_LITERAL}
 CHUNK = 1 << 16
-WARM_DECAY = 0.7
+WARM_DECAY = 0.25
+MOST_OPTICAL_DEPTH = 0.5  # of a cell, for the sampling PDF
+SWEEPS = (1, 2, 4, 8, 12)  # updates of the warm-up at which the whole grid is read
 PROBES = 64  # one cell in so many is read at an update, and as many open ones
 
 
@@ -60,7 +62,16 @@ class OccupancyGrid(nn.Module):
         opacity = self.density * self.step
         threshold = min(float(opacity[self.seen].mean()), self.config.threshold) if bool(self.seen.any()) else 1.0
         opened = (opacity > threshold) & self.seen
-        self.cells[:, 0] = torch.where(opened, self.density, 0.0)
+        # Neighbours of open cells are open too, or rays would slip through where they only graze a thin shell of cells.
+        n = self.config.resolution
+        grown = opened.view(n, n, n).clone()
+        for axis in range(3):
+            along = opened.view(n, n, n)
+            grown.narrow(axis, 1, n - 1).logical_or_(along.narrow(axis, 0, n - 1))
+            grown.narrow(axis, 0, n - 1).logical_or_(along.narrow(axis, 1, n - 1))
+        opened = grown.view(-1) & self.seen
+        # A cell's density is its maximum, but a ray may pass through its empty part: no cell may take all the samples.
+        self.cells[:, 0] = torch.where(opened, self.density.clamp(1e-3, MOST_OPTICAL_DEPTH / self.step), 0.0)
         self.cells[:, 1] = self.interest
         m = self.config.resolution // 4
         self.blocks.copy_(opened.view(m, 4, m, 4, m, 4).any(5).any(3).any(1).reshape(-1))
@@ -83,10 +94,24 @@ class OccupancyGrid(nn.Module):
             opened = opened[torch.randint(0, len(opened), (n3 // PROBES,), device=device, generator=generator)]
         return torch.cat([anywhere, opened])
 
+    def _sweep(self, density: Callable[[torch.Tensor], torch.Tensor], generator: torch.Generator | None) -> None:
+        """Read one point in every block of 2³ cells, with quick forgetting of the initial guess."""
+        half = self.config.resolution // 2
+        axis = torch.arange(half, device=self.density.device)
+        z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
+        corner = torch.stack([x, y, z], -1).reshape(-1, 3)
+        points = (corner + torch.rand(corner.shape, device=corner.device, generator=generator)) / half
+        fresh = torch.cat([density(part) for part in points.split(CHUNK)])
+        blocks = fresh.view(half, 1, half, 1, half, 1).expand(half, 2, half, 2, half, 2).reshape(-1)
+        torch.maximum(self.density * WARM_DECAY, blocks, out=self.density)
+        self.density[~self.seen] = 0
+
     @torch.no_grad()
-    def observe(self, points: torch.Tensor, density: torch.Tensor) -> None:
+    def observe(self, points: torch.Tensor, density: torch.Tensor, warming_up: bool) -> None:
         """Take in the densities (N,) that a training step read anyway at points (N, 3); rays see it at the next update."""
-        observe(self.density, self.scratch, self.config.resolution, points, density, self.config.decay)
+        # A cell is observed at up to every step: its decay is spread over them.
+        decay = 0.9 if warming_up else self.config.decay ** (1 / self.config.update_every)
+        observe(self.density, self.scratch, self.config.resolution, points, density, decay)
 
     @torch.no_grad()
     def update(
@@ -103,8 +128,10 @@ class OccupancyGrid(nn.Module):
             interest: points (N, 3) → (N,) in [0, 1], asked for open cells only.
         """
         if step < self.config.warmup:
-            # The initial guess is soon forgotten where nobody looks.
-            self.density *= WARM_DECAY
+            if step // self.config.update_every in SWEEPS:
+                self._sweep(density, generator)
+            self.rebuild()
+            return
         cells = self._chosen(generator)
         cells = cells[self.seen[cells]]
         points = self.positions(cells, generator)

@@ -15,6 +15,9 @@ from ..kernels.march import Samples, sample
 from ..sampling.occupancy import OccupancyGrid, class_interest
 
 
+ONE_PASS_SHARE = 0.67
+
+
 @dataclass(frozen=True)
 class Rendered:
     """Of R rays: color (R, 3) without background, opacity (R,), depth (R,) expected distance (normalised units, not
@@ -58,6 +61,9 @@ class Model(nn.Module):
         self.occupancy = OccupancyGrid(config.sampling, contracted, seen)
         self.register_buffer("priorities", torch.ones(max(classes, 1)) if priorities is None else priorities)
         self.priorities: torch.Tensor
+        self.warming_up = False
+        self.register_buffer("shown_share", torch.ones(()))
+        self.shown_share: torch.Tensor
 
     @property
     def contracted(self) -> bool:
@@ -97,18 +103,24 @@ class Model(nn.Module):
         s = sample(
             origins, directions, self.occupancy.cells, self.occupancy.blocks, settings, samples_per_ray, jitter, shift
         )
-        # A first pass without gradients finds the samples that show; only they are differentiated and coloured.
-        with torch.no_grad():
+        # Where many samples turn out invisible, a first pass without gradients finds the others, and only those are
+        # differentiated; where nearly all show, one pass is cheaper (3k + 1 against 3 forward costs at share k).
+        first_look = not torch.is_grad_enabled() or float(self.shown_share) < ONE_PASS_SHARE
+        with torch.set_grad_enabled(torch.is_grad_enabled() and not first_look):
             everywhere = self.field.geometry(s.points)
             weights = render_weights(everywhere.density, s.delta, s.packing)
-            if self.training:
-                self.occupancy.observe(s.points, everywhere.density)
+        with torch.no_grad():
             visible = weights > self.config.render.cull
             kept, packing = visible.nonzero()[:, 0], s.packing.subset(visible)
-        shown = everywhere[kept]
-        if torch.is_grad_enabled():
-            shown = self.field.geometry(s.points[kept], shown.explicit)
-        weight = render_weights(shown.density, s.delta[kept], packing)
+            if self.training:
+                self.occupancy.observe(s.points, everywhere.density.detach(), self.warming_up)
+                self.shown_share += 0.05 * (len(kept) / max(len(s), 1) - self.shown_share)
+        delta = s.delta[kept]
+        if torch.is_grad_enabled() and first_look:
+            shown = self.field.geometry(s.points[kept], everywhere.explicit[kept] if everywhere.explicit is not None else None)
+            weight = render_weights(shown.density, delta, packing)
+        else:
+            shown, weight = everywhere[kept], weights[kept]
         ray = packing.ray.long()
         # Per ray first: a ray's samples share direction and code.
         directional = spherical_harmonics(directions).to(self.field.dtype)
@@ -119,7 +131,7 @@ class Model(nn.Module):
         probabilities = None
         if semantics and self.field.semantic_head is not None:
             probabilities = self._probabilities(self.field.logits(shown), weight, packing)
-        shown_samples = Samples(s.points[kept], depth, s.delta[kept], packing, s.first, s.last)
+        shown_samples = Samples(s.points[kept], depth, delta, packing, s.first, s.last)
         return Rendered(
             summed[:, :3], summed[:, 3], summed[:, 4], probabilities, weight, shown.density, shown_samples, len(s)
         )

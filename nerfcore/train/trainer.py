@@ -73,6 +73,7 @@ class Trainer:
         """One optimisation step at `progress` in [0, 1] of the schedule."""
         config, model = self.config, self.model
         model.field.set_progress(progress, config.train.fade, self.steps)
+        model.warming_up = self.steps < config.sampling.warmup
         if self.steps % config.sampling.update_every == 0:
             interest = model.interest if model.wants_interest() and self.steps >= config.sampling.warmup else None
             model.occupancy.update(self.steps, model.field.density, interest, self.generator)

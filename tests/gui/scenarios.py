@@ -299,4 +299,5 @@ def drop(screen, folder):
 def finish(screen):
     """What every scenario promises."""
     screen.facts["slowest_tick"] = screen.queue.slowest_tick
+    screen.facts["slowest_result"] = screen.queue.slowest_result
     yield 0.1

@@ -1,6 +1,6 @@
 """Make the pictures of docs/user-guide.md from the screenshots that `make gui` left in build/gui.
 
-    python tests/gui/guide_images.py
+python tests/gui/guide_images.py
 """
 
 from __future__ import annotations

@@ -1,0 +1,115 @@
+"""What the panels decide and say. How they look is tested in the window (tests/gui)."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+pytest.importorskip("bpy")
+
+from fieldwork.addon.jobs import Job
+from fieldwork.panels.base import duration, progress_text, wrap
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(None, ""), (0.2, "0 s"), (59.4, "59 s"), (60, "1:00 min"), (185, "3:05 min"), (3600, "1:00 h"), (7860, "2:11 h")],
+)
+def test_durations_are_said_as_people_do(seconds, text):
+    assert duration(seconds) == text
+
+
+def test_progress_says_what_how_much_and_how_long():
+    job = Job("train", {}, "x", state="running")
+    assert progress_text(job) == "Training"
+    job.stage, job.fraction, job.eta = "Warming up", 0.254, 95.0
+    assert progress_text(job) == "Warming up · 25% · 1:35 min left"
+    job.state = "cancelling"
+    assert progress_text(job) == "Stopping…"
+
+
+def test_wrapped_text_keeps_its_words_and_breaks_long_paths():
+    text = "Nothing could be read from /home/somebody/a/very/long/path/that/never/ends/photo.jpg at all"
+    lines = wrap(text, 24)
+    assert all(len(line) <= 25 for line in lines)
+    assert "".join(lines).replace(" ", "") == text.replace(" ", "")
+    assert wrap("", 10) == []
+
+
+def test_the_next_step_leads_from_nothing_to_the_model(bpy_script, tmp_path):
+    steps = bpy_script(
+        """
+import fieldwork
+fieldwork.register()
+from fieldwork.addon import jobs
+from fieldwork.panels.main import next_step
+settings = bpy.context.scene.fieldwork
+folder = Path(project)
+seen = []
+def look():
+    step = next_step(bpy.context)
+    seen.append(step and step.operator + (" resume" if step.resume else ""))
+def write(name, value):
+    (folder / name).parent.mkdir(parents=True, exist_ok=True)
+    (folder / name).write_text(json.dumps(value))
+look()
+settings.photos = "/photos"
+look()
+settings.project = project
+look()
+write("project.json", {"format": "fieldwork-project"})
+look()
+write("poses/poses.json", {})
+look()
+write("runs/main/field.safetensors", "")
+look()
+write("runs/main/metrics.json", {"train": {"psnr": 30}})
+look()
+step = {"verb": "mesh", "result": {"faces": 8}}
+write("project.json", {"format": "fieldwork-project", "provenance": [step]})
+os.utime(folder / "project.json", (1, 1))
+look()
+settings.run = "second"
+look()
+jobs.queue.running = jobs.queue.make("train", {"project": project})
+look()
+answer(seen)
+""",
+        project=tmp_path / "project",
+    )
+    assert steps == [
+        "fieldwork.open",
+        "fieldwork.new",
+        "fieldwork.new",
+        "fieldwork.poses",
+        "fieldwork.train",
+        "fieldwork.train resume",
+        "fieldwork.mesh",
+        "fieldwork.import_scene",
+        "fieldwork.train",
+        None,
+    ]
+
+
+def test_quality_and_time_come_from_the_project(tmp_path):
+    from types import SimpleNamespace
+
+    from fieldwork.addon import state
+
+    project = {
+        "format": "fieldwork-project",
+        "provenance": [
+            {"verb": "train", "settings": {"preset": "draft"}, "result": {"seconds": 90.0}},
+            {"verb": "train", "settings": {"preset": "draft", "time_limit": 5.0}, "result": {"seconds": 5.0}},
+        ],
+    }
+    (tmp_path / "project.json").write_text(json.dumps(project))
+    (tmp_path / "runs" / "main").mkdir(parents=True)
+    (tmp_path / "runs" / "main" / "metrics.json").write_text(json.dumps({"test": {"psnr": 27.34, "miou": 0.871}}))
+    settings = SimpleNamespace(time_limit=0.0, steps=0, preset="draft")
+    assert state.time_estimate(tmp_path, settings) == 90.0
+    settings.preset = "high"
+    assert state.time_estimate(tmp_path, settings) is None
+    assert state.quality(tmp_path, "main") == "27.3 dB, mIoU 0.87"
+    assert state.quality(tmp_path, "other") == ""

@@ -13,10 +13,10 @@ from fieldwork.nerfcore.data.similarity import transform_points
 from fieldwork.nerfcore.errors import DiskError, FieldworkError, PosesError
 from fieldwork.nerfcore.poses import process
 from fieldwork.nerfcore.project import load_points, load_poses, load_project, load_scene, load_visibility
+from fieldwork.tests.nerfcore.support.captures import centre_errors, ingest, poses
 from PIL import Image
 
 Data = Callable[[str], Path]
-from fieldwork.tests.nerfcore.support.captures import centre_errors, ingest, poses
 
 
 def test_fountain_is_accurate(fountain: Path, shared_data: Data) -> None:

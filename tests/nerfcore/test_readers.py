@@ -25,12 +25,23 @@ from fieldwork.nerfcore.errors import FieldworkError, InputError, ProjectError
 from fieldwork.nerfcore.params import ImportParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project import load_project, load_scene
+from fieldwork.tests.nerfcore.support.matches import Matches, epipolar_error, find_matches
+from fieldwork.tests.nerfcore.support.writers import (
+    bend,
+    write_colmap_binary,
+    write_colmap_text,
+    write_dtu,
+    write_llff,
+    write_meshroom,
+    write_metashape,
+    write_realityscan,
+    write_replica,
+    write_scannet,
+    write_transforms,
+)
 from PIL import Image
 
 Data = Callable[[str], Path]
-Matches = dict[tuple[str, str], tuple[np.ndarray, np.ndarray]]
-from fieldwork.tests.nerfcore.support.matches import Matches, epipolar_error, find_matches
-from fieldwork.tests.nerfcore.support.writers import *
 
 
 @pytest.mark.parametrize(

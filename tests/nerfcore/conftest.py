@@ -1,0 +1,20 @@
+"""Fixtures of the engine's tests."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from fieldwork.tests.nerfcore.support.captures import ingest, poses
+
+Data = Callable[[str], Path]
+
+
+@pytest.fixture(scope="session")
+def fountain(shared_data: Data, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The fountain, ingested at 1000 pixels and posed; tests that change it copy it."""
+    project = tmp_path_factory.mktemp("poses") / "Brunnen ü"
+    ingest(shared_data("fountain_p11"), project, max_size=1000)
+    poses(project)
+    return project

@@ -1,0 +1,146 @@
+"""Label maps, masks and class files."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fieldwork.nerfcore.capture import ingest
+from fieldwork.nerfcore.errors import InputError
+from fieldwork.nerfcore.params import NewParams
+from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.project import load_project
+from fieldwork.tests.nerfcore.support.photos import exif, folder_of, new, picture
+from PIL import Image
+
+
+def labels(size: tuple[int, int] = (320, 200)) -> np.ndarray:
+    values = np.zeros((size[1], size[0]), np.uint8)
+    values[:, size[0] // 2 :] = 1
+    values[size[1] // 2 :, :] = 7
+    return values
+
+
+COLORS = {0: (0, 0, 0), 1: (200, 10, 10), 7: (10, 10, 200)}
+CLASSES = {"classes": {str(i): {"name": f"c{i}", "color": COLORS[i]} for i in (1, 7)}}
+
+
+def write_labels(folder: Path, kind: str, name: str) -> None:
+    folder.mkdir(exist_ok=True)
+    values = labels()
+    if kind == "index":
+        Image.fromarray(values).save(folder / name)
+    elif kind == "index16":
+        Image.fromarray(values.astype(np.uint16)).save(folder / name)
+    elif kind == "palette":
+        image = Image.fromarray(values).convert("P")
+        image.putpalette([c for i in range(8) for c in COLORS.get(i, (1, 1, 1))])
+        image.save(folder / name)
+    elif kind == "palette colours":  # the order of the palette is not that of the ids
+        order = {0: 2, 1: 0, 7: 1}
+        image = Image.fromarray(np.vectorize(order.get)(values).astype(np.uint8)).convert("P")
+        image.putpalette([*COLORS[1], *COLORS[7], *COLORS[0]])
+        image.save(folder / name)
+    else:
+        rgb = np.zeros((*values.shape, 3), np.uint8)
+        for i, color in COLORS.items():
+            rgb[values == i] = color
+        Image.fromarray(rgb).save(folder / name)
+
+
+@pytest.mark.parametrize("kind", ["index", "index16", "palette", "palette colours", "rgb"])
+def test_label_formats(tmp_path: Path, kind: str) -> None:
+    photos = folder_of(tmp_path / "photos")
+    write_labels(tmp_path / "labels", kind, "p1.png")
+    (tmp_path / "labels" / "classes.json").write_text(json.dumps(CLASSES))
+    if kind == "palette":
+        CLASSES_BY_INDEX = {"classes": {"1": "c1", "7": "c7"}}
+        (tmp_path / "labels" / "classes.json").write_text(json.dumps(CLASSES_BY_INDEX))
+    result = new(photos, tmp_path / "p", labels=tmp_path / "labels", max_size=160)
+    assert result["labelled"] == 1  # labels for some photos only are normal
+    assert result["classes"] == ["c1", "c7"]
+    record = next(r for r in load_project(tmp_path / "p").images if r.label)
+    assert record.name == "p1"
+    with Image.open(tmp_path / "p" / record.label) as image:
+        small = np.asarray(image)
+    assert small.shape == (100, 160)
+    assert set(np.unique(small)) == {0, 1, 7}  # nearest neighbour: no id that was not there
+    assert np.array_equal(small, labels()[1::2, 1::2])
+
+
+def test_unusable_labels_are_named_and_left_out(tmp_path: Path) -> None:
+    photos = folder_of(tmp_path / "photos")
+    (tmp_path / "labels").mkdir()
+    Image.fromarray(labels()).save(tmp_path / "labels" / "p0.jpg")
+    Image.fromarray(labels((200, 320))).save(tmp_path / "labels" / "p1.png")
+    picture().save(tmp_path / "labels" / "p2.png")
+    report = Reporter()
+    params = NewParams(photos=photos, project=tmp_path / "p", labels=tmp_path / "labels")
+    assert ingest.new(params, report)["labelled"] == 0
+    text = " ".join(report.warnings)
+    assert "compression changes ids" in text
+    assert "not the shape of the photo" in text
+    assert "--classes" in text
+
+
+def test_unknown_label_colour_is_named(tmp_path: Path) -> None:
+    photos = folder_of(tmp_path / "photos")
+    write_labels(tmp_path / "labels", "rgb", "p0.png")
+    (tmp_path / "classes.json").write_text(json.dumps({"classes": {"1": {"name": "a", "color": COLORS[1]}}}))
+    report = Reporter()
+    new_params = NewParams(
+        photos=photos, project=tmp_path / "p", labels=tmp_path / "labels", classes=tmp_path / "classes.json"
+    )
+    ingest.new(new_params, report)
+    assert any("50.0 % of its pixels" in warning and "#0a0ac8" in warning for warning in report.warnings)
+
+
+def test_labels_follow_the_orientation(tmp_path: Path) -> None:
+    """A phone photo stored sideways; its labels drawn on the sideways picture."""
+    photos, folder = tmp_path / "photos", tmp_path / "labels"
+    photos.mkdir()
+    folder.mkdir()
+    upright = picture()
+    for i in range(3):
+        sideways = picture(i).transpose(Image.Transpose.ROTATE_90)
+        sideways.save(photos / f"p{i}.jpg", quality=95, exif=exif(6))
+    assert upright.size == (320, 200)
+    Image.fromarray(labels()).transpose(Image.Transpose.ROTATE_90).save(folder / "p0.png")
+    new(photos, tmp_path / "p", labels=folder)
+    with Image.open(tmp_path / "p" / "labels" / "p0.png") as image:
+        assert np.array_equal(np.asarray(image), labels())
+
+
+@pytest.mark.parametrize("text", ["{", '{"classes": 3}', '["a", 3', '{"names": []}', '{"classes": {"x": "y"}}'])
+def test_unusable_classes_file(tmp_path: Path, text: str) -> None:
+    photos = folder_of(tmp_path / "photos")
+    (tmp_path / "classes.json").write_text(text)
+    with pytest.raises(InputError, match=r"classes file .*classes\.json"):
+        new(photos, tmp_path / "p", classes=tmp_path / "classes.json")
+
+
+def test_classes_as_a_list(tmp_path: Path) -> None:
+    photos = folder_of(tmp_path / "photos")
+    (tmp_path / "classes.json").write_text('["void", "Stein", "Gold"]')
+    new(photos, tmp_path / "p", classes=tmp_path / "classes.json")
+    classes = load_project(tmp_path / "p").classes
+    assert [(c.id, c.name) for c in classes] == [(1, "Stein"), (2, "Gold")]
+    assert len({c.color for c in classes}) == 2
+    assert (0.0, 0.0, 0.0) not in {c.color for c in classes}
+
+
+def test_masks(tmp_path: Path) -> None:
+    photos = folder_of(tmp_path / "photos")
+    (tmp_path / "masks").mkdir()
+    mask = np.zeros((200, 320), np.uint8)
+    mask[50:150] = 255
+    Image.fromarray(mask).save(tmp_path / "masks" / "p0_mask.png")
+    Image.fromarray(mask).save(tmp_path / "masks" / "p10.png")  # belongs to another photo
+    result = new(photos, tmp_path / "p", masks=tmp_path / "masks", mask_mode="empty")
+    assert result["masked"] == 1
+    project = load_project(tmp_path / "p")
+    assert project.mask_mode == "empty"
+    with Image.open(tmp_path / "p" / "masks" / "p0.png") as image:
+        assert np.array_equal(np.asarray(image), mask)

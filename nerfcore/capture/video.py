@@ -78,6 +78,40 @@ def _save(best: tuple[float, int, Image.Image], video: Path, folder: Path) -> Pa
     return path
 
 
+def every_nth(video: Path, count: int) -> int | None:
+    """The n for which taking every n-th frame of a video, from the first, gives `count` frames; None if none or many do.
+
+    Raises:
+        InputError: the file is no video.
+    """
+    try:
+        with av.open(str(video)) as container:
+            stream = container.streams.video[0]
+            frames = stream.frames or sum(packet.pts is not None for packet in container.demux(stream))
+    except (av.FFmpegError, IndexError) as error:
+        raise InputError(f"{video} cannot be decoded: {error}.", "Choose another video.") from error
+    found = [n for n in range(1, frames + 1) if -(-frames // n) == count]
+    return found[0] if len(found) == 1 else None
+
+
+def save_every_nth(video: Path, n: int, folder: Path) -> list[Path]:
+    """Save every n-th frame of a video, from the first, upright, as PNG files in `folder`, in order.
+
+    Raises:
+        InputError: the video cannot be decoded to its end.
+    """
+    paths = []
+    try:
+        with av.open(str(video)) as container:
+            for number, frame in enumerate(container.decode(container.streams.video[0])):
+                if number % n == 0:
+                    paths.append(folder / f"{video.stem}_{number:06d}.png")
+                    _upright(frame).save(paths[-1], compress_level=1)
+    except av.FFmpegError as error:
+        raise InputError(f"{video} cannot be decoded: {error}.", "Choose another video.") from error
+    return paths
+
+
 def _finished(folder: Path, key: list[Any]) -> list[Path]:
     try:
         index = json.loads((folder / INDEX_FILE).read_text(encoding="utf-8"))

@@ -15,9 +15,8 @@ from .scene import Points
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".exr", ".bmp", ".ppm", ".heic", ".heif")
 
-# World axes of common conventions, turned so that z is up.
+# A world with y up, turned so that z is up.
 Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-Y_DOWN = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 
 
 @dataclass(frozen=True)
@@ -54,6 +53,7 @@ class Dataset:
     points: Points = field(default_factory=Points.empty)
     bounds: np.ndarray | None = None
     warnings: list[str] = field(default_factory=list)
+    resources: tuple[object, ...] = ()  # temporary folders that live as long as this
 
 
 def unique_names(paths: Sequence[Path], root: Path) -> list[str]:

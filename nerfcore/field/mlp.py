@@ -13,8 +13,11 @@ from typing import Literal
 import torch
 from torch import nn
 
+from ..kernels.runtime import run_parallel, worker_count
+
 Precision = Literal["auto", "float32", "bfloat16", "float16"]
-_CPU_ROWS = 16384
+_CPU_ROWS = 16384  # of activations that fit a core's cache
+_LEAST_ROWS = 1024
 
 
 def compute_dtype(precision: Precision, device: torch.device) -> torch.dtype:
@@ -29,7 +32,10 @@ def compute_dtype(precision: Precision, device: torch.device) -> torch.dtype:
 
 
 def _slices(rows: int, device: torch.device) -> list[slice]:
-    step = _CPU_ROWS if device.type == "cpu" else max(rows, 1)
+    """Parts of the rows: on the CPU one or more for each thread, small enough for its cache."""
+    if device.type != "cpu":
+        return [slice(0, rows)]
+    step = min(_CPU_ROWS, max(_LEAST_ROWS, -(-rows // worker_count())))
     return [slice(begin, min(begin + step, rows)) for begin in range(0, rows, step)]
 
 
@@ -39,11 +45,15 @@ class _Chain(torch.autograd.Function):
         ctx.dtype, ctx.input_dtype = dtype, x.dtype
         matrices = [w.to(dtype) for w in weights]
         layers = [x.to(dtype), *(torch.empty(len(x), len(w), dtype=dtype, device=x.device) for w in matrices)]
-        for part in _slices(len(x), x.device):
-            for index, matrix in enumerate(matrices):
-                torch.mm(layers[index][part], matrix.t(), out=layers[index + 1][part])
-                if index < len(matrices) - 1:
-                    layers[index + 1][part].relu_()
+
+        def run(part: slice) -> None:
+            with torch.no_grad():
+                for index, matrix in enumerate(matrices):
+                    torch.mm(layers[index][part], matrix.t(), out=layers[index + 1][part])
+                    if index < len(matrices) - 1:
+                        layers[index + 1][part].relu_()
+
+        run_parallel([lambda p=part: run(p) for part in _slices(len(x), x.device)])
         ctx.save_for_backward(*matrices, *layers[:-1])
         return layers[-1]
 
@@ -52,17 +62,24 @@ class _Chain(torch.autograd.Function):
         count = len(ctx.saved_tensors) // 2
         matrices, layers = ctx.saved_tensors[:count], ctx.saved_tensors[count:]
         grad = grads[0].to(ctx.dtype)
-        grad_weights = [torch.zeros_like(m, dtype=torch.float32) for m in matrices]
-        needs_input = ctx.needs_input_grad[0]
-        grad_input = torch.empty_like(layers[0]) if needs_input else None
-        for part in _slices(len(grad), grad.device):
-            g = grad[part]
-            for index in range(count - 1, -1, -1):
-                grad_weights[index] += torch.mm(g.t(), layers[index][part])
-                if index > 0:
-                    g = torch.ops.aten.threshold_backward(torch.mm(g, matrices[index]), layers[index][part], 0)
-                elif grad_input is not None:
-                    torch.mm(g, matrices[0], out=grad_input[part])
+        grad_input = torch.empty_like(layers[0]) if ctx.needs_input_grad[0] else None
+        parts = _slices(len(grad), grad.device)
+        partial: list[list[torch.Tensor]] = [[] for _ in parts]
+
+        def run(number: int, part: slice) -> None:
+            with torch.no_grad():
+                g = grad[part]
+                for index in range(count - 1, -1, -1):
+                    partial[number].append(torch.mm(g.t(), layers[index][part]).float())
+                    if index > 0:
+                        g = torch.ops.aten.threshold_backward(torch.mm(g, matrices[index]), layers[index][part], 0)
+                    elif grad_input is not None:
+                        torch.mm(g, matrices[0], out=grad_input[part])
+
+        run_parallel([lambda n=number, p=part: run(n, p) for number, part in enumerate(parts)])
+        # Summed in the order of the slices, whatever order they ran in.
+        sums = [torch.stack(column).sum(0) for column in zip(*partial)]
+        grad_weights = sums[::-1] if sums else [torch.zeros_like(m, dtype=torch.float32) for m in matrices]
         return None if grad_input is None else grad_input.to(ctx.input_dtype), None, *grad_weights
 
 

@@ -8,6 +8,7 @@ and begin with `i = wp.tid() + offset`. On CUDA the whole range is one launch on
 from __future__ import annotations
 
 import os
+import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -31,12 +32,15 @@ def worker_count() -> int:
 
 @cache
 def _pool(workers: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(workers, thread_name_prefix="kernel")
+    # Each thread works on its own slice of rows; torch operations inside it must not start threads of their own.
+    return ThreadPoolExecutor(workers, "kernel", initializer=torch.set_num_threads, initargs=(1,))
 
 
 @cache
 def init() -> None:
     """Start Warp once (a fraction of a second)."""
+    # Kernel threads hold the interpreter lock for microseconds; at the default 5 ms they would wait for each other.
+    sys.setswitchinterval(1e-4)
     wp.init()
 
 
@@ -89,6 +93,10 @@ def launch(kernel: wp.Kernel, count: int, inputs: list[Any], device: torch.devic
 
 def run_parallel(tasks: list[Any]) -> None:
     """Run callables in the kernel pool and wait for all; the first exception is raised."""
+    if worker_count() == 1:
+        for task in tasks:
+            task()
+        return
     for future in [_pool(worker_count()).submit(task) for task in tasks]:
         future.result()
 

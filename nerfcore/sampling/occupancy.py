@@ -95,14 +95,14 @@ class OccupancyGrid(nn.Module):
         return torch.cat([anywhere, opened])
 
     def _sweep(self, density: Callable[[torch.Tensor], torch.Tensor], generator: torch.Generator | None) -> None:
-        """Read one point in every block of 2³ cells, with quick forgetting of the initial guess."""
-        half = self.config.resolution // 2
-        axis = torch.arange(half, device=self.density.device)
+        """Read one point in every block of 4³ cells, with quick forgetting of the initial guess."""
+        side = self.config.resolution // 4
+        axis = torch.arange(side, device=self.density.device)
         z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
         corner = torch.stack([x, y, z], -1).reshape(-1, 3)
-        points = (corner + torch.rand(corner.shape, device=corner.device, generator=generator)) / half
+        points = (corner + torch.rand(corner.shape, device=corner.device, generator=generator)) / side
         fresh = torch.cat([density(part) for part in points.split(CHUNK)])
-        blocks = fresh.view(half, 1, half, 1, half, 1).expand(half, 2, half, 2, half, 2).reshape(-1)
+        blocks = fresh.view(side, 1, side, 1, side, 1).expand(side, 4, side, 4, side, 4).reshape(-1)
         torch.maximum(self.density * WARM_DECAY, blocks, out=self.density)
         self.density[~self.seen] = 0
 

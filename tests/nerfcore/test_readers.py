@@ -250,9 +250,20 @@ def test_rotated_photo_keeps_the_pixels_its_pose_is_for(shared_data: Data, tmp_p
 # --- damage ---------------------------------------------------------------------------------------------------------
 
 
-def test_video_with_poses_says_what_to_do(shared_data: Data) -> None:
-    with pytest.raises(InputError, match=r"no images, only the video can\.mp4.*fieldwork new"):
-        read_dataset(shared_data("can_video"))
+def test_video_with_poses(shared_data: Data, tmp_path: Path) -> None:
+    """71 poses of a video of 706 frames: every tenth. One frame off would miss the epipolar lines by 20 pixels."""
+    dataset = read_dataset(shared_data("can_video"))
+    assert len(dataset.views) == 71
+    assert any("every 10th frame" in warning for warning in dataset.warnings)
+    views = dataset.views[20:41:4]
+    assert epipolar_error(views, find_matches(views, tmp_path / "work")) < 1.5
+
+
+def test_video_whose_frames_cannot_be_told(shared_data: Data, tmp_path: Path) -> None:
+    shutil.copy(shared_data("can_video") / "can.mp4", tmp_path)
+    np.save(tmp_path / "poses_bounds.npy", np.load(shared_data("can_video") / "poses_bounds.npy")[:5])
+    with pytest.raises(InputError, match=r"only can\.mp4.*fieldwork new"):
+        read_dataset(tmp_path)
 
 
 def test_unknown_folder(tmp_path: Path) -> None:

@@ -1,23 +1,24 @@
 """LLFF's poses_bounds.npy: (N, 17) per image a 3×5 matrix (pose, then height, width, focal) and near, far.
 
 The pose columns are LLFF's axes (down, right, backwards); one focal length, no distortion. Images are matched with the
-rows in name order. Source: the LLFF repository's description of its format.
+rows in name order; where there is only a video, with every n-th of its frames if one n fits the number of rows. Source: the LLFF repository's description of its format.
 """
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
 
 import numpy as np
 
 from ...capture.images import image_size
+from ...capture.video import VIDEO_SUFFIXES, every_nth, save_every_nth
 from ...errors import InputError
 from ..cameras import Camera
 from ..dataset import Dataset, DatasetView, beside, list_images, require, unique_names
 from ..frames import upright
 
 FILE = "poses_bounds.npy"
-VIDEO_SUFFIXES = (".mp4", ".mov", ".webm", ".mkv", ".avi")
 
 
 def matches(folder: Path) -> bool:
@@ -39,11 +40,21 @@ def read(folder: Path) -> Dataset:
     if rows.ndim != 2 or rows.shape[1] != 17 or not np.isfinite(rows).all():
         raise InputError(f"{path} has shape {rows.shape}, not (N, 17).", "Export the poses again.")
     images = next((found for name in ("images", ".") if (found := list_images(folder / name))), [])
-    if not images and (videos := [p for p in folder.iterdir() if p.suffix.lower() in VIDEO_SUFFIXES]):
-        raise InputError(
-            f"{folder} has poses but no images, only the video {videos[0].name}: nothing says which frames they are of.",
-            f"Use `fieldwork new PROJECT --photos {videos[0].name}` and `fieldwork poses` instead.",
-        )
+    resources, warnings = (), []
+    videos = [path for path in folder.iterdir() if path.suffix.lower() in VIDEO_SUFFIXES]
+    if not images and len(videos) == 1:
+        step = every_nth(videos[0], len(rows))
+        if step is None:
+            raise InputError(
+                f"{folder} has no images, only {videos[0].name}, and nothing says which frames the {len(rows)} poses "
+                "are of.",
+                f"Use `fieldwork new PROJECT --photos {videos[0].name}` and `fieldwork poses` instead.",
+            )
+        # It lives as long as the data set that names its files.
+        temporary = tempfile.TemporaryDirectory(prefix="fieldwork-")
+        resources = (temporary,)
+        images = save_every_nth(videos[0], step, Path(temporary.name))
+        warnings = [f"The {len(rows)} poses are taken to be those of every {step}th frame of {videos[0].name}."]
     if len(images) != len(rows):
         raise InputError(
             f"{folder} has {len(images)} images, but {FILE} has {len(rows)} poses.",
@@ -53,7 +64,14 @@ def read(folder: Path) -> Dataset:
     views = [_view(folder, name, image, row[:15].reshape(3, 5)) for name, image, row in zip(names, images, rows)]
     require(views, folder)
     world_from_sfm, confidence = upright([view.camera_to_world for view in views])
-    return Dataset(format="llff", views=views, world_from_sfm=world_from_sfm, up_confidence=confidence)
+    return Dataset(
+        format="llff",
+        views=views,
+        world_from_sfm=world_from_sfm,
+        up_confidence=confidence,
+        warnings=warnings,
+        resources=resources,
+    )
 
 
 def _view(folder: Path, name: str, image: Path, matrix: np.ndarray) -> DatasetView:

@@ -18,7 +18,7 @@ SIDEBAR = (1288, 84, 1548, None)
 VIEW = (0, 50, 1576, 980)
 # name: (screenshot, part of it, width in the guide)
 IMAGES = {
-    "preferences": ("preferences/preferences", (56, 140, 1010, 700), 720),
+    "preferences": ("preferences/preferences", (280, 362, 968, 690), 688),
     "drop": ("capture/drop-menu", (300, 300, 1000, 620), 480),
     "capture": ("capture/posed-capture", SIDEBAR, 260),
     "posing": ("capture/posing", SIDEBAR, 260),

@@ -20,9 +20,11 @@ def capture(screen):
     yield from drop(screen, PHOTOS)
     settings = bpy.context.scene.fieldwork
     screen.facts["dropped"] = [settings.photos, settings.project]
-    # Beside the photos may not be written here.
-    settings.project = str(screen.folder / "project")
+    # Beside the photos may not be written here; short names keep the machine's folders out of the pictures.
+    settings.photos = alias(PHOTOS, "banana")
+    settings.project = alias(screen.folder / "project", "banana_fieldwork")
     settings.max_size = 480
+    bpy.data.objects.remove(bpy.data.objects["Cube"])
     screen.shot("dropped")
     yield from screen.press_button("fieldwork.new")
     yield from screen.wait(lambda: screen.queue.running, 5, "the button did nothing")
@@ -51,6 +53,7 @@ def capture(screen):
 def train(screen):
     """Train the posed capture for some seconds, look at the live panel, extract the mesh, bring it into the scene."""
     settings = yield from opened(screen)
+    bpy.data.objects.remove(bpy.data.objects["Cube"])
     settings.preset, settings.time_limit = "draft", 40.0
     yield from screen.press_button("fieldwork.train")
     yield from screen.wait(lambda: screen.queue.running, 5, "the button did nothing")
@@ -68,7 +71,6 @@ def train(screen):
     yield from screen.press_button("fieldwork.mesh")
     yield from screen.wait(lambda: screen.queue.running, 5, "the button did nothing")
     yield from screen.idle(200)
-    bpy.data.objects.remove(bpy.data.objects["Cube"])
     yield from screen.run_operator("fieldwork.import_scene", 120)
     meshes = [obj for obj in bpy.data.objects if obj.get("fieldwork_role") == "mesh"]
     screen.facts["faces"] = [len(obj.data.polygons) for obj in meshes]
@@ -82,8 +84,8 @@ def labelled(screen):
     """A capture with labels, in a light theme and at high resolution too: classes, renders, visibility, presets."""
     yield from screen.show_sidebar()
     settings = bpy.context.scene.fieldwork
-    bpy.ops.fieldwork.open(filepath=os.environ["FIELDWORK_MUSEUM"])
-    settings.project = str(screen.folder / "project")
+    bpy.ops.fieldwork.open(filepath=alias(Path(os.environ["FIELDWORK_MUSEUM"]), "museum"))
+    settings.project = alias(screen.folder / "project", "museum_fieldwork")
     yield from screen.run_operator("fieldwork.new", 120)
     yield from screen.run_operator("fieldwork.poses", 300)
     settings.preset, settings.time_limit = "draft", 60.0
@@ -245,9 +247,17 @@ def opened(screen):
     if not project.is_dir():
         shutil.copytree(screen.folder.parent / "capture" / "project", project)
     settings = bpy.context.scene.fieldwork
-    settings.project = str(project)
+    settings.project = alias(project, "banana_fieldwork")
     yield from screen.show_sidebar()
     return settings
+
+
+def alias(folder, name):
+    """A short way to a folder."""
+    folder.mkdir(exist_ok=True)
+    link = Path("/tmp", name)
+    link.symlink_to(folder)
+    return str(link)
 
 
 def training(screen, operator, resume=False):

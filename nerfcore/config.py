@@ -44,9 +44,6 @@ class FieldConfig(Stage):
     coarsest: int = Field(16, ge=2, description="vertices along a side of the coarsest level")
     finest: int = Field(1024, ge=2, description="vertices along a side of the finest level")
     table_log2: int = Field(19, ge=10, le=24, description="at most 2^this vertices a level; larger levels are hashed")
-    voxel_init: Literal["rgb_stats", "cnn", "none"] = Field(
-        "rgb_stats", description="what the coarse levels start from"
-    )
     octaves: int = Field(8, ge=1, le=16, description="octaves of the implicit branch's frequency encoding")
     width: int = Field(64, ge=8, description="width of the hidden layers")
     implicit_layers: int = Field(2, ge=1, description="matrix products of the implicit branch")
@@ -111,7 +108,6 @@ class LossConfig(Stage):
     opacity_weight: float = Field(0.0, ge=0, description="entropy of the ray's opacity")
     entropy_ratio: float = Field(0.02, ge=0, description="λ_ent / λ_sem; entropy is raised")
     entropy_start: float = Field(0.2, ge=0, le=1, description="share of training before the entropy term")
-    depth_weight: float = Field(0.0, ge=0, description="of sparse points or depth maps")
 
 
 class TrainConfig(Stage):
@@ -123,8 +119,6 @@ class TrainConfig(Stage):
     network_rate: float = Field(0.005, gt=0, description="learning rate of the networks")
     decay: float = Field(0.33, gt=0, le=1, description="of the rates at ½, ¾ and 9/10")
     fade: float = Field(0.2, ge=0, lt=1, description="share of training over which finer levels appear")
-    pose_refinement: bool = False
-    pose_rate: float = Field(1e-4, gt=0)
     checkpoint_every: float = Field(30.0, gt=0, description="seconds between checkpoints")
     preview_every: float = Field(15.0, gt=0, description="seconds between preview pictures")
     seed: int = 0

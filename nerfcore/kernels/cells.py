@@ -68,7 +68,13 @@ def observe(
     """
     init()
     where = array(points, wp.vec3)
-    launch(write_max, len(points), [where, array(values.contiguous()), resolution, array(scratch)], points.device, serial=True)
+    launch(
+        write_max,
+        len(points),
+        [where, array(values.contiguous()), resolution, array(scratch)],
+        points.device,
+        serial=True,
+    )
     launch(take_max, len(points), [where, resolution, decay, array(scratch), array(grid)], points.device, serial=True)
 
 

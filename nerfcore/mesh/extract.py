@@ -11,12 +11,16 @@ import trimesh
 from scipy import ndimage
 from skimage.measure import marching_cubes
 
+from ..data.cameras import Camera, project
+from ..data.pixels import training_size
 from ..errors import TrainingError
 from ..field.encoding import spherical_harmonics
 from ..progress import Reporter
+from ..render.image import render_view
 from ..train.model import Model
 
 CHUNK = 1 << 16
+VISIBILITY_PIXELS = 160  # longest side of the depth images that decide what is visible
 
 
 @dataclass(frozen=True)
@@ -86,6 +90,7 @@ def extract(
     high: np.ndarray,
     class_ids: list[int],
     report: Reporter,
+    views: list[tuple[Camera, np.ndarray]],
     faces: int | None = None,
 ) -> tuple[Surface, float]:
     """Surface in the normalised frame, and the spacing of the grid it was found on.
@@ -93,6 +98,7 @@ def extract(
     Args:
         low, high: corners (3,) of the region within [−1, 1]³.
         class_ids: class id of each class index; empty without semantics (all vertices are then class 0).
+        views: cameras and camera-to-box poses; connected parts that none of them sees (cavities) are dropped.
         faces: target number of triangles; None keeps all.
     Raises:
         TrainingError: the field has no surface there.
@@ -110,7 +116,8 @@ def extract(
     vertices, triangles, _, _ = marching_cubes(padded, level)
     vertices = (vertices - 1) * spacing + low
     mesh = trimesh.Trimesh(vertices, triangles[:, ::-1], process=False)
-    mesh = drop_specks(mesh)
+    report.stage("Cleaning the surface")
+    mesh = drop_parts(mesh, visible_faces(model, mesh, views, 3 * spacing, report))
     if faces is not None and len(mesh.faces) > faces:
         report.stage("Simplifying")
         points, kept = fast_simplification.simplify(
@@ -134,14 +141,34 @@ def extract(
     return surface, spacing
 
 
-def drop_specks(mesh: trimesh.Trimesh, share: float = 0.01) -> trimesh.Trimesh:
-    """Remove connected parts with less than `share` of the largest one's triangles: floaters."""
+def visible_faces(
+    model: Model, mesh: trimesh.Trimesh, views: list[tuple[Camera, np.ndarray]], tolerance: float, report: Reporter
+) -> np.ndarray:
+    """Which faces (F,) lie within `tolerance` of the depth that some view renders; small images are enough."""
+    centers = mesh.triangles_center
+    seen = np.zeros(len(centers), bool)
+    for number, (camera, pose) in enumerate(views):
+        report.progress(number / len(views))
+        small = camera.resized(*training_size(camera, VISIBILITY_PIXELS))
+        depth = render_view(model, small, pose, 0.0, semantics=False, check=report.check).depth
+        local = (centers - pose[:3, 3]) @ pose[:3, :3]
+        pixel = project(small, local)
+        inside = np.isfinite(pixel).all(1) & (pixel >= 0).all(1) & (pixel < [small.width, small.height]).all(1)
+        x, y = pixel[inside].astype(int).T
+        seen[np.flatnonzero(inside)] |= local[inside, 2] < np.nan_to_num(depth[y, x], nan=-np.inf) + tolerance
+    return seen
+
+
+def drop_parts(mesh: trimesh.Trimesh, visible: np.ndarray, share: float = 0.01) -> trimesh.Trimesh:
+    """Remove connected parts with less than `share` of the largest one's triangles (floaters) and parts of which
+    less than a twentieth is visible (cavities inside solid things)."""
     labels = trimesh.graph.connected_component_labels(mesh.face_adjacency, node_count=len(mesh.faces))
     counts = np.bincount(labels)
-    keep = counts[labels] >= max(share * counts.max(), 16)
-    if keep.all():
+    shown = np.bincount(labels, visible) >= 0.05 * counts
+    good = shown & (counts >= max(share * counts[shown].max(initial=0), 16))
+    if good.all() or not good.any():
         return mesh
-    used, inverse = np.unique(mesh.faces[keep], return_inverse=True)
+    used, inverse = np.unique(mesh.faces[good[labels]], return_inverse=True)
     return trimesh.Trimesh(mesh.vertices[used], inverse.reshape(-1, 3), process=False)
 
 

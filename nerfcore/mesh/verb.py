@@ -9,6 +9,9 @@ from typing import Any
 import numpy as np
 import trimesh
 
+from ..data.box import box_poses
+from ..data.cameras import Camera
+from ..data.scene import Scene
 from ..data.similarity import similarity_scale, transform_points
 from ..errors import SettingError
 from ..files import atomic_path
@@ -43,6 +46,7 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
         np.full(3, 1.0),
         trained.info.class_ids if trained.model.field.classes else [],
         report,
+        spread_views(scene, trained.info.box(project).box_from_world),
         params.faces,
     )
     target = folder / "exports" / params.run
@@ -75,6 +79,13 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
     project.record("mesh", params.model_dump(mode="json"), result)
     save_project(folder, project)
     return result
+
+
+def spread_views(scene: Scene, box_from_world: np.ndarray, most: int = 24) -> list[tuple[Camera, np.ndarray]]:
+    """Up to `most` cameras with poses in the normalised frame, evenly chosen from the training views."""
+    chosen = np.linspace(0, len(scene.train) - 1, min(most, len(scene.train))).round().astype(int)
+    views = [scene.views[scene.train[i]] for i in chosen]
+    return [(view.camera, pose) for view, pose in zip(views, box_poses(views, box_from_world))]
 
 
 @dataclass(frozen=True)

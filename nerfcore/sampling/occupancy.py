@@ -42,13 +42,14 @@ class OccupancyGrid(nn.Module):
         self.register_buffer("density", torch.where(seen, 3.0, 0.0))
         self.register_buffer("interest", torch.zeros(n**3))
         self.register_buffer("seen", seen)
-        self.register_buffer("cells", torch.stack([self.density, self.interest], 1), persistent=False)
+        # Rays read these; they follow the density at updates only, so they are part of a checkpoint.
+        self.register_buffer("cells", torch.stack([self.density, self.interest], 1))
         self.density: torch.Tensor
         self.interest: torch.Tensor
         self.seen: torch.Tensor
         self.register_buffer("scratch", torch.full((n**3,), -1.0), persistent=False)
         self.scratch: torch.Tensor
-        self.register_buffer("blocks", torch.ones((n // 4) ** 3, dtype=torch.uint8), persistent=False)
+        self.register_buffer("blocks", torch.ones((n // 4) ** 3, dtype=torch.uint8))
         self.cells: torch.Tensor
         self.blocks: torch.Tensor
 
@@ -58,7 +59,7 @@ class OccupancyGrid(nn.Module):
         return MarchSettings(c.resolution, self.step, near, 1000.0, self.contracted, MODES[c.pdf], beta, c.epsilon)
 
     def rebuild(self) -> None:
-        """Recompute what rays read from densities and interest (also after loading a checkpoint)."""
+        """Recompute what rays read from densities and interest."""
         opacity = self.density * self.step
         threshold = min(float(opacity[self.seen].mean()), self.config.threshold) if bool(self.seen.any()) else 1.0
         opened = (opacity > threshold) & self.seen

@@ -71,7 +71,6 @@ def restore(trainer: Trainer, tensors: dict[str, torch.Tensor], state: dict[str,
     """Put a checkpoint back into a trainer of the same configuration."""
     model = {name.removeprefix("model."): value for name, value in tensors.items() if name.startswith("model.")}
     trainer.model.load_state_dict(model)
-    trainer.model.occupancy.rebuild()
     for index, parameter in enumerate(trainer.model.parameters()):
         prefix = f"optimizer.{index}."
         saved = {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}

@@ -14,7 +14,6 @@ from ..kernels.composite import render_weights, weighted_sum
 from ..kernels.march import Samples, sample
 from ..sampling.occupancy import OccupancyGrid, class_interest
 
-
 ONE_PASS_SHARE = 0.67
 
 
@@ -117,7 +116,9 @@ class Model(nn.Module):
                 self.shown_share += 0.05 * (len(kept) / max(len(s), 1) - self.shown_share)
         delta = s.delta[kept]
         if torch.is_grad_enabled() and first_look:
-            shown = self.field.geometry(s.points[kept], everywhere.explicit[kept] if everywhere.explicit is not None else None)
+            shown = self.field.geometry(
+                s.points[kept], everywhere.explicit[kept] if everywhere.explicit is not None else None
+            )
             weight = render_weights(shown.density, delta, packing)
         else:
             shown, weight = everywhere[kept], weights[kept]

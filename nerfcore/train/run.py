@@ -97,6 +97,5 @@ def load_trained(project: Path, run: str) -> Trained:
     tensors, state = read_checkpoint(path, device)
     model = new_model(info, device)
     model.load_state_dict({name.removeprefix("model."): t for name, t in tensors.items() if name.startswith("model.")})
-    model.occupancy.rebuild()
     model.field.set_progress(state["progress"], info.config.train.fade, state["steps"])
     return Trained(model.eval().requires_grad_(False), info, state, device)

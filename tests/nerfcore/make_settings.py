@@ -1,0 +1,45 @@
+"""Writes docs/settings.md from the settings' own descriptions: `python tests/nerfcore/make_settings.py`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from fieldwork.nerfcore.config import PRESETS, RunConfig
+
+TARGET = Path(__file__).resolve().parents[2] / "docs" / "settings.md"
+
+
+def settings_page() -> str:
+    lines = [
+        "# Settings of a run",
+        "",
+        "`fieldwork train PROJECT --preset NAME --set stage.name=value …`. Presets change only what is listed for them.",
+        "This page is made from `nerfcore/config.py`.",
+    ]
+    for stage, info in RunConfig.model_fields.items():
+        model = type(info.default)
+        lines += [
+            "",
+            f"## {stage}",
+            "",
+            (model.__doc__ or "").strip().split("\n")[0],
+            "",
+            "| setting | default | what |",
+            "| --- | --- | --- |",
+        ]
+        for name, setting in model.model_fields.items():
+            kind = str(setting.annotation).replace("typing.Literal", "") if "Literal" in str(setting.annotation) else ""
+            text = (setting.description or "") + (f" {kind}" if kind else "")
+            text = text.replace("|", "\\|").strip()
+            lines.append(f"| `{stage}.{name}` | `{json.dumps(setting.default)}` | {text} |")
+    lines += ["", "## Presets", ""]
+    for path in sorted(PRESETS.glob("*.json")):
+        values = json.loads(path.read_text(encoding="utf-8"))
+        changes = [f"`{stage}.{k}={json.dumps(v)}`" for stage, part in values.items() for k, v in part.items()]
+        lines.append(f"- **{path.stem}**: {', '.join(changes) or 'the defaults'}")
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    TARGET.write_text(settings_page(), encoding="utf-8")

@@ -1,0 +1,74 @@
+"""The loss terms: values, gradients where they matter, and the batches that once gave NaN."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from fieldwork.nerfcore.config import LossConfig
+from fieldwork.nerfcore.kernels.packing import Packing
+from fieldwork.nerfcore.train import losses
+from fieldwork.nerfcore.train.schedule import bias_correction, rate_factor
+
+
+def test_color_losses() -> None:
+    a, b = torch.tensor([[0.5, 0.5, 0.5]]), torch.tensor([[0.5, 0.55, 0.9]])
+    assert float(losses.color_loss(a, b, LossConfig(rgb="mse"))) == pytest.approx((0.05**2 + 0.4**2) / 3)
+    huber = (0.5 * 0.05**2 / 0.1 + (0.4 - 0.05)) / 3
+    assert float(losses.color_loss(a, b, LossConfig())) == pytest.approx(huber, rel=1e-5)
+
+
+def test_a_batch_without_labels_costs_nothing_and_is_not_nan() -> None:
+    probabilities = torch.full((4, 3), 0.2, requires_grad=True)
+    none = torch.zeros(4, dtype=torch.bool)
+    loss = losses.semantic_loss(probabilities, torch.full((4,), 255), none) + losses.entropy_loss(probabilities, none)
+    loss.backward()
+    assert float(loss) == 0.0
+    assert bool((probabilities.grad == 0).all())
+
+
+def test_cross_entropy_counts_labelled_rays_only() -> None:
+    probabilities = torch.tensor([[0.5, 0.25], [0.1, 0.8], [0.9, 0.1]])
+    labels, valid = torch.tensor([0, 1, 255]), torch.tensor([True, True, False])
+    expected = -(math.log(0.5) + math.log(0.8)) / 2
+    assert float(losses.semantic_loss(probabilities, labels, valid)) == pytest.approx(expected, rel=1e-5)
+    soft = torch.tensor([[1.0, 0.0], [0.0, 1.0], [0.5, 0.5]])
+    assert float(losses.semantic_loss(probabilities, soft, valid)) == pytest.approx(expected, rel=1e-5)
+
+
+def test_the_entropy_term_pulls_towards_uncertainty() -> None:
+    sure, unsure = torch.tensor([[0.98, 0.01]]), torch.tensor([[0.5, 0.5]])
+    everywhere = torch.tensor([True])
+    assert losses.entropy_loss(unsure, everywhere) < losses.entropy_loss(sure, everywhere)
+
+
+@pytest.mark.parametrize("kind", ["exponential", "cauchy", "l1"])
+def test_sparsity_is_zero_for_nothing_and_grows_with_density(kind: str) -> None:
+    config = LossConfig(sparsity=kind)
+    values = [float(losses.sparsity_loss(torch.full((8,), d), config)) for d in (0.0, 1.0, 10.0)]
+    assert values[0] == 0.0
+    assert values[0] < values[1] < values[2]
+
+
+def test_distortion_equals_its_double_sum() -> None:
+    generator = torch.Generator().manual_seed(0)
+    count, rays = 5, 3
+    w = torch.rand(rays * count, generator=generator) / count
+    s = torch.rand(rays, count, generator=generator).sort(1).values.reshape(-1)
+    d = torch.rand(rays * count, generator=generator) * 0.1
+    start = torch.arange(rays, dtype=torch.int32) * count
+    packing = Packing(
+        start, torch.full((rays,), count, dtype=torch.int32), torch.repeat_interleave(torch.arange(rays), count).int()
+    )
+    W, S, D = (x.view(rays, count) for x in (w, s, d))
+    pairs = (W[:, :, None] * W[:, None] * (S[:, :, None] - S[:, None]).abs()).sum((1, 2))
+    expected = (pairs + (W * W * D).sum(1) / 3).mean()
+    assert float(losses.distortion_loss(w, s, d, packing)) == pytest.approx(float(expected), rel=1e-5)
+
+
+def test_schedule() -> None:
+    assert rate_factor(0.0, 0.33) == 1.0
+    assert rate_factor(0.95, 0.33) == pytest.approx(0.33**3)
+    assert bias_correction(1) == pytest.approx(1.0)
+    assert bias_correction(100000) == pytest.approx(1.0)

@@ -1,0 +1,134 @@
+"""The renderer against a scene with a closed form: a ball of constant density, colour and class."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from fieldwork.nerfcore.config import RunConfig
+from fieldwork.nerfcore.data.cameras import Camera
+from fieldwork.nerfcore.field.hybrid import Geometry
+from fieldwork.nerfcore.render.image import Frame, render_view
+from fieldwork.nerfcore.render.verb import look_at
+from fieldwork.nerfcore.train.model import Model
+
+RADIUS, DENSITY = 0.6, 4.0
+COLOR = torch.tensor([0.9, 0.4, 0.1])
+
+
+class BallField(torch.nn.Module):
+    """A field with known values; stands in for the trained one."""
+
+    dtype = torch.float32
+    grid = blend = appearance = None
+    classes = 2
+    semantic_head = object()
+    strength = DENSITY
+
+    def geometry(self, points: torch.Tensor, known: torch.Tensor | None = None) -> Geometry:
+        inside = ((points * 2 - 1).norm(dim=1) < RADIUS).float()
+        return Geometry(inside * self.strength, inside[:, None], None, None)
+
+    def color(self, geometry: Geometry, directions: torch.Tensor, codes: torch.Tensor | None = None) -> torch.Tensor:
+        return COLOR.expand(len(geometry.density), 3)
+
+    def logits(self, geometry: Geometry) -> torch.Tensor:
+        return torch.tensor([0.0, 20.0]).expand(len(geometry.density), 2)
+
+
+def ball_model(samples: int, pdf: str = "default", resolution: int = 64) -> Model:
+    config = RunConfig.model_validate(
+        {
+            "sampling": {"samples": samples, "pdf": pdf, "resolution": resolution},
+            "render": {"cull": 0},
+            "field": {"levels": 1},
+        }
+    )
+    model = Model(config, 2, 0, contracted=False).eval()
+    model.field = BallField()  # type: ignore[assignment]
+    occupancy = model.occupancy
+    cells = torch.arange(resolution**3)
+    corner = torch.stack([cells % resolution, cells // resolution % resolution, cells // resolution**2], 1)
+    center = (corner + 0.5) / resolution * 2 - 1
+    occupancy.density = torch.where(center.norm(dim=1) < RADIUS + 2 / resolution, DENSITY, 0.0)
+    occupancy.rebuild()
+    return model
+
+
+def closed_form(camera: Camera, pose: np.ndarray, background: float) -> tuple[np.ndarray, np.ndarray]:
+    """Colour (H, W, 3) and opacity (H, W): 1 − exp(−σ · chord)."""
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    directions = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], -1)
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    directions = directions @ pose[:3, :3].T
+    middle = -(directions @ pose[:3, 3])
+    closest = np.linalg.norm(pose[:3, 3]) ** 2 - middle**2
+    chord = 2 * np.sqrt(np.maximum(RADIUS**2 - closest, 0))
+    opacity = 1 - np.exp(-DENSITY * chord)
+    return opacity[..., None] * COLOR.numpy() + background * (1 - opacity[..., None]), opacity
+
+
+def view() -> tuple[Camera, np.ndarray]:
+    camera = Camera(width=48, height=40, fx=70, fy=70, cx=24, cy=20)
+    return camera, look_at(np.array([1.8, -1.9, 1.2]), np.zeros(3))
+
+
+def rendered(samples: int, pdf: str = "default") -> tuple[Frame, np.ndarray, np.ndarray]:
+    camera, pose = view()
+    return render_view(ball_model(samples, pdf), camera, pose, 1.0), *closed_form(camera, pose, 1.0)
+
+
+@pytest.mark.parametrize("pdf", ["default", "uniform"])
+def test_a_ball_of_constant_density_renders_to_its_closed_form(pdf: str) -> None:
+    frame, color, opacity = rendered(192, pdf)
+    assert np.abs(frame.opacity - opacity).mean() < 0.01
+    assert np.abs(frame.color - color).mean() < 0.01
+    # the rim is where a cell of the grid is coarse; the middle must be exact
+    solid = opacity > 0.9
+    assert solid.sum() > 100
+    assert np.abs(frame.color - color)[solid].max() < 0.02
+
+
+def test_depth_labels_and_normals_of_the_ball() -> None:
+    frame, _, opacity = rendered(192)
+    camera, pose = view()
+    middle = frame.depth[20, 24]
+    distance = np.linalg.norm(pose[:3, 3])
+    # expected depth of an exponential absorber over the chord 2R
+    tau = DENSITY * 2 * RADIUS
+    expected = distance - RADIUS + (1 / DENSITY) * (1 - (1 + tau) * math.exp(-tau)) / (1 - math.exp(-tau))
+    assert middle == pytest.approx(expected, abs=0.03)
+    assert np.isnan(frame.depth[0, 0])
+    label = frame.label([3, 7])
+    assert label[20, 24] == 7
+    assert label[0, 0] == 0
+    assert np.array_equal(label[opacity > 0.6] == 7, np.full((opacity > 0.6).sum(), True))
+    toward = pose[:3, 3] / distance
+    assert frame.normal()[20, 24] @ toward > 0.97
+
+
+def test_an_empty_field_is_background() -> None:
+    camera, pose = view()
+    model = ball_model(8)
+    model.occupancy.density.zero_()
+    model.occupancy.rebuild()
+    frame = render_view(model, camera, pose, 0.25)
+    assert np.allclose(frame.color, 0.25)
+    assert not frame.label([1, 2]).any()
+
+
+def test_the_pdf_puts_samples_where_the_light_is_absorbed() -> None:
+    """Few samples place an opaque surface better when they follow the density than when they are spread evenly."""
+    camera, pose = view()
+    distance = np.linalg.norm(pose[:3, 3])
+    errors = {}
+    for pdf in ("default", "uniform"):
+        model = ball_model(8, pdf)
+        model.field.strength = 400.0  # type: ignore[assignment]
+        model.occupancy.density *= 100
+        model.occupancy.rebuild()
+        frame = render_view(model, camera, pose, 1.0)
+        errors[pdf] = abs(frame.depth[20, 24] - (distance - RADIUS))
+    assert errors["default"] < 0.5 * errors["uniform"]

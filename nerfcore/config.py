@@ -42,7 +42,7 @@ class FieldConfig(Stage):
     fusion: Literal["blend", "concat"] = Field("blend", description="how the two branches join")
     levels: int = Field(8, ge=1, le=16, description="levels of the vertex grid, 4 features each")
     coarsest: int = Field(16, ge=2, description="vertices along a side of the coarsest level")
-    finest: int = Field(1024, ge=2, description="vertices along a side of the finest level")
+    finest: int = Field(1600, ge=2, description="vertices along a side of the finest level")
     table_log2: int = Field(19, ge=10, le=24, description="at most 2^this vertices a level; larger levels are hashed")
     octaves: int = Field(8, ge=1, le=16, description="octaves of the implicit branch's frequency encoding")
     width: int = Field(64, ge=8, description="width of the hidden layers")

@@ -26,7 +26,7 @@ class SimulateParams(Params):
     out: Path = Field(description="folder to write the simulated capture to")
     scene: str = Field("museum", description="name of the built-in scene")
     views: int = Field(48, ge=4, description="number of photos")
-    size: tuple[int, int] = Field((720, 480), description="photo width and height in pixels")
+    size: tuple[int, int] = Field((480, 320), description="photo width and height in pixels")
     seed: int = Field(0, description="seed of the scene and of the camera path")
     samples: int = Field(4, ge=1, description="Cycles samples per pixel")
 

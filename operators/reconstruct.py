@@ -57,7 +57,7 @@ class FIELDWORK_OT_simulate(VerbOperator):
     out: StringProperty(name="Folder", description="New or empty folder for the capture", subtype="DIR_PATH")
     views: IntProperty(name="Photos", description="Number of photos", default=48, min=4, soft_max=200)
     size: IntVectorProperty(
-        name="Size", description="Width and height of the photos", size=2, default=(720, 480), min=16
+        name="Size", description="Width and height of the photos", size=2, default=(480, 320), min=16
     )
     seed: IntProperty(name="Seed", description="Another seed, another scene", min=0)
     samples: IntProperty(name="Samples", description="Cycles samples per pixel", default=4, min=1)

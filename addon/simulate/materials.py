@@ -1,4 +1,4 @@
-"""Procedural materials of the simulated scenes: matt, and full of detail at every scale, as old things are."""
+"""Procedural materials of the simulated scenes: matt, and full of detail at the scale a photo of some 500 pixels resolves."""
 
 from __future__ import annotations
 
@@ -77,8 +77,8 @@ class Nodes:
     def weathered(self, colour: Any, scale: float, strength: float) -> Any:
         """Darken by stains of several sizes, so that no two places look alike."""
         stains = self.ramp(self.noise(scale, 3), [(0.3, (0.45, 0.42, 0.4)), (0.68, (1.15, 1.14, 1.12))])
-        grain = self.ramp(self.noise(scale * 8, 1), [(0.3, (0.6, 0.6, 0.6)), (0.7, (1.2, 1.2, 1.2))])
-        return self.mix(strength * 0.8, self.mix(strength, colour, stains, "MULTIPLY"), grain, "MULTIPLY")
+        grain = self.ramp(self.noise(scale * 4, 1), [(0.3, (0.7, 0.7, 0.7)), (0.7, (1.15, 1.15, 1.15))])
+        return self.mix(strength * 0.4, self.mix(strength, colour, stains, "MULTIPLY"), grain, "MULTIPLY")
 
     def finish(self, colour: Any, average: Colour, roughness: float = 0.85) -> bpy.types.Material:
         """Complete the material. Light that has bounced sees only the average colour: that halves the render time."""
@@ -98,15 +98,15 @@ def stone(class_id: int) -> bpy.types.Material:
     base = n.ramp(n.noise(3.2, 4), [(0.3, (0.36, 0.31, 0.26)), (0.5, (0.62, 0.57, 0.5)), (0.7, (0.8, 0.76, 0.7))])
     veins = n.ramp(n.noise(4.5, 4, 2.5), [(0.47, (1, 1, 1)), (0.5, (0.42, 0.36, 0.33)), (0.53, (1, 1, 1))])
     base = n.mix(0.85, base, veins, "MULTIPLY")
-    fossils = n.ramp(n.cells(38), [(0.16, (0.38, 0.32, 0.27)), (0.24, (1, 1, 1))])
-    return n.finish(n.weathered(n.mix(0.7, base, fossils, "MULTIPLY"), 9, 0.75), (0.45, 0.41, 0.36))
+    fossils = n.ramp(n.cells(20), [(0.16, (0.38, 0.32, 0.27)), (0.24, (1, 1, 1))])
+    return n.finish(n.weathered(n.mix(0.45, base, fossils, "MULTIPLY"), 9, 0.75), (0.45, 0.41, 0.36))
 
 
 def gilding(class_id: int) -> bpy.types.Material:
     n = Nodes("gilding", class_id)
     base = n.ramp(n.noise(11, 3), [(0.32, (0.5, 0.24, 0.03)), (0.5, (0.86, 0.52, 0.08)), (0.72, (1.0, 0.78, 0.25))])
-    leaf = n.ramp(n.cells(30, "DISTANCE_TO_EDGE"), [(0.03, (0.34, 0.1, 0.04)), (0.09, (1, 1, 1))])
-    return n.finish(n.weathered(n.mix(0.8, base, leaf, "MULTIPLY"), 16, 0.5), (0.6, 0.35, 0.06), 0.6)
+    leaf = n.ramp(n.cells(16, "DISTANCE_TO_EDGE"), [(0.03, (0.34, 0.1, 0.04)), (0.09, (1, 1, 1))])
+    return n.finish(n.weathered(n.mix(0.5, base, leaf, "MULTIPLY"), 16, 0.5), (0.6, 0.35, 0.06), 0.6)
 
 
 def wood(class_id: int) -> bpy.types.Material:
@@ -132,44 +132,44 @@ def textile(class_id: int, name: str = "textile", rotation: Colour = (0, 0, 0)) 
     n = Nodes(name, class_id, flat=True)
     flat = n.object = n.mapped((1, 1, 1), rotation=rotation)
     field = n.ramp(
-        n.cells(7, vector=flat, output="Color"),
+        n.cells(4, vector=flat, output="Color"),
         [(0.3, (0.42, 0.03, 0.04)), (0.5, (0.06, 0.1, 0.3)), (0.62, (0.55, 0.32, 0.08))],
         hard=True,
     )
     petals = n.ramp(
-        n.cells(7, vector=flat), [(0.18, (0.8, 0.66, 0.4)), (0.24, (0.1, 0.02, 0.05)), (0.32, (1, 1, 1))], hard=True
+        n.cells(4, vector=flat), [(0.18, (0.8, 0.66, 0.4)), (0.24, (0.1, 0.02, 0.05)), (0.32, (1, 1, 1))], hard=True
     )
-    pattern = n.mix(n.ramp(n.cells(7, vector=flat), [(0.3, (1, 1, 1)), (0.31, (0, 0, 0))], hard=True), field, petals)
-    vines = n.ramp(n.cells(16, "DISTANCE_TO_EDGE", flat), [(0.07, (0.85, 0.72, 0.45)), (0.1, (0, 0, 0))], hard=True)
+    pattern = n.mix(n.ramp(n.cells(4, vector=flat), [(0.3, (1, 1, 1)), (0.31, (0, 0, 0))], hard=True), field, petals)
+    vines = n.ramp(n.cells(8, "DISTANCE_TO_EDGE", flat), [(0.07, (0.85, 0.72, 0.45)), (0.1, (0, 0, 0))], hard=True)
     pattern = n.mix(0.55, pattern, vines, "LIGHTEN")
     weave = n.ramp(
-        n.bricks(60, 0.5, 0.5, [(1, 1, 1), (0.66, 0.66, 0.66), (0.4, 0.4, 0.4)], flat),
+        n.bricks(30, 0.5, 0.5, [(1, 1, 1), (0.66, 0.66, 0.66), (0.4, 0.4, 0.4)], flat),
         [(0.0, (0.5, 0.5, 0.5)), (1.0, (1, 1, 1))],
     )
-    return n.finish(n.weathered(n.mix(0.7, pattern, weave, "MULTIPLY"), 7, 0.45), (0.4, 0.2, 0.12), 1.0)
+    return n.finish(n.weathered(n.mix(0.25, pattern, weave, "MULTIPLY"), 7, 0.45), (0.4, 0.2, 0.12), 1.0)
 
 
 def ceramic(class_id: int) -> bpy.types.Material:
     n = Nodes("ceramic", class_id)
     glaze = n.ramp(n.noise(6, 3), [(0.35, (0.62, 0.66, 0.66)), (0.65, (0.86, 0.87, 0.82))])
     scrolls = n.ramp(
-        n.noise(13, 1.5, 2.2),
+        n.noise(7, 1.5, 2.2),
         [(0.4, (0.03, 0.08, 0.38)), (0.46, (1, 1, 1)), (0.56, (1, 1, 1)), (0.6, (0.05, 0.3, 0.3))],
         hard=True,
     )
-    dots = n.ramp(n.cells(34), [(0.2, (0.02, 0.05, 0.3)), (0.24, (1, 1, 1))], hard=True)
-    crackle = n.ramp(n.cells(45, "DISTANCE_TO_EDGE"), [(0.02, (0.45, 0.4, 0.34)), (0.06, (1, 1, 1))])
+    dots = n.ramp(n.cells(17), [(0.2, (0.02, 0.05, 0.3)), (0.24, (1, 1, 1))], hard=True)
+    crackle = n.ramp(n.cells(22, "DISTANCE_TO_EDGE"), [(0.02, (0.45, 0.4, 0.34)), (0.06, (1, 1, 1))])
     colour = n.mix(1.0, n.mix(1.0, glaze, scrolls, "MULTIPLY"), dots, "MULTIPLY")
-    return n.finish(n.weathered(n.mix(0.6, colour, crackle, "MULTIPLY"), 10, 0.3), (0.4, 0.44, 0.5), 0.5)
+    return n.finish(n.weathered(n.mix(0.3, colour, crackle, "MULTIPLY"), 10, 0.3), (0.4, 0.44, 0.5), 0.5)
 
 
 def floor(class_id: int) -> bpy.types.Material:
     n = Nodes("floor", class_id, flat=True)
     tiles = n.bricks(1.0, 0.52, 0.34, [(0.3, 0.22, 0.17), (0.52, 0.46, 0.38), (0.1, 0.09, 0.08)])
     terrazzo = n.ramp(
-        n.cells(26, output="Color"), [(0.2, (0.35, 0.3, 0.28)), (0.5, (1, 1, 1)), (0.8, (0.75, 0.55, 0.45))]
+        n.cells(12, output="Color"), [(0.2, (0.35, 0.3, 0.28)), (0.5, (1, 1, 1)), (0.8, (0.75, 0.55, 0.45))]
     )
-    return n.finish(n.weathered(n.mix(0.65, tiles, terrazzo, "MULTIPLY"), 4, 0.7), (0.28, 0.23, 0.19))
+    return n.finish(n.weathered(n.mix(0.35, tiles, terrazzo, "MULTIPLY"), 4, 0.7), (0.28, 0.23, 0.19))
 
 
 def wall(class_id: int) -> bpy.types.Material:

@@ -24,108 +24,125 @@ class SceneConfig(Stage):
     """Which part of the world the field covers, and how the photos are read."""
 
     contraction: Literal["auto", "on", "off"] = Field(
-        "auto", description="contract all of space into the grid: on for captures whose surroundings are visible"
+        default="auto",
+        description="contract all of space into the grid: on for captures whose surroundings are visible",
     )
-    image_size: int = Field(1600, ge=32, description="longest side of the training images in pixels")
+    image_size: int = Field(default=1600, ge=32, description="longest side of the training images in pixels")
     background: Literal["auto", "random", "white", "black"] = Field(
-        "auto", description="colour behind the field; auto: random for transparent images, black otherwise"
+        default="auto", description="colour behind the field; auto: random for transparent images, black otherwise"
     )
-    margin: float = Field(1.05, gt=0, description="size of the box relative to what must fit in")
+    margin: float = Field(default=1.05, gt=0, description="size of the box relative to what must fit in")
 
 
 class FieldConfig(Stage):
     """The hybrid field."""
 
     branch: Literal["hybrid", "explicit", "implicit"] = Field(
-        "hybrid", description="explicit: grid only; implicit: network only"
+        default="hybrid", description="explicit: grid only; implicit: network only"
     )
-    fusion: Literal["blend", "concat"] = Field("blend", description="how the two branches join")
-    levels: int = Field(8, ge=1, le=16, description="levels of the vertex grid, 4 features each")
-    coarsest: int = Field(16, ge=2, description="vertices along a side of the coarsest level")
-    finest: int = Field(1600, ge=2, description="vertices along a side of the finest level")
-    table_log2: int = Field(19, ge=10, le=24, description="at most 2^this vertices a level; larger levels are hashed")
-    octaves: int = Field(8, ge=1, le=16, description="octaves of the implicit branch's frequency encoding")
-    width: int = Field(64, ge=8, description="width of the hidden layers")
-    implicit_layers: int = Field(2, ge=1, description="matrix products of the implicit branch")
-    color_layers: int = Field(3, ge=1, description="matrix products of the colour head")
-    semantic_layers: int = Field(2, ge=1, description="matrix products of the semantic head")
-    geometry_features: int = Field(15, ge=1, description="features the density head hands to the other heads")
+    fusion: Literal["blend", "concat"] = Field(default="blend", description="how the two branches join")
+    levels: int = Field(default=8, ge=1, le=16, description="levels of the vertex grid, 4 features each")
+    coarsest: int = Field(default=16, ge=2, description="vertices along a side of the coarsest level")
+    finest: int = Field(default=1600, ge=2, description="vertices along a side of the finest level")
+    table_log2: int = Field(
+        default=19, ge=10, le=24, description="at most 2^this vertices a level; larger levels are hashed"
+    )
+    octaves: int = Field(default=8, ge=1, le=16, description="octaves of the implicit branch's frequency encoding")
+    width: int = Field(default=64, ge=8, description="width of the hidden layers")
+    implicit_layers: int = Field(default=2, ge=1, description="matrix products of the implicit branch")
+    color_layers: int = Field(default=3, ge=1, description="matrix products of the colour head")
+    semantic_layers: int = Field(default=2, ge=1, description="matrix products of the semantic head")
+    geometry_features: int = Field(default=15, ge=1, description="features the density head hands to the other heads")
     blend_by: Literal["evidence", "density"] = Field(
-        "evidence", description="density: the original, literal blend weight"
+        default="evidence", description="density: the original, literal blend weight"
     )
-    blend_floor: float = Field(0.5, ge=0, le=1, description="share of the grid where nothing was seen (w0)")
-    blend_rate: float = Field(8.0, gt=0, description="how fast evidence raises the grid's share (κ)")
-    blend_warmup: int = Field(0, ge=0, description="steps with the grid alone")
-    appearance: int = Field(0, ge=0, description="length of the per-image appearance code; 0: none")
-    density_shift: float = Field(-1.0, description="added to the raw density before exp")
-    precision: Literal["auto", "float32", "bfloat16", "float16"] = Field("auto", description="of matrix products")
+    blend_floor: float = Field(default=0.5, ge=0, le=1, description="share of the grid where nothing was seen (w0)")
+    blend_rate: float = Field(default=8.0, gt=0, description="how fast evidence raises the grid's share (κ)")
+    blend_warmup: int = Field(default=0, ge=0, description="steps with the grid alone")
+    appearance: int = Field(default=0, ge=0, description="length of the per-image appearance code; 0: none")
+    density_shift: float = Field(default=-1.0, description="added to the raw density before exp")
+    precision: Literal["auto", "float32", "bfloat16", "float16"] = Field(
+        default="auto", description="of matrix products"
+    )
 
 
 class SamplingConfig(Stage):
     """Where the field is evaluated along a ray."""
 
-    resolution: int = Field(128, ge=8, le=512, multiple_of=4, description="cells along a side of the occupancy grid")
-    samples: int = Field(16, ge=1, le=512, description="samples a ray (M_f)")
-    bins_per_cell: float = Field(1.0, gt=0, description="bins of the coarse walk per grid cell")
-    pdf: Literal["default", "uniform", "literal"] = Field("default", description="distribution of the samples")
-    interest: Literal["priority", "boundary", "none"] = Field(
-        "priority", description="what draws samples besides density"
+    resolution: int = Field(
+        default=128, ge=8, le=512, multiple_of=4, description="cells along a side of the occupancy grid"
     )
-    beta: float = Field(1.0, ge=0, description="strength of the interest")
-    epsilon: float = Field(0.01, gt=0, description="weight every open bin keeps")
-    update_every: int = Field(16, ge=1, description="steps between updates of the occupancy grid")
-    decay: float = Field(0.95, gt=0, lt=1, description="of the occupancy grid at each update")
-    threshold: float = Field(0.01, gt=0, description="opacity of a bin below which its cell is closed")
-    warmup: int = Field(256, ge=0, description="steps in which all cells are updated at once")
-    coarse_cache: bool = Field(True, description="choose training rays by which image tiles met the field")
-    cache_every: int = Field(1000, ge=1, description="steps between updates of the coarse cache")
-    empty_rays: float = Field(0.1, ge=0, le=1, description="share of rays drawn from everywhere despite the cache")
+    samples: int = Field(default=16, ge=1, le=512, description="samples a ray (M_f)")
+    bins_per_cell: float = Field(default=1.0, gt=0, description="bins of the coarse walk per grid cell")
+    pdf: Literal["default", "uniform", "literal"] = Field(default="default", description="distribution of the samples")
+    interest: Literal["priority", "boundary", "none"] = Field(
+        default="priority", description="what draws samples besides density"
+    )
+    beta: float = Field(default=1.0, ge=0, description="strength of the interest")
+    epsilon: float = Field(default=0.01, gt=0, description="weight every open bin keeps")
+    update_every: int = Field(default=16, ge=1, description="steps between updates of the occupancy grid")
+    decay: float = Field(default=0.95, gt=0, lt=1, description="of the occupancy grid at each update")
+    threshold: float = Field(default=0.01, gt=0, description="opacity of a bin below which its cell is closed")
+    warmup: int = Field(default=256, ge=0, description="steps in which all cells are updated at once")
+    coarse_cache: bool = Field(default=True, description="choose training rays by which image tiles met the field")
+    cache_every: int = Field(default=1000, ge=1, description="steps between updates of the coarse cache")
+    empty_rays: float = Field(
+        default=0.1, ge=0, le=1, description="share of rays drawn from everywhere despite the cache"
+    )
 
 
 class RenderConfig(Stage):
     """Compositing."""
 
     accumulate: Literal["probabilities", "logits"] = Field(
-        "probabilities", description="what is summed along a ray for classes"
+        default="probabilities", description="what is summed along a ray for classes"
     )
-    cull: float = Field(1e-4, ge=0, description="rendering weight below which colour and classes are not computed")
-    samples: int | None = Field(None, description="samples a ray when rendering; none: as in training")
+    cull: float = Field(
+        default=1e-4, ge=0, description="rendering weight below which colour and classes are not computed"
+    )
+    samples: int | None = Field(default=None, description="samples a ray when rendering; none: as in training")
 
 
 class LossConfig(Stage):
     rgb: Literal["huber", "mse"] = "huber"
-    rgb_weight: float = Field(1.0, ge=0)
-    huber_delta: float = Field(0.1, gt=0)
-    semantic_weight: float = Field(0.04, ge=0, description="λ_sem; 0 trains without semantics")
-    detach_weights: bool = Field(True, description="labels do not move the geometry")
-    regularization: float = Field(1.0, ge=0, description="λ_reg, factor of sparsity, distortion and entropy")
+    rgb_weight: float = Field(default=1.0, ge=0)
+    huber_delta: float = Field(default=0.1, gt=0)
+    semantic_weight: float = Field(default=0.04, ge=0, description="λ_sem; 0 trains without semantics")
+    detach_weights: bool = Field(default=True, description="labels do not move the geometry")
+    regularization: float = Field(default=1.0, ge=0, description="λ_reg, factor of sparsity, distortion and entropy")
     sparsity: Literal["exponential", "cauchy", "l1"] = Field(
-        "exponential", description="l1: the original, literal form"
+        default="exponential", description="l1: the original, literal form"
     )
-    sparsity_weight: float = Field(1e-4, ge=0)
-    sparsity_scale: float = Field(0.05, gt=0, description="ℓ of 1−exp(−ℓσ)")
-    distortion_weight: float = Field(0.0, ge=0, description="against floaters")
-    opacity_weight: float = Field(0.0, ge=0, description="entropy of the ray's opacity")
-    entropy_ratio: float = Field(0.02, ge=0, description="λ_ent / λ_sem; entropy is raised")
-    entropy_start: float = Field(0.2, ge=0, le=1, description="share of training before the entropy term")
+    sparsity_weight: float = Field(default=1e-4, ge=0)
+    sparsity_scale: float = Field(default=0.05, gt=0, description="ℓ of 1−exp(−ℓσ)")
+    distortion_weight: float = Field(default=0.0, ge=0, description="against floaters")
+    opacity_weight: float = Field(default=0.0, ge=0, description="entropy of the ray's opacity")
+    entropy_ratio: float = Field(default=0.02, ge=0, description="λ_ent / λ_sem; entropy is raised")
+    entropy_start: float = Field(default=0.2, ge=0, le=1, description="share of training before the entropy term")
 
 
 class TrainConfig(Stage):
-    steps: int = Field(20000, gt=0, description="optimisation steps when there is no time limit")
-    batch_start: int = Field(1 << 14, ge=256, description="field samples of the first steps")
-    batch_samples: int = Field(1 << 17, ge=256, description="field samples of the last steps; grows geometrically")
-    max_rays: int = Field(32768, ge=16)
-    grid_rate: float = Field(0.03, gt=0, description="learning rate of the grid")
-    network_rate: float = Field(0.005, gt=0, description="learning rate of the networks")
-    decay: float = Field(0.33, gt=0, le=1, description="of the rates at ½, ¾ and 9/10")
-    fade: float = Field(0.2, ge=0, lt=1, description="share of training over which finer levels appear")
-    checkpoint_every: float = Field(30.0, gt=0, description="seconds between checkpoints")
-    preview_every: float = Field(15.0, gt=0, description="seconds between preview pictures")
+    steps: int = Field(default=20000, gt=0, description="optimisation steps when there is no time limit")
+    batch_start: int = Field(default=1 << 14, ge=256, description="field samples of the first steps")
+    batch_samples: int = Field(
+        default=1 << 17, ge=256, description="field samples of the last steps; grows geometrically"
+    )
+    max_rays: int = Field(default=32768, ge=16)
+    grid_rate: float = Field(default=0.03, gt=0, description="learning rate of the grid")
+    network_rate: float = Field(default=0.005, gt=0, description="learning rate of the networks")
+    decay: float = Field(default=0.33, gt=0, le=1, description="of the rates at ½, ¾ and 9/10")
+    fade: float = Field(default=0.2, ge=0, lt=1, description="share of training over which finer levels appear")
+    checkpoint_every: float = Field(default=30.0, gt=0, description="seconds between checkpoints")
+    preview_every: float = Field(default=15.0, gt=0, description="seconds between preview pictures")
     seed: int = 0
-    labelled_share: float = Field(1.0, ge=0, le=1, description="share of the training images whose labels are used")
-    noise: float = Field(0.0, ge=0, description="σ of Gaussian noise added to the photos (robustness tests)")
-    label_noise: float = Field(0.0, ge=0, le=1, description="share of labels replaced at random (robustness tests)")
-    view_share: float = Field(1.0, gt=0, le=1, description="share of the training images used")
+    labelled_share: float = Field(
+        default=1.0, ge=0, le=1, description="share of the training images whose labels are used"
+    )
+    noise: float = Field(default=0.0, ge=0, description="σ of Gaussian noise added to the photos (robustness tests)")
+    label_noise: float = Field(
+        default=0.0, ge=0, le=1, description="share of labels replaced at random (robustness tests)"
+    )
+    view_share: float = Field(default=1.0, gt=0, le=1, description="share of the training images used")
 
 
 class RunConfig(Stage):

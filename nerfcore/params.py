@@ -24,46 +24,53 @@ class DoctorParams(Params):
 
 class SimulateParams(Params):
     out: Path = Field(description="folder to write the simulated capture to")
-    scene: str = Field("museum", description="name of the built-in scene")
-    views: int = Field(48, ge=4, description="number of photos")
-    size: tuple[int, int] = Field((480, 320), description="photo width and height in pixels")
-    seed: int = Field(0, description="seed of the scene and of the camera path")
-    samples: int = Field(4, ge=1, description="Cycles samples per pixel")
+    scene: str = Field(default="museum", description="name of the built-in scene")
+    views: int = Field(default=48, ge=4, description="number of photos")
+    size: tuple[int, int] = Field(default=(480, 320), description="photo width and height in pixels")
+    seed: int = Field(default=0, description="seed of the scene and of the camera path")
+    samples: int = Field(default=4, ge=1, description="Cycles samples per pixel")
 
 
 class DatasetParams(Params):
     blend: Path = Field(description=".blend file whose active scene is photographed")
     out: Path = Field(description="folder to write the data set to")
     path: Literal["sphere", "hemisphere", "camera", "curve"] = Field(
-        "hemisphere",
+        default="hemisphere",
         description="where the photos are taken from: around the scene, the scene's animated camera, a curve",
     )
-    views: int = Field(100, ge=1, description="number of photos (camera: at most; spread over the frame range)")
+    views: int = Field(default=100, ge=1, description="number of photos (camera: at most; spread over the frame range)")
     center: tuple[float, float, float] | None = Field(
-        None, description="what is looked at; default: the scene's middle"
+        default=None, description="what is looked at; default: the scene's middle"
     )
-    radius: float | None = Field(None, gt=0, description="distance from it; default: so that all is in the picture")
-    curve: str | None = Field(None, description="name of the curve object, for path=curve")
-    size: tuple[int, int] | None = Field(None, description="photo width and height in pixels; default: the scene's")
-    samples: int = Field(32, ge=1, description="Cycles samples per pixel")
+    radius: float | None = Field(
+        default=None, gt=0, description="distance from it; default: so that all is in the picture"
+    )
+    curve: str | None = Field(default=None, description="name of the curve object, for path=curve")
+    size: tuple[int, int] | None = Field(
+        default=None, description="photo width and height in pixels; default: the scene's"
+    )
+    samples: int = Field(default=32, ge=1, description="Cycles samples per pixel")
     labels: Literal["material", "object", "collection", "none"] = Field(
-        "material", description="what tells classes apart: pass index (or name) of materials or objects, or collections"
+        default="material",
+        description="what tells classes apart: pass index (or name) of materials or objects, or collections",
     )
-    depth: bool = Field(True, description="write depth maps")
-    transparent: bool = Field(False, description="alpha 0 where there is nothing, instead of the world's background")
+    depth: bool = Field(default=True, description="write depth maps")
+    transparent: bool = Field(
+        default=False, description="alpha 0 where there is nothing, instead of the world's background"
+    )
 
 
 class NewParams(Params):
     project: Path
     photos: Path = Field(description="folder of photos, or a video file")
-    labels: Path | None = Field(None, description="folder of label maps named like the photos")
-    masks: Path | None = Field(None, description="folder of foreground masks named like the photos")
-    classes: Path | None = Field(None, description="classes.json: names of the label ids")
-    mask_mode: Literal["ignore", "empty"] = Field("ignore", description="what black mask pixels mean")
-    max_size: int = Field(1600, ge=64, description="long side of the working copies in pixels")
-    frames: int = Field(80, ge=4, description="number of frames taken from a video")
-    keep_blurry: bool = Field(False, description="use photos that look blurred too")
-    add: bool = Field(False, description="add the photos to an existing project")
+    labels: Path | None = Field(default=None, description="folder of label maps named like the photos")
+    masks: Path | None = Field(default=None, description="folder of foreground masks named like the photos")
+    classes: Path | None = Field(default=None, description="classes.json: names of the label ids")
+    mask_mode: Literal["ignore", "empty"] = Field(default="ignore", description="what black mask pixels mean")
+    max_size: int = Field(default=1600, ge=64, description="long side of the working copies in pixels")
+    frames: int = Field(default=80, ge=4, description="number of frames taken from a video")
+    keep_blurry: bool = Field(default=False, description="use photos that look blurred too")
+    add: bool = Field(default=False, description="add the photos to an existing project")
 
 
 class ImportParams(Params):
@@ -88,29 +95,31 @@ class ImportParams(Params):
 class PosesParams(Params):
     project: Path
     preset: Literal["fast", "standard", "robust"] = "standard"
-    restart: bool = Field(False, description="place all photos anew, also those that have a pose")
-    group: int = Field(0, ge=0, description="where photos fall into separate groups: which to use, 0 being the largest")
+    restart: bool = Field(default=False, description="place all photos anew, also those that have a pose")
+    group: int = Field(
+        default=0, ge=0, description="where photos fall into separate groups: which to use, 0 being the largest"
+    )
 
 
 class AlignParams(Params):
     project: Path
-    up: str | None = Field(None, description="direction that points up: x, -x, …, or three numbers a,b,c")
+    up: str | None = Field(default=None, description="direction that points up: x, -x, …, or three numbers a,b,c")
     scale: tuple[str, str, float] | None = Field(
-        None, description="two points (x,y,z) or camera names, and their distance in metres"
+        default=None, description="two points (x,y,z) or camera names, and their distance in metres"
     )
-    gps: bool = Field(False, description="take scale and north from the photos' GPS positions")
-    ground: bool = Field(False, description="level the ground and put it at z = 0")
+    gps: bool = Field(default=False, description="take scale and north from the photos' GPS positions")
+    ground: bool = Field(default=False, description="level the ground and put it at z = 0")
     crop: str | None = Field(
-        None, description="region of interest: auto, none, or x0,y0,z0,x1,y1,z1 in the aligned world"
+        default=None, description="region of interest: auto, none, or x0,y0,z0,x1,y1,z1 in the aligned world"
     )
 
 
 class TrainParams(Params):
     project: Path
     preset: Preset = "standard"
-    run: str = Field("main", pattern=r"^[\w.-]+$", description="name of the run")
-    time_limit: float | None = Field(None, gt=0, description="seconds of training")
-    steps: int | None = Field(None, gt=0, description="optimisation steps")
+    run: str = Field(default="main", pattern=r"^[\w.-]+$", description="name of the run")
+    time_limit: float | None = Field(default=None, gt=0, description="seconds of training")
+    steps: int | None = Field(default=None, gt=0, description="optimisation steps")
     set: dict[str, str] = Field(default_factory=dict, description="settings by name, e.g. loss.semantic=0.1")
     resume: bool = False
 
@@ -127,7 +136,7 @@ class RenderParams(Params):
     run: str = "main"
     test: bool = False
     camera: Path | None = None
-    orbit: int | None = Field(None, gt=0)
+    orbit: int | None = Field(default=None, gt=0)
     size: tuple[int, int] | None = None
     passes: list[Pass] = ["rgb", "depth", "semantic"]
 
@@ -136,9 +145,9 @@ class MeshParams(Params):
     project: Path
     run: str = "main"
     out: Path | None = None
-    faces: int | None = Field(None, gt=0, description="target number of triangles")
-    resolution: int = Field(256, ge=16, le=1024, description="cells along the longest side of the box")
-    texture: int | None = Field(None, ge=64, description="texture size in pixels; none: vertex colours only")
+    faces: int | None = Field(default=None, gt=0, description="target number of triangles")
+    resolution: int = Field(default=256, ge=16, le=1024, description="cells along the longest side of the box")
+    texture: int | None = Field(default=None, ge=64, description="texture size in pixels; none: vertex colours only")
     split: Literal["none", "classes"] = "none"
 
 
@@ -146,7 +155,7 @@ class BlendParams(Params):
     project: Path
     out: Path
     run: str = "main"
-    split: Literal["none", "classes"] = Field("none", description="classes: one mesh object for each class")
+    split: Literal["none", "classes"] = Field(default="none", description="classes: one mesh object for each class")
 
 
 class PackageParams(Params):
@@ -162,7 +171,7 @@ class ReconstructParams(Params):
     masks: Path | None = None
     classes: Path | None = None
     blend: Path | None = None
-    time_limit: float | None = Field(None, gt=0, description="seconds of training")
+    time_limit: float | None = Field(default=None, gt=0, description="seconds of training")
     set: dict[str, str] = Field(default_factory=dict)
-    report: Path | None = Field(None, description="HTML report to write")
-    renders: Path | None = Field(None, description="folder for renders of new views")
+    report: Path | None = Field(default=None, description="HTML report to write")
+    renders: Path | None = Field(default=None, description="folder for renders of new views")

@@ -70,7 +70,7 @@ class SemanticClass(Model):
     id: int = Field(ge=0)
     name: str
     color: tuple[float, float, float]
-    priority: float = Field(1.0, ge=0)
+    priority: float = Field(default=1.0, ge=0)
 
 
 class Frame(Model):

@@ -11,9 +11,20 @@ import shutil
 import subprocess
 import sys
 
-PACKAGES = (
-    "libx11-6 libxi6 libxxf86vm1 libxfixes3 libxrender1 libxkbcommon0 libsm6 libice6 libgl1 libegl1 libgomp1 libxext6"
-).split()
+PACKAGES = [
+    "libx11-6",
+    "libxi6",
+    "libxxf86vm1",
+    "libxfixes3",
+    "libxrender1",
+    "libxkbcommon0",
+    "libsm6",
+    "libice6",
+    "libgl1",
+    "libegl1",
+    "libgomp1",
+    "libxext6",
+]
 
 
 def missing_library() -> str:

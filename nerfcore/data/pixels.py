@@ -63,9 +63,8 @@ def resize(pixels: np.ndarray, width: int, height: int, nearest: bool = False) -
         x = ((np.arange(width) + 0.5) * pixels.shape[1] / width).astype(int)
         return pixels[y][:, x]
     source = oiio.ImageBuf(np.ascontiguousarray(pixels))
-    return oiio.ImageBufAlgo.resize(source, roi=oiio.ROI(0, width, 0, height, 0, 1, 0, pixels.shape[2])).get_pixels(
-        oiio.UINT8
-    )
+    result = oiio.ImageBufAlgo.resize(source, roi=oiio.ROI(0, width, 0, height, 0, 1, 0, pixels.shape[2]))
+    return np.asarray(result.get_pixels(oiio.UINT8))
 
 
 def training_size(camera: Camera, longest: int) -> tuple[int, int]:

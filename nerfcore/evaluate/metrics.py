@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from skimage.metrics import structural_similarity
@@ -18,11 +19,10 @@ def psnr(image: np.ndarray, photo: np.ndarray, keep: np.ndarray | None = None) -
 
 def ssim(image: np.ndarray, photo: np.ndarray) -> float:
     """Structural similarity, 11×11 Gaussian window with σ 1.5 (Wang et al., 2004), of (H, W, 3) uint8 images."""
-    return float(
-        structural_similarity(
-            image, photo, data_range=255, channel_axis=2, gaussian_weights=True, sigma=1.5, use_sample_covariance=False
-        )
+    value: Any = structural_similarity(
+        image, photo, data_range=255, channel_axis=2, gaussian_weights=True, sigma=1.5, use_sample_covariance=False
     )
+    return float(value)
 
 
 @dataclass

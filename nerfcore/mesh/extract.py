@@ -120,8 +120,8 @@ def extract(
     mesh = drop_parts(mesh, visible_faces(model, mesh, views, 3 * spacing, report))
     if faces is not None and len(mesh.faces) > faces:
         report.stage("Simplifying")
-        points, kept = fast_simplification.simplify(
-            mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32), target_count=faces
+        points, kept, *_ = fast_simplification.simplify(
+            np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int32), target_count=faces
         )
         mesh = trimesh.Trimesh(points, kept, process=False)
     if mesh.volume < 0:

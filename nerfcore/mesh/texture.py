@@ -107,5 +107,5 @@ def bake(
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
         texture[rows[part], columns[part]] = color(interpolate(vertices, part), normal)
     # Spread the border colours into the gaps, so that filtering at seams does not pick up black.
-    nearest = ndimage.distance_transform_edt(face < 0, return_distances=False, return_indices=True)
-    return texture[tuple(nearest)]
+    nearest = np.asarray(ndimage.distance_transform_edt(face < 0, return_distances=False, return_indices=True))
+    return texture[nearest[0], nearest[1]]

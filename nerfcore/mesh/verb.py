@@ -8,6 +8,10 @@ from typing import Any
 
 import numpy as np
 import trimesh
+from trimesh.exchange.export import export_scene
+from trimesh.exchange.obj import export_obj
+from trimesh.exchange.ply import export_ply
+from trimesh.visual import TextureVisuals
 
 from ..data.box import box_poses
 from ..data.cameras import Camera
@@ -126,15 +130,13 @@ def write_textured(path: Path, surface: Surface, texture: Texture, names: dict[i
             surface.vertices[u.source[used]],
             inverse.reshape(-1, 3),
             vertex_normals=surface.normals[u.source[used]],
-            visual=trimesh.visual.TextureVisuals(uv=u.uv[used], image=picture),
+            visual=TextureVisuals(uv=u.uv[used], image=picture),
             process=False,
         )
     kind = path.suffix[1:].lower()
-    data, extra = trimesh.exchange.export.export_scene(trimesh.Scene(parts), None, file_type="glb"), {}
+    data, extra = export_scene(trimesh.Scene(parts), None, file_type="glb"), {}
     if kind == "obj":
-        data, extra = trimesh.exchange.obj.export_obj(
-            trimesh.Scene(parts), return_texture=True, mtl_name=f"{path.stem}.mtl"
-        )
+        data, extra = export_obj(trimesh.Scene(parts), return_texture=True, mtl_name=f"{path.stem}.mtl")
     for target, content in {path: data, **{path.parent / name: value for name, value in extra.items()}}.items():
         with atomic_path(target) as temporary:
             temporary.write_bytes(content if isinstance(content, bytes) else content.encode())
@@ -191,11 +193,11 @@ def write_surface(
             if path.suffix.lower() == ".ply":
                 mesh = as_trimesh(surface)
                 mesh.vertex_attributes["class_id"] = surface.class_id.astype(np.int32)
-                temporary.write_bytes(mesh.export(file_type="ply", vertex_normal=True))
+                temporary.write_bytes(export_ply(mesh, vertex_normal=True))
             else:
                 as_trimesh(surface).export(temporary, file_type=path.suffix[1:].lower())
         return [path]
-    parts = {
+    parts: dict[str, Any] = {
         names.get(int(c), str(c)): as_trimesh(surface).submesh([np.flatnonzero(surface.face_class == c)], append=True)
         for c in np.unique(surface.face_class)
     }

@@ -195,7 +195,7 @@ def write_exr(path: Path, layers: dict[str, np.ndarray]) -> None:
     names = list(layers)
     height, width = layers[names[0]].shape
     spec = oiio.ImageSpec(width, height, len(names), oiio.FLOAT)
-    spec.channelnames = names
+    spec.channelnames = tuple(names)
     buffer = oiio.ImageBuf(spec)
     buffer.set_pixels(spec.roi, np.ascontiguousarray(np.stack([layers[n] for n in names], -1), np.float32))
     if not buffer.write(str(path)):

@@ -93,7 +93,7 @@ def test_a_ball_of_constant_density_renders_to_its_closed_form(pdf: str) -> None
 
 def test_depth_labels_and_normals_of_the_ball() -> None:
     frame, _, opacity = rendered(192)
-    camera, pose = view()
+    _, pose = view()
     middle = frame.depth[20, 24]
     distance = np.linalg.norm(pose[:3, 3])
     # expected depth of an exponential absorber over the chord 2R

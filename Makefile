@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 SHELL := /bin/bash
 export OMP_WAIT_POLICY := passive
 
-.PHONY: venv demo test test-all lint matrix gui gpu-compile gpu-check bench repository clean
+.PHONY: venv demo test test-all lint matrix gui gpu-compile gpu-check repository clean
 
 venv: $(VENV)/.ready
 
@@ -24,7 +24,7 @@ $(VENV)/.ready: pyproject.toml
 DEMO := build/demo$(if $(PHOTOS),-$(notdir $(patsubst %/,%,$(PHOTOS))))
 OWN := $(if $(LABELS),--labels "$(LABELS)") $(if $(CLASSES),--classes "$(CLASSES)") $(if $(MASKS),--masks "$(MASKS)")
 SIMULATED := --labels $(DEMO)/capture/labels --classes $(DEMO)/capture/classes.json
-TRAIN_SECONDS ?= 180
+TRAIN_SECONDS ?= 300
 
 demo: venv
 ifndef PHOTOS

@@ -51,7 +51,9 @@ def test_cancel_is_prompt_and_work_is_kept(shared_data: Data, tmp_path: Path, st
     assert time.monotonic() - report.asked < 2
     assert not (project / "poses" / "poses.json").exists()
     pairs = verified_pairs(project)
-    assert (pairs == 55) == (stage == "Placing cameras")
+    # A quick machine may finish matching before it hears of the cancel.
+    if stage != "Matching features":
+        assert pairs == (55 if stage == "Placing cameras" else 0)
     assert poses(project)["registered"] == 11
 
 

@@ -58,6 +58,8 @@ def train(params: TrainParams, report: Reporter) -> dict[str, Any]:
         for stale in (CHECKPOINT, "events.jsonl", "metrics.json"):
             (folder / stale).unlink(missing_ok=True)
         save_info(project_folder, params.run, info)
+    for half_written in folder.glob(".*.safetensors"):  # by a process that was killed
+        half_written.unlink()
     trainer = make_trainer(project_folder, info, scene, device, report)
     state = {"seconds": 0.0, "progress": 0.0, "psnr": None}
     if saved is not None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -197,6 +199,33 @@ def test_cancel_takes_less_than_two_seconds_and_leaves_a_checkpoint(tiny_project
         train(tiny_project, "cancelled", 100000, report)
     assert time.monotonic() - asked[0] < 2.0
     assert (tiny_project / "runs" / "cancelled" / "field.safetensors").is_file()
+
+
+def test_a_killed_training_goes_on_from_its_last_checkpoint(tiny_project: Path) -> None:
+    """`fieldwork train` dies by SIGKILL; the project stays readable and --resume finishes the run."""
+    settings = [f"--set={k}={v}" for k, v in {**SMALL, "train.checkpoint_every": "0.3"}.items()]
+    command = [
+        sys.executable,
+        "-m",
+        "fieldwork.nerfcore",
+        "train",
+        str(tiny_project),
+        "--run",
+        "killed",
+        "--preset=draft",
+    ]
+    checkpoint = tiny_project / "runs" / "killed" / "field.safetensors"
+    process = subprocess.Popen([*command, *settings, "--steps=100000", "--quiet"])
+    deadline = time.monotonic() + 120
+    while not checkpoint.is_file() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    process.kill()
+    assert process.wait() == -9
+    steps = read_checkpoint(checkpoint, torch.device("cpu"))[1]["steps"]
+    assert steps > 0
+    result = train(tiny_project, "killed", steps + 5, resume=True)
+    assert result["steps"] == steps + 5
+    assert not list(checkpoint.parent.glob(".field*"))
 
 
 def test_a_full_disk_ends_with_a_sentence_and_keeps_the_old_checkpoint(

@@ -24,7 +24,7 @@ $(VENV)/.ready: pyproject.toml
 DEMO := build/demo$(if $(PHOTOS),-$(notdir $(patsubst %/,%,$(PHOTOS))))
 OWN := $(if $(LABELS),--labels "$(LABELS)") $(if $(CLASSES),--classes "$(CLASSES)") $(if $(MASKS),--masks "$(MASKS)")
 SIMULATED := --labels $(DEMO)/capture/labels --classes $(DEMO)/capture/classes.json
-TRAIN_SECONDS ?= 300
+TRAIN_SECONDS ?= 240
 
 demo: venv
 ifndef PHOTOS

@@ -100,7 +100,9 @@ class RenderConfig(Stage):
     cull: float = Field(
         default=1e-4, ge=0, description="rendering weight below which colour and classes are not computed"
     )
-    samples: int | None = Field(default=None, description="samples a ray when rendering; none: as in training")
+    samples: int | None = Field(
+        default=32, ge=1, le=512, description="samples a ray when rendering; null: as in training"
+    )
 
 
 class LossConfig(Stage):

@@ -42,7 +42,7 @@ def ball_model(samples: int, pdf: str = "default", resolution: int = 64) -> Mode
     config = RunConfig.model_validate(
         {
             "sampling": {"samples": samples, "pdf": pdf, "resolution": resolution},
-            "render": {"cull": 0},
+            "render": {"cull": 0, "samples": None},
             "field": {"levels": 1},
         }
     )

@@ -25,6 +25,9 @@ from .image import Frame, background_of, render_view, write_picture
 from .pictures import colorize_depth, colorize_labels
 
 
+ORBIT_PIXELS = 800  # longest side of orbit frames unless a size is asked for
+
+
 def render(params: RenderParams, report: Reporter) -> dict[str, Any]:
     """Render a run from some cameras; existing frames are overwritten.
 
@@ -119,6 +122,7 @@ def orbit_cameras(scene: Scene, count: int) -> list[tuple[str, Camera, np.ndarra
     offsets = np.stack([v.camera_to_world[:3, 3] for v in views]) - focus
     height, radius = float(np.median(offsets[:, 2])), float(np.median(np.linalg.norm(offsets[:, :2], axis=1)))
     camera = views[0].camera.undistorted()
+    camera = camera.resized(*training_size(camera, ORBIT_PIXELS))
     frames = []
     for number in range(count):
         angle = 2 * np.pi * number / count

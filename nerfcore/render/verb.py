@@ -24,7 +24,6 @@ from ..train.run import load_trained
 from .image import Frame, background_of, render_view, write_picture
 from .pictures import colorize_depth, colorize_labels
 
-
 ORBIT_PIXELS = 800  # longest side of orbit frames unless a size is asked for
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 
@@ -32,10 +32,8 @@ class Measured:
     mse: float = 0.0
     steps: int = 0
     rays: int = 0
-    hits: int = 0
     samples: int = 0
     shown: int = 0
-    parts: dict[str, float] = field(default_factory=dict)
 
     @property
     def psnr(self) -> float:

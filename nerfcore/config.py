@@ -103,6 +103,10 @@ class RenderConfig(Stage):
     samples: int | None = Field(
         default=32, ge=1, le=512, description="samples a ray when rendering; null: as in training"
     )
+    fused: Literal["auto", "on", "off"] = Field(
+        default="auto",
+        description="march, networks and compositing in one kernel; auto: on CUDA; on: on the CPU too, slowly (tests)",
+    )
 
 
 class LossConfig(Stage):

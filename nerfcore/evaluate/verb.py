@@ -8,8 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import psutil
-import torch
 
 from ..data.box import box_poses
 from ..data.pixels import read_image, read_label, read_photo, resize, training_size
@@ -23,6 +21,7 @@ from ..render.image import Frame, background_of, render_view, to_bytes, write_pi
 from ..render.pictures import colorize_depth, colorize_labels, side_by_side
 from ..train.run import Trained, load_trained, run_folder
 from .metrics import Confusion, psnr, ssim
+from .speed import measure_speed, peak_memory
 
 
 def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
@@ -82,7 +81,7 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
         "rps": round(rays / seconds),
         "seconds_per_image": round(seconds / len(indices), 3),
         "params_m": round(trained.model.field.parameter_count() / 1e6, 3),
-        "memory_mb": round(_memory(trained.device)),
+        "memory_mb": round(peak_memory(trained.device)),
         "background": "white" if background == 1 else "black",
         "device": str(trained.device),
         "per_image": [{k: (round(v, 4) if isinstance(v, float) else v) for k, v in s.items()} for s in scores],
@@ -129,74 +128,3 @@ def _write_pictures(
     with atomic_path(path) as temporary:
         write_picture(temporary, side_by_side(tiles))
     return path
-
-
-def _memory(device: torch.device) -> float:
-    """Peak memory in MiB: of the GPU when one is used, else resident memory of this process."""
-    if device.type == "cuda":
-        return torch.cuda.max_memory_allocated(device) / 2**20
-    return psutil.Process().memory_info().rss / 2**20
-
-
-@torch.no_grad()
-def measure_speed(
-    trained: Trained, scene: Scene, indices: list[int], box_from_world: np.ndarray, report: Reporter, side: int = 800
-) -> dict[str, Any]:
-    """Frames a second at side × side with colour and classes: warm, synchronised; median over five test poses
-    on a GPU, one pose on a CPU.
-
-    `ms_sampling` and `ms_network` split one frame; `spr` is the number of field samples per ray.
-    """
-    from ..data.pixels import CameraRays
-    from ..kernels.composite import render_weights
-    from ..kernels.march import sample
-
-    model, device = trained.model, trained.device
-    count = model.config.render.samples or model.config.sampling.samples
-
-    def synchronize() -> None:
-        if device.type == "cuda":
-            torch.cuda.synchronize(device)
-
-    times, sampling, network, samples, rays = [], 0.0, 0.0, 0, 0
-    report.stage("Measuring speed")
-    # The evaluation before has warmed everything up; a frame on a CPU takes seconds, so one pose must do there.
-    for index in indices[: 5 if device.type == "cuda" else 1]:
-        report.check()
-        view = scene.views[index]
-        camera = view.camera.undistorted().resized(side, side)
-        pose = box_poses([view], box_from_world)[0]
-        synchronize()
-        begin = time.perf_counter()
-        render_view(model, camera, pose, 0.0, check=report.check)
-        synchronize()
-        times.append(time.perf_counter() - begin)
-    view = scene.views[indices[0]]
-    camera = view.camera.undistorted().resized(side, side)
-    camera_rays = CameraRays([camera], box_poses([view], box_from_world), device)
-    settings, occupancy = model.occupancy.march_settings(), model.occupancy
-    for pixel in torch.arange(side * side, device=device).split(1 << 15):
-        origins, directions = camera_rays(torch.zeros_like(pixel), pixel)
-        synchronize()
-        begin = time.perf_counter()
-        s = sample(origins, directions, occupancy.cells, occupancy.blocks, settings, count)
-        synchronize()
-        middle = time.perf_counter()
-        geometry = model.field.geometry(s.points)
-        weights = render_weights(geometry.density, s.delta, s.packing)
-        shown = geometry[(weights > model.config.render.cull).nonzero()[:, 0]]
-        model.field.color(shown, torch.zeros(len(shown.density), 16, device=device))
-        if model.field.semantic_head is not None:
-            model.field.logits(shown)
-        synchronize()
-        sampling += middle - begin
-        network += time.perf_counter() - middle
-        samples += len(s)
-        rays += len(pixel)
-    return {
-        "fps": round(1 / float(np.median(times)), 3),
-        "fps_size": [side, side],
-        "spr": round(samples / rays, 3),
-        "ms_sampling": round(sampling * 1e3, 2),
-        "ms_network": round(network * 1e3, 2),
-    }

@@ -12,12 +12,10 @@ from .march import cell_index
 from .runtime import array, init, launch
 
 
-@wp.kernel(module="fieldwork_cells")
-def read_trilinear(
-    grid: wp.array(dtype=float), n: int, points: wp.array(dtype=wp.vec3), out: wp.array(dtype=float), offset: int
-):
-    i = wp.tid() + offset
-    p = points[i] * float(n) - wp.vec3(0.5, 0.5, 0.5)
+@wp.func
+def trilinear_at(grid: wp.array(dtype=float), n: int, point: wp.vec3):
+    """Value of an n³ grid at a point in [0, 1]³; constant beyond the outermost cell centres."""
+    p = point * float(n) - wp.vec3(0.5, 0.5, 0.5)
     ix = wp.clamp(int(wp.floor(p[0])), 0, n - 2)
     iy = wp.clamp(int(wp.floor(p[1])), 0, n - 2)
     iz = wp.clamp(int(wp.floor(p[2])), 0, n - 2)
@@ -31,7 +29,15 @@ def read_trilinear(
         row = ((iz + dz) * n + iy + dy) * n + ix
         w = wp.where(dy == 1, fy, 1.0 - fy) * wp.where(dz == 1, fz, 1.0 - fz)
         total += w * ((1.0 - fx) * grid[row] + fx * grid[row + 1])
-    out[i] = total
+    return total
+
+
+@wp.kernel(module="fieldwork_cells")
+def read_trilinear(
+    grid: wp.array(dtype=float), n: int, points: wp.array(dtype=wp.vec3), out: wp.array(dtype=float), offset: int
+):
+    i = wp.tid() + offset
+    out[i] = trilinear_at(grid, n, points[i])
 
 
 @wp.kernel(module="fieldwork_cells")

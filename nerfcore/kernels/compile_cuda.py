@@ -1,50 +1,90 @@
-"""Compile every kernel module for NVIDIA GPUs without one: `python -m fieldwork.nerfcore.kernels.compile_cuda OUT`."""
+"""Compile every kernel for NVIDIA GPUs without one, and report what each takes of a multiprocessor.
+
+    python -m fieldwork.nerfcore.kernels.compile_cuda OUT [--architectures 75,86,89,90,120] [--jobs N]
+
+Writes OUT/sm_NN/MODULE/*.cubin, OUT/resources.json and OUT/resources.md.
+"""
 
 from __future__ import annotations
 
-import sys
+import argparse
+import dataclasses
+import multiprocessing
+import shutil
 import time
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import warp as wp
 
+from ..files import write_json, write_text
 from . import cells, composite, encode, march
-from .runtime import init
+from .fused import LANES, FusedShape, fused_kernel
+from .resources import Resources, disassembler, markdown, read_resources
+from .runtime import CUDA_BLOCK, default_threads, init
 
 ARCHITECTURES = (75, 86, 89, 90, 120)
-MODULES = {
-    kernel.module.name: kernel.module
-    for source in (encode, march, composite, cells)
-    for kernel in vars(source).values()
-    if isinstance(kernel, wp.Kernel)
-}
+SOURCES = (encode, march, composite, cells)
+# The standard preset: without classes, with few, with the most.
+FUSED = {f"fused, {classes} classes": FusedShape(8, 8, 64, 16, 3, 0, classes, False) for classes in (0, 16, 64)}
 
 
-def compile_all(folder: Path) -> list[tuple[str, int, float, int]]:
-    """Write one binary a module and architecture; returns (module, architecture, seconds, bytes) rows.
+def modules() -> dict[str, tuple[wp.Module, int]]:
+    """Every kernel module by name, with the threads a block it is launched with."""
+    kernels = [kernel for source in SOURCES for kernel in vars(source).values() if isinstance(kernel, wp.Kernel)]
+    found = {kernel.module.name: (kernel.module, CUDA_BLOCK) for kernel in kernels}
+    return found | {name: (fused_kernel(shape, LANES).module, LANES) for name, shape in FUSED.items()}
+
+
+def compile_architecture(folder: Path, architecture: int) -> list[tuple[str, float, list[Resources]]]:
+    """Compile all modules for one architecture; (module, seconds, resources of its kernels).
 
     Raises:
         RuntimeError: a kernel does not compile.
     """
     init()
     rows = []
-    for arch in ARCHITECTURES:
-        for name, module in MODULES.items():
-            target = folder / f"sm_{arch}" / name
-            target.mkdir(parents=True, exist_ok=True)
-            begin = time.perf_counter()
-            wp.compile_aot_module(module, device=None, arch=arch, module_dir=str(target))
-            size = sum(f.stat().st_size for f in target.iterdir() if f.suffix in (".cubin", ".ptx"))
-            if size == 0:
-                raise RuntimeError(f"{name} gave no binary for sm_{arch} in {target}")
-            rows.append((name, arch, time.perf_counter() - begin, size))
+    for name, (module, block) in modules().items():
+        target = folder / f"sm_{architecture}" / name.replace(", ", "_").replace(" ", "_")
+        shutil.rmtree(target, ignore_errors=True)
+        target.mkdir(parents=True)
+        begin = time.perf_counter()
+        module.options["block_dim"] = block
+        wp.compile_aot_module(module, device=None, arch=architecture, module_dir=str(target), use_ptx=False)
+        binary, meta = next(target.glob("*.cubin"), None), next(target.glob("*.meta"), None)
+        if binary is None or meta is None:
+            raise RuntimeError(f"{name} gave no binary for sm_{architecture} in {target}")
+        rows.append((name, time.perf_counter() - begin, read_resources(binary, meta, architecture)))
+    return rows
+
+
+def compile_all(folder: Path, architectures: list[int], jobs: int) -> list[tuple[str, Resources]]:
+    """Compile for several architectures, one process each, and write the report; (module, resources) of each kernel."""
+    rows: list[tuple[str, Resources]] = []
+    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
+        results = pool.map(compile_architecture, [folder] * len(architectures), architectures)
+        for architecture, compiled in zip(architectures, results):
+            for name, seconds, kernels in compiled:
+                print(f"sm_{architecture:<4} {name:22} {seconds:6.1f} s", flush=True)
+                for r in kernels:
+                    local = "" if r.local_loads is None else f", local memory {r.local_loads} + {r.local_stores}"
+                    print(f"    {r.kernel:18} {r.registers:3} registers, stack {r.stack}, shared {r.shared}{local}")
+                rows += [(name, r) for r in kernels]
+    write_json(folder / "resources.json", [{"module": m, **dataclasses.asdict(r)} for m, r in rows])
+    write_text(folder / "resources.md", markdown(rows))
     return rows
 
 
 def main() -> None:
-    folder = Path(sys.argv[1] if len(sys.argv) > 1 else "build/cubins")
-    for name, arch, seconds, size in compile_all(folder):
-        print(f"{name:22} sm_{arch:<4} {seconds:6.1f} s {size / 1024:8.1f} KiB")
+    parser = argparse.ArgumentParser(prog="compile_cuda", description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("out", type=Path, nargs="?", default=Path("build/cubins"))
+    parser.add_argument("--architectures", default=",".join(map(str, ARCHITECTURES)))
+    parser.add_argument("--jobs", type=int, default=default_threads())
+    options = parser.parse_args()
+    if disassembler() is None:
+        print("nvdisasm is not installed: local memory accesses are not measured.")
+    compile_all(options.out, [int(a) for a in options.architectures.split(",")], options.jobs)
+    print(f"Written: {options.out / 'resources.md'}")
 
 
 if __name__ == "__main__":

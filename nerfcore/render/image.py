@@ -15,8 +15,7 @@ from ..data.pixels import CameraRays
 from ..errors import DiskError
 from ..train.model import Model
 from ..train.run import RunInfo
-
-RAYS = 1 << 15  # rays rendered at once
+from .fused import ray_renderer
 
 
 @dataclass(frozen=True)
@@ -80,13 +79,14 @@ def render_view(
     count = model.config.render.samples or model.config.sampling.samples
     axis = rays.rotation[0, :, 2]
     colors, opacities, depths, classes, points = [], [], [], [], []
-    for pixel in torch.arange(camera.width * camera.height, device=device).split(RAYS):
+    render = ray_renderer(model, camera.width * camera.height, semantics)
+    for pixel in torch.arange(camera.width * camera.height, device=device).split(render.rays):
         if check is not None:
             check()
         origins, directions = rays(torch.zeros_like(pixel), pixel)
         valid = ~directions[:, 0].isnan()
         directions = torch.where(valid[:, None], directions, axis.expand_as(directions)).contiguous()
-        out = model.render(origins, directions, count, semantics=semantics)
+        out = render(origins, directions, count)
         opacity = out.opacity * valid
         distance = torch.where(opacity > 1e-3, out.depth / out.opacity.clamp(min=1e-3), torch.nan)
         colors.append(out.color * valid[:, None] + background * (1 - opacity[:, None]))

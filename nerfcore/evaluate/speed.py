@@ -1,0 +1,116 @@
+"""How fast a trained field renders: frames a second, and where the time goes."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+import psutil
+import torch
+
+from ..data.box import box_poses
+from ..data.pixels import CameraRays
+from ..data.scene import Scene
+from ..field.encoding import spherical_harmonics
+from ..kernels.composite import render_weights
+from ..kernels.march import sample
+from ..progress import Reporter
+from ..render.fused import FusedRenderer, ray_renderer
+from ..render.image import render_view
+from ..train.model import Model
+from ..train.run import Trained
+
+
+def peak_memory(device: torch.device) -> float:
+    """Peak memory of this process in MiB: of the GPU when one is used, else resident memory now."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device) / 2**20
+    return psutil.Process().memory_info().rss / 2**20
+
+
+def _synchronize(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+@torch.no_grad()
+def measure_speed(
+    trained: Trained,
+    scene: Scene,
+    indices: list[int],
+    box_from_world: np.ndarray,
+    report: Reporter,
+    side: int = 800,
+    poses: int | None = None,
+) -> dict[str, Any]:
+    """Frames a second at side × side with colour and classes: warm, synchronised; median over `poses` of the views
+    `indices`, by default five on a GPU and one on a CPU, where a frame takes seconds.
+
+    `ms_sampling` and `ms_network` split one frame: the coarse walk, and all that reads the field (the fused kernel
+    draws its samples there too); `spr` is the number of field samples per ray; `fused` says which kernels rendered.
+    """
+    model, device = trained.model, trained.device
+    report.stage(f"Measuring speed at {side}×{side}")
+    times = []
+    poses = poses or (5 if device.type == "cuda" else 1)
+    for turn, index in enumerate(indices[:1] * (device.type == "cuda") + indices[:poses]):
+        report.check()
+        view = scene.views[index]
+        camera = view.camera.undistorted().resized(side, side)
+        pose = box_poses([view], box_from_world)[0]
+        _synchronize(device)
+        begin = time.perf_counter()
+        render_view(model, camera, pose, 0.0, check=report.check)
+        _synchronize(device)
+        if turn > 0 or device.type != "cuda":  # the first frame of a GPU warms it up
+            times.append(time.perf_counter() - begin)
+    view = scene.views[indices[0]]
+    camera = view.camera.undistorted().resized(side, side)
+    rays = CameraRays([camera], box_poses([view], box_from_world), device)
+    sampling, network, samples, fused = split_times(model, rays, side * side, report)
+    return {
+        "fps": round(1 / float(np.median(times)), 3),
+        "fps_size": [side, side],
+        "spr": round(samples / side**2, 3),
+        "ms_sampling": round(sampling * 1e3, 2),
+        "ms_network": round(network * 1e3, 2),
+        "fused": fused,
+    }
+
+
+def split_times(model: Model, rays: CameraRays, count: int, report: Reporter) -> tuple[float, float, int, bool]:
+    """Seconds of sampling, seconds of reading the field, field samples, and whether the fused kernel was used, for the
+    first camera's `count` pixels."""
+    device = rays.device
+    renderer = ray_renderer(model, count)
+    per_ray = model.config.render.samples or model.config.sampling.samples
+    sampling, network, samples = 0.0, 0.0, 0
+    for pixel in torch.arange(count, device=device).split(renderer.rays):
+        report.check()
+        origins, directions = rays(torch.zeros_like(pixel), pixel)
+        _synchronize(device)
+        begin = time.perf_counter()
+        if isinstance(renderer, FusedRenderer):
+            coarse = renderer.coarse(origins, directions)
+            _synchronize(device)
+            middle = time.perf_counter()
+            evaluated = renderer.fine(coarse, per_ray).evaluated
+        else:
+            o = model.occupancy
+            drawn = sample(origins, directions, o.cells, o.blocks, o.march_settings(), per_ray)
+            _synchronize(device)
+            middle = time.perf_counter()
+            geometry = model.field.geometry(drawn.points)
+            weights = render_weights(geometry.density, drawn.delta, drawn.packing)
+            kept = (weights > model.config.render.cull).nonzero()[:, 0]
+            directional = spherical_harmonics(directions)[drawn.packing.ray[kept].long()]
+            model.field.color(geometry[kept], directional)
+            if model.field.semantic_head is not None:
+                model.field.logits(geometry[kept])
+            evaluated = len(drawn)
+        _synchronize(device)
+        sampling += middle - begin
+        network += time.perf_counter() - middle
+        samples += int(evaluated)
+    return sampling, network, samples, isinstance(renderer, FusedRenderer)

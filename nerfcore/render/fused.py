@@ -1,0 +1,196 @@
+"""When a model is rendered by the fused kernel, and how its field is packed for it."""
+
+from __future__ import annotations
+
+import logging
+from functools import cache
+
+import torch
+
+from ..field.hybrid import HybridField
+from ..field.mlp import MLP
+from ..kernels.fused import MOST_CLASSES, CoarseRays, FusedField, FusedRays, FusedShape, coarse_walk, render_coarse
+from ..kernels.fused_network import padded
+from ..train.model import Model, Rendered
+
+log = logging.getLogger("fieldwork")
+LEAST_RAYS = 1 << 17  # of a picture that "auto" renders fused: previews are not worth a minute of compilation
+
+
+def unsupported(model: Model) -> str | None:
+    """Why the fused kernel cannot render this model; None when it can."""
+    field = model.field
+    if not isinstance(field, HybridField):
+        return f"the field is a {type(field).__name__}"
+    c = field.config
+    if c.branch == "implicit":
+        return "field.branch is “implicit”"
+    if c.branch == "hybrid" and c.fusion != "blend":
+        return f"field.fusion is “{c.fusion}”"
+    if c.width % 16 or c.width > 64:
+        return f"field.width is {c.width}, not 16, 32, 48 or 64"
+    if c.levels > 16:
+        return f"field.levels is {c.levels}, more than 16"
+    if c.octaves > 10:
+        return f"field.octaves is {c.octaves}, more than 10"
+    if c.geometry_features > 31:
+        return f"field.geometry_features is {c.geometry_features}, more than 31"
+    if c.appearance > 16:
+        return f"field.appearance is {c.appearance}, more than 16"
+    if c.branch == "hybrid" and c.implicit_layers != 2:
+        return f"field.implicit_layers is {c.implicit_layers}, not 2"
+    if c.color_layers not in (2, 3):
+        return f"field.color_layers is {c.color_layers}, not 2 or 3"
+    if field.classes and c.semantic_layers != 2:
+        return f"field.semantic_layers is {c.semantic_layers}, not 2"
+    if field.classes > MOST_CLASSES:
+        return f"there are {field.classes} classes, more than {MOST_CLASSES}"
+    return None
+
+
+def wants_fused(model: Model, rays: int) -> bool:
+    """Whether to render `rays` rays with the fused kernel: `render.fused` is on, or auto on CUDA for a picture large
+    enough to be worth its compilation; and the model is one it supports."""
+    wanted = model.config.render.fused
+    if wanted == "off" or (wanted == "auto" and (model.priorities.device.type != "cuda" or rays < LEAST_RAYS)):
+        return False
+    reason = unsupported(model)
+    if reason is not None:
+        _log_once(f"Rendering without the fused kernel: {reason}.")
+    return reason is None
+
+
+@cache
+def _log_once(message: str) -> None:
+    log.warning(message)
+
+
+def shape_of(field: HybridField, semantics: bool, logits: bool) -> FusedShape:
+    """The kernel a field needs."""
+    c = field.config
+    return FusedShape(
+        levels=c.levels,
+        octaves=c.octaves if field.implicit is not None else 0,
+        width=c.width,
+        geometry=1 + c.geometry_features,
+        color_layers=c.color_layers,
+        appearance=c.appearance,
+        classes=padded(field.classes) if semantics else 0,
+        logits=logits and semantics,
+    )
+
+
+def _spread(matrix: torch.Tensor, parts: list[tuple[int, int]], columns: int) -> torch.Tensor:
+    """A first layer (out, in) with its inputs moved: each (width, padded width) part keeps its order and gets zero
+    columns behind it; the whole is `columns` wide."""
+    pieces, begin = [], 0
+    for width, room in parts:
+        pieces.append(torch.nn.functional.pad(matrix[:, begin : begin + width], (0, room - width)))
+        begin += width
+    joined = torch.cat(pieces, 1)
+    return torch.nn.functional.pad(joined, (0, columns - joined.shape[1]))
+
+
+def _rows(network: MLP, first: list[tuple[int, int]], sizes: tuple[int, ...], columns: int) -> list[torch.Tensor]:
+    """The layers of a network, padded to `sizes`, `columns` wide, float16."""
+    rows = []
+    for index, weight in enumerate(network.weights):
+        value = weight.detach().float()
+        value = _spread(value, first if index == 0 else [(value.shape[1], value.shape[1])], columns)
+        rows.append(torch.nn.functional.pad(value, (0, 0, 0, sizes[index + 1] - len(value))).half())
+    return rows
+
+
+@torch.no_grad()
+def pack(field: HybridField, semantics: bool = True, logits: bool = False) -> FusedField:
+    """A field's present state as the fused kernel reads it, in half precision (31 MB for the standard preset)."""
+    assert field.grid is not None
+    c, device = field.config, field.grid.table.device
+    semantics = semantics and field.semantic_head is not None
+    shape = shape_of(field, semantics, logits)
+    geometry, columns = shape.geometry, shape.columns
+    explicit = [(field.features, shape.features)]
+    firsts = {
+        "implicit": [(3 + 6 * c.octaves, shape.implicit[0])],
+        "density": explicit,
+        "color": [(geometry + 16 + c.appearance, shape.color[0])],
+        "semantic": [(geometry, padded(geometry)), *(explicit if shape.octaves else [])],
+    }
+    networks = {
+        "implicit": field.implicit,
+        "density": field.density_head,
+        "color": field.color_head,
+        "semantic": field.semantic_head,
+    }
+    rows: list[torch.Tensor] = []
+    for name, sizes in shape.networks().items():
+        network = networks[name]
+        assert network is not None
+        rows += _rows(network, firsts[name], sizes, columns)
+    code = torch.zeros(max(c.appearance, 1), device=device)
+    if field.appearance is not None:
+        code = field.appearance.detach().mean(0).float().contiguous()
+    blend = field.blend if field.blend is not None and not field.blend.warming_up else None
+    evidence = blend.evidence if blend is not None else torch.zeros(1, device=device)
+    return FusedField(
+        shape=shape,
+        table=field.grid.table.half(),
+        layout=torch.tensor(field.grid.levels, dtype=torch.int32, device=device),
+        gains=torch.tensor(field.gains, dtype=torch.float32, device=device),
+        weights=torch.cat(rows).contiguous(),
+        code=code,
+        evidence=evidence,
+        evidence_side=round(len(evidence) ** (1 / 3)) if blend is not None else 0,
+        blend_floor=blend.floor if blend is not None else 1.0,
+        blend_rate=blend.rate if blend is not None else 0.0,
+        density_shift=c.density_shift,
+        class_count=field.classes if semantics else 0,
+    )
+
+
+class FusedRenderer:
+    """A model packed for one picture or more; stale as soon as the model is trained further."""
+
+    rays = 1 << 20  # rendered at once
+
+    def __init__(self, model: Model, semantics: bool = True) -> None:
+        self.config, self.occupancy = model.config, model.occupancy
+        self.settings = model.occupancy.march_settings()
+        self.field = pack(model.field, semantics, self.config.render.accumulate == "logits")
+
+    def coarse(self, origins: torch.Tensor, directions: torch.Tensor) -> CoarseRays:
+        """The coarse walk of rays (R, 3), on the grid alone."""
+        o = self.occupancy
+        return coarse_walk(origins, directions, o.cells, o.blocks, self.settings)
+
+    def fine(self, rays: CoarseRays, count: int) -> FusedRays:
+        """Samples, field and compositing of rays after their coarse walk."""
+        o = self.occupancy
+        out = render_coarse(self.field, rays, o.cells, o.blocks, self.settings, count, self.config.render.cull)
+        if out.probabilities is None or self.config.render.accumulate == "probabilities":
+            return out
+        # Summed logits become probabilities of the ray once it is complete.
+        shares = torch.softmax(out.probabilities, 1) * out.opacity[:, None]
+        return FusedRays(out.color, out.opacity, out.depth, shares, out.evaluated)
+
+    def __call__(self, origins: torch.Tensor, directions: torch.Tensor, samples_per_ray: int) -> FusedRays:
+        """Render rays (R, 3) of the normalised frame with `samples_per_ray` samples where they meet something."""
+        return self.fine(self.coarse(origins, directions), samples_per_ray)
+
+
+class UnfusedRenderer:
+    """The same for any model, in separate kernels."""
+
+    rays = 1 << 15
+
+    def __init__(self, model: Model, semantics: bool = True) -> None:
+        self.model, self.semantics = model, semantics
+
+    def __call__(self, origins: torch.Tensor, directions: torch.Tensor, samples_per_ray: int) -> Rendered:
+        return self.model.render(origins, directions, samples_per_ray, semantics=self.semantics)
+
+
+def ray_renderer(model: Model, rays: int, semantics: bool = True) -> FusedRenderer | UnfusedRenderer:
+    """What renders a picture of `rays` rays: called with (origins, directions, samples_per_ray) it gives color,
+    opacity, depth and probabilities of up to its `rays` rays at once."""
+    return FusedRenderer(model, semantics) if wants_fused(model, rays) else UnfusedRenderer(model, semantics)

@@ -1,0 +1,164 @@
+"""The fused render kernel against the separate kernels, on fields of random values."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+
+import pytest
+import torch
+import warp as wp
+from fieldwork.nerfcore.config import make_config
+from fieldwork.nerfcore.kernels.fused import render_coarse
+from fieldwork.nerfcore.render.fused import FusedRenderer, UnfusedRenderer, ray_renderer, unsupported
+from fieldwork.nerfcore.train.model import Model
+
+DEVICES = [
+    "cpu",
+    pytest.param(
+        "cuda", marks=[pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="no NVIDIA GPU")]
+    ),
+]
+COUNT = 16
+
+
+@pytest.fixture(autouse=True)
+def _no_gradients() -> Iterator[None]:
+    with torch.no_grad():
+        yield
+
+
+# Largest and mean difference between half and single precision networks, in units of the values.
+LARGEST, MEAN = 5e-3, 5e-4
+
+
+def random_model(
+    classes: int,
+    contracted: bool = False,
+    preset: str = "standard",
+    settings: dict[str, str] | None = None,
+    device: str = "cpu",
+) -> Model:
+    """A field of random values in a ball of open cells; large ones, so that errors would show."""
+    torch.manual_seed(3)
+    values = {"field.precision": "float32", "field.table_log2": "12", "sampling.resolution": "64"}
+    model = Model(make_config(preset, values | (settings or {})), classes, 5, contracted).eval().requires_grad_(False)
+    assert model.field.grid is not None
+    model.field.grid.table.normal_(0, 0.3)
+    if model.field.blend is not None:
+        model.field.blend.evidence.uniform_(0, 0.6)
+    if model.field.appearance is not None:
+        model.field.appearance.normal_()
+    occupancy = model.occupancy
+    n = occupancy.config.resolution
+    cell = torch.arange(n**3)
+    center = (torch.stack([cell % n, cell // n % n, cell // n**2], 1) + 0.5) / n * 2 - 1
+    occupancy.density.copy_(torch.where(center.norm(dim=1) < 0.7, 6.0, 0.0))
+    occupancy.interest.uniform_()
+    occupancy.rebuild()
+    return model.to(device)
+
+
+def rays(count: int, device: str) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(4)
+    origin = torch.randn(count, 3, generator=generator)
+    origin = origin / origin.norm(dim=1, keepdim=True) * 3
+    direction = torch.rand(count, 3, generator=generator) * 1.6 - 0.8 - origin
+    return origin.to(device), (direction / direction.norm(dim=1, keepdim=True)).to(device)
+
+
+def assert_same(fused, unfused) -> None:
+    for name in ("color", "opacity", "depth", "probabilities"):
+        ours, theirs = getattr(fused, name), getattr(unfused, name)
+        assert (ours is None) == (theirs is None), name
+        if theirs is not None:
+            difference = (ours - theirs).abs()
+            scale = float(theirs.abs().max())
+            assert scale > 0.02, f"{name} of the oracle is nearly zero: nothing is compared"
+            assert float(difference.max()) < LARGEST * scale, name
+            assert float(difference.mean()) < MEAN * scale, name
+
+
+CASES = {
+    "standard, 7 classes": (7, False, "standard", {}),
+    "contracted, logits, 20 classes": (20, True, "standard", {"render.accumulate": "logits"}),
+    "grid alone, appearance, no classes": (
+        0,
+        False,
+        "standard",
+        {"field.branch": "explicit", "field.appearance": "4", "field.color_layers": "2"},
+    ),
+    "draft, narrow": (3, False, "draft", {"field.width": "32", "sampling.pdf": "uniform"}),
+}
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("case", CASES)
+def test_the_fused_kernel_renders_what_the_separate_kernels_do(case: str, device: str) -> None:
+    model = random_model(*CASES[case], device)
+    origins, directions = rays(200, device)
+    fused = FusedRenderer(model)(origins, directions, COUNT)
+    unfused = UnfusedRenderer(model)(origins, directions, COUNT)
+    assert_same(fused, unfused)
+    missed = unfused.opacity == 0
+    assert bool(missed.any()) or model.contracted
+    assert bool((fused.color[missed] == 0).all())
+    assert 0 < int(fused.evaluated) <= unfused.evaluated
+
+
+def test_threads_of_a_block_share_their_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Blocks of several samples, as on a GPU: two of them take rays from one queue."""
+    monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
+    model = random_model(7)
+    origins, directions = rays(100, "cpu")
+    renderer, o = FusedRenderer(model), model.occupancy
+    out = render_coarse(
+        renderer.field,
+        renderer.coarse(origins, directions),
+        o.cells,
+        o.blocks,
+        o.march_settings(),
+        COUNT,
+        model.config.render.cull,
+        lanes=16,
+    )
+    assert_same(out, UnfusedRenderer(model)(origins, directions, COUNT))
+
+
+def test_a_block_that_is_certain_of_its_grid_gets_the_same_picture() -> None:
+    """With w near 1 everywhere the implicit branch is skipped for density and colour, but read for classes."""
+    model = random_model(4)
+    assert model.field.blend is not None
+    model.field.blend.evidence.fill_(2.0)
+    origins, directions = rays(60, "cpu")
+    assert_same(FusedRenderer(model)(origins, directions, COUNT), UnfusedRenderer(model)(origins, directions, COUNT))
+
+
+def test_an_opaque_ray_ends_early() -> None:
+    model = random_model(0, settings={"field.density_shift": "6"})
+    origins, directions = rays(60, "cpu")
+    fused = FusedRenderer(model)(origins, directions, COUNT)
+    unfused = UnfusedRenderer(model)(origins, directions, COUNT)
+    assert int(fused.evaluated) < 0.7 * unfused.evaluated
+    assert_same(fused, unfused)
+
+
+def test_the_setting_chooses_the_kernel_and_says_why_not(caplog: pytest.LogCaptureFixture) -> None:
+    def chosen(**settings: str) -> type:
+        values = {name.replace("__", "."): value for name, value in settings.items()}
+        return type(ray_renderer(random_model(2, settings=values), 1 << 20))
+
+    assert chosen(render__fused="on") is FusedRenderer
+    assert chosen(render__fused="auto") is UnfusedRenderer  # no GPU
+    assert chosen(render__fused="off") is UnfusedRenderer
+    with caplog.at_level(logging.WARNING, "fieldwork"):
+        assert chosen(render__fused="on", field__fusion="concat") is UnfusedRenderer
+    assert "field.fusion is “concat”" in caplog.text
+
+
+def test_every_preset_is_supported() -> None:
+    from fieldwork.nerfcore.config import preset_names
+
+    for preset in preset_names():
+        config = make_config(preset, {"field.table_log2": "10", "sampling.resolution": "16"})
+        assert unsupported(Model(config, 64, 0, False)) is None, preset

@@ -17,6 +17,7 @@ from functools import cache
 import torch
 import warp as wp
 
+from .blocks import launch_blocks
 from .cells import trilinear_at
 from .fused_network import (
     GRANULE,
@@ -242,9 +243,8 @@ def fused_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
         pixels: wp.array2d(dtype=float),
         probabilities: wp.array2d(dtype=float),
         evaluated: wp.array(dtype=int),
-        offset: int,
     ):
-        lane = wp.tid() + offset
+        lane = wp.tid()
         ray = Ray()
         ray.index = -1
         depth = float(0.0)
@@ -478,16 +478,16 @@ def render_coarse(
     resident = 2 if lanes > 1 else 1  # blocks at a time; more than one on the CPU only to test that they share
     if cuda:
         resident = torch.cuda.get_device_properties(device).multi_processor_count * BLOCKS_PER_MULTIPROCESSOR
-    threads = lanes * max(1, min(-(-number // lanes), resident))
+    groups = max(1, min(-(-number // lanes), resident))
     pixels = torch.zeros(number, 5, device=device)
     classes = field.class_count
     probabilities = torch.zeros(number, max(classes, 1), device=device)
     taken = torch.zeros(1, dtype=torch.int32, device=device)
-    evaluated = torch.zeros(threads, dtype=torch.int32, device=device)
+    evaluated = torch.zeros(groups * lanes, dtype=torch.int32, device=device)
     inputs = [array(rays.origins, wp.vec3), array(rays.directions, wp.vec3), array(rays.total), array(rays.first)]
     inputs += [array(rays.queue), array(taken), array(rays.hits), count, m, array(cells, wp.vec2), array(blocks)]
     inputs += [array(field.table, half_feature), array(field.layout), array(field.gains), array(field.evidence)]
     inputs += [field.evidence_side, field.blend_floor, field.blend_rate, array(field.weights), array(field.code)]
     inputs += [field.density_shift, cull, classes, array(pixels), array(probabilities), array(evaluated)]
-    launch(kernel, threads, inputs, device, block_dim=lanes)
+    launch_blocks(kernel, groups, lanes, inputs, device)
     return FusedRays(pixels[:, :3], pixels[:, 3], pixels[:, 4], probabilities if classes else None, evaluated.sum())

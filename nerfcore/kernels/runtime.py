@@ -23,7 +23,6 @@ wp.config.log_level = 30  # warnings; stdout belongs to results
 wp.config.enable_backward = False
 
 _MINIMUM_CHUNK = 256
-CUDA_BLOCK = 256  # threads a block unless a kernel asks for another number
 
 
 def worker_count() -> int:
@@ -54,21 +53,15 @@ _loaded: dict[tuple[str, str], float] = {}
 _load_lock = threading.Lock()
 
 
-def load(kernel: wp.Kernel, device: torch.device, block_dim: int | None = None) -> None:
-    """Compile the kernel's module (seconds, the first time ever) or take it from Warp's cache, once for all threads.
-
-    `block_dim`: threads a block, for kernels that work on tiles."""
+def load(kernel: wp.Kernel, device: torch.device) -> None:
+    """Compile the kernel's module (seconds, the first time ever) or take it from Warp's cache, once for all threads."""
     key = (kernel.module.name, str(device))
     if key in _loaded:
         return
     with _load_lock:
         if key not in _loaded:
             begin = time.perf_counter()
-            # A module is compiled for a block size: the one it is launched with, or it would be compiled twice.
-            if device.type == "cpu":
-                kernel.module.load("cpu", block_dim or 1)
-            else:
-                kernel.module.load(wp.device_from_torch(device), block_dim or CUDA_BLOCK)
+            kernel.module.load("cpu" if device.type == "cpu" else wp.device_from_torch(device))
             _loaded[key] = time.perf_counter() - begin
 
 
@@ -77,29 +70,17 @@ def compile_seconds() -> float:
     return sum(_loaded.values())
 
 
-def launch(
-    kernel: wp.Kernel,
-    count: int,
-    inputs: list[Any],
-    device: torch.device,
-    serial: bool = False,
-    block_dim: int | None = None,
-) -> None:
+def launch(kernel: wp.Kernel, count: int, inputs: list[Any], device: torch.device, serial: bool = False) -> None:
     """Run `kernel` for indices 0 … count−1 with `inputs` followed by the chunk's offset.
 
-    `serial` keeps a CPU launch in one thread, for kernels that write places which indices share. `block_dim`: threads
-    a block, for kernels that work on tiles; such launches are serial on the CPU, where Warp's tiles need it.
+    `serial` keeps a CPU launch in one thread, for kernels that write places which indices share.
     """
     if count <= 0:
         return
-    load(kernel, device, block_dim)
+    load(kernel, device)
     if device.type == "cuda":
         stream = wp.stream_from_torch(torch.cuda.current_stream(device))
-        target, block = wp.device_from_torch(device), block_dim or CUDA_BLOCK
-        wp.launch(kernel, dim=count, inputs=[*inputs, 0], device=target, stream=stream, block_dim=block)
-        return
-    if block_dim is not None:
-        wp.launch(kernel, dim=count, inputs=[*inputs, 0], device="cpu", block_dim=block_dim)
+        wp.launch(kernel, dim=count, inputs=[*inputs, 0], device=wp.device_from_torch(device), stream=stream)
         return
     workers = worker_count()
     chunk = max(-(-count // workers), _MINIMUM_CHUNK)

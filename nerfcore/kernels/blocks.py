@@ -1,0 +1,31 @@
+"""Launching kernels whose blocks work together on tiles: the block size is part of how they are compiled."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import torch
+import warp as wp
+
+from .runtime import _load_lock, _loaded
+
+
+def load_blocks(kernel: wp.Kernel, lanes: int, device: torch.device) -> None:
+    """Compile the kernel for blocks of `lanes` threads (a minute on CUDA, the first time ever), or take it from
+    Warp's cache."""
+    key = (kernel.module.name, str(device))
+    with _load_lock:
+        if key not in _loaded:
+            begin = time.perf_counter()
+            kernel.module.load("cpu" if device.type == "cpu" else wp.device_from_torch(device), lanes)
+            _loaded[key] = time.perf_counter() - begin
+
+
+def launch_blocks(kernel: wp.Kernel, blocks: int, lanes: int, inputs: list[Any], device: torch.device) -> None:
+    """Run `blocks` blocks of `lanes` threads; on the CPU one after the other, as Warp's tiles need it there."""
+    load_blocks(kernel, lanes, device)
+    target, stream = "cpu", None
+    if device.type == "cuda":
+        target, stream = wp.device_from_torch(device), wp.stream_from_torch(torch.cuda.current_stream(device))
+    wp.launch(kernel, dim=blocks * lanes, inputs=inputs, device=target, stream=stream, block_dim=lanes)

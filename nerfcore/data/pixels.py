@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -88,6 +88,10 @@ class Batch:
     label: torch.Tensor
     image: torch.Tensor
     pixel: torch.Tensor
+
+    def part(self, rays: slice) -> Batch:
+        """Some of the rays."""
+        return Batch(*(getattr(self, field.name)[rays] for field in fields(self)))
 
 
 class CameraRays:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import numpy as np
 import torch
 from torch import nn
@@ -10,6 +14,7 @@ from ..kernels import encode
 from ..kernels.encode import BLOCK, FEATURES
 
 Levels = list[tuple[int, int, int]]
+Part = tuple[torch.Tensor, torch.Tensor]
 
 
 def level_layout(levels: int, coarsest: int, finest: int, table_log2: int) -> Levels:
@@ -38,7 +43,7 @@ class _Encode(torch.autograd.Function):
         grid: VertexGrid,
         gains: list[float],
     ):
-        ctx.grid, ctx.gains = grid, gains
+        ctx.grid, ctx.gains, ctx.collected = grid, gains, grid.collected()
         ctx.save_for_backward(points)
         return encode.forward(grid.table, grid.levels, gains, points) if known is None else known
 
@@ -46,7 +51,11 @@ class _Encode(torch.autograd.Function):
     def backward(ctx, *grads):
         (points,) = ctx.saved_tensors
         grid: VertexGrid = ctx.grid
-        encode.backward(grid.gradient, grid.touched, grid.levels, ctx.gains, points, grads[0].float().contiguous())
+        part = points, grads[0].float().contiguous()
+        if ctx.collected is None:
+            grid.scatter([part], ctx.gains)
+        else:
+            ctx.collected.append(part)
         return None, None, None, None, None
 
 
@@ -59,6 +68,7 @@ class VertexGrid(nn.Module):
     def __init__(self, levels: Levels, initial: float = 1e-2) -> None:
         super().__init__()
         self.levels = levels
+        self._here = threading.local()
         rows = levels[-1][1] + -(-levels[-1][2] // BLOCK) * BLOCK
         self.register_buffer("table", torch.empty(rows, FEATURES).uniform_(-initial, initial))
         self.register_buffer("mean", torch.zeros(rows, FEATURES))
@@ -90,6 +100,25 @@ class VertexGrid(nn.Module):
             return encode.forward(self.table, self.levels, gains, points)
         # The anchor only tells autograd that the result depends on something trainable.
         return _Encode.apply(points, known, self.anchor.requires_grad_(), self, gains)  # type: ignore[no-any-return]
+
+    def collected(self) -> list[Part] | None:
+        """Where this thread's gradients go instead of the grid, see `collecting`."""
+        return getattr(self._here, "collected", None)
+
+    @contextmanager
+    def collecting(self) -> Iterator[list[Part]]:
+        """Gradients of what this thread encodes here are listed instead of added, for one `scatter` later on: threads
+        that differentiate parts of a batch side by side must not write the same rows."""
+        parts: list[Part] = []
+        self._here.collected = parts
+        try:
+            yield parts
+        finally:
+            self._here.collected = None
+
+    def scatter(self, parts: list[Part], gains: list[float]) -> None:
+        """Add the gradients of encoded points, (points (N, 3), gradient (N, width)) each, to the grid's."""
+        encode.scatter(self.gradient, self.touched, self.levels, gains, parts)
 
     def step(self, rate: float, betas: tuple[float, float] = (0.9, 0.99)) -> None:
         """Adam on the rows touched since the last step; clears the gradient."""

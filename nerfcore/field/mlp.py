@@ -8,16 +8,16 @@ matrix units.
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Literal
 
 import torch
 from torch import nn
 
-from ..kernels.runtime import run_parallel, worker_count
+from ..kernels.runtime import run_parallel
 
 Precision = Literal["auto", "float32", "bfloat16", "float16"]
-_CPU_ROWS = 16384  # of activations that fit a core's cache
-_LEAST_ROWS = 1024
+_MOST_ROWS, _LEAST_ROWS = 8192, 1024  # of a matrix product on the CPU; the most still fits a core's cache
 
 
 def compute_dtype(precision: Precision, device: torch.device) -> torch.dtype:
@@ -32,11 +32,27 @@ def compute_dtype(precision: Precision, device: torch.device) -> torch.dtype:
 
 
 def _slices(rows: int, device: torch.device) -> list[slice]:
-    """Parts of the rows: on the CPU one or more for each thread, small enough for its cache."""
+    """Parts of the rows. The CPU's have few different sizes, powers of two, and the last one may reach beyond the rows:
+    the matrix library compiles a kernel for every new shape, which takes longer than using it."""
     if device.type != "cpu":
         return [slice(0, rows)]
-    step = min(_CPU_ROWS, max(_LEAST_ROWS, -(-rows // worker_count())))
-    return [slice(begin, min(begin + step, rows)) for begin in range(0, rows, step)]
+    parts, begin, size = [], 0, _MOST_ROWS
+    while begin < rows:
+        while size > _LEAST_ROWS and size > rows - begin:
+            size //= 2
+        parts.append(slice(begin, begin + size))
+        begin += size
+    return parts
+
+
+def _padded(x: torch.Tensor, rows: int, dtype: torch.dtype) -> torch.Tensor:
+    """`x` with zero rows after its own."""
+    if len(x) == rows:
+        return x.to(dtype)
+    out = torch.empty(rows, x.shape[1], dtype=dtype, device=x.device)
+    out[: len(x)] = x
+    out[len(x) :] = 0
+    return out
 
 
 class _Chain(torch.autograd.Function):
@@ -44,7 +60,9 @@ class _Chain(torch.autograd.Function):
     def forward(ctx, x: torch.Tensor, dtype: torch.dtype, *weights: torch.Tensor) -> torch.Tensor:
         ctx.dtype, ctx.input_dtype = dtype, x.dtype
         matrices = [w.to(dtype) for w in weights]
-        layers = [x.to(dtype), *(torch.empty(len(x), len(w), dtype=dtype, device=x.device) for w in matrices)]
+        parts = _slices(len(x), x.device)
+        rows = parts[-1].stop if parts else 0
+        layers = [_padded(x, rows, dtype), *(torch.empty(rows, len(w), dtype=dtype, device=x.device) for w in matrices)]
 
         def run(part: slice) -> None:
             with torch.no_grad():
@@ -53,34 +71,34 @@ class _Chain(torch.autograd.Function):
                     if index < len(matrices) - 1:
                         layers[index + 1][part].relu_()
 
-        run_parallel([lambda p=part: run(p) for part in _slices(len(x), x.device)])
+        run_parallel([partial(run, part) for part in parts])
         ctx.save_for_backward(*matrices, *layers[:-1])
-        return layers[-1]
+        return layers[-1][: len(x)]
 
     @staticmethod
     def backward(ctx, *grads):
         count = len(ctx.saved_tensors) // 2
         matrices, layers = ctx.saved_tensors[:count], ctx.saved_tensors[count:]
-        grad = grads[0].to(ctx.dtype)
+        grad = _padded(grads[0], len(layers[0]), ctx.dtype)
         grad_input = torch.empty_like(layers[0]) if ctx.needs_input_grad[0] else None
-        parts = _slices(len(grad), grad.device)
-        partial: list[list[torch.Tensor]] = [[] for _ in parts]
+        parts = _slices(len(grads[0]), grad.device)
+        found: list[list[torch.Tensor]] = [[] for _ in parts]
 
         def run(number: int, part: slice) -> None:
             with torch.no_grad():
                 g = grad[part]
                 for index in range(count - 1, -1, -1):
-                    partial[number].append(torch.mm(g.t(), layers[index][part]).float())
+                    found[number].append(torch.mm(g.t(), layers[index][part]).float())
                     if index > 0:
                         g = torch.ops.aten.threshold_backward(torch.mm(g, matrices[index]), layers[index][part], 0)
                     elif grad_input is not None:
                         torch.mm(g, matrices[0], out=grad_input[part])
 
-        run_parallel([lambda n=number, p=part: run(n, p) for number, part in enumerate(parts)])
+        run_parallel([partial(run, number, part) for number, part in enumerate(parts)])
         # Summed in the order of the slices, whatever order they ran in.
-        sums = [torch.stack(column).sum(0) for column in zip(*partial)]
+        sums = [torch.stack(column).sum(0) for column in zip(*found)]
         grad_weights = sums[::-1] if sums else [torch.zeros_like(m, dtype=torch.float32) for m in matrices]
-        return None if grad_input is None else grad_input.to(ctx.input_dtype), None, *grad_weights
+        return None if grad_input is None else grad_input[: len(grads[0])].to(ctx.input_dtype), None, *grad_weights
 
 
 class MLP(nn.Module):

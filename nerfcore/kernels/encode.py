@@ -7,6 +7,8 @@ The torch twins are in `encode_torch.py`.
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 import warp as wp
 
@@ -60,30 +62,35 @@ def corner_rows(ix: int, iy: int, iz: int, resolution: int, size: int, base: int
 def encode_forward(
     table: wp.array(dtype=feature),
     points: wp.array(dtype=wp.vec3),
-    level: int,
-    resolution: int,
-    base: int,
-    size: int,
-    gain: float,
+    levels: wp.array(dtype=wp.vec3i),
+    gains: wp.array(dtype=float),
     out: wp.array(dtype=feature, ndim=2),
     offset: int,
 ):
     i = wp.tid() + offset
-    p = points[i] * float(resolution - 1)
-    ix = wp.clamp(int(p[0]), 0, resolution - 2)
-    iy = wp.clamp(int(p[1]), 0, resolution - 2)
-    iz = wp.clamp(int(p[2]), 0, resolution - 2)
-    fx = p[0] - float(ix)
-    fy = p[1] - float(iy)
-    fz = p[2] - float(iz)
-    low, high = corner_rows(ix, iy, iz, resolution, size, base)
-    gx = 1.0 - fx
-    v00 = table[low[0]] * gx + table[high[0]] * fx
-    v10 = table[low[1]] * gx + table[high[1]] * fx
-    v01 = table[low[2]] * gx + table[high[2]] * fx
-    v11 = table[low[3]] * gx + table[high[3]] * fx
-    gy = 1.0 - fy
-    out[i, level] = (v00 * gy + v10 * fy) * ((1.0 - fz) * gain) + (v01 * gy + v11 * fy) * (fz * gain)
+    p = points[i]
+    for level in range(levels.shape[0]):
+        gain = gains[level]
+        if gain == 0.0:
+            out[i, level] = feature()
+            continue
+        layout = levels[level]
+        resolution = layout[0]
+        q = p * float(resolution - 1)
+        ix = wp.clamp(int(q[0]), 0, resolution - 2)
+        iy = wp.clamp(int(q[1]), 0, resolution - 2)
+        iz = wp.clamp(int(q[2]), 0, resolution - 2)
+        fx = q[0] - float(ix)
+        fy = q[1] - float(iy)
+        fz = q[2] - float(iz)
+        low, high = corner_rows(ix, iy, iz, resolution, layout[2], layout[1])
+        gx = 1.0 - fx
+        v00 = table[low[0]] * gx + table[high[0]] * fx
+        v10 = table[low[1]] * gx + table[high[1]] * fx
+        v01 = table[low[2]] * gx + table[high[2]] * fx
+        v11 = table[low[3]] * gx + table[high[3]] * fx
+        gy = 1.0 - fy
+        out[i, level] = (v00 * gy + v10 * fy) * ((1.0 - fz) * gain) + (v01 * gy + v11 * fy) * (fz * gain)
 
 
 @wp.func
@@ -174,55 +181,57 @@ def forward(
         gains: factor of each level's features (coarse-to-fine fading).
     """
     init()
-    out = torch.empty(len(points), len(levels), FEATURES, device=points.device)
-    rows, where, target = array(table, feature), array(points, wp.vec3), array(out, feature)
-    for index, (resolution, base, size) in enumerate(levels):
-        if gains[index] == 0.0:
-            out[:, index] = 0
-            continue
-        launch(
-            encode_forward,
-            len(points),
-            [rows, where, index, resolution, base, size, gains[index], target],
-            points.device,
-        )
+    device = points.device
+    out = torch.empty(len(points), len(levels), FEATURES, device=device)
+    layout = torch.tensor(levels, dtype=torch.int32, device=device)
+    factors = torch.tensor(gains, device=device)
+    inputs = [array(table, feature), array(points, wp.vec3), array(layout, wp.vec3i), array(factors)]
+    launch(encode_forward, len(points), [*inputs, array(out, feature)], device)
     return out.flatten(1)
 
 
-def backward(
+def scatter(
     grad_table: torch.Tensor,
     touched: torch.Tensor,
     levels: list[tuple[int, int, int]],
     gains: list[float],
-    points: torch.Tensor,
-    grad_out: torch.Tensor,
+    parts: list[tuple[torch.Tensor, torch.Tensor]],
 ) -> None:
     """Add the gradient of `forward` to `grad_table` (rows, FEATURES) and mark touched blocks (uint8).
+
+    Args:
+        parts: points (N, 3) and the gradient (N, levels · FEATURES) float32 of their features, any number of times.
 
     On the CPU each level is one task, so no two threads write the same row and the sum has a fixed order.
     On CUDA rows are summed with atomics.
     """
     init()
-    grad = array(grad_out.reshape(len(points), len(levels), FEATURES), feature)
-    where, rows, flags = array(points, wp.vec3), array(grad_table, feature), array(touched)
+    rows, flags = array(grad_table, feature), array(touched)
+    arrays = [
+        (array(points, wp.vec3), array(grad.reshape(len(points), len(levels), FEATURES), feature))
+        for points, grad in parts
+        if len(points)
+    ]
+    device = grad_table.device
 
-    def arguments(index: int) -> list:
+    def arguments(where: wp.array, grad: wp.array, index: int) -> list:
         resolution, base, size = levels[index]
         return [where, grad, index, resolution, base, size, gains[index], rows, flags]
 
     active = [index for index in range(len(levels)) if gains[index] != 0.0]
-    if points.device.type == "cuda":
-        for index in active:
-            launch(encode_backward, len(points), arguments(index), points.device)
+    if device.type == "cuda":
+        for where, grad in arrays:
+            for index in active:
+                launch(encode_backward, where.shape[0], arguments(where, grad, index), device)
         return
-    load(encode_backward, points.device)
+    load(encode_backward, device)
+
+    def one_level(index: int) -> None:
+        for where, grad in arrays:
+            wp.launch(encode_backward, dim=where.shape[0], inputs=[*arguments(where, grad, index), 0], device="cpu")
+
     # Levels share no block (rows are padded to BLOCK), so their flags do not race either.
-    run_parallel(
-        [
-            lambda k=index: wp.launch(encode_backward, dim=len(points), inputs=[*arguments(k), 0], device="cpu")
-            for index in reversed(active)
-        ]
-    )
+    run_parallel([partial(one_level, index) for index in reversed(active)])
 
 
 def adam(

@@ -11,9 +11,10 @@ import os
 import sys
 import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 import warp as wp
@@ -23,6 +24,7 @@ wp.config.log_level = 30  # warnings; stdout belongs to results
 wp.config.enable_backward = False
 
 _MINIMUM_CHUNK = 256
+Result = TypeVar("Result")
 
 
 def worker_count() -> int:
@@ -30,10 +32,23 @@ def worker_count() -> int:
     return max(1, torch.get_num_threads())
 
 
+_here = threading.local()
+
+
+def _enter_pool() -> None:
+    # Each thread works on its own part; what it calls must not start threads of its own.
+    torch.set_num_threads(1)
+    _here.in_pool = True
+
+
+def in_pool() -> bool:
+    """Whether this thread is one of `run_parallel`'s: launches and nested `run_parallel` calls then stay in it."""
+    return getattr(_here, "in_pool", False)
+
+
 @cache
 def _pool(workers: int) -> ThreadPoolExecutor:
-    # Each thread works on its own slice of rows; torch operations inside it must not start threads of their own.
-    return ThreadPoolExecutor(workers, "kernel", initializer=torch.set_num_threads, initargs=(1,))
+    return ThreadPoolExecutor(workers, "kernel", initializer=_enter_pool)
 
 
 @cache
@@ -82,7 +97,7 @@ def launch(kernel: wp.Kernel, count: int, inputs: list[Any], device: torch.devic
         stream = wp.stream_from_torch(torch.cuda.current_stream(device))
         wp.launch(kernel, dim=count, inputs=[*inputs, 0], device=wp.device_from_torch(device), stream=stream)
         return
-    workers = worker_count()
+    workers = 1 if in_pool() else worker_count()
     chunk = max(-(-count // workers), _MINIMUM_CHUNK)
     spans = [(begin, min(chunk, count - begin)) for begin in range(0, count, chunk)]
     if serial or len(spans) == 1:
@@ -91,14 +106,13 @@ def launch(kernel: wp.Kernel, count: int, inputs: list[Any], device: torch.devic
     run_parallel([lambda s=span: wp.launch(kernel, dim=s[1], inputs=[*inputs, s[0]], device="cpu") for span in spans])
 
 
-def run_parallel(tasks: list[Any]) -> None:
-    """Run callables in the kernel pool and wait for all; the first exception is raised."""
-    if worker_count() == 1:
-        for task in tasks:
-            task()
-        return
-    for future in [_pool(worker_count()).submit(task) for task in tasks]:
-        future.result()
+def run_parallel(tasks: Sequence[Callable[[], Result]]) -> list[Result]:
+    """Results of callables run in the kernel pool, in their order; the first exception is raised when all are done."""
+    if in_pool() or worker_count() == 1 or len(tasks) == 1:
+        return [task() for task in tasks]
+    futures = [_pool(worker_count()).submit(task) for task in tasks]
+    wait(futures)
+    return [future.result() for future in futures]
 
 
 def default_threads() -> int:

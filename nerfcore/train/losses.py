@@ -60,18 +60,19 @@ def distortion_loss(weights: torch.Tensor, place: torch.Tensor, delta: torch.Ten
 
     Args:
         weights (N,), place (N,): normalised distance of each sample along its ray, delta (N,): its extent.
-    All rays that have samples have the same number of them.
     """
-    hit = packing.count > 0
-    if not bool(hit.any()):
+    if len(weights) == 0:
         return weights.sum() * 0
-    count = int(packing.count.max())
-    w, s, d = (x.view(-1, count) for x in (weights, place, delta))
+    first = packing.start.clamp(min=0).long()[packing.ray.long()]
+
+    def before(values: torch.Tensor) -> torch.Tensor:
+        """Sum of the values in front of each sample on its ray."""
+        running = torch.cumsum(values.double(), 0) - values
+        return (running - running[first]).float()
+
     # Σ_i w_i (s_i W_<i − S_<i), twice, with running sums: linear in the samples.
-    before = torch.cumsum(w, 1) - w
-    moment = torch.cumsum(w * s, 1) - w * s
-    pairs = 2 * (w * (s * before - moment)).sum(1)
-    return (pairs + (w * w * d).sum(1) / 3).mean()
+    pairs = 2 * weights * (place * before(weights) - before(weights * place))
+    return (pairs + weights * weights * delta / 3).sum() / (packing.count > 0).sum()
 
 
 def psnr(mse: float) -> float:

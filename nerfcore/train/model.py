@@ -21,7 +21,8 @@ ONE_PASS_SHARE = 0.67
 class Rendered:
     """Of R rays: color (R, 3) without background, opacity (R,), depth (R,) expected distance (normalised units, not
     divided by opacity), probabilities (R, K) or None; of the samples that show: weights (N,), density (N,), packed as
-    in `samples`; `evaluated`: number of samples the field was read at."""
+    in `samples`; of all M samples the field was read at: `read_points` (M, 3) in grid coordinates and `read_density`.
+    """
 
     color: torch.Tensor
     opacity: torch.Tensor
@@ -30,7 +31,13 @@ class Rendered:
     weights: torch.Tensor
     density: torch.Tensor
     samples: Samples
-    evaluated: int
+    read_points: torch.Tensor
+    read_density: torch.Tensor
+
+    @property
+    def evaluated(self) -> int:
+        """Number of samples the field was read at."""
+        return len(self.read_density)
 
 
 class Model(nn.Module):
@@ -111,9 +118,6 @@ class Model(nn.Module):
         with torch.no_grad():
             visible = weights > self.config.render.cull
             kept, packing = visible.nonzero()[:, 0], s.packing.subset(visible)
-            if self.training:
-                self.occupancy.observe(s.points, everywhere.density.detach(), self.warming_up)
-                self.shown_share += 0.05 * (len(kept) / max(len(s), 1) - self.shown_share)
         delta = s.delta[kept]
         if torch.is_grad_enabled() and first_look:
             shown = self.field.geometry(
@@ -134,8 +138,25 @@ class Model(nn.Module):
             probabilities = self._probabilities(self.field.logits(shown), weight, packing)
         shown_samples = Samples(s.points[kept], depth, delta, packing, s.first, s.last)
         return Rendered(
-            summed[:, :3], summed[:, 3], summed[:, 4], probabilities, weight, shown.density, shown_samples, len(s)
+            summed[:, :3],
+            summed[:, 3],
+            summed[:, 4],
+            probabilities,
+            weight,
+            shown.density,
+            shown_samples,
+            s.points,
+            everywhere.density.detach(),
         )
+
+    @torch.no_grad()
+    def observe(self, rendered: list[Rendered]) -> None:
+        """Let the occupancy grid see what a training step read, and note how much of it showed."""
+        points = torch.cat([r.read_points for r in rendered])
+        density = torch.cat([r.read_density for r in rendered])
+        self.occupancy.observe(points, density, self.warming_up)
+        shown = sum(len(r.samples) for r in rendered)
+        self.shown_share += 0.05 * (shown / max(len(points), 1) - self.shown_share)
 
     def _probabilities(self, logits: torch.Tensor, weight: torch.Tensor, packing) -> torch.Tensor:
         if self.config.loss.detach_weights:

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 
 from ..config import RunConfig
 from ..data.pixels import VOID, Batch, PixelStore
+from ..field.grid import Part
+from ..kernels.runtime import run_parallel
 from ..sampling.cache import CoarseCache
 from .losses import (
     color_loss,
@@ -22,14 +27,27 @@ from .model import Model, Rendered
 from .schedule import bias_correction, rate_factor
 
 BETAS = (0.9, 0.99)
+SHARD_SAMPLES = 16384  # whose activations fit a core's cache
+
+
+@dataclass(frozen=True)
+class Learned:
+    """What one part of a batch taught: gradients of the model's parameters, in their order, and of encoded points;
+    its parts of the loss and of the squared error (scalars); what was rendered, if anything."""
+
+    gradients: Sequence[torch.Tensor | None]
+    encoded: list[Part]
+    loss: torch.Tensor
+    squared_error: torch.Tensor
+    rendered: Rendered | None
 
 
 @dataclass
 class Measured:
-    """What the last steps measured; `mse` and `loss` are averages since the last reading."""
+    """Sums over the steps since the last reading; `loss` and `mse` stay on the device until they are read."""
 
-    loss: float = 0.0
-    mse: float = 0.0
+    loss: float | torch.Tensor = 0.0
+    mse: float | torch.Tensor = 0.0
     steps: int = 0
     rays: int = 0
     samples: int = 0
@@ -37,7 +55,7 @@ class Measured:
 
     @property
     def psnr(self) -> float:
-        return psnr(self.mse / max(self.steps, 1))
+        return psnr(float(self.mse) / max(self.steps, 1))
 
 
 class Trainer:
@@ -76,15 +94,7 @@ class Trainer:
             interest = model.interest if model.wants_interest() and self.steps >= config.sampling.warmup else None
             model.occupancy.update(self.steps, model.field.density, interest, self.generator)
         batch = self.draw()
-        rays, per_ray = len(batch.rgb), config.sampling.samples
-        jitter = torch.rand(rays, device=self.device, generator=self.generator)
-        shift = torch.rand(rays * per_ray, device=self.device, generator=self.generator)
-        codes = model.field.appearance[batch.image] if model.field.appearance is not None else None
-        semantics = config.loss.semantic_weight > 0
-        rendered = model.render(batch.origins, batch.directions, per_ray, jitter, shift, codes, semantics)
-        loss = self.loss(batch, rendered, progress)
-        self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()
+        learned = self._learn(batch, progress)
         self.steps += 1
         factor = rate_factor(progress, config.train.decay)
         for group in self.optimizer.param_groups:
@@ -92,39 +102,116 @@ class Trainer:
         self.optimizer.step()
         if model.field.grid is not None:
             model.field.grid.step(config.train.grid_rate * factor * bias_correction(self.steps, *BETAS), BETAS)
+        rendered = [part.rendered for part in learned if part.rendered is not None]
+        model.observe(rendered)
         if model.field.blend is not None and self.steps % config.sampling.update_every == 0:
-            s = rendered.samples
-            model.field.blend.update(s.points, rendered.weights.detach(), rendered.density.detach())
-        self._adapt(rays, rendered, progress)
+            model.field.blend.update(
+                torch.cat([r.samples.points for r in rendered]),
+                torch.cat([r.weights.detach() for r in rendered]),
+                torch.cat([r.density.detach() for r in rendered]),
+            )
+        self._adapt(len(batch.rgb), rendered, progress)
 
-    def loss(self, batch: Batch, rendered: Rendered, progress: float) -> torch.Tensor:
-        """The composite loss of a batch."""
-        c = self.config.loss
+    def _learn(self, batch: Batch, progress: float) -> list[Learned]:
+        """Leave the gradient of the composite loss in the parameters and in the grid.
+
+        The CPU works on shards of the rays side by side, each small enough for a core's cache; a shard's loss is its
+        part of the whole batch's loss, and gradients are summed in the order of the shards.
+        """
+        per_ray, rays = self.config.sampling.samples, len(batch.rgb)
+        jitter = torch.rand(rays, device=self.device, generator=self.generator)
+        shift = torch.rand(rays * per_ray, device=self.device, generator=self.generator)
         background = torch.zeros_like(batch.rgb)
         if self.random_background:
             background = torch.rand(batch.rgb.shape, device=self.device, generator=self.generator)
+        labelled = (batch.label != VOID).sum().clamp(min=1)
+        size = rays if self.device.type != "cpu" else max(SHARD_SAMPLES // per_ray, 1)
+
+        def shard(begin: int) -> Learned:
+            part = batch.part(slice(begin, begin + size))
+            noise = jitter[begin : begin + size], shift[begin * per_ray : (begin + size) * per_ray]
+
+            def loss() -> tuple[torch.Tensor, torch.Tensor, Rendered]:
+                rendered = self._render(part, *noise)
+                share = len(part.rgb) / rays, (part.label != VOID).sum() / labelled
+                return *self.loss(part, rendered, background[begin : begin + size], progress, share), rendered
+
+            return self._differentiate(loss)
+
+        tasks = [partial(shard, begin) for begin in range(0, rays, size)]
+        c = self.config.loss
+        if c.regularization * c.sparsity_weight > 0:
+            points = torch.rand(1024, 3, device=self.device, generator=self.generator)
+
+            def sparsity() -> tuple[torch.Tensor, torch.Tensor, None]:
+                price = c.regularization * c.sparsity_weight * sparsity_loss(self.model.field.density(points), c)
+                return price, torch.zeros_like(price), None
+
+            tasks.append(partial(self._differentiate, sparsity))
+        learned = run_parallel(tasks)
+        for parameter, *gradients in zip(self.model.parameters(), *(part.gradients for part in learned)):
+            found = [g for g in gradients if g is not None]
+            parameter.grad = torch.stack(found).sum(0) if found else None
+        grid = self.model.field.grid
+        if grid is not None:
+            grid.scatter([pair for part in learned for pair in part.encoded], self.model.field.gains)
+        for part in learned:
+            self.measured.loss += part.loss
+            self.measured.mse += part.squared_error
+        return learned
+
+    def _differentiate(self, loss: Callable[[], tuple[torch.Tensor, torch.Tensor, Rendered | None]]) -> Learned:
+        """Value and gradients of one part of the loss, without touching what other threads read."""
+        grid = self.model.field.grid
+        with grid.collecting() if grid is not None else nullcontext([]) as encoded:
+            total, squared_error, rendered = loss()
+            parameters = list(self.model.parameters())
+            # The anchor stands for the grid, whose gradients are collected on the way to it.
+            wanted = parameters if grid is None else [*parameters, grid.anchor]
+            # A part that met nothing has no gradient.
+            gradients: Sequence[torch.Tensor | None] = [None] * len(parameters)
+            if total.requires_grad:
+                gradients = torch.autograd.grad(total, wanted, allow_unused=True)[: len(parameters)]
+        return Learned(gradients, encoded, total.detach(), squared_error.detach(), rendered)
+
+    def _render(self, batch: Batch, jitter: torch.Tensor, shift: torch.Tensor) -> Rendered:
+        appearance, semantics = self.model.field.appearance, self.config.loss.semantic_weight > 0
+        codes = appearance[batch.image] if appearance is not None else None
+        per_ray = self.config.sampling.samples
+        return self.model.render(batch.origins, batch.directions, per_ray, jitter, shift, codes, semantics)
+
+    def loss(
+        self,
+        batch: Batch,
+        rendered: Rendered,
+        background: torch.Tensor,
+        progress: float,
+        share: tuple[float, float | torch.Tensor] = (1.0, 1.0),
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """The composite loss of rays in front of `background` (R, 3), and their mean squared colour error.
+
+        `share`: the part of the whole batch's rays and of its labelled rays that these are; both results are scaled
+        so that those of all parts sum to the batch's.
+        """
+        c = self.config.loss
+        rays, labels = share
         alpha = batch.alpha[:, None]
         target = batch.rgb * alpha + background * (1 - alpha)
         predicted = rendered.color + background * (1 - rendered.opacity[:, None])
-        total = c.rgb_weight * color_loss(predicted, target, c)
+        total = rays * c.rgb_weight * color_loss(predicted, target, c)
         if rendered.probabilities is not None:
             valid = batch.label != VOID
-            total = total + c.semantic_weight * semantic_loss(rendered.probabilities, batch.label, valid)
+            total = total + labels * c.semantic_weight * semantic_loss(rendered.probabilities, batch.label, valid)
             if c.entropy_ratio > 0 and c.regularization > 0 and progress >= c.entropy_start:
                 weight = c.regularization * c.entropy_ratio * c.semantic_weight
-                total = total + weight * entropy_loss(rendered.probabilities, valid)
+                total = total + labels * weight * entropy_loss(rendered.probabilities, valid)
         if c.regularization > 0:
-            total = total + c.regularization * self._regularizers(rendered)
-        self.measured.loss += float(total.detach())
-        self.measured.mse += float(((predicted.detach() - target) ** 2).mean())
-        return total
+            total = total + rays * c.regularization * self._regularizers(rendered)
+        return total, rays * ((predicted.detach() - target) ** 2).mean()
 
     def _regularizers(self, rendered: Rendered) -> torch.Tensor:
         c, s = self.config.loss, rendered.samples
         total = rendered.opacity.sum() * 0
-        if c.sparsity_weight > 0:
-            points = torch.rand(1024, 3, device=self.device, generator=self.generator)
-            total = total + c.sparsity_weight * sparsity_loss(self.model.field.density(points), c)
         if c.distortion_weight > 0:
             place = s.depth / (1 + s.depth) if self.model.contracted else s.depth
             extent = s.delta / (1 + s.depth) ** 2 if self.model.contracted else s.delta
@@ -133,17 +220,18 @@ class Trainer:
             total = total + c.opacity_weight * opacity_entropy(rendered.opacity)
         return total
 
-    def _adapt(self, rays: int, rendered: Rendered, progress: float) -> None:
+    def _adapt(self, rays: int, rendered: list[Rendered], progress: float) -> None:
         """Keep the number of field samples a step near its budget, which grows with progress: early on many small
         steps learn faster, later large batches average out the noise."""
         m, train = self.measured, self.config.train
         budget = round(train.batch_start * (train.batch_samples / train.batch_start) ** progress)
         m.steps += 1
         m.rays += rays
-        m.samples += rendered.evaluated
-        m.shown += len(rendered.samples)
+        evaluated = sum(r.evaluated for r in rendered)
+        m.samples += evaluated
+        m.shown += sum(len(r.samples) for r in rendered)
         if self.steps % 8 == 0:
-            wanted = rays * budget / max(rendered.evaluated, 1)
+            wanted = rays * budget / max(evaluated, 1)
             self.rays = int(min(max(wanted, rays * 0.5, 16), rays * 2, train.max_rays))
 
     def take_measured(self) -> Measured:

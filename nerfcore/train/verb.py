@@ -140,9 +140,10 @@ class _Loop:
 
     def _tell(self, progress: float, elapsed: float, events: TextIO) -> None:
         measured = self.trainer.take_measured()
+        loss = float(measured.loss)
         if measured.steps == 0:
             return
-        if not measured.loss < float("inf"):
+        if not loss < float("inf"):
             raise TrainingError(
                 "Training diverged: the loss is no longer a number.", "Lower train.network_rate and train.grid_rate."
             )
@@ -150,7 +151,7 @@ class _Loop:
         values = {
             "step": self.trainer.steps,
             "seconds": round(self.clock.seconds(), 2),
-            "loss": round(measured.loss / measured.steps, 6),
+            "loss": round(loss / measured.steps, 6),
             "psnr": self.state["psnr"],
             "rays_per_second": round(measured.rays / elapsed),
         }

@@ -54,7 +54,7 @@ def test_encode_equals_its_twin_and_so_does_its_gradient(device: str) -> None:
     upstream = torch.randn(expected.shape, generator=generator).to(device)
     expected.backward(upstream)
     gradient, touched = torch.zeros_like(table), torch.zeros(ROWS // encode.BLOCK, dtype=torch.uint8, device=device)
-    encode.backward(gradient, touched, LEVELS, GAINS, points, upstream)
+    encode.scatter(gradient, touched, LEVELS, GAINS, [(points, upstream)])
     assert expected_table.grad is not None
     assert relative(gradient, expected_table.grad) <= 1e-4
     blocks = (expected_table.grad.abs().sum(1) > 0).view(-1, encode.BLOCK).any(1)
@@ -68,7 +68,7 @@ def test_the_gradient_scatter_gives_the_same_bits_every_time() -> None:
 
     def gradient() -> torch.Tensor:
         total = torch.zeros(ROWS, encode.FEATURES)
-        encode.backward(total, torch.zeros(ROWS // encode.BLOCK, dtype=torch.uint8), LEVELS, GAINS, points, upstream)
+        encode.scatter(total, torch.zeros(ROWS // encode.BLOCK, dtype=torch.uint8), LEVELS, GAINS, [(points, upstream)])
         return total
 
     first = gradient()

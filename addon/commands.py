@@ -7,11 +7,16 @@ import bpy
 _handle: object | None = None
 
 
+def run(arguments: list[str]) -> int:
+    """Run a verb; returns its exit status."""
+    from .cli import main  # not at the top: enabling the extension must be quick
+
+    return main(arguments)
+
+
 def register() -> None:
     global _handle
-    from .cli import main
-
-    _handle = bpy.utils.register_cli_command("fieldwork", main)
+    _handle = bpy.utils.register_cli_command("fieldwork", run)
 
 
 def unregister() -> None:

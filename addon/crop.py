@@ -8,7 +8,6 @@ from typing import Any
 import bpy
 from mathutils import Matrix, Vector
 
-from ..nerfcore.files import write_json
 from . import state
 
 MARK = "fieldwork_crop"
@@ -54,5 +53,7 @@ def write_bounds(folder: Path, bounds: list[list[float]] | None) -> None:
         raise ValueError(f"There is no project at {folder}.")
     if bounds is not None and any(high - low < 1e-6 for low, high in zip(*bounds)):
         raise ValueError("The training region is flat: scale its box.")
+    from ..nerfcore.files import write_json  # not at the top: enabling the extension must be quick
+
     project.setdefault("frame", {})["bounds"] = bounds
     write_json(folder / state.PROJECT_FILE, project)

@@ -1,16 +1,9 @@
-"""Where the engine's own Python lives, and how it gets there. Standard library only, no bpy: it runs in a thread.
-
-ENGINE/venv/           the environment, made from Blender's Python or a chosen one, which stays untouched
-ENGINE/tools/          the installer `uv`, where the machine has none
-ENGINE/cache/          downloads; an installation that broke off goes on from here
-ENGINE/complete.json   written last, when the doctor was content
-ENGINE/install.log     everything the tools said
-"""
+"""How the engine's own Python gets to its place (see engine_place.py). Standard library only, no bpy: it runs in a
+thread."""
 
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import os
 import re
@@ -25,12 +18,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
-from .link import EngineError, Link
+from .engine_place import COMPLETE, LOCK, LOG, lock_hash, python_in
+from .errors import EngineError
+from .link import Link
 
-ENVIRONMENT = "FIELDWORK_ENGINE_PYTHON"
-COMPLETE = "complete.json"
-LOG = "install.log"
-LOCK = Path(__file__).with_name("engine.lock")
 NEEDED_GB = {"cpu": 4.0, "mps": 4.0}  # free disk; builds for graphics cards bring their libraries along
 NEEDED_GPU_GB = 12.0
 Report = Callable[[float, str], None]
@@ -56,44 +47,6 @@ class Options:
     online: bool = True
 
 
-def python_in(folder: Path) -> Path:
-    """The interpreter of a virtual environment."""
-    return folder / "Scripts" / "python.exe" if sys.platform == "win32" else folder / "bin" / "python"
-
-
-def find_python(chosen: str, engine_folder: Path, root: Path) -> Path | None:
-    """The Python that runs the engine: the environment's, the chosen one (a file, or the folder of a virtual
-    environment), the installed engine's, or that of a source checkout. None when there is none."""
-    from_environment = os.environ.get(ENVIRONMENT)
-    if from_environment:
-        return Path(from_environment)
-    if chosen:
-        path = Path(chosen).expanduser()
-        return python_in(path) if path.is_dir() else path
-    if installed(engine_folder):
-        return python_in(engine_folder / "venv")
-    checkout = python_in(root / ".venv")
-    return checkout if checkout.is_file() else None
-
-
-def installed(folder: Path) -> dict[str, Any] | None:
-    """What is known of the installed engine; None when there is none, or only a part of one."""
-    try:
-        value = json.loads((folder / COMPLETE).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    return value if python_in(folder / "venv").is_file() else None
-
-
-def lock_hash() -> str:
-    return hashlib.sha256(LOCK.read_bytes()).hexdigest()
-
-
-def up_to_date(folder: Path) -> bool:
-    """Whether the installed engine has the versions of this extension."""
-    return (installed(folder) or {}).get("lock") == lock_hash()
-
-
 def remove(folder: Path) -> None:
     """Remove the engine and its downloads."""
     (folder / COMPLETE).unlink(missing_ok=True)
@@ -117,6 +70,7 @@ def install(options: Options, report: Report, cancelled: threading.Event, lock: 
     with open(folder / LOG, "w", encoding="utf-8") as log:
         run = Runner(log, cancelled, report)
         report(0.01, "Looking at Python")
+        _check_device(options.device)
         _check_base(options.base, run)
         uv = _find_uv(options, run)
         venv = folder / "venv"
@@ -132,7 +86,7 @@ def install(options: Options, report: Report, cancelled: threading.Event, lock: 
         report(0.92, "Checking the engine")
         result = _doctor(python_in(venv), folder)
         _check_doctor(result, options)
-    text = {"lock": hashlib.sha256(lock.read_bytes()).hexdigest(), "time": time.time(), "doctor": result}
+    text = {"lock": lock_hash(lock), "time": time.time(), "doctor": result}
     temporary = folder / (COMPLETE + ".part")
     temporary.write_text(json.dumps(text, indent=1), encoding="utf-8")
     os.replace(temporary, folder / COMPLETE)
@@ -253,7 +207,8 @@ def _check_base(base: Path, run: Runner) -> None:
 def _find_uv(options: Options, run: Runner) -> Path | None:
     """The installer `uv`: the machine's, or one of our own; None where only pip will do."""
     found = shutil.which("uv")
-    if found:
+    # An old one cannot choose among the builds of PyTorch.
+    if found and "--torch-backend" in run([found, "pip", "install", "--help"], "uv does not run"):
         return Path(found)
     tools = options.folder / "tools"
     name = "uv.exe" if sys.platform == "win32" else "uv"
@@ -270,14 +225,51 @@ def _find_uv(options: Options, run: Runner) -> Path | None:
     return own
 
 
+def _check_device(device: str) -> None:
+    """Whether PyTorch has builds for the device on this system at all."""
+    systems = {"cuda": ("linux", "win32"), "rocm": ("linux",), "mps": ("darwin",)}
+    if sys.platform not in systems.get(device, (sys.platform,)):
+        names = {"linux": "Linux", "win32": "Windows", "darwin": "macOS"}
+        where = " and ".join(names[system] for system in systems[device])
+        raise InstallError(
+            f"PyTorch has builds for {device.upper()} on {where} only. Choose “Automatic” or “CPU” as the device."
+        )
+
+
+def torch_backend(device: str) -> str | None:
+    """What tells uv which build of PyTorch to take; None where there is but one.
+
+    "auto" looks at the driver of the graphics card: NVIDIA's or AMD's, in its version. That the build runs on the
+    device that was asked for is seen by the doctor afterwards.
+    """
+    if sys.platform == "darwin":
+        return None
+    return "cpu" if device == "cpu" else "auto"
+
+
+def pip_can(device: str) -> bool:
+    """Whether the one build that pip takes suits the device: on Linux it is CUDA's, on Windows that for the CPU."""
+    if sys.platform == "darwin":
+        return True
+    if sys.platform == "win32":
+        return device == "cpu" or (device == "auto" and not _has_gpu())
+    return device in ("cpu", "cuda") or (device == "auto" and not Path("/dev/kfd").exists())
+
+
 def _install_command(options: Options, uv: Path | None, lock: Path) -> list[Any]:
     python = python_in(options.folder / "venv")
     if uv is None:
+        if not options.wheels and not pip_can(options.device):
+            raise InstallError(
+                "The build of PyTorch for this graphics card needs the installer uv, which could not be had (see the "
+                "log). Install uv, or choose “CPU” as the device."
+            )
         return [python, "-m", "pip", "install", *_index(options, "pip"), "-r", lock]
     command = [uv, "pip", "install", "--no-config", "--python", python, "--compile-bytecode"]
-    # Wheels on the disk are one certain build; else uv looks at the driver for the build that fits.
-    if not options.wheels and options.device != "mps":
-        command += ["--torch-backend", "cpu" if options.device == "cpu" else "auto"]
+    # Wheels on the disk are one certain build.
+    backend = None if options.wheels else torch_backend(options.device)
+    if backend is not None:
+        command += ["--torch-backend", backend]
     return [*command, *_index(options, "uv"), "-r", lock]
 
 

@@ -2,123 +2,44 @@
 
 The timer is persistent, so jobs survive loading another file, undo, and the operator that started them. Where
 there are no timers (`blender -b`, the `bpy` module) operators call `Queue.run` instead, which blocks.
+
+What a job has to do in Blender when it has ended may be a generator: the timer then runs it in slices, between which
+the window lives.
+
+Imported when the extension is enabled: what is needed only with a job is imported where it is used.
 """
 
 from __future__ import annotations
 
-import logging
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import bpy
 
-from ..nerfcore.engine import status as st
 from . import preferences, state
-from .engine_install import Installer
-from .link import EngineError, Link, tail
+from .errors import EngineError, SceneError
+from .job import Done, Job, Steps
+from .text import t
 
-log = logging.getLogger("fieldwork.addon")
+if TYPE_CHECKING:
+    from .engine_install import Installer
+    from .link import Link
 
 BUSY_PERIOD = 0.1  # seconds between two looks at the engine while something goes on
 IDLE_PERIOD = 0.5
 FOLLOW_PERIOD = 0.5  # seconds between two looks at the files of a job in another process
 STATUS_PERIOD = 0.4  # seconds between two drawings of the status bar
-CURVE_POINTS = 2000
 KEPT = 8  # finished jobs the panel remembers
-Done = Callable[["Job"], None]
-
-TITLES = {
-    "new": "Reading Photos",
-    "import": "Importing Data Set",
-    "poses": "Estimating Poses",
-    "align": "Aligning",
-    "train": "Training",
-    "evaluate": "Measuring",
-    "render": "Rendering",
-    "mesh": "Extracting Mesh",
-    "blend": "Writing .blend",
-    "reconstruct": "Reconstructing",
-    "dataset": "Photographing the Scene",
-    "doctor": "Checking the Engine",
-}
+SLICE = 0.02  # seconds of bringing a result into the scene at a time
+SLICE_PERIOD = 0.01  # seconds between two slices
 
 
-@dataclass
-class Job:
-    """One piece of work. `state`: queued, running, cancelling, done, failed, cancelled."""
+def open_link(python: Path, log: Path) -> Link:
+    """A way to an engine, which starts with the first request."""
+    from .link import Link
 
-    verb: str
-    params: dict[str, Any]
-    id: str
-    project: Path | None = None
-    on_done: Done | None = None
-    state: str = "queued"
-    stage: str = ""
-    fraction: float | None = None
-    message: str = ""
-    eta: float | None = None
-    started: float | None = None
-    seconds: float = 0.0
-    result: dict[str, Any] | None = None
-    error: EngineError | None = None
-    warnings: list[str] = field(default_factory=list)
-    curve: list[tuple[int, float, float]] = field(default_factory=list)  # step, loss, PSNR in dB
-    latest: dict[str, Any] = field(default_factory=dict)  # last "train" event
-    preview: str = ""  # picture of a held-out photo
-    preview_count: int = 0
-    followed: bool = False  # runs in an engine that another Blender started
-    events_read: int = 0
-
-    @property
-    def title(self) -> str:
-        return TITLES.get(self.verb, self.verb.capitalize())
-
-    @property
-    def active(self) -> bool:
-        return self.state in ("queued", "running", "cancelling")
-
-    def take(self, method: str, data: dict[str, Any]) -> None:
-        """A notification of the engine."""
-        if method == "progress":
-            self.stage, self.fraction = data.get("stage") or "", data.get("fraction")
-            self.message, self.eta = data.get("message") or "", data.get("eta_s")
-        elif method == "event":
-            self.take_event(data)
-        elif method == "log" and data.get("level") == "warning":
-            self.warnings.append(str(data.get("text")))
-
-    def take_event(self, data: dict[str, Any]) -> None:
-        if data.get("kind") == "train":
-            self.latest = data
-            loss, psnr = data.get("loss"), data.get("psnr")
-            nan = float("nan")
-            self.curve.append((data.get("step", 0), nan if loss is None else loss, nan if psnr is None else psnr))
-            if len(self.curve) > CURVE_POINTS:
-                # Every other one of the older half: the shape stays, the length is bounded.
-                half = CURVE_POINTS // 2
-                self.curve[:half] = self.curve[:half:2]
-        elif data.get("kind") == "preview" and data.get("path"):
-            self.preview = str(data["path"])
-            self.preview_count += 1
-
-    def report(self) -> str:
-        """Text for a bug report."""
-        lines = [f"Fieldwork job {self.id}: {self.state}", f"verb: {self.verb}", f"parameters: {self.params}"]
-        lines.append(f"Blender {bpy.app.version_string}, stage “{self.stage}”, {self.seconds:.0f} s")
-        if self.error:
-            lines += [f"error: {self.error.message}", f"advice: {self.error.hint}", self.error.detail]
-        lines += [f"warning: {text}" for text in self.warnings]
-        if self.project:
-            lines += ["--- log of the job", *tail(self.project / st.FOLDER / f"{self.verb}.log", 40)]
-        lines += ["--- log of the engine", *tail(engine_log(), 40)]
-        return "\n".join(line for line in lines if line)
-
-
-def engine_log() -> Path:
-    return preferences.user_folder("logs") / "engine.log"
+    return Link(python, log)
 
 
 class Queue:
@@ -133,9 +54,11 @@ class Queue:
         self.facts: dict[str, Any] = {}  # what the engine last said of itself
         self.doctor: dict[str, Any] = {}  # what the doctor last found
         self.installer: Installer | None = None
-        self.slowest_tick = 0.0  # seconds of the longest look at the engine
-        self.slowest_result = 0.0  # of bringing a result into the scene, which Blender allows on its main thread only
-        self._in_results = 0.0
+        self.bringing: tuple[Job, Steps] | None = None  # a job whose result comes into the scene
+        self.slowest_tick = 0.0  # seconds of the longest time Blender was held up
+        self.slowest_step = ""  # what that was
+        self.edits = 0  # files loaded, undone and redone steps: what was held of the scene is stale
+        self._edits_seen = 0
         self._number = 0
         self._looked = 0.0
         self._asked = 0.0
@@ -146,7 +69,8 @@ class Queue:
     @property
     def current(self) -> Job | None:
         """The job the panels show."""
-        return self.running or self.followed or (self.waiting[0] if self.waiting else None)
+        bringing = self.bringing[0] if self.bringing else None
+        return bringing or self.running or self.followed or (self.waiting[0] if self.waiting else None)
 
     @property
     def last(self) -> Job | None:
@@ -179,6 +103,8 @@ class Queue:
             self._finish(job, None, error)
             raise
         self._finish(job, result, None)
+        while self.bringing:
+            self._bring(SLICE)
         return result
 
     def cancel(self, job: Job | None = None) -> None:
@@ -188,10 +114,14 @@ class Queue:
         if job in self.waiting:
             self.waiting.remove(job)
             self._finish(job, None, EngineError("cancelled", "Cancelled."))
+        elif self.bringing and self.bringing[0] is job:
+            self._brought(job, EngineError("cancelled", "Cancelled."))
         elif job.active:
             job.state = "cancelling"
             if job.followed and job.project:
-                st.request_cancel(job.project, job.id)
+                from ..nerfcore.engine import status
+
+                status.request_cancel(job.project, job.id)
             elif self.link:
                 self.link.cancel(job.id)
         self.redraw()
@@ -211,6 +141,8 @@ class Queue:
         """Follow a job that another process runs on the project, and tell of one that died."""
         if self.running and self.running.project == project:
             return
+        from ..nerfcore.engine import status as st
+
         self.followed = None
         for status in reversed(st.list_jobs(project)):
             if status.state == "running":
@@ -232,7 +164,7 @@ class Queue:
 
     def tick(self) -> float:
         """One look at the engine. Returns the seconds until the next."""
-        begin, self._in_results = time.perf_counter(), 0.0
+        begin = time.perf_counter()
         try:
             state.write_classes()
             if self.link:
@@ -242,15 +174,20 @@ class Queue:
             self._start_next()
             self._follow()
             self._look_after_engine()
+            self._bring(SLICE)
         except Exception:
             # A timer that raises is dropped by Blender, and all jobs with it.
-            log.exception("Fieldwork's timer failed")
+            import logging
+
+            logging.getLogger("fieldwork.addon").exception("Fieldwork's timer failed")
         installing = self.installer is not None and self.installer.is_alive()
         busy = self.current is not None or installing or (self.link is not None and self.link.busy)
         if busy:
             self.redraw()
-        self.slowest_tick = max(self.slowest_tick, time.perf_counter() - begin - self._in_results)
-        return BUSY_PERIOD if busy else IDLE_PERIOD
+        seconds = time.perf_counter() - begin
+        if seconds > self.slowest_tick:
+            self.slowest_tick, self.slowest_step = seconds, self.current.stage if self.current else ""
+        return SLICE_PERIOD if self.bringing else BUSY_PERIOD if busy else IDLE_PERIOD
 
     def _start_next(self) -> None:
         if self.running is not None or not self.waiting:
@@ -280,7 +217,7 @@ class Queue:
                 raise EngineError(
                     "missing", "The engine is not installed.", "Install it in the preferences of Fieldwork."
                 )
-            self.link = Link(python, engine_log())
+            self.link = open_link(python, preferences.engine_log())
         return self.link
 
     def _finish(self, job: Job, result: dict[str, Any] | None, error: EngineError | None) -> None:
@@ -290,14 +227,46 @@ class Queue:
         if job.started:
             job.seconds = time.monotonic() - job.started
         job.state = "done" if error is None else "cancelled" if error.kind == "cancelled" else "failed"
-        self._remember(job)
         if job.verb == "doctor" and result:
             self.doctor = result
-        if job.on_done:
-            begin = time.perf_counter()
-            job.on_done(job)
-            self.slowest_result = max(self.slowest_result, time.perf_counter() - begin)
-            self._in_results += time.perf_counter() - begin
+        steps = job.on_done(job) if job.on_done else None
+        if steps is None:
+            self._remember(job)
+        else:
+            job.state, job.stage, job.fraction, job.message = "running", t("Updating the Scene"), None, ""
+            self.bringing, self._edits_seen = (job, steps), self.edits
+        self.redraw()
+
+    def _bring(self, seconds: float) -> None:
+        """Bring a result into the scene for that long."""
+        if self.bringing is None:
+            return
+        job, steps = self.bringing
+        end = time.perf_counter() + seconds
+        try:
+            if self._edits_seen != self.edits and job.on_done:
+                # What the steps hold of the scene may be gone. Made again, they go on with what is there.
+                self._edits_seen, job.state = self.edits, "done"
+                again = job.on_done(job)
+                if again is None:
+                    self._brought(job, None)
+                    return
+                job.state, self.bringing, steps = "running", (job, again), again
+            while time.perf_counter() < end:
+                job.fraction, job.message = next(steps)
+        except StopIteration:
+            self._brought(job, None)
+        except SceneError as error:
+            self._brought(job, EngineError("scene", str(error)))
+        except Exception as error:
+            self._brought(job, EngineError("scene", f"The result could not be brought into the scene: {error}."))
+            raise
+
+    def _brought(self, job: Job, error: EngineError | None) -> None:
+        self.bringing = None
+        job.error, job.fraction, job.message = error, None, ""
+        job.state = "done" if error is None else "cancelled" if error.kind == "cancelled" else "failed"
+        self._remember(job)
         self.redraw()
 
     def _remember(self, job: Job) -> None:
@@ -309,6 +278,8 @@ class Queue:
         if job is None or job.project is None or time.monotonic() - self._looked < FOLLOW_PERIOD:
             return
         self._looked = time.monotonic()
+        from ..nerfcore.engine import status as st
+
         status = st.read_job(st.job_path(job.project, job.id))
         events, job.events_read = st.read_events(job.project, job.id, job.events_read)
         for event in events:
@@ -369,8 +340,14 @@ def _tick() -> float:
 
 
 @bpy.app.handlers.persistent
+def _undone(*_: Any) -> None:
+    queue.edits += 1
+
+
+@bpy.app.handlers.persistent
 def _file_loaded(*_: Any) -> None:
     """Another file: its project may have a job that runs elsewhere."""
+    queue.edits += 1
     settings = getattr(bpy.context.scene, "fieldwork", None)
     folder = state.folder_of(settings) if settings else None
     if folder is not None:
@@ -381,6 +358,8 @@ def _file_loaded(*_: Any) -> None:
 
 def register() -> None:
     bpy.app.handlers.load_post.append(_file_loaded)
+    bpy.app.handlers.undo_post.append(_undone)
+    bpy.app.handlers.redo_post.append(_undone)
     if not bpy.app.background:
         bpy.app.timers.register(_tick, first_interval=IDLE_PERIOD, persistent=True)
 
@@ -389,5 +368,7 @@ def unregister() -> None:
     if bpy.app.timers.is_registered(_tick):
         bpy.app.timers.unregister(_tick)
     bpy.app.handlers.load_post.remove(_file_loaded)
+    bpy.app.handlers.undo_post.remove(_undone)
+    bpy.app.handlers.redo_post.remove(_undone)
     queue.stop_engine(detach=queue.running is not None and preferences.preferences().on_close == "continue")
     queue.__init__()

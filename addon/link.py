@@ -19,23 +19,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parents[1]
+from .engine_place import ROOT, tail
+from .errors import EngineError
+
 # Lines of a log that say why a process ended.
 _TELLING = re.compile(r"error|exception|fatal|abort|terminat|assert|no module|cannot|out of memory", re.IGNORECASE)
 EVENT = Callable[[str, dict[str, Any]], None]
-DONE = Callable[[dict[str, Any] | None, "EngineError | None"], None]
-
-
-class EngineError(Exception):
-    """What the engine answered instead of a result.
-
-    `kind`: "cancelled", "died", "missing", or the engine's own code ("poses", "input", "internal", …);
-    `message` and `hint` are sentences for the user; `detail` is text for a report.
-    """
-
-    def __init__(self, kind: str, message: str, hint: str = "", detail: str = "") -> None:
-        super().__init__(f"{message} {hint}".strip())
-        self.kind, self.message, self.hint, self.detail = kind, message, hint, detail
+DONE = Callable[[dict[str, Any] | None, EngineError | None], None]
 
 
 def engine_environment(base: dict[str, str] | None = None) -> dict[str, str]:
@@ -257,17 +247,6 @@ class Link:
     def tail(self, lines: int = 20) -> list[str]:
         """The last lines of the engine's log."""
         return tail(self.log, lines)
-
-
-def tail(path: Path, lines: int = 20) -> list[str]:
-    """The last lines of a text file that are not blank; none when there is no file."""
-    try:
-        with open(path, "rb") as file:
-            file.seek(max(0, os.path.getsize(path) - 16384))
-            text = file.read().decode("utf-8", "replace")
-    except OSError:
-        return []
-    return [line.rstrip() for line in text.splitlines() if line.strip()][-lines:]
 
 
 def _line(message: dict[str, Any]) -> bytes:

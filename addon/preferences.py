@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-import tempfile
-import textwrap
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import bpy
-from bpy.props import EnumProperty, IntProperty, StringProperty
 from bpy.types import AddonPreferences, Context, UILayout
 
-from . import engine_install
-from .link import ROOT, tail
+from . import engine_place
+from .engine_place import ROOT, tail
+from .props import EnumProperty, IntProperty, StringProperty
 from .registration import ROOT_PACKAGE
+from .text import t
+
+if TYPE_CHECKING:
+    from .engine_install import Installer
 
 AS_EXTENSION = ROOT_PACKAGE.startswith("bl_ext.")
 
@@ -22,6 +24,8 @@ def user_folder(*parts: str) -> Path:
     """A folder that outlives updates of the extension; outside an extension (tests, scripts), a temporary one."""
     if AS_EXTENSION:
         return Path(bpy.utils.extension_path_user(ROOT_PACKAGE, path="/".join(parts), create=True))
+    import tempfile
+
     folder = Path(tempfile.gettempdir(), "fieldwork-user", *parts)
     folder.mkdir(parents=True, exist_ok=True)
     return folder
@@ -92,41 +96,43 @@ def draw_preferences(preferences: FIELDWORK_AP_preferences, layout: UILayout) ->
     layout.prop(preferences, "idle_minutes")
 
 
-def draw_engine(layout: UILayout, installer: engine_install.Installer | None) -> None:
+def draw_engine(layout: UILayout, installer: Installer | None) -> None:
     """State of the installed engine, and the one button that changes it."""
     folder = engine_folder()
-    known = engine_install.installed(folder)
+    known = engine_place.installed(folder)
     if installer is not None and installer.is_alive():
         row = layout.row(align=True)
         row.progress(factor=installer.fraction, text=installer.message, type="BAR")
         row.operator("fieldwork.engine_install_cancel", text="", icon="X")
         column = layout.column(align=True)
         column.active, column.scale_y = False, 0.7
-        for line in tail(folder / engine_install.LOG, 5):
+        for line in tail(folder / engine_place.LOG, 5):
             column.label(text=line[:120])
         return
     if known:
         doctor = known.get("doctor", {})
-        text = f"Engine installed: PyTorch {doctor.get('torch')} on {doctor.get('device')}"
+        text = t("Engine installed: PyTorch {} on {}", doctor.get("torch"), doctor.get("device"))
         layout.label(text=text, icon="CHECKMARK")
-        if not engine_install.up_to_date(folder):
-            layout.label(text="This version of Fieldwork needs other packages: press Update", icon="INFO")
+        if not engine_place.up_to_date(folder):
+            layout.label(text=t("This version of Fieldwork needs other packages: press Update"), icon="INFO")
     elif engine_python() is not None:
-        layout.label(text=f"Using the environment of {engine_python()}", icon="CHECKMARK")
+        layout.label(text=t("Using the environment of {}", engine_python()), icon="CHECKMARK")
     else:
-        layout.label(text="The engine is not installed", icon="INFO")
-        layout.label(text="It takes about 2 GB of disk for the CPU, more for a graphics card", icon="BLANK1")
+        layout.label(text=t("The engine is not installed"), icon="INFO")
+        layout.label(text=t("It takes about 2 GB of disk for the CPU, more for a graphics card"), icon="BLANK1")
     if not bpy.app.online_access:
-        layout.label(text="Online access is off: allow it under System > Network", icon="INTERNET_OFFLINE")
+        layout.label(text=t("Online access is off: allow it under System > Network"), icon="INTERNET_OFFLINE")
     if installer is not None and installer.error:
+        import textwrap
+
         column = layout.column(align=True)
         for number, line in enumerate(textwrap.wrap(installer.error, 80)):
             column.label(text=line, icon="BLANK1" if number else "ERROR")
     row = layout.row(align=True)
-    action = "Install Engine" if not known else "Repair" if engine_install.up_to_date(folder) else "Update"
+    action = t("Install Engine") if not known else t("Repair") if engine_place.up_to_date(folder) else t("Update")
     row.operator("fieldwork.engine_install", text=action, icon="IMPORT")
-    row.operator("fieldwork.engine_remove", text="Remove", icon="TRASH")
-    row.operator("fieldwork.engine_install_log", text="Log", icon="TEXT")
+    row.operator("fieldwork.engine_remove", text=t("Remove"), icon="TRASH")
+    row.operator("fieldwork.engine_install_log", text=t("Log"), icon="TEXT")
 
 
 class _Defaults:
@@ -149,9 +155,13 @@ def engine_folder() -> Path:
     return user_folder("engine")
 
 
+def engine_log() -> Path:
+    return user_folder("logs") / "engine.log"
+
+
 def engine_python() -> Path | None:
     """The Python that runs the engine, None when it is not installed."""
-    return engine_install.find_python(bpy.path.abspath(preferences().engine_python), engine_folder(), ROOT)
+    return engine_place.find_python(bpy.path.abspath(preferences().engine_python), engine_folder(), ROOT)
 
 
 CLASSES = [FIELDWORK_AP_preferences]

@@ -1,7 +1,9 @@
 """What a scene remembers of its capture: `Scene.fieldwork`. The capture itself lives in the project folder."""
 
 import bpy
-from bpy.props import (
+from bpy.types import Context, PropertyGroup
+
+from .props import (
     BoolProperty,
     CollectionProperty,
     EnumProperty,
@@ -12,7 +14,6 @@ from bpy.props import (
     PointerProperty,
     StringProperty,
 )
-from bpy.types import Context, PropertyGroup
 
 PRESETS = [
     ("draft", "Draft", "A first look in a minute or two"),

@@ -12,8 +12,13 @@ from types import ModuleType
 
 import bpy
 
+from .text import CONTEXT
+
+WITH_CONTEXT = (bpy.types.Operator, bpy.types.Panel, bpy.types.Menu)
+
 # Relative to the root package.
 MODULES = (
+    "addon.text",
     "addon.properties",
     "addon.preferences",
     "addon.pictures",
@@ -58,6 +63,8 @@ def register(root_package: str) -> None:
             module = importlib.import_module(f"{root_package}.{name}")
             _registered.append(module)
             for cls in getattr(module, "CLASSES", ()):
+                if issubclass(cls, WITH_CONTEXT):
+                    cls.bl_translation_context = CONTEXT
                 bpy.utils.register_class(cls)
             if hasattr(module, "register"):
                 module.register()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
 from pathlib import Path
 
 import bpy
@@ -20,10 +21,10 @@ def load(path: Path) -> bpy.types.Image:
     return image
 
 
-def show(
+def show_steps(
     scene: bpy.types.Scene, files: list[Path], show_as: str, photos: bool, project: str
-) -> list[tuple[bpy.types.Object, bpy.types.Image]]:
-    """Load the rendered files, and put the colored ones where the user wants them.
+) -> Generator[tuple[float, str], None, list[tuple[bpy.types.Object, bpy.types.Image]]]:
+    """Load the rendered files, and put the colored ones where the user wants them, a step for each file.
 
     Args:
         files: what the engine wrote.
@@ -33,7 +34,10 @@ def show(
     Returns:
         the cameras that got an image, with it.
     """
-    images = {path: load(path) for path in files}
+    images = {}
+    for number, path in enumerate(files):
+        yield number / len(files), path.name
+        images[path] = load(path)
     colored = [path for path in files if path.suffix == ".png" and not path.stem.endswith(OTHER_PASSES)]
     if show_as == "none" or not colored:
         return []
@@ -50,6 +54,7 @@ def show(
             image.source = "SEQUENCE"
         pairs = [(scene.camera, image)] if scene.camera else []
     for camera, image in pairs:
+        yield 1.0, camera.name
         if show_as == "background":
             background(scene, camera, image, len(colored))
         else:

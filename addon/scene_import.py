@@ -2,27 +2,33 @@
 
 Everything hangs under one empty. What was built is recognised by custom properties, not by names, so that objects may
 be renamed; transforms given to the parent are kept.
+
+The work is cut into steps of a few milliseconds, between which Blender's window can draw; what needs no Blender is done
+in a thread meanwhile. A step may leave a part unfinished, but nothing that Blender could trip over.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Generator
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal
 
 import bpy
 import numpy as np
 from mathutils import Matrix
 
-from .label_material import COLOR_ATTRIBUTE, SWITCH, make_group, make_material
-from .package import SENSOR_MM, Package, blender_camera
+from .label_material import SWITCH, make_group, make_material
+from .mesh_data import Part, parts, rgba, slot_classes
+from .mesh_import import fill_points, fill_surface
+from .package import SENSOR_MM, Package, blender_camera, read_package
 from .point_cloud import show_points
 
 ROLE, PROJECT = "fieldwork_role", "fieldwork_project"
 SIZE = "fieldwork_size"  # photo size in pixels, on camera objects
-CLASS_ATTRIBUTE, VERTEX_CLASS_ATTRIBUTE = "class_id", "vertex_class_id"
-VOID_COLOR = [0.15, 0.15, 0.15]
 Cameras = Literal["many", "animated", "both"]
+Steps = Generator[tuple[float, str], None, Any]  # yields the share that is done and what is next
 
 
 @dataclass
@@ -54,6 +60,33 @@ def import_package(
     progress: Callable[[float, str], None] = lambda fraction, message: None,
 ) -> Imported:
     """Build or update everything of a package in a scene and return it; `split`: one mesh object for each class."""
+    steps = import_steps(scene, lambda: (package, parts(package, split)), cameras)
+    while True:
+        try:
+            progress(*next(steps))
+        except StopIteration as end:
+            return end.value
+
+
+def load(folder: Path | str, split: bool = False) -> Callable[[], tuple[Package, list[Part]]]:
+    """For `import_steps`: reads a package and prepares its surface."""
+
+    def read() -> tuple[Package, list[Part]]:
+        package = read_package(folder)
+        return package, parts(package, split)
+
+    return read
+
+
+def import_steps(
+    scene: bpy.types.Scene, read: Callable[[], tuple[Package, list[Part]]], cameras: Cameras = "both"
+) -> Steps:
+    """`import_package` step by step; `read` is called in a thread. Returns Imported.
+
+    Raises:
+        PackageError: the package cannot be read.
+    """
+    package, surface = yield from _in_thread(read)
     place = _Place(scene, package.name)
     root = place.object("root", f"Fieldwork · {package.name}", None)
     root.empty_display_size = 0.2
@@ -64,20 +97,51 @@ def import_package(
     if cameras in {"many", "both"}:
         size = _camera_size(package)
         for index, entry in enumerate(package.cameras):
-            progress(0.6 * index / len(package.cameras), entry["name"])
+            yield 0.1 + 0.5 * index / len(package.cameras), entry["name"]
             result.cameras.append(_camera(place, entry, package, root, size))
     if cameras in {"animated", "both"} and package.cameras:
-        result.animated = _animated_camera(place, package, root)
-    progress(0.7, "points")
+        result.animated = yield from _animated_camera(place, package, root)
+    yield 0.7, "points"
     if len(package.xyz):
         result.points = _points(place, package, root)
-    progress(0.8, "mesh")
-    if package.mesh is not None:
-        result.meshes = _meshes(place, package, root, split)
+    yield 0.8, "mesh"
+    if surface:
+        group = make_group(f"Fieldwork · {package.name}", root, _texture(package))
+        for part in surface:
+            result.meshes.append((yield from _surface(place, package, root, part, group)))
     place.remove_unused()
     if package.cameras:
         _frame_scene(scene, package, result)
     return result
+
+
+def _in_thread(function: Callable[[], Any]) -> Steps:
+    """Call a function that does not touch Blender in a thread; returns its value, raises what it raises."""
+    values: list[Any] = []
+    errors: list[Exception] = []
+
+    def call() -> None:
+        try:
+            values.append(function())
+        except Exception as error:  # noqa: BLE001 - raised again below, on the thread that asked
+            errors.append(error)
+
+    thread = threading.Thread(target=call, name="fieldwork-read", daemon=True)
+    thread.start()
+    while thread.is_alive():
+        yield 0.0, "reading"
+        thread.join(0.01)
+    if errors:
+        raise errors[0]
+    return values[0]
+
+
+def _texture(package: Package) -> bpy.types.Image | None:
+    if package.texture is None:
+        return None
+    texture = bpy.data.images.load(str(package.texture), check_existing=True)
+    texture.reload()
+    return texture
 
 
 def _frame_scene(scene: bpy.types.Scene, package: Package, result: Imported) -> None:
@@ -184,8 +248,8 @@ def _camera(
     return item
 
 
-def _animated_camera(place: _Place, package: Package, root: bpy.types.Object) -> bpy.types.Object:
-    """One camera that stands at the n-th photo's place in frame n."""
+def _animated_camera(place: _Place, package: Package, root: bpy.types.Object) -> Steps:
+    """One camera that stands at the n-th photo's place in frame n; returns it."""
     role = "camera path"
     found = place.existing(role)
     data = found.data if found else bpy.data.cameras.new("Photographer")
@@ -196,6 +260,7 @@ def _animated_camera(place: _Place, package: Package, root: bpy.types.Object) ->
     item.matrix_parent_inverse = Matrix.Identity(4)
     before = None
     for frame, entry in enumerate(package.cameras, 1):
+        yield 0.6 + 0.1 * frame / len(package.cameras), entry["name"]
         _set_lens(data, entry)
         position, rotation, _ = Matrix(entry["camera_to_world"]).decompose()
         if before is not None:
@@ -209,112 +274,39 @@ def _animated_camera(place: _Place, package: Package, root: bpy.types.Object) ->
     return item
 
 
-def _mesh_of(found: bpy.types.Object | None, name: str) -> bpy.types.Mesh:
-    """The mesh to fill: that of the object an earlier import made, emptied, or a new one."""
-    if found is None:
-        return bpy.data.meshes.new(name)
-    found.data.clear_geometry()
-    return found.data
-
-
 def _points(place: _Place, package: Package, root: bpy.types.Object) -> bpy.types.Object:
     # Vertices with a colour attribute work in every version, in every exporter, and stay in the file.
-    mesh = _mesh_of(place.existing("points"), "Sparse points")
-    mesh.vertices.add(len(package.xyz))
-    mesh.vertices.foreach_set("co", package.xyz.astype(np.float32).ravel())
-    set_colors(mesh, package.rgb)
-    mesh.update()
-    item = place.object("points", "Sparse points", mesh, root)
-    item.matrix_parent_inverse = item.matrix_basis = Matrix.Identity(4)
-    item.hide_render = True
-    centers = np.array([np.array(camera["camera_to_world"])[:3, 3] for camera in package.cameras]).reshape(-1, 3)
+    mesh = bpy.data.meshes.new("Sparse points")
+    fill_points(mesh, package.xyz, rgba(package.rgb))
+    item = _with_mesh(place, "points", "Sparse points", mesh, root)
+    centers = np.array([np.array(c["camera_to_world"])[:3, 3] for c in package.cameras]).reshape(-1, 3)
     group = make_group(f"Fieldwork · {package.name} · points", root)
     material = make_material(f"{package.name} · points", [0.8, 0.8, 0.8], group)
     show_points(item, float(np.ptp(centers, axis=0).max(initial=0.0)) / 600 or 0.005, material)
     return item
 
 
-def set_colors(mesh: bpy.types.Mesh, rgb: np.ndarray) -> None:
-    """Write vertex colours (V, 3) uint8 sRGB into the mesh's colour attribute."""
-    attribute = mesh.color_attributes.new(COLOR_ATTRIBUTE, "BYTE_COLOR", "POINT")
-    rgba = np.ones((len(rgb), 4), np.float32)
-    rgba[:, :3] = rgb.astype(np.float32) / 255
-    attribute.data.foreach_set("color_srgb", rgba.ravel())
-    mesh.color_attributes.active_color = attribute
-    mesh.color_attributes.render_color_index = mesh.color_attributes.find(COLOR_ATTRIBUTE)
-
-
-def _meshes(place: _Place, package: Package, root: bpy.types.Object, split: bool) -> list[bpy.types.Object]:
-    """The surface as one object, or as one for each class that occurs."""
-    arrays = package.mesh
-    assert arrays is not None
-    texture = None
-    if package.texture is not None:
-        texture = bpy.data.images.load(str(package.texture), check_existing=True)
-        texture.reload()
-    group = make_group(f"Fieldwork · {package.name}", root, texture)
-    if not split:
-        return [_mesh(place, package, root, "mesh", "Surface", arrays, group)]
-    names = {entry["id"]: entry["name"] for entry in package.classes}
-    made = []
-    for number in np.unique(arrays["face_class"]).tolist():
-        name = names.get(number, "void" if number == package.ignore_id else f"class {number}")
-        part = part_of(arrays, arrays["face_class"] == number)
-        made.append(_mesh(place, package, root, f"class:{number}", f"Surface · {name}", part, group))
-    return made
-
-
-def part_of(arrays: dict[str, np.ndarray], chosen: np.ndarray) -> dict[str, np.ndarray]:
-    """The arrays of a mesh (see `Package.mesh`) for a mask (F,) of its faces, with the vertices these use."""
-    used, corners = np.unique(arrays["faces"][chosen], return_inverse=True)
-    per_face = {name: arrays[name][chosen] for name in ("face_class", "uv") if name in arrays}
-    per_vertex = {name: arrays[name][used] for name in ("vertices", "colors", "class_id")}
-    return {"faces": corners.reshape(-1, 3).astype(np.int32), **per_face, **per_vertex}
-
-
-def _mesh(
-    place: _Place,
-    package: Package,
-    root: bpy.types.Object,
-    role: str,
-    name: str,
-    arrays: dict[str, np.ndarray],
-    group: bpy.types.NodeTree,
-) -> bpy.types.Object:
-    mesh = _mesh_of(place.existing(role), name)
-    fill_triangles(mesh, arrays["vertices"], arrays["faces"])
-    set_colors(mesh, arrays["colors"])
-    for attribute, domain, values in (
-        (CLASS_ATTRIBUTE, "FACE", arrays["face_class"]),
-        (VERTEX_CLASS_ATTRIBUTE, "POINT", arrays["class_id"]),
-    ):
-        mesh.attributes.new(attribute, "INT", domain).data.foreach_set("value", values.astype(np.int32))
-    if "uv" in arrays:
-        layer = mesh.uv_layers.new(name="UVMap")
-        layer.data.foreach_set("uv", np.ascontiguousarray(arrays["uv"], np.float32).ravel())
-    classes = [{"id": package.ignore_id, "name": "void", "color": VOID_COLOR}, *package.classes]
-    slots: dict[int, int] = {}
-    mesh.materials.clear()
-    for entry in classes:
-        slots.setdefault(entry["id"], len(mesh.materials))
-        mesh.materials.append(make_material(f"{package.name} · {entry['name']}", entry["color"], group))
-    slot_of = np.zeros(max(int(arrays["face_class"].max(initial=0)), *slots) + 1, np.int32)
-    for number, slot in slots.items():
-        slot_of[number] = slot
-    mesh.polygons.foreach_set("material_index", slot_of[np.maximum(arrays["face_class"], 0)])
-    mesh.update()
-    item = place.object(role, name, mesh, root)
+def _surface(place: _Place, package: Package, root: bpy.types.Object, part: Part, group: Any) -> Steps:
+    """One object of the surface; returns it."""
+    mesh = bpy.data.meshes.new(part.name)
+    for _ in fill_surface(mesh, part.data):
+        yield 0.9, "mesh"
+    for entry in slot_classes(package):
+        material = make_material(f"{package.name} · {entry['name']}", entry["color"], group)
+        mesh.materials.append(material)
+    item = _with_mesh(place, part.role, part.name, mesh, root)
     item.matrix_parent_inverse = item.matrix_basis = Matrix.Identity(4)
     return item
 
 
-def fill_triangles(mesh: bpy.types.Mesh, vertices: np.ndarray, faces: np.ndarray) -> None:
-    """Fill an empty mesh with vertices (V, 3) and smooth triangles (F, 3)."""
-    mesh.vertices.add(len(vertices))
-    mesh.vertices.foreach_set("co", np.ascontiguousarray(vertices, np.float32).ravel())
-    mesh.loops.add(3 * len(faces))
-    mesh.loops.foreach_set("vertex_index", np.ascontiguousarray(faces, np.int32).ravel())
-    mesh.polygons.add(len(faces))
-    mesh.polygons.foreach_set("loop_start", np.arange(0, 3 * len(faces), 3, dtype=np.int32))
-    mesh.update(calc_edges=True)
-    mesh.polygons.foreach_set("use_smooth", np.ones(len(faces), bool))
+def _with_mesh(place: _Place, role: str, name: str, mesh: bpy.types.Mesh, parent: bpy.types.Object) -> bpy.types.Object:
+    """The object of a role with this mesh, in place of the one an earlier import made, wherever that is used."""
+    item = place.existing(role)
+    if item is None:
+        return place.object(role, name, mesh, parent)
+    place.object(role, name, mesh)
+    before, kept = item.data, item.data.name
+    before.user_remap(mesh)
+    bpy.data.meshes.remove(before)
+    mesh.name = kept
+    return item

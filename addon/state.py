@@ -12,8 +12,6 @@ from typing import Any
 
 import bpy
 
-from ..nerfcore.files import write_json
-
 PROJECT_FILE = "project.json"
 POSES_FILE = "poses/poses.json"
 POSES_REPORT = "poses/report.json"
@@ -144,6 +142,8 @@ def write_classes() -> None:
         folder, classes = _changed_classes.popitem()
         project = read_project(Path(folder))
         if project is not None:
+            from ..nerfcore.files import write_json  # not at the top: enabling the extension must be quick
+
             project["classes"] = classes
             write_json(Path(folder) / PROJECT_FILE, project)
 

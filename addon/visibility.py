@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import bpy
 
-from .scene_import import CLASS_ATTRIBUTE, ROLE
+from .mesh_import import CLASS_ATTRIBUTE
+from .scene_import import PROJECT, ROLE
 
 NAME = "Fieldwork Classes"
 
@@ -12,7 +13,7 @@ NAME = "Fieldwork Classes"
 def meshes(project: str | None = None) -> list[bpy.types.Object]:
     """The labelled meshes in the file, of one project or of all."""
     found = [obj for obj in bpy.data.objects if obj.type == "MESH" and obj.get(ROLE) == "mesh"]
-    return [obj for obj in found if project is None or obj.get("fieldwork_project") == project]
+    return [obj for obj in found if project is None or obj.get(PROJECT) == project]
 
 
 def hide_classes(obj: bpy.types.Object, hidden: list[int]) -> None:

@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import bpy
-from bpy.props import StringProperty
 from bpy.types import Context, Operator
 
 from ..addon import jobs, preferences, state
-from ..addon.link import EngineError
+from ..addon.errors import EngineError
 from ..addon.properties import FieldworkScene
+from ..addon.props import StringProperty
+from ..addon.text import t
 
 
 def scene_settings(**names: str) -> Callable[[type], type]:
@@ -33,32 +34,32 @@ def scene_settings(**names: str) -> Callable[[type], type]:
 def engine_reason() -> str | None:
     """Why no engine can be started, None when one can."""
     if preferences.engine_python() is None:
-        return "Install the engine in the preferences of Fieldwork first"
+        return t("Install the engine in the preferences of Fieldwork first")
     return None
 
 
 def need_photos(context: Context) -> str | None:
-    return None if context.scene.fieldwork.photos else "Choose a folder of photos, or a video, first"
+    return None if context.scene.fieldwork.photos else t("Choose a folder of photos, or a video, first")
 
 
 def need_project_folder(context: Context) -> str | None:
-    return None if context.scene.fieldwork.project else "Choose a project folder first"
+    return None if context.scene.fieldwork.project else t("Choose a project folder first")
 
 
 def need_project(context: Context) -> str | None:
     folder = state.folder_of(context.scene.fieldwork)
-    return None if state.has_project(folder) else "Read photos into a project first"
+    return None if state.has_project(folder) else t("Read photos into a project first")
 
 
 def need_poses(context: Context) -> str | None:
     folder = state.folder_of(context.scene.fieldwork)
-    return need_project(context) or (None if state.has_poses(folder) else "Estimate the camera poses first")
+    return need_project(context) or (None if state.has_poses(folder) else t("Estimate the camera poses first"))
 
 
 def need_run(context: Context) -> str | None:
     settings = context.scene.fieldwork
     missing = (
-        None if state.has_run(state.folder_of(settings), settings.run) else f"Train the run “{settings.run}” first"
+        None if state.has_run(state.folder_of(settings), settings.run) else t("Train the run “{}” first", settings.run)
     )
     return need_poses(context) or missing
 
@@ -67,7 +68,7 @@ def same_verb_active(verb: str, context: Context) -> str | None:
     folder = state.folder_of(context.scene.fieldwork)
     for job in (jobs.queue.running, jobs.queue.followed, *jobs.queue.waiting):
         if job is not None and job.verb == verb and (job.project is None or job.project == folder):
-            return f"{job.title} is under way"
+            return t("{} is under way", job.title)
     return None
 
 
@@ -133,8 +134,8 @@ class VerbOperator(Operator):
             self.report({"WARNING"}, warning)
         return {"FINISHED"}
 
-    def after(self) -> Callable[[jobs.Job], None]:
-        """What is called when the job has ended. The operator itself is gone by then."""
+    def after(self) -> jobs.Done:
+        """What is called when the job has ended, and may be a generator. The operator itself is gone by then."""
         return refresh_scenes
 
 
@@ -151,7 +152,7 @@ class ProjectOperator(VerbOperator):
             return str(Path(bpy.path.abspath(self.project)).absolute())
         folder = state.folder_of(context.scene.fieldwork)
         if folder is None:
-            raise ValueError("Choose a project folder first.")
+            raise ValueError(t("Choose a project folder first."))
         return str(folder)
 
 

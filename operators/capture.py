@@ -6,10 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import bpy
-from bpy.props import EnumProperty, StringProperty
 from bpy.types import Context, FileHandler, Operator, OperatorFileListElement
 
 from ..addon import state
+from ..addon.props import BoolProperty, CollectionProperty, EnumProperty, StringProperty
+from ..addon.text import t
 from .base import ProjectOperator, need_photos, need_project_folder, scene_settings, set_if_empty
 
 PHOTOS = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".heic", ".heif", ".webp", ".exr", ".dng", ".bmp"}
@@ -80,7 +81,7 @@ class FIELDWORK_OT_new(ProjectOperator):
     def parameters(self, context: Context) -> dict[str, Any]:
         photos = self.path(context, "photos")
         if photos is None:
-            raise ValueError("Choose a folder of photos, or a video, first.")
+            raise ValueError(t("Choose a folder of photos, or a video, first."))
         project = self.project_path(context)
         set_if_empty(context.scene, project)
         plain = ("mask_mode", "max_size", "frames", "keep_blurry")
@@ -110,7 +111,7 @@ class FIELDWORK_OT_import_dataset(ProjectOperator):
 
     def parameters(self, context: Context) -> dict[str, Any]:
         if not self.directory:
-            raise ValueError("Choose the folder of a data set first.")
+            raise ValueError(t("Choose the folder of a data set first."))
         source = Path(bpy.path.abspath(self.directory)).absolute()
         # A scene that shows another capture gets a new project, not that capture's.
         given = self.properties.is_property_set("project") and bool(self.project)
@@ -128,10 +129,10 @@ class FIELDWORK_OT_open(Operator):
 
     filepath: StringProperty(subtype="FILE_PATH", options={"SKIP_SAVE"})
     directory: StringProperty(subtype="DIR_PATH", options={"SKIP_SAVE"})
-    files: bpy.props.CollectionProperty(type=OperatorFileListElement, options={"SKIP_SAVE", "HIDDEN"})
-    filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
-    filter_image: bpy.props.BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
-    filter_movie: bpy.props.BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
+    files: CollectionProperty(type=OperatorFileListElement, options={"SKIP_SAVE", "HIDDEN"})
+    filter_folder: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
+    filter_image: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
+    filter_movie: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
 
     def invoke(self, context: Context, event: bpy.types.Event) -> set[str]:
         # Dropped onto the viewport: the path is known already.
@@ -143,7 +144,7 @@ class FIELDWORK_OT_open(Operator):
     def execute(self, context: Context) -> set[str]:
         source = self.source()
         if source is None or not source.exists():
-            self.report({"ERROR"}, f"There is nothing at {source}.")
+            self.report({"ERROR"}, t("There is nothing at {}.", source))
             return {"CANCELLED"}
         choose_source(context.scene, source)
         show_sidebar(context)

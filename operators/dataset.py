@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import bpy
-from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
 from bpy.types import Context, Event
 
 from ..addon import jobs
+from ..addon.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
+from ..addon.text import t
 from .base import VerbOperator, refresh_scenes, set_if_empty
 from .capture import project_for
 
@@ -87,15 +88,15 @@ class FIELDWORK_OT_dataset(VerbOperator):
             column.prop(self, name)
         render = context.scene.render
         percent = render.resolution_percentage / 100
-        size = f"{round(render.resolution_x * percent)} × {round(render.resolution_y * percent)} pixels"
-        column.label(text=f"{size}, as set in Output Properties", icon="INFO")
+        size = (round(render.resolution_x * percent), round(render.resolution_y * percent))
+        column.label(text=t("{} × {} pixels, as set in Output Properties", *size), icon="INFO")
 
     def parameters(self, context: Context) -> dict[str, Any]:
         if not self.out:
-            raise ValueError("Choose a folder for the data set.")
+            raise ValueError(t("Choose a folder for the data set."))
         out = Path(bpy.path.abspath(self.out)).absolute()
         if out.is_dir() and any(out.iterdir()):
-            raise ValueError(f"{out} is not empty: choose another folder.")
+            raise ValueError(t("{} is not empty: choose another folder.", out))
         # What is photographed is the scene as it is now, saved or not, in a Blender of its own: this one stays free.
         self._copy = str(Path(bpy.app.tempdir) / f"fieldwork-dataset-{out.name}.blend")
         bpy.ops.wm.save_as_mainfile(filepath=self._copy, copy=True, check_existing=False)

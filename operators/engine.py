@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-import threading
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import bpy
 from bpy.types import Context, Event, Operator
 
-from ..addon import engine_install, jobs, preferences
+from ..addon import engine_place, jobs, preferences
+from ..addon.text import t
+
+if TYPE_CHECKING:
+    from ..addon.engine_install import Options
 
 
-def options() -> engine_install.Options:
+def options() -> Options:
+    from ..addon import engine_install  # not at the top: enabling the extension must be quick
+
     chosen = preferences.preferences()
     base, wheels = bpy.path.abspath(chosen.base_python), bpy.path.abspath(chosen.wheels)
     return engine_install.Options(
@@ -36,14 +42,18 @@ class FIELDWORK_OT_engine_install(Operator):
     @classmethod
     def poll(cls, context: Context) -> bool:
         if installing():
-            cls.poll_message_set("The installation is under way")
+            cls.poll_message_set(t("The installation is under way"))
         elif not bpy.app.online_access and not preferences.preferences().wheels:
-            cls.poll_message_set("Allow Online Access in the System preferences, or choose a folder of packages")
+            cls.poll_message_set(t("Allow Online Access in the System preferences, or choose a folder of packages"))
         else:
             return True
         return False
 
     def execute(self, context: Context) -> set[str]:
+        import threading
+
+        from ..addon import engine_install
+
         jobs.queue.stop_engine()
         if not bpy.app.background:
             jobs.queue.installer = engine_install.Installer(options())
@@ -68,7 +78,7 @@ class FIELDWORK_OT_engine_install_cancel(Operator):
     @classmethod
     def poll(cls, context: Context) -> bool:
         if not installing():
-            cls.poll_message_set("Nothing is being installed")
+            cls.poll_message_set(t("Nothing is being installed"))
             return False
         return True
 
@@ -87,9 +97,9 @@ class FIELDWORK_OT_engine_remove(Operator):
     def poll(cls, context: Context) -> bool:
         folder = preferences.engine_folder()
         if installing():
-            cls.poll_message_set("The installation is under way")
+            cls.poll_message_set(t("The installation is under way"))
         elif not (folder / "venv").exists() and not (folder / "cache").exists():
-            cls.poll_message_set("There is no engine to remove")
+            cls.poll_message_set(t("There is no engine to remove"))
         else:
             return True
         return False
@@ -98,6 +108,8 @@ class FIELDWORK_OT_engine_remove(Operator):
         return context.window_manager.invoke_confirm(self, event)
 
     def execute(self, context: Context) -> set[str]:
+        from ..addon import engine_install
+
         jobs.queue.stop_engine(timeout=5.0)
         engine_install.remove(preferences.engine_folder())
         jobs.queue.installer = None
@@ -112,17 +124,17 @@ class FIELDWORK_OT_engine_install_log(Operator):
 
     @classmethod
     def poll(cls, context: Context) -> bool:
-        if not (preferences.engine_folder() / engine_install.LOG).is_file():
-            cls.poll_message_set("Nothing has been installed yet")
+        if not (preferences.engine_folder() / engine_place.LOG).is_file():
+            cls.poll_message_set(t("Nothing has been installed yet"))
             return False
         return True
 
     def execute(self, context: Context) -> set[str]:
         name = "Fieldwork Installation Log"
         text = bpy.data.texts.get(name) or bpy.data.texts.new(name)
-        path = preferences.engine_folder() / engine_install.LOG
+        path = preferences.engine_folder() / engine_place.LOG
         text.from_string(path.read_text(encoding="utf-8", errors="replace"))
-        self.report({"INFO"}, f"See “{name}” in the text editor")
+        self.report({"INFO"}, t("See “{}” in the text editor", name))
         return {"FINISHED"}
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from bpy.types import Context
 
+from ..addon.text import t
 from .base import ProjectOperator, need_run, scene_settings
 
 
@@ -23,7 +24,7 @@ class FIELDWORK_OT_blend(ProjectOperator):
         project, run = self.project_path(context), self.value(context, "run")
         out = self.path(context, "out") or str(Path(project, "exports", run, f"{Path(project).name}.blend"))
         if not out.endswith(".blend"):
-            raise ValueError("Name a file that ends in .blend.")
+            raise ValueError(t("Name a file that ends in .blend."))
         return {"project": project, "run": run, "out": out}
 
 

@@ -8,6 +8,8 @@ import bpy
 from bpy.types import Context, Operator
 
 from ..addon import jobs, preferences
+from ..addon.props import StringProperty
+from ..addon.text import t
 from .base import VerbOperator
 
 
@@ -17,15 +19,15 @@ class FIELDWORK_OT_cancel(Operator):
     bl_idname = "fieldwork.cancel"
     bl_label = "Cancel"
 
-    job: bpy.props.StringProperty(options={"SKIP_SAVE", "HIDDEN"})
+    job: StringProperty(options={"SKIP_SAVE", "HIDDEN"})
 
     @classmethod
     def poll(cls, context: Context) -> bool:
         current = jobs.queue.current
         if current is None:
-            cls.poll_message_set("Nothing is running")
+            cls.poll_message_set(t("Nothing is running"))
         elif current.state == "cancelling" and not jobs.queue.waiting:
-            cls.poll_message_set("The job is stopping already")
+            cls.poll_message_set(t("The job is stopping already"))
         else:
             return True
         return False
@@ -45,14 +47,14 @@ class FIELDWORK_OT_copy_report(Operator):
     @classmethod
     def poll(cls, context: Context) -> bool:
         if jobs.queue.last is None and jobs.queue.current is None:
-            cls.poll_message_set("Nothing has run yet")
+            cls.poll_message_set(t("Nothing has run yet"))
             return False
         return True
 
     def execute(self, context: Context) -> set[str]:
         job = jobs.queue.last or jobs.queue.current
         context.window_manager.clipboard = job.report()
-        self.report({"INFO"}, "The report is on the clipboard")
+        self.report({"INFO"}, t("The report is on the clipboard"))
         return {"FINISHED"}
 
 
@@ -76,7 +78,7 @@ class FIELDWORK_OT_stop_engine(Operator):
     @classmethod
     def poll(cls, context: Context) -> bool:
         if jobs.queue.link is None or not jobs.queue.link.alive:
-            cls.poll_message_set("The engine is not running")
+            cls.poll_message_set(t("The engine is not running"))
             return False
         return True
 
@@ -95,7 +97,7 @@ class FIELDWORK_OT_detach(Operator):
     def poll(cls, context: Context) -> bool:
         job = jobs.queue.running
         if job is None or job.project is None:
-            cls.poll_message_set("No job of a project is running")
+            cls.poll_message_set(t("No job of a project is running"))
             return False
         return True
 
@@ -125,15 +127,15 @@ class FIELDWORK_OT_open_log(Operator):
 
     @classmethod
     def poll(cls, context: Context) -> bool:
-        if not jobs.engine_log().is_file():
-            cls.poll_message_set("The engine has not run yet")
+        if not preferences.engine_log().is_file():
+            cls.poll_message_set(t("The engine has not run yet"))
             return False
         return True
 
     def execute(self, context: Context) -> set[str]:
         text = bpy.data.texts.get("Fieldwork Engine Log") or bpy.data.texts.new("Fieldwork Engine Log")
-        text.from_string(jobs.engine_log().read_text(encoding="utf-8", errors="replace"))
-        self.report({"INFO"}, f"See “{text.name}” in the text editor")
+        text.from_string(preferences.engine_log().read_text(encoding="utf-8", errors="replace"))
+        self.report({"INFO"}, t("See “{}” in the text editor", text.name))
         return {"FINISHED"}
 
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from bpy.props import BoolProperty, EnumProperty
 from bpy.types import Context, Operator
 
+from ..addon.props import BoolProperty, EnumProperty
+from ..addon.text import t
 from .base import ProjectOperator, need_poses, need_project, scene_settings
 
 
@@ -47,7 +48,7 @@ class FIELDWORK_OT_align(ProjectOperator):
             distance = self.value(context, "distance") * unit
             params["scale"] = [",".join(f"{v:.9g}" for v in a), ",".join(f"{v:.9g}" for v in b), distance]
         if len(params) == 1:
-            raise ValueError("Choose an up direction, or pick two points first.")
+            raise ValueError(t("Choose an up direction, or pick two points first."))
         return params
 
 

@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import bpy
-from bpy.props import IntProperty, IntVectorProperty, StringProperty
 from bpy.types import Context
 
+from ..addon.props import IntProperty, IntVectorProperty, StringProperty
+from ..addon.text import t
 from .base import VerbOperator, scene_settings
 
 
@@ -34,9 +35,9 @@ class FIELDWORK_OT_reconstruct(VerbOperator):
     def parameters(self, context: Context) -> dict[str, Any]:
         photos, out = self.path(context, "photos"), self.out or context.scene.fieldwork.project
         if photos is None:
-            raise ValueError("Choose a folder of photos, or a video, first.")
+            raise ValueError(t("Choose a folder of photos, or a video, first."))
         if not out:
-            raise ValueError("Choose a project folder first.")
+            raise ValueError(t("Choose a project folder first."))
         return {
             "photos": photos,
             "out": str(Path(bpy.path.abspath(out)).absolute()),
@@ -64,7 +65,7 @@ class FIELDWORK_OT_simulate(VerbOperator):
 
     def parameters(self, context: Context) -> dict[str, Any]:
         if not self.out:
-            raise ValueError("Choose a folder for the capture.")
+            raise ValueError(t("Choose a folder for the capture."))
         return {
             "out": str(Path(bpy.path.abspath(self.out)).absolute()),
             "views": self.views,

@@ -7,6 +7,7 @@ from bpy.types import Context, Operator
 from mathutils import Vector
 
 from ..addon import crop, state
+from ..addon.text import t
 from .base import need_poses
 
 
@@ -19,7 +20,7 @@ class FIELDWORK_OT_crop_add(Operator):
 
     @classmethod
     def poll(cls, context: Context) -> bool:
-        reason = need_poses(context) or ("There is a box already" if crop.find(context.scene) else None)
+        reason = need_poses(context) or (t("There is a box already") if crop.find(context.scene) else None)
         if reason:
             cls.poll_message_set(reason)
         return reason is None
@@ -42,7 +43,7 @@ class FIELDWORK_OT_crop_apply(Operator):
 
     @classmethod
     def poll(cls, context: Context) -> bool:
-        reason = need_poses(context) or (None if crop.find(context.scene) else "Add a region box first")
+        reason = need_poses(context) or (None if crop.find(context.scene) else t("Add a region box first"))
         if reason:
             cls.poll_message_set(reason)
         return reason is None
@@ -54,7 +55,7 @@ class FIELDWORK_OT_crop_apply(Operator):
         except ValueError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        self.report({"INFO"}, "The next training covers the box")
+        self.report({"INFO"}, t("The next training covers the box"))
         return {"FINISHED"}
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,8 @@ import bpy
 from bpy.types import Context
 
 from ..addon import jobs, state
-from ..nerfcore.files import write_json
+from ..addon.props import StringProperty
+from ..addon.text import t
 from .base import ProjectOperator, need_run, refresh_scenes, scene_settings
 
 
@@ -23,9 +23,9 @@ def camera_frames(scene: bpy.types.Scene, animated: bool, size: tuple[int, int])
     """
     camera = scene.camera
     if camera is None:
-        raise ValueError("The scene has no active camera.")
+        raise ValueError(t("The scene has no active camera."))
     if camera.data.type != "PERSP":
-        raise ValueError(f"“{camera.name}” is not a perspective camera.")
+        raise ValueError(t("“{}” is not a perspective camera.", camera.name))
     percent = scene.render.resolution_percentage / 100
     width = size[0] or round(scene.render.resolution_x * percent)
     height = size[1] or round(scene.render.resolution_y * percent)
@@ -82,7 +82,7 @@ class FIELDWORK_OT_render(ProjectOperator):
     verb = "render"
     needs = (need_run,)
 
-    out: bpy.props.StringProperty(
+    out: StringProperty(
         name="Output", description="Folder for the images; empty: exports/renders of the project", subtype="DIR_PATH",
         options={"SKIP_SAVE"},
     )  # fmt: skip
@@ -91,7 +91,7 @@ class FIELDWORK_OT_render(ProjectOperator):
     def reason(cls, context: Context) -> str | None:
         settings = context.scene.fieldwork
         if settings.render_from in ("camera", "animation") and context.scene.camera is None:
-            return "The scene has no active camera"
+            return t("The scene has no active camera")
         return super().reason(context)
 
     def parameters(self, context: Context) -> dict[str, Any]:
@@ -100,7 +100,7 @@ class FIELDWORK_OT_render(ProjectOperator):
         folder = Path(bpy.path.abspath(self.out)) if self.out else Path(project) / "exports" / "renders" / source
         passes = self.value(context, "passes")
         if not passes:
-            raise ValueError("Choose at least one pass.")
+            raise ValueError(t("Choose at least one pass."))
         order = ("rgb", "depth", "semantic", "confidence", "normal")
         params: dict[str, Any] = {
             "project": project,
@@ -113,20 +113,22 @@ class FIELDWORK_OT_render(ProjectOperator):
             return {**params, "test": True}
         if source == "orbit":
             return {**params, "orbit": self.value(context, "orbit")}
+        from ..nerfcore.files import write_json  # not at the top: enabling the extension must be quick
+
         folder.mkdir(parents=True, exist_ok=True)
         cameras = camera_frames(context.scene, source == "animation", size)
         write_json(folder / "cameras.json", cameras)
         return {**params, "camera": str(folder / "cameras.json"), "size": None}
 
-    def after(self) -> Callable[[jobs.Job], None]:
+    def after(self) -> jobs.Done:
         return show_result
 
 
-def show_result(job: jobs.Job) -> None:
+def show_result(job: jobs.Job) -> jobs.Steps | None:
     """Bring the rendered images into Blender as image datablocks, and into the scene as its settings say."""
     refresh_scenes(job)
     if job.state != "done" or job.result is None or job.project is None:
-        return
+        return None
     # Not at the top: enabling the extension must be quick.
     from ..addon import render_result
 
@@ -134,7 +136,7 @@ def show_result(job: jobs.Job) -> None:
     files = [Path(path) for path in job.result["frames"]]
     # An orbit has no camera in the scene.
     show_as = scene.fieldwork.show_as if "orbit" not in job.params else "none"
-    render_result.show(scene, files, show_as, "test" in job.params, job.project.name)
+    return render_result.show_steps(scene, files, show_as, "test" in job.params, job.project.name)
 
 
 CLASSES = [FIELDWORK_OT_render]

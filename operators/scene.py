@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import bpy
-from bpy.props import EnumProperty
 from bpy.types import Context
 
 from ..addon import jobs, state
-from ..addon.link import EngineError
+from ..addon.props import EnumProperty
 from .base import ProjectOperator, need_poses, refresh_scenes, scene_settings, set_if_empty
 
 
@@ -39,36 +37,35 @@ class FIELDWORK_OT_import_scene(ProjectOperator):
         set_if_empty(context.scene, project)
         return {"project": project, "run": self.value(context, "run")}
 
-    def after(self) -> Callable[[jobs.Job], None]:
+    def after(self) -> jobs.Done:
         cameras, name = self.cameras, bpy.context.scene.name
         return lambda job: import_result(job, cameras, name)
 
 
-def import_result(job: jobs.Job, cameras: str, scene_name: str) -> None:
+def import_result(job: jobs.Job, cameras: str, scene_name: str) -> jobs.Steps | None:
     """Import what the engine prepared, as one step of undo."""
     refresh_scenes(job)
     if job.state != "done" or not job.result:
-        return
-    # Not at the top: enabling the extension must be quick.
-    from ..addon import visibility
-    from ..addon.package import PackageError, read_package
-    from ..addon.scene_import import import_package
-
+        return None
     # Another file may have been loaded meanwhile.
     scene = bpy.data.scenes.get(scene_name) or bpy.context.scene
     if state.folder_of(scene.fieldwork) != job.project and not bpy.app.background:
         job.warnings.append("The scene shows another project by now: press Update Scene there.")
-        return
+        return None
+    return import_steps(job, cameras, scene)
+
+
+def import_steps(job: jobs.Job, cameras: str, scene: bpy.types.Scene) -> jobs.Steps:
+    # Not at the top: enabling the extension must be quick.
+    from ..addon import scene_import, visibility
+
     first = not visibility.meshes(job.project.name)
-    try:
-        imported = import_package(scene, read_package(job.result["folder"]), cameras)
-    except PackageError as error:
-        job.state, job.error = "failed", EngineError("package", str(error))
-        return
+    imported = yield from scene_import.import_steps(scene, scene_import.load(job.result["folder"]), cameras)
     job.warnings += imported.warnings
     state.show_classes(scene.fieldwork)
     if first and imported.mesh is not None:
         show_colors()
+    yield 1.0, ""
     if not bpy.app.background:
         bpy.ops.ed.undo_push(message="Update Scene from Fieldwork")
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 from bl_operators.presets import AddPresetBase
-from bpy.props import BoolProperty, EnumProperty, StringProperty
 from bpy.types import Context, Menu, Operator
 
 from ..addon import state
+from ..addon.props import BoolProperty, EnumProperty, StringProperty
+from ..addon.text import t
 from .base import ProjectOperator, need_poses, need_run, scene_settings
 
 
@@ -18,7 +19,7 @@ def parse_settings(text: str) -> dict[str, str]:
     for word in text.split():
         name, equals, value = word.partition("=")
         if not (name and equals and value):
-            raise ValueError(f"“{word}” is not a setting: write name=value, e.g. loss.semantic=0.1.")
+            raise ValueError(t("“{}” is not a setting: write name=value, e.g. loss.semantic=0.1.", word))
         pairs[name] = value
     return pairs
 
@@ -36,12 +37,12 @@ class FIELDWORK_OT_train(ProjectOperator):
 
     @classmethod
     def description(cls, context: Context, properties: Any) -> str:
-        return "Go on from the last checkpoint of the run" if properties.resume else cls.__doc__ or ""
+        return t("Go on from the last checkpoint of the run") if properties.resume else t(cls.__doc__ or "")
 
     def parameters(self, context: Context) -> dict[str, Any]:
         run = self.value(context, "run")
         if not run:
-            raise ValueError("Give the run a name.")
+            raise ValueError(t("Give the run a name."))
         seconds, steps = self.value(context, "time_limit"), self.value(context, "steps")
         state.write_classes()
         return {

@@ -5,6 +5,7 @@ from __future__ import annotations
 from bpy.types import Context, Panel, UILayout
 
 from ..addon import jobs, state
+from ..addon.text import t
 
 
 class FieldworkPanel(Panel):
@@ -39,21 +40,21 @@ def duration(seconds: float | None) -> str:
         return ""
     seconds = max(0, round(seconds))
     if seconds < 60:
-        return f"{seconds} s"
+        return t("{} s", seconds)
     if seconds < 3600:
-        return f"{seconds // 60}:{seconds % 60:02} min"
-    return f"{seconds // 3600}:{seconds % 3600 // 60:02} h"
+        return t("{}:{:02} min", seconds // 60, seconds % 60)
+    return t("{}:{:02} h", seconds // 3600, seconds % 3600 // 60)
 
 
 def progress_text(job: jobs.Job) -> str:
     """What the job is at, in one line."""
     if job.state == "cancelling":
-        return "Stopping…"
+        return t("Stopping…")
     parts = [job.stage or job.title]
     if job.fraction is not None and job.state == "running":
         parts.append(f"{job.fraction:.0%}")
     if job.eta is not None:
-        parts.append(f"{duration(job.eta)} left")
+        parts.append(t("{} left", duration(job.eta)))
     return " · ".join(parts)
 
 

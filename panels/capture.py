@@ -5,6 +5,7 @@ from __future__ import annotations
 from bpy.types import Context, Panel, UIList
 
 from ..addon import pictures, state
+from ..addon.text import t
 from .base import FieldworkPanel, StepPanel, columns, draw_wrapped, project_folder, text_width
 
 STATUS_ICONS = {"ok": "CHECKMARK", "rejected": "CANCEL", "unregistered": "ERROR"}
@@ -37,12 +38,12 @@ class FIELDWORK_PT_capture(StepPanel):
         rejected = sum(image.status == "rejected" for image in settings.images)
         if state.has_project(folder):
             count = len(settings.images) - rejected
-            self.draw_state(True, f"{count} photos" + (f", {rejected} rejected" if rejected else ""))
+            self.draw_state(True, t("{} photos, {} rejected", count, rejected) if rejected else t("{} photos", count))
         else:
-            self.draw_state(False, "No photos yet")
+            self.draw_state(False, t("No photos yet"))
         row = layout.row(align=True)
-        row.operator("fieldwork.open", text="Open…", icon="FILE_FOLDER")
-        row.operator("fieldwork.import_dataset", text="Import Posed…", icon="IMPORT")
+        row.operator("fieldwork.open", text=t("Open…"), icon="FILE_FOLDER")
+        row.operator("fieldwork.import_dataset", text=t("Import Posed…"), icon="IMPORT")
         column = columns(layout)
         for name in ("photos", "labels", "masks", "class_file"):
             column.prop(settings, name)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from bpy.types import Context, UIList
 
 from ..addon import state
+from ..addon.text import t
 from .base import StepPanel, columns, project_folder
 
 
@@ -21,7 +22,7 @@ class FIELDWORK_UL_classes(UIList):
         side.alignment = "RIGHT"
         if item.area > 0:
             frame = (state.cached_project(project_folder(context)) or {}).get("frame", {})
-            side.label(text=f"{item.area:.3g} m²" if frame.get("scale_known") else f"{item.area:.3g}")
+            side.label(text=t("{:.3g} m²", item.area) if frame.get("scale_known") else f"{item.area:.3g}")
         weight = row.row()
         weight.ui_units_x = 2.4
         weight.prop(item, "priority", text="")
@@ -35,13 +36,13 @@ class FIELDWORK_PT_classes(StepPanel):
         layout, settings = self.layout, context.scene.fieldwork
         count = len(settings.classes)
         if not count:
-            self.draw_state(False, "No label maps")
+            self.draw_state(False, t("No label maps"))
             note = layout.row()
             note.active = False
-            note.label(text="Choose a folder of labels under Capture")
+            note.label(text=t("Choose a folder of labels under Capture"))
             return
         labelled = sum(image.labelled for image in settings.images)
-        self.draw_state(True, f"{count} classes on {labelled} photos")
+        self.draw_state(True, t("{} classes on {} photos", count, labelled))
         layout.template_list("FIELDWORK_UL_classes", "", settings, "classes", settings, "class_index", rows=4)
         if 0 <= settings.class_index < count:
             entry = settings.classes[settings.class_index]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from bpy.types import Context, Panel
 
 from ..addon import jobs
+from ..addon.text import t
 from .base import FieldworkPanel, draw_wrapped, text_width
 
 
@@ -16,13 +17,16 @@ class FIELDWORK_PT_dataset(FieldworkPanel, Panel):
     def draw(self, context: Context) -> None:
         layout = self.layout
         draw_wrapped(
-            layout, "Photograph this scene with poses, labels and depth.", text_width(context), icon="RENDER_RESULT"
+            layout,
+            t("Photograph this scene with poses, labels and depth."),
+            text_width(context),
+            icon="RENDER_RESULT",
         )
         layout.operator_context = "INVOKE_DEFAULT"
-        layout.operator("fieldwork.dataset", text="Dataset from Scene…", icon="OUTLINER_OB_CAMERA")
+        layout.operator("fieldwork.dataset", text=t("Dataset from Scene…"), icon="OUTLINER_OB_CAMERA")
         last = next((j for j in reversed(jobs.queue.finished) if j.verb == "dataset" and j.state == "done"), None)
         if last is not None and last.result:
-            text = f"{last.result['images']} photos in {last.result['folder']}"
+            text = t("{} photos in {}", last.result["images"], last.result["folder"])
             draw_wrapped(layout, text, text_width(context), icon="CHECKMARK")
 
 

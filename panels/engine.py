@@ -5,6 +5,7 @@ from __future__ import annotations
 from bpy.types import Context
 
 from ..addon import jobs, preferences
+from ..addon.text import t
 from .base import StepPanel, draw_wrapped, text_width
 
 
@@ -15,27 +16,27 @@ class FIELDWORK_PT_engine(StepPanel):
         layout, queue = self.layout, jobs.queue
         running = queue.link is not None and queue.link.alive
         if preferences.engine_python() is None:
-            self.draw_state(False, "Not installed")
+            self.draw_state(False, t("Not installed"))
         else:
-            self.draw_state(running, "Running" if running else "Starts when needed")
+            self.draw_state(running, t("Running") if running else t("Starts when needed"))
         if running and queue.facts:
-            memory = f"Memory {queue.facts.get('memory_mb', 0) / 1000:.1f} GB"
+            memory = t("Memory {:.1f} GB", queue.facts.get("memory_mb", 0) / 1000)
             gpu = queue.facts.get("gpu_memory_mb")
-            layout.label(text=memory + (f", GPU {gpu / 1000:.1f} GB" if gpu is not None else ""), icon="MEMORY")
+            layout.label(text=memory + (t(", GPU {:.1f} GB", gpu / 1000) if gpu is not None else ""), icon="MEMORY")
         report = queue.doctor
         if report:
             name = report.get("device_name") or ""
-            layout.label(text=f"Device: {report.get('device', '?')} {name}".strip(), icon="DESKTOP")
-            layout.label(text=f"{report.get('free_disk_gb', 0):.0f} GB free on disk", icon="DISK_DRIVE")
+            layout.label(text=t("Device: {} {}", report.get("device", "?"), name).strip(), icon="DESKTOP")
+            layout.label(text=t("{:.0f} GB free on disk", report.get("free_disk_gb", 0)), icon="DISK_DRIVE")
             for problem in report.get("problems", []):
                 draw_wrapped(layout, problem, text_width(context), icon="ERROR")
         grid = layout.grid_flow(columns=2, align=True, even_columns=True)
-        grid.operator("fieldwork.doctor", text="Check")
-        grid.operator("fieldwork.stop_engine", text="Stop")
-        grid.operator("fieldwork.open_log", text="Log")
+        grid.operator("fieldwork.doctor", text=t("Check"))
+        grid.operator("fieldwork.stop_engine", text=t("Stop"))
+        grid.operator("fieldwork.open_log", text=t("Log"))
         grid.operator("fieldwork.copy_report")
-        layout.operator("fieldwork.detach", text="Keep Running Without Blender", icon="UNLINKED")
-        layout.operator("fieldwork.open_preferences", text="Preferences…", icon="PREFERENCES")
+        layout.operator("fieldwork.detach", text=t("Keep Running Without Blender"), icon="UNLINKED")
+        layout.operator("fieldwork.open_preferences", text=t("Preferences…"), icon="PREFERENCES")
 
 
 CLASSES = [FIELDWORK_PT_engine]

@@ -8,6 +8,7 @@ import bpy
 from bpy.types import Context, STATUSBAR_HT_header
 
 from ..addon import jobs, preferences, state
+from ..addon.text import t
 from .base import FieldworkPanel, draw_error, draw_job, draw_wrapped, progress_text, project_folder, text_width
 
 
@@ -46,21 +47,21 @@ class FIELDWORK_PT_main(FieldworkPanel):
         layout, settings = self.layout, context.scene.fieldwork
         if preferences.engine_python() is None:
             box = layout.box()
-            draw_wrapped(box, "The engine is not installed yet.", text_width(context), icon="INFO")
-            box.operator("fieldwork.open_preferences", text="Install Engine…", icon="IMPORT")
+            draw_wrapped(box, t("The engine is not installed yet."), text_width(context), icon="INFO")
+            box.operator("fieldwork.open_preferences", text=t("Install Engine…"), icon="IMPORT")
         row = layout.row(align=True)
         row.prop(settings, "project", text="")
         if settings.project and not state.has_project(project_folder(context)):
             note = layout.row()
             note.active = False
-            note.label(text="New project")
+            note.label(text=t("New project"))
         job = jobs.queue.current
         if job is not None:
             draw_job(layout, job)
             if job.project is not None and job.project != project_folder(context):
                 note = layout.row()
                 note.active = False
-                note.label(text=f"for {job.project.name}")
+                note.label(text=t("for {}", job.project.name))
             for waiting in jobs.queue.waiting:
                 if waiting is not job:
                     draw_job(layout, waiting)
@@ -83,7 +84,7 @@ def draw_status(self: STATUSBAR_HT_header, context: Context) -> None:
         return
     row = self.layout.row(align=True)
     row.ui_units_x = 14
-    row.progress(factor=job.fraction or 0.0, text=f"Fieldwork: {progress_text(job)}", type="BAR")
+    row.progress(factor=job.fraction or 0.0, text=t("Fieldwork: {}", progress_text(job)), type="BAR")
     row.operator("fieldwork.cancel", text="", icon="X")
 
 

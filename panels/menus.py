@@ -5,20 +5,22 @@ from __future__ import annotations
 import bpy
 from bpy.types import Context, Menu
 
+from ..addon.text import t
+
 
 class FIELDWORK_MT_steps(Menu):
     bl_label = "Fieldwork"
 
     def draw(self, context: Context) -> None:
         layout = self.layout
-        layout.operator("fieldwork.open", text="Open Photos or Project…", icon="FILE_FOLDER")
-        layout.operator("fieldwork.import_dataset", text="Import Posed Data Set…")
+        layout.operator("fieldwork.open", text=t("Open Photos or Project…"), icon="FILE_FOLDER")
+        layout.operator("fieldwork.import_dataset", text=t("Import Posed Data Set…"))
         layout.separator()
         layout.operator("fieldwork.new")
         layout.operator("fieldwork.poses")
         layout.operator("fieldwork.align")
         layout.operator("fieldwork.train").resume = False
-        layout.operator("fieldwork.train", text="Resume Training").resume = True
+        layout.operator("fieldwork.train", text=t("Resume Training")).resume = True
         layout.operator("fieldwork.evaluate")
         layout.operator("fieldwork.render")
         layout.operator("fieldwork.mesh")
@@ -26,7 +28,7 @@ class FIELDWORK_MT_steps(Menu):
         layout.separator()
         layout.operator("fieldwork.cancel")
         layout.operator("fieldwork.doctor")
-        layout.operator("fieldwork.open_preferences", text="Preferences…")
+        layout.operator("fieldwork.open_preferences", text=t("Preferences…"))
 
 
 def draw_object_menu(self: Menu, context: Context) -> None:
@@ -35,11 +37,11 @@ def draw_object_menu(self: Menu, context: Context) -> None:
 
 
 def draw_import(self: Menu, context: Context) -> None:
-    self.layout.operator("fieldwork.open", text="Photos, Video or Project (Fieldwork)")
+    self.layout.operator("fieldwork.open", text=t("Photos, Video or Project (Fieldwork)"))
 
 
 def draw_export(self: Menu, context: Context) -> None:
-    self.layout.operator("fieldwork.blend", text="Capture as .blend (Fieldwork)")
+    self.layout.operator("fieldwork.blend", text=t("Capture as .blend (Fieldwork)"))
 
 
 CLASSES = [FIELDWORK_MT_steps]

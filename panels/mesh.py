@@ -5,6 +5,7 @@ from __future__ import annotations
 from bpy.types import Context
 
 from ..addon import state
+from ..addon.text import t
 from .base import StepPanel, columns, project_folder
 
 
@@ -16,12 +17,12 @@ class FIELDWORK_PT_mesh(StepPanel):
         folder = project_folder(context)
         result = state.last_result(state.cached_project(folder), "mesh")
         if result:
-            closed = "closed" if result.get("watertight") else "open"
-            self.draw_state(True, f"{result.get('faces', 0):,} triangles, {closed}")
+            closed = t("{:,} triangles, closed") if result.get("watertight") else t("{:,} triangles, open")
+            self.draw_state(True, closed.format(result.get("faces", 0)))
         elif state.has_run(folder, settings.run):
-            self.draw_state(False, "Ready to extract")
+            self.draw_state(False, t("Ready to extract"))
         else:
-            self.draw_state(False, f"Run “{settings.run}” is not trained yet")
+            self.draw_state(False, t("Run “{}” is not trained yet", settings.run))
         column = columns(layout)
         for name in ("resolution", "faces", "texture", "mesh_file"):
             column.prop(settings, name)

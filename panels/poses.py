@@ -5,6 +5,7 @@ from __future__ import annotations
 from bpy.types import Context, UIList
 
 from ..addon import crop, state
+from ..addon.text import t
 from .base import FieldworkPanel, StepPanel, columns, draw_wrapped, project_folder, text_width
 from .capture import STATUS_ICONS
 
@@ -19,9 +20,9 @@ class FIELDWORK_UL_poses(UIList):
         numbers = row.row()
         numbers.alignment = "RIGHT"
         if item.status == "ok" and item.points:
-            numbers.label(text=f"{item.points} pts, {item.error_px:.2f} px")
+            numbers.label(text=t("{} pts, {:.2f} px", item.points, item.error_px))
         elif item.status != "ok":
-            numbers.label(text="Not used" if item.status == "rejected" else "Not placed")
+            numbers.label(text=t("Not used") if item.status == "rejected" else t("Not placed"))
 
 
 class FIELDWORK_PT_poses(StepPanel):
@@ -33,7 +34,7 @@ class FIELDWORK_PT_poses(StepPanel):
         done = state.has_poses(folder)
         placed = sum(image.status == "ok" for image in settings.images)
         usable = sum(image.status != "rejected" for image in settings.images)
-        self.draw_state(done, f"{placed} of {usable} photos placed" if done else "No poses yet")
+        self.draw_state(done, t("{} of {} photos placed", placed, usable) if done else t("No poses yet"))
         columns(layout).prop(settings, "pose_preset")
         layout.operator("fieldwork.poses", icon="CAMERA_DATA")
         if not (done and folder):
@@ -41,7 +42,7 @@ class FIELDWORK_PT_poses(StepPanel):
         layout.template_list("FIELDWORK_UL_poses", "poses", settings, "images", settings, "image_index", rows=4)
         if 0 <= settings.image_index < len(settings.images) and settings.images[settings.image_index].reason:
             draw_wrapped(layout, settings.images[settings.image_index].reason, text_width(context), icon="INFO")
-        layout.operator("fieldwork.import_scene", text="Show in Scene", icon="OUTLINER_OB_CAMERA")
+        layout.operator("fieldwork.import_scene", text=t("Show in Scene"), icon="OUTLINER_OB_CAMERA")
 
 
 class FIELDWORK_PT_align(FieldworkPanel):
@@ -53,7 +54,7 @@ class FIELDWORK_PT_align(FieldworkPanel):
         layout, settings = self.layout, context.scene.fieldwork
         frame = (state.cached_project(project_folder(context)) or {}).get("frame", {})
         if frame:
-            known = "Scale is set" if frame.get("scale_known") else "Scale is unknown"
+            known = t("Scale is set") if frame.get("scale_known") else t("Scale is unknown")
             layout.label(text=known, icon="CHECKMARK" if frame.get("scale_known") else "INFO")
         columns(layout).prop(settings, "up")
         for end in "ab":
@@ -74,9 +75,9 @@ class FIELDWORK_PT_region(FieldworkPanel):
         box = crop.find(context.scene)
         draw_wrapped(
             layout,
-            "Move and scale the box in the viewport: what lies outside is not trained."
+            t("Move and scale the box in the viewport: what lies outside is not trained.")
             if box
-            else "Everything the photos show is trained.",
+            else t("Everything the photos show is trained."),
             text_width(context),
             icon="CUBE",
         )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from bpy.types import Context
 
 from ..addon import jobs, state
+from ..addon.text import t
 from .base import StepPanel, columns, project_folder
 
 
@@ -17,11 +18,11 @@ class FIELDWORK_PT_render(StepPanel):
         last = next((j for j in reversed(jobs.queue.finished) if j.verb == "render" and j.state == "done"), None)
         if last is not None:
             count = sum(str(path).endswith(".exr") for path in (last.result or {}).get("frames", []))
-            self.draw_state(True, f"{count} images rendered" if count != 1 else "1 image rendered")
+            self.draw_state(True, t("{} images rendered", count) if count != 1 else t("1 image rendered"))
         elif state.has_run(folder, settings.run):
-            self.draw_state(False, "Ready to render")
+            self.draw_state(False, t("Ready to render"))
         else:
-            self.draw_state(False, f"Run “{settings.run}” is not trained yet")
+            self.draw_state(False, t("Run “{}” is not trained yet", settings.run))
         column = columns(layout)
         column.prop(settings, "render_from")
         if settings.render_from == "orbit":

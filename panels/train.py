@@ -5,6 +5,7 @@ from __future__ import annotations
 from bpy.types import Context, UILayout
 
 from ..addon import jobs, pictures, state
+from ..addon.text import t
 from .base import FieldworkPanel, StepPanel, columns, duration, project_folder
 
 
@@ -26,15 +27,15 @@ class FIELDWORK_PT_train(StepPanel):
         active = job is not None and job.active
         checkpoint = state.can_resume(folder, settings.run)
         if active:
-            self.draw_state(True, f"Run “{settings.run}” is training")
+            self.draw_state(True, t("Run “{}” is training", settings.run))
         elif checkpoint:
-            self.draw_state(False, f"Run “{settings.run}” is paused")
+            self.draw_state(False, t("Run “{}” is paused", settings.run))
         elif state.has_run(folder, settings.run):
-            self.draw_state(True, f"Run “{settings.run}” is trained")
+            self.draw_state(True, t("Run “{}” is trained", settings.run))
         else:
-            self.draw_state(False, f"Run “{settings.run}” is not trained yet")
+            self.draw_state(False, t("Run “{}” is not trained yet", settings.run))
         row = layout.row(align=True)
-        row.menu("FIELDWORK_MT_train_presets", text="My Presets")
+        row.menu("FIELDWORK_MT_train_presets", text=t("My Presets"))
         row.operator("fieldwork.train_preset_add", text="", icon="ADD")
         row.operator("fieldwork.train_preset_add", text="", icon="REMOVE").remove_active = True
         column = columns(layout)
@@ -42,20 +43,20 @@ class FIELDWORK_PT_train(StepPanel):
         column.prop(settings, "run")
         if not active:
             estimate = state.time_estimate(folder, settings)
-            text = f"About {duration(estimate)}, as the last time here" if estimate else ""
+            text = t("About {}, as the last time here", duration(estimate)) if estimate else ""
             if settings.time_limit > 0:
-                text = f"Ends after {duration(settings.time_limit)}"
+                text = t("Ends after {}", duration(settings.time_limit))
             if text:
                 note = layout.row()
                 note.active = False
                 note.label(text=text, icon="TIME")
         if active:
-            layout.operator("fieldwork.cancel", text="Pause", icon="PAUSE").job = job.id
+            layout.operator("fieldwork.cancel", text=t("Pause"), icon="PAUSE").job = job.id
         else:
             row = layout.row(align=True)
-            row.operator("fieldwork.train", text="Restart" if checkpoint else "Train", icon="PLAY").resume = False
+            row.operator("fieldwork.train", text=t("Restart") if checkpoint else t("Train"), icon="PLAY").resume = False
             if checkpoint:
-                row.operator("fieldwork.train", text="Resume", icon="PLAY").resume = True
+                row.operator("fieldwork.train", text=t("Resume"), icon="PLAY").resume = True
         if job is not None:
             draw_curve(layout, job)
 
@@ -81,7 +82,7 @@ class FIELDWORK_PT_runs(FieldworkPanel):
         folder = project_folder(context)
         names = state.runs(folder)
         if not names:
-            layout.label(text="No runs yet")
+            layout.label(text=t("No runs yet"))
         for name in names:
             row = layout.row(align=True)
             chosen = name == settings.run
@@ -96,16 +97,16 @@ def draw_curve(layout: UILayout, job: jobs.Job) -> None:
     if icon:
         layout.template_icon(icon_value=icon, scale=7.0)
     if job.latest:
-        layout.label(text=f"Step {job.latest.get('step', 0):,}")
+        layout.label(text=t("Step {:,}", job.latest.get("step", 0)))
         row = layout.row()
         loss, psnr = job.latest.get("loss"), job.latest.get("psnr")
         # The colors are those of the two lines.
-        row.label(text="PSNR –" if psnr is None else f"PSNR {psnr:.1f} dB", icon="COLLECTION_COLOR_05")
-        row.label(text="Loss –" if loss is None else f"Loss {loss:.4f}", icon="COLLECTION_COLOR_02")
+        row.label(text=t("PSNR –") if psnr is None else t("PSNR {:.1f} dB", psnr), icon="COLLECTION_COLOR_05")
+        row.label(text=t("Loss –") if loss is None else t("Loss {:.4f}", loss), icon="COLLECTION_COLOR_02")
     if job.preview:
         preview = pictures.picture(job.preview, job.preview_count)
         if preview:
-            layout.label(text="Render of a held-out photo")
+            layout.label(text=t("Render of a held-out photo"))
             layout.template_icon(icon_value=preview, scale=9.0)
 
 

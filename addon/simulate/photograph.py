@@ -21,6 +21,7 @@ from .pixels import read_exr, write_index_png
 
 LabelSource = Literal["material", "object", "collection", "none"]
 SURFACES = {"MESH", "CURVE", "SURFACE", "META", "FONT"}
+MAX_ID = 32767  # Blender's largest pass index
 FAR = 1e9  # Cycles writes 1e10 where a ray meets nothing
 
 
@@ -95,22 +96,25 @@ def photograph(
     transparent: bool = False,
     progress: Callable[[int, Shot], None] = lambda index, shot: None,
 ) -> None:
-    """Render `shots` into out/NAME.png (8-bit sRGB), out/NAME.label.png (uint8 ids) and out/NAME.depth.npy.
+    """Render `shots` into out/NAME.png (8-bit sRGB), out/NAME.label.png (class ids) and out/NAME.depth.npy.
 
     Depth is the float32 distance along the viewing axis in scene units, 0 where there is nothing. Labels and depth
-    are taken at pixel centres, one ray each, so that ids are never mixed. `progress` hears of each finished shot.
+    are taken at pixel centres, one ray each, so that ids are never mixed; ids above 255 make maps of 16 bits. `progress` hears of each finished shot.
 
     Args:
         samples: Cycles samples per pixel of the colour picture.
         labels: what tells classes apart, see `class_ids`.
         transparent: RGBA pictures, alpha 0 where there is nothing, instead of the world's background.
     Raises:
-        SceneError: there are more classes than a uint8 label map can hold.
+        SceneError: there are more classes than Blender has pass indices for.
     """
-    if max(class_ids(scene, labels).values(), default=0) > 255:
+    largest = max(class_ids(scene, labels).values(), default=0)
+    if largest > MAX_ID:
         raise SceneError(
-            f"The {labels}s of the scene make more than 255 classes: tell classes apart by something else."
+            f"A class of the scene has the number {largest}; pass indices and classes go up to {MAX_ID}: tell classes "
+            "apart by something else."
         )
+    dtype = np.dtype(np.uint8 if largest < 256 else np.uint16)
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     with _settings_kept(scene), _indexed(scene, labels), _camera(scene):
@@ -127,7 +131,7 @@ def photograph(
             _aim(scene, shot)
             _render_colour(scene, out / f"{shot.name}.png", samples, transparent)
             if labels != "none" or depth:
-                _render_data(scene, out, shot.name, labels, depth)
+                _render_data(scene, out, shot.name, labels, depth, dtype)
             progress(index, shot)
 
 
@@ -161,7 +165,9 @@ def _render_colour(scene: bpy.types.Scene, path: Path, samples: int, transparent
     _render(scene, path)
 
 
-def _render_data(scene: bpy.types.Scene, out: Path, name: str, labels: LabelSource, depth: bool) -> None:
+def _render_data(
+    scene: bpy.types.Scene, out: Path, name: str, labels: LabelSource, depth: bool, dtype: np.dtype
+) -> None:
     _set_format(scene, "OPEN_EXR_MULTILAYER")
     scene.render.image_settings.exr_codec = "NONE"
     scene.render.image_settings.color_depth = "32"
@@ -183,7 +189,7 @@ def _render_data(scene: bpy.types.Scene, out: Path, name: str, labels: LabelSour
     if labels != "none":
         passes = ("IndexMA", "Material Index") if labels == "material" else ("IndexOB", "Object Index")
         index = np.maximum.reduce([_pass(channels, c, passes) for c in _layers(channels)])
-        write_index_png(out / f"{name}.label.png", np.where(empty, 0, np.rint(index)).astype(np.uint8))
+        write_index_png(out / f"{name}.label.png", np.where(empty, 0, np.rint(index)).astype(dtype))
 
 
 def _layers(channels: dict[str, np.ndarray]) -> list[str]:

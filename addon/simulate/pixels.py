@@ -58,14 +58,15 @@ def read_exr(path: Path) -> dict[str, np.ndarray]:
 
 
 def write_index_png(path: Path, index: np.ndarray) -> None:
-    """Write (height, width) uint8 as an 8-bit greyscale PNG whose values are the indices themselves."""
+    """Write (height, width) uint8 or uint16 as a greyscale PNG of 8 or 16 bits whose values are the indices."""
     height, width = index.shape
-    rows = np.zeros((height, width + 1), np.uint8)  # each row begins with its filter type, 0
-    rows[:, 1:] = index
+    bits = 8 * index.dtype.itemsize
+    rows = np.zeros((height, index.dtype.itemsize * width + 1), np.uint8)  # each row begins with its filter type, 0
+    rows[:, 1:] = np.ascontiguousarray(index, index.dtype.newbyteorder(">")).view(np.uint8)
     with open(path, "wb") as file:
         file.write(b"\x89PNG\r\n\x1a\n")
         for kind, body in (
-            (b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)),
+            (b"IHDR", struct.pack(">IIBBBBB", width, height, bits, 0, 0, 0, 0)),
             (b"IDAT", zlib.compress(rows.tobytes(), 6)),
             (b"IEND", b""),
         ):

@@ -2,7 +2,7 @@
 
 OUT/transforms.json   camera-to-world with OpenGL axes, in the scene's frame and units; intrinsics in pixels
 OUT/images/*.png      RGB, or RGBA with alpha 0 where there is nothing
-OUT/labels/*.png      uint8 class ids, 0 where there is nothing; OUT/classes.json names them
+OUT/labels/*.png      class ids, 8 bits (16 where one is above 255), 0 where there is nothing; OUT/classes.json names them
 OUT/depth/*.exr       float32 distance along the viewing axis, 0 where there is nothing
 """
 

@@ -175,6 +175,30 @@ def test_what_cannot_be_photographed_is_said(blend, tmp_path, bpy_script):
         take(tmp_path / "empty.blend", tmp_path / "d", path="camera")
 
 
+NUMBERS = """
+bpy.ops.wm.open_mainfile(filepath=blend)
+for name, number in (("floor", 300), ("cube", 2)):
+    bpy.data.objects[name].pass_index = number
+bpy.ops.wm.save_as_mainfile(filepath=path, copy=True)
+answer(1)
+"""
+
+
+def test_class_numbers_above_255_reach_the_project(blend, tmp_path, bpy_script):
+    bpy_script(NUMBERS, blend=blend, path=tmp_path / "numbers.blend")
+    result = take(tmp_path / "numbers.blend", tmp_path / "set", labels="object", views=2)
+    assert result["classes"] == ["cube", "floor"]
+    for path in (tmp_path / "set/labels").iterdir():
+        label = np.array(Image.open(path))
+        assert label.dtype == np.uint16
+        assert set(np.unique(label).tolist()) == {0, 2, 300}
+    assert np.abs(surfaces(tmp_path / "set")[300][:, 2]).max() < 1e-3, "300 is the floor"
+    import_dataset(ImportParams(dataset=tmp_path / "set", project=tmp_path / "project"), Reporter())
+    scene = load_scene(tmp_path / "project")
+    assert [c.id for c in scene.classes] == [2, 300]
+    assert set(np.unique(np.array(Image.open(scene.views[0].label))).tolist()) == {0, 2, 300}
+
+
 OPERATOR = """
 import fieldwork
 fieldwork.register()

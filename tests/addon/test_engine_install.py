@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from fieldwork.addon import engine_install as module
+from fieldwork.addon import engine_place as place
 from fieldwork.addon.engine_install import InstallCancelled, InstallError, Options, install
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -32,7 +33,7 @@ def make_wheel(folder: Path, name: str = "tiny", version: str = "1.0") -> Path:
 
 @pytest.fixture
 def options(tmp_path, monkeypatch):
-    monkeypatch.delenv(module.ENVIRONMENT, raising=False)
+    monkeypatch.delenv(place.ENVIRONMENT, raising=False)
     monkeypatch.delenv("PIP_FIND_LINKS", raising=False)
     return Options(
         folder=tmp_path / "ein Ordner" / "engine",
@@ -76,12 +77,12 @@ def test_offline_install_makes_an_environment_of_its_own(options, lock, tmp_path
     run = module.subprocess.run([python, "-c", "import tiny; print(tiny.answer)"], capture_output=True, check=True)
     assert run.stdout.strip() == b"42"
     assert set(Path(sys.prefix).rglob("tiny*")) == before, "the base Python was touched"
-    assert module.find_python("", options.folder, tmp_path) == python
-    assert module.installed(options.folder)["doctor"]["device"] == "cpu"
+    assert place.find_python("", options.folder, tmp_path) == python
+    assert place.installed(options.folder)["doctor"]["device"] == "cpu"
     assert "tiny" in (options.folder / module.LOG).read_text()
     module.remove(options.folder)
-    assert module.installed(options.folder) is None
-    assert module.find_python("", options.folder, tmp_path) is None
+    assert place.installed(options.folder) is None
+    assert place.find_python("", options.folder, tmp_path) is None
     assert not (options.folder / "venv").exists()
 
 
@@ -91,13 +92,13 @@ def test_broken_package_says_so_and_the_next_try_goes_on(options, lock, tmp_path
     broken.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(InstallError, match="Press Install again"):
         go(options, lock)
-    assert module.installed(options.folder) is None
+    assert place.installed(options.folder) is None
     marker = options.folder / "venv" / "marker"
     marker.touch()
     broken.write_bytes(whole)
     go(options, lock)
     assert marker.exists(), "the environment was kept"
-    assert module.installed(options.folder)
+    assert place.installed(options.folder)
 
 
 def test_engine_that_does_not_run_is_not_installed(options, lock, tmp_path):
@@ -105,7 +106,7 @@ def test_engine_that_does_not_run_is_not_installed(options, lock, tmp_path):
     make_wheel(tmp_path / "wheels")
     with pytest.raises(InstallError, match="does not run"):
         go(options, lock)
-    assert module.installed(options.folder) is None
+    assert place.installed(options.folder) is None
 
 
 def test_unexpected_device_is_refused(options, lock, tmp_path, content_doctor):
@@ -164,10 +165,10 @@ def test_choice_of_the_python(options, tmp_path, monkeypatch):
     python = module.python_in(checkout / ".venv")
     python.parent.mkdir(parents=True)
     python.touch()
-    assert module.find_python("", options.folder, checkout) == python
-    assert module.find_python(str(checkout / ".venv"), options.folder, checkout) == python
-    monkeypatch.setenv(module.ENVIRONMENT, "/x/python")
-    assert module.find_python("/y", options.folder, checkout) == Path("/x/python")
+    assert place.find_python("", options.folder, checkout) == python
+    assert place.find_python(str(checkout / ".venv"), options.folder, checkout) == python
+    monkeypatch.setenv(place.ENVIRONMENT, "/x/python")
+    assert place.find_python("/y", options.folder, checkout) == Path("/x/python")
 
 
 def test_lock_serves_what_the_project_needs():
@@ -187,9 +188,80 @@ def test_lock_serves_what_the_project_needs():
                 assert requirement.specifier.contains(version.version), requirement
 
 
+SYSTEMS = ["linux", "win32", "darwin"]
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+@pytest.mark.parametrize("device", ["auto", "cpu", "cuda", "rocm", "mps"])
+def test_each_device_gets_its_build_of_pytorch_or_a_sentence(options, lock, monkeypatch, system, device):
+    """What uv is told; it knows the places of the builds."""
+    monkeypatch.setattr(module.sys, "platform", system)
+    chosen = Options(**{**vars(options), "device": device, "wheels": "", "online": True})
+    exists = {"cuda": {"linux", "win32"}, "rocm": {"linux"}, "mps": {"darwin"}}.get(device, set(SYSTEMS))
+    if system not in exists:
+        with pytest.raises(InstallError, match="Choose “Automatic”"):
+            module._check_device(device)
+        return
+    module._check_device(device)
+    command = [str(word) for word in module._install_command(chosen, Path("uv"), lock)]
+    backend = command[command.index("--torch-backend") + 1] if "--torch-backend" in command else None
+    assert backend == {"darwin": None}.get(system, "cpu" if device == "cpu" else "auto")
+    assert command[-2:] == ["-r", str(lock)], "locked versions"
+    assert "--no-index" not in command
+    assert command[command.index("--python") + 1] == str(module.python_in(options.folder / "venv"))
+
+
+@pytest.mark.parametrize(
+    ("system", "device", "amd", "nvidia", "can"),
+    [
+        ("linux", "cpu", False, False, True),
+        ("linux", "cuda", False, True, True),
+        ("linux", "auto", False, True, True),
+        ("linux", "auto", True, False, False),
+        ("linux", "rocm", True, False, False),
+        ("win32", "cpu", False, True, True),
+        ("win32", "auto", False, False, True),
+        ("win32", "auto", False, True, False),
+        ("win32", "cuda", False, True, False),
+        ("darwin", "mps", False, False, True),
+        ("darwin", "auto", False, False, True),
+    ],
+)
+def test_without_uv_only_a_build_that_suits_is_taken(options, lock, monkeypatch, system, device, amd, nvidia, can):
+    monkeypatch.setattr(module.sys, "platform", system)
+    monkeypatch.setattr(module.Path, "exists", lambda path: amd if str(path) == "/dev/kfd" else False)
+    monkeypatch.setattr(module.shutil, "which", lambda name: "/bin/x" if nvidia and name == "nvidia-smi" else None)
+    chosen = Options(**{**vars(options), "device": device, "wheels": "", "online": True})
+    if can:
+        assert "pip" in module._install_command(chosen, None, lock)
+    else:
+        with pytest.raises(InstallError, match="needs the installer uv"):
+            module._install_command(chosen, None, lock)
+
+
+def test_wheels_on_the_disk_are_taken_as_they_are(options, lock):
+    for uv in (Path("uv"), None):
+        command = module._install_command(Options(**{**vars(options), "device": "rocm"}), uv, lock)
+        assert "--torch-backend" not in command
+        assert "--no-index" in command
+        assert command[command.index("--find-links") + 1] == options.wheels
+
+
+@pytest.mark.parametrize(("words", "own"), [("--torch-backend <B>", False), ("an old help text", True)])
+def test_an_old_uv_is_not_used(options, tmp_path, monkeypatch, words, own):
+    found = tmp_path / "uv"
+    found.write_text(f"#!/bin/sh\necho '{words}'\n")
+    found.chmod(0o755)
+    monkeypatch.setattr(module.shutil, "which", lambda name: str(found))
+    with open(tmp_path / "log", "w") as log:
+        uv = module._find_uv(options, module.Runner(log, threading.Event(), lambda *_: None))
+    # Offline there is no other to be had.
+    assert uv == (None if own else found)
+
+
 def test_state_of_a_half_installed_engine(options):
     options.folder.mkdir(parents=True)
-    (options.folder / module.COMPLETE).write_text(json.dumps({"lock": "x"}))
-    assert module.installed(options.folder) is None, "the environment is gone"
-    (options.folder / module.COMPLETE).write_text("{")
-    assert module.installed(options.folder) is None
+    (options.folder / place.COMPLETE).write_text(json.dumps({"lock": "x"}))
+    assert place.installed(options.folder) is None, "the environment is gone"
+    (options.folder / place.COMPLETE).write_text("{")
+    assert place.installed(options.folder) is None

@@ -11,7 +11,9 @@ import pytest
 bpy = pytest.importorskip("bpy")
 
 from fieldwork.addon import jobs, preferences  # noqa: E402
-from fieldwork.addon.link import EngineError, Link  # noqa: E402
+from fieldwork.addon.errors import EngineError  # noqa: E402
+from fieldwork.addon.job import CURVE_POINTS  # noqa: E402
+from fieldwork.addon.link import Link  # noqa: E402
 from fieldwork.nerfcore.engine import status as st  # noqa: E402
 
 ENGINE = [sys.executable, str(Path(__file__).resolve().parents[1] / "counting_engine.py")]
@@ -27,7 +29,7 @@ def settings(monkeypatch, tmp_path):
     monkeypatch.setattr(preferences, "preferences", lambda: Settings)
     monkeypatch.setattr(preferences, "user_folder", lambda *parts: Path(tmp_path, "user", *parts))
     monkeypatch.setattr(preferences, "engine_python", lambda: Path(sys.executable))
-    monkeypatch.setattr(jobs, "Link", lambda python, log, **more: Link(python, log, ENGINE))
+    monkeypatch.setattr(jobs, "open_link", lambda python, log: Link(python, log, ENGINE))
     return Settings
 
 
@@ -178,10 +180,10 @@ def test_idle_engine_is_released(queue, settings, project):
 
 def test_curve_stays_bounded_and_keeps_its_ends(queue, project):
     job = count(queue, project)
-    for step in range(5 * jobs.CURVE_POINTS):
+    for step in range(5 * CURVE_POINTS):
         job.take("event", {"kind": "train", "step": step, "loss": 1.0, "psnr": None})
-    assert len(job.curve) <= jobs.CURVE_POINTS
-    assert (job.curve[0][0], job.curve[-1][0]) == (0, 5 * jobs.CURVE_POINTS - 1)
+    assert len(job.curve) <= CURVE_POINTS
+    assert (job.curve[0][0], job.curve[-1][0]) == (0, 5 * CURVE_POINTS - 1)
     steps = [step for step, _, _ in job.curve]
     assert steps == sorted(steps)
 

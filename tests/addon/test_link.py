@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 from fieldwork.addon import link as module
-from fieldwork.addon.link import EngineError, Link, engine_environment
+from fieldwork.addon.errors import EngineError
+from fieldwork.addon.link import Link, engine_environment
 from fieldwork.nerfcore.engine import status as st
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -39,14 +40,15 @@ def wait_for(link: Link, condition, timeout: float = 20.0) -> None:
 
 
 def test_link_needs_only_the_standard_library():
-    tree = ast.parse(Path(module.__file__).read_text())
-    imported = {
-        (node.module if isinstance(node, ast.ImportFrom) else name.name).partition(".")[0]
-        for node in ast.walk(tree)
-        if isinstance(node, (ast.Import, ast.ImportFrom))
-        for name in node.names
-    }
-    assert imported <= sys.stdlib_module_names
+    own = {"link", "engine_place", "errors"}
+    for name in own:
+        tree = ast.parse(Path(module.__file__).with_name(f"{name}.py").read_text())
+        imports = [node for node in ast.walk(tree) if isinstance(node, (ast.Import, ast.ImportFrom))]
+        relative = {node.module for node in imports if isinstance(node, ast.ImportFrom) and node.level}
+        absolute = {node.module for node in imports if isinstance(node, ast.ImportFrom) and not node.level}
+        absolute |= {alias.name for node in imports if isinstance(node, ast.Import) for alias in node.names}
+        assert relative <= own
+        assert {found.partition(".")[0] for found in absolute} <= sys.stdlib_module_names
 
 
 def test_blocking_run_returns_the_result_and_hands_out_events(link, project):

@@ -328,8 +328,7 @@ def test_training_settings_are_read_from_text():
 
 
 def test_curve_picture_shows_both_lines():
-    pytest.importorskip("bpy")
-    from fieldwork.addon.pictures import LOSS_COLOR, PSNR_COLOR, draw_curve
+    from fieldwork.addon.curve import LOSS_COLOR, PSNR_COLOR, draw_curve
 
     curve = [(step, math.exp(-step / 50), 10 + step / 10) for step in range(100)]
     image = draw_curve(curve, 64, 32)
@@ -359,14 +358,21 @@ for name in "ab":
     cameras[name] = bpy.data.objects.new(name, bpy.data.cameras.new(name))
     cameras[name]["fieldwork_role"], cameras[name]["fieldwork_project"] = f"camera:{name}.jpg", "capture"
     scene.collection.objects.link(cameras[name])
+def show(kind, photos):
+    steps = render_result.show_steps(scene, files, kind, photos, "capture")
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            return end.value
 for _ in range(2):
     for kind in ("background", "plane", "none"):
-        pairs = render_result.show(scene, files, kind, True, "capture")
+        pairs = show(kind, True)
 answer({
     "images": sorted(i.name for i in bpy.data.images if i.filepath),
     "slots": {n: [s.image.name for s in c.data.background_images] for n, c in cameras.items()},
     "planes": {n: [o.data.name for o in c.children] for n, c in cameras.items()},
-    "animation": [[c.name, i.source] for c, i in render_result.show(scene, files, "background", False, "capture")],
+    "animation": [[c.name, i.source] for c, i in show("background", False)],
 })
 """,
         project=make_project(tmp_path / "capture"),

@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("bpy")
 
-from fieldwork.addon.jobs import Job
+from fieldwork.addon.job import Job
 from fieldwork.panels.base import duration, progress_text, wrap
 
 

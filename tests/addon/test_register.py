@@ -21,33 +21,30 @@ def run(script: str) -> dict:
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def test_register_is_quick_and_light():
-    facts = run(
-        """
-        import json, os, sys, time
-        import bpy, numpy
-        before = set(sys.modules)
-        begin = time.perf_counter()
-        import fieldwork
-        fieldwork.register()
-        first = time.perf_counter() - begin
-        heavy = {"torch", "pycolmap", "OpenImageIO", "pydantic", "warp", "av", "PIL", "scipy"}
-        fieldwork.unregister()
-        times = []
-        for _ in range(3):
-            begin = time.perf_counter()
-            fieldwork.register()
-            times.append(time.perf_counter() - begin)
-            fieldwork.unregister()
-        print(json.dumps({"first": first, "best": min(times), "heavy": sorted((set(sys.modules) - before) & heavy)}))
-        sys.stdout.flush()
-        os._exit(0)
-        """
-    )
-    assert facts["heavy"] == []
-    # The limit is 50 ms on an idle machine; the first time modules are compiled and read from disk.
-    assert facts["best"] < 0.05
-    assert facts["first"] < 0.5
+REGISTER = """
+    import json, os, sys, time
+    import bpy
+    before = set(sys.modules)
+    begin = time.perf_counter()
+    import fieldwork
+    fieldwork.register()
+    seconds = time.perf_counter() - begin
+    print(json.dumps({"seconds": seconds, "new": sorted(set(sys.modules) - before)}))
+    sys.stdout.flush()
+    os._exit(0)
+    """
+
+
+def test_enabling_takes_less_than_50_ms_and_imports_nothing_heavy():
+    """From nothing to registered, in a fresh Blender, as when the extension is enabled or Blender starts."""
+    runs = [run(REGISTER) for _ in range(5)]
+    for facts in runs:
+        # What a bare Blender has not loaded itself yet would come on top of Fieldwork's own modules.
+        foreign = {name.partition(".")[0] for name in facts["new"]} - {"fieldwork", "bpy"}
+        assert foreign & {"torch", "pycolmap", "OpenImageIO", "pydantic", "warp", "av", "PIL", "scipy"} == set()
+        assert foreign & {"numpy", "subprocess", "tempfile", "logging", "urllib", "hashlib", "ssl"} == set()
+    # Another program may have had the processor in the other runs.
+    assert min(facts["seconds"] for facts in runs) < 0.05
 
 
 def test_nothing_is_left_after_unregister():

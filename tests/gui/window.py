@@ -29,8 +29,12 @@ def missing() -> str | None:
 
 def enter(command: list[str], environment: dict[str, str], timeout: float) -> subprocess.CompletedProcess[str]:
     """Run a command inside the root, with the project, the shared data and the engine's Python at their places."""
-    variables = " ".join(f"{name}={value}" for name, value in environment.items())
+    threads = {name: os.environ[name] for name in ("OMP_NUM_THREADS", "FIELDWORK_THREADS") if name in os.environ}
+    variables = " ".join(f"{name}={value}" for name, value in {**environment, **threads}.items())
     binds = f"{ROOT.parent / 'shared'} {sys.base_prefix}"
+    # The environment may be shared by several checkouts, and then is a link to a folder elsewhere.
+    if not Path(sys.prefix).resolve().is_relative_to(ROOT):
+        binds += f" {Path(sys.prefix).resolve()}"
     return subprocess.run(
         ["timeout", "-k", "10", str(timeout), TOOLS / "enter", BLENDER_ROOT, ROOT, *command],
         env={**os.environ, "BIND": binds, "ENTER_ENV": variables},

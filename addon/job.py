@@ -30,6 +30,7 @@ TITLES = {
     "blend": "Writing .blend",
     "reconstruct": "Reconstructing",
     "dataset": "Photographing the Scene",
+    "package": "Preparing the Scene",
     "doctor": "Checking the Engine",
 }
 

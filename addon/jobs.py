@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import bpy
 
-from . import preferences, state
+from . import crop, preferences, state
 from .errors import EngineError, SceneError
 from .job import Done, Job, Steps
 from .text import t
@@ -165,6 +165,7 @@ class Queue:
     def tick(self) -> float:
         """One look at the engine. Returns the seconds until the next."""
         begin = time.perf_counter()
+        doing = f"{self.current.stage} {self.current.message}" if self.current else ""
         try:
             state.write_classes()
             if self.link:
@@ -175,6 +176,8 @@ class Queue:
             self._follow()
             self._look_after_engine()
             self._bring(SLICE)
+            if not bpy.app.background:
+                crop.follow(bpy.context.scene)
         except Exception:
             # A timer that raises is dropped by Blender, and all jobs with it.
             import logging
@@ -186,7 +189,7 @@ class Queue:
             self.redraw()
         seconds = time.perf_counter() - begin
         if seconds > self.slowest_tick:
-            self.slowest_tick, self.slowest_step = seconds, self.current.stage if self.current else ""
+            self.slowest_tick, self.slowest_step = seconds, doing
         return SLICE_PERIOD if self.bringing else BUSY_PERIOD if busy else IDLE_PERIOD
 
     def _start_next(self) -> None:

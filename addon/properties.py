@@ -154,6 +154,10 @@ class FieldworkScene(PropertyGroup):
         name="Distance", description="True distance of the two points", default=1.0, min=1e-4, unit="LENGTH"
     )
 
+    region_box: PointerProperty(
+        name="Region Box", description="Empty whose bounds are the training region", type=bpy.types.Object
+    )
+
     # Classes
     classes: CollectionProperty(type=FieldworkClass)
     class_index: IntProperty(name="Class", description="Selected class")

@@ -7,18 +7,10 @@ from pathlib import Path
 
 import bpy
 
+from .render_slot import MARK, load_render, render_slot
 from .scene_import import PROJECT, ROLE
 
 OTHER_PASSES = ("_depth", "_labels", "_confidence", "_normal")
-MARK = "fieldwork_render"
-
-
-def load(path: Path) -> bpy.types.Image:
-    """The image datablock of a file; one that is loaded already is read again."""
-    image = bpy.data.images.load(str(path), check_existing=True)
-    image.reload()
-    image[MARK] = True
-    return image
 
 
 def show_steps(
@@ -37,7 +29,7 @@ def show_steps(
     images = {}
     for number, path in enumerate(files):
         yield number / len(files), path.name
-        images[path] = load(path)
+        images[path] = load_render(path)
     colored = [path for path in files if path.suffix == ".png" and not path.stem.endswith(OTHER_PASSES)]
     if show_as == "none" or not colored:
         return []
@@ -64,8 +56,7 @@ def show_steps(
 
 def background(scene: bpy.types.Scene, camera: bpy.types.Object, image: bpy.types.Image, frames: int) -> None:
     """Put the image over the camera's view, in place of an earlier one; photos behind it stay."""
-    slots = camera.data.background_images
-    slot = next((s for s in slots if s.image and MARK in s.image), None) or slots.new()
+    slot = render_slot(camera.data)
     slot.image, slot.alpha, slot.display_depth, slot.frame_method = image, 1.0, "FRONT", "STRETCH"
     _play(scene, slot.image_user, image, frames)
     camera.data.show_background_images = True

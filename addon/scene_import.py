@@ -24,6 +24,7 @@ from .mesh_data import Part, parts, rgba, slot_classes
 from .mesh_import import fill_points, fill_surface
 from .package import SENSOR_MM, Package, blender_camera, read_package
 from .point_cloud import show_points
+from .render_slot import load_render, render_slot
 
 ROLE, PROJECT = "fieldwork_role", "fieldwork_project"
 SIZE = "fieldwork_size"  # photo size in pixels, on camera objects
@@ -245,6 +246,10 @@ def _camera(
         background.image.reload()
     background.frame_method, background.display_depth, background.alpha = "STRETCH", "BACK", 1.0
     data.show_background_images = True
+    if entry.get("render"):
+        slot = render_slot(data)
+        slot.image, slot.frame_method = load_render(package.folder / entry["render"]), "STRETCH"
+        slot.display_depth, slot.alpha = "BACK", 1.0
     return item
 
 

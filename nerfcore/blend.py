@@ -31,7 +31,7 @@ def blend(params: BlendParams, report: Reporter) -> dict[str, Any]:
         raise SettingError(f"{out} is no Blender file.", "Name a file that ends in .blend.")
     folder = params.project.absolute()
     scene = load_scene(folder)
-    package = write_package(folder, params.run, scene, folder.name, report)
+    package = write_package(folder, params.run, scene, folder.name, report, params.renders)
     warnings = []
     if not (package / "mesh.npz").is_file():
         warnings.append("There is no mesh yet: the .blend holds cameras and points only. Run `fieldwork mesh` first.")

@@ -1,6 +1,7 @@
 """The package: what Blender needs of a capture, readable with numpy and JSON alone.
 
 package.json        name, classes, cameras (camera-to-world in the world frame, OpenGL axes), settings
+renders/            rendered photos, without lens distortion too, where there are any
 images/             the photos without lens distortion, in the size of their camera
 points.npz          xyz (N, 3) float32 world, rgb (N, 3) uint8 sRGB
 lenses.json         which lens each photo was undistorted for
@@ -33,13 +34,17 @@ def package_folder(project: Path, run: str) -> Path:
     return project / "exports" / run / "package"
 
 
-def write_package(project: Path, run: str, scene: Scene, name: str, report: Reporter) -> Path:
+def write_package(
+    project: Path, run: str, scene: Scene, name: str, report: Reporter, renders: Path | None = None
+) -> Path:
     """Write the package of a run; photos that are already there and newer than their source are kept.
 
     Args:
         project: the project's folder; the mesh is read from exports/<run>/mesh.npz there, if it exists.
         scene: its views and points in the world frame.
         name: what Blender calls it.
+        renders: folder of pictures rendered from the photos' cameras, named like the photos; None: where Blender's panel
+            puts them.
     Returns:
         the folder.
     Raises:
@@ -57,12 +62,15 @@ def write_package(project: Path, run: str, scene: Scene, name: str, report: Repo
     for index, view in enumerate(scene.views):
         report.progress(index / len(scene.views), view.name)
         file = _write_photo(view, folder, grids, lenses)
-        cameras.append(camera_entry(view, f"images/{file.name}", "test" if index in test else "train"))
+        entry = camera_entry(view, f"images/{file.name}", "test" if index in test else "train")
+        render = _write_render(view, folder, renders or project / "exports" / "renders" / "photos", grids)
+        cameras.append(entry | ({"render": f"renders/{render.name}"} if render else {}))
     write_json(folder / "lenses.json", lenses)
-    kept = {Path(camera["image"]).name for camera in cameras}
-    for stale in (folder / "images").iterdir():
-        if stale.name not in kept:
-            stale.unlink()
+    for part, key in (("images", "image"), ("renders", "render")):
+        kept = {Path(camera[key]).name for camera in cameras if key in camera}
+        for stale in (folder / part).glob("*"):
+            if stale.name not in kept:
+                stale.unlink()
     points = scene.points
     with atomic_path(folder / "points.npz") as temporary, open(temporary, "wb") as out:
         np.savez_compressed(out, xyz=points.xyz.astype(np.float32), rgb=points.rgb.astype(np.uint8))
@@ -147,6 +155,29 @@ def _write_photo(view: View, folder: Path, grids: dict[str, torch.Tensor], lense
             if not plain and key not in grids:
                 grids[key] = undistortion_grid(camera)
             _develop(view, temporary, None if plain else grids[key])
+    return target
+
+
+def _write_render(view: View, folder: Path, renders: Path, grids: dict[str, torch.Tensor]) -> Path | None:
+    """The rendered picture of a photo, straightened as the photo is; None when there is none."""
+    source = renders / f"{Path(view.name).stem}.png"
+    if not source.is_file():
+        return None
+    try:
+        with Image.open(source) as picture:
+            pixels = np.array(picture.convert("RGB"))
+    except OSError as error:
+        raise InputError(f"The render {source} cannot be read: {error}.", "Render it again.") from error
+    camera = view.camera.resized(pixels.shape[1], pixels.shape[0])
+    if any(camera.distortion) or camera.model not in {"PINHOLE", "EQUIRECTANGULAR", "OPENCV"}:
+        key = json.dumps(camera.model_dump(mode="json"))
+        if key not in grids:
+            grids[key] = undistortion_grid(camera)
+        pixels = undistort(pixels, grids[key])
+    target = folder / "renders" / (view.name.replace("/", "_") + ".png")
+    target.parent.mkdir(exist_ok=True)
+    with atomic_path(target) as temporary:
+        Image.fromarray(pixels).save(temporary, "PNG")
     return target
 
 

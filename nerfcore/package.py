@@ -21,7 +21,7 @@ def package(params: PackageParams, report: Reporter) -> dict[str, Any]:
     """
     folder = params.project.absolute()
     scene = load_scene(folder)
-    target = write_package(folder, params.run, scene, folder.name, report)
+    target = write_package(folder, params.run, scene, folder.name, report, params.renders)
     return {
         "folder": str(target),
         "cameras": len(scene.views),

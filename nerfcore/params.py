@@ -156,11 +156,18 @@ class BlendParams(Params):
     out: Path
     run: str = "main"
     split: Literal["none", "classes"] = Field(default="none", description="classes: one mesh object for each class")
+    renders: Path | None = Field(
+        default=None,
+        description="folder of rendered photos to show behind their cameras; default: those Blender's panel rendered",
+    )
 
 
 class PackageParams(Params):
     project: Path
     run: str = "main"
+    renders: Path | None = Field(
+        default=None, description="folder of rendered photos; default: exports/renders/photos of the project"
+    )
 
 
 class ReconstructParams(Params):

@@ -36,7 +36,7 @@ class FIELDWORK_OT_crop_add(Operator):
 
 
 class FIELDWORK_OT_crop_apply(Operator):
-    """Train only what lies inside the box, from the next training on"""
+    """Train only what lies inside the box, from the next training on; in a window that goes without saying"""
 
     bl_idname = "fieldwork.crop_apply"
     bl_label = "Use Box"

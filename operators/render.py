@@ -136,7 +136,31 @@ def show_result(job: jobs.Job) -> jobs.Steps | None:
     files = [Path(path) for path in job.result["frames"]]
     # An orbit has no camera in the scene.
     show_as = scene.fieldwork.show_as if "orbit" not in job.params else "none"
-    return render_result.show_steps(scene, files, show_as, "test" in job.params, job.project.name)
+    photos = "test" in job.params
+    if photos and show_as != "none":
+        _show_straightened(job, scene.name, show_as)
+        show_as = "none"
+    return render_result.show_steps(scene, files, show_as, photos, job.project.name)
+
+
+def _show_straightened(job: jobs.Job, scene_name: str, show_as: str) -> None:
+    """Blender's cameras know no lens distortion: the engine takes it out of the renders before they are shown."""
+
+    def show(done: jobs.Job) -> jobs.Steps | None:
+        scene = bpy.data.scenes.get(scene_name)  # another file may have been loaded meanwhile
+        if done.state != "done" or not done.result or scene is None:
+            return None
+        from ..addon import render_result
+
+        files = sorted(Path(done.result["folder"], "renders").glob("*.png"))
+        return render_result.show_steps(scene, files, show_as, True, done.project.name)
+
+    params = {name: job.params[name] for name in ("project", "run")} | {"renders": job.params["out"]}
+    following = jobs.queue.make("package", params, show)
+    if bpy.app.background:
+        jobs.queue.run(following)
+    else:
+        jobs.queue.submit(following)
 
 
 CLASSES = [FIELDWORK_OT_render]

@@ -61,6 +61,8 @@ class FIELDWORK_PT_align(FieldworkPanel):
             row = layout.row(align=True)
             row.prop(settings, f"point_{end}", text="")
             row.operator("fieldwork.pick_point", text="", icon="EYEDROPPER").end = end.upper()
+            cursor = row.operator("fieldwork.pick_point", text="", icon="PIVOT_CURSOR")
+            cursor.end, cursor.use_cursor = end.upper(), True
         columns(layout).prop(settings, "distance")
         layout.operator("fieldwork.align", icon="ORIENTATION_GLOBAL")
 
@@ -75,16 +77,14 @@ class FIELDWORK_PT_region(FieldworkPanel):
         box = crop.find(context.scene)
         draw_wrapped(
             layout,
-            t("Move and scale the box in the viewport: what lies outside is not trained.")
+            t("Move and scale the box in the viewport: the next training covers what lies inside.")
             if box
             else t("Everything the photos show is trained."),
             text_width(context),
             icon="CUBE",
         )
         layout.operator("fieldwork.crop_add", icon="ADD")
-        row = layout.row(align=True)
-        row.operator("fieldwork.crop_apply", icon="CHECKMARK")
-        row.operator("fieldwork.crop_remove", icon="X")
+        layout.operator("fieldwork.crop_remove", icon="X")
 
 
 CLASSES = [FIELDWORK_UL_poses, FIELDWORK_PT_poses, FIELDWORK_PT_align, FIELDWORK_PT_region]

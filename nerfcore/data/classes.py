@@ -16,6 +16,7 @@ PALETTE = (
 )  # fmt: skip
 VOID_COLOR = (0.0, 0.0, 0.0)
 GOLDEN_ANGLE = 0.381966
+MOST_CLASSES = 254  # ids go up to 65535, but pixels are kept as one byte of class index each, one of them for void
 
 
 def class_color(class_id: int, ignore_id: int = 0) -> tuple[float, float, float]:
@@ -31,7 +32,16 @@ def class_color(class_id: int, ignore_id: int = 0) -> tuple[float, float, float]
 
 
 def make_classes(names: dict[int, str], ignore_id: int = 0) -> list[SemanticClass]:
-    """Classes with their colours from names by id, sorted by id. The void id is not a class and is left out."""
+    """Classes with their colours from names by id, sorted by id. The void id is not a class and is left out.
+
+    Raises:
+        InputError: there are more classes than a field can tell apart.
+    """
+    if len(names.keys() - {ignore_id}) > MOST_CLASSES:
+        raise InputError(
+            f"The capture has {len(names.keys() - {ignore_id})} classes; a field tells at most {MOST_CLASSES} apart.",
+            "Merge classes in the label maps.",
+        )
     return [
         SemanticClass(id=i, name=name, color=class_color(i, ignore_id), priority=1.0)
         for i, name in sorted(names.items())

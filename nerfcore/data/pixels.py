@@ -163,11 +163,6 @@ class PixelStore:
     ) -> None:
         self.views = [scene.views[i] for i in indices]
         self.device = device
-        if len(class_ids) > VOID:
-            raise InputError(
-                f"The capture has {len(class_ids)} classes; a training run tells at most {VOID} apart.",
-                "Merge classes in the label maps.",
-            )
         lookup = np.full(65536, VOID, np.uint8)
         for index, class_id in enumerate(class_ids):
             lookup[class_id] = index

@@ -20,8 +20,10 @@ from typing import Any
 
 import numpy as np
 from fieldwork.nerfcore.blend_package import write_package
+from fieldwork.nerfcore.capture.simulate import simulate
 from fieldwork.nerfcore.data.cameras import Camera
 from fieldwork.nerfcore.data.scene import ClassInfo, Points, Scene, View
+from fieldwork.nerfcore.params import SimulateParams
 from fieldwork.nerfcore.progress import Reporter
 from PIL import Image
 from rich.console import Console
@@ -110,6 +112,14 @@ def make_package(folder: Path) -> Path:
     return write_package(folder, "main", scene, "matrix", Reporter())
 
 
+def make_capture(folder: Path) -> Path:
+    """A small simulated capture with known poses and labels."""
+    simulate(SimulateParams(out=folder, views=12, size=(96, 64), samples=1), Reporter())
+    text = (folder / "ground_truth/transforms.json").read_text().replace('"../', '"')
+    (folder / "transforms.json").write_text(text)
+    return folder
+
+
 def run_wheel(python: Path, request: dict[str, Any], folder: Path) -> dict[str, Any]:
     return _answer([str(python), str(WORKER)], request, folder, dict(os.environ))
 
@@ -118,7 +128,7 @@ def run_window(root: Path, request: dict[str, Any], folder: Path) -> dict[str, A
     """In the background mode of a windowed Blender, which lives in a folder of its own."""
     environment = {
         **os.environ,
-        "BIND": f"{folder} {Path(request['zip']).parent}",
+        "BIND": f"{folder} {Path(request['zip']).parent} {engine_places()}",
         "ENTER_ENV": f"BLENDER_USER_RESOURCES={folder / 'user'}",
     }
     command = [str(GUI / "enter"), str(root), str(ROOT), "blender", "-noaudio", "--background", "--factory-startup"]
@@ -128,14 +138,19 @@ def run_window(root: Path, request: dict[str, Any], folder: Path) -> dict[str, A
     return row
 
 
+def engine_places() -> str:
+    """Folders that the engine needs in a Blender that lives in a folder of its own."""
+    places = [sys.base_prefix]
+    # The environment may be shared by several checkouts, and then is a link to a folder elsewhere.
+    if not (ROOT / ".venv").resolve().is_relative_to(ROOT):
+        places.append(str((ROOT / ".venv").resolve()))
+    return " ".join(places)
+
+
 def _command_line(root: Path, request: dict[str, Any], environment: dict[str, str]) -> dict[str, Any]:
     """`blender -c fieldwork doctor --json`, with this checkout's environment as the engine."""
-    base = subprocess.run(
-        [sys.executable, "-c", "import sys; print(sys.base_prefix)"], capture_output=True, text=True, check=True
-    ).stdout.strip()
     environment = {
         **environment,
-        "BIND": f"{environment['BIND']} {base}",
         "ENTER_ENV": f"{environment['ENTER_ENV']} FIELDWORK_ENGINE_PYTHON={ROOT}/.venv/bin/python",
     }
     blender = [str(GUI / "enter"), str(root), str(ROOT), "blender", "--command"]
@@ -174,7 +189,11 @@ def main() -> int:
     with tempfile.TemporaryDirectory(prefix="fieldwork-matrix-") as name:
         work = Path(name)
         (work / "capture").mkdir()
-        request: dict[str, Any] = {"package": str(make_package(work / "capture"))}
+        request: dict[str, Any] = {
+            "package": str(make_package(work / "capture")),
+            "capture": str(make_capture(work / "simulated")),
+            "engine": str(ROOT / ".venv/bin/python"),
+        }
         for version in filter(chosen, WHEELS):
             python = wheel_python(version)
             if isinstance(python, str):
@@ -199,23 +218,37 @@ def main() -> int:
             (work / suite).mkdir()
             zips = sorted((ROOT / "dist").glob("fieldwork-*.zip"))
             request["zip"] = shutil.copy(zips[-1], work / suite)
-            shutil.copytree(work / "capture", work / suite / "capture")
+            for name in ("capture", "simulated"):
+                shutil.copytree(work / name, work / suite / name)
             request["package"] = str(work / suite / "capture/exports/main/package")
+            request["capture"] = str(work / suite / "simulated")
             rows.append((f"windowed {suite}", run_window(root, request, work / suite)))
     return report(rows)
 
 
 def report(rows: list[tuple[str, dict[str, Any]]]) -> int:
-    table = Table("Blender", "version", "Python", "operators", "enable ms", "photo s", "denoiser", "-c", "result")
+    table = Table(
+        "Blender",
+        "version",
+        "Python",
+        "operators",
+        "enable ms",
+        "photo s",
+        "mesh s",
+        "faces",
+        "denoiser",
+        "-c",
+        "result",
+    )
     failures = 0
     for name, row in rows:
         if "skipped" in row:
-            table.add_row(name, *[""] * 7, f"skipped: {row['skipped']}")
+            table.add_row(name, *[""] * 9, f"skipped: {row['skipped']}")
             continue
         failures += not row["ok"]
         facts = [
             str(row.get(key, ""))
-            for key in ("blender", "python", "operators", "enable_ms", "photo_s", "oidn", "command")
+            for key in ("blender", "python", "operators", "enable_ms", "photo_s", "mesh_s", "faces", "oidn", "command")
         ]
         table.add_row(name, *facts, "ok" if row["ok"] else f"FAILED: {row['error']}")
         if not row["ok"]:

@@ -33,6 +33,25 @@ def installed():
     return Path(bpy.utils.user_resource("EXTENSIONS")) / "user_default" / "fieldwork"
 
 
+def capture_to_mesh(request, out):
+    """A tiny capture all the way to its mesh in the scene, by the operators and an engine."""
+    os.environ["FIELDWORK_ENGINE_PYTHON"] = request["engine"]
+    begin = time.perf_counter()
+    bpy.ops.fieldwork.import_dataset(directory=request["capture"], project=str(out / "project"), format="transforms")
+    settings = bpy.context.scene.fieldwork
+    assert len(settings.images) == 12, "the photos are missing from the list"
+    assert len(settings.classes) >= 5, "the classes are missing from the list"
+    bpy.ops.fieldwork.train(preset="draft", steps=120)
+    bpy.ops.fieldwork.mesh(resolution=48)
+    bpy.ops.fieldwork.import_scene()
+    surface = [
+        o for o in bpy.data.objects if o.get("fieldwork_role") == "mesh" and o.get("fieldwork_project") == "project"
+    ]
+    assert len(surface) == 1, "there is no mesh in the scene"
+    bpy.ops.fieldwork.stop_engine()
+    return {"faces": len(surface[0].data.polygons), "mesh_s": round(time.perf_counter() - begin, 1)}
+
+
 def run(request):
     import addon_utils  # exists once bpy is imported
 
@@ -62,6 +81,8 @@ def run(request):
     facts["oidn"] = photograph.has_denoiser()
     for name in ("a.png", "a.label.png", "a.depth.npy"):
         assert (out / name).is_file(), name
+
+    facts |= capture_to_mesh(request, out)
 
     begin = time.perf_counter()
     addon_utils.disable(MODULE, default_set=True)

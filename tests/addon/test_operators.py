@@ -249,6 +249,65 @@ answer({"written": written, "flat": flat, "after": crop.read_bounds(Path(project
     assert facts["box"]
 
 
+def test_moving_the_region_box_edits_the_training_region(bpy_script, tmp_path):
+    folder = make_project(tmp_path / "capture")
+    (folder / "poses").mkdir()
+    (folder / "poses" / "poses.json").write_text("{}")
+    facts = bpy_script(
+        SETUP
+        + """
+from fieldwork.addon import crop
+settings.project = project
+bpy.ops.fieldwork.crop_add()
+box = crop.find(scene)
+def look():
+    bpy.context.view_layer.update()
+    return crop.follow(scene), crop.read_bounds(Path(project))
+box.location, box.scale = (1, 2, 3), (1, 1, 1)
+seen = [look()]  # still moving, as far as is known
+seen.append(look())
+seen.append(look())
+box.location.x = 5
+seen += [look(), look()]
+box.scale.x = 0
+seen += [look(), look()]
+bpy.data.objects.remove(box)
+seen.append(look())
+answer(seen)
+""",
+        project=folder,
+    )
+    first, second = [[0, 1, 2], [2, 3, 4]], [[4, 1, 2], [6, 3, 4]]
+    assert [written for written, _ in facts] == [False, True, False, False, True, False, False, False]
+    assert [bounds for _, bounds in facts] == [None, first, first, first, second, second, second, second]
+
+
+def test_points_are_found_where_blender_draws_them(bpy_script):
+    facts = bpy_script(
+        """
+import numpy as np
+import fieldwork
+fieldwork.register()
+from bpy_extras.object_utils import world_to_camera_view
+from mathutils import Vector
+from fieldwork.addon.picking import project
+scene, camera = bpy.context.scene, bpy.context.scene.camera
+scene.render.resolution_x, scene.render.resolution_y = 200, 100
+depsgraph = bpy.context.evaluated_depsgraph_get()
+matrix = camera.calc_matrix_camera(depsgraph, x=200, y=100) @ camera.matrix_world.inverted()
+places = np.array([[0, 0, 0], [1, 0.5, -0.3], [40, -40, 30]], np.float32)
+seen = project(places, np.array(matrix), 200, 100)
+want = [list(world_to_camera_view(scene, camera, Vector(p))) for p in places.tolist()]
+answer({"seen": [[x if np.isfinite(x) else None for x in row] for row in seen.tolist()], "want": want})
+"""
+    )
+    for (x, y, depth), (u, v, z) in zip(facts["seen"][:2], facts["want"][:2]):
+        assert [x, y] == pytest.approx([200 * u, 100 * v], abs=0.01)
+        assert depth == pytest.approx(z, rel=1e-4)
+    assert facts["seen"][2][2] < 0, "behind the camera"
+    assert facts["seen"][2][0] is None
+
+
 def test_hidden_classes_vanish_from_the_mesh(bpy_script, tmp_path):
     facts = bpy_script(
         SETUP

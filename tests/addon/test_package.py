@@ -184,3 +184,36 @@ def test_sphere_covers_all_sides_and_hemisphere_stays_above():
         assert (offsets[:, 2] > 0).all() == hemisphere
         nearest = np.sort(np.linalg.norm(offsets[:, None] - offsets, axis=-1), axis=1)[:, 1]
         assert nearest.min() > 0.5 * nearest.max()
+
+
+@pytest.mark.parametrize("distortion", [(), (0.2, -0.05, 0.0, 0.0)], ids=["straight", "distorted"])
+def test_renders_of_photos_are_straightened_and_shown_by_their_camera(tmp_path, distortion, bpy_script):
+    lens = Camera(model="OPENCV", width=60, height=40, fx=50, fy=50, cx=29, cy=22, distortion=distortion or (0.0,) * 4)
+    taken = scene(tmp_path, lens)
+    renders = tmp_path / "exports/renders/photos"
+    renders.mkdir(parents=True)
+    pixels = np.array(Image.open(tmp_path / "a.png"))[:20, :30]
+    Image.fromarray(pixels).save(renders / "a.png")
+    Image.fromarray(pixels).save(renders / "of_no_photo.png")
+    folder = write_package(tmp_path, "main", taken, "p", Reporter())
+    assert read_package(folder).cameras[0]["render"] == "renders/a.png"
+    assert [path.name for path in (folder / "renders").iterdir()] == ["a.png"]
+    got = np.array(Image.open(folder / "renders/a.png"))
+    assert got.shape == pixels.shape
+    assert (got == pixels).all() == (not distortion)
+    if distortion:
+        assert (got == undistort(pixels, undistortion_grid(lens.resized(30, 20)))).all()
+    slots = bpy_script(
+        """
+from fieldwork.addon.package import read_package
+from fieldwork.addon.scene_import import import_package
+for _ in range(2):
+    imported = import_package(bpy.context.scene, read_package(package))
+answer([slot.image.filepath for slot in imported.cameras[0].data.background_images])
+""",
+        package=folder,
+    )
+    assert [str(Path(slot).relative_to(folder).parent) for slot in slots] == ["images", "renders"]
+    (renders / "a.png").unlink()
+    write_package(tmp_path, "main", taken, "p", Reporter())
+    assert not list((folder / "renders").iterdir()), "what is gone from the project is gone from the package"

@@ -1,14 +1,14 @@
-"""Runs inside the windowed Blender: drives one scenario of `scenarios.py` by simulated events.
+"""Runs inside the windowed Blender: drives one scenario of `scenarios.py` or `sessions.py` by simulated events.
 
     blender --enable-event-simulate --python driver.py -- SCENARIO OUTPUT_FOLDER
 
 A scenario is a generator; each `yield` lets Blender handle events and draw. Screenshots go to the output folder,
-`result.json` says how it ended.
+`<scenario>.json` says how it ended.
 """
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import json
 import os
 import subprocess
@@ -24,6 +24,7 @@ Steps = Iterator[float | None]
 TICK = 0.03
 PANELS = ["capture", "poses", "classes", "train", "render", "mesh", "export", "engine"]
 PACKAGE = "bl_ext.user_default.fieldwork"
+BARE = {"life"}  # scenarios that install and enable the extension themselves
 
 
 class Screen:
@@ -44,6 +45,10 @@ class Screen:
         return max((a for a in self.window.screen.areas if a.type == "VIEW_3D"), key=lambda a: a.width * a.height)
 
     @property
+    def view(self):
+        return next(region for region in self.area.regions if region.type == "WINDOW")
+
+    @property
     def sidebar(self):
         return next(region for region in self.area.regions if region.type == "UI")
 
@@ -56,6 +61,17 @@ class Screen:
 
     def move(self, x: float, y: float) -> None:
         self.window.event_simulate(type="MOUSEMOVE", value="NOTHING", x=int(x), y=int(y))
+
+    def type(self, text: str) -> Steps:
+        """Type letters where the mouse is."""
+        x, y = self.area.x + self.area.width // 2, self.area.y + self.area.height // 2
+        for letter in text:
+            kind = "SPACE" if letter == " " else letter.upper()
+            for value in ("PRESS", "RELEASE"):
+                self.window.event_simulate(
+                    type=kind, value=value, x=x, y=y, **({"unicode": letter} if value == "PRESS" else {})
+                )
+            yield 0.05
 
     def press(self, kind: str, x: float, y: float) -> None:
         for value in ("PRESS", "RELEASE"):
@@ -150,7 +166,7 @@ class Screen:
 
 def run(steps: Steps, screen: Screen) -> None:
     def finish(code: int, error: str = "") -> None:
-        (screen.folder / "result.json").write_text(json.dumps({**screen.facts, "error": error}, default=str))
+        (screen.folder / f"{sys.argv[-2]}.json").write_text(json.dumps({**screen.facts, "error": error}, default=str))
         # Leave as an artist does, so that the extension is unregistered.
         if code == 0:
             bpy.ops.wm.quit_blender()
@@ -176,13 +192,13 @@ def main() -> None:
     name, folder = sys.argv[sys.argv.index("--") + 1 :][:2]
     bpy.context.preferences.view.show_splash = False
     bpy.context.preferences.use_preferences_save = False
-    bpy.ops.preferences.addon_enable(module=PACKAGE)
-    spec = importlib.util.spec_from_file_location("scenarios", Path(__file__).with_name("scenarios.py"))
-    scenarios = importlib.util.module_from_spec(spec)
-    sys.modules["driver"] = sys.modules["__main__"]
-    spec.loader.exec_module(scenarios)
+    if name not in BARE:
+        bpy.ops.preferences.addon_enable(module=PACKAGE)
+    sys.path.insert(0, str(Path(__file__).parent))
+    modules = [importlib.import_module(module) for module in ("scenarios", "sessions")]
+    scenario = next(getattr(module, name) for module in modules if hasattr(module, name))
     screen = Screen(Path(folder))
-    run(getattr(scenarios, name)(screen), screen)
+    run(scenario(screen), screen)
 
 
 main()

@@ -8,9 +8,7 @@ import time
 from pathlib import Path
 
 import bpy
-
-DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
-PHOTOS = DATA / "banana" / "images"
+from steps import PHOTOS, alias, drop, every_panel, faces, finish, opened, training
 
 
 def capture(screen):
@@ -143,10 +141,6 @@ def labelled(screen):
     yield from finish(screen)
 
 
-def faces(obj):
-    return len(obj.evaluated_get(bpy.context.evaluated_depsgraph_get()).data.polygons)
-
-
 def interruptions(screen):
     """Cancel, kill the engine, undo and load another file, each in the middle of a training."""
     settings = yield from opened(screen)
@@ -230,86 +224,3 @@ def preferences(screen):
     yield 0.5
     screen.shot("failed")
     yield from finish(screen)
-
-
-def every_panel(screen, name):
-    """Open the sub-panels one by one."""
-    for panel in ("capture", "poses", "classes", "train", "render", "mesh", "export", "engine"):
-        yield from screen.toggle(panel)
-        yield 0.4
-        screen.shot(f"{name}-{panel}")
-        yield from screen.toggle(panel)
-
-
-def opened(screen):
-    """A copy of the posed capture that the scenario `capture` left."""
-    import shutil
-
-    project = screen.folder / "project"
-    if not project.is_dir():
-        shutil.copytree(screen.folder.parent / "capture" / "project", project)
-    settings = bpy.context.scene.fieldwork
-    settings.project = alias(project, "banana_fieldwork")
-    yield from screen.show_sidebar()
-    return settings
-
-
-def alias(folder, name):
-    """A short way to a folder."""
-    folder.mkdir(exist_ok=True)
-    link = Path("/tmp", name)
-    link.symlink_to(folder)
-    return str(link)
-
-
-def training(screen, operator, resume=False):
-    bpy.ops.fieldwork.train(resume=resume)
-    yield from screen.wait(
-        lambda: screen.queue.running is None or len(screen.queue.running.curve) > 1, 120, "training does not start"
-    )
-    assert screen.queue.running is not None, screen.queue.last.error
-
-
-def drop(screen, folder):
-    """Drag a photo from a file browser onto the viewport."""
-    browser = next(area for area in screen.window.screen.areas if area.type == "PROPERTIES")
-    browser.type = "FILE_BROWSER"
-    yield 1.0
-    browser.spaces.active.show_region_toolbar = False
-    params = browser.spaces.active.params
-    params.directory = str(folder).encode()
-    params.display_type = "LIST_VERTICAL"
-    params.use_filter = False
-    yield 2.0
-    region = next(region for region in browser.regions if region.type == "WINDOW")
-    x, y = region.x + 18, region.y + region.height - 40
-    for shift in (3, 1, 0):
-        screen.move(x + shift, y)
-        yield 0.2
-    screen.shot("browser")
-    screen.window.event_simulate(type="LEFTMOUSE", value="PRESS", x=int(x), y=int(y))
-    yield 0.3
-    for shift in range(2, 40, 3):
-        screen.move(x - shift / 4, y + shift)
-        yield 0.05
-    view = screen.area
-    target = (view.x + view.width * 0.4, view.y + view.height * 0.6)
-    for step in range(1, 12):
-        screen.move(x + (target[0] - x) * step / 11, y + (target[1] - y) * step / 11)
-        yield 0.1
-    screen.shot("dragging")
-    screen.window.event_simulate(type="LEFTMOUSE", value="RELEASE", x=int(target[0]), y=int(target[1]))
-    yield 1.0
-    # Blender itself can make an image of the photo: a menu asks, with our entry under the mouse.
-    screen.shot("drop-menu")
-    screen.press("RET", *target)
-    yield 0.5
-    browser.type = "PROPERTIES"
-    yield 0.5
-
-
-def finish(screen):
-    """What every scenario promises."""
-    screen.facts["slowest_tick"] = screen.queue.slowest_tick
-    screen.facts["slowest_result"] = screen.queue.slowest_result
-    yield 0.1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import shutil
 import subprocess
 import sys
@@ -12,22 +13,25 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 TOOLS = ROOT.parent / "shared" / "blender-gui"
 BLENDER_ROOT = Path(os.environ.get("FIELDWORK_GUI_ROOT", "/var/tmp/blender-sid"))
+OLDER_ROOT = Path(os.environ.get("FIELDWORK_GUI_OLDER_ROOT", "/var/tmp/blender-trixie"))  # Blender 4.3
 BUILD = ROOT / "build" / "gui"
 MUSEUM = BUILD / "museum"  # a small simulated capture with labels
 
 
-def missing() -> str | None:
+def missing(root: Path = BLENDER_ROOT, suite: str = "sid") -> str | None:
     """Why there can be no windowed Blender here."""
     if not TOOLS.is_dir():
         return f"the scripts that make a windowed Blender are not at {TOOLS}"
     if os.geteuid() != 0:
         return "a windowed Blender in its own root folder needs root"
-    if not (BLENDER_ROOT / ".complete").exists():
-        return f"there is no Blender root at {BLENDER_ROOT}: {TOOLS / 'make-root'} sid {BLENDER_ROOT}"
+    if not (root / ".complete").exists():
+        return f"there is no Blender root at {root}: {TOOLS / 'make-root'} {suite} {root}"
     return None
 
 
-def enter(command: list[str], environment: dict[str, str], timeout: float) -> subprocess.CompletedProcess[str]:
+def enter(
+    command: list[str], environment: dict[str, str], timeout: float, root: Path = BLENDER_ROOT
+) -> subprocess.CompletedProcess[str]:
     """Run a command inside the root, with the project, the shared data and the engine's Python at their places."""
     threads = {name: os.environ[name] for name in ("OMP_NUM_THREADS", "FIELDWORK_THREADS") if name in os.environ}
     variables = " ".join(f"{name}={value}" for name, value in {**environment, **threads}.items())
@@ -36,7 +40,7 @@ def enter(command: list[str], environment: dict[str, str], timeout: float) -> su
     if not Path(sys.prefix).resolve().is_relative_to(ROOT):
         binds += f" {Path(sys.prefix).resolve()}"
     return subprocess.run(
-        ["timeout", "-k", "10", str(timeout), TOOLS / "enter", BLENDER_ROOT, ROOT, *command],
+        ["timeout", "-k", "10", str(timeout), TOOLS / "enter", root, ROOT, *command],
         env={**os.environ, "BIND": binds, "ENTER_ENV": variables},
         capture_output=True,
         text=True,
@@ -53,54 +57,58 @@ def simulate() -> None:
 
 
 class Window:
-    """One Blender with the extension installed from its built archive, with preferences of its own."""
+    """A Blender with preferences of its own, and the extension installed from its built archive.
 
-    def __init__(self, name: str) -> None:
-        self.folder = BUILD / name
+    `install=False`: the archive is built (its path is in FIELDWORK_ZIP), but not installed.
+    """
+
+    def __init__(self, name: str, root: Path = BLENDER_ROOT, install: bool = True) -> None:
+        self.folder, self.root = BUILD / name, root
         shutil.rmtree(self.folder, ignore_errors=True)
         self.folder.mkdir(parents=True)
+        build = BUILD / "zip"
+        build.mkdir(parents=True, exist_ok=True)
+        archive = build / f"{name}.zip"
         self.environment = {
             "BLENDER_USER_RESOURCES": str(self.folder / "user"),
             "FIELDWORK_ENGINE_PYTHON": str(Path(sys.prefix) / "bin" / "python"),
             "FIELDWORK_MUSEUM": str(MUSEUM),
             "FIELDWORK_BASE_PYTHON": str(Path(sys.base_prefix) / "bin" / "python3"),
+            "FIELDWORK_ZIP": str(archive),
         }
-        build, out = BUILD / "zip", ""
-        build.mkdir(parents=True, exist_ok=True)
-        for arguments in (
-            ["build", "--source-dir", str(ROOT), "--output-filepath", str(build / f"{name}.zip")],
-            ["install-file", "-r", "user_default", "-e", str(build / f"{name}.zip")],
-        ):
-            done = enter(["blender", "--command", "extension", *arguments], self.environment, 120)
-            out += done.stdout + done.stderr
-            assert done.returncode == 0, out
+        steps = [["build", "--source-dir", str(ROOT), "--output-filepath", str(archive)]]
+        if install:
+            steps.append(["install-file", "-r", "user_default", "-e", str(archive)])
+        for arguments in steps:
+            done = enter(["blender", "--command", "extension", *arguments], self.environment, 120, root)
+            assert done.returncode == 0, done.stdout + done.stderr
 
-    def play(self, scenario: str, timeout: float = 300) -> dict:
-        """Drive a scenario; returns its facts. Fails with its traceback and Blender's output."""
-        result = self.folder / "result.json"
-        result.unlink(missing_ok=True)
-        done = enter(
-            [
-                *[str(TOOLS / "with-display"), "blender", "--factory-startup", "-noaudio", "--gpu-backend", "opengl"],
-                "--enable-event-simulate",
-                *[
-                    "--window-geometry",
-                    "0",
-                    "0",
-                    "1920",
-                    "1080",
-                    "--python",
-                    str(Path(__file__).with_name("driver.py")),
-                ],
-                *["--", scenario, str(self.folder)],
-            ],
-            self.environment,
-            timeout,
-        )
-        (self.folder / "blender.log").write_text(done.stdout + done.stderr)
-        assert result.is_file(), (
-            f"{scenario} did not end (status {done.returncode}): {(done.stdout + done.stderr)[-3000:]}"
-        )
-        facts = json.loads(result.read_text())
-        assert not facts["error"], f"{facts['error']}\nscreenshots: {self.folder}"
+    def play(self, *scenarios: str, timeout: float = 300) -> dict:
+        """Drive scenarios one after the other, each in a Blender of its own; returns the facts of the last.
+
+        Fails with the traceback of the scenario and Blender's output.
+        """
+        blender = ["blender", "--factory-startup", "-noaudio", "--gpu-backend", "opengl", "--enable-event-simulate"]
+        blender += [
+            "--window-geometry",
+            "0",
+            "0",
+            "1920",
+            "1080",
+            "--python",
+            str(Path(__file__).with_name("driver.py")),
+        ]
+        runs = [shlex.join([*blender, "--", scenario, str(self.folder)]) for scenario in scenarios]
+        for scenario in scenarios:
+            (self.folder / f"{scenario}.json").unlink(missing_ok=True)
+        command = [str(TOOLS / "with-display"), "sh", "-c", "; ".join(runs)]
+        done = enter(command, self.environment, timeout, self.root)
+        output = done.stdout + done.stderr
+        (self.folder / "blender.log").write_text(output)
+        facts = {}
+        for scenario in scenarios:
+            result = self.folder / f"{scenario}.json"
+            assert result.is_file(), f"{scenario} did not end (status {done.returncode}): {output[-3000:]}"
+            facts = json.loads(result.read_text())
+            assert not facts["error"], f"{facts['error']}\nscreenshots: {self.folder}"
         return facts

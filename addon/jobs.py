@@ -11,6 +11,8 @@ Imported when the extension is enabled: what is needed only with a job is import
 
 from __future__ import annotations
 
+import importlib
+import threading
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -42,6 +44,12 @@ def open_link(python: Path, log: Path) -> Link:
     return Link(python, log)
 
 
+def load_modules() -> None:
+    """Import what results and curves need: numpy alone takes longer than the window may be held up."""
+    for name in ("curve", "scene_import", "visibility", "render_result"):
+        importlib.import_module(f".{name}", __package__)
+
+
 class Queue:
     """All jobs of this Blender."""
 
@@ -59,6 +67,7 @@ class Queue:
         self.slowest_step = ""  # what that was
         self.edits = 0  # files loaded, undone and redone steps: what was held of the scene is stale
         self._edits_seen = 0
+        self._loader: threading.Thread | None = None
         self._number = 0
         self._looked = 0.0
         self._asked = 0.0
@@ -90,6 +99,9 @@ class Queue:
     def submit(self, job: Job) -> None:
         """Put a job at the end of the queue; it starts at once when nothing runs."""
         self.waiting.append(job)
+        if not self._loader:
+            self._loader = threading.Thread(target=load_modules, name="fieldwork-modules", daemon=True)
+            self._loader.start()
         self._start_next()
         self.redraw()
 

@@ -24,6 +24,8 @@ IMAGES = {
     "posing": ("capture/posing", SIDEBAR, 260),
     "poses": ("capture/posed-poses", SIDEBAR, 260),
     "scene": ("capture/scene", VIEW, 900),
+    "picking": ("tools/picking", VIEW, 900),
+    "dataset": ("tools/dataset", VIEW, 900),
     "classes": ("labelled/labelled-classes", SIDEBAR, 260),
     "training": ("train/training", SIDEBAR, 260),
     "trained": ("labelled/labelled-train", SIDEBAR, 260),

@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 SHELL := /bin/bash
 export OMP_WAIT_POLICY := passive
 
-.PHONY: venv demo test test-all lint matrix gui gpu-compile gpu-check repository clean
+.PHONY: venv demo test test-all lint matrix gui gpu-compile gpu-check bench repository clean
 
 venv: $(VENV)/.ready
 
@@ -55,8 +55,17 @@ gui: venv
 gpu-compile: venv
 	$(BIN)/python -m fieldwork.nerfcore.kernels.compile_cuda build/cubins
 
+# Kernels against their twins, then training, rendering and memory; writes the GPU section of docs/benchmarks.md.
 gpu-check: venv
-	$(BIN)/python -m pytest -m gpu $(PYTEST)
+	@mkdir -p build/bench/gpu
+	@rm -f build/bench/gpu/tests.xml
+	@$(BIN)/python -m pytest -m gpu tests/nerfcore --junitxml build/bench/gpu/tests.xml $(PYTEST); checks=$$?; \
+	$(BIN)/fieldwork bench --suite gpu --page docs/benchmarks.md --tests build/bench/gpu/tests.xml $(BENCH) && exit $$checks
+
+# make bench SUITE=ablation BENCH="--seconds 60 --scenes museum"
+SUITE ?= speed
+bench: venv
+	$(BIN)/fieldwork bench --suite $(SUITE) $(BENCH)
 
 repository: venv
 	$(BIN)/python tests/addon/make_repository.py dist/repository

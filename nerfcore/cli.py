@@ -30,7 +30,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 POSITIONAL = ("project", "dataset", "photos", "out")
 # Verbs in which one of the names above is an option.
-NAMED = {"new": {"photos"}, "render": {"out"}, "mesh": {"out"}, "reconstruct": {"out"}}
+NAMED = {"new": {"photos"}, "render": {"out"}, "mesh": {"out"}, "reconstruct": {"out"}, "bench": {"out"}}
 ORDER = {"import": ["dataset", "project"]}
 
 

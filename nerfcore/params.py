@@ -128,6 +128,7 @@ class EvaluateParams(Params):
     project: Path
     run: str = "main"
     split: Literal["test", "train"] = "test"
+    speed: bool = Field(default=True, description="measure frame times too")
 
 
 class RenderParams(Params):
@@ -182,3 +183,19 @@ class ReconstructParams(Params):
     set: dict[str, str] = Field(default_factory=dict)
     report: Path | None = Field(default=None, description="HTML report to write")
     renders: Path | None = Field(default=None, description="folder for renders of new views")
+
+
+class BenchParams(Params):
+    suite: Literal["speed", "ablation", "robustness", "baselines", "gpu"] = Field(description="which table")
+    out: Path = Field(default=Path("build/bench"), description="folder for results and scenes; finished runs are kept")
+    data: Path | None = Field(default=None, description="folder of data sets; default: ../shared/data when it is there")
+    scenes: list[str] | None = Field(default=None, description="data sets, museum (simulated) or capture projects")
+    variants: list[str] | None = Field(default=None, description="only these variants of the suite")
+    seconds: float | None = Field(default=None, gt=0, description="seconds of training a run, instead of the suite's")
+    steps: int | None = Field(default=None, gt=0, description="steps of training a run, instead of the suite's")
+    preset: Preset = "standard"
+    set: dict[str, str] = Field(default_factory=dict, description="settings changed in every run")
+    keep: bool = Field(default=False, description="keep the trained fields in OUT/projects")
+    yardstick: Path | None = Field(default=None, description="speed: script of another trainer to run beside ours")
+    page: Path | None = Field(default=None, description="gpu: Markdown page whose GPU section is rewritten")
+    tests: Path | None = Field(default=None, description="gpu: JUnit file of the kernels' tests")

@@ -21,6 +21,8 @@ from ..render.image import render_view
 from ..train.model import Model
 from ..train.run import Trained
 
+SPEED_KEYS = ("fps", "fps_size", "spr", "ms_sampling", "ms_network", "fused")
+
 
 def peak_memory(device: torch.device) -> float:
     """Peak memory of this process in MiB: of the GPU when one is used, else resident memory now."""

@@ -21,7 +21,7 @@ from ..render.image import Frame, background_of, render_view, to_bytes, write_pi
 from ..render.pictures import colorize_depth, colorize_labels, side_by_side
 from ..train.run import Trained, load_trained, run_folder
 from .metrics import Confusion, psnr, ssim
-from .speed import measure_speed, peak_memory
+from .speed import SPEED_KEYS, measure_speed, peak_memory
 
 
 def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
@@ -67,7 +67,9 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
         scores.append(score)
         pictures.append(_write_pictures(out, view.name, photo, frame, label, trained, scene))
     per_class = {names.get(c, str(c)): round(v, 4) for c, v in confusion.iou().items()}
-    speed = measure_speed(trained, scene, indices, box.box_from_world, report)
+    speed = dict.fromkeys(SPEED_KEYS)
+    if params.speed:
+        speed = measure_speed(trained, scene, indices, box.box_from_world, report)
     result: dict[str, Any] = {
         "run": params.run,
         "split": params.split,

@@ -1,0 +1,205 @@
+"""One training run of a benchmark: train, evaluate, measure, and remember the figures so that it is not repeated."""
+
+from __future__ import annotations
+
+import json
+import re
+import resource
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ..config import make_config
+from ..errors import FieldworkError, ProjectError
+from ..evaluate.speed import measure_speed
+from ..evaluate.verb import evaluate
+from ..files import write_json
+from ..params import EvaluateParams, Preset, TrainParams
+from ..progress import Reporter
+from ..project import load_project, load_scene
+from ..train.run import CHECKPOINT, load_info, load_trained, run_folder, use_device
+from ..train.verb import train
+
+COUNTING_SIDE = 200  # of a frame that only counts samples per ray
+SECONDS_PER_STEP = 0.1  # a guess, only for the estimate of the whole before anything ran
+
+
+@dataclass(frozen=True)
+class Job:
+    """A variant trained on a scene, until `steps` or `seconds` are used up. `sides`: frame sizes to time."""
+
+    scene: str
+    variant: str
+    settings: dict[str, str] = field(default_factory=dict)
+    steps: int | None = None
+    seconds: float | None = None
+    preset: Preset = "standard"
+    sides: tuple[int, ...] = (COUNTING_SIDE,)
+
+    @property
+    def budget(self) -> str:
+        return f"{self.steps} steps" if self.steps else f"{self.seconds:g} s"
+
+    @property
+    def name(self) -> str:
+        """Name of its run and of its file."""
+        return re.sub(r"[^\w.-]+", "-", f"bench-{self.scene}-{self.variant}-{self.budget}")
+
+    @property
+    def expected_seconds(self) -> float:
+        return self.seconds or (self.steps or 0) * SECONDS_PER_STEP
+
+
+class JobReporter(Reporter):
+    """Turns the stages of one job into a share of the whole suite's progress."""
+
+    def __init__(self, outer: Reporter, begin: float, share: float, title: str) -> None:
+        super().__init__()
+        self.outer, self.begin, self.share, self.title = outer, begin, share, title
+        self.inner = ""
+
+    def stage(self, name: str) -> None:
+        self.inner = name
+
+    def progress(self, fraction: float, message: str = "") -> None:
+        # Loading and evaluating take little beside training; only training moves the bar.
+        done = fraction if self.inner == "Training" else float(self.inner.startswith(("Rendering", "Measuring")))
+        self.outer.progress(self.begin + self.share * min(done, 1.0), f"{self.title}: {self.inner} {message}")
+
+    def warn(self, message: str) -> None:
+        self.outer.warn(f"{self.title}: {message}")
+
+    def check(self) -> None:
+        self.outer.check()
+
+
+def load_result(job: Job, out: Path) -> dict[str, Any] | None:
+    """The figures of a job that was finished before with the same settings."""
+    path = out / "runs" / f"{job.name}.json"
+    if not path.is_file():
+        return None
+    known = json.loads(path.read_text(encoding="utf-8"))
+    return known if known["job"] == _description(job) else None
+
+
+def _description(job: Job) -> dict[str, Any]:
+    return json.loads(json.dumps(asdict(job)))
+
+
+def run_job(job: Job, project: Path, out: Path, report: Reporter, keep: bool = False) -> dict[str, Any]:
+    """Train and measure; returns and stores {"job": …, figures…}. A run that was interrupted goes on.
+
+    `keep`: the trained field stays in the project; else only its figures, pictures and curve do.
+    """
+    device = use_device()
+    _reset_peak(device)
+    trained = train(
+        TrainParams(
+            project=project,
+            preset=job.preset,
+            run=job.name,
+            time_limit=job.seconds,
+            steps=job.steps,
+            set=job.settings,
+            resume=_interrupted(job, project),
+        ),
+        report,
+    )
+    memory = _peak(device)
+    _reset_peak(device)
+    evaluated = evaluate(EvaluateParams(project=project, run=job.name, speed=False), report)
+    folder = run_folder(project, job.name)
+    figures = {
+        "job": _description(job),
+        **{key: trained[key] for key in ("steps", "seconds", "compile_seconds", "psnr_train", "params_m", "device")},
+        **{key: evaluated[key] for key in ("psnr", "ssim", "lpips", "miou", "per_class_iou", "images", "background")},
+        "rays_per_second": training_rate(folder / "events.jsonl"),
+        "speed": _speeds(job, project, report),
+        "memory_training_mb": memory,
+        "memory_rendering_mb": _peak(device),
+        "curve": training_curve(folder / "events.jsonl"),
+        "pictures": evaluated["pictures"][:4],
+        "project": str(project),
+    }
+    write_json(out / "runs" / f"{job.name}.json", figures)
+    if not keep:
+        (folder / CHECKPOINT).unlink(missing_ok=True)
+    return figures
+
+
+def _interrupted(job: Job, project: Path) -> bool:
+    """Whether an unfinished run of just this job is there."""
+    try:
+        info = load_info(project, job.name)
+    except ProjectError:
+        return False
+    same = info.config == make_config(job.preset, job.settings) and info.preset == job.preset
+    return same and (run_folder(project, job.name) / CHECKPOINT).is_file()
+
+
+def _speeds(job: Job, project: Path, report: Reporter) -> list[dict[str, Any]]:
+    """Frame times at every side of the job."""
+    scene, trained = load_scene(project), load_trained(project, job.name)
+    box = trained.info.box(load_project(project))
+    views = scene.test or scene.train
+    return [measure_speed(trained, scene, views, box.box_from_world, report, side) for side in job.sides]
+
+
+def _reset_peak(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+
+
+def _peak(device: torch.device) -> float | None:
+    """Peak memory in MiB: on a GPU since the last reset, on a CPU of the process so far."""
+    if device.type == "cuda":
+        return round(torch.cuda.max_memory_allocated(device) / 2**20, 1)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return round(peak / (2**20 if sys.platform == "darwin" else 2**10), 1)
+
+
+def _events(path: Path) -> list[dict[str, Any]]:
+    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+    return [json.loads(line) for line in lines if line.endswith("}")]
+
+
+def training_rate(path: Path) -> int | None:
+    """Mean training rays a second over the second half of a run; None when nothing was recorded."""
+    rates = [event["rays_per_second"] for event in _events(path)]
+    late = rates[len(rates) // 2 :]
+    return round(sum(late) / len(late)) if late else None
+
+
+def training_curve(path: Path, points: int = 100) -> list[list[float]]:
+    """At most about `points` pairs (seconds, training PSNR)."""
+    events = _events(path)
+    step = max(1, len(events) // points)
+    return [[event["seconds"], event["psnr"]] for event in events[::step]]
+
+
+def run_all(
+    jobs: Sequence[Job], projects: dict[str, Path], out: Path, report: Reporter, keep: bool = False
+) -> list[dict[str, Any]]:
+    """Figures of all jobs in their order; finished ones are read, failed ones have only "job" and "error"."""
+    total = sum(job.expected_seconds for job in jobs) or 1.0
+    done, results, begin = 0.0, [], time.monotonic()
+    report.stage(f"{len(jobs)} runs")
+    for number, job in enumerate(jobs, 1):
+        share = job.expected_seconds / total
+        title = f"run {number} of {len(jobs)}, {job.scene} {job.variant} {job.budget}"
+        known = load_result(job, out)
+        if known is None:
+            try:
+                known = run_job(job, projects[job.scene], out, JobReporter(report, done, share, title), keep)
+            except FieldworkError as error:
+                report.warn(f"{title} failed: {error}")
+                known = {"job": _description(job), "error": str(error)}
+        results.append(known)
+        done += share
+        report.progress(min(done, 1.0), f"{title}: done after {time.monotonic() - begin:.0f} s")
+    return results

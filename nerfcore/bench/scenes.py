@@ -1,0 +1,70 @@
+"""The scenes of a benchmark as capture projects inside its output folder."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+from ..capture.simulate import simulate
+from ..data.importer import import_dataset
+from ..errors import InputError
+from ..params import ImportParams, SimulateParams
+from ..progress import Reporter
+from ..project import is_project, load_project
+
+MUSEUM = "museum"
+DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
+
+
+def data_folder(given: Path | None) -> Path | None:
+    """The folder of data sets: the one given, else ../shared/data beside the repository or the working folder."""
+    if given is not None:
+        if not given.is_dir():
+            raise InputError(f"{given} is not a folder.", "Give the folder that holds the data sets with --data.")
+        return given
+    return next((d for d in (DATA, Path("../shared/data")) if d.is_dir()), None)
+
+
+def available(scene: str, data: Path | None) -> bool:
+    """Whether the scene can be had: a capture project, a data set in the folder, or the simulated museum."""
+    return scene == MUSEUM or is_project(Path(scene)) or (data is not None and (data / scene).is_dir())
+
+
+def scene_name(scene: str) -> str:
+    return Path(scene).name
+
+
+def prepare(scene: str, data: Path | None, out: Path, report: Reporter) -> Path:
+    """The project of a scene, made on first use: imported with its poses, or simulated with the true ones.
+
+    `scene`: the name of a data set in `data`, "museum", or the path of a capture project, which is copied.
+
+    Raises:
+        InputError: there is no such scene. BlenderError: the museum needs the `bpy` package and it is missing.
+    """
+    project = out / "projects" / scene_name(scene)
+    if is_project(project):
+        return project
+    half_made = project.with_name(f".{project.name}")
+    shutil.rmtree(half_made, ignore_errors=True)
+    report.stage(f"Preparing {scene_name(scene)}")
+    if is_project(Path(scene)):
+        shutil.copytree(scene, half_made, ignore=shutil.ignore_patterns("runs", "jobs", "exports"))
+        (half_made / "runs").mkdir()
+    elif data is not None and (data / scene).is_dir():
+        import_dataset(ImportParams(dataset=data / scene, project=half_made), report)
+    elif scene == MUSEUM:
+        capture = out / "captures" / MUSEUM
+        simulate(SimulateParams(out=capture), report)
+        import_dataset(ImportParams(dataset=capture / "ground_truth", project=half_made), report)
+    else:
+        raise InputError(
+            f"There is no scene “{scene}” in {data or 'a data folder'}.", "Name a data set there, museum or a project."
+        )
+    half_made.rename(project)
+    return project
+
+
+def is_labelled(project: Path) -> bool:
+    """Whether any image of a project has labels."""
+    return any(image.label for image in load_project(project).images)

@@ -1,0 +1,110 @@
+"""What each suite trains: scenes × variants × budgets, as data."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import get_args
+
+from ..config import RunConfig
+from ..errors import SettingError
+from ..params import BenchParams
+from .jobs import COUNTING_SIDE, Job
+from .scenes import MUSEUM, scene_name
+
+SCENES = {
+    "speed": ["lego_400"],
+    "ablation": ["replica_room", MUSEUM, "mary_rose_tankard"],
+    "robustness": [MUSEUM, "replica_room"],
+    "baselines": ["lego_400", "replica_room"],
+    "gpu": ["lego_400", "replica_room"],
+}
+REFERENCE = {"ablation": "hybrid", "robustness": "clean", "baselines": "ours"}
+SECONDS = {"speed": 120.0, "ablation": 180.0, "robustness": 180.0, "baselines": 600.0, "gpu": 60.0}
+SIDES = {"speed": (400, 800), "gpu": (800,), "baselines": (800,)}
+LONGER = 5.0  # the speed suite's second run
+STEPS = 4000
+# Published drops of PSNR (dB) and of mIoU (points) under input noise, docs/benchmarks.md.
+PUBLISHED_DROPS = {"noise 0.01": (1.6, 2.5), "noise 0.03": (3.7, 4.7), "noise 0.05": (5.4, 8.1)}
+BASELINES = Path(__file__).parent / "baselines.json"
+MISSING_BASELINES = {
+    "mip-nerf": "needs cones instead of rays (integrated positional encoding), which the field does not have"
+}
+
+ABLATION = {
+    "hybrid": {},
+    "explicit": {"field.branch": "explicit"},
+    "implicit": {"field.branch": "implicit"},
+    "concat": {"field.fusion": "concat"},
+    "literal blend": {"field.blend_by": "density"},
+    "semantic pdf": {"sampling.interest": "boundary"},
+    "density pdf": {"sampling.interest": "none"},
+    "uniform pdf": {"sampling.pdf": "uniform"},
+    "literal pdf": {"sampling.pdf": "literal"},
+    "no semantics": {"loss.semantic_weight": "0"},
+}
+# Of these, figures at equal time stand beside those at equal steps.
+TIMED = ("hybrid", "explicit", "implicit", "semantic pdf", "uniform pdf", "literal pdf")
+
+ROBUSTNESS = {
+    "clean": {},
+    "noise 0.01": {"train.noise": "0.01"},
+    "noise 0.03": {"train.noise": "0.03"},
+    "noise 0.05": {"train.noise": "0.05"},
+    "half of the views": {"train.view_share": "0.5"},
+    "10 % labelled": {"train.labelled_share": "0.1"},
+    "30 % label noise": {"train.label_noise": "0.3"},
+}
+
+
+def baselines() -> dict[str, dict[str, str]]:
+    """Settings of each baseline that is a boundary case of the field."""
+    return {name: entry["settings"] for name, entry in json.loads(BASELINES.read_text(encoding="utf-8")).items()}
+
+
+def initialisations() -> dict[str, dict[str, str]]:
+    """A variant for every way the grid can be initialised, where there is such a setting."""
+    for stage, info in RunConfig.model_fields.items():
+        setting = type(info.default).model_fields.get("voxel_init")
+        if setting is not None:
+            return {f"voxel_init {v}": {f"{stage}.voxel_init": str(v)} for v in get_args(setting.annotation)}
+    return {}
+
+
+def variants(suite: str) -> dict[str, dict[str, str]]:
+    """Name and settings of everything a suite compares."""
+    if suite == "ablation":
+        return ABLATION | initialisations()
+    if suite == "robustness":
+        return ROBUSTNESS
+    return baselines() if suite == "baselines" else {"standard": {}}
+
+
+def plan(params: BenchParams, scenes: list[str]) -> list[Job]:
+    """The jobs of a suite on some scenes.
+
+    Without `seconds` and `steps` the suite's own budgets hold. Either of them replaces both kinds of budget.
+
+    Raises:
+        SettingError: a variant the suite does not have.
+    """
+    suite, found = params.suite, variants(params.suite)
+    wanted = params.variants or list(found)
+    unknown = [name for name in wanted if name not in found]
+    if unknown:
+        raise SettingError(f"The suite {suite} has no variant “{unknown[0]}”.", f"It has: {', '.join(found)}.")
+    own = params.seconds is None and params.steps is None
+    seconds = SECONDS[suite] if own else params.seconds
+    steps = (STEPS if suite == "ablation" else None) if own else params.steps
+    timed = TIMED if own and suite == "ablation" else wanted
+    jobs = []
+    for scene in map(scene_name, scenes):
+        for name in wanted:
+            settings = {**found[name], **params.set}
+            sides = SIDES.get(suite, (COUNTING_SIDE,))
+            if steps is not None:
+                jobs.append(Job(scene, name, settings, steps=steps, preset=params.preset, sides=sides))
+            if seconds is not None and name in timed:
+                limits = (seconds, seconds * LONGER) if suite == "speed" else (seconds,)
+                jobs += [Job(scene, name, settings, seconds=s, preset=params.preset, sides=sides) for s in limits]
+    return jobs

@@ -1,0 +1,206 @@
+"""Results of a suite as rows, Markdown and a plot."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+from ..files import atomic_path
+from .jobs import COUNTING_SIDE
+from .suites import PUBLISHED_DROPS, REFERENCE
+
+Row = dict[str, Any]
+COLUMNS = {
+    "scene": "scene",
+    "variant": "variant",
+    "budget": "budget",
+    "psnr": "PSNR (dB)",
+    "ssim": "SSIM",
+    "miou": "mIoU",
+    "psnr_gain": "Δ PSNR",
+    "miou_gain": "Δ mIoU",
+    "steps": "steps",
+    "seconds": "training (s)",
+    "rays_per_second": "rays/s trained",
+    "params_m": "parameters (M)",
+    "spr": "samples/ray",
+    "memory_training_mb": "peak memory, training (MiB)",
+    "memory_rendering_mb": "peak memory, rendering (MiB)",
+}
+SPEED = {"fps": "frames/s", "ms_frame": "ms a frame", "ms_sampling": "ms sampling", "ms_network": "ms network"}
+
+
+def text(value: Any) -> str:
+    """A figure as it stands in a table; what was not measured says so."""
+    if value is None:
+        return "not measured"
+    return f"{value:,.4g}" if isinstance(value, float) else str(value)
+
+
+def table(columns: dict[str, str], rows: Sequence[Row]) -> str:
+    """A Markdown table of the columns {key: heading} of rows."""
+    lines = ["| " + " | ".join(columns.values()) + " |", "|" + " --- |" * len(columns)]
+    lines += ["| " + " | ".join(text(row.get(key)) for key in columns) + " |" for row in rows]
+    return "\n".join(lines)
+
+
+def budget(job: Row) -> str:
+    return f"{job['steps']} steps" if job["steps"] else f"{job['seconds']:g} s"
+
+
+def make_rows(suite: str, results: Sequence[dict[str, Any]]) -> list[Row]:
+    """One row a run, with its difference from the suite's reference at the same scene and budget."""
+    rows = []
+    for result in results:
+        job = result["job"]
+        row: Row = {"scene": job["scene"], "variant": job["variant"], "budget": budget(job)}
+        row |= {key: result.get(key) for key in COLUMNS if key not in row}
+        for speed in result.get("speed", []):
+            side = speed["fps_size"][0]
+            row["spr"], row["fused"] = speed["spr"], speed["fused"]
+            values = {**speed, "ms_frame": round(1e3 / speed["fps"], 2)}
+            row |= {f"{key}_{side}": values[key] for key in SPEED}
+        row["error"] = result.get("error")
+        rows.append(row)
+    reference = {(r["scene"], r["budget"]): r for r in rows if r["variant"] == REFERENCE.get(suite)}
+    for row in rows:
+        base = reference.get((row["scene"], row["budget"]))
+        if base is None or base is row:
+            continue
+        for key, gain in (("psnr", "psnr_gain"), ("miou", "miou_gain")):
+            if row[key] is not None and base[key] is not None:
+                row[gain] = round(row[key] - base[key], 4)
+    return rows
+
+
+def verdicts(suite: str, rows: Sequence[Row]) -> list[str]:
+    """What the figures say about the claims they were taken for; nothing where a figure is missing."""
+    if suite == "ablation":
+        return _ablation_verdicts(rows)
+    if suite == "robustness":
+        return _drop_verdicts(rows)
+    return []
+
+
+def _by(rows: Sequence[Row]) -> dict[tuple[str, str], dict[str, Row]]:
+    """Rows by (scene, budget) and variant."""
+    found: dict[tuple[str, str], dict[str, Row]] = {}
+    for row in rows:
+        found.setdefault((row["scene"], row["budget"]), {})[row["variant"]] = row
+    return found
+
+
+def _better(a: Row, b: Row, keys: Sequence[str]) -> bool | None:
+    """Whether a beats b in every key; None when a figure is missing."""
+    pairs = [(a[key], b[key]) for key in keys]
+    if any(x is None or y is None for x, y in pairs):
+        return None
+    return all(x > y for x, y in pairs)
+
+
+def _ablation_verdicts(rows: Sequence[Row]) -> list[str]:
+    lines = []
+    for (scene, limit), found in _by(rows).items():
+        if {"hybrid", "explicit", "implicit"} <= found.keys():
+            wins = [_better(found["hybrid"], found[v], ("psnr", "miou")) for v in ("explicit", "implicit")]
+            if None not in wins:
+                how = "beats" if all(wins) else "does not beat"
+                lines.append(f"{scene}, {limit}: hybrid {how} both of its boundary cases in PSNR and mIoU.")
+        if {"hybrid", "semantic pdf", "uniform pdf"} <= found.keys():
+            best = max((found["hybrid"], found["semantic pdf"]), key=lambda row: row["psnr"] or 0.0)
+            won = _better(best, found["uniform pdf"], ("psnr",))
+            if won is not None:
+                how = "beats" if won else "does not beat"
+                lines.append(f"{scene}, {limit}: {best['variant']} {how} uniform samples in PSNR.")
+    return lines
+
+
+def _drop_verdicts(rows: Sequence[Row]) -> list[str]:
+    lines = []
+    for row in rows:
+        limits = PUBLISHED_DROPS.get(row["variant"])
+        if limits is None or row.get("psnr_gain") is None:
+            continue
+        kept = "within" if -row["psnr_gain"] <= limits[0] else "more than"
+        lines.append(
+            f"{row['scene']}, {row['variant']}: PSNR drops {-row['psnr_gain']:.2f} dB, {kept} the published {limits[0]}."
+        )
+        if row.get("miou_gain") is not None:
+            drop = -100 * row["miou_gain"]
+            kept = "within" if drop <= limits[1] else "more than"
+            lines.append(
+                f"{row['scene']}, {row['variant']}: mIoU drops {drop:.1f} points, {kept} the published {limits[1]}."
+            )
+    return lines
+
+
+def markdown(suite: str, rows: Sequence[Row], machine: str, command: str, notes: Sequence[str]) -> str:
+    """The page of a suite: machine, command, tables, verdicts."""
+    present = [key for key in COLUMNS if any(row.get(key) is not None for row in rows) or key in ("psnr", "miou")]
+    parts = [f"# Suite {suite}", "", f"Machine: {machine}. Command: `{command}`", ""]
+    parts += [table({key: COLUMNS[key] for key in present}, rows), ""]
+    for side in sorted({int(key.rsplit("_", 1)[1]) for row in rows for key in row if key.startswith("fps_")}):
+        if side == COUNTING_SIDE:
+            continue
+        columns = {"scene": "scene", "variant": "variant", "budget": "budget"}
+        columns |= {f"{key}_{side}": heading for key, heading in SPEED.items()}
+        classes = "colour and, where the scene has labels, classes"
+        parts += [f"## Frames of {side}×{side}, {classes}", "", table(columns, rows), ""]
+    failed = [f"- {r['scene']} {r['variant']}, {r['budget']}: {r['error']}" for r in rows if r.get("error")]
+    if failed:
+        parts += ["## Failed runs", "", *failed, ""]
+    lines = [f"- {line}" for line in [*verdicts(suite, rows), *notes]]
+    if lines:
+        parts += ["## Notes", "", *lines, ""]
+    return "\n".join(parts)
+
+
+def plot(path: Path, suite: str, rows: Sequence[Row], results: Sequence[dict[str, Any]]) -> None:
+    """A picture of the suite: training curves for speed and gpu, bars of PSNR and mIoU for the rest."""
+    matplotlib.use("Agg")
+    from matplotlib.figure import Figure
+
+    if suite in ("speed", "gpu"):
+        figure = Figure(figsize=(7, 4), layout="constrained")
+        axes = figure.subplots()
+        for result in results:
+            curve = result.get("curve") or []
+            job = result["job"]
+            axes.plot([s for s, _ in curve], [p for _, p in curve], label=f"{job['scene']}, {budget(job)}")
+        axes.set_xlabel("seconds of training")
+        axes.set_ylabel("training PSNR (dB)")
+        axes.grid(alpha=0.3)
+        axes.legend()
+    else:
+        groups = _by(rows)
+        most = max(len(found) for found in groups.values())
+        figure = Figure(figsize=(9, 0.6 + len(groups) * (0.9 + 0.28 * most)), layout="constrained")
+        for (left, right), ((scene, limit), found) in zip(
+            figure.subplots(len(groups), 2, squeeze=False, sharey="row"), groups.items()
+        ):
+            _bars(left, found, "psnr", f"{scene}, {limit}: PSNR (dB)")
+            _bars(right, found, "miou", "mIoU")
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=120)
+
+
+def _bars(axes: Any, found: dict[str, Row], key: str, title: str) -> None:
+    """Horizontal bars, the first variant on top; missing figures leave a gap that says so."""
+    names = list(found)[::-1]
+    values = [found[name][key] for name in names]
+    known = [v for v in values if v is not None]
+    axes.barh(
+        names, [v or 0.0 for v in values], color=["#2a6f97" if n == next(iter(found)) else "#89a9bd" for n in names]
+    )
+    low = min(known, default=0.0)
+    # Differences matter more than the distance from zero.
+    begin = max(0.0, low - 0.5 * (max(known, default=1.0) - low) - 0.02 * low)
+    end = max(known, default=1.0)
+    axes.set_xlim(begin, end + 0.18 * max(end - begin, 1e-3))
+    for place, value in enumerate(values):
+        label = " not measured" if value is None else f" {value:.4g}"
+        axes.text(begin if value is None else value, place, label, va="center", fontsize=8)
+    axes.set_title(title, fontsize=10, loc="left")

@@ -1,0 +1,268 @@
+"""The benchmark suites with tiny budgets, and what their tables say."""
+
+from __future__ import annotations
+
+import json
+import re
+import threading
+import time
+import warnings
+from pathlib import Path
+
+import pytest
+import torch
+from click.testing import CliRunner
+from fieldwork.nerfcore.bench import gpu, tables
+from fieldwork.nerfcore.bench.machine import run_yardstick
+from fieldwork.nerfcore.bench.suites import ABLATION, ROBUSTNESS, TIMED, baselines, plan
+from fieldwork.nerfcore.config import make_config
+from fieldwork.nerfcore.errors import Cancelled, InputError, SettingError
+from fieldwork.nerfcore.params import BenchParams
+from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.verbs import run_verb
+from fieldwork.tests.nerfcore.test_training import SMALL, tiny_project  # noqa: F401
+from PIL import Image
+
+TINY = {**SMALL, "sampling.samples": "4", "render.samples": "4"}
+
+
+class Recorder(Reporter):
+    def __init__(self) -> None:
+        super().__init__()
+        self.fractions: list[float] = []
+
+    def progress(self, fraction: float, message: str = "") -> None:
+        super().progress(fraction, message)
+        self.fractions.append(fraction)
+
+
+def bench(out: Path, project: Path, suite: str, report: Reporter | None = None, **values) -> dict:
+    values = {"preset": "draft", "set": TINY, **values}
+    params = BenchParams(suite=suite, out=out, scenes=[str(project)], **values)  # type: ignore[arg-type]
+    return run_verb("bench", params, report or Reporter())
+
+
+@pytest.fixture(scope="module")
+def ablation(tiny_project: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict, Recorder]:  # noqa: F811
+    out, report = tmp_path_factory.mktemp("bench"), Recorder()
+    variants = ["hybrid", "explicit", "implicit", "semantic pdf", "uniform pdf"]
+    return out, bench(out, tiny_project, "ablation", report, steps=12, variants=variants), report
+
+
+def test_a_suite_writes_figures_table_and_plot(ablation: tuple[Path, dict, Recorder]) -> None:
+    out, result, report = ablation
+    assert result["runs"] == 5
+    assert result["failed"] == 0
+    assert all(Path(file).is_file() for file in result["files"])
+    stored = json.loads((out / "ablation" / "results.json").read_text("utf-8"))
+    assert [row["variant"] for row in stored["rows"]] == [row["variant"] for row in result["rows"]]
+    for row in stored["rows"]:
+        assert row["steps"] == 12
+        assert 0 < row["psnr"] < 60
+        assert 0 <= row["miou"] <= 1
+        assert row["spr"] > 0
+    # equal samples per ray is what makes the comparison fair
+    by = {row["variant"]: row for row in stored["rows"]}
+    assert by["uniform pdf"]["spr"] == pytest.approx(by["hybrid"]["spr"], rel=0.3)
+    assert by["explicit"]["psnr_gain"] == pytest.approx(by["explicit"]["psnr"] - by["hybrid"]["psnr"], abs=1e-3)
+    text = (out / "ablation" / "table.md").read_text("utf-8")
+    assert "| explicit |" in text
+    assert "hybrid beats both" in text or "hybrid does not beat both" in text
+    with Image.open(out / "ablation" / "plot.png") as picture:
+        assert picture.width > 500
+    assert report.fractions[-1] == pytest.approx(1.0)
+
+
+def test_finished_runs_are_not_repeated_but_changed_ones_are(
+    ablation: tuple[Path, dict, Recorder],
+    tiny_project: Path,  # noqa: F811
+) -> None:
+    out, first, _ = ablation
+    files = {p: p.stat().st_mtime_ns for p in (out / "ablation" / "runs").glob("*.json")}
+    again = bench(out, tiny_project, "ablation", steps=12, variants=["hybrid", "explicit"])
+    assert {p: p.stat().st_mtime_ns for p in files} == files
+    assert again["rows"][0]["psnr"] == first["rows"][0]["psnr"]
+    changed = {**TINY, "train.seed": "4"}
+    bench(out, tiny_project, "ablation", steps=12, variants=["explicit"], set=changed)
+    rewritten = [p for p in files if p.stat().st_mtime_ns != files[p]]
+    assert [p.name for p in rewritten] == [
+        "bench-" + re.sub(r"[^\w.-]+", "-", tiny_project.name) + "-explicit-12-steps.json"
+    ]
+
+
+def test_fields_are_removed_unless_they_are_kept(ablation: tuple[Path, dict, Recorder], tiny_project: Path) -> None:  # noqa: F811
+    out, _, _ = ablation
+    assert not list((out / "projects").glob("*/runs/*/field.safetensors"))
+    bench(out, tiny_project, "ablation", steps=12, variants=["no semantics"], keep=True)
+    assert len(list((out / "projects").glob("*/runs/*/field.safetensors"))) == 1
+
+
+@pytest.mark.slow
+def test_speed_has_two_limits_and_two_frame_sizes(tiny_project: Path, tmp_path: Path) -> None:  # noqa: F811
+    result = bench(tmp_path, tiny_project, "speed", seconds=0.4)
+    assert [row["budget"] for row in result["rows"]] == ["0.4 s", "2 s"]
+    for row in result["rows"]:
+        for side in (400, 800):
+            assert row[f"fps_{side}"] > 0
+            assert row[f"ms_sampling_{side}"] > 0
+            assert row[f"ms_network_{side}"] > 0
+        assert row["rays_per_second"] > 0
+        assert row["memory_training_mb"] > 50
+        assert row["params_m"] > 0
+    assert "Frames of 800×800" in (tmp_path / "speed" / "table.md").read_text("utf-8")
+
+
+def test_robustness_reports_drops_against_the_clean_run(tiny_project: Path, tmp_path: Path) -> None:  # noqa: F811
+    result = bench(tmp_path, tiny_project, "robustness", steps=10, variants=["clean", "noise 0.05", "10 % labelled"])
+    by = {row["variant"]: row for row in result["rows"]}
+    assert by["clean"].get("psnr_gain") is None
+    assert by["noise 0.05"]["psnr_gain"] == pytest.approx(by["noise 0.05"]["psnr"] - by["clean"]["psnr"], abs=1e-3)
+    assert any("published 5.4" in note for note in result["notes"])
+
+
+def test_a_cancelled_suite_goes_on_where_it_stopped(tiny_project: Path, tmp_path: Path) -> None:  # noqa: F811
+    report = Reporter()
+    failures: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            bench(tmp_path, tiny_project, "ablation", report, seconds=1.5, variants=["hybrid", "explicit"])
+        except Cancelled as stop:
+            failures.append(stop)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    runs = tmp_path / "ablation" / "runs"
+    deadline = time.monotonic() + 240
+    while time.monotonic() < deadline and not list(runs.glob("*.json")):
+        time.sleep(0.05)
+    report.cancel()
+    thread.join(60)
+    assert len(failures) == 1
+    done = list(runs.glob("*.json"))
+    assert len(done) == 1
+    before = done[0].stat().st_mtime_ns
+    result = bench(tmp_path, tiny_project, "ablation", seconds=1.5, variants=["hybrid", "explicit"])
+    assert result["runs"] == 2
+    assert done[0].stat().st_mtime_ns == before
+
+
+def test_a_run_that_fails_does_not_stop_the_others(tiny_project: Path, tmp_path: Path) -> None:  # noqa: F811
+    broken = {**TINY, "train.network_rate": "1e30", "train.grid_rate": "1e30"}
+    report = Reporter()
+    result = bench(tmp_path, tiny_project, "ablation", report, steps=30, variants=["hybrid", "explicit"], set=broken)
+    assert result["failed"] == 2
+    assert result["rows"][0]["psnr"] is None
+    assert "diverged" in (tmp_path / "ablation" / "table.md").read_text("utf-8")
+    assert not list((tmp_path / "ablation" / "runs").glob("*.json"))
+    assert any("diverged" in warning for warning in report.warnings)
+
+
+def test_unknown_variants_and_scenes_are_named(tiny_project: Path, tmp_path: Path) -> None:  # noqa: F811
+    with pytest.raises(SettingError, match="no variant “warm”"):
+        bench(tmp_path, tiny_project, "ablation", variants=["warm"])
+    with pytest.raises(InputError, match="no scene “moon”"):
+        run_verb("bench", BenchParams(suite="speed", out=tmp_path, data=tmp_path, scenes=["moon"]), Reporter())
+    with pytest.raises(InputError, match="not a folder"):
+        run_verb("bench", BenchParams(suite="speed", out=tmp_path, data=tmp_path / "nowhere"), Reporter())
+
+
+def test_every_variant_is_made_of_settings_that_exist() -> None:
+    for settings in (*ABLATION.values(), *ROBUSTNESS.values(), *baselines().values()):
+        make_config("standard", settings)
+
+
+def test_the_plan_has_equal_steps_and_equal_time() -> None:
+    jobs = plan(BenchParams(suite="ablation"), ["museum"])
+    assert {job.variant for job in jobs if job.steps} >= set(ABLATION)
+    assert {job.variant for job in jobs if job.seconds} == set(TIMED)
+    assert len({job.name for job in jobs}) == len(jobs)
+    assert {job.seconds for job in plan(BenchParams(suite="speed"), ["lego_400"])} == {120.0, 600.0}
+    assert {(job.seconds, job.steps) for job in plan(BenchParams(suite="ablation", seconds=5), ["a"])} == {(5.0, None)}
+
+
+def test_the_yardstick_runs_beside_us(tmp_path: Path) -> None:
+    script = tmp_path / "other.py"
+    script.write_text(
+        "import json, sys\nprint('warming up')\nprint(json.dumps({'psnr': 24.5, 'asked': sys.argv[1]}))\n"
+    )
+    assert run_yardstick(script, 3, Reporter()) == {"psnr": 24.5, "asked": "3"}
+    script.write_text("raise SystemExit('no data')\n")
+    with pytest.raises(InputError, match="no data"):
+        run_yardstick(script, 3, Reporter())
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_without_a_gpu_nothing_is_made_up(tmp_path: Path) -> None:
+    page = tmp_path / "benchmarks.md"
+    page.write_text("# Benchmarks\n\n## GPU\n\nold text\n\n## CPU\n\nkept\n", encoding="utf-8")
+    result = run_verb("bench", BenchParams(suite="gpu", out=tmp_path, page=page), Reporter())
+    assert set(result["figures"].values()) == {None}
+    text = page.read_text("utf-8")
+    assert "Not measured: no NVIDIA GPU" in text
+    assert "old text" not in text
+    assert text.endswith("## CPU\n\nkept\n")
+
+
+def test_the_gpu_page_says_what_was_met_and_what_was_missed(tmp_path: Path) -> None:
+    rows = [
+        {
+            "scene": "lego_400",
+            "budget": "60 s",
+            "psnr": 33.4,
+            "miou": None,
+            "fps_800": 75.0,
+            "memory_training_mb": 900.0,
+        },
+        {
+            "scene": "replica_room",
+            "budget": "60 s",
+            "psnr": 29.0,
+            "miou": 0.9,
+            "fps_800": 50.0,
+            "memory_training_mb": 800.0,
+        },
+    ]
+    tests = tmp_path / "tests.xml"
+    tests.write_text('<testsuites><testsuite tests="14" skipped="2" failures="1" errors="0"/></testsuites>')
+    values = gpu.figures(rows, 3.0)
+    text = gpu.section("Some GPU", gpu.kernel_checks(tests), values, "TABLE", {"model.py:12": 3})
+    assert "11 of 12 agree with their twins" in text
+    assert "| lego_400: PSNR after 60 s (dB) | ≥ 33 | 33.4 | met |" in text
+    assert "| 800×800 colour and classes (frames/s) | ≥ 60 | 50 | missed |" in text
+    assert "| peak memory, rendering (MiB) | ≤ 1144 | not measured |  |" in text
+    assert "| host synchronisations in an ordinary step | ≤ 0 | 3 | missed |" in text
+    assert "`model.py:12` (3×)" in text
+
+
+def test_synchronisations_are_counted_in_ordinary_steps_only() -> None:
+    def step(index: int) -> None:
+        if index % 4 == 0 or index == 9:
+            warnings.warn("called a synchronizing CUDA operation (Triggered internally)", UserWarning, stacklevel=1)
+        warnings.warn("something else", UserWarning, stacklevel=1)
+
+    counted, places = gpu.count_synchronisations(step, 8, 8, 4)
+    assert counted == 6
+    assert sum(places.values()) == 1
+    assert next(iter(places)).startswith("nerfcore/test_bench.py:")
+
+
+def test_ablation_verdicts_follow_the_figures() -> None:
+    def row(variant: str, psnr: float, miou: float | None) -> dict:
+        return {"scene": "a", "budget": "10 steps", "variant": variant, "psnr": psnr, "miou": miou}
+
+    rows = [row("hybrid", 30, 0.9), row("explicit", 29, 0.8), row("implicit", 25, 0.85)]
+    assert "hybrid beats both" in tables.verdicts("ablation", rows)[0]
+    rows[1]["miou"] = 0.95
+    assert "hybrid does not beat both" in tables.verdicts("ablation", rows)[0]
+    rows[1]["miou"] = None
+    assert tables.verdicts("ablation", rows) == []
+
+
+def test_the_command_line_has_the_verb() -> None:
+    from fieldwork.nerfcore.cli import _command
+
+    result = CliRunner().invoke(_command("bench"), ["--help"])
+    assert result.exit_code == 0
+    assert "--suite" in result.output
+    assert "--yardstick" in result.output

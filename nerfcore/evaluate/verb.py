@@ -67,7 +67,7 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
         scores.append(score)
         pictures.append(_write_pictures(out, view.name, photo, frame, label, trained, scene))
     per_class = {names.get(c, str(c)): round(v, 4) for c, v in confusion.iou().items()}
-    speed = dict.fromkeys(SPEED_KEYS)
+    speed: dict[str, Any] = dict.fromkeys(SPEED_KEYS)
     if params.speed:
         speed = measure_speed(trained, scene, indices, box.box_from_world, report)
     result: dict[str, Any] = {

@@ -21,11 +21,10 @@ from ..files import write_json, write_text
 from . import cells, composite, encode, march
 from .fused import LANES, FusedShape, fused_kernel
 from .resources import Resources, disassembler, markdown, read_resources
-from .runtime import default_threads, init
+from .runtime import CUDA_BLOCK, default_threads, init
 
 ARCHITECTURES = (75, 86, 89, 90, 120)
 SOURCES = (encode, march, composite, cells)
-BLOCK = 256  # threads a block of the kernels without tiles, Warp's default
 # The standard preset: without classes, with few, with the most.
 FUSED = {f"fused, {classes} classes": FusedShape(8, 8, 64, 16, 3, 0, classes, False) for classes in (0, 16, 64)}
 
@@ -33,7 +32,7 @@ FUSED = {f"fused, {classes} classes": FusedShape(8, 8, 64, 16, 3, 0, classes, Fa
 def modules() -> dict[str, tuple[wp.Module, int]]:
     """Every kernel module by name, with the threads a block it is launched with."""
     kernels = [kernel for source in SOURCES for kernel in vars(source).values() if isinstance(kernel, wp.Kernel)]
-    found = {kernel.module.name: (kernel.module, BLOCK) for kernel in kernels}
+    found = {kernel.module.name: (kernel.module, CUDA_BLOCK) for kernel in kernels}
     return found | {name: (fused_kernel(shape, LANES).module, LANES) for name, shape in FUSED.items()}
 
 

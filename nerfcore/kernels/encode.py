@@ -12,7 +12,7 @@ from functools import partial
 import torch
 import warp as wp
 
-from .runtime import array, init, launch, load, run_parallel
+from .runtime import array, init, launch, load, run_parallel, small_tensor
 
 FEATURES = 4
 BLOCK = 16  # vertices that share one "touched" flag of the optimiser
@@ -183,8 +183,8 @@ def forward(
     init()
     device = points.device
     out = torch.empty(len(points), len(levels), FEATURES, device=device)
-    layout = torch.tensor(levels, dtype=torch.int32, device=device)
-    factors = torch.tensor(gains, device=device)
+    layout = small_tensor(levels, torch.int32, device)
+    factors = small_tensor(gains, torch.float32, device)
     inputs = [array(table, feature), array(points, wp.vec3), array(layout, wp.vec3i), array(factors)]
     launch(encode_forward, len(points), [*inputs, array(out, feature)], device)
     return out.flatten(1)

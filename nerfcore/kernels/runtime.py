@@ -24,6 +24,7 @@ wp.config.log_level = 30  # warnings; stdout belongs to results
 wp.config.enable_backward = False
 
 _MINIMUM_CHUNK = 256
+CUDA_BLOCK = 256  # threads a block, Warp's default
 Result = TypeVar("Result")
 
 
@@ -64,6 +65,12 @@ def array(tensor: torch.Tensor, dtype: Any = None) -> wp.array:
     return wp.from_torch(tensor.detach(), dtype=dtype) if dtype is not None else wp.from_torch(tensor.detach())
 
 
+def small_tensor(values: Any, dtype: torch.dtype, device: torch.device) -> torch.Tensor:
+    """A few numbers on the device, without making the host wait for it."""
+    tensor = torch.tensor(values, dtype=dtype)
+    return tensor.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else tensor.to(device)
+
+
 _loaded: dict[tuple[str, str], float] = {}
 _load_lock = threading.Lock()
 
@@ -76,7 +83,11 @@ def load(kernel: wp.Kernel, device: torch.device) -> None:
     with _load_lock:
         if key not in _loaded:
             begin = time.perf_counter()
-            kernel.module.load("cpu" if device.type == "cpu" else wp.device_from_torch(device))
+            # A module is compiled for a block size: for another one than launches use it would be compiled twice.
+            if device.type == "cpu":
+                kernel.module.load("cpu", 1)
+            else:
+                kernel.module.load(wp.device_from_torch(device), CUDA_BLOCK)
             _loaded[key] = time.perf_counter() - begin
 
 

@@ -11,6 +11,7 @@ from ..field.hybrid import HybridField
 from ..field.mlp import MLP
 from ..kernels.fused import MOST_CLASSES, CoarseRays, FusedField, FusedRays, FusedShape, coarse_walk, render_coarse
 from ..kernels.fused_network import padded
+from ..kernels.runtime import small_tensor
 from ..train.model import Model, Rendered
 
 log = logging.getLogger("fieldwork")
@@ -135,8 +136,8 @@ def pack(field: HybridField, semantics: bool = True, logits: bool = False) -> Fu
     return FusedField(
         shape=shape,
         table=field.grid.table.half(),
-        layout=torch.tensor(field.grid.levels, dtype=torch.int32, device=device),
-        gains=torch.tensor(field.gains, dtype=torch.float32, device=device),
+        layout=small_tensor(field.grid.levels, torch.int32, device),
+        gains=small_tensor(field.gains, torch.float32, device),
         weights=torch.cat(rows).contiguous(),
         code=code,
         evidence=evidence,

@@ -23,6 +23,7 @@ from pydantic.fields import FieldInfo
 from . import __version__
 from .console import ConsoleReporter
 from .errors import Cancelled, FieldworkError
+from .lock import lockable, project_lock
 from .verbs import VERBS, run_verb
 
 # Worker threads that spin while they wait take the cores other programs need; read when OpenMP starts.
@@ -134,7 +135,8 @@ def run_command(name: str, values: dict[str, Any], as_json: bool, quiet: bool, s
         raise click.UsageError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from error
     with _stdout_for_results() as stdout, ConsoleReporter(quiet or as_json) as report, _interruptible(report):
         try:
-            result = run_verb(name, params, report)
+            with project_lock(lockable(params), name):
+                result = run_verb(name, params, report)
         except Cancelled:
             click.echo("Cancelled. Run the same command again to go on.", err=True)
             return 130

@@ -1,4 +1,4 @@
-"""One verb at work: its reporter, its state on disk, its lock on the project."""
+"""One verb at work: its reporter and its state on disk."""
 
 from __future__ import annotations
 
@@ -7,15 +7,13 @@ import os
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
-
-from ..errors import DiskError, ProjectError
-from ..files import disk_errors
+from ..errors import DiskError
+from ..lock import lockable, project_of
 from ..params import Params
 from ..progress import Reporter
 from . import status as st
@@ -25,51 +23,6 @@ log = logging.getLogger("fieldwork.engine")
 
 Send = Callable[[dict[str, Any]], None]
 PROGRESS_PERIOD = 0.1  # seconds between two progress notifications
-LOCK_FILE = "engine.lock"
-
-
-def project_of(params: Params) -> Path | None:
-    """The project folder a verb writes to, None for a verb without one."""
-    folder = getattr(params, "project", None)
-    if folder is None and "photos" in type(params).model_fields:
-        folder = getattr(params, "out", None)
-    return Path(folder).absolute() if folder is not None else None
-
-
-@contextmanager
-def project_lock(project: Path | None, owner: str) -> Iterator[None]:
-    """Hold the project for writing. The operating system lets go of it when the process dies.
-
-    Raises:
-        ProjectError: another process holds it; the message says which.
-        DiskError: the folder is not writable.
-    """
-    if project is None:
-        yield
-        return
-    folder = project / st.FOLDER
-    try:
-        with disk_errors(folder):
-            folder.mkdir(parents=True, exist_ok=True)
-    except (FileExistsError, NotADirectoryError) as error:
-        raise ProjectError(f"{folder} cannot be a folder: a file is in its way.", "Choose another folder.") from error
-    note = folder / (LOCK_FILE + ".owner")
-    lock = FileLock(folder / LOCK_FILE, thread_local=False)
-    try:
-        with disk_errors(folder / LOCK_FILE):
-            lock.acquire(timeout=0)
-    except Timeout as error:
-        holder = note.read_text(encoding="utf-8") if note.is_file() else "another process"
-        raise ProjectError(
-            f"{project} is being worked on by {holder}.", "Wait until it is done, or cancel it there."
-        ) from error
-    try:
-        with disk_errors(note):
-            note.write_text(f"{owner} (process {os.getpid()})", encoding="utf-8")
-        yield
-    finally:
-        note.unlink(missing_ok=True)
-        lock.release()
 
 
 class Estimate:
@@ -123,9 +76,8 @@ class Job(Reporter):
 
     @property
     def lockable(self) -> Path | None:
-        """The project folder, None when it is not there and the verb would not make it: that is the verb's to tell."""
-        makes_it = {"photos", "dataset"} & type(self.params).model_fields.keys()
-        return self.project if self.project and (makes_it or self.project.is_dir()) else None
+        """The folder to lock; asked when the job begins, because a job before it may have made the project."""
+        return lockable(self.params)
 
     # What the verb calls.
 
@@ -189,8 +141,8 @@ class Job(Reporter):
 
     def write(self) -> None:
         """Write the job file. The job goes on when that fails: its own writes will tell of a full disk."""
-        # A verb that makes its project decides itself whether the folder may be made.
-        if self.project is None or not self.project.is_dir():
+        # The folder is there from the time the project is locked, and goes when nothing came of a new project.
+        if self.project is None or not (self.project / st.FOLDER).is_dir():
             return
         with self._lock:
             self._changed, self._written = False, time.monotonic()

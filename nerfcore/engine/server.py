@@ -28,9 +28,10 @@ import psutil
 
 from .. import __version__
 from ..errors import Cancelled, FieldworkError
+from ..lock import project_lock
 from ..verbs import VERBS, run_verb
 from . import protocol as rpc
-from .jobs import Job, project_lock
+from .jobs import Job
 
 log = logging.getLogger("fieldwork.engine")
 

@@ -44,6 +44,7 @@ def queue(settings):
 def project(tmp_path):
     folder = tmp_path / "project"
     folder.mkdir()
+    (folder / "project.json").write_text('{"format": "fieldwork-project", "version": 1}')
     return folder
 
 

@@ -29,6 +29,7 @@ def link(tmp_path):
 def project(tmp_path):
     folder = tmp_path / "project with blanks"
     folder.mkdir()
+    (folder / "project.json").write_text('{"format": "fieldwork-project", "version": 1}')
     return folder
 
 

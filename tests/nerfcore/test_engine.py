@@ -14,6 +14,8 @@ from pathlib import Path
 
 import pytest
 from fieldwork.nerfcore.engine import status as st
+from fieldwork.nerfcore.project import Project, save_project
+from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -101,7 +103,7 @@ def start(tmp_path):
 @pytest.fixture
 def project(tmp_path):
     folder = tmp_path / "Projekt mit Ümlaut"
-    folder.mkdir()
+    save_project(folder, Project())
     return folder
 
 
@@ -349,9 +351,34 @@ def test_a_project_that_is_not_there_is_not_made(start, tmp_path):
     assert not (tmp_path / "nowhere").exists()
 
 
+@pytest.mark.parametrize("there", [True, False])
+def test_failed_new_leaves_nothing(start, tmp_path, there):
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "a.jpg").write_bytes(b"no photo")
+    project = tmp_path / "new"
+    if there:
+        project.mkdir()
+    client = start()
+    error = client.answer(client.send("new", project=project, photos=tmp_path / "photos"))["error"]
+    assert error["data"]["code"] == "input"
+    time.sleep(1.2)  # two looks of the clock that writes states of jobs
+    assert (list(project.iterdir()) == []) if there else not project.exists()
+
+
+def test_a_job_locks_the_project_that_the_one_before_it_made(start, tmp_path):
+    """Poses queued while the project does not exist yet: its state is on disk in the end."""
+    (tmp_path / "photos").mkdir()
+    Image.new("RGB", (200, 100), (90, 120, 30)).save(tmp_path / "photos" / "a.png")
+    client = start()
+    client.send("new", project=tmp_path / "new", photos=tmp_path / "photos")
+    error = client.answer(client.send("poses", project=tmp_path / "new"))["error"]
+    assert error["data"]["code"] == "poses"
+    assert {job.verb: job.state for job in st.list_jobs(tmp_path / "new")} == {"new": "done", "poses": "failed"}
+
+
 def test_unwritable_project_is_an_error_that_names_it(start, tmp_path):
     blocked = tmp_path / "blocked"
-    blocked.mkdir()
+    save_project(blocked, Project())
     (blocked / "jobs").write_text("a file where a folder must be")
     client = start()
     error = client.answer(client.send("count", project=blocked, steps=1))["error"]

@@ -12,6 +12,7 @@ UNCERTAIN = 0.5  # confidence below which a level group of cameras is looked for
 GROUND_THICKNESS = 0.015  # of the height of the points
 GROUND_TILT = 6.0  # degrees from level
 GROUND_SHARE = 0.1  # of the points near the subject
+SIDEWAYS = 0.9  # certainty about a plane of down axes, and about the side from which it is seen
 LEVEL_SHARE = 0.3  # of the cameras that such a group must have
 
 
@@ -21,13 +22,16 @@ def up_direction(camera_to_world: Sequence[np.ndarray]) -> tuple[np.ndarray, flo
     People hold cameras level, so the cameras' right axes lie in the horizontal plane: up is the eigenvector of the
     smallest eigenvalue of Σ x xᵀ over the right axes x; its sign is that of the mean camera up. Where the right axes
     all agree (a single stand point) that plane is undetermined, and the mean camera up itself is taken. Where they
-    fill no plane (an object that was laid on its side for some of the photos), it is the plane of most of them.
+    fill no plane (an object that was laid on its side for some of the photos), it is the plane of most of them. Where
+    the down axes fill a plane instead (photos taken, or stored, sideways), up is its normal, on the side from which
+    the cameras look down.
 
     Args:
         camera_to_world: (4, 4) poses with OpenCV axes.
     Returns:
         up (3,), of unit length, in the frame of the poses; confidence in [0, 1]: 1 − λ₀/λ₁ of the eigenvalues, times
-        the agreement of the cameras about the sign (and times the share of cameras in the plane, if not all).
+        the agreement of the cameras about the sign (and times the share of cameras in the plane, if not all; sideways
+        photos are certain to a half at most).
     """
     poses = np.stack(camera_to_world)
     right, up = poses[:, :3, 0], -poses[:, :3, 1]
@@ -37,6 +41,11 @@ def up_direction(camera_to_world: Sequence[np.ndarray]) -> tuple[np.ndarray, flo
         if LEVEL_SHARE * len(poses) <= len(level) < len(poses):
             axis, certain = _plane_normal(right[level], up[level])
             confidence = max(confidence, certain * len(level) / len(poses))
+    if confidence < UNCERTAIN:
+        upended, certain = _plane_normal(poses[:, :3, 1], poses[:, :3, 0])
+        downwards = np.sign(poses[:, :3, 2] @ upended)
+        if certain > SIDEWAYS and abs(downwards.mean()) > SIDEWAYS:
+            return upended * -np.sign(downwards.mean()), UNCERTAIN * certain * abs(float(downwards.mean()))
     return axis, confidence
 
 

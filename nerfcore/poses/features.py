@@ -174,7 +174,7 @@ def likely_pairs(path: Path, names: list[str], neighbours: int, tell: Any) -> li
     count = max(64, min(RETRIEVAL_FEATURES, round(RETRIEVAL_FEATURES * (400 / len(ordered)) ** 0.5)))
     with database(path) as db:
         ids = {image.name: image.image_id for image in db.read_all_images()}
-        descriptors = [_largest_features(db, ids[name], count) for name in ordered]
+        descriptors = [largest_features(db, ids[name], count) for name in ordered]
     pairs = {
         (ordered[i], ordered[j])
         for i in range(len(ordered))
@@ -192,7 +192,7 @@ def likely_pairs(path: Path, names: list[str], neighbours: int, tell: Any) -> li
     return sorted(pairs)
 
 
-def _largest_features(db: Any, image_id: int, count: int) -> np.ndarray:
+def largest_features(db: Any, image_id: int, count: int) -> np.ndarray:
     """Unit descriptors (≤ count, 128) of the features of largest scale."""
     keypoints = np.asarray(db.read_keypoints(image_id))
     stored = db.read_descriptors(image_id)

@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
+import json
 import shutil
-from dataclasses import dataclass
+import zlib  # noqa: F401  (must be loaded before pycolmap, which exports a static zlib)
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pycolmap
 
 from ..data.colmap_cameras import camera_from_colmap
 from ..errors import PosesError
-from . import features, mapping
+from ..files import write_json
+from . import features, mapping, second_look
 from .presets import ENOUGH, EXHAUSTIVE_AT_MOST, EXHAUSTIVE_UP_TO, LADDERS, Level
 from .resume import mapping_folder
+from .transfer import start_model
 from .validate import MIN_POINTS, ImageCheck, pair_images
 
 MIN_FEATURES = 100
 MIN_COMMON = 40
 MIN_REGISTERED = 3
+LEVEL_FILE = "level.json"  # features of the model in poses/sparse
 
 
 @dataclass
@@ -56,7 +62,7 @@ def run(job: dict[str, Any], tell: Any) -> dict[str, Any]:
         shutil.rmtree(work / "mapping", ignore_errors=True)
     names = [image["file"] for image in job["images"]]
     best: Attempt | None = None
-    levels = LADDERS[job["preset"]]
+    levels = _levels(job, work)
     tried: set[tuple[str, bool]] = set()
     for level in levels:
         exhaustive = len(names) <= EXHAUSTIVE_UP_TO or (level.exhaustive and len(names) <= EXHAUSTIVE_AT_MOST)
@@ -78,6 +84,8 @@ def run(job: dict[str, Any], tell: Any) -> dict[str, Any]:
         raise PosesError(
             _why_nothing(best, names), "Take more photos that overlap by two thirds, with texture in view."
         )
+    if not job["group"]:
+        best = _second_look(best, job, names, tell)
     tell.stage("Final adjustment")
     model = best.models[0] = mapping.adjust(best.models[0], keep_cameras=job["start"] is not None)
     if model.num_points3D() < MIN_POINTS:
@@ -92,6 +100,7 @@ def run(job: dict[str, Any], tell: Any) -> dict[str, Any]:
     model.write(str(temporary))
     shutil.rmtree(sparse, ignore_errors=True)
     temporary.rename(sparse)
+    write_json(work / LEVEL_FILE, asdict(best.level))
     return _result(best, names, work / "points.npz")
 
 
@@ -106,7 +115,9 @@ def _attempt(job: dict[str, Any], level: Level, names: list[str], exhaustive: bo
     else:
         pairs = features.likely_pairs(path, names, job["neighbours"], tell)
     features.match(path, pairs, work / "pairs.txt", tell)
-    start = _start_model(job, path, work)
+    start = None
+    if job["start"] is not None:
+        start = start_model(pycolmap.Reconstruction(job["start"]), path, image_folder, work / "start")
     best, best_doubtful = Attempt(level, path, [], {}, {}, {}), False
     # Placing cameras is quick beside finding features: try lower demands before harder features.
     for full, relaxed in ((True, False), (False, False), (False, True)):
@@ -135,20 +146,44 @@ def _attempt(job: dict[str, Any], level: Level, names: list[str], exhaustive: bo
     return best
 
 
-def _start_model(job: dict[str, Any], path: Path, work: Path) -> Path | None:
-    """The model to extend, with its image ids brought to those of this database."""
+def _levels(job: dict[str, Any], work: Path) -> tuple[Level, ...]:
+    """The ladder of the preset; a model that is extended goes on with the features it was made of."""
+    ladder = LADDERS[job["preset"]]
     if job["start"] is None:
-        return None
-    import pycolmap
+        return ladder
+    try:
+        level = Level(**json.loads((work / LEVEL_FILE).read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError):
+        return ladder
+    return (level, *ladder) if (work / level.database).is_file() else ladder
 
-    model = pycolmap.Reconstruction(job["start"])
-    folder = work / "start"
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
-    with features.database(path) as db:
-        model.transcribe_image_ids_to_database(db)
-    model.write(str(folder))
-    return folder
+
+def _second_look(best: Attempt, job: dict[str, Any], names: list[str], tell: Any) -> Attempt:
+    """Place what a good model leaves out, at first on the matches there are, then on affine features."""
+    work, image_folder = Path(job["work"]), Path(job["image_folder"])
+    masks = Path(job["masks"]) if job["masks"] else None
+    if best.registered < len(names):
+        placed = second_look.place_rest(best.models[0], best.database, image_folder, work, names, tell)
+        best = _larger(best, best.level, best.database, placed)
+    # Where many are missing the ladder was climbed to affine features of all; what follows is for single ones.
+    has_them = best.level.affine or best.level.joined or job["preset"] == "fast"
+    if has_them or not ENOUGH * len(names) <= best.registered < len(names):
+        return best
+    level = replace(best.level, name=f"{best.level.name}, second look", joined=True)
+    joined = work / level.database
+    if not second_look.with_affine_features(
+        best.models[0], best.database, joined, image_folder, masks, job["images"], tell
+    ):
+        return best
+    placed = second_look.place_rest(best.models[0], joined, image_folder, work, names, tell)
+    return _larger(best, level, joined, placed)
+
+
+def _larger(best: Attempt, level: Level, database: Path, placed: Any) -> Attempt:
+    if placed is None:
+        return best
+    model, checks, links, dropped = placed
+    return Attempt(level, database, [model, *best.models[1:]], checks, links, best.dropped | dropped)
 
 
 def _result(best: Attempt, names: list[str], points_file: Path) -> dict[str, Any]:
@@ -243,9 +278,7 @@ def _reasons(best: Attempt, names: list[str], registered: set[str]) -> dict[str,
         elif counts[name] < MIN_FEATURES:
             reasons[name] = f"only {counts[name]} features: blurred, dark, masked out or without texture"
         elif name in dropped:
-            agreement = dropped[name].agreement
-            seen = f"{agreement:.0%} of its matches agree" if agreement is not None else "it sees too few points"
-            reasons[name] = f"its pose contradicted the other photos ({seen})"
+            reasons[name] = _why_dropped(dropped[name])
         elif name in elsewhere:
             reasons[name] = (
                 f"belongs to a separate group of {elsewhere[name]} photos that shares too little with the others"
@@ -259,6 +292,12 @@ def _reasons(best: Attempt, names: list[str], registered: set[str]) -> dict[str,
         else:
             reasons[name] = f"matches {len(placed)} placed photos, but too few of those features have a known depth"
     return reasons
+
+
+def _why_dropped(check: ImageCheck) -> str:
+    if check.points < MIN_POINTS or check.agreement is None:
+        return f"its pose rests on too little: {check.points} points"
+    return f"its pose contradicted the other photos ({check.agreement:.0%} of its matches agree)"
 
 
 def _why_nothing(best: Attempt, names: list[str]) -> str:

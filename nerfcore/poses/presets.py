@@ -10,7 +10,8 @@ class Level:
     """Settings of one attempt.
 
     `size` is the long side at which features are found, `features` their number, `octave` SIFT's first octave (−1
-    doubles the picture), `affine` adds affine shape and domain-size pooling, `exhaustive` matches all pairs.
+    doubles the picture), `affine` adds affine shape and domain-size pooling, `exhaustive` matches all pairs; `joined`
+    means that affine features of some photos were added to these.
     """
 
     name: str
@@ -19,11 +20,13 @@ class Level:
     octave: int = 0
     affine: bool = False
     exhaustive: bool = False
+    joined: bool = False
 
     @property
     def database(self) -> str:
         """Attempts with the same features share one database."""
-        return f"features_{self.size}_{self.features}_{self.octave}{'_affine' if self.affine else ''}.db"
+        kind = ("_affine" if self.affine else "") + ("_joined" if self.joined else "")
+        return f"features_{self.size}_{self.features}_{self.octave}{kind}.db"
 
 
 FAST = Level("fast", size=1000, features=2048)

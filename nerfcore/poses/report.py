@@ -62,24 +62,31 @@ def _middle_and_reach(centers: np.ndarray, cloud: np.ndarray) -> tuple[np.ndarra
 
 
 def _draw_graph(axes, records: list[ImageRecord], links: list[list], names: dict[str, str]) -> None:
-    """Photos on a circle in name order; a line for every verified pair, darker with more matches."""
+    """Photos on a circle in name order; a line for every verified pair, darker with more matches (by their logarithm)."""
     order = {record.name: i for i, record in enumerate(records)}
     angle = np.arange(len(records)) / max(len(records), 1) * 2 * np.pi
     place = np.stack([np.sin(angle), np.cos(angle)], -1)
-    strongest = max((count for *_, count in links), default=1)
+    strongest = np.log(max((count for *_, count in links), default=2))
     for a, b, count in sorted(links, key=lambda link: link[2]):
         ends = place[[order[names[a]], order[names[b]]]]
-        axes.plot(ends[:, 0], ends[:, 1], color="#0072b2", alpha=min(1.0, 0.08 + 0.9 * count / strongest), lw=0.8)
+        strength = np.log(max(count, 2)) / max(strongest, 1.0)
+        axes.plot(ends[:, 0], ends[:, 1], color="#0072b2", alpha=float(np.clip(strength**4, 0.06, 1)), lw=0.8)
     good = np.array([record.status == "ok" for record in records])
     axes.scatter(*place[good].T, s=18, c="#009e73", zorder=3, label="placed")
     if (~good).any():
         axes.scatter(*place[~good].T, s=28, c="#d55e00", marker="x", zorder=3, label="without a pose")
-    step = max(1, len(records) // 40)
+    step = max(1, -(-len(records) // 60))
     for i, record in enumerate(records):
         if i % step == 0 or not good[i]:
-            x, y = place[i] * 1.08
-            axes.text(x, y, record.name, fontsize=6, ha="left" if x >= 0 else "right", va="center")
-    axes.set(title="matches between photos", xlim=(-1.5, 1.5), ylim=(-1.3, 1.3))
+            # Along the radius, so that neighbours do not cover each other; never upside down.
+            degrees = 90 - np.degrees(angle[i])
+            left = np.sin(angle[i]) < 0
+            x, y = place[i] * 1.06
+            axes.text(
+                x, y, record.name, fontsize=6, rotation=degrees + 180 * left, rotation_mode="anchor",
+                ha="right" if left else "left", va="center",
+            )  # fmt: skip
+    axes.set(title="matches between photos", xlim=(-1.5, 1.5), ylim=(-1.5, 1.5))
     axes.set_aspect("equal")
     axes.axis("off")
     axes.legend(loc="lower left", fontsize=7, frameon=False)

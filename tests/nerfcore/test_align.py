@@ -116,6 +116,15 @@ def test_upside_down_orbit_is_turned_over() -> None:
     assert up @ [0, 0, 1] > 0.99
 
 
+@pytest.mark.parametrize("turn", [1, -1])
+def test_up_of_sideways_photos(turn: int) -> None:
+    """A camera turned by 90°, either way round: found, but only half believed; it looks down at its subject."""
+    roll = make_similarity(1.0, np.array([[0.0, -turn, 0], [turn, 0, 0], [0, 0, 1]]), np.zeros(3))
+    up, confidence = up_direction([pose @ roll for pose in orbit()])
+    assert up @ [0, 0, 1] > 0.999
+    assert 0.4 < confidence <= 0.5
+
+
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 10_000), st.floats(0.01, 100))
 def test_world_of_unknown_scale(seed: int, scale: float) -> None:

@@ -90,6 +90,11 @@ def test_upright_worlds(shared_data: Data) -> None:
 def test_turned_photos_of_the_temple_are_noticed(shared_data: Data) -> None:
     dataset = read_dataset(shared_data("temple_ring"))
     assert any("upside down" in warning for warning in dataset.warnings)
+    # They lie on their side, too: the world has the ring of cameras level, a little above the subject.
+    centres = np.stack([(dataset.world_from_sfm @ view.camera_to_world)[:3, 3] for view in dataset.views])
+    ahead = np.stack([dataset.world_from_sfm[:3, :3] @ view.camera_to_world[:3, 2] for view in dataset.views])
+    assert np.ptp(centres[:, 2]) < 0.1 * np.ptp(centres[:, 0])
+    assert -0.2 < ahead[:, 2].max() < 0
 
 
 # --- formats written by the test ------------------------------------------------------------------------------------

@@ -47,3 +47,9 @@ class Reporter:
     def check(self) -> None:
         if self._cancelled.is_set():
             raise Cancelled
+
+
+def shortened(what: str, items: list[str], most: int = 6) -> str:
+    """`what`, and the first of `items` behind it: "2 files were left out: a.jpg (…); b.jpg (…)." """
+    more = f"; and {len(items) - most} more" if len(items) > most else ""
+    return f"{what}: {'; '.join(items[:most])}{more}."

@@ -20,7 +20,7 @@ from ..data.dataset import beside, unique_names
 from ..errors import InputError, ProjectError
 from ..files import atomic_path, write_json
 from ..params import NewParams
-from ..progress import Reporter
+from ..progress import Reporter, shortened
 from ..project import PROJECT_FILE, ImageRecord, Project, create_folder, load_project, save_project
 from .images import FLOAT_SUFFIXES, PHOTO_SUFFIXES, float_exposure, read_photo
 from .labels import Colors, fit_to_photo, read_labels, read_mask
@@ -105,8 +105,12 @@ def new(params: NewParams, report: Reporter) -> dict[str, Any]:
         {"file": Path(record.source).name, "reason": record.reason} for record in records if record.status == "rejected"
     ]
     used = [record for record in records if record.status != "rejected"]
+    if rejected:
+        left_out = [f"{item['file']} ({item['reason']})" for item in rejected]
+        report.warn(shortened(f"{len(rejected)} of {len(used) + len(rejected)} files were left out", left_out))
     if len(used) < 3:
-        report.warn(f"Only {len(used)} usable photos: camera poses need at least three, better twenty.")
+        number = "one usable photo" if len(used) == 1 else f"{len(used)} usable photos"
+        report.warn(f"Only {number}: camera poses need at least three, better twenty.")
     result = {
         "images": len(used),
         "rejected": rejected,

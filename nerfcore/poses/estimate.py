@@ -16,7 +16,7 @@ from ..data.scene import Points
 from ..errors import PosesError
 from ..files import atomic_path, disk_errors, write_json
 from ..params import PosesParams
-from ..progress import Reporter
+from ..progress import Reporter, shortened
 from ..project import (
     POSES_FILE,
     Frame,
@@ -58,7 +58,8 @@ def estimate_poses(params: PosesParams, report: Reporter) -> dict[str, Any]:
     if len(records) < MIN_PHOTOS:
         rejected = len(project.images) - len(records)
         raise PosesError(
-            f"{folder} has {len(records)} usable photos ({rejected} rejected); poses need at least {MIN_PHOTOS}.",
+            f"{folder} has {len(records)} usable photo{'s' * (len(records) != 1)} ({rejected} rejected); "
+            f"poses need at least {MIN_PHOTOS}.",
             "Add photos with `fieldwork new --add`; twenty to a hundred around the subject work well.",
         )
     previous = None if params.restart or params.group else _extendable(folder, records)
@@ -86,9 +87,10 @@ def estimate_poses(params: PosesParams, report: Reporter) -> dict[str, Any]:
     project.record("poses", params.model_dump(mode="json"), {k: v for k, v in answer.items() if k != "images"})
     save_project(folder, project)
     _write_report(folder, project, poses, points, records, result, report)
-    missing = answer["total"] - answer["registered"]
+    missing = [f"{record.name} ({record.reason})" for record in records if record.status != "ok"]
     if missing:
-        report.warn(f"{missing} of {answer['total']} photos have no pose; {folder / REPORT_FILE} says why.")
+        where = f"{len(missing)} of {answer['total']} photos have no pose"
+        report.warn(f"{shortened(where, missing)} {folder / REPORT_FILE} says why.")
     return answer
 
 

@@ -10,6 +10,9 @@ from ..config import SceneConfig
 from .scene import Scene, View
 from .similarity import make_similarity, similarity_scale
 
+FEWEST_POINTS = 100  # sparse points that say where things are
+POINTS_MARGIN = 1.3  # surfaces reach beyond their points
+
 
 @dataclass(frozen=True)
 class Box:
@@ -48,8 +51,8 @@ def choose_box(scene: Scene, config: SceneConfig, transparent: bool) -> Box:
 
     - Bounds given by the capture (or the crop box): the cube around them, nothing outside.
     - Photos or masks with empty surroundings: the cube holds what the cameras surround, nothing outside.
-    - Inward-looking captures with visible surroundings: the cube reaches from the focus to the cameras; space beyond
-      is contracted.
+    - Inward-looking captures with visible surroundings: the cube reaches from the focus to the cameras, or holds the
+      sparse points where those all lie closer together; space beyond is contracted.
     - Everything else (rooms, walks): the cube holds all cameras and most sparse points; beyond is contracted.
     """
     centers = np.stack([view.camera_to_world[:3, 3] for view in scene.views])
@@ -63,13 +66,24 @@ def choose_box(scene: Scene, config: SceneConfig, transparent: bool) -> Box:
             return _box(focus, _object_radius(scene, focus, reach) * config.margin, False)
         # Cameras just inside the cube: what stands between and behind them is resolved finely too.
         extent = float(np.abs(centers - focus).max())
+        middle, half = _points_extent(scene)
+        if half * POINTS_MARGIN < extent:
+            return _box(middle, half * POINTS_MARGIN * config.margin, config.contraction != "off")
         return _box(focus, extent * config.margin, config.contraction != "off")
     low, high = centers.min(0), centers.max(0)
-    if len(scene.points) >= 100:
+    if len(scene.points) >= FEWEST_POINTS:
         inside = np.percentile(scene.points.xyz, [2, 98], axis=0)
         low, high = np.minimum(low, inside[0]), np.maximum(high, inside[1])
     half = float((high - low).max()) / 2
     return _box((low + high) / 2, max(half, 1e-6) * config.margin, config.contraction != "off")
+
+
+def _points_extent(scene: Scene) -> tuple[np.ndarray, float]:
+    """Centre (3,) and half side of the cube around nearly all sparse points; infinite when there are few."""
+    if len(scene.points) < FEWEST_POINTS:
+        return np.zeros(3), np.inf
+    low, high = np.percentile(scene.points.xyz, [1, 99], axis=0)
+    return (low + high) / 2, float((high - low).max()) / 2
 
 
 def _object_radius(scene: Scene, focus: np.ndarray, reach: np.ndarray) -> float:

@@ -37,7 +37,7 @@ from .march import (
     bin_length,
     bin_weight,
     cell_index,
-    empty_skip,
+    closed_length,
     grid_position,
     inside,
     march_weight,
@@ -182,10 +182,8 @@ def advanced(ray: Ray, m: March, cells: wp.array(dtype=wp.vec2), blocks: wp.arra
                     ray.transmittance *= wp.exp(-cell[0] * width)
                     if ray.transmittance < STOP:
                         ray.t = ray.high
-        elif m.contracted == 0:
-            ray.t += empty_skip(u, ray.direction, ray.inverse, m.n, m.step, blocks)
         else:
-            ray.t += width
+            ray.t += closed_length(u, ray.direction, ray.inverse, m.n, m.step, width, m.contracted, blocks)
     if found == 0:
         # Rounding left this interval just short of the total; nothing is behind it.
         length = ray.gathered

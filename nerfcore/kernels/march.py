@@ -95,25 +95,41 @@ def bin_length(p: wp.vec3, step: float, contracted: int):
 
 @wp.func
 def leave_distance(u: wp.vec3, d: wp.vec3, inverse: wp.vec3, n: float):
-    """Distance until a ray at grid position u leaves its cell of an n³ grid over the cube."""
+    """Way, in grid coordinates, until a ray at grid position u leaves its cell of an n³ grid."""
     ux = u[0] * n
     uy = u[1] * n
     uz = u[2] * n
     tx = (wp.floor(ux) + wp.where(d[0] > 0.0, 1.0, 0.0) - ux) * inverse[0]
     ty = (wp.floor(uy) + wp.where(d[1] > 0.0, 1.0, 0.0) - uy) * inverse[1]
     tz = (wp.floor(uz) + wp.where(d[2] > 0.0, 1.0, 0.0) - uz) * inverse[2]
-    return wp.max(wp.min(tx, wp.min(ty, tz)) * 2.0 / n, 0.0)
+    return wp.max(wp.min(tx, wp.min(ty, tz)) / n, 0.0)
 
 
 @wp.func
-def empty_skip(u: wp.vec3, d: wp.vec3, inverse: wp.vec3, n: int, step: float, blocks: wp.array(dtype=wp.uint8)):
-    """Whole steps until the ray leaves its closed cell, or its block of closed cells; bounded grid only."""
+def closed_length(
+    u: wp.vec3,
+    d: wp.vec3,
+    inverse: wp.vec3,
+    n: int,
+    step: float,
+    length: float,
+    contracted: int,
+    blocks: wp.array(dtype=wp.uint8),
+):
+    """How far to move from a closed cell: in whole steps until the ray leaves it, or its block of closed cells; one bin
+    where space is contracted."""
+    side = float(2.0)
+    if contracted == 1:
+        side = 4.0
+        c = u - wp.vec3(0.5, 0.5, 0.5)
+        if wp.max(wp.abs(c[0]), wp.max(wp.abs(c[1]), wp.abs(c[2]))) >= 0.25:
+            return length
     leave = float(0.0)
     if blocks[cell_index(u, n / MACRO)] == wp.uint8(0):
         leave = leave_distance(u, d, inverse, float(n / MACRO))
     else:
         leave = leave_distance(u, d, inverse, float(n))
-    return wp.max(1.0, wp.floor(leave / step + 0.5)) * step
+    return wp.max(1.0, wp.floor(leave * side / step + 0.5)) * step
 
 
 @wp.func
@@ -183,10 +199,8 @@ def march_weight(
                 if transmittance < STOP:
                     break
             t += length
-        elif contracted == 0:
-            t += empty_skip(u, d, inverse, n, step, blocks)
         else:
-            t += length
+            t += closed_length(u, d, inverse, n, step, length, contracted, blocks)
     total[r] = weight
     first[r] = t_first
     last[r] = t_last
@@ -270,10 +284,8 @@ def march_sample(
                 if transmittance < STOP:
                     break
             t += length
-        elif contracted == 0:
-            t += empty_skip(u, d, inverse, n, step, blocks)
         else:
-            t += length
+            t += closed_length(u, d, inverse, n, step, length, contracted, blocks)
     # Rounding can leave the last interval or sample just short of the total.
     while k < count:
         depth[base + k] = t_end

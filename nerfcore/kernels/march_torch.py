@@ -56,7 +56,7 @@ def walk(
                 if transmittance < STOP:
                     break
             t += length
-        elif s.contracted:
+        elif s.contracted and float((u - 0.5).abs().max()) >= 0.25:
             t += length
         else:
             bx, by, bz = x // MACRO * MACRO, y // MACRO * MACRO, z // MACRO * MACRO
@@ -64,7 +64,7 @@ def walk(
             m = n / MACRO if closed else float(n)
             scaled = u * m
             ahead = (scaled.floor() + (direction > 0).float() - scaled) * inverse
-            leave = max(float(ahead.min()) * 2 / m, 0.0)
+            leave = max(float(ahead.min()) * (4 if s.contracted else 2) / m, 0.0)
             t += max(1.0, math.floor(leave / s.step + 0.5)) * s.step
     return bins
 

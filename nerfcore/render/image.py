@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +14,13 @@ import torch
 from ..data.cameras import Camera
 from ..data.pixels import CameraRays
 from ..errors import DiskError
+from ..kernels.runtime import run_parallel
 from ..train.model import Model
 from ..train.run import RunInfo
 from .fused import ray_renderer
+
+CPU_RAYS = 2048
+TILES = 16  # rendered between two checks for cancelling
 
 
 @dataclass(frozen=True)
@@ -78,31 +83,31 @@ def render_view(
     rays = CameraRays([camera], camera_to_box[None], device)
     count = model.config.render.samples or model.config.sampling.samples
     axis = rays.rotation[0, :, 2]
-    colors, opacities, depths, classes, points = [], [], [], [], []
-    render = ray_renderer(model, camera.width * camera.height, semantics)
-    for pixel in torch.arange(camera.width * camera.height, device=device).split(render.rays):
-        if check is not None:
-            check()
+    pixels = torch.arange(camera.width * camera.height, device=device)
+    render = ray_renderer(model, len(pixels), semantics)
+
+    def tile(pixel: torch.Tensor) -> list[torch.Tensor]:
         origins, directions = rays(torch.zeros_like(pixel), pixel)
         valid = ~directions[:, 0].isnan()
         directions = torch.where(valid[:, None], directions, axis.expand_as(directions)).contiguous()
         out = render(origins, directions, count)
         opacity = out.opacity * valid
         distance = torch.where(opacity > 1e-3, out.depth / out.opacity.clamp(min=1e-3), torch.nan)
-        colors.append(out.color * valid[:, None] + background * (1 - opacity[:, None]))
-        opacities.append(opacity)
-        depths.append(distance * (directions @ axis))
-        points.append(origins + directions * distance[:, None])
-        if out.probabilities is not None:
-            classes.append(out.probabilities)
+        color = out.color * valid[:, None] + background * (1 - opacity[:, None])
+        found = [color, opacity, distance * (directions @ axis), origins + directions * distance[:, None]]
+        return found if out.probabilities is None else [*found, out.probabilities]
+
+    # The CPU renders small tiles side by side, each of which fits a core's cache.
+    tiles = pixels.split(render.rays if device.type != "cpu" else min(render.rays, CPU_RAYS))
+    parts: list[list[torch.Tensor]] = []
+    for begin in range(0, len(tiles), TILES):
+        if check is not None:
+            check()
+        parts += run_parallel([partial(torch.no_grad()(tile), pixel) for pixel in tiles[begin : begin + TILES]])
     shape = (camera.height, camera.width)
-
-    def image(parts: list[torch.Tensor]) -> np.ndarray:
-        return torch.cat(parts).reshape(*shape, *parts[0].shape[1:]).cpu().numpy()
-
-    return Frame(
-        image(colors).clip(0, 1), image(opacities), image(depths), image(classes) if classes else None, image(points)
-    )
+    images = [torch.cat(column).cpu() for column in zip(*parts)]
+    color, opacity, depth, position, *classes = (i.reshape(*shape, *i.shape[1:]).numpy() for i in images)
+    return Frame(color.clip(0, 1), opacity, depth, classes[0] if classes else None, position)
 
 
 def to_bytes(color: np.ndarray) -> np.ndarray:

@@ -6,6 +6,8 @@ import torch
 
 from ..data.cameras import Camera
 
+FEWEST_POINTS = 20  # in a photo, from which its depths are believed
+
 
 def grid_centers(resolution: int, contracted: bool, device: torch.device) -> torch.Tensor:
     """Normalised positions (resolution³, 3) of cell centres, x fastest."""
@@ -23,24 +25,63 @@ def uncontract(u: torch.Tensor) -> torch.Tensor:
     return torch.where(r > 1, q / r.clamp(min=1e-9) / (2 - r).clamp(min=1e-4), q)
 
 
+def depth_ranges(cameras: list[Camera], camera_to_box: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
+    """How near the sparse points (N, 3) come to each camera and where they mostly are: (V, 2) depths along the optical
+    axis, the 2nd percentile halved and the median; zeros for cameras that see too few points to tell."""
+    ranges = torch.zeros(len(cameras), 2, device=camera_to_box.device)
+    for index, (camera, pose) in enumerate(zip(cameras, camera_to_box)):
+        u, v, z = _project(camera, pose, points)
+        depth = z[(z > 1e-6) & (u > 0) & (u < 1) & (v > 0) & (v < 1)]
+        if len(depth) >= FEWEST_POINTS and not _sees_everything(camera):
+            ranges[index, 0] = depth.quantile(0.02) / 2
+            ranges[index, 1] = depth.median()
+    return ranges
+
+
+def _sees_everything(camera: Camera) -> bool:
+    return camera.model in ("EQUIRECTANGULAR", "OPENCV_FISHEYE")
+
+
+def _project(
+    camera: Camera, pose: torch.Tensor, points: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Place (u, v) of points (N, 3) in the undistorted image as shares of its size, and depth."""
+    x, y, z = ((points - pose[:3, 3]) @ pose[:3, :3]).unbind(1)
+    depth = z.clamp(min=1e-6)
+    u = (camera.fx * x / depth + camera.cx) / camera.width
+    v = (camera.fy * y / depth + camera.cy) / camera.height
+    return u, v, z
+
+
 def view_counts(
-    cameras: list[Camera], camera_to_box: torch.Tensor, resolution: int, contracted: bool, margin: float = 0.1
+    cameras: list[Camera],
+    camera_to_box: torch.Tensor,
+    resolution: int,
+    contracted: bool,
+    ranges: torch.Tensor | None = None,
+    margin: float = 0.1,
 ) -> torch.Tensor:
-    """How many cameras see each cell centre (resolution³,) float32.
+    """How many cameras see each cell centre (resolution³,) float32; 0 for cells that must be empty.
 
     A camera sees what its undistorted image, widened by `margin` of its size, holds in front of it. Equirectangular
-    and fisheye cameras see everything.
+    and fisheye cameras see everything. With `ranges` (V, 2) of `depth_ranges`, cells nearer to a camera than anything
+    in its photo are empty, and so are cells that only one camera sees, unless as far away as most of its photo:
+    either would let a field explain each photo by a curtain in front of its camera.
     """
     device = camera_to_box.device
     points = grid_centers(resolution, contracted, device)
-    counts = torch.zeros(len(points), device=device)
-    for camera, pose in zip(cameras, camera_to_box):
-        if camera.model in ("EQUIRECTANGULAR", "OPENCV_FISHEYE"):
+    counts, beyond = torch.zeros(len(points), device=device), torch.zeros(len(points), dtype=torch.bool, device=device)
+    empty = torch.zeros_like(beyond)
+    ranges = torch.zeros(len(cameras), 2, device=device) if ranges is None else ranges
+    for camera, pose, (near, typical) in zip(cameras, camera_to_box, ranges):
+        if _sees_everything(camera):
             counts += 1
+            beyond |= True
             continue
-        x, y, z = ((points - pose[:3, 3]) @ pose[:3, :3]).unbind(1)
-        depth = z.clamp(min=1e-6)
-        u = (camera.fx * x / depth + camera.cx) / camera.width
-        v = (camera.fy * y / depth + camera.cy) / camera.height
-        counts += (z > 1e-6) & (u > -margin) & (u < 1 + margin) & (v > -margin) & (v < 1 + margin)
+        u, v, z = _project(camera, pose, points)
+        seen = (z > 1e-6) & (u > -margin) & (u < 1 + margin) & (v > -margin) & (v < 1 + margin)
+        counts += seen
+        beyond |= seen & (z >= typical)
+        empty |= seen & (z < near)
+    counts[empty | ((counts < 2) & ~beyond)] = 0
     return counts

@@ -11,10 +11,11 @@ from ..config import RunConfig
 from ..data.box import box_poses, choose_box
 from ..data.pixels import PixelStore, read_label, read_photo
 from ..data.scene import Scene
+from ..data.similarity import transform_points
 from ..errors import TrainingError
 from ..progress import Reporter
 from ..project import load_project, load_scene, world_from_sfm
-from ..sampling.visibility import view_counts
+from ..sampling.visibility import depth_ranges, view_counts
 from .run import RunInfo, new_model
 from .trainer import Trainer
 
@@ -103,7 +104,9 @@ def make_trainer(project_folder: Path, info: RunInfo, scene: Scene, device: torc
     degrade(store, config)
     poses = torch.from_numpy(box_poses(store.views, box.box_from_world)).float().to(device)
     coarse = 64
-    counts = view_counts(store.cameras, poses, coarse, box.contracted)
+    points = torch.from_numpy(transform_points(box.box_from_world, scene.points.xyz)).float().to(device)
+    ranges = depth_ranges(store.cameras, poses, points)
+    counts = view_counts(store.cameras, poses, coarse, box.contracted, ranges)
     resolution = config.sampling.resolution
     index = (torch.arange(resolution, device=device) * coarse) // resolution
     seen = (counts > 0).view(coarse, coarse, coarse)[index][:, index][:, :, index].reshape(-1)

@@ -25,6 +25,8 @@ from .prepare import make_trainer, plan_run
 from .run import CHECKPOINT, RunInfo, load_info, run_folder, save_info, use_device
 from .trainer import Trainer
 
+PREVIEW_PAUSE = 20  # times what a preview costs, before the next one
+
 
 class _Clock:
     """Seconds of training, without kernel compilation, across resumed sessions."""
@@ -120,6 +122,7 @@ class _Loop:
     def run(self, preview: Callable[[], Path]) -> None:
         train = self.info.config.train
         told = saved = shown = time.perf_counter()
+        cost = 0.0  # seconds of the last preview
         with disk_errors(self.folder), open(self.folder / "events.jsonl", "a", encoding="utf-8") as events:
             while (progress := self.progress()) < 1:
                 self.trainer.step(progress)
@@ -131,9 +134,10 @@ class _Loop:
                 if now - saved >= train.checkpoint_every:
                     self.checkpoint()
                     saved = time.perf_counter()
-                if now - shown >= train.preview_every:
+                if now - shown >= max(train.preview_every, PREVIEW_PAUSE * cost):
                     self.report.event("preview", path=str(preview()))
                     shown = time.perf_counter()
+                    cost = shown - now
                 self.report.check()
             self.state["progress"] = 1.0
             self._tell(1.0, max(time.perf_counter() - told, 1e-3), events)

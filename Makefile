@@ -52,8 +52,9 @@ matrix: venv
 gui: venv
 	$(BIN)/python -m pytest tests/gui $(PYTEST)
 
+# Every kernel for every architecture without a GPU (minutes); writes the section Resources of docs/kernels.md.
 gpu-compile: venv
-	$(BIN)/python -m fieldwork.nerfcore.kernels.compile_cuda build/cubins
+	$(BIN)/python -m fieldwork.nerfcore.kernels.compile_cuda build/cubins --page docs/kernels.md
 
 # Kernels against their twins, then training, rendering and memory; writes the GPU section of docs/benchmarks.md.
 gpu-check: venv

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -61,6 +62,21 @@ def write_text(path: Path, text: str) -> None:
     """Atomically write UTF-8 text."""
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def write_section(page: Path, heading: str, text: str) -> None:
+    """Atomically replace what stands under "## heading" of a Markdown page, up to the next heading of that level.
+
+    A page or heading that is not there is added.
+    """
+    old = page.read_text(encoding="utf-8").rstrip() + "\n" if page.is_file() else ""
+    title = re.escape(f"## {heading}")
+    if not re.search(rf"^{title}$", old, flags=re.MULTILINE):
+        old = f"{old}\n## {heading}\n".lstrip()
+    new = re.sub(
+        rf"(^{title}$).*?(?=^## |\Z)", lambda m: f"{m[1]}\n\n{text.strip()}\n\n", old, flags=re.MULTILINE | re.DOTALL
+    )
+    write_text(page, new.rstrip() + "\n")
 
 
 def write_json(path: Path, value: Any) -> None:

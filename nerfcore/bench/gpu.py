@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import warnings
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -13,7 +12,6 @@ from xml.etree import ElementTree
 import torch
 
 from ..config import make_config
-from ..files import write_text
 from ..progress import Reporter
 from ..train.prepare import make_trainer, plan_run
 from ..train.run import use_device
@@ -130,14 +128,3 @@ def section(
     if places:
         lines += ["The host waited at: " + ", ".join(f"`{p}` ({n}×)" for p, n in places.items()) + ".", ""]
     return "\n".join(lines)
-
-
-def write_page(page: Path, text: str) -> None:
-    """Replace what stands under the heading "## GPU" of a Markdown page, up to the next heading of its level."""
-    old = page.read_text(encoding="utf-8") if page.is_file() else "# Benchmarks\n\n## GPU\n"
-    if not re.search(r"^## GPU$", old, flags=re.MULTILINE):
-        old = old.rstrip() + "\n\n## GPU\n"
-    new = re.sub(
-        r"(^## GPU$).*?(?=^## |\Z)", lambda m: f"{m[1]}\n\n{text.rstrip()}\n\n", old, flags=re.MULTILINE | re.DOTALL
-    )
-    write_text(page, new.rstrip() + "\n")

@@ -26,7 +26,8 @@ from ..train.run import CHECKPOINT, load_info, load_trained, run_folder, use_dev
 from ..train.verb import train
 
 COUNTING_SIDE = 200  # of a frame that only counts samples per ray
-SECONDS_PER_STEP = 0.1  # a guess, only for the estimate of the whole before anything ran
+# Guesses, only for the estimate of the time left.
+SECONDS_PER_STEP, EVALUATION_SECONDS = 0.1, 60.0
 
 
 @dataclass(frozen=True)
@@ -51,25 +52,38 @@ class Job:
         return re.sub(r"[^\w.-]+", "-", f"bench-{self.scene}-{self.variant}-{self.budget}")
 
     @property
-    def expected_seconds(self) -> float:
+    def training_seconds(self) -> float:
+        """Expected, not measured."""
         return self.seconds or (self.steps or 0) * SECONDS_PER_STEP
+
+    @property
+    def expected_seconds(self) -> float:
+        return self.training_seconds + EVALUATION_SECONDS
 
 
 class JobReporter(Reporter):
     """Turns the stages of one job into a share of the whole suite's progress."""
 
-    def __init__(self, outer: Reporter, begin: float, share: float, title: str) -> None:
+    def __init__(self, outer: Reporter, begin: float, share: float, job: Job, title: str) -> None:
         super().__init__()
         self.outer, self.begin, self.share, self.title = outer, begin, share, title
-        self.inner = ""
+        trained = job.training_seconds / job.expected_seconds
+        # Where in the job a stage begins and ends.
+        self.stages = {
+            "Training": (0.0, trained),
+            "Rendering": (trained, trained + 0.8 * (1 - trained)),
+            "Measuring": (trained + 0.8 * (1 - trained), 1.0),
+        }
+        self.inner, self.span = "", (0.0, 0.0)
 
     def stage(self, name: str) -> None:
         self.inner = name
+        self.span = self.stages.get(name.split(" ")[0], (0.0, 0.0))
 
     def progress(self, fraction: float, message: str = "") -> None:
-        # Loading and evaluating take little beside training; only training moves the bar.
-        done = fraction if self.inner == "Training" else float(self.inner.startswith(("Rendering", "Measuring")))
-        self.outer.progress(self.begin + self.share * min(done, 1.0), f"{self.title}: {self.inner} {message}")
+        low, high = self.span
+        done = low + (high - low) * min(fraction, 1.0)
+        self.outer.progress(self.begin + self.share * done, f"{self.title}: {self.inner} {message}")
 
     def warn(self, message: str) -> None:
         self.outer.warn(f"{self.title}: {message}")
@@ -195,7 +209,7 @@ def run_all(
         known = load_result(job, out)
         if known is None:
             try:
-                known = run_job(job, projects[job.scene], out, JobReporter(report, done, share, title), keep)
+                known = run_job(job, projects[job.scene], out, JobReporter(report, done, share, job, title), keep)
             except FieldworkError as error:
                 report.warn(f"{title} failed: {error}")
                 known = {"job": _description(job), "error": str(error)}

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 
 from ..errors import InputError
-from ..files import write_json, write_text
+from ..files import write_json, write_section, write_text
 from ..params import BenchParams
 from ..progress import Reporter
 from . import gpu, machine, tables
@@ -115,7 +115,8 @@ def _write_gpu_page(
         return
     columns = {"scene": "scene", "budget": "training", "psnr": "PSNR (dB)", "miou": "mIoU", "spr": "samples/ray"}
     columns |= {f"{key}_800": heading for key, heading in tables.SPEED.items()}
-    gpu.write_page(params.page, gpu.section(described, checks, values, tables.table(columns, rows), places))
+    text = gpu.section(described, checks, values, tables.table(columns, rows), places)
+    write_section(params.page, "GPU", text)
 
 
 def _without_gpu(params: BenchParams, out: Path, report: Reporter) -> dict[str, Any]:

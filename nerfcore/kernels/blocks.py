@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from typing import Any
 
@@ -9,6 +10,8 @@ import torch
 import warp as wp
 
 from .runtime import _load_lock, _loaded
+
+_one_at_a_time = threading.Lock()  # tiles of all CPU threads lie in the same memory
 
 
 def load_blocks(kernel: wp.Kernel, lanes: int, device: torch.device) -> None:
@@ -23,9 +26,11 @@ def load_blocks(kernel: wp.Kernel, lanes: int, device: torch.device) -> None:
 
 
 def launch_blocks(kernel: wp.Kernel, blocks: int, lanes: int, inputs: list[Any], device: torch.device) -> None:
-    """Run `blocks` blocks of `lanes` threads; on the CPU one after the other, as Warp's tiles need it there."""
+    """Run `blocks` blocks of `lanes` threads; on the CPU one after the other."""
     load_blocks(kernel, lanes, device)
-    target, stream = "cpu", None
     if device.type == "cuda":
         target, stream = wp.device_from_torch(device), wp.stream_from_torch(torch.cuda.current_stream(device))
-    wp.launch(kernel, dim=blocks * lanes, inputs=inputs, device=target, stream=stream, block_dim=lanes)
+        wp.launch(kernel, dim=blocks * lanes, inputs=inputs, device=target, stream=stream, block_dim=lanes)
+        return
+    with _one_at_a_time:
+        wp.launch(kernel, dim=blocks * lanes, inputs=inputs, device="cpu", block_dim=lanes)

@@ -59,10 +59,10 @@ def take_max(
 ):
     i = wp.tid() + offset
     cell = cell_index(points[i], n)
-    value = fresh[cell]
+    # Of all points in a cell one takes the value; a cell that decayed twice would depend on the order of threads.
+    value = wp.atomic_exch(fresh, cell, -1.0)
     if value >= 0.0:
         grid[cell] = wp.max(grid[cell] * decay, value)
-        fresh[cell] = -1.0
 
 
 def observe(

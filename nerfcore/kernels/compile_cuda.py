@@ -1,8 +1,8 @@
 """Compile every kernel for NVIDIA GPUs without one, and report what each takes of a multiprocessor.
 
-    python -m fieldwork.nerfcore.kernels.compile_cuda OUT [--architectures 75,86,89,90,120] [--jobs N]
+    python -m fieldwork.nerfcore.kernels.compile_cuda OUT [--architectures 75,86,89,90,120] [--jobs N] [--page FILE]
 
-Writes OUT/sm_NN/MODULE/*.cubin, OUT/resources.json and OUT/resources.md.
+Writes OUT/sm_NN/MODULE/*.cubin, OUT/resources.json and OUT/resources.md, and the section "Resources" of a page.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pathlib import Path
 
 import warp as wp
 
-from ..files import write_json, write_text
+from ..files import write_json, write_section, write_text
 from . import cells, composite, encode, march
 from .fused import LANES, FusedShape, fused_kernel
 from .resources import Resources, disassembler, markdown, read_resources
@@ -80,10 +80,13 @@ def main() -> None:
     parser.add_argument("out", type=Path, nargs="?", default=Path("build/cubins"))
     parser.add_argument("--architectures", default=",".join(map(str, ARCHITECTURES)))
     parser.add_argument("--jobs", type=int, default=default_threads())
+    parser.add_argument("--page", type=Path, help="Markdown page whose section “Resources” is rewritten")
     options = parser.parse_args()
     if disassembler() is None:
         print("nvdisasm is not installed: local memory accesses are not measured.")
-    compile_all(options.out, [int(a) for a in options.architectures.split(",")], options.jobs)
+    rows = compile_all(options.out, [int(a) for a in options.architectures.split(",")], options.jobs)
+    if options.page is not None:
+        write_section(options.page, "Resources", markdown(rows))
     print(f"Written: {options.out / 'resources.md'}")
 
 

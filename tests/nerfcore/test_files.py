@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from fieldwork.nerfcore.errors import DiskError
-from fieldwork.nerfcore.files import atomic_path, write_json, write_text
+from fieldwork.nerfcore.files import atomic_path, write_json, write_section, write_text
 
 
 @pytest.fixture
@@ -80,3 +80,12 @@ def test_keeps_the_suffix_for_image_writers(tmp_path: Path) -> None:
         assert temporary.suffix == ".exr"
         temporary.write_bytes(b"x")
     assert (tmp_path / "a.exr").read_bytes() == b"x"
+
+
+def test_a_section_of_a_page_is_replaced_and_the_rest_is_kept(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    write_section(page, "GPU", "first")
+    assert page.read_text("utf-8") == "## GPU\n\nfirst\n"
+    page.write_text("# Page\n\n## GPU\n\nold\n\n### deeper\n\nold too\n\n## CPU\n\nkept \\1\n", encoding="utf-8")
+    write_section(page, "GPU", "new \\1")
+    assert page.read_text("utf-8") == "# Page\n\n## GPU\n\nnew \\1\n\n## CPU\n\nkept \\1\n"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 import torch
@@ -162,3 +163,20 @@ def test_every_preset_is_supported() -> None:
     for preset in preset_names():
         config = make_config(preset, {"field.table_log2": "10", "sampling.resolution": "16"})
         assert unsupported(Model(config, 64, 0, False)) is None, preset
+
+
+def test_resources_of_a_compiled_kernel_are_read_without_a_gpu(tmp_path: Path) -> None:
+    """The report of `make gpu-compile`, on a module that compiles in a second."""
+    from fieldwork.nerfcore.kernels import composite
+    from fieldwork.nerfcore.kernels.resources import disassembler, markdown, read_resources
+    from fieldwork.nerfcore.kernels.runtime import init
+
+    init()
+    wp.compile_aot_module(composite.sum_forward.module, device=None, arch=90, module_dir=str(tmp_path), use_ptx=False)
+    rows = read_resources(next(tmp_path.glob("*.cubin")), next(tmp_path.glob("*.meta")), 90)
+    assert {r.kernel for r in rows} == {"sum_forward", "sum_backward", "weights_forward", "weights_backward"}
+    for row in rows:
+        assert 8 <= row.registers <= 255
+        assert row.stack == 0
+        assert row.local_loads == (0 if disassembler() else None)
+    assert "| composite | sum_forward | " in markdown([("composite", r) for r in rows])

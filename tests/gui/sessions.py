@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 from pathlib import Path
 
 import bpy
@@ -81,6 +80,13 @@ def life(screen):
     screen.shot("uninstalled")
 
 
+def open_from_the_start(panel):
+    """Let a panel be open when it is first drawn: clicking it open would need its place."""
+    bpy.utils.unregister_class(panel)
+    panel.bl_options = set()
+    bpy.utils.register_class(panel)
+
+
 def leave(screen):
     """Close Blender in the middle of a training that is to go on."""
     settings = yield from opened(screen)
@@ -94,8 +100,9 @@ def leave(screen):
 def back(screen):
     """A new Blender opens the project: the job is found, followed to its end, and its run can be chosen."""
     settings = bpy.context.scene.fieldwork
+    open_from_the_start(bpy.types.FIELDWORK_PT_runs)
     yield from screen.show_sidebar()
-    settings.project = str(screen.folder / "project")
+    settings.project = alias(screen.folder / "project", "banana_fieldwork")
     followed = screen.queue.followed
     assert followed is not None, "the job was not found"
     screen.facts["followed"] = followed.verb
@@ -108,11 +115,6 @@ def back(screen):
     yield from screen.wait(lambda: not followed.active, 120, "the end of the job")
     screen.facts["state"] = followed.state
     settings.run = "main"
-    # The list of runs, opened.
-    panel = bpy.types.FIELDWORK_PT_runs
-    bpy.utils.unregister_class(panel)
-    panel.bl_options = set()
-    bpy.utils.register_class(panel)
     yield 1.0
     screen.facts["runs"] = screen.module("addon.state").runs(screen.folder / "project")
     yield from screen.press_button("fieldwork.use_run", depth=2000)
@@ -122,6 +124,7 @@ def back(screen):
 
 def tools(screen):
     """Search and menus by the keyboard, picking points, the region box, a data set of the scene, translations."""
+    open_from_the_start(bpy.types.FIELDWORK_PT_align)
     settings = yield from opened(screen)
     queue = screen.queue
     bpy.data.objects.remove(bpy.data.objects["Cube"])
@@ -140,15 +143,13 @@ def tools(screen):
     screen.facts["searched"] = queue.current.verb
     yield from screen.idle(60)
 
-    # The menu, walked with the arrow keys: its fourth entry is that of the poses.
+    # The menu, walked with the arrow keys: three below the first entry comes that of the poses.
     with bpy.context.temp_override(window=screen.window, area=screen.area, region=screen.view):
         bpy.ops.wm.call_menu("INVOKE_DEFAULT", name="FIELDWORK_MT_steps")
     yield 0.5
-    for _ in range(12):
+    for _ in range(3):
         screen.press("DOWN_ARROW", x, y)
-        yield 0.15
-        if active_button(screen).startswith("bpy.ops.fieldwork.poses"):
-            break
+        yield 0.2
     screen.shot("menu")
     screen.press("RET", x, y)
     yield from screen.wait(lambda: queue.current, 5, "the menu")
@@ -171,15 +172,6 @@ def tools(screen):
     yield from data_set(screen)
     yield from translated(screen)
     yield from finish(screen)
-
-
-def active_button(screen):
-    """The Python command of the menu entry that the arrow keys have reached."""
-    bpy.context.window_manager.clipboard = ""
-    with bpy.context.temp_override(window=screen.window, area=screen.area, region=screen.view):
-        if bpy.ops.ui.copy_python_command_button.poll():
-            bpy.ops.ui.copy_python_command_button()
-    return bpy.context.window_manager.clipboard
 
 
 def pick(screen, settings):
@@ -223,11 +215,6 @@ def pick(screen, settings):
     screen.press("ESC", *target)
     yield 0.3
     screen.facts["cancelled"] = tuple(settings.point_b) == (0.0, 0.0, 0.0) and not screen.window.modal_operators
-    # The panel with the two points, opened.
-    panel = bpy.types.FIELDWORK_PT_align
-    bpy.utils.unregister_class(panel)
-    panel.bl_options = set()
-    bpy.utils.register_class(panel)
     yield from screen.toggle("poses")
     yield 0.5
     screen.shot("align")
@@ -260,9 +247,11 @@ def data_set(screen):
 
 def translated(screen):
     """With a translation in place the interface shows it."""
-    text = screen.module("addon.text")
-    if not bpy.app.build_options.international:
-        screen.facts["translated"] = "built without translations"
+    text, view = screen.module("addon.text"), bpy.context.preferences.view
+    try:
+        view.language = "de_DE"
+    except TypeError:
+        screen.facts["translated"] = "no languages here"
         return
     text.unregister()
     text.TRANSLATIONS["de_DE"] = {
@@ -271,11 +260,9 @@ def translated(screen):
         (text.CONTEXT, "Poses"): "Posen",
     }
     text.register()
-    view = bpy.context.preferences.view
-    view.language, view.use_translate_interface = "de_DE", True
+    view.use_translate_interface = True
     yield 1.0
     pgettext = bpy.app.translations.pgettext_iface
     screen.facts["translated"] = [pgettext("Estimate Poses", text.CONTEXT), text.t("{} of {} photos placed", 3, 4)]
     screen.shot("translated")
     view.language = "en_US"
-    sys.stdout.flush()

@@ -39,7 +39,8 @@ def alias(folder, name):
     """A short way to a folder."""
     folder.mkdir(exist_ok=True)
     link = Path("/tmp", name)
-    link.symlink_to(folder)
+    if not link.is_symlink():
+        link.symlink_to(folder)
     return str(link)
 
 

@@ -129,7 +129,7 @@ def test_keyboard_search_picked_points_region_and_data_set_of_the_scene(captured
     assert facts["photographed"] == 3
     assert facts["project images"] == 3
     assert facts["classes"]
-    assert facts["translated"] in (["Posen schätzen", "3 von 4 Fotos verortet"], "built without translations")
+    assert facts["translated"] in (["Posen schätzen", "3 von 4 Fotos verortet"], "no languages here")
     assert facts["slowest_tick"] < 0.1, facts["slowest_step"]
     assert {"search", "picking", "align", "region", "dataset", "photographed"} <= shots("tools")
 

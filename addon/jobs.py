@@ -65,6 +65,7 @@ class Queue:
         self.bringing: tuple[Job, Steps] | None = None  # a job whose result comes into the scene
         self.slowest_tick = 0.0  # seconds of the longest time Blender was held up
         self.slowest_step = ""  # what that was
+        self.slowest_cpu = 0.0  # the same in seconds of the processor, which other programs do not lengthen
         self.edits = 0  # files loaded, undone and redone steps: what was held of the scene is stale
         self._edits_seen = 0
         self._loader: threading.Thread | None = None
@@ -176,7 +177,7 @@ class Queue:
 
     def tick(self) -> float:
         """One look at the engine. Returns the seconds until the next."""
-        begin = time.perf_counter()
+        begin, busy_since = time.perf_counter(), time.thread_time()
         doing = f"{self.current.stage} {self.current.message}" if self.current else ""
         try:
             state.write_classes()
@@ -200,6 +201,7 @@ class Queue:
         if busy:
             self.redraw()
         seconds = time.perf_counter() - begin
+        self.slowest_cpu = max(self.slowest_cpu, time.thread_time() - busy_since)
         if seconds > self.slowest_tick:
             self.slowest_tick, self.slowest_step = seconds, doing
         return SLICE_PERIOD if self.bringing else BUSY_PERIOD if busy else IDLE_PERIOD

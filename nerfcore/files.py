@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from .errors import DiskError
+from .errors import DiskError, InputError
 
 
 @contextmanager
@@ -30,6 +30,16 @@ def disk_errors(path: Path) -> Iterator[None]:
                 f"{path} cannot be written: {os.strerror(error.errno)}.", "Choose a folder you may write to."
             ) from error
         raise
+
+
+def require_readable(folder: Path) -> None:
+    """Raise InputError where `folder` is there and its contents may not be looked at."""
+    try:
+        if folder.is_dir():
+            os.stat(folder / ".")  # the right to go in
+            os.listdir(folder)
+    except PermissionError as error:
+        raise InputError(f"{folder} cannot be read: {error.strerror}.", "Check its permissions.") from error
 
 
 @contextmanager

@@ -18,7 +18,7 @@ from PIL import Image
 from ..data.classes import make_classes, read_classes
 from ..data.dataset import beside, unique_names
 from ..errors import InputError, ProjectError
-from ..files import atomic_path, write_json
+from ..files import atomic_path, require_readable, write_json
 from ..params import NewParams
 from ..progress import Reporter, shortened
 from ..project import PROJECT_FILE, ImageRecord, Project, create_folder, load_project, save_project
@@ -100,14 +100,14 @@ def new(params: NewParams, report: Reporter) -> dict[str, Any]:
         reject_blurred(records)
     records = kept + records
     _check_usable(records, photos, skipped)
-    project = _assemble(params, previous, records, names, ignore_id, report)
+    project = _assemble(params, previous, records, (names, ignore_id, colors), report)
     rejected = skipped + [
         {"file": Path(record.source).name, "reason": record.reason} for record in records if record.status == "rejected"
     ]
     used = [record for record in records if record.status != "rejected"]
     if rejected:
-        left_out = [f"{item['file']} ({item['reason']})" for item in rejected]
-        report.warn(shortened(f"{len(rejected)} of {len(used) + len(rejected)} files were left out", left_out))
+        reasons = [f"{item['file']} ({item['reason']})" for item in rejected]
+        report.warn(shortened(f"{len(rejected)} of {len(used) + len(rejected)} files were left out", reasons))
     if len(used) < 3:
         number = "one usable photo" if len(used) == 1 else f"{len(used)} usable photos"
         report.warn(f"Only {number}: camera poses need at least three, better twenty.")
@@ -134,6 +134,7 @@ def list_photos(folder: Path, exclude: Iterable[Path | None] = ()) -> tuple[list
         raise InputError(f"{folder} does not exist.", "Choose a folder of photos or a video file.")
     if folder.is_file():
         raise InputError(f"{folder} is neither a folder of photos nor a video that Fieldwork reads.", "Choose another.")
+    require_readable(folder)
     root = folder / "images" if (folder / "images").is_dir() else folder
     skip_folders = {Path(p).resolve() for p in exclude if p} | {
         (folder / name).resolve() for name in ("labels", "masks", "depth")
@@ -361,11 +362,11 @@ def _assemble(
     params: NewParams,
     previous: Project | None,
     records: list[ImageRecord],
-    names: dict[int, str],
-    ignore_id: int,
+    classes: tuple[dict[int, str], int, Colors],
     report: Reporter,
 ) -> Project:
-    """The project with its classes: those named, and those that occur in the label maps without a name."""
+    """The project with its classes: those named (names, void id, colours), and those in the label maps without a name."""
+    names, ignore_id, colors = classes
     project = previous.model_copy() if previous else Project(mask_mode=params.mask_mode)
     if previous is not None and not params.add and previous.images:
         # A rerun keeps what was decided about the same photos later (splits, poses).
@@ -391,8 +392,10 @@ def _assemble(
         named = {**{i: f"class {i}" for i in present}, **names}
     else:
         named = {**{i: f"class {i}" for i in present}, **{c.id: c.name for c in project.classes}}
-    project.classes = [
-        known[c.id].model_copy(update={"name": c.name}) if c.id in known else c
-        for c in make_classes(named, project.ignore_id)
-    ]
+    # A class keeps what was decided about it earlier, unless the classes file says otherwise now.
+    project.classes = make_classes(named, project.ignore_id, colors)
+    for i, c in enumerate(project.classes):
+        if c.id in known:
+            said = {"name": c.name} | ({"color": c.color} if c.id in colors else {})
+            project.classes[i] = known[c.id].model_copy(update=said)
     return project

@@ -31,9 +31,13 @@ def class_color(class_id: int, ignore_id: int = 0) -> tuple[float, float, float]
     return colorsys.hsv_to_rgb(index * GOLDEN_ANGLE % 1.0, 0.45 + 0.2 * (index % 3), 0.95 - 0.18 * (index // 3 % 3))
 
 
-def make_classes(names: dict[int, str], ignore_id: int = 0) -> list[SemanticClass]:
-    """Classes with their colours from names by id, sorted by id. The void id is not a class and is left out.
+def make_classes(
+    names: dict[int, str], ignore_id: int = 0, colors: dict[int, tuple[int, int, int]] | None = None
+) -> list[SemanticClass]:
+    """Classes from names by id, sorted by id. The void id is not a class and is left out.
 
+    Args:
+        colors: sRGB 0–255 by id, as the classes file gives them; classes without one get their fixed colour.
     Raises:
         InputError: there are more classes than a field can tell apart.
     """
@@ -42,8 +46,9 @@ def make_classes(names: dict[int, str], ignore_id: int = 0) -> list[SemanticClas
             f"The capture has {len(names.keys() - {ignore_id})} classes; a field tells at most {MOST_CLASSES} apart.",
             "Merge classes in the label maps.",
         )
+    shown = {i: (r / 255, g / 255, b / 255) for i, (r, g, b) in (colors or {}).items()}
     return [
-        SemanticClass(id=i, name=name, color=class_color(i, ignore_id), priority=1.0)
+        SemanticClass(id=i, name=name, color=shown.get(i) or class_color(i, ignore_id), priority=1.0)
         for i, name in sorted(names.items())
         if i != ignore_id
     ]
@@ -54,7 +59,7 @@ def read_classes(path: Path) -> tuple[dict[int, str], int, dict[int, tuple[int, 
 
     Forms: `["void", "stone", …]` (index = id, 0 = void); `{"ignore_id": 0, "classes": {"1": "stone", …}}`; in the
     latter a class may also be `{"name": "stone", "color": [r, g, b]}` with 0–255 values, the colour that stands for
-    it in RGB label maps.
+    it in RGB label maps and in views.
 
     Returns:
         names by id (void left out), the ignore id, and RGB colours by id (where given).
@@ -82,6 +87,8 @@ def read_classes(path: Path) -> tuple[dict[int, str], int, dict[int, tuple[int, 
         for i, entry in entries.items():
             if isinstance(entry, dict) and "color" in entry:
                 red, green, blue = (int(c) for c in entry["color"])
+                if not all(0 <= c <= 255 for c in (red, green, blue)):
+                    raise ValueError(f"the colour of {names[i]} is not three numbers from 0 to 255")
                 colors[i] = (red, green, blue)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"The classes file {path} has an unknown form ({error}).", hint) from error

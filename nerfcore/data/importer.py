@@ -11,6 +11,7 @@ import numpy as np
 
 from ..capture.ingest import file_hash
 from ..errors import InputError, ProjectError
+from ..files import require_readable
 from ..params import ImportParams
 from ..progress import Reporter
 from ..project import (
@@ -95,6 +96,7 @@ def read_dataset(source: Path, format: str = "auto") -> Dataset:
     """
     if not source.exists():
         raise InputError(f"{source} does not exist.", "Choose the folder of a posed data set.")
+    require_readable(source)
     if format != "auto":
         if format not in FORMATS:
             raise InputError(f"The format {format} cannot be read.", f"Choose one of {', '.join(FORMATS)}.")
@@ -176,9 +178,9 @@ def _relative(path: Path | None, folder: Path) -> str | None:
 def _classes(dataset: Dataset, present: set[int]) -> list[SemanticClass]:
     """The classes that occur in the labels, named by the data set where it does so; all it names without labels."""
     if not present:
-        return make_classes(dataset.class_names, dataset.ignore_id)
+        return make_classes(dataset.class_names, dataset.ignore_id, dataset.class_colors)
     names = {i: dataset.class_names.get(i, f"class {i}") for i in present}
-    return make_classes(names, dataset.ignore_id)
+    return make_classes(names, dataset.ignore_id, dataset.class_colors)
 
 
 def _poses(views: list[DatasetView]) -> tuple[list[Camera], list[PosedImage]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import signal
@@ -133,6 +134,30 @@ def test_unreadable_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(os, "scandir", refuse)
     with pytest.raises(InputError, match=r"cannot be read: Permission denied"):
         ingest.list_photos(photos)
+
+
+@pytest.mark.parametrize("verb", ["new", "import"])
+def test_unreadable_folder_for_real(tmp_path: Path, verb: str) -> None:
+    """The command line without root's right to read everything."""
+    photos = folder_of(tmp_path / "photos")
+    photos.chmod(0)
+    arguments = {
+        "new": [str(tmp_path / "p"), "--photos", str(photos)],
+        "import": [str(photos), str(tmp_path / "p")],
+    }[verb]
+    command = [sys.executable, "-m", "fieldwork.nerfcore", verb, *arguments, "--json"]
+    if os.geteuid() == 0:
+        if shutil.which("setpriv") is None:
+            pytest.skip("root reads everything, and setpriv is not here to take that right")
+        rights = "-dac_override,-dac_read_search"
+        command = ["setpriv", "--bounding-set", rights, "--inh-caps", rights, *command]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+    finally:
+        photos.chmod(0o755)
+    assert done.returncode == 1, done.stderr
+    assert json.loads(done.stdout)["error"]["message"] == f"{photos} cannot be read: Permission denied."
+    assert not (tmp_path / "p").exists()
 
 
 def test_one_photo_is_taken_with_a_warning(tmp_path: Path) -> None:

@@ -61,6 +61,9 @@ def test_label_formats(tmp_path: Path, kind: str) -> None:
     result = new(photos, tmp_path / "p", labels=tmp_path / "labels", max_size=160)
     assert result["labelled"] == 1  # labels for some photos only are normal
     assert result["classes"] == ["c1", "c7"]
+    if kind != "palette":  # the classes are shown in the colours of the file
+        shown = {c.id: [round(255 * part) for part in c.color] for c in load_project(tmp_path / "p").classes}
+        assert shown == {i: list(COLORS[i]) for i in (1, 7)}
     record = next(r for r in load_project(tmp_path / "p").images if r.label)
     assert record.name == "p1"
     with Image.open(tmp_path / "p" / record.label) as image:

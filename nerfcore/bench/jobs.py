@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import re
 import resource
@@ -165,7 +166,9 @@ def _speeds(job: Job, project: Path, report: Reporter) -> list[dict[str, Any]]:
 
 
 def _reset_peak(device: torch.device) -> None:
+    gc.collect()
     if device.type == "cuda":
+        torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats(device)
 
 

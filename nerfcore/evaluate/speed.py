@@ -10,6 +10,7 @@ import psutil
 import torch
 
 from ..data.box import box_poses
+from ..data.cameras import Camera
 from ..data.pixels import CameraRays
 from ..data.scene import Scene
 from ..field.encoding import spherical_harmonics
@@ -47,29 +48,19 @@ def measure_speed(
     poses: int | None = None,
 ) -> dict[str, Any]:
     """Frames a second at side × side with colour and classes: warm, synchronised; median over `poses` of the views
-    `indices`, by default five on a GPU and one on a CPU, where a frame takes seconds.
+    `indices`, by default five on a GPU and one on a CPU, where a frame takes seconds. A frame on a GPU ends on the GPU.
 
     `ms_sampling` and `ms_network` split one frame: the coarse walk, and all that reads the field (the fused kernel
     draws its samples there too); `spr` is the number of field samples per ray; `fused` says which kernels rendered.
     """
     model, device = trained.model, trained.device
     report.stage(f"Measuring speed at {side}×{side}")
-    times = []
-    poses = poses or (5 if device.type == "cuda" else 1)
-    for turn, index in enumerate(indices[:1] * (device.type == "cuda") + indices[:poses]):
-        report.check()
-        view = scene.views[index]
-        camera = view.camera.undistorted().resized(side, side)
-        pose = box_poses([view], box_from_world)[0]
-        _synchronize(device)
-        begin = time.perf_counter()
-        render_view(model, camera, pose, 0.0, check=report.check)
-        _synchronize(device)
-        if turn > 0 or device.type != "cuda":  # the first frame of a GPU warms it up
-            times.append(time.perf_counter() - begin)
-    view = scene.views[indices[0]]
-    camera = view.camera.undistorted().resized(side, side)
-    rays = CameraRays([camera], box_poses([view], box_from_world), device)
+    frame = _device_frame if device.type == "cuda" else _host_frame
+    chosen = indices[: poses or (5 if device.type == "cuda" else 1)]
+    if device.type == "cuda":
+        frame(model, scene, indices[0], box_from_world, side, report)  # warms up
+    times = [frame(model, scene, index, box_from_world, side, report) for index in chosen]
+    rays = CameraRays([_camera(scene, indices[0], side)], box_poses([scene.views[indices[0]]], box_from_world), device)
     sampling, network, samples, fused = split_times(model, rays, side * side, report)
     return {
         "fps": round(1 / float(np.median(times)), 3),
@@ -79,6 +70,38 @@ def measure_speed(
         "ms_network": round(network * 1e3, 2),
         "fused": fused,
     }
+
+
+def _camera(scene: Scene, index: int, side: int) -> Camera:
+    return scene.views[index].camera.undistorted().resized(side, side)
+
+
+def _host_frame(
+    model: Model, scene: Scene, index: int, box_from_world: np.ndarray, side: int, report: Reporter
+) -> float:
+    """Seconds of a whole picture as `render` makes it."""
+    pose = box_poses([scene.views[index]], box_from_world)[0]
+    begin = time.perf_counter()
+    render_view(model, _camera(scene, index, side), pose, 0.0, check=report.check)
+    return time.perf_counter() - begin
+
+
+def _device_frame(
+    model: Model, scene: Scene, index: int, box_from_world: np.ndarray, side: int, report: Reporter
+) -> float:
+    """Seconds from a pose to colours, depths and class probabilities on the GPU; they are not brought to the host."""
+    report.check()
+    rays = CameraRays(
+        [_camera(scene, index, side)], box_poses([scene.views[index]], box_from_world), model.priorities.device
+    )
+    renderer = ray_renderer(model, side * side)
+    count = model.config.render.samples or model.config.sampling.samples
+    _synchronize(rays.device)
+    begin = time.perf_counter()
+    for pixel in torch.arange(side * side, device=rays.device).split(renderer.rays):
+        renderer(*rays(torch.zeros_like(pixel), pixel), count)
+    _synchronize(rays.device)
+    return time.perf_counter() - begin
 
 
 def split_times(model: Model, rays: CameraRays, count: int, report: Reporter) -> tuple[float, float, int, bool]:

@@ -14,6 +14,7 @@ from ..data.pixels import read_image, read_label, read_photo, resize, training_s
 from ..data.scene import Scene, View
 from ..errors import InputError
 from ..files import atomic_path, write_json
+from ..kernels.runtime import compile_seconds
 from ..params import EvaluateParams
 from ..progress import Reporter
 from ..project import load_project, load_scene
@@ -54,9 +55,9 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
         pose = box_poses([view], box.box_from_world)[0]
         # Views larger than the training images are compared at the training size.
         camera = view.camera.resized(*training_size(view.camera, trained.info.config.scene.image_size))
-        begin = time.perf_counter()
+        begin, compiled = time.perf_counter(), compile_seconds()
         frame = render_view(trained.model, camera, pose, background, check=report.check)
-        seconds += time.perf_counter() - begin
+        seconds += time.perf_counter() - begin - (compile_seconds() - compiled)
         rays += camera.width * camera.height
         photo, keep, label = _truth(view, scene, camera.width, camera.height, background)
         image = to_bytes(frame.color)

@@ -40,6 +40,5 @@ class BlendWeight(nn.Module):
         """Take in one batch: points (N, 3), rendering weights (N,), densities (N,)."""
         value = weights if self.by == "evidence" else density
         fresh = cells.scatter_max(RESOLUTION, points, value.detach())
-        seen = fresh > 0
         target = fresh * self.views if self.by == "evidence" else fresh
-        self.evidence[seen] = decay * self.evidence[seen] + (1 - decay) * target[seen]
+        self.evidence.copy_(torch.where(fresh > 0, decay * self.evidence + (1 - decay) * target, self.evidence))

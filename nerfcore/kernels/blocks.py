@@ -21,7 +21,7 @@ def load_blocks(kernel: wp.Kernel, lanes: int, device: torch.device) -> None:
     with _load_lock:
         if key not in _loaded:
             begin = time.perf_counter()
-            kernel.module.load("cpu" if device.type == "cpu" else wp.device_from_torch(device), lanes)
+            kernel.module.load("cpu" if device.type == "cpu" else wp.device_from_torch(str(device)), lanes)
             _loaded[key] = time.perf_counter() - begin
 
 
@@ -29,7 +29,7 @@ def launch_blocks(kernel: wp.Kernel, blocks: int, lanes: int, inputs: list[Any],
     """Run `blocks` blocks of `lanes` threads; on the CPU one after the other."""
     load_blocks(kernel, lanes, device)
     if device.type == "cuda":
-        target, stream = wp.device_from_torch(device), wp.stream_from_torch(torch.cuda.current_stream(device))
+        target, stream = wp.device_from_torch(str(device)), wp.stream_from_torch(torch.cuda.current_stream(device))
         wp.launch(kernel, dim=blocks * lanes, inputs=inputs, device=target, stream=stream, block_dim=lanes)
         return
     with _one_at_a_time:

@@ -87,7 +87,7 @@ def load(kernel: wp.Kernel, device: torch.device) -> None:
             if device.type == "cpu":
                 kernel.module.load("cpu", 1)
             else:
-                kernel.module.load(wp.device_from_torch(device), CUDA_BLOCK)
+                kernel.module.load(wp.device_from_torch(str(device)), CUDA_BLOCK)
             _loaded[key] = time.perf_counter() - begin
 
 
@@ -106,7 +106,7 @@ def launch(kernel: wp.Kernel, count: int, inputs: list[Any], device: torch.devic
     load(kernel, device)
     if device.type == "cuda":
         stream = wp.stream_from_torch(torch.cuda.current_stream(device))
-        wp.launch(kernel, dim=count, inputs=[*inputs, 0], device=wp.device_from_torch(device), stream=stream)
+        wp.launch(kernel, dim=count, inputs=[*inputs, 0], device=wp.device_from_torch(str(device)), stream=stream)
         return
     workers = 1 if in_pool() else worker_count()
     chunk = max(-(-count // workers), _MINIMUM_CHUNK)

@@ -25,7 +25,7 @@ def describe() -> str:
         p = torch.cuda.get_device_properties(device)
         what = f"{p.name}, {p.total_memory / 2**30:.0f} GiB, compute capability {p.major}.{p.minor}"
     else:
-        what = f"{_processor()}, {torch.get_num_threads()} threads"
+        what = f"{_processor()}, threads: {torch.get_num_threads()}"
     return f"{what}; PyTorch {torch.__version__}, {platform.system()}"
 
 

@@ -43,7 +43,7 @@ def text(value: Any) -> str:
 def table(columns: dict[str, str], rows: Sequence[Row]) -> str:
     """A Markdown table of the columns {key: heading} of rows."""
     lines = ["| " + " | ".join(columns.values()) + " |", "|" + " --- |" * len(columns)]
-    lines += ["| " + " | ".join(text(row.get(key)) for key in columns) + " |" for row in rows]
+    lines += ["| " + " | ".join(text(row.get(key, "–")) for key in columns) + " |" for row in rows]
     return "\n".join(lines)
 
 

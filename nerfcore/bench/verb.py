@@ -91,9 +91,13 @@ def _write(
     """JSON, Markdown and plot of a suite."""
     files = [out / "results.json", out / "table.md", out / "plot.png"]
     command = f"fieldwork bench --suite {params.suite}"
-    command += "".join(
-        f" --{name} {value:g}" for name, value in (("seconds", params.seconds), ("steps", params.steps)) if value
-    )
+    for name in ("scenes", "variants", "seconds", "steps", "preset"):
+        value = getattr(params, name)
+        if value != type(params).model_fields[name].default:
+            command += f" --{name} " + (f'"{",".join(value)}"' if isinstance(value, list) else f"{value}")
+    command += "".join(f" --set {name}={value}" for name, value in params.set.items())
+    if "capability" not in described:
+        notes = [*notes, "Peak memory on a CPU is that of the whole process up to then, all runs before included."]
     if params.suite == "robustness":
         limits = ", ".join(f"{name}: {p} dB, {m} points" for name, (p, m) in PUBLISHED_DROPS.items())
         notes = [*notes, f"Published drops of PSNR and mIoU: {limits}."]

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 BUSY_PERIOD = 0.1  # seconds between two looks at the engine while something goes on
 IDLE_PERIOD = 0.5
 FOLLOW_PERIOD = 0.5  # seconds between two looks at the files of a job in another process
-STATUS_PERIOD = 0.4  # seconds between two drawings of the status bar
+DRAW_PERIOD = 0.4  # seconds between two drawings of the panels and the status bar while a job runs
 KEPT = 8  # finished jobs the panel remembers
 SLICE = 0.02  # seconds of bringing a result into the scene at a time
 SLICE_PERIOD = 0.01  # seconds between two slices
@@ -72,7 +72,8 @@ class Queue:
         self._number = 0
         self._looked = 0.0
         self._asked = 0.0
-        self._status_drawn = 0.0
+        self._drawn = 0.0
+        self._status_shown = ""  # id of the job that the status bar shows
 
     # For operators
 
@@ -198,7 +199,8 @@ class Queue:
             logging.getLogger("fieldwork.addon").exception("Fieldwork's timer failed")
         installing = self.installer is not None and self.installer.is_alive()
         busy = self.current is not None or installing or (self.link is not None and self.link.busy)
-        if busy:
+        due = busy and time.monotonic() - self._drawn > DRAW_PERIOD
+        if due or self._status_shown != self._current_id():
             self.redraw()
         seconds = time.perf_counter() - begin
         self.slowest_cpu = max(self.slowest_cpu, time.thread_time() - busy_since)
@@ -332,14 +334,18 @@ class Queue:
 
     # Drawing
 
+    def _current_id(self) -> str:
+        return self.current.id if self.current else ""
+
     def redraw(self) -> None:
         """Redraw what shows jobs: sidebars, preferences, the status bar."""
         if bpy.app.background:
             return
+        self._drawn = time.monotonic()
         for window in bpy.context.window_manager.windows:
             # Nothing else redraws the status bar; a running tool's own text in it must stay.
-            if not getattr(window, "modal_operators", None) and time.monotonic() - self._status_drawn > STATUS_PERIOD:
-                self._status_drawn = time.monotonic()
+            if not getattr(window, "modal_operators", None):
+                self._status_shown = self._current_id()
                 with bpy.context.temp_override(window=window):
                     window.workspace.status_text_set_internal(None)
             for area in window.screen.areas:

@@ -101,10 +101,10 @@ class Queue:
     def submit(self, job: Job) -> None:
         """Put a job at the end of the queue; it starts at once when nothing runs."""
         self.waiting.append(job)
+        self._start_next()
         if not self._loader:
             self._loader = threading.Thread(target=load_modules, name="fieldwork-modules", daemon=True)
             self._loader.start()
-        self._start_next()
         self.redraw()
 
     def run(self, job: Job) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """Make the pictures of docs/user-guide.md from the screenshots that `make gui` left in build/gui.
 
-python tests/gui/guide_images.py
+python tests/gui/guide_images.py [NAME …]      # all pictures, or those named
 """
 
 from __future__ import annotations
@@ -25,7 +25,6 @@ IMAGES = {
     "poses": ("capture/posed-poses", SIDEBAR, 260),
     "scene": ("capture/scene", VIEW, 900),
     "align": ("tools/align", SIDEBAR, 260),
-    "dataset": ("tools/dataset", (970, 150, 1400, 510), 430),
     "classes": ("labelled/labelled-classes", SIDEBAR, 260),
     "training": ("train/training", SIDEBAR, 260),
     "trained": ("labelled/labelled-train", SIDEBAR, 260),
@@ -46,7 +45,8 @@ def panel_bottom(picture: Image.Image, left: int, top: int) -> int:
 
 def main() -> int:
     OUT.mkdir(parents=True, exist_ok=True)
-    for name, (shot, box, width) in IMAGES.items():
+    for name in sys.argv[1:] or IMAGES:
+        shot, box, width = IMAGES[name]
         picture = Image.open(SHOTS / f"{shot}.png").convert("RGB")
         left, top, right, bottom = box
         part = picture.crop((left, top, right, bottom or panel_bottom(picture, left, top)))

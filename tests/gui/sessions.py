@@ -228,7 +228,7 @@ def data_set(screen):
     yield from screen.show_sidebar()
     scene = bpy.context.scene
     scene.render.resolution_x, scene.render.resolution_y = 96, 64
-    out = screen.folder / "set"
+    out = Path(alias(screen.folder / "set", "house_dataset"))
     with bpy.context.temp_override(window=screen.window, area=screen.area, region=screen.view):
         bpy.ops.fieldwork.dataset("INVOKE_DEFAULT", out=str(out))
     yield 0.7

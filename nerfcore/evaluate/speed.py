@@ -63,7 +63,7 @@ def measure_speed(
     rays = CameraRays([_camera(scene, indices[0], side)], box_poses([scene.views[indices[0]]], box_from_world), device)
     sampling, network, samples, fused = split_times(model, rays, side * side, report)
     return {
-        "fps": round(1 / float(np.median(times)), 3),
+        "fps": float(f"{1 / float(np.median(times)):.4g}"),
         "fps_size": [side, side],
         "spr": round(samples / side**2, 3),
         "ms_sampling": round(sampling * 1e3, 2),

@@ -27,7 +27,11 @@ class SceneConfig(Stage):
         default="auto",
         description="contract all of space into the grid: on for captures whose surroundings are visible",
     )
-    image_size: int = Field(default=1600, ge=32, description="longest side of the training images in pixels")
+    image_size: int | None = Field(
+        default=None,
+        ge=32,
+        description="longest side of the training images in pixels; null: 1600 on a GPU, 800 on the CPU",
+    )
     background: Literal["auto", "random", "white", "black"] = Field(
         default="auto", description="colour behind the field; auto: random for transparent images, black otherwise"
     )
@@ -43,7 +47,11 @@ class FieldConfig(Stage):
     fusion: Literal["blend", "concat"] = Field(default="blend", description="how the two branches join")
     levels: int = Field(default=8, ge=1, le=16, description="levels of the vertex grid, 4 features each")
     coarsest: int = Field(default=16, ge=2, description="vertices along a side of the coarsest level")
-    finest: int = Field(default=1600, ge=2, description="vertices along a side of the finest level")
+    finest: int | None = Field(
+        default=None,
+        ge=2,
+        description="vertices along a side of the finest level; null: one for each pixel of the photos, at most 2048",
+    )
     table_log2: int = Field(
         default=19, ge=10, le=24, description="at most 2^this vertices a level; larger levels are hashed"
     )

@@ -56,7 +56,7 @@ def count_synchronisations(step: Callable[[int], None], first: int, steps: int, 
 def step_synchronisations(project: Path, report: Reporter) -> tuple[float, dict[str, int]]:
     """Host synchronisations a training step, outside of updates of the occupancy grid, and where. Needs a GPU."""
     device = use_device()
-    info, scene = plan_run(project, "standard", make_config("standard", {}))
+    info, scene = plan_run(project, "standard", make_config("standard", {}), device)
     trainer = make_trainer(project, info, scene, device, report)
     report.stage("Looking for host synchronisation")
     for index in range(WARM_STEPS):

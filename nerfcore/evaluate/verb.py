@@ -20,6 +20,7 @@ from ..progress import Reporter
 from ..project import load_project, load_scene
 from ..render.image import Frame, background_of, render_view, to_bytes, write_picture
 from ..render.pictures import colorize_depth, colorize_labels, side_by_side
+from ..train.prepare import GPU_IMAGE_SIZE
 from ..train.run import Trained, load_trained, run_folder
 from .metrics import Confusion, psnr, ssim
 from .speed import SPEED_KEYS, measure_speed, peak_memory
@@ -54,7 +55,7 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
         report.progress(number / len(indices), view.name)
         pose = box_poses([view], box.box_from_world)[0]
         # Views larger than the training images are compared at the training size.
-        camera = view.camera.resized(*training_size(view.camera, trained.info.config.scene.image_size))
+        camera = view.camera.resized(*training_size(view.camera, trained.info.config.scene.image_size or GPU_IMAGE_SIZE))
         begin, compiled = time.perf_counter(), compile_seconds()
         frame = render_view(trained.model, camera, pose, background, check=report.check)
         seconds += time.perf_counter() - begin - (compile_seconds() - compiled)

@@ -15,6 +15,7 @@ from .grid import VertexGrid, level_layout
 from .mlp import MLP, compute_dtype
 
 DIRECTION_FEATURES = 16
+FINEST = 2048  # vertices along a side where no photos say otherwise
 
 
 class _TruncatedExp(torch.autograd.Function):
@@ -61,7 +62,7 @@ class HybridField(nn.Module):
         self.config, self.classes = config, classes
         self.features = config.levels * FEATURES
         self.grid = (
-            VertexGrid(level_layout(config.levels, config.coarsest, config.finest, config.table_log2))
+            VertexGrid(level_layout(config.levels, config.coarsest, config.finest or FINEST, config.table_log2))
             if config.branch != "implicit"
             else None
         )

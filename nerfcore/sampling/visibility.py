@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 
 from ..data.cameras import Camera
+from ..kernels.march_torch import grid_position
 
 FEWEST_POINTS = 20  # in a photo, from which its depths are believed
 
@@ -27,14 +28,19 @@ def uncontract(u: torch.Tensor) -> torch.Tensor:
 
 def depth_ranges(cameras: list[Camera], camera_to_box: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
     """How near the sparse points (N, 3) come to each camera and where they mostly are: (V, 2) depths along the optical
-    axis, the 2nd percentile halved and the median; zeros for cameras that see too few points to tell."""
+    axis, the nearest with a margin and the median; zeros for cameras that see too few points to tell.
+
+    The margin is half the depth that 96 % of the points span, at most half of their distance: surfaces without points
+    may come nearer than the points.
+    """
     ranges = torch.zeros(len(cameras), 2, device=camera_to_box.device)
     for index, (camera, pose) in enumerate(zip(cameras, camera_to_box)):
         u, v, z = _project(camera, pose, points)
         depth = z[(z > 1e-6) & (u > 0) & (u < 1) & (v > 0) & (v < 1)]
         if len(depth) >= FEWEST_POINTS and not _sees_everything(camera):
-            ranges[index, 0] = depth.quantile(0.02) / 2
-            ranges[index, 1] = depth.median()
+            low, middle, high = depth.quantile(torch.tensor([0.02, 0.5, 0.98], device=depth.device))
+            ranges[index, 0] = torch.maximum(low / 2, low - (high - low) / 2)
+            ranges[index, 1] = middle
     return ranges
 
 
@@ -51,6 +57,22 @@ def _project(
     u = (camera.fx * x / depth + camera.cx) / camera.width
     v = (camera.fy * y / depth + camera.cy) / camera.height
     return u, v, z
+
+
+def cells_at(points: torch.Tensor, resolution: int, contracted: bool) -> torch.Tensor:
+    """Indices (M,) of the cells that hold those of the normalised positions (N, 3) that lie in the grid."""
+    place = (grid_position(points, contracted) * resolution).floor().long()
+    place = place[((place >= 0) & (place < resolution)).all(1)]
+    return (place[:, 2] * resolution + place[:, 1]) * resolution + place[:, 0]
+
+
+def _frustum(camera: Camera, pose: torch.Tensor, depth: float) -> torch.Tensor:
+    """Points (N, 3) that fill what a camera sees up to a depth: where space is contracted, a cell may hold all of it
+    and have its centre elsewhere."""
+    side, steps = torch.linspace(0, 1, 16, device=pose.device), torch.linspace(0, 1, 48, device=pose.device)
+    v, u, z = torch.meshgrid(side, side, steps * depth, indexing="ij")
+    x, y = (u * camera.width - camera.cx) / camera.fx * z, (v * camera.height - camera.cy) / camera.fy * z
+    return torch.stack([x, y, z], -1).reshape(-1, 3) @ pose[:3, :3].T + pose[:3, 3]
 
 
 def view_counts(
@@ -83,5 +105,7 @@ def view_counts(
         counts += seen
         beyond |= seen & (z >= typical)
         empty |= seen & (z < near)
+        if near > 0:
+            empty[cells_at(_frustum(camera, pose, float(near)), resolution, contracted)] = True
     counts[empty | ((counts < 2) & ~beyond)] = 0
     return counts

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from ..config import RunConfig
-from ..data.box import box_poses, choose_box
+from ..data.box import Box, box_poses, choose_box
 from ..data.pixels import PixelStore, read_label, read_photo
 from ..data.scene import Scene
 from ..data.similarity import transform_points
@@ -19,6 +19,8 @@ from ..sampling.visibility import depth_ranges, view_counts
 from .run import RunInfo, new_model
 from .trainer import Trainer
 
+CPU_IMAGE_SIZE, GPU_IMAGE_SIZE = 800, 1600
+MOST_VERTICES = 2048
 VIEWS_ENOUGH = 8  # cells seen by this many cameras count fully as evidence
 
 
@@ -42,8 +44,19 @@ def has_transparency(scene: Scene) -> bool:
     return bool((read_photo(view.image)[..., 3] < 255).any())
 
 
-def plan_run(project_folder: Path, preset: str, config: RunConfig) -> tuple[RunInfo, Scene]:
-    """Decide what a run will be: its views, classes and box.
+def pixels_across(scene: Scene, views: list[int], box: Box, image_size: int) -> int:
+    """Pixels of the photos that fit side by side into the grid: its side by the median footprint of a pixel at the
+    middle of the box."""
+    footprints = []
+    for index, pose in zip(views, box_poses([scene.views[i] for i in views], box.box_from_world)):
+        camera = scene.views[index].camera
+        scale = min(1.0, image_size / max(camera.width, camera.height))
+        footprints.append(max(float(np.linalg.norm(pose[:3, 3])), 0.5) / (camera.fx * scale))
+    return round((4.0 if box.contracted else 2.0) / float(np.median(footprints)))
+
+
+def plan_run(project_folder: Path, preset: str, config: RunConfig, device: torch.device) -> tuple[RunInfo, Scene]:
+    """Decide what a run will be: its views, classes and box, and the settings that follow from the photos.
 
     Raises:
         TrainingError: fewer than two posed training images.
@@ -57,6 +70,12 @@ def plan_run(project_folder: Path, preset: str, config: RunConfig) -> tuple[RunI
         )
     transparent = has_transparency(scene)
     box = choose_box(scene, config.scene, transparent)
+    config = config.model_copy(deep=True)
+    if config.scene.image_size is None:
+        config.scene.image_size = CPU_IMAGE_SIZE if device.type == "cpu" else GPU_IMAGE_SIZE
+    if config.field.finest is None:
+        across = pixels_across(scene, train, box, config.scene.image_size)
+        config.field.finest = min(max(across, 2 * config.field.coarsest), MOST_VERTICES)
     class_ids = present_classes(scene, train) if config.loss.semantic_weight > 0 else []
     priority = {c.id: c.priority for c in scene.classes}
     info = RunInfo(
@@ -97,7 +116,7 @@ def make_trainer(project_folder: Path, info: RunInfo, scene: Scene, device: torc
         [names[name] for name in info.images],
         info.class_ids,
         box.box_from_world,
-        config.scene.image_size,
+        config.scene.image_size or GPU_IMAGE_SIZE,
         device,
         report,
     )

@@ -54,7 +54,7 @@ def train(params: TrainParams, report: Reporter) -> dict[str, Any]:
         info, scene = load_info(project_folder, params.run), load_scene(project_folder)
         saved = read_checkpoint(folder / CHECKPOINT, device)
     else:
-        info, scene = plan_run(project_folder, params.preset, make_config(params.preset, params.set))
+        info, scene = plan_run(project_folder, params.preset, make_config(params.preset, params.set), device)
         with disk_errors(folder):
             folder.mkdir(parents=True, exist_ok=True)
         for stale in (CHECKPOINT, "events.jsonl", "metrics.json"):

@@ -8,7 +8,7 @@ from fieldwork.nerfcore.config import SceneConfig
 from fieldwork.nerfcore.data.box import choose_box
 from fieldwork.nerfcore.data.cameras import Camera
 from fieldwork.nerfcore.data.scene import Points, Scene, View
-from fieldwork.nerfcore.sampling.visibility import depth_ranges, grid_centers, view_counts
+from fieldwork.nerfcore.sampling.visibility import cells_at, depth_ranges, grid_centers, view_counts
 
 CAMERA = Camera(model="PINHOLE", width=100, height=80, fx=80.0, fy=80.0, cx=50.0, cy=40.0)
 
@@ -33,12 +33,12 @@ def ball(count: int, radius: float) -> np.ndarray:
     return points / np.linalg.norm(points, axis=1, keepdims=True) * radius
 
 
-def test_depth_ranges_are_half_the_nearest_and_the_median_depth_of_the_points_in_view():
+def test_depth_ranges_are_a_margin_before_the_points_in_view_and_their_median():
     poses = torch.from_numpy(half_ring(3, 0.9)).float()
     points = torch.from_numpy(ball(2000, 0.2)).float()
     distance = float(poses[0, :3, 3].norm())
     ranges = depth_ranges([CAMERA] * 3, poses, points)
-    assert torch.allclose(ranges[:, 0], torch.full((3,), (distance - 0.2) / 2), atol=0.02)
+    assert torch.allclose(ranges[:, 0], torch.full((3,), distance - 0.4), atol=0.03)
     assert torch.allclose(ranges[:, 1], torch.full((3,), distance), atol=0.02)
 
 
@@ -78,3 +78,12 @@ def test_the_cube_shrinks_to_the_points_where_cameras_stand_far_off():
     assert near.contracted
     assert 0.4 < far.world_from_box[0, 0] < 0.65
     assert near.world_from_box[0, 0] > 2.5
+
+
+def test_the_large_cells_around_far_cameras_are_empty():
+    poses = torch.from_numpy(half_ring(9, 6.0)).float()
+    points = torch.from_numpy(ball(2000, 0.7)).float()
+    counts = view_counts([CAMERA] * 9, poses, 64, True, depth_ranges([CAMERA] * 9, poses, points))
+    near = poses[:, :3, 3] + 0.02 * poses[:, :3, 2]
+    assert not counts[cells_at(near, 64, True)].any()
+    assert (counts[cells_at(points, 64, True)] > 0).all()

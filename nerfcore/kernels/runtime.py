@@ -52,12 +52,22 @@ def _pool(workers: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(workers, "kernel", initializer=_enter_pool)
 
 
-@cache
+_load_lock = threading.Lock()
+_started = False
+
+
 def init() -> None:
-    """Start Warp once (a fraction of a second)."""
-    # Kernel threads hold the interpreter lock for microseconds; at the default 5 ms they would wait for each other.
-    sys.setswitchinterval(1e-4)
-    wp.init()
+    """Start Warp once (a fraction of a second), whichever thread asks first."""
+    global _started
+    if _started:
+        return
+    with _load_lock:
+        if not _started:
+            # Kernel threads hold the interpreter lock for microseconds; at the default 5 ms they would wait for each
+            # other.
+            sys.setswitchinterval(1e-4)
+            wp.init()
+            _started = True
 
 
 def array(tensor: torch.Tensor, dtype: Any = None) -> wp.array:
@@ -72,7 +82,6 @@ def small_tensor(values: Any, dtype: torch.dtype, device: torch.device) -> torch
 
 
 _loaded: dict[tuple[str, str], float] = {}
-_load_lock = threading.Lock()
 
 
 def load(kernel: wp.Kernel, device: torch.device) -> None:

@@ -1,0 +1,52 @@
+"""Launching kernels from many threads."""
+
+import subprocess
+import sys
+
+FIRST_USE = """
+import threading, torch
+torch.set_num_threads(4)
+from fieldwork.nerfcore.kernels import runtime
+real, running, most = runtime.wp.init, [0], [0]
+def slow():
+    running[0] += 1
+    most[0] = max(most[0], running[0])
+    threading.Event().wait(0.2)
+    real()
+    running[0] -= 1
+runtime.wp.init = slow
+threads = [threading.Thread(target=runtime.init) for _ in range(8)]
+[t.start() for t in threads]
+[t.join() for t in threads]
+print(most[0])
+"""
+
+
+def test_warp_is_started_by_one_thread_only():
+    done = subprocess.run([sys.executable, "-c", FIRST_USE], capture_output=True, text=True, check=True)
+    assert done.stdout.split()[-1] == "1"
+
+
+def test_results_come_in_the_order_of_the_tasks_and_nested_calls_stay_in_their_thread():
+    import threading
+
+    import torch
+    from fieldwork.nerfcore.kernels.runtime import run_parallel
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+
+        def outer(k):
+            here = threading.get_ident()
+            return [
+                k * 10 + j
+                for j, thread in run_parallel([lambda j=j: (j, threading.get_ident()) for j in range(3)])
+                if thread == here
+            ]
+
+        assert run_parallel([lambda k=k: outer(k) for k in range(5)]) == [
+            [10 * k + j for j in range(3)] for k in range(5)
+        ]
+    finally:
+        torch.set_num_threads(before)

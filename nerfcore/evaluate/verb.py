@@ -55,7 +55,9 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
         report.progress(number / len(indices), view.name)
         pose = box_poses([view], box.box_from_world)[0]
         # Views larger than the training images are compared at the training size.
-        camera = view.camera.resized(*training_size(view.camera, trained.info.config.scene.image_size or GPU_IMAGE_SIZE))
+        camera = view.camera.resized(
+            *training_size(view.camera, trained.info.config.scene.image_size or GPU_IMAGE_SIZE)
+        )
         begin, compiled = time.perf_counter(), compile_seconds()
         frame = render_view(trained.model, camera, pose, background, check=report.check)
         seconds += time.perf_counter() - begin - (compile_seconds() - compiled)

@@ -84,6 +84,28 @@ def observe(
     launch(take_max, len(points), [where, resolution, decay, array(scratch), array(grid)], points.device, serial=True)
 
 
+@wp.kernel(module="fieldwork_cells")
+def move_mean(
+    points: wp.array(dtype=wp.vec3),
+    values: wp.array(dtype=float),
+    n: int,
+    rate: float,
+    grid: wp.array(dtype=float),
+    offset: int,
+):
+    i = wp.tid() + offset
+    cell = cell_index(points[i], n)
+    grid[cell] = grid[cell] + rate * (values[i] - grid[cell])
+
+
+def average(grid: torch.Tensor, resolution: int, points: torch.Tensor, values: torch.Tensor, rate: float) -> None:
+    """Move the cells that hold points (N, 3) towards the points' values (N,) in place, one point after the other:
+    grid ← grid + rate · (value − grid)."""
+    init()
+    inputs = [array(points, wp.vec3), array(values.contiguous()), resolution, rate, array(grid)]
+    launch(move_mean, len(points), inputs, points.device, serial=True)
+
+
 def trilinear(grid: torch.Tensor, resolution: int, points: torch.Tensor) -> torch.Tensor:
     """Values (N,) at points (N, 3) in [0, 1]³; constant beyond the outermost cell centres."""
     init()

@@ -38,3 +38,11 @@ def observe(
     fresh = scratch.scatter_reduce(0, (z * n + y) * n + x, values, "amax")
     seen = fresh >= 0
     grid[seen] = torch.maximum(grid[seen] * decay, fresh[seen])
+
+
+def average(grid: torch.Tensor, resolution: int, points: torch.Tensor, values: torch.Tensor, rate: float) -> None:
+    """As `cells.average`."""
+    n = resolution
+    x, y, z = (points * n).long().clamp(0, n - 1).unbind(-1)
+    for cell, value in zip(((z * n + y) * n + x).tolist(), values.tolist()):
+        grid[cell] += rate * (value - grid[cell])

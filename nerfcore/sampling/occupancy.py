@@ -9,22 +9,23 @@ import torch
 from torch import nn
 
 from ..config import SamplingConfig
-from ..kernels.cells import observe
+from ..kernels.cells import average, observe
 from ..kernels.march import PDF_DEFAULT, PDF_LITERAL, PDF_UNIFORM, MarchSettings
 
 MODES = {"default": PDF_DEFAULT, "uniform": PDF_UNIFORM, "literal": PDF_LITERAL}
 CHUNK = 1 << 16
 WARM_DECAY = 0.25
-MOST_OPTICAL_DEPTH = 0.5  # of a cell, for the sampling PDF
+MOST_OPTICAL_DEPTH = 1.0  # of a cell, for the sampling PDF
+MEAN_RATE = 0.1  # at which a cell's mean density follows each point read in it
 SWEEPS = (1, 2, 4, 8, 12)  # updates of the warm-up at which the whole grid is read
 PROBES = 64  # one cell in so many is read at an update, and as many open ones
 
 
 class OccupancyGrid(nn.Module):
-    """Moving maximum of the field's density in each cell of a resolution³ grid over the field's domain.
+    """Moving maximum and mean of the field's density in each cell of a resolution³ grid over the field's domain.
 
-    `cells` (resolution³, 2) is what rays read: density per normalised unit length, 0 where the cell is closed, and
-    interest in [0, 1]. Cells that no camera sees are never open.
+    The maximum decides which cells are open. `cells` (resolution³, 2) is what rays read: mean density per normalised
+    unit length, 0 where the cell is closed, and interest in [0, 1]. Cells that no camera sees are never open.
 
     Args:
         config: sampling settings.
@@ -44,6 +45,8 @@ class OccupancyGrid(nn.Module):
         self.register_buffer("seen", seen)
         # Rays read these; they follow the density at updates only, so they are part of a checkpoint.
         self.register_buffer("cells", torch.stack([self.density, self.interest], 1))
+        self.register_buffer("mean", torch.where(seen, 3.0, 0.0))
+        self.mean: torch.Tensor
         self.density: torch.Tensor
         self.interest: torch.Tensor
         self.seen: torch.Tensor
@@ -71,8 +74,9 @@ class OccupancyGrid(nn.Module):
             grown.narrow(axis, 1, n - 1).logical_or_(along.narrow(axis, 0, n - 1))
             grown.narrow(axis, 0, n - 1).logical_or_(along.narrow(axis, 1, n - 1))
         opened = grown.view(-1) & self.seen
-        # A cell's density is its maximum, but a ray may pass through its empty part: no cell may take all the samples.
-        self.cells[:, 0] = torch.where(opened, self.density.clamp(1e-3, MOST_OPTICAL_DEPTH / self.step), 0.0)
+        # What a ray meets in a cell is rather its mean than its largest density, and even of that no cell may take all
+        # the samples: the ray may pass through its empty part.
+        self.cells[:, 0] = torch.where(opened, self.mean.clamp(1e-3, MOST_OPTICAL_DEPTH / self.step), 0.0)
         self.cells[:, 1] = self.interest
         m = self.config.resolution // 4
         self.blocks.copy_(opened.view(m, 4, m, 4, m, 4).any(5).any(3).any(1).reshape(-1))
@@ -112,6 +116,7 @@ class OccupancyGrid(nn.Module):
         """Take in the densities (N,) that a training step read anyway at points (N, 3); rays see it at the next update."""
         # A cell is observed at up to every step: its decay is spread over them.
         decay = 0.9 if warming_up else self.config.decay ** (1 / self.config.update_every)
+        average(self.mean, self.config.resolution, points, density, MEAN_RATE)
         observe(self.density, self.scratch, self.config.resolution, points, density, decay)
 
     @torch.no_grad()
@@ -138,6 +143,7 @@ class OccupancyGrid(nn.Module):
         points = self.positions(cells, generator)
         fresh = torch.cat([density(part) for part in points.split(CHUNK)]) if len(points) else points[:, 0]
         self.density[cells] = torch.maximum(self.density[cells] * self.config.decay, fresh)
+        average(self.mean, self.config.resolution, points, fresh, MEAN_RATE)
         if interest is not None:
             dense = fresh * self.step > self.config.threshold
             if bool(dense.any()):

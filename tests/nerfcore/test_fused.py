@@ -55,6 +55,7 @@ def random_model(
     cell = torch.arange(n**3)
     center = (torch.stack([cell % n, cell // n % n, cell // n**2], 1) + 0.5) / n * 2 - 1
     occupancy.density.copy_(torch.where(center.norm(dim=1) < 0.7, 6.0, 0.0))
+    occupancy.mean.copy_(occupancy.density)
     occupancy.interest.uniform_()
     occupancy.rebuild()
     return model.to(device)

@@ -244,6 +244,16 @@ def test_interest_and_density_draw_samples() -> None:
     assert share(4.0) > 1.5 * share(0.0)
 
 
+def test_cells_follow_the_mean_of_the_points_in_them() -> None:
+    generator = torch.Generator().manual_seed(18)
+    points, values = torch.rand(3000, 3, generator=generator), torch.rand(3000, generator=generator)
+    grids = [torch.zeros(4**3) for _ in range(2)]
+    cells.average(grids[0], 4, points, values, 0.1)
+    cells_torch.average(grids[1], 4, points, values, 0.1)
+    assert relative(grids[0], grids[1]) <= 1e-5
+    assert float((grids[0] - 0.5).abs().max()) < 0.35
+
+
 @pytest.mark.parametrize("device", DEVICES)
 def test_observing_samples_equals_its_twin(device: str) -> None:
     generator = torch.Generator().manual_seed(8)

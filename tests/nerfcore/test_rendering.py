@@ -53,6 +53,7 @@ def ball_model(samples: int, pdf: str = "default", resolution: int = 64) -> Mode
     corner = torch.stack([cells % resolution, cells // resolution % resolution, cells // resolution**2], 1)
     center = (corner + 0.5) / resolution * 2 - 1
     occupancy.density = torch.where(center.norm(dim=1) < RADIUS + 2 / resolution, DENSITY, 0.0)
+    occupancy.mean = occupancy.density.clone()
     occupancy.rebuild()
     return model
 
@@ -128,6 +129,7 @@ def test_the_pdf_puts_samples_where_the_light_is_absorbed() -> None:
         model = ball_model(8, pdf)
         model.field.strength = 400.0  # type: ignore[assignment]
         model.occupancy.density *= 100
+        model.occupancy.mean *= 100
         model.occupancy.rebuild()
         frame = render_view(model, camera, pose, 1.0)
         errors[pdf] = abs(frame.depth[20, 24] - (distance - RADIUS))

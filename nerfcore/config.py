@@ -131,6 +131,9 @@ class LossConfig(Stage):
     sparsity_scale: float = Field(default=0.05, gt=0, description="ℓ of 1−exp(−ℓσ)")
     distortion_weight: float = Field(default=0.0, ge=0, description="against floaters")
     opacity_weight: float = Field(default=0.0, ge=0, description="entropy of the ray's opacity")
+    depth_weight: float = Field(
+        default=0.0, ge=0, description="pulls surfaces to the sparse points of the poses and to depth maps; 0: off"
+    )
     entropy_ratio: float = Field(default=0.02, ge=0, description="λ_ent / λ_sem; entropy is raised")
     entropy_start: float = Field(default=0.2, ge=0, le=1, description="share of training before the entropy term")
 
@@ -146,6 +149,11 @@ class TrainConfig(Stage):
     network_rate: float = Field(default=0.005, gt=0, description="learning rate of the networks")
     decay: float = Field(default=0.33, gt=0, le=1, description="of the rates at ½, ¾ and 9/10")
     fade: float = Field(default=0.2, ge=0, lt=1, description="share of training over which finer levels appear")
+    refine_poses: bool = Field(default=False, description="correct the cameras of the training photos while training")
+    pose_rate: float = Field(
+        default=1e-3, gt=0, description="learning rate of the cameras, in radians and halves of the box; falls to 1 %"
+    )
+    pose_start: float = Field(default=0.05, ge=0, lt=1, description="share of training before cameras move")
     checkpoint_every: float = Field(default=30.0, gt=0, description="seconds between checkpoints")
     preview_every: float = Field(default=15.0, gt=0, description="seconds between preview pictures")
     seed: int = 0

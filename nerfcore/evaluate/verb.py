@@ -21,8 +21,9 @@ from ..project import load_project, load_scene
 from ..render.image import Frame, background_of, render_view, to_bytes, write_picture
 from ..render.pictures import colorize_depth, colorize_labels, side_by_side
 from ..train.prepare import GPU_IMAGE_SIZE
-from ..train.run import Trained, load_trained, run_folder
+from ..train.run import Trained, load_trained, refined_poses, run_folder
 from .metrics import Confusion, psnr, ssim
+from .refit import refit_camera
 from .speed import SPEED_KEYS, measure_speed, peak_memory
 
 
@@ -31,7 +32,9 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
 
     Returns:
         {"psnr", "ssim", "lpips", "miou", "per_class_iou", "fps", "rps", "spr", "ms_sampling", "ms_network",
-        "params_m", "memory_mb", "images", "background", …}; what was not measured is None.
+        "params_m", "memory_mb", "images", "background", …}; what was not measured is None. Of runs with refined poses
+        training views are rendered from those and held-out ones from poses fitted to their photos;
+        "psnr_given_poses" is what the latter score without that.
     Raises:
         ProjectError: no such run. InputError: nothing is held out, or a photo cannot be read.
     """
@@ -46,6 +49,7 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
     out = run_folder(folder, params.run) / "evaluation"
     confusion = Confusion(trained.info.class_ids if trained.model.field.classes else [])
     names = {c.id: c.name for c in scene.classes}
+    refined = refined_poses(folder, params.run, trained.info)
     scores: list[dict[str, Any]] = []
     pictures = []
     seconds, rays = 0.0, 0
@@ -58,13 +62,20 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
         camera = view.camera.resized(
             *training_size(view.camera, trained.info.config.scene.image_size or GPU_IMAGE_SIZE)
         )
+        photo, keep, label = _truth(view, scene, camera.width, camera.height, background)
+        given: dict[str, float] = {}
+        if view.name in refined:
+            pose = refined[view.name]
+        elif refined:
+            before = render_view(trained.model, camera, pose, background, semantics=False, check=report.check)
+            given["psnr_given_pose"] = psnr(to_bytes(before.color), photo, keep)
+            pose = refit_camera(trained.model, camera, pose, photo, keep, background, report.check)
         begin, compiled = time.perf_counter(), compile_seconds()
         frame = render_view(trained.model, camera, pose, background, check=report.check)
         seconds += time.perf_counter() - begin - (compile_seconds() - compiled)
         rays += camera.width * camera.height
-        photo, keep, label = _truth(view, scene, camera.width, camera.height, background)
         image = to_bytes(frame.color)
-        score = {"name": view.name, "psnr": psnr(image, photo, keep), "ssim": ssim(image, photo)}
+        score = {"name": view.name, "psnr": psnr(image, photo, keep), "ssim": ssim(image, photo), **given}
         if label is not None and confusion.class_ids:
             present = frame.label(confusion.class_ids, scene.ignore_id)
             confusion.add(label, present)
@@ -93,6 +104,8 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
         "per_image": [{k: (round(v, 4) if isinstance(v, float) else v) for k, v in s.items()} for s in scores],
         "pictures": [str(p.relative_to(folder)) for p in pictures],
     }
+    if any("psnr_given_pose" in score for score in scores):
+        result["psnr_given_poses"] = round(float(np.mean([score["psnr_given_pose"] for score in scores])), 3)
     path = run_folder(folder, params.run) / "metrics.json"
     known = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     write_json(path, {**known, params.split: result})

@@ -12,6 +12,7 @@ from torch import nn
 
 from ..kernels import encode
 from ..kernels.encode import BLOCK, FEATURES
+from ..kernels.encode_points import backward_points
 
 Levels = list[tuple[int, int, int]]
 Part = tuple[torch.Tensor, torch.Tensor]
@@ -51,12 +52,16 @@ class _Encode(torch.autograd.Function):
     def backward(ctx, *grads):
         (points,) = ctx.saved_tensors
         grid: VertexGrid = ctx.grid
-        part = points, grads[0].float().contiguous()
+        part = points.detach(), grads[0].float().contiguous()
         if ctx.collected is None:
             grid.scatter([part], ctx.gains)
         else:
             ctx.collected.append(part)
-        return None, None, None, None, None
+        moved = None
+        if ctx.needs_input_grad[0]:
+            gains = [gain * weight for gain, weight in zip(ctx.gains, grid.point_gains)]
+            moved = backward_points(grid.table, grid.levels, gains, *part)
+        return moved, None, None, None, None
 
 
 class VertexGrid(nn.Module):
@@ -68,6 +73,7 @@ class VertexGrid(nn.Module):
     def __init__(self, levels: Levels, initial: float = 1e-2) -> None:
         super().__init__()
         self.levels = levels
+        self.point_gains = [1.0] * len(levels)  # weights of the levels in the gradient of the points
         self._here = threading.local()
         rows = levels[-1][1] + -(-levels[-1][2] // BLOCK) * BLOCK
         self.register_buffer("table", torch.empty(rows, FEATURES).uniform_(-initial, initial))

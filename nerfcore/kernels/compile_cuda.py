@@ -18,13 +18,13 @@ from pathlib import Path
 import warp as wp
 
 from ..files import write_json, write_section, write_text
-from . import cells, composite, encode, march
+from . import cells, composite, encode, encode_points, march
 from .fused import LANES, FusedShape, fused_kernel
 from .resources import Resources, disassembler, markdown, read_resources
 from .runtime import CUDA_BLOCK, default_threads, init
 
 ARCHITECTURES = (75, 86, 89, 90, 120)
-SOURCES = (encode, march, composite, cells)
+SOURCES = (encode, encode_points, march, composite, cells)
 # The standard preset: without classes, with few, with the most.
 FUSED = {f"fused, {classes} classes": FusedShape(8, 8, 64, 16, 3, 0, classes, False) for classes in (0, 16, 64)}
 

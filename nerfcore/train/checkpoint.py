@@ -27,6 +27,8 @@ def trainer_tensors(trainer: Trainer) -> dict[str, torch.Tensor]:
     tensors["generator"] = trainer.generator.get_state()
     if trainer.cache.hit is not None:
         tensors["cache.hit"] = trainer.cache.hit
+    if trainer.poses is not None:
+        tensors.update({f"poses.{name}": value for name, value in trainer.poses.tensors().items()})
     return tensors
 
 
@@ -77,6 +79,8 @@ def restore(trainer: Trainer, tensors: dict[str, torch.Tensor], state: dict[str,
         if saved:
             # Adam keeps its step count on the CPU unless it is fused on a GPU.
             trainer.optimizer.state[parameter] = saved
+    if trainer.poses is not None:
+        trainer.poses.restore({n.removeprefix("poses."): t for n, t in tensors.items() if n.startswith("poses.")})
     trainer.generator.set_state(tensors["generator"].cpu())
     trainer.cache.hit = tensors.get("cache.hit")
     trainer.steps, trainer.rays = state["steps"], state["rays"]

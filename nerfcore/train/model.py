@@ -12,6 +12,7 @@ from ..field.encoding import spherical_harmonics
 from ..field.hybrid import HybridField
 from ..kernels.composite import render_weights, weighted_sum
 from ..kernels.march import Samples, sample
+from ..kernels.march_torch import grid_position
 from ..sampling.occupancy import OccupancyGrid, class_interest
 
 ONE_PASS_SHARE = 0.67
@@ -109,11 +110,16 @@ class Model(nn.Module):
         s = sample(
             origins, directions, self.occupancy.cells, self.occupancy.blocks, settings, samples_per_ray, jitter, shift
         )
+        points = s.points
+        if origins.requires_grad:  # pose refinement: samples move with their ray
+            along = s.packing.ray.long()
+            moved = origins[along] + directions[along] * s.depth[:, None]
+            points = grid_position(moved, self.contracted).clamp(0, 1)
         # Where many samples turn out invisible, a first pass without gradients finds the others, and only those are
         # differentiated; where nearly all show, one pass is cheaper (3k + 1 against 3 forward costs at share k).
         first_look = not torch.is_grad_enabled() or float(self.shown_share) < ONE_PASS_SHARE
         with torch.set_grad_enabled(torch.is_grad_enabled() and not first_look):
-            everywhere = self.field.geometry(s.points)
+            everywhere = self.field.geometry(points)
             weights = render_weights(everywhere.density, s.delta, s.packing)
         with torch.no_grad():
             visible = weights > self.config.render.cull
@@ -121,7 +127,7 @@ class Model(nn.Module):
         delta = s.delta[kept]
         if torch.is_grad_enabled() and first_look:
             shown = self.field.geometry(
-                s.points[kept], everywhere.explicit[kept] if everywhere.explicit is not None else None
+                points[kept], everywhere.explicit[kept] if everywhere.explicit is not None else None
             )
             weight = render_weights(shown.density, delta, packing)
         else:

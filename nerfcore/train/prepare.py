@@ -14,8 +14,9 @@ from ..data.scene import Scene
 from ..data.similarity import transform_points
 from ..errors import TrainingError
 from ..progress import Reporter
-from ..project import load_project, load_scene, world_from_sfm
+from ..project import load_project, load_scene, load_visibility, world_from_sfm
 from ..sampling.visibility import depth_ranges, view_counts
+from .depth import depth_scale, find_depths
 from .run import RunInfo, new_model
 from .trainer import Trainer
 
@@ -134,7 +135,14 @@ def make_trainer(project_folder: Path, info: RunInfo, scene: Scene, device: torc
         model.field.blend.views.copy_((counts / VIEWS_ENOUGH).clamp(max=1))
     background = config.scene.background
     random = background == "random" or background == "auto"
-    return Trainer(model, store, config, random_background=random)
+    trainer = Trainer(model, store, config, random_background=random)
+    if config.loss.depth_weight > 0:
+        scale = depth_scale(world_from_sfm(load_project(project_folder)), box.box_from_world)
+        visibility = load_visibility(project_folder)
+        trainer.depths = find_depths(scene, store, visibility, box.box_from_world, scale, box.contracted)
+        if not len(trainer.depths):
+            report.warn("loss.depth_weight has no effect: the project has neither depth maps nor points of its views.")
+    return trainer
 
 
 def degrade(store: PixelStore, config: RunConfig) -> None:

@@ -13,13 +13,15 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from ..config import RunConfig
 from ..data.box import Box
+from ..data.scene import transform_pose
 from ..errors import ProjectError
 from ..files import write_json
 from ..kernels.runtime import default_threads
-from ..project import Project, world_from_sfm
+from ..project import Poses, Project, world_from_sfm
 from .model import Model
 
 CHECKPOINT = "field.safetensors"
+REFINED_POSES = "poses.json"  # of a run with train.refine_poses
 
 
 class RunInfo(BaseModel):
@@ -59,6 +61,23 @@ def load_info(project: Path, run: str) -> RunInfo:
         raise ProjectError(f"{project} has no run “{run}”.", "Run `fieldwork train` first.") from error
     except (json.JSONDecodeError, ValidationError) as error:
         raise ProjectError(f"{path} is damaged or from another version.", "Train the run again.") from error
+
+
+def refined_poses(project: Path, run: str, info: RunInfo) -> dict[str, np.ndarray]:
+    """Camera-to-box poses (4, 4) by image of a run that refined them; empty otherwise.
+
+    Raises:
+        ProjectError: the run's poses.json is damaged.
+    """
+    path = run_folder(project, run) / REFINED_POSES
+    if not (info.config.train.refine_poses and path.is_file()):
+        return {}
+    try:
+        poses = Poses.model_validate_json(path.read_text(encoding="utf-8"))
+    except (OSError, ValidationError) as error:
+        raise ProjectError(f"{path} is damaged: {error}.", "Train the run again.") from error
+    box_from_sfm = np.linalg.inv(np.array(info.sfm_from_box))
+    return {image.name: transform_pose(box_from_sfm, np.array(image.camera_to_world)) for image in poses.images}
 
 
 def use_device() -> torch.device:

@@ -14,6 +14,7 @@ from ..data.pixels import VOID, Batch, PixelStore
 from ..field.grid import Part
 from ..kernels.runtime import run_parallel
 from ..sampling.cache import CoarseCache
+from .depth import DepthRays, depth_loss
 from .losses import (
     color_loss,
     distortion_loss,
@@ -24,6 +25,7 @@ from .losses import (
     sparsity_loss,
 )
 from .model import Model, Rendered
+from .pose_refinement import PoseRefinement, level_weights
 from .schedule import bias_correction, rate_factor
 
 BETAS = (0.9, 0.99)
@@ -33,13 +35,15 @@ SHARD_SAMPLES = 16384  # whose activations fit a core's cache
 @dataclass(frozen=True)
 class Learned:
     """What one part of a batch taught: gradients of the model's parameters, in their order, and of encoded points;
-    its parts of the loss and of the squared error (scalars); what was rendered, if anything."""
+    its parts of the loss and of the squared error (scalars); what was rendered, if anything; gradients of the rays'
+    origins and directions where cameras move."""
 
     gradients: Sequence[torch.Tensor | None]
     encoded: list[Part]
     loss: torch.Tensor
     squared_error: torch.Tensor
     rendered: Rendered | None
+    rays: Sequence[torch.Tensor] = ()
 
 
 @dataclass
@@ -76,6 +80,8 @@ class Trainer:
         self.steps = 0
         self.rays = max(16, min(config.train.max_rays, config.train.batch_start // config.sampling.samples))
         self.cache = CoarseCache(store)
+        self.poses = PoseRefinement(store.rays, config.train) if config.train.refine_poses else None
+        self.depths: DepthRays | None = None
         self.measured = Measured()
 
     def draw(self) -> Batch:
@@ -93,8 +99,15 @@ class Trainer:
         if self.steps % config.sampling.update_every == 0:
             interest = model.interest if model.wants_interest() and self.steps >= config.sampling.warmup else None
             model.occupancy.update(self.steps, model.field.density, interest, self.generator)
-        batch = self.draw()
+        batch, start = self.draw(), config.train.pose_start
+        moving = self.poses if progress >= start else None
+        if moving is not None:
+            batch = moving.move(batch)
+            if model.field.grid is not None:
+                model.field.grid.point_gains = level_weights(config.field.levels, progress)
         learned = self._learn(batch, progress)
+        if moving is not None:
+            moving.step([part.rays for part in learned if part.rays], (progress - start) / (1 - start))
         self.steps += 1
         factor = rate_factor(progress, config.train.decay)
         for group in self.optimizer.param_groups:
@@ -136,7 +149,8 @@ class Trainer:
                 share = len(part.rgb) / rays, (part.label != VOID).sum() / labelled
                 return *self.loss(part, rendered, background[begin : begin + size], progress, share), rendered
 
-            return self._differentiate(loss)
+            moved = (part.origins, part.directions) if part.origins.requires_grad else ()
+            return self._differentiate(loss, moved)
 
         tasks = [partial(shard, begin) for begin in range(0, rays, size)]
         c = self.config.loss
@@ -148,6 +162,8 @@ class Trainer:
                 return price, torch.zeros_like(price), None
 
             tasks.append(partial(self._differentiate, sparsity))
+        if self.depths is not None and len(self.depths):
+            tasks.append(self._depth_task(self.depths))
         learned = run_parallel(tasks)
         for parameter, *gradients in zip(self.model.parameters(), *(part.gradients for part in learned)):
             found = [g for g in gradients if g is not None]
@@ -160,19 +176,44 @@ class Trainer:
             self.measured.mse += part.squared_error
         return learned
 
-    def _differentiate(self, loss: Callable[[], tuple[torch.Tensor, torch.Tensor, Rendered | None]]) -> Learned:
-        """Value and gradients of one part of the loss, without touching what other threads read."""
+    def _depth_task(self, depths: DepthRays) -> Callable[[], Learned]:
+        """The task that learns from some of the rays of known length, drawn here."""
+        rays, per_ray = self.store.rays, self.config.sampling.samples
+        cameras = rays.rotation, rays.center
+        if self.poses is not None:
+            moved = self.poses.poses(rays)
+            cameras = moved[:, :3, :3], moved[:, :3, 3]
+        origins, directions, distance, weight = depths.draw(*cameras, self.generator)
+        jitter = torch.rand(len(origins), device=self.device, generator=self.generator)
+        shift = torch.rand(len(origins) * per_ray, device=self.device, generator=self.generator)
+
+        def loss() -> tuple[torch.Tensor, torch.Tensor, Rendered]:
+            rendered = self.model.render(origins, directions, per_ray, jitter, shift, semantics=False)
+            term = self.config.loss.depth_weight * depth_loss(rendered.depth, distance, weight)
+            return term, torch.zeros_like(term), rendered
+
+        return partial(self._differentiate, loss)
+
+    def _differentiate(
+        self,
+        loss: Callable[[], tuple[torch.Tensor, torch.Tensor, Rendered | None]],
+        rays: Sequence[torch.Tensor] = (),
+    ) -> Learned:
+        """Value and gradients of one part of the loss, without touching what other threads read; also those of
+        `rays`, zero where the part met nothing."""
         grid = self.model.field.grid
         with grid.collecting() if grid is not None else nullcontext([]) as encoded:
             total, squared_error, rendered = loss()
             parameters = list(self.model.parameters())
             # The anchor stands for the grid, whose gradients are collected on the way to it.
-            wanted = parameters if grid is None else [*parameters, grid.anchor]
+            wanted = [*parameters, *rays] if grid is None else [*parameters, *rays, grid.anchor]
             # A part that met nothing has no gradient.
-            gradients: Sequence[torch.Tensor | None] = [None] * len(parameters)
+            gradients: Sequence[torch.Tensor | None] = [None] * len(wanted)
             if total.requires_grad:
-                gradients = torch.autograd.grad(total, wanted, allow_unused=True)[: len(parameters)]
-        return Learned(gradients, encoded, total.detach(), squared_error.detach(), rendered)
+                gradients = torch.autograd.grad(total, wanted, allow_unused=True)
+        own, moved = gradients[: len(parameters)], gradients[len(parameters) : len(parameters) + len(rays)]
+        turned = [torch.zeros_like(ray) if g is None else g for ray, g in zip(rays, moved)]
+        return Learned(own, encoded, total.detach(), squared_error.detach(), rendered, turned)
 
     def _render(self, batch: Batch, jitter: torch.Tensor, shift: torch.Tensor) -> Rendered:
         appearance, semantics = self.model.field.appearance, self.config.loss.semantic_weight > 0

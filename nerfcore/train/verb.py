@@ -8,6 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TextIO
 
+import numpy as np
+
 from ..config import make_config
 from ..data.box import box_poses
 from ..data.pixels import training_size
@@ -21,8 +23,9 @@ from ..project import load_project, load_scene, save_project
 from ..render.image import background_of, render_view, write_picture
 from .checkpoint import read_checkpoint, restore, save_checkpoint
 from .model import Model
+from .pose_refinement import write_poses
 from .prepare import make_trainer, plan_run
-from .run import CHECKPOINT, RunInfo, load_info, run_folder, save_info, use_device
+from .run import CHECKPOINT, REFINED_POSES, RunInfo, load_info, run_folder, save_info, use_device
 from .trainer import Trainer
 
 PREVIEW_PAUSE = 20  # times what a preview costs, before the next one
@@ -57,7 +60,7 @@ def train(params: TrainParams, report: Reporter) -> dict[str, Any]:
         info, scene = plan_run(project_folder, params.preset, make_config(params.preset, params.set), device)
         with disk_errors(folder):
             folder.mkdir(parents=True, exist_ok=True)
-        for stale in (CHECKPOINT, "events.jsonl", "metrics.json"):
+        for stale in (CHECKPOINT, REFINED_POSES, "events.jsonl", "metrics.json"):
             (folder / stale).unlink(missing_ok=True)
         save_info(project_folder, params.run, info)
     for half_written in folder.glob(".*.safetensors"):  # by a process that was killed
@@ -87,6 +90,8 @@ def train(params: TrainParams, report: Reporter) -> dict[str, Any]:
         "params_m": round(trainer.model.field.parameter_count() / 1e6, 2),
         "device": str(device),
     }
+    if trainer.poses is not None:
+        result["pose_shift"] = trainer.poses.shift(info.box(load_project(project_folder)).world_from_box)
     write_json(folder / "metrics.json", {"train": result})
     project = load_project(project_folder)
     project.record("train", params.model_dump(mode="json"), result)
@@ -165,7 +170,11 @@ class _Loop:
         self.report.progress(progress, f"step {values['step']}, {values['psnr']:.1f} dB")
 
     def checkpoint(self) -> None:
-        save_checkpoint(self.folder / CHECKPOINT, self.trainer, self.state)
+        trainer, info = self.trainer, self.info
+        save_checkpoint(self.folder / CHECKPOINT, trainer, self.state)
+        if trainer.poses is not None:
+            path = self.folder / REFINED_POSES
+            write_poses(path, trainer.poses, trainer.store.rays, info.images, np.array(info.sfm_from_box))
 
 
 def _preview(project_folder: Path, folder: Path, info: RunInfo, scene: Scene, model: Model) -> Callable[[], Path]:

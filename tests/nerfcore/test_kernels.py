@@ -10,6 +10,7 @@ from fieldwork.nerfcore.kernels import (
     composite,
     composite_torch,
     encode,
+    encode_points,
     encode_torch,
     march,
     march_torch,
@@ -59,6 +60,43 @@ def test_encode_equals_its_twin_and_so_does_its_gradient(device: str) -> None:
     assert relative(gradient, expected_table.grad) <= 1e-4
     blocks = (expected_table.grad.abs().sum(1) > 0).view(-1, encode.BLOCK).any(1)
     assert torch.equal(touched.bool() & blocks, blocks)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_the_gradient_of_encoded_points_equals_its_twin(device: str) -> None:
+    generator = torch.Generator().manual_seed(11)
+    table = torch.randn(ROWS, encode.FEATURES, generator=generator).to(device)
+    points = torch.rand(3000, 3, generator=generator).to(device).requires_grad_()
+    expected = encode_torch.forward(table, LEVELS, GAINS, points)
+    upstream = torch.randn(expected.shape, generator=generator).to(device)
+    expected.backward(upstream)
+    assert points.grad is not None
+    ours = encode_points.backward_points(table, LEVELS, GAINS, points.detach(), upstream)
+    assert relative(ours, points.grad) <= 1e-4
+    coarse = encode_points.backward_points(table, LEVELS, [1.0, 0.0, 0.0], points.detach(), upstream)
+    assert relative(coarse, ours) > 0.5
+
+
+def test_the_gradient_of_encoded_points_agrees_with_finite_differences() -> None:
+    generator = torch.Generator().manual_seed(12)
+    table = torch.randn(ROWS, encode.FEATURES, generator=generator)
+    # In the middle of the finest level's cells, so that the steps stay inside one cell of every level.
+    cells_ = torch.randint(0, 63, (64, 3), generator=generator)
+    points = (cells_ + 0.5) / 63
+    step = 2e-4
+    for resolution in (5, 17):
+        f = points * (resolution - 1)
+        points = points[((f - f.round()).abs() > 0.02).all(1)]
+    assert len(points) > 20
+    upstream = torch.randn(len(points), len(LEVELS) * encode.FEATURES, generator=generator)
+    ours = encode_points.backward_points(table, LEVELS, GAINS, points, upstream)
+    for axis in range(3):
+        shift = torch.zeros(3)
+        shift[axis] = step
+        ahead = encode.forward(table, LEVELS, GAINS, points + shift)
+        behind = encode.forward(table, LEVELS, GAINS, points - shift)
+        difference = ((ahead - behind) * upstream).sum(1) / (2 * step)
+        assert relative(ours[:, axis], difference) < 5e-3
 
 
 def test_the_gradient_scatter_gives_the_same_bits_every_time() -> None:

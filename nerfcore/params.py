@@ -63,7 +63,11 @@ class DatasetParams(Params):
 class NewParams(Params):
     project: Path
     photos: Path = Field(description="folder of photos, or a video file")
-    labels: Path | None = Field(default=None, description="folder of label maps named like the photos")
+    labels: Path | None = Field(
+        default=None,
+        description="folder of label maps (or .npy, .npz, .exr probability maps) named like the photos; "
+        "confidence/ in it may hold grey maps of how sure they are",
+    )
     masks: Path | None = Field(default=None, description="folder of foreground masks named like the photos")
     classes: Path | None = Field(default=None, description="classes.json: names of the label ids")
     mask_mode: Literal["ignore", "empty"] = Field(default="ignore", description="what black mask pixels mean")

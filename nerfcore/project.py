@@ -58,6 +58,7 @@ class ImageRecord(Model):
     sharpness: float | None = None
     label: str | None = None
     mask: str | None = None
+    confidence: str | None = None  # how sure the labels are, 8-bit grey
     depth: str | None = None
     split: Literal["train", "test", "auto"] = "auto"
     status: Literal["ok", "rejected", "unregistered"] = "ok"
@@ -235,6 +236,7 @@ def load_scene(folder: Path) -> Scene:
                 image=folder / record.file,
                 label=folder / record.label if record.label else None,
                 mask=folder / record.mask if record.mask else None,
+                confidence=folder / record.confidence if record.confidence else None,
                 depth=folder / record.depth if record.depth else None,
             )
         )

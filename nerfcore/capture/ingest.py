@@ -26,6 +26,7 @@ from .images import FLOAT_SUFFIXES, PHOTO_SUFFIXES, float_exposure, read_photo
 from .labels import Colors, fit_to_photo, read_labels, read_mask
 from .select import reject_blurred, reject_duplicates
 from .sharpness import sharpness, thumbnail
+from .soft_labels import find_confidence, find_probabilities, read_confidence
 from .video import VIDEO_SUFFIXES, extract_frames
 
 CACHE_FILE = "jobs/ingested.json"
@@ -44,6 +45,7 @@ class Source:
     path: Path
     label: Path | None
     mask: Path | None
+    confidence: Path | None
 
 
 @dataclass(frozen=True)
@@ -191,7 +193,7 @@ def _previous_project(params: NewParams) -> Project | None:
 
 def _remove_halves(folder: Path) -> None:
     """Delete what a run that was killed had half written: hidden files in the folders of working copies."""
-    for name in ("images", "labels", "masks"):
+    for name in ("images", "labels", "masks", "confidence"):
         for path in (folder / name).glob(".*"):
             path.unlink(missing_ok=True)
 
@@ -218,9 +220,13 @@ def _sources(paths: list[Path], root: Path, labels: Path | None, masks: Path | N
         while unique in taken:
             unique += "_b"
         taken.add(unique)
-        label = (beside(labels, name, False) or beside(labels, path.stem, False)) if labels else None
+        label = confidence = None
+        if labels:
+            soft = find_probabilities(labels, name) or find_probabilities(labels, path.stem)
+            label = soft or beside(labels, name, False) or beside(labels, path.stem, False)
+            confidence = find_confidence(labels, name, label) or find_confidence(labels, path.stem, label)
         mask = (beside(masks, name, False) or beside(masks, path.stem, False)) if masks else None
-        sources.append(Source(unique, path, label, mask))
+        sources.append(Source(unique, path, label, mask, confidence))
     return sources
 
 
@@ -257,7 +263,7 @@ def _ingest_all(
 
 def _cache_key(source: Source, settings: Settings) -> list[Any]:
     stamps = []
-    for path in (source.path, source.label, source.mask):
+    for path in (source.path, source.label, source.mask, source.confidence):
         stat = path.stat() if path else None
         stamps.append([str(path), stat.st_size, stat.st_mtime] if stat else None)
     colors = {str(i): list(color) for i, color in sorted((settings.colors or {}).items())}
@@ -322,16 +328,19 @@ def _ingest_one(source: Source, settings: Settings) -> tuple[ImageRecord, np.nda
     with atomic_path(settings.folder / record.file) as path:
         image.save(path, quality=95, subsampling=0) if suffix == ".jpg" else image.save(path, compress_level=2)
     problems = []
-    for kind, given in (("label", source.label), ("mask", source.mask)):
+    for kind, given in (("label", source.label), ("mask", source.mask), ("confidence", source.confidence)):
         if given is None:
             continue
         try:
-            values = read_labels(given, settings.colors, settings.ignore_id) if kind == "label" else read_mask(given)
+            if kind == "label":
+                values = read_labels(given, settings.colors, settings.ignore_id)
+            else:
+                values = read_mask(given) if kind == "mask" else read_confidence(given)
             fitted = fit_to_photo(values, photo.orientation, photo.full_size, image.size, f"{kind} {given.name}")
         except InputError as error:
             problems.append(str(error))
             continue
-        file = f"{kind}s/{source.name}.png"
+        file = f"{kind if kind == 'confidence' else kind + 's'}/{source.name}.png"
         with atomic_path(settings.folder / file) as path:
             small = fitted.astype(np.uint8) if fitted.max(initial=0) < 256 else fitted
             Image.fromarray(small).save(path, compress_level=2)

@@ -9,6 +9,7 @@ from PIL import Image, UnidentifiedImageError
 
 from ..errors import InputError
 from .images import upright
+from .soft_labels import PROBABILITY_SUFFIXES, read_probabilities
 
 Colors = dict[int, tuple[int, int, int]]
 
@@ -17,11 +18,14 @@ def read_labels(path: Path, colors: Colors | None = None, ignore_id: int = 0) ->
     """Class ids (H, W) uint16 of a label map.
 
     Grey PNGs (8 or 16 bits) and palette PNGs hold the ids themselves; a palette whose colours are those of the
-    classes, and RGB pictures, are looked up in `colors` (id → RGB). Transparent pixels become `ignore_id`.
+    classes, and RGB pictures, are looked up in `colors` (id → RGB). Transparent pixels become `ignore_id`. Of
+    probability maps the most probable class is taken.
 
     Raises:
         InputError: it is no image, lossily compressed, or has colours that no class has. One clause, fit as a reason.
     """
+    if path.suffix.lower() in PROBABILITY_SUFFIXES:
+        return read_probabilities(path).argmax(2).astype(np.uint16)
     try:
         with Image.open(path) as image:
             if image.format in ("JPEG", "MPO", "HEIF"):

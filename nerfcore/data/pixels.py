@@ -78,7 +78,8 @@ class Batch:
     """R rays in the normalised frame with what their pixels hold.
 
     origins, directions (R, 3) float32, unit directions; rgb (R, 3) and alpha (R,) float32 in [0, 1] (sRGB, straight
-    alpha); label (R,) int64 class index or VOID; image (R,) int64 index into the store; pixel (R,) int64 its place.
+    alpha); label (R,) int64 class index or VOID; image (R,) int64 index into the store; pixel (R,) int64 its place;
+    confidence (R,) float32 in [0, 1], how sure the label is.
     """
 
     origins: torch.Tensor
@@ -88,6 +89,7 @@ class Batch:
     label: torch.Tensor
     image: torch.Tensor
     pixel: torch.Tensor
+    confidence: torch.Tensor
 
     def part(self, rays: slice) -> Batch:
         """Some of the rays."""
@@ -166,7 +168,7 @@ class PixelStore:
         lookup = np.full(65536, VOID, np.uint8)
         for index, class_id in enumerate(class_ids):
             lookup[class_id] = index
-        cameras, colours, labels, usable = [], [], [], []
+        cameras, colours, labels, usable, sure = [], [], [], [], []
         self.transparent = False
         for number, view in enumerate(self.views):
             report.progress(number / len(self.views), view.name)
@@ -175,6 +177,10 @@ class PixelStore:
             label = np.full((height, width), VOID, np.uint8)
             if view.label is not None:
                 label = lookup[resize(read_label(view.label)[..., None], width, height, nearest=True)[..., 0]]
+            confidence = np.full((height, width), 255, np.uint8)
+            if view.confidence is not None:
+                confidence = resize(read_image(view.confidence)[..., :1], width, height, nearest=True)[..., 0]
+            sure.append(torch.from_numpy(np.ascontiguousarray(confidence)).reshape(-1))
             keep = np.ones((height, width), bool)
             if view.mask is not None:
                 inside = resize(read_image(view.mask)[..., :1], width, height, nearest=True)[..., 0] > 127
@@ -191,6 +197,8 @@ class PixelStore:
         self.cameras = cameras
         self.rgba = torch.cat(colours).to(device)
         self.label = torch.cat(labels).to(device)
+        known = any(view.confidence is not None for view in self.views)
+        self.confidence = torch.cat(sure).to(device) if known else None
         sizes = torch.tensor([c.width * c.height for c in cameras])
         self.first = torch.cat([torch.zeros(1, dtype=torch.long), sizes.cumsum(0)]).to(device)
         self.rays = CameraRays(cameras, box_poses(self.views, box_from_world), device)
@@ -212,7 +220,8 @@ class PixelStore:
         pixel = places - self.first[image]
         origins, directions = self.rays(image, pixel)
         value = self.rgba[places].float() / 255
-        return Batch(origins, directions, value[:, :3], value[:, 3], self.label[places].long(), image, pixel)
+        sure = torch.ones_like(value[:, 3]) if self.confidence is None else self.confidence[places].float() / 255
+        return Batch(origins, directions, value[:, :3], value[:, 3], self.label[places].long(), image, pixel, sure)
 
     def random_places(self, count: int, generator: torch.Generator) -> torch.Tensor:
         """`count` flat positions of usable pixels, with repetition."""

@@ -22,6 +22,7 @@ class View:
     label: Path | None = None
     mask: Path | None = None
     depth: Path | None = None
+    confidence: Path | None = None
 
 
 @dataclass(frozen=True)

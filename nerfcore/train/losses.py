@@ -18,19 +18,24 @@ def color_loss(predicted: torch.Tensor, target: torch.Tensor, config: LossConfig
     return F.huber_loss(predicted, target, delta=config.huber_delta) / config.huber_delta
 
 
-def semantic_loss(probabilities: torch.Tensor, target: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
+def semantic_loss(
+    probabilities: torch.Tensor, target: torch.Tensor, valid: torch.Tensor, confidence: torch.Tensor | None = None
+) -> torch.Tensor:
     """Cross-entropy in image space: −log Ŝ_y summed over labelled rays / max(their number, 1).
 
     Args:
         probabilities: (R, K) rendered class probabilities; the rest to 1 is void.
         target: (R,) class index, or (R, K) soft labels.
         valid: (R,) bool, labelled rays; none gives 0, not NaN.
+        confidence: (R,) in [0, 1], factor of each ray's term; the number of rays stays as it is.
     """
     log = probabilities.clamp(min=1e-6).log()
     if target.dim() == 1:
         picked = log.gather(1, torch.where(valid, target, 0)[:, None])[:, 0]
     else:
         picked = (log * target).sum(1)
+    if confidence is not None:
+        picked = picked * confidence
     return -(picked * valid).sum() / valid.sum().clamp(min=1)
 
 

@@ -152,7 +152,7 @@ class Trainer:
             moved = (part.origins, part.directions) if part.origins.requires_grad else ()
             return self._differentiate(loss, moved)
 
-        tasks = [partial(shard, begin) for begin in range(0, rays, size)]
+        tasks: list[Callable[[], Learned]] = [partial(shard, begin) for begin in range(0, rays, size)]
         c = self.config.loss
         if c.regularization * c.sparsity_weight > 0:
             points = torch.rand(1024, 3, device=self.device, generator=self.generator)
@@ -242,7 +242,8 @@ class Trainer:
         total = rays * c.rgb_weight * color_loss(predicted, target, c)
         if rendered.probabilities is not None:
             valid = batch.label != VOID
-            total = total + labels * c.semantic_weight * semantic_loss(rendered.probabilities, batch.label, valid)
+            price = semantic_loss(rendered.probabilities, batch.label, valid, batch.confidence)
+            total = total + labels * c.semantic_weight * price
             if c.entropy_ratio > 0 and c.regularization > 0 and progress >= c.entropy_start:
                 weight = c.regularization * c.entropy_ratio * c.semantic_weight
                 total = total + labels * weight * entropy_loss(rendered.probabilities, valid)

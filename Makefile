@@ -21,7 +21,7 @@ $(VENV)/.ready: pyproject.toml
 
 # PHOTOS=folder reconstructs your own photos (LABELS, CLASSES, MASKS optional); without it a museum scene is
 # simulated and photographed first.
-DEMO := build/demo$(if $(PHOTOS),-$(notdir $(patsubst %/,%,$(PHOTOS))))
+DEMO := build/demo$(if $(PHOTOS),-$(notdir $(patsubst %/images,%,$(patsubst %/,%,$(PHOTOS)))))
 OWN := $(if $(LABELS),--labels "$(LABELS)") $(if $(CLASSES),--classes "$(CLASSES)") $(if $(MASKS),--masks "$(MASKS)")
 SIMULATED := --labels $(DEMO)/capture/labels --classes $(DEMO)/capture/classes.json
 TRAIN_SECONDS ?= 240

@@ -52,7 +52,8 @@ def choose_box(scene: Scene, config: SceneConfig, transparent: bool) -> Box:
     - Bounds given by the capture (or the crop box): the cube around them, nothing outside.
     - Photos or masks with empty surroundings: the cube holds what the cameras surround, nothing outside.
     - Inward-looking captures with visible surroundings: the cube reaches from the focus to the cameras, or holds the
-      sparse points where those all lie closer together; space beyond is contracted.
+      sparse points (without points: what fills the photos) where those all lie closer together; space beyond is
+      contracted.
     - Everything else (rooms, walks): the cube holds all cameras and most sparse points; beyond is contracted.
     """
     centers = np.stack([view.camera_to_world[:3, 3] for view in scene.views])
@@ -67,6 +68,8 @@ def choose_box(scene: Scene, config: SceneConfig, transparent: bool) -> Box:
         # Cameras just inside the cube: what stands between and behind them is resolved finely too.
         extent = float(np.abs(centers - focus).max())
         middle, half = _points_extent(scene)
+        if not np.isfinite(half):
+            middle, half = focus, _object_radius(scene, focus, reach)
         if half * POINTS_MARGIN < extent:
             return _box(middle, half * POINTS_MARGIN * config.margin, config.contraction != "off")
         return _box(focus, extent * config.margin, config.contraction != "off")

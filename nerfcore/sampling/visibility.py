@@ -26,12 +26,15 @@ def uncontract(u: torch.Tensor) -> torch.Tensor:
     return torch.where(r > 1, q / r.clamp(min=1e-9) / (2 - r).clamp(min=1e-4), q)
 
 
-def depth_ranges(cameras: list[Camera], camera_to_box: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
+def depth_ranges(
+    cameras: list[Camera], camera_to_box: torch.Tensor, points: torch.Tensor, focus: torch.Tensor | None = None
+) -> torch.Tensor:
     """How near the sparse points (N, 3) come to each camera and where they mostly are: (V, 2) depths along the optical
     axis, the nearest with a margin and the median; zeros for cameras that see too few points to tell.
 
     The margin is half the depth that 96 % of the points span, at most half of their distance: surfaces without points
-    may come nearer than the points.
+    may come nearer than the points. Where there are no points, cameras that surround `focus` (3,) are taken to show
+    something that fills their photos there.
     """
     ranges = torch.zeros(len(cameras), 2, device=camera_to_box.device)
     for index, (camera, pose) in enumerate(zip(cameras, camera_to_box)):
@@ -41,6 +44,11 @@ def depth_ranges(cameras: list[Camera], camera_to_box: torch.Tensor, points: tor
             low, middle, high = depth.quantile(torch.tensor([0.02, 0.5, 0.98], device=depth.device))
             ranges[index, 0] = torch.maximum(low / 2, low - (high - low) / 2)
             ranges[index, 1] = middle
+        elif focus is not None and not _sees_everything(camera):
+            distance = (focus - pose[:3, 3]) @ pose[:3, 2]
+            filled = distance * max(camera.width / camera.fx, camera.height / camera.fy) / 2
+            ranges[index, 0] = (distance - 1.5 * filled).clamp(min=0)
+            ranges[index, 1] = distance.clamp(min=0)
     return ranges
 
 

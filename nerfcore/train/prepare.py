@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from ..config import RunConfig
-from ..data.box import Box, box_poses, choose_box
+from ..data.box import Box, box_poses, choose_box, focus_point, looks_inward
 from ..data.pixels import PixelStore, read_label, read_photo
 from ..data.scene import Scene
 from ..data.similarity import transform_points
@@ -125,7 +125,12 @@ def make_trainer(project_folder: Path, info: RunInfo, scene: Scene, device: torc
     poses = torch.from_numpy(box_poses(store.views, box.box_from_world)).float().to(device)
     coarse = 64
     points = torch.from_numpy(transform_points(box.box_from_world, scene.points.xyz)).float().to(device)
-    ranges = depth_ranges(store.cameras, poses, points)
+    focus = (
+        transform_points(box.box_from_world, focus_point(scene.views)[None])[0] if looks_inward(scene.views) else None
+    )
+    ranges = depth_ranges(
+        store.cameras, poses, points, None if focus is None else torch.from_numpy(focus).float().to(device)
+    )
     counts = view_counts(store.cameras, poses, coarse, box.contracted, ranges)
     resolution = config.sampling.resolution
     index = (torch.arange(resolution, device=device) * coarse) // resolution

@@ -87,3 +87,14 @@ def test_the_large_cells_around_far_cameras_are_empty():
     near = poses[:, :3, 3] + 0.02 * poses[:, :3, 2]
     assert not counts[cells_at(near, 64, True)].any()
     assert (counts[cells_at(points, 64, True)] > 0).all()
+
+
+def test_without_points_cameras_around_something_show_what_fills_their_photos():
+    poses = torch.from_numpy(half_ring(5, 2.0)).float()
+    ranges = depth_ranges([CAMERA] * 5, poses, torch.zeros(0, 3), torch.zeros(3))
+    distance = float(poses[0, :3, 3].norm())
+    assert torch.allclose(ranges[:, 1], torch.full((5,), distance), atol=1e-4)
+    assert torch.allclose(ranges[:, 0], torch.full((5,), distance * (1 - 1.5 * 100 / 80 / 2)), atol=1e-4)
+    box = choose_box(scene(half_ring(5, 2.0), np.zeros((0, 3))), SceneConfig(), False)
+    assert box.contracted
+    assert box.world_from_box[0, 0] < 2.0

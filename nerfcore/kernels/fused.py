@@ -442,7 +442,7 @@ def coarse_walk(
     inputs = [array(origins, wp.vec3), array(directions, wp.vec3), array(jitter), array(cells, wp.vec2), array(blocks)]
     s = settings
     inputs += [s.resolution, s.step, s.near, s.far, int(s.contracted), s.mode, s.beta, s.epsilon]
-    launch(march_weight, rays, [*inputs, array(total), array(first), array(last)], device)
+    launch(march_weight, rays, [*inputs, s.empty, array(total), array(first), array(last)], device)
     hit = total > 0
     place = torch.cumsum(hit, 0)
     # Rays that miss are written to a place behind the queue.

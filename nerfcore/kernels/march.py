@@ -25,12 +25,17 @@ PDF_DEFAULT, PDF_UNIFORM, PDF_LITERAL = 0, 1, 2
 _DEFAULT, _UNIFORM, _LITERAL = wp.constant(PDF_DEFAULT), wp.constant(PDF_UNIFORM), wp.constant(PDF_LITERAL)
 MAX_BINS = wp.constant(4096)
 MACRO = wp.constant(4)  # cells along a side of a block that can be skipped at once
+BEFORE_CUBE = wp.constant(0.8)  # share of the way to the cube that may be taken to be empty
 STOP = wp.constant(1.0e-4)  # transmittance below which the walk ends
 
 
 @dataclass(frozen=True)
 class MarchSettings:
-    """How rays are walked. `step` is the bin length inside the cube; `near`, `far` clip the ray (normalised units)."""
+    """How rays are walked. `step` is the bin length inside the cube; `near`, `far` clip the ray (normalised units).
+
+    `empty`: where space is contracted, rays from outside of the cube start as far away as this, but before they reach
+    the cube.
+    """
 
     resolution: int
     step: float
@@ -40,6 +45,7 @@ class MarchSettings:
     mode: int = PDF_DEFAULT
     beta: float = 1.0
     epsilon: float = 0.01
+    empty: float = 0.0
 
 
 @wp.func
@@ -80,6 +86,15 @@ def ray_interval(o: wp.vec3, inverse: wp.vec3, near: float, far: float, contract
             lo = wp.max(lo, wp.min(t0, t1))
             hi = wp.min(hi, wp.max(t0, t1))
     return lo, hi
+
+
+@wp.func
+def cube_entry(o: wp.vec3, inverse: wp.vec3):
+    """Distance at which a ray enters the cube [−1, 1]³; negative from inside."""
+    entry = float(-1.0e9)
+    for a in range(3):
+        entry = wp.max(entry, wp.min((-1.0 - o[a]) * inverse[a], (1.0 - o[a]) * inverse[a]))
+    return entry
 
 
 @wp.func
@@ -167,6 +182,7 @@ def march_weight(
     mode: int,
     beta: float,
     epsilon: float,
+    empty: float,
     total: wp.array(dtype=float),
     first: wp.array(dtype=float),
     last: wp.array(dtype=float),
@@ -177,6 +193,8 @@ def march_weight(
     d = directions[r]
     inverse = reciprocal(d)
     lo, hi = ray_interval(o, inverse, near, far, contracted)
+    if contracted == 1 and empty > 0.0:
+        lo = wp.max(lo, wp.min(empty, BEFORE_CUBE * cube_entry(o, inverse)))
     t = lo + jitter[r] * step
     transmittance = float(1.0)
     weight = float(0.0)
@@ -351,7 +369,7 @@ def sample(
     total, first, last = (torch.empty(rays, device=device) for _ in range(3))
     o, d, j = array(origins, wp.vec3), array(directions, wp.vec3), array(jitter)
     fixed = [array(cells, wp.vec2), array(blocks), *_arguments(settings)]
-    launch(march_weight, rays, [o, d, j, *fixed, array(total), array(first), array(last)], device)
+    launch(march_weight, rays, [o, d, j, *fixed, settings.empty, array(total), array(first), array(last)], device)
     hit = total > 0
     slot = torch.cumsum(hit, 0, dtype=torch.int32) - 1
     if capacity is None:

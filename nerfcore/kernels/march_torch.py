@@ -28,6 +28,9 @@ def walk(
     opened = (cells[:, 0] > 0).view(n, n, n)
     low, high = s.near, s.far
     inverse = 1 / torch.where(direction.abs() < 1e-9, 1e-9, direction)
+    if s.contracted and s.empty > 0:
+        entry = torch.minimum((-1 - origin) * inverse, (1 - origin) * inverse).max()
+        low = max(low, min(s.empty, 0.8 * float(entry)))
     if not s.contracted:
         a, b = (-1 - origin) * inverse, (1 - origin) * inverse
         low = max(low, float(torch.minimum(a, b).max()))

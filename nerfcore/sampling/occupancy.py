@@ -45,6 +45,9 @@ class OccupancyGrid(nn.Module):
         self.register_buffer("seen", seen)
         # Rays read these; they follow the density at updates only, so they are part of a checkpoint.
         self.register_buffer("cells", torch.stack([self.density, self.interest], 1))
+        # How far from every camera of the capture nothing was seen: other cameras outside of the cube need not look.
+        self.register_buffer("empty", torch.zeros(()))
+        self.empty: torch.Tensor
         self.register_buffer("mean", torch.where(seen, 3.0, 0.0))
         self.mean: torch.Tensor
         self.density: torch.Tensor
@@ -59,7 +62,9 @@ class OccupancyGrid(nn.Module):
     def march_settings(self, near: float = 0.02) -> MarchSettings:
         c = self.config
         beta = c.beta if c.interest != "none" else 0.0
-        return MarchSettings(c.resolution, self.step, near, 1000.0, self.contracted, MODES[c.pdf], beta, c.epsilon)
+        return MarchSettings(
+            c.resolution, self.step, near, 1000.0, self.contracted, MODES[c.pdf], beta, c.epsilon, float(self.empty)
+        )
 
     def rebuild(self) -> None:
         """Recompute what rays read from densities and interest."""

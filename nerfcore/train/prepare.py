@@ -136,6 +136,7 @@ def make_trainer(project_folder: Path, info: RunInfo, scene: Scene, device: torc
     index = (torch.arange(resolution, device=device) * coarse) // resolution
     seen = (counts > 0).view(coarse, coarse, coarse)[index][:, index][:, :, index].reshape(-1)
     model = new_model(info, device, seen.cpu())
+    model.occupancy.empty.copy_(ranges[:, 0].min())
     if model.field.blend is not None:
         model.field.blend.views.copy_((counts / VIEWS_ENOUGH).clamp(max=1))
     background = config.scene.background

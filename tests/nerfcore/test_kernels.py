@@ -282,6 +282,21 @@ def test_interest_and_density_draw_samples() -> None:
     assert share(4.0) > 1.5 * share(0.0)
 
 
+def test_rays_from_outside_start_where_nothing_was_seen_to_be() -> None:
+    """A cell in front of a far camera is passed over, the cube never is; twin and kernel agree."""
+    n = 32
+    grid = torch.full((n**3, 2), 1.0)
+    blocks = torch.ones((n // 4) ** 3, dtype=torch.uint8)
+    origins = torch.tensor([[0.1, -5.0, 0.2], [0.1, -1.5, 0.2], [0.0, 0.5, 0.0]])
+    directions = torch.tensor([[0.0, 1.0, 0.0]]).expand(3, 3).contiguous()
+    s = MarchSettings(n, 0.125, far=50.0, contracted=True, empty=2.0)
+    found = march.sample(origins, directions, grid, blocks, s, 4, torch.zeros(3))
+    assert torch.allclose(found.first, torch.tensor([2.0, 0.4, 0.02]), atol=1e-5)
+    for i in range(3):
+        bins = march_torch.walk(origins[i], directions[i], 0.0, grid, s)
+        assert bins[0][0] == pytest.approx(float(found.first[i]), abs=1e-5)
+
+
 def test_cells_follow_the_mean_of_the_points_in_them() -> None:
     generator = torch.Generator().manual_seed(18)
     points, values = torch.rand(3000, 3, generator=generator), torch.rand(3000, generator=generator)

@@ -32,22 +32,6 @@ class _TruncatedExp(torch.autograd.Function):
         return grads[0] * ctx.saved_tensors[0]
 
 
-class _LiveSigmoid(torch.autograd.Function):
-    """Sigmoid whose slope never falls below 0.01: photos that are mostly black would else drive all colours so far
-    into saturation at the start that nothing brings the bright parts back."""
-
-    @staticmethod
-    def forward(ctx, x: torch.Tensor) -> torch.Tensor:
-        y = torch.sigmoid(x)
-        ctx.save_for_backward(y)
-        return y
-
-    @staticmethod
-    def backward(ctx, *grads):
-        (y,) = ctx.saved_tensors
-        return grads[0] * (y * (1 - y)).clamp(min=0.01)
-
-
 @dataclass(frozen=True)
 class Geometry:
     """What the density head knows of N points: density (N,) float32, features (N, G), implicit and
@@ -162,7 +146,7 @@ class HybridField(nn.Module):
                 )
                 codes = mean.expand(len(directions), -1)
             parts.append(codes.to(self.dtype))
-        return _LiveSigmoid.apply(self.color_head(torch.cat(parts, 1), self.dtype).float())  # type: ignore[return-value]
+        return torch.sigmoid(self.color_head(torch.cat(parts, 1), self.dtype).float())
 
     def logits(self, geometry: Geometry) -> torch.Tensor:
         """Class logits (N, K). The viewing direction has no say, the smooth implicit branch has a strong one."""

@@ -83,6 +83,21 @@ def _frustum(camera: Camera, pose: torch.Tensor, depth: float) -> torch.Tensor:
     return torch.stack([x, y, z], -1).reshape(-1, 3) @ pose[:3, :3].T + pose[:3, 3]
 
 
+def in_front(
+    cameras: list[Camera], camera_to_box: torch.Tensor, resolution: int, contracted: bool, ranges: torch.Tensor
+) -> torch.Tensor:
+    """Which cells (resolution³,) bool are nearer to a camera, in its view, than anything in its photo; `ranges` (V, 2)
+    of `depth_ranges`."""
+    points = grid_centers(resolution, contracted, camera_to_box.device)
+    empty = torch.zeros(len(points), dtype=torch.bool, device=points.device)
+    for camera, pose, near in zip(cameras, camera_to_box, ranges[:, 0].tolist()):
+        if near > 0 and not _sees_everything(camera):
+            u, v, z = _project(camera, pose, points)
+            empty |= (z > 1e-6) & (z < near) & (u > 0) & (u < 1) & (v > 0) & (v < 1)
+            empty[cells_at(_frustum(camera, pose, near), resolution, contracted)] = True
+    return empty
+
+
 def view_counts(
     cameras: list[Camera],
     camera_to_box: torch.Tensor,
@@ -101,9 +116,8 @@ def view_counts(
     device = camera_to_box.device
     points = grid_centers(resolution, contracted, device)
     counts, beyond = torch.zeros(len(points), device=device), torch.zeros(len(points), dtype=torch.bool, device=device)
-    empty = torch.zeros_like(beyond)
     ranges = torch.zeros(len(cameras), 2, device=device) if ranges is None else ranges
-    for camera, pose, (near, typical) in zip(cameras, camera_to_box, ranges):
+    for camera, pose, typical in zip(cameras, camera_to_box, ranges[:, 1]):
         if _sees_everything(camera):
             counts += 1
             beyond |= True
@@ -112,8 +126,5 @@ def view_counts(
         seen = (z > 1e-6) & (u > -margin) & (u < 1 + margin) & (v > -margin) & (v < 1 + margin)
         counts += seen
         beyond |= seen & (z >= typical)
-        empty |= seen & (z < near)
-        if near > 0:
-            empty[cells_at(_frustum(camera, pose, float(near)), resolution, contracted)] = True
-    counts[empty | ((counts < 2) & ~beyond)] = 0
+    counts[in_front(cameras, camera_to_box, resolution, contracted, ranges) | ((counts < 2) & ~beyond)] = 0
     return counts

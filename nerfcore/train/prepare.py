@@ -15,7 +15,7 @@ from ..data.similarity import transform_points
 from ..errors import TrainingError
 from ..progress import Reporter
 from ..project import load_project, load_scene, load_visibility, world_from_sfm
-from ..sampling.visibility import depth_ranges, view_counts
+from ..sampling.visibility import depth_ranges, in_front, view_counts
 from .depth import depth_scale, find_depths
 from .run import RunInfo, new_model
 from .trainer import Trainer
@@ -128,10 +128,14 @@ def make_trainer(project_folder: Path, info: RunInfo, scene: Scene, device: torc
     focus = (
         transform_points(box.box_from_world, focus_point(scene.views)[None])[0] if looks_inward(scene.views) else None
     )
-    ranges = depth_ranges(
-        store.cameras, poses, points, None if focus is None else torch.from_numpy(focus).float().to(device)
-    )
+    focus = None if focus is None else torch.from_numpy(focus).float().to(device)
+    ranges = depth_ranges(store.cameras, poses, points, focus)
     counts = view_counts(store.cameras, poses, coarse, box.contracted, ranges)
+    # Where held-out cameras stood, nothing hangs in front of them either; their photos are not looked at.
+    cameras = [view.camera for view in scene.views]
+    everywhere = torch.from_numpy(box_poses(scene.views, box.box_from_world)).float().to(device)
+    all_ranges = depth_ranges(cameras, everywhere, points, focus)
+    counts[in_front(cameras, everywhere, coarse, box.contracted, all_ranges)] = 0
     resolution = config.sampling.resolution
     index = (torch.arange(resolution, device=device) * coarse) // resolution
     seen = (counts > 0).view(coarse, coarse, coarse)[index][:, index][:, :, index].reshape(-1)

@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from .errors import SettingError
 
 PRESETS = Path(__file__).parent / "presets"
+MOST_VERTICES = 2048  # along a side of the finest level that a run chooses by itself
 
 
 class Stage(BaseModel):
@@ -50,7 +51,8 @@ class FieldConfig(Stage):
     finest: int | None = Field(
         default=None,
         ge=2,
-        description="vertices along a side of the finest level; null: one for each pixel of the photos, at most 2048",
+        description="vertices along a side of the finest level; null: one for each pixel of the photos, at most "
+        f"{MOST_VERTICES}",
     )
     table_log2: int = Field(
         default=19, ge=10, le=24, description="at most 2^this vertices a level; larger levels are hashed"

@@ -20,7 +20,6 @@ from ..progress import Reporter
 from ..project import load_project, load_scene
 from ..render.image import Frame, background_of, render_view, to_bytes, write_picture
 from ..render.pictures import colorize_depth, colorize_labels, side_by_side
-from ..train.prepare import GPU_IMAGE_SIZE
 from ..train.run import Trained, load_trained, refined_poses, run_folder
 from .metrics import Confusion, psnr, ssim
 from .refit import refit_camera
@@ -59,9 +58,7 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
         report.progress(number / len(indices), view.name)
         pose = box_poses([view], box.box_from_world)[0]
         # Views larger than the training images are compared at the training size.
-        camera = view.camera.resized(
-            *training_size(view.camera, trained.info.config.scene.image_size or GPU_IMAGE_SIZE)
-        )
+        camera = view.camera.resized(*training_size(view.camera, trained.info.image_size))
         photo, keep, label = _truth(view, scene, camera.width, camera.height, background)
         given: dict[str, float] = {}
         if view.name in refined:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import nn
 
-from ..config import FieldConfig
+from ..config import MOST_VERTICES, FieldConfig
 from ..kernels.encode import FEATURES
 from .blend import BlendWeight
 from .encoding import frequency_encoding
@@ -15,7 +15,6 @@ from .grid import VertexGrid, level_layout
 from .mlp import MLP, compute_dtype
 
 DIRECTION_FEATURES = 16
-FINEST = 2048  # vertices along a side where no photos say otherwise
 
 
 class _TruncatedExp(torch.autograd.Function):
@@ -62,7 +61,7 @@ class HybridField(nn.Module):
         self.config, self.classes = config, classes
         self.features = config.levels * FEATURES
         self.grid = (
-            VertexGrid(level_layout(config.levels, config.coarsest, config.finest or FINEST, config.table_log2))
+            VertexGrid(level_layout(config.levels, config.coarsest, config.finest or MOST_VERTICES, config.table_log2))
             if config.branch != "implicit"
             else None
         )

@@ -8,6 +8,7 @@ The torch twins are in `encode_torch.py`.
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import torch
 import warp as wp
@@ -58,6 +59,24 @@ def corner_rows(ix: int, iy: int, iz: int, resolution: int, size: int, base: int
     return low, high
 
 
+@wp.func
+def cell_of(p: wp.vec3, resolution: int, base: int, size: int):
+    """Table rows of the corners of the cell that holds a point of [0, 1]³, as `corner_rows` has them, and the point's
+    place in the cell."""
+    q = p * float(resolution - 1)
+    ix = wp.clamp(int(q[0]), 0, resolution - 2)
+    iy = wp.clamp(int(q[1]), 0, resolution - 2)
+    iz = wp.clamp(int(q[2]), 0, resolution - 2)
+    low, high = corner_rows(ix, iy, iz, resolution, size, base)
+    return low, high, q - wp.vec3(float(ix), float(iy), float(iz))
+
+
+@wp.func
+def across(low: Any, high: Any, f: float):
+    """From `low` at f = 0 to `high` at 1."""
+    return low * (1.0 - f) + high * f
+
+
 @wp.kernel(module="fieldwork_encode")
 def encode_forward(
     table: wp.array(dtype=feature),
@@ -75,22 +94,12 @@ def encode_forward(
             out[i, level] = feature()
             continue
         layout = levels[level]
-        resolution = layout[0]
-        q = p * float(resolution - 1)
-        ix = wp.clamp(int(q[0]), 0, resolution - 2)
-        iy = wp.clamp(int(q[1]), 0, resolution - 2)
-        iz = wp.clamp(int(q[2]), 0, resolution - 2)
-        fx = q[0] - float(ix)
-        fy = q[1] - float(iy)
-        fz = q[2] - float(iz)
-        low, high = corner_rows(ix, iy, iz, resolution, layout[2], layout[1])
-        gx = 1.0 - fx
-        v00 = table[low[0]] * gx + table[high[0]] * fx
-        v10 = table[low[1]] * gx + table[high[1]] * fx
-        v01 = table[low[2]] * gx + table[high[2]] * fx
-        v11 = table[low[3]] * gx + table[high[3]] * fx
-        gy = 1.0 - fy
-        out[i, level] = (v00 * gy + v10 * fy) * ((1.0 - fz) * gain) + (v01 * gy + v11 * fy) * (fz * gain)
+        low, high, f = cell_of(p, layout[0], layout[1], layout[2])
+        v00 = across(table[low[0]], table[high[0]], f[0])
+        v10 = across(table[low[1]], table[high[1]], f[0])
+        v01 = across(table[low[2]], table[high[2]], f[0])
+        v11 = across(table[low[3]], table[high[3]], f[0])
+        out[i, level] = across(v00, v10, f[1]) * ((1.0 - f[2]) * gain) + across(v01, v11, f[1]) * (f[2] * gain)
 
 
 @wp.func
@@ -113,21 +122,14 @@ def encode_backward(
     offset: int,
 ):
     i = wp.tid() + offset
-    p = points[i] * float(resolution - 1)
-    ix = wp.clamp(int(p[0]), 0, resolution - 2)
-    iy = wp.clamp(int(p[1]), 0, resolution - 2)
-    iz = wp.clamp(int(p[2]), 0, resolution - 2)
-    fx = p[0] - float(ix)
-    fy = p[1] - float(iy)
-    fz = p[2] - float(iz)
-    low, high = corner_rows(ix, iy, iz, resolution, size, base)
+    low, high, f = cell_of(points[i], resolution, base, size)
     g = grad_out[i, level] * gain
-    g0 = g * (1.0 - fx)
-    g1 = g * fx
-    w00 = (1.0 - fy) * (1.0 - fz)
-    w10 = fy * (1.0 - fz)
-    w01 = (1.0 - fy) * fz
-    w11 = fy * fz
+    g0 = g * (1.0 - f[0])
+    g1 = g * f[0]
+    w00 = (1.0 - f[1]) * (1.0 - f[2])
+    w10 = f[1] * (1.0 - f[2])
+    w01 = (1.0 - f[1]) * f[2]
+    w11 = f[1] * f[2]
     add(grad_table, touched, low[0], g0 * w00)
     add(grad_table, touched, high[0], g1 * w00)
     add(grad_table, touched, low[1], g0 * w10)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 import warp as wp
 
-from .encode import FEATURES, corner_rows, feature
+from .encode import FEATURES, across, cell_of, feature
 from .runtime import array, init, launch
 
 
@@ -28,15 +28,7 @@ def encode_points_backward(
     offset: int,
 ):
     i = wp.tid() + offset
-    scale = float(resolution - 1)
-    p = points[i] * scale
-    ix = wp.clamp(int(p[0]), 0, resolution - 2)
-    iy = wp.clamp(int(p[1]), 0, resolution - 2)
-    iz = wp.clamp(int(p[2]), 0, resolution - 2)
-    fx = p[0] - float(ix)
-    fy = p[1] - float(iy)
-    fz = p[2] - float(iz)
-    low, high = corner_rows(ix, iy, iz, resolution, size, base)
+    low, high, f = cell_of(points[i], resolution, base, size)
     g = grad_out[i, level]
     # Projected on the incoming gradient the eight corners are numbers; then it is scalar trilinear interpolation.
     a00 = wp.dot(g, table[low[0]])
@@ -47,17 +39,14 @@ def encode_points_backward(
     b10 = wp.dot(g, table[high[1]])
     b01 = wp.dot(g, table[high[2]])
     b11 = wp.dot(g, table[high[3]])
-    gx = 1.0 - fx
-    gy = 1.0 - fy
-    gz = 1.0 - fz
-    dx = ((b00 - a00) * gy + (b10 - a10) * fy) * gz + ((b01 - a01) * gy + (b11 - a11) * fy) * fz
-    c00 = a00 * gx + b00 * fx
-    c10 = a10 * gx + b10 * fx
-    c01 = a01 * gx + b01 * fx
-    c11 = a11 * gx + b11 * fx
-    dy = (c10 - c00) * gz + (c11 - c01) * fz
-    dz = (c01 - c00) * gy + (c11 - c10) * fy
-    grad_points[i] = grad_points[i] + wp.vec3(dx, dy, dz) * (gain * scale)
+    dx = across(across(b00 - a00, b10 - a10, f[1]), across(b01 - a01, b11 - a11, f[1]), f[2])
+    c00 = across(a00, b00, f[0])
+    c10 = across(a10, b10, f[0])
+    c01 = across(a01, b01, f[0])
+    c11 = across(a11, b11, f[0])
+    dy = across(c10 - c00, c11 - c01, f[2])
+    dz = across(c01 - c00, c11 - c10, f[1])
+    grad_points[i] = grad_points[i] + wp.vec3(dx, dy, dz) * (gain * float(resolution - 1))
 
 
 def backward_points(

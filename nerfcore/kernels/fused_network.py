@@ -11,7 +11,7 @@ from typing import Any
 
 import warp as wp
 
-from .encode import FEATURES, corner_rows
+from .encode import FEATURES, across, cell_of
 
 half_feature = wp.types.vector(length=FEATURES, dtype=wp.float16)
 GRANULE = 16  # sides of matrices are multiples of this, as the matrix units want them
@@ -97,21 +97,12 @@ def grid_encoding(levels: int, length: int) -> Any:
     ):
         out = vector()
         for level in range(levels):
-            resolution = layout[level, 0]
-            q = p * float(resolution - 1)
-            ix = wp.clamp(int(q[0]), 0, resolution - 2)
-            iy = wp.clamp(int(q[1]), 0, resolution - 2)
-            iz = wp.clamp(int(q[2]), 0, resolution - 2)
-            fx = q[0] - float(ix)
-            fy = q[1] - float(iy)
-            fz = q[2] - float(iz)
-            low, high = corner_rows(ix, iy, iz, resolution, layout[level, 2], layout[level, 1])
-            v00 = widened(table[low[0]]) * (1.0 - fx) + widened(table[high[0]]) * fx
-            v10 = widened(table[low[1]]) * (1.0 - fx) + widened(table[high[1]]) * fx
-            v01 = widened(table[low[2]]) * (1.0 - fx) + widened(table[high[2]]) * fx
-            v11 = widened(table[low[3]]) * (1.0 - fx) + widened(table[high[3]]) * fx
-            value = (v00 * (1.0 - fy) + v10 * fy) * (1.0 - fz) + (v01 * (1.0 - fy) + v11 * fy) * fz
-            value = value * gains[level]
+            low, high, f = cell_of(p, layout[level, 0], layout[level, 1], layout[level, 2])
+            v00 = across(widened(table[low[0]]), widened(table[high[0]]), f[0])
+            v10 = across(widened(table[low[1]]), widened(table[high[1]]), f[0])
+            v01 = across(widened(table[low[2]]), widened(table[high[2]]), f[0])
+            v11 = across(widened(table[low[3]]), widened(table[high[3]]), f[0])
+            value = across(across(v00, v10, f[1]), across(v01, v11, f[1]), f[2]) * gains[level]
             for k in range(FEATURES):
                 out[level * FEATURES + k] = wp.float16(value[k])
         return out

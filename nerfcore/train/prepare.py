@@ -7,21 +7,21 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ..config import RunConfig
+from ..config import MOST_VERTICES, RunConfig
 from ..data.box import Box, box_poses, choose_box, focus_point, looks_inward
 from ..data.pixels import PixelStore, read_label, read_photo
 from ..data.scene import Scene
 from ..data.similarity import transform_points
 from ..errors import TrainingError
+from ..field.blend import RESOLUTION
 from ..progress import Reporter
 from ..project import load_project, load_scene, load_visibility, world_from_sfm
-from ..sampling.visibility import depth_ranges, in_front, view_counts
+from ..sampling.visibility import depth_ranges, view_counts
 from .depth import depth_scale, find_depths
 from .run import RunInfo, new_model
 from .trainer import Trainer
 
 CPU_IMAGE_SIZE, GPU_IMAGE_SIZE = 800, 1600
-MOST_VERTICES = 2048
 VIEWS_ENOUGH = 8  # cells seen by this many cameras count fully as evidence
 
 
@@ -110,49 +110,58 @@ def make_trainer(project_folder: Path, info: RunInfo, scene: Scene, device: torc
         raise TrainingError(
             f"Image {missing[0]} of this run is gone from the project.", "Train a new run (--run NAME)."
         )
-    box = info.box(load_project(project_folder))
+    trained = [names[name] for name in info.images]
+    project = load_project(project_folder)
+    box = info.box(project)
     report.stage("Loading photos")
     store = PixelStore(
         scene,
-        [names[name] for name in info.images],
+        trained,
         info.class_ids,
         box.box_from_world,
-        config.scene.image_size or GPU_IMAGE_SIZE,
+        info.image_size,
         device,
         report,
     )
     degrade(store, config)
-    poses = torch.from_numpy(box_poses(store.views, box.box_from_world)).float().to(device)
-    coarse = 64
-    points = torch.from_numpy(transform_points(box.box_from_world, scene.points.xyz)).float().to(device)
-    focus = (
-        transform_points(box.box_from_world, focus_point(scene.views)[None])[0] if looks_inward(scene.views) else None
-    )
-    focus = None if focus is None else torch.from_numpy(focus).float().to(device)
-    ranges = depth_ranges(store.cameras, poses, points, focus)
-    counts = view_counts(store.cameras, poses, coarse, box.contracted, ranges)
-    # Where held-out cameras stood, nothing hangs in front of them either; their photos are not looked at.
-    cameras = [view.camera for view in scene.views]
-    everywhere = torch.from_numpy(box_poses(scene.views, box.box_from_world)).float().to(device)
-    all_ranges = depth_ranges(cameras, everywhere, points, focus)
-    counts[in_front(cameras, everywhere, coarse, box.contracted, all_ranges)] = 0
-    resolution = config.sampling.resolution
-    index = (torch.arange(resolution, device=device) * coarse) // resolution
-    seen = (counts > 0).view(coarse, coarse, coarse)[index][:, index][:, :, index].reshape(-1)
-    model = new_model(info, device, seen.cpu())
-    model.occupancy.empty.copy_(ranges[:, 0].min())
+    counts, nearest = seen_cells(scene, trained, box, device)
+    model = new_model(info, device, _refined(counts > 0, config.sampling.resolution).cpu())
+    model.occupancy.empty.fill_(nearest)
     if model.field.blend is not None:
         model.field.blend.views.copy_((counts / VIEWS_ENOUGH).clamp(max=1))
     background = config.scene.background
     random = background == "random" or background == "auto"
     trainer = Trainer(model, store, config, random_background=random)
     if config.loss.depth_weight > 0:
-        scale = depth_scale(world_from_sfm(load_project(project_folder)), box.box_from_world)
+        scale = depth_scale(world_from_sfm(project), box.box_from_world)
         visibility = load_visibility(project_folder)
         trainer.depths = find_depths(scene, store, visibility, box.box_from_world, scale, box.contracted)
         if not len(trainer.depths):
             report.warn("loss.depth_weight has no effect: the project has neither depth maps nor points of its views.")
     return trainer
+
+
+def seen_cells(scene: Scene, trained: list[int], box: Box, device: torch.device) -> tuple[torch.Tensor, float]:
+    """How many of the views `trained` see each cell of the grid of evidence, 0 for cells that must be
+    empty; and how far from every one of them nothing was seen (normalised units)."""
+    cameras = [view.camera for view in scene.views]
+    poses = torch.from_numpy(box_poses(scene.views, box.box_from_world)).float().to(device)
+    points = torch.from_numpy(transform_points(box.box_from_world, scene.points.xyz)).float().to(device)
+    focus = None
+    if looks_inward(scene.views):
+        place = transform_points(box.box_from_world, focus_point(scene.views)[None])[0]
+        focus = torch.from_numpy(place).float().to(device)
+    ranges = depth_ranges(cameras, poses, points, focus)
+    # Where held-out cameras stood, nothing hangs in front of them either; their photos are not looked at.
+    counts = view_counts(cameras, poses, RESOLUTION, box.contracted, ranges, counted=trained)
+    return counts, float(ranges[trained, 0].min())
+
+
+def _refined(cells: torch.Tensor, resolution: int) -> torch.Tensor:
+    """A cubic grid of cells (N³,) at another resolution (resolution³,)."""
+    side = round(len(cells) ** (1 / 3))
+    index = (torch.arange(resolution, device=cells.device) * side) // resolution
+    return cells.view(side, side, side)[index][:, index][:, :, index].reshape(-1)
 
 
 def degrade(store: PixelStore, config: RunConfig) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
 
 from ..config import RunConfig
 from ..data.box import Box
@@ -38,6 +38,19 @@ class RunInfo(BaseModel):
     sfm_from_box: list[list[float]]
     contracted: bool
     transparent: bool
+
+    @field_validator("config")
+    @classmethod
+    def _settled(cls, config: RunConfig) -> RunConfig:
+        if config.scene.image_size is None:
+            raise ValueError("scene.image_size is not settled")
+        return config
+
+    @property
+    def image_size(self) -> int:
+        """Longest side of the training images in pixels."""
+        assert self.config.scene.image_size is not None
+        return self.config.scene.image_size
 
     def box(self, project: Project) -> Box:
         """The cube in the project's present world frame."""

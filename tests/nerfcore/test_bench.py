@@ -20,7 +20,8 @@ from fieldwork.nerfcore.errors import Cancelled, InputError, SettingError
 from fieldwork.nerfcore.params import BenchParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.verbs import run_verb
-from fieldwork.tests.nerfcore.test_training import SMALL, tiny_project  # noqa: F401
+from fieldwork.tests.nerfcore.support.ball import SMALL
+from fieldwork.tests.nerfcore.test_training import tiny_project  # noqa: F401
 from PIL import Image
 
 TINY = {**SMALL, "sampling.samples": "4", "render.samples": "4"}

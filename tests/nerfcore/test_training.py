@@ -23,19 +23,8 @@ from fieldwork.nerfcore.project import ImageRecord, PosedImage, Poses, Project, 
 from fieldwork.nerfcore.render.verb import look_at
 from fieldwork.nerfcore.train.checkpoint import read_checkpoint
 from fieldwork.nerfcore.verbs import run_verb
+from fieldwork.tests.nerfcore.support.ball import SMALL
 from PIL import Image
-
-SMALL = {
-    "field.levels": "3",
-    "field.finest": "48",
-    "field.table_log2": "14",
-    "field.width": "16",
-    "sampling.resolution": "32",
-    "sampling.warmup": "32",
-    "train.batch_start": "2048",
-    "train.batch_samples": "4096",
-    "train.seed": "3",
-}
 
 
 def draw_ball(camera: Camera, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,9 +1,7 @@
-"""Incremental mapping, repair and final adjustment. Runs in the pose process."""
+"""Incremental mapping and repair. Runs in the pose process."""
 
 from __future__ import annotations
 
-import collections
-import copy
 import shutil
 from pathlib import Path
 from typing import Any
@@ -11,12 +9,9 @@ from typing import Any
 import pycolmap
 
 from . import resume
-from .features import FULL_MODEL_FROM, LONG_LENS
 from .validate import ImageCheck, check_images
 
 REPAIR_ROUNDS = 2
-PRINCIPAL_POINT_FROM = 10  # photos through one lens
-MAX_POINT_ERROR = 4.0  # pixels
 SNAPSHOT_EVERY = 40  # photos
 SEED = 1
 
@@ -131,65 +126,3 @@ def repair(
             model = models[0]
     checks, links = check_images(model, path)
     return model, checks, links, {i: c for i, c in dropped.items() if i not in checks}
-
-
-def has_long_lens(model: Any) -> bool:
-    """Whether a lens in use has a view too narrow for its principal point and higher distortion to be seen."""
-    return any(camera.mean_focal_length() >= LONG_LENS * max(camera.width, camera.height) for camera in _used(model))
-
-
-def has_odd_lens(model: Any) -> bool:
-    """Whether a lens in use is like none that exists, so that self-calibration has run away.
-
-    Real ones have square pixels within 3 %, a principal point within 12 % of the long side of the middle, and little
-    tangential distortion.
-    """
-    for camera in _used(model):
-        side = max(camera.width, camera.height)
-        if abs(camera.focal_length_x / camera.focal_length_y - 1) > 0.03:
-            return True
-        offset = camera.principal_point_x - camera.width / 2, camera.principal_point_y - camera.height / 2
-        if max(abs(offset[0]), abs(offset[1])) > 0.12 * side:
-            return True
-        if camera.model_name == "OPENCV" and max(abs(camera.params[6]), abs(camera.params[7])) > 0.02:
-            return True
-    return False
-
-
-def _used(model: Any) -> list[Any]:
-    return [model.camera(i) for i in sorted({model.image(i).camera_id for i in model.reg_image_ids()})]
-
-
-def adjust(model: Any, keep_cameras: bool) -> Any:
-    """Final bundle adjustment of a model; the adjusted model is returned.
-
-    A lens that took at least fifteen photos is given all of OPENCV's parameters, and its principal point is refined
-    where there is no other lens; not so where its view is narrow, or where the outcome is like no real lens.
-    """
-    if keep_cameras:
-        return model
-    if not has_long_lens(model):
-        freed = copy.deepcopy(model)
-        _adjust(freed, full=True)
-        if not has_odd_lens(freed):
-            return freed
-    _adjust(model, full=False)
-    return model
-
-
-def _adjust(model: Any, full: bool) -> None:
-    taken = collections.Counter(model.image(i).camera_id for i in model.reg_image_ids())
-    for camera_id, count in taken.items():
-        camera = model.camera(camera_id)
-        if full and count >= FULL_MODEL_FROM and camera.model_name == "SIMPLE_RADIAL":
-            focal, cx, cy, k = camera.params
-            camera.model = pycolmap.CameraModelId.OPENCV
-            camera.params = [focal, focal, cx, cy, k, 0.0, 0.0, 0.0]
-    options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary = False
-    # Through a long lens a shifted principal point looks like a turned camera.
-    options.refine_principal_point = full and len(taken) == 1 and model.num_reg_images() >= PRINCIPAL_POINT_FROM
-    pycolmap.bundle_adjustment(model, options)
-    model.update_point_3d_errors()
-    for point_id in [i for i, point in model.points3D.items() if point.error > MAX_POINT_ERROR]:
-        model.delete_point3D(point_id)

@@ -16,6 +16,7 @@ from ..data.colmap_cameras import camera_from_colmap
 from ..errors import PosesError
 from ..files import write_json
 from . import features, mapping, second_look
+from .adjust import adjust, has_long_lens, has_odd_lens
 from .presets import ENOUGH, EXHAUSTIVE_AT_MOST, EXHAUSTIVE_UP_TO, LADDERS, Level
 from .resume import mapping_folder
 from .transfer import start_model
@@ -87,7 +88,7 @@ def run(job: dict[str, Any], tell: Any) -> dict[str, Any]:
     if not job["group"]:
         best = _second_look(best, job, names, tell)
     tell.stage("Final adjustment")
-    model = best.models[0] = mapping.adjust(best.models[0], keep_cameras=job["start"] is not None)
+    model = best.models[0] = adjust(best.models[0], keep_cameras=job["start"] is not None)
     if model.num_points3D() < MIN_POINTS:
         raise PosesError(
             f"The {len(names)} photos were taken from too few different positions: no depth can be seen.",
@@ -136,7 +137,7 @@ def _attempt(job: dict[str, Any], level: Level, names: list[str], exhaustive: bo
             continue
         # Self-calibration may run away, and a lens of unknown focal length turn out to be long: then the full model
         # is worth no more than the simple one that follows.
-        doubtful = full and (mapping.has_long_lens(model) or mapping.has_odd_lens(model))
+        doubtful = full and (has_long_lens(model) or has_odd_lens(model))
         if model.num_reg_images() > best.registered or (best_doubtful and model.num_reg_images() >= MIN_REGISTERED):
             best, best_doubtful = Attempt(level, path, [model, *models[1:]], checks, links, dropped), doubtful
         if best_doubtful:

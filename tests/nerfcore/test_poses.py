@@ -13,7 +13,7 @@ from fieldwork.nerfcore.data.similarity import transform_points
 from fieldwork.nerfcore.errors import DiskError, FieldworkError, PosesError
 from fieldwork.nerfcore.poses import process
 from fieldwork.nerfcore.project import load_points, load_poses, load_project, load_scene, load_visibility
-from fieldwork.tests.nerfcore.support.captures import centre_errors, ingest, poses, view_errors
+from fieldwork.tests.nerfcore.support.captures import centre_errors, ingest, poses, rotation_errors, view_errors
 from PIL import Image
 
 Data = Callable[[str], Path]
@@ -256,7 +256,52 @@ def test_two_unrelated_scenes(shared_data: Data, tmp_path: Path) -> None:
         poses(project, group=7)
 
 
+def test_noise_is_that_of_the_right_matches(fountain: Path) -> None:
+    """Displaced features are counted along one axis; a tenth of wild ones changes little."""
+    import pycolmap
+    from fieldwork.nerfcore.poses.adjust import noise
+
+    model = pycolmap.Reconstruction(str(fountain / "poses" / "sparse"))
+    random = np.random.default_rng(0)
+    for i in model.reg_image_ids():
+        image = model.image(i)
+        pose = image.cam_from_world().matrix()
+        for point in image.points2D:
+            if not point.has_point3D():
+                continue
+            local = pose[:, :3] @ model.point3D(point.point3D_id).xyz + pose[:, 3]
+            wild = 40.0 if random.random() < 0.1 else 1.0
+            point.xy = np.asarray(image.camera.img_from_cam(local[None]))[0] + random.normal(0, 0.7 * wild, 2)
+    assert noise(model) == pytest.approx(0.7 * 1.08, abs=0.02)  # 1.08: the median of the mixture
+    assert noise(pycolmap.Reconstruction()) == 0
+
+
+def test_wrong_matches_do_not_move_the_lens(fountain: Path, shared_data: Data) -> None:
+    """One feature in fifty is moved by ten pixels, the way repeated structure would: always to the same side."""
+    import pycolmap
+    from fieldwork.nerfcore.poses.adjust import adjust, noise
+
+    model = pycolmap.Reconstruction(str(fountain / "poses" / "sparse"))
+    before = model.camera(1).params.copy()
+    random = np.random.default_rng(1)
+    for i in model.reg_image_ids():
+        for point in model.image(i).points2D:
+            if point.has_point3D() and random.random() < 0.02:
+                point.xy = point.xy + np.array([0.0, 10.0])
+    adjusted = adjust(model, keep_cameras=False)
+    assert noise(adjusted) < 0.3
+    assert np.abs(adjusted.camera(1).params[:3] - before[:3]).max() < 1
+
+
 # --- the figures of the larger captures -----------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_fountain_at_full_size(shared_data: Data, tmp_path: Path) -> None:
+    project = ingest(shared_data("fountain_p11"), tmp_path / "p")
+    assert poses(project, "standard")["registered"] == 11
+    assert rotation_errors(project, shared_data("fountain_p11")).max() < 0.1
+    assert centre_errors(project, shared_data("fountain_p11")).max() < 0.1
 
 
 @pytest.mark.slow

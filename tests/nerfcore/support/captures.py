@@ -59,3 +59,15 @@ def view_errors(project: Path, dataset: Path) -> np.ndarray:
         sine = np.linalg.norm(np.cross(a, b), axis=1) / np.linalg.norm(a, axis=1) / np.linalg.norm(b, axis=1)
         errors.append(np.degrees(np.arcsin(np.clip(sine, 0, 1)))[valid_a & valid_b])
     return np.concatenate(errors)
+
+
+def rotation_errors(project: Path, dataset: Path) -> np.ndarray:
+    """Errors of the cameras' rotations in degrees, after the similarity that fits their centres best."""
+    truth = {view.name: view.camera_to_world for view in read_dataset(dataset).views}
+    images = load_poses(project).images
+    found = np.stack([np.array(image.camera_to_world) for image in images])
+    true = np.stack([truth[image.name] for image in images])
+    fit = fit_similarity(found[:, :3, 3], true[:, :3, 3])
+    turn = fit[:3, :3] / np.cbrt(np.linalg.det(fit[:3, :3]))
+    left = np.einsum("nji,jk,nkl->nil", true[:, :3, :3], turn, found[:, :3, :3])
+    return np.degrees(np.arccos(np.clip((np.trace(left, axis1=1, axis2=2) - 1) / 2, -1, 1)))

@@ -198,7 +198,9 @@ class BenchParams(Params):
     seconds: float | None = Field(default=None, gt=0, description="seconds of training a run, instead of the suite's")
     steps: int | None = Field(default=None, gt=0, description="steps of training a run, instead of the suite's")
     preset: Preset = "standard"
-    set: dict[str, str] = Field(default_factory=dict, description="settings changed in every run")
+    set: dict[str, str] = Field(
+        default_factory=dict, description="settings changed in every run, but for what a variant changes"
+    )
     keep: bool = Field(default=False, description="keep the trained fields in OUT/projects")
     yardstick: Path | None = Field(default=None, description="speed: script of another trainer to run beside ours")
     page: Path | None = Field(default=None, description="gpu: Markdown page whose GPU section is rewritten")

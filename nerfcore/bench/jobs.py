@@ -23,7 +23,7 @@ from ..files import write_json
 from ..params import EvaluateParams, Preset, TrainParams
 from ..progress import Reporter
 from ..project import load_project, load_scene
-from ..train.run import CHECKPOINT, load_info, load_trained, run_folder, use_device
+from ..train.run import CHECKPOINT, load_info, load_trained, run_folder, settled_as, use_device
 from ..train.verb import train
 
 COUNTING_SIDE = 200  # of a frame that only counts samples per ray
@@ -121,7 +121,7 @@ def run_job(job: Job, project: Path, out: Path, report: Reporter, keep: bool = F
             time_limit=job.seconds,
             steps=job.steps,
             set=job.settings,
-            resume=_interrupted(job, project),
+            resume=interrupted(job, project),
         ),
         report,
     )
@@ -147,13 +147,13 @@ def run_job(job: Job, project: Path, out: Path, report: Reporter, keep: bool = F
     return figures
 
 
-def _interrupted(job: Job, project: Path) -> bool:
+def interrupted(job: Job, project: Path) -> bool:
     """Whether an unfinished run of just this job is there."""
     try:
         info = load_info(project, job.name)
     except ProjectError:
         return False
-    same = info.config == make_config(job.preset, job.settings) and info.preset == job.preset
+    same = info.preset == job.preset and info.config == settled_as(make_config(job.preset, job.settings), info.config)
     return same and (run_folder(project, job.name) / CHECKPOINT).is_file()
 
 

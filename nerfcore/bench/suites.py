@@ -100,7 +100,7 @@ def plan(params: BenchParams, scenes: list[str]) -> list[Job]:
     jobs = []
     for scene in map(scene_name, scenes):
         for name in wanted:
-            settings = {**found[name], **params.set}
+            settings = {**params.set, **found[name]}  # a variant is what its name says
             sides = SIDES.get(suite, (COUNTING_SIDE,))
             if steps is not None:
                 jobs.append(Job(scene, name, settings, steps=steps, preset=params.preset, sides=sides))

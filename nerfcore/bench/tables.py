@@ -9,7 +9,7 @@ from typing import Any
 import matplotlib
 
 from ..files import atomic_path
-from .jobs import COUNTING_SIDE
+from .jobs import COUNTING_SIDE, Job
 from .suites import PUBLISHED_DROPS, REFERENCE
 
 Row = dict[str, Any]
@@ -47,16 +47,12 @@ def table(columns: dict[str, str], rows: Sequence[Row]) -> str:
     return "\n".join(lines)
 
 
-def budget(job: Row) -> str:
-    return f"{job['steps']} steps" if job["steps"] else f"{job['seconds']:g} s"
-
-
 def make_rows(suite: str, results: Sequence[dict[str, Any]]) -> list[Row]:
     """One row a run, with its difference from the suite's reference at the same scene and budget."""
     rows = []
     for result in results:
         job = result["job"]
-        row: Row = {"scene": job["scene"], "variant": job["variant"], "budget": budget(job)}
+        row: Row = {"scene": job["scene"], "variant": job["variant"], "budget": Job(**job).budget}
         row |= {key: result.get(key) for key in COLUMNS if key not in row}
         for speed in result.get("speed", []):
             side = speed["fps_size"][0]
@@ -109,12 +105,12 @@ def _ablation_verdicts(rows: Sequence[Row]) -> list[str]:
             if None not in wins:
                 how = "beats" if all(wins) else "does not beat"
                 lines.append(f"{scene}, {limit}: hybrid {how} both of its boundary cases in PSNR and mIoU.")
-        if {"hybrid", "semantic pdf", "uniform pdf"} <= found.keys():
-            best = max((found["hybrid"], found["semantic pdf"]), key=lambda row: row["psnr"] or 0.0)
-            won = _better(best, found["uniform pdf"], ("psnr",))
-            if won is not None:
-                how = "beats" if won else "does not beat"
-                lines.append(f"{scene}, {limit}: {best['variant']} {how} uniform samples in PSNR.")
+        for variant in ("hybrid", "semantic pdf"):
+            if {variant, "uniform pdf"} <= found.keys():
+                won = _better(found[variant], found["uniform pdf"], ("psnr",))
+                if won is not None:
+                    how = "beats" if won else "does not beat"
+                    lines.append(f"{scene}, {limit}: {variant} {how} uniform samples in PSNR.")
     return lines
 
 
@@ -169,7 +165,7 @@ def plot(path: Path, suite: str, rows: Sequence[Row], results: Sequence[dict[str
         for result in results:
             curve = result.get("curve") or []
             job = result["job"]
-            axes.plot([s for s, _ in curve], [p for _, p in curve], label=f"{job['scene']}, {budget(job)}")
+            axes.plot([s for s, _ in curve], [p for _, p in curve], label=f"{job['scene']}, {Job(**job).budget}")
         axes.set_xlabel("seconds of training")
         axes.set_ylabel("training PSNR (dB)")
         axes.grid(alpha=0.3)

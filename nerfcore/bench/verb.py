@@ -16,10 +16,11 @@ from ..errors import InputError
 from ..files import write_json, write_section, write_text
 from ..params import BenchParams
 from ..progress import Reporter
+from ..train.run import use_device
 from . import gpu, machine, tables
 from .jobs import run_all
 from .scenes import available, data_folder, is_labelled, prepare, scene_name
-from .suites import MISSING_BASELINES, PUBLISHED_DROPS, SCENES, plan
+from .suites import MISSING_BASELINES, PUBLISHED_DROPS, SCENES, SECONDS, plan
 
 
 def bench(params: BenchParams, report: Reporter) -> dict[str, Any]:
@@ -32,7 +33,7 @@ def bench(params: BenchParams, report: Reporter) -> dict[str, Any]:
     """
     root = Path(params.out)
     out = root / params.suite
-    if params.suite == "gpu" and machine.use_device().type != "cuda":
+    if params.suite == "gpu" and use_device().type != "cuda":
         return _without_gpu(params, out, report)
     data = data_folder(params.data)
     projects, notes = _scenes(params, data, root, report)
@@ -41,7 +42,7 @@ def bench(params: BenchParams, report: Reporter) -> dict[str, Any]:
     rows = tables.make_rows(params.suite, results)
     described = machine.describe()
     if params.yardstick is not None and params.suite == "speed":
-        seconds = min(job.seconds for job in jobs if job.seconds) if any(job.seconds for job in jobs) else 120.0
+        seconds = min((job.seconds for job in jobs if job.seconds), default=SECONDS["speed"])
         notes.append(f"Yardstick {params.yardstick.name}: {machine.run_yardstick(params.yardstick, seconds, report)}")
     if params.suite == "baselines":
         notes += [f"{name} is not there: it {why}." for name, why in MISSING_BASELINES.items()]
@@ -74,6 +75,8 @@ def _scenes(params: BenchParams, data: Path | None, root: Path, report: Reporter
         if not params.scenes and params.suite in ("ablation", "robustness") and not is_labelled(project):
             notes.append(f"{scene} is left out: it has no labels.")
             continue
+        if scene_name(scene) in projects:
+            raise InputError(f"Two scenes are called “{scene_name(scene)}”.", "Rename one of the folders.")
         projects[scene_name(scene)] = project
     if not projects:
         raise InputError("None of the suite's scenes is there.", "Give a folder of data sets with --data.")
@@ -96,7 +99,7 @@ def _write(
         if value != type(params).model_fields[name].default:
             command += f" --{name} " + (f'"{",".join(value)}"' if isinstance(value, list) else f"{value}")
     command += "".join(f" --set {name}={value}" for name, value in params.set.items())
-    if "capability" not in described:
+    if use_device().type == "cpu":
         notes = [*notes, "Peak memory on a CPU is that of the whole process up to then, all runs before included."]
     if params.suite == "robustness":
         limits = ", ".join(f"{name}: {p} dB, {m} points" for name, (p, m) in PUBLISHED_DROPS.items())

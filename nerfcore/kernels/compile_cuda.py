@@ -19,7 +19,8 @@ import warp as wp
 
 from ..files import write_json, write_section, write_text
 from . import cells, composite, encode, encode_points, march
-from .fused import LANES, FusedShape, fused_kernel
+from .fused import LANES
+from .fused_kernel import FusedShape, fused_kernel
 from .resources import Resources, disassembler, markdown, read_resources
 from .runtime import CUDA_BLOCK, default_threads, init
 

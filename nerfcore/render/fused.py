@@ -9,7 +9,8 @@ import torch
 
 from ..field.hybrid import HybridField
 from ..field.mlp import MLP
-from ..kernels.fused import MOST_CLASSES, CoarseRays, FusedField, FusedRays, FusedShape, coarse_walk, render_coarse
+from ..kernels.fused import MOST_CLASSES, CoarseRays, FusedField, FusedRays, coarse_walk, render_coarse
+from ..kernels.fused_kernel import FusedShape
 from ..kernels.fused_network import padded
 from ..kernels.runtime import small_tensor
 from ..train.model import Model, Rendered

@@ -57,6 +57,16 @@ class RunInfo(BaseModel):
         return Box(world_from_sfm(project) @ np.array(self.sfm_from_box), self.contracted)
 
 
+def settled_as(asked: RunConfig, settled: RunConfig) -> RunConfig:
+    """The settings asked for, with those that were left to the photos and the device as in a run that settled them."""
+    config = asked.model_copy(deep=True)
+    if config.scene.image_size is None:
+        config.scene.image_size = settled.scene.image_size
+    if config.field.finest is None:
+        config.field.finest = settled.field.finest
+    return config
+
+
 def run_folder(project: Path, run: str) -> Path:
     return Path(project) / "runs" / run
 

@@ -7,17 +7,19 @@ import re
 import threading
 import time
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 from click.testing import CliRunner
 from fieldwork.nerfcore.bench import gpu, tables
+from fieldwork.nerfcore.bench.jobs import Job, interrupted
 from fieldwork.nerfcore.bench.machine import run_yardstick
 from fieldwork.nerfcore.bench.suites import ABLATION, ROBUSTNESS, TIMED, baselines, plan
 from fieldwork.nerfcore.config import make_config
 from fieldwork.nerfcore.errors import Cancelled, InputError, SettingError
-from fieldwork.nerfcore.params import BenchParams
+from fieldwork.nerfcore.params import BenchParams, TrainParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.verbs import run_verb
 from fieldwork.tests.nerfcore.support.ball import SMALL
@@ -146,6 +148,29 @@ def test_a_cancelled_suite_goes_on_where_it_stopped(tiny_project: Path, tmp_path
     result = bench(tmp_path, tiny_project, "ablation", seconds=1.5, variants=["hybrid", "explicit"])
     assert result["runs"] == 2
     assert done[0].stat().st_mtime_ns == before
+
+
+def test_an_unfinished_run_goes_on_only_with_its_own_settings(tiny_project: Path) -> None:  # noqa: F811
+    settings = {k: v for k, v in TINY.items() if k != "field.finest"}  # the photos decide
+    job = Job("a", "unfinished", settings, steps=12)
+    train = TrainParams(project=tiny_project, preset=job.preset, run=job.name, steps=4, set=settings)
+    run_verb("train", train, Reporter())
+    assert interrupted(job, tiny_project)
+    assert not interrupted(replace(job, settings={**settings, "train.seed": "4"}), tiny_project)
+    assert not interrupted(replace(job, variant="other"), tiny_project)
+
+
+def test_two_scenes_of_one_name_are_refused(tiny_project: Path, tmp_path: Path) -> None:  # noqa: F811
+    params = BenchParams(suite="speed", out=tmp_path, scenes=[str(tiny_project), str(tiny_project)])
+    with pytest.raises(InputError, match="Two scenes are called"):
+        run_verb("bench", params, Reporter())
+
+
+def test_a_variant_is_what_its_name_says() -> None:
+    (job,) = plan(
+        BenchParams(suite="ablation", steps=5, variants=["explicit"], set={"field.branch": "implicit"}), ["a"]
+    )
+    assert job.settings["field.branch"] == "explicit"
 
 
 def test_a_run_that_fails_does_not_stop_the_others(tiny_project: Path, tmp_path: Path) -> None:  # noqa: F811

@@ -1,0 +1,369 @@
+"""The kernel of the fused renderer: second march, encodings, networks and compositing of whole rays.
+
+The coarse walk (`march_weight`) says which rays meet open cells and how much weight their bins have; this kernel
+takes those rays from a queue. Every thread of a block follows one ray: it advances to the ray's next sample, the block
+evaluates its samples together on the matrix units (`fused_network`), and the thread composites its own. A ray that
+is used up, or opaque, makes room for the next one, so blocks stay full. Samples are those of `march.sample` with all
+shifts ½; the unfused path in `train/model.py` is the oracle (equal within half precision). `fused.py` launches it.
+
+The same source runs on the CPU for tests, on one thread and slowly.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import warp as wp
+
+from .cells import trilinear_at
+from .fused_network import (
+    GRANULE,
+    frequency_encoding,
+    grid_encoding,
+    half_feature,
+    half_vector,
+    network,
+    padded,
+    spherical_harmonics,
+)
+from .march import (
+    _DEFAULT,
+    MAX_BINS,
+    STOP,
+    bin_length,
+    bin_weight,
+    cell_index,
+    closed_length,
+    grid_position,
+    inside,
+    ray_interval,
+    reciprocal,
+)
+
+CERTAIN = wp.constant(0.999)  # blend weight from which the implicit branch no longer shows in half precision
+HARMONICS = 16
+MOST_UNROLLED = 64
+
+
+@dataclass(frozen=True)
+class FusedShape:
+    """What a fused kernel is compiled for. Sizes of networks are those of the field, not padded.
+
+    levels: of the grid. octaves: of the implicit branch, 0 when there is none. width: of hidden layers.
+    geometry: outputs of the density head. color_layers: 2 or 3. appearance: length of the code. classes: padded
+    number of classes, 0 without semantics. logits: sum logits instead of probabilities.
+    """
+
+    levels: int
+    octaves: int
+    width: int
+    geometry: int
+    color_layers: int
+    appearance: int
+    classes: int
+    logits: bool
+
+    @property
+    def features(self) -> int:
+        return padded(self.levels * 4)
+
+    @property
+    def implicit(self) -> tuple[int, ...]:
+        return (padded(3 + 6 * self.octaves), self.width, self.features)
+
+    @property
+    def density(self) -> tuple[int, ...]:
+        return (self.features, self.width, padded(self.geometry))
+
+    @property
+    def color(self) -> tuple[int, ...]:
+        inputs = padded(self.geometry + HARMONICS + self.appearance)
+        return (inputs, *[self.width] * (self.color_layers - 1), GRANULE)
+
+    @property
+    def semantic(self) -> tuple[int, ...]:
+        """The implicit features follow the padded geometry, so that both start at a multiple of 16."""
+        inputs = padded(self.geometry) + (self.features if self.octaves else 0)
+        return (inputs, self.width, self.classes)
+
+    def networks(self) -> dict[str, tuple[int, ...]]:
+        """Padded sizes of the networks there are, in the order in which their weights are packed."""
+        parts = {"implicit": self.implicit} if self.octaves else {}
+        parts |= {"density": self.density, "color": self.color}
+        return parts | ({"semantic": self.semantic} if self.classes else {})
+
+    def rows(self) -> dict[str, int]:
+        """First row of each network in the packed weights, and their number as "all"."""
+        row, first = 0, {}
+        for name, sizes in self.networks().items():
+            first[name] = row
+            row += sum(sizes[1:])
+        return {**first, "all": row}
+
+    @property
+    def columns(self) -> int:
+        return max(max(sizes[:-1]) for sizes in self.networks().values())
+
+
+@wp.struct
+class Ray:
+    """One ray on its way: what `march_sample` keeps in local variables."""
+
+    index: int
+    origin: wp.vec3
+    direction: wp.vec3
+    inverse: wp.vec3
+    high: float
+    share: float
+    t: float
+    last: float  # distance of the last open bin
+    transmittance: float
+    below: float  # weight of the bins behind
+    used: float  # part of the present bin given to intervals already
+    gathered: float  # open length of the next sample's interval so far
+    sample: int
+    ended: int
+
+
+@wp.struct
+class March:
+    n: int
+    step: float
+    near: float
+    far: float
+    contracted: int
+    mode: int
+    beta: float
+    epsilon: float
+
+
+@wp.func
+def advanced(ray: Ray, m: March, cells: wp.array(dtype=wp.vec2), blocks: wp.array(dtype=wp.uint8)):
+    """The ray after its next sample, with the sample's distance and length."""
+    target = (float(ray.sample) + 0.5) * ray.share
+    edge = float(ray.sample + 1) * ray.share
+    place = float(-1.0)
+    length = float(0.0)
+    found = int(0)
+    for _ in range(MAX_BINS):
+        if found == 1 or ray.t >= ray.high:
+            break
+        p = ray.origin + ray.direction * ray.t
+        width = bin_length(p, m.step, m.contracted)
+        u = grid_position(p, m.contracted)
+        cell = cells[cell_index(u, m.n)]
+        if cell[0] > 0.0:
+            weight = bin_weight(cell, ray.transmittance, width, m.mode, m.beta, m.epsilon)
+            above = ray.below + weight
+            ray.last = ray.t
+            if place < 0.0 and target <= above:
+                place = ray.t + ((target - ray.below) / weight - 0.5) * width
+            if edge <= above:
+                upto = (edge - ray.below) / weight
+                length = ray.gathered + (upto - ray.used) * width
+                ray.gathered = 0.0
+                ray.used = upto
+                found = 1
+            else:
+                ray.gathered += (1.0 - ray.used) * width
+                ray.used = 0.0
+                ray.below = above
+                ray.t += width
+                if m.mode == _DEFAULT:
+                    ray.transmittance *= wp.exp(-cell[0] * width)
+                    if ray.transmittance < STOP:
+                        ray.t = ray.high
+        else:
+            ray.t += closed_length(u, ray.direction, ray.inverse, m.n, m.step, width, m.contracted, blocks)
+    if found == 0:
+        # Rounding left this interval just short of the total; nothing is behind it.
+        length = ray.gathered
+        ray.gathered = 0.0
+        ray.ended = 1
+        if place < 0.0:
+            place = ray.last
+    ray.sample += 1
+    return ray, place, length
+
+
+@cache
+def fused_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
+    """The kernel for fields of a shape; `lanes` samples a block (1 on the CPU)."""
+    grid = grid_encoding(shape.levels, shape.features)
+    octaves, classes, logits = shape.octaves, shape.classes, int(shape.logits)
+    geometry, geometry_rows, appearance = shape.geometry, padded(shape.geometry), shape.appearance
+    features = shape.features
+    color_code = shape.geometry + HARMONICS
+    rows = shape.rows()
+    density_row, color_row = rows["density"], rows["color"]
+    implicit_row, semantic_row = rows.get("implicit", 0), rows.get("semantic", 0)
+    density_network = network(shape.density, lanes)
+    color_network, color_input = network(shape.color, lanes), half_vector(shape.color[0])
+    implicit_network = network(shape.implicit, lanes) if octaves else None
+    frequencies = frequency_encoding(octaves, shape.implicit[0]) if octaves else None
+    semantic_network = network(shape.semantic, lanes) if classes else None
+    semantic_input = half_vector(shape.semantic[0])
+    implicit_vector, known_vector = half_vector(features), half_vector(geometry)
+
+    def fused_render(
+        origins: wp.array(dtype=wp.vec3),
+        directions: wp.array(dtype=wp.vec3),
+        total: wp.array(dtype=float),
+        first: wp.array(dtype=float),
+        queue: wp.array(dtype=int),
+        taken: wp.array(dtype=int),
+        hits: wp.array(dtype=int),
+        count: int,
+        m: March,
+        cells: wp.array(dtype=wp.vec2),
+        blocks: wp.array(dtype=wp.uint8),
+        table: wp.array(dtype=half_feature),
+        layout: wp.array2d(dtype=int),
+        gains: wp.array(dtype=float),
+        evidence: wp.array(dtype=float),
+        evidence_side: int,
+        blend_floor: float,
+        blend_rate: float,
+        weights: wp.array2d(dtype=wp.float16),
+        code: wp.array(dtype=float),
+        density_shift: float,
+        cull: float,
+        class_count: int,
+        pixels: wp.array2d(dtype=float),
+        probabilities: wp.array2d(dtype=float),
+        evaluated: wp.array(dtype=int),
+    ):
+        lane = wp.tid()
+        ray = Ray()
+        ray.index = -1
+        depth = float(0.0)
+        before = float(1.0)
+        red = float(0.0)
+        green = float(0.0)
+        blue = float(0.0)
+        opacity = float(0.0)
+        distance = float(0.0)
+        samples = int(0)
+        working = int(1)
+        while working > 0:
+            if ray.index < 0:
+                place = wp.atomic_add(taken, 0, 1)
+                if place < hits[0]:
+                    r = queue[place]
+                    ray.index = r
+                    ray.origin = origins[r]
+                    ray.direction = directions[r]
+                    ray.inverse = reciprocal(ray.direction)
+                    _, high = ray_interval(ray.origin, ray.inverse, m.near, m.far, m.contracted)
+                    ray.high = high
+                    ray.share = total[r] / float(count)
+                    ray.t = first[r]
+                    ray.last = first[r]
+                    ray.transmittance = 1.0
+                    ray.below = 0.0
+                    ray.used = 0.0
+                    ray.gathered = 0.0
+                    ray.sample = 0
+                    ray.ended = 0
+                    depth = 0.0
+                    before = 1.0
+                    red = 0.0
+                    green = 0.0
+                    blue = 0.0
+                    opacity = 0.0
+                    distance = 0.0
+            active = wp.where(ray.index >= 0, 1, 0)
+            working = wp.tile_sum(wp.tile(active))[0]
+            if working > 0:
+                t = float(0.0)
+                length = float(0.0)
+                p = wp.vec3(0.5, 0.5, 0.5)
+                if active == 1:
+                    ray, t, length = advanced(ray, m, cells, blocks)
+                    p = inside(grid_position(ray.origin + ray.direction * t, m.contracted))
+                    samples += 1
+                hidden = grid(p, table, layout, gains)
+                implicit = implicit_vector()
+                if wp.static(octaves > 0):
+                    w = float(1.0)
+                    if active == 1 and evidence_side > 0:
+                        w = 1.0 - (1.0 - blend_floor) * wp.exp(-blend_rate * trilinear_at(evidence, evidence_side, p))
+                    # Where the whole block is certain of its grid the implicit branch waits until someone asks.
+                    unsure = wp.tile_sum(wp.tile(wp.where(w < CERTAIN, 1, 0)))[0]
+                    if unsure > 0:
+                        smooth = implicit_network(frequencies(p), weights, implicit_row)
+                        for k in range(features):
+                            hidden[k] = wp.float16(w * float(hidden[k]) + (1.0 - w) * smooth[k])
+                            implicit[k] = wp.float16(smooth[k])
+                out = density_network(hidden, weights, density_row)
+                known = known_vector()
+                for k in range(geometry):
+                    known[k] = wp.float16(out[k])
+                density = wp.exp(wp.clamp(out[0] + density_shift, -15.0, 11.0))
+                depth += density * length
+                after = wp.exp(-depth)
+                weight = before - after
+                before = after
+                shows = wp.where(active == 1 and weight > cull, 1, 0)
+                seen = wp.tile_sum(wp.tile(shows))[0]
+                if seen > 0:
+                    x = color_input()
+                    for k in range(geometry):
+                        x[k] = known[k]
+                    sh = spherical_harmonics(ray.direction)
+                    for k in range(HARMONICS):
+                        x[geometry + k] = wp.float16(sh[k])
+                    for k in range(appearance):
+                        x[color_code + k] = wp.float16(code[k])
+                    color = color_network(x, weights, color_row)
+                    if shows == 1:
+                        red += weight / (1.0 + wp.exp(-color[0]))
+                        green += weight / (1.0 + wp.exp(-color[1]))
+                        blue += weight / (1.0 + wp.exp(-color[2]))
+                        opacity += weight
+                        distance += weight * t
+                    if wp.static(classes > 0):
+                        y = semantic_input()
+                        for k in range(geometry):
+                            y[k] = known[k]
+                        if wp.static(octaves > 0):
+                            if unsure == 0:
+                                smooth = implicit_network(frequencies(p), weights, implicit_row)
+                                for k in range(features):
+                                    implicit[k] = wp.float16(smooth[k])
+                            for k in range(features):
+                                y[geometry_rows + k] = implicit[k]
+                        scores = semantic_network(y, weights, semantic_row)
+                        if shows == 1:
+                            if wp.static(logits == 0):
+                                largest = float(-1.0e30)
+                                for k in range(classes):
+                                    largest = wp.where(k < class_count, wp.max(largest, scores[k]), largest)
+                                sum = float(0.0)
+                                for k in range(classes):
+                                    e = wp.where(k < class_count, wp.exp(scores[k] - largest), 0.0)
+                                    scores[k] = e
+                                    sum += e
+                                scores = scores / sum
+                            for k in range(classes):
+                                if k < class_count:
+                                    probabilities[ray.index, k] = probabilities[ray.index, k] + weight * scores[k]
+                if active == 1 and (ray.ended == 1 or ray.sample >= count or before < STOP):
+                    pixels[ray.index, 0] = red
+                    pixels[ray.index, 1] = green
+                    pixels[ray.index, 2] = blue
+                    pixels[ray.index, 3] = opacity
+                    pixels[ray.index, 4] = distance
+                    ray.index = -1
+        evaluated[lane] = samples
+
+    classes_text = f"{classes}{'l' if logits else ''}"
+    name = (
+        f"fieldwork_fused_{shape.levels}_{octaves}_{shape.width}_{geometry}_{shape.color_layers}_{appearance}"
+        f"_{classes_text}_{lanes}"
+    )
+    kernel = wp.kernel(fused_render, name="fused_render", module=name, launch_bounds=lanes, grid_stride=False)
+    # Vectors indexed in loops that are not unrolled would live in local memory.
+    kernel.module.options["max_unroll"] = MOST_UNROLLED
+    return kernel

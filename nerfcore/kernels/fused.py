@@ -10,8 +10,8 @@ import warp as wp
 from .blocks import launch_blocks
 from .fused_kernel import FusedShape, March, fused_kernel
 from .fused_network import half_feature
-from .march import MarchSettings, march_weight
-from .runtime import array, init, launch
+from .march import MarchSettings, coarse
+from .runtime import array, init
 
 LANES = 64  # samples a block works on, on CUDA; two to eight blocks fit a multiprocessor of sm_75 and later
 BLOCKS_PER_MULTIPROCESSOR = 8
@@ -76,14 +76,8 @@ def coarse_walk(
 
     Nothing is read back from the device.
     """
-    init()
     device, rays = origins.device, len(origins)
-    jitter = torch.full((rays,), 0.5, device=device)
-    total, first, last = (torch.empty(rays, device=device) for _ in range(3))
-    inputs = [array(origins, wp.vec3), array(directions, wp.vec3), array(jitter), array(cells, wp.vec2), array(blocks)]
-    s = settings
-    inputs += [s.resolution, s.step, s.near, s.far, int(s.contracted), s.mode, s.beta, s.epsilon]
-    launch(march_weight, rays, [*inputs, s.empty, array(total), array(first), array(last)], device)
+    total, first, _ = coarse(origins, directions, cells, blocks, settings)
     hit = total > 0
     place = torch.cumsum(hit, 0)
     # Rays that miss are written to a place behind the queue.

@@ -341,6 +341,26 @@ def _arguments(settings: MarchSettings) -> list:
     return [s.resolution, s.step, s.near, s.far, int(s.contracted), s.mode, s.beta, s.epsilon]
 
 
+def coarse(
+    origins: torch.Tensor,
+    directions: torch.Tensor,
+    cells: torch.Tensor,
+    blocks: torch.Tensor,
+    settings: MarchSettings,
+    jitter: torch.Tensor | None = None,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """The coarse walk of rays, arguments as for `sample`: weight of all open bins (R,), 0 where there is none, and
+    distances (R,) of the first and the last of them, −1 where there is none."""
+    init()
+    device, rays = origins.device, len(origins)
+    jitter = torch.full((rays,), 0.5, device=device) if jitter is None else jitter
+    total, first, last = (torch.empty(rays, device=device) for _ in range(3))
+    inputs = [array(origins, wp.vec3), array(directions, wp.vec3), array(jitter), array(cells, wp.vec2), array(blocks)]
+    inputs += [*_arguments(settings), settings.empty, array(total), array(first), array(last)]
+    launch(march_weight, rays, inputs, device)
+    return total, first, last
+
+
 def sample(
     origins: torch.Tensor,
     directions: torch.Tensor,
@@ -363,13 +383,9 @@ def sample(
         capacity: on CUDA, the fixed number of rays that may get samples, so that no count is read back; rays
             beyond it get none, unused places have ray −1 and delta 0.
     """
-    init()
     device, rays = origins.device, len(origins)
     jitter = torch.full((rays,), 0.5, device=device) if jitter is None else jitter
-    total, first, last = (torch.empty(rays, device=device) for _ in range(3))
-    o, d, j = array(origins, wp.vec3), array(directions, wp.vec3), array(jitter)
-    fixed = [array(cells, wp.vec2), array(blocks), *_arguments(settings)]
-    launch(march_weight, rays, [o, d, j, *fixed, settings.empty, array(total), array(first), array(last)], device)
+    total, first, last = coarse(origins, directions, cells, blocks, settings, jitter)
     hit = total > 0
     slot = torch.cumsum(hit, 0, dtype=torch.int32) - 1
     if capacity is None:
@@ -387,7 +403,8 @@ def sample(
     launch(
         march_sample,
         rays,
-        [o, d, j, array(shift), *fixed, array(total), array(first), array(start), count]
+        [array(origins, wp.vec3), array(directions, wp.vec3), array(jitter), array(shift), array(cells, wp.vec2)]
+        + [array(blocks), *_arguments(settings), array(total), array(first), array(start), count]
         + [array(points, wp.vec3), array(depth), array(delta), array(ray)],
         device,
     )

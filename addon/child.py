@@ -24,6 +24,7 @@ TASKS = {
     "simulate": "addon.simulate.task:simulate",
     "dataset": "addon.simulate.dataset:dataset",
     "blend": "addon.package_task:write_blend",
+    "usd": "addon.package_task:write_usd",
 }
 
 

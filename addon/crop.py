@@ -11,9 +11,10 @@ from mathutils import Matrix, Vector
 from . import state
 
 CORNERS = [Vector((x, y, z)) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
+Bounds = list[list[float]]  # [min, max] in the world, metres
 
-
-_seen: dict[str, list[list[float]]] = {}  # scene → bounds of its box at the last look
+# scene → bounds of its box and of its project at the last look, and whether the box was moved since they agreed
+_seen: dict[str, tuple[Bounds, Bounds | None, bool]] = {}
 
 
 def find(scene: bpy.types.Scene) -> bpy.types.Object | None:
@@ -24,21 +25,35 @@ def find(scene: bpy.types.Scene) -> bpy.types.Object | None:
 
 
 def follow(scene: bpy.types.Scene) -> bool:
-    """Take a box that was moved to the project, once it rests; whether the project was written."""
+    """Keep the box and the project alike; whether the project was written.
+
+    A box that was moved goes to the project once it rests. Where the project has changed by itself (it was aligned, or
+    the file with the box is an old one), the box goes to it.
+    """
     box, folder = find(scene), state.folder_of(scene.fieldwork)
     if box is None or not state.has_project(folder):
         _seen.pop(scene.name, None)
         return False
-    bounds, before = bounds_of(box), _seen.get(scene.name)
-    _seen[scene.name] = bounds
-    if bounds != before or _flat(bounds) or bounds == _bounds(state.cached_project(folder)):
+    bounds, wanted = bounds_of(box), _bounds(state.cached_project(folder))
+    new = scene.name not in _seen
+    before, known, moved = _seen.get(scene.name, (bounds, wanted, wanted is None))
+    if not _same(bounds, before):
+        _seen[scene.name] = bounds, wanted, True
+        return False
+    if new or wanted != known:
+        _seen[scene.name] = bounds, wanted, new and moved
+        if wanted is not None and not _same(bounds, wanted):
+            add(scene, wanted)
+        return False
+    if not moved or _flat(bounds) or _same(bounds, wanted):
         return False
     write_bounds(folder, bounds)
+    _seen[scene.name] = bounds, bounds, False
     return True
 
 
-def add(scene: bpy.types.Scene, bounds: list[list[float]]) -> bpy.types.Object:
-    """Put a box with the bounds [min, max] (world, metres) into the scene, or move the one that is there."""
+def add(scene: bpy.types.Scene, bounds: Bounds) -> bpy.types.Object:
+    """Put a box with the bounds into the scene, or move the one that is there."""
     box = find(scene)
     if box is None:
         box = bpy.data.objects.new("Fieldwork Training Region", None)
@@ -46,30 +61,41 @@ def add(scene: bpy.types.Scene, bounds: list[list[float]]) -> bpy.types.Object:
         scene.collection.objects.link(box)
     low, high = Vector(bounds[0]), Vector(bounds[1])
     scene.fieldwork.region_box = box
+    box.empty_display_size = 1.0
     box.matrix_world = Matrix.LocRotScale((low + high) / 2, None, (high - low) / 2)
+    wanted = _bounds(state.cached_project(state.folder_of(scene.fieldwork)))
+    _seen[scene.name] = bounds_of(box), wanted, wanted is None
     return box
 
 
-def bounds_of(box: bpy.types.Object) -> list[list[float]]:
+def bounds_of(box: bpy.types.Object) -> Bounds:
     """Axis-aligned bounds [min, max] of the box in the world, also of a rotated one."""
     corners = [box.matrix_world @ (corner * box.empty_display_size) for corner in CORNERS]
     return [[float(pick(c[i] for c in corners)) for i in range(3)] for pick in (min, max)]
 
 
-def _flat(bounds: list[list[float]]) -> bool:
+def _same(a: Bounds, b: Bounds | None) -> bool:
+    """Whether bounds agree as far as Blender's single precision goes."""
+    if b is None:
+        return False
+    size = max(1.0, *(abs(value) for row in a for value in row))
+    return all(abs(x - y) < 1e-5 * size for row, other in zip(a, b) for x, y in zip(row, other))
+
+
+def _flat(bounds: Bounds) -> bool:
     return any(high - low < 1e-6 for low, high in zip(*bounds))
 
 
-def _bounds(project: dict[str, Any] | None) -> list[list[float]] | None:
+def _bounds(project: dict[str, Any] | None) -> Bounds | None:
     return ((project or {}).get("frame") or {}).get("bounds")
 
 
-def read_bounds(folder: Path) -> list[list[float]] | None:
+def read_bounds(folder: Path) -> Bounds | None:
     """The training region of the project, None when everything is trained."""
     return _bounds(state.read_project(folder))
 
 
-def write_bounds(folder: Path, bounds: list[list[float]] | None) -> None:
+def write_bounds(folder: Path, bounds: Bounds | None) -> None:
     """Set or clear the training region of the project.
 
     Raises:

@@ -107,6 +107,13 @@ class Queue:
             self._loader.start()
         self.redraw()
 
+    def follow_up(self, job: Job) -> None:
+        """Another job from within the end of one: queued in a window, done at once without."""
+        if bpy.app.background:
+            self.run(job)
+        else:
+            self.submit(job)
+
     def run(self, job: Job) -> dict[str, Any]:
         """Run a job and wait for it. Raises EngineError."""
         job.state, job.started = "running", time.monotonic()

@@ -1,13 +1,16 @@
-"""The child process of `fieldwork blend`: a package as a .blend of its own."""
+"""The child processes of `fieldwork blend` and `fieldwork export --to usd`: a package as a file of its own."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import bpy
 
-from .package import read_package
+from .errors import SceneError
+from .label_material import COLOR_ATTRIBUTE
+from .package import Package, read_package
 from .scene_import import Imported, import_package
 
 PACKED_LIMIT = 256 * 2**20  # bytes of photos above which they stay outside the .blend
@@ -18,23 +21,8 @@ def write_blend(request: dict[str, Any], emit: Callable[..., None]) -> dict[str,
 
     `request["split"]`: one mesh object for each class.
     """
-    emit(kind="stage", name="Building the Blender file")
-    bpy.ops.wm.read_factory_settings()
-    bpy.context.preferences.filepaths.save_version = 0
-    for item in list(bpy.data.objects):
-        bpy.data.objects.remove(item)
-    for collection in list(bpy.data.collections):
-        bpy.data.collections.remove(collection)
-    scene = bpy.context.scene
-    scene.name = "Fieldwork"
-    package = read_package(request["package"])
-    imported = import_package(
-        scene,
-        package,
-        split=request["split"],
-        progress=lambda fraction, message: emit(kind="progress", fraction=fraction, message=message),
-    )
-    prepare_scene(scene, len(package.cameras))
+    package, imported = _build(request, emit, "Building the Blender file")
+    prepare_scene(bpy.context.scene, len(package.cameras))
     _show_colors(imported)
     warnings = imported.warnings
     size = sum((package.folder / camera["image"]).stat().st_size for camera in package.cameras)
@@ -53,6 +41,73 @@ def write_blend(request: dict[str, Any], emit: Callable[..., None]) -> dict[str,
         "mesh": len(package.mesh["faces"]) if package.mesh is not None else None,
         "warnings": warnings,
     }
+
+
+def write_usd(request: dict[str, Any], emit: Callable[..., None]) -> dict[str, Any]:
+    """Write the cameras and the mesh of the package as USD, z up, in metres.
+
+    The surface has the baked texture, else the colours of its classes; the photographed colours are its display
+    colours, the classes its primvar `class_id`.
+
+    Raises:
+        SceneError: this Blender cannot write USD.
+    """
+    if not bpy.app.build_options.usd:
+        raise SceneError(
+            f"This Blender {bpy.app.version_string} was built without USD. Set FIELDWORK_BLENDER to another one."
+        )
+    package, imported = _build(request, emit, "Building the scene")
+    for item in (imported.animated, imported.points):
+        if item is not None:  # one camera for each photo is enough, and loose points are no surface
+            bpy.data.objects.remove(item)
+    texture = bpy.data.images.load(str(package.texture), check_existing=True) if package.texture else None
+    for item in imported.meshes:
+        item.data.color_attributes[COLOR_ATTRIBUTE].name = "displayColor"  # USD's name of it
+        if texture is None and not package.classes:
+            item.data.materials.clear()  # readers show the display colours where there is no material
+        for material in item.data.materials:
+            _make_plain(material, texture)
+    emit(kind="stage", name="Writing")
+    bpy.ops.wm.usd_export(filepath=request["out"], overwrite_textures=True)
+    if not Path(request["out"]).stat().st_size:
+        raise SceneError(f"Blender could not write {request['out']}.")
+    return {"warnings": imported.warnings}
+
+
+def _make_plain(material: bpy.types.Material, texture: bpy.types.Image | None) -> None:
+    """A material that other programs know: the texture, or the colour of the class."""
+    material.use_nodes = True
+    tree = material.node_tree
+    tree.nodes.clear()
+    shader, output = tree.nodes.new("ShaderNodeBsdfPrincipled"), tree.nodes.new("ShaderNodeOutputMaterial")
+    tree.links.new(shader.outputs[0], output.inputs[0])
+    shader.inputs["Roughness"].default_value = 1.0
+    shader.inputs["Base Color"].default_value = material.diffuse_color
+    if texture is not None:
+        picture = tree.nodes.new("ShaderNodeTexImage")
+        picture.image = texture
+        tree.links.new(picture.outputs[0], shader.inputs["Base Color"])
+
+
+def _build(request: dict[str, Any], emit: Callable[..., None], stage: str) -> tuple[Package, Imported]:
+    """The package of a request in an empty scene."""
+    emit(kind="stage", name=stage)
+    bpy.ops.wm.read_factory_settings()
+    bpy.context.preferences.filepaths.save_version = 0
+    for item in list(bpy.data.objects):
+        bpy.data.objects.remove(item)
+    for collection in list(bpy.data.collections):
+        bpy.data.collections.remove(collection)
+    scene = bpy.context.scene
+    scene.name = "Fieldwork"
+    package = read_package(request["package"])
+    imported = import_package(
+        scene,
+        package,
+        split=request["split"],
+        progress=lambda fraction, message: emit(kind="progress", fraction=fraction, message=message),
+    )
+    return package, imported
 
 
 def prepare_scene(scene: bpy.types.Scene, frames: int) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 from bpy_extras import view3d_utils
 from mathutils import Vector
 
-from .scene_import import ROLE
+from .roles import ROLE
 
 REACH = 14  # pixels
 

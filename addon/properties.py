@@ -34,6 +34,16 @@ UP = [
     ("z", "Z", "The positive Z axis of the scene becomes up"),
     ("-z", "-Z", "The negative Z axis of the scene becomes up"),
 ]
+EXPORTS = [
+    ("blend", "Blender (.blend)", "Cameras, points, mesh and materials as a Blender file of its own"),
+    ("glb", "glTF (.glb)", "The mesh with its colors or texture, for game engines and the web"),
+    ("usd", "USD (.usdc)", "The mesh and the cameras, for other 3D programs"),
+    ("obj", "Wavefront (.obj)", "The mesh with its texture, for nearly everything"),
+    ("ply", "Stanford (.ply)", "The mesh with colors and the class of each vertex"),
+    ("stl", "STL (.stl)", "The bare surface, for 3D printers"),
+    ("onnx", "Field (.onnx)", "The trained field as a function of place and direction"),
+    ("voxels", "Voxels (.npz)", "Density, color and class on a regular grid"),
+]
 PASSES = [
     ("rgb", "Color", "The photographed colors"),
     ("depth", "Depth", "Distance along the ray in meters"),
@@ -147,6 +157,13 @@ class FieldworkScene(PropertyGroup):
 
     # Poses
     pose_preset: EnumProperty(name="Preset", description="How hard to try", items=POSE_PRESETS, default="standard")
+    pose_group: IntProperty(
+        name="Group",
+        description="Where the photos fall into separate groups: which one to use; 0 is the largest",
+        default=0,
+        min=0,
+        soft_max=5,
+    )
     up: EnumProperty(name="Up", description="Which direction of the scene is up", items=UP)
     point_a: FloatVectorProperty(name="Point A", description="One end of a known distance", subtype="TRANSLATION")
     point_b: FloatVectorProperty(name="Point B", description="Other end of a known distance", subtype="TRANSLATION")
@@ -249,6 +266,15 @@ class FieldworkScene(PropertyGroup):
     )
 
     # Export
+    export_to: EnumProperty(name="Format", description="What is written", items=EXPORTS)
+    export_split: EnumProperty(
+        name="Objects",
+        description="What the file holds: one object, or one for each class",
+        items=[("none", "One", "One object"), ("classes", "One per Class", "One object for each class")],
+    )
+    voxels: IntProperty(
+        name="Voxels", description="Cells along each side of the field's cube", default=128, min=8, max=512
+    )
     export_path: StringProperty(
         name="File", description="File to write; empty: in the exports of the project", subtype="FILE_PATH"
     )

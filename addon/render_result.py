@@ -8,7 +8,7 @@ from pathlib import Path
 import bpy
 
 from .render_slot import MARK, load_render, render_slot
-from .scene_import import PROJECT, ROLE
+from .roles import PROJECT, ROLE
 
 OTHER_PASSES = ("_depth", "_labels", "_confidence", "_normal")
 

@@ -25,8 +25,8 @@ from .mesh_import import fill_points, fill_surface
 from .package import SENSOR_MM, Package, blender_camera, read_package
 from .point_cloud import show_points
 from .render_slot import load_render, render_slot
+from .roles import PROJECT, ROLE
 
-ROLE, PROJECT = "fieldwork_role", "fieldwork_project"
 SIZE = "fieldwork_size"  # photo size in pixels, on camera objects
 Cameras = Literal["many", "animated", "both"]
 Steps = Generator[tuple[float, str], None, Any]  # yields the share that is done and what is next

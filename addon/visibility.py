@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from .mesh_import import CLASS_ATTRIBUTE
-from .scene_import import PROJECT, ROLE
+from .roles import PROJECT, ROLE
 
 NAME = "Fieldwork Classes"
 

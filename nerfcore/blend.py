@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from pathlib import Path
 from typing import Any
 
 from .blend_package import write_package
@@ -12,7 +11,7 @@ from .errors import SettingError
 from .files import atomic_path
 from .params import BlendParams
 from .progress import Reporter
-from .project import load_project, load_scene, save_project
+from .project import load_scene, record_step
 
 
 def blend(params: BlendParams, report: Reporter) -> dict[str, Any]:
@@ -47,16 +46,10 @@ def blend(params: BlendParams, report: Reporter) -> dict[str, Any]:
         )
     for warning in [*warnings, *result.pop("warnings")]:
         report.warn(warning)
-    _record(folder, params, out)
+    record_step(folder, "blend", params.model_dump(mode="json"), {"file": str(out)})
     return {
         "file": str(out),
         **result,
         "seconds": round(time.monotonic() - started, 1),
         "warnings": report.warnings,
     }
-
-
-def _record(folder: Path, params: BlendParams, out: Path) -> None:
-    project = load_project(folder)
-    project.record("blend", params.model_dump(mode="json"), {"file": str(out)})
-    save_project(folder, project)

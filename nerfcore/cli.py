@@ -29,9 +29,16 @@ from .verbs import VERBS, run_verb
 # Worker threads that spin while they wait take the cores other programs need; read when OpenMP starts.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
-POSITIONAL = ("project", "dataset", "photos", "out")
+POSITIONAL = ("project", "dataset", "photos", "list", "out")
 # Verbs in which one of the names above is an option.
-NAMED = {"new": {"photos"}, "render": {"out"}, "mesh": {"out"}, "reconstruct": {"out"}, "bench": {"out"}}
+NAMED = {
+    "new": {"photos"},
+    "render": {"out"},
+    "mesh": {"out"},
+    "reconstruct": {"out"},
+    "bench": {"out"},
+    "export": {"out"},
+}
 ORDER = {"import": ["dataset", "project"]}
 # Whether a path can be read is for the verb to say, in its own words and with exit code 1.
 PATH = click.Path(path_type=Path, readable=False)
@@ -142,7 +149,7 @@ def run_command(name: str, values: dict[str, Any], as_json: bool, quiet: bool, s
             return 130
         except FieldworkError as error:
             if as_json:
-                value = {"error": {"code": error.code, "message": error.message, "hint": error.hint}}
+                value = {**error.result, "error": {"code": error.code, "message": error.message, "hint": error.hint}}
                 print(json.dumps(value, ensure_ascii=False), file=stdout)
             click.secho(f"{error.message}", fg="red", err=True)
             if error.hint:

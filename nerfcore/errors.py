@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 
 class FieldworkError(Exception):
     """A failure with a sentence for the user.
 
-    `code` names the kind of failure in JSON-RPC and `--json` output (stable, snake_case); `hint` says what to do.
+    `code` names the kind of failure in JSON-RPC and `--json` output (stable, snake_case); `hint` says what to do;
+    `result` holds what was done all the same.
     """
 
     code = "failed"
 
-    def __init__(self, message: str, hint: str = "") -> None:
+    def __init__(self, message: str, hint: str = "", result: dict[str, Any] | None = None) -> None:
         super().__init__(message)
         self.message = message
         self.hint = hint
+        self.result = result or {}
 
     def __str__(self) -> str:
         return f"{self.message} {self.hint}".strip()

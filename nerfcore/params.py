@@ -167,6 +167,15 @@ class BlendParams(Params):
     )
 
 
+class ExportParams(Params):
+    project: Path
+    to: Literal["glb", "obj", "ply", "stl", "usd", "onnx", "voxels"] = Field(description="format")
+    run: str = "main"
+    out: Path | None = Field(default=None, description="file to write; default: exports/RUN/PROJECT of the project")
+    split: Literal["none", "classes"] = Field(default="none", description="classes: one object for each class")
+    resolution: int = Field(default=128, ge=8, le=512, description="voxels: cells along each side of the field's cube")
+
+
 class PackageParams(Params):
     project: Path
     run: str = "main"
@@ -187,6 +196,12 @@ class ReconstructParams(Params):
     set: dict[str, str] = Field(default_factory=dict)
     report: Path | None = Field(default=None, description="HTML report to write")
     renders: Path | None = Field(default=None, description="folder for renders of new views")
+
+
+class BatchParams(Params):
+    list: Path = Field(description=".csv or .json file with one capture a row: the settings of reconstruct by name")
+    retries: int = Field(default=1, ge=0, description="how often a capture that failed is tried again")
+    report: Path | None = Field(default=None, description="JSON report to write; default: LIST-report.json beside it")
 
 
 class BenchParams(Params):

@@ -158,6 +158,13 @@ def save_project(folder: Path, project: Project) -> None:
     write_json(Path(folder) / PROJECT_FILE, project.model_dump(mode="json"))
 
 
+def record_step(folder: Path, verb: str, settings: dict[str, Any], result: dict[str, Any]) -> None:
+    """Append one step to the provenance of a project on disk, whatever else has changed in it meanwhile."""
+    project = load_project(folder)
+    project.record(verb, settings, result)
+    save_project(folder, project)
+
+
 def is_project(folder: Path) -> bool:
     return (Path(folder) / PROJECT_FILE).is_file()
 

@@ -31,8 +31,10 @@ VERBS = {
     "mesh": Verb(p.MeshParams, "mesh.verb:mesh", "Extract the labelled surface."),
     "blend": Verb(p.BlendParams, "blend:blend", "Write a .blend with cameras, points, mesh and materials."),
     "package": Verb(p.PackageParams, "package:package", "Prepare cameras, points and mesh for Blender."),
+    "export": Verb(p.ExportParams, "export.verb:export", "Write what other programs read."),
     "bench": Verb(p.BenchParams, "bench.verb:bench", "Reproduce a table of figures on this machine."),
     "reconstruct": Verb(p.ReconstructParams, "reconstruct:reconstruct", "Photos in, a labelled .blend out."),
+    "batch": Verb(p.BatchParams, "batch:batch", "Reconstruct many captures, one after the other."),
 }
 
 

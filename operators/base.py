@@ -72,6 +72,11 @@ def same_verb_active(verb: str, context: Context) -> str | None:
     return None
 
 
+def absolute(path: str) -> str | None:
+    """A path as the user gave it, absolute; None when it is empty."""
+    return str(Path(bpy.path.abspath(path)).absolute()) if path else None
+
+
 class VerbOperator(Operator):
     """An operator that runs a verb in the engine: queued in a window, blocking without one."""
 
@@ -105,8 +110,7 @@ class VerbOperator(Operator):
 
     def path(self, context: Context, name: str) -> str | None:
         """A setting that is a path, absolute; None when it is empty."""
-        value = self.value(context, name)
-        return str(Path(bpy.path.abspath(value)).absolute()) if value else None
+        return absolute(self.value(context, name))
 
     def parameters(self, context: Context) -> dict[str, Any]:
         """Parameters of the verb. Raises ValueError with a sentence for the user."""
@@ -148,12 +152,10 @@ class ProjectOperator(VerbOperator):
     )  # fmt: skip
 
     def project_path(self, context: Context) -> str:
-        if self.properties.is_property_set("project") and self.project:
-            return str(Path(bpy.path.abspath(self.project)).absolute())
-        folder = state.folder_of(context.scene.fieldwork)
+        folder = absolute(self.project) or absolute(context.scene.fieldwork.project)
         if folder is None:
             raise ValueError(t("Choose a project folder first."))
-        return str(folder)
+        return folder
 
 
 def refresh_scenes(job: jobs.Job) -> None:

@@ -78,6 +78,12 @@ class FIELDWORK_OT_new(ProjectOperator):
     verb = "new"
     needs = (need_photos, need_project_folder)
 
+    add: BoolProperty(name="Add", description="Add the photos to those that the project has", options={"SKIP_SAVE"})
+
+    @classmethod
+    def description(cls, context: Context, properties: Any) -> str:
+        return t("Add the photos to those that the project has") if properties.add else t(cls.__doc__ or "")
+
     def parameters(self, context: Context) -> dict[str, Any]:
         photos = self.path(context, "photos")
         if photos is None:
@@ -90,6 +96,7 @@ class FIELDWORK_OT_new(ProjectOperator):
             "photos": photos,
             **{name: self.path(context, name) for name in ("labels", "masks", "classes")},
             **{name: self.value(context, name) for name in plain},
+            "add": self.add,
         }
 
 

@@ -10,7 +10,7 @@ import bpy
 from bpy.types import Context, Event
 
 from ..addon import jobs
-from ..addon.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
+from ..addon.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, IntVectorProperty, StringProperty
 from ..addon.text import t
 from .base import VerbOperator, refresh_scenes, set_if_empty
 from .capture import project_for
@@ -55,6 +55,13 @@ class FIELDWORK_OT_dataset(VerbOperator):
     )
     curve: StringProperty(name="Curve", description="Curve object to walk along")
     labels: EnumProperty(name="Labels", description="What tells classes apart", items=LABELS)
+    size: IntVectorProperty(
+        name="Size",
+        description="Width and height of the photos in pixels; 0: as set in Output Properties",
+        size=2,
+        default=(0, 0),
+        min=0,
+    )
     samples: IntProperty(name="Samples", description="Cycles samples per pixel", default=32, min=1, soft_max=512)
     depth: BoolProperty(name="Depth", description="Write depth maps", default=True)
     transparent: BoolProperty(name="Transparent", description="Alpha 0 where there is nothing, instead of the world")
@@ -84,12 +91,13 @@ class FIELDWORK_OT_dataset(VerbOperator):
         if self.path_kind in {"sphere", "hemisphere"}:
             column.prop(self, "radius")
         column.separator()
-        for name in ("labels", "samples", "depth", "transparent", "make_project"):
+        for name in ("labels", "size", "samples", "depth", "transparent", "make_project"):
             column.prop(self, name)
         render = context.scene.render
-        percent = render.resolution_percentage / 100
-        size = (round(render.resolution_x * percent), round(render.resolution_y * percent))
-        column.label(text=t("{} × {} pixels, as set in Output Properties", *size), icon="INFO")
+        if not all(self.size):
+            percent = render.resolution_percentage / 100
+            size = (round(render.resolution_x * percent), round(render.resolution_y * percent))
+            column.label(text=t("{} × {} pixels, as set in Output Properties", *size), icon="INFO")
 
     def parameters(self, context: Context) -> dict[str, Any]:
         if not self.out:
@@ -108,6 +116,7 @@ class FIELDWORK_OT_dataset(VerbOperator):
             "center": list(context.scene.cursor.location) if self.around == "cursor" else None,
             "radius": self.radius or None,
             "curve": self.curve or None,
+            "size": list(self.size) if all(self.size) else None,
             "samples": self.samples,
             "labels": self.labels,
             "depth": self.depth,
@@ -128,11 +137,7 @@ class FIELDWORK_OT_dataset(VerbOperator):
             if job.state == "done" and make_project:
                 folder = Path(job.params["out"])
                 params = {"dataset": str(folder), "project": str(project_for(folder)), "format": "transforms"}
-                following = jobs.queue.make("import", params, show)
-                if bpy.app.background:
-                    jobs.queue.run(following)
-                else:
-                    jobs.queue.submit(following)
+                jobs.queue.follow_up(jobs.queue.make("import", params, show))
 
         return done
 

@@ -1,4 +1,4 @@
-"""Export: the capture as a .blend of its own."""
+"""Export: the capture as a .blend of its own, and in the formats of other programs."""
 
 from __future__ import annotations
 
@@ -7,11 +7,15 @@ from typing import Any
 
 from bpy.types import Context
 
+from ..addon import state
+from ..addon.props import StringProperty
 from ..addon.text import t
-from .base import ProjectOperator, need_run, scene_settings
+from .base import ProjectOperator, absolute, need_run, scene_settings
+
+OF_THE_MESH = {"glb", "obj", "ply", "stl", "usd"}
 
 
-@scene_settings(run="run", out="export_path")
+@scene_settings(run="run", out="export_path", split="export_split")
 class FIELDWORK_OT_blend(ProjectOperator):
     """Write a .blend with the cameras, points, mesh and materials of the capture"""
 
@@ -20,12 +24,54 @@ class FIELDWORK_OT_blend(ProjectOperator):
     verb = "blend"
     needs = (need_run,)
 
+    renders: StringProperty(
+        name="Renders",
+        description="Folder of rendered photos to show behind their cameras; empty: those of the panel",
+        subtype="DIR_PATH",
+        options={"SKIP_SAVE"},
+    )
+
     def parameters(self, context: Context) -> dict[str, Any]:
         project, run = self.project_path(context), self.value(context, "run")
         out = self.path(context, "out") or str(Path(project, "exports", run, f"{Path(project).name}.blend"))
         if not out.endswith(".blend"):
             raise ValueError(t("Name a file that ends in .blend."))
-        return {"project": project, "run": run, "out": out}
+        split, renders = self.value(context, "split"), absolute(self.renders)
+        return {"project": project, "run": run, "out": out, "split": split, "renders": renders}
 
 
-CLASSES = [FIELDWORK_OT_blend]
+@scene_settings(run="run", to="export_to", out="export_path", split="export_split", resolution="voxels")
+class FIELDWORK_OT_export(ProjectOperator):
+    """Write the mesh or the field in a format that other programs read"""
+
+    bl_idname = "fieldwork.export"
+    bl_label = "Export"
+    verb = "export"
+    needs = (need_run,)
+
+    @classmethod
+    def reason(cls, context: Context) -> str | None:
+        return super().reason(context) or cls.need_mesh(context)
+
+    @staticmethod
+    def need_mesh(context: Context) -> str | None:
+        settings = context.scene.fieldwork
+        folder = state.folder_of(settings)
+        mesh = folder is not None and (folder / "exports" / settings.run / "mesh.npz").is_file()
+        return t("Extract the mesh first") if settings.export_to in OF_THE_MESH and not mesh else None
+
+    def parameters(self, context: Context) -> dict[str, Any]:
+        to = self.value(context, "to")
+        if to == "blend":
+            raise ValueError(t("Choose a format, or use Write .blend."))
+        return {
+            "project": self.project_path(context),
+            "run": self.value(context, "run"),
+            "to": to,
+            "out": self.path(context, "out"),
+            "split": self.value(context, "split"),
+            "resolution": self.value(context, "resolution"),
+        }
+
+
+CLASSES = [FIELDWORK_OT_blend, FIELDWORK_OT_export]

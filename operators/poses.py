@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from typing import Any
 
+import bpy
 from bpy.types import Context, Event, Operator
 
-from ..addon.props import BoolProperty, EnumProperty
+from ..addon import jobs, state
+from ..addon.props import BoolProperty, EnumProperty, StringProperty
 from ..addon.text import t
-from .base import ProjectOperator, need_poses, need_project, scene_settings
+from .base import ProjectOperator, need_poses, need_project, refresh_scenes, scene_settings
+from .scene import update_scene
 
 
-@scene_settings(preset="pose_preset")
+@scene_settings(preset="pose_preset", group="pose_group")
 class FIELDWORK_OT_poses(ProjectOperator):
     """Estimate where each photo was taken"""
 
@@ -20,8 +23,22 @@ class FIELDWORK_OT_poses(ProjectOperator):
     verb = "poses"
     needs = (need_project,)
 
+    restart: BoolProperty(
+        name="Start Over", description="Place all photos anew, also those that have a pose", options={"SKIP_SAVE"}
+    )
+
+    @classmethod
+    def description(cls, context: Context, properties: Any) -> str:
+        anew = t("Place all photos anew, also those that have a pose")
+        return anew if properties.restart else t(cls.__doc__ or "")
+
     def parameters(self, context: Context) -> dict[str, Any]:
-        return {"project": self.project_path(context), "preset": self.value(context, "preset")}
+        return {
+            "project": self.project_path(context),
+            "preset": self.value(context, "preset"),
+            "group": self.value(context, "group"),
+            "restart": self.restart,
+        }
 
 
 @scene_settings(up="up", point_a="point_a", point_b="point_b", distance="distance")
@@ -36,6 +53,27 @@ class FIELDWORK_OT_align(ProjectOperator):
     use_scale: BoolProperty(
         name="Scale", description="Set the scale from the two points", default=True, options={"SKIP_SAVE"}
     )
+    ground: BoolProperty(
+        name="Level Ground",
+        description="Level the ground the photos show and put it at height 0",
+        options={"SKIP_SAVE"},
+    )
+    gps: BoolProperty(
+        name="GPS", description="Take the true size and north from the photos' GPS positions", options={"SKIP_SAVE"}
+    )
+    crop: StringProperty(
+        name="Region",
+        description="Training region in meters: auto, none, or x0,y0,z0,x1,y1,z1; empty: as it is",
+        options={"SKIP_SAVE"},
+    )
+
+    @classmethod
+    def description(cls, context: Context, properties: Any) -> str:
+        if properties.ground:
+            return t("Level the ground the photos show and put it at height 0")
+        if properties.gps:
+            return t("Take the true size and north from the photos' GPS positions")
+        return t(cls.__doc__ or "")
 
     def parameters(self, context: Context) -> dict[str, Any]:
         params: dict[str, Any] = {"project": self.project_path(context)}
@@ -47,9 +85,27 @@ class FIELDWORK_OT_align(ProjectOperator):
             unit = context.scene.unit_settings.scale_length or 1.0
             distance = self.value(context, "distance") * unit
             params["scale"] = [",".join(f"{v:.9g}" for v in a), ",".join(f"{v:.9g}" for v in b), distance]
+        params |= {name: True for name in ("ground", "gps") if getattr(self, name)}
+        params |= {"crop": self.crop} if self.crop else {}
         if len(params) == 1:
             raise ValueError(t("Choose an up direction, or pick two points first."))
         return params
+
+    def after(self) -> jobs.Done:
+        return aligned
+
+
+def aligned(job: jobs.Job) -> None:
+    """Directions and points were those of the frame before: forget them, and bring the scene into the new frame."""
+    refresh_scenes(job)
+    if job.state != "done":
+        return
+    for scene in bpy.data.scenes:
+        settings = scene.fieldwork
+        if state.folder_of(settings) == job.project:
+            settings.up = "auto"
+            settings.point_a = settings.point_b = (0.0, 0.0, 0.0)
+            update_scene(job, scene)
 
 
 class FIELDWORK_OT_pick_point(Operator):

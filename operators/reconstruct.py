@@ -1,21 +1,22 @@
-"""Whole jobs in one step, made for scripts: photos to a .blend, and simulated photos."""
+"""Whole jobs in one step, made for scripts: photos to a .blend, many captures, simulated photos, benchmarks."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import bpy
 from bpy.types import Context
 
-from ..addon.props import IntProperty, IntVectorProperty, StringProperty
+from ..addon.properties import PRESETS
+from ..addon.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, IntVectorProperty, StringProperty
 from ..addon.text import t
-from .base import VerbOperator, scene_settings
+from .base import VerbOperator, absolute, scene_settings
+from .train import parse_settings
 
 
 @scene_settings(
     photos="photos", labels="labels", masks="masks", classes="class_file", preset="preset",
-    time_limit="time_limit",
+    time_limit="time_limit", settings="settings",
 )  # fmt: skip
 class FIELDWORK_OT_reconstruct(VerbOperator):
     """Take photos all the way to a labelled mesh: read, estimate poses, train, extract the mesh, write a .blend"""
@@ -31,21 +32,114 @@ class FIELDWORK_OT_reconstruct(VerbOperator):
     blend: StringProperty(
         name="Blender File", description=".blend to write; empty: none", subtype="FILE_PATH", options={"SKIP_SAVE"}
     )
+    report_file: StringProperty(
+        name="Report", description="HTML report to write; empty: none", subtype="FILE_PATH", options={"SKIP_SAVE"}
+    )
+    renders: StringProperty(
+        name="Renders", description="Folder for renders of new views; empty: in the project", subtype="DIR_PATH",
+        options={"SKIP_SAVE"},
+    )  # fmt: skip
 
     def parameters(self, context: Context) -> dict[str, Any]:
-        photos, out = self.path(context, "photos"), self.out or context.scene.fieldwork.project
+        photos, out = self.path(context, "photos"), absolute(self.out or context.scene.fieldwork.project)
         if photos is None:
             raise ValueError(t("Choose a folder of photos, or a video, first."))
         if not out:
             raise ValueError(t("Choose a project folder first."))
         return {
             "photos": photos,
-            "out": str(Path(bpy.path.abspath(out)).absolute()),
+            "out": out,
             **{name: self.path(context, name) for name in ("labels", "masks", "classes")},
             "preset": self.value(context, "preset"),
             "time_limit": self.value(context, "time_limit") or None,
-            "blend": str(Path(bpy.path.abspath(self.blend)).absolute()) if self.blend else None,
+            "set": parse_settings(self.value(context, "settings")),
+            "blend": absolute(self.blend),
+            "report": absolute(self.report_file),
+            "renders": absolute(self.renders),
         }
+
+
+class FIELDWORK_OT_batch(VerbOperator):
+    """Reconstruct many captures, one after the other; one that fails does not stop the others"""
+
+    bl_idname = "fieldwork.batch"
+    bl_label = "Reconstruct Many"
+    verb = "batch"
+
+    list: StringProperty(
+        name="List", description=".csv or .json file with one capture a row", subtype="FILE_PATH", options={"SKIP_SAVE"}
+    )
+    retries: IntProperty(
+        name="Retries", description="How often a capture that failed is tried again", default=1, min=0, soft_max=5
+    )
+    report_file: StringProperty(
+        name="Report", description="JSON report to write; empty: beside the list", subtype="FILE_PATH",
+        options={"SKIP_SAVE"},
+    )  # fmt: skip
+
+    def invoke(self, context: Context, event: bpy.types.Event) -> set[str]:
+        return context.window_manager.invoke_props_dialog(self, width=380)
+
+    def parameters(self, context: Context) -> dict[str, Any]:
+        if not self.list:
+            raise ValueError(t("Choose a list of captures."))
+        return {"list": absolute(self.list), "retries": self.retries, "report": absolute(self.report_file)}
+
+
+class FIELDWORK_OT_bench(VerbOperator):
+    """Reproduce a table of figures on this machine; takes from minutes to hours"""
+
+    bl_idname = "fieldwork.bench"
+    bl_label = "Run Benchmark"
+    verb = "bench"
+
+    suite: EnumProperty(
+        name="Suite",
+        description="Which table",
+        items=[
+            ("speed", "Speed", "Quality after a short and a longer training, frame times"),
+            ("ablation", "Ablation", "The parts of the method, one left out at a time"),
+            ("robustness", "Robustness", "Noise, missing views, missing and wrong labels"),
+            ("baselines", "Baselines", "Other methods as boundary cases of the field"),
+            ("gpu", "GPU", "What is asked of a graphics card"),
+        ],
+    )
+    out: StringProperty(name="Folder", description="Folder for results and scenes", subtype="DIR_PATH")
+    data: StringProperty(name="Data", description="Folder of data sets; empty: only simulated ones", subtype="DIR_PATH")
+    scenes: StringProperty(name="Scenes", description="Data sets, museum, or capture projects, separated by commas")
+    variants: StringProperty(name="Variants", description="Only these variants of the suite, separated by commas")
+    seconds: FloatProperty(name="Time", description="Seconds of training a run; 0: as the suite says", min=0.0)
+    steps: IntProperty(name="Steps", description="Steps of training a run; 0: as the suite says", min=0)
+    preset: EnumProperty(name="Preset", description="Preset of every run", items=PRESETS, default="standard")
+    settings: StringProperty(name="Settings", description="Settings of every run: name=value, separated by spaces")
+    keep: BoolProperty(name="Keep", description="Keep the trained fields")
+    yardstick: StringProperty(
+        name="Yardstick", description="Speed: script of another trainer to run beside ours", subtype="FILE_PATH"
+    )
+    page: StringProperty(name="Page", description="GPU: Markdown page to write the figures into", subtype="FILE_PATH")
+    tests: StringProperty(name="Tests", description="GPU: JUnit file of the kernels' tests", subtype="FILE_PATH")
+
+    def invoke(self, context: Context, event: bpy.types.Event) -> set[str]:
+        return context.window_manager.invoke_props_dialog(self, width=380)
+
+    def parameters(self, context: Context) -> dict[str, Any]:
+        if not self.out:
+            raise ValueError(t("Choose a folder for the results."))
+        return {
+            "suite": self.suite,
+            "scenes": _words(self.scenes),
+            "variants": _words(self.variants),
+            "seconds": self.seconds or None,
+            "steps": self.steps or None,
+            "preset": self.preset,
+            "set": parse_settings(self.settings),
+            "keep": self.keep,
+            **{name: absolute(getattr(self, name)) for name in ("out", "data", "yardstick", "page", "tests")},
+        }
+
+
+def _words(text: str) -> list[str] | None:
+    return [word.strip() for word in text.split(",") if word.strip()] or None
 
 
 class FIELDWORK_OT_simulate(VerbOperator):
@@ -56,6 +150,11 @@ class FIELDWORK_OT_simulate(VerbOperator):
     verb = "simulate"
 
     out: StringProperty(name="Folder", description="New or empty folder for the capture", subtype="DIR_PATH")
+    scene: EnumProperty(
+        name="Scene",
+        description="What is built",
+        items=[("museum", "Museum", "Exhibits on plinths, one of them gilded in part")],
+    )
     views: IntProperty(name="Photos", description="Number of photos", default=48, min=4, soft_max=200)
     size: IntVectorProperty(
         name="Size", description="Width and height of the photos", size=2, default=(480, 320), min=16
@@ -67,7 +166,8 @@ class FIELDWORK_OT_simulate(VerbOperator):
         if not self.out:
             raise ValueError(t("Choose a folder for the capture."))
         return {
-            "out": str(Path(bpy.path.abspath(self.out)).absolute()),
+            "out": absolute(self.out),
+            "scene": self.scene,
             "views": self.views,
             "size": list(self.size),
             "seed": self.seed,
@@ -75,4 +175,4 @@ class FIELDWORK_OT_simulate(VerbOperator):
         }
 
 
-CLASSES = [FIELDWORK_OT_reconstruct, FIELDWORK_OT_simulate]
+CLASSES = [FIELDWORK_OT_reconstruct, FIELDWORK_OT_batch, FIELDWORK_OT_simulate, FIELDWORK_OT_bench]

@@ -7,6 +7,7 @@ from bpy.types import Context, Operator
 from mathutils import Vector
 
 from ..addon import crop, state
+from ..addon.roles import ROLE
 from ..addon.text import t
 from .base import need_poses
 
@@ -86,7 +87,7 @@ def default_bounds(scene: bpy.types.Scene) -> list[list[float]]:
     corners = [
         obj.matrix_world @ Vector(corner)
         for obj in scene.objects
-        if obj.type == "MESH" and "fieldwork_role" in obj
+        if obj.type == "MESH" and ROLE in obj
         for corner in obj.bound_box
     ]
     if corners:

@@ -12,7 +12,7 @@ from bpy.types import Context
 from ..addon import jobs, state
 from ..addon.props import StringProperty
 from ..addon.text import t
-from .base import ProjectOperator, need_run, refresh_scenes, scene_settings
+from .base import ProjectOperator, absolute, need_run, refresh_scenes, scene_settings
 
 
 def camera_frames(scene: bpy.types.Scene, animated: bool, size: tuple[int, int]) -> dict[str, Any]:
@@ -86,6 +86,10 @@ class FIELDWORK_OT_render(ProjectOperator):
         name="Output", description="Folder for the images; empty: exports/renders of the project", subtype="DIR_PATH",
         options={"SKIP_SAVE"},
     )  # fmt: skip
+    camera: StringProperty(
+        name="Camera File", description="transforms.json with the cameras; empty: as chosen under From",
+        subtype="FILE_PATH", options={"SKIP_SAVE"},
+    )  # fmt: skip
 
     @classmethod
     def reason(cls, context: Context) -> str | None:
@@ -109,6 +113,8 @@ class FIELDWORK_OT_render(ProjectOperator):
             "passes": [name for name in order if name in passes],
             "size": list(size) if all(size) else None,
         }
+        if self.camera:
+            return {**params, "camera": absolute(self.camera)}
         if source == "photos":
             return {**params, "test": True}
         if source == "orbit":
@@ -156,11 +162,7 @@ def _show_straightened(job: jobs.Job, scene_name: str, show_as: str) -> None:
         return render_result.show_steps(scene, files, show_as, True, done.project.name)
 
     params = {name: job.params[name] for name in ("project", "run")} | {"renders": job.params["out"]}
-    following = jobs.queue.make("package", params, show)
-    if bpy.app.background:
-        jobs.queue.run(following)
-    else:
-        jobs.queue.submit(following)
+    jobs.queue.follow_up(jobs.queue.make("package", params, show))
 
 
 CLASSES = [FIELDWORK_OT_render]

@@ -8,8 +8,9 @@ import bpy
 from bpy.types import Context
 
 from ..addon import jobs, state
-from ..addon.props import EnumProperty
-from .base import ProjectOperator, need_poses, refresh_scenes, scene_settings, set_if_empty
+from ..addon.props import EnumProperty, StringProperty
+from ..addon.roles import PROJECT, ROLE
+from .base import ProjectOperator, absolute, need_poses, refresh_scenes, scene_settings, set_if_empty
 
 
 @scene_settings(run="run")
@@ -31,15 +32,32 @@ class FIELDWORK_OT_import_scene(ProjectOperator):
         ],
         options={"SKIP_SAVE"},
     )
+    renders: StringProperty(
+        name="Renders",
+        description="Folder of rendered photos to show behind their cameras; empty: those of the panel",
+        subtype="DIR_PATH",
+        options={"SKIP_SAVE"},
+    )
 
     def parameters(self, context: Context) -> dict[str, Any]:
         project = self.project_path(context)
         set_if_empty(context.scene, project)
-        return {"project": project, "run": self.value(context, "run")}
+        return {"project": project, "run": self.value(context, "run"), "renders": absolute(self.renders)}
 
     def after(self) -> jobs.Done:
         cameras, name = self.cameras, bpy.context.scene.name
         return lambda job: import_result(job, cameras, name)
+
+
+def update_scene(job: jobs.Job, scene: bpy.types.Scene) -> None:
+    """After a job that moved everything: update what an earlier import put into the scene; nothing where none did."""
+    roles = {str(o[ROLE]) for o in scene.objects if ROLE in o and o.get(PROJECT) == job.project.name}
+    if not roles:
+        return
+    many, animated = any(role.startswith("camera:") for role in roles), "camera path" in roles
+    cameras, name = "both" if many == animated else "many" if many else "animated", scene.name
+    params = {"project": str(job.project), "run": scene.fieldwork.run}
+    jobs.queue.follow_up(jobs.queue.make("package", params, lambda done: import_result(done, cameras, name)))
 
 
 def import_result(job: jobs.Job, cameras: str, scene_name: str) -> jobs.Steps | None:

@@ -71,9 +71,11 @@ class FIELDWORK_OT_evaluate(ProjectOperator):
         items=[("test", "Held Out", "Photos that training did not see"), ("train", "Training", "Training photos")],
         options={"SKIP_SAVE"},
     )
+    speed: BoolProperty(name="Speed", description="Measure frame times too", default=True, options={"SKIP_SAVE"})
 
     def parameters(self, context: Context) -> dict[str, Any]:
-        return {"project": self.project_path(context), "run": self.value(context, "run"), "split": self.split}
+        project, run = self.project_path(context), self.value(context, "run")
+        return {"project": project, "run": run, "split": self.split, "speed": self.speed}
 
 
 class FIELDWORK_OT_use_run(Operator):

@@ -47,7 +47,10 @@ class FIELDWORK_PT_capture(StepPanel):
         column = columns(layout)
         for name in ("photos", "labels", "masks", "class_file"):
             column.prop(settings, name)
-        layout.operator("fieldwork.new", icon="IMAGE_DATA")
+        row = layout.row(align=True)
+        row.operator("fieldwork.new", icon="IMAGE_DATA").add = False
+        if state.has_project(folder):
+            row.operator("fieldwork.new", text=t("Add"), icon="ADD").add = True
         if settings.images:
             draw_images(layout, context)
 

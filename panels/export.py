@@ -6,9 +6,9 @@ from pathlib import Path
 
 from bpy.types import Context
 
-from ..addon import jobs
+from ..addon import jobs, state
 from ..addon.text import t
-from .base import StepPanel, columns
+from .base import StepPanel, columns, project_folder
 
 
 class FIELDWORK_PT_export(StepPanel):
@@ -16,11 +16,26 @@ class FIELDWORK_PT_export(StepPanel):
 
     def draw(self, context: Context) -> None:
         layout = self.layout
-        last = next((j for j in reversed(jobs.queue.finished) if j.verb == "blend" and j.state == "done"), None)
-        if last is not None:
-            self.draw_state(True, t("Written: {}", Path((last.result or {}).get("file", "")).name))
-        columns(layout).prop(context.scene.fieldwork, "export_path")
-        layout.operator("fieldwork.blend", icon="FILE_BLEND")
+        settings, folder = context.scene.fieldwork, project_folder(context)
+        last = next((j for j in reversed(jobs.queue.finished) if j.verb in ("blend", "export") and j.result), None)
+        if last is not None and last.result is not None:
+            first = last.result["file"] if last.verb == "blend" else last.result["files"][0]
+            self.draw_state(True, t("Written: {}", Path(first).name))
+        elif state.has_run(folder, settings.run):
+            self.draw_state(False, t("Ready to export"))
+        else:
+            self.draw_state(False, t("Run “{}” is not trained yet", settings.run))
+        column = columns(layout)
+        column.prop(settings, "export_to")
+        column.prop(settings, "export_path")
+        if settings.export_to == "voxels":
+            column.prop(settings, "voxels")
+        elif settings.export_to != "onnx":
+            column.prop(settings, "export_split")
+        if settings.export_to == "blend":
+            layout.operator("fieldwork.blend", icon="FILE_BLEND")
+        else:
+            layout.operator("fieldwork.export", icon="EXPORT")
 
 
 CLASSES = [FIELDWORK_PT_export]

@@ -25,6 +25,8 @@ class FIELDWORK_MT_steps(Menu):
         layout.operator("fieldwork.render")
         layout.operator("fieldwork.mesh")
         layout.operator("fieldwork.import_scene")
+        layout.operator("fieldwork.blend")
+        layout.operator("fieldwork.export")
         layout.separator()
         layout.operator("fieldwork.cancel")
         layout.operator("fieldwork.doctor")

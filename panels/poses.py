@@ -36,13 +36,30 @@ class FIELDWORK_PT_poses(StepPanel):
         usable = sum(image.status != "rejected" for image in settings.images)
         self.draw_state(done, t("{} of {} photos placed", placed, usable) if done else t("No poses yet"))
         columns(layout).prop(settings, "pose_preset")
-        layout.operator("fieldwork.poses", icon="CAMERA_DATA")
+        row = layout.row(align=True)
+        row.operator("fieldwork.poses", icon="CAMERA_DATA").restart = False
+        if done:
+            row.operator("fieldwork.poses", text=t("Start Over"), icon="FILE_REFRESH").restart = True
         if not (done and folder):
             return
         layout.template_list("FIELDWORK_UL_poses", "poses", settings, "images", settings, "image_index", rows=4)
         if 0 <= settings.image_index < len(settings.images) and settings.images[settings.image_index].reason:
             draw_wrapped(layout, settings.images[settings.image_index].reason, text_width(context), icon="INFO")
         layout.operator("fieldwork.import_scene", text=t("Show in Scene"), icon="OUTLINER_OB_CAMERA")
+
+
+class FIELDWORK_PT_poses_options(FieldworkPanel):
+    bl_label = "Options"
+    bl_parent_id = "FIELDWORK_PT_poses"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    def draw(self, context: Context) -> None:
+        settings = context.scene.fieldwork
+        columns(self.layout).prop(settings, "pose_group")
+        groups = state.last_result(state.cached_project(project_folder(context)), "poses").get("groups", [])
+        if len(groups) > 1:
+            text = t("The photos fall into groups of {}.", ", ".join(map(str, groups)))
+            draw_wrapped(self.layout, text, text_width(context), icon="INFO")
 
 
 class FIELDWORK_PT_align(FieldworkPanel):
@@ -65,6 +82,11 @@ class FIELDWORK_PT_align(FieldworkPanel):
             cursor.end, cursor.use_cursor = end.upper(), True
         columns(layout).prop(settings, "distance")
         layout.operator("fieldwork.align", icon="ORIENTATION_GLOBAL")
+        row = layout.row(align=True)
+        for name, text, icon in (("ground", t("Level Ground"), "VIEW_ORTHO"), ("gps", t("From GPS"), "WORLD")):
+            button = row.operator("fieldwork.align", text=text, icon=icon)
+            button.up, button.use_scale = "auto", False
+            setattr(button, name, True)
 
 
 class FIELDWORK_PT_region(FieldworkPanel):
@@ -87,4 +109,10 @@ class FIELDWORK_PT_region(FieldworkPanel):
         layout.operator("fieldwork.crop_remove", icon="X")
 
 
-CLASSES = [FIELDWORK_UL_poses, FIELDWORK_PT_poses, FIELDWORK_PT_align, FIELDWORK_PT_region]
+CLASSES = [
+    FIELDWORK_UL_poses,
+    FIELDWORK_PT_poses,
+    FIELDWORK_PT_poses_options,
+    FIELDWORK_PT_align,
+    FIELDWORK_PT_region,
+]

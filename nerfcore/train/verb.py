@@ -19,7 +19,7 @@ from ..files import atomic_path, disk_errors, write_json
 from ..kernels.runtime import compile_seconds
 from ..params import TrainParams
 from ..progress import Reporter
-from ..project import load_project, load_scene, save_project
+from ..project import load_project, load_scene, record_step
 from ..render.image import background_of, render_view, write_picture
 from .checkpoint import read_checkpoint, restore, save_checkpoint
 from .model import Model
@@ -93,9 +93,7 @@ def train(params: TrainParams, report: Reporter) -> dict[str, Any]:
     if trainer.poses is not None:
         result["pose_shift"] = trainer.poses.shift(info.box(load_project(project_folder)).world_from_box)
     write_json(folder / "metrics.json", {"train": result})
-    project = load_project(project_folder)
-    project.record("train", params.model_dump(mode="json"), result)
-    save_project(project_folder, project)
+    record_step(project_folder, "train", params.model_dump(mode="json"), result)
     return result
 
 

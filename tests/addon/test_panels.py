@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 
 import pytest
 
@@ -113,3 +114,16 @@ def test_quality_and_time_come_from_the_project(tmp_path):
     assert state.time_estimate(tmp_path, settings) is None
     assert state.quality(tmp_path, "main") == "27.3 dB, mIoU 0.87"
     assert state.quality(tmp_path, "other") == ""
+
+
+def test_curve_picture_shows_both_lines():
+    from fieldwork.addon.curve import LOSS_COLOR, PSNR_COLOR, draw_curve
+
+    curve = [(step, math.exp(-step / 50), 10 + step / 10) for step in range(100)]
+    image = draw_curve(curve, 64, 32)
+    assert image.shape == (32, 64, 4)
+    for color, slope in ((PSNR_COLOR, 1), (LOSS_COLOR, -1)):
+        rows, columns = (abs(image[..., :3] - color).max(-1) < 1e-6).nonzero()
+        left, right = rows[columns < 8].mean(), rows[columns >= 56].mean()
+        assert (right - left) * slope > 10
+    assert draw_curve([(0, 1.0, float("nan")), (1, 1.0, float("nan"))], 8, 8).shape == (8, 8, 4)

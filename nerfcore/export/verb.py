@@ -1,0 +1,109 @@
+"""The verb `export`: what was made of a capture, in the formats of other programs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+from PIL import Image
+
+from ..blend_package import write_package
+from ..blender import run_in_blender
+from ..errors import ProjectError, SettingError
+from ..files import atomic_path
+from ..mesh.extract import Surface
+from ..mesh.files import Texture, texture_of, write_surface
+from ..params import ExportParams
+from ..progress import Reporter
+from ..project import load_project, load_scene, record_step
+from ..train.run import load_trained
+
+SUFFIXES = {
+    "glb": (".glb",),
+    "obj": (".obj",),
+    "ply": (".ply",),
+    "stl": (".stl",),
+    "usd": (".usdc", ".usda", ".usd", ".usdz"),
+    "onnx": (".onnx",),
+    "voxels": (".npz",),
+}
+
+
+def export(params: ExportParams, report: Reporter) -> dict[str, Any]:
+    """Write one format to `out`, or to exports/<run>/<project>.<suffix>.
+
+    Meshes (glb, obj, ply, stl) are the last one that the verb `mesh` extracted; usd has the cameras and the sparse
+    points as well; onnx is the trained field itself as a function, voxels its values on a regular grid.
+
+    Returns:
+        {"files": [paths], "to": format}
+    Raises:
+        SettingError: the file has another ending. ProjectError: there is no mesh or no trained run.
+        BlenderError: usd, and there is no Blender that can write it.
+    """
+    folder = Path(params.project).absolute()
+    project = load_project(folder)
+    suffixes = SUFFIXES[params.to]
+    out = params.out or folder / "exports" / params.run / f"{folder.name}{suffixes[0]}"
+    if out.suffix.lower() not in suffixes:
+        raise SettingError(f"{out}: {params.to} files end in {' or '.join(suffixes)}.", "Choose one of these endings.")
+    if params.to == "onnx":
+        from .field_graph import write_onnx  # the library takes its time to load
+
+        report.stage("Writing the field")
+        write_onnx(out, load_trained(folder, params.run), project)
+        files = [out]
+    elif params.to == "voxels":
+        from .voxels import write_voxels
+
+        write_voxels(out, load_trained(folder, params.run), project, params.resolution, report)
+        files = [out]
+    elif params.to == "usd":
+        files = [_write_usd(out, folder, params, report)]
+    else:
+        report.stage("Writing")
+        surface, texture = load_surface(folder, params.run)
+        names = {c.id: c.name for c in project.classes}
+        files = write_surface(out, surface, names, params.split == "classes", texture)
+    result = {"to": params.to, "files": [str(path) for path in files]}
+    record_step(folder, "export", params.model_dump(mode="json"), result)
+    return result
+
+
+def load_surface(folder: Path, run: str) -> tuple[Surface, Texture | None]:
+    """The surface of a run in the world, and its texture, as `mesh` left them.
+
+    Raises:
+        ProjectError: there is none, or its file is damaged.
+    """
+    path = folder / "exports" / run / "mesh.npz"
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            surface = Surface(**{name: data[name] for name in Surface.__dataclass_fields__})
+            uv = data.get("uv", None)
+    except FileNotFoundError as error:
+        raise ProjectError(f"The run “{run}” has no mesh yet.", "Run `fieldwork mesh` first.") from error
+    except (OSError, ValueError, KeyError, BadZipFile) as error:
+        raise ProjectError(f"{path} is damaged: {error}.", "Run `fieldwork mesh` again.") from error
+    picture = path.with_name("texture.png")
+    if uv is None or not picture.is_file():
+        return surface, None
+    with Image.open(picture) as image:
+        return surface, texture_of(surface.faces, uv, np.array(image.convert("RGB")))
+
+
+def _write_usd(out: Path, folder: Path, params: ExportParams, report: Reporter) -> Path:
+    load_surface(folder, params.run)  # says so when there is none
+    package = write_package(folder, params.run, load_scene(folder), folder.name, report)
+    with atomic_path(out) as temporary:
+        result = run_in_blender(
+            "usd",
+            {"package": str(package), "out": str(temporary), "split": params.split == "classes"},
+            report,
+            lambda event: report.progress(event["fraction"], event.get("message", "")),
+        )
+    for warning in result["warnings"]:
+        report.warn(warning)
+    return out

@@ -1,0 +1,46 @@
+"""What tests of the Blender side share."""
+
+from __future__ import annotations
+
+import json
+
+SETUP = """
+import fieldwork
+fieldwork.register()
+scene = bpy.context.scene
+settings = scene.fieldwork
+def attempt(call):
+    try:
+        return sorted(call())
+    except RuntimeError as error:
+        return str(error)
+"""
+
+
+def make_project(folder, **more):
+    """A project as the panels see it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    project = {
+        "format": "fieldwork-project",
+        "version": 1,
+        "images": [
+            {"name": "a", "file": "images/a.jpg", "width": 640, "height": 480, "label": "labels/a.png"},
+            {"name": "b", "file": "", "status": "rejected", "reason": "It is blurred."},
+        ],
+        "classes": [
+            {"id": 1, "name": "stone", "color": [0.5, 0.5, 0.5], "priority": 1.0},
+            {"id": 2, "name": "gold", "color": [1.0, 0.8, 0.0], "priority": 2.0},
+        ],
+        "provenance": [{"verb": "mesh", "time": "", "version": "", "result": {"classes": {"gold": {"area": 0.25}}}}],
+        **more,
+    }
+    (folder / "project.json").write_text(json.dumps(project))
+    return folder
+
+
+def make_posed_project(folder):
+    """A project with camera poses, as the panels see it."""
+    make_project(folder)
+    (folder / "poses").mkdir()
+    (folder / "poses" / "poses.json").write_text("{}")
+    return folder

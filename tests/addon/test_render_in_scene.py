@@ -1,0 +1,124 @@
+"""Cameras of the scene as pixels for the engine, and rendered images back in the scene."""
+
+from __future__ import annotations
+
+import pytest
+from fieldwork.tests.addon.support import SETUP, make_project
+
+
+@pytest.mark.parametrize(("width", "height"), [(640, 480), (480, 640)])
+@pytest.mark.parametrize("fit", ["AUTO", "HORIZONTAL", "VERTICAL"])
+def test_scene_camera_as_pixels_agrees_with_blender(bpy_script, width, height, fit):
+    """Blender's own projection of a point, and that through the exported intrinsics, meet."""
+    facts = bpy_script(
+        SETUP
+        + """
+from bpy_extras.object_utils import world_to_camera_view
+from mathutils import Matrix, Vector
+from fieldwork.operators.render import camera_frames
+scene.render.resolution_x, scene.render.resolution_y = width, height
+camera = scene.camera
+camera.data.sensor_fit, camera.data.lens = fit, 41.0
+camera.data.shift_x, camera.data.shift_y = 0.11, -0.07
+camera.scale = (2, 2, 2)
+bpy.context.view_layer.update()
+frame = camera_frames(scene, False, (0, 0))["frames"][0]
+seen = []
+for point in (Vector((0, 0, 0)), Vector((1, 0.5, -0.3)), Vector((-0.8, 0.2, 1.0))):
+    x, y, _ = world_to_camera_view(scene, camera, point)
+    p = Matrix(frame["transform_matrix"]).inverted() @ point
+    mine = [frame["cx"] + frame["fl_x"] * p.x / -p.z, frame["cy"] - frame["fl_y"] * p.y / -p.z]
+    seen.append([[x * width, (1 - y) * height], mine])
+answer(seen)
+""",
+        width=width,
+        height=height,
+        fit=fit,
+    )
+    for blender, mine in facts:
+        assert mine == pytest.approx(blender, abs=0.01)
+
+
+def test_animation_gives_a_frame_each_and_leaves_the_scene_where_it_was(bpy_script):
+    facts = bpy_script(
+        SETUP
+        + """
+from fieldwork.operators.render import camera_frames
+scene.frame_start, scene.frame_end, scene.frame_step = 2, 8, 3
+for frame, x in ((2, 0.0), (8, 6.0)):
+    scene.camera.location.x = x
+    scene.camera.keyframe_insert("location", frame=frame)
+scene.frame_set(5)
+frames = camera_frames(scene, True, (100, 50))["frames"]
+answer({"names": [f["file_path"] for f in frames], "x": [f["transform_matrix"][0][3] for f in frames],
+        "size": [frames[0]["w"], frames[0]["h"]], "now": scene.frame_current})
+"""
+    )
+    assert facts["names"] == ["frame_0002", "frame_0005", "frame_0008"]
+    assert facts["x"][0] == pytest.approx(0, abs=1e-6)
+    assert facts["x"][2] == pytest.approx(6, abs=1e-6)
+    assert (facts["size"], facts["now"]) == ([100, 50], 5)
+
+
+def test_renders_appear_behind_their_cameras_or_on_planes_once(bpy_script, tmp_path):
+    facts = bpy_script(
+        SETUP
+        + """
+from fieldwork.addon import render_result
+settings.project = project
+files = []
+for name in ("a", "a_depth", "b"):
+    image = bpy.data.images.new(name, 64, 48)
+    image.filepath_raw, image.file_format = f"{project}/{name}.png", "PNG"
+    image.save()
+    bpy.data.images.remove(image)
+    files.append(Path(project) / f"{name}.png")
+cameras = {}
+for name in "ab":
+    cameras[name] = bpy.data.objects.new(name, bpy.data.cameras.new(name))
+    cameras[name]["fieldwork_role"], cameras[name]["fieldwork_project"] = f"camera:{name}.jpg", "capture"
+    scene.collection.objects.link(cameras[name])
+def show(kind, photos):
+    steps = render_result.show_steps(scene, files, kind, photos, "capture")
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            return end.value
+for _ in range(2):
+    for kind in ("background", "plane", "none"):
+        pairs = show(kind, True)
+answer({
+    "images": sorted(i.name for i in bpy.data.images if i.filepath),
+    "slots": {n: [s.image.name for s in c.data.background_images] for n, c in cameras.items()},
+    "planes": {n: [o.data.name for o in c.children] for n, c in cameras.items()},
+    "animation": [[c.name, i.source] for c, i in show("background", False)],
+})
+""",
+        project=make_project(tmp_path / "capture"),
+    )
+    assert facts["images"] == ["a.png", "a_depth.png", "b.png"]
+    assert facts["slots"] == {"a": ["a.png"], "b": ["b.png"]}
+    assert facts["planes"] == {"a": ["a.png"], "b": ["b.png"]}
+    assert facts["animation"] == [["Camera", "SEQUENCE"]]
+
+
+def test_image_plane_covers_exactly_what_the_camera_sees(bpy_script, tmp_path):
+    facts = bpy_script(
+        SETUP
+        + """
+from bpy_extras.object_utils import world_to_camera_view
+from mathutils import Vector
+from fieldwork.addon import render_result
+scene.render.resolution_x, scene.render.resolution_y = 200, 100
+scene.camera.data.shift_x = 0.2
+image = bpy.data.images.new("frame", 200, 100)
+render_result.plane(scene, scene.camera, image, 1)
+bpy.context.view_layer.update()
+(empty,) = scene.camera.children
+half = empty.empty_display_size / 2
+corners = [empty.matrix_world @ Vector((x * half, y * half / 2, 0)) for x in (-1, 1) for y in (-1, 1)]
+answer([[round(v, 4) for v in world_to_camera_view(scene, scene.camera, c)[:2]] for c in corners])
+"""
+    )
+    assert facts == [[0, 0], [0, 1], [1, 0], [1, 1]]

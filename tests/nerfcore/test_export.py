@@ -1,0 +1,206 @@
+"""Files for other programs, read back by other libraries; and the field as a graph, computed by another program."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import torch
+import trimesh
+from fieldwork.nerfcore.blender import find_blender
+from fieldwork.nerfcore.config import FieldConfig
+from fieldwork.nerfcore.data.box import Box
+from fieldwork.nerfcore.errors import BlenderError, ProjectError, SettingError
+from fieldwork.nerfcore.export.field_graph import field_model
+from fieldwork.nerfcore.field.encoding import spherical_harmonics
+from fieldwork.nerfcore.field.hybrid import HybridField
+from fieldwork.nerfcore.kernels.march_torch import grid_position
+from fieldwork.nerfcore.params import ExportParams, MeshParams, TrainParams
+from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.verbs import run_verb
+from fieldwork.tests.nerfcore.support.ball import SMALL, ball_project
+from onnx.reference import ReferenceEvaluator
+
+
+def has_blender() -> bool:
+    try:
+        find_blender()
+    except BlenderError:
+        return False
+    return True
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A ball of two classes, trained for a moment, with a textured mesh."""
+    folder = ball_project(tmp_path_factory.mktemp("export") / "Kugel ü")
+    run_verb("train", TrainParams(project=folder, preset="draft", steps=250, set=SMALL), Reporter())
+    run_verb("mesh", MeshParams(project=folder, resolution=32, texture=128), Reporter())
+    return folder
+
+
+def export(folder: Path, to: str, **more) -> list[Path]:
+    params = ExportParams.model_validate({"project": folder, "to": to, **more})
+    return [Path(path) for path in run_verb("export", params, Reporter())["files"]]
+
+
+def surface(folder: Path) -> dict[str, np.ndarray]:
+    with np.load(folder / "exports/main/mesh.npz") as data:
+        return {name: data[name] for name in data.files}
+
+
+def test_glb_and_obj_stand_upright_with_texture(trained: Path, tmp_path: Path) -> None:
+    ours = surface(trained)
+    for kind in ("glb", "obj"):
+        first, *beside = export(trained, kind, out=tmp_path / f"ball.{kind}")
+        loaded = trimesh.load(first, force="mesh")
+        assert len(loaded.faces) == len(ours["faces"])
+        # Blender's x, y, z are x, −z, y there.
+        turned = np.stack([loaded.vertices[:, 0], -loaded.vertices[:, 2], loaded.vertices[:, 1]], 1)
+        assert np.abs(turned.min(0) - ours["vertices"].min(0)).max() < 1e-5
+        assert np.abs(turned.max(0) - ours["vertices"].max(0)).max() < 1e-5
+        material = loaded.visual.material
+        assert (material.image if kind == "obj" else material.baseColorTexture).size == (128, 128)
+        # The same texel of the picture at the same place of the surface.
+        corner_uv, face = loaded.visual.uv[loaded.faces], loaded.vertices[loaded.faces]
+        centres = np.stack([face[..., 0], -face[..., 2], face[..., 1]], -1).mean(1)
+        order = np.argsort(np.linalg.norm(centres, axis=1).round(6), kind="stable")
+        mine = ours["vertices"][ours["faces"]].mean(1)
+        nearest = np.array([np.argmin(np.linalg.norm(mine - c, axis=1)) for c in centres[order[:20]]])
+        assert np.abs(corner_uv[order[:20]].mean(1) - ours["uv"][nearest].mean(1)).max() < 1e-4
+        assert {path.suffix for path in beside} == ({".mtl", ".png"} if kind == "obj" else set())
+
+
+def test_ply_and_stl_keep_the_world_and_the_classes(trained: Path, tmp_path: Path) -> None:
+    ours = surface(trained)
+    (ply,) = export(trained, "ply", out=tmp_path / "ball.ply")
+    loaded = trimesh.load(ply, process=False)
+    assert np.abs(loaded.vertices - ours["vertices"]).max() < 1e-5
+    assert (loaded.metadata["_ply_raw"]["vertex"]["data"]["class_id"].ravel() == ours["class_id"]).all()
+    assert (loaded.visual.vertex_colors[:, :3] == ours["colors"]).all()
+    parts = export(trained, "stl", out=tmp_path / "ball.stl", split="classes")
+    assert sorted(path.name for path in parts) == ["ball_bottom.stl", "ball_top.stl"]
+    assert sum(len(trimesh.load(path).faces) for path in parts) == len(ours["faces"])
+
+
+def test_default_place_and_wrong_endings(trained: Path, tmp_path: Path) -> None:
+    (path,) = export(trained, "glb", split="classes")
+    assert path == trained / "exports/main/Kugel ü.glb"
+    assert set(trimesh.load(path).geometry) == {"top", "bottom"}
+    with pytest.raises(SettingError, match=r"end in \.glb"):
+        export(trained, "glb", out=tmp_path / "ball.obj")
+    with pytest.raises(ProjectError, match="no mesh yet"):
+        export(trained, "ply", run="other")
+    steps = json.loads((trained / "project.json").read_text())["provenance"]
+    assert [step["verb"] for step in steps][-1] == "export"
+
+
+@pytest.mark.skipif(not has_blender(), reason="needs a Blender")
+def test_usd_is_read_back_by_blender(trained: Path, tmp_path: Path) -> None:
+    (path,) = export(trained, "usd", out=tmp_path / "ball.usda")
+    text = path.read_text()
+    assert 'upAxis = "Z"' in text
+    assert "primvars:class_id" in text
+    assert "primvars:displayColor" in text
+    assert len(list(path.parent.glob("textures/*.png"))) == 1
+    code = f"""
+import bpy, json, os
+bpy.ops.wm.read_factory_settings(use_empty=True)
+bpy.ops.wm.usd_import(filepath={str(path)!r})
+meshes = [o for o in bpy.data.objects if o.type == "MESH"]
+print(json.dumps({{
+    "faces": [len(o.data.polygons) for o in meshes],
+    "materials": sorted(s.material.name for o in meshes for s in o.material_slots),
+    "size": [round(max((o.matrix_world @ v.co).x for v in o.data.vertices), 4) for o in meshes],
+    "cameras": sum(o.type == "CAMERA" for o in bpy.data.objects),
+}}), flush=True)
+os._exit(0)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)
+    facts = json.loads(done.stdout.splitlines()[-1])
+    ours = surface(trained)
+    assert facts["faces"] == [len(ours["faces"])]
+    assert facts["cameras"] == 16
+    assert facts["size"][0] == pytest.approx(ours["vertices"][:, 0].max(), abs=1e-3)
+    assert any("top" in name for name in facts["materials"])
+
+
+def test_voxels_hold_the_ball_where_it_is(trained: Path) -> None:
+    (path,) = export(trained, "voxels", resolution=24)
+    with np.load(path, allow_pickle=False) as data:
+        density, ids, matrix = data["density"], data["class_id"], data["world_from_voxel"]
+        assert density.shape == (25, 25, 25)
+        assert data["class_names"].tolist() == ["top", "bottom"]
+        place = np.stack(np.meshgrid(*[np.arange(25.0)] * 3, indexing="ij"), -1) @ matrix[:3, :3].T + matrix[:3, 3]
+        radius = np.linalg.norm(place, axis=-1)
+        assert density[radius > 0.75].max() < 0.2 * np.median(density[(radius > 0.4) & (radius < 0.5)])
+        shell = (radius > 0.42) & (radius < 0.52) & (np.abs(place[..., 2]) > 0.15) & (ids > 0)
+        assert shell.sum() > 50
+        assert (np.where(place[..., 2] > 0, 1, 2)[shell] == ids[shell]).mean() > 0.9
+        assert data["color"][shell].std() > 10
+
+
+def test_the_trained_field_as_a_graph(trained: Path) -> None:
+    (path,) = export(trained, "onnx")
+    model = onnx.load(path)
+    props = {entry.key: json.loads(entry.value) for entry in model.metadata_props}
+    assert props["class_names"] == ["top", "bottom"]
+    angle = np.linspace(0, 6, 40)
+    ring = np.stack([0.49 * np.cos(angle) * 0.9, 0.49 * np.sin(angle) * 0.9, 0.49 * 0.43 * np.ones(40)], 1)
+    points = np.concatenate([ring, 2.0 * ring]).astype(np.float32)
+    view = (-points / np.linalg.norm(points, axis=1, keepdims=True)).astype(np.float32)
+    density, color, classes = ReferenceEvaluator(model).run(None, {"points": points, "directions": view})
+    assert np.median(density[:40]) > 10 * np.median(density[40:])
+    assert (classes[:40].argmax(1) == 0).mean() > 0.9
+    assert color.min() >= 0
+    assert color.max() <= 1
+
+
+WORLD = np.array([[2.4, -0.7, 0.0, 1.0], [0.7, 2.4, 0.0, 2.0], [0.0, 0.0, 2.5, 3.0], [0.0, 0.0, 0.0, 1.0]])
+
+
+@pytest.mark.parametrize("contracted", [False, True])
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {},
+        {"branch": "explicit"},
+        {"branch": "implicit"},
+        {"fusion": "concat", "appearance": 8},
+        {"blend_by": "density"},
+    ],
+    ids=str,
+)
+def test_the_graph_computes_what_the_field_does(settings: dict, contracted: bool) -> None:
+    """Dense and hashed levels, every branch and fusion, a turned and scaled cube, at any place and direction."""
+    torch.manual_seed(0)
+    small = {"precision": "float32", "levels": 4, "coarsest": 8, "finest": 200, "table_log2": 12}
+    field = HybridField(FieldConfig(**small, **settings), classes=3, images=5)
+    if field.grid is not None:
+        field.grid.table.normal_(0, 0.5)
+    if field.blend is not None:
+        field.blend.evidence.uniform_(0, 3)
+    if field.appearance is not None:
+        torch.nn.init.normal_(field.appearance)
+    field.set_progress(0.05, 0.2, 10**6)
+    model = field_model(field, Box(WORLD, contracted))
+    onnx.checker.check_model(model, full_check=True)
+    random = np.random.default_rng(1)
+    places = random.uniform(-1, 1, (200, 3)) * (2.5 if contracted else 1.0)
+    directions = random.normal(size=(200, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    world = (places @ WORLD[:3, :3].T + WORLD[:3, 3]).astype(np.float32)
+    turned = (directions @ WORLD[:3, :3].T / 2.5).astype(np.float32)
+    density, color, classes = ReferenceEvaluator(model).run(None, {"points": world, "directions": turned})
+    with torch.no_grad():
+        geometry = field.geometry(grid_position(torch.from_numpy(places).float(), contracted))
+        true_color = field.color(geometry, spherical_harmonics(torch.from_numpy(directions).float()))
+        true_classes = torch.softmax(field.logits(geometry), 1)
+    assert density == pytest.approx((geometry.density / 2.5).numpy(), rel=1e-3, abs=1e-6)
+    assert color == pytest.approx(true_color.numpy(), abs=1e-4)
+    assert classes == pytest.approx(true_classes.numpy(), abs=1e-4)

@@ -9,9 +9,10 @@ import bpy
 from mathutils import Matrix, Vector
 
 from . import state
+from .capture_frame import root_of, scene_from_capture
 
 CORNERS = [Vector((x, y, z)) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
-Bounds = list[list[float]]  # [min, max] in the world, metres
+Bounds = list[list[float]]  # [min, max] in the capture's frame, metres
 
 # scene → bounds of its box and of its project at the last look, and whether the box was moved since they agreed
 _seen: dict[str, tuple[Bounds, Bounds | None, bool]] = {}
@@ -34,7 +35,7 @@ def follow(scene: bpy.types.Scene) -> bool:
     if box is None or not state.has_project(folder):
         _seen.pop(scene.name, None)
         return False
-    bounds, wanted = bounds_of(box), _bounds(state.cached_project(folder))
+    bounds, wanted = bounds_of(scene, box), _bounds(state.cached_project(folder))
     new = scene.name not in _seen
     before, known, moved = _seen.get(scene.name, (bounds, wanted, wanted is None))
     if not _same(bounds, before):
@@ -59,18 +60,22 @@ def add(scene: bpy.types.Scene, bounds: Bounds) -> bpy.types.Object:
         box = bpy.data.objects.new("Fieldwork Training Region", None)
         box.empty_display_type, box.empty_display_size = "CUBE", 1.0
         scene.collection.objects.link(box)
+    folder = state.folder_of(scene.fieldwork)
     low, high = Vector(bounds[0]), Vector(bounds[1])
     scene.fieldwork.region_box = box
     box.empty_display_size = 1.0
-    box.matrix_world = Matrix.LocRotScale((low + high) / 2, None, (high - low) / 2)
-    wanted = _bounds(state.cached_project(state.folder_of(scene.fieldwork)))
-    _seen[scene.name] = bounds_of(box), wanted, wanted is None
+    if box.parent is None:
+        box.parent = root_of(scene, folder)  # so that it goes where the capture goes
+    box.matrix_world = scene_from_capture(scene, folder) @ Matrix.LocRotScale((low + high) / 2, None, (high - low) / 2)
+    wanted = _bounds(state.cached_project(folder))
+    _seen[scene.name] = bounds_of(scene, box), wanted, wanted is None
     return box
 
 
-def bounds_of(box: bpy.types.Object) -> Bounds:
-    """Axis-aligned bounds [min, max] of the box in the world, also of a rotated one."""
-    corners = [box.matrix_world @ (corner * box.empty_display_size) for corner in CORNERS]
+def bounds_of(scene: bpy.types.Scene, box: bpy.types.Object) -> Bounds:
+    """Axis-aligned bounds [min, max] of the box in the capture's frame, also of a rotated one."""
+    matrix = scene_from_capture(scene, state.folder_of(scene.fieldwork)).inverted_safe() @ box.matrix_world
+    corners = [matrix @ (corner * box.empty_display_size) for corner in CORNERS]
     return [[float(pick(c[i] for c in corners)) for i in range(3)] for pick in (min, max)]
 
 

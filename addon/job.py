@@ -62,6 +62,7 @@ class Job:
     latest: dict[str, Any] = field(default_factory=dict)  # last "train" event
     preview: str = ""  # picture of a held-out photo
     preview_count: int = 0
+    dismissed: bool = False  # its message was put away
     followed: bool = False  # runs in an engine that another Blender started
     events_read: int = 0
 

@@ -87,6 +87,18 @@ class Queue:
     def last(self) -> Job | None:
         return self.finished[-1] if self.finished else None
 
+    @property
+    def outcome(self) -> Job | None:
+        """The newest job whose failure or warnings should be read: not put away, and not made good since."""
+        done: set[tuple[str, Path | None]] = set()
+        for job in reversed(self.finished):
+            key = (job.verb, job.project)
+            if not job.dismissed and key not in done and (job.state == "failed" or job.warnings):
+                return job
+            if job.state == "done":
+                done.add(key)
+        return None
+
     def make(self, verb: str, params: dict[str, Any], on_done: Done | None = None) -> Job:
         self._number += 1
         folder = params.get("project") or (params.get("out") if verb == "reconstruct" else None)
@@ -153,10 +165,18 @@ class Queue:
         self.facts = {}
         if link is None:
             return
+        if detach:
+            self._hand_over(link)
         link.close(detach, timeout)
         job, self.running = self.running, None
         if job and not detach:
             self._finish(job, None, EngineError("cancelled", "The engine was stopped.", "Run it again to resume."))
+
+    def _hand_over(self, link: Link) -> None:
+        """Give an engine that is to go on by itself what waits as well; what has no project cannot be found again."""
+        for job in [job for job in self.waiting if job.project is not None]:
+            link.request(job.verb, {**job.params, "detach": True, "job": job.id})
+            self.waiting.remove(job)
 
     def reattach(self, project: Path) -> None:
         """Follow a job that another process runs on the project, and tell of one that died."""
@@ -318,6 +338,7 @@ class Queue:
         self.followed = None
         if status is not None and status.state == "done":
             self._finish(job, status.result, None)
+            self.reattach(job.project)  # the next one of those that were left to the engine
             return
         error = (status.error if status else None) or {"code": "died", "message": "The job is gone."}
         kind = "cancelled" if status and status.state == "cancelled" else error.get("code", "died")
@@ -372,6 +393,8 @@ def _tick() -> float:
 @bpy.app.handlers.persistent
 def _undone(*_: Any) -> None:
     queue.edits += 1
+    for scene in bpy.data.scenes:
+        state.undone(scene.fieldwork)
 
 
 @bpy.app.handlers.persistent

@@ -62,13 +62,13 @@ def _project_changed(self: "FieldworkScene", context: Context) -> None:
 def _classes_changed(self: PropertyGroup, context: Context) -> None:
     from . import state
 
-    state.classes_changed(context.scene.fieldwork)
+    state.classes_changed(self.id_data.fieldwork)
 
 
 def _class_visibility(self: "FieldworkClass", context: Context) -> None:
     from . import state
 
-    state.show_classes(context.scene.fieldwork)
+    state.show_classes(self.id_data.fieldwork)
 
 
 class FieldworkImage(PropertyGroup):

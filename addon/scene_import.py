@@ -17,8 +17,9 @@ from typing import Any, Literal
 
 import bpy
 import numpy as np
-from mathutils import Matrix
+from mathutils import Matrix, Vector
 
+from .capture_frame import units_per_metre
 from .label_material import SWITCH, make_group, make_material
 from .mesh_data import Part, parts, rgba, slot_classes
 from .mesh_import import fill_points, fill_surface
@@ -91,6 +92,8 @@ def import_steps(
     place = _Place(scene, package.name)
     root = place.object("root", f"Fieldwork · {package.name}", None)
     root.empty_display_size = 0.2
+    if root.scale == Vector((1.0, 1.0, 1.0)):
+        root.scale = [units_per_metre(scene)] * 3
     if SWITCH not in root:
         root[SWITCH] = 0.0
         root.id_properties_ui(SWITCH).update(min=0.0, max=1.0, description="0: colours of the photos, 1: class colours")

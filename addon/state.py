@@ -115,6 +115,21 @@ def refresh(settings: Any) -> None:
         settings.class_index = min(settings.class_index, max(0, len(settings.classes) - 1))
 
 
+def undone(settings: Any) -> None:
+    """After an undo or redo the lists may be those of before a job: bring them up to date.
+
+    An edit of the classes that was undone is undone in the project too.
+    """
+    folder = folder_of(settings)
+    project = cached_project(folder)
+    if project is None:
+        return
+    if [entry.id for entry in settings.classes] == [value["id"] for value in project.get("classes", [])]:
+        classes_changed(settings)
+        write_classes()
+    refresh(settings)
+
+
 def project_changed(settings: Any) -> None:
     """Called when another project folder was chosen."""
     from . import jobs
@@ -141,11 +156,22 @@ def write_classes() -> None:
     while _changed_classes:
         folder, classes = _changed_classes.popitem()
         project = read_project(Path(folder))
-        if project is not None:
+        if project is not None and not _agree(project.get("classes", []), classes):
             from ..nerfcore.files import write_json  # not at the top: enabling the extension must be quick
 
             project["classes"] = classes
             write_json(Path(folder) / PROJECT_FILE, project)
+
+
+def _agree(old: list[dict[str, Any]], new: list[dict[str, Any]]) -> bool:
+    """Whether classes say the same, as far as Blender's single precision goes."""
+    exact = [(c["id"], c["name"]) for c in old] == [(c["id"], c["name"]) for c in new]
+    pairs = [
+        (a, b)
+        for o, n in zip(old, new)
+        for a, b in zip([*o["color"], o.get("priority", 1.0)], [*n["color"], n["priority"]])
+    ]
+    return exact and all(abs(a - b) < 1e-5 * max(1.0, abs(a)) for a, b in pairs)
 
 
 def show_classes(settings: Any) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -106,7 +107,7 @@ class FIELDWORK_OT_dataset(VerbOperator):
         if out.is_dir() and any(out.iterdir()):
             raise ValueError(t("{} is not empty: choose another folder.", out))
         # What is photographed is the scene as it is now, saved or not, in a Blender of its own: this one stays free.
-        self._copy = str(Path(bpy.app.tempdir) / f"fieldwork-dataset-{out.name}.blend")
+        self._copy = str(Path(bpy.app.tempdir) / f"fieldwork-dataset-{time.time_ns()}.blend")
         bpy.ops.wm.save_as_mainfile(filepath=self._copy, copy=True, check_existing=False)
         return {
             "blend": self._copy,

@@ -33,8 +33,11 @@ class FIELDWORK_OT_cancel(Operator):
         return False
 
     def execute(self, context: Context) -> set[str]:
-        named = [job for job in jobs.queue.waiting if job.id == self.job]
-        jobs.queue.cancel(named[0] if named else None)
+        queue = jobs.queue
+        meant = next((job for job in (queue.current, *queue.waiting) if job and job.id == self.job), None)
+        # The job of a button may have ended while the mouse was on its way.
+        if meant is not None or not self.job:
+            queue.cancel(meant)
         return {"FINISHED"}
 
 
@@ -52,7 +55,7 @@ class FIELDWORK_OT_copy_report(Operator):
         return True
 
     def execute(self, context: Context) -> set[str]:
-        job = jobs.queue.last or jobs.queue.current
+        job = jobs.queue.outcome or jobs.queue.last or jobs.queue.current
         context.window_manager.clipboard = job.report()
         self.report({"INFO"}, t("The report is on the clipboard"))
         return {"FINISHED"}
@@ -64,8 +67,16 @@ class FIELDWORK_OT_dismiss(Operator):
     bl_idname = "fieldwork.dismiss"
     bl_label = "Dismiss"
 
+    @classmethod
+    def poll(cls, context: Context) -> bool:
+        if jobs.queue.outcome is None:
+            cls.poll_message_set(t("There is no message"))
+            return False
+        return True
+
     def execute(self, context: Context) -> set[str]:
-        jobs.queue.finished.clear()
+        for job in jobs.queue.finished:
+            job.dismissed = True
         return {"FINISHED"}
 
 

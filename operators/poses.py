@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import bpy
 from bpy.types import Context, Event, Operator
+from mathutils import Vector
 
 from ..addon import jobs, state
+from ..addon.capture_frame import scene_from_capture
 from ..addon.props import BoolProperty, EnumProperty, StringProperty
 from ..addon.text import t
 from .base import ProjectOperator, need_poses, need_project, refresh_scenes, scene_settings
@@ -80,7 +83,8 @@ class FIELDWORK_OT_align(ProjectOperator):
         up = self.value(context, "up")
         if up != "auto":
             params["up"] = up
-        a, b = (tuple(self.value(context, name)) for name in ("point_a", "point_b"))
+        capture_from_scene = scene_from_capture(context.scene, Path(params["project"])).inverted_safe()
+        a, b = (capture_from_scene @ Vector(self.value(context, name)) for name in ("point_a", "point_b"))
         if self.use_scale and a != b:
             unit = context.scene.unit_settings.scale_length or 1.0
             distance = self.value(context, "distance") * unit

@@ -7,6 +7,7 @@ from bpy.types import Context, Operator
 from mathutils import Vector
 
 from ..addon import crop, state
+from ..addon.capture_frame import scene_from_capture
 from ..addon.roles import ROLE
 from ..addon.text import t
 from .base import need_poses
@@ -52,7 +53,9 @@ class FIELDWORK_OT_crop_apply(Operator):
     def execute(self, context: Context) -> set[str]:
         context.view_layer.update()
         try:
-            crop.write_bounds(state.folder_of(context.scene.fieldwork), crop.bounds_of(crop.find(context.scene)))
+            crop.write_bounds(
+                state.folder_of(context.scene.fieldwork), crop.bounds_of(context.scene, crop.find(context.scene))
+            )
         except ValueError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
@@ -83,16 +86,17 @@ class FIELDWORK_OT_crop_remove(Operator):
 
 
 def default_bounds(scene: bpy.types.Scene) -> list[list[float]]:
-    """Bounds of what the capture put into the scene, else a cube of two metres around the cursor."""
+    """Bounds, in the capture's frame, of what it put into the scene, else a cube of two metres around the cursor."""
+    capture_from_scene = scene_from_capture(scene, state.folder_of(scene.fieldwork)).inverted_safe()
     corners = [
-        obj.matrix_world @ Vector(corner)
+        capture_from_scene @ obj.matrix_world @ Vector(corner)
         for obj in scene.objects
         if obj.type == "MESH" and ROLE in obj
         for corner in obj.bound_box
     ]
     if corners:
         return [[pick(c[i] for c in corners) for i in range(3)] for pick in (min, max)]
-    center = scene.cursor.location
+    center = capture_from_scene @ scene.cursor.location
     return [[v - 1.0 for v in center], [v + 1.0 for v in center]]
 
 

@@ -10,13 +10,19 @@ import bpy
 from bpy.types import Context
 
 from ..addon import jobs, state
+from ..addon.capture_frame import scene_from_capture
+from ..addon.lens import pinhole
 from ..addon.props import StringProperty
 from ..addon.text import t
 from .base import ProjectOperator, absolute, need_run, refresh_scenes, scene_settings
 
 
-def camera_frames(scene: bpy.types.Scene, animated: bool, size: tuple[int, int]) -> dict[str, Any]:
-    """The scene's camera as transforms.json: intrinsics in pixels, camera-to-world with Blender's axes.
+def camera_frames(
+    scene: bpy.types.Scene, animated: bool, size: tuple[int, int], project: Path | None = None
+) -> dict[str, Any]:
+    """The scene's camera as transforms.json: intrinsics in pixels, camera-to-capture with Blender's axes.
+
+    Where the capture of the project was moved in the scene, the camera is taken as it stands to the capture.
 
     Raises:
         ValueError: there is no camera, or it is not a perspective one.
@@ -37,7 +43,8 @@ def camera_frames(scene: bpy.types.Scene, animated: bool, size: tuple[int, int])
             scene.frame_set(number)
         evaluated = camera.evaluated_get(bpy.context.evaluated_depsgraph_get())
         # A scaled parent must not scale the camera's axes.
-        location, rotation, _ = evaluated.matrix_world.decompose()
+        capture_from_scene = scene_from_capture(scene, project).inverted_safe()
+        location, rotation, _ = (capture_from_scene @ evaluated.matrix_world).decompose()
         matrix = rotation.to_matrix().to_4x4()
         matrix.translation = location
         frames.append(
@@ -50,27 +57,10 @@ def camera_frames(scene: bpy.types.Scene, animated: bool, size: tuple[int, int])
 
 
 def intrinsics(camera: bpy.types.Camera, width: int, height: int) -> dict[str, float]:
-    """Pinhole intrinsics in pixels of a Blender camera at a picture size (square pixels).
-
-    Blender measures the field of view and the shift along the longer side (or along the side `sensor_fit` names).
-    """
-    fit = camera.sensor_fit
-    if fit == "AUTO":
-        fit = "HORIZONTAL" if width >= height else "VERTICAL"
-        sensor = camera.sensor_width
-    else:
-        sensor = camera.sensor_width if fit == "HORIZONTAL" else camera.sensor_height
-    side = width if fit == "HORIZONTAL" else height
-    focal = camera.lens / sensor * side
-    return {
-        "w": width,
-        "h": height,
-        "fl_x": focal,
-        "fl_y": focal,
-        "cx": width / 2 - camera.shift_x * side,
-        "cy": height / 2 + camera.shift_y * side,
-        "camera_angle_x": 2 * math.atan(width / 2 / focal),
-    }
+    """Pinhole intrinsics of a Blender camera as transforms.json has them."""
+    focal, cx, cy = pinhole(camera, width, height)
+    angle = 2 * math.atan(width / 2 / focal)
+    return {"w": width, "h": height, "fl_x": focal, "fl_y": focal, "cx": cx, "cy": cy, "camera_angle_x": angle}
 
 
 @scene_settings(run="run", source="render_from", orbit="orbit", size="size", passes="passes")
@@ -122,7 +112,7 @@ class FIELDWORK_OT_render(ProjectOperator):
         from ..nerfcore.files import write_json  # not at the top: enabling the extension must be quick
 
         folder.mkdir(parents=True, exist_ok=True)
-        cameras = camera_frames(context.scene, source == "animation", size)
+        cameras = camera_frames(context.scene, source == "animation", size, Path(project))
         write_json(folder / "cameras.json", cameras)
         return {**params, "camera": str(folder / "cameras.json"), "size": None}
 

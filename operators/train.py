@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from bl_operators.presets import AddPresetBase
-from bpy.types import Context, Menu, Operator
+from bpy.types import Context, Event, Menu, Operator
 
 from ..addon import state
 from ..addon.props import BoolProperty, EnumProperty, StringProperty
@@ -38,6 +38,19 @@ class FIELDWORK_OT_train(ProjectOperator):
     @classmethod
     def description(cls, context: Context, properties: Any) -> str:
         return t("Go on from the last checkpoint of the run") if properties.resume else t(cls.__doc__ or "")
+
+    def invoke(self, context: Context, event: Event) -> set[str]:
+        settings = context.scene.fieldwork
+        if not self.resume and state.has_run(state.folder_of(settings), settings.run):
+            # Hours of training may be in it.
+            return context.window_manager.invoke_confirm(
+                self,
+                event,
+                title=t("Train the run “{}” anew?", settings.run),
+                message=t("What it has learned is lost. Give it another name to keep both."),
+                confirm_text=t("Train"),
+            )
+        return self.execute(context)
 
     def parameters(self, context: Context) -> dict[str, Any]:
         run = self.value(context, "run")

@@ -7,6 +7,8 @@ from bpy.types import Context, Panel, UILayout
 from ..addon import jobs, state
 from ..addon.text import t
 
+MOST_WARNINGS = 3  # of a job in the panel
+
 
 class FieldworkPanel(Panel):
     bl_space_type = "VIEW_3D"
@@ -63,10 +65,11 @@ def draw_job(layout: UILayout, job: jobs.Job) -> None:
     row = layout.row(align=True)
     row.progress(factor=job.fraction or 0.0, text=progress_text(job), type="BAR")
     row.operator("fieldwork.cancel", text="", icon="X").job = job.id
-    if job.message:
+    if job.state != "queued":
+        # Also without a message: panels that come and go make all below them slide.
         small = layout.row()
         small.active = False
-        small.label(text=job.message)
+        small.label(text=job.message or " ")
 
 
 def draw_wrapped(layout: UILayout, text: str, width: int, icon: str = "NONE") -> None:
@@ -98,14 +101,18 @@ def text_width(context: Context) -> int:
     return max(20, int((context.region.width / scale - 60) / 6.3)) if context.region else 40
 
 
-def draw_error(layout: UILayout, context: Context, job: jobs.Job) -> None:
-    """A job that failed: what happened, what to do, and the report."""
-    if job.error is None:
-        return
-    box = layout.box()
-    draw_wrapped(box, job.error.message, text_width(context) - 4, icon="ERROR")
-    if job.error.hint:
-        draw_wrapped(box, job.error.hint, text_width(context) - 4, icon="INFO")
+def draw_outcome(layout: UILayout, context: Context, job: jobs.Job) -> None:
+    """A job that failed, or has something to say: what happened, what to do, and the report."""
+    width, box = text_width(context) - 4, layout.box()
+    if job.error is not None:
+        draw_wrapped(box, job.error.message, width, icon="ERROR")
+        if job.error.hint:
+            draw_wrapped(box, job.error.hint, width, icon="INFO")
+    else:
+        for warning in job.warnings[:MOST_WARNINGS]:
+            draw_wrapped(box, warning, width, icon="INFO")
+        if len(job.warnings) > MOST_WARNINGS:
+            box.label(text=t("{} more in the report", len(job.warnings) - MOST_WARNINGS), icon="BLANK1")
     row = box.row()
     row.operator("fieldwork.copy_report", icon="COPYDOWN")
     row.operator("fieldwork.dismiss")

@@ -9,7 +9,7 @@ from bpy.types import Context, STATUSBAR_HT_header
 
 from ..addon import jobs, preferences, state
 from ..addon.text import t
-from .base import FieldworkPanel, draw_error, draw_job, draw_wrapped, progress_text, project_folder, text_width
+from .base import FieldworkPanel, draw_job, draw_outcome, draw_wrapped, progress_text, project_folder, text_width
 
 
 class Step(NamedTuple):
@@ -65,9 +65,9 @@ class FIELDWORK_PT_main(FieldworkPanel):
             for waiting in jobs.queue.waiting:
                 if waiting is not job:
                     draw_job(layout, waiting)
-        last = jobs.queue.last
-        if last is not None and last.state == "failed":
-            draw_error(layout, context, last)
+        outcome = jobs.queue.outcome
+        if outcome is not None:
+            draw_outcome(layout, context, outcome)
         step = next_step(context)
         if step is not None:
             row = layout.row()

@@ -12,6 +12,7 @@ import numpy as np
 from mathutils import Matrix
 
 from ..errors import SceneError
+from ..lens import pinhole
 from .orbit import look_at, sphere
 from .photograph import Lens, Shot, class_ids, has_denoiser, photograph
 
@@ -28,7 +29,8 @@ def dataset(request: dict[str, Any], emit: Callable[..., None]) -> dict[str, Any
     bpy.ops.wm.open_mainfile(filepath=request["blend"], load_ui=False, use_scripts=False)
     scene = bpy.context.scene
     shots = plan(scene, request)
-    emit(kind="plan", views=len(shots))
+    metre = scene.unit_settings.scale_length or 1.0
+    emit(kind="plan", views=len(shots), metre=metre)
     emit(kind="stage", name="Photographing")
     pending = [shot for shot in shots if shot.name not in request["done"]]
     photograph(
@@ -41,12 +43,13 @@ def dataset(request: dict[str, Any], emit: Callable[..., None]) -> dict[str, Any
         transparent=request["transparent"],
         progress=lambda index, shot: emit(kind="view", name=shot.name),
     )
+    to_metres = np.array([[1.0, 1.0, 1.0, metre]] * 3 + [[1.0] * 4])
     return {
         "frames": [
             {
                 "name": s.name,
                 "intrinsics": s.lens.intrinsics(),
-                "camera_to_world": np.asarray(s.camera_to_world).tolist(),
+                "camera_to_world": (np.asarray(s.camera_to_world) * to_metres).tolist(),
             }
             for s in shots
         ],
@@ -94,19 +97,9 @@ def scene_lens(scene: bpy.types.Scene, size: list[int] | None) -> Lens:
 
 
 def camera_lens(camera: bpy.types.Camera, width: int, height: int) -> Lens:
-    """A Blender camera's focal length and principal point in pixels.
-
-    Blender measures the angle and the shifts along the side that `sensor_fit` names, or along the longer one.
-    """
-    fit = camera.sensor_fit
-    if fit == "AUTO":
-        fit = "HORIZONTAL" if width >= height else "VERTICAL"
-        sensor = camera.sensor_width
-    else:
-        sensor = camera.sensor_width if fit == "HORIZONTAL" else camera.sensor_height
-    side = width if fit == "HORIZONTAL" else height
-    center = (width / 2 - camera.shift_x * side, height / 2 + camera.shift_y * side)
-    return Lens(width, height, camera.lens / sensor * side, center)
+    """A Blender camera's focal length and principal point in pixels."""
+    found = pinhole(camera, width, height)
+    return Lens(width, height, found.focal, (found.cx, found.cy))
 
 
 def camera_shots(scene: bpy.types.Scene, views: int, size: list[int] | None) -> list[Shot]:

@@ -1,9 +1,9 @@
 """The verb `dataset`: any .blend photographed as a posed, labelled data set.
 
-OUT/transforms.json   camera-to-world with OpenGL axes, in the scene's frame and units; intrinsics in pixels
+OUT/transforms.json   camera-to-world with OpenGL axes, in the scene's frame, in metres; intrinsics in pixels
 OUT/images/*.png      RGB, or RGBA with alpha 0 where there is nothing
 OUT/labels/*.png      class ids, 8 bits (16 where one is above 255), 0 where there is nothing; OUT/classes.json names them
-OUT/depth/*.exr       float32 distance along the viewing axis, 0 where there is nothing
+OUT/depth/*.exr       float32 distance along the viewing axis in metres, 0 where there is nothing
 """
 
 from __future__ import annotations
@@ -44,14 +44,14 @@ def dataset(params: DatasetParams, report: Reporter) -> dict[str, Any]:
     claim_folder(out, SETTINGS, settings, folders)
     raw, total = out / ".raw", params.views
     done = sorted(path.stem for path in (out / "images").glob("*.png"))
-    finished = len(done)
+    finished, metre = len(done), 1.0
 
     def on_event(event: dict[str, Any]) -> None:
-        nonlocal total, finished
+        nonlocal total, finished, metre
         if event.get("kind") == "plan":
-            total = event["views"]
+            total, metre = event["views"], event["metre"]
         elif event.get("kind") == "view":
-            _deliver(out, raw, event["name"], folders)
+            _deliver(out, raw, event["name"], folders, metre)
             finished += 1
             report.progress(finished / total, f"{finished} of {total} photos")
             report.event("preview", path=str(out / "images" / f"{event['name']}.png"))
@@ -77,11 +77,14 @@ def _sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _deliver(out: Path, raw: Path, name: str, folders: list[str]) -> None:
-    """Move one view to its places; the photo comes last: its presence says that the view is complete."""
+def _deliver(out: Path, raw: Path, name: str, folders: list[str], metre: float) -> None:
+    """Move one view to its places, depths from the scene's units, of `metre` metres, to metres.
+
+    The photo comes last: its presence says that the view is complete.
+    """
     if "depth" in folders:
         source = raw / f"{name}.depth.npy"
-        write_depth(out / "depth" / f"{name}.exr", np.load(source, allow_pickle=False))
+        write_depth(out / "depth" / f"{name}.exr", np.load(source, allow_pickle=False) * np.float32(metre))
         source.unlink()
     for folder, suffix in (("labels", ".label.png"), ("images", ".png")):
         if folder in folders:

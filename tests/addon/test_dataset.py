@@ -228,3 +228,14 @@ def test_the_operator_photographs_the_scene_as_it_is_and_makes_a_project(blend, 
     cube = surfaces(tmp_path / "set")[next(int(k) for k, name in ids.items() if name == "cube")]
     np.testing.assert_allclose(np.abs(cube - [1.5, 0, 0.5]).max(-1), 0.5, atol=2e-3)
     assert len(load_scene(tmp_path / "set_fieldwork").views) == 3
+
+
+def test_a_scene_in_centimetres_becomes_a_data_set_in_metres(blend, tmp_path, bpy_script):
+    """Lengths of the scene, times the scale of its units: here the cube of one unit has a side of one centimetre."""
+    small = tmp_path / "small.blend"
+    code = "bpy.ops.wm.open_mainfile(filepath=path)\nbpy.context.scene.unit_settings.scale_length = 0.01\n"
+    bpy_script(code + "bpy.ops.wm.save_as_mainfile(filepath=out)\nanswer(1)", path=blend, out=small)
+    result = take(small, tmp_path / "out", views=2, labels="object")
+    ids = {name: number for number, name in enumerate(["", *result["classes"]])}
+    from_center = np.abs(surfaces(tmp_path / "out")[ids["cube"]] - [0, 0, 0.005])
+    np.testing.assert_allclose(from_center.max(-1), 0.005, atol=5e-5)

@@ -210,3 +210,48 @@ def test_what_becomes_of_a_job_when_blender_crashes_is_the_users_choice(queue, s
     queue.link.process.stdin.close()
     queue.link.process.wait(timeout=20)
     assert st.read_job(st.job_path(project, job.id)).state == state
+
+
+def test_what_waits_goes_on_without_blender_too(queue, project):
+    queue.submit(count(queue, project, steps=60))
+    waiting = [count(queue, project, steps=4), count(queue, project, steps=5)]
+    for job in waiting:
+        queue.submit(job)
+    tick_until(queue, lambda: queue.running.fraction)
+    queue.stop_engine(detach=True)
+    assert queue.waiting == []
+    other = jobs.Queue()
+    other.reattach(project)
+    tick_until(other, lambda: len(other.finished) == 3 or (other.followed is None and other.finished))
+    end = time.monotonic() + 20
+    while (
+        st.read_job(st.job_path(project, waiting[-1].id)) is None
+        or not st.read_job(st.job_path(project, waiting[-1].id)).finished
+    ):
+        assert time.monotonic() < end, "the last job did not run"
+        time.sleep(0.1)
+    last = st.read_job(st.job_path(project, waiting[-1].id))
+    assert (last.state, last.result["steps"]) == ("done", 5)
+
+
+def test_messages_stay_until_read_or_made_good(queue, project, tmp_path):
+    def ended(verb, state, folder=project, warnings=()):
+        job = queue.make(verb, {"project": str(folder)})
+        job.state, job.warnings = state, list(warnings)
+        queue._remember(job)
+        return job
+
+    assert queue.outcome is None
+    failed = ended("poses", "failed")
+    ended("mesh", "done")
+    assert queue.outcome is failed, "another job does not hide it"
+    ended("poses", "done", tmp_path / "other")
+    assert queue.outcome is failed
+    ended("poses", "done")
+    assert queue.outcome is None, "it went well the second time"
+    warned = ended("new", "done", warnings=["2 photos are blurred."])
+    assert queue.outcome is warned
+    warned.dismissed = True
+    assert queue.outcome is None
+    ended("new", "cancelled")
+    assert queue.outcome is None

@@ -161,3 +161,29 @@ answer(lacking)
         renamed={f"{verb}.{name}": own for (verb, name), own in RENAMED.items()},
     )
     assert lacking == []
+
+
+def test_a_button_cancels_only_its_own_job(bpy_script, tmp_path):
+    facts = bpy_script(
+        SETUP
+        + """
+from fieldwork.addon import jobs
+queue = jobs.queue
+make = lambda: queue.make("count", {"project": folder})
+running, first, second = make(), make(), make()
+running.state, queue.running, queue.waiting = "running", running, [first, second]
+bpy.ops.fieldwork.cancel(job="count-of-yesterday")
+states = [[j.state for j in (running, first, second)]]
+bpy.ops.fieldwork.cancel(job=second.id)
+states.append([j.state for j in (running, first, second)])
+bpy.ops.fieldwork.cancel()
+states.append([j.state for j in (running, first, second)])
+answer(states)
+""",
+        folder=tmp_path,
+    )
+    assert facts == [
+        ["running", "queued", "queued"],
+        ["running", "queued", "cancelled"],
+        ["cancelling", "queued", "cancelled"],
+    ]

@@ -109,3 +109,36 @@ answer({"counts": counts, "modifiers": len(obj.modifiers), "groups": len(bpy.dat
         project=make_project(tmp_path / "capture"),
     )
     assert facts == {"counts": [3, 1, 2, 0, 3], "modifiers": 0, "groups": 0}
+
+
+def test_undo_leaves_the_lists_as_the_project_says(bpy_script, tmp_path):
+    """Undo brings back an edit of a class, in the project too, but not the lists of before a job."""
+    folder = make_project(tmp_path / "capture")
+    facts = bpy_script(
+        SETUP
+        + """
+from fieldwork.addon import state
+settings.project = project
+classes = lambda: [c["priority"] for c in json.loads((Path(project) / "project.json").read_text())["classes"]]
+bpy.ops.ed.undo_push(message="project")
+bpy.context.scene.fieldwork.classes[0].priority = 4.0
+state.write_classes()
+bpy.ops.ed.undo_push(message="priority")
+edited = classes()
+# A job adds a photo to the project.
+path = Path(project) / "project.json"
+value = json.loads(path.read_text())
+value["images"].append({"name": "c", "file": "images/c.jpg"})
+path.write_text(json.dumps(value))
+os.utime(path, (1, 1))
+state.refresh(bpy.context.scene.fieldwork)
+bpy.ops.ed.undo()
+now = bpy.context.scene.fieldwork
+answer({"edited": edited, "undone": classes(), "shown": [c.priority for c in now.classes],
+        "images": [i.name for i in now.images]})
+""",
+        project=folder,
+    )
+    assert facts["edited"] == [4.0, 2.0]
+    assert facts["undone"] == facts["shown"] == [1.0, 2.0]
+    assert facts["images"] == ["a", "b", "c"]

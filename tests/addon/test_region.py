@@ -79,7 +79,7 @@ def look():
     bpy.context.view_layer.update()
     written = crop.follow(scene)
     bpy.context.view_layer.update()
-    return written, crop.bounds_of(box), crop.read_bounds(Path(project))
+    return written, crop.bounds_of(scene, box), crop.read_bounds(Path(project))
 seen = [look(), look()]
 crop.write_bounds(Path(project), [[0, 0, 0], [4, 2, 6]])  # as aligning does
 os.utime(Path(project) / "project.json", (1, 1))

@@ -99,6 +99,10 @@ class Screen:
 
     def toggle(self, panel: str) -> Steps:
         """Click the header of a sub-panel while those above it are closed and no job runs."""
+        if self.queue.outcome is not None:  # a message above the headers would move them
+            bpy.ops.fieldwork.dismiss()
+            self.sidebar.tag_redraw()
+            yield 0.3
         state = [(job.id, job.state) for job in [*self.queue.finished, self.queue.current] if job]
         if self.headers[0] != state:
             found = yield from self.buttons(depth=260)
@@ -106,7 +110,7 @@ class Screen:
             assert main, "the main panel has no button"
             # Below the big button of the next step, or the bar of the job and its message, come the headers.
             job = self.queue.current
-            below = (self.unit * 1.8 if job.message else self.unit) if job else 24 + self.unit / 2
+            below = self.unit * 1.8 if job else 24 + self.unit / 2
             self.headers = (state, max(y for _, _, y in main) - below)
         yield from self.click(self.sidebar.x + 60, self.headers[1] - PANELS.index(panel) * self.unit)
 

@@ -32,6 +32,7 @@ IMAGES = {
     "died": ("interruptions/died", SIDEBAR, 260),
     "render": ("labelled/labelled-render", SIDEBAR, 260),
     "mesh": ("labelled/labelled-mesh", SIDEBAR, 260),
+    "export": ("labelled/labelled-export", SIDEBAR, 260),
     "engine": ("labelled/labelled-engine", SIDEBAR, 260),
 }
 

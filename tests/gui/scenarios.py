@@ -100,6 +100,9 @@ def labelled(screen):
     yield from screen.run_operator("fieldwork.render", 600)
     screen.facts["background"] = [s.image.name for s in bpy.context.scene.camera.data.background_images]
     screen.facts["classes"] = [[c.name, c.area] for c in settings.classes]
+    settings.export_to = "glb"
+    yield from screen.run_operator("fieldwork.export", 120)
+    screen.facts["exported"] = screen.queue.last.result["files"]
     space = screen.area.spaces.active
     space.region_3d.view_perspective = "CAMERA"
     yield from screen.toggle("classes")

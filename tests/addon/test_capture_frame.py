@@ -1,0 +1,84 @@
+"""A capture that was moved, turned or scaled in the scene, and scenes in other units than metres."""
+
+from __future__ import annotations
+
+import pytest
+from fieldwork.tests.addon.support import SETUP, make_posed_project
+from fieldwork.tests.addon.test_mesh_import import make_package
+
+MOVED = """
+from mathutils import Euler, Matrix, Vector
+root = bpy.data.objects.new("capture", None)
+root["fieldwork_role"], root["fieldwork_project"] = "root", "capture"
+scene.collection.objects.link(root)
+root.location, root.scale, root.rotation_euler = (5, -3, 2), (2, 2, 2), (0.3, 0.2, 1.0)
+bpy.context.view_layer.update()
+settings.project = project
+"""
+
+
+def test_cameras_points_and_region_are_those_of_the_capture(bpy_script, tmp_path):
+    facts = bpy_script(
+        SETUP
+        + MOVED
+        + """
+from fieldwork.addon import crop
+from fieldwork.operators.render import camera_frames
+# A camera, two points and a box, each given in the capture and put where they appear in the scene.
+pose = Matrix.LocRotScale(Vector((1, 2, 3)), Euler((1.1, 0.2, 0.4)), None)
+scene.camera.matrix_world = root.matrix_world @ pose
+bpy.context.view_layer.update()
+frame = camera_frames(scene, False, (100, 50), Path(project))["frames"][0]
+settings.point_a, settings.point_b = (root.matrix_world @ Vector(p) for p in ((1, 0, 0), (1, 2, 0)))
+settings.distance = 5.0
+class Operator:
+    use_scale, ground, gps, crop, project = True, False, False, "", ""
+    value = lambda self, context, name: getattr(context.scene.fieldwork, name)
+    project_path = lambda self, context: project
+params = bpy.types.FIELDWORK_OT_align.parameters(Operator(), bpy.context)
+box = crop.add(scene, [[0, 0, 0], [1, 2, 4]])
+bpy.context.view_layer.update()
+bounds = crop.bounds_of(scene, box)
+root.location.x += 10
+bpy.context.view_layer.update()
+answer({"frame": frame["transform_matrix"], "pose": [list(r) for r in pose], "scale": params["scale"],
+        "bounds": bounds, "moved along": crop.bounds_of(scene, box)})
+""",
+        project=make_posed_project(tmp_path / "capture"),
+    )
+    for mine, true in zip(facts["frame"], facts["pose"]):
+        assert mine == pytest.approx(true, abs=1e-5)
+    a, b, metres = facts["scale"]
+    assert [float(v) for v in a.split(",")] == pytest.approx([1, 0, 0], abs=1e-5)
+    assert [float(v) for v in b.split(",")] == pytest.approx([1, 2, 0], abs=1e-5)
+    assert metres == pytest.approx(5.0)
+    for found in (facts["bounds"], facts["moved along"]):
+        assert found[0] == pytest.approx([0, 0, 0], abs=1e-5)
+        assert found[1] == pytest.approx([1, 2, 4], abs=1e-5)
+
+
+@pytest.mark.parametrize("metres", [1.0, 0.01, 0.3048])
+def test_a_metre_is_a_metre_in_every_unit(bpy_script, tmp_path, metres):
+    facts = bpy_script(
+        SETUP
+        + """
+from fieldwork.addon.scene_import import import_steps, load
+scene.unit_settings.scale_length = metres
+for _ in range(2):
+    steps = import_steps(scene, load(folder))
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            imported = end.value
+            break
+bpy.context.view_layer.update()
+mesh = imported.mesh
+width = max((mesh.matrix_world @ v.co).x for v in mesh.data.vertices)
+answer({"width": width * metres, "scale": list(imported.root.scale)})
+""",
+        folder=make_package(tmp_path / "package", 20, cameras=3, points=50),
+        metres=metres,
+    )
+    assert facts["width"] == pytest.approx(0.95, rel=1e-4)
+    assert facts["scale"] == pytest.approx([1 / metres] * 3, rel=1e-4)

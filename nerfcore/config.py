@@ -34,7 +34,8 @@ class SceneConfig(Stage):
         description="longest side of the training images in pixels; null: 1600 on a GPU, 800 on the CPU",
     )
     background: Literal["auto", "random", "white", "black"] = Field(
-        default="auto", description="colour behind the field; auto: random for transparent images, black otherwise"
+        default="auto",
+        description="colour behind the field; auto: black or white where an object is photographed in front of that, else random",
     )
     margin: float = Field(default=1.05, gt=0, description="size of the box relative to what must fit in")
 

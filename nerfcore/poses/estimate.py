@@ -159,7 +159,7 @@ def _database_name(record: ImageRecord) -> str:
 def _job(
     folder: Path, project: Project, records: list[ImageRecord], masks: Path | None, params: PosesParams, extend: bool
 ) -> dict[str, Any]:
-    from_video = any(Path(record.source).parent.name == "frames" for record in records)
+    frames = [Path(record.source).parent.name == "frames" for record in records]
     return {
         "image_folder": str((folder / "images").resolve()),
         "masks": str(masks.resolve()) if masks else None,
@@ -169,7 +169,8 @@ def _job(
         "preset": params.preset,
         "restart": params.restart,
         "group": params.group,
-        "neighbours": VIDEO_NEIGHBOURS if from_video else PHOTO_NEIGHBOURS,
+        "neighbours": VIDEO_NEIGHBOURS if any(frames) else PHOTO_NEIGHBOURS,
+        "video": all(frames),
         "images": [
             {
                 "file": _database_name(record),
@@ -241,6 +242,7 @@ def _write_report(
         {
             "level": result["level"],
             "groups": result["groups"],
+            "contradicting_pairs": result["contradicting_pairs"],
             "reprojection_px": result["reprojection_px"],
             "points": len(points),
             "up_confidence": project.frame.up_confidence,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import zlib  # noqa: F401  (must be loaded before pycolmap, which exports a static zlib)
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -42,6 +43,16 @@ def watched(path: Path, table: str, total: int, tell: Any, noun: str) -> Iterato
         yield
     finally:
         tell.watch_end()
+
+
+def copy_database(path: Path, target: Path) -> Path:
+    """Copy a database that nobody has open, with its write-ahead log; returns `target`."""
+    for suffix in ("", "-wal"):
+        source, copy = Path(f"{path}{suffix}"), Path(f"{target}{suffix}")
+        copy.unlink(missing_ok=True)
+        if source.is_file():
+            shutil.copyfile(source, copy)
+    return target
 
 
 def add_images(path: Path, image_folder: Path, images: list[dict[str, Any]]) -> None:

@@ -15,12 +15,12 @@ import pycolmap
 from ..data.colmap_cameras import camera_from_colmap
 from ..errors import PosesError
 from ..files import write_json
-from . import features, mapping, second_look
+from . import chain, features, mapping, second_look
 from .adjust import adjust, has_long_lens, has_odd_lens
 from .presets import ENOUGH, EXHAUSTIVE_AT_MOST, EXHAUSTIVE_UP_TO, LADDERS, Level
 from .resume import mapping_folder
 from .transfer import start_model
-from .validate import MIN_POINTS, ImageCheck, pair_images
+from .validate import MIN_MATCHES, MIN_POINTS, ImageCheck, pair_images
 
 MIN_FEATURES = 100
 MIN_COMMON = 40
@@ -30,7 +30,8 @@ LEVEL_FILE = "level.json"  # features of the model in poses/sparse
 
 @dataclass
 class Attempt:
-    """The outcome of one level: its models (largest first), and what validation says of the first one."""
+    """The outcome of one level: its models (largest first), and what validation says of the first one; `contradicting`:
+    pairs of frames whose matches were taken out, see `chain`."""
 
     level: Level
     database: Path
@@ -38,6 +39,7 @@ class Attempt:
     checks: dict[int, ImageCheck]
     links: dict[tuple[int, int], int]
     dropped: dict[int, ImageCheck]
+    contradicting: int = 0
 
     @property
     def registered(self) -> int:
@@ -47,13 +49,13 @@ class Attempt:
 def run(job: dict[str, Any], tell: Any) -> dict[str, Any]:
     """Estimate poses for a job and write the sparse model.
 
-    Job: image_folder, masks (or null), work and sparse (folders), preset, neighbours, restart (forget earlier mappings), group
-    (which of several separate models),
-    start (a model to extend, or null), images [{file, group, width, height, focal_px}].
+    Job: image_folder, masks (or null), work and sparse (folders), preset, neighbours, video (all are
+    frames in order), restart (forget earlier mappings), group (which of several separate models), start (a model to
+    extend, or null), images [{file, group, width, height, focal_px}].
 
     Returns:
         {cameras, images [{file, status, reason, camera, camera_to_world, agreement, points, error_px, mates}], links,
-        groups, reprojection_px, level, points_file}; points_file has xyz, rgb, error, view and point.
+        groups, reprojection_px, contradicting_pairs, level, points_file}; points_file has xyz, rgb, error, view and point.
     Raises:
         PosesError: no two photos could be placed; the message says why.
     """
@@ -116,10 +118,11 @@ def _attempt(job: dict[str, Any], level: Level, names: list[str], exhaustive: bo
     else:
         pairs = features.likely_pairs(path, names, job["neighbours"], tell)
     features.match(path, pairs, work / "pairs.txt", tell)
+    contradicting = _tell_apart(job, path, names, tell)
     start = None
     if job["start"] is not None:
         start = start_model(pycolmap.Reconstruction(job["start"]), path, image_folder, work / "start")
-    best, best_doubtful = Attempt(level, path, [], {}, {}, {}), False
+    best, best_doubtful = Attempt(level, path, [], {}, {}, {}, contradicting), False
     # Placing cameras is quick beside finding features: try lower demands before harder features.
     for full, relaxed in ((True, False), (False, False), (False, True)):
         if start is None and features.set_lenses(path, job["images"], full) != full:
@@ -139,12 +142,24 @@ def _attempt(job: dict[str, Any], level: Level, names: list[str], exhaustive: bo
         # is worth no more than the simple one that follows.
         doubtful = full and (has_long_lens(model) or has_odd_lens(model))
         if model.num_reg_images() > best.registered or (best_doubtful and model.num_reg_images() >= MIN_REGISTERED):
-            best, best_doubtful = Attempt(level, path, [model, *models[1:]], checks, links, dropped), doubtful
+            best, best_doubtful = (
+                replace(best, models=[model, *models[1:]], checks=checks, links=links, dropped=dropped),
+                doubtful,
+            )
         if best_doubtful:
             continue
         if best.registered >= ENOUGH * len(names):
             break
     return best
+
+
+def _tell_apart(job: dict[str, Any], path: Path, names: list[str], tell: Any) -> int:
+    """In a video, take matches out that contradict the way the camera went; returns of how many pairs in all."""
+    if not job["video"] or job["start"] is not None:
+        return 0
+    features.set_lenses(path, job["images"], full=False)
+    found = chain.follow(path, Path(job["image_folder"]), Path(job["work"]), names, tell)
+    return chain.reject_contradicting(path, found, names)
 
 
 def _levels(job: dict[str, Any], work: Path) -> tuple[Level, ...]:
@@ -176,6 +191,7 @@ def _second_look(best: Attempt, job: dict[str, Any], names: list[str], tell: Any
         best.models[0], best.database, joined, image_folder, masks, job["images"], tell
     ):
         return best
+    _tell_apart(job, joined, names, tell)
     placed = second_look.place_rest(best.models[0], joined, image_folder, work, names, tell)
     return _larger(best, level, joined, placed)
 
@@ -184,7 +200,10 @@ def _larger(best: Attempt, level: Level, database: Path, placed: Any) -> Attempt
     if placed is None:
         return best
     model, checks, links, dropped = placed
-    return Attempt(level, database, [model, *best.models[1:]], checks, links, best.dropped | dropped)
+    models = [model, *best.models[1:]]
+    return replace(
+        best, level=level, database=database, models=models, checks=checks, links=links, dropped=best.dropped | dropped
+    )
 
 
 def _result(best: Attempt, names: list[str], points_file: Path) -> dict[str, Any]:
@@ -228,6 +247,7 @@ def _result(best: Attempt, names: list[str], points_file: Path) -> dict[str, Any
         "links": [[name_of[a], name_of[b], n] for (a, b), n in best.links.items() if a in name_of and b in name_of],
         "groups": [m.num_reg_images() for m in best.models],
         "reprojection_px": model.compute_mean_reprojection_error(),
+        "contradicting_pairs": best.contradicting,
         "level": best.level.name,
         "points_file": str(points_file),
     }
@@ -262,7 +282,7 @@ def _reasons(best: Attempt, names: list[str], registered: set[str]) -> dict[str,
     for pair_id, geometry in zip(pair_ids, geometries):
         a, b = (name_of[i] for i in pair_images(pair_id))
         inliers = len(geometry.inlier_matches)
-        if inliers >= 15 and a in mates and b in mates:
+        if inliers >= MIN_MATCHES and a in mates and b in mates:
             mates[a][b] = mates[b][a] = inliers
     elsewhere = {}
     for model in best.models[1:]:

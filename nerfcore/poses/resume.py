@@ -23,8 +23,8 @@ SNAPSHOTS = "snapshots"
 def mapping_folder(work: Path, path: Path, full: bool, relaxed: bool, names: list[str]) -> Path:
     """Where the models of one way to map are kept: it depends on all that decides about them."""
     with database(path) as db:
-        pairs = db.num_matched_image_pairs()
-    key = json.dumps([path.name, pairs, full, relaxed, sorted(names)])
+        pairs, matches = db.num_matched_image_pairs(), db.num_inlier_matches()
+    key = json.dumps([path.name, pairs, matches, full, relaxed, sorted(names)])
     return work / "mapping" / hashlib.sha256(key.encode()).hexdigest()[:16]
 
 

@@ -6,7 +6,6 @@ likely mates, joined to the features in use. The poses found before stay as they
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ import pycolmap
 from . import features, mapping
 from .presets import AFFINE
 from .transfer import start_model
-from .validate import ImageCheck, check_images, pair_images
+from .validate import MIN_MATCHES, ImageCheck, check_images, pair_images
 
 NEIGHBOURS = 2  # by name, to either side
 MATES = 6  # by retrieval
@@ -113,12 +112,7 @@ def join(path: Path, other: Path, joined: Path) -> None:
 
     Features of `other` come after those of the same photo in `path`, so that models of `path` stay valid in number.
     """
-    temporary = joined.with_name(joined.name + ".new")
-    for suffix in ("", "-wal"):
-        source, target = Path(f"{path}{suffix}"), Path(f"{temporary}{suffix}")
-        target.unlink(missing_ok=True)
-        if source.is_file():
-            shutil.copyfile(source, target)
+    temporary = features.copy_database(path, joined.with_name(joined.name + ".new"))
     with features.database(temporary) as db, features.database(other) as more:
         ids = {image.name: image.image_id for image in db.read_all_images()}
         same = {image.image_id: ids[image.name] for image in more.read_all_images() if image.name in ids}
@@ -145,14 +139,14 @@ def _join_matches(db: Any, more: Any, same: dict[int, int], offset: dict[int, in
     pair_ids, geometries = more.read_two_view_geometries()
     for pair_id, geometry in zip(pair_ids, geometries):
         theirs = pair_images(pair_id)
-        if len(geometry.inlier_matches) < 15 or not all(i in same for i in theirs):
+        if len(geometry.inlier_matches) < MIN_MATCHES or not all(i in same for i in theirs):
             continue
         a, b = (same[i] for i in theirs)
         shift = np.array([offset[a], offset[b]], np.uint32)
         inliers, matches = geometry.inlier_matches + shift, more.read_matches(*theirs) + shift
         if db.exists_two_view_geometry(a, b):
             ours = db.read_two_view_geometry(a, b)
-            if len(ours.inlier_matches) >= 15:
+            if len(ours.inlier_matches) >= MIN_MATCHES:
                 inliers = np.concatenate([ours.inlier_matches, inliers])
                 geometry = ours
             db.delete_two_view_geometry(a, b)

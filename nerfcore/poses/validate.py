@@ -12,6 +12,7 @@ from .features import database
 
 GOOD_AGREEMENT = 0.5  # wrong poses measure ≤ 0.02, right ones ≥ 0.83
 MIN_POINTS = 20
+MIN_MATCHES = 15  # of a pair, from which it counts
 TOLERANCE_PX = 4.0
 MATCHES_PER_PAIR = 300
 
@@ -55,7 +56,7 @@ def check_images(reconstruction: Any, path: Path) -> tuple[dict[int, ImageCheck]
     for pair_id, geometry in zip(pair_ids, geometries):
         a, b = pair_images(pair_id)
         matches = np.asarray(geometry.inlier_matches)
-        if a not in registered or b not in registered or len(matches) < 15:
+        if a not in registered or b not in registered or len(matches) < MIN_MATCHES:
             continue
         links[a, b] = len(matches)
         if len(matches) > MATCHES_PER_PAIR:

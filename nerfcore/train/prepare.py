@@ -17,6 +17,7 @@ from ..field.blend import RESOLUTION
 from ..progress import Reporter
 from ..project import load_project, load_scene, load_visibility, world_from_sfm
 from ..sampling.visibility import depth_ranges, view_counts
+from .background import LEVEL, choose_background
 from .depth import depth_scale, find_depths
 from .run import RunInfo, new_model
 from .trainer import Trainer
@@ -74,6 +75,8 @@ def plan_run(project_folder: Path, preset: str, config: RunConfig, device: torch
     config = config.model_copy(deep=True)
     if config.scene.image_size is None:
         config.scene.image_size = CPU_IMAGE_SIZE if device.type == "cpu" else GPU_IMAGE_SIZE
+    if config.scene.background == "auto":
+        config.scene.background = choose_background(scene, transparent)
     if config.field.finest is None:
         across = pixels_across(scene, train, box, config.scene.image_size)
         config.field.finest = min(max(across, 2 * config.field.coarsest), MOST_VERTICES)
@@ -129,9 +132,7 @@ def make_trainer(project_folder: Path, info: RunInfo, scene: Scene, device: torc
     model.occupancy.empty.fill_(nearest)
     if model.field.blend is not None:
         model.field.blend.views.copy_((counts / VIEWS_ENOUGH).clamp(max=1))
-    background = config.scene.background
-    random = background == "random" or background == "auto"
-    trainer = Trainer(model, store, config, random_background=random)
+    trainer = Trainer(model, store, config, background=LEVEL.get(config.scene.background))
     if config.loss.depth_weight > 0:
         scale = depth_scale(world_from_sfm(project), box.box_from_world)
         visibility = load_visibility(project_folder)

@@ -66,12 +66,13 @@ class Trainer:
     """Trains a `Model` on a `PixelStore`.
 
     Progress through the schedule is a number in [0, 1] handed to `step`, so that a time limit and a number of steps
-    drive it alike. All random numbers come from one generator, which is part of the checkpoint.
+    drive it alike. All random numbers come from one generator, which is part of the checkpoint. `background`: the grey
+    value behind the field, None for random colours.
     """
 
-    def __init__(self, model: Model, store: PixelStore, config: RunConfig, random_background: bool) -> None:
+    def __init__(self, model: Model, store: PixelStore, config: RunConfig, background: float | None) -> None:
         self.model, self.store, self.config = model, store, config
-        self.random_background = random_background
+        self.background = background
         self.device = store.device
         self.optimizer = torch.optim.Adam(
             model.parameters(), config.train.network_rate, betas=BETAS, eps=1e-15, fused=self.device.type != "mps"
@@ -134,8 +135,8 @@ class Trainer:
         per_ray, rays = self.config.sampling.samples, len(batch.rgb)
         jitter = torch.rand(rays, device=self.device, generator=self.generator)
         shift = torch.rand(rays * per_ray, device=self.device, generator=self.generator)
-        background = torch.zeros_like(batch.rgb)
-        if self.random_background:
+        background = torch.full_like(batch.rgb, self.background or 0.0)
+        if self.background is None:
             background = torch.rand(batch.rgb.shape, device=self.device, generator=self.generator)
         labelled = (batch.label != VOID).sum().clamp(min=1)
         size = rays if self.device.type != "cpu" else max(SHARD_SAMPLES // per_ray, 1)

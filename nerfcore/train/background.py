@@ -1,0 +1,45 @@
+"""What is behind the field: which colour a ray has that meets nothing."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from ..data.box import looks_inward
+from ..data.pixels import read_photo
+from ..data.scene import Scene
+
+Background = Literal["random", "white", "black"]
+LEVEL: dict[str, float] = {"white": 1.0, "black": 0.0}
+
+LOOKED_AT = 12  # photos
+EDGE = 0.04  # of the sides: the strip along the borders that is looked at
+BLACK, WHITE = 8, 248  # of 255: all channels below, all channels above
+SHARE = 0.5  # of the strip
+
+
+def choose_background(scene: Scene, transparent: bool) -> Background:
+    """The background of a capture for which none is set.
+
+    - An object in front of black (or white) on nearly all sides: that colour. Nothing has to be there, then, for rays
+      past the object; a field that must be opaque everywhere fills the space around it with black clouds instead, at
+      any depth, since black looks the same from all sides.
+    - All else: random, so that rays without alpha have to meet something, and transparent ones nothing.
+    """
+    if transparent or any(view.mask is not None for view in scene.views) or not looks_inward(scene.views):
+        return "random"
+    chosen = np.unique(np.linspace(0, len(scene.train) - 1, LOOKED_AT).round().astype(int))
+    shares = [edge_shares(read_photo(scene.views[scene.train[i]].image)[..., :3]) for i in chosen]
+    black, white = np.median(shares, axis=0)
+    return "black" if black > SHARE else "white" if white > SHARE else "random"
+
+
+def edge_shares(photo: np.ndarray) -> tuple[float, float]:
+    """Which shares of the strip along the borders of a photo (H, W, 3) uint8 are black, and white."""
+    height, width = photo.shape[:2]
+    strip = np.ones((height, width), bool)
+    y, x = max(1, round(EDGE * height)), max(1, round(EDGE * width))
+    strip[y : height - y, x : width - x] = False
+    pixels = photo[strip]
+    return float((pixels.max(1) < BLACK).mean()), float((pixels.min(1) >= WHITE).mean())

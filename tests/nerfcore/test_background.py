@@ -1,0 +1,93 @@
+"""What is behind the field: recognised from the photos, and free space in front of it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fieldwork.nerfcore.data.box import box_poses
+from fieldwork.nerfcore.params import TrainParams
+from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.project import load_project, load_scene, save_project
+from fieldwork.nerfcore.render.image import render_view
+from fieldwork.nerfcore.train.background import choose_background, edge_shares
+from fieldwork.nerfcore.train.run import load_trained
+from fieldwork.nerfcore.verbs import run_verb
+from fieldwork.tests.nerfcore.support.ball import SMALL, ball_project, camera_poses, draw
+from PIL import Image
+
+
+def on_background(project: Path, value: int | None) -> Path:
+    """Make the photos opaque: in front of a grey value with a little noise, or of a pattern (None)."""
+    random = np.random.default_rng(0)
+    for path in (project / "images").iterdir():
+        rgba = np.asarray(Image.open(path)).astype(int)
+        height, width = rgba.shape[:2]
+        if value is None:
+            behind = random.integers(0, 255, (height, width, 3))
+        else:
+            behind = np.clip(value + random.integers(-3, 4, (height, width, 3)), 0, 255)
+        rgb = np.where(rgba[..., 3:] > 0, rgba[..., :3], behind)
+        Image.fromarray(rgb.astype(np.uint8)).save(path)
+    return project
+
+
+@pytest.mark.parametrize(
+    ("value", "chosen"), [(0, "black"), (255, "white"), (128, "random"), (25, "random"), (None, "random")]
+)
+def test_black_and_white_surroundings_are_recognised(tmp_path: Path, value: int | None, chosen: str) -> None:
+    project = on_background(ball_project(tmp_path / "p"), value)
+    assert choose_background(load_scene(project), transparent=False) == chosen
+
+
+def test_only_around_objects_without_alpha_and_masks(tmp_path: Path) -> None:
+    project = on_background(ball_project(tmp_path / "p"), 0)
+    assert choose_background(load_scene(project), transparent=True) == "random"
+    settings = load_project(project)
+    (project / "masks").mkdir()
+    for record in settings.images:
+        Image.new("L", (40, 40), 255).save(project / "masks" / f"{record.name}.png")
+        record.mask = f"masks/{record.name}.png"
+    save_project(project, settings)
+    assert choose_background(load_scene(project), transparent=False) == "random"
+    outward = [pose @ np.diag([-1.0, 1, -1, 1]) for pose in camera_poses(16)]
+    room = on_background(ball_project(tmp_path / "room", given=outward), 0)
+    assert choose_background(load_scene(room), transparent=False) == "random"
+
+
+def test_edges_only() -> None:
+    photo = np.full((50, 100, 3), 120, np.uint8)
+    photo[4:-4, 4:-4] = 0
+    assert edge_shares(photo) == (0, 0)
+    photo[:2] = 0
+    photo[-2:] = 255
+    black, white = edge_shares(photo)
+    assert black == white == pytest.approx(200 / (50 * 100 - 46 * 92))
+
+
+def opacities(project: Path, run: str, value: int) -> tuple[float, float]:
+    """Mean opacity of what a trained run shows beside the ball, and on it."""
+    trained, scene = load_trained(project, run), load_scene(project)
+    poses = box_poses(scene.views, trained.info.box(load_project(project)).box_from_world)
+    beside, on = [], []
+    for i in range(0, 16, 3):
+        frame = render_view(trained.model, scene.views[i].camera, poses[i], float(value == 255))
+        _, label, _ = draw(scene.views[i].camera, camera_poses(16)[i])
+        beside.append(frame.opacity[label == 0].mean())
+        on.append(frame.opacity[label > 0].mean())
+    return float(np.mean(beside)), float(np.mean(on))
+
+
+@pytest.mark.parametrize(("value", "name"), [(0, "black"), (255, "white")])
+def test_nothing_is_put_around_an_object(tmp_path: Path, value: int, name: str) -> None:
+    project = on_background(ball_project(tmp_path / "p"), value)
+    found = {}
+    for run, settings in (("main", SMALL), ("filled", {**SMALL, "scene.background": "random"})):
+        run_verb("train", TrainParams(project=project, preset="draft", run=run, steps=300, set=settings), Reporter())
+        found[run] = opacities(project, run, value)
+    config = json.loads((project / "runs" / "main" / "config.json").read_text())
+    assert config["config"]["scene"]["background"] == name
+    assert found["main"][1] > 0.9
+    assert found["main"][0] < 0.3 < 0.9 < found["filled"][0]

@@ -48,6 +48,7 @@ class Job:
     id: str
     project: Path | None = None
     on_done: Done | None = None
+    before: Steps | None = None  # work in Blender before the job can start
     state: str = "queued"
     stage: str = ""
     fraction: float | None = None

@@ -99,7 +99,7 @@ class Queue:
                 done.add(key)
         return None
 
-    def make(self, verb: str, params: dict[str, Any], on_done: Done | None = None) -> Job:
+    def make(self, verb: str, params: dict[str, Any], on_done: Done | None = None, before: Steps | None = None) -> Job:
         self._number += 1
         folder = params.get("project") or (params.get("out") if verb == "reconstruct" else None)
         return Job(
@@ -108,6 +108,7 @@ class Queue:
             id=f"{verb}-{time.strftime('%Y%m%d-%H%M%S')}-{self._number}",
             project=Path(folder) if folder else None,
             on_done=on_done,
+            before=before,
         )
 
     def submit(self, job: Job) -> None:
@@ -130,6 +131,8 @@ class Queue:
         """Run a job and wait for it. Raises EngineError."""
         job.state, job.started = "running", time.monotonic()
         self.running = job
+        for _ in job.before or ():
+            pass
         try:
             result = self._engine().run_blocking(job.verb, {**job.params, "job": job.id}, job.take)
         except EngineError as error:
@@ -213,6 +216,7 @@ class Queue:
                 self.link.pump()
             if self.running:
                 self.running.seconds = time.monotonic() - (self.running.started or time.monotonic())
+            self._prepare(SLICE)
             self._start_next()
             self._follow()
             self._look_after_engine()
@@ -233,10 +237,27 @@ class Queue:
         self.slowest_cpu = max(self.slowest_cpu, time.thread_time() - busy_since)
         if seconds > self.slowest_tick:
             self.slowest_tick, self.slowest_step = seconds, doing
-        return SLICE_PERIOD if self.bringing else BUSY_PERIOD if busy else IDLE_PERIOD
+        sliced = self.bringing or any(job.before for job in self.waiting)
+        return SLICE_PERIOD if sliced else BUSY_PERIOD if busy else IDLE_PERIOD
+
+    def _prepare(self, seconds: float) -> None:
+        """Do what a waiting job needs of Blender, for that long: at once, not when its turn comes."""
+        job = next((job for job in self.waiting if job.before is not None), None)
+        if job is None or job.before is None:
+            return
+        end = time.perf_counter() + seconds
+        try:
+            while time.perf_counter() < end:
+                job.fraction, job.message = next(job.before)
+        except StopIteration:
+            job.before, job.fraction, job.message = None, None, ""
+        except Exception as error:
+            self.waiting.remove(job)
+            self._finish(job, None, EngineError("scene", f"The scene cannot be read: {error}."))
+            raise
 
     def _start_next(self) -> None:
-        if self.running is not None or not self.waiting:
+        if self.running is not None or not self.waiting or self.waiting[0].before is not None:
             return
         job = self.waiting.pop(0)
         self.running = job

@@ -122,7 +122,8 @@ class VerbOperator(Operator):
         except ValueError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        job = jobs.queue.make(self.verb, {k: v for k, v in params.items() if v is not None}, self.after())
+        params = {name: value for name, value in params.items() if value is not None}
+        job = jobs.queue.make(self.verb, params, self.after(), self.before(context, params))
         if not bpy.app.background:
             jobs.queue.submit(job)
             return {"FINISHED"}
@@ -137,6 +138,10 @@ class VerbOperator(Operator):
         for warning in job.warnings:
             self.report({"WARNING"}, warning)
         return {"FINISHED"}
+
+    def before(self, context: Context, params: dict[str, Any]) -> jobs.Steps | None:
+        """Steps in Blender before the verb can start."""
+        return None
 
     def after(self) -> jobs.Done:
         """What is called when the job has ended, and may be a generator. The operator itself is gone by then."""

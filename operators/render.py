@@ -17,31 +17,36 @@ from ..addon.text import t
 from .base import ProjectOperator, absolute, need_run, refresh_scenes, scene_settings
 
 
-def camera_frames(
-    scene: bpy.types.Scene, animated: bool, size: tuple[int, int], project: Path | None = None
-) -> dict[str, Any]:
-    """The scene's camera as transforms.json: intrinsics in pixels, camera-to-capture with Blender's axes.
+def check_camera(scene: bpy.types.Scene) -> None:
+    """Raise ValueError when the scene has no camera to render from, or not a perspective one."""
+    if scene.camera is None:
+        raise ValueError(t("The scene has no active camera."))
+    if scene.camera.data.type != "PERSP":
+        raise ValueError(t("“{}” is not a perspective camera.", scene.camera.name))
+
+
+def write_cameras(
+    path: Path, scene: bpy.types.Scene, animated: bool, size: tuple[int, int], project: Path | None = None
+) -> jobs.Steps:
+    """Write the scene's camera as transforms.json, a frame in each step: intrinsics in pixels, camera-to-capture with
+    Blender's axes.
 
     Where the capture of the project was moved in the scene, the camera is taken as it stands to the capture.
-
-    Raises:
-        ValueError: there is no camera, or it is not a perspective one.
     """
-    camera = scene.camera
-    if camera is None:
-        raise ValueError(t("The scene has no active camera."))
-    if camera.data.type != "PERSP":
-        raise ValueError(t("“{}” is not a perspective camera.", camera.name))
+    from ..nerfcore.files import write_json  # not at the top: enabling the extension must be quick
+
     percent = scene.render.resolution_percentage / 100
     width = size[0] or round(scene.render.resolution_x * percent)
     height = size[1] or round(scene.render.resolution_y * percent)
-    current = scene.frame_current
-    numbers = range(scene.frame_start, scene.frame_end + 1, scene.frame_step) if animated else [current]
+    numbers = [scene.frame_current]
+    if animated:
+        numbers = list(range(scene.frame_start, scene.frame_end + 1, scene.frame_step))
     frames = []
     for number in numbers:
-        if number != scene.frame_current:
+        current = scene.frame_current
+        if number != current:
             scene.frame_set(number)
-        evaluated = camera.evaluated_get(bpy.context.evaluated_depsgraph_get())
+        evaluated = scene.camera.evaluated_get(bpy.context.evaluated_depsgraph_get())
         # A scaled parent must not scale the camera's axes.
         capture_from_scene = scene_from_capture(scene, project).inverted_safe()
         location, rotation, _ = (capture_from_scene @ evaluated.matrix_world).decompose()
@@ -51,9 +56,10 @@ def camera_frames(
             {"file_path": f"frame_{number:04}", "transform_matrix": [list(row) for row in matrix]}
             | intrinsics(evaluated.data, width, height)
         )
-    if scene.frame_current != current:
-        scene.frame_set(current)
-    return {"frames": frames}
+        if number != current:
+            scene.frame_set(current)  # the window may be drawn between two steps
+        yield len(frames) / len(numbers), t("frame {}", number)
+    write_json(path, {"frames": frames})
 
 
 def intrinsics(camera: bpy.types.Camera, width: int, height: int) -> dict[str, float]:
@@ -61,6 +67,9 @@ def intrinsics(camera: bpy.types.Camera, width: int, height: int) -> dict[str, f
     focal, cx, cy = pinhole(camera, width, height)
     angle = 2 * math.atan(width / 2 / focal)
     return {"w": width, "h": height, "fl_x": focal, "fl_y": focal, "cx": cx, "cy": cy, "camera_angle_x": angle}
+
+
+CAMERAS = "cameras.json"  # beside the images
 
 
 @scene_settings(run="run", source="render_from", orbit="orbit", size="size", passes="passes")
@@ -109,12 +118,14 @@ class FIELDWORK_OT_render(ProjectOperator):
             return {**params, "test": True}
         if source == "orbit":
             return {**params, "orbit": self.value(context, "orbit")}
-        from ..nerfcore.files import write_json  # not at the top: enabling the extension must be quick
+        check_camera(context.scene)
+        return {**params, "camera": str(folder / CAMERAS), "size": None}
 
-        folder.mkdir(parents=True, exist_ok=True)
-        cameras = camera_frames(context.scene, source == "animation", size, Path(project))
-        write_json(folder / "cameras.json", cameras)
-        return {**params, "camera": str(folder / "cameras.json"), "size": None}
+    def before(self, context: Context, params: dict[str, Any]) -> jobs.Steps | None:
+        if self.camera or "camera" not in params:
+            return None
+        animated, size = self.value(context, "source") == "animation", tuple(self.value(context, "size"))
+        return write_cameras(Path(params["camera"]), context.scene, animated, size, Path(params["project"]))
 
     def after(self) -> jobs.Done:
         return show_result

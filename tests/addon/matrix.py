@@ -134,7 +134,7 @@ def run_window(root: Path, request: dict[str, Any], folder: Path) -> dict[str, A
     command = [str(GUI / "enter"), str(root), str(ROOT), "blender", "-noaudio", "--background", "--factory-startup"]
     row = _answer([*command, "--python", str(WORKER), "--"], request, folder, environment)
     if row["ok"]:
-        row |= _command_line(root, request, environment)
+        row |= _command_line(root, request, environment, folder / "out" / "project")
     return row
 
 
@@ -147,8 +147,9 @@ def engine_places() -> str:
     return " ".join(places)
 
 
-def _command_line(root: Path, request: dict[str, Any], environment: dict[str, str]) -> dict[str, Any]:
-    """`blender -c fieldwork doctor --json`, with this checkout's environment as the engine."""
+def _command_line(root: Path, request: dict[str, Any], environment: dict[str, str], project: Path) -> dict[str, Any]:
+    """`blender -c fieldwork VERB`, with this checkout's environment as the engine: the doctor, an export of the project,
+    and the exit status of a failure."""
     environment = {
         **environment,
         "ENTER_ENV": f"{environment['ENTER_ENV']} FIELDWORK_ENGINE_PYTHON={ROOT}/.venv/bin/python",
@@ -156,12 +157,22 @@ def _command_line(root: Path, request: dict[str, Any], environment: dict[str, st
     blender = [str(GUI / "enter"), str(root), str(ROOT), "blender", "--command"]
     install = [*blender, "extension", "install-file", "-r", "user_default", "-e", request["zip"]]
     done = subprocess.run(install, capture_output=True, text=True, env=environment, timeout=300)
-    if done.returncode == 0:
-        doctor = [*blender, "fieldwork", "doctor", "--json"]
-        done = subprocess.run(doctor, capture_output=True, text=True, env=environment, timeout=300)
-    answer = next((line for line in done.stdout.splitlines() if line.startswith("{")), None)
-    if answer is None or not json.loads(answer).get("torch"):
-        return {"ok": False, "error": "`blender -c fieldwork doctor` failed", "log": done.stdout + done.stderr}
+    if done.returncode != 0:
+        return {"ok": False, "error": "the extension was not installed for -c", "log": done.stdout + done.stderr}
+    for verb, key, status in (
+        (["doctor"], "torch", 0),
+        (["export", project, "--to", "ply"], "files", 0),
+        (["export", project, "--to", "ply", "--run", "none"], "error", 1),
+        (["train"], None, 2),
+    ):
+        ran = subprocess.run(
+            [*blender, "fieldwork", *map(str, verb), "--json"],
+            capture_output=True, text=True, env=environment, timeout=300,
+        )  # fmt: skip
+        answer = json.loads(next((line for line in ran.stdout.splitlines() if line.startswith("{")), "{}"))
+        if ran.returncode != status or (key and not answer.get(key)):
+            error = f"`blender -c fieldwork {verb[0]}` ended with {ran.returncode} instead of {status}"
+            return {"ok": False, "error": error, "log": ran.stdout + ran.stderr}
     return {"command": "ok"}
 
 

@@ -48,6 +48,8 @@ def capture_to_mesh(request, out):
         o for o in bpy.data.objects if o.get("fieldwork_role") == "mesh" and o.get("fieldwork_project") == "project"
     ]
     assert len(surface) == 1, "there is no mesh in the scene"
+    bpy.ops.fieldwork.export(to="glb", out=str(out / "project.glb"))
+    assert (out / "project.glb").read_bytes()[:4] == b"glTF"
     bpy.ops.fieldwork.stop_engine()
     return {"faces": len(surface[0].data.polygons), "mesh_s": round(time.perf_counter() - begin, 1)}
 

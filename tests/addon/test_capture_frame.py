@@ -23,12 +23,15 @@ def test_cameras_points_and_region_are_those_of_the_capture(bpy_script, tmp_path
         + MOVED
         + """
 from fieldwork.addon import crop
-from fieldwork.operators.render import camera_frames
+from fieldwork.operators.render import write_cameras
 # A camera, two points and a box, each given in the capture and put where they appear in the scene.
 pose = Matrix.LocRotScale(Vector((1, 2, 3)), Euler((1.1, 0.2, 0.4)), None)
 scene.camera.matrix_world = root.matrix_world @ pose
 bpy.context.view_layer.update()
-frame = camera_frames(scene, False, (100, 50), Path(project))["frames"][0]
+file = Path(project, "cameras.json")
+for _ in write_cameras(file, scene, False, (100, 50), Path(project)):
+    pass
+frame = json.loads(file.read_text())["frames"][0]
 settings.point_a, settings.point_b = (root.matrix_world @ Vector(p) for p in ((1, 0, 0), (1, 2, 0)))
 settings.distance = 5.0
 class Operator:

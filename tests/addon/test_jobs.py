@@ -255,3 +255,36 @@ def test_messages_stay_until_read_or_made_good(queue, project, tmp_path):
     assert queue.outcome is None
     ended("new", "cancelled")
     assert queue.outcome is None
+
+
+def test_what_a_job_needs_of_the_scene_is_done_in_slices_and_at_once(queue, project):
+    """Before its turn: the scene may look otherwise by then."""
+    done = []
+
+    def steps():
+        for number in range(30):
+            end = time.perf_counter() + 0.005
+            while time.perf_counter() < end:
+                pass
+            done.append(number)
+            yield number / 30, "frame"
+
+    first, second = count(queue, project, steps=100_000), queue.make("count", {"project": str(project)}, before=steps())
+    queue.submit(first)
+    queue.submit(second)
+    assert done == []
+    tick_until(queue, lambda: second.before is None)
+    assert len(done) == 30
+    assert (first.state, second.state) == ("running", "queued")
+    assert queue.slowest_cpu < 0.1
+    queue.cancel()
+    tick_until(queue, lambda: second.state == "done")
+
+    def fails():
+        yield 0.0, ""
+        raise ReferenceError("the scene is gone")
+
+    third = queue.make("count", {"project": str(project)}, before=fails())
+    queue.submit(third)
+    tick_until(queue, lambda: third.state == "failed")
+    assert "the scene is gone" in third.error.message

@@ -8,21 +8,24 @@ from fieldwork.tests.addon.support import SETUP, make_project
 
 @pytest.mark.parametrize(("width", "height"), [(640, 480), (480, 640)])
 @pytest.mark.parametrize("fit", ["AUTO", "HORIZONTAL", "VERTICAL"])
-def test_scene_camera_as_pixels_agrees_with_blender(bpy_script, width, height, fit):
+def test_scene_camera_as_pixels_agrees_with_blender(bpy_script, tmp_path, width, height, fit):
     """Blender's own projection of a point, and that through the exported intrinsics, meet."""
     facts = bpy_script(
         SETUP
         + """
 from bpy_extras.object_utils import world_to_camera_view
 from mathutils import Matrix, Vector
-from fieldwork.operators.render import camera_frames
+from fieldwork.operators.render import write_cameras
 scene.render.resolution_x, scene.render.resolution_y = width, height
 camera = scene.camera
 camera.data.sensor_fit, camera.data.lens = fit, 41.0
 camera.data.shift_x, camera.data.shift_y = 0.11, -0.07
 camera.scale = (2, 2, 2)
 bpy.context.view_layer.update()
-frame = camera_frames(scene, False, (0, 0))["frames"][0]
+file = Path(folder, "cameras.json")
+for _ in write_cameras(file, scene, False, (0, 0)):
+    pass
+frame = json.loads(file.read_text())["frames"][0]
 seen = []
 for point in (Vector((0, 0, 0)), Vector((1, 0.5, -0.3)), Vector((-0.8, 0.2, 1.0))):
     x, y, _ = world_to_camera_view(scene, camera, point)
@@ -34,30 +37,34 @@ answer(seen)
         width=width,
         height=height,
         fit=fit,
+        folder=tmp_path,
     )
     for blender, mine in facts:
         assert mine == pytest.approx(blender, abs=0.01)
 
 
-def test_animation_gives_a_frame_each_and_leaves_the_scene_where_it_was(bpy_script):
+def test_animation_gives_a_frame_each_and_leaves_the_scene_where_it_was(bpy_script, tmp_path):
     facts = bpy_script(
         SETUP
         + """
-from fieldwork.operators.render import camera_frames
+from fieldwork.operators.render import write_cameras
 scene.frame_start, scene.frame_end, scene.frame_step = 2, 8, 3
 for frame, x in ((2, 0.0), (8, 6.0)):
     scene.camera.location.x = x
     scene.camera.keyframe_insert("location", frame=frame)
 scene.frame_set(5)
-frames = camera_frames(scene, True, (100, 50))["frames"]
+file = Path(folder, "cameras.json")
+seen = [scene.frame_current for _ in write_cameras(file, scene, True, (100, 50))]
+frames = json.loads(file.read_text())["frames"]
 answer({"names": [f["file_path"] for f in frames], "x": [f["transform_matrix"][0][3] for f in frames],
-        "size": [frames[0]["w"], frames[0]["h"]], "now": scene.frame_current})
-"""
+        "size": [frames[0]["w"], frames[0]["h"]], "now": seen})
+""",
+        folder=tmp_path,
     )
     assert facts["names"] == ["frame_0002", "frame_0005", "frame_0008"]
     assert facts["x"][0] == pytest.approx(0, abs=1e-6)
     assert facts["x"][2] == pytest.approx(6, abs=1e-6)
-    assert (facts["size"], facts["now"]) == ([100, 50], 5)
+    assert (facts["size"], facts["now"]) == ([100, 50], [5, 5, 5])
 
 
 def test_renders_appear_behind_their_cameras_or_on_planes_once(bpy_script, tmp_path):

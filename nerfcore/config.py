@@ -112,7 +112,17 @@ class RenderConfig(Stage):
         default=1e-4, ge=0, description="rendering weight below which colour and classes are not computed"
     )
     samples: int | None = Field(
-        default=32, ge=1, le=512, description="samples a ray when rendering; null: as in training"
+        default=32, ge=1, le=512, description="most samples a ray when rendering; null: as in training"
+    )
+    per_bin: float = Field(
+        default=1.25,
+        ge=0,
+        le=16,
+        description="samples for each open bin on a ray when rendering, at least 4 a ray; 0: `samples` on every ray",
+    )
+    refine: Literal[1, 2, 4] = Field(
+        default=2,
+        description="how many times finer than the occupancy grid the grid is that finished fields render with",
     )
     fused: Literal["auto", "on", "off"] = Field(
         default="auto",

@@ -122,8 +122,8 @@ def split_times(model: Model, rays: CameraRays, count: int, report: Reporter) ->
             middle = time.perf_counter()
             evaluated = renderer.fine(coarse, per_ray).evaluated
         else:
-            o = model.occupancy
-            drawn = sample(origins, directions, o.cells, o.blocks, o.march_settings(), per_ray)
+            g = model.render_grid()
+            drawn = sample(origins, directions, g.cells, g.reach, g.settings, per_ray)
             _synchronize(device)
             middle = time.perf_counter()
             geometry = model.field.geometry(drawn.points)

@@ -43,6 +43,7 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
     indices = scene.test if params.split == "test" else scene.train
     if not indices:
         raise InputError(f"{folder} has no held-out images.", "Captures of 8 or more photos hold every 8th one out.")
+    trained.model.refine(report.check)
     box = trained.info.box(project)
     background = background_of(trained.info)
     out = run_folder(folder, params.run) / "evaluation"

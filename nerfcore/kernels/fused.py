@@ -10,7 +10,7 @@ import warp as wp
 from .blocks import launch_blocks
 from .fused_kernel import FusedShape, March, fused_kernel
 from .fused_network import half_feature
-from .march import MarchSettings, coarse
+from .march import MarchSettings, coarse, sample_counts
 from .runtime import array, init
 
 LANES = 64  # samples a block works on, on CUDA; two to eight blocks fit a multiprocessor of sm_75 and later
@@ -54,13 +54,14 @@ class FusedRays:
 
 @dataclass(frozen=True)
 class CoarseRays:
-    """What the coarse walk found: total weight and first open distance (R,), the rays that meet something in `queue`
-    (R,) int32 and their number `hits` (1,) int32, all on the device."""
+    """What the coarse walk found: total weight, first open distance and number of open bins (R,), the rays that meet
+    something in `queue` (R,) int32 and their number `hits` (1,) int32, all on the device."""
 
     origins: torch.Tensor
     directions: torch.Tensor
     total: torch.Tensor
     first: torch.Tensor
+    bins: torch.Tensor
     queue: torch.Tensor
     hits: torch.Tensor
 
@@ -69,7 +70,7 @@ def coarse_walk(
     origins: torch.Tensor,
     directions: torch.Tensor,
     cells: torch.Tensor,
-    blocks: torch.Tensor,
+    reach: torch.Tensor,
     settings: MarchSettings,
 ) -> CoarseRays:
     """Walk rays (R, 3) of the normalised frame through the occupancy grid; see `march.sample` for the arguments.
@@ -77,26 +78,26 @@ def coarse_walk(
     Nothing is read back from the device.
     """
     device, rays = origins.device, len(origins)
-    total, first, _ = coarse(origins, directions, cells, blocks, settings)
+    total, first, _, bins = coarse(origins, directions, cells, reach, settings)
     hit = total > 0
     place = torch.cumsum(hit, 0)
     # Rays that miss are written to a place behind the queue.
     queue = torch.empty(rays + 1, dtype=torch.int32, device=device)
     queue.scatter_(0, torch.where(hit, place - 1, rays), torch.arange(rays, dtype=torch.int32, device=device))
-    return CoarseRays(origins, directions, total, first, queue, place[-1:].to(torch.int32))
+    return CoarseRays(origins, directions, total, first, bins, queue, place[-1:].to(torch.int32))
 
 
 def render_coarse(
     field: FusedField,
     rays: CoarseRays,
     cells: torch.Tensor,
-    blocks: torch.Tensor,
+    reach: torch.Tensor,
     settings: MarchSettings,
     count: int,
     cull: float,
     lanes: int | None = None,
 ) -> FusedRays:
-    """Colour, opacity, depth and class probabilities of rays after their coarse walk, `count` samples a ray.
+    """Colour, opacity, depth and class probabilities of rays after their coarse walk, at most `count` samples a ray.
 
     `lanes`: samples a block, by default `LANES` on CUDA and 1 on the CPU, where more need Warp's `enable_cpu_blocks`.
     """
@@ -111,6 +112,7 @@ def render_coarse(
     resident = 2 if lanes > 1 else 1  # blocks at a time; more than one on the CPU only to test that they share
     if cuda:
         resident = torch.cuda.get_device_properties(device).multi_processor_count * BLOCKS_PER_MULTIPROCESSOR
+    counts = sample_counts(rays.bins, count, settings.per_bin)
     groups = max(1, min(-(-number // lanes), resident))
     pixels = torch.zeros(number, 5, device=device)
     classes = field.class_count
@@ -118,7 +120,7 @@ def render_coarse(
     taken = torch.zeros(1, dtype=torch.int32, device=device)
     evaluated = torch.zeros(groups * lanes, dtype=torch.int32, device=device)
     inputs = [array(rays.origins, wp.vec3), array(rays.directions, wp.vec3), array(rays.total), array(rays.first)]
-    inputs += [array(rays.queue), array(taken), array(rays.hits), count, m, array(cells, wp.vec2), array(blocks)]
+    inputs += [array(rays.queue), array(taken), array(rays.hits), array(counts), m, array(cells, wp.vec2), array(reach)]
     inputs += [array(field.table, half_feature), array(field.layout), array(field.gains), array(field.evidence)]
     inputs += [field.evidence_side, field.blend_floor, field.blend_rate, array(field.weights), array(field.code)]
     inputs += [field.density_shift, cull, classes, array(pixels), array(probabilities), array(evaluated)]

@@ -123,6 +123,7 @@ class Ray:
     used: float  # part of the present bin given to intervals already
     gathered: float  # open length of the next sample's interval so far
     sample: int
+    count: int
     ended: int
 
 
@@ -139,7 +140,7 @@ class March:
 
 
 @wp.func
-def advanced(ray: Ray, m: March, cells: wp.array(dtype=wp.vec2), blocks: wp.array(dtype=wp.uint8)):
+def advanced(ray: Ray, m: March, cells: wp.array(dtype=wp.vec2), reach: wp.array(dtype=wp.uint8)):
     """The ray after its next sample, with the sample's distance and length."""
     target = (float(ray.sample) + 0.5) * ray.share
     edge = float(ray.sample + 1) * ray.share
@@ -154,7 +155,8 @@ def advanced(ray: Ray, m: March, cells: wp.array(dtype=wp.vec2), blocks: wp.arra
         u = grid_position(p, m.contracted)
         cell = cells[cell_index(u, m.n)]
         if cell[0] > 0.0:
-            weight = bin_weight(cell, ray.transmittance, width, m.mode, m.beta, m.epsilon)
+            through = wp.exp(-cell[0] * width)
+            weight = bin_weight(cell, ray.transmittance, through, m.mode, m.beta, m.epsilon)
             above = ray.below + weight
             ray.last = ray.t
             if place < 0.0 and target <= above:
@@ -171,11 +173,11 @@ def advanced(ray: Ray, m: March, cells: wp.array(dtype=wp.vec2), blocks: wp.arra
                 ray.below = above
                 ray.t += width
                 if m.mode == _DEFAULT:
-                    ray.transmittance *= wp.exp(-cell[0] * width)
+                    ray.transmittance *= through
                     if ray.transmittance < STOP:
                         ray.t = ray.high
         else:
-            ray.t += closed_length(u, ray.direction, ray.inverse, m.n, m.step, width, m.contracted, blocks)
+            ray.t += closed_length(u, ray.direction, ray.inverse, m.n, m.step, width, m.contracted, reach)
     if found == 0:
         # Rounding left this interval just short of the total; nothing is behind it.
         length = ray.gathered
@@ -214,10 +216,10 @@ def fused_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
         queue: wp.array(dtype=int),
         taken: wp.array(dtype=int),
         hits: wp.array(dtype=int),
-        count: int,
+        counts: wp.array(dtype=int),
         m: March,
         cells: wp.array(dtype=wp.vec2),
-        blocks: wp.array(dtype=wp.uint8),
+        reach: wp.array(dtype=wp.uint8),
         table: wp.array(dtype=half_feature),
         layout: wp.array2d(dtype=int),
         gains: wp.array(dtype=float),
@@ -257,7 +259,8 @@ def fused_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
                     ray.inverse = reciprocal(ray.direction)
                     _, high = ray_interval(ray.origin, ray.inverse, m.near, m.far, m.contracted)
                     ray.high = high
-                    ray.share = total[r] / float(count)
+                    ray.count = counts[r]
+                    ray.share = total[r] / float(ray.count)
                     ray.t = first[r]
                     ray.last = first[r]
                     ray.transmittance = 1.0
@@ -280,7 +283,7 @@ def fused_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
                 length = float(0.0)
                 p = wp.vec3(0.5, 0.5, 0.5)
                 if active == 1:
-                    ray, t, length = advanced(ray, m, cells, blocks)
+                    ray, t, length = advanced(ray, m, cells, reach)
                     p = inside(grid_position(ray.origin + ray.direction * t, m.contracted))
                     samples += 1
                 hidden = grid(p, table, layout, gains)
@@ -349,7 +352,7 @@ def fused_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
                             for k in range(classes):
                                 if k < class_count:
                                     probabilities[ray.index, k] = probabilities[ray.index, k] + weight * scores[k]
-                if active == 1 and (ray.ended == 1 or ray.sample >= count or before < STOP):
+                if active == 1 and (ray.ended == 1 or ray.sample >= ray.count or before < STOP):
                     pixels[ray.index, 0] = red
                     pixels[ray.index, 1] = green
                     pixels[ray.index, 2] = blue

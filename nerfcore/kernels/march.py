@@ -27,6 +27,8 @@ MAX_BINS = wp.constant(4096)
 MACRO = wp.constant(4)  # cells along a side of a block that can be skipped at once
 BEFORE_CUBE = wp.constant(0.8)  # share of the way to the cube that may be taken to be empty
 STOP = wp.constant(1.0e-4)  # transmittance below which the walk ends
+FARTHEST = 8  # blocks that can be skipped at once, from the middle one on
+LEAST = 4  # samples on a ray whose number of samples follows that of its open bins
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,8 @@ class MarchSettings:
     """How rays are walked. `step` is the bin length inside the cube; `near`, `far` clip the ray (normalised units).
 
     `empty`: where space is contracted, rays from outside of the cube start as far away as this, but before they reach
-    the cube.
+    the cube. `per_bin`: samples for each open bin of a ray, at most the number asked for and at least `LEAST`; all
+    rays get the number asked for when it is 0.
     """
 
     resolution: int
@@ -46,6 +49,7 @@ class MarchSettings:
     beta: float = 1.0
     epsilon: float = 0.01
     empty: float = 0.0
+    per_bin: float = 0.0
 
 
 @wp.func
@@ -109,15 +113,22 @@ def bin_length(p: wp.vec3, step: float, contracted: int):
 
 
 @wp.func
-def leave_distance(u: wp.vec3, d: wp.vec3, inverse: wp.vec3, n: float):
-    """Way, in grid coordinates, until a ray at grid position u leaves its cell of an n³ grid."""
-    ux = u[0] * n
-    uy = u[1] * n
-    uz = u[2] * n
-    tx = (wp.floor(ux) + wp.where(d[0] > 0.0, 1.0, 0.0) - ux) * inverse[0]
-    ty = (wp.floor(uy) + wp.where(d[1] > 0.0, 1.0, 0.0) - uy) * inverse[1]
-    tz = (wp.floor(uz) + wp.where(d[2] > 0.0, 1.0, 0.0) - uz) * inverse[2]
-    return wp.max(wp.min(tx, wp.min(ty, tz)) / n, 0.0)
+def way_out(u: float, d: float, inverse: float, low: float, high: float):
+    """Way until a ray at u leaves the interval low … high of one axis."""
+    return (wp.where(d > 0.0, high, low) - u) * inverse
+
+
+@wp.func
+def leave_distance(u: wp.vec3, d: wp.vec3, inverse: wp.vec3, n: float, reach: float, border: float):
+    """Way, in grid coordinates, until a ray at grid position u leaves its cell of an n³ grid and the `reach` cells
+    around it, or the part of the grid that is `border` away from its sides."""
+    away = float(1.0e9)
+    for a in range(3):
+        cell = wp.floor(u[a] * n)
+        low = wp.max((cell - reach) / n, border)
+        high = wp.min((cell + 1.0 + reach) / n, 1.0 - border)
+        away = wp.min(away, way_out(u[a], d[a], inverse[a], low, high))
+    return wp.max(away, 0.0)
 
 
 @wp.func
@@ -129,21 +140,24 @@ def closed_length(
     step: float,
     length: float,
     contracted: int,
-    blocks: wp.array(dtype=wp.uint8),
+    reach: wp.array(dtype=wp.uint8),
 ):
-    """How far to move from a closed cell: in whole steps until the ray leaves it, or its block of closed cells; one bin
-    where space is contracted."""
+    """How far to move from a closed cell: in whole steps until the ray leaves it, or the closed reach around it; one
+    bin where space is contracted."""
     side = float(2.0)
+    border = float(0.0)
     if contracted == 1:
         side = 4.0
+        border = 0.25
         c = u - wp.vec3(0.5, 0.5, 0.5)
         if wp.max(wp.abs(c[0]), wp.max(wp.abs(c[1]), wp.abs(c[2]))) >= 0.25:
             return length
     leave = float(0.0)
-    if blocks[cell_index(u, n / MACRO)] == wp.uint8(0):
-        leave = leave_distance(u, d, inverse, float(n / MACRO))
+    closed = int(reach[cell_index(u, n / MACRO)])
+    if closed > 0:
+        leave = leave_distance(u, d, inverse, float(n / MACRO), float(closed - 1), border)
     else:
-        leave = leave_distance(u, d, inverse, float(n))
+        leave = leave_distance(u, d, inverse, float(n), 0.0, border)
     return wp.max(1.0, wp.floor(leave * side / step + 0.5)) * step
 
 
@@ -157,14 +171,13 @@ def reciprocal(d: wp.vec3):
 
 
 @wp.func
-def bin_weight(cell: wp.vec2, transmittance: float, length: float, mode: int, beta: float, epsilon: float):
-    """Weight of one open bin; `cell` holds (density, interest)."""
+def bin_weight(cell: wp.vec2, transmittance: float, through: float, mode: int, beta: float, epsilon: float):
+    """Weight of one open bin; `cell` holds (density, interest), `through` is the bin's own transmittance."""
     if mode == _UNIFORM:
         return 1.0
     if mode == _LITERAL:
         return cell[0] * cell[1] + 1.0e-6
-    alpha = 1.0 - wp.exp(-cell[0] * length)
-    return transmittance * alpha * (1.0 + beta * cell[1]) + epsilon
+    return transmittance * (1.0 - through) * (1.0 + beta * cell[1]) + epsilon
 
 
 @wp.kernel(module="fieldwork_march")
@@ -173,7 +186,7 @@ def march_weight(
     directions: wp.array(dtype=wp.vec3),
     jitter: wp.array(dtype=float),
     cells: wp.array(dtype=wp.vec2),
-    blocks: wp.array(dtype=wp.uint8),
+    reach: wp.array(dtype=wp.uint8),
     n: int,
     step: float,
     near: float,
@@ -186,6 +199,7 @@ def march_weight(
     total: wp.array(dtype=float),
     first: wp.array(dtype=float),
     last: wp.array(dtype=float),
+    bins: wp.array(dtype=int),
     offset: int,
 ):
     r = wp.tid() + offset
@@ -198,6 +212,7 @@ def march_weight(
     t = lo + jitter[r] * step
     transmittance = float(1.0)
     weight = float(0.0)
+    opened = int(0)
     t_first = float(-1.0)
     t_last = float(-1.0)
     for _ in range(MAX_BINS):
@@ -208,20 +223,23 @@ def march_weight(
         u = grid_position(p, contracted)
         cell = cells[cell_index(u, n)]
         if cell[0] > 0.0:
-            weight += bin_weight(cell, transmittance, length, mode, beta, epsilon)
+            through = wp.exp(-cell[0] * length)
+            weight += bin_weight(cell, transmittance, through, mode, beta, epsilon)
             if t_first < 0.0:
                 t_first = t
             t_last = t
+            opened += 1
             if mode == _DEFAULT:
-                transmittance *= wp.exp(-cell[0] * length)
+                transmittance *= through
                 if transmittance < STOP:
                     break
             t += length
         else:
-            t += closed_length(u, d, inverse, n, step, length, contracted, blocks)
+            t += closed_length(u, d, inverse, n, step, length, contracted, reach)
     total[r] = weight
     first[r] = t_first
     last[r] = t_last
+    bins[r] = opened
 
 
 @wp.kernel(module="fieldwork_march")
@@ -231,7 +249,7 @@ def march_sample(
     jitter: wp.array(dtype=float),
     shift: wp.array(dtype=float),
     cells: wp.array(dtype=wp.vec2),
-    blocks: wp.array(dtype=wp.uint8),
+    reach: wp.array(dtype=wp.uint8),
     n: int,
     step: float,
     near: float,
@@ -243,7 +261,7 @@ def march_sample(
     total: wp.array(dtype=float),
     first: wp.array(dtype=float),
     start: wp.array(dtype=int),
-    count: int,
+    counts: wp.array(dtype=int),
     points: wp.array(dtype=wp.vec3),
     depth: wp.array(dtype=float),
     delta: wp.array(dtype=float),
@@ -251,9 +269,10 @@ def march_sample(
     offset: int,
 ):
     r = wp.tid() + offset
-    base = start[r]
-    if base < 0:
+    count = counts[r]
+    if count == 0:
         return
+    base = start[r]
     o = origins[r]
     d = directions[r]
     inverse = reciprocal(d)
@@ -276,7 +295,8 @@ def march_sample(
         u = grid_position(p, contracted)
         cell = cells[cell_index(u, n)]
         if cell[0] > 0.0:
-            weight = bin_weight(cell, transmittance, length, mode, beta, epsilon)
+            through = wp.exp(-cell[0] * length)
+            weight = bin_weight(cell, transmittance, through, mode, beta, epsilon)
             above = below + weight
             while k < count and target <= above:
                 tk = t + ((target - below) / weight - 0.5) * length
@@ -298,12 +318,12 @@ def march_sample(
             t_end = t
             below = above
             if mode == _DEFAULT:
-                transmittance *= wp.exp(-cell[0] * length)
+                transmittance *= through
                 if transmittance < STOP:
                     break
             t += length
         else:
-            t += closed_length(u, d, inverse, n, step, length, contracted, blocks)
+            t += closed_length(u, d, inverse, n, step, length, contracted, reach)
     # Rounding can leave the last interval or sample just short of the total.
     while k < count:
         depth[base + k] = t_end
@@ -336,6 +356,18 @@ class Samples:
         return len(self.depth)
 
 
+def closed_reach(opened: torch.Tensor) -> torch.Tensor:
+    """How many blocks of 4³ cells around one, itself included, are closed in all directions: ((n / 4)³,) uint8 from
+    the open cells (n, n, n) bool of a grid; 0 for blocks with an open cell."""
+    m = len(opened) // int(MACRO)
+    near = opened.view(m, int(MACRO), m, int(MACRO), m, int(MACRO)).any(5).any(3).any(1).float()[None]
+    closed = 1 - near
+    for _ in range(FARTHEST - 1):
+        near = torch.nn.functional.max_pool3d(near, 3, 1, 1)
+        closed += 1 - near
+    return closed.to(torch.uint8).reshape(-1)
+
+
 def _arguments(settings: MarchSettings) -> list:
     s = settings
     return [s.resolution, s.step, s.near, s.far, int(s.contracted), s.mode, s.beta, s.epsilon]
@@ -345,27 +377,36 @@ def coarse(
     origins: torch.Tensor,
     directions: torch.Tensor,
     cells: torch.Tensor,
-    blocks: torch.Tensor,
+    reach: torch.Tensor,
     settings: MarchSettings,
     jitter: torch.Tensor | None = None,
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """The coarse walk of rays, arguments as for `sample`: weight of all open bins (R,), 0 where there is none, and
-    distances (R,) of the first and the last of them, −1 where there is none."""
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """The coarse walk of rays, arguments as for `sample`: weight of all open bins (R,), 0 where there is none,
+    distances (R,) of the first and the last of them, −1 where there is none, and their number (R,) int32."""
     init()
     device, rays = origins.device, len(origins)
     jitter = torch.full((rays,), 0.5, device=device) if jitter is None else jitter
     total, first, last = (torch.empty(rays, device=device) for _ in range(3))
-    inputs = [array(origins, wp.vec3), array(directions, wp.vec3), array(jitter), array(cells, wp.vec2), array(blocks)]
-    inputs += [*_arguments(settings), settings.empty, array(total), array(first), array(last)]
+    bins = torch.empty(rays, dtype=torch.int32, device=device)
+    inputs = [array(origins, wp.vec3), array(directions, wp.vec3), array(jitter), array(cells, wp.vec2), array(reach)]
+    inputs += [*_arguments(settings), settings.empty, array(total), array(first), array(last), array(bins)]
     launch(march_weight, rays, inputs, device)
-    return total, first, last
+    return total, first, last, bins
+
+
+def sample_counts(bins: torch.Tensor, most: int, per_bin: float) -> torch.Tensor:
+    """How many samples (R,) int32 rays with so many open bins get: `per_bin` for each, `most` where that is 0."""
+    if per_bin == 0:
+        return torch.where(bins > 0, most, 0).to(torch.int32)
+    wanted = torch.ceil(bins * per_bin).clamp(min(LEAST, most), most)
+    return torch.where(bins > 0, wanted, 0.0).to(torch.int32)
 
 
 def sample(
     origins: torch.Tensor,
     directions: torch.Tensor,
     cells: torch.Tensor,
-    blocks: torch.Tensor,
+    reach: torch.Tensor,
     settings: MarchSettings,
     count: int,
     jitter: torch.Tensor | None = None,
@@ -377,7 +418,7 @@ def sample(
     Args:
         origins, directions: (R, 3) float32 normalised frame; directions of unit length.
         cells: (resolution³, 2) float32: density per normalised unit length (0 = closed) and interest in [0, 1].
-        blocks: ((resolution / 4)³,) uint8: 0 where all 4³ cells are closed.
+        reach: ((resolution / 4)³,) uint8, see `closed_reach`.
         jitter: (R,) in [0, 1) shift of the walk in bins; 0.5 when None.
         shift: (R · count,) in [0, 1) place of each sample within its share of the PDF; 0.5 when None.
         capacity: on CUDA, the fixed number of rays that may get samples, so that no count is read back; rays
@@ -385,18 +426,17 @@ def sample(
     """
     device, rays = origins.device, len(origins)
     jitter = torch.full((rays,), 0.5, device=device) if jitter is None else jitter
-    total, first, last = coarse(origins, directions, cells, blocks, settings, jitter)
-    hit = total > 0
-    slot = torch.cumsum(hit, 0, dtype=torch.int32) - 1
+    total, first, last, bins = coarse(origins, directions, cells, reach, settings, jitter)
+    counts = sample_counts(bins, count, settings.per_bin)
+    end = torch.cumsum(counts, 0, dtype=torch.int32)
+    start = end - counts
     if capacity is None:
-        places = int(slot[-1]) + 1 if rays else 0
-        start = torch.where(hit, slot * count, -1).to(torch.int32)
-        ray = torch.empty(places * count, dtype=torch.int32, device=device)
+        n = int(end[-1]) if rays else 0
+        ray = torch.empty(n, dtype=torch.int32, device=device)
     else:
-        places = capacity
-        start = torch.where(hit & (slot < capacity), slot * count, -1).to(torch.int32)
-        ray = torch.full((places * count,), -1, dtype=torch.int32, device=device)
-    n = places * count
+        n = capacity * count
+        counts = torch.where(end <= n, counts, 0).to(torch.int32)
+        ray = torch.full((n,), -1, dtype=torch.int32, device=device)
     shift = torch.full((n,), 0.5, device=device) if shift is None else shift[:n]
     fill = torch.empty if capacity is None else torch.zeros
     points, depth, delta = fill(n, 3, device=device), fill(n, device=device), fill(n, device=device)
@@ -404,9 +444,8 @@ def sample(
         march_sample,
         rays,
         [array(origins, wp.vec3), array(directions, wp.vec3), array(jitter), array(shift), array(cells, wp.vec2)]
-        + [array(blocks), *_arguments(settings), array(total), array(first), array(start), count]
+        + [array(reach), *_arguments(settings), array(total), array(first), array(start), array(counts)]
         + [array(points, wp.vec3), array(depth), array(delta), array(ray)],
         device,
     )
-    counts = torch.where(start >= 0, count, 0).to(torch.int32)
     return Samples(points, depth, delta, Packing(start, counts, ray), first, last)

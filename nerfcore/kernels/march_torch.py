@@ -6,7 +6,7 @@ import math
 
 import torch
 
-from .march import MAX_BINS, PDF_DEFAULT, PDF_UNIFORM, MarchSettings
+from .march import FARTHEST, MAX_BINS, PDF_DEFAULT, PDF_UNIFORM, MarchSettings
 
 STOP = 1e-4
 MACRO = 4
@@ -18,6 +18,15 @@ def grid_position(p: torch.Tensor, contracted: bool) -> torch.Tensor:
         return p * 0.5 + 0.5
     r = p.abs().amax(-1, keepdim=True)
     return torch.where(r > 1, p * ((2 - 1 / r.clamp(min=1)) / r.clamp(min=1)), p) * 0.25 + 0.5
+
+
+def closed_around(opened: torch.Tensor, block: torch.Tensor) -> int:
+    """How many blocks around one (x, y, z), itself included, are closed in all directions, at most FARTHEST."""
+    for radius in range(FARTHEST):
+        low, high = ((block - radius) * MACRO).clamp(min=0).tolist(), ((block + radius + 1) * MACRO).tolist()
+        if bool(opened[low[2] : high[2], low[1] : high[1], low[0] : high[0]].any()):
+            return radius
+    return FARTHEST
 
 
 def walk(
@@ -62,12 +71,12 @@ def walk(
         elif s.contracted and float((u - 0.5).abs().max()) >= 0.25:
             t += length
         else:
-            bx, by, bz = x // MACRO * MACRO, y // MACRO * MACRO, z // MACRO * MACRO
-            closed = not bool(opened[bz : bz + MACRO, by : by + MACRO, bx : bx + MACRO].any())
-            m = n / MACRO if closed else float(n)
-            scaled = u * m
-            ahead = (scaled.floor() + (direction > 0).float() - scaled) * inverse
-            leave = max(float(ahead.min()) * (4 if s.contracted else 2) / m, 0.0)
+            block = torch.tensor([x, y, z]) // MACRO
+            closed, border = closed_around(opened, block), 0.25 if s.contracted else 0.0
+            begin = (block - closed + 1) * MACRO if closed else torch.tensor([x, y, z])
+            end = (block + closed) * MACRO if closed else begin + 1
+            edge = torch.where(direction > 0, (end / n).clamp(max=1 - border), (begin / n).clamp(min=border))
+            leave = max(float(((edge - u) * inverse).min()) * (4 if s.contracted else 2), 0.0)
             t += max(1.0, math.floor(leave / s.step + 0.5)) * s.step
     return bins
 

@@ -156,19 +156,18 @@ class FusedRenderer:
     rays = 1 << 20  # rendered at once
 
     def __init__(self, model: Model, semantics: bool = True) -> None:
-        self.config, self.occupancy = model.config, model.occupancy
-        self.settings = model.occupancy.march_settings()
+        self.config, self.grid = model.config, model.render_grid()
         self.field = pack(model.field, semantics, self.config.render.accumulate == "logits")
 
     def coarse(self, origins: torch.Tensor, directions: torch.Tensor) -> CoarseRays:
         """The coarse walk of rays (R, 3), on the grid alone."""
-        o = self.occupancy
-        return coarse_walk(origins, directions, o.cells, o.blocks, self.settings)
+        g = self.grid
+        return coarse_walk(origins, directions, g.cells, g.reach, g.settings)
 
     def fine(self, rays: CoarseRays, count: int) -> FusedRays:
         """Samples, field and compositing of rays after their coarse walk."""
-        o = self.occupancy
-        out = render_coarse(self.field, rays, o.cells, o.blocks, self.settings, count, self.config.render.cull)
+        g = self.grid
+        out = render_coarse(self.field, rays, g.cells, g.reach, g.settings, count, self.config.render.cull)
         if out.probabilities is None or self.config.render.accumulate == "probabilities":
             return out
         # Summed logits become probabilities of the ray once it is complete.
@@ -176,7 +175,7 @@ class FusedRenderer:
         return FusedRays(out.color, out.opacity, out.depth, shares, out.evaluated)
 
     def __call__(self, origins: torch.Tensor, directions: torch.Tensor, samples_per_ray: int) -> FusedRays:
-        """Render rays (R, 3) of the normalised frame with `samples_per_ray` samples where they meet something."""
+        """Render rays (R, 3) of the normalised frame with at most `samples_per_ray` samples where they meet something."""
         return self.fine(self.coarse(origins, directions), samples_per_ray)
 
 
@@ -186,10 +185,10 @@ class UnfusedRenderer:
     rays = 1 << 15
 
     def __init__(self, model: Model, semantics: bool = True) -> None:
-        self.model, self.semantics = model, semantics
+        self.model, self.semantics, self.grid = model, semantics, model.render_grid()
 
     def __call__(self, origins: torch.Tensor, directions: torch.Tensor, samples_per_ray: int) -> Rendered:
-        return self.model.render(origins, directions, samples_per_ray, semantics=self.semantics)
+        return self.model.render(origins, directions, samples_per_ray, semantics=self.semantics, grid=self.grid)
 
 
 def ray_renderer(model: Model, rays: int, semantics: bool = True) -> FusedRenderer | UnfusedRenderer:

@@ -19,8 +19,8 @@ from ..train.model import Model
 from ..train.run import RunInfo
 from .fused import ray_renderer
 
-CPU_RAYS = 2048
-TILES = 16  # rendered between two checks for cancelling
+CPU_RAYS = 8192
+TILES = 8  # rendered between two checks for cancelling
 
 
 @dataclass(frozen=True)

@@ -41,6 +41,7 @@ def render(params: RenderParams, report: Reporter) -> dict[str, Any]:
     folder, out = Path(params.project), Path(params.out)
     project, scene = load_project(folder), load_scene(folder)
     trained = load_trained(folder, params.run)
+    trained.model.refine(report.check)
     box = trained.info.box(project)
     cameras = chosen_cameras(params, scene)
     with disk_errors(out):

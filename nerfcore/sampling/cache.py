@@ -54,7 +54,7 @@ class CoarseCache:
                         batch.origins,
                         batch.directions,
                         occupancy.cells,
-                        occupancy.blocks,
+                        occupancy.reach,
                         occupancy.march_settings(),
                         1,
                     ).first

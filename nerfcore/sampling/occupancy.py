@@ -10,7 +10,7 @@ from torch import nn
 
 from ..config import SamplingConfig
 from ..kernels.cells import average, observe
-from ..kernels.march import PDF_DEFAULT, PDF_LITERAL, PDF_UNIFORM, MarchSettings
+from ..kernels.march import PDF_DEFAULT, PDF_LITERAL, PDF_UNIFORM, MarchSettings, closed_reach
 
 MODES = {"default": PDF_DEFAULT, "uniform": PDF_UNIFORM, "literal": PDF_LITERAL}
 CHUNK = 1 << 16
@@ -55,9 +55,9 @@ class OccupancyGrid(nn.Module):
         self.seen: torch.Tensor
         self.register_buffer("scratch", torch.full((n**3,), -1.0), persistent=False)
         self.scratch: torch.Tensor
-        self.register_buffer("blocks", torch.ones((n // 4) ** 3, dtype=torch.uint8))
+        self.register_buffer("reach", torch.zeros((n // 4) ** 3, dtype=torch.uint8))
         self.cells: torch.Tensor
-        self.blocks: torch.Tensor
+        self.reach: torch.Tensor
 
     def march_settings(self, near: float = 0.02) -> MarchSettings:
         c = self.config
@@ -83,8 +83,7 @@ class OccupancyGrid(nn.Module):
         # the samples: the ray may pass through its empty part.
         self.cells[:, 0] = torch.where(opened, self.mean.clamp(1e-3, MOST_OPTICAL_DEPTH / self.step), 0.0)
         self.cells[:, 1] = self.interest
-        m = self.config.resolution // 4
-        self.blocks.copy_(opened.view(m, 4, m, 4, m, 4).any(5).any(3).any(1).reshape(-1))
+        self.reach.copy_(closed_reach(opened.view(n, n, n)))
 
     def open_share(self) -> float:
         """Share of the cells that are open."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -14,6 +15,7 @@ from ..kernels.composite import render_weights, weighted_sum
 from ..kernels.march import Samples, sample
 from ..kernels.march_torch import grid_position
 from ..sampling.occupancy import OccupancyGrid, class_interest
+from ..sampling.render_grid import RenderGrid, present_grid, refined_grid
 
 ONE_PASS_SHARE = 0.67
 
@@ -71,6 +73,7 @@ class Model(nn.Module):
         self.warming_up = False
         self.register_buffer("shown_share", torch.ones(()))
         self.shown_share: torch.Tensor
+        self._refined: RenderGrid | None = None
 
     @property
     def contracted(self) -> bool:
@@ -92,6 +95,16 @@ class Model(nn.Module):
         flat = bool((self.priorities == self.priorities[0]).all())
         return s.beta > 0 and (s.interest == "boundary" or (s.interest == "priority" and not flat))
 
+    def refine(self, check: Callable[[], None] | None = None) -> None:
+        """Render from now on with a finer grid, which training leaves behind: for fields that are finished."""
+        if self._refined is None:
+            c = self.config.render
+            self._refined = refined_grid(self.occupancy, self.field.density, c.refine, c.per_bin, check)
+
+    def render_grid(self) -> RenderGrid:
+        """What the rays of a picture walk."""
+        return self._refined or present_grid(self.occupancy, self.config.render.per_bin)
+
     def render(
         self,
         origins: torch.Tensor,
@@ -101,15 +114,15 @@ class Model(nn.Module):
         shift: torch.Tensor | None = None,
         codes: torch.Tensor | None = None,
         semantics: bool = True,
+        grid: RenderGrid | None = None,
     ) -> Rendered:
         """Render rays (R, 3) of the normalised frame; differentiable in the field.
 
-        `jitter`, `shift`: see kernels.march.sample; `codes` (R, A): appearance code of each ray.
+        `grid`: what the rays walk, by default the occupancy grid, as in training; `jitter`, `shift`: see
+        kernels.march.sample; `codes` (R, A): appearance code of each ray.
         """
-        settings = self.occupancy.march_settings()
-        s = sample(
-            origins, directions, self.occupancy.cells, self.occupancy.blocks, settings, samples_per_ray, jitter, shift
-        )
+        grid = grid or present_grid(self.occupancy, 0.0)
+        s = sample(origins, directions, grid.cells, grid.reach, grid.settings, samples_per_ray, jitter, shift)
         points = s.points
         if origins.requires_grad:  # pose refinement: samples move with their ray
             along = s.packing.ray.long()

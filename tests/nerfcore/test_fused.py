@@ -108,18 +108,27 @@ def test_the_fused_kernel_renders_what_the_separate_kernels_do(case: str, device
     assert 0 < int(fused.evaluated) <= unfused.evaluated
 
 
+@pytest.mark.parametrize("device", DEVICES)
+def test_both_renderers_walk_the_refined_grid(device: str) -> None:
+    model = random_model(3, settings={"field.density_shift": "4"}, device=device)
+    model.refine()
+    assert model.render_grid().settings.resolution == 2 * model.occupancy.config.resolution
+    origins, directions = rays(100, device)
+    assert_same(FusedRenderer(model)(origins, directions, COUNT), UnfusedRenderer(model)(origins, directions, COUNT))
+
+
 def test_threads_of_a_block_share_their_work(monkeypatch: pytest.MonkeyPatch) -> None:
     """Blocks of several samples, as on a GPU: two of them take rays from one queue."""
     monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
     model = random_model(7)
     origins, directions = rays(100, "cpu")
-    renderer, o = FusedRenderer(model), model.occupancy
+    renderer, grid = FusedRenderer(model), model.render_grid()
     out = render_coarse(
         renderer.field,
         renderer.coarse(origins, directions),
-        o.cells,
-        o.blocks,
-        o.march_settings(),
+        grid.cells,
+        grid.reach,
+        grid.settings,
         COUNT,
         model.config.render.cull,
         lanes=16,

@@ -197,8 +197,7 @@ def random_cells(n: int, share: float, generator: torch.Generator) -> tuple[torc
     opened[: n // 2] = False  # whole blocks to skip
     density = torch.where(opened, torch.rand(n, n, n, generator=generator) * 20, 0.0)
     grid = torch.stack([density.reshape(-1), torch.rand(n**3, generator=generator)], 1).contiguous()
-    m = n // 4
-    return grid, opened.view(m, 4, m, 4, m, 4).any(5).any(3).any(1).reshape(-1).to(torch.uint8)
+    return grid, march.closed_reach(opened)
 
 
 def random_rays(count: int, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
@@ -214,11 +213,11 @@ def random_rays(count: int, generator: torch.Generator) -> tuple[torch.Tensor, t
 def test_marching_equals_its_twin(device: str, mode: int, contracted: bool) -> None:
     generator = torch.Generator().manual_seed(6)
     n, count, rays = 16, 8, 40
-    grid, blocks = random_cells(n, 0.3, generator)
+    grid, reach = random_cells(n, 0.3, generator)
     origin, direction = random_rays(rays, generator)
     jitter, shift = torch.rand(rays, generator=generator), torch.rand(rays * count, generator=generator)
     s = MarchSettings(n, 0.06, far=50.0, contracted=contracted, mode=mode)
-    on = [x.to(device) for x in (origin, direction, grid, blocks)]
+    on = [x.to(device) for x in (origin, direction, grid, reach)]
     samples = march.sample(*on, s, count, jitter.to(device), shift.to(device))
     depth, delta = samples.depth.cpu(), samples.delta.cpu()
     agreeing = hits = 0
@@ -241,10 +240,10 @@ def test_marching_equals_its_twin(device: str, mode: int, contracted: bool) -> N
 @settings(max_examples=25, deadline=None)
 def test_samples_are_sorted_inside_the_open_interval_and_their_lengths_add_up(seed: int, mode: int, count: int) -> None:
     generator = torch.Generator().manual_seed(seed)
-    grid, blocks = random_cells(16, 0.2, generator)
+    grid, reach = random_cells(16, 0.2, generator)
     origin, direction = random_rays(50, generator)
     s = MarchSettings(16, 0.0625, mode=mode)
-    samples = march.sample(origin, direction, grid, blocks, s, count, torch.rand(50), torch.rand(50 * count))
+    samples = march.sample(origin, direction, grid, reach, s, count, torch.rand(50), torch.rand(50 * count))
     hit = samples.packing.count > 0
     depth, delta = samples.depth.view(-1, count), samples.delta.view(-1, count)
     assert bool((depth.diff(dim=1) >= -1e-5).all())
@@ -259,7 +258,7 @@ def test_samples_are_sorted_inside_the_open_interval_and_their_lengths_add_up(se
 def test_an_empty_grid_gives_no_samples() -> None:
     origin, direction = random_rays(10, torch.Generator().manual_seed(7))
     samples = march.sample(
-        origin, direction, torch.zeros(16**3, 2), torch.zeros(4**3, dtype=torch.uint8), MarchSettings(16, 0.06), 8
+        origin, direction, torch.zeros(16**3, 2), torch.full((4**3,), 8, dtype=torch.uint8), MarchSettings(16, 0.06), 8
     )
     assert len(samples) == 0
     assert bool((samples.packing.count == 0).all())
@@ -270,12 +269,12 @@ def test_interest_and_density_draw_samples() -> None:
     grid = torch.zeros(n, n, n, 2)
     grid[:, :, 4:12, 0] = 0.5
     grid[:, :, 8:10, 1] = 1.0  # an interesting slab
-    blocks = torch.ones((n // 4) ** 3, dtype=torch.uint8)
+    reach = torch.zeros((n // 4) ** 3, dtype=torch.uint8)
     origin, direction = torch.tensor([[-3.0, 0.01, 0.01]]), torch.tensor([[1.0, 0.0, 0.0]])
 
     def share(beta: float) -> float:
         s = MarchSettings(n, 0.125, beta=beta, epsilon=1e-4)
-        samples = march.sample(origin, direction, grid.view(-1, 2).contiguous(), blocks, s, 64)
+        samples = march.sample(origin, direction, grid.view(-1, 2).contiguous(), reach, s, 64)
         x = samples.points[:, 0] * n
         return float(((x >= 8) & (x < 10)).float().mean())
 
@@ -286,11 +285,11 @@ def test_rays_from_outside_start_where_nothing_was_seen_to_be() -> None:
     """A cell in front of a far camera is passed over, the cube never is; twin and kernel agree."""
     n = 32
     grid = torch.full((n**3, 2), 1.0)
-    blocks = torch.ones((n // 4) ** 3, dtype=torch.uint8)
+    reach = torch.zeros((n // 4) ** 3, dtype=torch.uint8)
     origins = torch.tensor([[0.1, -5.0, 0.2], [0.1, -1.5, 0.2], [0.0, 0.5, 0.0]])
     directions = torch.tensor([[0.0, 1.0, 0.0]]).expand(3, 3).contiguous()
     s = MarchSettings(n, 0.125, far=50.0, contracted=True, empty=2.0)
-    found = march.sample(origins, directions, grid, blocks, s, 4, torch.zeros(3))
+    found = march.sample(origins, directions, grid, reach, s, 4, torch.zeros(3))
     assert torch.allclose(found.first, torch.tensor([2.0, 0.4, 0.02]), atol=1e-5)
     for i in range(3):
         bins = march_torch.walk(origins[i], directions[i], 0.0, grid, s)

@@ -1,0 +1,82 @@
+"""The grid that rays walk when a trained field is rendered: the occupancy grid's open cells, cut finer and read anew.
+
+Fewer of its cells are open, and their densities are nearer to what a ray meets, so that a picture needs fewer samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+
+import torch
+
+from ..kernels.march import MarchSettings, closed_reach
+from ..kernels.runtime import run_parallel
+from .occupancy import MOST_OPTICAL_DEPTH, OccupancyGrid
+
+PROBES = 4  # points read in each fine cell
+MOST_CELLS = 1 << 22  # fine cells that are worth reading before a picture
+CHUNK = 1 << 14
+
+
+@dataclass(frozen=True)
+class RenderGrid:
+    """What rays walk: cells (resolution³, 2) and reach as `kernels.march.sample` takes them, and the settings."""
+
+    cells: torch.Tensor
+    reach: torch.Tensor
+    settings: MarchSettings
+
+
+def present_grid(occupancy: OccupancyGrid, per_bin: float) -> RenderGrid:
+    """The occupancy grid as it is."""
+    settings = replace(occupancy.march_settings(), per_bin=per_bin)
+    return RenderGrid(occupancy.cells, occupancy.reach, settings)
+
+
+@torch.no_grad()
+def refined_grid(
+    occupancy: OccupancyGrid,
+    density: Callable[[torch.Tensor], torch.Tensor],
+    factor: int,
+    per_bin: float,
+    check: Callable[[], None] | None = None,
+) -> RenderGrid:
+    """Every open cell cut into factor³, of which those stay open where `density` (points (N, 3) in grid coordinates →
+    (N,), per normalised unit length) is not negligible at one of a few random points; their mean is the density.
+
+    The occupancy grid itself where that would take too long. `check` is called now and then and may raise to stop.
+    """
+    present = present_grid(occupancy, per_bin)
+    coarse = (occupancy.cells[:, 0] > 0).nonzero()[:, 0]
+    if factor == 1 or len(coarse) * factor**3 > MOST_CELLS:
+        return present
+    device, n = coarse.device, occupancy.config.resolution
+    axis = torch.arange(factor, device=device)
+    part = torch.cartesian_prod(axis, axis, axis)
+    corner = torch.stack([coarse % n, coarse // n % n, coarse // (n * n)], 1)
+    fine = (corner[:, None] * factor + part).view(-1, 3)
+    generator = torch.Generator(device).manual_seed(0)  # the same picture every time
+    side = n * factor
+    largest, mean = (torch.zeros(len(fine), device=device) for _ in range(2))
+
+    @torch.no_grad()
+    def read(points: torch.Tensor) -> torch.Tensor:
+        return density(points)
+
+    for _ in range(PROBES):
+        if check is not None:
+            check()
+        points = (fine + torch.rand(fine.shape, device=device, generator=generator)) / side
+        found = torch.cat(run_parallel([partial(read, some) for some in points.split(CHUNK)]))
+        mean += found / PROBES
+        torch.maximum(largest, found, out=largest)
+    step = present.settings.step / factor
+    row = (fine[:, 2] * side + fine[:, 1]) * side + fine[:, 0]
+    opened = largest * step > occupancy.config.threshold
+    cells = torch.zeros(side**3, 2, device=device)
+    cells[row, 0] = torch.where(opened, mean.clamp(1e-3, MOST_OPTICAL_DEPTH / step), 0.0)
+    cells[row, 1] = occupancy.interest[coarse].repeat_interleave(factor**3)
+    settings = replace(present.settings, resolution=side, step=step)
+    return RenderGrid(cells, closed_reach((cells[:, 0] > 0).view(side, side, side)), settings)

@@ -1,0 +1,93 @@
+"""The grid that finished fields are rendered with, and how many samples its rays get."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from fieldwork.nerfcore.config import SamplingConfig
+from fieldwork.nerfcore.kernels.march import LEAST, closed_reach, sample, sample_counts
+from fieldwork.nerfcore.sampling import render_grid
+from fieldwork.nerfcore.sampling.occupancy import OccupancyGrid
+from fieldwork.nerfcore.sampling.render_grid import present_grid, refined_grid
+
+N = 32
+THICK = 0.02
+
+
+def shell(points: torch.Tensor) -> torch.Tensor:
+    """Density of a thin sphere around the middle of the grid."""
+    away = (points * 2 - 1).norm(dim=1) - 0.5
+    return torch.where(away.abs() < THICK, 200.0, 0.0)
+
+
+def shell_grid() -> OccupancyGrid:
+    grid = OccupancyGrid(SamplingConfig(resolution=N), contracted=False)
+    cell = torch.arange(N**3)
+    middle = (torch.stack([cell % N, cell // N % N, cell // N**2], 1) + 0.5) / N
+    near = ((middle * 2 - 1).norm(dim=1) - 0.5).abs() < 2 / N
+    grid.density.copy_(torch.where(near, 200.0, 0.0))
+    grid.mean.copy_(grid.density)
+    grid.rebuild()
+    return grid
+
+
+def parallel_rays() -> tuple[torch.Tensor, torch.Tensor]:
+    side = torch.linspace(-0.6, 0.6, 25)
+    x, y = torch.meshgrid(side, side, indexing="ij")
+    origins = torch.stack([x, y, torch.full_like(x, -2)], -1).view(-1, 3)
+    return origins, torch.tensor([[0.0, 0.0, 1.0]]).expand(len(origins), 3).contiguous()
+
+
+def test_the_refined_grid_closes_what_is_empty_and_keeps_every_surface() -> None:
+    coarse = shell_grid()
+    fine = refined_grid(coarse, shell, 2, 1.0)
+    assert fine.settings.resolution == 2 * N
+    assert fine.settings.step == pytest.approx(coarse.step / 2)
+    opened = fine.cells[:, 0] > 0
+    assert float(opened.float().mean()) < 0.6 * coarse.open_share()
+    points = torch.nn.functional.normalize(torch.randn(2000, 3, generator=torch.Generator().manual_seed(1)), dim=1) / 4
+    x, y, z = ((points + 0.5) * 2 * N).long().unbind(1)
+    assert float(opened[(z * 2 * N + y) * 2 * N + x].float().mean()) > 0.9
+    origins, directions = parallel_rays()
+    found = sample(origins, directions, fine.cells, fine.reach, fine.settings, 16)
+    met = found.packing.count > 0
+    inside = origins[:, :2].norm(dim=1)
+    assert bool(met[inside < 0.5].all())
+    assert not bool(met[inside > 0.5 + 3 / N].any())
+    # The first surface is at −√(¼ − r²), where half of the samples of the middle ray lie.
+    middle = len(origins) // 2
+    begin, count = int(found.packing.start[middle]), int(found.packing.count[middle])
+    assert float((found.depth[begin : begin + count] - 1.5).abs().min()) < THICK
+
+
+def test_the_refined_grid_is_the_present_one_where_it_would_take_too_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    coarse = shell_grid()
+    monkeypatch.setattr(render_grid, "MOST_CELLS", 100)
+    assert refined_grid(coarse, shell, 2, 1.0).cells is coarse.cells
+    assert refined_grid(coarse, shell, 1, 1.0).settings.resolution == N
+
+
+def test_rays_through_more_open_cells_get_more_samples() -> None:
+    bins = torch.tensor([0, 1, 3, 10, 100])
+    assert sample_counts(bins, 32, 1.5).tolist() == [0, LEAST, 5, 15, 32]
+    assert sample_counts(bins, 2, 1.5).tolist() == [0, 2, 2, 2, 2]
+    assert sample_counts(bins, 32, 0.0).tolist() == [0, 32, 32, 32, 32]
+    grid = shell_grid()
+    origins, directions = parallel_rays()
+    few, all_of_them = (
+        sample(origins, directions, g.cells, g.reach, g.settings, 32)
+        for g in (present_grid(grid, 0.5), present_grid(grid, 0.0))
+    )
+    assert len(few) < len(all_of_them)
+    assert bool(((few.packing.count > 0) == (all_of_them.packing.count > 0)).all())
+    # However few they are, a ray's samples stand for all of its open length.
+    lengths = [torch.zeros(len(origins)).index_add_(0, s.packing.ray.long(), s.delta) for s in (few, all_of_them)]
+    assert torch.allclose(*lengths, atol=1e-4)
+
+
+def test_closed_reach_counts_closed_blocks_in_all_directions() -> None:
+    opened = torch.zeros(64, 64, 64, dtype=torch.bool)
+    opened[0, 0, 0] = True
+    reach = closed_reach(opened).view(16, 16, 16)
+    for z, y, x in ((0, 0, 0), (0, 0, 1), (3, 2, 1), (7, 7, 0), (15, 15, 15)):
+        assert int(reach[z, y, x]) == min(max(z, y, x), 8)

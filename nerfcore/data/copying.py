@@ -28,8 +28,12 @@ def copy_photo(source: Path, folder: Path, name: str) -> Path:
     """
     suffix = source.suffix.lower()
     if suffix in PLAIN_SUFFIXES:
-        with Image.open(source) as image:
-            plain = image.mode in PLAIN_MODES and image.getexif().get(0x0112, 1) in (0, 1)
+        try:
+            with Image.open(source) as image:
+                plain = image.mode in PLAIN_MODES and image.getexif().get(0x0112, 1) in (0, 1)
+                image.load()  # headers of truncated files are whole
+        except OSError as error:
+            raise InputError(f"The photo {source} cannot be used: {error}.", "Replace or remove it.") from error
         if plain:
             return copy_file(source, folder, name)
     target = folder / f"{name}.png"

@@ -267,6 +267,8 @@ def test_full_disk(tmp_path: Path) -> None:
     try:
         with pytest.raises(DiskError, match="No space left"):
             new(photos, disk / "p")
+        subprocess.run(["mount", "-o", "remount,size=10m", str(disk)], check=True)
+        assert new(photos, disk / "p")["images"] == 8
     finally:
         subprocess.run(["umount", str(disk)], check=True)
 

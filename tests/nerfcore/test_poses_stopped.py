@@ -57,7 +57,9 @@ def test_cancel_is_prompt_and_work_is_kept(shared_data: Data, tmp_path: Path, st
     assert poses(project)["registered"] == 11
 
 
-@pytest.mark.parametrize("stage", ["Finding features", "Matching features", "Placing cameras", "Final adjustment"])
+@pytest.mark.parametrize(
+    "stage", ["Finding features", "Matching features", "Placing cameras", "Checking poses", "Final adjustment"]
+)
 def test_killed_in_each_stage_then_run_again(
     shared_data: Data, tmp_path: Path, stage: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

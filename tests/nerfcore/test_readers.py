@@ -10,6 +10,7 @@ import json
 import shutil
 import subprocess
 import sys
+import time
 import zlib  # noqa: F401  (before pycolmap)
 from collections.abc import Callable
 from dataclasses import replace
@@ -323,6 +324,77 @@ def test_damaged_files_are_named(
         read_dataset(folder, format)
     assert len(str(caught.value)) > 20
     assert not isinstance(caught.value, AssertionError)
+
+
+def test_truncated_photo_is_named(truth: tuple[list[DatasetView], Matches], tmp_path: Path) -> None:
+    """Its header is whole: reading the data set finds nothing wrong."""
+    write_transforms(truth[0], tmp_path, "instant-ngp")
+    path = tmp_path / "images" / truth[0][2].image.name
+    whole = path.read_bytes()
+    path.unlink()
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match=rf"{path.name} cannot be used.*truncated"):
+        import_dataset(ImportParams(dataset=tmp_path, project=tmp_path / "p"), Reporter())
+    path.write_bytes(whole)
+    assert import_dataset(ImportParams(dataset=tmp_path, project=tmp_path / "p"), Reporter())["images"] == 6
+
+
+def test_import_killed_and_run_again(shared_data: Data, tmp_path: Path) -> None:
+    dataset, project = shared_data("lego_400"), tmp_path / "p"
+    code = (
+        "from pathlib import Path; from fieldwork.nerfcore.data.importer import import_dataset\n"
+        "from fieldwork.nerfcore.params import ImportParams; from fieldwork.nerfcore.progress import Reporter\n"
+        f"import_dataset(ImportParams(dataset=Path({str(dataset)!r}), project=Path({str(project)!r})), Reporter())\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code])
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline and len(list(project.glob("images/*.png"))) < 5:
+        time.sleep(0.005)
+    process.kill()
+    process.wait()
+    assert list(project.glob("images/*.png"))
+    assert not (project / "project.json").exists()
+    assert import_dataset(ImportParams(dataset=dataset, project=project), Reporter())["images"] == 140
+    for view in load_scene(project).views:
+        with Image.open(view.image) as image:
+            image.load()
+
+
+def test_nerfstudio_masks_depth_and_lenses_of_their_own(tmp_path: Path) -> None:
+    """Each frame has its own size and lens, a mask and a depth map in millimetres."""
+    folder = tmp_path / "set"
+    (folder / "images").mkdir(parents=True)
+    frames = []
+    for i, (width, height) in enumerate([(90, 60), (60, 90), (80, 80)]):
+        pixels = np.random.default_rng(i).integers(0, 255, (height, width, 3), np.uint8)
+        Image.fromarray(pixels).save(folder / "images" / f"{i}.png")
+        Image.fromarray(np.pad(np.full((height - 20, width), 255, np.uint8), ((20, 0), (0, 0)))).save(
+            folder / f"mask_{i}.png"
+        )
+        Image.fromarray(np.full((height, width), 1500 + i, np.uint16)).save(folder / f"depth_{i}.png")
+        pose = np.eye(4)
+        pose[0, 3] = i
+        frames.append(
+            {
+                "file_path": f"images/{i}.png", "mask_path": f"mask_{i}.png", "depth_file_path": f"depth_{i}.png",
+                "transform_matrix": pose.tolist(), "w": width, "h": height, "fl_x": 70 + i, "fl_y": 71 + i,
+                "cx": width / 2 + i, "cy": height / 2, "k1": 0.01 * i,
+            }
+        )  # fmt: skip
+    (folder / "transforms.json").write_text(json.dumps({"camera_model": "OPENCV", "frames": frames}))
+    import_dataset(ImportParams(dataset=folder, project=tmp_path / "p"), Reporter())
+    scene = load_scene(tmp_path / "p")
+    for i, view in enumerate(scene.views):
+        camera = view.camera
+        size = frames[i]["w"], frames[i]["h"]
+        assert (camera.width, camera.height, camera.fx, camera.fy) == (*size, 70 + i, 71 + i)
+        assert camera.cx == pytest.approx(size[0] / 2 + i)
+        assert (camera.distortion[0] if camera.distortion else 0) == pytest.approx(0.01 * i)
+        with Image.open(view.mask) as mask:
+            assert mask.size == size
+            assert np.asarray(mask)[:20].max() == 0 < np.asarray(mask)[20:].min()
+        depth = oiio.ImageBuf(str(view.depth)).get_pixels(oiio.FLOAT)
+        assert depth == pytest.approx(1.5 + i / 1000)
 
 
 def test_missing_photos_are_counted(truth: tuple[list[DatasetView], Matches], tmp_path: Path) -> None:

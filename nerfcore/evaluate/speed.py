@@ -54,6 +54,7 @@ def measure_speed(
     draws its samples there too); `spr` is the number of field samples per ray; `fused` says which kernels rendered.
     """
     model, device = trained.model, trained.device
+    model.refine(check=report.check)
     report.stage(f"Measuring speed at {side}×{side}")
     frame = _device_frame if device.type == "cuda" else _host_frame
     chosen = indices[: poses or (5 if device.type == "cuda" else 1)]

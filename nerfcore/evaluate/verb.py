@@ -43,7 +43,10 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
     indices = scene.test if params.split == "test" else scene.train
     if not indices:
         raise InputError(f"{folder} has no held-out images.", "Captures of 8 or more photos hold every 8th one out.")
-    trained.model.refine(report.check)
+    # Views larger than the training images are compared at the training size.
+    sizes = [training_size(scene.views[index].camera, trained.info.image_size) for index in indices]
+    report.stage("Preparing")
+    trained.model.refine(sum(width * height for width, height in sizes), report.check)
     box = trained.info.box(project)
     background = background_of(trained.info)
     out = run_folder(folder, params.run) / "evaluation"
@@ -58,8 +61,7 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
         view = scene.views[index]
         report.progress(number / len(indices), view.name)
         pose = box_poses([view], box.box_from_world)[0]
-        # Views larger than the training images are compared at the training size.
-        camera = view.camera.resized(*training_size(view.camera, trained.info.image_size))
+        camera = view.camera.resized(*sizes[number])
         photo, keep, label = _truth(view, scene, camera.width, camera.height, background)
         given: dict[str, float] = {}
         if view.name in refined:

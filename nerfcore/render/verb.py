@@ -41,9 +41,12 @@ def render(params: RenderParams, report: Reporter) -> dict[str, Any]:
     folder, out = Path(params.project), Path(params.out)
     project, scene = load_project(folder), load_scene(folder)
     trained = load_trained(folder, params.run)
-    trained.model.refine(report.check)
     box = trained.info.box(project)
     cameras = chosen_cameras(params, scene)
+    if params.size is not None:
+        cameras = [(name, camera.resized(*params.size), pose) for name, camera, pose in cameras]
+    report.stage("Preparing")
+    trained.model.refine(sum(camera.width * camera.height for _, camera, _ in cameras), report.check)
     with disk_errors(out):
         out.mkdir(parents=True, exist_ok=True)
     colors = {c.id: c.color for c in scene.classes}
@@ -51,8 +54,6 @@ def render(params: RenderParams, report: Reporter) -> dict[str, Any]:
     report.stage("Rendering")
     for number, (name, camera, pose) in enumerate(cameras):
         report.progress(number / len(cameras), name)
-        if params.size is not None:
-            camera = camera.resized(*params.size)
         view = View(name, camera, pose, Path())
         begin = time.perf_counter()
         frame = render_view(

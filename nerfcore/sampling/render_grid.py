@@ -16,7 +16,7 @@ from ..kernels.runtime import run_parallel
 from .occupancy import MOST_OPTICAL_DEPTH, OccupancyGrid
 
 PROBES = 4  # points read in each fine cell
-MOST_CELLS = 1 << 22  # fine cells that are worth reading before a picture
+SAVED = 8  # samples that a pixel needs less with it
 CHUNK = 1 << 14
 
 
@@ -41,16 +41,18 @@ def refined_grid(
     density: Callable[[torch.Tensor], torch.Tensor],
     factor: int,
     per_bin: float,
+    pixels: float,
     check: Callable[[], None] | None = None,
 ) -> RenderGrid:
     """Every open cell cut into factor³, of which those stay open where `density` (points (N, 3) in grid coordinates →
     (N,), per normalised unit length) is not negligible at one of a few random points; their mean is the density.
 
-    The occupancy grid itself where that would take too long. `check` is called now and then and may raise to stop.
+    The occupancy grid itself where reading the cells takes longer than it saves in rendering so many `pixels`.
+    `check` is called now and then and may raise to stop.
     """
     present = present_grid(occupancy, per_bin)
     coarse = (occupancy.cells[:, 0] > 0).nonzero()[:, 0]
-    if factor == 1 or len(coarse) * factor**3 > MOST_CELLS:
+    if factor == 1 or len(coarse) * factor**3 * PROBES > pixels * SAVED:
         return present
     device, n = coarse.device, occupancy.config.resolution
     axis = torch.arange(factor, device=device)

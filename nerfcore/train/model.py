@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -95,11 +96,12 @@ class Model(nn.Module):
         flat = bool((self.priorities == self.priorities[0]).all())
         return s.beta > 0 and (s.interest == "boundary" or (s.interest == "priority" and not flat))
 
-    def refine(self, check: Callable[[], None] | None = None) -> None:
-        """Render from now on with a finer grid, which training leaves behind: for fields that are finished."""
+    def refine(self, pixels: float = math.inf, check: Callable[[], None] | None = None) -> None:
+        """Render from now on with a finer grid if it pays for so many pixels. Training leaves it behind: for fields that
+        are finished."""
         if self._refined is None:
             c = self.config.render
-            self._refined = refined_grid(self.occupancy, self.field.density, c.refine, c.per_bin, check)
+            self._refined = refined_grid(self.occupancy, self.field.density, c.refine, c.per_bin, pixels, check)
 
     def render_grid(self) -> RenderGrid:
         """What the rays of a picture walk."""

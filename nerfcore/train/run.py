@@ -62,6 +62,8 @@ def settled_as(asked: RunConfig, settled: RunConfig) -> RunConfig:
     config = asked.model_copy(deep=True)
     if config.scene.image_size is None:
         config.scene.image_size = settled.scene.image_size
+    if config.scene.background == "auto":
+        config.scene.background = settled.scene.background
     if config.field.finest is None:
         config.field.finest = settled.field.finest
     return config

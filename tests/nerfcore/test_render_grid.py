@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from fieldwork.nerfcore.config import SamplingConfig
 from fieldwork.nerfcore.kernels.march import LEAST, closed_reach, sample, sample_counts
-from fieldwork.nerfcore.sampling import render_grid
 from fieldwork.nerfcore.sampling.occupancy import OccupancyGrid
-from fieldwork.nerfcore.sampling.render_grid import present_grid, refined_grid
+from fieldwork.nerfcore.sampling.render_grid import PROBES, SAVED, present_grid, refined_grid
 
 N = 32
 THICK = 0.02
@@ -40,7 +41,7 @@ def parallel_rays() -> tuple[torch.Tensor, torch.Tensor]:
 
 def test_the_refined_grid_closes_what_is_empty_and_keeps_every_surface() -> None:
     coarse = shell_grid()
-    fine = refined_grid(coarse, shell, 2, 1.0)
+    fine = refined_grid(coarse, shell, 2, 1.0, math.inf)
     assert fine.settings.resolution == 2 * N
     assert fine.settings.step == pytest.approx(coarse.step / 2)
     opened = fine.cells[:, 0] > 0
@@ -60,11 +61,13 @@ def test_the_refined_grid_closes_what_is_empty_and_keeps_every_surface() -> None
     assert float((found.depth[begin : begin + count] - 1.5).abs().min()) < THICK
 
 
-def test_the_refined_grid_is_the_present_one_where_it_would_take_too_long(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_refined_grid_is_the_present_one_where_it_does_not_pay() -> None:
     coarse = shell_grid()
-    monkeypatch.setattr(render_grid, "MOST_CELLS", 100)
-    assert refined_grid(coarse, shell, 2, 1.0).cells is coarse.cells
-    assert refined_grid(coarse, shell, 1, 1.0).settings.resolution == N
+    cells = int((coarse.cells[:, 0] > 0).sum())
+    pays = cells * 2**3 * PROBES / SAVED
+    assert refined_grid(coarse, shell, 2, 1.0, 0.9 * pays).cells is coarse.cells
+    assert refined_grid(coarse, shell, 2, 1.0, 1.1 * pays).settings.resolution == 2 * N
+    assert refined_grid(coarse, shell, 1, 1.0, math.inf).settings.resolution == N
 
 
 def test_rays_through_more_open_cells_get_more_samples() -> None:

@@ -43,6 +43,8 @@ ABLATION = {
     "literal pdf": {"sampling.pdf": "literal"},
     "no semantics": {"loss.semantic_weight": "0"},
 }
+# Pictures of all variants take the same number of samples on every ray.
+EQUAL_SAMPLES = {"ablation": {"render.per_bin": "0"}}
 # Of these, figures at equal time stand beside those at equal steps.
 TIMED = ("hybrid", "explicit", "implicit", "semantic pdf", "uniform pdf", "literal pdf")
 
@@ -100,7 +102,7 @@ def plan(params: BenchParams, scenes: list[str]) -> list[Job]:
     jobs = []
     for scene in map(scene_name, scenes):
         for name in wanted:
-            settings = {**params.set, **found[name]}  # a variant is what its name says
+            settings = {**EQUAL_SAMPLES.get(suite, {}), **params.set, **found[name]}  # a variant is what its name says
             sides = SIDES.get(suite, (COUNTING_SIDE,))
             if steps is not None:
                 jobs.append(Job(scene, name, settings, steps=steps, preset=params.preset, sides=sides))

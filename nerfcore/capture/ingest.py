@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,36 +16,23 @@ import numpy as np
 from PIL import Image
 
 from ..data.classes import make_classes, read_classes
-from ..data.dataset import beside, unique_names
 from ..errors import InputError, ProjectError
-from ..files import atomic_path, require_readable, write_json
+from ..files import atomic_path, write_json
 from ..params import NewParams
 from ..progress import Reporter, shortened
 from ..project import PROJECT_FILE, ImageRecord, Project, create_folder, load_project, save_project
-from .images import FLOAT_SUFFIXES, PHOTO_SUFFIXES, float_exposure, read_photo
+from .find import Source, classes_beside, find_sources, list_photos, subfolder
+from .images import FLOAT_SUFFIXES, float_exposure, read_photo
 from .labels import Colors, fit_to_photo, read_labels, read_mask
 from .select import reject_blurred, reject_duplicates
 from .sharpness import sharpness, thumbnail
-from .soft_labels import find_confidence, find_probabilities, read_confidence
+from .soft_labels import read_confidence
 from .video import VIDEO_SUFFIXES, extract_frames
 
 CACHE_FILE = "jobs/ingested.json"
 FRAMES_FOLDER = "frames"
-# Files that lie beside photos and are none.
-SIDECARS = {".json", ".txt", ".md", ".xmp", ".aae", ".csv", ".npy", ".npz", ".db", ".ini", ".xml", ".thm", ".log", ""}
 MAX_ASPECT = 3.0
 SPHERE_WIDTH = 5000
-
-
-@dataclass(frozen=True)
-class Source:
-    """One candidate photo with the label and mask found for it."""
-
-    name: str
-    path: Path
-    label: Path | None
-    mask: Path | None
-    confidence: Path | None
 
 
 @dataclass(frozen=True)
@@ -75,7 +62,7 @@ def new(params: NewParams, report: Reporter) -> dict[str, Any]:
     folder, photos = Path(params.project), Path(params.photos)
     previous = _previous_project(params)
     names, ignore_id, colors = {}, 0, {}
-    classes_file = params.classes or _beside_labels(params.labels)
+    classes_file = params.classes or classes_beside(params.labels)
     if classes_file:
         names, ignore_id, colors = read_classes(classes_file)
     create_folder(folder)
@@ -87,10 +74,10 @@ def new(params: NewParams, report: Reporter) -> dict[str, Any]:
         root = folder / FRAMES_FOLDER
     else:
         paths, skipped, root = list_photos(photos, exclude=[params.labels, params.masks])
-    labels_folder = params.labels or _folder_in(photos, "labels")
-    masks_folder = params.masks or _folder_in(photos, "masks")
+    labels_folder = params.labels or subfolder(photos, "labels")
+    masks_folder = params.masks or subfolder(photos, "masks")
     kept = [record for record in previous.images if record.file] if previous and params.add else []
-    sources = _sources(paths, root, labels_folder, masks_folder, {record.name for record in kept})
+    sources = find_sources(paths, root, labels_folder, masks_folder, {record.name for record in kept})
     floats = [path for path in paths if path.suffix.lower() in FLOAT_SUFFIXES]
     settings = Settings(folder, params.max_size, float_exposure(floats), colors or None, ignore_id)
 
@@ -126,47 +113,6 @@ def new(params: NewParams, report: Reporter) -> dict[str, Any]:
     return result
 
 
-def list_photos(folder: Path, exclude: Iterable[Path | None] = ()) -> tuple[list[Path], list[dict[str, str]], Path]:
-    """Photos below `folder` (subfolders are cameras of one capture), files skipped with reasons, and the root.
-
-    Raises:
-        InputError: the folder is missing, unreadable or has no photos.
-    """
-    if not folder.exists():
-        raise InputError(f"{folder} does not exist.", "Choose a folder of photos or a video file.")
-    if folder.is_file():
-        raise InputError(f"{folder} is neither a folder of photos nor a video that Fieldwork reads.", "Choose another.")
-    require_readable(folder)
-    root = folder / "images" if (folder / "images").is_dir() else folder
-    skip_folders = {Path(p).resolve() for p in exclude if p} | {
-        (folder / name).resolve() for name in ("labels", "masks", "depth")
-    }
-    photos, skipped = [], []
-    problems: list[OSError] = []
-    for place, folders, files in os.walk(root, onerror=problems.append):
-        here = Path(place)
-        folders[:] = sorted(f for f in folders if not f.startswith(".") and (here / f).resolve() not in skip_folders)
-        for name in sorted(files):
-            suffix = Path(name).suffix.lower()
-            if name.startswith(".") or suffix in SIDECARS:
-                continue
-            if suffix in PHOTO_SUFFIXES:
-                photos.append(here / name)
-            elif suffix in VIDEO_SUFFIXES:
-                skipped.append({"file": name, "reason": "a video among photos: give it alone as --photos"})
-            else:
-                skipped.append({"file": name, "reason": f"{suffix} is not a photo format that Fieldwork reads"})
-    for problem in problems:
-        if Path(str(problem.filename)) == root:
-            raise InputError(f"{root} cannot be read: {problem.strerror}.", "Check its permissions.")
-        skipped.append({"file": str(problem.filename), "reason": f"folder cannot be read: {problem.strerror}"})
-    if not photos:
-        raise InputError(
-            f"There are no photos in {folder}.", "Choose a folder with JPEG, PNG, TIFF, HEIC or raw files."
-        )
-    return photos, skipped, root
-
-
 def file_hash(path: Path) -> str:
     """SHA-256 of a file, in hex."""
     with open(path, "rb") as file:
@@ -196,38 +142,6 @@ def _remove_halves(folder: Path) -> None:
     for name in ("images", "labels", "masks", "confidence"):
         for path in (folder / name).glob(".*"):
             path.unlink(missing_ok=True)
-
-
-def _beside_labels(labels: Path | None) -> Path | None:
-    """classes.json in the labels folder or next to it, when none is given."""
-    if labels is None:
-        return None
-    return next((p for p in (labels / "classes.json", labels.parent / "classes.json") if p.is_file()), None)
-
-
-def _folder_in(photos: Path, name: str) -> Path | None:
-    return photos / name if (photos / name).is_dir() else None
-
-
-def _sources(paths: list[Path], root: Path, labels: Path | None, masks: Path | None, taken: set[str]) -> list[Source]:
-    for folder, what in ((labels, "labels"), (masks, "masks")):
-        if folder is not None and not folder.is_dir():
-            raise InputError(f"The {what} folder {folder} does not exist.", f"Choose the folder that holds the {what}.")
-    names = unique_names(paths, root)
-    sources = []
-    for path, name in zip(paths, names):
-        unique = name
-        while unique in taken:
-            unique += "_b"
-        taken.add(unique)
-        label = confidence = None
-        if labels:
-            soft = find_probabilities(labels, name) or find_probabilities(labels, path.stem)
-            label = soft or beside(labels, name, False) or beside(labels, path.stem, False)
-            confidence = find_confidence(labels, name, label) or find_confidence(labels, path.stem, label)
-        mask = (beside(masks, name, False) or beside(masks, path.stem, False)) if masks else None
-        sources.append(Source(unique, path, label, mask, confidence))
-    return sources
 
 
 def _ingest_all(
@@ -289,7 +203,7 @@ def _ingest_cached(
 ) -> tuple[Source, ImageRecord, np.ndarray | None]:
     if entry and entry.get("key") == json.loads(json.dumps(_cache_key(source, settings))):
         record = ImageRecord.model_validate(entry["record"])
-        files = [file for file in (record.file, record.label, record.mask) if file]
+        files = [file for file in (record.file, record.label, record.mask, record.confidence) if file]
         if all((settings.folder / file).is_file() for file in files):
             small = entry.get("thumbnail")
             picture = (

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 from fieldwork.nerfcore.capture import ingest
+from fieldwork.nerfcore.capture.find import list_photos
 from fieldwork.nerfcore.capture.images import read_photo
 from fieldwork.nerfcore.errors import Cancelled, DiskError, InputError, ProjectError
 from fieldwork.nerfcore.params import NewParams
@@ -133,7 +134,7 @@ def test_unreadable_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
 
     monkeypatch.setattr(os, "scandir", refuse)
     with pytest.raises(InputError, match=r"cannot be read: Permission denied"):
-        ingest.list_photos(photos)
+        list_photos(photos)
 
 
 @pytest.mark.parametrize("verb", ["new", "import"])

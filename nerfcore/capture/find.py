@@ -1,0 +1,110 @@
+"""Which files a capture consists of: photos, and the label maps, masks and classes that belong to them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..data.dataset import beside, unique_names
+from ..errors import InputError
+from ..files import require_readable
+from .images import PHOTO_SUFFIXES
+from .soft_labels import find_confidence, find_probabilities
+from .video import VIDEO_SUFFIXES
+
+# Files that lie beside photos and are none.
+SIDECARS = {".json", ".txt", ".md", ".xmp", ".aae", ".csv", ".npy", ".npz", ".db", ".ini", ".xml", ".thm", ".log", ""}
+
+
+@dataclass(frozen=True)
+class Source:
+    """One candidate photo with the label and mask found for it."""
+
+    name: str
+    path: Path
+    label: Path | None
+    mask: Path | None
+    confidence: Path | None
+
+
+def list_photos(folder: Path, exclude: Iterable[Path | None] = ()) -> tuple[list[Path], list[dict[str, str]], Path]:
+    """Photos below `folder` (subfolders are cameras of one capture), files skipped with reasons, and the root.
+
+    Raises:
+        InputError: the folder is missing, unreadable or has no photos.
+    """
+    if not folder.exists():
+        raise InputError(f"{folder} does not exist.", "Choose a folder of photos or a video file.")
+    if folder.is_file():
+        raise InputError(f"{folder} is neither a folder of photos nor a video that Fieldwork reads.", "Choose another.")
+    require_readable(folder)
+    root = folder / "images" if (folder / "images").is_dir() else folder
+    skip_folders = {Path(p).resolve() for p in exclude if p} | {
+        (folder / name).resolve() for name in ("labels", "masks", "depth")
+    }
+    photos, skipped = [], []
+    problems: list[OSError] = []
+    for place, folders, files in os.walk(root, onerror=problems.append):
+        here = Path(place)
+        folders[:] = sorted(f for f in folders if not f.startswith(".") and (here / f).resolve() not in skip_folders)
+        for name in sorted(files):
+            suffix = Path(name).suffix.lower()
+            if name.startswith(".") or suffix in SIDECARS:
+                continue
+            if suffix in PHOTO_SUFFIXES:
+                photos.append(here / name)
+            elif suffix in VIDEO_SUFFIXES:
+                skipped.append({"file": name, "reason": "a video among photos: give it alone as --photos"})
+            else:
+                skipped.append({"file": name, "reason": f"{suffix} is not a photo format that Fieldwork reads"})
+    for problem in problems:
+        if Path(str(problem.filename)) == root:
+            raise InputError(f"{root} cannot be read: {problem.strerror}.", "Check its permissions.")
+        skipped.append({"file": str(problem.filename), "reason": f"folder cannot be read: {problem.strerror}"})
+    if not photos:
+        raise InputError(
+            f"There are no photos in {folder}.", "Choose a folder with JPEG, PNG, TIFF, HEIC or raw files."
+        )
+    return photos, skipped, root
+
+
+def classes_beside(labels: Path | None) -> Path | None:
+    """classes.json in the labels folder or next to it, when none is given."""
+    if labels is None:
+        return None
+    return next((p for p in (labels / "classes.json", labels.parent / "classes.json") if p.is_file()), None)
+
+
+def subfolder(photos: Path, name: str) -> Path | None:
+    """A folder of that name in the folder of photos, if there is one."""
+    return photos / name if (photos / name).is_dir() else None
+
+
+def find_sources(
+    paths: list[Path], root: Path, labels: Path | None, masks: Path | None, taken: set[str]
+) -> list[Source]:
+    """Photos below `root` with names of their own, not among `taken`, and their labels and masks.
+
+    Raises:
+        InputError: the folder of labels or of masks does not exist.
+    """
+    for folder, what in ((labels, "labels"), (masks, "masks")):
+        if folder is not None and not folder.is_dir():
+            raise InputError(f"The {what} folder {folder} does not exist.", f"Choose the folder that holds the {what}.")
+    names = unique_names(paths, root)
+    sources = []
+    for path, name in zip(paths, names):
+        unique = name
+        while unique in taken:
+            unique += "_b"
+        taken.add(unique)
+        label = confidence = None
+        if labels:
+            soft = find_probabilities(labels, name) or find_probabilities(labels, path.stem)
+            label = soft or beside(labels, name, False) or beside(labels, path.stem, False)
+            confidence = find_confidence(labels, name, label) or find_confidence(labels, path.stem, label)
+        mask = (beside(masks, name, False) or beside(masks, path.stem, False)) if masks else None
+        sources.append(Source(unique, path, label, mask, confidence))
+    return sources

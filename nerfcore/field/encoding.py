@@ -10,13 +10,14 @@ def frequency_encoding(points: torch.Tensor, octaves: int) -> torch.Tensor:
 
     Source: Mildenhall et al., "NeRF", 2020, eq. 4. Higher octaves follow from the first by the double-angle formulas.
     """
-    centered = points * 2 - 1
+    # One row per coordinate: whole rows are written at once, columns would be written number by number.
+    centered = (points * 2 - 1).t().contiguous()
     sine, cosine = torch.sin(torch.pi * centered), torch.cos(torch.pi * centered)
     parts = [centered, sine, cosine]
     for _ in range(octaves - 1):
         sine, cosine = 2 * sine * cosine, 1 - 2 * sine * sine
         parts += [sine, cosine]
-    return torch.cat(parts, -1)
+    return torch.cat(parts).t()
 
 
 def spherical_harmonics(directions: torch.Tensor) -> torch.Tensor:

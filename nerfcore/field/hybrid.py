@@ -124,7 +124,7 @@ class HybridField(nn.Module):
             if self.config.fusion == "concat":
                 hidden = torch.cat([w * explicit, (1 - w) * implicit], 1)
             else:
-                hidden = w * explicit + (1 - w) * implicit
+                hidden = torch.lerp(implicit.to(explicit.dtype), explicit, w)
         out = self.density_head(hidden, self.dtype)
         density = _TruncatedExp.apply(out[:, 0].float() + self.config.density_shift)
         return Geometry(density, out, implicit, explicit)  # type: ignore[arg-type]

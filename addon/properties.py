@@ -204,6 +204,7 @@ class FieldworkScene(PropertyGroup):
             ("camera", "Scene Camera", "The active camera of the scene at the current frame"),
             ("animation", "Animation", "The active camera of the scene over its frame range"),
             ("photos", "Held-Out Photos", "The photos that training did not see"),
+            ("all", "All Photos", "Every photo, also those of training"),
             ("orbit", "Orbit", "Once around the scene"),
         ],
     )

@@ -12,9 +12,12 @@ from typing import Any
 
 import bpy
 
+from . import preferences
+
 PROJECT_FILE = "project.json"
 POSES_FILE = "poses/poses.json"
 POSES_REPORT = "poses/report.json"
+TIMES_FILE = "training_times.json"  # of the machine: seconds by preset
 
 _loading = False
 _changed_classes: dict[str, list[dict[str, Any]]] = {}  # project folder → classes to be written
@@ -216,11 +219,21 @@ def quality(folder: Path | None, run: str) -> str:
 
 
 def time_estimate(folder: Path | None, settings: Any) -> float | None:
-    """Seconds that training with this preset took here the last time; None when that says nothing."""
+    """Seconds that training with this preset took the last time, in this project or else on this machine; None when
+    that says nothing."""
     if settings.time_limit > 0 or settings.steps > 0:
         return None
     for step in reversed((cached_project(folder) or {}).get("provenance", [])):
         same = step.get("verb") == "train" and step.get("settings", {}).get("preset") == settings.preset
         if same and not step["settings"].get("time_limit") and not step["settings"].get("steps"):
             return step.get("result", {}).get("seconds")
-    return None
+    times = cached_json(preferences.user_folder() / TIMES_FILE)
+    return times.get(settings.preset) if isinstance(times, dict) else None
+
+
+def remember_time(preset: str, seconds: float) -> None:
+    """Note how long a whole training with a preset took on this machine."""
+    from ..nerfcore.files import write_json  # not at the top: enabling the extension must be quick
+
+    path = preferences.user_folder() / TIMES_FILE
+    write_json(path, {**(read_json(path) or {}), preset: seconds})

@@ -34,6 +34,9 @@ LIBRARIES = [
     ("trimesh", "trimesh", "trimesh"),
     ("xatlas", "xatlas", "xatlas"),
     ("safetensors", "safetensors", "safetensors"),
+    ("rawpy", "rawpy", "rawpy"),
+    ("fast-simplification", "fast_simplification", "fast_simplification"),
+    ("onnx", "onnx", "onnx"),
 ]
 
 

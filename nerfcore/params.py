@@ -139,7 +139,8 @@ class RenderParams(Params):
     project: Path
     out: Path
     run: str = "main"
-    test: bool = False
+    test: bool = Field(default=False, description="from the held-out photos")
+    all: bool = Field(default=False, description="from every photo, also those of training")
     camera: Path | None = None
     orbit: int | None = Field(default=None, gt=0)
     size: tuple[int, int] | None = None

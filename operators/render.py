@@ -114,8 +114,8 @@ class FIELDWORK_OT_render(ProjectOperator):
         }
         if self.camera:
             return {**params, "camera": absolute(self.camera)}
-        if source == "photos":
-            return {**params, "test": True}
+        if source in ("photos", "all"):
+            return {**params, "test" if source == "photos" else "all": True}
         if source == "orbit":
             return {**params, "orbit": self.value(context, "orbit")}
         check_camera(context.scene)
@@ -143,7 +143,7 @@ def show_result(job: jobs.Job) -> jobs.Steps | None:
     files = [Path(path) for path in job.result["frames"]]
     # An orbit has no camera in the scene.
     show_as = scene.fieldwork.show_as if "orbit" not in job.params else "none"
-    photos = "test" in job.params
+    photos = "test" in job.params or "all" in job.params
     if photos and show_as != "none":
         _show_straightened(job, scene.name, show_as)
         show_as = "none"

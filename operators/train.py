@@ -7,10 +7,10 @@ from typing import Any
 from bl_operators.presets import AddPresetBase
 from bpy.types import Context, Event, Menu, Operator
 
-from ..addon import state
+from ..addon import jobs, state
 from ..addon.props import BoolProperty, EnumProperty, StringProperty
 from ..addon.text import t
-from .base import ProjectOperator, need_poses, need_run, scene_settings
+from .base import ProjectOperator, need_poses, need_run, refresh_scenes, scene_settings
 
 
 def parse_settings(text: str) -> dict[str, str]:
@@ -67,6 +67,16 @@ class FIELDWORK_OT_train(ProjectOperator):
             "set": parse_settings(self.value(context, "settings")),
             "resume": self.resume,
         }
+
+    def after(self) -> jobs.Done:
+        return trained
+
+
+def trained(job: jobs.Job) -> None:
+    refresh_scenes(job)
+    whole = not ({"time_limit", "steps"} & job.params.keys()) and not job.params["resume"] and not job.params["set"]
+    if job.state == "done" and job.result and whole:
+        state.remember_time(job.params["preset"], job.result["seconds"])
 
 
 @scene_settings(run="run")

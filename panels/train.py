@@ -43,7 +43,7 @@ class FIELDWORK_PT_train(StepPanel):
         column.prop(settings, "run")
         if not active:
             estimate = state.time_estimate(folder, settings)
-            text = t("About {}, as the last time here", duration(estimate)) if estimate else ""
+            text = t("About {}, as the last time", duration(estimate)) if estimate else ""
             if settings.time_limit > 0:
                 text = t("Ends after {}", duration(settings.time_limit))
             if text:

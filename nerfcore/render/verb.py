@@ -74,9 +74,10 @@ def chosen_cameras(params: RenderParams, scene: Scene) -> list[tuple[str, Camera
         return read_cameras(params.camera)
     if params.orbit is not None:
         return orbit_cameras(scene, params.orbit)
-    indices = scene.test if params.test else []
+    indices = list(range(len(scene.views))) if params.all else scene.test if params.test else []
     if not indices:
-        raise InputError("No cameras to render from.", "Use --test (with held-out photos), --camera FILE or --orbit N.")
+        advice = "Use --test (with held-out photos), --all, --camera FILE or --orbit N."
+        raise InputError("No cameras to render from.", advice)
     size = 1600
     return [
         (Path(v.name).stem, v.camera.resized(*training_size(v.camera, size)), v.camera_to_world)

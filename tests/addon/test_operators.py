@@ -125,6 +125,7 @@ RENAMED = {
     ("align", "scale"): "distance",
     ("train", "set"): "settings",
     ("render", "test"): "source",
+    ("render", "all"): "source",
     ("reconstruct", "set"): "settings",
     ("reconstruct", "report"): "report_file",
     ("batch", "report"): "report_file",

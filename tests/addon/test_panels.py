@@ -93,10 +93,12 @@ answer(seen)
     ]
 
 
-def test_quality_and_time_come_from_the_project(tmp_path):
+def test_quality_and_time_come_from_the_project(tmp_path, monkeypatch):
     from types import SimpleNamespace
 
-    from fieldwork.addon import state
+    from fieldwork.addon import preferences, state
+
+    monkeypatch.setattr(preferences, "user_folder", lambda *parts: tmp_path / "user")
 
     project = {
         "format": "fieldwork-project",
@@ -111,6 +113,12 @@ def test_quality_and_time_come_from_the_project(tmp_path):
     settings = SimpleNamespace(time_limit=0.0, steps=0, preset="draft")
     assert state.time_estimate(tmp_path, settings) == 90.0
     settings.preset = "high"
+    assert state.time_estimate(tmp_path, settings) is None
+    state.remember_time("high", 300.0)
+    state.remember_time("standard", 200.0)
+    assert state.time_estimate(tmp_path, settings) == 300.0, "from another project on this machine"
+    assert state.time_estimate(None, settings) == 300.0
+    settings.steps = 10
     assert state.time_estimate(tmp_path, settings) is None
     assert state.quality(tmp_path, "main") == "27.3 dB, mIoU 0.87"
     assert state.quality(tmp_path, "other") == ""

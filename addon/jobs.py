@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import bpy
 
-from . import crop, preferences, state
+from . import crop, preferences, redraw, state
 from .errors import EngineError, SceneError
 from .job import Done, Job, Steps
 from .text import t
@@ -391,58 +391,8 @@ class Queue:
         if bpy.app.background:
             return
         self._drawn = time.monotonic()
-        for window in bpy.context.window_manager.windows:
-            # Nothing else redraws the status bar; a running tool's own text in it must stay.
-            if not getattr(window, "modal_operators", None):
-                self._status_shown = self._current_id()
-                with bpy.context.temp_override(window=window):
-                    window.workspace.status_text_set_internal(None)
-            for area in window.screen.areas:
-                if area.type in ("VIEW_3D", "PREFERENCES"):
-                    for region in area.regions:
-                        if region.type in ("UI", "WINDOW") and (area.type != "VIEW_3D" or region.type == "UI"):
-                            region.tag_redraw()
+        if redraw.panels():
+            self._status_shown = self._current_id()
 
 
 queue = Queue()
-
-
-def _tick() -> float:
-    return queue.tick()
-
-
-@bpy.app.handlers.persistent
-def _undone(*_: Any) -> None:
-    queue.edits += 1
-    for scene in bpy.data.scenes:
-        state.undone(scene.fieldwork)
-
-
-@bpy.app.handlers.persistent
-def _file_loaded(*_: Any) -> None:
-    """Another file: its project may have a job that runs elsewhere."""
-    queue.edits += 1
-    settings = getattr(bpy.context.scene, "fieldwork", None)
-    folder = state.folder_of(settings) if settings else None
-    if folder is not None:
-        state.refresh(settings)
-        if not bpy.app.background:
-            queue.reattach(folder)
-
-
-def register() -> None:
-    bpy.app.handlers.load_post.append(_file_loaded)
-    bpy.app.handlers.undo_post.append(_undone)
-    bpy.app.handlers.redo_post.append(_undone)
-    if not bpy.app.background:
-        bpy.app.timers.register(_tick, first_interval=IDLE_PERIOD, persistent=True)
-
-
-def unregister() -> None:
-    if bpy.app.timers.is_registered(_tick):
-        bpy.app.timers.unregister(_tick)
-    bpy.app.handlers.load_post.remove(_file_loaded)
-    bpy.app.handlers.undo_post.remove(_undone)
-    bpy.app.handlers.redo_post.remove(_undone)
-    queue.stop_engine(detach=queue.running is not None and preferences.preferences().on_close == "continue")
-    queue.__init__()

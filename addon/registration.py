@@ -22,7 +22,7 @@ MODULES = (
     "addon.properties",
     "addon.preferences",
     "addon.pictures",
-    "addon.jobs",
+    "addon.timer",
     "addon.commands",
     "operators.engine",
     "operators.job",

@@ -6,9 +6,8 @@ import time
 from typing import Any
 
 from .blend_package import write_package
-from .blender import run_in_blender
+from .blender import write_in_blender
 from .errors import SettingError
-from .files import atomic_path
 from .params import BlendParams
 from .progress import Reporter
 from .project import load_scene, record_step
@@ -36,14 +35,7 @@ def blend(params: BlendParams, report: Reporter) -> dict[str, Any]:
         warnings.append("There is no mesh yet: the .blend holds cameras and points only. Run `fieldwork mesh` first.")
     if not len(scene.points):
         warnings.append("The project has no sparse points.")
-    with atomic_path(out) as temporary:
-        # Blender writes beside its target and renames; the two names must stay on one disk.
-        result = run_in_blender(
-            "blend",
-            {"package": str(package), "out": str(temporary), "split": params.split == "classes"},
-            report,
-            lambda event: report.progress(event["fraction"], event.get("message", "")),
-        )
+    result = write_in_blender("blend", package, out, params.split == "classes", report)
     for warning in [*warnings, *result.pop("warnings")]:
         report.warn(warning)
     record_step(folder, "blend", params.model_dump(mode="json"), {"file": str(out)})

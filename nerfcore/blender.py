@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from .errors import BlenderError
+from .files import atomic_path
 from .progress import Reporter
 
 CHILD = Path(__file__).resolve().parents[1] / "addon" / "child.py"
@@ -92,6 +93,18 @@ def run_in_blender(
             for stream in (child.stdin, child.stdout, child.stderr):
                 if stream is not None:
                     stream.close()
+
+
+def write_in_blender(task: str, package: Path, out: Path, split: bool, report: Reporter) -> dict[str, Any]:
+    """Let Blender write a package folder as the file `out`, see addon/package_task.py; returns the task's result."""
+    with atomic_path(out) as temporary:
+        # Blender writes beside its target and renames; the two names must stay on one disk.
+        return run_in_blender(
+            task,
+            {"package": str(package), "out": str(temporary), "split": split},
+            report,
+            lambda event: report.progress(event["fraction"], event.get("message", "")),
+        )
 
 
 def _follow(

@@ -10,9 +10,8 @@ import numpy as np
 from PIL import Image
 
 from ..blend_package import write_package
-from ..blender import run_in_blender
+from ..blender import write_in_blender
 from ..errors import ProjectError, SettingError
-from ..files import atomic_path
 from ..mesh.extract import Surface
 from ..mesh.files import Texture, texture_of, write_surface
 from ..params import ExportParams
@@ -97,13 +96,7 @@ def load_surface(folder: Path, run: str) -> tuple[Surface, Texture | None]:
 def _write_usd(out: Path, folder: Path, params: ExportParams, report: Reporter) -> Path:
     load_surface(folder, params.run)  # says so when there is none
     package = write_package(folder, params.run, load_scene(folder), folder.name, report)
-    with atomic_path(out) as temporary:
-        result = run_in_blender(
-            "usd",
-            {"package": str(package), "out": str(temporary), "split": params.split == "classes"},
-            report,
-            lambda event: report.progress(event["fraction"], event.get("message", "")),
-        )
+    result = write_in_blender("usd", package, out, params.split == "classes", report)
     for warning in result["warnings"]:
         report.warn(warning)
     return out

@@ -5,17 +5,23 @@ from __future__ import annotations
 import pytest
 from fieldwork.tests.addon.support import SETUP, make_posed_project
 
-
-def test_crop_box_becomes_the_training_region(bpy_script, tmp_path):
-    folder = make_posed_project(tmp_path / "capture")
-    facts = bpy_script(
-        SETUP
-        + """
-import math
+BOX = (
+    SETUP
+    + """
 from fieldwork.addon import crop
 settings.project = project
 bpy.ops.fieldwork.crop_add()
 box = crop.find(scene)
+"""
+)
+
+
+def test_crop_box_becomes_the_training_region(bpy_script, tmp_path):
+    folder = make_posed_project(tmp_path / "capture")
+    facts = bpy_script(
+        BOX
+        + """
+import math
 box.location, box.scale, box.rotation_euler = (1, 2, 3), (1, 2, 0.5), (0, 0, math.pi / 2)
 bpy.ops.fieldwork.crop_apply()
 written = crop.read_bounds(Path(project))
@@ -36,12 +42,8 @@ answer({"written": written, "flat": flat, "after": crop.read_bounds(Path(project
 def test_moving_the_region_box_edits_the_training_region(bpy_script, tmp_path):
     folder = make_posed_project(tmp_path / "capture")
     facts = bpy_script(
-        SETUP
+        BOX
         + """
-from fieldwork.addon import crop
-settings.project = project
-bpy.ops.fieldwork.crop_add()
-box = crop.find(scene)
 def look():
     bpy.context.view_layer.update()
     return crop.follow(scene), crop.read_bounds(Path(project))
@@ -68,12 +70,8 @@ def test_the_box_goes_where_the_project_says(bpy_script, tmp_path):
     """After aligning, and in a file that was saved before: the box must not carry its old bounds back."""
     folder = make_posed_project(tmp_path / "capture")
     facts = bpy_script(
-        SETUP
+        BOX
         + """
-from fieldwork.addon import crop
-settings.project = project
-bpy.ops.fieldwork.crop_add()
-box = crop.find(scene)
 box.location, box.scale = (1, 2, 3), (1, 1, 1)
 def look():
     bpy.context.view_layer.update()

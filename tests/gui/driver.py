@@ -22,6 +22,7 @@ import bpy
 
 Steps = Iterator[float | None]
 TICK = 0.03
+PATIENCE = float(os.environ.get("FIELDWORK_GUI_PATIENCE", "1"))  # factor of all waiting, for a machine under load
 PANELS = ["capture", "poses", "classes", "train", "render", "mesh", "export", "engine"]
 PACKAGE = "bl_ext.user_default.fieldwork"
 BARE = {"life"}  # scenarios that install and enable the extension themselves
@@ -162,9 +163,9 @@ class Screen:
         yield 0.3
 
     def wait(self, condition: Callable[[], object], seconds: float, what: str) -> Steps:
-        end = time.monotonic() + seconds
+        end = time.monotonic() + seconds * PATIENCE
         while not condition():
-            assert time.monotonic() < end, f"{what}: nothing after {seconds} s"
+            assert time.monotonic() < end, f"{what}: nothing after {seconds * PATIENCE:g} s"
             yield 0.1
 
 

@@ -64,7 +64,7 @@ def life(screen):
     yield 1.0
     screen.shot("scene")
     yield from finish(screen)
-    tick = screen.module("addon.jobs")._tick
+    tick = screen.module("addon.timer")._tick
     engine = screen.queue.link.process
     bpy.ops.preferences.addon_disable(module=MODULE)
     yield 0.5

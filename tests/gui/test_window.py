@@ -27,7 +27,7 @@ REASON = window.missing()
 pytestmark = [
     pytest.mark.gui,
     pytest.mark.slow,
-    pytest.mark.timeout(1200),
+    pytest.mark.timeout(1200 * window.PATIENCE),
     pytest.mark.skipif(REASON is not None, reason=str(REASON)),
 ]
 WINDOW = window.Window

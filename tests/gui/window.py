@@ -15,6 +15,7 @@ TOOLS = ROOT.parent / "shared" / "blender-gui"
 BLENDER_ROOT = Path(os.environ.get("FIELDWORK_GUI_ROOT", "/var/tmp/blender-sid"))
 OLDER_ROOT = Path(os.environ.get("FIELDWORK_GUI_OLDER_ROOT", "/var/tmp/blender-trixie"))  # Blender 4.3
 BUILD = ROOT / "build" / "gui"
+PATIENCE = float(os.environ.get("FIELDWORK_GUI_PATIENCE", "1"))  # factor of all waiting, for a machine under load
 MUSEUM = BUILD / "museum"  # a small simulated capture with labels
 
 
@@ -75,6 +76,7 @@ class Window:
             "FIELDWORK_MUSEUM": str(MUSEUM),
             "FIELDWORK_BASE_PYTHON": str(Path(sys.base_prefix) / "bin" / "python3"),
             "FIELDWORK_ZIP": str(archive),
+            "FIELDWORK_GUI_PATIENCE": str(PATIENCE),
         }
         steps = [["build", "--source-dir", str(ROOT), "--output-filepath", str(archive)]]
         if install:
@@ -102,7 +104,7 @@ class Window:
         for scenario in scenarios:
             (self.folder / f"{scenario}.json").unlink(missing_ok=True)
         command = [str(TOOLS / "with-display"), "sh", "-c", "; ".join(runs)]
-        done = enter(command, self.environment, timeout, self.root)
+        done = enter(command, self.environment, timeout * PATIENCE, self.root)
         output = done.stdout + done.stderr
         (self.folder / "blender.log").write_text(output)
         facts = {}

@@ -70,6 +70,15 @@ class FieldConfig(Stage):
     blend_floor: float = Field(default=0.5, ge=0, le=1, description="share of the grid where nothing was seen (w0)")
     blend_rate: float = Field(default=8.0, gt=0, description="how fast evidence raises the grid's share (κ)")
     blend_warmup: int = Field(default=0, ge=0, description="steps with the grid alone")
+    voxel_init: Literal["rgb_stats", "cnn", "none"] = Field(
+        default="none",
+        description="what is written into the dense levels after the coarse stage: mean and variance over the photos "
+        "of what they show at a vertex, as colours or as features of a small network",
+    )
+    voxel_init_step: int = Field(default=128, ge=1, description="steps of the coarse stage before voxel_init")
+    voxel_init_weights: str | None = Field(
+        default=None, description="file with the weights of voxel_init=cnn; null: they are learned with the field"
+    )
     appearance: int = Field(default=0, ge=0, description="length of the per-image appearance code; 0: none")
     density_shift: float = Field(default=-1.0, description="added to the raw density before exp")
     precision: Literal["auto", "float32", "bfloat16", "float16"] = Field(

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import get_args
 
-from ..config import RunConfig
 from ..errors import SettingError
 from ..params import BenchParams
 from .jobs import COUNTING_SIDE, Job
@@ -42,6 +40,9 @@ ABLATION = {
     "uniform pdf": {"sampling.pdf": "uniform"},
     "literal pdf": {"sampling.pdf": "literal"},
     "no semantics": {"loss.semantic_weight": "0"},
+    "voxel_init none": {"field.voxel_init": "none"},
+    "voxel_init rgb_stats": {"field.voxel_init": "rgb_stats"},
+    "voxel_init cnn": {"field.voxel_init": "cnn"},
 }
 # Pictures of all variants take the same number of samples on every ray.
 EQUAL_SAMPLES = {"ablation": {"render.per_bin": "0"}}
@@ -64,19 +65,10 @@ def baselines() -> dict[str, dict[str, str]]:
     return {name: entry["settings"] for name, entry in json.loads(BASELINES.read_text(encoding="utf-8")).items()}
 
 
-def initialisations() -> dict[str, dict[str, str]]:
-    """A variant for every way the grid can be initialised, where there is such a setting."""
-    for stage, info in RunConfig.model_fields.items():
-        setting = type(info.default).model_fields.get("voxel_init")
-        if setting is not None:
-            return {f"voxel_init {v}": {f"{stage}.voxel_init": str(v)} for v in get_args(setting.annotation)}
-    return {}
-
-
 def variants(suite: str) -> dict[str, dict[str, str]]:
     """Name and settings of everything a suite compares."""
     if suite == "ablation":
-        return ABLATION | initialisations()
+        return ABLATION
     if suite == "robustness":
         return ROBUSTNESS
     return baselines() if suite == "baselines" else {"standard": {}}

@@ -126,6 +126,11 @@ class VertexGrid(nn.Module):
         """Add the gradients of encoded points, (points (N, 3), gradient (N, width)) each, to the grid's."""
         encode.scatter(self.gradient, self.touched, self.levels, gains, parts)
 
+    def clear(self) -> None:
+        """Forget the gradient gathered since the last step."""
+        self.gradient.zero_()
+        self.touched.zero_()
+
     def step(self, rate: float, betas: tuple[float, float] = (0.9, 0.99)) -> None:
         """Adam on the rows touched since the last step; clears the gradient."""
         encode.adam(self.table, self.gradient, self.mean, self.square, self.touched, rate, betas)

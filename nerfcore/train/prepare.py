@@ -132,7 +132,7 @@ def make_trainer(project_folder: Path, info: RunInfo, scene: Scene, device: torc
     model.occupancy.empty.fill_(nearest)
     if model.field.blend is not None:
         model.field.blend.views.copy_((counts / VIEWS_ENOUGH).clamp(max=1))
-    trainer = Trainer(model, store, config, background=LEVEL.get(config.scene.background))
+    trainer = Trainer(model, store, config, LEVEL.get(config.scene.background), report.check)
     if config.loss.depth_weight > 0:
         scale = depth_scale(world_from_sfm(project), box.box_from_world)
         visibility = load_visibility(project_folder)

@@ -22,6 +22,7 @@ from .model import Model
 
 CHECKPOINT = "field.safetensors"
 REFINED_POSES = "poses.json"  # of a run with train.refine_poses
+PIXEL_FEATURES = "voxel_init.safetensors"  # of a run with field.voxel_init=cnn
 
 
 class RunInfo(BaseModel):

@@ -27,6 +27,7 @@ from .losses import (
 from .model import Model, Rendered
 from .pose_refinement import PoseRefinement, level_weights
 from .schedule import bias_correction, rate_factor
+from .voxel_init import PixelFeatures, initialise
 
 BETAS = (0.9, 0.99)
 SHARD_SAMPLES = 16384  # whose activations fit a core's cache
@@ -67,10 +68,17 @@ class Trainer:
 
     Progress through the schedule is a number in [0, 1] handed to `step`, so that a time limit and a number of steps
     drive it alike. All random numbers come from one generator, which is part of the checkpoint. `background`: the grey
-    value behind the field, None for random colours.
+    value behind the field, None for random colours. `check` is called in steps that take long and may raise to stop.
     """
 
-    def __init__(self, model: Model, store: PixelStore, config: RunConfig, background: float | None) -> None:
+    def __init__(
+        self,
+        model: Model,
+        store: PixelStore,
+        config: RunConfig,
+        background: float | None,
+        check: Callable[[], None] = lambda: None,
+    ) -> None:
         self.model, self.store, self.config = model, store, config
         self.background = background
         self.device = store.device
@@ -83,6 +91,8 @@ class Trainer:
         self.cache = CoarseCache(store)
         self.poses = PoseRefinement(store.rays, config.train) if config.train.refine_poses else None
         self.depths: DepthRays | None = None
+        self.check = check
+        self.pixel_features: PixelFeatures | None = None
         self.measured = Measured()
 
     def draw(self) -> Batch:
@@ -97,6 +107,8 @@ class Trainer:
         config, model = self.config, self.model
         model.field.set_progress(progress, config.train.fade, self.steps)
         model.warming_up = self.steps < config.sampling.warmup
+        if config.field.voxel_init != "none" and self.steps == config.field.voxel_init_step:
+            self._initialise(progress)
         if self.steps % config.sampling.update_every == 0:
             interest = model.interest if model.wants_interest() and self.steps >= config.sampling.warmup else None
             model.occupancy.update(self.steps, model.field.density, interest, self.generator)
@@ -125,6 +137,16 @@ class Trainer:
                 torch.cat([r.density.detach() for r in rendered]),
             )
         self._adapt(len(batch.rgb), rendered, progress)
+
+    def _initialise(self, progress: float) -> None:
+        """Let the grid take up what the photos show, see `voxel_init`."""
+        measured, self.measured = self.measured, Measured()
+
+        def learn() -> None:
+            self._learn(self.draw(), progress)
+
+        self.pixel_features = initialise(self.model, self.store, learn, self.check)
+        self.measured = measured
 
     def _learn(self, batch: Batch, progress: float) -> list[Learned]:
         """Leave the gradient of the composite loss in the parameters and in the grid.

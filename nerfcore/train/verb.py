@@ -25,8 +25,9 @@ from .checkpoint import read_checkpoint, restore, save_checkpoint
 from .model import Model
 from .pose_refinement import write_poses
 from .prepare import make_trainer, plan_run
-from .run import CHECKPOINT, REFINED_POSES, RunInfo, load_info, run_folder, save_info, use_device
+from .run import CHECKPOINT, PIXEL_FEATURES, REFINED_POSES, RunInfo, load_info, run_folder, save_info, use_device
 from .trainer import Trainer
+from .voxel_init import save_features
 
 PREVIEW_PAUSE = 20  # times what a preview costs, before the next one
 
@@ -60,7 +61,7 @@ def train(params: TrainParams, report: Reporter) -> dict[str, Any]:
         info, scene = plan_run(project_folder, params.preset, make_config(params.preset, params.set), device)
         with disk_errors(folder):
             folder.mkdir(parents=True, exist_ok=True)
-        for stale in (CHECKPOINT, REFINED_POSES, "events.jsonl", "metrics.json"):
+        for stale in (CHECKPOINT, REFINED_POSES, PIXEL_FEATURES, "events.jsonl", "metrics.json"):
             (folder / stale).unlink(missing_ok=True)
         save_info(project_folder, params.run, info)
     for half_written in folder.glob(".*.safetensors"):  # by a process that was killed
@@ -173,6 +174,8 @@ class _Loop:
         if trainer.poses is not None:
             path = self.folder / REFINED_POSES
             write_poses(path, trainer.poses, trainer.store.rays, info.images, np.array(info.sfm_from_box))
+        if trainer.pixel_features is not None:
+            save_features(self.folder / PIXEL_FEATURES, trainer.pixel_features)
 
 
 def _preview(project_folder: Path, folder: Path, info: RunInfo, scene: Scene, model: Model) -> Callable[[], Path]:

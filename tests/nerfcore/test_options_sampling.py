@@ -1,0 +1,245 @@
+"""Each setting of `sampling` and `render` changes what its description says."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from fieldwork.nerfcore.data.cameras import Camera
+from fieldwork.nerfcore.kernels.march import Samples, sample
+from fieldwork.nerfcore.kernels.packing import Packing
+from fieldwork.nerfcore.render.fused import wants_fused
+from fieldwork.nerfcore.render.image import render_view
+from fieldwork.nerfcore.render.verb import look_at
+from fieldwork.nerfcore.sampling.cache import CoarseCache
+from fieldwork.nerfcore.sampling.occupancy import OccupancyGrid, class_interest
+from fieldwork.nerfcore.train.model import Model
+from fieldwork.nerfcore.train.trainer import Trainer
+from fieldwork.tests.nerfcore.support.ball import ball_project
+from fieldwork.tests.nerfcore.support.settings import config_of, trainer_of
+
+N = 32  # cells along a side of the grid, as in SMALL
+
+
+@pytest.fixture(scope="module")
+def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return ball_project(tmp_path_factory.mktemp("sampling") / "ball", views=8, side=24)
+
+
+def model(**settings: str) -> Model:
+    torch.manual_seed(0)
+    return Model(config_of(**settings), classes=3, images=2, contracted=False)
+
+
+def slab(density: float, interest: float = 0.0, **settings: str) -> tuple[OccupancyGrid, Samples]:
+    """64 samples of a ray along x through a block whose cells from N/4 on are open; the third quarter is interesting."""
+    grid = OccupancyGrid(config_of(**settings).sampling, contracted=False)
+    n = grid.config.resolution
+    cells = torch.zeros(n, n, n, 2)
+    cells[..., n // 4 :, 0] = density
+    cells[..., n // 2 : 3 * n // 4, 1] = interest
+    grid.cells.copy_(cells.view(-1, 2))
+    origin, direction = torch.tensor([[-3.0, 0.01, 0.01]]), torch.tensor([[1.0, 0.0, 0.0]])
+    return grid, sample(origin, direction, grid.cells, grid.blocks, grid.march_settings(), 64)
+
+
+def share(samples: Samples, low: float, high: float) -> float:
+    """Share of the samples between two places along x in [0, 1]."""
+    x = samples.points[:, 0]
+    return float(((x >= low) & (x < high)).float().mean())
+
+
+@pytest.mark.setting("sampling.resolution", "sampling.bins_per_cell")
+def test_cells_and_bins() -> None:
+    grid = OccupancyGrid(config_of(**{"sampling.resolution": "16", "sampling.bins_per_cell": "2"}).sampling, False)
+    assert len(grid.cells) == 16**3
+    assert grid.march_settings().step == pytest.approx(2 / 16 / 2)
+
+
+@pytest.mark.setting("sampling.samples")
+def test_a_ray_has_the_samples_asked_for(ball: Path) -> None:
+    for count in (4, 9):
+        trainer = trainer_of(ball, **{"sampling.samples": str(count)})
+        trainer.step(0.0)
+        measured = trainer.take_measured()
+        assert measured.samples == measured.rays * count  # at first every ray meets open cells
+
+
+@pytest.mark.setting("sampling.pdf")
+def test_samples_gather_at_surfaces_or_spread() -> None:
+    near = {pdf: share(slab(20.0, 1.0, **{"sampling.pdf": pdf})[1], 0.25, 0.35) for pdf in ("default", "uniform")}
+    assert near["uniform"] == pytest.approx(0.1 / 0.75, abs=0.03)
+    assert near["default"] > 3 * near["uniform"]
+    # The literal form has no transmittance: it looks at what is interesting behind the surface too.
+    assert share(slab(20.0, 1.0, **{"sampling.pdf": "literal"})[1], 0.5, 0.75) > 0.95
+
+
+@pytest.mark.setting("sampling.interest")
+def test_interest_is_priority_boundary_or_nothing() -> None:
+    certain, torn = torch.tensor([[1.0, 0.0, 0.0]]), torch.full((1, 3), 1 / 3)
+    priorities = torch.tensor([0.5, 2.0, 1.0])
+    assert float(class_interest(certain, "priority", priorities)) == pytest.approx(0.25)
+    assert float(class_interest(certain, "boundary", priorities)) == pytest.approx(0.0, abs=1e-5)
+    assert float(class_interest(torn, "boundary", priorities)) == pytest.approx(1.0, abs=1e-5)
+    assert not model(**{"sampling.interest": "priority"}).wants_interest()  # all priorities alike
+    assert model(**{"sampling.interest": "boundary"}).wants_interest()
+    assert not model(**{"sampling.interest": "none"}).wants_interest()
+    assert model(**{"sampling.pdf": "literal", "sampling.interest": "none"}).wants_interest()
+    drawn = {kind: share(slab(0.5, 1.0, **{"sampling.interest": kind})[1], 0.5, 0.75) for kind in ("priority", "none")}
+    assert drawn["priority"] > 1.2 * drawn["none"]
+
+
+@pytest.mark.setting("sampling.beta", "sampling.epsilon")
+def test_interest_draws_as_strongly_as_told_and_every_open_bin_keeps_a_weight() -> None:
+    strong, weak = (share(slab(0.5, 1.0, **{"sampling.beta": beta})[1], 0.5, 0.75) for beta in ("6", "0"))
+    assert strong > 1.5 * weak
+    far = [share(slab(30.0, 0.0, **{"sampling.epsilon": e})[1], 0.35, 1.0) for e in ("0.0001", "0.1")]
+    assert far[1] > far[0] + 0.1
+
+
+@pytest.mark.setting("sampling.update_every", "sampling.cache_every", "sampling.coarse_cache", "sampling.warmup")
+def test_the_grid_and_the_cache_are_updated_when_told(ball: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    updates, rebuilds = [], []
+    update, rebuild = OccupancyGrid.update, CoarseCache.rebuild
+
+    def counted_update(self: OccupancyGrid, step: int, *rest: object) -> None:
+        updates.append(step)
+        update(self, step, *rest)  # type: ignore[arg-type]
+
+    def counted_rebuild(self: CoarseCache, model: Model) -> None:
+        rebuilds.append(trainer.steps)
+        rebuild(self, model)
+
+    monkeypatch.setattr(OccupancyGrid, "update", counted_update)
+    monkeypatch.setattr(CoarseCache, "rebuild", counted_rebuild)
+    settings = {"sampling.update_every": "5", "sampling.cache_every": "6", "sampling.warmup": "8"}
+    trainer = trainer_of(ball, **settings)
+    warm = []
+    for _ in range(21):
+        trainer.step(0.1)
+        warm.append(trainer.model.warming_up)
+    assert updates == [0, 5, 10, 15, 20]
+    assert rebuilds == [8, 14, 20]
+    assert warm == [True] * 8 + [False] * 13
+    trainer = trainer_of(ball, **settings, **{"sampling.coarse_cache": "false"})
+    for _ in range(21):
+        trainer.step(0.1)
+    assert len(rebuilds) == 3
+    assert trainer.cache.hit is None
+
+
+@pytest.mark.setting("sampling.decay", "sampling.threshold")
+def test_cells_close_below_the_threshold_after_decaying() -> None:
+    grid = OccupancyGrid(config_of(**{"sampling.decay": "0.5", "sampling.threshold": "0.004"}).sampling, False)
+    grid.density[0], grid.density[1:] = 0.005 / grid.step, 1.0
+    grid.rebuild()
+    opened = (grid.cells[:, 0] > 0).view(N, N, N)
+    assert bool(opened.all())
+    grid.density[:] = 1.0
+    generator = torch.Generator().manual_seed(0)
+    grid.update(1000, lambda points: torch.zeros(len(points)), generator=generator)
+    assert set(grid.density.tolist()) == {0.5, 1.0}
+    for threshold, share_open in (("0.05", 0.0), ("0.03", 1.0)):
+        grid = OccupancyGrid(config_of(**{"sampling.threshold": threshold}).sampling, False)
+        grid.density.fill_(0.04 / grid.step)
+        grid.density[: N**3 // 2] = 10 / grid.step  # the mean is far above
+        grid.rebuild()
+        assert bool((grid.cells[-N * N * 4 :, 0] > 0).all()) == bool(share_open)
+
+
+@pytest.mark.setting("sampling.empty_rays")
+def test_a_share_of_the_rays_comes_from_everywhere(ball: Path) -> None:
+    trainer = trainer_of(ball)
+    cache = trainer.cache
+    cache.hit = torch.tensor([0])  # the corner of the first image
+    for free in (0.0, 0.4):
+        places = cache.places(5000, free, trainer.generator)
+        elsewhere = float((trainer.store.batch(places).image != 0).float().mean())
+        assert elsewhere == pytest.approx(free * (1 - 1 / len(trainer.store.views)), abs=0.03)
+
+
+def two_samples() -> tuple[torch.Tensor, torch.Tensor, Packing]:
+    """A faint sample with huge logits for class 0 in front of a surface of class 1."""
+    packing = Packing(torch.tensor([0]).int(), torch.tensor([2]).int(), torch.tensor([0, 0]).int())
+    return torch.tensor([[60.0, 0.0, 0.0], [0.0, 4.0, 0.0]]), torch.tensor([0.1, 0.8], requires_grad=True), packing
+
+
+@pytest.mark.setting("render.accumulate")
+def test_a_faint_sample_outvotes_a_surface_only_where_logits_are_summed() -> None:
+    logits, weights, packing = two_samples()
+    kept, summed = (
+        model(**{"render.accumulate": how})._probabilities(logits, weights, packing)[0]
+        for how in ("probabilities", "logits")
+    )
+    assert kept.argmax() == 1
+    assert summed.argmax() == 0
+    assert float(kept.sum()) == pytest.approx(0.9, abs=1e-5)
+    assert float(summed.sum()) == pytest.approx(0.9, abs=1e-5)
+
+
+@pytest.mark.setting("loss.detach_weights")
+def test_labels_move_the_geometry_only_when_told() -> None:
+    logits, weights, packing = two_samples()
+    held = model()._probabilities(logits, weights, packing)
+    moving = model(**{"loss.detach_weights": "false"})._probabilities(logits, weights, packing)
+    assert torch.equal(held, moving)
+    assert not held.requires_grad
+    assert bool((torch.autograd.grad(moving[0, 1], weights)[0] != 0).any())
+
+
+def rendered(trainer: Trainer, count: int = 8):
+    places = torch.arange(200) * 5
+    batch = trainer.store.batch(places)
+    return trainer.model.render(batch.origins, batch.directions, count)
+
+
+@pytest.mark.setting("render.cull")
+def test_samples_of_little_weight_are_left_out(ball: Path) -> None:
+    shown = {}
+    for cull in ("0", "0.02", "0.9"):
+        trainer = trainer_of(ball, **{"render.cull": cull})
+        out = rendered(trainer)
+        shown[cull] = len(out.samples)
+        if len(out.weights):
+            assert float(out.weights.min()) > float(cull)
+    assert shown["0"] > shown["0.02"] > shown["0.9"]
+
+
+@pytest.mark.setting("render.samples")
+def test_pictures_have_samples_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    camera, pose = Camera(width=4, height=4, fx=4, fy=4, cx=2, cy=2), look_at(np.array([2.0, 0, 0]), np.zeros(3))
+    for value, expected in (("7", 7), ("null", 5)):
+        m, counts = model(**{"render.samples": value, "sampling.samples": "5"}), []
+        original = m.render
+
+        def render(origins, directions, count, *rest, _to=original, _counts=counts, **more):
+            _counts.append(count)
+            return _to(origins, directions, count, *rest, **more)
+
+        monkeypatch.setattr(m, "render", render)
+        render_view(m, camera, pose, 0.0)
+        assert set(counts) == {expected}
+
+
+@pytest.mark.setting("render.fused")
+def test_the_fused_kernel_is_used_when_told_and_possible() -> None:
+    rays = 1 << 20
+    assert not wants_fused(model(), rays)  # auto, on a CPU
+    assert wants_fused(model(**{"render.fused": "on"}), 10)
+    assert not wants_fused(model(**{"render.fused": "off"}), rays)
+    assert not wants_fused(model(**{"render.fused": "on", "field.fusion": "concat"}), rays)
+
+
+@pytest.mark.setting("train.fade")
+def test_finer_levels_fade_in() -> None:
+    field = model(**{"field.levels": "4", "train.fade": "0.5"}).field
+    gains = []
+    for progress in (0.0, 0.125, 0.5):
+        field.set_progress(progress, 0.5, 0)
+        gains.append(field.gains)
+    assert gains == [[1, 1, 0, 0], [1, 1, 0.5, 0], [1, 1, 1, 1]]
+    field.set_progress(0.0, 0.0, 0)
+    assert math.prod(field.gains) == 1

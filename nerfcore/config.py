@@ -140,16 +140,18 @@ class RenderConfig(Stage):
 
 
 class LossConfig(Stage):
-    rgb: Literal["huber", "mse"] = "huber"
-    rgb_weight: float = Field(default=1.0, ge=0)
-    huber_delta: float = Field(default=0.1, gt=0)
+    """What training minimises."""
+
+    rgb: Literal["huber", "mse"] = Field(default="huber", description="price of colour errors; mse: squared")
+    rgb_weight: float = Field(default=1.0, ge=0, description="of colour errors")
+    huber_delta: float = Field(default=0.1, gt=0, description="colour error from which its price grows linearly")
     semantic_weight: float = Field(default=0.04, ge=0, description="λ_sem; 0 trains without semantics")
     detach_weights: bool = Field(default=True, description="labels do not move the geometry")
     regularization: float = Field(default=1.0, ge=0, description="λ_reg, factor of sparsity, distortion and entropy")
     sparsity: Literal["exponential", "cauchy", "l1"] = Field(
         default="exponential", description="l1: the original, literal form"
     )
-    sparsity_weight: float = Field(default=1e-4, ge=0)
+    sparsity_weight: float = Field(default=1e-4, ge=0, description="of density at random points")
     sparsity_scale: float = Field(default=0.05, gt=0, description="ℓ of 1−exp(−ℓσ)")
     distortion_weight: float = Field(default=0.0, ge=0, description="against floaters")
     opacity_weight: float = Field(default=0.0, ge=0, description="entropy of the ray's opacity")
@@ -161,12 +163,14 @@ class LossConfig(Stage):
 
 
 class TrainConfig(Stage):
+    """The course of training."""
+
     steps: int = Field(default=20000, gt=0, description="optimisation steps when there is no time limit")
     batch_start: int = Field(default=1 << 14, ge=256, description="field samples of the first steps")
     batch_samples: int = Field(
         default=1 << 17, ge=256, description="field samples of the last steps; grows geometrically"
     )
-    max_rays: int = Field(default=32768, ge=16)
+    max_rays: int = Field(default=32768, ge=16, description="at most so many rays a step")
     grid_rate: float = Field(default=0.03, gt=0, description="learning rate of the grid")
     network_rate: float = Field(default=0.005, gt=0, description="learning rate of the networks")
     decay: float = Field(default=0.33, gt=0, le=1, description="of the rates at ½, ¾ and 9/10")
@@ -178,7 +182,7 @@ class TrainConfig(Stage):
     pose_start: float = Field(default=0.05, ge=0, lt=1, description="share of training before cameras move")
     checkpoint_every: float = Field(default=30.0, gt=0, description="seconds between checkpoints")
     preview_every: float = Field(default=15.0, gt=0, description="seconds between preview pictures")
-    seed: int = 0
+    seed: int = Field(default=0, description="of all random numbers: the same one gives the same run")
     labelled_share: float = Field(
         default=1.0, ge=0, le=1, description="share of the training images whose labels are used"
     )

@@ -19,10 +19,9 @@ from ..project import load_project, load_scene, load_visibility, world_from_sfm
 from ..sampling.visibility import depth_ranges, view_counts
 from .background import LEVEL, choose_background
 from .depth import depth_scale, find_depths
-from .run import RunInfo, new_model
+from .run import CPU_IMAGE_SIZE, GPU_IMAGE_SIZE, RunInfo, new_model
 from .trainer import Trainer
 
-CPU_IMAGE_SIZE, GPU_IMAGE_SIZE = 800, 1600
 VIEWS_ENOUGH = 8  # cells seen by this many cameras count fully as evidence
 
 

@@ -20,6 +20,7 @@ from ..kernels.runtime import default_threads
 from ..project import Poses, Project, world_from_sfm
 from .model import Model
 
+CPU_IMAGE_SIZE, GPU_IMAGE_SIZE = 800, 1600
 CHECKPOINT = "field.safetensors"
 REFINED_POSES = "poses.json"  # of a run with train.refine_poses
 PIXEL_FEATURES = "voxel_init.safetensors"  # of a run with field.voxel_init=cnn

@@ -157,9 +157,10 @@ class Trainer:
         per_ray, rays = self.config.sampling.samples, len(batch.rgb)
         jitter = torch.rand(rays, device=self.device, generator=self.generator)
         shift = torch.rand(rays * per_ray, device=self.device, generator=self.generator)
-        background = torch.full_like(batch.rgb, self.background or 0.0)
         if self.background is None:
             background = torch.rand(batch.rgb.shape, device=self.device, generator=self.generator)
+        else:
+            background = torch.full_like(batch.rgb, self.background)
         labelled = (batch.label != VOID).sum().clamp(min=1)
         size = rays if self.device.type != "cpu" else max(SHARD_SAMPLES // per_ray, 1)
 

@@ -35,6 +35,7 @@ def known_rays(folder: Path, **settings: str) -> tuple[DepthRays, torch.Tensor]:
     return known, end @ from_box[:3, :3].T + from_box[:3, 3]
 
 
+@pytest.mark.setting("loss.depth_weight")
 def test_rays_through_sparse_points_end_on_them(tmp_path: Path) -> None:
     known, ends = known_rays(ball_project(tmp_path / "ball", 8, 40, points=60))
     assert len(known) > 100

@@ -148,6 +148,7 @@ def test_fine_levels_move_cameras_later() -> None:
     assert 3 < sum(middle) < 8
 
 
+@pytest.mark.setting("train.refine_poses", "train.pose_start")
 def test_refinement_starts_when_told_and_survives_a_checkpoint(tmp_path: Path) -> None:
     folder = ball_project(tmp_path / "ball", 9, 24)
     settings = {"train__refine_poses": "true", "train__pose_start": "0.5"}

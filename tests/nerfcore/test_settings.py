@@ -1,0 +1,75 @@
+"""The settings as a whole: all described, all tested, presets and boundary cases."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import torch
+from fieldwork.nerfcore.bench.suites import ABLATION
+from fieldwork.nerfcore.config import RunConfig, make_config
+from fieldwork.nerfcore.field.hybrid import HybridField
+from fieldwork.nerfcore.kernels.march import PDF_UNIFORM
+from fieldwork.nerfcore.sampling.occupancy import OccupancyGrid
+from fieldwork.nerfcore.train.model import Model
+
+NAMES = [
+    f"{stage}.{name}" for stage, info in RunConfig.model_fields.items() for name in type(info.default).model_fields
+]
+
+
+def test_every_setting_is_described() -> None:
+    bare = [
+        f"{stage}.{name}"
+        for stage, info in RunConfig.model_fields.items()
+        for name, setting in type(info.default).model_fields.items()
+        if not setting.description
+    ]
+    assert bare == []
+
+
+def test_every_setting_has_a_test_of_what_it_changes() -> None:
+    marked: set[str] = set()
+    for file in Path(__file__).parent.glob("test_*.py"):
+        for marker in re.findall(r"pytest\.mark\.setting\(([^)]*)\)", file.read_text("utf-8")):
+            marked.update(re.findall(r'"([\w.]+)"', marker))
+    assert sorted(set(NAMES) - marked) == []
+    assert sorted(marked - set(NAMES)) == []
+
+
+def test_every_setting_is_reached_by_its_name() -> None:
+    for name in NAMES:
+        stage, key = name.split(".")
+        default = getattr(getattr(RunConfig(), stage), key)
+        text = default if isinstance(default, str) else json.dumps(default)
+        assert getattr(getattr(make_config("standard", {name: text}), stage), key) == default
+
+
+def test_boundary_cases_are_settings_of_one_pipeline() -> None:
+    def model(variant: str, classes: int = 3) -> Model:
+        small = {"field.levels": "3", "field.finest": "48", "sampling.resolution": "16"}
+        return Model(make_config("standard", {**small, **ABLATION[variant]}), classes, 2, contracted=False)
+
+    explicit, implicit, uniform = (model(name) for name in ("explicit", "implicit", "uniform pdf"))
+    assert (explicit.field.grid is not None, explicit.field.implicit is not None) == (True, False)
+    assert (implicit.field.grid is not None, implicit.field.implicit is not None) == (False, True)
+    assert uniform.occupancy.march_settings().mode == PDF_UNIFORM
+    assert make_config("standard", ABLATION["no semantics"]).loss.semantic_weight == 0
+    assert model("no semantics", 0).field.semantic_head is None
+    origins = torch.tensor([[-3.0, 0.0, 0.0]]).repeat(4, 1)
+    directions = torch.nn.functional.normalize(torch.tensor([[1.0, 0.01 * k, 0.02] for k in range(4)]), dim=1)
+    for boundary in (explicit, implicit, uniform, model("no semantics", 0)):
+        out = boundary.render(origins, directions, 8)
+        assert bool(torch.isfinite(out.color).all())
+        assert (out.probabilities is None) == (boundary.field.semantic_head is None)
+
+
+def test_presets_grow_and_the_standard_one_stays_within_its_parameters() -> None:
+    counts = [HybridField(make_config(name).field, 101).parameter_count() for name in ("draft", "standard", "high")]
+    assert counts == sorted(counts)
+    assert counts[1] <= 15.6e6
+    samples = [make_config(name).sampling.samples for name in ("draft", "standard", "high")]
+    assert samples == sorted(samples)
+    for name in ("draft", "standard", "high"):
+        assert len(OccupancyGrid(make_config(name).sampling, False).cells) == make_config(name).sampling.resolution ** 3

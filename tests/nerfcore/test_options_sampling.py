@@ -43,7 +43,7 @@ def slab(density: float, interest: float = 0.0, **settings: str) -> tuple[Occupa
     cells[..., n // 2 : 3 * n // 4, 1] = interest
     grid.cells.copy_(cells.view(-1, 2))
     origin, direction = torch.tensor([[-3.0, 0.01, 0.01]]), torch.tensor([[1.0, 0.0, 0.0]])
-    return grid, sample(origin, direction, grid.cells, grid.blocks, grid.march_settings(), 64)
+    return grid, sample(origin, direction, grid.cells, grid.reach, grid.march_settings(), 64)
 
 
 def share(samples: Samples, low: float, high: float) -> float:
@@ -204,7 +204,7 @@ def test_samples_of_little_weight_are_left_out(ball: Path) -> None:
         out = rendered(trainer)
         shown[cull] = len(out.samples)
         if len(out.weights):
-            assert float(out.weights.min()) > float(cull)
+            assert float(out.weights.detach().min()) > float(cull)
     assert shown["0"] > shown["0.02"] > shown["0.9"]
 
 
@@ -222,6 +222,18 @@ def test_pictures_have_samples_of_their_own(monkeypatch: pytest.MonkeyPatch) -> 
         monkeypatch.setattr(m, "render", render)
         render_view(m, camera, pose, 0.0)
         assert set(counts) == {expected}
+
+
+@pytest.mark.setting("render.refine", "render.per_bin")
+def test_pictures_have_a_grid_and_a_number_of_samples_of_their_own() -> None:
+    for factor in (1, 2):
+        m = model(**{"render.refine": str(factor), "render.per_bin": "0.5"})
+        m.occupancy.cells[: N**3 // 2, 0] = 0  # an untrained grid is open everywhere
+        m.refine()
+        settings = m.render_grid().settings
+        assert settings.resolution == factor * N
+        assert settings.per_bin == 0.5
+    assert m.occupancy.march_settings().per_bin == 0.0  # training has its own
 
 
 @pytest.mark.setting("render.fused")

@@ -17,6 +17,7 @@ import numpy as np
 import pycolmap
 
 from . import features, mapping
+from .resume import mapping_folder
 from .validate import MIN_MATCHES, pair_images
 
 NEIGHBOURS = 5  # frames to either side whose matches are believed
@@ -37,17 +38,17 @@ def follow(path: Path, image_folder: Path, work: Path, names: list[str], tell: A
 
     The outcome is kept in `work` and read from there when it was found before.
     """
-    memory = work / "mapping" / f"chain_{path.stem}_{len(names)}"
     folder = work / "chain"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    near = features.copy_database(path, folder / "near.db")
+    near = features.copy_database(path, folder / f"near_{path.name}")
     with features.database(near) as db:
         place = _places(db, names)
         db.clear_descriptors()
         for a, b in (pair_images(pair_id) for pair_id in db.read_two_view_geometries()[0]):
             if a not in place or b not in place or abs(place[a] - place[b]) > NEIGHBOURS:
                 db.delete_two_view_geometry(a, b)
+    memory = mapping_folder(work, near, False, False, names)
     models = mapping.build(near, image_folder, folder / "models", False, names, tell, memory=memory)
     shutil.rmtree(folder)
     rotations, cameras = [], {}

@@ -47,10 +47,10 @@ def watched(path: Path, table: str, total: int, tell: Any, noun: str) -> Iterato
 
 def copy_database(path: Path, target: Path) -> Path:
     """Copy a database that nobody has open, with its write-ahead log; returns `target`."""
-    for suffix in ("", "-wal"):
+    for suffix in ("", "-wal", "-shm"):
         source, copy = Path(f"{path}{suffix}"), Path(f"{target}{suffix}")
         copy.unlink(missing_ok=True)
-        if source.is_file():
+        if source.is_file() and suffix != "-shm":
             shutil.copyfile(source, copy)
     return target
 

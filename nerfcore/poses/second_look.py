@@ -131,7 +131,9 @@ def join(path: Path, other: Path, joined: Path) -> None:
         for i, values in descriptors.items():
             db.write_descriptors(i, values)
         _join_matches(db, more, same, offset)
-    # Closing has emptied the write-ahead log into the file.
+    # Closing has emptied the write-ahead log into the file; one that a killed run left must not be read into it.
+    for suffix in ("-wal", "-shm"):
+        Path(f"{joined}{suffix}").unlink(missing_ok=True)
     temporary.replace(joined)
 
 

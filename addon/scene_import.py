@@ -98,13 +98,13 @@ def import_steps(
         root[SWITCH] = 0.0
         root.id_properties_ui(SWITCH).update(min=0.0, max=1.0, description="0: colours of the photos, 1: class colours")
     result = Imported(root)
+    size = _camera_size(package)
     if cameras in {"many", "both"}:
-        size = _camera_size(package)
         for index, entry in enumerate(package.cameras):
             yield 0.1 + 0.5 * index / len(package.cameras), entry["name"]
             result.cameras.append(_camera(place, entry, package, root, size))
     if cameras in {"animated", "both"} and package.cameras:
-        result.animated = yield from _animated_camera(place, package, root)
+        result.animated = yield from _animated_camera(place, package, root, size)
     yield 0.7, "points"
     if len(package.xyz):
         result.points = _points(place, package, root)
@@ -256,7 +256,7 @@ def _camera(
     return item
 
 
-def _animated_camera(place: _Place, package: Package, root: bpy.types.Object) -> Steps:
+def _animated_camera(place: _Place, package: Package, root: bpy.types.Object, size: float) -> Steps:
     """One camera that stands at the n-th photo's place in frame n; returns it."""
     role = "camera path"
     found = place.existing(role)
@@ -278,7 +278,7 @@ def _animated_camera(place: _Place, package: Package, root: bpy.types.Object) ->
         item.keyframe_insert("rotation_quaternion", frame=frame)
         for path in ("lens", "shift_x", "shift_y"):
             data.keyframe_insert(path, frame=frame)
-    data.clip_start, data.clip_end = 0.01, 1000.0
+    data.display_size, data.clip_start, data.clip_end = size, 0.01, 1000.0
     return item
 
 

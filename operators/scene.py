@@ -75,13 +75,13 @@ def import_result(job: jobs.Job, cameras: str, scene_name: str) -> jobs.Steps | 
 
 def import_steps(job: jobs.Job, cameras: str, scene: bpy.types.Scene) -> jobs.Steps:
     # Not at the top: enabling the extension must be quick.
-    from ..addon import scene_import, visibility
+    from ..addon import capture_frame, scene_import
 
-    first = not visibility.meshes(job.project.name)
+    first = capture_frame.root_of(scene, job.project) is None
     imported = yield from scene_import.import_steps(scene, scene_import.load(job.result["folder"]), cameras)
     job.warnings += imported.warnings
     state.show_classes(scene.fieldwork)
-    if first and imported.mesh is not None:
+    if first:
         show_colors()
     yield 1.0, ""
     if not bpy.app.background:
@@ -89,7 +89,7 @@ def import_steps(job: jobs.Job, cameras: str, scene: bpy.types.Scene) -> jobs.St
 
 
 def show_colors() -> None:
-    """Let solid viewports show the photographed colors of the mesh, where they show plain material colors."""
+    """Let solid viewports show the photographed colors of points and mesh, where they show plain material colors."""
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
             if area.type == "VIEW_3D" and area.spaces.active.shading.color_type == "MATERIAL":

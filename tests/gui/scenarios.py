@@ -41,6 +41,12 @@ def capture(screen):
     screen.facts["placed"] = [placed, len(settings.images)]
     yield from every_panel(screen, "posed")
     yield from screen.run_operator("fieldwork.import_scene", 120)
+    bpy.ops.object.select_all(action="DESELECT")
+    for obj in bpy.data.objects:
+        obj.select_set(obj.get("fieldwork_role", "").startswith(("camera", "points")))
+    with bpy.context.temp_override(window=screen.window, area=screen.area, region=screen.view):
+        bpy.ops.view3d.view_selected()
+    bpy.ops.object.select_all(action="DESELECT")
     yield 1.0
     screen.shot("scene")
     screen.facts["cameras"] = sum(obj.type == "CAMERA" for obj in bpy.data.objects)

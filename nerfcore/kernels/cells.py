@@ -70,7 +70,8 @@ def observe(
 ) -> None:
     """Update the cells that hold points (N, 3) in place: grid ← max(decay · grid, largest value of the points in it).
 
-    `scratch` (resolution³,) must be −1 everywhere and is so again afterwards.
+    `scratch` (resolution³,) must be −1 everywhere and is so again afterwards. Points with negative values are passed
+    over.
     """
     init()
     where = array(points, wp.vec3)
@@ -94,13 +95,14 @@ def move_mean(
     offset: int,
 ):
     i = wp.tid() + offset
-    cell = cell_index(points[i], n)
-    grid[cell] = grid[cell] + rate * (values[i] - grid[cell])
+    if values[i] >= 0.0:
+        cell = cell_index(points[i], n)
+        grid[cell] = grid[cell] + rate * (values[i] - grid[cell])
 
 
 def average(grid: torch.Tensor, resolution: int, points: torch.Tensor, values: torch.Tensor, rate: float) -> None:
     """Move the cells that hold points (N, 3) towards the points' values (N,) in place, one point after the other:
-    grid ← grid + rate · (value − grid)."""
+    grid ← grid + rate · (value − grid). Points with negative values are passed over."""
     init()
     inputs = [array(points, wp.vec3), array(values.contiguous()), resolution, rate, array(grid)]
     launch(move_mean, len(points), inputs, points.device, serial=True)

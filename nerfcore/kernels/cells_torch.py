@@ -45,4 +45,5 @@ def average(grid: torch.Tensor, resolution: int, points: torch.Tensor, values: t
     n = resolution
     x, y, z = (points * n).long().clamp(0, n - 1).unbind(-1)
     for cell, value in zip(((z * n + y) * n + x).tolist(), values.tolist()):
-        grid[cell] += rate * (value - grid[cell])
+        if value >= 0:
+            grid[cell] += rate * (value - grid[cell])

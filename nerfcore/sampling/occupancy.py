@@ -48,6 +48,7 @@ class OccupancyGrid(nn.Module):
         # How far from every camera of the capture nothing was seen: other cameras outside of the cube need not look.
         self.register_buffer("empty", torch.zeros(()))
         self.empty: torch.Tensor
+        self._empty = (-1, 0.0)
         self.register_buffer("mean", torch.where(seen, 3.0, 0.0))
         self.mean: torch.Tensor
         self.density: torch.Tensor
@@ -61,9 +62,11 @@ class OccupancyGrid(nn.Module):
 
     def march_settings(self, near: float = 0.02) -> MarchSettings:
         c = self.config
+        if self._empty[0] != self.empty._version:  # reading it back from a device takes long
+            self._empty = (self.empty._version, float(self.empty))
         beta = c.beta if c.interest != "none" else 0.0
         return MarchSettings(
-            c.resolution, self.step, near, 1000.0, self.contracted, MODES[c.pdf], beta, c.epsilon, float(self.empty)
+            c.resolution, self.step, near, 1000.0, self.contracted, MODES[c.pdf], beta, c.epsilon, self._empty[1]
         )
 
     def rebuild(self) -> None:
@@ -117,7 +120,9 @@ class OccupancyGrid(nn.Module):
 
     @torch.no_grad()
     def observe(self, points: torch.Tensor, density: torch.Tensor, warming_up: bool) -> None:
-        """Take in the densities (N,) that a training step read anyway at points (N, 3); rays see it at the next update."""
+        """Take in the densities (N,) that a training step read anyway at points (N, 3); rays see it at the next update.
+
+        Points with a negative density were not read."""
         # A cell is observed at up to every step: its decay is spread over them.
         decay = 0.9 if warming_up else self.config.decay ** (1 / self.config.update_every)
         average(self.mean, self.config.resolution, points, density, MEAN_RATE)

@@ -19,13 +19,15 @@ from ..sampling.occupancy import OccupancyGrid, class_interest
 from ..sampling.render_grid import RenderGrid, present_grid, refined_grid
 
 ONE_PASS_SHARE = 0.67
+ROOM = 1.6  # places for samples that show, as a multiple of how many did lately
 
 
 @dataclass(frozen=True)
 class Rendered:
     """Of R rays: color (R, 3) without background, opacity (R,), depth (R,) expected distance (normalised units, not
     divided by opacity), probabilities (R, K) or None; of the samples that show: weights (N,), density (N,), packed as
-    in `samples`; of all M samples the field was read at: `read_points` (M, 3) in grid coordinates and `read_density`.
+    in `samples`; of all M samples the field was read at: `read_points` (M, 3) in grid coordinates and `read_density`,
+    −1 where a place is unused.
     """
 
     color: torch.Tensor
@@ -40,7 +42,7 @@ class Rendered:
 
     @property
     def evaluated(self) -> int:
-        """Number of samples the field was read at."""
+        """Number of places at which the field was evaluated."""
         return len(self.read_density)
 
 
@@ -75,6 +77,18 @@ class Model(nn.Module):
         self.register_buffer("shown_share", torch.ones(()))
         self.shown_share: torch.Tensor
         self._refined: RenderGrid | None = None
+        # What is differentiated has places for as many samples as there may be, so that the host need not wait for
+        # their number; None: on devices that run behind the host.
+        self.fixed_places: bool | None = None
+        self.known_share = 1.0  # `shown_share` as the host last read it
+
+    def has_fixed_places(self) -> bool:
+        """Whether `render` reads nothing back from the device where it keeps gradients."""
+        return self.priorities.device.type == "cuda" if self.fixed_places is None else self.fixed_places
+
+    def refresh(self) -> None:
+        """Read back how many of the samples show."""
+        self.known_share = float(self.shown_share)
 
     @property
     def contracted(self) -> bool:
@@ -124,7 +138,12 @@ class Model(nn.Module):
         kernels.march.sample; `codes` (R, A): appearance code of each ray.
         """
         grid = grid or present_grid(self.occupancy, 0.0)
-        s = sample(origins, directions, grid.cells, grid.reach, grid.settings, samples_per_ray, jitter, shift)
+        learning = torch.is_grad_enabled()
+        fixed = learning and self.has_fixed_places()
+        if not fixed:
+            self.refresh()
+        capacity = len(origins) if fixed else None
+        s = sample(origins, directions, grid.cells, grid.reach, grid.settings, samples_per_ray, jitter, shift, capacity)
         points = s.points
         if origins.requires_grad:  # pose refinement: samples move with their ray
             along = s.packing.ray.long()
@@ -132,21 +151,24 @@ class Model(nn.Module):
             points = grid_position(moved, self.contracted).clamp(0, 1)
         # Where many samples turn out invisible, a first pass without gradients finds the others, and only those are
         # differentiated; where nearly all show, one pass is cheaper (3k + 1 against 3 forward costs at share k).
-        first_look = not torch.is_grad_enabled() or float(self.shown_share) < ONE_PASS_SHARE
-        with torch.set_grad_enabled(torch.is_grad_enabled() and not first_look):
+        first_look = not learning or self.known_share < ONE_PASS_SHARE
+        with torch.set_grad_enabled(learning and not first_look):
             everywhere = self.field.geometry(points)
             weights = render_weights(everywhere.density, s.delta, s.packing)
         with torch.no_grad():
             visible = weights > self.config.render.cull
-            kept, packing = visible.nonzero()[:, 0], s.packing.subset(visible)
+            room = math.ceil(len(s) * min(1.0, ROOM * self.known_share)) if fixed else None
+            kept, packing = s.packing.subset(visible, room)
         delta = s.delta[kept]
-        if torch.is_grad_enabled() and first_look:
+        if learning and first_look:
             shown = self.field.geometry(
                 points[kept], everywhere.explicit[kept] if everywhere.explicit is not None else None
             )
             weight = render_weights(shown.density, delta, packing)
         else:
             shown, weight = everywhere[kept], weights[kept]
+            if fixed:
+                weight = torch.where(packing.ray < 0, 0.0, weight)
         ray = packing.ray.long()
         # Per ray first: a ray's samples share direction and code.
         directional = spherical_harmonics(directions).to(self.field.dtype)
@@ -164,10 +186,10 @@ class Model(nn.Module):
             summed[:, 4],
             probabilities,
             weight,
-            shown.density,
+            torch.where(packing.ray < 0, 0.0, shown.density) if fixed else shown.density,
             shown_samples,
             s.points,
-            everywhere.density.detach(),
+            torch.where(s.packing.ray < 0, -1.0, everywhere.density.detach()) if fixed else everywhere.density.detach(),
         )
 
     @torch.no_grad()
@@ -176,8 +198,8 @@ class Model(nn.Module):
         points = torch.cat([r.read_points for r in rendered])
         density = torch.cat([r.read_density for r in rendered])
         self.occupancy.observe(points, density, self.warming_up)
-        shown = sum(len(r.samples) for r in rendered)
-        self.shown_share += 0.05 * (shown / max(len(points), 1) - self.shown_share)
+        shown = torch.stack([r.samples.packing.count.sum() for r in rendered]).sum()
+        self.shown_share += 0.05 * (shown / (density >= 0).sum().clamp(min=1) - self.shown_share)
 
     def _probabilities(self, logits: torch.Tensor, weight: torch.Tensor, packing) -> torch.Tensor:
         if self.config.loss.detach_weights:

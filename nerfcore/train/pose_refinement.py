@@ -35,6 +35,17 @@ def skew(vector: torch.Tensor) -> torch.Tensor:
     return torch.stack([o, -z, y, z, o, -x, -y, x, o], 1).view(-1, 3, 3)
 
 
+def turns(vector: torch.Tensor) -> torch.Tensor:
+    """Rotation matrices (N, 3, 3) exp([ω]×) of rotation vectors (N, 3) in radians, by Rodrigues' formula, without
+    a singularity at 0."""
+    squared = (vector * vector).sum(1)[:, None, None]
+    angle = torch.sqrt(squared + 1e-20)
+    cross = skew(vector)
+    half = torch.sinc(angle / (2 * torch.pi))
+    identity = torch.eye(3, device=vector.device, dtype=vector.dtype)
+    return identity + torch.sinc(angle / torch.pi) * cross + 0.5 * half * half * (cross @ cross)
+
+
 def rig_motions(centers: torch.Tensor) -> torch.Tensor:
     """Velocities (V·3, 7) of camera centres (V, 3) under the seven motions of a rigid, scalable rig."""
     middle = centers - centers.mean(0)
@@ -55,7 +66,8 @@ class PoseRefinement(nn.Module):
         super().__init__()
         self.config = config
         self.correction = nn.Parameter(torch.zeros(len(rays.center), 6, device=rays.center.device))
-        self.optimizer = torch.optim.Adam([self.correction], config.pose_rate, betas=BETAS, eps=1e-15)
+        fused = self.correction.device.type != "mps"
+        self.optimizer = torch.optim.Adam([self.correction], config.pose_rate, betas=BETAS, eps=1e-15, fused=fused)
         motions = rig_motions(rays.center) if keep_rig else None
         self.motions = None if motions is None else (motions, torch.linalg.pinv(motions.double()).float())
         self._moved: tuple[torch.Tensor, torch.Tensor] | None = None
@@ -63,8 +75,7 @@ class PoseRefinement(nn.Module):
     def move(self, batch: Batch) -> Batch:
         """The batch with corrected rays, which require gradients: `step` takes those up."""
         image = batch.image
-        turns = torch.matrix_exp(skew(self.correction[:, :3]))
-        directions = torch.einsum("nij,nj->ni", turns[image], batch.directions)
+        directions = torch.einsum("nij,nj->ni", turns(self.correction[:, :3])[image], batch.directions)
         origins = batch.origins + self.correction[image, 3:]
         self._moved = origins, directions
         return replace(
@@ -99,7 +110,7 @@ class PoseRefinement(nn.Module):
     def poses(self, rays: CameraRays) -> torch.Tensor:
         """Corrected camera-to-box poses (V, 4, 4)."""
         result = torch.eye(4, device=rays.center.device).repeat(len(rays.center), 1, 1)
-        result[:, :3, :3] = torch.matrix_exp(skew(self.correction[:, :3])) @ rays.rotation
+        result[:, :3, :3] = turns(self.correction[:, :3]) @ rays.rotation
         result[:, :3, 3] = rays.center + self.correction[:, 3:]
         return result
 

@@ -56,7 +56,6 @@ class Measured:
     steps: int = 0
     rays: int = 0
     samples: int = 0
-    shown: int = 0
 
     @property
     def psnr(self) -> float:
@@ -112,6 +111,7 @@ class Trainer:
         if self.steps % config.sampling.update_every == 0:
             interest = model.interest if model.wants_interest() and self.steps >= config.sampling.warmup else None
             model.occupancy.update(self.steps, model.field.density, interest, self.generator)
+            model.refresh()
         batch, start = self.draw(), config.train.pose_start
         moving = self.poses if progress >= start else None
         if moving is not None:
@@ -295,7 +295,6 @@ class Trainer:
         m.rays += rays
         evaluated = sum(r.evaluated for r in rendered)
         m.samples += evaluated
-        m.shown += sum(len(r.samples) for r in rendered)
         if self.steps % 8 == 0:
             wanted = rays * budget / max(evaluated, 1)
             self.rays = int(min(max(wanted, rays * 0.5, 16), rays * 2, train.max_rays))

@@ -1,0 +1,179 @@
+"""Training steps that read nothing back from the device: the same numbers, and nothing the host would wait for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+from fieldwork.nerfcore.kernels.packing import Packing
+from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.train.model import Rendered
+from fieldwork.nerfcore.train.prepare import make_trainer, plan_run
+from fieldwork.nerfcore.train.trainer import Trainer
+from fieldwork.tests.nerfcore.support.ball import ball_project
+from fieldwork.tests.nerfcore.support.settings import config_of, trainer_of
+from torch.utils._python_dispatch import TorchDispatchMode
+
+UPDATE = 16  # steps between updates of the occupancy grid, which may read back
+WAITS = {"_local_scalar_dense", "nonzero", "masked_select", "equal", "unique2", "_unique2", "repeat_interleave"}
+
+
+@pytest.fixture(scope="module")
+def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return ball_project(tmp_path_factory.mktemp("fixed") / "ball", views=9, side=24, depth=True)
+
+
+def warm(project: Path, steps: int = 40, **settings: str) -> Trainer:
+    trainer = trainer_of(project, **settings)
+    for _ in range(steps):
+        trainer.step(0.1)
+    return trainer
+
+
+class Waits(TorchDispatchMode):
+    """Lists the operations whose result the host needs before it can go on."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        name = func.overloadpacket.__name__
+        masks = args[1] if name in ("index", "index_put", "index_put_") else ()
+        by_mask = any(isinstance(m, torch.Tensor) and m.dtype in (torch.bool, torch.uint8) for m in masks)
+        if name in WAITS or by_mask:
+            self.found.append(name)
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.fixture
+def one_thread() -> Iterator[None]:
+    """Threads of the kernel pool would escape the listener."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def test_places_are_those_of_the_kept_samples_and_the_rest_is_marked() -> None:
+    generator = torch.Generator().manual_seed(0)
+    count = torch.randint(0, 6, (40,), generator=generator, dtype=torch.int32)
+    start = torch.cumsum(count, 0, dtype=torch.int32) - count
+    packing = Packing(start, count, torch.repeat_interleave(torch.arange(40).int(), count.long()))
+    kept = torch.rand(len(packing.ray), generator=generator) < 0.4
+    places, exact = packing.subset(kept)
+    with Waits() as waits:
+        fixed, padded = packing.subset(kept, len(places) + 7)
+    assert waits.found == []
+    assert torch.equal(fixed[: len(places)], places)
+    assert torch.equal(padded.ray[: len(places)], exact.ray)
+    assert bool((padded.ray[len(places) :] == -1).all())
+    assert torch.equal(padded.count, exact.count)
+    assert torch.equal(padded.start[exact.count > 0], exact.start[exact.count > 0])
+    few, cut = packing.subset(kept, 9)
+    assert torch.equal(few, places[:9])
+    assert int(cut.count.sum()) == 9
+    assert bool((cut.start + cut.count <= 9).all())
+
+
+@pytest.mark.parametrize("share", [0.66, 1.0], ids=["two passes", "one pass"])
+def test_fixed_places_give_the_same_picture_gradients_and_grid(ball: Path, share: float) -> None:
+    trainer = warm(ball, **{"field.appearance": "2"})
+    model = trainer.model
+    batch = trainer.store.batch(torch.arange(0, len(trainer.store), 3))
+    rays = len(batch.rgb)
+    jitter, shift = torch.rand(rays), torch.rand(rays * 12)
+    origins, directions = (x.clone().requires_grad_() for x in (batch.origins, batch.directions))
+    grid = model.field.grid
+    assert grid is not None
+    assert model.field.appearance is not None
+
+    def result(fixed: bool) -> tuple[Rendered, list[torch.Tensor]]:
+        model.fixed_places = fixed
+        model.shown_share.fill_(share)
+        model.refresh()
+        grid.clear()
+        codes = model.field.appearance[batch.image]
+        out = model.render(origins, directions, 12, jitter, shift, codes)
+        assert out.probabilities is not None
+        loss = (out.color.square().sum(1) + out.depth + out.opacity).sum() + out.probabilities.square().sum()
+        found = torch.autograd.grad(loss, [*model.parameters(), origins, directions])
+        before = {name: value.clone() for name, value in model.occupancy.state_dict().items()}
+        model.observe([out])
+        after = [model.occupancy.density.clone(), model.occupancy.mean.clone(), model.shown_share.clone()]
+        model.occupancy.load_state_dict(before)
+        return out, [*found, grid.gradient.clone(), *after]
+
+    exact, padded = result(False), result(True)
+    live = exact[0].samples.packing.count.sum()
+    assert len(exact[0].read_density) < len(padded[0].read_density)  # some rays meet nothing
+    assert len(exact[0].weights) == live < len(padded[0].weights)
+    for name in ("color", "opacity", "depth", "probabilities"):
+        assert torch.allclose(getattr(exact[0], name), getattr(padded[0], name), atol=1e-6), name
+    assert torch.allclose(exact[0].weights, padded[0].weights[:live], atol=1e-6)
+    assert bool((padded[0].weights[live:] == 0).all())
+    for a, b in zip(exact[1], padded[1]):
+        assert torch.allclose(a, b, atol=1e-5 * float(a.abs().max().clamp(min=1e-6)))
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {},
+        {"train.refine_poses": "true", "train.pose_start": "0", "loss.depth_weight": "0.1"},
+        {"loss.distortion_weight": "0.01", "loss.opacity_weight": "0.01", "field.fusion": "concat"},
+        {"field.branch": "implicit", "render.accumulate": "logits", "field.appearance": "4"},
+        {"field.branch": "explicit", "sampling.pdf": "uniform", "field.blend_by": "density"},
+    ],
+    ids=lambda s: " ".join(s) or "default",
+)
+def test_an_ordinary_step_asks_the_device_for_nothing(
+    ball: Path,
+    settings: dict[str, str],
+    one_thread: None,
+) -> None:
+    trainer = trainer_of(ball, **settings)
+    trainer.model.fixed_places = True
+    waited: dict[int, list[str]] = {}
+    for step in range(2 * UPDATE + 20):
+        with Waits() as waits:
+            trainer.step(0.5)
+        if waits.found:
+            waited[step] = waits.found
+    # The grid's updates may, and the step at which the coarse cache is made.
+    assert {step for step in waited if step % UPDATE and step != trainer.config.sampling.warmup} == set()
+    assert waited  # the listener works
+    assert all(bool(torch.isfinite(p).all()) for p in trainer.model.parameters())
+
+
+def test_training_with_fixed_places_learns_as_well(ball: Path) -> None:
+    errors = {}
+    for fixed in (False, True):
+        trainer = trainer_of(ball)
+        trainer.model.fixed_places = fixed
+        for step in range(150):
+            trainer.step(step / 150)
+        trainer.take_measured()
+        for _ in range(10):
+            trainer.step(1.0)
+        errors[fixed] = trainer.take_measured().psnr
+    assert errors[True] == pytest.approx(errors[False], abs=1.0)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no NVIDIA GPU")
+def test_ordinary_steps_on_a_gpu_never_make_the_host_wait(ball: Path) -> None:
+    device = torch.device("cuda")
+    info, scene = plan_run(ball, "draft", config_of(), device)
+    trainer = make_trainer(ball, info, scene, device, Reporter())
+    for _ in range(3 * UPDATE):  # kernels are compiled, the cache is made
+        trainer.step(0.5)
+    try:
+        for step in range(3 * UPDATE, 5 * UPDATE):
+            torch.cuda.set_sync_debug_mode("default" if step % UPDATE == 0 else "error")
+            trainer.step(0.5)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert trainer.take_measured().psnr > 5

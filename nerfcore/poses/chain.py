@@ -8,6 +8,7 @@ alone, and matches between far frames that would turn a camera elsewhere are tak
 from __future__ import annotations
 
 import copy
+import json
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,10 +17,12 @@ from typing import Any
 import numpy as np
 import pycolmap
 
+from ..files import write_json
 from . import features, mapping
 from .resume import mapping_folder
 from .validate import MIN_MATCHES, pair_images
 
+COUNTS = "contradicting.json"  # of pairs, by database
 NEIGHBOURS = 5  # frames to either side whose matches are believed
 TURNED = 30.0  # degrees: chains drift less over a walk, and repeated things are usually two- to sixfold
 
@@ -59,6 +62,23 @@ def follow(path: Path, image_folder: Path, work: Path, names: list[str], tell: A
         rotations.append({image.name: image.cam_from_world().rotation.matrix() for image in fresh})
         cameras |= {image.name: copy.copy(image.camera) for image in fresh}  # theirs die with the model
     return Chain(rotations, cameras)
+
+
+def tell_apart(path: Path, image_folder: Path, work: Path, names: list[str], tell: Any) -> int:
+    """Take the matches out of the database of a video that contradict the way the camera went.
+
+    Returns:
+        of how many pairs, those of earlier runs on the same database included.
+    """
+    count = reject_contradicting(path, follow(path, image_folder, work, names, tell), names)
+    known = work / COUNTS
+    try:
+        counts = json.loads(known.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        counts = {}
+    counts[path.name] = counts.get(path.name, 0) + count
+    write_json(known, counts)
+    return counts[path.name]
 
 
 def reject_contradicting(path: Path, chain: Chain, names: list[str]) -> int:

@@ -158,8 +158,7 @@ def _tell_apart(job: dict[str, Any], path: Path, names: list[str], tell: Any) ->
     if not job["video"] or job["start"] is not None:
         return 0
     features.set_lenses(path, job["images"], full=False)
-    found = chain.follow(path, Path(job["image_folder"]), Path(job["work"]), names, tell)
-    return chain.reject_contradicting(path, found, names)
+    return chain.tell_apart(path, Path(job["image_folder"]), Path(job["work"]), names, tell)
 
 
 def _levels(job: dict[str, Any], work: Path) -> tuple[Level, ...]:

@@ -95,10 +95,11 @@ def matched(path: Path) -> dict[tuple[int, int], int]:
 def test_matches_between_alike_sides_are_taken_out(tmp_path: Path) -> None:
     path, names = can_database(tmp_path)
     before = matched(path)
-    found = chain.follow(path, tmp_path, tmp_path / "work", names, Quiet())
+    work = tmp_path / "work"
+    found = chain.follow(path, tmp_path, work, names, Quiet())
     assert matched(path) == before  # the database itself was not touched
     assert [len(stretch) for stretch in found.rotations] == [FRAMES]
-    count = chain.reject_contradicting(path, found, names)
+    count = chain.tell_apart(path, tmp_path, work, names, Quiet())
     after = matched(path)
     assert set(after) == set(before)
     apart = {pair: min(pair[1] - pair[0], FRAMES - pair[1] + pair[0]) * 360 / FRAMES for pair in before}
@@ -107,9 +108,10 @@ def test_matches_between_alike_sides_are_taken_out(tmp_path: Path) -> None:
     assert {pair for pair in after if after[pair] == 0} == wrong
     assert count == len(wrong)
     # Once more: the chain is remembered, and nothing is left to take out.
-    again = chain.follow(path, tmp_path, tmp_path / "work", names, Quiet())
+    again = chain.follow(path, tmp_path, work, names, Quiet())
     assert all(np.allclose(again.rotations[0][name], found.rotations[0][name]) for name in names)
     assert chain.reject_contradicting(path, again, names) == 0
+    assert chain.tell_apart(path, tmp_path, work, names, Quiet()) == count
 
 
 def test_angle_between_rotations() -> None:

@@ -40,7 +40,6 @@ ABLATION = {
     "uniform pdf": {"sampling.pdf": "uniform"},
     "literal pdf": {"sampling.pdf": "literal"},
     "no semantics": {"loss.semantic_weight": "0"},
-    "voxel_init none": {"field.voxel_init": "none"},
     "voxel_init rgb_stats": {"field.voxel_init": "rgb_stats"},
     "voxel_init cnn": {"field.voxel_init": "cnn"},
 }

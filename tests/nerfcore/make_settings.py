@@ -5,9 +5,13 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+from fieldwork.nerfcore.bench.suites import ABLATION
 from fieldwork.nerfcore.config import PRESETS, RunConfig
 
 TARGET = Path(__file__).resolve().parents[2] / "docs" / "settings.md"
+
+
+BOUNDARIES = ("explicit", "implicit", "no semantics", "uniform pdf")
 
 
 def settings_page() -> str:
@@ -33,6 +37,15 @@ def settings_page() -> str:
             text = (setting.description or "") + (f" {kind}" if kind else "")
             text = text.replace("|", "\\|").strip()
             lines.append(f"| `{stage}.{name}` | `{json.dumps(setting.default)}` | {text} |")
+    lines += [
+        "",
+        "## Boundary cases",
+        "",
+        "Of the same pipeline, and variants of `fieldwork bench --suite ablation`:",
+        "",
+    ]
+    for case in BOUNDARIES:
+        lines.append(f"- **{case}**: {', '.join(f'`{name}={value}`' for name, value in ABLATION[case].items())}")
     lines += ["", "## Presets", ""]
     for path in sorted(PRESETS.glob("*.json")):
         values = json.loads(path.read_text(encoding="utf-8"))

@@ -51,11 +51,13 @@ class FIELDWORK_OT_export(ProjectOperator):
 
     @classmethod
     def reason(cls, context: Context) -> str | None:
-        return super().reason(context) or cls.need_mesh(context)
+        return super().reason(context) or cls.need_format(context)
 
     @staticmethod
-    def need_mesh(context: Context) -> str | None:
+    def need_format(context: Context) -> str | None:
         settings = context.scene.fieldwork
+        if settings.export_to == "blend":
+            return t("Choose a format for other programs in the Export panel")
         folder = state.folder_of(settings)
         mesh = folder is not None and (folder / "exports" / settings.run / "mesh.npz").is_file()
         return t("Extract the mesh first") if settings.export_to in OF_THE_MESH and not mesh else None

@@ -162,6 +162,9 @@ class FIELDWORK_OT_simulate(VerbOperator):
     seed: IntProperty(name="Seed", description="Another seed, another scene", min=0)
     samples: IntProperty(name="Samples", description="Cycles samples per pixel", default=4, min=1)
 
+    def invoke(self, context: Context, event: bpy.types.Event) -> set[str]:
+        return context.window_manager.invoke_props_dialog(self, width=380)
+
     def parameters(self, context: Context) -> dict[str, Any]:
         if not self.out:
             raise ValueError(t("Choose a folder for the capture."))

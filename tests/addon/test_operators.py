@@ -79,10 +79,20 @@ reasons = {name: cls.reason(bpy.context) for name, cls in operators.items()}
 preferences.engine_python = lambda: None
 settings.project = project
 reasons["no engine"] = operators["poses"].reason(bpy.context)
+need = bpy.types.FIELDWORK_OT_export.need_format
+needs = [need(bpy.context)]
+for settings.export_to in ("glb", "onnx"):
+    needs.append(need(bpy.context))
+reasons["export"] = needs
 answer(reasons)
 """,
         project=make_project(tmp_path / "capture"),
     )
+    assert facts.pop("export") == [
+        "Choose a format for other programs in the Export panel",
+        "Extract the mesh first",
+        None,
+    ]
     assert facts.pop("new") == "Choose a folder of photos, or a video, first"
     assert "preferences" in facts.pop("no engine")
     assert set(facts.values()) <= {"Read photos into a project first", "The scene has no active camera"}

@@ -16,7 +16,7 @@ def capture(screen):
     yield from screen.show_sidebar()
     screen.shot("empty")
     settings = bpy.context.scene.fieldwork
-    for _ in range(3):  # a machine under load may miss the start of a drag
+    for _ in range(6):  # a machine under load may miss the start of a drag
         if not settings.photos:
             yield from drop(screen, PHOTOS)
     screen.facts["dropped"] = [settings.photos, settings.project]

@@ -54,7 +54,7 @@ def estimate_poses(params: PosesParams, report: Reporter) -> dict[str, Any]:
     """
     folder = Path(params.project)
     project = load_project(folder)
-    records = [record for record in project.images if record.status != "rejected"]
+    records = _usable(project)
     if len(records) < MIN_PHOTOS:
         rejected = len(project.images) - len(records)
         raise PosesError(
@@ -69,6 +69,9 @@ def estimate_poses(params: PosesParams, report: Reporter) -> dict[str, Any]:
         _forget_changed(work, records)
         masks = _prepare_masks(folder, work, records, report)
     result = run_worker(_job(folder, project, records, masks, params, extend=previous is not None), work, report)
+    # Blender may have changed the classes or the region meanwhile.
+    project = load_project(folder)
+    records = _usable(project)
     poses, points, visibility = _poses(result, records)
     _update_project(project, records, poses, points, result, keep_frame=previous is not None)
     save_poses(folder, poses, points, visibility)
@@ -200,6 +203,10 @@ def _poses(result: dict[str, Any], records: list[ImageRecord]) -> tuple[Poses, P
     with np.load(result["points_file"], allow_pickle=False) as data:
         points = Points(data["xyz"], data["rgb"], data["error"])
         return poses, points, (data["view"], data["point"])
+
+
+def _usable(project: Project) -> list[ImageRecord]:
+    return [record for record in project.images if record.status != "rejected"]
 
 
 def _update_project(

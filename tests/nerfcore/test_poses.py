@@ -6,13 +6,22 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from fieldwork.nerfcore.data.similarity import transform_points
 from fieldwork.nerfcore.errors import DiskError, FieldworkError, PosesError
-from fieldwork.nerfcore.poses import process
-from fieldwork.nerfcore.project import load_points, load_poses, load_project, load_scene, load_visibility
+from fieldwork.nerfcore.poses import estimate, process
+from fieldwork.nerfcore.project import (
+    SemanticClass,
+    load_points,
+    load_poses,
+    load_project,
+    load_scene,
+    load_visibility,
+    save_project,
+)
 from fieldwork.tests.nerfcore.support.captures import centre_errors, ingest, poses, rotation_errors, view_errors
 from PIL import Image
 
@@ -137,6 +146,26 @@ def test_second_look_joins_further_features(fountain: Path, tmp_path: Path) -> N
         ours, all_ = db.read_two_view_geometry(a, b).inlier_matches, both.read_two_view_geometry(a, b).inlier_matches
         count = db.num_keypoints_for_image(a), db.num_keypoints_for_image(b)
         assert np.array_equal(all_, np.concatenate([ours, ours + np.array(count, np.uint32)]))
+
+
+def test_classes_edited_meanwhile_are_kept(fountain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Blender writes names and colours of classes into the project at any time, also while poses are estimated."""
+    project = Path(shutil.copytree(fountain, tmp_path / "fountain"))
+    run = estimate.run_worker
+
+    def edited_meanwhile(*arguments: Any) -> dict[str, Any]:
+        result = run(*arguments)
+        edited = load_project(project)
+        edited.classes.append(SemanticClass(id=7, name="marble", color=(1, 1, 1)))
+        save_project(project, edited)
+        return result
+
+    monkeypatch.setattr(estimate, "run_worker", edited_meanwhile)
+    poses(project, restart=True)
+    after = load_project(project)
+    assert [c.name for c in after.classes] == ["marble"]
+    assert after.provenance[-1].verb == "poses"
+    assert all(record.status == "ok" for record in after.images)
 
 
 def test_masks_are_honoured(fountain: Path, shared_data: Data, tmp_path: Path) -> None:

@@ -20,7 +20,6 @@ from ..train.run import RunInfo
 from .fused import ray_renderer
 
 CPU_RAYS = 8192
-TILES = 8  # rendered between two checks for cancelling
 
 
 @dataclass(frozen=True)
@@ -77,7 +76,7 @@ def render_view(
 ) -> Frame:
     """Render what a camera (pose (4, 4) in the normalised frame, OpenCV axes) sees.
 
-    `check` is called between tiles and may raise to stop.
+    `check` is called before every tile, on the CPU by several threads, and may raise to stop.
     """
     device = model.priorities.device
     rays = CameraRays([camera], camera_to_box[None], device)
@@ -86,7 +85,10 @@ def render_view(
     pixels = torch.arange(camera.width * camera.height, device=device)
     render = ray_renderer(model, len(pixels), semantics)
 
+    @torch.no_grad()
     def tile(pixel: torch.Tensor) -> list[torch.Tensor]:
+        if check is not None:
+            check()
         origins, directions = rays(torch.zeros_like(pixel), pixel)
         valid = ~directions[:, 0].isnan()
         directions = torch.where(valid[:, None], directions, axis.expand_as(directions)).contiguous()
@@ -99,11 +101,7 @@ def render_view(
 
     # The CPU renders small tiles side by side, each of which fits a core's cache.
     tiles = pixels.split(render.rays if device.type != "cpu" else min(render.rays, CPU_RAYS))
-    parts: list[list[torch.Tensor]] = []
-    for begin in range(0, len(tiles), TILES):
-        if check is not None:
-            check()
-        parts += run_parallel([partial(torch.no_grad()(tile), pixel) for pixel in tiles[begin : begin + TILES]])
+    parts = run_parallel([partial(tile, pixel) for pixel in tiles])
     shape = (camera.height, camera.width)
     images = [torch.cat(column).cpu() for column in zip(*parts)]
     color, opacity, depth, position, *classes = (i.reshape(*shape, *i.shape[1:]).numpy() for i in images)

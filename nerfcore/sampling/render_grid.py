@@ -48,7 +48,7 @@ def refined_grid(
     (N,), per normalised unit length) is not negligible at one of a few random points; their mean is the density.
 
     The occupancy grid itself where reading the cells takes longer than it saves in rendering so many `pixels`.
-    `check` is called now and then and may raise to stop.
+    `check` is called often, on the CPU by several threads, and may raise to stop.
     """
     present = present_grid(occupancy, per_bin)
     coarse = (occupancy.cells[:, 0] > 0).nonzero()[:, 0]
@@ -65,11 +65,11 @@ def refined_grid(
 
     @torch.no_grad()
     def read(points: torch.Tensor) -> torch.Tensor:
+        if check is not None:
+            check()
         return density(points)
 
     for _ in range(PROBES):
-        if check is not None:
-            check()
         points = (fine + torch.rand(fine.shape, device=device, generator=generator)) / side
         found = torch.cat(run_parallel([partial(read, some) for some in points.split(CHUNK)]))
         mean += found / PROBES

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import math
+import threading
 
 import pytest
 import torch
 from fieldwork.nerfcore.config import SamplingConfig
+from fieldwork.nerfcore.errors import Cancelled
 from fieldwork.nerfcore.kernels.march import LEAST, closed_reach, sample, sample_counts
+from fieldwork.nerfcore.kernels.runtime import worker_count
+from fieldwork.nerfcore.sampling import render_grid
 from fieldwork.nerfcore.sampling.occupancy import OccupancyGrid
 from fieldwork.nerfcore.sampling.render_grid import PROBES, SAVED, present_grid, refined_grid
 
@@ -94,3 +98,21 @@ def test_closed_reach_counts_closed_blocks_in_all_directions() -> None:
     reach = closed_reach(opened).view(16, 16, 16)
     for z, y, x in ((0, 0, 0), (0, 0, 1), (3, 2, 1), (7, 7, 0), (15, 15, 15)):
         assert int(reach[z, y, x]) == min(max(z, y, x), 8)
+
+
+def test_reading_the_finer_cells_stops_as_soon_as_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(render_grid, "CHUNK", 64)
+    asked, read = threading.Event(), []
+
+    def density(points: torch.Tensor) -> torch.Tensor:
+        read.append(len(points))
+        asked.set()
+        return shell(points)
+
+    def check() -> None:
+        if asked.is_set():
+            raise Cancelled
+
+    with pytest.raises(Cancelled):
+        refined_grid(shell_grid(), density, 2, 1.0, math.inf, check)
+    assert len(read) <= worker_count()  # what was under way already

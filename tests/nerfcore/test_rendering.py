@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import math
+import threading
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from fieldwork.nerfcore.config import RunConfig
 from fieldwork.nerfcore.data.cameras import Camera
+from fieldwork.nerfcore.errors import Cancelled
 from fieldwork.nerfcore.field.hybrid import Geometry
+from fieldwork.nerfcore.kernels.runtime import worker_count
+from fieldwork.nerfcore.render import image
 from fieldwork.nerfcore.render.image import Frame, render_view
 from fieldwork.nerfcore.render.verb import look_at
 from fieldwork.nerfcore.train.model import Model
@@ -118,6 +123,27 @@ def test_an_empty_field_is_background() -> None:
     frame = render_view(model, camera, pose, 0.25)
     assert np.allclose(frame.color, 0.25)
     assert not frame.label([1, 2]).any()
+
+
+def test_a_picture_stops_as_soon_as_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(image, "CPU_RAYS", 16)
+    camera, pose = view()
+    model = ball_model(8)
+    asked, tiles, render = threading.Event(), [], model.render
+
+    def rendering(*arguments: Any, **settings: Any) -> Any:
+        tiles.append(1)
+        asked.set()
+        return render(*arguments, **settings)
+
+    def check() -> None:
+        if asked.is_set():
+            raise Cancelled
+
+    monkeypatch.setattr(model, "render", rendering)
+    with pytest.raises(Cancelled):
+        render_view(model, camera, pose, 1.0, check=check)
+    assert 0 < len(tiles) <= worker_count()
 
 
 def test_the_pdf_puts_samples_where_the_light_is_absorbed() -> None:

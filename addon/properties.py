@@ -137,7 +137,11 @@ class FieldworkScene(PropertyGroup):
         description="What black pixels of a mask mean",
         items=[
             ("ignore", "Unknown", "Nothing is learned from these pixels: for masks that hide people or reflections"),
-            ("empty", "Empty Space", "There is nothing along these rays: for masks around an object, on a turntable for instance"),
+            (
+                "empty",
+                "Empty Space",
+                "There is nothing along these rays: for masks around an object, on a turntable for instance",
+            ),
         ],
     )
     max_size: IntProperty(

@@ -8,8 +8,8 @@ from __future__ import annotations
 import torch
 import warp as wp
 
-from .march import cell_index
 from .runtime import array, init, launch
+from .walk import cell_index
 
 
 @wp.func

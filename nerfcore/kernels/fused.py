@@ -10,8 +10,9 @@ import warp as wp
 from .blocks import launch_blocks
 from .fused_kernel import FusedShape, March, fused_kernel
 from .fused_network import half_feature
-from .march import MarchSettings, coarse, sample_counts
+from .march import coarse, sample_counts
 from .runtime import array, init
+from .walk import MarchSettings
 
 LANES = 64  # samples a block works on, on CUDA; two to eight blocks fit a multiprocessor of sm_75 and later
 BLOCKS_PER_MULTIPROCESSOR = 8

@@ -27,7 +27,7 @@ from .fused_network import (
     padded,
     spherical_harmonics,
 )
-from .march import (
+from .walk import (
     _DEFAULT,
     MAX_BINS,
     STOP,

@@ -1,14 +1,6 @@
 """Two-stage ray sampling on the occupancy grid: a coarse walk that reads the grid, then samples from its PDF.
 
-Positions are in the *normalised* frame, whose unit cube [−1, 1]³ is the region of interest. `contracted` maps all of
-space into the grid (Barron et al., "Mip-NeRF 360", 2022, eq. 10, with the infinity norm); otherwise the grid covers
-just the cube. A ray is walked in bins of about half a grid cell; bins in closed cells are skipped.
-
-Bin weights (`mode`):
-  PDF_DEFAULT  T·α·(1 + β·interest) + ε        transmittance-weighted, ε keeps every open bin alive
-  PDF_UNIFORM  1                               the same number of samples spread over the open bins
-  PDF_LITERAL  σ·max softmax(s)                the original formulation: no transmittance
-The torch twins are in `march_torch.py`.
+How rays walk is in `walk.py`, the torch twins are in `march_torch.py`.
 """
 
 from __future__ import annotations
@@ -20,164 +12,24 @@ import warp as wp
 
 from .packing import Packing
 from .runtime import array, init, launch
+from .walk import (
+    _DEFAULT,
+    BEFORE_CUBE,
+    MAX_BINS,
+    STOP,
+    MarchSettings,
+    bin_length,
+    bin_weight,
+    cell_index,
+    closed_length,
+    cube_entry,
+    grid_position,
+    inside,
+    ray_interval,
+    reciprocal,
+)
 
-PDF_DEFAULT, PDF_UNIFORM, PDF_LITERAL = 0, 1, 2
-_DEFAULT, _UNIFORM, _LITERAL = wp.constant(PDF_DEFAULT), wp.constant(PDF_UNIFORM), wp.constant(PDF_LITERAL)
-MAX_BINS = wp.constant(4096)
-MACRO = wp.constant(4)  # cells along a side of a block that can be skipped at once
-BEFORE_CUBE = wp.constant(0.8)  # share of the way to the cube that may be taken to be empty
-STOP = wp.constant(1.0e-4)  # transmittance below which the walk ends
-FARTHEST = 8  # blocks that can be skipped at once, from the middle one on
 LEAST = 4  # samples on a ray whose number of samples follows that of its open bins
-
-
-@dataclass(frozen=True)
-class MarchSettings:
-    """How rays are walked. `step` is the bin length inside the cube; `near`, `far` clip the ray (normalised units).
-
-    `empty`: where space is contracted, rays from outside of the cube start as far away as this, but before they reach
-    the cube. `per_bin`: samples for each open bin of a ray, at most the number asked for and at least `LEAST`; all
-    rays get the number asked for when it is 0.
-    """
-
-    resolution: int
-    step: float
-    near: float = 0.02
-    far: float = 1000.0
-    contracted: bool = False
-    mode: int = PDF_DEFAULT
-    beta: float = 1.0
-    epsilon: float = 0.01
-    empty: float = 0.0
-    per_bin: float = 0.0
-
-
-@wp.func
-def grid_position(p: wp.vec3, contracted: int):
-    """Normalised position → grid coordinates in [0, 1]³."""
-    if contracted == 0:
-        return p * 0.5 + wp.vec3(0.5, 0.5, 0.5)
-    r = wp.max(wp.abs(p[0]), wp.max(wp.abs(p[1]), wp.abs(p[2])))
-    q = p
-    if r > 1.0:
-        q = p * ((2.0 - 1.0 / r) / r)
-    return q * 0.25 + wp.vec3(0.5, 0.5, 0.5)
-
-
-@wp.func
-def inside(u: wp.vec3):
-    """Bins at the border reach out of the grid by half their length."""
-    return wp.vec3(wp.clamp(u[0], 0.0, 1.0), wp.clamp(u[1], 0.0, 1.0), wp.clamp(u[2], 0.0, 1.0))
-
-
-@wp.func
-def cell_index(u: wp.vec3, n: int):
-    ix = wp.clamp(int(u[0] * float(n)), 0, n - 1)
-    iy = wp.clamp(int(u[1] * float(n)), 0, n - 1)
-    iz = wp.clamp(int(u[2] * float(n)), 0, n - 1)
-    return (iz * n + iy) * n + ix
-
-
-@wp.func
-def ray_interval(o: wp.vec3, inverse: wp.vec3, near: float, far: float, contracted: int):
-    """Entry and exit distance of the walk."""
-    lo = near
-    hi = far
-    if contracted == 0:
-        for a in range(3):
-            t0 = (-1.0 - o[a]) * inverse[a]
-            t1 = (1.0 - o[a]) * inverse[a]
-            lo = wp.max(lo, wp.min(t0, t1))
-            hi = wp.min(hi, wp.max(t0, t1))
-    return lo, hi
-
-
-@wp.func
-def cube_entry(o: wp.vec3, inverse: wp.vec3):
-    """Distance at which a ray enters the cube [−1, 1]³; negative from inside."""
-    entry = float(-1.0e9)
-    for a in range(3):
-        entry = wp.max(entry, wp.min((-1.0 - o[a]) * inverse[a], (1.0 - o[a]) * inverse[a]))
-    return entry
-
-
-@wp.func
-def bin_length(p: wp.vec3, step: float, contracted: int):
-    """Bins grow outside the cube, where the grid's cells do."""
-    if contracted == 0:
-        return step
-    r = wp.max(wp.abs(p[0]), wp.max(wp.abs(p[1]), wp.abs(p[2])))
-    if r <= 1.0:
-        return step
-    return step * r * wp.sqrt(r)
-
-
-@wp.func
-def way_out(u: float, d: float, inverse: float, low: float, high: float):
-    """Way until a ray at u leaves the interval low … high of one axis."""
-    return (wp.where(d > 0.0, high, low) - u) * inverse
-
-
-@wp.func
-def leave_distance(u: wp.vec3, d: wp.vec3, inverse: wp.vec3, n: float, reach: float, border: float):
-    """Way, in grid coordinates, until a ray at grid position u leaves its cell of an n³ grid and the `reach` cells
-    around it, or the part of the grid that is `border` away from its sides."""
-    away = float(1.0e9)
-    for a in range(3):
-        cell = wp.floor(u[a] * n)
-        low = wp.max((cell - reach) / n, border)
-        high = wp.min((cell + 1.0 + reach) / n, 1.0 - border)
-        away = wp.min(away, way_out(u[a], d[a], inverse[a], low, high))
-    return wp.max(away, 0.0)
-
-
-@wp.func
-def closed_length(
-    u: wp.vec3,
-    d: wp.vec3,
-    inverse: wp.vec3,
-    n: int,
-    step: float,
-    length: float,
-    contracted: int,
-    reach: wp.array(dtype=wp.uint8),
-):
-    """How far to move from a closed cell: in whole steps until the ray leaves it, or the closed reach around it; one
-    bin where space is contracted."""
-    side = float(2.0)
-    border = float(0.0)
-    if contracted == 1:
-        side = 4.0
-        border = 0.25
-        c = u - wp.vec3(0.5, 0.5, 0.5)
-        if wp.max(wp.abs(c[0]), wp.max(wp.abs(c[1]), wp.abs(c[2]))) >= 0.25:
-            return length
-    leave = float(0.0)
-    closed = int(reach[cell_index(u, n / MACRO)])
-    if closed > 0:
-        leave = leave_distance(u, d, inverse, float(n / MACRO), float(closed - 1), border)
-    else:
-        leave = leave_distance(u, d, inverse, float(n), 0.0, border)
-    return wp.max(1.0, wp.floor(leave * side / step + 0.5)) * step
-
-
-@wp.func
-def reciprocal(d: wp.vec3):
-    return wp.vec3(
-        1.0 / wp.where(wp.abs(d[0]) < 1.0e-9, 1.0e-9, d[0]),
-        1.0 / wp.where(wp.abs(d[1]) < 1.0e-9, 1.0e-9, d[1]),
-        1.0 / wp.where(wp.abs(d[2]) < 1.0e-9, 1.0e-9, d[2]),
-    )
-
-
-@wp.func
-def bin_weight(cell: wp.vec2, transmittance: float, through: float, mode: int, beta: float, epsilon: float):
-    """Weight of one open bin; `cell` holds (density, interest), `through` is the bin's own transmittance."""
-    if mode == _UNIFORM:
-        return 1.0
-    if mode == _LITERAL:
-        return cell[0] * cell[1] + 1.0e-6
-    return transmittance * (1.0 - through) * (1.0 + beta * cell[1]) + epsilon
 
 
 @wp.kernel(module="fieldwork_march")
@@ -354,18 +206,6 @@ class Samples:
 
     def __len__(self) -> int:
         return len(self.depth)
-
-
-def closed_reach(opened: torch.Tensor) -> torch.Tensor:
-    """How many blocks of 4³ cells around one, itself included, are closed in all directions: ((n / 4)³,) uint8 from
-    the open cells (n, n, n) bool of a grid; 0 for blocks with an open cell."""
-    m = len(opened) // int(MACRO)
-    near = opened.view(m, int(MACRO), m, int(MACRO), m, int(MACRO)).any(5).any(3).any(1).float()[None]
-    closed = 1 - near
-    for _ in range(FARTHEST - 1):
-        near = torch.nn.functional.max_pool3d(near, 3, 1, 1)
-        closed += 1 - near
-    return closed.to(torch.uint8).reshape(-1)
 
 
 def _arguments(settings: MarchSettings) -> list:

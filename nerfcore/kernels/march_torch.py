@@ -6,7 +6,7 @@ import math
 
 import torch
 
-from .march import FARTHEST, MAX_BINS, PDF_DEFAULT, PDF_UNIFORM, MarchSettings
+from .walk import FARTHEST, MAX_BINS, PDF_DEFAULT, PDF_UNIFORM, MarchSettings
 
 STOP = 1e-4
 MACRO = 4

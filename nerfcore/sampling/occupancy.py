@@ -10,7 +10,7 @@ from torch import nn
 
 from ..config import SamplingConfig
 from ..kernels.cells import average, observe
-from ..kernels.march import PDF_DEFAULT, PDF_LITERAL, PDF_UNIFORM, MarchSettings, closed_reach
+from ..kernels.walk import PDF_DEFAULT, PDF_LITERAL, PDF_UNIFORM, MarchSettings, closed_reach
 
 MODES = {"default": PDF_DEFAULT, "uniform": PDF_UNIFORM, "literal": PDF_LITERAL}
 CHUNK = 1 << 16

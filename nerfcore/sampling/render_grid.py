@@ -11,8 +11,8 @@ from functools import partial
 
 import torch
 
-from ..kernels.march import MarchSettings, closed_reach
 from ..kernels.runtime import run_parallel
+from ..kernels.walk import MarchSettings, closed_reach
 from .occupancy import MOST_OPTICAL_DEPTH, OccupancyGrid
 
 PROBES = 4  # points read in each fine cell

@@ -14,9 +14,10 @@ from fieldwork.nerfcore.kernels import (
     encode_torch,
     march,
     march_torch,
+    walk,
 )
-from fieldwork.nerfcore.kernels.march import PDF_DEFAULT, PDF_LITERAL, PDF_UNIFORM, MarchSettings
 from fieldwork.nerfcore.kernels.packing import Packing
+from fieldwork.nerfcore.kernels.walk import PDF_DEFAULT, PDF_LITERAL, PDF_UNIFORM, MarchSettings
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -197,7 +198,7 @@ def random_cells(n: int, share: float, generator: torch.Generator) -> tuple[torc
     opened[: n // 2] = False  # whole blocks to skip
     density = torch.where(opened, torch.rand(n, n, n, generator=generator) * 20, 0.0)
     grid = torch.stack([density.reshape(-1), torch.rand(n**3, generator=generator)], 1).contiguous()
-    return grid, march.closed_reach(opened)
+    return grid, walk.closed_reach(opened)
 
 
 def random_rays(count: int, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:

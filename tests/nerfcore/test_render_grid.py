@@ -9,8 +9,9 @@ import pytest
 import torch
 from fieldwork.nerfcore.config import SamplingConfig
 from fieldwork.nerfcore.errors import Cancelled
-from fieldwork.nerfcore.kernels.march import LEAST, closed_reach, sample, sample_counts
+from fieldwork.nerfcore.kernels.march import LEAST, sample, sample_counts
 from fieldwork.nerfcore.kernels.runtime import worker_count
+from fieldwork.nerfcore.kernels.walk import closed_reach
 from fieldwork.nerfcore.sampling import render_grid
 from fieldwork.nerfcore.sampling.occupancy import OccupancyGrid
 from fieldwork.nerfcore.sampling.render_grid import PROBES, SAVED, present_grid, refined_grid

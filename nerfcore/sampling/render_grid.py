@@ -43,17 +43,16 @@ def refined_grid(
     per_bin: float,
     pixels: float,
     check: Callable[[], None] | None = None,
-) -> RenderGrid:
+) -> RenderGrid | None:
     """Every open cell cut into factor³, of which those stay open where `density` (points (N, 3) in grid coordinates →
     (N,), per normalised unit length) is not negligible at one of a few random points; their mean is the density.
 
-    The occupancy grid itself where reading the cells takes longer than it saves in rendering so many `pixels`.
+    None where reading the cells takes longer than it saves in rendering so many `pixels`.
     `check` is called often, on the CPU by several threads, and may raise to stop.
     """
-    present = present_grid(occupancy, per_bin)
     coarse = (occupancy.cells[:, 0] > 0).nonzero()[:, 0]
     if factor == 1 or len(coarse) * factor**3 * PROBES > pixels * SAVED:
-        return present
+        return None
     device, n = coarse.device, occupancy.config.resolution
     axis = torch.arange(factor, device=device)
     part = torch.cartesian_prod(axis, axis, axis)
@@ -74,11 +73,11 @@ def refined_grid(
         found = torch.cat(run_parallel([partial(read, some) for some in points.split(CHUNK)]))
         mean += found / PROBES
         torch.maximum(largest, found, out=largest)
-    step = present.settings.step / factor
+    step = occupancy.step / factor
     row = (fine[:, 2] * side + fine[:, 1]) * side + fine[:, 0]
     opened = largest * step > occupancy.config.threshold
     cells = torch.zeros(side**3, 2, device=device)
     cells[row, 0] = torch.where(opened, mean.clamp(1e-3, MOST_OPTICAL_DEPTH / step), 0.0)
     cells[row, 1] = occupancy.interest[coarse].repeat_interleave(factor**3)
-    settings = replace(present.settings, resolution=side, step=step)
+    settings = replace(occupancy.march_settings(), per_bin=per_bin, resolution=side, step=step)
     return RenderGrid(cells, closed_reach((cells[:, 0] > 0).view(side, side, side)), settings)

@@ -117,6 +117,14 @@ def test_both_renderers_walk_the_refined_grid(device: str) -> None:
     assert_same(FusedRenderer(model)(origins, directions, COUNT), UnfusedRenderer(model)(origins, directions, COUNT))
 
 
+def test_a_few_pixels_first_do_not_keep_many_from_the_refined_grid() -> None:
+    model = random_model(3, settings={"field.density_shift": "4"})
+    model.refine(pixels=1)
+    assert model.render_grid().settings.resolution == model.occupancy.config.resolution
+    model.refine()
+    assert model.render_grid().settings.resolution == 2 * model.occupancy.config.resolution
+
+
 def test_threads_of_a_block_share_their_work(monkeypatch: pytest.MonkeyPatch) -> None:
     """Blocks of several samples, as on a GPU: two of them take rays from one queue."""
     monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)

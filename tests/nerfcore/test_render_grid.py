@@ -47,6 +47,7 @@ def parallel_rays() -> tuple[torch.Tensor, torch.Tensor]:
 def test_the_refined_grid_closes_what_is_empty_and_keeps_every_surface() -> None:
     coarse = shell_grid()
     fine = refined_grid(coarse, shell, 2, 1.0, math.inf)
+    assert fine is not None
     assert fine.settings.resolution == 2 * N
     assert fine.settings.step == pytest.approx(coarse.step / 2)
     opened = fine.cells[:, 0] > 0
@@ -66,13 +67,15 @@ def test_the_refined_grid_closes_what_is_empty_and_keeps_every_surface() -> None
     assert float((found.depth[begin : begin + count] - 1.5).abs().min()) < THICK
 
 
-def test_the_refined_grid_is_the_present_one_where_it_does_not_pay() -> None:
+def test_cells_are_not_refined_where_it_does_not_pay() -> None:
     coarse = shell_grid()
     cells = int((coarse.cells[:, 0] > 0).sum())
     pays = cells * 2**3 * PROBES / SAVED
-    assert refined_grid(coarse, shell, 2, 1.0, 0.9 * pays).cells is coarse.cells
-    assert refined_grid(coarse, shell, 2, 1.0, 1.1 * pays).settings.resolution == 2 * N
-    assert refined_grid(coarse, shell, 1, 1.0, math.inf).settings.resolution == N
+    assert refined_grid(coarse, shell, 2, 1.0, 0.9 * pays) is None
+    finer = refined_grid(coarse, shell, 2, 1.0, 1.1 * pays)
+    assert finer is not None
+    assert finer.settings.resolution == 2 * N
+    assert refined_grid(coarse, shell, 1, 1.0, math.inf) is None
 
 
 def test_rays_through_more_open_cells_get_more_samples() -> None:

@@ -10,7 +10,6 @@ import json
 import shutil
 import subprocess
 import sys
-import time
 import zlib  # noqa: F401  (before pycolmap)
 from collections.abc import Callable
 from dataclasses import replace
@@ -20,7 +19,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 from fieldwork.nerfcore.data.dataset import Dataset, DatasetView
-from fieldwork.nerfcore.data.importer import FORMATS, import_dataset, read_dataset
+from fieldwork.nerfcore.data.importer import import_dataset, read_dataset
 from fieldwork.nerfcore.data.similarity import transform_points
 from fieldwork.nerfcore.errors import FieldworkError, InputError, ProjectError
 from fieldwork.nerfcore.params import ImportParams
@@ -265,27 +264,6 @@ def test_video_with_poses(shared_data: Data, tmp_path: Path) -> None:
     assert epipolar_error(views, find_matches(views, tmp_path / "work")) < 1.5
 
 
-def test_video_whose_frames_cannot_be_told(shared_data: Data, tmp_path: Path) -> None:
-    shutil.copy(shared_data("can_video") / "can.mp4", tmp_path)
-    np.save(tmp_path / "poses_bounds.npy", np.load(shared_data("can_video") / "poses_bounds.npy")[:5])
-    with pytest.raises(InputError, match=r"only can\.mp4.*fieldwork new"):
-        read_dataset(tmp_path)
-
-
-def test_unknown_folder(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no posed data set"):
-        read_dataset(tmp_path)
-    with pytest.raises(InputError, match="does not exist"):
-        read_dataset(tmp_path / "nowhere")
-
-
-@pytest.mark.parametrize("format", FORMATS)
-def test_asking_for_a_format_that_is_not_there(tmp_path: Path, format: str) -> None:
-    with pytest.raises(InputError) as caught:
-        read_dataset(tmp_path, format)
-    assert str(tmp_path) in str(caught.value)
-
-
 DAMAGE: list[tuple[str, Callable[[list[DatasetView], Path], None], str, Callable[[bytes], bytes]]] = [
     ("transforms cut", WITH_LENS["instant-ngp"][0], "transforms.json", lambda data: data[: len(data) // 2]),
     ("transforms without frames", WITH_LENS["instant-ngp"][0], "transforms.json", lambda data: b"{}"),
@@ -337,27 +315,6 @@ def test_truncated_photo_is_named(truth: tuple[list[DatasetView], Matches], tmp_
         import_dataset(ImportParams(dataset=tmp_path, project=tmp_path / "p"), Reporter())
     path.write_bytes(whole)
     assert import_dataset(ImportParams(dataset=tmp_path, project=tmp_path / "p"), Reporter())["images"] == 6
-
-
-def test_import_killed_and_run_again(shared_data: Data, tmp_path: Path) -> None:
-    dataset, project = shared_data("lego_400"), tmp_path / "p"
-    code = (
-        "from pathlib import Path; from fieldwork.nerfcore.data.importer import import_dataset\n"
-        "from fieldwork.nerfcore.params import ImportParams; from fieldwork.nerfcore.progress import Reporter\n"
-        f"import_dataset(ImportParams(dataset=Path({str(dataset)!r}), project=Path({str(project)!r})), Reporter())\n"
-    )
-    process = subprocess.Popen([sys.executable, "-c", code])
-    deadline = time.monotonic() + 60
-    while time.monotonic() < deadline and len(list(project.glob("images/*.png"))) < 5:
-        time.sleep(0.005)
-    process.kill()
-    process.wait()
-    assert list(project.glob("images/*.png"))
-    assert not (project / "project.json").exists()
-    assert import_dataset(ImportParams(dataset=dataset, project=project), Reporter())["images"] == 140
-    for view in load_scene(project).views:
-        with Image.open(view.image) as image:
-            image.load()
 
 
 def test_nerfstudio_masks_depth_and_lenses_of_their_own(tmp_path: Path) -> None:

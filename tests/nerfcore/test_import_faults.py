@@ -1,0 +1,63 @@
+"""Data sets that are not there or say too little, and imports that are killed."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fieldwork.nerfcore.data.importer import FORMATS, import_dataset, read_dataset
+from fieldwork.nerfcore.errors import InputError
+from fieldwork.nerfcore.params import ImportParams
+from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.project import load_scene
+from PIL import Image
+
+Data = Callable[[str], Path]
+
+
+def test_video_whose_frames_cannot_be_told(shared_data: Data, tmp_path: Path) -> None:
+    shutil.copy(shared_data("can_video") / "can.mp4", tmp_path)
+    np.save(tmp_path / "poses_bounds.npy", np.load(shared_data("can_video") / "poses_bounds.npy")[:5])
+    with pytest.raises(InputError, match=r"only can\.mp4.*fieldwork new"):
+        read_dataset(tmp_path)
+
+
+def test_unknown_folder(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no posed data set"):
+        read_dataset(tmp_path)
+    with pytest.raises(InputError, match="does not exist"):
+        read_dataset(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_asking_for_a_format_that_is_not_there(tmp_path: Path, format: str) -> None:
+    with pytest.raises(InputError) as caught:
+        read_dataset(tmp_path, format)
+    assert str(tmp_path) in str(caught.value)
+
+
+def test_import_killed_and_run_again(shared_data: Data, tmp_path: Path) -> None:
+    dataset, project = shared_data("lego_400"), tmp_path / "p"
+    code = (
+        "from pathlib import Path; from fieldwork.nerfcore.data.importer import import_dataset\n"
+        "from fieldwork.nerfcore.params import ImportParams; from fieldwork.nerfcore.progress import Reporter\n"
+        f"import_dataset(ImportParams(dataset=Path({str(dataset)!r}), project=Path({str(project)!r})), Reporter())\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code])
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline and len(list(project.glob("images/*.png"))) < 5:
+        time.sleep(0.005)
+    process.kill()
+    process.wait()
+    assert list(project.glob("images/*.png"))
+    assert not (project / "project.json").exists()
+    assert import_dataset(ImportParams(dataset=dataset, project=project), Reporter())["images"] == 140
+    for view in load_scene(project).views:
+        with Image.open(view.image) as image:
+            image.load()

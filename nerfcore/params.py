@@ -24,7 +24,9 @@ class DoctorParams(Params):
 
 class SimulateParams(Params):
     out: Path = Field(description="folder to write the simulated capture to")
-    scene: str = Field(default="museum", description="name of the built-in scene")
+    scene: str = Field(
+        default="museum", description="built-in scene: museum (exhibits in a room) or facade (weathered stone outdoors)"
+    )
     views: int = Field(default=48, ge=4, description="number of photos")
     size: tuple[int, int] = Field(default=(480, 320), description="photo width and height in pixels")
     seed: int = Field(default=0, description="seed of the scene and of the camera path")
@@ -209,7 +211,9 @@ class BenchParams(Params):
     suite: Literal["speed", "ablation", "robustness", "baselines", "gpu"] = Field(description="which table")
     out: Path = Field(default=Path("build/bench"), description="folder for results and scenes; finished runs are kept")
     data: Path | None = Field(default=None, description="folder of data sets; default: ../shared/data when it is there")
-    scenes: list[str] | None = Field(default=None, description="data sets, museum (simulated) or capture projects")
+    scenes: list[str] | None = Field(
+        default=None, description="data sets, museum or facade (simulated), or capture projects"
+    )
     variants: list[str] | None = Field(default=None, description="only these variants of the suite")
     seconds: float | None = Field(default=None, gt=0, description="seconds of training a run, instead of the suite's")
     steps: int | None = Field(default=None, gt=0, description="steps of training a run, instead of the suite's")

@@ -106,7 +106,9 @@ class FIELDWORK_OT_bench(VerbOperator):
     )
     out: StringProperty(name="Folder", description="Folder for results and scenes", subtype="DIR_PATH")
     data: StringProperty(name="Data", description="Folder of data sets; empty: only simulated ones", subtype="DIR_PATH")
-    scenes: StringProperty(name="Scenes", description="Data sets, museum, or capture projects, separated by commas")
+    scenes: StringProperty(
+        name="Scenes", description="Data sets, museum, facade, or capture projects, separated by commas"
+    )
     variants: StringProperty(name="Variants", description="Only these variants of the suite, separated by commas")
     seconds: FloatProperty(name="Time", description="Seconds of training a run; 0: as the suite says", min=0.0)
     steps: IntProperty(name="Steps", description="Steps of training a run; 0: as the suite says", min=0)
@@ -143,7 +145,7 @@ def _words(text: str) -> list[str] | None:
 
 
 class FIELDWORK_OT_simulate(VerbOperator):
-    """Build a museum scene and photograph it: a capture to try everything on, with the truth beside it"""
+    """Build a scene and photograph it: a capture to try everything on, with the truth beside it"""
 
     bl_idname = "fieldwork.simulate"
     bl_label = "Simulate Capture"
@@ -153,7 +155,10 @@ class FIELDWORK_OT_simulate(VerbOperator):
     scene: EnumProperty(
         name="Scene",
         description="What is built",
-        items=[("museum", "Museum", "Exhibits on plinths, one of them gilded in part")],
+        items=[
+            ("museum", "Museum", "Exhibits on plinths, one of them gilded in part"),
+            ("facade", "Facade", "A weathered piece of a church front in the open, with its damage as classes"),
+        ],
     )
     views: IntProperty(name="Photos", description="Number of photos", default=48, min=4, soft_max=200)
     size: IntVectorProperty(

@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
 
 import bmesh
 import bpy
 import numpy as np
 from mathutils import Matrix, Vector, noise
 
-from . import materials
+from . import materials, shapes
 from .orbit import rings
 
 CLASSES = {1: "stone", 2: "gilding", 3: "wood", 4: "textile", 5: "ceramic", 6: "floor", 7: "wall"}
@@ -34,8 +33,7 @@ RINGS = [(0.38, 1.75, 16.0), (0.37, 1.8, 33.0), (0.25, 1.7, 56.0)]
 
 def build(seed: int) -> bpy.types.Scene:
     """Replace everything in this Blender by the scene; `seed` moves the textures and the ornament."""
-    bpy.ops.wm.read_homefile(use_factory_startup=True, use_empty=True)  # unlike factory settings, keeps extensions
-    scene = bpy.context.scene
+    scene = shapes.new_scene()
     noise.seed_set(seed + 1)
     shift = Vector(np.random.default_rng(seed).uniform(-20, 20, 3).tolist())
     stone, gold = materials.stone(1), materials.gilding(2)
@@ -48,9 +46,6 @@ def build(seed: int) -> bpy.types.Scene:
     _vase(materials.ceramic(5), shift)
     _carpet(carpet, shift)
     _banner(banner)
-    scene.view_settings.view_transform = "Standard"
-    scene.cycles.max_bounces, scene.cycles.diffuse_bounces, scene.cycles.glossy_bounces = 2, 1, 0
-    scene.cycles.caustics_reflective = scene.cycles.caustics_refractive = False
     return scene
 
 
@@ -78,50 +73,6 @@ def _light(scene: bpy.types.Scene) -> None:
         scene.collection.objects.link(light)
 
 
-def _add(name: str, mesh: bpy.types.Mesh, *slots: bpy.types.Material) -> bpy.types.Object:
-    for material in slots:
-        mesh.materials.append(material)
-    item = bpy.data.objects.new(name, mesh)
-    bpy.context.scene.collection.objects.link(item)
-    return item
-
-
-def _from_bmesh(name: str, bm: bmesh.types.BMesh, smooth: bool = False) -> bpy.types.Mesh:
-    for face in bm.faces:
-        face.smooth = smooth
-    bmesh.ops.recalc_face_normals(bm, faces=bm.faces)
-    mesh = bpy.data.meshes.new(name)
-    bm.to_mesh(mesh)
-    bm.free()
-    return mesh
-
-
-def _boxes(
-    name: str, boxes: list[tuple[tuple[float, float, float], tuple[float, float, float]]], bevel: float
-) -> bpy.types.Mesh:
-    """Bevelled boxes, each given by its centre and its size."""
-    bm = bmesh.new()
-    for center, size in boxes:
-        bmesh.ops.create_cube(bm, matrix=Matrix.Translation(center) @ Matrix.Diagonal((*size, 1)))
-    bmesh.ops.bevel(bm, geom=bm.edges[:], offset=bevel, segments=2, affect="EDGES", profile=0.5)
-    return _from_bmesh(name, bm)
-
-
-def _grid(
-    width: float, depth: float, nx: int, ny: int, place: Callable[[float, float], tuple[float, float, float]]
-) -> bmesh.types.BMesh:
-    """A grid of quads; `place(x, y)` gives the position of the vertex at x, y around the origin."""
-    bm = bmesh.new()
-    rows = [
-        [bm.verts.new(place(width * (i / nx - 0.5), depth * (j / ny - 0.5))) for i in range(nx + 1)]
-        for j in range(ny + 1)
-    ]
-    for below, above in itertools.pairwise(rows):
-        for i in range(nx):
-            bm.faces.new((below[i], below[i + 1], above[i + 1], above[i]))
-    return bm
-
-
 def _lathe(profile: list[tuple[float, float]], steps: int = 64) -> bmesh.types.BMesh:
     """Turn a profile of (radius, height) pairs around the z axis."""
     bm = bmesh.new()
@@ -138,18 +89,20 @@ def _lathe(profile: list[tuple[float, float]], steps: int = 64) -> bmesh.types.B
 
 
 def _room(floor: bpy.types.Material, wall: bpy.types.Material) -> None:
-    _add("floor", _from_bmesh("floor", _grid(2 * HALF, 2 * HALF, 1, 1, lambda x, y: (x, y, 0.0))), floor)
+    shapes.add(
+        "floor", shapes.from_bmesh("floor", shapes.grid(2 * HALF, 2 * HALF, 1, 1, lambda x, y: (x, y, 0.0))), floor
+    )
     thick = 0.12
     far, length = HALF + thick / 2, 2 * HALF + 2 * thick
     boxes = [((s * far, 0, HEIGHT / 2), (thick, length, HEIGHT)) for s in (-1, 1)]
     boxes += [((0, s * far, HEIGHT / 2), (length, thick, HEIGHT)) for s in (-1, 1)]
     boxes += [((s * (HALF - 0.03), 0, 0.05), (0.06, 2 * HALF, 0.1)) for s in (-1, 1)]
     boxes += [((0, s * (HALF - 0.03), 0.05), (2 * HALF, 0.06, 0.1)) for s in (-1, 1)]
-    _add("wall", _boxes("wall", boxes, 0.008), wall)
+    shapes.add("wall", shapes.boxes("wall", boxes, 0.008), wall)
 
 
 def _plinth(stone: bpy.types.Material, gold: bpy.types.Material) -> None:
-    mesh = _boxes(
+    mesh = shapes.boxes(
         "plinth",
         [
             ((0, 0, 0.04), (0.56, 0.56, 0.08)),
@@ -159,7 +112,7 @@ def _plinth(stone: bpy.types.Material, gold: bpy.types.Material) -> None:
         ],
         0.012,
     )
-    _add("plinth", mesh, stone)
+    shapes.add("plinth", mesh, stone)
     # The shaft is finely divided, so that ornament can be gilded face by face on the one stone surface.
     bm, size, height = bmesh.new(), 0.43, 0.32
     bmesh.ops.create_cube(bm, matrix=Matrix.Translation((0, 0, 0.295)) @ Matrix.Diagonal((size, size, height, 1)))
@@ -172,19 +125,14 @@ def _plinth(stone: bpy.types.Material, gold: bpy.types.Material) -> None:
         rosette = math.hypot(u, v) < 0.3 + 0.06 * math.cos(8 * math.atan2(v, u))
         border = 0.74 < max(abs(u), abs(v)) < 0.9
         face.material_index = int(0.52 < lozenge < 0.7 or rosette or border)
-    _add("plinth shaft", _from_bmesh("plinth shaft", bm), stone, gold)
+    shapes.add("plinth shaft", shapes.from_bmesh("plinth shaft", bm), stone, gold)
 
 
 def _bust(stone: bpy.types.Material, gold: bpy.types.Material, shift: Vector) -> None:
-    data = bpy.data.metaballs.new("bust")
-    data.resolution = data.render_resolution = 0.016
-    data.threshold = 0.3
+    lumps = []
 
     def lump(center: tuple[float, float, float], size: tuple[float, float, float], negative: bool = False) -> None:
-        element = data.elements.new(type="ELLIPSOID")
-        element.co, element.radius, element.stiffness = center, 1.0, 2.0
-        element.size_x, element.size_y, element.size_z = size
-        element.use_negative = negative
+        lumps.append((center, size, negative))
 
     lump((0, 0, 0.075), (0.15, 0.15, 0.13))  # socle
     lump((0, 0.01, 0.22), (0.33, 0.19, 0.17))  # shoulders
@@ -199,16 +147,7 @@ def _bust(stone: bpy.types.Material, gold: bpy.types.Material, shift: Vector) ->
         lump((side * 0.056, -0.2, 0.555), (0.045, 0.07, 0.04), negative=True)
         lump((side * 0.15, 0.02, 0.52), (0.035, 0.06, 0.07))  # ears
     lump((0, 0.13, 0.56), (0.13, 0.13, 0.13))  # bun
-    ball = bpy.data.objects.new("bust", data)
-    bpy.context.scene.collection.objects.link(ball)
-    bpy.context.view_layer.update()
-    mesh = bpy.data.meshes.new_from_object(ball.evaluated_get(bpy.context.evaluated_depsgraph_get()))
-    bpy.data.objects.remove(ball)
-
-    bm = bmesh.new()
-    bm.from_mesh(mesh)
-    bpy.data.meshes.remove(mesh)
-    bmesh.ops.triangulate(bm, faces=bm.faces[:])
+    bm = shapes.metaballs(lumps, 0.016)
     bm.normal_update()
     moved = []
     for vertex in bm.verts:
@@ -228,13 +167,13 @@ def _bust(stone: bpy.types.Material, gold: bpy.types.Material, shift: Vector) ->
         collar = abs(z - 0.305 + 0.05 * math.cos(2 * angle)) < 0.026 and math.hypot(x, y) > 0.085
         medal = math.hypot(x, z - 0.21) < 0.055 and y < 0
         face.material_index = int(wreath or collar or medal)
-    bust = _add("bust", _from_bmesh("bust", bm, smooth=True), stone, gold)
+    bust = shapes.add("bust", shapes.from_bmesh("bust", bm, smooth=True), stone, gold)
     bust.location, bust.scale = (0, 0, 0.54), (0.82, 0.82, 0.82)
     bust.rotation_euler = (0, 0, math.radians(-25))
 
 
 def _chest(wood: bpy.types.Material) -> None:
-    mesh = _boxes(
+    mesh = shapes.boxes(
         "chest",
         [((0, 0, 0.17), (0.62, 0.36, 0.28)), ((0, 0, 0.035), (0.66, 0.4, 0.05)), ((0, 0, 0.325), (0.65, 0.39, 0.03))]
         + [((x, 0, 0.17), (0.06, 0.385, 0.28)) for x in (-0.24, 0.24)],
@@ -251,7 +190,7 @@ def _chest(wood: bpy.types.Material) -> None:
         @ Matrix.Rotation(math.pi / 2, 4, "Y"),
     )
     bpy.data.meshes.remove(mesh)
-    chest = _add("chest", _from_bmesh("chest", bm), wood)
+    chest = shapes.add("chest", shapes.from_bmesh("chest", bm), wood)
     chest.location, chest.rotation_euler = (0.72, -0.42, 0), (0, 0, math.radians(28))
 
 
@@ -261,7 +200,7 @@ def _vase(ceramic: bpy.types.Material, shift: Vector) -> None:
     points = np.array(profile)
     knots, fine = np.arange(len(points)), np.linspace(0, len(points) - 1, 70)
     smooth = [(float(np.interp(t, knots, points[:, 0])), float(np.interp(t, knots, points[:, 1]))) for t in fine]
-    vase = _add("vase", _from_bmesh("vase", _lathe(smooth), smooth=True), ceramic)
+    vase = shapes.add("vase", shapes.from_bmesh("vase", _lathe(smooth), smooth=True), ceramic)
     vase.location, vase.rotation_euler = (-0.72, -0.3, 0.02), (0, 0, shift.x)
 
 
@@ -269,7 +208,9 @@ def _carpet(textile: bpy.types.Material, shift: Vector) -> None:
     def place(x: float, y: float) -> tuple[float, float, float]:
         return x, y, 0.012 + 0.007 * noise.noise(Vector((x * 3, y * 3, 0)) + shift)
 
-    carpet = _add("carpet", _from_bmesh("carpet", _grid(2.2, 1.5, 80, 60, place), smooth=True), textile)
+    carpet = shapes.add(
+        "carpet", shapes.from_bmesh("carpet", shapes.grid(2.2, 1.5, 80, 60, place), smooth=True), textile
+    )
     carpet.rotation_euler = (0, 0, math.radians(8))
     carpet.modifiers.new("thickness", "SOLIDIFY").thickness = -0.01
 
@@ -278,6 +219,8 @@ def _banner(textile: bpy.types.Material) -> None:
     def place(x: float, y: float) -> tuple[float, float, float]:
         return x, 0.035 * math.sin(9 * x + 1.5 * y), y
 
-    banner = _add("banner", _from_bmesh("banner", _grid(1.3, 1.0, 80, 30, place), smooth=True), textile)
+    banner = shapes.add(
+        "banner", shapes.from_bmesh("banner", shapes.grid(1.3, 1.0, 80, 30, place), smooth=True), textile
+    )
     banner.location = (-0.3, HALF - 0.1, 0.74)
     banner.modifiers.new("thickness", "SOLIDIFY").thickness = 0.012

@@ -45,6 +45,40 @@ def rings(views: int, levels: list[tuple[float, float, float]], target: np.ndarr
     return poses
 
 
+def arc(
+    views: int,
+    levels: list[tuple[float, float, float]],
+    target: np.ndarray,
+    spread: float,
+    wander: tuple[float, float, float],
+    seed: int,
+) -> list[np.ndarray]:
+    """A walk to and fro before a facade that faces −y, by hand and so not quite even.
+
+    Args:
+        views: number of poses.
+        levels: (share of the views, distance from the target over the ground, height of the camera), metres, per walk.
+        target: (3,) point to look at.
+        spread: angle of the arc in degrees.
+        wander: standard deviation of the place looked at from one photo to the next, metres.
+        seed: of the unevenness.
+    """
+    random = np.random.default_rng(seed)
+    counts = np.floor(np.array([share for share, _, _ in levels]) * views).astype(int)
+    counts[0] += views - counts.sum()
+    poses = []
+    for level, (count, (_, distance, height)) in enumerate(zip(counts, levels)):
+        start = 0.5 * (level % 2)  # every second walk stands between the places of the one before
+        for index in range(count):
+            share = (index + start) / max(count - 1 + 2 * start, 1)
+            angle = math.radians(spread * (share - 0.5) + random.normal(0, 1.5))
+            reach = distance * random.normal(1, 0.03)
+            place = [math.sin(angle) * reach, -math.cos(angle) * reach]
+            position = np.array([target[0] + place[0], target[1] + place[1], height * random.normal(1, 0.03)])
+            poses.append(look_at(position, target + random.normal(0, wander)))
+    return poses
+
+
 def sphere(views: int, center: np.ndarray, radius: float, hemisphere: bool = False) -> list[np.ndarray]:
     """Evenly spread poses on a sphere (or its upper half) around `center`, looking inwards (golden spiral)."""
     poses = []

@@ -6,11 +6,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from . import museum
+from . import facade, museum
 from .photograph import Lens, Shot, has_denoiser, photograph
 from .truth import write_truth
 
-SCENES = {"museum": museum}
+SCENES = {"museum": museum, "facade": facade}
 ANGLE_OF_VIEW_FOCAL = 28 / 36  # focal length over sensor width: a 28 mm lens on full frame
 
 

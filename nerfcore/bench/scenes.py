@@ -5,14 +5,13 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
-from ..capture.simulate import simulate
+from ..capture.simulate import SCENES, simulate
 from ..data.importer import import_dataset
 from ..errors import InputError
 from ..params import ImportParams, SimulateParams
 from ..progress import Reporter
 from ..project import is_project, load_project
 
-MUSEUM = "museum"
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 
 
@@ -26,8 +25,8 @@ def data_folder(given: Path | None) -> Path | None:
 
 
 def available(scene: str, data: Path | None) -> bool:
-    """Whether the scene can be had: a capture project, a data set in the folder, or the simulated museum."""
-    return scene == MUSEUM or is_project(Path(scene)) or (data is not None and (data / scene).is_dir())
+    """Whether the scene can be had: a capture project, a data set in the folder, or a simulated one."""
+    return scene in SCENES or is_project(Path(scene)) or (data is not None and (data / scene).is_dir())
 
 
 def scene_name(scene: str) -> str:
@@ -37,10 +36,11 @@ def scene_name(scene: str) -> str:
 def prepare(scene: str, data: Path | None, out: Path, report: Reporter) -> Path:
     """The project of a scene, made on first use: imported with its poses, or simulated with the true ones.
 
-    `scene`: the name of a data set in `data`, "museum", or the path of a capture project, which is copied.
+    `scene`: the name of a data set in `data` or of a scene of `simulate`, or the path of a capture project, which is
+    copied.
 
     Raises:
-        InputError: there is no such scene. BlenderError: the museum needs the `bpy` package and it is missing.
+        InputError: there is no such scene. BlenderError: simulating needs the `bpy` package and it is missing.
     """
     project = out / "projects" / scene_name(scene)
     if is_project(project):
@@ -53,13 +53,14 @@ def prepare(scene: str, data: Path | None, out: Path, report: Reporter) -> Path:
         (half_made / "runs").mkdir()
     elif data is not None and (data / scene).is_dir():
         import_dataset(ImportParams(dataset=data / scene, project=half_made), report)
-    elif scene == MUSEUM:
-        capture = out / "captures" / MUSEUM
-        simulate(SimulateParams(out=capture), report)
+    elif scene in SCENES:
+        capture = out / "captures" / scene
+        simulate(SimulateParams(out=capture, scene=scene), report)
         import_dataset(ImportParams(dataset=capture / "ground_truth", project=half_made), report)
     else:
         raise InputError(
-            f"There is no scene “{scene}” in {data or 'a data folder'}.", "Name a data set there, museum or a project."
+            f"There is no scene “{scene}” in {data or 'a data folder'}.",
+            f"Name a data set there, {', '.join(SCENES)} or a project.",
         )
     half_made.rename(project)
     return project

@@ -8,12 +8,12 @@ from pathlib import Path
 from ..errors import SettingError
 from ..params import BenchParams
 from .jobs import COUNTING_SIDE, Job
-from .scenes import MUSEUM, scene_name
+from .scenes import scene_name
 
 SCENES = {
     "speed": ["lego_400"],
-    "ablation": ["replica_room", MUSEUM, "mary_rose_tankard"],
-    "robustness": [MUSEUM, "replica_room"],
+    "ablation": ["replica_room", "museum", "facade"],
+    "robustness": ["museum", "replica_room"],
     "baselines": ["lego_400", "replica_room"],
     "gpu": ["lego_400", "replica_room"],
 }

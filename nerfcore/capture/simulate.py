@@ -28,7 +28,7 @@ from ..params import SimulateParams
 from ..progress import Reporter
 from .develop import claim_folder, write_depth
 
-SCENES = ("museum",)
+SCENES = ("museum", "facade")
 SETTINGS = "simulate.json"
 START = datetime(2026, 5, 18, 10, 0, 0)
 FOCAL_MM = 28.0

@@ -73,16 +73,17 @@ def run(request):
     bpy.ops.wm.save_as_mainfile(filepath=str(out / "scene.blend"), copy=True)
     assert (out / "scene.blend").stat().st_size > 10_000
 
-    museum = importlib.import_module(MODULE + ".addon.simulate.museum")
+    scenes = importlib.import_module(MODULE + ".addon.simulate.task").SCENES
     photograph = importlib.import_module(MODULE + ".addon.simulate.photograph")
     begin = time.perf_counter()
-    scene = museum.build(0)
-    shot = photograph.Shot("a", museum.poses(4, 0)[0], photograph.Lens(96, 64, 75.0))
-    photograph.photograph(scene, [shot], out, samples=1)
+    for name, module in scenes.items():
+        shot = photograph.Shot(name, module.poses(4, 0)[0], photograph.Lens(96, 64, 75.0))
+        photograph.photograph(module.build(0), [shot], out, samples=1)
     facts["photo_s"] = round(time.perf_counter() - begin, 1)
     facts["oidn"] = photograph.has_denoiser()
-    for name in ("a.png", "a.label.png", "a.depth.npy"):
-        assert (out / name).is_file(), name
+    for name in scenes:
+        for suffix in (".png", ".label.png", ".depth.npy"):
+            assert (out / f"{name}{suffix}").is_file(), name + suffix
 
     facts |= capture_to_mesh(request, out)
 

@@ -16,6 +16,7 @@ from click.testing import CliRunner
 from fieldwork.nerfcore.bench import gpu, tables
 from fieldwork.nerfcore.bench.jobs import Job, interrupted
 from fieldwork.nerfcore.bench.machine import run_yardstick
+from fieldwork.nerfcore.bench.scenes import available
 from fieldwork.nerfcore.bench.suites import ABLATION, ROBUSTNESS, TIMED, baselines, plan
 from fieldwork.nerfcore.config import make_config
 from fieldwork.nerfcore.errors import Cancelled, InputError, SettingError
@@ -196,6 +197,13 @@ def test_unknown_variants_and_scenes_are_named(tiny_project: Path, tmp_path: Pat
 def test_every_variant_is_made_of_settings_that_exist() -> None:
     for settings in (*ABLATION.values(), *ROBUSTNESS.values(), *baselines().values()):
         make_config("standard", settings)
+
+
+def test_simulated_scenes_need_no_data(tmp_path: Path) -> None:
+    assert available("museum", None)
+    assert available("facade", tmp_path)
+    assert not available("replica_room", None)
+    assert not available("replica_room", tmp_path)
 
 
 def test_the_plan_has_equal_steps_and_equal_time() -> None:

@@ -70,7 +70,8 @@ def field_model(field: HybridField, box: Box) -> onnx.ModelProto:
     g.add("Sigmoid", _network(g, field.color_head, g.join(parts)), name="color")
     outputs = [("density", ["N"]), ("color", ["N", 3])]
     if field.semantic_head is not None:
-        logits = _network(g, field.semantic_head, out if implicit is None else g.join([out, implicit]))
+        branches = [part for part in (implicit, explicit) if part is not None]
+        logits = _network(g, field.semantic_head, g.join([out, *branches]))
         g.add("Softmax", logits, name="probabilities", axis=1)
         outputs.append(("probabilities", ["N", field.classes]))
     value = lambda name, shape: helper.make_tensor_value_info(name, TensorProto.FLOAT, shape)  # noqa: E731

@@ -78,7 +78,7 @@ class HybridField(nn.Module):
         self.color_head = MLP(
             outputs + DIRECTION_FEATURES + config.appearance, 3, config.width, config.color_layers, output_gain=0.5
         )
-        semantic_inputs = outputs + (self.features if self.implicit is not None else 0)
+        semantic_inputs = outputs + self.features * sum(b is not None for b in (self.grid, self.implicit))
         self.semantic_head = (
             MLP(semantic_inputs, classes, config.width, config.semantic_layers) if classes > 0 else None
         )
@@ -148,9 +148,8 @@ class HybridField(nn.Module):
         return torch.sigmoid(self.color_head(torch.cat(parts, 1), self.dtype).float())
 
     def logits(self, geometry: Geometry) -> torch.Tensor:
-        """Class logits (N, K). The viewing direction has no say, the smooth implicit branch has a strong one."""
+        """Class logits (N, K). The viewing direction has no say; both branches are read as they are as well, for what
+        is too fine for the features that density and colour share."""
         assert self.semantic_head is not None
-        features = geometry.features
-        if geometry.implicit is not None:
-            features = torch.cat([features, geometry.implicit], 1)
-        return self.semantic_head(features, self.dtype).float()
+        branches = [part.to(self.dtype) for part in (geometry.implicit, geometry.explicit) if part is not None]
+        return self.semantic_head(torch.cat([geometry.features, *branches], 1), self.dtype).float()

@@ -83,8 +83,8 @@ class FusedShape:
 
     @property
     def semantic(self) -> tuple[int, ...]:
-        """The implicit features follow the padded geometry, so that both start at a multiple of 16."""
-        inputs = padded(self.geometry) + (self.features if self.octaves else 0)
+        """Implicit and explicit features follow the padded geometry, so that all start at a multiple of 16."""
+        inputs = padded(self.geometry) + self.features * (2 if self.octaves else 1)
         return (inputs, self.width, self.classes)
 
     def networks(self) -> dict[str, tuple[int, ...]]:
@@ -206,7 +206,8 @@ def fused_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
     frequencies = frequency_encoding(octaves, shape.implicit[0]) if octaves else None
     semantic_network = network(shape.semantic, lanes) if classes else None
     semantic_input = half_vector(shape.semantic[0])
-    implicit_vector, known_vector = half_vector(features), half_vector(geometry)
+    branch_vector, known_vector = half_vector(features), half_vector(geometry)
+    explicit_place = geometry_rows + (features if octaves else 0)
 
     def fused_render(
         origins: wp.array(dtype=wp.vec3),
@@ -287,7 +288,11 @@ def fused_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
                     p = inside(grid_position(ray.origin + ray.direction * t, m.contracted))
                     samples += 1
                 hidden = grid(p, table, layout, gains)
-                implicit = implicit_vector()
+                implicit = branch_vector()
+                explicit = branch_vector()
+                if wp.static(classes > 0 and octaves > 0):
+                    for k in range(features):
+                        explicit[k] = hidden[k]
                 if wp.static(octaves > 0):
                     w = float(1.0)
                     if active == 1 and evidence_side > 0:
@@ -337,6 +342,10 @@ def fused_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
                                     implicit[k] = wp.float16(smooth[k])
                             for k in range(features):
                                 y[geometry_rows + k] = implicit[k]
+                                y[explicit_place + k] = explicit[k]
+                        else:
+                            for k in range(features):
+                                y[explicit_place + k] = hidden[k]
                         scores = semantic_network(y, weights, semantic_row)
                         if shows == 1:
                             if wp.static(logits == 0):

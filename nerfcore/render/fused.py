@@ -116,7 +116,7 @@ def pack(field: HybridField, semantics: bool = True, logits: bool = False) -> Fu
         "implicit": [(3 + 6 * c.octaves, shape.implicit[0])],
         "density": explicit,
         "color": [(geometry + 16 + c.appearance, shape.color[0])],
-        "semantic": [(geometry, padded(geometry)), *(explicit if shape.octaves else [])],
+        "semantic": [(geometry, padded(geometry)), *explicit * (2 if shape.octaves else 1)],
     }
     networks = {
         "implicit": field.implicit,

@@ -46,7 +46,7 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
     # Views larger than the training images are compared at the training size.
     sizes = [training_size(scene.views[index].camera, trained.info.image_size) for index in indices]
     report.stage("Preparing")
-    trained.model.refine(sum(width * height for width, height in sizes), report.check)
+    trained.model.refine(check=report.check)
     box = trained.info.box(project)
     background = background_of(trained.info)
     out = run_folder(folder, params.run) / "evaluation"

@@ -14,6 +14,7 @@ from ..data.pixels import VOID, Batch, PixelStore
 from ..field.grid import Part
 from ..kernels.runtime import run_parallel
 from ..sampling.cache import CoarseCache
+from ..sampling.outlines import outline_places
 from .depth import DepthRays, depth_loss
 from .losses import (
     color_loss,
@@ -91,6 +92,8 @@ class Trainer:
         self.poses = PoseRefinement(store.rays, config.train) if config.train.refine_poses else None
         self.depths: DepthRays | None = None
         self.check = check
+        semantic = config.loss.semantic_weight > 0 and config.sampling.outline_rays > 0
+        self.outlines = outline_places(store) if semantic else torch.zeros(0, dtype=torch.long, device=self.device)
         self.pixel_features: PixelFeatures | None = None
         self.measured = Measured()
 
@@ -99,7 +102,10 @@ class Trainer:
         s = self.config.sampling
         if s.coarse_cache and self.steps >= s.warmup and (self.steps - s.warmup) % s.cache_every == 0:
             self.cache.rebuild(self.model)
-        return self.store.batch(self.cache.places(self.rays, s.empty_rays, self.generator))
+        count = int(self.rays * s.outline_rays) if len(self.outlines) else 0
+        places = self.cache.places(self.rays - count, s.empty_rays, self.generator)
+        chosen = torch.randint(0, max(len(self.outlines), 1), (count,), device=self.device, generator=self.generator)
+        return self.store.batch(torch.cat([places, self.outlines[chosen]]))
 
     def step(self, progress: float) -> None:
         """One optimisation step at `progress` in [0, 1] of the schedule."""

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from fieldwork.nerfcore.data.cameras import Camera
+from fieldwork.nerfcore.data.pixels import VOID
 from fieldwork.nerfcore.kernels.march import Samples, sample
 from fieldwork.nerfcore.kernels.packing import Packing
 from fieldwork.nerfcore.render.fused import wants_fused
@@ -16,6 +17,7 @@ from fieldwork.nerfcore.render.image import render_view
 from fieldwork.nerfcore.render.verb import look_at
 from fieldwork.nerfcore.sampling.cache import CoarseCache
 from fieldwork.nerfcore.sampling.occupancy import OccupancyGrid, class_interest
+from fieldwork.nerfcore.sampling.outlines import REACH, outline_places
 from fieldwork.nerfcore.train.model import Model
 from fieldwork.nerfcore.train.trainer import Trainer
 from fieldwork.tests.nerfcore.support.ball import ball_project
@@ -159,6 +161,37 @@ def test_a_share_of_the_rays_comes_from_everywhere(ball: Path) -> None:
         places = cache.places(5000, free, trainer.generator)
         elsewhere = float((trainer.store.batch(places).image != 0).float().mean())
         assert elsewhere == pytest.approx(free * (1 - 1 / len(trainer.store.views)), abs=0.03)
+
+
+def near_another_class(label: torch.Tensor, y: int, x: int) -> bool:
+    """The definition of an outline, looked up pixel by pixel."""
+    around = label[max(y - REACH, 0) : y + REACH + 1, max(x - REACH, 0) : x + REACH + 1]
+    return bool(label[y, x] != VOID) and bool(((around != label[y, x]) & (around != VOID)).any())
+
+
+@pytest.mark.setting("sampling.outline_rays")
+def test_outlines_are_where_classes_meet_and_get_their_share_of_the_rays(ball: Path) -> None:
+    trainer = trainer_of(ball, **{"sampling.outline_rays": "0.5"})
+    store = trainer.store
+    store.label[:40] = VOID
+    store.label[5000:5003] = 0
+    camera, first = store.cameras[0], int(store.first[1])
+    label = store.label[:first].view(camera.height, camera.width)
+    expected = [near_another_class(label, y, x) for y in range(camera.height) for x in range(camera.width)]
+    places = outline_places(store)
+    found = torch.zeros(len(store), dtype=torch.bool)
+    found[places] = True
+    assert 0 < sum(expected) < 0.5 * len(expected)
+    assert found[:first].tolist() == expected
+    store.usable = torch.arange(0, len(store), 2)
+    assert torch.equal(outline_places(store), places[places % 2 == 0])
+    store.usable = None
+    batch = trainer.draw()
+    assert len(batch.rgb) == trainer.rays
+    inside = torch.isin(store.first[batch.image] + batch.pixel, trainer.outlines)
+    assert 0.5 <= float(inside.float().mean()) < 0.8
+    for settings in ({"sampling.outline_rays": "0"}, {"loss.semantic_weight": "0"}):
+        assert len(trainer_of(ball, **settings).outlines) == 0
 
 
 def two_samples() -> tuple[torch.Tensor, torch.Tensor, Packing]:

@@ -8,6 +8,7 @@ import torch.nn.functional as F
 from ..data.pixels import VOID, PixelStore
 
 REACH = 2  # pixels from another class
+MOST_OFTEN = 5  # times as often as others: where few photos are labelled, these must not have most of the rays
 
 
 def outline_places(store: PixelStore) -> torch.Tensor:
@@ -26,3 +27,8 @@ def outline_places(store: PixelStore) -> torch.Tensor:
     if store.usable is not None:
         return store.usable[outline[store.usable]]
     return outline.nonzero()[:, 0]
+
+
+def outline_share(outlines: int, pixels: int, asked: float) -> float:
+    """Share of the rays to draw from so many outline places among all pixels."""
+    return min(asked, MOST_OFTEN * outlines / max(pixels, 1))

@@ -14,7 +14,7 @@ from ..data.pixels import VOID, Batch, PixelStore
 from ..field.grid import Part
 from ..kernels.runtime import run_parallel
 from ..sampling.cache import CoarseCache
-from ..sampling.outlines import outline_places
+from ..sampling.outlines import outline_places, outline_share
 from .depth import DepthRays, depth_loss
 from .losses import (
     color_loss,
@@ -102,7 +102,7 @@ class Trainer:
         s = self.config.sampling
         if s.coarse_cache and self.steps >= s.warmup and (self.steps - s.warmup) % s.cache_every == 0:
             self.cache.rebuild(self.model)
-        count = int(self.rays * s.outline_rays) if len(self.outlines) else 0
+        count = int(self.rays * outline_share(len(self.outlines), len(self.store), s.outline_rays))
         places = self.cache.places(self.rays - count, s.empty_rays, self.generator)
         chosen = torch.randint(0, max(len(self.outlines), 1), (count,), device=self.device, generator=self.generator)
         return self.store.batch(torch.cat([places, self.outlines[chosen]]))

@@ -17,7 +17,7 @@ from fieldwork.nerfcore.render.image import render_view
 from fieldwork.nerfcore.render.verb import look_at
 from fieldwork.nerfcore.sampling.cache import CoarseCache
 from fieldwork.nerfcore.sampling.occupancy import OccupancyGrid, class_interest
-from fieldwork.nerfcore.sampling.outlines import REACH, outline_places
+from fieldwork.nerfcore.sampling.outlines import REACH, outline_places, outline_share
 from fieldwork.nerfcore.train.model import Model
 from fieldwork.nerfcore.train.trainer import Trainer
 from fieldwork.tests.nerfcore.support.ball import ball_project
@@ -186,6 +186,8 @@ def test_outlines_are_where_classes_meet_and_get_their_share_of_the_rays(ball: P
     store.usable = torch.arange(0, len(store), 2)
     assert torch.equal(outline_places(store), places[places % 2 == 0])
     store.usable = None
+    assert outline_share(10, 1000, 0.35) == 0.05
+    assert outline_share(200, 1000, 0.35) == 0.35
     batch = trainer.draw()
     assert len(batch.rgb) == trainer.rays
     inside = torch.isin(store.first[batch.image] + batch.pixel, trainer.outlines)

@@ -107,7 +107,7 @@ class SamplingConfig(Stage):
     coarse_cache: bool = Field(default=True, description="choose training rays by which image tiles met the field")
     cache_every: int = Field(default=1000, ge=1, description="steps between updates of the coarse cache")
     outline_rays: float = Field(
-        default=0.35, ge=0, le=1, description="share of rays drawn where classes meet in the labels"
+        default=0.2, ge=0, le=1, description="share of rays drawn where classes meet in the labels"
     )
     empty_rays: float = Field(
         default=0.1, ge=0, le=1, description="share of rays drawn from everywhere despite the cache"

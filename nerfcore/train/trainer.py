@@ -14,7 +14,7 @@ from ..data.pixels import VOID, Batch, PixelStore
 from ..field.grid import Part
 from ..kernels.runtime import run_parallel
 from ..sampling.cache import CoarseCache
-from ..sampling.outlines import outline_places, outline_share
+from ..sampling.outlines import Outlines
 from .depth import DepthRays, depth_loss
 from .losses import (
     color_loss,
@@ -93,7 +93,7 @@ class Trainer:
         self.depths: DepthRays | None = None
         self.check = check
         semantic = config.loss.semantic_weight > 0 and config.sampling.outline_rays > 0
-        self.outlines = outline_places(store) if semantic else torch.zeros(0, dtype=torch.long, device=self.device)
+        self.outlines = Outlines(store) if semantic else None
         self.pixel_features: PixelFeatures | None = None
         self.measured = Measured()
 
@@ -102,10 +102,11 @@ class Trainer:
         s = self.config.sampling
         if s.coarse_cache and self.steps >= s.warmup and (self.steps - s.warmup) % s.cache_every == 0:
             self.cache.rebuild(self.model)
-        count = int(self.rays * outline_share(len(self.outlines), len(self.store), s.outline_rays))
+        count = self.outlines.number(self.rays, s.outline_rays) if self.outlines is not None else 0
         places = self.cache.places(self.rays - count, s.empty_rays, self.generator)
-        chosen = torch.randint(0, max(len(self.outlines), 1), (count,), device=self.device, generator=self.generator)
-        return self.store.batch(torch.cat([places, self.outlines[chosen]]))
+        if self.outlines is not None and count > 0:
+            places = torch.cat([places, self.outlines.draw(count, self.generator)])
+        return self.store.batch(places)
 
     def step(self, progress: float) -> None:
         """One optimisation step at `progress` in [0, 1] of the schedule."""

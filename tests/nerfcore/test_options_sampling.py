@@ -17,7 +17,7 @@ from fieldwork.nerfcore.render.image import render_view
 from fieldwork.nerfcore.render.verb import look_at
 from fieldwork.nerfcore.sampling.cache import CoarseCache
 from fieldwork.nerfcore.sampling.occupancy import OccupancyGrid, class_interest
-from fieldwork.nerfcore.sampling.outlines import REACH, outline_places, outline_share
+from fieldwork.nerfcore.sampling.outlines import REACH, Outlines, outline_mask
 from fieldwork.nerfcore.train.model import Model
 from fieldwork.nerfcore.train.trainer import Trainer
 from fieldwork.tests.nerfcore.support.ball import ball_project
@@ -178,22 +178,34 @@ def test_outlines_are_where_classes_meet_and_get_their_share_of_the_rays(ball: P
     camera, first = store.cameras[0], int(store.first[1])
     label = store.label[:first].view(camera.height, camera.width)
     expected = [near_another_class(label, y, x) for y in range(camera.height) for x in range(camera.width)]
-    places = outline_places(store)
-    found = torch.zeros(len(store), dtype=torch.bool)
-    found[places] = True
+    found = outline_mask(store)
     assert 0 < sum(expected) < 0.5 * len(expected)
     assert found[:first].tolist() == expected
     store.usable = torch.arange(0, len(store), 2)
-    assert torch.equal(outline_places(store), places[places % 2 == 0])
+    assert torch.equal(outline_mask(store), found & (torch.arange(len(store)) % 2 == 0))
     store.usable = None
-    assert outline_share(10, 1000, 0.35) == 0.05
-    assert outline_share(200, 1000, 0.35) == 0.35
     batch = trainer.draw()
     assert len(batch.rgb) == trainer.rays
-    inside = torch.isin(store.first[batch.image] + batch.pixel, trainer.outlines)
-    assert 0.5 <= float(inside.float().mean()) < 0.8
+    trainer = trainer_of(ball, **{"sampling.outline_rays": "0.5"})
+    assert trainer.outlines is not None
+    inside = torch.isin(store.first[batch.image] + batch.pixel, trainer.outlines.places)
+    assert trainer.outlines.number(1000, 0.5) / 1000 - 0.01 <= float(inside.float().mean()) < 0.8
     for settings in ({"sampling.outline_rays": "0"}, {"loss.semantic_weight": "0"}):
-        assert len(trainer_of(ball, **settings).outlines) == 0
+        assert trainer_of(ball, **settings).outlines is None
+
+
+def test_rare_classes_have_more_than_their_share_of_the_outline_rays(ball: Path) -> None:
+    store = trainer_of(ball).store
+    store.label[:] = 0
+    width = store.cameras[0].width
+    store.label[width * 10 + 10] = 1  # one pixel, with 24 of class 0 around it
+    outlines = Outlines(store)
+    assert outlines.places.tolist()[-1] == width * 10 + 10
+    assert len(outlines.places) == 25
+    assert outlines.number(len(store), 0.5) == 125  # never more than five times as often as others
+    drawn = outlines.draw(20000, torch.Generator().manual_seed(0))
+    assert set(drawn.tolist()) == set(outlines.places.tolist())
+    assert float((store.label[drawn] == 1).float().mean()) == pytest.approx(1 / (1 + 24**0.5), abs=0.01)
 
 
 def two_samples() -> tuple[torch.Tensor, torch.Tensor, Packing]:

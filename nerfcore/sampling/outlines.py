@@ -8,33 +8,34 @@ import torch.nn.functional as F
 from ..data.pixels import VOID, PixelStore
 
 REACH = 2  # pixels from another class
-MOST_OFTEN = 5  # times as often as others: where few photos are labelled, these must not have most of the rays
+# Times as often as other pixels: more would have rare classes seen where they are not, and where few photos are
+# labelled these would have most of the rays.
+MOST_OFTEN = 4
 
 
 class Outlines:
     """The usable labelled pixels that have another class at most `REACH` pixels away in x and in y.
 
     places (N,) int64: their flat positions, class after class, on the store's device. A class with n of them gets
-    rays in proportion to √n, so that rare classes have more than their share.
+    rays in proportion to √n, so that rare classes have more than their share, but at most `MOST_OFTEN` times as many
+    as other pixels. `share`: of a step's rays that these are when a share `asked` is asked for.
     """
 
-    def __init__(self, store: PixelStore) -> None:
+    def __init__(self, store: PixelStore, asked: float) -> None:
         found = outline_mask(store).nonzero()[:, 0]
         label = store.label[found].long()
         self.places = found[torch.argsort(label, stable=True)]
         self.count = torch.bincount(label, minlength=VOID)
         self.first = self.count.cumsum(0) - self.count
-        self.upto = self.count.sqrt().cumsum(0)
-        self.share = len(self.places) / max(len(store), 1)
-
-    def number(self, rays: int, asked: float) -> int:
-        """How many of the rays of a step to draw here when a share of them is asked for."""
-        return round(rays * min(asked, MOST_OFTEN * self.share))
+        root = self.count.double().sqrt()
+        share = torch.minimum(asked * root / root.sum().clamp(min=1), MOST_OFTEN * self.count / max(len(store), 1))
+        self.upto = share.cumsum(0)
+        self.share = float(self.upto[-1])
 
     def draw(self, count: int, generator: torch.Generator) -> torch.Tensor:
         """`count` flat positions (count,), with repetition; there must be outlines."""
         where, which = torch.rand(2, count, device=self.places.device, generator=generator)
-        label = torch.searchsorted(self.upto, where * self.upto[-1], right=True).clamp(max=VOID - 1)
+        label = torch.searchsorted(self.upto, where.double() * self.upto[-1], right=True).clamp(max=VOID - 1)
         index = self.first[label] + (which * self.count[label]).long()
         return self.places[index.clamp(max=len(self.places) - 1)]
 

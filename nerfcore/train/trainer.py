@@ -93,7 +93,7 @@ class Trainer:
         self.depths: DepthRays | None = None
         self.check = check
         semantic = config.loss.semantic_weight > 0 and config.sampling.outline_rays > 0
-        self.outlines = Outlines(store) if semantic else None
+        self.outlines = Outlines(store, config.sampling.outline_rays) if semantic else None
         self.pixel_features: PixelFeatures | None = None
         self.measured = Measured()
 
@@ -102,7 +102,7 @@ class Trainer:
         s = self.config.sampling
         if s.coarse_cache and self.steps >= s.warmup and (self.steps - s.warmup) % s.cache_every == 0:
             self.cache.rebuild(self.model)
-        count = self.outlines.number(self.rays, s.outline_rays) if self.outlines is not None else 0
+        count = round(self.rays * self.outlines.share) if self.outlines is not None else 0
         places = self.cache.places(self.rays - count, s.empty_rays, self.generator)
         if self.outlines is not None and count > 0:
             places = torch.cat([places, self.outlines.draw(count, self.generator)])

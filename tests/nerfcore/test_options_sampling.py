@@ -189,7 +189,7 @@ def test_outlines_are_where_classes_meet_and_get_their_share_of_the_rays(ball: P
     trainer = trainer_of(ball, **{"sampling.outline_rays": "0.5"})
     assert trainer.outlines is not None
     inside = torch.isin(store.first[batch.image] + batch.pixel, trainer.outlines.places)
-    assert trainer.outlines.number(1000, 0.5) / 1000 - 0.01 <= float(inside.float().mean()) < 0.8
+    assert trainer.outlines.share - 0.01 <= float(inside.float().mean()) < 0.8
     for settings in ({"sampling.outline_rays": "0"}, {"loss.semantic_weight": "0"}):
         assert trainer_of(ball, **settings).outlines is None
 
@@ -199,13 +199,17 @@ def test_rare_classes_have_more_than_their_share_of_the_outline_rays(ball: Path)
     store.label[:] = 0
     width = store.cameras[0].width
     store.label[width * 10 + 10] = 1  # one pixel, with 24 of class 0 around it
-    outlines = Outlines(store)
+    outlines = Outlines(store, 0.01)
     assert outlines.places.tolist()[-1] == width * 10 + 10
     assert len(outlines.places) == 25
-    assert outlines.number(len(store), 0.5) == 125  # never more than five times as often as others
+    assert outlines.share == pytest.approx((4 + 0.01 * len(store) * 24**0.5 / (1 + 24**0.5)) / len(store), rel=1e-3)
     drawn = outlines.draw(20000, torch.Generator().manual_seed(0))
     assert set(drawn.tolist()) == set(outlines.places.tolist())
-    assert float((store.label[drawn] == 1).float().mean()) == pytest.approx(1 / (1 + 24**0.5), abs=0.01)
+    assert float((store.label[drawn] == 1).float().mean()) == pytest.approx(
+        4 / outlines.share / len(store),
+        abs=0.01,  # at most four times as often as any pixel
+    )
+    assert Outlines(store, 0.5).share == pytest.approx(4 * 25 / len(store), rel=1e-3)
 
 
 def two_samples() -> tuple[torch.Tensor, torch.Tensor, Packing]:

@@ -190,7 +190,7 @@ def test_outlines_are_where_classes_meet_and_get_their_share_of_the_rays(ball: P
     assert trainer.outlines is not None
     inside = torch.isin(store.first[batch.image] + batch.pixel, trainer.outlines.places)
     assert trainer.outlines.share - 0.01 <= float(inside.float().mean()) < 0.8
-    for settings in ({"sampling.outline_rays": "0"}, {"loss.semantic_weight": "0"}):
+    for settings in ({"sampling.outline_rays": "0"}, {"sampling.outline_rays": "0.5", "loss.semantic_weight": "0"}):
         assert trainer_of(ball, **settings).outlines is None
 
 

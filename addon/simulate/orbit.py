@@ -22,6 +22,13 @@ def look_at(position: np.ndarray, target: np.ndarray) -> np.ndarray:
     return matrix
 
 
+def _counts(views: int, levels: list[tuple[float, float, float]]) -> np.ndarray:
+    """Number of views on each level; the first one takes what rounding leaves over."""
+    counts = np.floor(np.array([share for share, _, _ in levels]) * views).astype(int)
+    counts[0] += views - counts.sum()
+    return counts
+
+
 def rings(views: int, levels: list[tuple[float, float, float]], target: np.ndarray, seed: int) -> list[np.ndarray]:
     """A walk around `target` on several rings, as a photographer does it, by hand and so not quite even.
 
@@ -32,10 +39,8 @@ def rings(views: int, levels: list[tuple[float, float, float]], target: np.ndarr
         seed: of the unevenness.
     """
     random = np.random.default_rng(seed)
-    counts = np.floor(np.array([share for share, _, _ in levels]) * views).astype(int)
-    counts[0] += views - counts.sum()
     poses = []
-    for ring, (count, (_, distance, elevation)) in enumerate(zip(counts, levels)):
+    for ring, (count, (_, distance, elevation)) in enumerate(zip(_counts(views, levels), levels)):
         for index in range(count):
             angle = 2 * math.pi * (index + 0.37 * ring) / count + random.normal(0, 0.02)
             height = math.radians(elevation + random.normal(0, 1.5))
@@ -64,10 +69,8 @@ def arc(
         seed: of the unevenness.
     """
     random = np.random.default_rng(seed)
-    counts = np.floor(np.array([share for share, _, _ in levels]) * views).astype(int)
-    counts[0] += views - counts.sum()
     poses = []
-    for level, (count, (_, distance, height)) in enumerate(zip(counts, levels)):
+    for level, (count, (_, distance, height)) in enumerate(zip(_counts(views, levels), levels)):
         start = 0.5 * (level % 2)  # every second walk stands between the places of the one before
         for index in range(count):
             share = (index + start) / max(count - 1 + 2 * start, 1)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..config import SceneConfig
+from .frames import focus_point
 from .scene import Scene, View
 from .similarity import make_similarity, similarity_scale
 
@@ -26,20 +27,9 @@ class Box:
         return np.linalg.inv(self.world_from_box)
 
 
-def focus_point(views: list[View]) -> np.ndarray:
-    """The point (3,) nearest to all optical axes, in the least-squares sense."""
-    total, right = np.zeros((3, 3)), np.zeros(3)
-    for view in views:
-        axis = view.camera_to_world[:3, 2]
-        across = np.eye(3) - np.outer(axis, axis)
-        total += across
-        right += across @ view.camera_to_world[:3, 3]
-    return np.linalg.lstsq(total, right, rcond=1e-6)[0]
-
-
 def looks_inward(views: list[View]) -> bool:
     """True when the cameras surround what they look at: their focus is in front of nearly all of them."""
-    focus = focus_point(views)
+    focus = focus_point([view.camera_to_world for view in views])
     offsets = np.stack([focus - view.camera_to_world[:3, 3] for view in views])
     axes = np.stack([view.camera_to_world[:3, 2] for view in views])
     cosine = (offsets * axes).sum(1) / np.maximum(np.linalg.norm(offsets, axis=1), 1e-9)
@@ -61,7 +51,7 @@ def choose_box(scene: Scene, config: SceneConfig, transparent: bool) -> Box:
         low, high = scene.bounds
         return _box((low + high) / 2, float((high - low).max()) / 2 * config.margin, config.contraction == "on")
     if looks_inward(scene.views):
-        focus = focus_point(scene.views)
+        focus = focus_point([view.camera_to_world for view in scene.views])
         reach = np.linalg.norm(centers - focus, axis=1)
         if transparent and config.contraction != "on":
             return _box(focus, _object_radius(scene, focus, reach) * config.margin, False)

@@ -96,7 +96,8 @@ def focus_point(camera_to_world: Sequence[np.ndarray]) -> np.ndarray:
     poses = np.stack(camera_to_world)
     direction, center = poses[:, :3, 2], poses[:, :3, 3]
     projector = np.eye(3) - direction[:, :, None] * direction[:, None, :]
-    return np.linalg.lstsq(projector.sum(0), (projector @ center[:, :, None]).sum(0)[:, 0], rcond=None)[0]
+    # Axes that are nearly parallel meet nowhere: their common direction is left out.
+    return np.linalg.lstsq(projector.sum(0), (projector @ center[:, :, None]).sum(0)[:, 0], rcond=1e-6)[0]
 
 
 def upright(

@@ -79,7 +79,8 @@ class Batch:
 
     origins, directions (R, 3) float32, unit directions; rgb (R, 3) and alpha (R,) float32 in [0, 1] (sRGB, straight
     alpha); label (R,) int64 class index or VOID; image (R,) int64 index into the store; pixel (R,) int64 its place;
-    confidence (R,) float32 in [0, 1], how sure the label is.
+    confidence (R,) float32 in [0, 1], how sure the label is; weight (R,) float32, how much of a pixel drawn as often as
+    any other the ray stands for.
     """
 
     origins: torch.Tensor
@@ -90,6 +91,12 @@ class Batch:
     image: torch.Tensor
     pixel: torch.Tensor
     confidence: torch.Tensor
+    weight: torch.Tensor
+
+    @property
+    def labelled(self) -> torch.Tensor:
+        """Weights (R,) of the rays, 0 for those without a label."""
+        return self.weight * (self.label != VOID)
 
     def part(self, rays: slice) -> Batch:
         """Some of the rays."""
@@ -221,7 +228,8 @@ class PixelStore:
         origins, directions = self.rays(image, pixel)
         value = self.rgba[places].float() / 255
         sure = torch.ones_like(value[:, 3]) if self.confidence is None else self.confidence[places].float() / 255
-        return Batch(origins, directions, value[:, :3], value[:, 3], self.label[places].long(), image, pixel, sure)
+        rgb, alpha, label = value[:, :3], value[:, 3], self.label[places].long()
+        return Batch(origins, directions, rgb, alpha, label, image, pixel, sure, torch.ones_like(sure))
 
     def random_places(self, count: int, generator: torch.Generator) -> torch.Tensor:
         """`count` flat positions of usable pixels, with repetition."""

@@ -53,7 +53,7 @@ def refit_camera(
         valid = ~directions[:, 0].isnan()
         origins, directions, pixel, image = (x[valid] for x in (origins, directions, pixel, image))
         solid = torch.ones(len(pixel), device=device)
-        batch = refinement.move(Batch(origins, directions, colors[pixel], solid, image, image, pixel, solid))
+        batch = refinement.move(Batch(origins, directions, colors[pixel], solid, image, image, pixel, solid, solid))
         jitter = torch.rand(len(pixel), device=device, generator=generator)
         shift = torch.rand(len(pixel) * count, device=device, generator=generator)
         if grid is not None:

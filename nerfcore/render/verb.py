@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 import OpenImageIO as oiio
 
-from ..data.box import Box, box_poses, focus_point
+from ..data.box import Box, box_poses
 from ..data.cameras import Camera, flip_camera_axes
+from ..data.frames import focus_point
 from ..data.pixels import training_size
 from ..data.scene import Scene, View
 from ..data.similarity import similarity_scale
@@ -120,7 +121,7 @@ def read_cameras(path: Path) -> list[tuple[str, Camera, np.ndarray]]:
 def orbit_cameras(scene: Scene, count: int) -> list[tuple[str, Camera, np.ndarray]]:
     """`count` cameras on a circle around the focus of the training views, at their median distance and height."""
     views = [scene.views[i] for i in scene.train]
-    focus = focus_point(views)
+    focus = focus_point([view.camera_to_world for view in views])
     offsets = np.stack([v.camera_to_world[:3, 3] for v in views]) - focus
     height, radius = float(np.median(offsets[:, 2])), float(np.median(np.linalg.norm(offsets[:, :2], axis=1)))
     camera = views[0].camera.undistorted()

@@ -8,9 +8,7 @@ import torch.nn.functional as F
 from ..data.pixels import VOID, PixelStore
 
 REACH = 2  # pixels from another class
-# Times as often as other pixels: more would have rare classes seen where they are not, and where few photos are
-# labelled these would have most of the rays.
-MOST_OFTEN = 4
+MOST_OFTEN = 4  # times as often as other pixels: where few photos are labelled these would have most of the rays
 
 
 class Outlines:
@@ -22,15 +20,19 @@ class Outlines:
     """
 
     def __init__(self, store: PixelStore, asked: float) -> None:
-        found = outline_mask(store).nonzero()[:, 0]
+        self.mask, self.label = outline_mask(store), store.label
+        found = self.mask.nonzero()[:, 0]
         label = store.label[found].long()
         self.places = found[torch.argsort(label, stable=True)]
         self.count = torch.bincount(label, minlength=VOID)
         self.first = self.count.cumsum(0) - self.count
         root = self.count.double().sqrt()
-        share = torch.minimum(asked * root / root.sum().clamp(min=1), MOST_OFTEN * self.count / max(len(store), 1))
+        pixels = max(len(store), 1)
+        share = torch.minimum(asked * root / root.sum().clamp(min=1), MOST_OFTEN * self.count / pixels)
         self.upto = share.cumsum(0)
         self.share = float(self.upto[-1])
+        drawn = 1 - self.share + share * pixels / self.count.clamp(min=1)
+        self.class_weight = (1 / drawn).float()
 
     def draw(self, count: int, generator: torch.Generator) -> torch.Tensor:
         """`count` flat positions (count,), with repetition; there must be outlines."""
@@ -38,6 +40,12 @@ class Outlines:
         label = torch.searchsorted(self.upto, where.double() * self.upto[-1], right=True).clamp(max=VOID - 1)
         index = self.first[label] + (which * self.count[label]).long()
         return self.places[index.clamp(max=len(self.places) - 1)]
+
+    def weight(self, places: torch.Tensor) -> torch.Tensor:
+        """How much each of a step's rays must count (R,), so that the pixels drawn more often do not count for more:
+        one over how many times as often as evenly a pixel is drawn. Their mean is about 1."""
+        label = self.label[places].long().clamp(max=VOID - 1)
+        return torch.where(self.mask[places], self.class_weight[label], 1 / (1 - self.share))
 
 
 def outline_mask(store: PixelStore) -> torch.Tensor:

@@ -19,24 +19,24 @@ def color_loss(predicted: torch.Tensor, target: torch.Tensor, config: LossConfig
 
 
 def semantic_loss(
-    probabilities: torch.Tensor, target: torch.Tensor, valid: torch.Tensor, confidence: torch.Tensor | None = None
+    probabilities: torch.Tensor, target: torch.Tensor, weight: torch.Tensor, confidence: torch.Tensor | None = None
 ) -> torch.Tensor:
-    """Cross-entropy in image space: −log Ŝ_y summed over labelled rays / max(their number, 1).
+    """Cross-entropy in image space: mean of −log Ŝ_y over the rays, weighted; 0 where none is labelled.
 
     Args:
         probabilities: (R, K) rendered class probabilities; the rest to 1 is void.
         target: (R,) class index, or (R, K) soft labels.
-        valid: (R,) bool, labelled rays; none gives 0, not NaN.
-        confidence: (R,) in [0, 1], factor of each ray's term; the number of rays stays as it is.
+        weight: (R,) how much each ray counts, 0 for those without a label.
+        confidence: (R,) in [0, 1], factor of each ray's term; what the rays count stays as it is.
     """
     log = probabilities.clamp(min=1e-6).log()
     if target.dim() == 1:
-        picked = log.gather(1, torch.where(valid, target, 0)[:, None])[:, 0]
+        picked = log.gather(1, torch.where(weight > 0, target, 0)[:, None])[:, 0]
     else:
         picked = (log * target).sum(1)
     if confidence is not None:
         picked = picked * confidence
-    return -(picked * valid).sum() / valid.sum().clamp(min=1)
+    return -(picked * weight).sum() / weight.sum().clamp(min=1e-6)
 
 
 def sparsity_loss(density: torch.Tensor, config: LossConfig) -> torch.Tensor:
@@ -48,10 +48,11 @@ def sparsity_loss(density: torch.Tensor, config: LossConfig) -> torch.Tensor:
     return density.abs().mean()
 
 
-def entropy_loss(probabilities: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
-    """−H(Ŝ) of labelled rays: minimising it raises the entropy, so that labels do not become overconfident."""
+def entropy_loss(probabilities: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
+    """Weighted mean of −H(Ŝ) of labelled rays, `weight` as for `semantic_loss`: minimising it raises the entropy, so
+    that labels do not become overconfident."""
     entropy = -(probabilities * probabilities.clamp(min=1e-6).log()).sum(1)
-    return -(entropy * valid).sum() / valid.sum().clamp(min=1)
+    return -(entropy * weight).sum() / weight.sum().clamp(min=1e-6)
 
 
 def opacity_entropy(opacity: torch.Tensor) -> torch.Tensor:

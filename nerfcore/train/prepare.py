@@ -8,7 +8,8 @@ import numpy as np
 import torch
 
 from ..config import MOST_VERTICES, RunConfig
-from ..data.box import Box, box_poses, choose_box, focus_point, looks_inward
+from ..data.box import Box, box_poses, choose_box, looks_inward
+from ..data.frames import focus_point
 from ..data.pixels import PixelStore, read_label, read_photo
 from ..data.scene import Scene
 from ..data.similarity import transform_points
@@ -149,7 +150,8 @@ def seen_cells(scene: Scene, trained: list[int], box: Box, device: torch.device)
     points = torch.from_numpy(transform_points(box.box_from_world, scene.points.xyz)).float().to(device)
     focus = None
     if looks_inward(scene.views):
-        place = transform_points(box.box_from_world, focus_point(scene.views)[None])[0]
+        point = focus_point([view.camera_to_world for view in scene.views])
+        place = transform_points(box.box_from_world, point[None])[0]
         focus = torch.from_numpy(place).float().to(device)
     ranges = depth_ranges(cameras, poses, points, focus)
     # Where held-out cameras stood, nothing hangs in front of them either; their photos are not looked at.

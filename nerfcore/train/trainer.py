@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
 
 from ..config import RunConfig
-from ..data.pixels import VOID, Batch, PixelStore
+from ..data.pixels import Batch, PixelStore
 from ..field.grid import Part
 from ..kernels.runtime import run_parallel
 from ..sampling.cache import CoarseCache
@@ -106,6 +106,7 @@ class Trainer:
         places = self.cache.places(self.rays - count, s.empty_rays, self.generator)
         if self.outlines is not None and count > 0:
             places = torch.cat([places, self.outlines.draw(count, self.generator)])
+            return replace(self.store.batch(places), weight=self.outlines.weight(places))
         return self.store.batch(places)
 
     def step(self, progress: float) -> None:
@@ -168,7 +169,7 @@ class Trainer:
             background = torch.rand(batch.rgb.shape, device=self.device, generator=self.generator)
         else:
             background = torch.full_like(batch.rgb, self.background)
-        labelled = (batch.label != VOID).sum().clamp(min=1)
+        labelled = batch.labelled.sum().clamp(min=1e-6)
         size = rays if self.device.type != "cpu" else max(SHARD_SAMPLES // per_ray, 1)
 
         def shard(begin: int) -> Learned:
@@ -177,7 +178,7 @@ class Trainer:
 
             def loss() -> tuple[torch.Tensor, torch.Tensor, Rendered]:
                 rendered = self._render(part, *noise)
-                share = len(part.rgb) / rays, (part.label != VOID).sum() / labelled
+                share = len(part.rgb) / rays, part.labelled.sum() / labelled
                 return *self.loss(part, rendered, background[begin : begin + size], progress, share), rendered
 
             moved = (part.origins, part.directions) if part.origins.requires_grad else ()
@@ -272,15 +273,14 @@ class Trainer:
         predicted = rendered.color + background * (1 - rendered.opacity[:, None])
         total = rays * c.rgb_weight * color_loss(predicted, target, c)
         if rendered.probabilities is not None:
-            valid = batch.label != VOID
-            price = semantic_loss(rendered.probabilities, batch.label, valid, batch.confidence)
+            price = semantic_loss(rendered.probabilities, batch.label, batch.labelled, batch.confidence)
             total = total + labels * c.semantic_weight * price
             if c.entropy_ratio > 0 and c.regularization > 0 and progress >= c.entropy_start:
                 weight = c.regularization * c.entropy_ratio * c.semantic_weight
-                total = total + labels * weight * entropy_loss(rendered.probabilities, valid)
+                total = total + labels * weight * entropy_loss(rendered.probabilities, batch.labelled)
         if c.regularization > 0:
             total = total + rays * c.regularization * self._regularizers(rendered)
-        return total, rays * ((predicted.detach() - target) ** 2).mean()
+        return total, rays * ((predicted.detach() - target) ** 2 * batch.weight[:, None]).mean()
 
     def _regularizers(self, rendered: Rendered) -> torch.Tensor:
         c, s = self.config.loss, rendered.samples

@@ -212,6 +212,20 @@ def test_rare_classes_have_more_than_their_share_of_the_outline_rays(ball: Path)
     assert Outlines(store, 0.5).share == pytest.approx(4 * 25 / len(store), rel=1e-3)
 
 
+def test_what_is_drawn_more_often_counts_less(ball: Path) -> None:
+    """Weighted, a step's rays lie on outlines as often as pixels do."""
+    trainer = trainer_of(ball, **{"sampling.outline_rays": "0.5"})
+    assert trainer.outlines is not None
+    on_outline = trainer.outlines.mask
+    batches = [trainer.draw() for _ in range(30)]
+    drawn = torch.cat([on_outline[trainer.store.first[b.image] + b.pixel] for b in batches]).float()
+    weight = torch.cat([b.weight for b in batches])
+    even = float(on_outline.float().mean())
+    assert float(drawn.mean()) > even + 0.2
+    assert float((drawn * weight).mean()) == pytest.approx(even, abs=0.02)
+    assert float(weight.mean()) == pytest.approx(1, abs=0.02)
+
+
 def two_samples() -> tuple[torch.Tensor, torch.Tensor, Packing]:
     """A faint sample with huge logits for class 0 in front of a surface of class 1."""
     packing = Packing(torch.tensor([0]).int(), torch.tensor([2]).int(), torch.tensor([0, 0]).int())

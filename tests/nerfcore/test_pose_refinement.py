@@ -112,7 +112,8 @@ def test_gradients_on_rays_lead_to_the_true_cameras() -> None:
     wanted = goal(image, pixel)
     before = float((rays.center - goal.center).norm(dim=1).mean())
     for step in range(300):
-        batch = Batch(*rays(image, pixel), torch.zeros(320, 3), torch.ones(320), image, image, pixel, torch.ones(320))
+        solid = torch.ones(320)
+        batch = Batch(*rays(image, pixel), torch.zeros(320, 3), solid, image, image, pixel, solid, solid)
         batch = refinement.move(batch)
         loss = ((batch.origins - wanted[0]) ** 2).sum() + ((batch.directions - wanted[1]) ** 2).sum()
         o, d = torch.autograd.grad(loss, (batch.origins, batch.directions))

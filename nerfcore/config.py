@@ -156,7 +156,8 @@ class LossConfig(Stage):
     )
     sparsity_weight: float = Field(default=1e-4, ge=0, description="of density at random points")
     sparsity_scale: float = Field(default=0.05, gt=0, description="ℓ of 1−exp(−ℓσ)")
-    distortion_weight: float = Field(default=0.0, ge=0, description="against floaters")
+    distortion_weight: float = Field(default=0.01, ge=0, description="against floaters and fog before surfaces")
+    distortion_start: float = Field(default=0.2, ge=0, le=1, description="share of training before that term")
     opacity_weight: float = Field(default=0.0, ge=0, description="entropy of the ray's opacity")
     depth_weight: float = Field(
         default=0.0, ge=0, description="pulls surfaces to the sparse points of the poses and to depth maps; 0: off"

@@ -279,13 +279,13 @@ class Trainer:
                 weight = c.regularization * c.entropy_ratio * c.semantic_weight
                 total = total + labels * weight * entropy_loss(rendered.probabilities, batch.labelled)
         if c.regularization > 0:
-            total = total + rays * c.regularization * self._regularizers(rendered)
+            total = total + rays * c.regularization * self._regularizers(rendered, progress)
         return total, rays * ((predicted.detach() - target) ** 2 * batch.weight[:, None]).mean()
 
-    def _regularizers(self, rendered: Rendered) -> torch.Tensor:
+    def _regularizers(self, rendered: Rendered, progress: float) -> torch.Tensor:
         c, s = self.config.loss, rendered.samples
         total = rendered.opacity.sum() * 0
-        if c.distortion_weight > 0:
+        if c.distortion_weight > 0 and progress >= c.distortion_start:
             place = s.depth / (1 + s.depth) if self.model.contracted else s.depth
             extent = s.delta / (1 + s.depth) ** 2 if self.model.contracted else s.delta
             total = total + c.distortion_weight * distortion_loss(rendered.weights, place, extent, s.packing)

@@ -173,6 +173,13 @@ def test_the_entropy_term_begins_when_told(priced: Callable[..., float]) -> None
     assert priced(0.31, entropy_start=0.3, entropy_ratio=1.0) < without
 
 
+@pytest.mark.setting("loss.distortion_start")
+def test_the_distortion_term_begins_when_told(priced: Callable[..., float]) -> None:
+    without = priced(distortion_weight=0.0)
+    assert priced(0.29, distortion_start=0.3, distortion_weight=1.0) == without
+    assert priced(0.31, distortion_start=0.3, distortion_weight=1.0) > without
+
+
 @pytest.mark.setting("loss.semantic_weight")
 def test_without_semantics_there_are_no_classes(ball: Path) -> None:
     trainer = trainer_of(ball, **{"loss.semantic_weight": "0"})

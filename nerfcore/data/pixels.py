@@ -93,11 +93,6 @@ class Batch:
     confidence: torch.Tensor
     weight: torch.Tensor
 
-    @property
-    def labelled(self) -> torch.Tensor:
-        """Weights (R,) of the rays, 0 for those without a label."""
-        return self.weight * (self.label != VOID)
-
     def part(self, rays: slice) -> Batch:
         """Some of the rays."""
         return Batch(*(getattr(self, field.name)[rays] for field in fields(self)))

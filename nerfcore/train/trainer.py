@@ -20,6 +20,7 @@ from .losses import (
     color_loss,
     distortion_loss,
     entropy_loss,
+    label_weights,
     opacity_entropy,
     psnr,
     semantic_loss,
@@ -169,7 +170,8 @@ class Trainer:
             background = torch.rand(batch.rgb.shape, device=self.device, generator=self.generator)
         else:
             background = torch.full_like(batch.rgb, self.background)
-        labelled = batch.labelled.sum().clamp(min=1e-6)
+        counted = label_weights(batch.label, batch.weight)
+        labelled = counted.sum().clamp(min=1e-6)
         size = rays if self.device.type != "cpu" else max(SHARD_SAMPLES // per_ray, 1)
 
         def shard(begin: int) -> Learned:
@@ -178,7 +180,7 @@ class Trainer:
 
             def loss() -> tuple[torch.Tensor, torch.Tensor, Rendered]:
                 rendered = self._render(part, *noise)
-                share = len(part.rgb) / rays, part.labelled.sum() / labelled
+                share = len(part.rgb) / rays, counted[begin : begin + size].sum() / labelled
                 return *self.loss(part, rendered, background[begin : begin + size], progress, share), rendered
 
             moved = (part.origins, part.directions) if part.origins.requires_grad else ()
@@ -273,11 +275,12 @@ class Trainer:
         predicted = rendered.color + background * (1 - rendered.opacity[:, None])
         total = rays * c.rgb_weight * color_loss(predicted, target, c)
         if rendered.probabilities is not None:
-            price = semantic_loss(rendered.probabilities, batch.label, batch.labelled, batch.confidence)
+            counted = label_weights(batch.label, batch.weight)
+            price = semantic_loss(rendered.probabilities, batch.label, counted, batch.confidence)
             total = total + labels * c.semantic_weight * price
             if c.entropy_ratio > 0 and c.regularization > 0 and progress >= c.entropy_start:
                 weight = c.regularization * c.entropy_ratio * c.semantic_weight
-                total = total + labels * weight * entropy_loss(rendered.probabilities, batch.labelled)
+                total = total + labels * weight * entropy_loss(rendered.probabilities, counted)
         if c.regularization > 0:
             total = total + rays * c.regularization * self._regularizers(rendered, progress)
         return total, rays * ((predicted.detach() - target) ** 2 * batch.weight[:, None]).mean()

@@ -37,6 +37,18 @@ def test_cross_entropy_counts_labelled_rays_only() -> None:
     assert float(losses.semantic_loss(probabilities, soft, valid)) == pytest.approx(expected, rel=1e-5)
 
 
+def test_rays_count_by_their_weight() -> None:
+    label, weight = torch.tensor([0, 1, 255]), torch.tensor([1.0, 0.25, 1.0])
+    counted = losses.label_weights(label, weight)
+    assert counted.tolist() == [1.0, 0.5, 0.0]  # half of the correction
+    probabilities = torch.tensor([[0.5, 0.25], [0.1, 0.8], [0.9, 0.1]])
+    expected = -(math.log(0.5) + math.log(0.8) / 2) / 1.5
+    assert float(losses.semantic_loss(probabilities, label, counted)) == pytest.approx(expected, rel=1e-5)
+    entropy = [-sum(p * math.log(p) for p in row) for row in probabilities.tolist()]
+    expected = -(entropy[0] + entropy[1] / 2) / 1.5
+    assert float(losses.entropy_loss(probabilities, counted)) == pytest.approx(expected, rel=1e-5)
+
+
 def test_the_entropy_term_pulls_towards_uncertainty() -> None:
     sure, unsure = torch.tensor([[0.98, 0.01]]), torch.tensor([[0.5, 0.5]])
     everywhere = torch.tensor([True])

@@ -277,7 +277,7 @@ def test_one_image_is_not_enough(tiny_project: Path, tmp_path: Path) -> None:
         {"render__accumulate": "logits"},
         {"loss__rgb": "mse"},
         {"loss__sparsity": "cauchy"},
-        {"loss__distortion_weight": "0.01"},
+        {"loss__distortion_weight": "0"},
         {"loss__opacity_weight": "0.01"},
         {"loss__detach_weights": "false"},
         {"scene__background": "white"},

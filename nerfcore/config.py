@@ -149,7 +149,7 @@ class LossConfig(Stage):
     rgb_weight: float = Field(default=1.0, ge=0, description="of colour errors")
     huber_delta: float = Field(default=0.1, gt=0, description="colour error from which its price grows linearly")
     semantic_weight: float = Field(default=0.04, ge=0, description="λ_sem; 0 trains without semantics")
-    detach_weights: bool = Field(default=True, description="labels do not move the geometry")
+    detach_weights: bool = Field(default=False, description="labels do not move the geometry")
     regularization: float = Field(default=1.0, ge=0, description="λ_reg, factor of sparsity, distortion and entropy")
     sparsity: Literal["exponential", "cauchy", "l1"] = Field(
         default="exponential", description="l1: the original, literal form"

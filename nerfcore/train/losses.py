@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 
 from ..config import LossConfig
-from ..data.pixels import VOID
+from ..data.pixels import VOID, Batch
 from ..kernels.packing import Packing
 
 
@@ -19,15 +19,16 @@ def color_loss(predicted: torch.Tensor, target: torch.Tensor, config: LossConfig
     return F.huber_loss(predicted, target, delta=config.huber_delta) / config.huber_delta
 
 
-def label_weights(label: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
-    """How much rays (R,) count for the classes: the root of `weight`, so that pixels drawn more often keep half of
-    their advantage, and 0 without a label.
+def label_weights(batch: Batch) -> torch.Tensor:
+    """How much each ray of a batch counts for the classes (R,): the root of its weight, so that pixels drawn more often
+    keep half of their advantage; nothing without a label or where the photo is transparent, since a label there would
+    call for something to be seen.
 
     The union of a class is best met when pixels count as its own from a probability of J/(1+J) on, J its IoU (Lipton
     et al., "Optimal thresholding of classifiers to maximize F1 measure", 2014, with F = 2J/(1+J)), less than a half;
     rare classes, which are drawn more often, have the smallest J.
     """
-    return weight.sqrt() * (label != VOID)
+    return batch.weight.sqrt() * batch.alpha * (batch.label != VOID)
 
 
 def semantic_loss(

@@ -170,7 +170,7 @@ class Trainer:
             background = torch.rand(batch.rgb.shape, device=self.device, generator=self.generator)
         else:
             background = torch.full_like(batch.rgb, self.background)
-        counted = label_weights(batch.label, batch.weight)
+        counted = label_weights(batch)
         labelled = counted.sum().clamp(min=1e-6)
         size = rays if self.device.type != "cpu" else max(SHARD_SAMPLES // per_ray, 1)
 
@@ -275,7 +275,7 @@ class Trainer:
         predicted = rendered.color + background * (1 - rendered.opacity[:, None])
         total = rays * c.rgb_weight * color_loss(predicted, target, c)
         if rendered.probabilities is not None:
-            counted = label_weights(batch.label, batch.weight)
+            counted = label_weights(batch)
             price = semantic_loss(rendered.probabilities, batch.label, counted, batch.confidence)
             total = total + labels * c.semantic_weight * price
             if c.entropy_ratio > 0 and c.regularization > 0 and progress >= c.entropy_start:

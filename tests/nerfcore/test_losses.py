@@ -7,6 +7,7 @@ import math
 import pytest
 import torch
 from fieldwork.nerfcore.config import LossConfig
+from fieldwork.nerfcore.data.pixels import VOID, Batch
 from fieldwork.nerfcore.kernels.packing import Packing
 from fieldwork.nerfcore.train import losses
 from fieldwork.nerfcore.train.schedule import bias_correction, rate_factor
@@ -38,10 +39,13 @@ def test_cross_entropy_counts_labelled_rays_only() -> None:
 
 
 def test_rays_count_by_their_weight() -> None:
-    label, weight = torch.tensor([0, 1, 255]), torch.tensor([1.0, 0.25, 1.0])
-    counted = losses.label_weights(label, weight)
-    assert counted.tolist() == [1.0, 0.5, 0.0]  # half of the correction
-    probabilities = torch.tensor([[0.5, 0.25], [0.1, 0.8], [0.9, 0.1]])
+    label, weight = torch.tensor([0, 1, VOID, 0]), torch.tensor([1.0, 0.25, 1.0, 1.0])
+    alpha, none = torch.tensor([1.0, 1.0, 1.0, 0.0]), torch.zeros(4, dtype=torch.int64)
+    nowhere = torch.zeros(4, 3)
+    batch = Batch(nowhere, nowhere, nowhere, alpha, label, none, none, torch.ones(4), weight)
+    counted = losses.label_weights(batch)
+    assert counted.tolist() == [1.0, 0.5, 0.0, 0.0]  # half of the correction
+    probabilities = torch.tensor([[0.5, 0.25], [0.1, 0.8], [0.9, 0.1], [0.9, 0.1]])
     expected = -(math.log(0.5) + math.log(0.8) / 2) / 1.5
     assert float(losses.semantic_loss(probabilities, label, counted)) == pytest.approx(expected, rel=1e-5)
     entropy = [-sum(p * math.log(p) for p in row) for row in probabilities.tolist()]

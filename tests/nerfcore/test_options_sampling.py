@@ -246,10 +246,10 @@ def test_a_faint_sample_outvotes_a_surface_only_where_logits_are_summed() -> Non
 
 
 @pytest.mark.setting("loss.detach_weights")
-def test_labels_move_the_geometry_only_when_told() -> None:
+def test_labels_move_the_geometry_unless_told_not_to() -> None:
     logits, weights, packing = two_samples()
-    held = model()._probabilities(logits, weights, packing)
-    moving = model(**{"loss.detach_weights": "false"})._probabilities(logits, weights, packing)
+    held = model(**{"loss.detach_weights": "true"})._probabilities(logits, weights, packing)
+    moving = model()._probabilities(logits, weights, packing)
     assert torch.equal(held, moving)
     assert not held.requires_grad
     assert bool((torch.autograd.grad(moving[0, 1], weights)[0] != 0).any())

@@ -279,7 +279,7 @@ def test_one_image_is_not_enough(tiny_project: Path, tmp_path: Path) -> None:
         {"loss__sparsity": "cauchy"},
         {"loss__distortion_weight": "0"},
         {"loss__opacity_weight": "0.01"},
-        {"loss__detach_weights": "false"},
+        {"loss__detach_weights": "true"},
         {"scene__background": "white"},
         {"scene__contraction": "on"},
         {"train__labelled_share": "0.2"},

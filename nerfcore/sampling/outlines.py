@@ -31,7 +31,8 @@ class Outlines:
         share = torch.minimum(asked * root / root.sum().clamp(min=1), MOST_OFTEN * self.count / pixels)
         self.upto = share.cumsum(0)
         self.share = float(self.upto[-1])
-        drawn = 1 - self.share + share * pixels / self.count.clamp(min=1)
+        self.elsewhere = max(1 - self.share, 1e-6)  # of the rays; all may be asked for
+        drawn = self.elsewhere + share * pixels / self.count.clamp(min=1)
         self.class_weight = (1 / drawn).float()
 
     def draw(self, count: int, generator: torch.Generator) -> torch.Tensor:
@@ -45,7 +46,7 @@ class Outlines:
         """How much each of a step's rays must count (R,), so that the pixels drawn more often do not count for more:
         one over how many times as often as evenly a pixel is drawn. Their mean is about 1."""
         label = self.label[places].long().clamp(max=VOID - 1)
-        return torch.where(self.mask[places], self.class_weight[label], 1 / (1 - self.share))
+        return torch.where(self.mask[places], self.class_weight[label], 1 / self.elsewhere)
 
 
 def outline_mask(store: PixelStore) -> torch.Tensor:

@@ -224,6 +224,10 @@ def test_what_is_drawn_more_often_counts_less(ball: Path) -> None:
     assert float(drawn.mean()) > even + 0.2
     assert float((drawn * weight).mean()) == pytest.approx(even, abs=0.02)
     assert float(weight.mean()) == pytest.approx(1, abs=0.02)
+    trainer.store.label[:] = torch.arange(len(trainer.store)) % 2  # nothing but outlines, and all rays on them
+    everything = Outlines(trainer.store, 1.0)
+    assert everything.share == pytest.approx(1)
+    assert everything.weight(everything.places).tolist() == pytest.approx([1.0] * len(everything.places), rel=1e-3)
 
 
 def two_samples() -> tuple[torch.Tensor, torch.Tensor, Packing]:

@@ -31,6 +31,12 @@ def label_weights(batch: Batch) -> torch.Tensor:
     return batch.weight.sqrt() * batch.alpha * (batch.label != VOID)
 
 
+def at_given_opacity(probabilities: torch.Tensor, opacity: torch.Tensor) -> torch.Tensor:
+    """The rendered probabilities (R, K), with gradients that move weight along a ray but leave its opacity (R,) alone:
+    labels say where a thing is, not how much of it; they would fill the free space beside things with fog."""
+    return probabilities * (opacity.detach() / opacity.clamp(min=1e-6))[:, None]
+
+
 def semantic_loss(
     probabilities: torch.Tensor, target: torch.Tensor, weight: torch.Tensor, confidence: torch.Tensor | None = None
 ) -> torch.Tensor:

@@ -17,6 +17,7 @@ from ..sampling.cache import CoarseCache
 from ..sampling.outlines import Outlines
 from .depth import DepthRays, depth_loss
 from .losses import (
+    at_given_opacity,
     color_loss,
     distortion_loss,
     entropy_loss,
@@ -276,11 +277,12 @@ class Trainer:
         total = rays * c.rgb_weight * color_loss(predicted, target, c)
         if rendered.probabilities is not None:
             counted = label_weights(batch)
-            price = semantic_loss(rendered.probabilities, batch.label, counted, batch.confidence)
+            probabilities = at_given_opacity(rendered.probabilities, rendered.opacity)
+            price = semantic_loss(probabilities, batch.label, counted, batch.confidence)
             total = total + labels * c.semantic_weight * price
             if c.entropy_ratio > 0 and c.regularization > 0 and progress >= c.entropy_start:
                 weight = c.regularization * c.entropy_ratio * c.semantic_weight
-                total = total + labels * weight * entropy_loss(rendered.probabilities, counted)
+                total = total + labels * weight * entropy_loss(probabilities, counted)
         if c.regularization > 0:
             total = total + rays * c.regularization * self._regularizers(rendered, progress)
         return total, rays * ((predicted.detach() - target) ** 2 * batch.weight[:, None]).mean()

@@ -53,6 +53,16 @@ def test_rays_count_by_their_weight() -> None:
     assert float(losses.entropy_loss(probabilities, counted)) == pytest.approx(expected, rel=1e-5)
 
 
+def test_labels_move_weight_along_a_ray_but_not_its_opacity() -> None:
+    weights = torch.tensor([0.3, 0.2], requires_grad=True)
+    classes = torch.tensor([[0.9, 0.1], [0.2, 0.8]])
+    kept = losses.at_given_opacity((weights[:, None] * classes).sum(0)[None], weights.sum()[None])
+    assert kept[0].tolist() == pytest.approx([0.31, 0.19])
+    (gradient,) = torch.autograd.grad(losses.semantic_loss(kept, torch.tensor([0]), torch.ones(1)), weights)
+    assert gradient[0] < 0 < gradient[1]  # to the sample that has the class
+    assert float(gradient @ weights.detach()) == pytest.approx(0, abs=1e-6)  # the opacity has no say
+
+
 def test_the_entropy_term_pulls_towards_uncertainty() -> None:
     sure, unsure = torch.tensor([[0.98, 0.01]]), torch.tensor([[0.5, 0.5]])
     everywhere = torch.tensor([True])

@@ -277,7 +277,9 @@ class Trainer:
         total = rays * c.rgb_weight * color_loss(predicted, target, c)
         if rendered.probabilities is not None:
             counted = label_weights(batch)
-            probabilities = at_given_opacity(rendered.probabilities, rendered.opacity)
+            probabilities = rendered.probabilities
+            if not c.detach_weights:
+                probabilities = at_given_opacity(probabilities, rendered.opacity)
             price = semantic_loss(probabilities, batch.label, counted, batch.confidence)
             total = total + labels * c.semantic_weight * price
             if c.entropy_ratio > 0 and c.regularization > 0 and progress >= c.entropy_start:

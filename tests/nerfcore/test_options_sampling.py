@@ -259,6 +259,20 @@ def test_labels_move_the_geometry_unless_told_not_to() -> None:
     assert bool((torch.autograd.grad(moving[0, 1], weights)[0] != 0).any())
 
 
+@pytest.mark.parametrize("detached", ["true", "false"])
+def test_labels_alone_never_change_how_opaque_a_ray_is(ball: Path, detached: str) -> None:
+    settings = {"loss.detach_weights": detached, "loss.rgb_weight": "0", "loss.regularization": "0"}
+    trainer = trainer_of(ball, **settings)
+    batch = trainer.store.batch(torch.arange(0, len(trainer.store), 7))
+    shown = trainer._render(batch, torch.full((len(batch.rgb),), 0.5), torch.full((len(batch.rgb) * 12,), 0.5))
+    total, _ = trainer.loss(batch, shown, torch.ones_like(batch.rgb), 0.0)
+    (moved,) = torch.autograd.grad(total, shown.weights, allow_unused=True)
+    moved = torch.zeros_like(shown.weights) if moved is None else moved
+    assert bool((moved != 0).any()) == (detached == "false")
+    push = torch.zeros(len(batch.rgb)).index_add(0, shown.samples.packing.ray.long(), moved * shown.weights.detach())
+    assert float(push.abs().max()) < 1e-6
+
+
 def rendered(trainer: Trainer, count: int = 8):
     places = torch.arange(200) * 5
     batch = trainer.store.batch(places)

@@ -133,7 +133,7 @@ def _describe(out: Path, described: dict[str, Any]) -> None:
         }
         for index, pose in enumerate(described["camera_to_world"])
     ]
-    intrinsics = {"camera_model": "OPENCV", **described["intrinsics"]}
+    intrinsics = {"camera_model": "OPENCV", "depth_unit_scale_factor": 1.0, **described["intrinsics"]}
     write_json(out / "ground_truth" / "transforms.json", {**intrinsics, "frames": frames})
     for folder in (out, out / "ground_truth"):  # beside the photos, and beside the posed data set
         write_json(folder / "classes.json", {"ignore_id": 0, "classes": described["classes"]})

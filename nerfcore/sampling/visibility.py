@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -10,6 +11,7 @@ from ..data.cameras import Camera
 from ..kernels.march_torch import grid_position
 
 FEWEST_POINTS = 20  # in a photo, from which its depths are believed
+WIDER = 2.0  # view that all of what is photographed from around it fits in, relative to the photos'
 
 
 def grid_centers(resolution: int, contracted: bool, device: torch.device) -> torch.Tensor:
@@ -35,8 +37,9 @@ def depth_ranges(
     axis, the nearest with a margin and the median; zeros for cameras that see too few points to tell.
 
     The margin is half the depth that 96 % of the points span, at most half of their distance: surfaces without points
-    may come nearer than the points. Where there are no points, cameras that surround `focus` (3,) are taken to show
-    something that fills their photos there.
+    may come nearer than the points. Where there are no points, cameras that surround `focus` (3,) are taken to show a
+    ball there that just fits a view twice as wide as theirs: with φ the half angle of that view, the ball comes as near
+    as d (1 − sin φ).
     """
     ranges = torch.zeros(len(cameras), 2, device=camera_to_box.device)
     for index, (camera, pose) in enumerate(zip(cameras, camera_to_box)):
@@ -48,8 +51,8 @@ def depth_ranges(
             ranges[index, 1] = middle
         elif focus is not None and not _sees_everything(camera):
             distance = (focus - pose[:3, 3]) @ pose[:3, 2]
-            filled = distance * max(camera.width / camera.fx, camera.height / camera.fy) / 2
-            ranges[index, 0] = (distance - 1.5 * filled).clamp(min=0)
+            slope = WIDER * max(camera.width / camera.fx, camera.height / camera.fy) / 2
+            ranges[index, 0] = (distance * (1 - slope / math.hypot(1, slope))).clamp(min=0)
             ranges[index, 1] = distance.clamp(min=0)
     return ranges
 

@@ -74,6 +74,7 @@ def take(blend: Path, out: Path, **changes) -> dict:
 def surfaces(out: Path) -> dict[int, np.ndarray]:
     """World points (N, 3) of all pixels, by class id."""
     truth = json.loads((out / "transforms.json").read_text())
+    assert truth["depth_unit_scale_factor"] == 1.0  # without it others would read millimetres
     found: dict[int, list[np.ndarray]] = {}
     for frame in truth["frames"]:
         lens = {**truth, **frame}

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+from fieldwork.nerfcore.capture.develop import write_depth
 from fieldwork.nerfcore.data.dataset import Dataset, DatasetView
 from fieldwork.nerfcore.data.importer import import_dataset, read_dataset
 from fieldwork.nerfcore.data.similarity import transform_points
@@ -318,7 +319,7 @@ def test_truncated_photo_is_named(truth: tuple[list[DatasetView], Matches], tmp_
 
 
 def test_nerfstudio_masks_depth_and_lenses_of_their_own(tmp_path: Path) -> None:
-    """Each frame has its own size and lens, a mask and a depth map in millimetres."""
+    """Each frame has its own size and lens, a mask and a depth map: in millimetres, or as EXR in the poses' units."""
     folder = tmp_path / "set"
     (folder / "images").mkdir(parents=True)
     frames = []
@@ -328,12 +329,16 @@ def test_nerfstudio_masks_depth_and_lenses_of_their_own(tmp_path: Path) -> None:
         Image.fromarray(np.pad(np.full((height - 20, width), 255, np.uint8), ((20, 0), (0, 0)))).save(
             folder / f"mask_{i}.png"
         )
-        Image.fromarray(np.full((height, width), 1500 + i, np.uint16)).save(folder / f"depth_{i}.png")
+        depth_file = f"depth_{i}.exr" if i == 2 else f"depth_{i}.png"
+        if i == 2:
+            write_depth(folder / depth_file, np.full((height, width), 1.502, np.float32))
+        else:
+            Image.fromarray(np.full((height, width), 1500 + i, np.uint16)).save(folder / depth_file)
         pose = np.eye(4)
         pose[0, 3] = i
         frames.append(
             {
-                "file_path": f"images/{i}.png", "mask_path": f"mask_{i}.png", "depth_file_path": f"depth_{i}.png",
+                "file_path": f"images/{i}.png", "mask_path": f"mask_{i}.png", "depth_file_path": depth_file,
                 "transform_matrix": pose.tolist(), "w": width, "h": height, "fl_x": 70 + i, "fl_y": 71 + i,
                 "cx": width / 2 + i, "cy": height / 2, "k1": 0.01 * i,
             }

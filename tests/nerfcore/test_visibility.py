@@ -1,5 +1,6 @@
 """Which cells may hold something, from cameras and sparse points."""
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -94,7 +95,8 @@ def test_without_points_cameras_around_something_show_what_fills_their_photos():
     ranges = depth_ranges([CAMERA] * 5, poses, torch.zeros(0, 3), torch.zeros(3))
     distance = float(poses[0, :3, 3].norm())
     assert torch.allclose(ranges[:, 1], torch.full((5,), distance), atol=1e-4)
-    assert torch.allclose(ranges[:, 0], torch.full((5,), distance * (1 - 1.5 * 100 / 80 / 2)), atol=1e-4)
+    touching = math.atan(2 * 100 / 80 / 2)  # of the ray that touches the ball, at twice the half of the photo
+    assert torch.allclose(ranges[:, 0], torch.full((5,), distance * (1 - math.sin(touching))), atol=1e-4)
     box = choose_box(scene(half_ring(5, 2.0), np.zeros((0, 3))), SceneConfig(), False)
     assert box.contracted
     assert box.world_from_box[0, 0] < 2.0

@@ -119,7 +119,7 @@ def _view(folder: Path, name: str, image: Path, frame: dict[str, Any], split: Sp
     if matrix.shape != (4, 4):
         raise InputError(f"The pose of {image.name} in {folder} is not a 4×4 matrix.", "Export the data set again.")
     label_path = frame.get("semantic_path") or frame.get("label_path")
-    depth_path = frame.get("depth_file_path") or frame.get("depth_path")
+    depth = _optional(folder, frame.get("depth_file_path") or frame.get("depth_path"))
     label = _optional(folder, label_path) or beside(folder / "labels", image.stem)
     mask = _optional(folder, frame.get("mask_path")) or beside(folder / "masks", image.stem, exact=False)
     return DatasetView(
@@ -129,18 +129,19 @@ def _view(folder: Path, name: str, image: Path, frame: dict[str, Any], split: Sp
         camera_to_world=flip_camera_axes(matrix),
         label=label,
         mask=mask,
-        depth=_optional(folder, depth_path),
-        depth_scale=_depth_scale(frame),
+        depth=depth,
+        depth_scale=_depth_scale(frame, depth),
         split=split,
     )
 
 
-def _depth_scale(frame: dict[str, Any]) -> float:
-    # nerfstudio: depth files in millimetres unless the file says otherwise; Instant-NGP: integer_depth_scale.
+def _depth_scale(frame: dict[str, Any], depth: Path | None) -> float:
+    # nerfstudio: depth files in millimetres unless the file says otherwise; Instant-NGP: integer_depth_scale. EXR files
+    # hold what a renderer measured, in the units of the poses.
     for key in ("depth_unit_scale_factor", "integer_depth_scale"):
         if key in frame:
             return float(frame[key])
-    return 1e-3
+    return 1.0 if depth is not None and depth.suffix.lower() == ".exr" else 1e-3
 
 
 def _optional(folder: Path, value: Any) -> Path | None:

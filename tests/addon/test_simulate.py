@@ -75,6 +75,7 @@ def each(request) -> Path:
 def views(capture: Path):
     """Per frame: camera, camera-to-world (OpenCV), label map, depth map."""
     truth = json.loads((capture / "ground_truth/transforms.json").read_text())
+    assert truth["depth_unit_scale_factor"] == 1.0  # without it others would read millimetres
     camera = Camera(
         width=truth["w"], height=truth["h"], fx=truth["fl_x"], fy=truth["fl_y"], cx=truth["cx"], cy=truth["cy"]
     )

@@ -226,6 +226,13 @@ class PixelStore:
         rgb, alpha, label = value[:, :3], value[:, 3], self.label[places].long()
         return Batch(origins, directions, rgb, alpha, label, image, pixel, sure, torch.ones_like(sure))
 
+    def labelled_share(self) -> float:
+        """Share of the usable pixels with something in them that have a label; 1 where there are no labels at all."""
+        places = slice(None) if self.usable is None else self.usable
+        shows = self.rgba[places, 3] > 127
+        labelled = (self.label[places] != VOID) & shows
+        return float(labelled.sum() / shows.sum().clamp(min=1)) or 1.0
+
     def random_places(self, count: int, generator: torch.Generator) -> torch.Tensor:
         """`count` flat positions of usable pixels, with repetition."""
         total = len(self) if self.usable is None else len(self.usable)

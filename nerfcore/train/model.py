@@ -74,6 +74,7 @@ class Model(nn.Module):
         self.register_buffer("priorities", torch.ones(max(classes, 1)) if priorities is None else priorities)
         self.priorities: torch.Tensor
         self.warming_up = False
+        self.labelled = 1.0  # share of the training pixels that have a label
         self.register_buffer("shown_share", torch.ones(()))
         self.shown_share: torch.Tensor
         self._refined: RenderGrid | None = None
@@ -116,6 +117,12 @@ class Model(nn.Module):
         if self._refined is None:
             c = self.config.render
             self._refined = refined_grid(self.occupancy, self.field.density, c.refine, c.per_bin, pixels, check)
+
+    @property
+    def label_pull(self) -> float:
+        """Factor of the gradient that labels have in the geometry: the labelled share of the pixels, so that each label
+        counts as if all pixels had one; else the few there are would bend the geometry to their photos."""
+        return 0.0 if self.config.loss.detach_weights else self.labelled
 
     def render_grid(self) -> RenderGrid:
         """What the rays of a picture walk."""
@@ -202,8 +209,8 @@ class Model(nn.Module):
         self.shown_share += 0.05 * (shown / (density >= 0).sum().clamp(min=1) - self.shown_share)
 
     def _probabilities(self, logits: torch.Tensor, weight: torch.Tensor, packing) -> torch.Tensor:
-        if self.config.loss.detach_weights:
-            weight = weight.detach()
+        pull = self.label_pull
+        weight = torch.lerp(weight.detach(), weight, pull) if pull > 0 else weight.detach()
         if self.config.render.accumulate == "probabilities":
             return weighted_sum(torch.softmax(logits, 1), weight, packing)
         total = weighted_sum(torch.cat([logits, torch.ones_like(weight)[:, None]], 1), weight, packing)

@@ -83,6 +83,7 @@ class Trainer:
     ) -> None:
         self.model, self.store, self.config = model, store, config
         self.background = background
+        model.labelled = store.labelled_share()
         self.device = store.device
         self.optimizer = torch.optim.Adam(
             model.parameters(), config.train.network_rate, betas=BETAS, eps=1e-15, fused=self.device.type != "mps"
@@ -277,9 +278,8 @@ class Trainer:
         total = rays * c.rgb_weight * color_loss(predicted, target, c)
         if rendered.probabilities is not None:
             counted = label_weights(batch)
-            probabilities = rendered.probabilities
-            if not c.detach_weights:
-                probabilities = at_given_opacity(probabilities, rendered.opacity)
+            opacity = torch.lerp(rendered.opacity.detach(), rendered.opacity, self.model.label_pull)
+            probabilities = at_given_opacity(rendered.probabilities, opacity)
             price = semantic_loss(probabilities, batch.label, counted, batch.confidence)
             total = total + labels * c.semantic_weight * price
             if c.entropy_ratio > 0 and c.regularization > 0 and progress >= c.entropy_start:

@@ -273,6 +273,20 @@ def test_labels_alone_never_change_how_opaque_a_ray_is(ball: Path, detached: str
     assert float(push.abs().max()) < 1e-6
 
 
+def test_few_labels_pull_at_the_geometry_as_much_each_as_many_do(ball: Path) -> None:
+    whole, part = trainer_of(ball), trainer_of(ball, **{"train.labelled_share": "0.25"})
+    assert whole.model.label_pull > 0.9
+    views = len(part.store.cameras)
+    labelled = sum(bool((part.store.label[a:b] != VOID).any()) for a, b in zip(part.store.first, part.store.first[1:]))
+    assert part.model.label_pull == pytest.approx(whole.model.label_pull * labelled / views, rel=0.2)
+    logits, weights, packing = two_samples()
+    pulled = []
+    for trainer in (whole, part):
+        moving = trainer.model._probabilities(logits, weights, packing)
+        pulled.append(torch.autograd.grad(moving[0, 1], weights)[0] / trainer.model.label_pull)
+    assert torch.allclose(*pulled)
+
+
 def rendered(trainer: Trainer, count: int = 8):
     places = torch.arange(200) * 5
     batch = trainer.store.batch(places)

@@ -65,15 +65,15 @@ class HybridField(nn.Module):
             if config.branch != "implicit"
             else None
         )
+        self.concat = config.branch == "hybrid" and config.fusion == "concat"
         self.implicit = (
             MLP(3 + 6 * config.octaves, self.features, config.width, config.implicit_layers)
             if config.branch != "explicit"
             else None
         )
         self.blend = BlendWeight(config) if config.branch == "hybrid" else None
-        hybrid_concat = config.branch == "hybrid" and config.fusion == "concat"
-        decoder_inputs = self.features * (2 if hybrid_concat else 1)
         outputs = 1 + config.geometry_features
+        decoder_inputs = self.features * (2 if self.concat else 1)
         self.density_head = MLP(decoder_inputs, outputs, config.width, 2)
         self.color_head = MLP(
             outputs + DIRECTION_FEATURES + config.appearance, 3, config.width, config.color_layers, output_gain=0.5
@@ -121,7 +121,7 @@ class HybridField(nn.Module):
         else:
             assert self.blend is not None
             w = self.blend(points)[:, None]
-            if self.config.fusion == "concat":
+            if self.concat:
                 hidden = torch.cat([w * explicit, (1 - w) * implicit], 1)
             else:
                 hidden = torch.lerp(implicit.to(explicit.dtype), explicit, w)

@@ -50,13 +50,15 @@ MOST_UNROLLED = 64
 class FusedShape:
     """What a fused kernel is compiled for. Sizes of networks are those of the field, not padded.
 
-    levels: of the grid. octaves: of the implicit branch, 0 when there is none. width: of hidden layers.
-    geometry: outputs of the density head. color_layers: 2 or 3. appearance: length of the code. classes: padded
-    number of classes, 0 without semantics. logits: sum logits instead of probabilities.
+    levels: of the grid. octaves: of the implicit branch, 0 when there is none. concat: the density head reads both
+    branches side by side. width: of hidden layers. geometry: outputs of the density head. color_layers: 2 or 3.
+    appearance: length of the code. classes: padded number of classes, 0 without semantics. logits: sum logits instead
+    of probabilities.
     """
 
     levels: int
     octaves: int
+    concat: bool
     width: int
     geometry: int
     color_layers: int
@@ -74,7 +76,7 @@ class FusedShape:
 
     @property
     def density(self) -> tuple[int, ...]:
-        return (self.features, self.width, padded(self.geometry))
+        return (self.features * (2 if self.concat else 1), self.width, padded(self.geometry))
 
     @property
     def color(self) -> tuple[int, ...]:
@@ -195,7 +197,7 @@ def fused_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
     grid = grid_encoding(shape.levels, shape.features)
     octaves, classes, logits = shape.octaves, shape.classes, int(shape.logits)
     geometry, geometry_rows, appearance = shape.geometry, padded(shape.geometry), shape.appearance
-    features = shape.features
+    features, concat = shape.features, shape.concat
     color_code = shape.geometry + HARMONICS
     rows = shape.rows()
     density_row, color_row = rows["density"], rows["color"]
@@ -206,7 +208,8 @@ def fused_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
     frequencies = frequency_encoding(octaves, shape.implicit[0]) if octaves else None
     semantic_network = network(shape.semantic, lanes) if classes else None
     semantic_input = half_vector(shape.semantic[0])
-    branch_vector, known_vector = half_vector(features), half_vector(geometry)
+    density_input, branch_vector = half_vector(shape.density[0]), half_vector(features)
+    known_vector = half_vector(geometry)
     explicit_place = geometry_rows + (features if octaves else 0)
 
     def fused_render(
@@ -287,12 +290,11 @@ def fused_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
                     ray, t, length = advanced(ray, m, cells, reach)
                     p = inside(grid_position(ray.origin + ray.direction * t, m.contracted))
                     samples += 1
-                hidden = grid(p, table, layout, gains)
+                explicit = grid(p, table, layout, gains)
                 implicit = branch_vector()
-                explicit = branch_vector()
-                if wp.static(classes > 0 and octaves > 0):
-                    for k in range(features):
-                        explicit[k] = hidden[k]
+                hidden = density_input()
+                for k in range(features):
+                    hidden[k] = explicit[k]
                 if wp.static(octaves > 0):
                     w = float(1.0)
                     if active == 1 and evidence_side > 0:
@@ -302,8 +304,12 @@ def fused_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
                     if unsure > 0:
                         smooth = implicit_network(frequencies(p), weights, implicit_row)
                         for k in range(features):
-                            hidden[k] = wp.float16(w * float(hidden[k]) + (1.0 - w) * smooth[k])
                             implicit[k] = wp.float16(smooth[k])
+                            if wp.static(concat):
+                                hidden[k] = wp.float16(w * float(explicit[k]))
+                                hidden[features + k] = wp.float16((1.0 - w) * smooth[k])
+                            else:
+                                hidden[k] = wp.float16(w * float(explicit[k]) + (1.0 - w) * smooth[k])
                 out = density_network(hidden, weights, density_row)
                 known = known_vector()
                 for k in range(geometry):
@@ -342,10 +348,8 @@ def fused_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
                                     implicit[k] = wp.float16(smooth[k])
                             for k in range(features):
                                 y[geometry_rows + k] = implicit[k]
-                                y[explicit_place + k] = explicit[k]
-                        else:
-                            for k in range(features):
-                                y[explicit_place + k] = hidden[k]
+                        for k in range(features):
+                            y[explicit_place + k] = explicit[k]
                         scores = semantic_network(y, weights, semantic_row)
                         if shows == 1:
                             if wp.static(logits == 0):
@@ -371,8 +375,9 @@ def fused_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
         evaluated[lane] = samples
 
     classes_text = f"{classes}{'l' if logits else ''}"
+    joined = f"{octaves}{'c' if concat else ''}"
     name = (
-        f"fieldwork_fused_{shape.levels}_{octaves}_{shape.width}_{geometry}_{shape.color_layers}_{appearance}"
+        f"fieldwork_fused_{shape.levels}_{joined}_{shape.width}_{geometry}_{shape.color_layers}_{appearance}"
         f"_{classes_text}_{lanes}"
     )
     kernel = wp.kernel(fused_render, name="fused_render", module=name, launch_bounds=lanes, grid_stride=False)

@@ -27,8 +27,6 @@ def unsupported(model: Model) -> str | None:
     c = field.config
     if c.branch == "implicit":
         return "field.branch is “implicit”"
-    if c.branch == "hybrid" and c.fusion != "blend":
-        return f"field.fusion is “{c.fusion}”"
     if c.width % 16 or c.width > 64:
         return f"field.width is {c.width}, not 16, 32, 48 or 64"
     if c.levels > 16:
@@ -73,6 +71,7 @@ def shape_of(field: HybridField, semantics: bool, logits: bool) -> FusedShape:
     return FusedShape(
         levels=c.levels,
         octaves=c.octaves if field.implicit is not None else 0,
+        concat=field.concat,
         width=c.width,
         geometry=1 + c.geometry_features,
         color_layers=c.color_layers,
@@ -114,7 +113,7 @@ def pack(field: HybridField, semantics: bool = True, logits: bool = False) -> Fu
     explicit = [(field.features, shape.features)]
     firsts = {
         "implicit": [(3 + 6 * c.octaves, shape.implicit[0])],
-        "density": explicit,
+        "density": explicit * (2 if shape.concat else 1),
         "color": [(geometry + 16 + c.appearance, shape.color[0])],
         "semantic": [(geometry, padded(geometry)), *explicit * (2 if shape.octaves else 1)],
     }

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import torch
 
@@ -110,29 +109,26 @@ def view_counts(
     contracted: bool,
     ranges: torch.Tensor | None = None,
     margin: float = 0.1,
-    counted: Sequence[int] | None = None,
 ) -> torch.Tensor:
     """How many cameras see each cell centre (resolution³,) float32; 0 for cells that must be empty.
 
     A camera sees what its undistorted image, widened by `margin` of its size, holds in front of it. Equirectangular
     and fisheye cameras see everything. With `ranges` (V, 2) of `depth_ranges`, cells nearer to a camera than anything
     in its photo are empty, and so are cells that only one camera sees, unless as far away as most of its photo:
-    either would let a field explain each photo by a curtain in front of its camera. `counted`: the cameras that count
-    as seeing, by default all; what is in front of the others is empty too.
+    either would let a field explain each photo by a curtain in front of its camera.
     """
     device = camera_to_box.device
     points = grid_centers(resolution, contracted, device)
     counts, beyond = torch.zeros(len(points), device=device), torch.zeros(len(points), dtype=torch.bool, device=device)
     ranges = torch.zeros(len(cameras), 2, device=device) if ranges is None else ranges
-    for index in range(len(cameras)) if counted is None else counted:
-        camera = cameras[index]
+    for camera, pose, middle in zip(cameras, camera_to_box, ranges[:, 1]):
         if _sees_everything(camera):
             counts += 1
             beyond |= True
             continue
-        u, v, z = _project(camera, camera_to_box[index], points)
+        u, v, z = _project(camera, pose, points)
         seen = (z > 1e-6) & (u > -margin) & (u < 1 + margin) & (v > -margin) & (v < 1 + margin)
         counts += seen
-        beyond |= seen & (z >= ranges[index, 1])
+        beyond |= seen & (z >= middle)
     counts[in_front(cameras, camera_to_box, resolution, contracted, ranges) | ((counts < 2) & ~beyond)] = 0
     return counts

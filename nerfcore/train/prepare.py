@@ -17,6 +17,7 @@ from ..errors import TrainingError
 from ..field.blend import RESOLUTION
 from ..progress import Reporter
 from ..project import load_project, load_scene, load_visibility, world_from_sfm
+from ..sampling.path import cells_before_path
 from ..sampling.visibility import depth_ranges, view_counts
 from .background import LEVEL, choose_background
 from .depth import depth_scale, find_depths
@@ -145,18 +146,20 @@ def make_trainer(project_folder: Path, info: RunInfo, scene: Scene, device: torc
 def seen_cells(scene: Scene, trained: list[int], box: Box, device: torch.device) -> tuple[torch.Tensor, float]:
     """How many of the views `trained` see each cell of the grid of evidence, 0 for cells that must be
     empty; and how far from every one of them nothing was seen (normalised units)."""
-    cameras = [view.camera for view in scene.views]
-    poses = torch.from_numpy(box_poses(scene.views, box.box_from_world)).float().to(device)
+    views = [scene.views[i] for i in trained]
+    cameras = [view.camera for view in views]
+    poses = torch.from_numpy(box_poses(views, box.box_from_world)).float().to(device)
     points = torch.from_numpy(transform_points(box.box_from_world, scene.points.xyz)).float().to(device)
     focus = None
-    if looks_inward(scene.views):
-        point = focus_point([view.camera_to_world for view in scene.views])
+    if looks_inward(views):
+        point = focus_point([view.camera_to_world for view in views])
         place = transform_points(box.box_from_world, point[None])[0]
         focus = torch.from_numpy(place).float().to(device)
     ranges = depth_ranges(cameras, poses, points, focus)
-    # Where held-out cameras stood, nothing hangs in front of them either; their photos are not looked at.
-    counts = view_counts(cameras, poses, RESOLUTION, box.contracted, ranges, counted=trained)
-    return counts, float(ranges[trained, 0].min())
+    counts = view_counts(cameras, poses, RESOLUTION, box.contracted, ranges)
+    if focus is not None:
+        counts[cells_before_path(cameras, poses, focus, points, RESOLUTION, box.contracted)] = 0
+    return counts, float(ranges[:, 0].min())
 
 
 def _refined(cells: torch.Tensor, resolution: int) -> torch.Tensor:

@@ -90,6 +90,8 @@ CASES = {
         "standard",
         {"field.branch": "explicit", "field.appearance": "4", "field.color_layers": "2"},
     ),
+    "side by side": (5, False, "standard", {"field.fusion": "concat", "field.levels": "6"}),
+    "blended": (5, False, "standard", {"field.fusion": "blend"}),
     "draft, narrow": (3, False, "draft", {"field.width": "32", "sampling.pdf": "uniform"}),
 }
 
@@ -171,8 +173,8 @@ def test_the_setting_chooses_the_kernel_and_says_why_not(caplog: pytest.LogCaptu
     assert chosen(render__fused="auto") is UnfusedRenderer  # no GPU
     assert chosen(render__fused="off") is UnfusedRenderer
     with caplog.at_level(logging.WARNING, "fieldwork"):
-        assert chosen(render__fused="on", field__fusion="concat") is UnfusedRenderer
-    assert "field.fusion is “concat”" in caplog.text
+        assert chosen(render__fused="on", field__implicit_layers="3") is UnfusedRenderer
+    assert "field.implicit_layers is 3" in caplog.text
 
 
 def test_every_preset_is_supported() -> None:

@@ -9,6 +9,7 @@ from fieldwork.nerfcore.config import SceneConfig
 from fieldwork.nerfcore.data.box import choose_box
 from fieldwork.nerfcore.data.cameras import Camera
 from fieldwork.nerfcore.data.scene import Points, Scene, View
+from fieldwork.nerfcore.sampling.path import cells_before_path
 from fieldwork.nerfcore.sampling.visibility import cells_at, depth_ranges, grid_centers, view_counts
 
 CAMERA = Camera(model="PINHOLE", width=100, height=80, fx=80.0, fy=80.0, cx=50.0, cy=40.0)
@@ -100,3 +101,54 @@ def test_without_points_cameras_around_something_show_what_fills_their_photos():
     box = choose_box(scene(half_ring(5, 2.0), np.zeros((0, 3))), SceneConfig(), False)
     assert box.contracted
     assert box.world_from_box[0, 0] < 2.0
+
+
+def ring(count: int, radius: float) -> torch.Tensor:
+    angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    poses = [looking_at_origin([radius * np.cos(a), radius * np.sin(a), 0.3]) for a in angles]
+    return torch.from_numpy(np.stack(poses)).float()
+
+
+def free_cells(poses: torch.Tensor, points: torch.Tensor, contracted: bool) -> torch.Tensor:
+    return cells_before_path([CAMERA] * len(poses), poses, torch.zeros(3), points, 64, contracted)
+
+
+def test_nothing_hangs_where_the_photos_were_taken_from():
+    """Also between the cameras, where no photo looks, and behind them; what they surround stays."""
+    poses, cells = ring(18, 0.8), grid_centers(64, False, torch.device("cpu"))
+    empty = free_cells(poses, torch.zeros(0, 3), False)
+    circle = torch.stack([torch.tensor([0.8 * math.cos(a), 0.8 * math.sin(a), 0.3]) for a in np.linspace(0, 6.28, 90)])
+    assert empty[cells_at(circle, 64, False)].all()
+    distance = torch.hypot(cells[:, :2].norm(dim=1) - 0.8, cells[:, 2] - 0.3)
+    free = 0.125 * math.hypot(0.8, 0.3)
+    behind = cells[:, :2].norm(dim=1) > 0.8
+    # The way's straight pieces, to cameras as far as 40° on, leave the circle by up to 0.05.
+    assert empty[distance < free - 0.03].all()
+    assert not empty[behind & (distance > free + 0.06)].any()
+    assert not empty[cells.norm(dim=1) < 0.6].any()
+
+
+def test_cameras_far_apart_or_looking_elsewhere_have_no_way_between_them():
+    middle = torch.tensor([[0.0, 0.0, 0.3]])  # of the ring
+    for count in (2, 4):
+        poses = ring(count, 0.8)
+        empty = free_cells(poses, torch.zeros(0, 3), False)
+        assert empty[cells_at(poses[:, :3, 3], 64, False)].sum() == 0
+        assert not empty[cells_at(middle, 64, False)].any()
+
+
+def test_sparse_points_beside_the_way_are_kept():
+    poses, post = ring(18, 0.8), torch.tensor([0.8, 0.0, 0.37]) + torch.linspace(-0.003, 0.003, 40)[:, None]
+    without = free_cells(poses, torch.zeros(0, 3), False)
+    kept = free_cells(poses, torch.cat([torch.from_numpy(ball(500, 0.3)).float(), post]), False)
+    there = cells_at(post, 64, False)
+    assert without[there].all()
+    assert not kept[there].any()
+    assert kept[cells_at(poses[9:10, :3, 3], 64, False)].all()  # the other side is as free as before
+
+
+def test_large_cells_on_the_way_around_something_small_are_empty():
+    poses = ring(18, 6.0)
+    empty = free_cells(poses, torch.zeros(0, 3), True)
+    assert empty[cells_at((poses[:-1, :3, 3] + poses[1:, :3, 3]) / 2, 64, True)].all()
+    assert not empty[cells_at(torch.from_numpy(ball(2000, 0.9)).float(), 64, True)].any()

@@ -1,0 +1,97 @@
+"""Where the photos of something were taken from: new viewpoints are mostly there as well, and nothing may hang before
+them.
+
+No photo looks at what is beside its camera, so a field may leave haze there which the photos from the other side show in
+the colours of what is behind it.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from ..data.cameras import Camera
+from .visibility import FEWEST_POINTS, cells_at, depth_ranges, grid_centers, in_front
+
+CLEAR = 0.125  # of their distance to what they surround, that nothing comes nearer to the way between cameras
+NEIGHBOURS = 6  # of a camera, to which that way leads
+APART = 0.1  # of that distance: cameras in between that are nearer to others add nothing
+
+
+def cells_before_path(
+    cameras: list[Camera],
+    camera_to_box: torch.Tensor,
+    focus: torch.Tensor,
+    points: torch.Tensor,
+    resolution: int,
+    contracted: bool,
+) -> torch.Tensor:
+    """Which cells (resolution³,) bool must be empty because cameras that surround `focus` (3,) went past them: those
+    close to the way between neighbours, and those nearer to a camera half way than anything it would show. Sparse
+    points (N, 3) near the way keep it at half their distance."""
+    pairs = _neighbours(camera_to_box, focus)
+    lenses, between = cameras_between(cameras, camera_to_box, pairs, focus)
+    ranges = depth_ranges(lenses, between, points, focus)
+    near = _along(camera_to_box, pairs, focus, points, resolution, contracted)
+    return near | in_front(lenses, between, resolution, contracted, ranges)
+
+
+def cameras_between(
+    cameras: list[Camera], camera_to_box: torch.Tensor, pairs: list[tuple[int, int]], focus: torch.Tensor
+) -> tuple[list[Camera], torch.Tensor]:
+    """Cameras half way between those of each pair, with the lens of one: lenses and poses (M, 4, 4). Left out where
+    another is near."""
+    lenses, poses = [], list(camera_to_box)
+    for i, j in pairs:
+        pose = (camera_to_box[i] + camera_to_box[j]) / 2
+        u, _, v = torch.linalg.svd(pose[:3, :3])
+        pose[:3, :3] = u @ v  # the nearest rotation
+        gap = (torch.stack(poses)[:, :3, 3] - pose[:3, 3]).norm(dim=1).min()
+        if gap > APART * (pose[:3, 3] - focus).norm():
+            lenses.append(cameras[i])
+            poses.append(pose)
+    return lenses, torch.stack(poses)[len(camera_to_box) :]
+
+
+def _along(
+    camera_to_box: torch.Tensor,
+    pairs: list[tuple[int, int]],
+    focus: torch.Tensor,
+    points: torch.Tensor,
+    resolution: int,
+    contracted: bool,
+) -> torch.Tensor:
+    """Cells (resolution³,) close to the lines between the cameras of each pair."""
+    cells = grid_centers(resolution, contracted, camera_to_box.device)
+    close = torch.zeros(len(cells), dtype=torch.bool, device=cells.device)
+    steps = torch.linspace(0, 1, 16, device=cells.device)[:, None]
+    centers = camera_to_box[:, :3, 3]
+    away = (centers - focus).norm(dim=1)
+    for i, j in pairs:
+        radius = CLEAR * float(torch.minimum(away[i], away[j]))
+        if len(points) >= FEWEST_POINTS:
+            nearest = _distance_to(centers[i], centers[j], points).kthvalue(FEWEST_POINTS).values
+            radius = min(radius, float(nearest) / 2)
+        close |= _distance_to(centers[i], centers[j], cells) < radius
+        # Where space is contracted, a cell may be larger than what is free around the way.
+        close[cells_at(torch.lerp(centers[i], centers[j], steps), resolution, contracted)] = True
+    return close
+
+
+def _neighbours(camera_to_box: torch.Tensor, focus: torch.Tensor) -> list[tuple[int, int]]:
+    """Pairs of cameras that look within 45° of each other and are nearer to each other than to the focus: of each
+    camera the nearest few."""
+    centers, axes = camera_to_box[:, :3, 3], camera_to_box[:, :3, 2]
+    gap = torch.cdist(centers, centers).fill_diagonal_(math.inf)
+    gap[(axes @ axes.T < math.sqrt(0.5)) | (gap > (centers - focus).norm(dim=1))] = math.inf
+    nearest = gap.topk(min(NEIGHBOURS, len(gap)), largest=False)
+    found = zip(nearest.indices.tolist(), nearest.values.isfinite().tolist())
+    return sorted({(min(i, j), max(i, j)) for i, (row, near) in enumerate(found) for j, ok in zip(row, near) if ok})
+
+
+def _distance_to(start: torch.Tensor, end: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
+    """Distances (N,) of points (N, 3) from the line between two points."""
+    along, offset = end - start, points - start
+    share = (offset @ along / (along @ along).clamp(min=1e-12)).clamp(0, 1)
+    return (offset - share[:, None] * along).norm(dim=1)

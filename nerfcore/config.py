@@ -46,7 +46,9 @@ class FieldConfig(Stage):
     branch: Literal["hybrid", "explicit", "implicit"] = Field(
         default="hybrid", description="explicit: grid only; implicit: network only"
     )
-    fusion: Literal["blend", "concat"] = Field(default="blend", description="how the two branches join")
+    fusion: Literal["blend", "concat"] = Field(
+        default="concat", description="how the two branches join: their weighted sum, or both weighted and side by side"
+    )
     levels: int = Field(default=8, ge=1, le=16, description="levels of the vertex grid, 4 features each")
     coarsest: int = Field(default=16, ge=2, description="vertices along a side of the coarsest level")
     finest: int | None = Field(
@@ -176,7 +178,7 @@ class TrainConfig(Stage):
     )
     max_rays: int = Field(default=32768, ge=16, description="at most so many rays a step")
     grid_rate: float = Field(default=0.03, gt=0, description="learning rate of the grid")
-    network_rate: float = Field(default=0.005, gt=0, description="learning rate of the networks")
+    network_rate: float = Field(default=0.01, gt=0, description="learning rate of the networks")
     decay: float = Field(default=0.33, gt=0, le=1, description="of the rates at ½, ¾ and 9/10")
     fade: float = Field(default=0.2, ge=0, lt=1, description="share of training over which finer levels appear")
     refine_poses: bool = Field(default=False, description="correct the cameras of the training photos while training")

@@ -48,7 +48,7 @@ class Geometry:
 
 
 class HybridField(nn.Module):
-    """Explicit grid and implicit network, blended by evidence, read by one decoder.
+    """Explicit grid and implicit network, weighed by evidence, read by one decoder.
 
     Args:
         config: settings of the field.
@@ -122,7 +122,8 @@ class HybridField(nn.Module):
             assert self.blend is not None
             w = self.blend(points)[:, None]
             if self.concat:
-                hidden = torch.cat([w * explicit, (1 - w) * implicit], 1)
+                parts = w.to(self.dtype) * explicit.to(self.dtype), (1 - w).to(self.dtype) * implicit
+                hidden = torch.cat(parts, 1)
             else:
                 hidden = torch.lerp(implicit.to(explicit.dtype), explicit, w)
         out = self.density_head(hidden, self.dtype)

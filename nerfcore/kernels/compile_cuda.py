@@ -26,12 +26,12 @@ from .runtime import CUDA_BLOCK, default_threads, init
 
 ARCHITECTURES = (75, 86, 89, 90, 120)
 SOURCES = (encode, encode_points, march, composite, cells)
-# The standard preset: without classes, with few, with the most; and the branches side by side.
+# The standard preset: without classes, with few, with the most; and the branches blended.
 _STANDARD = FusedShape(
-    levels=8, octaves=8, concat=False, width=64, geometry=16, color_layers=3, appearance=0, classes=16, logits=False
+    levels=8, octaves=8, concat=True, width=64, geometry=16, color_layers=3, appearance=0, classes=16, logits=False
 )
 FUSED = {f"fused, {classes} classes": dataclasses.replace(_STANDARD, classes=classes) for classes in (0, 16, 64)}
-FUSED["fused, concat"] = dataclasses.replace(_STANDARD, concat=True)
+FUSED["fused, blend"] = dataclasses.replace(_STANDARD, concat=False)
 
 
 def modules() -> dict[str, tuple[wp.Module, int]]:

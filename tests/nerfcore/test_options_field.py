@@ -38,7 +38,7 @@ def test_a_branch_alone_has_no_other() -> None:
 
 @pytest.mark.setting("field.fusion")
 def test_branches_are_blended_or_stand_side_by_side() -> None:
-    blend, concat = field(), field(fusion="concat")
+    blend, concat = field(fusion="blend"), field(fusion="concat")
     assert blend.density_head.weights[0].shape[1] == blend.features
     assert concat.density_head.weights[0].shape[1] == 2 * concat.features
     assert concat.grid is not None

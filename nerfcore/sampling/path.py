@@ -9,14 +9,16 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
+from scipy.spatial import cKDTree
 
 from ..data.cameras import Camera
 from .visibility import FEWEST_POINTS, cells_at, depth_ranges, grid_centers, in_front
 
 CLEAR = 0.125  # of their distance to what they surround, that nothing comes nearer to the way between cameras
 NEIGHBOURS = 6  # of a camera, to which that way leads
-APART = 0.1  # of that distance: cameras in between that are nearer to others add nothing
+APART = 0.1  # of that distance: cameras nearer to others add nothing
 
 
 def cells_before_path(
@@ -30,6 +32,8 @@ def cells_before_path(
     """Which cells (resolution³,) bool must be empty because cameras that surround `focus` (3,) went past them: those
     close to the way between neighbours, and those nearer to a camera half way than anything it would show. Sparse
     points (N, 3) near the way keep it at half their distance."""
+    apart = _apart(camera_to_box[:, :3, 3], focus)  # hundreds of photos would take long and add nothing
+    cameras, camera_to_box = [cameras[i] for i in apart], camera_to_box[apart]
     pairs = _neighbours(camera_to_box, focus)
     lenses, between = cameras_between(cameras, camera_to_box, pairs, focus)
     ranges = depth_ranges(lenses, between, points, focus)
@@ -63,9 +67,9 @@ def _along(
     contracted: bool,
 ) -> torch.Tensor:
     """Cells (resolution³,) close to the lines between the cameras of each pair."""
-    cells = grid_centers(resolution, contracted, camera_to_box.device)
-    close = torch.zeros(len(cells), dtype=torch.bool, device=cells.device)
-    steps = torch.linspace(0, 1, 16, device=cells.device)[:, None]
+    device = camera_to_box.device
+    tree = cKDTree(grid_centers(resolution, contracted, device).cpu().numpy())
+    close = torch.zeros(resolution**3, dtype=torch.bool, device=device)
     centers = camera_to_box[:, :3, 3]
     away = (centers - focus).norm(dim=1)
     for i, j in pairs:
@@ -73,10 +77,23 @@ def _along(
         if len(points) >= FEWEST_POINTS:
             nearest = _distance_to(centers[i], centers[j], points).kthvalue(FEWEST_POINTS).values
             radius = min(radius, float(nearest) / 2)
-        close |= _distance_to(centers[i], centers[j], cells) < radius
+        count = 2 + math.ceil(float((centers[j] - centers[i]).norm()) / (radius / 4 + 1e-6))
+        steps = torch.lerp(centers[i], centers[j], torch.linspace(0, 1, count, device=device)[:, None])
+        found = np.concatenate(tree.query_ball_point(steps.cpu().numpy(), radius))
+        close[torch.from_numpy(found.astype(np.int64)).to(device)] = True
         # Where space is contracted, a cell may be larger than what is free around the way.
-        close[cells_at(torch.lerp(centers[i], centers[j], steps), resolution, contracted)] = True
+        close[cells_at(steps, resolution, contracted)] = True
     return close
+
+
+def _apart(centers: torch.Tensor, focus: torch.Tensor) -> list[int]:
+    """Indices of cameras, in order, that are not near to one before."""
+    gap, least = torch.cdist(centers, centers), APART * (centers - focus).norm(dim=1)
+    kept: list[int] = []
+    for index in range(len(centers)):
+        if not kept or bool(gap[index, kept].min() > least[index]):
+            kept.append(index)
+    return kept
 
 
 def _neighbours(camera_to_box: torch.Tensor, focus: torch.Tensor) -> list[tuple[int, int]]:

@@ -76,12 +76,11 @@ def read_job(path: Path) -> JobStatus | None:
 
     A job that says it is queued or running while its process is gone has state "died" and an error that says so.
     """
-    try:
-        value = json.loads(Path(path).read_text(encoding="utf-8"))
-        status = JobStatus(**{f.name: value[f.name] for f in fields(JobStatus) if f.name in value})
-    except (OSError, ValueError, TypeError, AttributeError):
-        return None
-    if not status.finished and not engine_alive(status):
+    status = _stored_job(path)
+    if status is not None and not status.finished and not engine_alive(status):
+        status = _stored_job(path)  # its last words may have been written since
+        if status is None or status.finished:
+            return status
         doing = status.stage or status.verb
         status.state = "died"
         status.error = {
@@ -91,6 +90,15 @@ def read_job(path: Path) -> JobStatus | None:
             "log": status.log,
         }
     return status
+
+
+def _stored_job(path: Path) -> JobStatus | None:
+    """What is written in the file of a job; None when it is gone or is not a job."""
+    try:
+        value = json.loads(Path(path).read_text(encoding="utf-8"))
+        return JobStatus(**{f.name: value[f.name] for f in fields(JobStatus) if f.name in value})
+    except (OSError, ValueError, TypeError, AttributeError):
+        return None
 
 
 def list_jobs(project: Path) -> list[JobStatus]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import queue
@@ -305,6 +306,18 @@ def test_killed_engine_reads_as_died(start, project):
     # The lock went with the process: the next engine may work.
     other = start()
     assert other.answer(other.send("count", project=project, steps=2))["result"]["steps"] == 2
+    assert only_job(project).state == "done"
+
+
+def test_a_job_that_ends_while_it_is_read_did_not_die(project, monkeypatch):
+    job = st.JobStatus("x", "count", {}, state="running", pid=os.getpid())
+    st.write_job(project, job)
+
+    def ends(status):
+        st.write_job(project, dataclasses.replace(status, state="done"))
+        return False
+
+    monkeypatch.setattr(st, "engine_alive", ends)
     assert only_job(project).state == "done"
 
 

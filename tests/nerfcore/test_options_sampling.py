@@ -339,7 +339,7 @@ def test_the_fused_kernel_is_used_when_told_and_possible() -> None:
     assert not wants_fused(model(), rays)  # auto, on a CPU
     assert wants_fused(model(**{"render.fused": "on"}), 10)
     assert not wants_fused(model(**{"render.fused": "off"}), rays)
-    assert not wants_fused(model(**{"render.fused": "on", "field.fusion": "concat"}), rays)
+    assert not wants_fused(model(**{"render.fused": "on", "field.implicit_layers": "3"}), rays)
 
 
 @pytest.mark.setting("train.fade")

@@ -268,7 +268,7 @@ def test_one_image_is_not_enough(tiny_project: Path, tmp_path: Path) -> None:
     [
         {"field__branch": "explicit"},
         {"field__branch": "implicit"},
-        {"field__fusion": "concat"},
+        {"field__fusion": "blend"},
         {"field__blend_by": "density"},
         {"field__appearance": "4"},
         {"sampling__pdf": "uniform"},

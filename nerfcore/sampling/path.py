@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from ..data.cameras import Camera
 from .visibility import FEWEST_POINTS, cells_at, depth_ranges, grid_centers, in_front
@@ -68,7 +68,7 @@ def _along(
 ) -> torch.Tensor:
     """Cells (resolution³,) close to the lines between the cameras of each pair."""
     device = camera_to_box.device
-    tree = cKDTree(grid_centers(resolution, contracted, device).cpu().numpy())
+    tree = KDTree(grid_centers(resolution, contracted, device).cpu().numpy())
     close = torch.zeros(resolution**3, dtype=torch.bool, device=device)
     centers = camera_to_box[:, :3, 3]
     away = (centers - focus).norm(dim=1)

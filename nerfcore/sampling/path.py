@@ -34,10 +34,14 @@ def cells_before_path(
     points (N, 3) near the way keep it at half their distance."""
     apart = _apart(camera_to_box[:, :3, 3], focus)  # hundreds of photos would take long and add nothing
     cameras, camera_to_box = [cameras[i] for i in apart], camera_to_box[apart]
-    pairs = _neighbours(camera_to_box, focus)
-    lenses, between = cameras_between(cameras, camera_to_box, pairs, focus)
+    free = {
+        pair: _clearance(camera_to_box[list(pair), :3, 3], focus, points) for pair in _neighbours(camera_to_box, focus)
+    }
+    # Less than half a cell: something stands on the way, so nobody went there.
+    free = {pair: radius for pair, radius in free.items() if radius >= 1 / resolution}
+    lenses, between = cameras_between(cameras, camera_to_box, list(free), focus)
     ranges = depth_ranges(lenses, between, points, focus)
-    near = _along(camera_to_box, pairs, focus, points, resolution, contracted)
+    near = _along(camera_to_box, free, resolution, contracted)
     return near | in_front(lenses, between, resolution, contracted, ranges)
 
 
@@ -58,26 +62,24 @@ def cameras_between(
     return lenses, torch.stack(poses)[len(camera_to_box) :]
 
 
+def _clearance(ends: torch.Tensor, focus: torch.Tensor, points: torch.Tensor) -> float:
+    """How far around the line between two cameras (2, 3) there is nothing."""
+    radius = CLEAR * float((ends - focus).norm(dim=1).min())
+    if len(points) < FEWEST_POINTS:
+        return radius
+    return min(radius, float(_distance_to(ends[0], ends[1], points).kthvalue(FEWEST_POINTS).values) / 2)
+
+
 def _along(
-    camera_to_box: torch.Tensor,
-    pairs: list[tuple[int, int]],
-    focus: torch.Tensor,
-    points: torch.Tensor,
-    resolution: int,
-    contracted: bool,
+    camera_to_box: torch.Tensor, free: dict[tuple[int, int], float], resolution: int, contracted: bool
 ) -> torch.Tensor:
-    """Cells (resolution³,) close to the lines between the cameras of each pair."""
+    """Cells (resolution³,) around the lines between pairs of cameras, as far as these are `free`."""
     device = camera_to_box.device
     tree = KDTree(grid_centers(resolution, contracted, device).cpu().numpy())
     close = torch.zeros(resolution**3, dtype=torch.bool, device=device)
     centers = camera_to_box[:, :3, 3]
-    away = (centers - focus).norm(dim=1)
-    for i, j in pairs:
-        radius = CLEAR * float(torch.minimum(away[i], away[j]))
-        if len(points) >= FEWEST_POINTS:
-            nearest = _distance_to(centers[i], centers[j], points).kthvalue(FEWEST_POINTS).values
-            radius = min(radius, float(nearest) / 2)
-        count = 2 + math.ceil(float((centers[j] - centers[i]).norm()) / (radius / 4 + 1e-6))
+    for (i, j), radius in free.items():
+        count = 2 + math.ceil(float((centers[j] - centers[i]).norm()) / (radius / 4))
         steps = torch.lerp(centers[i], centers[j], torch.linspace(0, 1, count, device=device)[:, None])
         found = np.concatenate(tree.query_ball_point(steps.cpu().numpy(), radius))
         close[torch.from_numpy(found.astype(np.int64)).to(device)] = True

@@ -147,6 +147,15 @@ def test_sparse_points_beside_the_way_are_kept():
     assert kept[cells_at(poses[9:10, :3, 3], 64, False)].all()  # the other side is as free as before
 
 
+def test_what_stands_on_the_way_itself_is_kept():
+    poses = ring(18, 0.8)
+    middle = (poses[0, :3, 3] + poses[1, :3, 3]) / 2
+    post = middle + torch.linspace(-0.003, 0.003, 40)[:, None]
+    kept = free_cells(poses[:2], torch.cat([torch.from_numpy(ball(500, 0.3)).float(), post]), False)
+    assert free_cells(poses[:2], torch.zeros(0, 3), False)[cells_at(post, 64, False)].all()
+    assert not kept[cells_at(post, 64, False)].any()
+
+
 def test_large_cells_on_the_way_around_something_small_are_empty():
     poses = ring(18, 6.0)
     empty = free_cells(poses, torch.zeros(0, 3), True)

@@ -209,10 +209,10 @@ class FieldworkScene(PropertyGroup):
             ("animation", "Animation", "The active camera of the scene over its frame range"),
             ("photos", "Held-Out Photos", "The photos that training did not see"),
             ("all", "All Photos", "Every photo, also those of training"),
-            ("orbit", "Orbit", "Once around the scene"),
+            ("orbit", "Orbit", "Around the scene, as far as photos were taken"),
         ],
     )
-    orbit: IntProperty(name="Frames", description="Images once around the scene", default=24, min=2, soft_max=360)
+    orbit: IntProperty(name="Frames", description="Images around the scene", default=24, min=2, soft_max=360)
     size: IntVectorProperty(
         name="Size",
         description="Width and height in pixels; 0: that of the camera",

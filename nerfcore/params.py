@@ -145,7 +145,9 @@ class RenderParams(Params):
     all: bool = Field(default=False, description="from every photo, also those of training")
     camera: Path | None = None
     orbit: int | None = Field(default=None, gt=0)
-    size: tuple[int, int] | None = None
+    size: tuple[int, int] | None = Field(
+        default=None, description="WxH; cut where a camera has other proportions (held-out and all photos: resampled)"
+    )
     passes: list[Pass] = ["rgb", "depth", "semantic"]
 
 

@@ -49,6 +49,20 @@ class Camera(BaseModel):
             }
         )
 
+    def reframed(self, width: int, height: int) -> Camera:
+        """The same lens on an image width × height, cut at two sides where its proportions differ."""
+        scale = max(width / self.width, height / self.height)
+        return self.model_copy(
+            update={
+                "width": width,
+                "height": height,
+                "fx": self.fx * scale,
+                "fy": self.fy * scale,
+                "cx": self.cx * scale + (width - self.width * scale) / 2,
+                "cy": self.cy * scale + (height - self.height * scale) / 2,
+            }
+        )
+
     def undistorted(self) -> Camera:
         """The pinhole camera with the same focal lengths and principal point."""
         return self.model_copy(update={"model": "PINHOLE", "distortion": ()})

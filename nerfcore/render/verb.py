@@ -26,6 +26,7 @@ from .image import Frame, background_of, render_view, write_picture
 from .pictures import colorize_depth, colorize_labels
 
 ORBIT_PIXELS = 800  # longest side of orbit frames unless a size is asked for
+OPEN_ANGLE = np.pi / 2  # around the subject without a photo: from there on an orbit is an arc
 
 
 def render(params: RenderParams, report: Reporter) -> dict[str, Any]:
@@ -45,7 +46,12 @@ def render(params: RenderParams, report: Reporter) -> dict[str, Any]:
     box = trained.info.box(project)
     cameras = chosen_cameras(params, scene)
     if params.size is not None:
-        cameras = [(name, camera.resized(*params.size), pose) for name, camera, pose in cameras]
+        # Pictures of photos' cameras are laid over the photos; all others keep their pixels square.
+        photos = params.camera is None and params.orbit is None
+        cameras = [
+            (name, (camera.resized if photos else camera.reframed)(*params.size), pose)
+            for name, camera, pose in cameras
+        ]
     report.stage("Preparing")
     trained.model.refine(sum(camera.width * camera.height for _, camera, _ in cameras), report.check)
     with disk_errors(out):
@@ -119,7 +125,8 @@ def read_cameras(path: Path) -> list[tuple[str, Camera, np.ndarray]]:
 
 
 def orbit_cameras(scene: Scene, count: int) -> list[tuple[str, Camera, np.ndarray]]:
-    """`count` cameras on a circle around the focus of the training views, at their median distance and height."""
+    """`count` cameras around the focus of the training views, at their median distance and height: on a circle, or on
+    the arc where photos were taken if they leave much of the circle open, as before a facade."""
     views = [scene.views[i] for i in scene.train]
     focus = focus_point([view.camera_to_world for view in views])
     offsets = np.stack([v.camera_to_world[:3, 3] for v in views]) - focus
@@ -127,11 +134,24 @@ def orbit_cameras(scene: Scene, count: int) -> list[tuple[str, Camera, np.ndarra
     camera = views[0].camera.undistorted()
     camera = camera.resized(*training_size(camera, ORBIT_PIXELS))
     frames = []
-    for number in range(count):
-        angle = 2 * np.pi * number / count
+    for number, angle in enumerate(orbit_angles(offsets, count)):
         center = focus + [radius * np.cos(angle), radius * np.sin(angle), height]
         frames.append((f"orbit_{number:04d}", camera, look_at(center, focus)))
     return frames
+
+
+def orbit_angles(offsets: np.ndarray, count: int) -> np.ndarray:
+    """Angles (count,) about the z axis, evenly around it or between the cameras beside the widest gap.
+
+    Args:
+        offsets: (N, 3) camera centers from the subject.
+    """
+    taken = np.sort(np.arctan2(offsets[:, 1], offsets[:, 0]))
+    gaps = np.diff(taken, append=taken[0] + 2 * np.pi)
+    widest = int(gaps.argmax())
+    if gaps[widest] < OPEN_ANGLE:
+        return 2 * np.pi * np.arange(count) / count
+    return taken[widest] + gaps[widest] + (2 * np.pi - gaps[widest]) * (np.arange(count) + 0.5) / count
 
 
 def look_at(center: np.ndarray, target: np.ndarray, up: np.ndarray | None = None) -> np.ndarray:

@@ -115,6 +115,21 @@ def test_resizing_keeps_directions() -> None:
     assert np.allclose(rays(camera, pixels)[0], rays(half, pixels / 2)[0])
 
 
+@pytest.mark.parametrize(("width", "height"), [(160, 160), (90, 200), (640, 100)])
+def test_reframing_cuts_the_same_from_opposite_sides_and_keeps_pixels_square(width: int, height: int) -> None:
+    camera = Camera(fx=300, fy=310, cx=150, cy=90, **sizes)
+    cut = camera.reframed(width, height)
+    assert (cut.width, cut.height) == (width, height)
+    assert np.isclose(cut.fx / cut.fy, 300 / 310)
+    corners = np.array([[0.0, 0.0], [width, height]])
+    scale = 300 / cut.fx
+    seen = (corners - [width / 2, height / 2]) * scale + [camera.width / 2, camera.height / 2]
+    assert np.allclose(rays(cut, corners)[0], rays(camera, seen)[0])
+    assert np.isclose(np.ptp(seen, axis=0), [camera.width, camera.height]).any()
+    assert (seen >= -1e-9).all()
+    assert (seen <= [camera.width + 1e-9, camera.height + 1e-9]).all()
+
+
 def test_points_behind_have_no_pixel() -> None:
     camera = Camera(fx=300, fy=300, cx=160, cy=100, **sizes)
     assert np.isnan(project(camera, np.array([[0.0, 0, -1]]))).all()

@@ -16,7 +16,7 @@ from fieldwork.nerfcore.field.hybrid import Geometry
 from fieldwork.nerfcore.kernels.runtime import worker_count
 from fieldwork.nerfcore.render import image
 from fieldwork.nerfcore.render.image import Frame, render_view
-from fieldwork.nerfcore.render.verb import look_at
+from fieldwork.nerfcore.render.verb import look_at, orbit_angles
 from fieldwork.nerfcore.train.model import Model
 
 RADIUS, DENSITY = 0.6, 4.0
@@ -160,3 +160,23 @@ def test_the_pdf_puts_samples_where_the_light_is_absorbed() -> None:
         frame = render_view(model, camera, pose, 1.0)
         errors[pdf] = abs(frame.depth[20, 24] - (distance - RADIUS))
     assert errors["default"] < 0.5 * errors["uniform"]
+
+
+def on_circle(degrees: np.ndarray) -> np.ndarray:
+    return np.stack([np.cos(np.radians(degrees)), np.sin(np.radians(degrees)), np.full(len(degrees), 0.4)], 1)
+
+
+def test_an_orbit_goes_once_around_what_was_photographed_from_all_sides():
+    angles = orbit_angles(on_circle(np.arange(0, 360, 45) + 7.0), 8)
+    assert np.allclose(np.degrees(angles), np.arange(8) * 45)
+
+
+@pytest.mark.parametrize("middle", [-90.0, 0.0, 178.0])
+def test_an_orbit_before_a_facade_stays_where_photos_were_taken(middle: float):
+    shots = np.random.default_rng(3).permutation(np.linspace(middle - 50, middle + 50, 15))
+    away = (np.degrees(orbit_angles(on_circle(shots), 10)) - middle + 180) % 360 - 180
+    assert np.allclose(away, np.linspace(-45, 45, 10))
+
+
+def test_an_orbit_of_one_photo_stays_with_it():
+    assert np.allclose(orbit_angles(on_circle(np.array([30.0])), 3) % (2 * math.pi), math.radians(30))

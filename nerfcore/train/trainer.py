@@ -12,7 +12,7 @@ import torch
 from ..config import RunConfig
 from ..data.pixels import Batch, PixelStore
 from ..field.grid import Part
-from ..kernels.runtime import run_parallel
+from ..kernels.runtime import run_parallel, worker_count
 from ..sampling.cache import CoarseCache
 from ..sampling.outlines import Outlines
 from .depth import DepthRays, depth_loss
@@ -29,11 +29,11 @@ from .losses import (
 )
 from .model import Model, Rendered
 from .pose_refinement import PoseRefinement, level_weights
-from .schedule import bias_correction, rate_factor
+from .schedule import bias_correction, rate_factor, sample_budget
 from .voxel_init import PixelFeatures, initialise
 
 BETAS = (0.9, 0.99)
-SHARD_SAMPLES = 16384  # whose activations fit a core's cache
+SHARD_SAMPLES = 12288  # fewer would take longer to hand out than to learn from
 
 
 @dataclass(frozen=True)
@@ -162,8 +162,8 @@ class Trainer:
     def _learn(self, batch: Batch, progress: float) -> list[Learned]:
         """Leave the gradient of the composite loss in the parameters and in the grid.
 
-        The CPU works on shards of the rays side by side, each small enough for a core's cache; a shard's loss is its
-        part of the whole batch's loss, and gradients are summed in the order of the shards.
+        The CPU works on shards of the rays side by side, few enough that threads do not wait for each other's interpreter
+        lock; a shard's loss is its part of the whole batch's loss, and gradients are summed in the order of the shards.
         """
         per_ray, rays = self.config.sampling.samples, len(batch.rgb)
         jitter = torch.rand(rays, device=self.device, generator=self.generator)
@@ -174,7 +174,10 @@ class Trainer:
             background = torch.full_like(batch.rgb, self.background)
         counted = label_weights(batch)
         labelled = counted.sum().clamp(min=1e-6)
-        size = rays if self.device.type != "cpu" else max(SHARD_SAMPLES // per_ray, 1)
+        shards = 1
+        if self.device.type == "cpu":
+            shards = max(2, min(worker_count(), sample_budget(self.config.train, progress) // SHARD_SAMPLES))
+        size = -(-rays // shards)
 
         def shard(begin: int) -> Learned:
             part = batch.part(slice(begin, begin + size))
@@ -301,16 +304,14 @@ class Trainer:
         return total
 
     def _adapt(self, rays: int, rendered: list[Rendered], progress: float) -> None:
-        """Keep the number of field samples a step near its budget, which grows with progress: early on many small
-        steps learn faster, later large batches average out the noise."""
+        """Keep the number of field samples a step near its budget, which grows with progress."""
         m, train = self.measured, self.config.train
-        budget = round(train.batch_start * (train.batch_samples / train.batch_start) ** progress)
         m.steps += 1
         m.rays += rays
         evaluated = sum(r.evaluated for r in rendered)
         m.samples += evaluated
         if self.steps % 8 == 0:
-            wanted = rays * budget / max(evaluated, 1)
+            wanted = rays * sample_budget(train, progress) / max(evaluated, 1)
             self.rays = int(min(max(wanted, rays * 0.5, 16), rays * 2, train.max_rays))
 
     def take_measured(self) -> Measured:

@@ -18,6 +18,7 @@ from .visibility import FEWEST_POINTS, cells_at, depth_ranges, grid_centers, in_
 
 CLEAR = 0.125  # of their distance to what they surround, that nothing comes nearer to the way between cameras
 NEIGHBOURS = 6  # of a camera, to which that way leads
+SAME_WAY = math.cos(math.radians(55))  # of viewing directions: a round of seven photos has ways between them
 APART = 0.1  # of that distance: cameras nearer to others add nothing
 
 
@@ -99,11 +100,11 @@ def _apart(centers: torch.Tensor, focus: torch.Tensor) -> list[int]:
 
 
 def _neighbours(camera_to_box: torch.Tensor, focus: torch.Tensor) -> list[tuple[int, int]]:
-    """Pairs of cameras that look within 45° of each other and are nearer to each other than to the focus: of each
+    """Pairs of cameras that look within 55° of each other and are nearer to each other than to the focus: of each
     camera the nearest few."""
     centers, axes = camera_to_box[:, :3, 3], camera_to_box[:, :3, 2]
     gap = torch.cdist(centers, centers).fill_diagonal_(math.inf)
-    gap[(axes @ axes.T < math.sqrt(0.5)) | (gap > (centers - focus).norm(dim=1))] = math.inf
+    gap[(axes @ axes.T < SAME_WAY) | (gap > (centers - focus).norm(dim=1))] = math.inf
     nearest = gap.topk(min(NEIGHBOURS, len(gap)), largest=False)
     found = zip(nearest.indices.tolist(), nearest.values.isfinite().tolist())
     return sorted({(min(i, j), max(i, j)) for i, (row, near) in enumerate(found) for j, ok in zip(row, near) if ok})

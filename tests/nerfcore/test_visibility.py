@@ -128,6 +128,12 @@ def test_nothing_hangs_where_the_photos_were_taken_from():
     assert not empty[cells.norm(dim=1) < 0.6].any()
 
 
+def test_few_cameras_have_a_way_between_them_too():
+    poses = ring(7, 0.8)  # 51° apart
+    halves = (poses[:, :3, 3] + poses.roll(1, 0)[:, :3, 3]) / 2
+    assert free_cells(poses, torch.zeros(0, 3), False)[cells_at(halves, 64, False)].all()
+
+
 def test_cameras_far_apart_or_looking_elsewhere_have_no_way_between_them():
     middle = torch.tensor([[0.0, 0.0, 0.3]])  # of the ring
     for count in (2, 4):

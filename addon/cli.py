@@ -9,15 +9,15 @@ import signal
 import subprocess
 import sys
 
-from . import preferences
-from .link import engine_environment
+from . import machine
+from .engine.link import engine_environment
 
 NO_ENGINE = "The engine is not installed. Install it in the preferences of Fieldwork, or set FIELDWORK_ENGINE_PYTHON."
 
 
 def main(arguments: list[str]) -> int:
     """Run the command line in the engine's Python; returns its exit status (see docs/headless.md)."""
-    python = preferences.engine_python()
+    python = machine.engine_python()
     if python is None:
         print(NO_ENGINE, file=sys.stderr)
         return 1

@@ -2,33 +2,20 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import bpy
 from bpy.types import AddonPreferences, Context, UILayout
 
-from . import engine_place
-from .engine_place import ROOT, tail
+from .engine import place as engine_place
+from .engine.place import tail
+from .machine import engine_folder, engine_python
 from .props import EnumProperty, IntProperty, StringProperty
 from .registration import ROOT_PACKAGE
 from .text import t
 
 if TYPE_CHECKING:
-    from .engine_install import Installer
-
-AS_EXTENSION = ROOT_PACKAGE.startswith("bl_ext.")
-
-
-def user_folder(*parts: str) -> Path:
-    """A folder that outlives updates of the extension; outside an extension (tests, scripts), a temporary one."""
-    if AS_EXTENSION:
-        return Path(bpy.utils.extension_path_user(ROOT_PACKAGE, path="/".join(parts), create=True))
-    import tempfile
-
-    folder = Path(tempfile.gettempdir(), "fieldwork-user", *parts)
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
+    from .engine.install import Installer
 
 
 class FIELDWORK_AP_preferences(AddonPreferences):
@@ -81,7 +68,7 @@ class FIELDWORK_AP_preferences(AddonPreferences):
 
 
 def draw_preferences(preferences: FIELDWORK_AP_preferences, layout: UILayout) -> None:
-    from . import jobs
+    from .jobs import queue as jobs
 
     layout.use_property_split = True
     layout.use_property_decorate = False
@@ -133,35 +120,6 @@ def draw_engine(layout: UILayout, installer: Installer | None) -> None:
     row.operator("fieldwork.engine_install", text=action, icon="IMPORT")
     row.operator("fieldwork.engine_remove", text=t("Remove"), icon="TRASH")
     row.operator("fieldwork.engine_install_log", text=t("Log"), icon="TEXT")
-
-
-class _Defaults:
-    """What the preferences say where the extension is not enabled as one (tests, scripts)."""
-
-    engine_python = ""
-    device = "auto"
-    base_python = ""
-    wheels = ""
-    on_close = "stop"
-    idle_minutes = 5
-
-
-def preferences() -> Any:
-    addon = bpy.context.preferences.addons.get(ROOT_PACKAGE)
-    return addon.preferences if addon and addon.preferences else _Defaults
-
-
-def engine_folder() -> Path:
-    return user_folder("engine")
-
-
-def engine_log() -> Path:
-    return user_folder("logs") / "engine.log"
-
-
-def engine_python() -> Path | None:
-    """The Python that runs the engine, None when it is not installed."""
-    return engine_place.find_python(bpy.path.abspath(preferences().engine_python), engine_folder(), ROOT)
 
 
 CLASSES = [FIELDWORK_AP_preferences]

@@ -54,19 +54,24 @@ PASSES = [
 
 
 def _project_changed(self: "FieldworkScene", context: Context) -> None:
-    from . import state
+    """Another project folder was chosen."""
+    from .jobs import queue as jobs
+    from .project import snapshot as state
 
-    state.project_changed(self)
+    state.refresh(self)
+    folder = state.folder_of(self)
+    if folder is not None and not bpy.app.background:
+        jobs.queue.reattach(folder)
 
 
 def _classes_changed(self: PropertyGroup, context: Context) -> None:
-    from . import state
+    from .project import snapshot as state
 
     state.classes_changed(self.id_data.fieldwork)
 
 
 def _class_visibility(self: "FieldworkClass", context: Context) -> None:
-    from . import state
+    from .project import snapshot as state
 
     state.show_classes(self.id_data.fieldwork)
 

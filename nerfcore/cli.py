@@ -23,7 +23,7 @@ from pydantic.fields import FieldInfo
 from . import __version__
 from .console import ConsoleReporter
 from .errors import Cancelled, FieldworkError
-from .lock import lockable, project_lock
+from .project.lock import lockable, project_lock
 from .verbs import VERBS, run_verb
 
 # Worker threads that spin while they wait take the cores other programs need; read when OpenMP starts.

@@ -18,9 +18,9 @@ class Verb(NamedTuple):
 
 
 VERBS = {
-    "doctor": Verb(p.DoctorParams, "doctor:doctor", "Check the engine, the device and the disk."),
-    "simulate": Verb(p.SimulateParams, "capture.simulate:simulate", "Build a scene and photograph it with Cycles."),
-    "dataset": Verb(p.DatasetParams, "capture.dataset:dataset", "Photograph any .blend as a posed, labelled data set."),
+    "doctor": Verb(p.DoctorParams, "engine.doctor:doctor", "Check the engine, the device and the disk."),
+    "simulate": Verb(p.SimulateParams, "blender.simulate:simulate", "Build a scene and photograph it with Cycles."),
+    "dataset": Verb(p.DatasetParams, "blender.dataset:dataset", "Photograph any .blend as a posed, labelled data set."),
     "new": Verb(p.NewParams, "capture.ingest:new", "Make a project from photos or a video."),
     "import": Verb(p.ImportParams, "data.importer:import_dataset", "Make a project from a posed data set."),
     "poses": Verb(p.PosesParams, "poses.estimate:estimate_poses", "Estimate the camera poses."),
@@ -29,12 +29,12 @@ VERBS = {
     "evaluate": Verb(p.EvaluateParams, "evaluate.verb:evaluate", "Measure the held-out images."),
     "render": Verb(p.RenderParams, "render.verb:render", "Render images from the field."),
     "mesh": Verb(p.MeshParams, "mesh.verb:mesh", "Extract the labelled surface."),
-    "blend": Verb(p.BlendParams, "blend:blend", "Write a .blend with cameras, points, mesh and materials."),
-    "package": Verb(p.PackageParams, "package:package", "Prepare cameras, points and mesh for Blender."),
+    "blend": Verb(p.BlendParams, "blender.blend:blend", "Write a .blend with cameras, points, mesh and materials."),
+    "package": Verb(p.PackageParams, "blender.package:package", "Prepare cameras, points and mesh for Blender."),
     "export": Verb(p.ExportParams, "export.verb:export", "Write what other programs read."),
     "bench": Verb(p.BenchParams, "bench.verb:bench", "Reproduce a table of figures on this machine."),
-    "reconstruct": Verb(p.ReconstructParams, "reconstruct:reconstruct", "Photos in, a labelled .blend out."),
-    "batch": Verb(p.BatchParams, "batch:batch", "Reconstruct many captures, one after the other."),
+    "reconstruct": Verb(p.ReconstructParams, "workflows.reconstruct:reconstruct", "Photos in, a labelled .blend out."),
+    "batch": Verb(p.BatchParams, "workflows.batch:batch", "Reconstruct many captures, one after the other."),
 }
 
 

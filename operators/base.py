@@ -9,8 +9,10 @@ from typing import Any, ClassVar
 import bpy
 from bpy.types import Context, Operator
 
-from ..addon import jobs, preferences, state
+from ..addon import machine
 from ..addon.errors import EngineError
+from ..addon.jobs import queue as jobs
+from ..addon.project import snapshot as state
 from ..addon.properties import FieldworkScene
 from ..addon.props import StringProperty
 from ..addon.text import t
@@ -33,7 +35,7 @@ def scene_settings(**names: str) -> Callable[[type], type]:
 
 def engine_reason() -> str | None:
     """Why no engine can be started, None when one can."""
-    if preferences.engine_python() is None:
+    if machine.engine_python() is None:
         return t("Install the engine in the preferences of Fieldwork first")
     return None
 

@@ -8,7 +8,7 @@ from typing import Any
 import bpy
 from bpy.types import Context, FileHandler, Operator, OperatorFileListElement
 
-from ..addon import state
+from ..addon.project import snapshot as state
 from ..addon.props import BoolProperty, CollectionProperty, EnumProperty, StringProperty
 from ..addon.text import t
 from .base import ProjectOperator, need_photos, need_project_folder, scene_settings, set_if_empty

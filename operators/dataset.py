@@ -10,7 +10,7 @@ from typing import Any
 import bpy
 from bpy.types import Context, Event
 
-from ..addon import jobs
+from ..addon.jobs import queue as jobs
 from ..addon.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, IntVectorProperty, StringProperty
 from ..addon.text import t
 from .base import VerbOperator, refresh_scenes, set_if_empty

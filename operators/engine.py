@@ -8,20 +8,22 @@ from typing import TYPE_CHECKING
 import bpy
 from bpy.types import Context, Event, Operator
 
-from ..addon import engine_place, jobs, preferences
+from ..addon import machine
+from ..addon.engine import place as engine_place
+from ..addon.jobs import queue as jobs
 from ..addon.text import t
 
 if TYPE_CHECKING:
-    from ..addon.engine_install import Options
+    from ..addon.engine.install import Options
 
 
 def options() -> Options:
-    from ..addon import engine_install  # not at the top: enabling the extension must be quick
+    from ..addon.engine import install as engine_install  # not at the top: enabling the extension must be quick
 
-    chosen = preferences.preferences()
+    chosen = machine.preferences()
     base, wheels = bpy.path.abspath(chosen.base_python), bpy.path.abspath(chosen.wheels)
     return engine_install.Options(
-        folder=preferences.engine_folder(),
+        folder=machine.engine_folder(),
         base=Path(base) if base else engine_install.default_base(),
         device=chosen.device,
         wheels=wheels,
@@ -43,7 +45,7 @@ class FIELDWORK_OT_engine_install(Operator):
     def poll(cls, context: Context) -> bool:
         if installing():
             cls.poll_message_set(t("The installation is under way"))
-        elif not bpy.app.online_access and not preferences.preferences().wheels:
+        elif not bpy.app.online_access and not machine.preferences().wheels:
             cls.poll_message_set(t("Allow Online Access in the System preferences, or choose a folder of packages"))
         else:
             return True
@@ -52,7 +54,7 @@ class FIELDWORK_OT_engine_install(Operator):
     def execute(self, context: Context) -> set[str]:
         import threading
 
-        from ..addon import engine_install
+        from ..addon.engine import install as engine_install
 
         jobs.queue.stop_engine()
         if not bpy.app.background:
@@ -95,7 +97,7 @@ class FIELDWORK_OT_engine_remove(Operator):
 
     @classmethod
     def poll(cls, context: Context) -> bool:
-        folder = preferences.engine_folder()
+        folder = machine.engine_folder()
         if installing():
             cls.poll_message_set(t("The installation is under way"))
         elif not (folder / "venv").exists() and not (folder / "cache").exists():
@@ -108,10 +110,10 @@ class FIELDWORK_OT_engine_remove(Operator):
         return context.window_manager.invoke_confirm(self, event)
 
     def execute(self, context: Context) -> set[str]:
-        from ..addon import engine_install
+        from ..addon.engine import install as engine_install
 
         jobs.queue.stop_engine(timeout=5.0)
-        engine_install.remove(preferences.engine_folder())
+        engine_install.remove(machine.engine_folder())
         jobs.queue.installer = None
         return {"FINISHED"}
 
@@ -124,7 +126,7 @@ class FIELDWORK_OT_engine_install_log(Operator):
 
     @classmethod
     def poll(cls, context: Context) -> bool:
-        if not (preferences.engine_folder() / engine_place.LOG).is_file():
+        if not (machine.engine_folder() / engine_place.LOG).is_file():
             cls.poll_message_set(t("Nothing has been installed yet"))
             return False
         return True
@@ -132,7 +134,7 @@ class FIELDWORK_OT_engine_install_log(Operator):
     def execute(self, context: Context) -> set[str]:
         name = "Fieldwork Installation Log"
         text = bpy.data.texts.get(name) or bpy.data.texts.new(name)
-        path = preferences.engine_folder() / engine_place.LOG
+        path = machine.engine_folder() / engine_place.LOG
         text.from_string(path.read_text(encoding="utf-8", errors="replace"))
         self.report({"INFO"}, t("See “{}” in the text editor", name))
         return {"FINISHED"}

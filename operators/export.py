@@ -7,7 +7,7 @@ from typing import Any
 
 from bpy.types import Context
 
-from ..addon import state
+from ..addon.project import snapshot as state
 from ..addon.props import StringProperty
 from ..addon.text import t
 from .base import ProjectOperator, absolute, need_run, scene_settings

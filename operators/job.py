@@ -7,7 +7,8 @@ from typing import Any
 import bpy
 from bpy.types import Context, Operator
 
-from ..addon import jobs, preferences
+from ..addon import machine, registration
+from ..addon.jobs import queue as jobs
 from ..addon.props import StringProperty
 from ..addon.text import t
 from .base import VerbOperator
@@ -138,14 +139,14 @@ class FIELDWORK_OT_open_log(Operator):
 
     @classmethod
     def poll(cls, context: Context) -> bool:
-        if not preferences.engine_log().is_file():
+        if not machine.engine_log().is_file():
             cls.poll_message_set(t("The engine has not run yet"))
             return False
         return True
 
     def execute(self, context: Context) -> set[str]:
         text = bpy.data.texts.get("Fieldwork Engine Log") or bpy.data.texts.new("Fieldwork Engine Log")
-        text.from_string(preferences.engine_log().read_text(encoding="utf-8", errors="replace"))
+        text.from_string(machine.engine_log().read_text(encoding="utf-8", errors="replace"))
         self.report({"INFO"}, t("See “{}” in the text editor", text.name))
         return {"FINISHED"}
 
@@ -157,7 +158,7 @@ class FIELDWORK_OT_open_preferences(Operator):
     bl_label = "Preferences"
 
     def execute(self, context: Context) -> set[str]:
-        bpy.ops.preferences.addon_show(module=preferences.ROOT_PACKAGE)
+        bpy.ops.preferences.addon_show(module=registration.ROOT_PACKAGE)
         return {"FINISHED"}
 
 

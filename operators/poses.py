@@ -9,9 +9,10 @@ import bpy
 from bpy.types import Context, Event, Operator
 from mathutils import Vector
 
-from ..addon import jobs, state
-from ..addon.capture_frame import scene_from_capture
+from ..addon.jobs import queue as jobs
+from ..addon.project import snapshot as state
 from ..addon.props import BoolProperty, EnumProperty, StringProperty
+from ..addon.scene.frame import scene_from_capture
 from ..addon.text import t
 from .base import ProjectOperator, need_poses, need_project, refresh_scenes, scene_settings
 from .scene import update_scene
@@ -148,7 +149,9 @@ class FIELDWORK_OT_pick_point(Operator):
         if event.type in {"ESC", "RIGHTMOUSE"} and event.value == "PRESS":
             return self._end(context, {"CANCELLED"})
         if event.type == "LEFTMOUSE" and event.value == "PRESS":
-            from ..addon import picking  # not at the top: it needs numpy, and enabling the extension must be quick
+            from ..addon.scene import (
+                picking,  # not at the top: it needs numpy, and enabling the extension must be quick
+            )
 
             point = picking.point_under(context, self._area, event.mouse_x, event.mouse_y)
             if point is None:

@@ -6,9 +6,10 @@ import bpy
 from bpy.types import Context, Operator
 from mathutils import Vector
 
-from ..addon import crop, state
-from ..addon.capture_frame import scene_from_capture
+from ..addon.project import region as crop
+from ..addon.project import snapshot as state
 from ..addon.roles import ROLE
+from ..addon.scene.frame import scene_from_capture
 from ..addon.text import t
 from .base import need_poses
 

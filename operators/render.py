@@ -9,10 +9,11 @@ from typing import Any
 import bpy
 from bpy.types import Context
 
-from ..addon import jobs, state
-from ..addon.capture_frame import scene_from_capture
-from ..addon.lens import pinhole
+from ..addon.jobs import queue as jobs
+from ..addon.project import snapshot as state
 from ..addon.props import StringProperty
+from ..addon.scene.frame import scene_from_capture
+from ..addon.scene.lens import pinhole
 from ..addon.text import t
 from .base import ProjectOperator, absolute, need_run, refresh_scenes, scene_settings
 
@@ -137,7 +138,7 @@ def show_result(job: jobs.Job) -> jobs.Steps | None:
     if job.state != "done" or job.result is None or job.project is None:
         return None
     # Not at the top: enabling the extension must be quick.
-    from ..addon import render_result
+    from ..addon.render import result as render_result
 
     scene = next((s for s in bpy.data.scenes if state.folder_of(s.fieldwork) == job.project), bpy.context.scene)
     files = [Path(path) for path in job.result["frames"]]
@@ -157,7 +158,7 @@ def _show_straightened(job: jobs.Job, scene_name: str, show_as: str) -> None:
         scene = bpy.data.scenes.get(scene_name)  # another file may have been loaded meanwhile
         if done.state != "done" or not done.result or scene is None:
             return None
-        from ..addon import render_result
+        from ..addon.render import result as render_result
 
         files = sorted(Path(done.result["folder"], "renders").glob("*.png"))
         return render_result.show_steps(scene, files, show_as, True, done.project.name)

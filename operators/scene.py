@@ -7,7 +7,8 @@ from typing import Any
 import bpy
 from bpy.types import Context
 
-from ..addon import jobs, state
+from ..addon.jobs import queue as jobs
+from ..addon.project import snapshot as state
 from ..addon.props import EnumProperty, StringProperty
 from ..addon.roles import PROJECT, ROLE
 from .base import ProjectOperator, absolute, need_poses, refresh_scenes, scene_settings, set_if_empty
@@ -75,7 +76,8 @@ def import_result(job: jobs.Job, cameras: str, scene_name: str) -> jobs.Steps | 
 
 def import_steps(job: jobs.Job, cameras: str, scene: bpy.types.Scene) -> jobs.Steps:
     # Not at the top: enabling the extension must be quick.
-    from ..addon import capture_frame, scene_import
+    from ..addon.scene import build as scene_import
+    from ..addon.scene import frame as capture_frame
 
     first = capture_frame.root_of(scene, job.project) is None
     imported = yield from scene_import.import_steps(scene, scene_import.load(job.result["folder"]), cameras)

@@ -7,7 +7,8 @@ from typing import Any
 from bl_operators.presets import AddPresetBase
 from bpy.types import Context, Event, Menu, Operator
 
-from ..addon import jobs, state
+from ..addon.jobs import queue as jobs
+from ..addon.project import snapshot as state
 from ..addon.props import BoolProperty, EnumProperty, StringProperty
 from ..addon.text import t
 from .base import ProjectOperator, need_poses, need_run, refresh_scenes, scene_settings

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from bpy.types import Context, Panel, UILayout
 
-from ..addon import jobs, state
+from ..addon.jobs import queue as jobs
+from ..addon.project import snapshot as state
 from ..addon.text import t
 
 MOST_WARNINGS = 3  # of a job in the panel

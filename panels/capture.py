@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from bpy.types import Context, Panel, UIList
 
-from ..addon import pictures, state
+from ..addon.pictures import thumbnails as pictures
+from ..addon.project import snapshot as state
 from ..addon.text import t
 from .base import FieldworkPanel, StepPanel, columns, draw_wrapped, project_folder, text_width
 

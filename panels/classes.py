@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bpy.types import Context, UIList
 
-from ..addon import state
+from ..addon.project import snapshot as state
 from ..addon.text import t
 from .base import StepPanel, columns, project_folder
 

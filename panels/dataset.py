@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bpy.types import Context, Panel
 
-from ..addon import jobs
+from ..addon.jobs import queue as jobs
 from ..addon.text import t
 from .base import FieldworkPanel, draw_wrapped, text_width
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from bpy.types import Context
 
-from ..addon import jobs, preferences
+from ..addon import machine
+from ..addon.jobs import queue as jobs
 from ..addon.text import t
 from .base import StepPanel, draw_wrapped, text_width
 
@@ -15,7 +16,7 @@ class FIELDWORK_PT_engine(StepPanel):
     def draw(self, context: Context) -> None:
         layout, queue = self.layout, jobs.queue
         running = queue.link is not None and queue.link.alive
-        if preferences.engine_python() is None:
+        if machine.engine_python() is None:
             self.draw_state(False, t("Not installed"))
         else:
             self.draw_state(running, t("Running") if running else t("Starts when needed"))

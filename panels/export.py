@@ -6,7 +6,8 @@ from pathlib import Path
 
 from bpy.types import Context
 
-from ..addon import jobs, state
+from ..addon.jobs import queue as jobs
+from ..addon.project import snapshot as state
 from ..addon.text import t
 from .base import StepPanel, columns, project_folder
 

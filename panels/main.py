@@ -7,7 +7,9 @@ from typing import NamedTuple
 import bpy
 from bpy.types import Context, STATUSBAR_HT_header
 
-from ..addon import jobs, preferences, state
+from ..addon import machine
+from ..addon.jobs import queue as jobs
+from ..addon.project import snapshot as state
 from ..addon.text import t
 from .base import FieldworkPanel, draw_job, draw_outcome, draw_wrapped, progress_text, project_folder, text_width
 
@@ -45,7 +47,7 @@ class FIELDWORK_PT_main(FieldworkPanel):
 
     def draw(self, context: Context) -> None:
         layout, settings = self.layout, context.scene.fieldwork
-        if preferences.engine_python() is None:
+        if machine.engine_python() is None:
             box = layout.box()
             draw_wrapped(box, t("The engine is not installed yet."), text_width(context), icon="INFO")
             box.operator("fieldwork.open_preferences", text=t("Install Engine…"), icon="IMPORT")

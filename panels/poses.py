@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from bpy.types import Context, UIList
 
-from ..addon import crop, state
+from ..addon.project import region as crop
+from ..addon.project import snapshot as state
 from ..addon.text import t
 from .base import FieldworkPanel, StepPanel, columns, draw_wrapped, project_folder, text_width
 from .capture import STATUS_ICONS

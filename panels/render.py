@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from bpy.types import Context
 
-from ..addon import jobs, state
+from ..addon.jobs import queue as jobs
+from ..addon.project import snapshot as state
 from ..addon.text import t
 from .base import StepPanel, columns, project_folder
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from bpy.types import Context, UILayout
 
-from ..addon import jobs, pictures, state
+from ..addon.jobs import queue as jobs
+from ..addon.pictures import thumbnails as pictures
+from ..addon.project import snapshot as state
 from ..addon.text import t
 from .base import FieldworkPanel, StepPanel, columns, duration, project_folder
 

@@ -13,9 +13,9 @@ import bpy
 import numpy as np
 from mathutils import Matrix, Vector
 
+from ..photograph.orbit import arc
 from . import masonry, materials, shapes
 from .masonry import Opening, Wall, along_x, around, outline, solid, turned
-from .orbit import arc
 
 CLASSES = {1: "stone", 2: "moss", 3: "black crust", 4: "crack", 5: "loss", 6: "wood", 7: "metal", 8: "ground"}
 COLORS = {  # sRGB, 0 to 255

@@ -13,8 +13,8 @@ import bpy
 import numpy as np
 from mathutils import Matrix, Vector, noise
 
+from ..photograph.orbit import rings
 from . import materials, shapes
-from .orbit import rings
 
 CLASSES = {1: "stone", 2: "gilding", 3: "wood", 4: "textile", 5: "ceramic", 6: "floor", 7: "wall"}
 COLORS = {  # sRGB, 0 to 255

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from ..photograph.shoot import Lens, Shot, has_denoiser, photograph
 from . import facade, museum
-from .photograph import Lens, Shot, has_denoiser, photograph
 from .truth import write_truth
 
 SCENES = {"museum": museum, "facade": facade}

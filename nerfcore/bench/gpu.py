@@ -12,9 +12,9 @@ from xml.etree import ElementTree
 import torch
 
 from ..config import make_config
+from ..kernels.device import use_device
 from ..progress import Reporter
 from ..train.prepare import make_trainer, plan_run
-from ..train.run import use_device
 
 ASKED = {
     "lego_400: PSNR after 60 s (dB)": ("≥", 33.0),

@@ -16,14 +16,16 @@ from typing import Any
 import torch
 
 from ..config import make_config
+from ..data.load import load_scene
 from ..errors import FieldworkError, ProjectError
 from ..evaluate.speed import measure_speed
 from ..evaluate.verb import evaluate
 from ..files import write_json
+from ..kernels.device import use_device
 from ..params import EvaluateParams, Preset, TrainParams
 from ..progress import Reporter
-from ..project import load_project, load_scene
-from ..train.run import CHECKPOINT, load_info, load_trained, run_folder, settled_as, use_device
+from ..project.store import load_project
+from ..render.run import CHECKPOINT, load_info, load_trained, run_folder, settled_as
 from ..train.verb import train
 
 COUNTING_SIDE = 200  # of a frame that only counts samples per ray

@@ -13,9 +13,9 @@ from typing import Any
 import torch
 
 from ..errors import InputError
+from ..kernels.device import use_device
 from ..kernels.runtime import default_threads
 from ..progress import Reporter
-from ..train.run import use_device
 
 
 def describe() -> str:

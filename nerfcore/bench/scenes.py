@@ -5,12 +5,12 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
-from ..capture.simulate import SCENES, simulate
+from ..blender.simulate import SCENES, simulate
 from ..data.importer import import_dataset
 from ..errors import InputError
 from ..params import ImportParams, SimulateParams
 from ..progress import Reporter
-from ..project import is_project, load_project
+from ..project.store import is_project, load_project
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 

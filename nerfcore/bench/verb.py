@@ -14,9 +14,9 @@ import torch
 
 from ..errors import InputError
 from ..files import write_json, write_section, write_text
+from ..kernels.device import use_device
 from ..params import BenchParams
 from ..progress import Reporter
-from ..train.run import use_device
 from . import gpu, machine, tables
 from .jobs import run_all
 from .scenes import available, data_folder, is_labelled, prepare, scene_name

@@ -7,11 +7,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..data.dataset import beside, unique_names
 from ..errors import InputError
 from ..files import require_readable
-from .images import PHOTO_SUFFIXES
-from .soft_labels import find_confidence, find_probabilities
+from ..images.decode import PHOTO_SUFFIXES
+from ..images.names import beside, unique_names
+from ..images.soft_labels import find_confidence, find_probabilities
 from .video import VIDEO_SUFFIXES
 
 # Files that lie beside photos and are none.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import time
@@ -15,18 +14,19 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from ..data.classes import make_classes, read_classes
 from ..errors import InputError, ProjectError
-from ..files import atomic_path, write_json
+from ..files import atomic_path, file_hash, write_json
+from ..images.decode import FLOAT_SUFFIXES, float_exposure, read_photo
+from ..images.labels import Colors, fit_to_photo, read_labels, read_mask
+from ..images.sharpness import sharpness, thumbnail
+from ..images.soft_labels import read_confidence
 from ..params import NewParams
 from ..progress import Reporter, shortened
-from ..project import PROJECT_FILE, ImageRecord, Project, create_folder, load_project, save_project
+from ..project.classes import make_classes, read_classes
+from ..project.schema import ImageRecord, Project
+from ..project.store import PROJECT_FILE, create_folder, load_project, save_project
 from .find import Source, classes_beside, find_sources, list_photos, subfolder
-from .images import FLOAT_SUFFIXES, float_exposure, read_photo
-from .labels import Colors, fit_to_photo, read_labels, read_mask
 from .select import reject_blurred, reject_duplicates
-from .sharpness import sharpness, thumbnail
-from .soft_labels import read_confidence
 from .video import VIDEO_SUFFIXES, extract_frames
 
 CACHE_FILE = "jobs/ingested.json"
@@ -111,12 +111,6 @@ def new(params: NewParams, report: Reporter) -> dict[str, Any]:
     project.record("new", params.model_dump(mode="json"), result | origin)
     save_project(folder, project)
     return result
-
-
-def file_hash(path: Path) -> str:
-    """SHA-256 of a file, in hex."""
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _previous_project(params: NewParams) -> Project | None:

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..project import ImageRecord
-from .sharpness import same_picture
+from ..images.sharpness import same_picture
+from ..project.schema import ImageRecord
 
 # A photo is left out when its sharpness is below this share of the median of its neighbours in the capture.
 BLUR_SHARE = 0.1

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..config import SceneConfig
-from .frames import focus_point
+from ..geometry.frames import focus_point
+from ..geometry.similarity import make_similarity, similarity_scale
 from .scene import Scene, View
-from .similarity import make_similarity, similarity_scale
 
 FEWEST_POINTS = 100  # sparse points that say where things are
 POINTS_MARGIN = 1.3  # surfaces reach beyond their points

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from ..capture.images import FLOAT_SUFFIXES, RAW_SUFFIXES, read_photo
-from ..capture.labels import Colors, read_labels, read_mask
 from ..errors import InputError
 from ..files import atomic_path
+from ..images.decode import FLOAT_SUFFIXES, RAW_SUFFIXES, read_photo
+from ..images.labels import Colors, read_labels, read_mask
 
 PLAIN_SUFFIXES = {".png", ".jpg", ".jpeg", ".webp"}
 PLAIN_MODES = {"RGB", "RGBA", "L", "LA", "P"}

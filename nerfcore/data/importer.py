@@ -9,26 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from ..capture.ingest import file_hash
 from ..errors import InputError, ProjectError
-from ..files import require_readable
+from ..files import file_hash, require_readable
+from ..geometry.cameras import Camera
 from ..params import ImportParams
 from ..progress import Reporter
-from ..project import (
-    PROJECT_FILE,
-    Frame,
-    ImageRecord,
-    PosedImage,
-    Poses,
-    Project,
-    SemanticClass,
-    create_folder,
-    load_project,
-    save_poses,
-    save_project,
-)
-from .cameras import Camera
-from .classes import make_classes
+from ..project.classes import make_classes
+from ..project.schema import Frame, ImageRecord, PosedImage, Poses, Project, SemanticClass
+from ..project.store import PROJECT_FILE, create_folder, load_project, save_poses, save_project
 from .copying import copy_depth, copy_labels, copy_mask, copy_photo
 from .dataset import Dataset, DatasetView
 

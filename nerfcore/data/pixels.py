@@ -3,68 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from pathlib import Path
 
 import numpy as np
-import OpenImageIO as oiio
 import torch
 
-from ..errors import InputError
+from ..geometry.cameras import Camera
+from ..images.working import read_image, read_label, read_photo, resize
 from ..progress import Reporter
 from .box import box_poses
-from .cameras import Camera, pixel_centers, rays
+from .camera_rays import CameraRays
 from .scene import Scene
 
 VOID = 255  # class index of unlabelled pixels
-
-
-def read_image(path: Path) -> np.ndarray:
-    """Pixels (H, W, C) uint8, C 1 to 4, of an image file. Raises InputError naming the file."""
-    buffer = oiio.ImageBuf(str(path))
-    pixels = None if buffer.has_error else buffer.get_pixels(oiio.UINT8)
-    if pixels is None:
-        raise InputError(f"{path} cannot be read: {buffer.geterror() or 'no pixels'}.", "Replace or remove the file.")
-    return pixels
-
-
-def read_photo(path: Path) -> np.ndarray:
-    """A photo as (H, W, 4) uint8 with straight alpha. Raises InputError naming the file."""
-    buffer = oiio.ImageBuf()
-    config = oiio.ImageSpec()
-    config["oiio:UnassociatedAlpha"] = 1
-    buffer.reset(str(path), 0, 0, config)
-    pixels = None if buffer.has_error else buffer.get_pixels(oiio.UINT8)
-    if pixels is None:
-        raise InputError(f"{path} cannot be read: {buffer.geterror() or 'no pixels'}.", "Replace or remove the file.")
-    if pixels.shape[2] <= 2:
-        pixels = np.concatenate([np.repeat(pixels[..., :1], 3, 2), pixels[..., 1:]], 2)
-    if pixels.shape[2] == 3:
-        pixels = np.concatenate([pixels, np.full_like(pixels[..., :1], 255)], 2)
-    return pixels
-
-
-def read_label(path: Path) -> np.ndarray:
-    """A label map as class ids (H, W) int64. Raises InputError naming the file."""
-    buffer = oiio.ImageBuf(str(path))
-    pixels = (
-        None if buffer.has_error else buffer.get_pixels(oiio.UINT16 if buffer.spec().format == "uint16" else oiio.UINT8)
-    )
-    if pixels is None:
-        raise InputError(f"{path} cannot be read: {buffer.geterror() or 'no pixels'}.", "Replace or remove the file.")
-    return pixels[..., 0].astype(np.int64)
-
-
-def resize(pixels: np.ndarray, width: int, height: int, nearest: bool = False) -> np.ndarray:
-    """Resample (H, W, C) uint8 to width × height; box-like filtering unless `nearest`."""
-    if pixels.shape[1] == width and pixels.shape[0] == height:
-        return pixels
-    if nearest:
-        y = ((np.arange(height) + 0.5) * pixels.shape[0] / height).astype(int)
-        x = ((np.arange(width) + 0.5) * pixels.shape[1] / width).astype(int)
-        return pixels[y][:, x]
-    source = oiio.ImageBuf(np.ascontiguousarray(pixels))
-    result = oiio.ImageBufAlgo.resize(source, roi=oiio.ROI(0, width, 0, height, 0, 1, 0, pixels.shape[2]))
-    return np.asarray(result.get_pixels(oiio.UINT8))
 
 
 def training_size(camera: Camera, longest: int) -> tuple[int, int]:
@@ -96,50 +46,6 @@ class Batch:
     def part(self, rays: slice) -> Batch:
         """Some of the rays."""
         return Batch(*(getattr(self, field.name)[rays] for field in fields(self)))
-
-
-class CameraRays:
-    """Viewing directions of pixels for a list of cameras, on the device.
-
-    Pinhole directions are computed; other models are inverted once per distinct camera and kept as a table of
-    directions, one row a pixel (12 bytes).
-    """
-
-    def __init__(self, cameras: list[Camera], camera_to_box: np.ndarray, device: torch.device) -> None:
-        self.device = device
-        self.cameras = cameras
-        pose = torch.from_numpy(camera_to_box.astype(np.float32)).to(device)
-        self.rotation, self.center = pose[:, :3, :3].contiguous(), pose[:, :3, 3].contiguous()
-        self.width = torch.tensor([c.width for c in cameras], device=device)
-        self.lens = torch.tensor([[c.fx, c.fy, c.cx, c.cy] for c in cameras], dtype=torch.float32, device=device)
-        distinct = list(dict.fromkeys(c for c in cameras if c.model != "PINHOLE"))
-        tables, begin, first = [], 0, {}
-        for camera in distinct:
-            directions, valid = rays(camera, pixel_centers(camera.width, camera.height).reshape(-1, 2))
-            directions[~valid] = np.nan
-            first[camera] = begin
-            begin += len(directions)
-            tables.append(torch.from_numpy(directions.astype(np.float32)))
-        self.table = torch.cat(tables).to(device) if tables else None
-        self.table_start = torch.tensor([first.get(c, -1) for c in cameras], device=device)
-
-    def camera_directions(self, image: torch.Tensor, pixel: torch.Tensor) -> torch.Tensor:
-        """Unit directions (N, 3) in camera axes of pixels y · width + x; NaN where the lens cannot be inverted."""
-        x = (pixel % self.width[image]).float() + 0.5
-        y = torch.div(pixel, self.width[image], rounding_mode="floor").float() + 0.5
-        fx, fy, cx, cy = self.lens[image].unbind(1)
-        directions = torch.stack([(x - cx) / fx, (y - cy) / fy, torch.ones_like(x)], 1)
-        directions = directions / directions.norm(dim=1, keepdim=True)
-        if self.table is None:
-            return directions
-        start = self.table_start[image]
-        known = self.table[(start.clamp(min=0) + pixel).clamp(max=len(self.table) - 1)]
-        return torch.where((start >= 0)[:, None], known, directions)
-
-    def __call__(self, image: torch.Tensor, pixel: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Origins and unit directions (N, 3), normalised frame."""
-        directions = torch.einsum("nij,nj->ni", self.rotation[image], self.camera_directions(image, pixel))
-        return self.center[image].contiguous(), directions.contiguous()
 
 
 class PixelStore:

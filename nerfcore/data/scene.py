@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from .cameras import Camera
-from .similarity import similarity_scale, transform_points
+from ..geometry.cameras import Camera
+from ..geometry.points import Points
+from ..geometry.similarity import transform_points, transform_pose
 
 
 @dataclass(frozen=True)
@@ -23,22 +24,6 @@ class View:
     mask: Path | None = None
     depth: Path | None = None
     confidence: Path | None = None
-
-
-@dataclass(frozen=True)
-class Points:
-    """A sparse point cloud: positions (N, 3), colours (N, 3) uint8 sRGB, reprojection error (N,) pixels."""
-
-    xyz: np.ndarray
-    rgb: np.ndarray
-    error: np.ndarray
-
-    @staticmethod
-    def empty() -> Points:
-        return Points(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0))
-
-    def __len__(self) -> int:
-        return len(self.xyz)
 
 
 @dataclass(frozen=True)
@@ -83,10 +68,3 @@ class Scene:
             moved = transform_points(similarity, corners)
             bounds = np.stack([moved.min(0), moved.max(0)])
         return Scene(views, self.train, self.test, self.classes, self.ignore_id, points, bounds, self.mask_mode, frame)
-
-
-def transform_pose(similarity: np.ndarray, camera_to_world: np.ndarray) -> np.ndarray:
-    """Move a pose (4, 4) by a similarity (4, 4); its rotation stays a rotation, only its centre is scaled."""
-    moved = similarity @ camera_to_world
-    moved[:3, :3] /= similarity_scale(similarity)
-    return moved

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import DiskError
-from ..lock import lockable, project_of
 from ..params import Params
 from ..progress import Reporter
+from ..project.lock import lockable, project_of
 from . import status as st
 from .protocol import encode, notification, plain
 

@@ -28,7 +28,7 @@ import psutil
 
 from .. import __version__
 from ..errors import Cancelled, FieldworkError
-from ..lock import project_lock
+from ..project.lock import project_lock
 from ..verbs import VERBS, run_verb
 from . import protocol as rpc
 from .jobs import Job

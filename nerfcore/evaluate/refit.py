@@ -11,9 +11,10 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from ..data.cameras import Camera
-from ..data.pixels import Batch, CameraRays
-from ..train.model import Model
+from ..data.camera_rays import CameraRays
+from ..data.pixels import Batch
+from ..geometry.cameras import Camera
+from ..render.model import Model
 from ..train.pose_refinement import PoseRefinement, level_weights
 
 STEPS = 120

@@ -12,8 +12,8 @@ import jinja2
 import matplotlib
 
 from ..files import write_text
-from ..project import load_project
-from ..train.run import run_folder
+from ..project.store import load_project
+from ..render.run import run_folder
 
 TEMPLATE = Path(__file__).parent / "report.html.j2"
 

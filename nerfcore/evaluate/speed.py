@@ -10,17 +10,17 @@ import psutil
 import torch
 
 from ..data.box import box_poses
-from ..data.cameras import Camera
-from ..data.pixels import CameraRays
+from ..data.camera_rays import CameraRays
 from ..data.scene import Scene
 from ..field.encoding import spherical_harmonics
+from ..geometry.cameras import Camera
 from ..kernels.composite import render_weights
 from ..kernels.march import sample
 from ..progress import Reporter
 from ..render.fused import FusedRenderer, ray_renderer
 from ..render.image import render_view
-from ..train.model import Model
-from ..train.run import Trained
+from ..render.model import Model
+from ..render.run import Trained
 
 SPEED_KEYS = ("fps", "fps_size", "spr", "ms_sampling", "ms_network", "fused")
 

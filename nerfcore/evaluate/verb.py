@@ -10,17 +10,20 @@ from typing import Any
 import numpy as np
 
 from ..data.box import box_poses
-from ..data.pixels import read_image, read_label, read_photo, resize, training_size
+from ..data.load import load_scene
+from ..data.pixels import training_size
 from ..data.scene import Scene, View
 from ..errors import InputError
 from ..files import atomic_path, write_json
+from ..images.encode import to_bytes, write_picture
+from ..images.working import read_image, read_label, read_photo, resize
 from ..kernels.runtime import compile_seconds
 from ..params import EvaluateParams
 from ..progress import Reporter
-from ..project import load_project, load_scene
-from ..render.image import Frame, background_of, render_view, to_bytes, write_picture
+from ..project.store import load_project
+from ..render.image import Frame, background_of, render_view
 from ..render.pictures import colorize_depth, colorize_labels, side_by_side
-from ..train.run import Trained, load_trained, refined_poses, run_folder
+from ..render.run import Trained, load_trained, refined_poses, run_folder
 from .metrics import Confusion, psnr, ssim
 from .refit import refit_camera
 from .speed import SPEED_KEYS, measure_speed, peak_memory

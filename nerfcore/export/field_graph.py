@@ -18,15 +18,15 @@ from onnx import TensorProto, helper, numpy_helper
 
 from .. import __version__
 from ..data.box import Box
-from ..data.similarity import similarity_scale
 from ..field.blend import RESOLUTION, BlendWeight
 from ..field.grid import VertexGrid
 from ..field.hybrid import HybridField
 from ..field.mlp import MLP
 from ..files import atomic_path
+from ..geometry.similarity import similarity_scale
 from ..kernels.encode_torch import PRIMES
-from ..project import Project
-from ..train.run import Trained
+from ..project.schema import Project
+from ..render.run import Trained
 
 OPSET = 18  # the first with BitwiseXor
 

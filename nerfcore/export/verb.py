@@ -9,15 +9,16 @@ from zipfile import BadZipFile
 import numpy as np
 from PIL import Image
 
-from ..blend_package import write_package
-from ..blender import write_in_blender
+from ..blender.package import write_package
+from ..blender.process import write_in_blender
+from ..data.load import load_scene
 from ..errors import ProjectError, SettingError
 from ..mesh.extract import Surface
 from ..mesh.files import Texture, texture_of, write_surface
 from ..params import ExportParams
 from ..progress import Reporter
-from ..project import load_project, load_scene, record_step
-from ..train.run import load_trained
+from ..project.store import load_project, record_step
+from ..render.run import load_trained
 
 SUFFIXES = {
     "glb": (".glb",),

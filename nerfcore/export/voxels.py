@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ..data.similarity import make_similarity, similarity_scale
 from ..files import atomic_path
+from ..geometry.similarity import make_similarity, similarity_scale
 from ..mesh.extract import density_volume, shade, surface_level
 from ..progress import Reporter
-from ..project import Project
-from ..train.run import Trained
+from ..project.schema import Project
+from ..render.run import Trained
 
 
 def write_voxels(path: Path, trained: Trained, project: Project, resolution: int, report: Reporter) -> None:

@@ -6,18 +6,11 @@ import math
 
 import torch
 
+from ..geometry.contraction import grid_position
 from .walk import FARTHEST, MAX_BINS, PDF_DEFAULT, PDF_UNIFORM, MarchSettings
 
 STOP = 1e-4
 MACRO = 4
-
-
-def grid_position(p: torch.Tensor, contracted: bool) -> torch.Tensor:
-    """Normalised positions (..., 3) → grid coordinates in [0, 1]³."""
-    if not contracted:
-        return p * 0.5 + 0.5
-    r = p.abs().amax(-1, keepdim=True)
-    return torch.where(r > 1, p * ((2 - 1 / r.clamp(min=1)) / r.clamp(min=1)), p) * 0.25 + 0.5
 
 
 def closed_around(opened: torch.Tensor, block: torch.Tensor) -> int:

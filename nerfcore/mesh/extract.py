@@ -11,13 +11,13 @@ import trimesh
 from scipy import ndimage
 from skimage.measure import marching_cubes
 
-from ..data.cameras import Camera, project
 from ..data.pixels import training_size
 from ..errors import TrainingError
 from ..field.encoding import spherical_harmonics
+from ..geometry.cameras import Camera, project
 from ..progress import Reporter
 from ..render.image import render_view
-from ..train.model import Model
+from ..render.model import Model
 
 CHUNK = 1 << 16
 VISIBILITY_PIXELS = 160  # longest side of the depth images that decide what is visible

@@ -9,15 +9,16 @@ import numpy as np
 import trimesh
 
 from ..data.box import box_poses
-from ..data.cameras import Camera
+from ..data.load import load_scene
 from ..data.scene import Scene
-from ..data.similarity import similarity_scale, transform_points
 from ..files import atomic_path
+from ..geometry.cameras import Camera
+from ..geometry.similarity import similarity_scale, transform_points
+from ..images.encode import write_picture
 from ..params import MeshParams
 from ..progress import Reporter
-from ..project import load_project, load_scene, record_step
-from ..render.image import write_picture
-from ..train.run import Trained, load_trained
+from ..project.store import load_project, record_step
+from ..render.run import Trained, load_trained
 from .extract import Surface, extract, shade
 from .files import Texture, check_format, write_surface
 from .texture import bake, unwrap

@@ -7,13 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from ..data.frames import on_ground, rotation_to_z
-from ..data.scene import Points, transform_pose
-from ..data.similarity import similarity_scale, transform_points
 from ..errors import PosesError, SettingError
+from ..geometry.frames import on_ground, rotation_to_z
+from ..geometry.points import Points
+from ..geometry.similarity import similarity_scale, transform_points, transform_pose
 from ..params import AlignParams
 from ..progress import Reporter
-from ..project import Poses, Project, load_points, load_poses, load_project, save_project, world_from_sfm
+from ..project.schema import Poses, Project
+from ..project.store import load_points, load_poses, load_project, save_project, world_from_sfm
 from .gps import fit_gps
 
 AXES = {f"{sign}{axis}": value * np.eye(3)[i] for i, axis in enumerate("xyz") for sign, value in (("", 1), ("-", -1))}

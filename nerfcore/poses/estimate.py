@@ -10,25 +10,15 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from ..data.cameras import Camera
-from ..data.frames import upright
-from ..data.scene import Points
 from ..errors import PosesError
 from ..files import atomic_path, disk_errors, write_json
+from ..geometry.cameras import Camera
+from ..geometry.frames import upright
+from ..geometry.points import Points
 from ..params import PosesParams
 from ..progress import Reporter, shortened
-from ..project import (
-    POSES_FILE,
-    Frame,
-    ImageRecord,
-    PosedImage,
-    Poses,
-    Project,
-    load_poses,
-    load_project,
-    save_poses,
-    save_project,
-)
+from ..project.schema import Frame, ImageRecord, PosedImage, Poses, Project
+from ..project.store import POSES_FILE, load_poses, load_project, save_poses, save_project
 from .align import gps_frame
 from .process import run_worker
 

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from ..data.colmap_cameras import camera_from_colmap
 from ..errors import PosesError
 from ..files import write_json
+from ..geometry.colmap_cameras import camera_from_colmap
 from . import chain, features, mapping, second_look
 from .adjust import adjust, has_long_lens, has_odd_lens
 from .presets import ENOUGH, EXHAUSTIVE_AT_MOST, EXHAUSTIVE_UP_TO, LADDERS, Level

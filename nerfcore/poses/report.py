@@ -8,10 +8,11 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from ..data.scene import Points, transform_pose
-from ..data.similarity import transform_points
 from ..files import atomic_path
-from ..project import ImageRecord, Poses, Project, world_from_sfm
+from ..geometry.points import Points
+from ..geometry.similarity import transform_points, transform_pose
+from ..project.schema import ImageRecord, Poses, Project
+from ..project.store import world_from_sfm
 
 MAX_POINTS = 20000
 

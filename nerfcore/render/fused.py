@@ -13,7 +13,7 @@ from ..kernels.fused import MOST_CLASSES, CoarseRays, FusedField, FusedRays, coa
 from ..kernels.fused_kernel import FusedShape
 from ..kernels.fused_network import padded
 from ..kernels.runtime import small_tensor
-from ..train.model import Model, Rendered
+from .model import Model, Rendered
 
 log = logging.getLogger("fieldwork")
 LEAST_RAYS = 1 << 17  # of a picture that "auto" renders fused: previews are not worth a minute of compilation

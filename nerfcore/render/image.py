@@ -5,19 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 
 import numpy as np
-import OpenImageIO as oiio
 import torch
 
-from ..data.cameras import Camera
-from ..data.pixels import CameraRays
-from ..errors import DiskError
+from ..data.camera_rays import CameraRays
+from ..geometry.cameras import Camera
 from ..kernels.runtime import run_parallel
-from ..train.model import Model
-from ..train.run import RunInfo
 from .fused import ray_renderer
+from .model import Model
+from .run import RunInfo
 
 CPU_RAYS = 8192
 
@@ -106,22 +103,3 @@ def render_view(
     images = [torch.cat(column).cpu() for column in zip(*parts)]
     color, opacity, depth, position, *classes = (i.reshape(*shape, *i.shape[1:]).numpy() for i in images)
     return Frame(color.clip(0, 1), opacity, depth, classes[0] if classes else None, position)
-
-
-def to_bytes(color: np.ndarray) -> np.ndarray:
-    """Values in [0, 1] → uint8, rounded."""
-    return (color.clip(0, 1) * 255 + 0.5).astype(np.uint8)
-
-
-def write_picture(path: Path, color: np.ndarray) -> None:
-    """Write (H, W, 3 or 1) values in [0, 1], or uint8/uint16 as they are, in the format of the suffix.
-
-    Raises:
-        DiskError: the file cannot be written.
-    """
-    pixels = to_bytes(color) if color.dtype.kind == "f" and path.suffix.lower() != ".exr" else color
-    buffer = oiio.ImageBuf(np.ascontiguousarray(pixels if pixels.ndim == 3 else pixels[..., None]))
-    if not buffer.write(str(path)):
-        raise DiskError(
-            f"{path} cannot be written: {buffer.geterror()}.", "Check the disk and the folder's permissions."
-        )

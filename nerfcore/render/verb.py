@@ -11,19 +11,21 @@ import numpy as np
 import OpenImageIO as oiio
 
 from ..data.box import Box, box_poses
-from ..data.cameras import Camera, flip_camera_axes
-from ..data.frames import focus_point
+from ..data.load import load_scene
 from ..data.pixels import training_size
 from ..data.scene import Scene, View
-from ..data.similarity import similarity_scale
 from ..errors import DiskError, InputError
 from ..files import atomic_path, disk_errors
+from ..geometry.cameras import Camera, flip_camera_axes
+from ..geometry.frames import focus_point
+from ..geometry.similarity import similarity_scale
+from ..images.encode import write_picture
 from ..params import RenderParams
 from ..progress import Reporter
-from ..project import load_project, load_scene
-from ..train.run import load_trained
-from .image import Frame, background_of, render_view, write_picture
+from ..project.store import load_project
+from .image import Frame, background_of, render_view
 from .pictures import colorize_depth, colorize_labels
+from .run import load_trained
 
 ORBIT_PIXELS = 800  # longest side of orbit frames unless a size is asked for
 OPEN_ANGLE = np.pi / 2  # around the subject without a photo: from there on an orbit is an arc

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from scipy.spatial import KDTree
 
-from ..data.cameras import Camera
+from ..geometry.cameras import Camera
 from .visibility import FEWEST_POINTS, cells_at, depth_ranges, grid_centers, in_front
 
 CLEAR = 0.125  # of their distance to what they surround, that nothing comes nearer to the way between cameras

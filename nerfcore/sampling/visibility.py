@@ -6,8 +6,8 @@ import math
 
 import torch
 
-from ..data.cameras import Camera
-from ..kernels.march_torch import grid_position
+from ..geometry.cameras import Camera
+from ..geometry.contraction import grid_position, uncontract
 
 FEWEST_POINTS = 20  # in a photo, from which its depths are believed
 WIDER = 2.0  # view that all of what is photographed from around it fits in, relative to the photos'
@@ -19,14 +19,6 @@ def grid_centers(resolution: int, contracted: bool, device: torch.device) -> tor
     z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
     u = torch.stack([x, y, z], -1).reshape(-1, 3)
     return uncontract(u) if contracted else u * 2 - 1
-
-
-def uncontract(u: torch.Tensor) -> torch.Tensor:
-    """Inverse of the contraction: grid coordinates (N, 3) in (0, 1)³ → normalised positions."""
-    q = (u - 0.5) * 4
-    r = q.abs().max(1, keepdim=True).values
-    # ‖q‖ = 2 − 1/‖p‖ outside the cube
-    return torch.where(r > 1, q / r.clamp(min=1e-9) / (2 - r).clamp(min=1e-4), q)
 
 
 def depth_ranges(

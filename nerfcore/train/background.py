@@ -7,8 +7,8 @@ from typing import Literal
 import numpy as np
 
 from ..data.box import looks_inward
-from ..data.pixels import read_photo
 from ..data.scene import Scene
+from ..images.working import read_photo
 
 Background = Literal["random", "white", "black"]
 LEVEL: dict[str, float] = {"white": 1.0, "black": 0.0}

@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 from safetensors.torch import save_file
 
-from ..errors import ProjectError
 from ..files import atomic_path
 from .trainer import Trainer
 
@@ -54,19 +53,6 @@ def _disk_error(error: Exception) -> OSError:
 
     found = re.search(r"os error (\d+)", str(error))
     return OSError(int(found[1]) if found else errno.EIO, str(error))
-
-
-def read_checkpoint(path: Path, device: torch.device) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
-    """Tensors and state of a checkpoint. Raises ProjectError when it is missing, truncated or foreign."""
-    if not path.is_file():
-        raise ProjectError(f"{path.parent} has no checkpoint.", "Run `fieldwork train` first.")
-    try:
-        with safe_open(path, "pt", device=str(device)) as file:
-            state = json.loads((file.metadata() or {})["fieldwork"])
-            names = list(file.keys())
-            return {name: file.get_tensor(name) for name in names}, state
-    except (SafetensorError, KeyError, json.JSONDecodeError, OSError) as error:
-        raise ProjectError(f"{path} is damaged: {error}.", "Train the run again.") from error
 
 
 def restore(trainer: Trainer, tensors: dict[str, torch.Tensor], state: dict[str, Any]) -> None:

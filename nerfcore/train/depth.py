@@ -7,17 +7,15 @@ each point reprojects. Sensor depth, where a capture has it, is the same with ma
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
-import OpenImageIO as oiio
 import torch
 
-from ..data.cameras import Camera, project, rays
 from ..data.pixels import PixelStore
 from ..data.scene import Scene, View
-from ..data.similarity import similarity_scale, transform_points
-from ..errors import InputError
+from ..geometry.cameras import Camera, project, rays
+from ..geometry.similarity import similarity_scale, transform_points
+from ..images.working import read_depth
 
 RAYS = 512  # a step
 MAP_PIXELS = 20000  # of one depth map
@@ -140,15 +138,6 @@ def _of_map(view: View, camera: Camera, scale: float, free: np.ndarray) -> Found
     valid &= (z > 0) & np.isfinite(z) & free[y, x] & (direction[:, 2] > 1e-3)
     direction = direction[valid]
     return direction, z[valid] / direction[:, 2], np.ones(len(direction))
-
-
-def read_depth(path: Path) -> np.ndarray:
-    """A depth map (H, W) float32 of a project. Raises InputError naming the file."""
-    buffer = oiio.ImageBuf(str(path))
-    pixels = None if buffer.has_error else buffer.get_pixels(oiio.FLOAT)
-    if pixels is None:
-        raise InputError(f"{path} cannot be read: {buffer.geterror() or 'no pixels'}.", "Replace or remove the file.")
-    return pixels[..., 0]
 
 
 def depth_scale(world_from_sfm: np.ndarray, box_from_world: np.ndarray) -> float:

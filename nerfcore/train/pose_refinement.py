@@ -17,10 +17,11 @@ import torch
 from torch import nn
 
 from ..config import TrainConfig
-from ..data.pixels import Batch, CameraRays
-from ..data.similarity import similarity_scale
+from ..data.camera_rays import CameraRays
+from ..data.pixels import Batch
 from ..files import write_json
-from ..project import PosedImage, Poses
+from ..geometry.similarity import similarity_scale
+from ..project.schema import PosedImage, Poses
 
 BETAS = (0.9, 0.99)
 LAST_RATE = 0.01  # of the first one, at the end of training

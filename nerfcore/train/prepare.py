@@ -9,19 +9,21 @@ import torch
 
 from ..config import MOST_VERTICES, RunConfig
 from ..data.box import Box, box_poses, choose_box, looks_inward
-from ..data.frames import focus_point
-from ..data.pixels import PixelStore, read_label, read_photo
+from ..data.load import load_scene
+from ..data.pixels import PixelStore
 from ..data.scene import Scene
-from ..data.similarity import transform_points
 from ..errors import TrainingError
 from ..field.blend import RESOLUTION
+from ..geometry.frames import focus_point
+from ..geometry.similarity import transform_points
+from ..images.working import read_label, read_photo
 from ..progress import Reporter
-from ..project import load_project, load_scene, load_visibility, world_from_sfm
+from ..project.store import load_project, load_visibility, world_from_sfm
+from ..render.run import CPU_IMAGE_SIZE, GPU_IMAGE_SIZE, RunInfo, new_model
 from ..sampling.path import cells_before_path
 from ..sampling.visibility import depth_ranges, view_counts
 from .background import LEVEL, choose_background
 from .depth import depth_scale, find_depths
-from .run import CPU_IMAGE_SIZE, GPU_IMAGE_SIZE, RunInfo, new_model
 from .trainer import Trainer
 
 VIEWS_ENOUGH = 8  # cells seen by this many cameras count fully as evidence

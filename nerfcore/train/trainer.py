@@ -13,6 +13,7 @@ from ..config import RunConfig
 from ..data.pixels import Batch, PixelStore
 from ..field.grid import Part
 from ..kernels.runtime import run_parallel, worker_count
+from ..render.model import Model, Rendered
 from ..sampling.cache import CoarseCache
 from ..sampling.outlines import Outlines
 from .depth import DepthRays, depth_loss
@@ -27,7 +28,6 @@ from .losses import (
     semantic_loss,
     sparsity_loss,
 )
-from .model import Model, Rendered
 from .pose_refinement import PoseRefinement, level_weights
 from .schedule import bias_correction, rate_factor, sample_budget
 from .voxel_init import PixelFeatures, initialise

@@ -12,20 +12,32 @@ import numpy as np
 
 from ..config import make_config
 from ..data.box import box_poses
+from ..data.load import load_scene
 from ..data.pixels import training_size
 from ..data.scene import Scene
 from ..errors import Cancelled, TrainingError
 from ..files import atomic_path, disk_errors, write_json
+from ..images.encode import write_picture
+from ..kernels.device import use_device
 from ..kernels.runtime import compile_seconds
 from ..params import TrainParams
 from ..progress import Reporter
-from ..project import load_project, load_scene, record_step
-from ..render.image import background_of, render_view, write_picture
-from .checkpoint import read_checkpoint, restore, save_checkpoint
-from .model import Model
+from ..project.store import load_project, record_step
+from ..render.image import background_of, render_view
+from ..render.model import Model
+from ..render.run import (
+    CHECKPOINT,
+    PIXEL_FEATURES,
+    REFINED_POSES,
+    RunInfo,
+    load_info,
+    read_checkpoint,
+    run_folder,
+    save_info,
+)
+from .checkpoint import restore, save_checkpoint
 from .pose_refinement import write_poses
 from .prepare import make_trainer, plan_run
-from .run import CHECKPOINT, PIXEL_FEATURES, REFINED_POSES, RunInfo, load_info, run_folder, save_info, use_device
 from .trainer import Trainer
 from .voxel_init import save_features
 

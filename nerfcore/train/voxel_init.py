@@ -20,15 +20,16 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import nn
 
-from ..data.cameras import project
-from ..data.pixels import CameraRays, PixelStore, training_size
+from ..data.camera_rays import CameraRays
+from ..data.pixels import PixelStore, training_size
 from ..errors import InputError
 from ..field.grid import VertexGrid
 from ..files import atomic_path
+from ..geometry.cameras import project
+from ..geometry.contraction import uncontract
 from ..kernels.encode import FEATURES
 from ..kernels.runtime import run_parallel
-from ..sampling.visibility import uncontract
-from .model import Model
+from ..render.model import Model
 
 SIDE = 96  # longest side of the reduced photos
 VIEWS = 48  # photos that are looked at, evenly spread

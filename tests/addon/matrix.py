@@ -19,10 +19,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from fieldwork.nerfcore.blend_package import write_package
-from fieldwork.nerfcore.capture.simulate import simulate
-from fieldwork.nerfcore.data.cameras import Camera
-from fieldwork.nerfcore.data.scene import ClassInfo, Points, Scene, View
+from fieldwork.nerfcore.blender.package import write_package
+from fieldwork.nerfcore.blender.simulate import simulate
+from fieldwork.nerfcore.data.scene import ClassInfo, Scene, View
+from fieldwork.nerfcore.geometry.cameras import Camera
+from fieldwork.nerfcore.geometry.points import Points
 from fieldwork.nerfcore.params import SimulateParams
 from fieldwork.nerfcore.progress import Reporter
 from PIL import Image

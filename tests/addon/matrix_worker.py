@@ -66,15 +66,15 @@ def run(request):
     assert facts["operators"] > 10, "operators are missing"
 
     out = Path(request["out"])
-    package = importlib.import_module(MODULE + ".addon.package").read_package(request["package"])
-    imported = importlib.import_module(MODULE + ".addon.scene_import").import_package(bpy.context.scene, package)
+    package = importlib.import_module(MODULE + ".addon.scene.package").read_package(request["package"])
+    imported = importlib.import_module(MODULE + ".addon.scene.build").import_package(bpy.context.scene, package)
     assert len(imported.cameras) == 2
     assert len(imported.meshes[0].data.polygons) == 12
     bpy.ops.wm.save_as_mainfile(filepath=str(out / "scene.blend"), copy=True)
     assert (out / "scene.blend").stat().st_size > 10_000
 
     scenes = importlib.import_module(MODULE + ".addon.simulate.task").SCENES
-    photograph = importlib.import_module(MODULE + ".addon.simulate.photograph")
+    photograph = importlib.import_module(MODULE + ".addon.photograph.shoot")
     begin = time.perf_counter()
     for name, module in scenes.items():
         shot = photograph.Shot(name, module.poses(4, 0)[0], photograph.Lens(96, 64, 75.0))

@@ -7,24 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fieldwork.nerfcore.blend import blend
-from fieldwork.nerfcore.data.cameras import Camera, pixel_centers, rays
-from fieldwork.nerfcore.data.scene import Points, transform_pose
-from fieldwork.nerfcore.data.similarity import make_similarity, transform_points
+from fieldwork.nerfcore.blender.blend import blend
 from fieldwork.nerfcore.errors import ProjectError, SettingError
+from fieldwork.nerfcore.geometry.cameras import Camera, pixel_centers, rays
+from fieldwork.nerfcore.geometry.points import Points
+from fieldwork.nerfcore.geometry.similarity import make_similarity, transform_points, transform_pose
 from fieldwork.nerfcore.params import BlendParams
 from fieldwork.nerfcore.progress import Reporter
-from fieldwork.nerfcore.project import (
-    Frame,
-    ImageRecord,
-    PosedImage,
-    Poses,
-    Project,
-    SemanticClass,
-    load_project,
-    save_poses,
-    save_project,
-)
+from fieldwork.nerfcore.project.schema import Frame, ImageRecord, PosedImage, Poses, Project, SemanticClass
+from fieldwork.nerfcore.project.store import load_project, save_poses, save_project
 from PIL import Image
 from skimage.registration import phase_cross_correlation
 

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 import pytest
-from fieldwork.nerfcore.capture.dataset import dataset
-from fieldwork.nerfcore.data.cameras import Camera, flip_camera_axes, pixel_centers, rays
+from fieldwork.nerfcore.blender.dataset import dataset
 from fieldwork.nerfcore.data.importer import import_dataset
+from fieldwork.nerfcore.data.load import load_scene
 from fieldwork.nerfcore.errors import BlenderError, InputError
+from fieldwork.nerfcore.geometry.cameras import Camera, flip_camera_axes, pixel_centers, rays
 from fieldwork.nerfcore.params import DatasetParams, ImportParams
 from fieldwork.nerfcore.progress import Reporter
-from fieldwork.nerfcore.project import load_scene
 from PIL import Image
 
 # A floor of 4 m at z = 0 and a cube of 1 m on it; a camera with a vertical sensor fit and a shift that moves for ten
@@ -203,8 +203,8 @@ def test_class_numbers_above_255_reach_the_project(blend, tmp_path, bpy_script):
 OPERATOR = """
 import fieldwork
 fieldwork.register()
-from fieldwork.addon import preferences
-preferences.engine_python = lambda: Path(sys.executable)
+from fieldwork.addon import machine
+machine.engine_python = lambda: Path(sys.executable)
 bpy.ops.wm.open_mainfile(filepath=blend)
 bpy.data.objects["cube"].location.x = 1.5  # not saved: the scene is photographed as it is now
 result = bpy.ops.fieldwork.dataset(out=out, views=3, samples=1, labels="object", path_kind="hemisphere")

@@ -11,9 +11,9 @@ import zipfile
 from pathlib import Path
 
 import pytest
-from fieldwork.addon import engine_install as module
-from fieldwork.addon import engine_place as place
-from fieldwork.addon.engine_install import InstallCancelled, InstallError, Options, install
+from fieldwork.addon.engine import install as module
+from fieldwork.addon.engine import place as place
+from fieldwork.addon.engine.install import InstallCancelled, InstallError, Options, install
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from fieldwork import nerfcore
-from fieldwork.nerfcore.capture.simulate import simulate
+from fieldwork.nerfcore.blender.simulate import simulate
 from fieldwork.nerfcore.params import SimulateParams
 from fieldwork.nerfcore.progress import Reporter
 

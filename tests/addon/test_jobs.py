@@ -11,10 +11,11 @@ import pytest
 
 bpy = pytest.importorskip("bpy")
 
-from fieldwork.addon import jobs, preferences  # noqa: E402
+from fieldwork.addon import machine  # noqa: E402
+from fieldwork.addon.engine.link import Link  # noqa: E402
 from fieldwork.addon.errors import EngineError  # noqa: E402
-from fieldwork.addon.job import CURVE_POINTS  # noqa: E402
-from fieldwork.addon.link import Link  # noqa: E402
+from fieldwork.addon.jobs import queue as jobs  # noqa: E402
+from fieldwork.addon.jobs.job import CURVE_POINTS  # noqa: E402
 from fieldwork.nerfcore.engine import status as st  # noqa: E402
 
 ENGINE = [sys.executable, str(Path(__file__).resolve().parents[1] / "counting_engine.py")]
@@ -24,12 +25,12 @@ ENGINE = [sys.executable, str(Path(__file__).resolve().parents[1] / "counting_en
 def settings(monkeypatch, tmp_path):
     """Preferences of the test, and an engine that counts."""
 
-    class Settings(preferences._Defaults):
+    class Settings(machine._Defaults):
         pass
 
-    monkeypatch.setattr(preferences, "preferences", lambda: Settings)
-    monkeypatch.setattr(preferences, "user_folder", lambda *parts: Path(tmp_path, "user", *parts))
-    monkeypatch.setattr(preferences, "engine_python", lambda: Path(sys.executable))
+    monkeypatch.setattr(machine, "machine", lambda: Settings)
+    monkeypatch.setattr(machine, "user_folder", lambda *parts: Path(tmp_path, "user", *parts))
+    monkeypatch.setattr(machine, "engine_python", lambda: Path(sys.executable))
     monkeypatch.setattr(jobs, "open_link", lambda python, log: Link(python, log, ENGINE))
     return Settings
 
@@ -118,7 +119,7 @@ def test_killed_engine_fails_the_job_and_the_next_one_gets_a_new_engine(queue, p
 
 
 def test_missing_engine_is_told(queue, project, monkeypatch):
-    monkeypatch.setattr(preferences, "engine_python", lambda: None)
+    monkeypatch.setattr(machine, "engine_python", lambda: None)
     job = count(queue, project)
     queue.submit(job)
     assert job.state == "failed"

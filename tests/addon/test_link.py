@@ -9,9 +9,9 @@ import time
 from pathlib import Path
 
 import pytest
-from fieldwork.addon import link as module
+from fieldwork.addon.engine import link as module
+from fieldwork.addon.engine.link import Link, engine_environment
 from fieldwork.addon.errors import EngineError
-from fieldwork.addon.link import Link, engine_environment
 from fieldwork.nerfcore.engine import status as st
 
 ROOT = Path(__file__).resolve().parents[2]

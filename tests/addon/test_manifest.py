@@ -72,7 +72,7 @@ def test_the_zip_is_small_and_holds_nothing_that_does_not_run(archive):
 def test_the_zipped_sources_stand_alone(archive, tmp_path):
     """The engine's Python runs `nerfcore` from the installed extension, whatever its folder is called."""
     zipfile.ZipFile(archive).extractall(tmp_path / "ext")
-    code = "import nerfcore.verbs as v, nerfcore.blender as b; print(len(v.VERBS), b.CHILD)"
+    code = "import nerfcore.verbs as v, nerfcore.blender.process as b; print(len(v.VERBS), b.CHILD)"
     done = subprocess.run(
         [sys.executable, "-s", "-c", code],
         cwd=tmp_path,
@@ -84,7 +84,7 @@ def test_the_zipped_sources_stand_alone(archive, tmp_path):
     assert done.returncode == 0, done.stderr
     count, child = done.stdout.split()
     assert int(count) >= 12
-    assert Path(child) == tmp_path / "ext/addon/child.py"
+    assert Path(child) == tmp_path / "ext/addon/child/main.py"
     assert Path(child).is_file()
 
 

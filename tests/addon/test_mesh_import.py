@@ -7,7 +7,7 @@ import os
 
 import numpy as np
 import pytest
-from fieldwork.addon.mesh_data import edges_of, mesh_data
+from fieldwork.addon.scene.mesh_data import edges_of, mesh_data
 
 LIMIT = 0.1  # seconds that nothing may hold the window up for
 

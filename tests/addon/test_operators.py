@@ -57,8 +57,8 @@ def test_missing_engine_is_told(bpy_script, tmp_path):
     message = bpy_script(
         SETUP
         + """
-from fieldwork.addon import preferences
-preferences.engine_python = lambda: None
+from fieldwork.addon import machine
+machine.engine_python = lambda: None
 answer(attempt(lambda: bpy.ops.fieldwork.doctor()))
 """
     )
@@ -70,13 +70,13 @@ def test_grey_buttons_say_why(bpy_script, tmp_path):
         SETUP
         + """
 import sys
-from fieldwork.addon import preferences
+from fieldwork.addon import machine
 operators = {
     name: getattr(bpy.types, f"FIELDWORK_OT_{name}")
     for name in ("new", "poses", "align", "train", "render", "mesh", "blend", "import_scene", "evaluate")
 }
 reasons = {name: cls.reason(bpy.context) for name, cls in operators.items()}
-preferences.engine_python = lambda: None
+machine.engine_python = lambda: None
 settings.project = project
 reasons["no engine"] = operators["poses"].reason(bpy.context)
 need = bpy.types.FIELDWORK_OT_export.need_format

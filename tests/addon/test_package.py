@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 import pytest
-from fieldwork.addon.package import SENSOR_MM, PackageError, blender_camera, read_package
-from fieldwork.addon.simulate import orbit
-from fieldwork.addon.simulate.pixels import read_exr, write_index_png
-from fieldwork.nerfcore.blend_package import undistort, undistortion_grid, write_package
-from fieldwork.nerfcore.data.cameras import Camera, flip_camera_axes, pixel_centers, project, rays
-from fieldwork.nerfcore.data.scene import ClassInfo, Points, Scene, View
+from fieldwork.addon.photograph import orbit
+from fieldwork.addon.photograph.pixels import read_exr, write_index_png
+from fieldwork.addon.scene.package import SENSOR_MM, PackageError, blender_camera, read_package
+from fieldwork.nerfcore.blender.package import undistort, undistortion_grid, write_package
+from fieldwork.nerfcore.data.scene import ClassInfo, Scene, View
+from fieldwork.nerfcore.geometry.cameras import Camera, flip_camera_axes, pixel_centers, project, rays
+from fieldwork.nerfcore.geometry.points import Points
 from fieldwork.nerfcore.progress import Reporter
 from hypothesis import given, settings
 from hypothesis import strategies as st

@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("bpy")
 
-from fieldwork.addon.job import Job
+from fieldwork.addon.jobs.job import Job
 from fieldwork.panels.base import duration, progress_text, wrap
 
 
@@ -96,9 +96,10 @@ answer(seen)
 def test_quality_and_time_come_from_the_project(tmp_path, monkeypatch):
     from types import SimpleNamespace
 
-    from fieldwork.addon import preferences, state
+    from fieldwork.addon import machine
+    from fieldwork.addon.project import snapshot as state
 
-    monkeypatch.setattr(preferences, "user_folder", lambda *parts: tmp_path / "user")
+    monkeypatch.setattr(machine, "user_folder", lambda *parts: tmp_path / "user")
 
     project = {
         "format": "fieldwork-project",
@@ -125,7 +126,7 @@ def test_quality_and_time_come_from_the_project(tmp_path, monkeypatch):
 
 
 def test_curve_picture_shows_both_lines():
-    from fieldwork.addon.curve import LOSS_COLOR, PSNR_COLOR, draw_curve
+    from fieldwork.addon.pictures.curve import LOSS_COLOR, PSNR_COLOR, draw_curve
 
     curve = [(step, math.exp(-step / 50), 10 + step / 10) for step in range(100)]
     image = draw_curve(curve, 64, 32)

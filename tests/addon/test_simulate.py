@@ -11,12 +11,12 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 from fieldwork.nerfcore.bench.scenes import is_labelled, prepare
-from fieldwork.nerfcore.capture.simulate import SCENES, simulate
-from fieldwork.nerfcore.data.cameras import Camera, flip_camera_axes, pixel_centers, rays
+from fieldwork.nerfcore.blender.simulate import SCENES, simulate
 from fieldwork.nerfcore.errors import Cancelled, InputError, SettingError
+from fieldwork.nerfcore.geometry.cameras import Camera, flip_camera_axes, pixel_centers, rays
 from fieldwork.nerfcore.params import SimulateParams
 from fieldwork.nerfcore.progress import Reporter
-from fieldwork.nerfcore.project import load_poses
+from fieldwork.nerfcore.project.store import load_poses
 from PIL import Image
 from PIL.ExifTags import IFD, Base
 

@@ -58,7 +58,7 @@ class Screen:
 
     @property
     def queue(self):
-        return self.module("addon.jobs").queue
+        return self.module("addon.jobs.queue").queue
 
     def move(self, x: float, y: float) -> None:
         self.window.event_simulate(type="MOUSEMOVE", value="NOTHING", x=int(x), y=int(y))

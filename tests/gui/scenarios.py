@@ -214,8 +214,8 @@ def interruptions(screen):
 
 def preferences(screen):
     """The preferences: without an engine, while it is installed, after a failure."""
-    jobs = screen.module("addon.jobs")
-    prefs = screen.module("addon.preferences")
+    jobs = screen.module("addon.jobs.queue")
+    prefs = screen.module("addon.machine")
     yield from screen.show_sidebar()
     os.environ.pop("FIELDWORK_ENGINE_PYTHON", None)
     screen.shot("no-engine")

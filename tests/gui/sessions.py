@@ -64,7 +64,7 @@ def life(screen):
     yield 1.0
     screen.shot("scene")
     yield from finish(screen)
-    tick = screen.module("addon.timer")._tick
+    tick = screen.module("addon.jobs.timer")._tick
     engine = screen.queue.link.process
     bpy.ops.preferences.addon_disable(module=MODULE)
     yield 0.5
@@ -90,7 +90,7 @@ def open_from_the_start(panel):
 def leave(screen):
     """Close Blender in the middle of a training that is to go on."""
     settings = yield from opened(screen)
-    screen.module("addon.preferences").preferences().on_close = "continue"
+    screen.module("addon.machine").preferences().on_close = "continue"
     settings.preset, settings.time_limit, settings.run = "draft", 45.0, "second"
     bpy.ops.fieldwork.train()
     yield from screen.wait(lambda: screen.queue.running and len(screen.queue.running.curve) > 2, 120, "the curve")
@@ -116,7 +116,7 @@ def back(screen):
     screen.facts["state"] = followed.state
     settings.run = "main"
     yield 1.0
-    screen.facts["runs"] = screen.module("addon.state").runs(screen.folder / "project")
+    screen.facts["runs"] = screen.module("addon.project.snapshot").runs(screen.folder / "project")
     yield from screen.press_button("fieldwork.use_run", depth=2000)
     screen.facts["used"] = settings.run
     screen.shot("runs")
@@ -161,7 +161,7 @@ def tools(screen):
 
     # The box of the training region is an object like any other.
     bpy.ops.fieldwork.crop_add()
-    crop = screen.module("addon.crop")
+    crop = screen.module("addon.project.region")
     box = crop.find(bpy.context.scene)
     box.location, box.scale = (1, 0, 1), (2, 2, 1)
     yield 2.0

@@ -160,7 +160,7 @@ def test_closing_blender_leaves_no_engine_and_no_half_project(captured):
     copy = window.BUILD / "copy"
     shutil.rmtree(copy, ignore_errors=True)
     shutil.copytree(project, copy)
-    code = f"from fieldwork.nerfcore.project import load_scene; print(len(load_scene({str(copy)!r}).views))"
+    code = f"from fieldwork.nerfcore.data.load import load_scene; print(len(load_scene({str(copy)!r}).views))"
     done = window.subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=False, env=dict(os.environ)
     )

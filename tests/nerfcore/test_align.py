@@ -6,25 +6,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fieldwork.nerfcore.data.cameras import Camera
-from fieldwork.nerfcore.data.frames import on_ground, rotation_to_z, up_direction, upright
-from fieldwork.nerfcore.data.scene import Points
-from fieldwork.nerfcore.data.similarity import make_similarity, transform_points
+from fieldwork.nerfcore.data.load import load_scene
 from fieldwork.nerfcore.errors import PosesError, SettingError
+from fieldwork.nerfcore.geometry.cameras import Camera
+from fieldwork.nerfcore.geometry.frames import on_ground, rotation_to_z, up_direction, upright
+from fieldwork.nerfcore.geometry.points import Points
+from fieldwork.nerfcore.geometry.similarity import make_similarity, transform_points
 from fieldwork.nerfcore.params import AlignParams
 from fieldwork.nerfcore.poses.align import align
 from fieldwork.nerfcore.poses.gps import fit_gps
 from fieldwork.nerfcore.progress import Reporter
-from fieldwork.nerfcore.project import (
-    ImageRecord,
-    PosedImage,
-    Poses,
-    Project,
-    load_project,
-    load_scene,
-    save_poses,
-    save_project,
-)
+from fieldwork.nerfcore.project.schema import ImageRecord, PosedImage, Poses, Project
+from fieldwork.nerfcore.project.store import load_project, save_poses, save_project
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

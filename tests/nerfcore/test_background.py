@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fieldwork.nerfcore.data.box import box_poses
+from fieldwork.nerfcore.data.load import load_scene
 from fieldwork.nerfcore.params import TrainParams
 from fieldwork.nerfcore.progress import Reporter
-from fieldwork.nerfcore.project import load_project, load_scene, save_project
+from fieldwork.nerfcore.project.store import load_project, save_project
 from fieldwork.nerfcore.render.image import render_view
+from fieldwork.nerfcore.render.run import load_trained
 from fieldwork.nerfcore.train.background import choose_background, edge_shares
-from fieldwork.nerfcore.train.run import load_trained
 from fieldwork.nerfcore.verbs import run_verb
 from fieldwork.tests.nerfcore.support.ball import SMALL, ball_project, camera_poses, draw
 from PIL import Image

@@ -7,13 +7,14 @@ import re
 from pathlib import Path
 
 import pytest
-from fieldwork.nerfcore import batch as module
 from fieldwork.nerfcore import cli
-from fieldwork.nerfcore.batch import BatchError, batch, read_list
 from fieldwork.nerfcore.errors import Cancelled, InputError, PosesError, SettingError
 from fieldwork.nerfcore.params import BatchParams
 from fieldwork.nerfcore.progress import Reporter
-from fieldwork.nerfcore.project import Project, save_project
+from fieldwork.nerfcore.project.schema import Project
+from fieldwork.nerfcore.project.store import save_project
+from fieldwork.nerfcore.workflows import batch as module
+from fieldwork.nerfcore.workflows.batch import BatchError, batch, read_list
 
 
 @pytest.fixture
@@ -24,7 +25,7 @@ def reconstructed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """
     asked: list[str] = []
 
-    def work(verb, params, report):
+    def work(params, report):
         name = params.out.name
         asked.append(name)
         report.stage("Working")
@@ -38,7 +39,7 @@ def reconstructed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         save_project(params.out, Project())
         return {"project": str(params.out), "stages": {"new": 0.1}}
 
-    monkeypatch.setattr(module, "run_verb", work)
+    monkeypatch.setattr(module, "reconstruct", work)
     return asked
 
 

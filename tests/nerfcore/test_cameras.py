@@ -7,9 +7,9 @@ import zlib  # noqa: F401  (before pycolmap)
 import numpy as np
 import pycolmap
 import pytest
-from fieldwork.nerfcore.data.cameras import Camera, flip_camera_axes, pixel_centers, project, rays
-from fieldwork.nerfcore.data.colmap_cameras import camera_from_colmap
 from fieldwork.nerfcore.errors import InputError
+from fieldwork.nerfcore.geometry.cameras import Camera, flip_camera_axes, pixel_centers, project, rays
+from fieldwork.nerfcore.geometry.colmap_cameras import camera_from_colmap
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+from fieldwork.nerfcore.data.load import load_scene
 from fieldwork.nerfcore.poses import chain, features
-from fieldwork.nerfcore.project import load_scene
 from fieldwork.nerfcore.render.verb import look_at
 from fieldwork.tests.nerfcore.support.captures import ingest, poses
 

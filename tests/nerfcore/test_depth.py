@@ -10,14 +10,14 @@ import pytest
 import torch
 from fieldwork.nerfcore.config import make_config
 from fieldwork.nerfcore.data.box import box_poses
-from fieldwork.nerfcore.data.pixels import read_photo
+from fieldwork.nerfcore.data.load import load_scene
+from fieldwork.nerfcore.images.working import read_photo
 from fieldwork.nerfcore.params import TrainParams
 from fieldwork.nerfcore.progress import Reporter
-from fieldwork.nerfcore.project import load_scene
 from fieldwork.nerfcore.render.image import render_view
+from fieldwork.nerfcore.render.run import load_trained
 from fieldwork.nerfcore.train.depth import DepthRays, depth_loss, point_trust
 from fieldwork.nerfcore.train.prepare import make_trainer, plan_run
-from fieldwork.nerfcore.train.run import load_trained
 from fieldwork.nerfcore.verbs import run_verb
 from fieldwork.tests.nerfcore.support.ball import RADIUS, SMALL, ball_project
 

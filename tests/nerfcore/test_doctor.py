@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from importlib import metadata
 
-from fieldwork.nerfcore import doctor as module
+from fieldwork.nerfcore.engine import doctor as module
 from fieldwork.nerfcore.params import DoctorParams
 from fieldwork.nerfcore.progress import Reporter
 

@@ -15,7 +15,8 @@ from pathlib import Path
 
 import pytest
 from fieldwork.nerfcore.engine import status as st
-from fieldwork.nerfcore.project import Project, save_project
+from fieldwork.nerfcore.project.schema import Project
+from fieldwork.nerfcore.project.store import save_project
 from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -12,14 +12,14 @@ import onnx
 import pytest
 import torch
 import trimesh
-from fieldwork.nerfcore.blender import find_blender
+from fieldwork.nerfcore.blender.process import find_blender
 from fieldwork.nerfcore.config import FieldConfig
 from fieldwork.nerfcore.data.box import Box
 from fieldwork.nerfcore.errors import BlenderError, ProjectError, SettingError
 from fieldwork.nerfcore.export.field_graph import field_model
 from fieldwork.nerfcore.field.encoding import spherical_harmonics
 from fieldwork.nerfcore.field.hybrid import HybridField
-from fieldwork.nerfcore.kernels.march_torch import grid_position
+from fieldwork.nerfcore.geometry.contraction import grid_position
 from fieldwork.nerfcore.params import ExportParams, MeshParams, TrainParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.verbs import run_verb

@@ -9,7 +9,7 @@ import pytest
 import torch
 from fieldwork.nerfcore.kernels.packing import Packing
 from fieldwork.nerfcore.progress import Reporter
-from fieldwork.nerfcore.train.model import Rendered
+from fieldwork.nerfcore.render.model import Rendered
 from fieldwork.nerfcore.train.prepare import make_trainer, plan_run
 from fieldwork.nerfcore.train.trainer import Trainer
 from fieldwork.tests.nerfcore.support.ball import ball_project

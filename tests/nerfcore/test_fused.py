@@ -12,7 +12,7 @@ import warp as wp
 from fieldwork.nerfcore.config import make_config
 from fieldwork.nerfcore.kernels.fused import render_coarse
 from fieldwork.nerfcore.render.fused import FusedRenderer, UnfusedRenderer, ray_renderer, unsupported
-from fieldwork.nerfcore.train.model import Model
+from fieldwork.nerfcore.render.model import Model
 
 DEVICES = [
     "cpu",

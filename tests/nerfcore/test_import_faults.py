@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fieldwork.nerfcore.data.importer import FORMATS, import_dataset, read_dataset
+from fieldwork.nerfcore.data.load import load_scene
 from fieldwork.nerfcore.errors import InputError
 from fieldwork.nerfcore.params import ImportParams
 from fieldwork.nerfcore.progress import Reporter
-from fieldwork.nerfcore.project import load_scene
 from PIL import Image
 
 Data = Callable[[str], Path]

@@ -14,11 +14,11 @@ from pathlib import Path
 import pytest
 from fieldwork.nerfcore.capture import ingest
 from fieldwork.nerfcore.capture.find import list_photos
-from fieldwork.nerfcore.capture.images import read_photo
 from fieldwork.nerfcore.errors import Cancelled, DiskError, InputError, ProjectError
+from fieldwork.nerfcore.images.decode import read_photo
 from fieldwork.nerfcore.params import NewParams
 from fieldwork.nerfcore.progress import Reporter
-from fieldwork.nerfcore.project import load_project
+from fieldwork.nerfcore.project.store import load_project
 from fieldwork.tests.nerfcore.support.photos import exif, folder_of, new, picture
 from PIL import Image, ImageFilter
 

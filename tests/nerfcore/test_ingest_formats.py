@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 import pytest
-from fieldwork.nerfcore.capture.images import linear_to_srgb8, read_photo
 from fieldwork.nerfcore.errors import InputError
+from fieldwork.nerfcore.images.decode import linear_to_srgb8, read_photo
 from fieldwork.tests.nerfcore.support.photos import close, exif, new, picture
 from PIL import ExifTags, Image
 
@@ -127,7 +127,7 @@ def test_raw_by_name_but_not_by_content(tmp_path: Path) -> None:
 def test_orientation_is_baked_in(tmp_path: Path, orientation: int) -> None:
     upright = picture()
     inverse = {6: 8, 8: 6}.get(orientation, orientation)
-    from fieldwork.nerfcore.capture.images import upright as turn
+    from fieldwork.nerfcore.images.decode import upright as turn
 
     turn(upright, inverse).save(tmp_path / "a.jpg", quality=95, exif=exif(orientation))
     photo = read_photo(tmp_path / "a.jpg")

@@ -11,7 +11,7 @@ from fieldwork.nerfcore.capture import ingest
 from fieldwork.nerfcore.errors import InputError
 from fieldwork.nerfcore.params import NewParams
 from fieldwork.nerfcore.progress import Reporter
-from fieldwork.nerfcore.project import load_project
+from fieldwork.nerfcore.project.store import load_project
 from fieldwork.tests.nerfcore.support.photos import exif, folder_of, new, picture
 from PIL import Image
 

@@ -12,7 +12,7 @@ from fieldwork.nerfcore.capture.video import extract_frames
 from fieldwork.nerfcore.errors import Cancelled, InputError
 from fieldwork.nerfcore.params import NewParams
 from fieldwork.nerfcore.progress import Reporter
-from fieldwork.nerfcore.project import load_project
+from fieldwork.nerfcore.project.store import load_project
 from PIL import Image, ImageFilter
 
 COUNT, SHARP_EVERY = 48, 6

@@ -12,14 +12,15 @@ from pathlib import Path
 import pytest
 from fieldwork.nerfcore.cli import main
 from fieldwork.nerfcore.errors import InputError, ProjectError
-from fieldwork.nerfcore.lock import lockable, project_lock
 from fieldwork.nerfcore.params import ImportParams, NewParams, PosesParams, ReconstructParams
-from fieldwork.nerfcore.project import Project, save_project
+from fieldwork.nerfcore.project.lock import lockable, project_lock
+from fieldwork.nerfcore.project.schema import Project
+from fieldwork.nerfcore.project.store import save_project
 from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[2]
 HOLD = (
-    "import sys; from pathlib import Path; from nerfcore.lock import project_lock\n"
+    "import sys; from pathlib import Path; from nerfcore.project.lock import project_lock\n"
     "with project_lock(Path(sys.argv[1]), 'train'):\n"
     "    print('held', flush=True); sys.stdin.read()\n"
 )

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from fieldwork.nerfcore.data.load import load_scene
 from fieldwork.nerfcore.data.pixels import PixelStore
 from fieldwork.nerfcore.progress import Reporter
-from fieldwork.nerfcore.project import load_project, load_scene, save_project
+from fieldwork.nerfcore.project.store import load_project, save_project
 from fieldwork.nerfcore.train.prepare import has_transparency
 from fieldwork.tests.nerfcore.support.ball import ball_project
 from PIL import Image

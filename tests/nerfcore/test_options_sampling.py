@@ -8,17 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fieldwork.nerfcore.data.cameras import Camera
 from fieldwork.nerfcore.data.pixels import VOID
+from fieldwork.nerfcore.geometry.cameras import Camera
 from fieldwork.nerfcore.kernels.march import Samples, sample
 from fieldwork.nerfcore.kernels.packing import Packing
 from fieldwork.nerfcore.render.fused import wants_fused
 from fieldwork.nerfcore.render.image import render_view
+from fieldwork.nerfcore.render.model import Model
 from fieldwork.nerfcore.render.verb import look_at
 from fieldwork.nerfcore.sampling.cache import CoarseCache
 from fieldwork.nerfcore.sampling.occupancy import OccupancyGrid, class_interest
 from fieldwork.nerfcore.sampling.outlines import REACH, Outlines, outline_mask
-from fieldwork.nerfcore.train.model import Model
 from fieldwork.nerfcore.train.trainer import Trainer
 from fieldwork.tests.nerfcore.support.ball import ball_project
 from fieldwork.tests.nerfcore.support.settings import config_of, trainer_of

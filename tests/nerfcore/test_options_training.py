@@ -13,13 +13,13 @@ import torch
 from fieldwork.nerfcore.config import LossConfig, SceneConfig
 from fieldwork.nerfcore.data.box import choose_box
 from fieldwork.nerfcore.data.pixels import VOID
-from fieldwork.nerfcore.data.similarity import similarity_scale
+from fieldwork.nerfcore.geometry.similarity import similarity_scale
 from fieldwork.nerfcore.params import TrainParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.render.image import background_of
+from fieldwork.nerfcore.render.run import CPU_IMAGE_SIZE, GPU_IMAGE_SIZE, RunInfo
 from fieldwork.nerfcore.train import losses, verb
 from fieldwork.nerfcore.train.prepare import plan_run
-from fieldwork.nerfcore.train.run import CPU_IMAGE_SIZE, GPU_IMAGE_SIZE, RunInfo
 from fieldwork.nerfcore.train.schedule import bias_correction
 from fieldwork.nerfcore.train.trainer import Trainer
 from fieldwork.nerfcore.verbs import run_verb

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 import torch
 from fieldwork.nerfcore.config import TrainConfig
-from fieldwork.nerfcore.data.cameras import Camera
-from fieldwork.nerfcore.data.pixels import Batch, CameraRays
-from fieldwork.nerfcore.data.similarity import fit_similarity
+from fieldwork.nerfcore.data.camera_rays import CameraRays
+from fieldwork.nerfcore.data.pixels import Batch
 from fieldwork.nerfcore.errors import Cancelled
+from fieldwork.nerfcore.geometry.cameras import Camera
+from fieldwork.nerfcore.geometry.similarity import fit_similarity
 from fieldwork.nerfcore.params import EvaluateParams, TrainParams
 from fieldwork.nerfcore.progress import Reporter
-from fieldwork.nerfcore.train.checkpoint import read_checkpoint
+from fieldwork.nerfcore.render.run import read_checkpoint
 from fieldwork.nerfcore.train.pose_refinement import PoseRefinement, level_weights, skew
 from fieldwork.nerfcore.verbs import run_verb
 from fieldwork.tests.nerfcore.support.ball import SMALL, ball_project, camera_poses

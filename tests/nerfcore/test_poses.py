@@ -10,18 +10,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fieldwork.nerfcore.data.similarity import transform_points
+from fieldwork.nerfcore.data.load import load_scene
 from fieldwork.nerfcore.errors import DiskError, FieldworkError, PosesError
+from fieldwork.nerfcore.geometry.similarity import transform_points
 from fieldwork.nerfcore.poses import estimate, process
-from fieldwork.nerfcore.project import (
-    SemanticClass,
-    load_points,
-    load_poses,
-    load_project,
-    load_scene,
-    load_visibility,
-    save_project,
-)
+from fieldwork.nerfcore.project.schema import SemanticClass
+from fieldwork.nerfcore.project.store import load_points, load_poses, load_project, load_visibility, save_project
 from fieldwork.tests.nerfcore.support.captures import centre_errors, ingest, poses, rotation_errors, view_errors
 from PIL import Image
 
@@ -57,7 +51,7 @@ def test_world_is_upright_and_of_sane_size(fountain: Path) -> None:
 
 
 def test_points_are_where_the_photos_see_them(fountain: Path) -> None:
-    from fieldwork.nerfcore.data.cameras import project as to_pixels
+    from fieldwork.nerfcore.geometry.cameras import project as to_pixels
 
     poses_, points, seen = load_poses(fountain), load_points(fountain), load_visibility(fountain)
     assert len(points) > 500

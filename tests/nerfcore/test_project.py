@@ -7,24 +7,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fieldwork.nerfcore.data.cameras import Camera
-from fieldwork.nerfcore.data.scene import Points
+from fieldwork.nerfcore.data.load import load_scene, split_views
 from fieldwork.nerfcore.errors import ProjectError
-from fieldwork.nerfcore.project import (
-    Frame,
-    ImageRecord,
-    PosedImage,
-    Poses,
-    Project,
-    SemanticClass,
+from fieldwork.nerfcore.geometry.cameras import Camera
+from fieldwork.nerfcore.geometry.points import Points
+from fieldwork.nerfcore.project.schema import Frame, ImageRecord, PosedImage, Poses, Project, SemanticClass
+from fieldwork.nerfcore.project.store import (
     load_points,
     load_poses,
     load_project,
-    load_scene,
     load_visibility,
     save_poses,
     save_project,
-    split_views,
 )
 
 

@@ -18,14 +18,15 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 import pytest
-from fieldwork.nerfcore.capture.develop import write_depth
 from fieldwork.nerfcore.data.dataset import Dataset, DatasetView
 from fieldwork.nerfcore.data.importer import import_dataset, read_dataset
-from fieldwork.nerfcore.data.similarity import transform_points
+from fieldwork.nerfcore.data.load import load_scene
 from fieldwork.nerfcore.errors import FieldworkError, InputError, ProjectError
+from fieldwork.nerfcore.geometry.similarity import transform_points
+from fieldwork.nerfcore.images.encode import write_depth
 from fieldwork.nerfcore.params import ImportParams
 from fieldwork.nerfcore.progress import Reporter
-from fieldwork.nerfcore.project import load_project, load_scene
+from fieldwork.nerfcore.project.store import load_project
 from fieldwork.tests.nerfcore.support.matches import Matches, epipolar_error, find_matches
 from fieldwork.tests.nerfcore.support.writers import (
     bend,

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 import torch
 from fieldwork.nerfcore.config import RunConfig
-from fieldwork.nerfcore.data.cameras import Camera
 from fieldwork.nerfcore.errors import Cancelled
 from fieldwork.nerfcore.field.hybrid import Geometry
+from fieldwork.nerfcore.geometry.cameras import Camera
 from fieldwork.nerfcore.kernels.runtime import worker_count
 from fieldwork.nerfcore.render import image
 from fieldwork.nerfcore.render.image import Frame, render_view
+from fieldwork.nerfcore.render.model import Model
 from fieldwork.nerfcore.render.verb import look_at, orbit_angles
-from fieldwork.nerfcore.train.model import Model
 
 RADIUS, DENSITY = 0.6, 4.0
 COLOR = torch.tensor([0.9, 0.4, 0.1])

@@ -11,8 +11,8 @@ from fieldwork.nerfcore.bench.suites import ABLATION
 from fieldwork.nerfcore.config import RunConfig, make_config
 from fieldwork.nerfcore.field.hybrid import HybridField
 from fieldwork.nerfcore.kernels.walk import PDF_UNIFORM
+from fieldwork.nerfcore.render.model import Model
 from fieldwork.nerfcore.sampling.occupancy import OccupancyGrid
-from fieldwork.nerfcore.train.model import Model
 
 NAMES = [
     f"{stage}.{name}" for stage, info in RunConfig.model_fields.items() for name in type(info.default).model_fields

@@ -7,13 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fieldwork.nerfcore.capture.soft_labels import read_confidence, read_probabilities
 from fieldwork.nerfcore.config import make_config
+from fieldwork.nerfcore.data.load import load_scene
 from fieldwork.nerfcore.data.pixels import VOID, PixelStore
 from fieldwork.nerfcore.errors import InputError
+from fieldwork.nerfcore.images.soft_labels import read_confidence, read_probabilities
 from fieldwork.nerfcore.params import EvaluateParams, TrainParams
 from fieldwork.nerfcore.progress import Reporter
-from fieldwork.nerfcore.project import load_project, load_scene, save_project
+from fieldwork.nerfcore.project.store import load_project, save_project
 from fieldwork.nerfcore.train.losses import semantic_loss
 from fieldwork.nerfcore.verbs import run_verb
 from fieldwork.tests.nerfcore.support.ball import SMALL, ball_project

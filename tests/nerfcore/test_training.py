@@ -14,14 +14,15 @@ import numpy as np
 import pytest
 import torch
 from fieldwork.nerfcore.config import make_config, preset_names
-from fieldwork.nerfcore.data.cameras import Camera
-from fieldwork.nerfcore.data.scene import Points
 from fieldwork.nerfcore.errors import Cancelled, DiskError, ProjectError, SettingError, TrainingError
+from fieldwork.nerfcore.geometry.cameras import Camera
+from fieldwork.nerfcore.geometry.points import Points
 from fieldwork.nerfcore.params import EvaluateParams, MeshParams, RenderParams, TrainParams
 from fieldwork.nerfcore.progress import Reporter
-from fieldwork.nerfcore.project import ImageRecord, PosedImage, Poses, Project, SemanticClass, save_poses, save_project
+from fieldwork.nerfcore.project.schema import ImageRecord, PosedImage, Poses, Project, SemanticClass
+from fieldwork.nerfcore.project.store import save_poses, save_project
+from fieldwork.nerfcore.render.run import read_checkpoint
 from fieldwork.nerfcore.render.verb import look_at
-from fieldwork.nerfcore.train.checkpoint import read_checkpoint
 from fieldwork.nerfcore.verbs import run_verb
 from fieldwork.tests.nerfcore.support.ball import SMALL
 from PIL import Image

@@ -7,8 +7,9 @@ import numpy as np
 import torch
 from fieldwork.nerfcore.config import SceneConfig
 from fieldwork.nerfcore.data.box import choose_box
-from fieldwork.nerfcore.data.cameras import Camera
-from fieldwork.nerfcore.data.scene import Points, Scene, View
+from fieldwork.nerfcore.data.scene import Scene, View
+from fieldwork.nerfcore.geometry.cameras import Camera
+from fieldwork.nerfcore.geometry.points import Points
 from fieldwork.nerfcore.sampling.path import cells_before_path
 from fieldwork.nerfcore.sampling.visibility import cells_at, depth_ranges, grid_centers, view_counts
 

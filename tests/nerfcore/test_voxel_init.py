@@ -7,13 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from fieldwork.nerfcore.data.load import load_scene
 from fieldwork.nerfcore.data.pixels import PixelStore
 from fieldwork.nerfcore.errors import Cancelled, InputError
 from fieldwork.nerfcore.params import TrainParams
 from fieldwork.nerfcore.progress import Reporter
-from fieldwork.nerfcore.project import load_scene
-from fieldwork.nerfcore.train.checkpoint import read_checkpoint
-from fieldwork.nerfcore.train.run import PIXEL_FEATURES
+from fieldwork.nerfcore.render.run import PIXEL_FEATURES, read_checkpoint
 from fieldwork.nerfcore.train.voxel_init import (
     GAIN,
     Sighting,

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fieldwork.nerfcore.data.cameras import Camera, pixel_centers, rays
+from fieldwork.nerfcore.data.load import load_scene
+from fieldwork.nerfcore.geometry.cameras import Camera, pixel_centers, rays
 from fieldwork.nerfcore.params import EvaluateParams, ImportParams, TrainParams
 from fieldwork.nerfcore.progress import Reporter
-from fieldwork.nerfcore.project import load_scene
 from fieldwork.nerfcore.render.verb import look_at
 from fieldwork.nerfcore.verbs import run_verb
 from PIL import Image

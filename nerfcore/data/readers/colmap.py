@@ -14,13 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from ...capture.images import image_size
 from ...errors import InputError
-from ..cameras import Camera
-from ..colmap_cameras import MODELS, camera_from_colmap
-from ..dataset import Dataset, DatasetView, beside, find_image, require, unique_names
-from ..frames import upright
-from ..scene import Points
+from ...geometry.cameras import Camera
+from ...geometry.colmap_cameras import MODELS, camera_from_colmap
+from ...geometry.frames import upright
+from ...geometry.points import Points
+from ...images.decode import image_size
+from ...images.names import beside, find_image, unique_names
+from ..dataset import Dataset, DatasetView, require
 
 PLACES = ("sparse/0", "sparse", "colmap/sparse/0", "dense/sparse", ".")
 

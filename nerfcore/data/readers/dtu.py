@@ -12,11 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ...capture.images import image_size
 from ...errors import InputError
-from ..dataset import Dataset, DatasetView, list_images, plain_name, require
-from ..frames import upright
-from ..similarity import transform_points
+from ...geometry.frames import upright
+from ...geometry.similarity import transform_points
+from ...images.decode import image_size
+from ...images.names import list_images, plain_name
+from ..dataset import Dataset, DatasetView, require
 from .matrices import camera_from_matrix, decompose_projection
 
 FILES = ("cameras.npz", "cameras_sphere.npz")

@@ -11,12 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
-from ...capture.images import image_size
 from ...capture.video import VIDEO_SUFFIXES, every_nth, save_every_nth
 from ...errors import InputError
-from ..cameras import Camera
-from ..dataset import Dataset, DatasetView, beside, list_images, require, unique_names
-from ..frames import upright
+from ...geometry.cameras import Camera
+from ...geometry.frames import upright
+from ...images.decode import image_size
+from ...images.names import beside, list_images, unique_names
+from ..dataset import Dataset, DatasetView, require
 
 FILE = "poses_bounds.npy"
 

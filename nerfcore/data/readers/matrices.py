@@ -12,7 +12,7 @@ import numpy as np
 import scipy.linalg
 
 from ...errors import InputError
-from ..cameras import Camera
+from ...geometry.cameras import Camera
 
 
 def camera_from_matrix(k: np.ndarray, size: tuple[int, int], full_size: tuple[int, int] | None = None) -> Camera:

@@ -13,11 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from ...capture.images import image_size
 from ...errors import InputError
-from ..cameras import Camera
-from ..dataset import Dataset, DatasetView, beside, find_image, require, unique_names
-from ..frames import upright
+from ...geometry.cameras import Camera
+from ...geometry.frames import upright
+from ...images.decode import image_size
+from ...images.names import beside, find_image, unique_names
+from ..dataset import Dataset, DatasetView, require
 
 RADIAL = {"radial1": 1, "radial3": 3, "radialk1": 1, "radialk3": 3}
 

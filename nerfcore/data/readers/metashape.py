@@ -13,12 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from ...capture.images import image_size
 from ...errors import InputError
-from ..cameras import Camera
-from ..dataset import Dataset, DatasetView, beside, find_image, plain_name, require
-from ..frames import rotation_to_z, upright
-from ..similarity import make_similarity
+from ...geometry.cameras import Camera
+from ...geometry.frames import rotation_to_z, upright
+from ...geometry.similarity import make_similarity
+from ...images.decode import image_size
+from ...images.names import beside, find_image, plain_name
+from ..dataset import Dataset, DatasetView, require
 
 EARTH = 5_000_000.0  # metres from the centre of the earth beyond which coordinates are geocentric
 

@@ -7,11 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ...capture.images import image_size, read_photo
-from ...capture.sharpness import thumbnail
 from ...errors import InputError
-from ..dataset import Dataset, DatasetView, beside, find_image, plain_name, require
-from ..frames import axis_upright
+from ...geometry.frames import axis_upright
+from ...images.decode import image_size, read_photo
+from ...images.names import beside, find_image, plain_name
+from ...images.sharpness import thumbnail
+from ..dataset import Dataset, DatasetView, require
 from .matrices import camera_from_matrix, pose_from_world_to_camera
 
 

@@ -13,11 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from ...capture.images import image_size
 from ...errors import InputError
-from ..cameras import Camera
-from ..dataset import Dataset, DatasetView, beside, find_image, plain_name, require
-from ..frames import upright
+from ...geometry.cameras import Camera
+from ...geometry.frames import upright
+from ...images.decode import image_size
+from ...images.names import beside, find_image, plain_name
+from ..dataset import Dataset, DatasetView, require
 
 METRIC = ("absolute",)
 

@@ -12,12 +12,13 @@ from pathlib import Path
 
 import numpy as np
 
-from ...capture.images import image_size
 from ...errors import InputError
-from ..cameras import Camera
-from ..classes import read_classes
-from ..dataset import Dataset, DatasetView, list_images, plain_name, require
-from ..frames import axis_upright
+from ...geometry.cameras import Camera
+from ...geometry.frames import axis_upright
+from ...images.decode import image_size
+from ...images.names import list_images, plain_name
+from ...project.classes import read_classes
+from ..dataset import Dataset, DatasetView, require
 from .matrices import read_numbers
 
 TRAJECTORIES = ("traj_w_c.txt", "traj.txt")

@@ -10,11 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ...capture.images import image_size
 from ...errors import InputError
-from ..classes import read_classes
-from ..dataset import Dataset, DatasetView, beside, list_images, plain_name, require
-from ..frames import axis_upright
+from ...geometry.frames import axis_upright
+from ...images.decode import image_size
+from ...images.names import beside, list_images, plain_name
+from ...project.classes import read_classes
+from ..dataset import Dataset, DatasetView, require
 from .matrices import camera_from_matrix, read_numbers
 
 COLOR_FOLDERS, LABEL_FOLDERS = ("color", "rgb", "images"), ("label-filt", "label", "labels", "semantic")

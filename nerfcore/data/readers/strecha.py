@@ -6,10 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ...capture.images import image_size
 from ...errors import InputError
-from ..dataset import Dataset, DatasetView, beside, find_image, plain_name, require
-from ..frames import axis_upright
+from ...geometry.frames import axis_upright
+from ...images.decode import image_size
+from ...images.names import beside, find_image, plain_name
+from ..dataset import Dataset, DatasetView, require
 from .matrices import camera_from_matrix, read_numbers
 
 

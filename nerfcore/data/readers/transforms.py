@@ -13,12 +13,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ...capture.images import image_size
 from ...errors import InputError
-from ..cameras import Camera, flip_camera_axes
-from ..classes import read_classes
-from ..dataset import Y_UP, Dataset, DatasetView, beside, find_image, require, unique_names
-from ..scene import Points
+from ...geometry.cameras import Camera, flip_camera_axes
+from ...geometry.points import Points
+from ...images.decode import image_size
+from ...images.names import beside, find_image, unique_names
+from ...project.classes import read_classes
+from ..dataset import Y_UP, Dataset, DatasetView, require
 
 SPLIT_FILES = {"transforms_train.json": "train", "transforms_test.json": "test", "transforms_val.json": "val"}
 Split = Literal["train", "test", "auto"]

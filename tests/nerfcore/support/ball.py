@@ -7,17 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import OpenImageIO as oiio
-from fieldwork.nerfcore.data.cameras import Camera
-from fieldwork.nerfcore.data.scene import Points
-from fieldwork.nerfcore.project import (
-    ImageRecord,
-    PosedImage,
-    Poses,
-    Project,
-    SemanticClass,
-    save_poses,
-    save_project,
-)
+from fieldwork.nerfcore.geometry.cameras import Camera
+from fieldwork.nerfcore.geometry.points import Points
+from fieldwork.nerfcore.project.schema import ImageRecord, PosedImage, Poses, Project, SemanticClass
+from fieldwork.nerfcore.project.store import save_poses, save_project
 from fieldwork.nerfcore.render.verb import look_at
 from PIL import Image
 

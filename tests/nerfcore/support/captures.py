@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 from fieldwork.nerfcore.capture.ingest import new
-from fieldwork.nerfcore.data.cameras import rays
 from fieldwork.nerfcore.data.importer import read_dataset
-from fieldwork.nerfcore.data.similarity import fit_similarity, transform_points
+from fieldwork.nerfcore.geometry.cameras import rays
+from fieldwork.nerfcore.geometry.similarity import fit_similarity, transform_points
 from fieldwork.nerfcore.params import NewParams, PosesParams
 from fieldwork.nerfcore.poses.estimate import estimate_poses
 from fieldwork.nerfcore.progress import Reporter
-from fieldwork.nerfcore.project import load_poses
+from fieldwork.nerfcore.project.store import load_poses
 
 Data = Callable[[str], Path]
 

@@ -7,8 +7,8 @@ import zlib  # noqa: F401  (before pycolmap)
 from pathlib import Path
 
 import numpy as np
-from fieldwork.nerfcore.data.cameras import rays
 from fieldwork.nerfcore.data.dataset import DatasetView
+from fieldwork.nerfcore.geometry.cameras import rays
 from fieldwork.nerfcore.poses import features
 from fieldwork.nerfcore.poses.presets import FAST
 from fieldwork.nerfcore.poses.validate import pair_images, sampson_distance

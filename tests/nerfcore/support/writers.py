@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 import pycolmap
-from fieldwork.nerfcore.data.cameras import Camera, flip_camera_axes, project, rays
 from fieldwork.nerfcore.data.dataset import DatasetView
+from fieldwork.nerfcore.geometry.cameras import Camera, flip_camera_axes, project, rays
 from PIL import Image
 
 

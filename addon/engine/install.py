@@ -1,0 +1,332 @@
+"""How the engine's own Python gets to its place (see engine_place.py). Standard library only, no bpy: it runs in a
+thread."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+from ..errors import EngineError
+from .link import Link
+from .place import COMPLETE, LOCK, LOG, lock_hash, python_in
+
+NEEDED_GB = {"cpu": 4.0, "mps": 4.0}  # free disk; builds for graphics cards bring their libraries along
+NEEDED_GPU_GB = 12.0
+Report = Callable[[float, str], None]
+
+
+class InstallError(Exception):
+    """The installation cannot go on; the text says why and what to do."""
+
+
+class InstallCancelled(Exception):
+    """The user asked to stop."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """`base`: Python that the environment is made from. `device`: auto, cuda, rocm, mps or cpu. `wheels`: folder of
+    package files to be used besides the index, or instead of it when not `online`; may be empty."""
+
+    folder: Path
+    base: Path
+    device: str = "auto"
+    wheels: str = ""
+    online: bool = True
+
+
+def remove(folder: Path) -> None:
+    """Remove the engine and its downloads."""
+    (folder / COMPLETE).unlink(missing_ok=True)
+    for name in ("venv", "tools", "cache"):
+        shutil.rmtree(folder / name, ignore_errors=True)
+
+
+def install(options: Options, report: Report, cancelled: threading.Event, lock: Path = LOCK) -> dict[str, Any]:
+    """Install or repair the engine; what is there already is kept.
+
+    Returns:
+        what the doctor found.
+    Raises:
+        InstallError: with what to do about it.
+        InstallCancelled: `cancelled` was set; running it again goes on.
+    """
+    folder = options.folder
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / COMPLETE).unlink(missing_ok=True)
+    _check_disk(options)
+    with open(folder / LOG, "w", encoding="utf-8") as log:
+        run = Runner(log, cancelled, report)
+        report(0.01, "Looking at Python")
+        _check_device(options.device)
+        _check_base(options.base, run)
+        uv = _find_uv(options, run)
+        venv = folder / "venv"
+        if not python_in(venv).is_file():
+            report(0.08, "Making the environment")
+            shutil.rmtree(venv, ignore_errors=True)
+            if uv:
+                run([uv, "venv", "--no-config", "--python", options.base, venv], "The environment cannot be made")
+            else:
+                run([options.base, "-m", "venv", venv], "The environment cannot be made")
+        report(0.1, "Loading packages")
+        run(_install_command(options, uv, lock), "The packages could not be installed", packages=_count(lock))
+        report(0.92, "Checking the engine")
+        result = _doctor(python_in(venv), folder)
+        _check_doctor(result, options)
+    text = {"lock": lock_hash(lock), "time": time.time(), "doctor": result}
+    temporary = folder / (COMPLETE + ".part")
+    temporary.write_text(json.dumps(text, indent=1), encoding="utf-8")
+    os.replace(temporary, folder / COMPLETE)
+    report(1.0, "The engine is installed")
+    return result
+
+
+class Runner:
+    """Runs the tools: their words go to the log and, in short, to the user; ends them when cancelled."""
+
+    def __init__(self, log: IO[str], cancelled: threading.Event, report: Report) -> None:
+        self.log, self.cancelled, self.report = log, cancelled, report
+
+    def __call__(self, command: list[Any], failure: str, packages: int = 0) -> str:
+        """Run to the end and return the output. `packages`: how many are expected, for the progress.
+
+        Raises:
+            InstallError: `failure` and the last line the tool said.
+            InstallCancelled.
+        """
+        if self.cancelled.is_set():
+            raise InstallCancelled
+        words = [str(word) for word in command]
+        self.log.write("> " + " ".join(words) + "\n")
+        self.log.flush()
+        options: dict[str, Any] = {"start_new_session": True}
+        if sys.platform == "win32":
+            options = {"creationflags": subprocess.CREATE_NO_WINDOW}
+        try:
+            process = subprocess.Popen(
+                words, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+                encoding="utf-8", errors="replace", env=_environment(self.log), **options,
+            )  # fmt: skip
+        except OSError as error:
+            raise InstallError(f"{failure}: {words[0]} cannot be run: {error}.") from error
+        watcher = threading.Thread(target=self._watch, args=(process,), daemon=True)
+        watcher.start()
+        lines: list[str] = []
+        done = 0
+        assert process.stdout is not None
+        for line in process.stdout:
+            self.log.write(line)
+            self.log.flush()
+            lines.append(line.strip())
+            done += bool(re.match(r"\s*(Downloaded|Collecting|Built)\b", line))
+            if packages and line.strip():
+                # uv names only the large downloads, then what it has prepared.
+                share = 0.9 if line.lstrip().startswith(("Prepared", "Installed", "+")) else min(done / packages, 0.85)
+                self.report(0.1 + 0.8 * share, line.strip()[:80])
+        status = process.wait()
+        if self.cancelled.is_set():
+            raise InstallCancelled
+        if status:
+            told = [line for line in lines if line]
+            reason = next((line for line in told if line.lower().startswith("error")), told[-1] if told else "")
+            raise InstallError(
+                f"{failure}. {reason[:300].rstrip('.')}. Press Install again to go on; what was loaded is kept. "
+                "If it fails again, see the log."
+            )
+        return "\n".join(lines)
+
+    def _watch(self, process: subprocess.Popen[str]) -> None:
+        while process.poll() is None:
+            if self.cancelled.wait(0.2):
+                _kill_tree(process)
+                return
+
+
+def _kill_tree(process: subprocess.Popen[str]) -> None:
+    """End a tool and what it started: pip builds and downloads in processes of its own."""
+    if sys.platform == "win32":
+        command = ["taskkill", "/F", "/T", "/PID", str(process.pid)]
+        subprocess.run(command, capture_output=True, check=False, creationflags=subprocess.CREATE_NO_WINDOW)
+        return
+    with contextlib.suppress(ProcessLookupError):  # it has just ended
+        os.killpg(process.pid, signal.SIGKILL)
+
+
+def _environment(log: IO[str]) -> dict[str, str]:
+    """No user site, no settings of another environment, downloads in the engine's own folder."""
+    env = {k: v for k, v in os.environ.items() if k not in ("PYTHONHOME", "PYTHONPATH", "VIRTUAL_ENV")}
+    env["PYTHONNOUSERSITE"] = "1"
+    env["PIP_DISABLE_PIP_VERSION_CHECK"] = "1"
+    env["UV_CACHE_DIR"] = str(Path(log.name).with_name("cache"))
+    env["UV_PYTHON_DOWNLOADS"] = "never"
+    env["UV_HTTP_TIMEOUT"] = "120"
+    return env
+
+
+def _check_disk(options: Options) -> None:
+    free = shutil.disk_usage(options.folder).free / 1e9
+    needed = NEEDED_GB.get(options.device, 4.0 if options.device == "auto" and not _has_gpu() else NEEDED_GPU_GB)
+    # What a broken installation has loaded already counts.
+    there = sum(f.stat().st_size for f in options.folder.rglob("*") if f.is_file() and not f.is_symlink()) / 1e9
+    if free + there < needed:
+        raise InstallError(
+            f"The disk of {options.folder} has {free:.1f} GB free; the engine needs about {needed:.0f} GB. Free some "
+            "space, or choose an existing environment."
+        )
+
+
+def _has_gpu() -> bool:
+    return shutil.which("nvidia-smi") is not None or Path("/dev/kfd").exists()
+
+
+def _check_base(base: Path, run: Runner) -> None:
+    """The base must be a Python that the packages exist for."""
+    code = "import sys, struct; print(sys.version_info[0], sys.version_info[1], struct.calcsize('P') * 8)"
+    words = run([base, "-I", "-c", code], f"{base} is not a Python").split()
+    version = (int(words[0]), int(words[1]))
+    if version < (3, 11) or words[2] != "64":
+        raise InstallError(
+            f"{base} is Python {version[0]}.{version[1]}, {words[2]} bits; the engine needs 3.11 or newer with 64 bits. "
+            "Choose another Base Python."
+        )
+
+
+def _find_uv(options: Options, run: Runner) -> Path | None:
+    """The installer `uv`: the machine's, or one of our own; None where only pip will do."""
+    found = shutil.which("uv")
+    # An old one cannot choose among the builds of PyTorch.
+    if found and "--torch-backend" in run([found, "pip", "install", "--help"], "uv does not run"):
+        return Path(found)
+    tools = options.folder / "tools"
+    name = "uv.exe" if sys.platform == "win32" else "uv"
+    own = python_in(tools).with_name(name)
+    if own.is_file():
+        return own
+    run.report(0.03, "Getting the installer")
+    try:
+        run([options.base, "-m", "venv", tools], "no environment for the installer")
+        run([python_in(tools), "-m", "pip", "install", *_index(options, "pip"), "uv"], "no installer")
+    except InstallError as error:
+        run.log.write(f"going on with pip: {error}\n")
+        return None
+    return own
+
+
+def _check_device(device: str) -> None:
+    """Whether PyTorch has builds for the device on this system at all."""
+    systems = {"cuda": ("linux", "win32"), "rocm": ("linux",), "mps": ("darwin",)}
+    if sys.platform not in systems.get(device, (sys.platform,)):
+        names = {"linux": "Linux", "win32": "Windows", "darwin": "macOS"}
+        where = " and ".join(names[system] for system in systems[device])
+        raise InstallError(
+            f"PyTorch has builds for {device.upper()} on {where} only. Choose “Automatic” or “CPU” as the device."
+        )
+
+
+def torch_backend(device: str) -> str | None:
+    """What tells uv which build of PyTorch to take; None where there is but one.
+
+    "auto" looks at the driver of the graphics card: NVIDIA's or AMD's, in its version. That the build runs on the
+    device that was asked for is seen by the doctor afterwards.
+    """
+    if sys.platform == "darwin":
+        return None
+    return "cpu" if device == "cpu" else "auto"
+
+
+def pip_can(device: str) -> bool:
+    """Whether the one build that pip takes suits the device: on Linux it is CUDA's, on Windows that for the CPU."""
+    if sys.platform == "darwin":
+        return True
+    if sys.platform == "win32":
+        return device == "cpu" or (device == "auto" and not _has_gpu())
+    return device in ("cpu", "cuda") or (device == "auto" and not Path("/dev/kfd").exists())
+
+
+def _install_command(options: Options, uv: Path | None, lock: Path) -> list[Any]:
+    python = python_in(options.folder / "venv")
+    if uv is None:
+        if not options.wheels and not pip_can(options.device):
+            raise InstallError(
+                "The build of PyTorch for this graphics card needs the installer uv, which could not be had (see the "
+                "log). Install uv, or choose “CPU” as the device."
+            )
+        return [python, "-m", "pip", "install", *_index(options, "pip"), "-r", lock]
+    command = [uv, "pip", "install", "--no-config", "--python", python, "--compile-bytecode"]
+    # Wheels on the disk are one certain build.
+    backend = None if options.wheels else torch_backend(options.device)
+    if backend is not None:
+        command += ["--torch-backend", backend]
+    return [*command, *_index(options, "uv"), "-r", lock]
+
+
+def _index(options: Options, tool: str) -> list[str]:
+    arguments = ["--find-links", options.wheels] if options.wheels else []
+    if not options.online:
+        arguments += ["--no-index"] + (["--offline"] if tool == "uv" else [])
+    return arguments
+
+
+def _count(lock: Path) -> int:
+    return sum(bool(re.match(r"[A-Za-z]", line)) for line in lock.read_text(encoding="utf-8").splitlines())
+
+
+def _doctor(python: Path, folder: Path) -> dict[str, Any]:
+    link = Link(python, folder / "doctor.log")
+    try:
+        return link.run_blocking("doctor", {})
+    except EngineError as error:
+        raise InstallError(f"The engine does not run: {error}. Press Repair.") from error
+    finally:
+        link.close(timeout=5.0)
+
+
+def _check_doctor(result: dict[str, Any], options: Options) -> None:
+    if not result.get("ok"):
+        raise InstallError("The engine is not in order: " + " ".join(result.get("problems", [])))
+    expected, found = options.device, result.get("device")
+    if expected in ("cuda", "rocm", "mps") and found != expected:
+        raise InstallError(
+            f"The engine runs on {found}, not on {expected}: update the driver of the graphics card, or choose "
+            "another device."
+        )
+
+
+class Installer(threading.Thread):
+    """One installation in the background; its fields may be read at any time."""
+
+    def __init__(self, options: Options) -> None:
+        super().__init__(name="fieldwork-install", daemon=True)
+        self.options = options
+        self.fraction, self.message, self.error = 0.0, "", ""
+        self.result: dict[str, Any] | None = None
+        self.cancelled = threading.Event()
+
+    def run(self) -> None:
+        try:
+            self.result = install(self.options, self._report, self.cancelled)
+        except InstallCancelled:
+            self.error = "Stopped. Press Install to go on."
+        except (InstallError, OSError) as error:
+            self.error = str(error)
+
+    def _report(self, fraction: float, message: str) -> None:
+        self.fraction, self.message = fraction, message
+
+
+def default_base() -> Path:
+    """Python that Blender runs on."""
+    return Path(sys.executable)

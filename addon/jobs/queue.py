@@ -1,0 +1,401 @@
+"""The queue of jobs on Blender's side: one engine, one timer, one job at a time.
+
+The timer is persistent, so jobs survive loading another file, undo, and the operator that started them. Where
+there are no timers (`blender -b`, the `bpy` module) operators call `Queue.run` instead, which blocks.
+
+What a job has to do in Blender when it has ended may be a generator: the timer then runs it in slices, between which
+the window lives.
+
+Imported when the extension is enabled: what is needed only with a job is imported where it is used.
+"""
+
+from __future__ import annotations
+
+import importlib
+import threading
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import bpy
+
+from .. import machine
+from ..errors import EngineError, SceneError
+from ..project import region as crop
+from ..project import snapshot as state
+from ..text import t
+from . import redraw
+from .job import Done, Job, Steps
+
+if TYPE_CHECKING:
+    from ..engine.install import Installer
+    from ..engine.link import Link
+
+BUSY_PERIOD = 0.1  # seconds between two looks at the engine while something goes on
+IDLE_PERIOD = 0.5
+FOLLOW_PERIOD = 0.5  # seconds between two looks at the files of a job in another process
+DRAW_PERIOD = 0.4  # seconds between two drawings of the panels and the status bar while a job runs
+KEPT = 8  # finished jobs the panel remembers
+SLICE = 0.02  # seconds of bringing a result into the scene at a time
+SLICE_PERIOD = 0.01  # seconds between two slices
+
+
+def open_link(python: Path, log: Path) -> Link:
+    """A way to an engine, which starts with the first request."""
+    from ..engine.link import Link
+
+    return Link(python, log)
+
+
+def load_modules() -> None:
+    """Import what results and curves need: numpy alone takes longer than the window may be held up."""
+    for name in ("pictures.curve", "scene.build", "scene.visibility", "render.result"):
+        importlib.import_module(f"..{name}", __package__)
+
+
+class Queue:
+    """All jobs of this Blender."""
+
+    def __init__(self) -> None:
+        self.link: Link | None = None
+        self.running: Job | None = None
+        self.waiting: list[Job] = []
+        self.followed: Job | None = None
+        self.finished: list[Job] = []
+        self.facts: dict[str, Any] = {}  # what the engine last said of itself
+        self.doctor: dict[str, Any] = {}  # what the doctor last found
+        self.installer: Installer | None = None
+        self.bringing: tuple[Job, Steps] | None = None  # a job whose result comes into the scene
+        self.slowest_tick = 0.0  # seconds of the longest time Blender was held up
+        self.slowest_step = ""  # what that was
+        self.slowest_cpu = 0.0  # the same in seconds of the processor, which other programs do not lengthen
+        self.edits = 0  # files loaded, undone and redone steps: what was held of the scene is stale
+        self._edits_seen = 0
+        self._loader: threading.Thread | None = None
+        self._number = 0
+        self._looked = 0.0
+        self._asked = 0.0
+        self._drawn = 0.0
+        self._status_shown = ""  # id of the job that the status bar shows
+
+    # For operators
+
+    @property
+    def current(self) -> Job | None:
+        """The job the panels show."""
+        bringing = self.bringing[0] if self.bringing else None
+        return bringing or self.running or self.followed or (self.waiting[0] if self.waiting else None)
+
+    @property
+    def last(self) -> Job | None:
+        return self.finished[-1] if self.finished else None
+
+    @property
+    def outcome(self) -> Job | None:
+        """The newest job whose failure or warnings should be read: not put away, and not made good since."""
+        done: set[tuple[str, Path | None]] = set()
+        for job in reversed(self.finished):
+            key = (job.verb, job.project)
+            if not job.dismissed and key not in done and (job.state == "failed" or job.warnings):
+                return job
+            if job.state == "done":
+                done.add(key)
+        return None
+
+    def make(self, verb: str, params: dict[str, Any], on_done: Done | None = None, before: Steps | None = None) -> Job:
+        self._number += 1
+        folder = params.get("project") or (params.get("out") if verb == "reconstruct" else None)
+        return Job(
+            verb,
+            params,
+            id=f"{verb}-{time.strftime('%Y%m%d-%H%M%S')}-{self._number}",
+            project=Path(folder) if folder else None,
+            on_done=on_done,
+            before=before,
+        )
+
+    def submit(self, job: Job) -> None:
+        """Put a job at the end of the queue; it starts at once when nothing runs."""
+        self.waiting.append(job)
+        self._start_next()
+        if not self._loader:
+            self._loader = threading.Thread(target=load_modules, name="fieldwork-modules", daemon=True)
+            self._loader.start()
+        self.redraw()
+
+    def follow_up(self, job: Job) -> None:
+        """Another job from within the end of one: queued in a window, done at once without."""
+        if bpy.app.background:
+            self.run(job)
+        else:
+            self.submit(job)
+
+    def run(self, job: Job) -> dict[str, Any]:
+        """Run a job and wait for it. Raises EngineError."""
+        job.state, job.started = "running", time.monotonic()
+        self.running = job
+        for _ in job.before or ():
+            pass
+        try:
+            result = self._engine().run_blocking(job.verb, {**job.params, "job": job.id}, job.take)
+        except EngineError as error:
+            self._finish(job, None, error)
+            raise
+        self._finish(job, result, None)
+        while self.bringing:
+            self._bring(SLICE)
+        return result
+
+    def cancel(self, job: Job | None = None) -> None:
+        job = job or self.current
+        if job is None:
+            return
+        if job in self.waiting:
+            self.waiting.remove(job)
+            self._finish(job, None, EngineError("cancelled", "Cancelled."))
+        elif self.bringing and self.bringing[0] is job:
+            self._brought(job, EngineError("cancelled", "Cancelled."))
+        elif job.active:
+            job.state = "cancelling"
+            if job.followed and job.project:
+                from ...nerfcore.engine import status
+
+                status.request_cancel(job.project, job.id)
+            elif self.link:
+                self.link.cancel(job.id)
+        self.redraw()
+
+    def stop_engine(self, detach: bool = False, timeout: float | None = None) -> None:
+        """End the engine and free its memory. A running job is cancelled, or goes on with `detach`."""
+        link, self.link = self.link, None
+        self.facts = {}
+        if link is None:
+            return
+        if detach:
+            self._hand_over(link)
+        link.close(detach, timeout)
+        job, self.running = self.running, None
+        if job and not detach:
+            self._finish(job, None, EngineError("cancelled", "The engine was stopped.", "Run it again to resume."))
+
+    def _hand_over(self, link: Link) -> None:
+        """Give an engine that is to go on by itself what waits as well; what has no project cannot be found again."""
+        for job in [job for job in self.waiting if job.project is not None]:
+            link.request(job.verb, {**job.params, "detach": True, "job": job.id})
+            self.waiting.remove(job)
+
+    def reattach(self, project: Path) -> None:
+        """Follow a job that another process runs on the project, and tell of one that died."""
+        if self.running and self.running.project == project:
+            return
+        from ...nerfcore.engine import status as st
+
+        self.followed = None
+        for status in reversed(st.list_jobs(project)):
+            if status.state == "running":
+                self.followed = Job(
+                    status.verb, status.params, status.id, project, state="running", followed=True,
+                    started=time.monotonic() - max(0.0, time.time() - (status.started or time.time())),
+                )  # fmt: skip
+                self._follow()
+                break
+            if status.state == "died" and all(job.id != status.id for job in self.finished):
+                job = Job(status.verb, status.params, status.id, project, state="failed", stage=status.stage)
+                error = status.error or {}
+                job.error = EngineError("died", error.get("message", ""), error.get("hint", ""))
+                self._remember(job)
+                break
+        self.redraw()
+
+    # The timer
+
+    def tick(self) -> float:
+        """One look at the engine. Returns the seconds until the next."""
+        begin, busy_since = time.perf_counter(), time.thread_time()
+        doing = f"{self.current.stage} {self.current.message}" if self.current else ""
+        try:
+            state.write_classes()
+            if self.link:
+                self.link.pump()
+            if self.running:
+                self.running.seconds = time.monotonic() - (self.running.started or time.monotonic())
+            self._prepare(SLICE)
+            self._start_next()
+            self._follow()
+            self._look_after_engine()
+            self._bring(SLICE)
+            if not bpy.app.background:
+                crop.follow(bpy.context.scene)
+        except Exception:
+            # A timer that raises is dropped by Blender, and all jobs with it.
+            import logging
+
+            logging.getLogger("fieldwork.addon").exception("Fieldwork's timer failed")
+        installing = self.installer is not None and self.installer.is_alive()
+        busy = self.current is not None or installing or (self.link is not None and self.link.busy)
+        due = busy and time.monotonic() - self._drawn > DRAW_PERIOD
+        if due or self._status_shown != self._current_id():
+            self.redraw()
+        seconds = time.perf_counter() - begin
+        self.slowest_cpu = max(self.slowest_cpu, time.thread_time() - busy_since)
+        if seconds > self.slowest_tick:
+            self.slowest_tick, self.slowest_step = seconds, doing
+        sliced = self.bringing or any(job.before for job in self.waiting)
+        return SLICE_PERIOD if sliced else BUSY_PERIOD if busy else IDLE_PERIOD
+
+    def _prepare(self, seconds: float) -> None:
+        """Do what a waiting job needs of Blender, for that long: at once, not when its turn comes."""
+        job = next((job for job in self.waiting if job.before is not None), None)
+        if job is None or job.before is None:
+            return
+        end = time.perf_counter() + seconds
+        try:
+            while time.perf_counter() < end:
+                job.fraction, job.message = next(job.before)
+        except StopIteration:
+            job.before, job.fraction, job.message = None, None, ""
+        except Exception as error:
+            self.waiting.remove(job)
+            self._finish(job, None, EngineError("scene", f"The scene cannot be read: {error}."))
+            raise
+
+    def _start_next(self) -> None:
+        if self.running is not None or not self.waiting or self.waiting[0].before is not None:
+            return
+        job = self.waiting.pop(0)
+        self.running = job
+        job.state, job.started = "running", time.monotonic()
+        detach = {"detach": True} if machine.preferences().on_close == "continue" else {}
+        try:
+            self._engine().request(
+                job.verb,
+                {**job.params, **detach, "job": job.id},
+                lambda result, error: self._finish(job, result, error),
+                job.take,
+            )
+        except EngineError as error:
+            self._finish(job, None, error)
+
+    def _engine(self) -> Link:
+        if self.link is not None and not self.link.alive:
+            self.link.pump()
+            if not self.link.alive:
+                self.link = None
+        if self.link is None:
+            python = machine.engine_python()
+            if python is None:
+                raise EngineError(
+                    "missing", "The engine is not installed.", "Install it in the preferences of Fieldwork."
+                )
+            self.link = open_link(python, machine.engine_log())
+        return self.link
+
+    def _finish(self, job: Job, result: dict[str, Any] | None, error: EngineError | None) -> None:
+        if self.running is job:
+            self.running = None
+        job.result, job.error, job.eta = result, error, None
+        if job.started:
+            job.seconds = time.monotonic() - job.started
+        job.state = "done" if error is None else "cancelled" if error.kind == "cancelled" else "failed"
+        if job.verb == "doctor" and result:
+            self.doctor = result
+        steps = job.on_done(job) if job.on_done else None
+        if steps is None:
+            self._remember(job)
+        else:
+            job.state, job.stage, job.fraction, job.message = "running", t("Updating the Scene"), None, ""
+            self.bringing, self._edits_seen = (job, steps), self.edits
+        self.redraw()
+
+    def _bring(self, seconds: float) -> None:
+        """Bring a result into the scene for that long."""
+        if self.bringing is None:
+            return
+        job, steps = self.bringing
+        end = time.perf_counter() + seconds
+        try:
+            if self._edits_seen != self.edits and job.on_done:
+                # What the steps hold of the scene may be gone. Made again, they go on with what is there.
+                self._edits_seen, job.state = self.edits, "done"
+                again = job.on_done(job)
+                if again is None:
+                    self._brought(job, None)
+                    return
+                job.state, self.bringing, steps = "running", (job, again), again
+            while time.perf_counter() < end:
+                job.fraction, job.message = next(steps)
+        except StopIteration:
+            self._brought(job, None)
+        except SceneError as error:
+            self._brought(job, EngineError("scene", str(error)))
+        except Exception as error:
+            self._brought(job, EngineError("scene", f"The result could not be brought into the scene: {error}."))
+            raise
+
+    def _brought(self, job: Job, error: EngineError | None) -> None:
+        self.bringing = None
+        job.error, job.fraction, job.message = error, None, ""
+        job.state = "done" if error is None else "cancelled" if error.kind == "cancelled" else "failed"
+        self._remember(job)
+        self.redraw()
+
+    def _remember(self, job: Job) -> None:
+        self.finished = [*self.finished, job][-KEPT:]
+
+    def _follow(self) -> None:
+        """Bring the job of another process up to date from its files."""
+        job = self.followed
+        if job is None or job.project is None or time.monotonic() - self._looked < FOLLOW_PERIOD:
+            return
+        self._looked = time.monotonic()
+        from ...nerfcore.engine import status as st
+
+        status = st.read_job(st.job_path(job.project, job.id))
+        events, job.events_read = st.read_events(job.project, job.id, job.events_read)
+        for event in events:
+            job.take_event(event)
+        job.seconds = time.monotonic() - (job.started or time.monotonic())
+        if status is not None and not status.finished:
+            job.stage, job.fraction = status.stage, status.fraction
+            job.message, job.eta = status.message, status.eta_s
+            return
+        self.followed = None
+        if status is not None and status.state == "done":
+            self._finish(job, status.result, None)
+            self.reattach(job.project)  # the next one of those that were left to the engine
+            return
+        error = (status.error if status else None) or {"code": "died", "message": "The job is gone."}
+        kind = "cancelled" if status and status.state == "cancelled" else error.get("code", "died")
+        self._finish(job, None, EngineError(kind, error.get("message", ""), error.get("hint", "")))
+
+    def _look_after_engine(self) -> None:
+        """Ask a living engine for its memory now and then; end one that was idle for long."""
+        link = self.link
+        if link is None or not link.alive:
+            return
+        minutes = machine.preferences().idle_minutes
+        if minutes and not link.busy and time.monotonic() - link.last_used > 60 * minutes:
+            self.stop_engine()
+            self.redraw()
+        elif self.running and time.monotonic() - self._asked > 2.0:
+            self._asked = time.monotonic()
+            link.request("status", on_done=self._take_facts)
+
+    def _take_facts(self, result: dict[str, Any] | None, error: EngineError | None) -> None:
+        self.facts = result or self.facts
+
+    # Drawing
+
+    def _current_id(self) -> str:
+        return self.current.id if self.current else ""
+
+    def redraw(self) -> None:
+        """Redraw what shows jobs: sidebars, preferences, the status bar."""
+        if bpy.app.background:
+            return
+        self._drawn = time.monotonic()
+        if redraw.panels():
+            self._status_shown = self._current_id()
+
+
+queue = Queue()

@@ -1,0 +1,28 @@
+"""Where the capture's own frame (metres, z up) lies in a scene: its parent may be moved, turned and scaled."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+from mathutils import Matrix
+
+from ..roles import PROJECT, ROLE
+
+
+def root_of(scene: bpy.types.Scene, project: Path | None) -> bpy.types.Object | None:
+    """The empty under which everything of a project hangs in a scene; None where nothing was imported."""
+    if project is None:
+        return None
+    return next((o for o in scene.objects if o.get(ROLE) == "root" and o.get(PROJECT) == project.name), None)
+
+
+def scene_from_capture(scene: bpy.types.Scene, project: Path | None) -> Matrix:
+    """The matrix (4×4) from the capture's frame to the scene; only the units' factor where nothing was imported."""
+    root = root_of(scene, project)
+    return root.matrix_world.copy() if root is not None else Matrix.Scale(units_per_metre(scene), 4)
+
+
+def units_per_metre(scene: bpy.types.Scene) -> float:
+    """How many of the scene's units are a metre."""
+    return 1.0 / (scene.unit_settings.scale_length or 1.0)

@@ -1,0 +1,66 @@
+"""Showing and hiding classes of the labelled mesh, by a geometry-nodes modifier that leaves the mesh alone."""
+
+from __future__ import annotations
+
+import bpy
+
+from ..roles import PROJECT, ROLE
+from .surface import CLASS_ATTRIBUTE
+
+NAME = "Fieldwork Classes"
+
+
+def meshes(project: str | None = None) -> list[bpy.types.Object]:
+    """The labelled meshes in the file, of one project or of all."""
+    found = [obj for obj in bpy.data.objects if obj.type == "MESH" and obj.get(ROLE) == "mesh"]
+    return [obj for obj in found if project is None or obj.get(PROJECT) == project]
+
+
+def hide_classes(obj: bpy.types.Object, hidden: list[int]) -> None:
+    """Hide the faces of these classes, show all others."""
+    modifier = obj.modifiers.get(NAME)
+    if not hidden:
+        if modifier is not None:
+            group = modifier.node_group
+            obj.modifiers.remove(modifier)
+            if group is not None and group.users == 0:
+                bpy.data.node_groups.remove(group)
+        return
+    if modifier is None:
+        modifier = obj.modifiers.new(NAME, "NODES")
+    if modifier.node_group is None:
+        modifier.node_group = bpy.data.node_groups.new(f"{NAME} · {obj.name}", "GeometryNodeTree")
+        for side in ("INPUT", "OUTPUT"):
+            modifier.node_group.interface.new_socket("Geometry", in_out=side, socket_type="NodeSocketGeometry")
+    build(modifier.node_group, hidden)
+
+
+def build(tree: bpy.types.NodeTree, hidden: list[int]) -> None:
+    """Nodes that delete the faces whose class is one of `hidden`."""
+    tree.nodes.clear()
+    nodes, links = tree.nodes, tree.links
+    source, target = nodes.new("NodeGroupInput"), nodes.new("NodeGroupOutput")
+    attribute = nodes.new("GeometryNodeInputNamedAttribute")
+    attribute.data_type = "INT"
+    attribute.inputs["Name"].default_value = CLASS_ATTRIBUTE
+    delete = nodes.new("GeometryNodeDeleteGeometry")
+    delete.domain = "FACE"
+    value = next(socket for socket in attribute.outputs if socket.enabled)
+    any_of = None
+    for number in hidden:
+        equal = nodes.new("FunctionNodeCompare")
+        equal.data_type, equal.operation = "INT", "EQUAL"
+        a, b = (socket for socket in equal.inputs if socket.enabled and socket.type == "INT")
+        links.new(value, a)
+        b.default_value = number
+        if any_of is None:
+            any_of = equal.outputs[0]
+        else:
+            either = nodes.new("FunctionNodeBooleanMath")
+            either.operation = "OR"
+            links.new(any_of, either.inputs[0])
+            links.new(equal.outputs[0], either.inputs[1])
+            any_of = either.outputs[0]
+    links.new(source.outputs[0], delete.inputs["Geometry"])
+    links.new(any_of, delete.inputs["Selection"])
+    links.new(delete.outputs[0], target.inputs[0])

@@ -1,0 +1,252 @@
+"""The package: what Blender needs of a capture, readable with numpy and JSON alone.
+
+package.json        name, classes, cameras (camera-to-world in the world frame, OpenGL axes), settings
+renders/            rendered photos, without lens distortion too, where there are any
+images/             the photos without lens distortion, in the size of their camera
+points.npz          xyz (N, 3) float32 world, rgb (N, 3) uint8 sRGB
+lenses.json         which lens each photo was undistorted for
+mesh.npz            only when there is a mesh: vertices, faces, normals, colors, class_id, face_class
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+
+from ..data.load import load_scene
+from ..data.scene import Scene, View
+from ..errors import InputError, ProjectError
+from ..files import atomic_path, disk_errors, write_json
+from ..geometry.cameras import Camera, flip_camera_axes, pixel_centers, project, rays
+from ..params import PackageParams
+from ..progress import Reporter
+
+FORMAT, VERSION = "fieldwork-package", 1
+MESH_ARRAYS = ("vertices", "faces", "colors", "class_id", "face_class")
+
+
+def package_folder(project: Path, run: str) -> Path:
+    return project / "exports" / run / "package"
+
+
+def write_package(
+    project: Path, run: str, scene: Scene, name: str, report: Reporter, renders: Path | None = None
+) -> Path:
+    """Write the package of a run; photos that are already there and newer than their source are kept.
+
+    Args:
+        project: the project's folder; the mesh is read from exports/<run>/mesh.npz there, if it exists.
+        scene: its views and points in the world frame.
+        name: what Blender calls it.
+        renders: folder of pictures rendered from the photos' cameras, named like the photos; None: where Blender's panel
+            puts them.
+    Returns:
+        the folder.
+    Raises:
+        InputError: a photo is missing or unreadable.
+        ProjectError: the mesh file is damaged.
+    """
+    folder = package_folder(project, run)
+    with disk_errors(folder):
+        (folder / "images").mkdir(parents=True, exist_ok=True)
+    cameras = []
+    report.stage("Undistorting the photos")
+    grids: dict[str, torch.Tensor] = {}
+    lenses = _lenses(folder)
+    test = set(scene.test)
+    for index, view in enumerate(scene.views):
+        report.progress(index / len(scene.views), view.name)
+        file = _write_photo(view, folder, grids, lenses)
+        entry = camera_entry(view, f"images/{file.name}", "test" if index in test else "train")
+        render = _write_render(view, folder, renders or project / "exports" / "renders" / "photos", grids)
+        cameras.append(entry | ({"render": f"renders/{render.name}"} if render else {}))
+    write_json(folder / "lenses.json", lenses)
+    for part, key in (("images", "image"), ("renders", "render")):
+        kept = {Path(camera[key]).name for camera in cameras if key in camera}
+        for stale in (folder / part).glob("*"):
+            if stale.name not in kept:
+                stale.unlink()
+    points = scene.points
+    with atomic_path(folder / "points.npz") as temporary, open(temporary, "wb") as out:
+        np.savez_compressed(out, xyz=points.xyz.astype(np.float32), rgb=points.rgb.astype(np.uint8))
+    source = project / "exports" / run
+    has_mesh = _copy_mesh(source / "mesh.npz", folder / "mesh.npz")
+    has_texture = has_mesh and _copy_texture(source / "texture.png", folder)
+    write_json(
+        folder / "package.json",
+        {
+            "format": FORMAT,
+            "version": VERSION,
+            "name": name,
+            "run": run,
+            "frame": "world",
+            "ignore_id": scene.ignore_id,
+            "classes": [{"id": c.id, "name": c.name, "color": list(c.color)} for c in scene.classes],
+            "cameras": cameras,
+            "mesh": has_mesh,
+            "texture": "texture.png" if has_texture else None,
+        },
+    )
+    return folder
+
+
+def camera_entry(view: View, image: str, split: str) -> dict[str, Any]:
+    """One camera of package.json: pinhole in pixels, or a panorama; `camera_to_world` has OpenGL axes."""
+    camera = view.camera
+    return {
+        "name": view.name,
+        "model": "EQUIRECTANGULAR" if camera.model == "EQUIRECTANGULAR" else "PINHOLE",
+        "width": camera.width,
+        "height": camera.height,
+        "fx": camera.fx,
+        "fy": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        "camera_to_world": flip_camera_axes(view.camera_to_world).tolist(),
+        "image": image,
+        "split": split,
+    }
+
+
+def undistortion_grid(camera: Camera) -> torch.Tensor:
+    """Where each pixel of the distortion-free picture lies in the photo: (1, H, W, 2) in torch's −1 … 1.
+
+    The distortion-free camera has the same size, focal lengths and principal point. Pixels that the lens never
+    imaged lie outside.
+    """
+    directions, _ = rays(camera.undistorted(), pixel_centers(camera.width, camera.height).reshape(-1, 2))
+    found = project(camera, directions)
+    inside = np.isfinite(found).all(-1)
+    # Beyond the angle where the lens polynomial turns back, a projection is a mirage: it must lead back to its ray.
+    back, valid = rays(camera, np.where(inside[:, None], found, 0))
+    inside &= valid & ((back * directions).sum(-1) > 1 - 1e-6)
+    grid = np.where(inside[:, None], found / [camera.width, camera.height] * 2 - 1, 9.0)
+    return torch.from_numpy(grid.astype(np.float32)).reshape(1, camera.height, camera.width, 2)
+
+
+def undistort(pixels: np.ndarray, grid: torch.Tensor) -> np.ndarray:
+    """Resample a photo (H, W, C) uint8 along `undistortion_grid`; black where the lens saw nothing."""
+    photo = torch.from_numpy(pixels).permute(2, 0, 1)[None].float()
+    out = torch.nn.functional.grid_sample(photo, grid, mode="bicubic", padding_mode="zeros", align_corners=False)
+    return out[0].clamp(0, 255).round().byte().permute(1, 2, 0).numpy()
+
+
+def _write_photo(view: View, folder: Path, grids: dict[str, torch.Tensor], lenses: dict[str, str]) -> Path:
+    camera = view.camera
+    plain = camera.model in {"PINHOLE", "EQUIRECTANGULAR"} or (not any(camera.distortion) and camera.model == "OPENCV")
+    suffix = view.image.suffix.lower()
+    keep = plain and suffix in {".jpg", ".jpeg", ".png"}
+    target = folder / "images" / (view.name.replace("/", "_") + (suffix if keep else ".jpg"))
+    if not view.image.is_file():
+        raise InputError(f"The photo {view.image} is missing.", "Restore it, or make the project again.")
+    key = json.dumps(camera.model_dump(mode="json"))
+    if target.is_file() and target.stat().st_mtime >= view.image.stat().st_mtime and lenses.get(view.name) == key:
+        return target
+    lenses[view.name] = key
+    with atomic_path(target) as temporary:
+        if keep:
+            shutil.copyfile(view.image, temporary)
+        else:
+            if not plain and key not in grids:
+                grids[key] = undistortion_grid(camera)
+            _develop(view, temporary, None if plain else grids[key])
+    return target
+
+
+def _write_render(view: View, folder: Path, renders: Path, grids: dict[str, torch.Tensor]) -> Path | None:
+    """The rendered picture of a photo, straightened as the photo is; None when there is none."""
+    source = renders / f"{Path(view.name).stem}.png"
+    if not source.is_file():
+        return None
+    try:
+        with Image.open(source) as picture:
+            pixels = np.array(picture.convert("RGB"))
+    except OSError as error:
+        raise InputError(f"The render {source} cannot be read: {error}.", "Render it again.") from error
+    camera = view.camera.resized(pixels.shape[1], pixels.shape[0])
+    if any(camera.distortion) or camera.model not in {"PINHOLE", "EQUIRECTANGULAR", "OPENCV"}:
+        key = json.dumps(camera.model_dump(mode="json"))
+        if key not in grids:
+            grids[key] = undistortion_grid(camera)
+        pixels = undistort(pixels, grids[key])
+    target = folder / "renders" / (view.name.replace("/", "_") + ".png")
+    target.parent.mkdir(exist_ok=True)
+    with atomic_path(target) as temporary:
+        Image.fromarray(pixels).save(temporary, "PNG")
+    return target
+
+
+def _lenses(folder: Path) -> dict[str, str]:
+    """The lens each photo of the package was undistorted for: it may have been estimated anew since."""
+    try:
+        value = json.loads((folder / "lenses.json").read_text("utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return value if isinstance(value, dict) else {}
+
+
+def _develop(view: View, target: Path, grid: torch.Tensor | None) -> None:
+    try:
+        with Image.open(view.image) as picture:
+            pixels = np.array(picture.convert("RGB"))
+    except OSError as error:
+        raise InputError(f"The photo {view.image} cannot be read: {error}.", "Restore it.") from error
+    if grid is not None:
+        pixels = undistort(pixels, grid)
+    Image.fromarray(pixels).save(target, "JPEG", quality=92, subsampling=0)
+
+
+def _copy_mesh(source: Path, target: Path) -> bool:
+    """Copy the mesh into the package; false when there is none yet."""
+    if not source.is_file():
+        target.unlink(missing_ok=True)
+        return False
+    try:
+        with np.load(source, allow_pickle=False) as data:
+            missing = [name for name in MESH_ARRAYS if name not in data]
+    except (OSError, ValueError, zipfile.BadZipFile) as error:
+        raise ProjectError(f"{source} is damaged: {error}.", "Run `fieldwork mesh` again.") from error
+    if missing:
+        raise ProjectError(f"{source} lacks {', '.join(missing)}.", "Run `fieldwork mesh` again.")
+    with atomic_path(target) as temporary:
+        shutil.copyfile(source, temporary)
+    return True
+
+
+def _copy_texture(source: Path, folder: Path) -> bool:
+    """Copy the texture of the packaged mesh; false when it has no UVs."""
+    with np.load(folder / "mesh.npz", allow_pickle=False) as data:
+        wanted = "uv" in data and source.is_file()
+    if not wanted:
+        (folder / "texture.png").unlink(missing_ok=True)
+        return False
+    with atomic_path(folder / "texture.png") as temporary:
+        shutil.copyfile(source, temporary)
+    return True
+
+
+def package(params: PackageParams, report: Reporter) -> dict[str, Any]:
+    """Prepare the package of a project (see blend_package.py).
+
+    Returns:
+        {"folder", "cameras": count, "points": count, "mesh": whether there is one}
+    Raises:
+        ProjectError: there are no poses.
+        InputError: a photo is missing.
+    """
+    folder = params.project.absolute()
+    scene = load_scene(folder)
+    target = write_package(folder, params.run, scene, folder.name, report, params.renders)
+    return {
+        "folder": str(target),
+        "cameras": len(scene.views),
+        "points": len(scene.points),
+        "mesh": (target / "mesh.npz").is_file(),
+    }

@@ -1,0 +1,129 @@
+"""Label maps and masks of photos: decoding, matching orientation and size, nearest neighbour only."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, UnidentifiedImageError
+
+from ..errors import InputError
+from .decode import upright
+from .soft_labels import PROBABILITY_SUFFIXES, read_probabilities
+
+Colors = dict[int, tuple[int, int, int]]
+
+
+def read_labels(path: Path, colors: Colors | None = None, ignore_id: int = 0) -> np.ndarray:
+    """Class ids (H, W) uint16 of a label map.
+
+    Grey PNGs (8 or 16 bits) and palette PNGs hold the ids themselves; a palette whose colours are those of the
+    classes, and RGB pictures, are looked up in `colors` (id → RGB). Transparent pixels become `ignore_id`. Of
+    probability maps the most probable class is taken.
+
+    Raises:
+        InputError: it is no image, lossily compressed, or has colours that no class has. One clause, fit as a reason.
+    """
+    if path.suffix.lower() in PROBABILITY_SUFFIXES:
+        return read_probabilities(path).argmax(2).astype(np.uint16)
+    try:
+        with Image.open(path) as image:
+            if image.format in ("JPEG", "MPO", "HEIF"):
+                raise InputError(f"label map {path.name} is a {image.format}: its compression changes ids; save as PNG")
+            mode = image.mode
+            if mode in ("L", "I", "I;16", "I;16B", "I;16L", "1"):
+                values = np.asarray(image).astype(np.int64)
+            elif mode == "P":
+                values = _from_palette(image, colors, ignore_id)
+            elif mode in ("RGB", "RGBA", "LA"):
+                values = _from_colors(np.asarray(image.convert("RGBA")), colors, ignore_id, path.name)
+            else:
+                raise InputError(f"label map {path.name} has the unusual mode {mode}; save as 8-bit PNG")
+    except (OSError, UnidentifiedImageError, SyntaxError, ValueError) as error:
+        raise InputError(f"label map {path.name} cannot be read: {error}") from error
+    if values.min() < 0 or values.max() > 65535:
+        raise InputError(f"label map {path.name} has ids outside 0…65535")
+    return values.astype(np.uint16)
+
+
+def _from_palette(image: Image.Image, colors: Colors | None, ignore_id: int) -> np.ndarray:
+    indices = np.asarray(image).astype(np.int64)
+    palette = np.array(image.getpalette("RGB"), np.uint8).reshape(-1, 3)
+    if not colors:
+        return indices
+    used = np.unique(indices)
+    by_color = {(0, 0, 0): ignore_id} | {tuple(color): i for i, color in colors.items()}
+    ids = [by_color.get(tuple(palette[i].tolist())) if i < len(palette) else None for i in used]
+    if any(i is None for i in ids):
+        return indices
+    table = np.zeros(int(used.max()) + 1, np.int64)
+    table[used] = ids
+    return table[indices]
+
+
+def _from_colors(rgba: np.ndarray, colors: Colors | None, ignore_id: int, name: str) -> np.ndarray:
+    opaque = rgba[..., 3] > 127
+    rgb = rgba[..., :3].astype(np.int64)
+    if not colors:
+        # Some tools save ids as grey RGB; anything coloured needs a class file to be understood.
+        if (rgb.max(-1) == rgb.min(-1)).all():
+            return np.where(opaque, rgb[..., 0], ignore_id)
+        raise InputError(f"label map {name} is coloured; give --classes with a colour for each class")
+    packed = rgb @ [65536, 256, 1]
+    values = np.full(packed.shape, -1, np.int64)
+    for class_id, (red, green, blue) in colors.items():
+        values[packed == red * 65536 + green * 256 + blue] = class_id
+    values[~opaque | ((values < 0) & (packed == 0))] = ignore_id  # black means unlabelled unless a class has it
+    unknown = values < 0
+    if unknown.any():
+        example = f"#{int(packed[unknown][0]):06x}"
+        raise InputError(
+            f"label map {name}: {100 * unknown.mean():.1f} % of its pixels have colours of no class (e.g. {example})"
+        )
+    return values
+
+
+def read_mask(path: Path) -> np.ndarray:
+    """Foreground mask (H, W) bool: alpha where the file has one, else brightness above one half.
+
+    Raises:
+        InputError: it is no image. One clause, fit as a reason.
+    """
+    try:
+        with Image.open(path) as image:
+            channel = image.getchannel("A") if image.mode in ("RGBA", "LA") else image.convert("L")
+            return np.asarray(channel) > 127
+    except (OSError, UnidentifiedImageError, SyntaxError, ValueError) as error:
+        raise InputError(f"mask {path.name} cannot be read: {error}") from error
+
+
+def fit_to_photo(
+    values: np.ndarray, orientation: int, full_size: tuple[int, int], size: tuple[int, int], name: str
+) -> np.ndarray:
+    """Bring a map (H, W) to the photo's working copy, nearest neighbour.
+
+    Args:
+        orientation: EXIF orientation of the photo; applied when the map was drawn on the unrotated picture.
+        full_size: upright width, height of the original photo.
+        size: width, height of the working copy.
+    Raises:
+        InputError: its proportions are not those of the photo.
+    """
+    image = Image.fromarray(values.astype(np.uint8) * 255 if values.dtype == bool else values)
+    wanted = full_size[0] / full_size[1]
+    if (
+        orientation >= 5
+        and not _close(image.width / image.height, wanted)
+        and _close(image.height / image.width, wanted)
+    ):
+        image = upright(image, orientation)
+    if not _close(image.width / image.height, wanted):
+        raise InputError(
+            f"{name} is {image.width}×{image.height}, which is not the shape of the photo ({full_size[0]}×{full_size[1]})"
+        )
+    resized = image.resize(size, Image.Resampling.NEAREST) if image.size != size else image
+    return np.asarray(resized)
+
+
+def _close(a: float, b: float) -> bool:
+    return abs(a / b - 1) < 0.02

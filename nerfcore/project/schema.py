@@ -1,0 +1,112 @@
+"""What is written in a capture project, as typed models."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from ..geometry.cameras import Camera
+
+FORMAT = "fieldwork-project"
+VERSION = 1
+IDENTITY = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+
+
+class Model(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class ImageRecord(Model):
+    """One ingested photo. Paths are relative to the project folder and use forward slashes.
+
+    `status`: "ok", "rejected" (never used; `reason` says why) or "unregistered" (no pose found).
+    `source` is where the original came from, `sha256` its hash; `width`/`height` those of the working copy.
+    """
+
+    name: str
+    file: str = ""
+    source: str = ""
+    sha256: str = ""
+    width: int = 0
+    height: int = 0
+    camera_group: str = ""
+    focal_px: float | None = None
+    exif: dict[str, Any] = {}
+    sharpness: float | None = None
+    label: str | None = None
+    mask: str | None = None
+    confidence: str | None = None  # how sure the labels are, 8-bit grey
+    depth: str | None = None
+    split: Literal["train", "test", "auto"] = "auto"
+    status: Literal["ok", "rejected", "unregistered"] = "ok"
+    reason: str = ""
+
+
+class SemanticClass(Model):
+    """A class of the label maps; id 0 is void unless `Project.ignore_id` says otherwise."""
+
+    id: int = Field(ge=0)
+    name: str
+    color: tuple[float, float, float]
+    priority: float = Field(default=1.0, ge=0)
+
+
+class Frame(Model):
+    """How the SfM frame lies in the world: z up, metres once `scale_known`."""
+
+    world_from_sfm: list[list[float]] = IDENTITY
+    up_confidence: float | None = None
+    scale_known: bool = False
+    bounds: list[list[float]] | None = None  # region of interest in the world: [min, max]
+
+
+class ProvenanceStep(Model):
+    verb: str
+    time: str
+    version: str
+    settings: dict[str, Any] = {}
+    result: dict[str, Any] = {}
+
+
+class Project(Model):
+    format: Literal["fieldwork-project"] = FORMAT
+    version: int = VERSION
+    created: str = Field(default_factory=lambda: now())
+    images: list[ImageRecord] = []
+    classes: list[SemanticClass] = []
+    ignore_id: int = 0
+    mask_mode: Literal["ignore", "empty"] = "ignore"
+    frame: Frame = Frame()
+    provenance: list[ProvenanceStep] = []
+
+    def record(self, verb: str, settings: dict[str, Any], result: dict[str, Any]) -> None:
+        """Append one step to the provenance."""
+        from .. import __version__
+
+        self.provenance.append(
+            ProvenanceStep(verb=verb, time=now(), version=__version__, settings=settings, result=result)
+        )
+
+
+class PosedImage(Model):
+    """Pose of one registered image: camera-to-world 4×4 in the SfM frame, OpenCV axes."""
+
+    name: str
+    camera: int
+    camera_to_world: list[list[float]]
+
+
+class Poses(Model):
+    """Registered images. `reprojection_px` and `report` come from SfM, absent for imported poses."""
+
+    version: int = 1
+    source: str = ""
+    cameras: list[Camera] = []
+    images: list[PosedImage] = []
+    reprojection_px: float | None = None
+
+
+def now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")

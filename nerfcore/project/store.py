@@ -1,0 +1,145 @@
+"""The capture project: a folder that holds everything known about one capture.
+
+    project.json        this schema: images, classes, frame, provenance
+    images/ labels/ masks/ depth/   working copies, same stem for one photo
+    poses/poses.json    estimated or imported cameras; poses/points.npz the sparse points
+    runs/<name>/        config.json, field.safetensors, events.jsonl, metrics.json, …
+    jobs/               status of the running and the last job of each verb
+    exports/            meshes, .blend files, renders
+
+Every write is atomic. Nothing here is ever pickled.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, TypeVar
+from zipfile import BadZipFile
+
+import numpy as np
+from pydantic import BaseModel, ValidationError
+
+from ..errors import ProjectError
+from ..files import atomic_path, disk_errors, write_json
+from ..geometry.points import Points
+from .schema import FORMAT, VERSION, Poses, Project
+
+PROJECT_FILE = "project.json"
+POSES_FILE = "poses/poses.json"
+POINTS_FILE = "poses/points.npz"
+M = TypeVar("M", bound=BaseModel)
+
+
+def load_project(folder: Path) -> Project:
+    """Read `folder`/project.json.
+
+    Raises:
+        ProjectError: it is missing, foreign, truncated or from a newer version.
+    """
+    path = Path(folder) / PROJECT_FILE
+    value = _read_json(path, f"{folder} is not a capture project: it has no {PROJECT_FILE}.")
+    if not isinstance(value, dict) or value.get("format") != FORMAT:
+        raise ProjectError(
+            f"{path} was not written by Fieldwork.", "Choose a folder made by `fieldwork new` or `import`."
+        )
+    if isinstance(value.get("version"), int) and value["version"] > VERSION:
+        raise ProjectError(
+            f"{path} has version {value['version']}; this Fieldwork reads up to {VERSION}.",
+            "Update Fieldwork to open it.",
+        )
+    return _validated(Project, value, path)
+
+
+def save_project(folder: Path, project: Project) -> None:
+    """Atomically write `folder`/project.json. Raises DiskError when it cannot be written."""
+    write_json(Path(folder) / PROJECT_FILE, project.model_dump(mode="json"))
+
+
+def record_step(folder: Path, verb: str, settings: dict[str, Any], result: dict[str, Any]) -> None:
+    """Append one step to the provenance of a project on disk, whatever else has changed in it meanwhile."""
+    project = load_project(folder)
+    project.record(verb, settings, result)
+    save_project(folder, project)
+
+
+def is_project(folder: Path) -> bool:
+    return (Path(folder) / PROJECT_FILE).is_file()
+
+
+def load_poses(folder: Path) -> Poses:
+    """Read the camera poses of a project. Raises ProjectError when there are none or the file is damaged."""
+    path = Path(folder) / POSES_FILE
+    value = _read_json(path, f"{folder} has no camera poses yet.", "Run `fieldwork poses` first.")
+    return _validated(Poses, value, path)
+
+
+def save_poses(
+    folder: Path, poses: Poses, points: Points, visibility: tuple[np.ndarray, np.ndarray] | None = None
+) -> None:
+    """Atomically write poses and sparse points (SfM frame).
+
+    `visibility` says which image saw which point: two int arrays (M,), indices into `poses.images` and into points.
+    """
+    view, point = visibility if visibility is not None else (np.zeros(0, np.int32), np.zeros(0, np.int32))
+    with atomic_path(Path(folder) / POINTS_FILE) as temporary, open(temporary, "wb") as file:
+        np.savez_compressed(file, xyz=points.xyz, rgb=points.rgb, error=points.error, view=view, point=point)
+    write_json(Path(folder) / POSES_FILE, poses.model_dump(mode="json"))
+
+
+def load_points(folder: Path) -> Points:
+    """Sparse points in the SfM frame; empty when the project has none."""
+    path = Path(folder) / POINTS_FILE
+    if not path.is_file():
+        return Points.empty()
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            return Points(data["xyz"], data["rgb"], data["error"])
+    except (ValueError, OSError, KeyError, BadZipFile) as error:
+        raise ProjectError(f"{path} is damaged: {error}.", "Run `fieldwork poses` again.") from error
+
+
+def load_visibility(folder: Path) -> dict[str, np.ndarray]:
+    """For each image name, the indices (M,) of the sparse points it saw; empty when that is not known."""
+    path = Path(folder) / POINTS_FILE
+    if not path.is_file():
+        return {}
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            if "view" not in data:
+                return {}
+            view, point = data["view"], data["point"]
+    except (ValueError, OSError, KeyError, BadZipFile) as error:
+        raise ProjectError(f"{path} is damaged: {error}.", "Run `fieldwork poses` again.") from error
+    return {image.name: point[view == i] for i, image in enumerate(load_poses(folder).images)}
+
+
+def world_from_sfm(project: Project) -> np.ndarray:
+    """Similarity (4, 4) from the SfM frame to the Blender world."""
+    return np.array(project.frame.world_from_sfm, np.float64)
+
+
+def create_folder(folder: Path) -> None:
+    """Make the project folder. Raises DiskError when that is not allowed."""
+    with disk_errors(folder):
+        Path(folder).mkdir(parents=True, exist_ok=True)
+
+
+def _read_json(path: Path, missing: str, hint: str = "Choose a folder made by `fieldwork new` or `import`.") -> Any:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise ProjectError(missing, hint) from error
+    except OSError as error:
+        raise ProjectError(f"{path} cannot be read: {error.strerror}.", "Check its permissions.") from error
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise ProjectError(f"{path} is damaged: {error}.", "Restore it from a backup.") from error
+
+
+def _validated(model: type[M], value: Any, path: Path) -> M:
+    try:
+        return model.model_validate(value)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        raise ProjectError(f"{path} is damaged: {place}: {first['msg']}.", "Restore it from a backup.") from error

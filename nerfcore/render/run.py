@@ -1,0 +1,151 @@
+"""A training run on disk: `runs/<name>/config.json`, its checkpoint, and the model they describe."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
+from safetensors import SafetensorError, safe_open
+
+from ..config import RunConfig
+from ..data.box import Box
+from ..errors import ProjectError
+from ..files import write_json
+from ..geometry.similarity import transform_pose
+from ..kernels.device import use_device
+from ..project.schema import Poses, Project
+from ..project.store import world_from_sfm
+from .model import Model
+
+CPU_IMAGE_SIZE, GPU_IMAGE_SIZE = 800, 1600
+CHECKPOINT = "field.safetensors"
+REFINED_POSES = "poses.json"  # of a run with train.refine_poses
+PIXEL_FEATURES = "voxel_init.safetensors"  # of a run with field.voxel_init=cnn
+
+
+class RunInfo(BaseModel):
+    """What a run was trained on and with. `sfm_from_box` (4, 4) carries the cube [−1, 1]³ into the SfM frame."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    version: Literal[2] = 2
+    preset: str
+    config: RunConfig
+    class_ids: list[int]
+    priorities: list[float]
+    images: list[str]
+    sfm_from_box: list[list[float]]
+    contracted: bool
+    transparent: bool
+
+    @field_validator("config")
+    @classmethod
+    def _settled(cls, config: RunConfig) -> RunConfig:
+        if config.scene.image_size is None:
+            raise ValueError("scene.image_size is not settled")
+        return config
+
+    @property
+    def image_size(self) -> int:
+        """Longest side of the training images in pixels."""
+        assert self.config.scene.image_size is not None
+        return self.config.scene.image_size
+
+    def box(self, project: Project) -> Box:
+        """The cube in the project's present world frame."""
+        return Box(world_from_sfm(project) @ np.array(self.sfm_from_box), self.contracted)
+
+
+def settled_as(asked: RunConfig, settled: RunConfig) -> RunConfig:
+    """The settings asked for, with those that were left to the photos and the device as in a run that settled them."""
+    config = asked.model_copy(deep=True)
+    if config.scene.image_size is None:
+        config.scene.image_size = settled.scene.image_size
+    if config.scene.background == "auto":
+        config.scene.background = settled.scene.background
+    if config.field.finest is None:
+        config.field.finest = settled.field.finest
+    return config
+
+
+def run_folder(project: Path, run: str) -> Path:
+    return Path(project) / "runs" / run
+
+
+def save_info(project: Path, run: str, info: RunInfo) -> None:
+    write_json(run_folder(project, run) / "config.json", info.model_dump(mode="json"))
+
+
+def load_info(project: Path, run: str) -> RunInfo:
+    """Raises ProjectError when there is no such run or its config.json is damaged."""
+    path = run_folder(project, run) / "config.json"
+    try:
+        return RunInfo.model_validate(json.loads(path.read_text(encoding="utf-8")))
+    except FileNotFoundError as error:
+        raise ProjectError(f"{project} has no run “{run}”.", "Run `fieldwork train` first.") from error
+    except (json.JSONDecodeError, ValidationError) as error:
+        raise ProjectError(f"{path} is damaged or from another version.", "Train the run again.") from error
+
+
+def refined_poses(project: Path, run: str, info: RunInfo) -> dict[str, np.ndarray]:
+    """Camera-to-box poses (4, 4) by image of a run that refined them; empty otherwise.
+
+    Raises:
+        ProjectError: the run's poses.json is damaged.
+    """
+    path = run_folder(project, run) / REFINED_POSES
+    if not (info.config.train.refine_poses and path.is_file()):
+        return {}
+    try:
+        poses = Poses.model_validate_json(path.read_text(encoding="utf-8"))
+    except (OSError, ValidationError) as error:
+        raise ProjectError(f"{path} is damaged: {error}.", "Train the run again.") from error
+    box_from_sfm = np.linalg.inv(np.array(info.sfm_from_box))
+    return {image.name: transform_pose(box_from_sfm, np.array(image.camera_to_world)) for image in poses.images}
+
+
+def new_model(info: RunInfo, device: torch.device, seen: torch.Tensor | None = None) -> Model:
+    """An untrained model of the run's shape."""
+    torch.manual_seed(info.config.train.seed)
+    classes = len(info.class_ids) if info.config.loss.semantic_weight > 0 else 0
+    priorities = torch.tensor(info.priorities) if classes else None
+    return Model(info.config, classes, len(info.images), info.contracted, seen, priorities).to(device)
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A trained model, ready to be read."""
+
+    model: Model
+    info: RunInfo
+    state: dict[str, Any]
+    device: torch.device
+
+
+def load_trained(project: Path, run: str) -> Trained:
+    """Raises ProjectError when the run has no usable checkpoint."""
+    info, device = load_info(project, run), use_device()
+    path = run_folder(project, run) / CHECKPOINT
+    tensors, state = read_checkpoint(path, device)
+    model = new_model(info, device)
+    model.load_state_dict({name.removeprefix("model."): t for name, t in tensors.items() if name.startswith("model.")})
+    model.field.set_progress(state["progress"], info.config.train.fade, state["steps"])
+    return Trained(model.eval().requires_grad_(False), info, state, device)
+
+
+def read_checkpoint(path: Path, device: torch.device) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+    """Tensors and state of a checkpoint. Raises ProjectError when it is missing, truncated or foreign."""
+    if not path.is_file():
+        raise ProjectError(f"{path.parent} has no checkpoint.", "Run `fieldwork train` first.")
+    try:
+        with safe_open(path, "pt", device=str(device)) as file:
+            state = json.loads((file.metadata() or {})["fieldwork"])
+            names = list(file.keys())
+            return {name: file.get_tensor(name) for name in names}, state
+    except (SafetensorError, KeyError, json.JSONDecodeError, OSError) as error:
+        raise ProjectError(f"{path} is damaged: {error}.", "Train the run again.") from error

@@ -281,8 +281,8 @@ def test_what_the_file_holds(tmp_path, bpy_script):
 
 
 AGAIN = """
-from fieldwork.addon.package import read_package
-from fieldwork.addon.scene_import import import_package
+from fieldwork.addon.scene.package import read_package
+from fieldwork.addon.scene.build import import_package
 scene = bpy.context.scene
 first = import_package(scene, read_package(package))
 count = [len(bpy.data.objects), len(bpy.data.meshes), len(bpy.data.materials), len(bpy.data.cameras),

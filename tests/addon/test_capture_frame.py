@@ -22,7 +22,7 @@ def test_cameras_points_and_region_are_those_of_the_capture(bpy_script, tmp_path
         SETUP
         + MOVED
         + """
-from fieldwork.addon import crop
+from fieldwork.addon.project import region as crop
 from fieldwork.operators.render import write_cameras
 # A camera, two points and a box, each given in the capture and put where they appear in the scene.
 pose = Matrix.LocRotScale(Vector((1, 2, 3)), Euler((1.1, 0.2, 0.4)), None)
@@ -65,7 +65,7 @@ def test_a_metre_is_a_metre_in_every_unit(bpy_script, tmp_path, metres):
     facts = bpy_script(
         SETUP
         + """
-from fieldwork.addon.scene_import import import_steps, load
+from fieldwork.addon.scene.build import import_steps, load
 scene.unit_settings.scale_length = metres
 for _ in range(2):
     steps = import_steps(scene, load(folder))

@@ -213,7 +213,7 @@ try:
     refused = ""
 except RuntimeError as error:
     refused = str(error)
-from fieldwork.addon import jobs
+from fieldwork.addon.jobs import queue as jobs
 jobs.queue.stop_engine()
 answer({"result": list(result), "project": bpy.context.scene.fieldwork.project, "refused": refused, "left": os.listdir(bpy.app.tempdir)})
 """

@@ -28,7 +28,7 @@ def settings(monkeypatch, tmp_path):
     class Settings(machine._Defaults):
         pass
 
-    monkeypatch.setattr(machine, "machine", lambda: Settings)
+    monkeypatch.setattr(machine, "preferences", lambda: Settings)
     monkeypatch.setattr(machine, "user_folder", lambda *parts: Path(tmp_path, "user", *parts))
     monkeypatch.setattr(machine, "engine_python", lambda: Path(sys.executable))
     monkeypatch.setattr(jobs, "open_link", lambda python, log: Link(python, log, ENGINE))

@@ -78,7 +78,7 @@ import time
 import numpy as np
 import fieldwork
 fieldwork.register()
-from fieldwork.addon import jobs
+from fieldwork.addon.jobs import queue as jobs
 from fieldwork.operators.scene import import_result
 scene, queue = bpy.context.scene, jobs.queue
 Path(project, "project.json").write_text(json.dumps({"format": "fieldwork-project"}))

@@ -178,7 +178,7 @@ def test_a_button_cancels_only_its_own_job(bpy_script, tmp_path):
     facts = bpy_script(
         SETUP
         + """
-from fieldwork.addon import jobs
+from fieldwork.addon.jobs import queue as jobs
 queue = jobs.queue
 make = lambda: queue.make("count", {"project": folder})
 running, first, second = make(), make(), make()

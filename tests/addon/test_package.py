@@ -206,8 +206,8 @@ def test_renders_of_photos_are_straightened_and_shown_by_their_camera(tmp_path, 
         assert (got == undistort(pixels, undistortion_grid(lens.resized(30, 20)))).all()
     slots = bpy_script(
         """
-from fieldwork.addon.package import read_package
-from fieldwork.addon.scene_import import import_package
+from fieldwork.addon.scene.package import read_package
+from fieldwork.addon.scene.build import import_package
 for _ in range(2):
     imported = import_package(bpy.context.scene, read_package(package))
 answer([slot.image.filepath for slot in imported.cameras[0].data.background_images])

@@ -43,7 +43,7 @@ def test_the_next_step_leads_from_nothing_to_the_model(bpy_script, tmp_path):
         """
 import fieldwork
 fieldwork.register()
-from fieldwork.addon import jobs
+from fieldwork.addon.jobs import queue as jobs
 from fieldwork.panels.main import next_step
 settings = bpy.context.scene.fieldwork
 folder = Path(project)

@@ -13,7 +13,7 @@ import fieldwork
 fieldwork.register()
 from bpy_extras.object_utils import world_to_camera_view
 from mathutils import Vector
-from fieldwork.addon.picking import project
+from fieldwork.addon.scene.picking import project
 scene, camera = bpy.context.scene, bpy.context.scene.camera
 scene.render.resolution_x, scene.render.resolution_y = 200, 100
 depsgraph = bpy.context.evaluated_depsgraph_get()

@@ -31,7 +31,7 @@ def test_lists_follow_the_project_and_class_edits_go_back(bpy_script, tmp_path):
     facts = bpy_script(
         SETUP
         + """
-from fieldwork.addon import state
+from fieldwork.addon.project import snapshot as state
 settings.project = project
 rows = [[i.name, i.status, i.reason, i.labelled] for i in settings.images]
 classes = [[c.id, c.name, round(c.priority, 3), round(c.area, 3)] for c in settings.classes]
@@ -90,7 +90,7 @@ def test_hidden_classes_vanish_from_the_mesh(bpy_script, tmp_path):
     facts = bpy_script(
         SETUP
         + """
-from fieldwork.addon import visibility
+from fieldwork.addon.scene import visibility
 settings.project = project
 mesh = bpy.data.meshes.new("Surface")
 mesh.from_pydata([(x, y, 0) for y in range(2) for x in range(4)], [], [(i, i + 1, i + 5, i + 4) for i in range(3)])
@@ -117,7 +117,7 @@ def test_undo_leaves_the_lists_as_the_project_says(bpy_script, tmp_path):
     facts = bpy_script(
         SETUP
         + """
-from fieldwork.addon import state
+from fieldwork.addon.project import snapshot as state
 settings.project = project
 classes = lambda: [c["priority"] for c in json.loads((Path(project) / "project.json").read_text())["classes"]]
 bpy.ops.ed.undo_push(message="project")

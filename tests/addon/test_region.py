@@ -8,7 +8,7 @@ from fieldwork.tests.addon.support import SETUP, make_posed_project
 BOX = (
     SETUP
     + """
-from fieldwork.addon import crop
+from fieldwork.addon.project import region as crop
 settings.project = project
 bpy.ops.fieldwork.crop_add()
 box = crop.find(scene)

@@ -71,7 +71,7 @@ def test_renders_appear_behind_their_cameras_or_on_planes_once(bpy_script, tmp_p
     facts = bpy_script(
         SETUP
         + """
-from fieldwork.addon import render_result
+from fieldwork.addon.render import result as render_result
 settings.project = project
 files = []
 for name in ("a", "a_depth", "b"):
@@ -116,7 +116,7 @@ def test_image_plane_covers_exactly_what_the_camera_sees(bpy_script, tmp_path):
         + """
 from bpy_extras.object_utils import world_to_camera_view
 from mathutils import Vector
-from fieldwork.addon import render_result
+from fieldwork.addon.render import result as render_result
 scene.render.resolution_x, scene.render.resolution_y = 200, 100
 scene.camera.data.shift_x = 0.2
 image = bpy.data.images.new("frame", 200, 100)

@@ -11,7 +11,7 @@ import os
 import signal
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin
@@ -40,6 +40,8 @@ NAMED = {
     "export": {"out"},
 }
 ORDER = {"import": ["dataset", "project"]}
+# Parameters that the command line takes from a file only.
+FILES = {"classes": {"classes"}}
 # Whether a path can be read is for the verb to say, in its own words and with exit code 1.
 PATH = click.Path(path_type=Path, readable=False)
 
@@ -64,6 +66,10 @@ class CommaList(click.ParamType):
         return value if isinstance(value, list) else [part.strip() for part in str(value).split(",")]
 
 
+def _box(ctx: click.Context, param: click.Parameter, value: tuple[float, ...] | None) -> list[list[float]] | None:
+    return [list(value[:3]), list(value[3:])] if value else None
+
+
 def _plain(annotation: Any) -> Any:
     """The type without None."""
     if get_origin(annotation) in (Union, UnionType):
@@ -75,6 +81,9 @@ def _option(name: str, info: FieldInfo) -> click.Option:
     """The option of one field of a parameter model."""
     kind = _plain(info.annotation)
     flags = ["--" + name.replace("_", "-"), name]
+    if kind == list[list[float]]:
+        shape = {"nargs": 6, "type": float, "metavar": "X0 Y0 Z0 X1 Y1 Z1"}
+        return click.Option(["--box", name], callback=_box, help=info.description, **shape)
     shared: dict[str, Any] = {"help": info.description or "", "required": info.is_required()}
     default = None if info.is_required() else info.get_default(call_default_factory=True)
     if kind is bool:
@@ -101,7 +110,8 @@ def _command(name: str) -> click.Command:
     fields = verb.params.model_fields
     arguments = ORDER.get(name) or [n for n in POSITIONAL if n in fields and n not in NAMED.get(name, set())]
     params: list[click.Parameter] = [click.Argument([n], type=PATH, metavar=n.upper()) for n in arguments]
-    params += [_option(n, info) for n, info in fields.items() if n not in arguments]
+    left_out = {*arguments, *FILES.get(name, {})}
+    params += [_option(n, info) for n, info in fields.items() if n not in left_out]
     params += [
         click.Option(["--json", "as_json"], is_flag=True, help="print one JSON object on stdout and nothing else"),
         click.Option(["--quiet"], is_flag=True, help="no progress"),
@@ -133,16 +143,17 @@ def _serve() -> int:
 def run_command(name: str, values: dict[str, Any], as_json: bool, quiet: bool, strict: bool) -> int:
     """Run a verb for the command line; returns the exit code."""
     values = {k: v for k, v in values.items() if v is not None}
+    verb = VERBS[name]
     try:
         if isinstance(values.get("set"), tuple):
             values["set"] = dict(_assignment(text) for text in values["set"])
-        params = VERBS[name].params.model_validate(values)
+        params = verb.params.model_validate(values)
     except ValidationError as error:
         first = error.errors()[0]
         raise click.UsageError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from error
     with _stdout_for_results() as stdout, ConsoleReporter(quiet or as_json) as report, _interruptible(report):
         try:
-            with project_lock(lockable(params), name):
+            with nullcontext() if verb.immediate else project_lock(lockable(params), name):
                 result = run_verb(name, params, report)
         except Cancelled:
             click.echo("Cancelled. Run the same command again to go on.", err=True)

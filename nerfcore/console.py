@@ -88,7 +88,8 @@ def flattened(value: dict[str, Any], prefix: str = "") -> list[tuple[str, str]]:
         if isinstance(item, dict):
             rows += flattened(item, f"{name}.") if item else [(name, "–")]
         elif isinstance(item, list):
-            short = ", ".join(map(str, item)) if all(not isinstance(i, (dict, list)) for i in item) else ""
+            named = [i.get("name") if isinstance(i, dict) else i for i in item]
+            short = ", ".join(map(str, named)) if all(not isinstance(i, dict) and i is not None for i in named) else ""
             rows.append((name, short if short and len(short) < 90 else f"{len(item)} items"))
         else:
             rows.append((name, "not measured" if item is None else str(item)))

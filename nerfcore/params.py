@@ -120,6 +120,33 @@ class AlignParams(Params):
     )
 
 
+class ClassValues(Params):
+    """One class; what is None stays as it is, or gets its default where the class is new."""
+
+    id: int
+    name: str
+    color: tuple[float, float, float] | None = None  # sRGB in [0, 1]
+    priority: float | None = Field(default=None, ge=0)
+
+
+class ClassesParams(Params):
+    project: Path
+    classes: list[ClassValues] | None = Field(
+        default=None, description="all classes the project shall have; None: list them"
+    )
+    file: Path | None = Field(
+        default=None, description="classes.json with all classes the project shall have; none: list them"
+    )
+
+
+class RegionParams(Params):
+    project: Path
+    bounds: list[list[float]] | None = Field(
+        default=None, description="region of interest x0 y0 z0 x1 y1 z1 in the aligned world"
+    )
+    clear: bool = Field(default=False, description="no region: everything is trained")
+
+
 class TrainParams(Params):
     project: Path
     preset: Preset = "standard"

@@ -10,11 +10,15 @@ from .progress import Reporter
 
 
 class Verb(NamedTuple):
-    """`function` is "module:name" below this package, called as function(params, report) → JSON-ready dict."""
+    """`function` is "module:name" below this package, called as function(params, report) → JSON-ready dict.
+
+    `immediate`: an edit of project.json that takes no time; it runs beside a job of the same project.
+    """
 
     params: type[p.Params]
     function: str
     summary: str
+    immediate: bool = False
 
 
 VERBS = {
@@ -25,6 +29,8 @@ VERBS = {
     "import": Verb(p.ImportParams, "data.importer:import_dataset", "Make a project from a posed data set."),
     "poses": Verb(p.PosesParams, "poses.estimate:estimate_poses", "Estimate the camera poses."),
     "align": Verb(p.AlignParams, "poses.align:align", "Set the up direction and the metric scale."),
+    "classes": Verb(p.ClassesParams, "project.edit:classes", "List or change the classes.", immediate=True),
+    "region": Verb(p.RegionParams, "project.edit:region", "Show, set or clear the region of interest.", immediate=True),
     "train": Verb(p.TrainParams, "train.verb:train", "Train the field."),
     "evaluate": Verb(p.EvaluateParams, "evaluate.verb:evaluate", "Measure the held-out images."),
     "render": Verb(p.RenderParams, "render.verb:render", "Render images from the field."),

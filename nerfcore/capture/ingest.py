@@ -24,7 +24,7 @@ from ..params import NewParams
 from ..progress import Reporter, shortened
 from ..project.classes import make_classes, read_classes
 from ..project.schema import ImageRecord, Project
-from ..project.store import PROJECT_FILE, create_folder, load_project, save_project
+from ..project.store import PROJECT_FILE, create_folder, edit_project, load_project
 from .find import Source, classes_beside, find_sources, list_photos, subfolder
 from .select import reject_blurred, reject_duplicates
 from .video import VIDEO_SUFFIXES, extract_frames
@@ -89,7 +89,10 @@ def new(params: NewParams, report: Reporter) -> dict[str, Any]:
         reject_blurred(records)
     records = kept + records
     _check_usable(records, photos, skipped)
-    project = _assemble(params, previous, records, (names, ignore_id, colors), report)
+    for record in records:
+        if record.status != "rejected" and record.reason:
+            report.warn(f"{record.name}: {record.reason}")
+    present = _present_ids(folder, records, report)
     rejected = skipped + [
         {"file": Path(record.source).name, "reason": record.reason} for record in records if record.status == "rejected"
     ]
@@ -100,16 +103,17 @@ def new(params: NewParams, report: Reporter) -> dict[str, Any]:
     if len(used) < 3:
         number = "one usable photo" if len(used) == 1 else f"{len(used)} usable photos"
         report.warn(f"Only {number}: camera poses need at least three, better twenty.")
-    result = {
+    result: dict[str, Any] = {
         "images": len(used),
         "rejected": rejected,
         "labelled": sum(record.label is not None for record in used),
         "masked": sum(record.mask is not None for record in used),
-        "classes": [c.name for c in project.classes],
     }
     origin = {"video_sha256": file_hash(photos)} if photos.is_file() else {}
-    project.record("new", params.model_dump(mode="json"), result | origin)
-    save_project(folder, project)
+    with edit_project(folder, Project(mask_mode=params.mask_mode)) as project:
+        _put_in(project, records, present, (names, ignore_id, colors), params, previous is not None)
+        result["classes"] = [c.name for c in project.classes]
+        project.record("new", params.model_dump(mode="json"), result | origin)
     return result
 
 
@@ -275,34 +279,40 @@ def _check_usable(records: list[ImageRecord], photos: Path, skipped: list[dict[s
     )
 
 
-def _assemble(
-    params: NewParams,
-    previous: Project | None,
-    records: list[ImageRecord],
-    classes: tuple[dict[int, str], int, Colors],
-    report: Reporter,
-) -> Project:
-    """The project with its classes: those named (names, void id, colours), and those in the label maps without a name."""
-    names, ignore_id, colors = classes
-    project = previous.model_copy() if previous else Project(mask_mode=params.mask_mode)
-    if previous is not None and not params.add and previous.images:
-        # A rerun keeps what was decided about the same photos later (splits, poses).
-        old = {record.name: record for record in previous.images}
-        for record in records:
-            before = old.get(record.name)
-            if before and before.sha256 == record.sha256:
-                record.split = before.split
-    project.images = records
-    project.mask_mode = params.mask_mode if params.masks or not previous else project.mask_mode
-    for record in records:
-        if record.status != "rejected" and record.reason:
-            report.warn(f"{record.name}: {record.reason}")
+def _present_ids(folder: Path, records: list[ImageRecord], report: Reporter) -> set[int]:
+    """Class ids that occur in the label maps of the project."""
     present: set[int] = set()
     for record in records:
         if record.label:
             report.check()
-            with Image.open(Path(params.project) / record.label) as image:
+            with Image.open(folder / record.label) as image:
                 present |= set(np.unique(np.asarray(image)).tolist())
+    return present
+
+
+def _put_in(
+    project: Project,
+    records: list[ImageRecord],
+    present: set[int],
+    classes: tuple[dict[int, str], int, Colors],
+    params: NewParams,
+    there: bool,
+) -> None:
+    """Put the photos into the project, and the classes: those named (names, void id, colours), and those `present` in
+    the label maps without a name. `there`: the project was there before."""
+    names, ignore_id, colors = classes
+    if not params.add:
+        # A rerun keeps what was decided about the same photos later.
+        old = {record.name: record for record in project.images}
+        for record in records:
+            before = old.get(record.name)
+            if before and before.sha256 == record.sha256:
+                record.split = before.split
+                if record.status == "ok" and before.status == "unregistered":
+                    record.status, record.reason = before.status, before.reason
+    project.images = records
+    if params.masks or not there:
+        project.mask_mode = params.mask_mode
     known = {c.id: c for c in project.classes}
     if names or not known:
         project.ignore_id = ignore_id
@@ -315,4 +325,3 @@ def _assemble(
         if c.id in known:
             said = {"name": c.name} | ({"color": c.color} if c.id in colors else {})
             project.classes[i] = known[c.id].model_copy(update=said)
-    return project

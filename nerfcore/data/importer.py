@@ -16,7 +16,7 @@ from ..params import ImportParams
 from ..progress import Reporter
 from ..project.classes import make_classes
 from ..project.schema import Frame, ImageRecord, PosedImage, Poses, Project, SemanticClass
-from ..project.store import PROJECT_FILE, create_folder, load_project, save_poses, save_project
+from ..project.store import PROJECT_FILE, create_folder, edit_project, load_project, save_poses
 from .copying import copy_depth, copy_labels, copy_mask, copy_photo
 from .dataset import Dataset, DatasetView
 
@@ -53,17 +53,6 @@ def import_dataset(params: ImportParams, report: Reporter) -> dict[str, Any]:
         present |= ids
     classes = _classes(dataset, present)
     cameras, images = _poses(dataset.views)
-    project = Project(
-        images=records,
-        classes=classes,
-        ignore_id=dataset.ignore_id,
-        frame=Frame(
-            world_from_sfm=dataset.world_from_sfm.tolist(),
-            up_confidence=dataset.up_confidence,
-            scale_known=dataset.scale_known,
-            bounds=None if dataset.bounds is None else dataset.bounds.tolist(),
-        ),
-    )
     result = {
         "format": dataset.format,
         "images": len(records),
@@ -71,8 +60,16 @@ def import_dataset(params: ImportParams, report: Reporter) -> dict[str, Any]:
         "classes": [c.name for c in classes],
     }
     save_poses(folder, Poses(source=dataset.format, cameras=cameras, images=images), dataset.points)
-    project.record("import", params.model_dump(mode="json"), result)
-    save_project(folder, project)
+    with edit_project(folder, Project()) as project:
+        project.images, project.classes, project.ignore_id = records, classes, dataset.ignore_id
+        project.frame = Frame(
+            world_from_sfm=dataset.world_from_sfm.tolist(),
+            up_confidence=dataset.up_confidence,
+            scale_known=dataset.scale_known,
+            bounds=None if dataset.bounds is None else dataset.bounds.tolist(),
+        )
+        project.mask_mode, project.provenance = "ignore", []
+        project.record("import", params.model_dump(mode="json"), result)
     return result
 
 

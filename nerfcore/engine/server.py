@@ -2,7 +2,8 @@
 
 Requests: every verb of `verbs.py` (its parameters, and two of the engine's own: `job`, an id the caller chooses,
 and `detach`, true when the job is to outlive the caller); `cancel {job}`, `detach {job}`, `ping`, `status`,
-`shutdown`. Notifications: `progress {job, stage, fraction, message, eta_s}`, `event {job, kind, …}`,
+`shutdown`. `classes` and `region` are no jobs: they are done at once, in order, also while a job works on the same
+project. Notifications: `progress {job, stage, fraction, message, eta_s}`, `event {job, kind, …}`,
 `log {level, text}`.
 
 When stdin ends the caller is gone: running jobs are cancelled (they leave a checkpoint) unless they were detached,
@@ -28,6 +29,7 @@ import psutil
 
 from .. import __version__
 from ..errors import Cancelled, FieldworkError
+from ..progress import Reporter
 from ..project.lock import project_lock
 from ..verbs import VERBS, run_verb
 from . import protocol as rpc
@@ -50,6 +52,7 @@ class Server:
         self._jobs: dict[str, Job] = {}  # queued and running
         self._jobs_lock = threading.RLock()
         self._queue: queue.Queue[Job | None] = queue.Queue()
+        self._edits: queue.Queue[rpc.Request | None] = queue.Queue()
         self._cancelled_at: dict[str, float] = {}
         self._count = 0
         self._connected = True
@@ -58,6 +61,8 @@ class Server:
         """Answer requests until stdin ends or `shutdown`. Returns the exit status."""
         worker = threading.Thread(target=self._work, name="worker", daemon=True)
         worker.start()
+        editor = threading.Thread(target=self._edit, name="editor", daemon=True)
+        editor.start()
         threading.Thread(target=self._clock, name="clock", daemon=True).start()
         told_to_stop = False
         try:
@@ -66,6 +71,8 @@ class Server:
                     break
         except _Stop:
             told_to_stop = True
+        self._edits.put(None)
+        editor.join(GRACE)
         self._close(worker, told_to_stop)
         return 0
 
@@ -76,6 +83,9 @@ class Server:
         request = None
         try:
             request = rpc.parse_request(line)
+            if request.method in VERBS and VERBS[request.method].immediate:
+                self._edits.put(request)
+                return True
             if request.method in VERBS:
                 self._enqueue(request)
                 return True
@@ -166,6 +176,19 @@ class Server:
     def _work(self) -> None:
         while (job := self._queue.get()) is not None:
             self._run(job)
+
+    def _edit(self) -> None:
+        """Verbs that take no time, in the order they came, beside the running job."""
+        while (request := self._edits.get()) is not None:
+            try:
+                params = rpc.parse_params(request.method, request.params)
+                message = rpc.answer(request.id, run_verb(request.method, params, Reporter()))
+            except BaseException as error:  # noqa: BLE001 - everything a verb raises is answered
+                tail = traceback.format_exception(error)[-6:]
+                wrong = error if isinstance(error, rpc.RpcError) else rpc.as_rpc_error(error, None, tail)
+                message = rpc.failure(request.id, wrong)
+            if request.id is not None:
+                self.send(message)
 
     def _run(self, job: Job) -> None:
         try:

@@ -14,7 +14,7 @@ from ..geometry.similarity import similarity_scale, transform_points, transform_
 from ..params import AlignParams
 from ..progress import Reporter
 from ..project.schema import Poses, Project
-from ..project.store import load_points, load_poses, load_project, save_project, world_from_sfm
+from ..project.store import edit_project, load_points, load_poses, world_from_sfm
 from .gps import fit_gps
 
 AXES = {f"{sign}{axis}": value * np.eye(3)[i] for i, axis in enumerate("xyz") for sign, value in (("", 1), ("-", -1))}
@@ -33,8 +33,16 @@ def align(params: AlignParams, report: Reporter) -> dict[str, Any]:
         ProjectError, PosesError (GPS or ground say nothing), SettingError (a value cannot be understood).
     """
     folder = Path(params.project)
-    project, poses, points = load_project(folder), load_poses(folder), load_points(folder)
+    poses, points = load_poses(folder), load_points(folder)
     report.stage("Aligning")
+    with edit_project(folder) as project:
+        result = _aligned(project, poses, points, params)
+        project.record("align", params.model_dump(mode="json"), result)
+    return result
+
+
+def _aligned(project: Project, poses: Poses, points: Points, params: AlignParams) -> dict[str, Any]:
+    """Change the frame of the project; what the verb returns."""
     before = world_from_sfm(project)
     frame = before
     result: dict[str, Any] = {}
@@ -69,8 +77,6 @@ def align(params: AlignParams, report: Reporter) -> dict[str, Any]:
         "up_confidence": project.frame.up_confidence,
         "bounds": project.frame.bounds,
     }
-    project.record("align", params.model_dump(mode="json"), result)
-    save_project(folder, project)
     return result
 
 

@@ -18,7 +18,7 @@ from ..geometry.points import Points
 from ..params import PosesParams
 from ..progress import Reporter, shortened
 from ..project.schema import Frame, ImageRecord, PosedImage, Poses, Project
-from ..project.store import POSES_FILE, load_poses, load_project, save_poses, save_project
+from ..project.store import POSES_FILE, edit_project, load_poses, load_project, save_poses
 from .align import gps_frame
 from .process import run_worker
 
@@ -59,26 +59,25 @@ def estimate_poses(params: PosesParams, report: Reporter) -> dict[str, Any]:
         _forget_changed(work, records)
         masks = _prepare_masks(folder, work, records, report)
     result = run_worker(_job(folder, project, records, masks, params, extend=previous is not None), work, report)
-    # Blender may have changed the classes or the region meanwhile.
-    project = load_project(folder)
-    records = _usable(project)
-    poses, points, visibility = _poses(result, records)
-    _update_project(project, records, poses, points, result, keep_frame=previous is not None)
-    save_poses(folder, poses, points, visibility)
-    answer = {
-        "registered": len(poses.images),
-        "total": len(records),
-        "reprojection_px": result["reprojection_px"],
-        "up_confidence": project.frame.up_confidence,
-        "level": result["level"],
-        "groups": result["groups"],
-        "images": [
-            {"name": record.name, "status": image["status"], "reason": image["reason"]}
-            for record, image in zip(records, result["images"])
-        ],
-    }
-    project.record("poses", params.model_dump(mode="json"), {k: v for k, v in answer.items() if k != "images"})
-    save_project(folder, project)
+    # Classes and region may have been edited meanwhile.
+    with edit_project(folder) as project:
+        records = _usable(project)
+        poses, points, visibility = _poses(result, records)
+        _update_project(project, records, poses, points, result, keep_frame=previous is not None)
+        save_poses(folder, poses, points, visibility)
+        answer = {
+            "registered": len(poses.images),
+            "total": len(records),
+            "reprojection_px": result["reprojection_px"],
+            "up_confidence": project.frame.up_confidence,
+            "level": result["level"],
+            "groups": result["groups"],
+            "images": [
+                {"name": record.name, "status": image["status"], "reason": image["reason"]}
+                for record, image in zip(records, result["images"])
+            ],
+        }
+        project.record("poses", params.model_dump(mode="json"), {k: v for k, v in answer.items() if k != "images"})
     _write_report(folder, project, poses, points, records, result, report)
     missing = [f"{record.name} ({record.reason})" for record in records if record.status != "ok"]
     if missing:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import uuid
 from datetime import UTC, datetime
 from typing import Any, Literal
 
@@ -10,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from ..geometry.cameras import Camera
 
 FORMAT = "fieldwork-project"
-VERSION = 1
+VERSION = 2
 IDENTITY = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 
 
@@ -73,6 +74,7 @@ class ProvenanceStep(Model):
 class Project(Model):
     format: Literal["fieldwork-project"] = FORMAT
     version: int = VERSION
+    uuid: str = Field(default_factory=lambda: uuid.uuid4().hex)  # what it is known by, wherever its folder goes
     created: str = Field(default_factory=lambda: now())
     images: list[ImageRecord] = []
     classes: list[SemanticClass] = []

@@ -7,27 +7,34 @@
     jobs/               status of the running and the last job of each verb
     exports/            meshes, .blend files, renders
 
-Every write is atomic. Nothing here is ever pickled.
+Every write is atomic. Nothing here is ever pickled. project.json is read, changed and written under a lock of its own
+(`edit_project`) that nobody holds for long: an edit during a training is neither lost nor overwritten.
 """
 
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 from zipfile import BadZipFile
 
 import numpy as np
+from filelock import FileLock, Timeout
 from pydantic import BaseModel, ValidationError
 
 from ..errors import ProjectError
 from ..files import atomic_path, disk_errors, write_json
 from ..geometry.points import Points
+from .migrate import migrated
 from .schema import FORMAT, VERSION, Poses, Project
 
 PROJECT_FILE = "project.json"
 POSES_FILE = "poses/poses.json"
 POINTS_FILE = "poses/points.npz"
+LOCK_FILE = "jobs/project.lock"
+PATIENCE = 30.0  # seconds to wait for another edit, which takes milliseconds
 M = TypeVar("M", bound=BaseModel)
 
 
@@ -38,6 +45,11 @@ def load_project(folder: Path) -> Project:
         ProjectError: it is missing, foreign, truncated or from a newer version.
     """
     path = Path(folder) / PROJECT_FILE
+    if not Path(folder).exists():
+        raise ProjectError(
+            f"{folder} is not a capture project: the folder is not there.",
+            "Connect the disk it is on, or choose the folder it was moved to.",
+        )
     value = _read_json(path, f"{folder} is not a capture project: it has no {PROJECT_FILE}.")
     if not isinstance(value, dict) or value.get("format") != FORMAT:
         raise ProjectError(
@@ -48,19 +60,53 @@ def load_project(folder: Path) -> Project:
             f"{path} has version {value['version']}; this Fieldwork reads up to {VERSION}.",
             "Update Fieldwork to open it.",
         )
-    return _validated(Project, value, path)
+    return _validated(Project, migrated(value), path)
+
+
+@contextmanager
+def edit_project(folder: Path, fresh: Project | None = None) -> Iterator[Project]:
+    """Read project.json, let the block change it, write it: no other edit comes between. Keep the block short.
+
+    Args:
+        fresh: what to begin with where there is no project yet.
+    Raises:
+        ProjectError: there is no project, or it stays locked. DiskError. The block's own errors: nothing is written.
+    """
+    folder = Path(folder)
+    if fresh is None or is_project(folder):
+        load_project(folder)  # says what is wrong before a lock file is made
+    path = folder / LOCK_FILE
+    with disk_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(path, thread_local=False)
+        try:
+            lock.acquire(timeout=PATIENCE)
+        except Timeout as error:
+            raise ProjectError(
+                f"{folder / PROJECT_FILE} has been locked by another program for {PATIENCE:.0f} s.",
+                "End that program, then try again.",
+            ) from error
+    try:
+        project = load_project(folder) if fresh is None or is_project(folder) else fresh
+        yield project
+        save_project(folder, project)
+    finally:
+        lock.release()
 
 
 def save_project(folder: Path, project: Project) -> None:
-    """Atomically write `folder`/project.json. Raises DiskError when it cannot be written."""
+    """Atomically write `folder`/project.json as a whole; whoever changes one that is there uses `edit_project`.
+
+    Raises:
+        DiskError: it cannot be written.
+    """
     write_json(Path(folder) / PROJECT_FILE, project.model_dump(mode="json"))
 
 
 def record_step(folder: Path, verb: str, settings: dict[str, Any], result: dict[str, Any]) -> None:
     """Append one step to the provenance of a project on disk, whatever else has changed in it meanwhile."""
-    project = load_project(folder)
-    project.record(verb, settings, result)
-    save_project(folder, project)
+    with edit_project(folder) as project:
+        project.record(verb, settings, result)
 
 
 def is_project(folder: Path) -> bool:

@@ -1,6 +1,9 @@
 """Mesh files for other programs: PLY, OBJ, GLB, STL, in world units.
 
 GLB and OBJ have y up, as the one demands and most readers of the other expect; PLY and STL have Blender's z up.
+
+Colours: textures are sRGB everywhere. Vertex colours are linear in GLB, as glTF 2.0 (3.9.2, 3.7.2.1) has it, and sRGB
+in PLY and OBJ, where readers show the numbers as they are.
 """
 
 from __future__ import annotations
@@ -13,24 +16,29 @@ from typing import Any
 import numpy as np
 import trimesh
 from PIL import Image
-from trimesh.exchange.export import export_scene
+from trimesh.exchange.gltf import export_glb
 from trimesh.exchange.obj import export_obj
 from trimesh.exchange.ply import export_ply
 from trimesh.exchange.stl import export_stl
 from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from ..errors import SettingError
 from ..files import atomic_path
+from ..images.picture import srgb_to_linear
 from .extract import Surface
 from .texture import Unwrapped
 
 FORMATS = (".ply", ".obj", ".glb", ".stl")
 Y_UP = (".glb", ".obj")
+TEXTURED = (".glb", ".obj")
+# Exporters keep attributes with a leading underscore; this one becomes glTF's COLOR_0.
+LINEAR_COLOR = "_linear_color"
 
 
 @dataclass(frozen=True)
 class Texture:
-    """A baked texture: image (S, S, 3) uint8, unwrapped mesh, corner_uv (F, 3, 2): UV of every face's corners."""
+    """A baked texture: image (S, S, 3) uint8 sRGB, unwrapped mesh, corner_uv (F, 3, 2): UV of every face's corners."""
 
     image: np.ndarray
     unwrapped: Unwrapped
@@ -69,9 +77,9 @@ def write_surface(
     kind = path.suffix.lower()
     if kind in Y_UP:
         surface = y_up(surface)
-    parts = _parts(surface, names, texture if kind in (".glb", ".obj") else None, split)
+    parts = _parts(surface, names, texture if kind in TEXTURED else None, split)
     if kind == ".glb":
-        return _write(path, export_scene(trimesh.Scene(parts), None, file_type="glb"))
+        return _write_glb(path, parts)
     if not split:
         return _write_one(path, parts["mesh"])
     written = []
@@ -110,7 +118,8 @@ def _part(surface: Surface, texture: Texture | None, chosen: np.ndarray) -> trim
     source = used if texture is None else texture.unwrapped.source[used]
     look: dict[str, Any] = {"vertex_colors": surface.colors[source]}
     if texture is not None:
-        look = {"visual": TextureVisuals(uv=texture.unwrapped.uv[used], image=Image.fromarray(texture.image))}
+        image = SimpleMaterial(image=Image.fromarray(texture.image))
+        look = {"visual": TextureVisuals(uv=texture.unwrapped.uv[used], material=image)}
     return trimesh.Trimesh(
         surface.vertices[source],
         corners.reshape(-1, 3),
@@ -128,12 +137,45 @@ def _write_one(path: Path, part: trimesh.Trimesh) -> list[Path]:
         return _write(path, export_ply(part, vertex_normal=True))
     if kind == ".stl":
         return _write(path, export_stl(part))
-    # Names of their own: several objects may lie in one folder.
-    text, extra = export_obj(trimesh.Scene(part), return_texture=True, mtl_name=f"{path.stem}.mtl")
+    if isinstance(part.visual, TextureVisuals):
+        # Several objects may lie in one folder, or be brought into one scene: all of their names are their own. White
+        # space ends a name for many readers.
+        name = re.sub(r"\s+", "_", path.stem)
+        white, black = [255, 255, 255, 255], [0, 0, 0, 255]
+        part.visual.material = SimpleMaterial(
+            image=part.visual.material.image, ambient=white, diffuse=white, specular=black, name=name
+        )
+        text, extra = export_obj(trimesh.Scene(part), return_texture=True, mtl_name=f"{name}.mtl")
+    else:
+        text, extra = export_obj(trimesh.Scene(part), return_texture=True)
     written = _write(path, text)
     for name, content in extra.items():
         written += _write(path.parent / name, content)
     return written
+
+
+def _write_glb(path: Path, parts: dict[str, Any]) -> list[Path]:
+    """One GLB of named meshes with a matt material: texture or vertex colour alone decide how they look."""
+    for part in parts.values():
+        matt: dict[str, Any] = {"baseColorFactor": [255, 255, 255, 255], "metallicFactor": 0.0, "roughnessFactor": 1.0}
+        if isinstance(part.visual, TextureVisuals):
+            part.visual.material = PBRMaterial(baseColorTexture=part.visual.material.image, **matt)
+        else:
+            # 16 bits: 8 bits of linear light would make dark colours alike.
+            color = srgb_to_linear(part.visual.vertex_colors[:, :3] / 255)
+            color = np.concatenate([color, np.ones_like(color[:, :1])], 1)
+            part.vertex_attributes[LINEAR_COLOR] = (color * 65535 + 0.5).astype(np.uint16)
+            part.visual = TextureVisuals(material=PBRMaterial(**matt))
+    return _write(path, export_glb(trimesh.Scene(parts), tree_postprocessor=_name_colors))
+
+
+def _name_colors(tree: dict[str, Any]) -> None:
+    """Make our linear vertex colours glTF's."""
+    for mesh in tree["meshes"]:
+        attributes = mesh["primitives"][0]["attributes"]
+        if LINEAR_COLOR in attributes:
+            accessor = attributes["COLOR_0"] = attributes.pop(LINEAR_COLOR)
+            tree["accessors"][accessor]["normalized"] = True
 
 
 def _write(path: Path, content: Any) -> list[Path]:

@@ -13,8 +13,7 @@ from typing import Any
 import torch
 
 from ..errors import InputError
-from ..kernels.device import use_device
-from ..kernels.runtime import default_threads
+from ..kernels.device import default_threads, use_device
 from ..progress import Reporter
 
 

@@ -15,6 +15,7 @@ from ..data.scene import Scene
 from ..field.encoding import spherical_harmonics
 from ..geometry.cameras import Camera
 from ..kernels.composite import render_weights
+from ..kernels.device import backend_of, synchronize
 from ..kernels.march import sample
 from ..progress import Reporter
 from ..render.fused import FusedRenderer, ray_renderer
@@ -30,11 +31,6 @@ def peak_memory(device: torch.device) -> float:
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device) / 2**20
     return psutil.Process().memory_info().rss / 2**20
-
-
-def _synchronize(device: torch.device) -> None:
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
 
 
 @torch.no_grad()
@@ -56,9 +52,10 @@ def measure_speed(
     model, device = trained.model, trained.device
     model.refine(check=report.check)
     report.stage(f"Measuring speed at {side}×{side}")
-    frame = _device_frame if device.type == "cuda" else _host_frame
-    chosen = indices[: poses or (5 if device.type == "cuda" else 1)]
-    if device.type == "cuda":
+    asynchronous = backend_of(device).asynchronous
+    frame = _device_frame if asynchronous else _host_frame
+    chosen = indices[: poses or (5 if asynchronous else 1)]
+    if asynchronous:
         frame(model, scene, indices[0], box_from_world, side, report)  # warms up
     times = [frame(model, scene, index, box_from_world, side, report) for index in chosen]
     rays = CameraRays([_camera(scene, indices[0], side)], box_poses([scene.views[indices[0]]], box_from_world), device)
@@ -97,11 +94,11 @@ def _device_frame(
     )
     renderer = ray_renderer(model, side * side)
     count = model.config.render.samples or model.config.sampling.samples
-    _synchronize(rays.device)
+    synchronize(rays.device)
     begin = time.perf_counter()
     for pixel in torch.arange(side * side, device=rays.device).split(renderer.rays):
         renderer(*rays(torch.zeros_like(pixel), pixel), count)
-    _synchronize(rays.device)
+    synchronize(rays.device)
     return time.perf_counter() - begin
 
 
@@ -115,17 +112,17 @@ def split_times(model: Model, rays: CameraRays, count: int, report: Reporter) ->
     for pixel in torch.arange(count, device=device).split(renderer.rays):
         report.check()
         origins, directions = rays(torch.zeros_like(pixel), pixel)
-        _synchronize(device)
+        synchronize(device)
         begin = time.perf_counter()
         if isinstance(renderer, FusedRenderer):
             coarse = renderer.coarse(origins, directions)
-            _synchronize(device)
+            synchronize(device)
             middle = time.perf_counter()
             evaluated = renderer.fine(coarse, per_ray).evaluated
         else:
             g = model.render_grid()
             drawn = sample(origins, directions, g.cells, g.reach, g.settings, per_ray)
-            _synchronize(device)
+            synchronize(device)
             middle = time.perf_counter()
             geometry = model.field.geometry(drawn.points)
             weights = render_weights(geometry.density, drawn.delta, drawn.packing)
@@ -135,7 +132,7 @@ def split_times(model: Model, rays: CameraRays, count: int, report: Reporter) ->
             if model.field.semantic_head is not None:
                 model.field.logits(geometry[kept])
             evaluated = len(drawn)
-        _synchronize(device)
+        synchronize(device)
         sampling += middle - begin
         network += time.perf_counter() - middle
         samples += int(evaluated)

@@ -81,12 +81,15 @@ class VertexGrid(nn.Module):
         self.register_buffer("square", torch.zeros(rows, FEATURES))
         self.register_buffer("gradient", torch.zeros(rows, FEATURES), persistent=False)
         self.register_buffer("touched", torch.zeros(rows // BLOCK, dtype=torch.uint8), persistent=False)
+        # Rows whose gradient was not finite when they were to be updated, since `lost` was last cleared.
+        self.register_buffer("lost", torch.zeros(1, dtype=torch.int32), persistent=False)
         self.register_buffer("anchor", torch.zeros(1), persistent=False)
         self.table: torch.Tensor
         self.mean: torch.Tensor
         self.square: torch.Tensor
         self.gradient: torch.Tensor
         self.touched: torch.Tensor
+        self.lost: torch.Tensor
         self.anchor: torch.Tensor
 
     @property
@@ -132,5 +135,6 @@ class VertexGrid(nn.Module):
         self.touched.zero_()
 
     def step(self, rate: float, betas: tuple[float, float] = (0.9, 0.99)) -> None:
-        """Adam on the rows touched since the last step; clears the gradient."""
-        encode.adam(self.table, self.gradient, self.mean, self.square, self.touched, rate, betas)
+        """Adam on the rows touched since the last step; clears the gradient. Rows whose gradient is not finite stay as
+        they are and are counted in `lost`."""
+        encode.adam(self.table, self.gradient, self.mean, self.square, self.touched, self.lost, rate, betas)

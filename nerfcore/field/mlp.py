@@ -14,6 +14,7 @@ from typing import Literal
 import torch
 from torch import nn
 
+from ..kernels.device import native_half
 from ..kernels.runtime import run_parallel
 
 Precision = Literal["auto", "float32", "bfloat16", "float16"]
@@ -21,14 +22,9 @@ _MOST_ROWS, _LEAST_ROWS = 8192, 1024  # of a matrix product on the CPU; the most
 
 
 def compute_dtype(precision: Precision, device: torch.device) -> torch.dtype:
-    """The dtype of matrix products: "auto" takes bfloat16 where the device multiplies it natively."""
-    if precision != "auto":
-        return getattr(torch, precision)
-    if device.type == "cpu":
-        return torch.bfloat16 if torch.cpu._is_avx512_bf16_supported() else torch.float32
-    if device.type == "cuda":
-        return torch.bfloat16 if torch.cuda.is_bf16_supported() else torch.float16
-    return torch.float32
+    """The dtype of matrix products: "auto" takes what the device multiplies natively, bfloat16 before float16 (whose
+    losses are scaled in training, see `train.loss_scale`) before float32."""
+    return getattr(torch, precision) if precision != "auto" else native_half(device) or torch.float32
 
 
 def _slices(rows: int, device: torch.device) -> list[slice]:
@@ -71,7 +67,7 @@ class _Chain(torch.autograd.Function):
                     if index < len(matrices) - 1:
                         layers[index + 1][part].relu_()
 
-        run_parallel([partial(run, part) for part in parts])
+        run_parallel([partial(run, part) for part in parts], x.device)
         ctx.save_for_backward(*matrices, *layers[:-1])
         return layers[-1][: len(x)]
 
@@ -94,7 +90,7 @@ class _Chain(torch.autograd.Function):
                     elif grad_input is not None:
                         torch.mm(g, matrices[0], out=grad_input[part])
 
-        run_parallel([partial(run, number, part) for number, part in enumerate(parts)])
+        run_parallel([partial(run, number, part) for number, part in enumerate(parts)], grad.device)
         # Summed in the order of the slices, whatever order they ran in.
         sums = [torch.stack(column).sum(0) for column in zip(*found)]
         grad_weights = sums[::-1] if sums else [torch.zeros_like(m, dtype=torch.float32) for m in matrices]

@@ -1,6 +1,6 @@
-"""Scalar grids of cells: trilinear reading, and the largest value of the points in each cell.
+"""Scalar grids of cells: trilinear reading, and the largest and the mean value of the points in each cell.
 
-Values sit at cell centres, (resolution³,) float32, x fastest. The torch twins are in `cells_torch.py`.
+Values sit at cell centres, (resolution³,) float32, x fastest. The torch backend is in `cells_torch.py`.
 """
 
 from __future__ import annotations
@@ -8,8 +8,13 @@ from __future__ import annotations
 import torch
 import warp as wp
 
+from . import cells_torch
+from .device import backend_of
 from .runtime import array, init, launch
 from .walk import cell_index
+
+FIXED_POINT = wp.constant(cells_torch.FIXED_POINT)
+LARGEST = wp.constant(cells_torch.LARGEST)
 
 
 @wp.func
@@ -73,6 +78,8 @@ def observe(
     `scratch` (resolution³,) must be −1 everywhere and is so again afterwards. Points with negative values are passed
     over.
     """
+    if not backend_of(points.device).warp:
+        return cells_torch.observe(grid, scratch, resolution, points, values, decay)
     init()
     where = array(points, wp.vec3)
     launch(
@@ -86,30 +93,78 @@ def observe(
 
 
 @wp.kernel(module="fieldwork_cells")
-def move_mean(
+def add_values(
     points: wp.array(dtype=wp.vec3),
     values: wp.array(dtype=float),
     n: int,
-    rate: float,
-    grid: wp.array(dtype=float),
+    sums: wp.array(dtype=wp.int64),
+    counts: wp.array(dtype=int),
     offset: int,
 ):
     i = wp.tid() + offset
     if values[i] >= 0.0:
         cell = cell_index(points[i], n)
-        grid[cell] = grid[cell] + rate * (values[i] - grid[cell])
+        wp.atomic_add(sums, cell, wp.int64(wp.min(values[i], LARGEST) * FIXED_POINT))
+        wp.atomic_add(counts, cell, 1)
 
 
-def average(grid: torch.Tensor, resolution: int, points: torch.Tensor, values: torch.Tensor, rate: float) -> None:
-    """Move the cells that hold points (N, 3) towards the points' values (N,) in place, one point after the other:
-    grid ← grid + rate · (value − grid). Points with negative values are passed over."""
+@wp.kernel(module="fieldwork_cells")
+def take_mean(
+    points: wp.array(dtype=wp.vec3),
+    n: int,
+    rate: float,
+    sums: wp.array(dtype=wp.int64),
+    counts: wp.array(dtype=int),
+    grid: wp.array(dtype=float),
+    offset: int,
+):
+    i = wp.tid() + offset
+    cell = cell_index(points[i], n)
+    # One of the points in a cell takes their sum, whichever comes first.
+    count = wp.atomic_exch(counts, cell, 0)
+    if count > 0:
+        mean = float(sums[cell]) / FIXED_POINT / float(count)
+        sums[cell] = wp.int64(0)
+        grid[cell] = grid[cell] + (1.0 - wp.pow(1.0 - rate, float(count))) * (mean - grid[cell])
+
+
+class MeanScratch:
+    """What `average` sums up in: sums (n³,) int64 in units of 2⁻²⁰, so that the order of the points changes nothing,
+    and counts (n³,) int32; both zero between calls."""
+
+    def __init__(self, cells: int, device: torch.device) -> None:
+        # Without 64-bit atomics (MPS) the sums are floats, whose last bits follow the order of the points.
+        exact = torch.int64 if backend_of(device).has_float64 else torch.float32
+        self.sums = torch.zeros(cells, dtype=exact, device=device)
+        self.counts = torch.zeros(cells, dtype=torch.int32, device=device)
+
+
+def average(
+    grid: torch.Tensor,
+    scratch: MeanScratch,
+    resolution: int,
+    points: torch.Tensor,
+    values: torch.Tensor,
+    rate: float,
+) -> None:
+    """Move the cells that hold points (N, 3) towards the mean of the points' values (N,) in place, as far as one step
+    at `rate` for each of the n points would: grid ← grid + (1 − (1 − rate)ⁿ) · (mean − grid).
+
+    Points with negative values are passed over. The order of the points does not matter.
+    """
+    if not backend_of(points.device).warp:
+        return cells_torch.average(grid, scratch.sums, scratch.counts, resolution, points, values, rate)
     init()
-    inputs = [array(points, wp.vec3), array(values.contiguous()), resolution, rate, array(grid)]
-    launch(move_mean, len(points), inputs, points.device, serial=True)
+    where, sums, counts = array(points, wp.vec3), array(scratch.sums), array(scratch.counts)
+    inputs = [where, array(values.contiguous()), resolution, sums, counts]
+    launch(add_values, len(points), inputs, points.device, serial=True)
+    launch(take_mean, len(points), [where, resolution, rate, sums, counts, array(grid)], points.device, serial=True)
 
 
 def trilinear(grid: torch.Tensor, resolution: int, points: torch.Tensor) -> torch.Tensor:
     """Values (N,) at points (N, 3) in [0, 1]³; constant beyond the outermost cell centres."""
+    if not backend_of(points.device).warp:
+        return cells_torch.trilinear(grid, resolution, points)
     init()
     out = torch.empty(len(points), device=points.device)
     launch(read_trilinear, len(points), [array(grid), resolution, array(points, wp.vec3), array(out)], points.device)
@@ -118,8 +173,10 @@ def trilinear(grid: torch.Tensor, resolution: int, points: torch.Tensor) -> torc
 
 def scatter_max(resolution: int, points: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
     """Largest non-negative value of the points in each cell, 0 where there is none: (resolution³,)."""
-    init()
     grid = torch.zeros(resolution**3, device=points.device)
+    if not backend_of(points.device).warp:
+        return cells_torch.scatter_max(grid, resolution, points, values)
+    init()
     inputs = [array(points, wp.vec3), array(values.contiguous()), resolution, array(grid)]
     launch(write_max, len(points), inputs, points.device, serial=True)
     return grid

@@ -1,8 +1,17 @@
-"""Slow torch twin of `cells.py`."""
+"""Torch backend of `cells.py`."""
 
 from __future__ import annotations
 
 import torch
+
+FIXED_POINT = float(1 << 20)  # sums of values are integers in units of its inverse
+LARGEST = float(1 << 20)  # value; 2²³ points of it fit into a sum
+
+
+def cell_index(points: torch.Tensor, n: int) -> torch.Tensor:
+    """Indices (N,) int64 of the cells of an n³ grid that hold points (N, 3) of [0, 1]³."""
+    x, y, z = (points * n).long().clamp(0, n - 1).unbind(-1)
+    return (z * n + y) * n + x
 
 
 def trilinear(grid: torch.Tensor, resolution: int, points: torch.Tensor) -> torch.Tensor:
@@ -10,40 +19,51 @@ def trilinear(grid: torch.Tensor, resolution: int, points: torch.Tensor) -> torc
     n = resolution
     p = points * n - 0.5
     corner = p.floor().long().clamp(0, n - 2)
-    f = (p - corner).clamp(0, 1)
+    high = (p - corner).clamp(0, 1)
+    x, y, z = corner.unbind(-1)
+    row = (z * n + y) * n + x
+    weight = torch.stack([1 - high, high])  # (2, N, 3)
     total = torch.zeros(len(points), device=points.device)
     for dz in (0, 1):
         for dy in (0, 1):
             for dx in (0, 1):
-                offset = torch.tensor([dx, dy, dz], device=points.device)
-                x, y, z = (corner + offset).unbind(-1)
-                total = total + torch.where(offset == 1, f, 1 - f).prod(-1) * grid[(z * n + y) * n + x]
+                factor = weight[dx, :, 0] * weight[dy, :, 1] * weight[dz, :, 2]
+                total += factor * grid[row + (dz * n + dy) * n + dx]
     return total
 
 
-def scatter_max(resolution: int, points: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
-    """As `cells.scatter_max`."""
-    n = resolution
-    x, y, z = (points * n).long().clamp(0, n - 1).unbind(-1)
-    grid = torch.zeros(n**3, device=points.device)
-    return grid.scatter_reduce(0, (z * n + y) * n + x, values, "amax")
+def scatter_max(grid: torch.Tensor, resolution: int, points: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+    """As `cells.scatter_max`; `grid` (resolution³,) holds zeros."""
+    return grid.scatter_reduce(0, cell_index(points, resolution), values, "amax")
 
 
 def observe(
     grid: torch.Tensor, scratch: torch.Tensor, resolution: int, points: torch.Tensor, values: torch.Tensor, decay: float
 ) -> None:
     """As `cells.observe`."""
-    n = resolution
-    x, y, z = (points * n).long().clamp(0, n - 1).unbind(-1)
-    fresh = scratch.scatter_reduce(0, (z * n + y) * n + x, values, "amax")
-    seen = fresh >= 0
-    grid[seen] = torch.maximum(grid[seen] * decay, fresh[seen])
+    cell = cell_index(points, resolution)
+    fresh = scratch.scatter_reduce(0, cell, values, "amax")[cell]
+    # Points of one cell write the same number.
+    grid[cell] = torch.where(fresh >= 0, torch.maximum(grid[cell] * decay, fresh), grid[cell])
 
 
-def average(grid: torch.Tensor, resolution: int, points: torch.Tensor, values: torch.Tensor, rate: float) -> None:
-    """As `cells.average`."""
-    n = resolution
-    x, y, z = (points * n).long().clamp(0, n - 1).unbind(-1)
-    for cell, value in zip(((z * n + y) * n + x).tolist(), values.tolist()):
-        if value >= 0:
-            grid[cell] += rate * (value - grid[cell])
+def average(
+    grid: torch.Tensor,
+    sums: torch.Tensor,
+    counts: torch.Tensor,
+    resolution: int,
+    points: torch.Tensor,
+    values: torch.Tensor,
+    rate: float,
+) -> None:
+    """As `cells.average`; `sums` and `counts` as in `cells.MeanScratch`."""
+    cell, counted = cell_index(points, resolution), values >= 0
+    scaled = values.clamp(0, LARGEST) * FIXED_POINT
+    sums.index_add_(0, cell, torch.where(counted, scaled, 0).to(sums.dtype))
+    counts.index_add_(0, cell, counted.to(counts.dtype))
+    count = counts[cell]
+    mean = sums[cell].float() / FIXED_POINT / count.clamp(min=1)
+    before = grid[cell]
+    # Points of one cell write the same number.
+    grid[cell] = before + (1 - (1 - rate) ** count.float()) * (mean - before)
+    sums[cell], counts[cell] = 0, 0

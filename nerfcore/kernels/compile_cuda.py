@@ -19,10 +19,11 @@ import warp as wp
 
 from ..files import write_json, write_section, write_text
 from . import cells, composite, encode, encode_points, march
+from .device import default_threads
 from .fused import LANES
 from .fused_kernel import FusedShape, fused_kernel
 from .resources import Resources, disassembler, markdown, read_resources
-from .runtime import CUDA_BLOCK, default_threads, init
+from .runtime import CUDA_BLOCK, init
 
 ARCHITECTURES = (75, 86, 89, 90, 120)
 SOURCES = (encode, encode_points, march, composite, cells)

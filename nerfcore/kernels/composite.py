@@ -1,7 +1,7 @@
 """Volume rendering weights and sums over packed samples, with hand-written gradients.
 
 α_j = 1 − exp(−σ_j δ_j), T_j = Π_{k<j} (1 − α_k), w_j = T_j α_j (Max, "Optical models for direct volume rendering",
-1995). Rays are independent, each is one thread, so no sums race. The torch twins are in `composite_torch.py`.
+1995). Rays are independent, each is one thread, so no sums race. The torch backend is in `composite_torch.py`.
 """
 
 from __future__ import annotations
@@ -9,6 +9,8 @@ from __future__ import annotations
 import torch
 import warp as wp
 
+from . import composite_torch
+from .device import backend_of
 from .packing import Packing
 from .runtime import array, init, launch
 
@@ -154,9 +156,13 @@ class _Sum(torch.autograd.Function):
 
 def render_weights(density: torch.Tensor, delta: torch.Tensor, packing: Packing) -> torch.Tensor:
     """Rendering weights (N,) of packed samples from their densities and lengths (N,); differentiable in `density`."""
+    if not backend_of(density.device).warp:
+        return composite_torch.render_weights(density, delta, packing)
     return _Weights.apply(density, delta, packing)  # type: ignore[no-any-return]
 
 
 def weighted_sum(values: torch.Tensor, weights: torch.Tensor, packing: Packing) -> torch.Tensor:
     """Σ_j w_j v_j per ray: values (N, C), weights (N,) → (R, C) float32, zero for rays without samples."""
+    if not backend_of(weights.device).warp:
+        return composite_torch.weighted_sum(values, weights, packing)
     return _Sum.apply(values, weights, packing)  # type: ignore[no-any-return]

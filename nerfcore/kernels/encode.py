@@ -2,7 +2,7 @@
 
 One table holds all levels, `FEATURES` float32 a vertex. A level is *dense* when its (resolution)³ vertices fit its
 share of the table, else *hashed* (Müller et al., "Instant Neural Graphics Primitives", 2022, eq. 4).
-The torch twins are in `encode_torch.py`.
+The torch backend is in `encode_torch.py`.
 """
 
 from __future__ import annotations
@@ -13,10 +13,11 @@ from typing import Any
 import torch
 import warp as wp
 
+from . import encode_torch
+from .device import backend_of
+from .encode_torch import BLOCK, FEATURES
 from .runtime import array, init, launch, load, run_parallel, small_tensor
 
-FEATURES = 4
-BLOCK = 16  # vertices that share one "touched" flag of the optimiser
 feature = wp.types.vector(length=FEATURES, dtype=wp.float32)
 
 # Primes of the spatial hash; the first is 1 so that neighbours along x share cache lines.
@@ -151,6 +152,7 @@ def adam_touched(
     beta1: float,
     beta2: float,
     epsilon: float,
+    lost: wp.array(dtype=int),
     offset: int,
 ):
     block = wp.tid() + offset
@@ -160,7 +162,12 @@ def adam_touched(
     begin = block * BLOCK
     for row in range(begin, wp.min(begin + BLOCK, table.shape[0])):
         g = grad[row]
-        if wp.dot(g, g) > 0.0:
+        size = wp.dot(g, g)
+        if not wp.isfinite(size):
+            # Left there it would keep the row from ever moving again.
+            wp.atomic_add(lost, 0, 1)
+            grad[row] = feature()
+        elif size > 0.0:
             m = mean[row] * beta1 + g * (1.0 - beta1)
             v = square[row] * beta2 + wp.cw_mul(g, g) * (1.0 - beta2)
             value = table[row]
@@ -182,8 +189,10 @@ def forward(
         levels: (resolution, first row, rows) of each level.
         gains: factor of each level's features (coarse-to-fine fading).
     """
-    init()
     device = points.device
+    if not backend_of(device).warp:
+        return encode_torch.forward(table, levels, gains, points)
+    init()
     out = torch.empty(len(points), len(levels), FEATURES, device=device)
     layout = small_tensor(levels, torch.int32, device)
     factors = small_tensor(gains, torch.float32, device)
@@ -207,6 +216,8 @@ def scatter(
     On the CPU each level is one task, so no two threads write the same row and the sum has a fixed order.
     On CUDA rows are summed with atomics.
     """
+    if not backend_of(grad_table.device).warp:
+        return encode_torch.scatter(grad_table, touched, levels, gains, parts)
     init()
     rows, flags = array(grad_table, feature), array(touched)
     arrays = [
@@ -221,7 +232,7 @@ def scatter(
         return [where, grad, index, resolution, base, size, gains[index], rows, flags]
 
     active = [index for index in range(len(levels)) if gains[index] != 0.0]
-    if device.type == "cuda":
+    if not backend_of(device).host_threads:
         for where, grad in arrays:
             for index in active:
                 launch(encode_backward, where.shape[0], arguments(where, grad, index), device)
@@ -233,7 +244,7 @@ def scatter(
             wp.launch(encode_backward, dim=where.shape[0], inputs=[*arguments(where, grad, index), 0], device="cpu")
 
     # Levels share no block (rows are padded to BLOCK), so their flags do not race either.
-    run_parallel([partial(one_level, index) for index in reversed(active)])
+    run_parallel([partial(one_level, index) for index in reversed(active)], device)
 
 
 def adam(
@@ -242,19 +253,23 @@ def adam(
     mean: torch.Tensor,
     square: torch.Tensor,
     touched: torch.Tensor,
+    lost: torch.Tensor,
     rate: float,
     betas: tuple[float, float] = (0.9, 0.99),
     epsilon: float = 1e-15,
 ) -> None:
     """One Adam step on the rows whose gradient is not zero; gradients and flags are cleared.
 
-    `rate` already holds the bias correction. Rows never touched keep their value and moments ("lazy" Adam).
+    `rate` already holds the bias correction. Rows never touched keep their value and moments ("lazy" Adam), and so do
+    those whose gradient is not finite: their number is added to `lost` (1,) int32.
     """
+    if not backend_of(table.device).warp:
+        return encode_torch.adam(table, grad, mean, square, touched, lost, rate, betas, epsilon)
     init()
     launch(
         adam_touched,
         len(touched),
         [array(table, feature), array(grad, feature), array(mean, feature), array(square, feature), array(touched)]
-        + [rate, betas[0], betas[1], epsilon],
+        + [rate, betas[0], betas[1], epsilon, array(lost)],
         table.device,
     )

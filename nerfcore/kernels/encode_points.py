@@ -2,7 +2,7 @@
 
 Inside a cell the encoding is trilinear, so its gradient jumps at cell faces and grows with a level's resolution;
 `gains` may therefore weigh fine levels less than the encoding itself does (Lin et al., "BARF", 2021, section 3.3).
-The torch twin is autograd through `encode_torch.forward`.
+The torch backend is in `encode_torch.py`.
 """
 
 from __future__ import annotations
@@ -10,6 +10,8 @@ from __future__ import annotations
 import torch
 import warp as wp
 
+from . import encode_torch
+from .device import backend_of
 from .encode import FEATURES, across, cell_of, feature
 from .runtime import array, init, launch
 
@@ -60,6 +62,8 @@ def backward_points(
 
     Each point is one thread and levels follow one another, so nothing races. Arguments as for `encode.forward`.
     """
+    if not backend_of(points.device).warp:
+        return encode_torch.backward_points(table, levels, gains, points, grad_out)
     init()
     out = torch.zeros_like(points)
     grad = array(grad_out.reshape(len(points), len(levels), FEATURES), feature)

@@ -1,6 +1,6 @@
 """Two-stage ray sampling on the occupancy grid: a coarse walk that reads the grid, then samples from its PDF.
 
-How rays walk is in `walk.py`, the torch twins are in `march_torch.py`.
+How rays walk is in `walk.py`, the torch backend in `march_torch.py`.
 """
 
 from __future__ import annotations
@@ -10,6 +10,8 @@ from dataclasses import dataclass
 import torch
 import warp as wp
 
+from . import march_torch
+from .device import backend_of
 from .packing import Packing
 from .runtime import array, init, launch
 from .walk import (
@@ -223,9 +225,11 @@ def coarse(
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
     """The coarse walk of rays, arguments as for `sample`: weight of all open bins (R,), 0 where there is none,
     distances (R,) of the first and the last of them, −1 where there is none, and their number (R,) int32."""
-    init()
     device, rays = origins.device, len(origins)
     jitter = torch.full((rays,), 0.5, device=device) if jitter is None else jitter
+    if not backend_of(device).warp:
+        return march_torch.coarse(origins, directions, cells, settings, jitter)
+    init()
     total, first, last = (torch.empty(rays, device=device) for _ in range(3))
     bins = torch.empty(rays, dtype=torch.int32, device=device)
     inputs = [array(origins, wp.vec3), array(directions, wp.vec3), array(jitter), array(cells, wp.vec2), array(reach)]
@@ -280,6 +284,10 @@ def sample(
     shift = torch.full((n,), 0.5, device=device) if shift is None else shift[:n]
     fill = torch.empty if capacity is None else torch.zeros
     points, depth, delta = fill(n, 3, device=device), fill(n, device=device), fill(n, device=device)
+    if not backend_of(device).warp:
+        out = points, depth, delta, ray
+        march_torch.draw(origins, directions, cells, settings, jitter, shift, start, counts, out)
+        return Samples(points, depth, delta, Packing(start, counts, ray), first, last)
     launch(
         march_sample,
         rays,

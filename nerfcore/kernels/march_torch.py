@@ -1,94 +1,175 @@
-"""Slow torch twin of `march.py`, one ray at a time."""
+"""Torch backend of `march.py`: all bins of some rays at once, without skipping closed ones.
+
+Skipping goes in whole bins and never past an open one, so that both walks meet the same open bins.
+"""
 
 from __future__ import annotations
 
-import math
+from dataclasses import dataclass
 
 import torch
 
 from ..geometry.contraction import grid_position
-from .walk import FARTHEST, MAX_BINS, PDF_DEFAULT, PDF_UNIFORM, MarchSettings
+from .cells_torch import cell_index
+from .walk import BEFORE_CUBE, MAX_BINS, PDF_DEFAULT, PDF_UNIFORM, STOP, MarchSettings
 
-STOP = 1e-4
-MACRO = 4
-
-
-def closed_around(opened: torch.Tensor, block: torch.Tensor) -> int:
-    """How many blocks around one (x, y, z), itself included, are closed in all directions, at most FARTHEST."""
-    for radius in range(FARTHEST):
-        low, high = ((block - radius) * MACRO).clamp(min=0).tolist(), ((block + radius + 1) * MACRO).tolist()
-        if bool(opened[low[2] : high[2], low[1] : high[1], low[0] : high[0]].any()):
-            return radius
-    return FARTHEST
+MOST_BINS = 1 << 21  # of the rays that are walked at once
 
 
-def walk(
-    origin: torch.Tensor, direction: torch.Tensor, jitter: float, cells: torch.Tensor, s: MarchSettings
-) -> list[tuple[float, float, float]]:
-    """The open bins of one ray: (middle, length, weight), front to back."""
-    n = s.resolution
-    opened = (cells[:, 0] > 0).view(n, n, n)
-    low, high = s.near, s.far
-    inverse = 1 / torch.where(direction.abs() < 1e-9, 1e-9, direction)
-    if s.contracted and s.empty > 0:
-        entry = torch.minimum((-1 - origin) * inverse, (1 - origin) * inverse).max()
-        low = max(low, min(s.empty, 0.8 * float(entry)))
+@dataclass(frozen=True)
+class _Bins:
+    """The bins of R rays, front to back: middle, length, weight (0 where closed or behind the walk's end), and which
+    count as open, each (R, M)."""
+
+    middle: torch.Tensor
+    length: torch.Tensor
+    weight: torch.Tensor
+    opened: torch.Tensor
+
+
+def _interval(
+    origins: torch.Tensor, directions: torch.Tensor, s: MarchSettings
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Where the walks begin and end (R,), and where rays enter the cube [−1, 1]³, negative from inside."""
+    inverse = 1 / torch.where(directions.abs() < 1e-9, 1e-9, directions)
+    one, other = (-1 - origins) * inverse, (1 - origins) * inverse
+    entry, leave = torch.minimum(one, other).amax(1), torch.maximum(one, other).amin(1)
+    low, high = torch.full_like(entry, s.near), torch.full_like(entry, s.far)
     if not s.contracted:
-        a, b = (-1 - origin) * inverse, (1 - origin) * inverse
-        low = max(low, float(torch.minimum(a, b).max()))
-        high = min(high, float(torch.maximum(a, b).min()))
-    t, transmittance, bins = low + jitter * s.step, 1.0, []
-    for _ in range(int(MAX_BINS)):
-        if t >= high:
-            break
-        p = origin + direction * t
-        r = float(p.abs().max())
-        length = s.step * r * math.sqrt(r) if s.contracted and r > 1 else s.step
-        u = grid_position(p, s.contracted)
-        x, y, z = (u * n).long().clamp(0, n - 1).tolist()
-        density, interest = cells[(z * n + y) * n + x].tolist()
-        if density > 0:
-            if s.mode == PDF_UNIFORM:
-                weight = 1.0
-            elif s.mode == PDF_DEFAULT:
-                alpha = 1 - math.exp(-density * length)
-                weight = transmittance * alpha * (1 + s.beta * interest) + s.epsilon
-            else:
-                weight = density * interest + 1e-6
-            bins.append((t, length, weight))
-            if s.mode == PDF_DEFAULT:
-                transmittance *= math.exp(-density * length)
-                if transmittance < STOP:
-                    break
-            t += length
-        elif s.contracted and float((u - 0.5).abs().max()) >= 0.25:
-            t += length
-        else:
-            block = torch.tensor([x, y, z]) // MACRO
-            closed, border = closed_around(opened, block), 0.25 if s.contracted else 0.0
-            begin = (block - closed + 1) * MACRO if closed else torch.tensor([x, y, z])
-            end = (block + closed) * MACRO if closed else begin + 1
-            edge = torch.where(direction > 0, (end / n).clamp(max=1 - border), (begin / n).clamp(min=border))
-            leave = max(float(((edge - u) * inverse).min()) * (4 if s.contracted else 2), 0.0)
-            t += max(1.0, math.floor(leave / s.step + 0.5)) * s.step
-    return bins
+        return torch.maximum(low, entry), torch.minimum(high, leave), entry
+    if s.empty > 0:
+        low = torch.maximum(low, (float(BEFORE_CUBE) * entry).clamp(max=s.empty))
+    return low, high, entry
 
 
-def sample_ray(
-    bins: list[tuple[float, float, float]], count: int, shift: list[float]
-) -> tuple[list[float], list[float]]:
-    """Distances and lengths of `count` samples on one ray by inverting the bins' cumulative weight."""
-    total = sum(weight for _, _, weight in bins)
-    share = total / count
-    depth, delta = [], [0.0] * count
-    below = 0.0
-    for middle, length, weight in bins:
-        above = below + weight
-        for k in range(count):
-            target = (k + shift[k]) * share
-            if len(depth) == k and target <= above:
-                depth.append(middle + ((target - below) / weight - 0.5) * length)
-            overlap = max(0.0, min((k + 1) * share, above) - max(k * share, below))
-            delta[k] += overlap / weight * length
-        below = above
-    return depth + [bins[-1][0]] * (count - len(depth)), delta
+def _places(
+    origins: torch.Tensor, directions: torch.Tensor, jitter: torch.Tensor, s: MarchSettings
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Middle and length of each bin of R rays, and whether the walk gets there: (R, M) each."""
+    low, high, _ = _interval(origins, directions, s)
+    begin = low + jitter * s.step
+    most = int(MAX_BINS)
+    if not s.contracted:
+        longest = float(((high - begin) / s.step).clamp(min=0).amax()) if len(begin) else 0.0
+        number = torch.arange(min(most, int(longest) + 2), device=begin.device)
+        middle = begin[:, None] + number * s.step
+        return middle, torch.full_like(middle, s.step), middle < high[:, None]
+    # Outside the cube a bin's length follows from where it is, so that bins come one after the other.
+    t, columns, lengths = begin, [], []
+    while len(columns) < most and bool((t < high).any()):
+        radius = (origins + directions * t[:, None]).abs().amax(1)
+        length = torch.where(radius <= 1, s.step, s.step * radius * radius.sqrt())
+        columns.append(t)
+        lengths.append(length)
+        t = t + length
+    if not columns:
+        nothing = begin.new_zeros(len(begin), 0)
+        return nothing, nothing, nothing.bool()
+    middle = torch.stack(columns, 1)
+    return middle, torch.stack(lengths, 1), middle < high[:, None]
+
+
+def _bins(
+    origins: torch.Tensor, directions: torch.Tensor, cells: torch.Tensor, s: MarchSettings, jitter: torch.Tensor
+) -> _Bins:
+    middle, length, there = _places(origins, directions, jitter, s)
+    points = origins[:, None] + directions[:, None] * middle[..., None]
+    cell = cells[cell_index(grid_position(points, s.contracted).view(-1, 3), s.resolution)].view(*middle.shape, 2)
+    opened = there & (cell[..., 0] > 0)
+    if s.mode == PDF_UNIFORM:
+        weight = torch.ones_like(middle)
+    elif s.mode == PDF_DEFAULT:
+        depth = torch.where(opened, cell[..., 0] * length, 0.0)
+        transmittance = torch.exp(depth - torch.cumsum(depth, 1))
+        opened = opened & (transmittance >= float(STOP))
+        weight = transmittance * (1 - torch.exp(-depth)) * (1 + s.beta * cell[..., 1]) + s.epsilon
+    else:
+        weight = cell[..., 0] * cell[..., 1] + 1e-6
+    return _Bins(middle, length, torch.where(opened, weight, 0.0), opened)
+
+
+def _parts(origins: torch.Tensor, s: MarchSettings) -> list[slice]:
+    """Rays in numbers that are walked at once."""
+    side = 4.0 if s.contracted else 3.5  # how long a walk about is
+    rays = max(1, MOST_BINS // max(1, int(side / s.step) * (2 if s.contracted else 1)))
+    return [slice(begin, begin + rays) for begin in range(0, len(origins), rays)]
+
+
+@torch.no_grad()
+def coarse(
+    origins: torch.Tensor, directions: torch.Tensor, cells: torch.Tensor, s: MarchSettings, jitter: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """As `march.coarse`."""
+    rays, device = len(origins), origins.device
+    total, first, last = torch.zeros(rays, device=device), *(torch.full((rays,), -1.0, device=device) for _ in range(2))
+    number = torch.zeros(rays, dtype=torch.int32, device=device)
+    for part in _parts(origins, s):
+        bins = _bins(origins[part], directions[part], cells, s, jitter[part])
+        if bins.opened.shape[1] == 0:
+            continue
+        some = bins.opened.any(1)
+        total[part] = bins.weight.sum(1)
+        number[part] = bins.opened.sum(1).to(torch.int32)
+        first[part] = torch.where(some, torch.where(bins.opened, bins.middle, torch.inf).amin(1), -1.0)
+        last[part] = torch.where(some, torch.where(bins.opened, bins.middle, -1.0).amax(1), -1.0)
+    return total, first, last, number
+
+
+@torch.no_grad()
+def draw(
+    origins: torch.Tensor,
+    directions: torch.Tensor,
+    cells: torch.Tensor,
+    s: MarchSettings,
+    jitter: torch.Tensor,
+    shift: torch.Tensor,
+    start: torch.Tensor,
+    counts: torch.Tensor,
+    out: tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor],
+) -> None:
+    """Write the samples of rays (`start`, `counts` (R,)) into `out`: points (N, 3), depth (N,), delta (N,), ray (N,)."""
+    for part in _parts(origins, s):
+        count = counts[part]
+        some = (count > 0).nonzero()[:, 0]
+        if len(some) == 0:
+            continue
+        ray = some + part.start
+        o, d = origins[ray], directions[ray]
+        bins = _bins(o, d, cells, s, jitter[ray])
+        number = torch.arange(int(count.max()), device=o.device)
+        used = number < count[some][:, None]
+        place = (start[ray].long()[:, None] + number)[used]
+        shifts = torch.full(used.shape, 0.5, device=o.device).masked_scatter(used, shift[place])
+        depth, delta = _invert(bins, count[some], (number + shifts), number)
+        row = torch.arange(len(some), device=o.device)[:, None].expand_as(used)[used]
+        points, depths, deltas, rays = out
+        depths[place], deltas[place] = depth[used], delta[used]
+        points[place] = grid_position(o[row] + d[row] * depth[used][:, None], s.contracted).clamp(0, 1)
+        rays[place] = ray[row].to(rays.dtype)
+
+
+def _invert(
+    bins: _Bins, count: torch.Tensor, quantile: torch.Tensor, number: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Distance and length (R, K) of samples at `quantile` (R, K) of `count` (R,) equal shares of the bins' weight;
+    sample k's length is what share `number` (K,) covers of the open bins."""
+    above = torch.cumsum(bins.weight, 1)
+    length = torch.where(bins.opened, bins.length, 0.0)
+    passed = torch.cumsum(length, 1) - length  # open length in front of each bin
+    share = above[:, -1:] / count[:, None]
+    bin_number = torch.arange(above.shape[1], device=above.device)
+    first = torch.where(bins.opened, bin_number, above.shape[1]).amin(1, keepdim=True)
+    last = torch.where(bins.opened, bin_number, 0).amax(1, keepdim=True)
+
+    def find(target: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """The bins in which the weight reaches `target` (R, K), and how far into them that is, in [0, 1]."""
+        index = torch.searchsorted(above, target.contiguous()).clamp(first, last)
+        weight = bins.weight.gather(1, index)
+        return index, ((target - above.gather(1, index)) / weight + 1).clamp(0, 1)
+
+    index, into = find(quantile * share)
+    depth = bins.middle.gather(1, index) + (into - 0.5) * bins.length.gather(1, index)
+    edges = torch.cat([number, number[-1:] + 1]) * share
+    index, into = find(edges)
+    upto = passed.gather(1, index) + into * length.gather(1, index)
+    return depth, upto.diff(dim=1)

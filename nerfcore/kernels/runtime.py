@@ -1,4 +1,4 @@
-"""Launching Warp kernels on CPU and CUDA from one source.
+"""Launching Warp kernels on CPU and CUDA from one source, and host threads for the CPU.
 
 A CPU launch runs its threads one after the other, but releases the interpreter lock: `launch` cuts the range into
 chunks and runs them in a small thread pool. Kernels therefore take the first index of their chunk as last argument
@@ -7,7 +7,6 @@ and begin with `i = wp.tid() + offset`. On CUDA the whole range is one launch on
 
 from __future__ import annotations
 
-import os
 import sys
 import threading
 import time
@@ -18,6 +17,8 @@ from typing import Any, TypeVar
 
 import torch
 import warp as wp
+
+from .device import backend_of
 
 wp.config.log_level = 30  # warnings; stdout belongs to results
 # The adjoints are written by hand (`torch.autograd.Function`), so that nothing is compiled that is never called.
@@ -123,22 +124,16 @@ def launch(kernel: wp.Kernel, count: int, inputs: list[Any], device: torch.devic
     if serial or len(spans) == 1:
         wp.launch(kernel, dim=count, inputs=[*inputs, 0], device="cpu")
         return
-    run_parallel([lambda s=span: wp.launch(kernel, dim=s[1], inputs=[*inputs, s[0]], device="cpu") for span in spans])
+    run_parallel(
+        [lambda s=span: wp.launch(kernel, dim=s[1], inputs=[*inputs, s[0]], device="cpu") for span in spans], device
+    )
 
 
-def run_parallel(tasks: Sequence[Callable[[], Result]]) -> list[Result]:
-    """Results of callables run in the kernel pool, in their order; the first exception is raised when all are done."""
-    if in_pool() or worker_count() == 1 or len(tasks) == 1:
+def run_parallel(tasks: Sequence[Callable[[], Result]], device: torch.device) -> list[Result]:
+    """Results of callables that compute on a device, in their order: run in the kernel pool where its backend shares
+    work among host threads, else one after the other; the first exception is raised when all are done."""
+    if not backend_of(device).host_threads or in_pool() or worker_count() == 1 or len(tasks) == 1:
         return [task() for task in tasks]
     futures = [_pool(worker_count()).submit(task) for task in tasks]
     wait(futures)
     return [future.result() for future in futures]
-
-
-def default_threads() -> int:
-    """Threads the engine may use: all cores but one, so that Blender stays responsive.
-
-    FIELDWORK_THREADS overrides it.
-    """
-    available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
-    return int(os.environ.get("FIELDWORK_THREADS", 0)) or max(1, available - 1)

@@ -8,7 +8,7 @@ Bin weights (`mode`):
   PDF_DEFAULT  T·α·(1 + β·interest) + ε        transmittance-weighted, ε keeps every open bin alive
   PDF_UNIFORM  1                               the same number of samples spread over the open bins
   PDF_LITERAL  σ·max softmax(s)                the original formulation: no transmittance
-The torch twin is in `march_torch.py`.
+The torch backend is in `march_torch.py`.
 """
 
 from __future__ import annotations

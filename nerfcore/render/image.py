@@ -98,7 +98,7 @@ def render_view(
 
     # The CPU renders small tiles side by side, each of which fits a core's cache.
     tiles = pixels.split(render.rays if device.type != "cpu" else min(render.rays, CPU_RAYS))
-    parts = run_parallel([partial(tile, pixel) for pixel in tiles])
+    parts = run_parallel([partial(tile, pixel) for pixel in tiles], device)
     shape = (camera.height, camera.width)
     images = [torch.cat(column).cpu() for column in zip(*parts)]
     color, opacity, depth, position, *classes = (i.reshape(*shape, *i.shape[1:]).numpy() for i in images)

@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from ..config import SamplingConfig
-from ..kernels.cells import average, observe
+from ..kernels.cells import MeanScratch, average, observe
 from ..kernels.walk import PDF_DEFAULT, PDF_LITERAL, PDF_UNIFORM, MarchSettings, closed_reach
 
 MODES = {"default": PDF_DEFAULT, "uniform": PDF_UNIFORM, "literal": PDF_LITERAL}
@@ -17,6 +17,7 @@ CHUNK = 1 << 16
 WARM_DECAY = 0.25
 MOST_OPTICAL_DEPTH = 1.0  # of a cell, for the sampling PDF
 MEAN_RATE = 0.1  # at which a cell's mean density follows each point read in it
+INTEREST_RATE = 0.2  # at which its interest does
 SWEEPS = (1, 2, 4, 8, 12)  # updates of the warm-up at which the whole grid is read
 PROBES = 64  # one cell in so many is read at an update, and as many open ones
 
@@ -49,6 +50,7 @@ class OccupancyGrid(nn.Module):
         self.register_buffer("empty", torch.zeros(()))
         self.empty: torch.Tensor
         self._empty = (-1, 0.0)
+        self._scratch: MeanScratch | None = None
         self.register_buffer("mean", torch.where(seen, 3.0, 0.0))
         self.mean: torch.Tensor
         self.density: torch.Tensor
@@ -59,6 +61,11 @@ class OccupancyGrid(nn.Module):
         self.register_buffer("reach", torch.zeros((n // 4) ** 3, dtype=torch.uint8))
         self.cells: torch.Tensor
         self.reach: torch.Tensor
+
+    def _mean_scratch(self) -> MeanScratch:
+        if self._scratch is None or self._scratch.counts.device != self.mean.device:
+            self._scratch = MeanScratch(len(self.mean), self.mean.device)
+        return self._scratch
 
     def march_settings(self, near: float = 0.02) -> MarchSettings:
         c = self.config
@@ -125,7 +132,7 @@ class OccupancyGrid(nn.Module):
         Points with a negative density were not read."""
         # A cell is observed at up to every step: its decay is spread over them.
         decay = 0.9 if warming_up else self.config.decay ** (1 / self.config.update_every)
-        average(self.mean, self.config.resolution, points, density, MEAN_RATE)
+        average(self.mean, self._mean_scratch(), self.config.resolution, points, density, MEAN_RATE)
         observe(self.density, self.scratch, self.config.resolution, points, density, decay)
 
     @torch.no_grad()
@@ -151,13 +158,15 @@ class OccupancyGrid(nn.Module):
         cells = cells[self.seen[cells]]
         points = self.positions(cells, generator)
         fresh = torch.cat([density(part) for part in points.split(CHUNK)]) if len(points) else points[:, 0]
-        self.density[cells] = torch.maximum(self.density[cells] * self.config.decay, fresh)
-        average(self.mean, self.config.resolution, points, fresh, MEAN_RATE)
+        # A cell may have been chosen twice.
+        n, scratch = self.config.resolution, self._mean_scratch()
+        observe(self.density, self.scratch, n, points, fresh, self.config.decay)
+        average(self.mean, scratch, n, points, fresh, MEAN_RATE)
         if interest is not None:
             dense = fresh * self.step > self.config.threshold
             if bool(dense.any()):
                 value = torch.cat([interest(part) for part in points[dense].split(CHUNK)])
-                self.interest[cells[dense]] += 0.2 * (value - self.interest[cells[dense]])
+                average(self.interest, scratch, n, points[dense].contiguous(), value, INTEREST_RATE)
         self.rebuild()
 
 

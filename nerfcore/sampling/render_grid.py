@@ -70,7 +70,7 @@ def refined_grid(
 
     for _ in range(PROBES):
         points = (fine + torch.rand(fine.shape, device=device, generator=generator)) / side
-        found = torch.cat(run_parallel([partial(read, some) for some in points.split(CHUNK)]))
+        found = torch.cat(run_parallel([partial(read, some) for some in points.split(CHUNK)], device))
         mean += found / PROBES
         torch.maximum(largest, found, out=largest)
     step = occupancy.step / factor

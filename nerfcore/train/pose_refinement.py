@@ -21,6 +21,7 @@ from ..data.camera_rays import CameraRays
 from ..data.pixels import Batch
 from ..files import write_json
 from ..geometry.similarity import similarity_scale
+from ..kernels.device import backend_of
 from ..project.schema import PosedImage, Poses
 
 BETAS = (0.9, 0.99)
@@ -67,10 +68,10 @@ class PoseRefinement(nn.Module):
         super().__init__()
         self.config = config
         self.correction = nn.Parameter(torch.zeros(len(rays.center), 6, device=rays.center.device))
-        fused = self.correction.device.type != "mps"
+        fused = backend_of(self.correction.device).fused_optimizer
         self.optimizer = torch.optim.Adam([self.correction], config.pose_rate, betas=BETAS, eps=1e-15, fused=fused)
         motions = rig_motions(rays.center) if keep_rig else None
-        self.motions = None if motions is None else (motions, torch.linalg.pinv(motions.double()).float())
+        self.motions = None if motions is None else (motions, torch.linalg.pinv(motions.cpu().double()).to(motions))
         self._moved: tuple[torch.Tensor, torch.Tensor] | None = None
 
     def move(self, batch: Batch) -> Batch:

@@ -203,7 +203,7 @@ class Trainer:
             tasks.append(partial(self._differentiate, sparsity))
         if self.depths is not None and len(self.depths):
             tasks.append(self._depth_task(self.depths))
-        learned = run_parallel(tasks)
+        learned = run_parallel(tasks, self.device)
         for parameter, *gradients in zip(self.model.parameters(), *(part.gradients for part in learned)):
             found = [g for g in gradients if g is not None]
             parameter.grad = torch.stack(found).sum(0) if found else None

@@ -134,7 +134,9 @@ def reduce_photos(model: Model, store: PixelStore, check: Callable[[], None]) ->
                 return torch.where(out.opacity > 0.5, out.depth / out.opacity.clamp(min=0.5), torch.inf)
 
         parts = torch.arange(small.width * small.height, device=store.device).split(RAYS)
-        found.append(Reduced(color, torch.cat(run_parallel([partial(distance, part) for part in parts])), rays))
+        found.append(
+            Reduced(color, torch.cat(run_parallel([partial(distance, part) for part in parts], store.device)), rays)
+        )
     return found
 
 

@@ -6,7 +6,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from fieldwork.tests.nerfcore.support.backends import device
 from fieldwork.tests.nerfcore.support.captures import ingest, poses
+
+__all__ = ["device", "fountain"]
 
 Data = Callable[[str], Path]
 

@@ -33,7 +33,7 @@ def test_results_come_in_the_order_of_the_tasks_and_nested_calls_stay_in_their_t
     import torch
     from fieldwork.nerfcore.kernels.runtime import run_parallel
 
-    before = torch.get_num_threads()
+    cpu, before = torch.device("cpu"), torch.get_num_threads()
     torch.set_num_threads(3)
     try:
 
@@ -41,12 +41,34 @@ def test_results_come_in_the_order_of_the_tasks_and_nested_calls_stay_in_their_t
             here = threading.get_ident()
             return [
                 k * 10 + j
-                for j, thread in run_parallel([lambda j=j: (j, threading.get_ident()) for j in range(3)])
+                for j, thread in run_parallel([lambda j=j: (j, threading.get_ident()) for j in range(3)], cpu)
                 if thread == here
             ]
 
-        assert run_parallel([lambda k=k: outer(k) for k in range(5)]) == [
+        assert run_parallel([lambda k=k: outer(k) for k in range(5)], cpu) == [
             [10 * k + j for j in range(3)] for k in range(5)
         ]
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_host_threads_serve_the_cpu_only():
+    import threading
+
+    import torch
+    from fieldwork.nerfcore.kernels.device import using_kernels
+    from fieldwork.nerfcore.kernels.runtime import run_parallel
+
+    def threads(device):
+        return set(run_parallel([threading.get_ident] * 8, device))
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        assert threading.get_ident() not in threads(torch.device("cpu"))
+        assert threads(torch.device("cuda")) == {threading.get_ident()}
+        assert threads(torch.device("mps")) == {threading.get_ident()}
+        with using_kernels("torch"):
+            assert threads(torch.device("cpu")) == {threading.get_ident()}
     finally:
         torch.set_num_threads(before)

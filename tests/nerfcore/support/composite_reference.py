@@ -1,0 +1,26 @@
+"""What the functions of `composite.py` must give, one ray at a time."""
+
+from __future__ import annotations
+
+import torch
+from fieldwork.nerfcore.kernels.packing import Packing
+
+
+def render_weights(density: torch.Tensor, delta: torch.Tensor, packing: Packing) -> torch.Tensor:
+    """As `composite.render_weights`, differentiable by autograd."""
+    parts = []
+    for start, count in zip(packing.start.tolist(), packing.count.tolist()):
+        if count == 0:
+            continue
+        tau = density[start : start + count] * delta[start : start + count]
+        after = torch.cumsum(tau, 0)
+        parts.append(torch.exp(-(after - tau)) - torch.exp(-after))
+    return torch.cat(parts) if parts else density * 0
+
+
+def weighted_sum(values: torch.Tensor, weights: torch.Tensor, packing: Packing) -> torch.Tensor:
+    """As `composite.weighted_sum`."""
+    rows = []
+    for start, count in zip(packing.start.tolist(), packing.count.tolist()):
+        rows.append((values[start : start + count] * weights[start : start + count, None]).sum(0))
+    return torch.stack(rows)

@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 SHELL := /bin/bash
 export OMP_WAIT_POLICY := passive
 
-.PHONY: venv demo test test-all lint matrix gui gpu-compile gpu-check bench repository clean
+.PHONY: venv demo test test-all lint matrix gui gpu-compile gpu-check bench benchmarks-page repository clean
 
 venv: $(VENV)/.ready
 
@@ -57,7 +57,7 @@ gui: venv
 gpu-compile: venv
 	$(BIN)/python -m fieldwork.nerfcore.kernels.compile_cuda build/cubins --page docs/kernels.md
 
-# Kernels against their twins, then training, rendering and memory; writes the GPU section of docs/benchmarks.md.
+# Kernels against their twins, then training, rendering and memory; adds the figures to docs/figures and writes docs/benchmarks.md.
 gpu-check: venv
 	@mkdir -p build/bench/gpu
 	@rm -f build/bench/gpu/tests.xml
@@ -68,6 +68,10 @@ gpu-check: venv
 SUITE ?= speed
 bench: venv
 	$(BIN)/fieldwork bench --suite $(SUITE) $(BENCH)
+
+# docs/benchmarks.md anew from docs/figures, without measuring anything.
+benchmarks-page: venv
+	$(BIN)/python -m fieldwork.nerfcore.bench.page docs/benchmarks.md
 
 repository: venv
 	$(BIN)/python tests/addon/make_repository.py dist/repository

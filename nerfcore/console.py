@@ -68,6 +68,10 @@ class ConsoleReporter(Reporter):
             left = f", about {elapsed / fraction - elapsed:.0f} s left" if fraction > 0.02 else ""
             self.console.print(f"{self.name}: {fraction:.0%}{left}  {message}")
 
+    def note(self, message: str) -> None:
+        if not self.quiet:
+            self.console.print(message)
+
     def warn(self, message: str) -> None:
         self.warnings.append(message)
         self.console.print(f"[yellow]Warning:[/yellow] {message}")

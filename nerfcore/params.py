@@ -237,7 +237,7 @@ class BatchParams(Params):
 
 
 class BenchParams(Params):
-    suite: Literal["speed", "ablation", "robustness", "baselines", "gpu"] = Field(description="which table")
+    suite: Literal["figures", "speed", "ablation", "robustness", "baselines", "gpu"] = Field(description="which table")
     out: Path = Field(default=Path("build/bench"), description="folder for results and scenes; finished runs are kept")
     data: Path | None = Field(default=None, description="folder of data sets; default: ../shared/data when it is there")
     scenes: list[str] | None = Field(
@@ -246,11 +246,14 @@ class BenchParams(Params):
     variants: list[str] | None = Field(default=None, description="only these variants of the suite")
     seconds: float | None = Field(default=None, gt=0, description="seconds of training a run, instead of the suite's")
     steps: int | None = Field(default=None, gt=0, description="steps of training a run, instead of the suite's")
+    seeds: list[int] | None = Field(default=None, description="a run for each of these seeds, instead of the suite's")
     preset: Preset = "standard"
     set: dict[str, str] = Field(
         default_factory=dict, description="settings changed in every run, but for what a variant changes"
     )
     keep: bool = Field(default=False, description="keep the trained fields in OUT/projects")
     yardstick: Path | None = Field(default=None, description="speed: script of another trainer to run beside ours")
-    page: Path | None = Field(default=None, description="gpu: Markdown page whose GPU section is rewritten")
+    page: Path | None = Field(
+        default=None, description="Markdown page written anew from the folder figures beside it, which gets this table"
+    )
     tests: Path | None = Field(default=None, description="gpu: JUnit file of the kernels' tests")

@@ -32,6 +32,10 @@ class Reporter:
     def event(self, kind: str, **data: Any) -> None:
         """A measured value or artefact: kind "train" (step, loss, psnr), "preview" (path), …"""
 
+    def note(self, message: str) -> None:
+        """A line for whoever watches: a plan, what is reused. Nothing needs to be done about it."""
+        log.info(message)
+
     def warn(self, message: str) -> None:
         """Something the user should know of; the work goes on."""
         self.warnings.append(message)

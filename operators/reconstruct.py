@@ -98,6 +98,7 @@ class FIELDWORK_OT_bench(VerbOperator):
         description="Which table",
         items=[
             ("speed", "Speed", "Quality after a short and a longer training, frame times"),
+            ("figures", "Figures", "Quality on each scene with two seeds"),
             ("ablation", "Ablation", "The parts of the method, one left out at a time"),
             ("robustness", "Robustness", "Noise, missing views, missing and wrong labels"),
             ("baselines", "Baselines", "Other methods as boundary cases of the field"),
@@ -112,13 +113,20 @@ class FIELDWORK_OT_bench(VerbOperator):
     variants: StringProperty(name="Variants", description="Only these variants of the suite, separated by commas")
     seconds: FloatProperty(name="Time", description="Seconds of training a run; 0: as the suite says", min=0.0)
     steps: IntProperty(name="Steps", description="Steps of training a run; 0: as the suite says", min=0)
+    seeds: StringProperty(
+        name="Seeds", description="A run for each of these seeds, separated by commas; empty: as the suite says"
+    )
     preset: EnumProperty(name="Preset", description="Preset of every run", items=PRESETS, default="standard")
     settings: StringProperty(name="Settings", description="Settings of every run: name=value, separated by spaces")
     keep: BoolProperty(name="Keep", description="Keep the trained fields")
     yardstick: StringProperty(
         name="Yardstick", description="Speed: script of another trainer to run beside ours", subtype="FILE_PATH"
     )
-    page: StringProperty(name="Page", description="GPU: Markdown page to write the figures into", subtype="FILE_PATH")
+    page: StringProperty(
+        name="Page",
+        description="Markdown page written anew from the folder “figures” beside it, which gets this table",
+        subtype="FILE_PATH",
+    )
     tests: StringProperty(name="Tests", description="GPU: JUnit file of the kernels' tests", subtype="FILE_PATH")
 
     def invoke(self, context: Context, event: bpy.types.Event) -> set[str]:
@@ -133,6 +141,7 @@ class FIELDWORK_OT_bench(VerbOperator):
             "variants": _words(self.variants),
             "seconds": self.seconds or None,
             "steps": self.steps or None,
+            "seeds": _words(self.seeds),
             "preset": self.preset,
             "set": parse_settings(self.settings),
             "keep": self.keep,

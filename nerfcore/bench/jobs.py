@@ -27,6 +27,7 @@ from ..progress import Reporter
 from ..project.store import load_project
 from ..render.run import CHECKPOINT, load_info, load_trained, run_folder, settled_as
 from ..train.verb import train
+from .machine import taken
 
 COUNTING_SIDE = 200  # of a frame that only counts samples per ray
 # Guesses, only for the estimate of the time left.
@@ -35,7 +36,10 @@ SECONDS_PER_STEP, EVALUATION_SECONDS = 0.1, 60.0
 
 @dataclass(frozen=True)
 class Job:
-    """A variant trained on a scene, until `steps` or `seconds` are used up. `sides`: frame sizes to time."""
+    """A variant trained on a scene, until `steps` or `seconds` are used up.
+
+    `sides`: frame sizes to time. `seed`: of the settings, where a suite trains several.
+    """
 
     scene: str
     variant: str
@@ -44,6 +48,7 @@ class Job:
     seconds: float | None = None
     preset: Preset = "standard"
     sides: tuple[int, ...] = (COUNTING_SIDE,)
+    seed: int | None = None
 
     @property
     def budget(self) -> str:
@@ -52,7 +57,13 @@ class Job:
     @property
     def name(self) -> str:
         """Name of its run and of its file."""
-        return re.sub(r"[^\w.-]+", "-", f"bench-{self.scene}-{self.variant}-{self.budget}")
+        seed = "" if self.seed is None else f"-seed-{self.seed}"
+        return re.sub(r"[^\w.-]+", "-", f"bench-{self.scene}-{self.variant}-{self.budget}{seed}")
+
+    @property
+    def title(self) -> str:
+        """Name of it for the user."""
+        return f"{self.scene} {self.variant} {self.budget}" + ("" if self.seed is None else f", seed {self.seed}")
 
     @property
     def training_seconds(self) -> float:
@@ -105,7 +116,8 @@ def load_result(job: Job, out: Path) -> dict[str, Any] | None:
 
 
 def _description(job: Job) -> dict[str, Any]:
-    return json.loads(json.dumps(asdict(job)))
+    values = json.loads(json.dumps(asdict(job)))
+    return {key: value for key, value in values.items() if key != "seed" or value is not None}
 
 
 def run_job(job: Job, project: Path, out: Path, report: Reporter, keep: bool = False) -> dict[str, Any]:
@@ -141,6 +153,7 @@ def run_job(job: Job, project: Path, out: Path, report: Reporter, keep: bool = F
         "memory_rendering_mb": _peak(device),
         "curve": training_curve(folder / "events.jsonl"),
         "pictures": evaluated["pictures"][:4],
+        "taken": taken().model_dump(mode="json"),
         "project": str(project),
     }
     write_json(out / "runs" / f"{job.name}.json", figures)
@@ -201,16 +214,26 @@ def training_curve(path: Path, points: int = 100) -> list[list[float]]:
     return [[event["seconds"], event["psnr"]] for event in events[::step]]
 
 
+def planned(jobs: Sequence[Job], out: Path) -> list[str]:
+    """The plan in lines for the user: what is trained, what is there already, about how long it takes."""
+    there = [load_result(job, out) is not None for job in jobs]
+    lines = [f"{'there' if known else 'to do'}: {job.title}" for job, known in zip(jobs, there)]
+    left = sum(job.expected_seconds for job, known in zip(jobs, there) if not known)
+    return [*lines, f"{len(jobs) - sum(there)} of {len(jobs)} runs to do, roughly {max(left / 60, 1):.0f} minutes."]
+
+
 def run_all(
     jobs: Sequence[Job], projects: dict[str, Path], out: Path, report: Reporter, keep: bool = False
 ) -> list[dict[str, Any]]:
     """Figures of all jobs in their order; finished ones are read, failed ones have only "job" and "error"."""
     total = sum(job.expected_seconds for job in jobs) or 1.0
     done, results, begin = 0.0, [], time.monotonic()
+    for line in planned(jobs, out):
+        report.note(line)
     report.stage(f"{len(jobs)} runs")
     for number, job in enumerate(jobs, 1):
         share = job.expected_seconds / total
-        title = f"run {number} of {len(jobs)}, {job.scene} {job.variant} {job.budget}"
+        title = f"run {number} of {len(jobs)}, {job.title}"
         known = load_result(job, out)
         if known is None:
             try:

@@ -7,34 +7,86 @@ import platform
 import subprocess
 import sys
 import time
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import psutil
 import torch
 
 from ..errors import InputError
 from ..kernels.device import default_threads, use_device
 from ..progress import Reporter
+from .results import CPU_FLAGS, Machine, Taken
+
+ROOT = Path(__file__).resolve().parents[2]
+CODE = ("nerfcore", "addon", "operators", "panels", "pyproject.toml")
+CPUINFO = Path("/proc/cpuinfo")
 
 
 def describe() -> str:
     """Name of the device, its threads, and the versions that matter."""
     device = use_device()
-    if device.type == "cuda":
-        p = torch.cuda.get_device_properties(device)
-        what = f"{p.name}, {p.total_memory / 2**30:.0f} GiB, compute capability {p.major}.{p.minor}"
-    else:
-        what = f"{_processor()}, threads: {torch.get_num_threads()}"
-    return f"{what}; PyTorch {torch.__version__}, {platform.system()}"
+    what = _gpu(device) or f"{_processor()}, threads: {torch.get_num_threads()}"
+    return f"{what}; {_software()}"
+
+
+def taken() -> Taken:
+    """Machine, code and time of what is measured now."""
+    device = use_device()
+    commit, modified = checked_out()
+    flags = _cpuinfo("flags").split()
+    machine = Machine(
+        cpu=_processor(),
+        flags=tuple(flag for flag in CPU_FLAGS if flag in flags),
+        cores=psutil.cpu_count(logical=False) or psutil.cpu_count(),
+        threads=torch.get_num_threads(),
+        gpu=_gpu(device),
+        software=_software(),
+    )
+    return Taken(machine=machine, date=datetime.now(UTC).date().isoformat(), commit=commit, modified=modified)
+
+
+def checked_out(root: Path = ROOT) -> tuple[str | None, bool]:
+    """Commit of the checkout at `root`, and whether its code differs from it; (None, False) where there is none."""
+
+    def git(*words: str) -> str | None:
+        try:
+            done = subprocess.run(["git", "-C", str(root), *words], capture_output=True, text=True, timeout=30)
+        except (OSError, subprocess.TimeoutExpired):
+            return None
+        return done.stdout.strip() if done.returncode == 0 else None
+
+    top = git("rev-parse", "--show-toplevel")
+    if top is None or Path(top).resolve() != root:
+        return None, False
+    commit = git("rev-parse", "--short=8", "HEAD")
+    return commit or None, bool(commit and git("status", "--porcelain", "--", *CODE))
+
+
+def _gpu(device: torch.device) -> str | None:
+    if device.type != "cuda":
+        return None
+    p = torch.cuda.get_device_properties(device)
+    return f"{p.name}, {p.total_memory / 2**30:.0f} GiB, compute capability {p.major}.{p.minor}"
+
+
+def _software() -> str:
+    return f"PyTorch {torch.__version__}, {platform.system()}"
+
+
+def _cpuinfo(key: str) -> str:
+    """What Linux says about its first processor; empty elsewhere."""
+    if CPUINFO.is_file():
+        for line in CPUINFO.read_text(encoding="utf-8").splitlines():
+            name, _, value = line.partition(":")
+            if name.strip() == key:
+                return value.strip()
+    return ""
 
 
 def _processor() -> str:
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.is_file():
-        for line in cpuinfo.read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
+    return _cpuinfo("model name") or platform.processor() or platform.machine()
 
 
 def run_yardstick(script: Path, seconds: float, report: Reporter) -> dict[str, Any]:

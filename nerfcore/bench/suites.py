@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 from ..errors import SettingError
@@ -11,6 +13,7 @@ from .jobs import COUNTING_SIDE, Job
 from .scenes import scene_name
 
 SCENES = {
+    "figures": ["lego_400", "museum", "replica_room", "facade"],
     "speed": ["lego_400"],
     "ablation": ["replica_room", "museum", "facade"],
     "robustness": ["museum", "replica_room"],
@@ -21,8 +24,9 @@ REFERENCE = {"ablation": "hybrid", "robustness": "clean", "baselines": "ours"}
 SECONDS = {"speed": 120.0, "ablation": 180.0, "robustness": 180.0, "baselines": 600.0, "gpu": 60.0}
 SIDES = {"speed": (400, 800), "gpu": (800,), "baselines": (800,)}
 LONGER = 5.0  # the speed suite's second run
-STEPS = 4000
-# Published drops of PSNR (dB) and of mIoU (points) under input noise, docs/benchmarks.md.
+STEPS = {"figures": 600, "ablation": 4000}
+SEEDS = {"figures": [0, 1]}
+# Published drops of PSNR (dB) and of mIoU (points) under input noise.
 PUBLISHED_DROPS = {"noise 0.01": (1.6, 2.5), "noise 0.03": (3.7, 4.7), "noise 0.05": (5.4, 8.1)}
 BASELINES = Path(__file__).parent / "baselines.json"
 MISSING_BASELINES = {
@@ -76,7 +80,8 @@ def variants(suite: str) -> dict[str, dict[str, str]]:
 def plan(params: BenchParams, scenes: list[str]) -> list[Job]:
     """The jobs of a suite on some scenes.
 
-    Without `seconds` and `steps` the suite's own budgets hold. Either of them replaces both kinds of budget.
+    Without `seconds` and `steps` the suite's own budgets hold. Either of them replaces both kinds of budget. Without
+    `seeds` the suite's own are taken, unless `set` has one.
 
     Raises:
         SettingError: a variant the suite does not have.
@@ -87,17 +92,20 @@ def plan(params: BenchParams, scenes: list[str]) -> list[Job]:
     if unknown:
         raise SettingError(f"The suite {suite} has no variant “{unknown[0]}”.", f"It has: {', '.join(found)}.")
     own = params.seconds is None and params.steps is None
-    seconds = SECONDS[suite] if own else params.seconds
-    steps = (STEPS if suite == "ablation" else None) if own else params.steps
+    seconds = SECONDS.get(suite) if own else params.seconds
+    steps = STEPS.get(suite) if own else params.steps
+    seeds = params.seeds or (None if "train.seed" in params.set else SEEDS.get(suite)) or [None]
     timed = TIMED if own and suite == "ablation" else wanted
     jobs = []
     for scene in map(scene_name, scenes):
-        for name in wanted:
-            settings = {**EQUAL_SAMPLES.get(suite, {}), **params.set, **found[name]}  # a variant is what its name says
-            sides = SIDES.get(suite, (COUNTING_SIDE,))
+        for name, seed in product(wanted, seeds):
+            own_seed = {} if seed is None else {"train.seed": str(seed)}
+            # a variant is what its name says
+            settings = {**EQUAL_SAMPLES.get(suite, {}), **params.set, **own_seed, **found[name]}
+            job = Job(scene, name, settings, preset=params.preset, sides=SIDES.get(suite, (COUNTING_SIDE,)), seed=seed)
             if steps is not None:
-                jobs.append(Job(scene, name, settings, steps=steps, preset=params.preset, sides=sides))
+                jobs.append(replace(job, steps=steps))
             if seconds is not None and name in timed:
                 limits = (seconds, seconds * LONGER) if suite == "speed" else (seconds,)
-                jobs += [Job(scene, name, settings, seconds=s, preset=params.preset, sides=sides) for s in limits]
+                jobs += [replace(job, seconds=s) for s in limits]
     return jobs

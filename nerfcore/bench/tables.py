@@ -4,19 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from statistics import mean
 from typing import Any
 
 import matplotlib
 
 from ..files import atomic_path
 from .jobs import COUNTING_SIDE, Job
+from .results import Row
 from .suites import PUBLISHED_DROPS, REFERENCE
 
-Row = dict[str, Any]
 COLUMNS = {
     "scene": "scene",
     "variant": "variant",
     "budget": "budget",
+    "seed": "seed",
     "psnr": "PSNR (dB)",
     "ssim": "SSIM",
     "miou": "mIoU",
@@ -30,20 +32,23 @@ COLUMNS = {
     "memory_training_mb": "peak memory, training (MiB)",
     "memory_rendering_mb": "peak memory, rendering (MiB)",
 }
+DIGITS = {"psnr": ".2f", "ssim": ".3f", "miou": ".3f", "psnr_gain": "+.2f", "miou_gain": "+.3f"}
 SPEED = {"fps": "frames/s", "ms_frame": "ms a frame", "ms_sampling": "ms sampling", "ms_network": "ms network"}
 
 
-def text(value: Any) -> str:
+def text(value: Any, digits: str = ",.4g") -> str:
     """A figure as it stands in a table; what was not measured says so."""
     if value is None:
         return "not measured"
-    return f"{value:,.4g}" if isinstance(value, float) else str(value)
+    return format(value, digits) if isinstance(value, float) else str(value)
 
 
 def table(columns: dict[str, str], rows: Sequence[Row]) -> str:
     """A Markdown table of the columns {key: heading} of rows."""
     lines = ["| " + " | ".join(columns.values()) + " |", "|" + " --- |" * len(columns)]
-    lines += ["| " + " | ".join(text(row.get(key, "–")) for key in columns) + " |" for row in rows]
+    lines += [
+        "| " + " | ".join(text(row.get(key, "–"), DIGITS.get(key, ",.4g")) for key in columns) + " |" for row in rows
+    ]
     return "\n".join(lines)
 
 
@@ -52,7 +57,12 @@ def make_rows(suite: str, results: Sequence[dict[str, Any]]) -> list[Row]:
     rows = []
     for result in results:
         job = result["job"]
-        row: Row = {"scene": job["scene"], "variant": job["variant"], "budget": Job(**job).budget}
+        row: Row = {
+            "scene": job["scene"],
+            "variant": job["variant"],
+            "budget": Job(**job).budget,
+            "seed": job.get("seed"),
+        }
         row |= {key: result.get(key) for key in COLUMNS if key not in row}
         for speed in result.get("speed", []):
             side = speed["fps_size"][0]
@@ -61,9 +71,9 @@ def make_rows(suite: str, results: Sequence[dict[str, Any]]) -> list[Row]:
             row |= {f"{key}_{side}": values[key] for key in SPEED}
         row["error"] = result.get("error")
         rows.append(row)
-    reference = {(r["scene"], r["budget"]): r for r in rows if r["variant"] == REFERENCE.get(suite)}
+    reference = {_case(r): r for r in rows if r["variant"] == REFERENCE.get(suite)}
     for row in rows:
-        base = reference.get((row["scene"], row["budget"]))
+        base = reference.get(_case(row))
         if base is None or base is row:
             continue
         for key, gain in (("psnr", "psnr_gain"), ("miou", "miou_gain")):
@@ -78,15 +88,43 @@ def verdicts(suite: str, rows: Sequence[Row]) -> list[str]:
         return _ablation_verdicts(rows)
     if suite == "robustness":
         return _drop_verdicts(rows)
-    return []
+    return _seed_verdicts(rows) if suite == "figures" else []
 
 
-def _by(rows: Sequence[Row]) -> dict[tuple[str, str], dict[str, Row]]:
-    """Rows by (scene, budget) and variant."""
-    found: dict[tuple[str, str], dict[str, Row]] = {}
+def frame_sides(rows: Sequence[Row]) -> list[int]:
+    """Sides of the frames that were timed, less that which only counts samples."""
+    sides = {int(key.rsplit("_", 1)[1]) for row in rows for key in row if key.startswith("fps_")}
+    return sorted(sides - {COUNTING_SIDE})
+
+
+def _case(row: Row) -> str:
+    """What a row has in common with the variants it is compared with."""
+    return f"{row['scene']}, {row['budget']}" + ("" if row.get("seed") is None else f", seed {row['seed']}")
+
+
+def _by(rows: Sequence[Row]) -> dict[str, dict[str, Row]]:
+    """Rows by what they have in common and variant."""
+    found: dict[str, dict[str, Row]] = {}
     for row in rows:
-        found.setdefault((row["scene"], row["budget"]), {})[row["variant"]] = row
+        found.setdefault(_case(row), {})[row["variant"]] = row
     return found
+
+
+def _seed_verdicts(rows: Sequence[Row]) -> list[str]:
+    """Mean and spread of equal runs with several seeds."""
+    lines, groups = [], {}
+    for row in rows:
+        groups.setdefault((row["scene"], row["variant"], row["budget"]), []).append(row)
+    for (scene, _, limit), group in groups.items():
+        known = {key: [r[key] for r in group if r.get(key) is not None] for key in ("psnr", "miou")}
+        if len(known["psnr"]) < 2:
+            continue
+        half = {key: (max(values) - min(values)) / 2 for key, values in known.items() if values}
+        parts = [f"PSNR {mean(known['psnr']):.2f} ± {half['psnr']:.2f} dB"]
+        if len(known["miou"]) > 1:
+            parts.append(f"mIoU {mean(known['miou']):.3f} ± {half['miou']:.3f}")
+        lines.append(f"{scene}, {limit}, {len(known['psnr'])} seeds: {', '.join(parts)} (mean ± half of the range).")
+    return lines
 
 
 def _better(a: Row, b: Row, keys: Sequence[str]) -> bool | None:
@@ -99,18 +137,18 @@ def _better(a: Row, b: Row, keys: Sequence[str]) -> bool | None:
 
 def _ablation_verdicts(rows: Sequence[Row]) -> list[str]:
     lines = []
-    for (scene, limit), found in _by(rows).items():
+    for case, found in _by(rows).items():
         if {"hybrid", "explicit", "implicit"} <= found.keys():
             wins = [_better(found["hybrid"], found[v], ("psnr", "miou")) for v in ("explicit", "implicit")]
             if None not in wins:
                 how = "beats" if all(wins) else "does not beat"
-                lines.append(f"{scene}, {limit}: hybrid {how} both of its boundary cases in PSNR and mIoU.")
+                lines.append(f"{case}: hybrid {how} both of its boundary cases in PSNR and mIoU.")
         for variant in ("hybrid", "semantic pdf"):
             if {variant, "uniform pdf"} <= found.keys():
                 won = _better(found[variant], found["uniform pdf"], ("psnr",))
                 if won is not None:
                     how = "beats" if won else "does not beat"
-                    lines.append(f"{scene}, {limit}: {variant} {how} uniform samples in PSNR.")
+                    lines.append(f"{case}: {variant} {how} uniform samples in PSNR.")
     return lines
 
 
@@ -138,9 +176,7 @@ def markdown(suite: str, rows: Sequence[Row], machine: str, command: str, notes:
     present = [key for key in COLUMNS if any(row.get(key) is not None for row in rows) or key in ("psnr", "miou")]
     parts = [f"# Suite {suite}", "", f"Machine: {machine}. Command: `{command}`", ""]
     parts += [table({key: COLUMNS[key] for key in present}, rows), ""]
-    for side in sorted({int(key.rsplit("_", 1)[1]) for row in rows for key in row if key.startswith("fps_")}):
-        if side == COUNTING_SIDE:
-            continue
+    for side in frame_sides(rows):
         columns = {"scene": "scene", "variant": "variant", "budget": "budget"}
         columns |= {f"{key}_{side}": heading for key, heading in SPEED.items()}
         classes = "colour and, where the scene has labels, classes"
@@ -174,10 +210,10 @@ def plot(path: Path, suite: str, rows: Sequence[Row], results: Sequence[dict[str
         groups = _by(rows)
         most = max(len(found) for found in groups.values())
         figure = Figure(figsize=(9, 0.6 + len(groups) * (0.9 + 0.28 * most)), layout="constrained")
-        for (left, right), ((scene, limit), found) in zip(
+        for (left, right), (case, found) in zip(
             figure.subplots(len(groups), 2, squeeze=False, sharey="row"), groups.items()
         ):
-            _bars(left, found, "psnr", f"{scene}, {limit}: PSNR (dB)")
+            _bars(left, found, "psnr", f"{case}: PSNR (dB)")
             _bars(right, found, "miou", "mIoU")
     with atomic_path(path) as temporary:
         figure.savefig(temporary, dpi=120)

@@ -3,6 +3,7 @@
 OUT/SUITE/results.json   every figure      OUT/SUITE/table.md   the table      OUT/SUITE/plot.png
 OUT/SUITE/runs/*.json    one file a run: it is not repeated while its settings stay the same
 OUT/projects/            the scenes
+With a page its result sets, figures/*.json beside it, get those of this command, and the page is written anew.
 """
 
 from __future__ import annotations
@@ -13,12 +14,14 @@ from typing import Any
 import torch
 
 from ..errors import InputError
-from ..files import write_json, write_section, write_text
+from ..files import write_json, write_text
 from ..kernels.device import use_device
 from ..params import BenchParams
 from ..progress import Reporter
 from . import gpu, machine, tables
 from .jobs import run_all
+from .page import SUITES, check_page, figures_folder, write_page
+from .results import Asked, ResultSet, Row, grouped, write_set
 from .scenes import available, data_folder, is_labelled, prepare, scene_name
 from .suites import MISSING_BASELINES, PUBLISHED_DROPS, SCENES, SECONDS, plan
 
@@ -33,6 +36,8 @@ def bench(params: BenchParams, report: Reporter) -> dict[str, Any]:
     """
     root = Path(params.out)
     out = root / params.suite
+    if params.page is not None:
+        check_page(params.page)
     if params.suite == "gpu" and use_device().type != "cuda":
         return _without_gpu(params, out, report)
     data = data_folder(params.data)
@@ -46,13 +51,14 @@ def bench(params: BenchParams, report: Reporter) -> dict[str, Any]:
         notes.append(f"Yardstick {params.yardstick.name}: {machine.run_yardstick(params.yardstick, seconds, report)}")
     if params.suite == "baselines":
         notes += [f"{name} is not there: it {why}." for name, why in MISSING_BASELINES.items()]
-    places: dict[str, int] = {}
+    asked = None
     if params.suite == "gpu":
-        synchronisations, places = gpu.step_synchronisations(next(iter(projects.values())), report)
-        checks = gpu.kernel_checks(params.tests)
-        values = gpu.figures(rows, synchronisations)
-        _write_gpu_page(params, described, checks, values, rows, places)
+        synchronisations, waits = gpu.step_synchronisations(next(iter(projects.values())), report)
+        checks, values = gpu.kernel_checks(params.tests), gpu.figures(rows, synchronisations)
+        asked = Asked(figures=values, checks=checks, waits=waits)
     files = _write(params, out, rows, results, described, notes)
+    if params.page is not None:
+        files += _write_page(params, params.page, rows, results, notes, asked)
     return {
         "suite": params.suite,
         "machine": described,
@@ -83,54 +89,72 @@ def _scenes(params: BenchParams, data: Path | None, root: Path, report: Reporter
     return projects, notes
 
 
+def command_of(params: BenchParams) -> str:
+    """The command line that measures the same."""
+    command = f"fieldwork bench --suite {params.suite}"
+    for name in ("scenes", "variants", "seconds", "steps", "seeds", "preset"):
+        value = getattr(params, name)
+        if value != type(params).model_fields[name].default:
+            text = (
+                ",".join(map(str, value)) if isinstance(value, list) else f"{value:g}" if name == "seconds" else value
+            )
+            command += f' --{name} "{text}"' if name in ("scenes", "variants") else f" --{name} {text}"
+    return command + "".join(f" --set {name}={value}" for name, value in params.set.items())
+
+
 def _write(
     params: BenchParams,
     out: Path,
-    rows: list[tables.Row],
+    rows: list[Row],
     results: list[dict[str, Any]],
     described: str,
     notes: list[str],
 ) -> list[Path]:
     """JSON, Markdown and plot of a suite."""
     files = [out / "results.json", out / "table.md", out / "plot.png"]
-    command = f"fieldwork bench --suite {params.suite}"
-    for name in ("scenes", "variants", "seconds", "steps", "preset"):
-        value = getattr(params, name)
-        if value != type(params).model_fields[name].default:
-            command += f" --{name} " + (f'"{",".join(value)}"' if isinstance(value, list) else f"{value}")
-    command += "".join(f" --set {name}={value}" for name, value in params.set.items())
     if use_device().type == "cpu":
         notes = [*notes, "Peak memory on a CPU is that of the whole process up to then, all runs before included."]
     if params.suite == "robustness":
         limits = ", ".join(f"{name}: {p} dB, {m} points" for name, (p, m) in PUBLISHED_DROPS.items())
         notes = [*notes, f"Published drops of PSNR and mIoU: {limits}."]
     write_json(files[0], {"suite": params.suite, "machine": described, "notes": notes, "rows": rows, "runs": results})
-    write_text(files[1], tables.markdown(params.suite, rows, described, command, notes))
+    write_text(files[1], tables.markdown(params.suite, rows, described, command_of(params), notes))
     tables.plot(files[2], params.suite, rows, results)
     return files
 
 
-def _write_gpu_page(
+def _write_page(
     params: BenchParams,
-    described: str | None,
-    checks: str | None,
-    values: dict[str, float | None],
-    rows: list[tables.Row],
-    places: dict[str, int],
-) -> None:
-    if params.page is None:
-        return
-    columns = {"scene": "scene", "budget": "training", "psnr": "PSNR (dB)", "miou": "mIoU", "spr": "samples/ray"}
-    columns |= {f"{key}_800": heading for key, heading in tables.SPEED.items()}
-    text = gpu.section(described, checks, values, tables.table(columns, rows), places)
-    write_section(params.page, "GPU", text)
+    page: Path,
+    rows: list[Row],
+    results: list[dict[str, Any]],
+    notes: list[str],
+    asked: Asked | None,
+) -> list[Path]:
+    """Add the result sets of this command to the page's, one for each machine and commit, and write the page anew."""
+    files = []
+    for taken, own in grouped(results, rows):
+        result = ResultSet(
+            suite=params.suite,
+            title=f"{SUITES[params.suite][0]}, {taken.date}",
+            command="make gpu-check" if params.suite == "gpu" else command_of(params),
+            source="bench",
+            taken=taken,
+            rows=own,
+            notes=[*tables.verdicts(params.suite, own), *notes],
+            asked=asked,
+        )
+        files.append(write_set(figures_folder(page), result))
+    write_page(page)
+    return [*files, page]
 
 
 def _without_gpu(params: BenchParams, out: Path, report: Reporter) -> dict[str, Any]:
     """The result where there is no GPU: every figure is there and says that it was not measured."""
     report.warn("No NVIDIA GPU: nothing of this suite was measured.")
     values = dict.fromkeys(gpu.ASKED)
-    _write_gpu_page(params, None, None, values, [], {})
+    if params.page is not None:
+        write_page(params.page)
     result = {
         "suite": "gpu",
         "machine": f"no NVIDIA GPU; PyTorch {torch.__version__}",

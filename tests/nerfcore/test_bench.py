@@ -8,6 +8,7 @@ import threading
 import time
 import warnings
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,8 @@ from click.testing import CliRunner
 from fieldwork.nerfcore.bench import gpu, tables
 from fieldwork.nerfcore.bench.jobs import Job, interrupted
 from fieldwork.nerfcore.bench.machine import run_yardstick
+from fieldwork.nerfcore.bench.page import figures_folder
+from fieldwork.nerfcore.bench.results import Asked, read_sets, write_set
 from fieldwork.nerfcore.bench.scenes import available
 from fieldwork.nerfcore.bench.suites import ABLATION, ROBUSTNESS, TIMED, baselines, plan
 from fieldwork.nerfcore.config import make_config
@@ -24,6 +27,7 @@ from fieldwork.nerfcore.params import BenchParams, TrainParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.verbs import run_verb
 from fieldwork.tests.nerfcore.support.ball import SMALL
+from fieldwork.tests.nerfcore.test_bench_page import some_set
 from fieldwork.tests.nerfcore.test_training import tiny_project  # noqa: F401
 from PIL import Image
 
@@ -34,6 +38,10 @@ class Recorder(Reporter):
     def __init__(self) -> None:
         super().__init__()
         self.fractions: list[float] = []
+        self.notes: list[str] = []
+
+    def note(self, message: str) -> None:
+        self.notes.append(message)
 
     def progress(self, fraction: float, message: str = "") -> None:
         super().progress(fraction, message)
@@ -99,6 +107,39 @@ def test_fields_are_removed_unless_they_are_kept(ablation: tuple[Path, dict, Rec
     assert not list((out / "projects").glob("*/runs/*/field.safetensors"))
     bench(out, tiny_project, "ablation", steps=12, variants=["no semantics"], keep=True)
     assert len(list((out / "projects").glob("*/runs/*/field.safetensors"))) == 1
+
+
+def test_a_page_gets_the_figures_of_a_suite(tiny_project: Path, tmp_path: Path) -> None:  # noqa: F811
+    page, report = tmp_path / "docs" / "benchmarks.md", Recorder()
+    run = partial(bench, tmp_path, tiny_project, "figures", steps=6, page=page)
+    result = run(report, seeds=[0, 3])
+    assert [row["seed"] for row in result["rows"]] == [0, 3]
+    assert any("2 seeds: PSNR" in note for note in result["notes"])
+    assert report.notes[-1] == "2 of 2 runs to do, roughly 2 minutes."
+    (measured,) = read_sets(figures_folder(page))
+    assert measured.source == "bench"
+    assert measured.command.endswith(
+        "--steps 6 --seeds 0,3 --preset draft" + "".join(f" --set {k}={v}" for k, v in TINY.items())
+    )
+    assert measured.taken.machine.threads == torch.get_num_threads()
+    assert [row["psnr"] for row in measured.rows] == [row["psnr"] for row in result["rows"]]
+    text = page.read_text("utf-8")
+    assert measured.command in text
+    assert measured.origin() in text
+    again = Recorder()
+    run(again, seeds=[0, 3])
+    assert again.notes[-1].startswith("0 of 2 runs to do")
+    assert len(read_sets(figures_folder(page))) == 1
+    assert page.read_text("utf-8") == text
+
+
+def test_a_page_that_somebody_wrote_is_not_overwritten(tiny_project: Path, tmp_path: Path) -> None:  # noqa: F811
+    page = tmp_path / "README.md"
+    page.write_text("# Mine\n", encoding="utf-8")
+    with pytest.raises(InputError, match="was not made by this command"):
+        bench(tmp_path, tiny_project, "figures", steps=6, page=page)
+    assert page.read_text("utf-8") == "# Mine\n"
+    assert not (tmp_path / "figures" / "runs").exists()
 
 
 @pytest.mark.slow
@@ -215,6 +256,37 @@ def test_the_plan_has_equal_steps_and_equal_time() -> None:
     assert {(job.seconds, job.steps) for job in plan(BenchParams(suite="ablation", seconds=5), ["a"])} == {(5.0, None)}
 
 
+def test_the_figures_are_trained_with_two_seeds_unless_one_is_set() -> None:
+    jobs = plan(BenchParams(suite="figures"), ["museum"])
+    assert [(job.steps, job.seconds, job.seed, job.settings["train.seed"]) for job in jobs] == [
+        (600, None, 0, "0"),
+        (600, None, 1, "1"),
+    ]
+    assert len({job.name for job in jobs}) == 2
+    (job,) = plan(BenchParams(suite="figures", set={"train.seed": "7"}), ["museum"])
+    assert (job.seed, job.settings["train.seed"]) == (None, "7")
+    jobs = plan(BenchParams(suite="ablation", steps=5, seeds=[2, 3], variants=["hybrid", "explicit"]), ["museum"])
+    assert [(job.variant, job.settings["train.seed"]) for job in jobs] == [
+        ("hybrid", "2"),
+        ("hybrid", "3"),
+        ("explicit", "2"),
+        ("explicit", "3"),
+    ]
+
+
+def test_rows_of_several_seeds_are_compared_within_their_seed() -> None:
+    results = [
+        {"job": {"scene": "a", "variant": variant, "steps": 5, "seed": seed}, "psnr": psnr, "miou": None}
+        for variant, seed, psnr in (
+            ("hybrid", 0, 20.0),
+            ("hybrid", 1, 22.0),
+            ("explicit", 0, 19.0),
+            ("explicit", 1, 23.0),
+        )
+    ]
+    assert [row.get("psnr_gain") for row in tables.make_rows("ablation", results)] == [None, None, -1.0, 1.0]
+
+
 def test_the_yardstick_runs_beside_us(tmp_path: Path) -> None:
     script = tmp_path / "other.py"
     script.write_text(
@@ -229,13 +301,23 @@ def test_the_yardstick_runs_beside_us(tmp_path: Path) -> None:
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_without_a_gpu_nothing_is_made_up(tmp_path: Path) -> None:
     page = tmp_path / "benchmarks.md"
-    page.write_text("# Benchmarks\n\n## GPU\n\nold text\n\n## CPU\n\nkept\n", encoding="utf-8")
     result = run_verb("bench", BenchParams(suite="gpu", out=tmp_path, page=page), Reporter())
     assert set(result["figures"].values()) == {None}
+    assert "Not measured: no NVIDIA GPU" in page.read_text("utf-8")
+    assert not figures_folder(page).exists()
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_without_a_gpu_what_one_measured_stays(tmp_path: Path) -> None:
+    page = tmp_path / "benchmarks.md"
+    asked = Asked(figures={"800×800 colour (frames/s)": 75.0}, checks="12 of 12", waits={"model.py:12": 3})
+    write_set(figures_folder(page), some_set(suite="gpu", command="make gpu-check", asked=asked))
+    run_verb("bench", BenchParams(suite="gpu", out=tmp_path, page=page), Reporter())
     text = page.read_text("utf-8")
-    assert "Not measured: no NVIDIA GPU" in text
-    assert "old text" not in text
-    assert text.endswith("## CPU\n\nkept\n")
+    assert "| 800×800 colour (frames/s) | ≥ 60 | 75 | met |" in text
+    assert "| lego_400: PSNR after 60 s (dB) | ≥ 33 | not measured |  |" in text
+    assert "Kernels: 12 of 12" in text
+    assert "no NVIDIA GPU was at hand" not in text
 
 
 def test_the_gpu_page_says_what_was_met_and_what_was_missed(tmp_path: Path) -> None:

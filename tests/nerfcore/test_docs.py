@@ -1,0 +1,113 @@
+"""The pages name only what there is: links, files, functions, settings, rooms, verbs."""
+
+from __future__ import annotations
+
+import ast
+import re
+import tomllib
+from functools import cache
+from pathlib import Path
+
+import pytest
+from fieldwork.nerfcore.config import RunConfig
+from fieldwork.nerfcore.verbs import VERBS
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+NAMED = pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
+# Where a path in a page may begin.
+STARTS = (ROOT, ROOT / "nerfcore", ROOT / "addon", ROOT / "docs")
+
+
+def prose(page: Path) -> str:
+    """A page without its fenced blocks."""
+    return re.sub(r"^```.*?^```", "", page.read_text("utf-8"), flags=re.MULTILINE | re.DOTALL)
+
+
+def code(page: Path) -> list[str]:
+    """What stands between backticks."""
+    return re.findall(r"`([^`\n]+)`", prose(page))
+
+
+def anchors(page: Path) -> set[str]:
+    """The anchors that GitHub gives the headings of a page."""
+    headings = re.findall(r"^#+ (.+)$", prose(page), flags=re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}
+
+
+@cache
+def defined(file: Path) -> frozenset[str]:
+    """Functions and classes of a module, methods as Class.method."""
+    found = set()
+    for node in ast.parse(file.read_text("utf-8")).body:
+        if isinstance(node, ast.ClassDef):
+            found |= {f"{node.name}.{item.name}" for item in node.body if isinstance(item, ast.FunctionDef)}
+        if isinstance(node, (ast.ClassDef, ast.FunctionDef)):
+            found.add(node.name)
+    return frozenset(found)
+
+
+@NAMED
+def test_links_lead_somewhere(page: Path) -> None:
+    lost = []
+    for target in re.findall(r"\]\(([^)\s]+)\)", prose(page)):
+        if re.match(r"[a-z]+:", target):
+            continue
+        path, _, anchor = target.partition("#")
+        file = (page.parent / path).resolve() if path else page
+        if not file.exists() or (anchor and anchor not in anchors(file)):
+            lost.append(target)
+    assert lost == []
+
+
+@NAMED
+def test_files_and_functions_that_a_page_names_exist(page: Path) -> None:
+    lost = []
+    for text in code(page):
+        named = re.fullmatch(r"([\w./]+\.(?:py|toml|json|lock))(?::([\w.]+))?", text)
+        if named is None or "/" not in text or not (named[1].endswith(".py") or named[2]):
+            continue
+        file = next((start / named[1] for start in STARTS if (start / named[1]).is_file()), None)
+        if file is None or (named[2] and named[2] not in defined(file)):
+            lost.append(text)
+    assert lost == []
+
+
+@NAMED
+def test_settings_that_a_page_names_exist(page: Path) -> None:
+    stages = {stage: type(info.default).model_fields for stage, info in RunConfig.model_fields.items()}
+    named = [re.match(r"(\w+)\.(\w+)(?:=|$)", text) for text in code(page)]
+    found = [(m[1], m[2]) for m in named if m and m[1] in stages and m[2] not in ("py", "md")]
+    assert [f"{stage}.{name}" for stage, name in found if name not in stages[stage]] == []
+
+
+def test_every_room_is_on_the_map() -> None:
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["importlinter"]["contracts"]
+    rooms = {
+        room
+        for contract in contracts
+        if contract["type"] == "layers"
+        for floor in contract["layers"]
+        for room in re.split(r" [|:] ", floor)
+    }
+    named = {part for text in code(ROOT / "docs" / "architecture.md") for part in text.split(", ")}
+    assert sorted(rooms - named) == []
+
+
+def test_every_verb_is_explained() -> None:
+    readme = {text.split(" ")[0] for text in code(ROOT / "README.md")}
+    keys = {text.split(" ")[0] for text in code(ROOT / "docs" / "cli.md")}
+    assert sorted(VERBS.keys() - readme) == []
+    assert sorted(VERBS.keys() - keys) == []
+
+
+def test_every_page_is_reached_from_the_readme() -> None:
+    reached, waiting = set(), [ROOT / "README.md"]
+    while waiting:
+        page = waiting.pop()
+        if page in reached or not page.is_file():
+            continue
+        reached.add(page)
+        links = re.findall(r"\]\(([^)\s#]+\.md)", prose(page))
+        waiting += [(page.parent / link).resolve() for link in links]
+    assert sorted(page.name for page in PAGES if page not in reached) == []

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import bpy
 from bpy.types import AddonPreferences, Context, UILayout
 
-from .engine import place as engine_place
+from .engine import place
 from .engine.place import tail
 from .machine import engine_folder, engine_python
 from .props import EnumProperty, IntProperty, StringProperty
@@ -68,12 +68,12 @@ class FIELDWORK_AP_preferences(AddonPreferences):
 
 
 def draw_preferences(preferences: FIELDWORK_AP_preferences, layout: UILayout) -> None:
-    from .jobs import queue as jobs
+    from .jobs.queue import queue
 
     layout.use_property_split = True
     layout.use_property_decorate = False
     box = layout.box()
-    draw_engine(box, jobs.queue.installer)
+    draw_engine(box, queue.installer)
     column = box.column()
     column.prop(preferences, "device")
     column.prop(preferences, "base_python")
@@ -86,21 +86,21 @@ def draw_preferences(preferences: FIELDWORK_AP_preferences, layout: UILayout) ->
 def draw_engine(layout: UILayout, installer: Installer | None) -> None:
     """State of the installed engine, and the one button that changes it."""
     folder = engine_folder()
-    known = engine_place.installed(folder)
+    known = place.installed(folder)
     if installer is not None and installer.is_alive():
         row = layout.row(align=True)
         row.progress(factor=installer.fraction, text=installer.message, type="BAR")
         row.operator("fieldwork.engine_install_cancel", text="", icon="X")
         column = layout.column(align=True)
         column.active, column.scale_y = False, 0.7
-        for line in tail(folder / engine_place.LOG, 5):
+        for line in tail(folder / place.LOG, 5):
             column.label(text=line[:120])
         return
     if known:
         doctor = known.get("doctor", {})
         text = t("Engine installed: PyTorch {} on {}", doctor.get("torch"), doctor.get("device"))
         layout.label(text=text, icon="CHECKMARK")
-        if not engine_place.up_to_date(folder):
+        if not place.up_to_date(folder):
             layout.label(text=t("This version of Fieldwork needs other packages: press Update"), icon="INFO")
     elif engine_python() is not None:
         layout.label(text=t("Using the environment of {}", engine_python()), icon="CHECKMARK")
@@ -116,7 +116,7 @@ def draw_engine(layout: UILayout, installer: Installer | None) -> None:
         for number, line in enumerate(textwrap.wrap(installer.error, 80)):
             column.label(text=line, icon="BLANK1" if number else "ERROR")
     row = layout.row(align=True)
-    action = t("Install Engine") if not known else t("Repair") if engine_place.up_to_date(folder) else t("Update")
+    action = t("Install Engine") if not known else t("Repair") if place.up_to_date(folder) else t("Update")
     row.operator("fieldwork.engine_install", text=action, icon="IMPORT")
     row.operator("fieldwork.engine_remove", text=t("Remove"), icon="TRASH")
     row.operator("fieldwork.engine_install_log", text=t("Log"), icon="TEXT")

@@ -55,25 +55,26 @@ PASSES = [
 
 def _project_changed(self: "FieldworkScene", context: Context) -> None:
     """Another project folder was chosen."""
-    from .jobs import queue as jobs
-    from .project import snapshot as state
+    from .jobs.follow import reattach
+    from .jobs.queue import queue
+    from .project import lists, snapshot
 
-    state.refresh(self)
-    folder = state.folder_of(self)
+    lists.other_project(self)
+    folder = snapshot.folder_of(self)
     if folder is not None and not bpy.app.background:
-        jobs.queue.reattach(folder)
+        reattach(queue, folder)
 
 
-def _classes_changed(self: PropertyGroup, context: Context) -> None:
-    from .project import snapshot as state
+def _classes_edited(self: PropertyGroup, context: Context) -> None:
+    from .project import classes
 
-    state.classes_changed(self.id_data.fieldwork)
+    classes.edited(self.id_data.fieldwork)
 
 
 def _class_visibility(self: "FieldworkClass", context: Context) -> None:
-    from .project import snapshot as state
+    from .project import classes
 
-    state.show_classes(self.id_data.fieldwork)
+    classes.show(self.id_data.fieldwork)
 
 
 class FieldworkImage(PropertyGroup):
@@ -95,14 +96,14 @@ class FieldworkClass(PropertyGroup):
     """One class of the label maps."""
 
     id: IntProperty(name="Id", description="Value of the class in the label maps")
-    name: StringProperty(name="Name", description="Name of the class", update=_classes_changed)
+    name: StringProperty(name="Name", description="Name of the class", update=_classes_edited)
     color: FloatVectorProperty(
         name="Color",
         description="Color of the class in label images and on the mesh",
         subtype="COLOR_GAMMA",
         min=0.0,
         max=1.0,
-        update=_classes_changed,
+        update=_classes_edited,
     )
     priority: FloatProperty(
         name="Priority",
@@ -110,7 +111,7 @@ class FieldworkClass(PropertyGroup):
         default=1.0,
         min=0.0,
         soft_max=10.0,
-        update=_classes_changed,
+        update=_classes_edited,
     )
     visible: BoolProperty(
         name="Visible", description="Show the class on the mesh in the scene", default=True, update=_class_visibility
@@ -125,6 +126,10 @@ class FieldworkScene(PropertyGroup):
         subtype="DIR_PATH",
         update=_project_changed,
     )
+    project_key: StringProperty(
+        name="Project Seen", description="Which project was found in the folder when it was last there",
+        options={"HIDDEN"},
+    )  # fmt: skip
 
     # Capture
     photos: StringProperty(name="Photos", description="Folder of photos, or a video file", subtype="FILE_PATH")

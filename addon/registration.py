@@ -26,6 +26,7 @@ MODULES = (
     "addon.commands",
     "operators.engine",
     "operators.job",
+    "operators.project",
     "operators.capture",
     "operators.dataset",
     "operators.poses",

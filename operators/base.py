@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar
@@ -11,11 +12,14 @@ from bpy.types import Context, Operator
 
 from ..addon import machine
 from ..addon.errors import EngineError
-from ..addon.jobs import queue as jobs
-from ..addon.project import snapshot as state
+from ..addon.jobs.job import Done, Job, Steps
+from ..addon.jobs.queue import queue
+from ..addon.project import edits, lists, runs, snapshot
 from ..addon.properties import FieldworkScene
 from ..addon.props import StringProperty
 from ..addon.text import t
+
+EDIT_SECONDS = 15.0  # how long a job waits for edits: the engine may have to start first
 
 
 def scene_settings(**names: str) -> Callable[[type], type]:
@@ -49,26 +53,29 @@ def need_project_folder(context: Context) -> str | None:
 
 
 def need_project(context: Context) -> str | None:
-    folder = state.folder_of(context.scene.fieldwork)
-    return None if state.has_project(folder) else t("Read photos into a project first")
+    settings = context.scene.fieldwork
+    missing = None if snapshot.has_project(snapshot.folder_of(settings)) else t("Read photos into a project first")
+    return snapshot.absence(settings) or missing
 
 
 def need_poses(context: Context) -> str | None:
-    folder = state.folder_of(context.scene.fieldwork)
-    return need_project(context) or (None if state.has_poses(folder) else t("Estimate the camera poses first"))
+    folder = snapshot.folder_of(context.scene.fieldwork)
+    return need_project(context) or (None if snapshot.has_poses(folder) else t("Estimate the camera poses first"))
 
 
 def need_run(context: Context) -> str | None:
     settings = context.scene.fieldwork
     missing = (
-        None if state.has_run(state.folder_of(settings), settings.run) else t("Train the run “{}” first", settings.run)
+        None
+        if runs.has_run(snapshot.folder_of(settings), settings.run)
+        else t("Train the run “{}” first", settings.run)
     )
     return need_poses(context) or missing
 
 
 def same_verb_active(verb: str, context: Context) -> str | None:
-    folder = state.folder_of(context.scene.fieldwork)
-    for job in (jobs.queue.running, jobs.queue.followed, *jobs.queue.waiting):
+    folder = snapshot.folder_of(context.scene.fieldwork)
+    for job in (queue.running, queue.followed, *queue.waiting):
         if job is not None and job.verb == verb and (job.project is None or job.project == folder):
             return t("{} is under way", job.title)
     return None
@@ -125,12 +132,14 @@ class VerbOperator(Operator):
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         params = {name: value for name, value in params.items() if value is not None}
-        job = jobs.queue.make(self.verb, params, self.after(), self.before(context, params))
+        if not self.edits_delivered(params):
+            return {"CANCELLED"}
+        job = queue.make(self.verb, params, self.after(), after_edits(self.before(context, params)))
         if not bpy.app.background:
-            jobs.queue.submit(job)
+            queue.submit(job)
             return {"FINISHED"}
         try:
-            jobs.queue.run(job)
+            queue.run(job)
         except EngineError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
@@ -141,11 +150,21 @@ class VerbOperator(Operator):
             self.report({"WARNING"}, warning)
         return {"FINISHED"}
 
-    def before(self, context: Context, params: dict[str, Any]) -> jobs.Steps | None:
+    def edits_delivered(self, params: dict[str, Any]) -> bool:
+        """Let the engine know of edits before the verb works with them; whether it may go on."""
+        deliver_edits()
+        edit = edits.failed()
+        if edit is None or not bpy.app.background:
+            return True
+        own = str(edit.folder) in (params.get("project"), params.get("out"))
+        self.report({"ERROR" if own else "WARNING"}, t("An edit of {} is not saved. {}", edit.folder, str(edit.error)))
+        return not own
+
+    def before(self, context: Context, params: dict[str, Any]) -> Steps | None:
         """Steps in Blender before the verb can start."""
         return None
 
-    def after(self) -> jobs.Done:
+    def after(self) -> Done:
         """What is called when the job has ended, and may be a generator. The operator itself is gone by then."""
         return refresh_scenes
 
@@ -165,11 +184,35 @@ class ProjectOperator(VerbOperator):
         return folder
 
 
-def refresh_scenes(job: jobs.Job) -> None:
+def deliver_edits() -> None:
+    """Hand edited classes and regions to the engine; without a window, wait until it has taken them."""
+    edits.send(queue.ask_and_wait if bpy.app.background else queue.ask, at_once=True)
+
+
+def after_edits(steps: Steps | None) -> Steps | None:
+    """Steps that wait a little for the engine to take the edits, before others."""
+    if bpy.app.background or not edits.waiting():
+        return steps
+
+    def wait() -> Steps:
+        end = time.monotonic() + EDIT_SECONDS
+        while edits.waiting() and edits.failed() is None and time.monotonic() < end:
+            yield 0.0, t("saving edits")
+            time.sleep(0.005)
+        if steps is not None:
+            yield from steps
+
+    return wait()
+
+
+def refresh_scenes(job: Job) -> None:
     """Bring what the job changed in the project into the scenes that show it."""
     for scene in bpy.data.scenes:
-        if job.project is not None and state.folder_of(scene.fieldwork) == job.project:
-            state.refresh(scene.fieldwork)
+        if job.project is not None and snapshot.folder_of(scene.fieldwork) == job.project:
+            if job.verb in ("new", "import", "reconstruct") and job.state == "done":
+                lists.other_project(scene.fieldwork)  # it may have been made anew
+            else:
+                lists.refresh(scene.fieldwork)
 
 
 def set_if_empty(scene: bpy.types.Scene, folder: str) -> None:

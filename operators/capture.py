@@ -8,7 +8,7 @@ from typing import Any
 import bpy
 from bpy.types import Context, FileHandler, Operator, OperatorFileListElement
 
-from ..addon.project import snapshot as state
+from ..addon.project import snapshot
 from ..addon.props import BoolProperty, CollectionProperty, EnumProperty, StringProperty
 from ..addon.text import t
 from .base import ProjectOperator, need_photos, need_project_folder, scene_settings, set_if_empty
@@ -56,7 +56,7 @@ def beside(photos: Path, name: str) -> str:
 def choose_source(scene: bpy.types.Scene, source: Path) -> None:
     """Let the scene show a folder of photos, a video, or a project."""
     settings = scene.fieldwork
-    if state.has_project(source):
+    if snapshot.has_project(source):
         settings.project = str(source)
         return
     photos = photo_folder(source)

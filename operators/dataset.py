@@ -10,7 +10,8 @@ from typing import Any
 import bpy
 from bpy.types import Context, Event
 
-from ..addon.jobs import queue as jobs
+from ..addon.jobs.job import Job
+from ..addon.jobs.queue import queue
 from ..addon.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, IntVectorProperty, StringProperty
 from ..addon.text import t
 from .base import VerbOperator, refresh_scenes, set_if_empty
@@ -124,21 +125,21 @@ class FIELDWORK_OT_dataset(VerbOperator):
             "transparent": self.transparent,
         }
 
-    def after(self) -> Callable[[jobs.Job], None]:
+    def after(self) -> Callable[[Job], None]:
         copy, make_project, name = Path(self._copy), self.make_project, bpy.context.scene.name
 
-        def show(job: jobs.Job) -> None:
+        def show(job: Job) -> None:
             scene = bpy.data.scenes.get(name)  # another file may have been loaded meanwhile
             if scene is not None and job.state == "done":
                 set_if_empty(scene, job.params["project"])
             refresh_scenes(job)
 
-        def done(job: jobs.Job) -> None:
+        def done(job: Job) -> None:
             copy.unlink(missing_ok=True)
             if job.state == "done" and make_project:
                 folder = Path(job.params["out"])
                 params = {"dataset": str(folder), "project": str(project_for(folder)), "format": "transforms"}
-                jobs.queue.follow_up(jobs.queue.make("import", params, show))
+                queue.follow_up(queue.make("import", params, show))
 
         return done
 

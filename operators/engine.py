@@ -9,8 +9,8 @@ import bpy
 from bpy.types import Context, Event, Operator
 
 from ..addon import machine
-from ..addon.engine import place as engine_place
-from ..addon.jobs import queue as jobs
+from ..addon.engine import place
+from ..addon.jobs.queue import queue
 from ..addon.text import t
 
 if TYPE_CHECKING:
@@ -18,13 +18,13 @@ if TYPE_CHECKING:
 
 
 def options() -> Options:
-    from ..addon.engine import install as engine_install  # not at the top: enabling the extension must be quick
+    from ..addon.engine import install  # not at the top: enabling the extension must be quick
 
     chosen = machine.preferences()
     base, wheels = bpy.path.abspath(chosen.base_python), bpy.path.abspath(chosen.wheels)
-    return engine_install.Options(
+    return install.Options(
         folder=machine.engine_folder(),
-        base=Path(base) if base else engine_install.default_base(),
+        base=Path(base) if base else install.default_base(),
         device=chosen.device,
         wheels=wheels,
         online=bpy.app.online_access,
@@ -32,7 +32,7 @@ def options() -> Options:
 
 
 def installing() -> bool:
-    return jobs.queue.installer is not None and jobs.queue.installer.is_alive()
+    return queue.installer is not None and queue.installer.is_alive()
 
 
 class FIELDWORK_OT_engine_install(Operator):
@@ -54,18 +54,16 @@ class FIELDWORK_OT_engine_install(Operator):
     def execute(self, context: Context) -> set[str]:
         import threading
 
-        from ..addon.engine import install as engine_install
+        from ..addon.engine import install
 
-        jobs.queue.stop_engine()
+        queue.stop_engine()
         if not bpy.app.background:
-            jobs.queue.installer = engine_install.Installer(options())
-            jobs.queue.installer.start()
+            queue.installer = install.Installer(options())
+            queue.installer.start()
             return {"FINISHED"}
         try:
-            engine_install.install(
-                options(), lambda fraction, text: print(f"{fraction:4.0%} {text}"), threading.Event()
-            )
-        except engine_install.InstallError as error:
+            install.install(options(), lambda fraction, text: print(f"{fraction:4.0%} {text}"), threading.Event())
+        except install.InstallError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         return {"FINISHED"}
@@ -85,7 +83,7 @@ class FIELDWORK_OT_engine_install_cancel(Operator):
         return True
 
     def execute(self, context: Context) -> set[str]:
-        jobs.queue.installer.cancelled.set()
+        queue.installer.cancelled.set()
         return {"FINISHED"}
 
 
@@ -110,11 +108,11 @@ class FIELDWORK_OT_engine_remove(Operator):
         return context.window_manager.invoke_confirm(self, event)
 
     def execute(self, context: Context) -> set[str]:
-        from ..addon.engine import install as engine_install
+        from ..addon.engine import install
 
-        jobs.queue.stop_engine(timeout=5.0)
-        engine_install.remove(machine.engine_folder())
-        jobs.queue.installer = None
+        queue.stop_engine(timeout=5.0)
+        install.remove(machine.engine_folder())
+        queue.installer = None
         return {"FINISHED"}
 
 
@@ -126,7 +124,7 @@ class FIELDWORK_OT_engine_install_log(Operator):
 
     @classmethod
     def poll(cls, context: Context) -> bool:
-        if not (machine.engine_folder() / engine_place.LOG).is_file():
+        if not (machine.engine_folder() / place.LOG).is_file():
             cls.poll_message_set(t("Nothing has been installed yet"))
             return False
         return True
@@ -134,7 +132,7 @@ class FIELDWORK_OT_engine_install_log(Operator):
     def execute(self, context: Context) -> set[str]:
         name = "Fieldwork Installation Log"
         text = bpy.data.texts.get(name) or bpy.data.texts.new(name)
-        path = machine.engine_folder() / engine_place.LOG
+        path = machine.engine_folder() / place.LOG
         text.from_string(path.read_text(encoding="utf-8", errors="replace"))
         self.report({"INFO"}, t("See “{}” in the text editor", name))
         return {"FINISHED"}

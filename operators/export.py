@@ -7,7 +7,7 @@ from typing import Any
 
 from bpy.types import Context
 
-from ..addon.project import snapshot as state
+from ..addon.project import snapshot
 from ..addon.props import StringProperty
 from ..addon.text import t
 from .base import ProjectOperator, absolute, need_run, scene_settings
@@ -58,7 +58,7 @@ class FIELDWORK_OT_export(ProjectOperator):
         settings = context.scene.fieldwork
         if settings.export_to == "blend":
             return t("Choose a format for other programs in the Export panel")
-        folder = state.folder_of(settings)
+        folder = snapshot.folder_of(settings)
         mesh = folder is not None and (folder / "exports" / settings.run / "mesh.npz").is_file()
         return t("Extract the mesh first") if settings.export_to in OF_THE_MESH and not mesh else None
 

@@ -8,7 +8,8 @@ import bpy
 from bpy.types import Context, Operator
 
 from ..addon import machine, registration
-from ..addon.jobs import queue as jobs
+from ..addon.jobs.follow import reattach
+from ..addon.jobs.queue import queue
 from ..addon.props import StringProperty
 from ..addon.text import t
 from .base import VerbOperator
@@ -24,17 +25,16 @@ class FIELDWORK_OT_cancel(Operator):
 
     @classmethod
     def poll(cls, context: Context) -> bool:
-        current = jobs.queue.current
+        current = queue.current
         if current is None:
             cls.poll_message_set(t("Nothing is running"))
-        elif current.state == "cancelling" and not jobs.queue.waiting:
+        elif current.state == "cancelling" and not queue.waiting:
             cls.poll_message_set(t("The job is stopping already"))
         else:
             return True
         return False
 
     def execute(self, context: Context) -> set[str]:
-        queue = jobs.queue
         meant = next((job for job in (queue.current, *queue.waiting) if job and job.id == self.job), None)
         # The job of a button may have ended while the mouse was on its way.
         if meant is not None or not self.job:
@@ -50,13 +50,13 @@ class FIELDWORK_OT_copy_report(Operator):
 
     @classmethod
     def poll(cls, context: Context) -> bool:
-        if jobs.queue.last is None and jobs.queue.current is None:
+        if queue.last is None and queue.current is None:
             cls.poll_message_set(t("Nothing has run yet"))
             return False
         return True
 
     def execute(self, context: Context) -> set[str]:
-        job = jobs.queue.outcome or jobs.queue.last or jobs.queue.current
+        job = queue.outcome or queue.last or queue.current
         context.window_manager.clipboard = job.report()
         self.report({"INFO"}, t("The report is on the clipboard"))
         return {"FINISHED"}
@@ -70,13 +70,13 @@ class FIELDWORK_OT_dismiss(Operator):
 
     @classmethod
     def poll(cls, context: Context) -> bool:
-        if jobs.queue.outcome is None:
+        if queue.outcome is None:
             cls.poll_message_set(t("There is no message"))
             return False
         return True
 
     def execute(self, context: Context) -> set[str]:
-        for job in jobs.queue.finished:
+        for job in queue.finished:
             job.dismissed = True
         return {"FINISHED"}
 
@@ -89,13 +89,13 @@ class FIELDWORK_OT_stop_engine(Operator):
 
     @classmethod
     def poll(cls, context: Context) -> bool:
-        if jobs.queue.link is None or not jobs.queue.link.alive:
+        if queue.link is None or not queue.link.alive:
             cls.poll_message_set(t("The engine is not running"))
             return False
         return True
 
     def execute(self, context: Context) -> set[str]:
-        jobs.queue.stop_engine()
+        queue.stop_engine()
         return {"FINISHED"}
 
 
@@ -107,16 +107,16 @@ class FIELDWORK_OT_detach(Operator):
 
     @classmethod
     def poll(cls, context: Context) -> bool:
-        job = jobs.queue.running
+        job = queue.running
         if job is None or job.project is None:
             cls.poll_message_set(t("No job of a project is running"))
             return False
         return True
 
     def execute(self, context: Context) -> set[str]:
-        job = jobs.queue.running
-        jobs.queue.stop_engine(detach=True)
-        jobs.queue.reattach(job.project)
+        job = queue.running
+        queue.stop_engine(detach=True)
+        reattach(queue, job.project)
         return {"FINISHED"}
 
 

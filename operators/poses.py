@@ -9,8 +9,8 @@ import bpy
 from bpy.types import Context, Event, Operator
 from mathutils import Vector
 
-from ..addon.jobs import queue as jobs
-from ..addon.project import snapshot as state
+from ..addon.jobs.job import Done, Job
+from ..addon.project import snapshot
 from ..addon.props import BoolProperty, EnumProperty, StringProperty
 from ..addon.scene.frame import scene_from_capture
 from ..addon.text import t
@@ -84,7 +84,7 @@ class FIELDWORK_OT_align(ProjectOperator):
         up = self.value(context, "up")
         if up != "auto":
             params["up"] = up
-        capture_from_scene = scene_from_capture(context.scene, Path(params["project"])).inverted_safe()
+        capture_from_scene = scene_from_capture(context.scene, snapshot.owner(Path(params["project"]))).inverted_safe()
         a, b = (capture_from_scene @ Vector(self.value(context, name)) for name in ("point_a", "point_b"))
         if self.use_scale and a != b:
             unit = context.scene.unit_settings.scale_length or 1.0
@@ -96,18 +96,18 @@ class FIELDWORK_OT_align(ProjectOperator):
             raise ValueError(t("Choose an up direction, or pick two points first."))
         return params
 
-    def after(self) -> jobs.Done:
+    def after(self) -> Done:
         return aligned
 
 
-def aligned(job: jobs.Job) -> None:
+def aligned(job: Job) -> None:
     """Directions and points were those of the frame before: forget them, and bring the scene into the new frame."""
     refresh_scenes(job)
     if job.state != "done":
         return
     for scene in bpy.data.scenes:
         settings = scene.fieldwork
-        if state.folder_of(settings) == job.project:
+        if snapshot.folder_of(settings) == job.project:
             settings.up = "auto"
             settings.point_a = settings.point_b = (0.0, 0.0, 0.0)
             update_scene(job, scene)

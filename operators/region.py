@@ -6,12 +6,11 @@ import bpy
 from bpy.types import Context, Operator
 from mathutils import Vector
 
-from ..addon.project import region as crop
-from ..addon.project import snapshot as state
+from ..addon.project import edits, region, snapshot
 from ..addon.roles import ROLE
 from ..addon.scene.frame import scene_from_capture
 from ..addon.text import t
-from .base import need_poses
+from .base import deliver_edits, need_poses
 
 
 class FIELDWORK_OT_crop_add(Operator):
@@ -23,14 +22,14 @@ class FIELDWORK_OT_crop_add(Operator):
 
     @classmethod
     def poll(cls, context: Context) -> bool:
-        reason = need_poses(context) or (t("There is a box already") if crop.find(context.scene) else None)
+        reason = need_poses(context) or (t("There is a box already") if region.find(context.scene) else None)
         if reason:
             cls.poll_message_set(reason)
         return reason is None
 
     def execute(self, context: Context) -> set[str]:
-        folder = state.folder_of(context.scene.fieldwork)
-        box = crop.add(context.scene, crop.read_bounds(folder) or default_bounds(context.scene))
+        folder = snapshot.folder_of(context.scene.fieldwork)
+        box = region.add(context.scene, region.bounds(folder) or default_bounds(context.scene))
         for obj in context.selected_objects:
             obj.select_set(False)
         box.select_set(True)
@@ -46,7 +45,7 @@ class FIELDWORK_OT_crop_apply(Operator):
 
     @classmethod
     def poll(cls, context: Context) -> bool:
-        reason = need_poses(context) or (None if crop.find(context.scene) else t("Add a region box first"))
+        reason = need_poses(context) or (None if region.find(context.scene) else t("Add a region box first"))
         if reason:
             cls.poll_message_set(reason)
         return reason is None
@@ -54,11 +53,12 @@ class FIELDWORK_OT_crop_apply(Operator):
     def execute(self, context: Context) -> set[str]:
         context.view_layer.update()
         try:
-            crop.write_bounds(
-                state.folder_of(context.scene.fieldwork), crop.bounds_of(context.scene, crop.find(context.scene))
-            )
+            bounds = region.bounds_of(context.scene, region.find(context.scene))
+            region.edit(snapshot.folder_of(context.scene.fieldwork), bounds)
         except ValueError as error:
             self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        if not delivered(self):
             return {"CANCELLED"}
         self.report({"INFO"}, t("The next training covers the box"))
         return {"FINISHED"}
@@ -79,20 +79,34 @@ class FIELDWORK_OT_crop_remove(Operator):
         return reason is None
 
     def execute(self, context: Context) -> set[str]:
-        crop.write_bounds(state.folder_of(context.scene.fieldwork), None)
-        box = crop.find(context.scene)
+        region.edit(snapshot.folder_of(context.scene.fieldwork), None)
+        if not delivered(self):
+            return {"CANCELLED"}
+        box = region.find(context.scene)
         if box is not None:
             bpy.data.objects.remove(box)
         return {"FINISHED"}
 
 
+def delivered(operator: Operator) -> bool:
+    """Hand the region to the engine; without a window, whether it has taken it. Its refusal is reported."""
+    deliver_edits()
+    edit = edits.failed()
+    if edit is None or not bpy.app.background:
+        return True
+    operator.report({"ERROR"}, str(edit.error))
+    return False
+
+
 def default_bounds(scene: bpy.types.Scene) -> list[list[float]]:
     """Bounds, in the capture's frame, of what it put into the scene, else a cube of two metres around the cursor."""
-    capture_from_scene = scene_from_capture(scene, state.folder_of(scene.fieldwork)).inverted_safe()
+    folder = snapshot.folder_of(scene.fieldwork)
+    owner = snapshot.owner(folder) if folder else None
+    capture_from_scene = scene_from_capture(scene, owner).inverted_safe()
     corners = [
         capture_from_scene @ obj.matrix_world @ Vector(corner)
         for obj in scene.objects
-        if obj.type == "MESH" and ROLE in obj
+        if obj.type == "MESH" and ROLE in obj and owner is not None and owner.owns(obj)
         for corner in obj.bound_box
     ]
     if corners:

@@ -9,9 +9,11 @@ from typing import Any
 import bpy
 from bpy.types import Context
 
-from ..addon.jobs import queue as jobs
-from ..addon.project import snapshot as state
+from ..addon.jobs.job import Done, Job, Steps
+from ..addon.jobs.queue import queue
+from ..addon.project import snapshot
 from ..addon.props import StringProperty
+from ..addon.roles import Owner
 from ..addon.scene.frame import scene_from_capture
 from ..addon.scene.lens import pinhole
 from ..addon.text import t
@@ -27,12 +29,12 @@ def check_camera(scene: bpy.types.Scene) -> None:
 
 
 def write_cameras(
-    path: Path, scene: bpy.types.Scene, animated: bool, size: tuple[int, int], project: Path | None = None
-) -> jobs.Steps:
+    path: Path, scene: bpy.types.Scene, animated: bool, size: tuple[int, int], owner: Owner | None = None
+) -> Steps:
     """Write the scene's camera as transforms.json, a frame in each step: intrinsics in pixels, camera-to-capture with
     Blender's axes.
 
-    Where the capture of the project was moved in the scene, the camera is taken as it stands to the capture.
+    Where the capture of a project was moved in the scene, the camera is taken as it stands to the capture.
     """
     from ..nerfcore.files import write_json  # not at the top: enabling the extension must be quick
 
@@ -49,7 +51,7 @@ def write_cameras(
             scene.frame_set(number)
         evaluated = scene.camera.evaluated_get(bpy.context.evaluated_depsgraph_get())
         # A scaled parent must not scale the camera's axes.
-        capture_from_scene = scene_from_capture(scene, project).inverted_safe()
+        capture_from_scene = scene_from_capture(scene, owner).inverted_safe()
         location, rotation, _ = (capture_from_scene @ evaluated.matrix_world).decompose()
         matrix = rotation.to_matrix().to_4x4()
         matrix.translation = location
@@ -122,25 +124,27 @@ class FIELDWORK_OT_render(ProjectOperator):
         check_camera(context.scene)
         return {**params, "camera": str(folder / CAMERAS), "size": None}
 
-    def before(self, context: Context, params: dict[str, Any]) -> jobs.Steps | None:
+    def before(self, context: Context, params: dict[str, Any]) -> Steps | None:
         if self.camera or "camera" not in params:
             return None
         animated, size = self.value(context, "source") == "animation", tuple(self.value(context, "size"))
-        return write_cameras(Path(params["camera"]), context.scene, animated, size, Path(params["project"]))
+        return write_cameras(
+            Path(params["camera"]), context.scene, animated, size, snapshot.owner(Path(params["project"]))
+        )
 
-    def after(self) -> jobs.Done:
+    def after(self) -> Done:
         return show_result
 
 
-def show_result(job: jobs.Job) -> jobs.Steps | None:
+def show_result(job: Job) -> Steps | None:
     """Bring the rendered images into Blender as image datablocks, and into the scene as its settings say."""
     refresh_scenes(job)
     if job.state != "done" or job.result is None or job.project is None:
         return None
     # Not at the top: enabling the extension must be quick.
-    from ..addon.render import result as render_result
+    from ..addon.render.result import show_steps
 
-    scene = next((s for s in bpy.data.scenes if state.folder_of(s.fieldwork) == job.project), bpy.context.scene)
+    scene = next((s for s in bpy.data.scenes if snapshot.folder_of(s.fieldwork) == job.project), bpy.context.scene)
     files = [Path(path) for path in job.result["frames"]]
     # An orbit has no camera in the scene.
     show_as = scene.fieldwork.show_as if "orbit" not in job.params else "none"
@@ -148,23 +152,23 @@ def show_result(job: jobs.Job) -> jobs.Steps | None:
     if photos and show_as != "none":
         _show_straightened(job, scene.name, show_as)
         show_as = "none"
-    return render_result.show_steps(scene, files, show_as, photos, job.project.name)
+    return show_steps(scene, files, show_as, photos, snapshot.owner(job.project))
 
 
-def _show_straightened(job: jobs.Job, scene_name: str, show_as: str) -> None:
+def _show_straightened(job: Job, scene_name: str, show_as: str) -> None:
     """Blender's cameras know no lens distortion: the engine takes it out of the renders before they are shown."""
 
-    def show(done: jobs.Job) -> jobs.Steps | None:
+    def show(done: Job) -> Steps | None:
         scene = bpy.data.scenes.get(scene_name)  # another file may have been loaded meanwhile
         if done.state != "done" or not done.result or scene is None:
             return None
-        from ..addon.render import result as render_result
+        from ..addon.render.result import show_steps
 
         files = sorted(Path(done.result["folder"], "renders").glob("*.png"))
-        return render_result.show_steps(scene, files, show_as, True, done.project.name)
+        return show_steps(scene, files, show_as, True, snapshot.owner(done.project))
 
     params = {name: job.params[name] for name in ("project", "run")} | {"renders": job.params["out"]}
-    jobs.queue.follow_up(jobs.queue.make("package", params, show))
+    queue.follow_up(queue.make("package", params, show))
 
 
 CLASSES = [FIELDWORK_OT_render]

@@ -7,10 +7,11 @@ from typing import Any
 import bpy
 from bpy.types import Context
 
-from ..addon.jobs import queue as jobs
-from ..addon.project import snapshot as state
+from ..addon.jobs.job import Done, Job, Steps
+from ..addon.jobs.queue import queue
+from ..addon.project import classes, snapshot
 from ..addon.props import EnumProperty, StringProperty
-from ..addon.roles import PROJECT, ROLE
+from ..addon.roles import ROLE
 from .base import ProjectOperator, absolute, need_poses, refresh_scenes, scene_settings, set_if_empty
 
 
@@ -45,44 +46,46 @@ class FIELDWORK_OT_import_scene(ProjectOperator):
         set_if_empty(context.scene, project)
         return {"project": project, "run": self.value(context, "run"), "renders": absolute(self.renders)}
 
-    def after(self) -> jobs.Done:
+    def after(self) -> Done:
         cameras, name = self.cameras, bpy.context.scene.name
         return lambda job: import_result(job, cameras, name)
 
 
-def update_scene(job: jobs.Job, scene: bpy.types.Scene) -> None:
+def update_scene(job: Job, scene: bpy.types.Scene) -> None:
     """After a job that moved everything: update what an earlier import put into the scene; nothing where none did."""
-    roles = {str(o[ROLE]) for o in scene.objects if ROLE in o and o.get(PROJECT) == job.project.name}
+    owner = snapshot.owner(job.project)
+    roles = {str(item[ROLE]) for item in scene.objects if ROLE in item and owner.owns(item)}
     if not roles:
         return
     many, animated = any(role.startswith("camera:") for role in roles), "camera path" in roles
     cameras, name = "both" if many == animated else "many" if many else "animated", scene.name
     params = {"project": str(job.project), "run": scene.fieldwork.run}
-    jobs.queue.follow_up(jobs.queue.make("package", params, lambda done: import_result(done, cameras, name)))
+    queue.follow_up(queue.make("package", params, lambda done: import_result(done, cameras, name)))
 
 
-def import_result(job: jobs.Job, cameras: str, scene_name: str) -> jobs.Steps | None:
+def import_result(job: Job, cameras: str, scene_name: str) -> Steps | None:
     """Import what the engine prepared, as one step of undo."""
     refresh_scenes(job)
     if job.state != "done" or not job.result:
         return None
     # Another file may have been loaded meanwhile.
     scene = bpy.data.scenes.get(scene_name) or bpy.context.scene
-    if state.folder_of(scene.fieldwork) != job.project and not bpy.app.background:
+    if snapshot.folder_of(scene.fieldwork) != job.project and not bpy.app.background:
         job.warnings.append("The scene shows another project by now: press Update Scene there.")
         return None
     return import_steps(job, cameras, scene)
 
 
-def import_steps(job: jobs.Job, cameras: str, scene: bpy.types.Scene) -> jobs.Steps:
+def import_steps(job: Job, cameras: str, scene: bpy.types.Scene) -> Steps:
     # Not at the top: enabling the extension must be quick.
-    from ..addon.scene import build as scene_import
-    from ..addon.scene import frame as capture_frame
+    from ..addon.scene import build
+    from ..addon.scene.frame import root_of
 
-    first = capture_frame.root_of(scene, job.project) is None
-    imported = yield from scene_import.import_steps(scene, scene_import.load(job.result["folder"]), cameras)
+    owner = snapshot.owner(job.project)
+    first = root_of(scene, owner) is None
+    imported = yield from build.import_steps(scene, build.load(job.result["folder"]), cameras, owner)
     job.warnings += imported.warnings
-    state.show_classes(scene.fieldwork)
+    classes.show(scene.fieldwork)
     if first:
         show_colors()
     yield 1.0, ""

@@ -7,8 +7,8 @@ from typing import Any
 from bl_operators.presets import AddPresetBase
 from bpy.types import Context, Event, Menu, Operator
 
-from ..addon.jobs import queue as jobs
-from ..addon.project import snapshot as state
+from ..addon.jobs.job import Done, Job
+from ..addon.project import runs, snapshot
 from ..addon.props import BoolProperty, EnumProperty, StringProperty
 from ..addon.text import t
 from .base import ProjectOperator, need_poses, need_run, refresh_scenes, scene_settings
@@ -42,7 +42,7 @@ class FIELDWORK_OT_train(ProjectOperator):
 
     def invoke(self, context: Context, event: Event) -> set[str]:
         settings = context.scene.fieldwork
-        if not self.resume and state.has_run(state.folder_of(settings), settings.run):
+        if not self.resume and runs.has_run(snapshot.folder_of(settings), settings.run):
             # Hours of training may be in it.
             return context.window_manager.invoke_confirm(
                 self,
@@ -58,7 +58,6 @@ class FIELDWORK_OT_train(ProjectOperator):
         if not run:
             raise ValueError(t("Give the run a name."))
         seconds, steps = self.value(context, "time_limit"), self.value(context, "steps")
-        state.write_classes()
         return {
             "project": self.project_path(context),
             "preset": self.value(context, "preset"),
@@ -69,15 +68,15 @@ class FIELDWORK_OT_train(ProjectOperator):
             "resume": self.resume,
         }
 
-    def after(self) -> jobs.Done:
+    def after(self) -> Done:
         return trained
 
 
-def trained(job: jobs.Job) -> None:
+def trained(job: Job) -> None:
     refresh_scenes(job)
     whole = not ({"time_limit", "steps"} & job.params.keys()) and not job.params["resume"] and not job.params["set"]
     if job.state == "done" and job.result and whole:
-        state.remember_time(job.params["preset"], job.result["seconds"])
+        runs.remember_time(job.params["preset"], job.result["seconds"])
 
 
 @scene_settings(run="run")

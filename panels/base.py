@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from bpy.types import Context, Panel, UILayout
 
-from ..addon.jobs import queue as jobs
-from ..addon.project import snapshot as state
+from ..addon.jobs.job import Job
+from ..addon.project import snapshot
 from ..addon.text import t
 
 MOST_WARNINGS = 3  # of a job in the panel
@@ -49,7 +49,7 @@ def duration(seconds: float | None) -> str:
     return t("{}:{:02} h", seconds // 3600, seconds % 3600 // 60)
 
 
-def progress_text(job: jobs.Job) -> str:
+def progress_text(job: Job) -> str:
     """What the job is at, in one line."""
     if job.state == "cancelling":
         return t("Stopping…")
@@ -61,7 +61,7 @@ def progress_text(job: jobs.Job) -> str:
     return " · ".join(parts)
 
 
-def draw_job(layout: UILayout, job: jobs.Job) -> None:
+def draw_job(layout: UILayout, job: Job) -> None:
     """A running or waiting job: a bar with its estimate, and a button that stops it."""
     row = layout.row(align=True)
     row.progress(factor=job.fraction or 0.0, text=progress_text(job), type="BAR")
@@ -102,7 +102,7 @@ def text_width(context: Context) -> int:
     return max(20, int((context.region.width / scale - 60) / 6.3)) if context.region else 40
 
 
-def draw_outcome(layout: UILayout, context: Context, job: jobs.Job) -> None:
+def draw_outcome(layout: UILayout, context: Context, job: Job) -> None:
     """A job that failed, or has something to say: what happened, what to do, and the report."""
     width, box = text_width(context) - 4, layout.box()
     if job.error is not None:
@@ -120,4 +120,4 @@ def draw_outcome(layout: UILayout, context: Context, job: jobs.Job) -> None:
 
 
 def project_folder(context: Context):
-    return state.folder_of(context.scene.fieldwork)
+    return snapshot.folder_of(context.scene.fieldwork)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from bpy.types import Context, Panel, UIList
 
-from ..addon.pictures import thumbnails as pictures
-from ..addon.project import snapshot as state
+from ..addon.pictures import thumbnails
+from ..addon.project import snapshot
 from ..addon.text import t
 from .base import FieldworkPanel, StepPanel, columns, draw_wrapped, project_folder, text_width
 
@@ -17,7 +17,7 @@ class FIELDWORK_UL_images(UIList):
 
     def draw_item(self, context, layout, data, item, icon, active_data, active_property, index=0, flt_flag=0):
         folder = project_folder(context)
-        thumbnail = pictures.picture(folder / item.file) if folder and item.file else 0
+        thumbnail = thumbnails.picture(folder / item.file) if folder and item.file else 0
         row = layout.row(align=True)
         row.active = item.status == "ok"
         row.label(text=item.name, icon_value=thumbnail or 0) if thumbnail else row.label(text=item.name)
@@ -37,7 +37,7 @@ class FIELDWORK_PT_capture(StepPanel):
         layout, settings = self.layout, context.scene.fieldwork
         folder = project_folder(context)
         rejected = sum(image.status == "rejected" for image in settings.images)
-        if state.has_project(folder):
+        if snapshot.has_project(folder):
             count = len(settings.images) - rejected
             self.draw_state(True, t("{} photos, {} rejected", count, rejected) if rejected else t("{} photos", count))
         else:
@@ -50,7 +50,7 @@ class FIELDWORK_PT_capture(StepPanel):
             column.prop(settings, name)
         row = layout.row(align=True)
         row.operator("fieldwork.new", icon="IMAGE_DATA").add = False
-        if state.has_project(folder):
+        if snapshot.has_project(folder):
             row.operator("fieldwork.new", text=t("Add"), icon="ADD").add = True
         if settings.images:
             draw_images(layout, context)
@@ -73,7 +73,7 @@ def draw_images(layout, context: Context) -> None:
     if not 0 <= settings.image_index < len(settings.images):
         return
     image = settings.images[settings.image_index]
-    icon = pictures.picture(folder / image.file) if folder and image.file else 0
+    icon = thumbnails.picture(folder / image.file) if folder and image.file else 0
     if icon:
         layout.template_icon(icon_value=icon, scale=6.0)
     if image.reason:

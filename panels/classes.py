@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bpy.types import Context, UIList
 
-from ..addon.project import snapshot as state
+from ..addon.project import snapshot
 from ..addon.text import t
 from .base import StepPanel, columns, project_folder
 
@@ -21,7 +21,7 @@ class FIELDWORK_UL_classes(UIList):
         side = row.row(align=True)
         side.alignment = "RIGHT"
         if item.area > 0:
-            frame = (state.cached_project(project_folder(context)) or {}).get("frame", {})
+            frame = snapshot.frame(project_folder(context))
             side.label(text=t("{:.3g} m²", item.area) if frame.get("scale_known") else f"{item.area:.3g}")
         weight = row.row()
         weight.ui_units_x = 2.4

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bpy.types import Context, Panel
 
-from ..addon.jobs import queue as jobs
+from ..addon.jobs.queue import queue
 from ..addon.text import t
 from .base import FieldworkPanel, draw_wrapped, text_width
 
@@ -24,7 +24,7 @@ class FIELDWORK_PT_dataset(FieldworkPanel, Panel):
         )
         layout.operator_context = "INVOKE_DEFAULT"
         layout.operator("fieldwork.dataset", text=t("Dataset from Scene…"), icon="OUTLINER_OB_CAMERA")
-        last = next((j for j in reversed(jobs.queue.finished) if j.verb == "dataset" and j.state == "done"), None)
+        last = next((j for j in reversed(queue.finished) if j.verb == "dataset" and j.state == "done"), None)
         if last is not None and last.result:
             text = t("{} photos in {}", last.result["images"], last.result["folder"])
             draw_wrapped(layout, text, text_width(context), icon="CHECKMARK")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from bpy.types import Context
 
 from ..addon import machine
-from ..addon.jobs import queue as jobs
+from ..addon.jobs.queue import queue
 from ..addon.text import t
 from .base import StepPanel, draw_wrapped, text_width
 
@@ -14,7 +14,7 @@ class FIELDWORK_PT_engine(StepPanel):
     bl_label = "Engine"
 
     def draw(self, context: Context) -> None:
-        layout, queue = self.layout, jobs.queue
+        layout = self.layout
         running = queue.link is not None and queue.link.alive
         if machine.engine_python() is None:
             self.draw_state(False, t("Not installed"))

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from bpy.types import Context
 
-from ..addon.jobs import queue as jobs
-from ..addon.project import snapshot as state
+from ..addon.jobs.queue import queue
+from ..addon.project import runs
 from ..addon.text import t
 from .base import StepPanel, columns, project_folder
 
@@ -18,11 +18,11 @@ class FIELDWORK_PT_export(StepPanel):
     def draw(self, context: Context) -> None:
         layout = self.layout
         settings, folder = context.scene.fieldwork, project_folder(context)
-        last = next((j for j in reversed(jobs.queue.finished) if j.verb in ("blend", "export") and j.result), None)
+        last = next((j for j in reversed(queue.finished) if j.verb in ("blend", "export") and j.result), None)
         if last is not None and last.result is not None:
             first = last.result["file"] if last.verb == "blend" else last.result["files"][0]
             self.draw_state(True, t("Written: {}", Path(first).name))
-        elif state.has_run(folder, settings.run):
+        elif runs.has_run(folder, settings.run):
             self.draw_state(False, t("Ready to export"))
         else:
             self.draw_state(False, t("Run “{}” is not trained yet", settings.run))

@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import bpy
-from bpy.types import Context, STATUSBAR_HT_header
+from bpy.types import Context, STATUSBAR_HT_header, UILayout
 
 from ..addon import machine
-from ..addon.jobs import queue as jobs
-from ..addon.project import snapshot as state
+from ..addon.jobs.queue import queue
+from ..addon.project import edits, runs, snapshot
 from ..addon.text import t
 from .base import FieldworkPanel, draw_job, draw_outcome, draw_wrapped, progress_text, project_folder, text_width
 
@@ -26,18 +26,20 @@ class Step(NamedTuple):
 def next_step(context: Context) -> Step | None:
     """The one obvious next thing to do; None while something runs."""
     settings = context.scene.fieldwork
-    folder = state.folder_of(settings)
-    if jobs.queue.current is not None:
+    folder = snapshot.folder_of(settings)
+    if queue.current is not None:
         return None
-    if not state.has_project(folder):
+    if snapshot.absence(settings):
+        return Step("fieldwork.locate_project", "FILE_FOLDER")
+    if not snapshot.has_project(folder):
         return Step("fieldwork.new", "IMAGE_DATA") if settings.photos else Step("fieldwork.open", "FILE_FOLDER")
-    if not state.has_poses(folder):
+    if not snapshot.has_poses(folder):
         return Step("fieldwork.poses", "CAMERA_DATA")
-    if state.can_resume(folder, settings.run):
+    if runs.can_resume(folder, settings.run):
         return Step("fieldwork.train", "PLAY", "Resume Training", resume=True)
-    if not state.has_run(folder, settings.run):
+    if not runs.has_run(folder, settings.run):
         return Step("fieldwork.train", "PLAY")
-    if not state.last_result(state.cached_project(folder), "mesh"):
+    if not snapshot.last_result(folder, "mesh"):
         return Step("fieldwork.mesh", "MESH_DATA")
     return Step("fieldwork.import_scene", "SCENE_DATA")
 
@@ -53,21 +55,27 @@ class FIELDWORK_PT_main(FieldworkPanel):
             box.operator("fieldwork.open_preferences", text=t("Install Engine…"), icon="IMPORT")
         row = layout.row(align=True)
         row.prop(settings, "project", text="")
-        if settings.project and not state.has_project(project_folder(context)):
+        absence = snapshot.absence(settings)
+        if absence:
+            draw_wrapped(layout, absence, text_width(context), icon="ERROR")
+        elif settings.project and not snapshot.has_project(project_folder(context)):
             note = layout.row()
             note.active = False
             note.label(text=t("New project"))
-        job = jobs.queue.current
+        edit = edits.failed()
+        if edit is not None:
+            draw_edit(layout, context, edit)
+        job = queue.current
         if job is not None:
             draw_job(layout, job)
             if job.project is not None and job.project != project_folder(context):
                 note = layout.row()
                 note.active = False
                 note.label(text=t("for {}", job.project.name))
-            for waiting in jobs.queue.waiting:
+            for waiting in queue.waiting:
                 if waiting is not job:
                     draw_job(layout, waiting)
-        outcome = jobs.queue.outcome
+        outcome = queue.outcome
         if outcome is not None:
             draw_outcome(layout, context, outcome)
         step = next_step(context)
@@ -80,8 +88,21 @@ class FIELDWORK_PT_main(FieldworkPanel):
                 button.resume = True
 
 
+def draw_edit(layout: UILayout, context: Context, edit: edits.Edit) -> None:
+    """An edit that the engine could not take: why, and what to do."""
+    texts = {
+        "classes": t("The edited classes of “{}” are not saved yet.", edit.folder.name),
+        "region": t("The training region of “{}” is not saved yet.", edit.folder.name),
+    }
+    box = layout.box()
+    draw_wrapped(box, f"{texts[edit.verb]} {edit.error}", text_width(context) - 4, icon="ERROR")
+    row = box.row()
+    row.operator("fieldwork.save_edits", text=t("Try Again"))
+    row.operator("fieldwork.discard_edits", text=t("Discard"))
+
+
 def draw_status(self: STATUSBAR_HT_header, context: Context) -> None:
-    job = jobs.queue.current
+    job = queue.current
     if job is None:
         return
     row = self.layout.row(align=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bpy.types import Context
 
-from ..addon.project import snapshot as state
+from ..addon.project import runs, snapshot
 from ..addon.text import t
 from .base import StepPanel, columns, project_folder
 
@@ -15,11 +15,11 @@ class FIELDWORK_PT_mesh(StepPanel):
     def draw(self, context: Context) -> None:
         layout, settings = self.layout, context.scene.fieldwork
         folder = project_folder(context)
-        result = state.last_result(state.cached_project(folder), "mesh")
+        result = snapshot.last_result(folder, "mesh")
         if result:
             closed = t("{:,} triangles, closed") if result.get("watertight") else t("{:,} triangles, open")
             self.draw_state(True, closed.format(result.get("faces", 0)))
-        elif state.has_run(folder, settings.run):
+        elif runs.has_run(folder, settings.run):
             self.draw_state(False, t("Ready to extract"))
         else:
             self.draw_state(False, t("Run “{}” is not trained yet", settings.run))

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from bpy.types import Context, UIList
 
-from ..addon.project import region as crop
-from ..addon.project import snapshot as state
+from ..addon.project import region, snapshot
 from ..addon.text import t
 from .base import FieldworkPanel, StepPanel, columns, draw_wrapped, project_folder, text_width
 from .capture import STATUS_ICONS
@@ -32,7 +31,7 @@ class FIELDWORK_PT_poses(StepPanel):
     def draw(self, context: Context) -> None:
         layout, settings = self.layout, context.scene.fieldwork
         folder = project_folder(context)
-        done = state.has_poses(folder)
+        done = snapshot.has_poses(folder)
         placed = sum(image.status == "ok" for image in settings.images)
         usable = sum(image.status != "rejected" for image in settings.images)
         self.draw_state(done, t("{} of {} photos placed", placed, usable) if done else t("No poses yet"))
@@ -57,7 +56,7 @@ class FIELDWORK_PT_poses_options(FieldworkPanel):
     def draw(self, context: Context) -> None:
         settings = context.scene.fieldwork
         columns(self.layout).prop(settings, "pose_group")
-        groups = state.last_result(state.cached_project(project_folder(context)), "poses").get("groups", [])
+        groups = snapshot.last_result(project_folder(context), "poses").get("groups", [])
         if len(groups) > 1:
             text = t("The photos fall into groups of {}.", ", ".join(map(str, groups)))
             draw_wrapped(self.layout, text, text_width(context), icon="INFO")
@@ -70,7 +69,7 @@ class FIELDWORK_PT_align(FieldworkPanel):
 
     def draw(self, context: Context) -> None:
         layout, settings = self.layout, context.scene.fieldwork
-        frame = (state.cached_project(project_folder(context)) or {}).get("frame", {})
+        frame = snapshot.frame(project_folder(context))
         if frame:
             known = t("Scale is set") if frame.get("scale_known") else t("Scale is unknown")
             layout.label(text=known, icon="CHECKMARK" if frame.get("scale_known") else "INFO")
@@ -97,7 +96,7 @@ class FIELDWORK_PT_region(FieldworkPanel):
 
     def draw(self, context: Context) -> None:
         layout = self.layout
-        box = crop.find(context.scene)
+        box = region.find(context.scene)
         draw_wrapped(
             layout,
             t("Move and scale the box in the viewport: the next training covers what lies inside.")

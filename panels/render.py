@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from bpy.types import Context
 
-from ..addon.jobs import queue as jobs
-from ..addon.project import snapshot as state
+from ..addon.jobs.queue import queue
+from ..addon.project import runs
 from ..addon.text import t
 from .base import StepPanel, columns, project_folder
 
@@ -16,11 +16,11 @@ class FIELDWORK_PT_render(StepPanel):
     def draw(self, context: Context) -> None:
         layout, settings = self.layout, context.scene.fieldwork
         folder = project_folder(context)
-        last = next((j for j in reversed(jobs.queue.finished) if j.verb == "render" and j.state == "done"), None)
+        last = next((j for j in reversed(queue.finished) if j.verb == "render" and j.state == "done"), None)
         if last is not None:
             count = sum(str(path).endswith(".exr") for path in (last.result or {}).get("frames", []))
             self.draw_state(True, t("{} images rendered", count) if count != 1 else t("1 image rendered"))
-        elif state.has_run(folder, settings.run):
+        elif runs.has_run(folder, settings.run):
             self.draw_state(False, t("Ready to render"))
         else:
             self.draw_state(False, t("Run “{}” is not trained yet", settings.run))

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from bpy.types import Context, UILayout
 
-from ..addon.jobs import queue as jobs
-from ..addon.pictures import thumbnails as pictures
-from ..addon.project import snapshot as state
+from ..addon.jobs.job import Job
+from ..addon.jobs.queue import queue
+from ..addon.pictures import thumbnails
+from ..addon.project import runs
 from ..addon.text import t
 from .base import FieldworkPanel, StepPanel, columns, duration, project_folder
 
 
-def training_job(context: Context) -> jobs.Job | None:
+def training_job(context: Context) -> Job | None:
     """The training of this scene's project: the one under way, else the last that ended."""
     folder = project_folder(context)
-    queue = jobs.queue
     candidates = [queue.running, queue.followed, *reversed(queue.finished)]
     return next((j for j in candidates if j and j.verb in ("train", "reconstruct") and j.project == folder), None)
 
@@ -27,12 +27,12 @@ class FIELDWORK_PT_train(StepPanel):
         folder = project_folder(context)
         job = training_job(context)
         active = job is not None and job.active
-        checkpoint = state.can_resume(folder, settings.run)
+        checkpoint = runs.can_resume(folder, settings.run)
         if active:
             self.draw_state(True, t("Run “{}” is training", settings.run))
         elif checkpoint:
             self.draw_state(False, t("Run “{}” is paused", settings.run))
-        elif state.has_run(folder, settings.run):
+        elif runs.has_run(folder, settings.run):
             self.draw_state(True, t("Run “{}” is trained", settings.run))
         else:
             self.draw_state(False, t("Run “{}” is not trained yet", settings.run))
@@ -44,7 +44,7 @@ class FIELDWORK_PT_train(StepPanel):
         column.prop(settings, "preset")
         column.prop(settings, "run")
         if not active:
-            estimate = state.time_estimate(folder, settings)
+            estimate = runs.time_estimate(folder, settings)
             text = t("About {}, as the last time", duration(estimate)) if estimate else ""
             if settings.time_limit > 0:
                 text = t("Ends after {}", duration(settings.time_limit))
@@ -82,20 +82,20 @@ class FIELDWORK_PT_runs(FieldworkPanel):
     def draw(self, context: Context) -> None:
         layout, settings = self.layout, context.scene.fieldwork
         folder = project_folder(context)
-        names = state.runs(folder)
+        names = runs.runs(folder)
         if not names:
             layout.label(text=t("No runs yet"))
         for name in names:
             row = layout.row(align=True)
             chosen = name == settings.run
             row.operator("fieldwork.use_run", text=name, icon="RADIOBUT_ON" if chosen else "RADIOBUT_OFF").run = name
-            row.label(text=state.quality(folder, name))
+            row.label(text=runs.quality(folder, name))
         layout.operator("fieldwork.evaluate", icon="VIEWZOOM")
 
 
-def draw_curve(layout: UILayout, job: jobs.Job) -> None:
+def draw_curve(layout: UILayout, job: Job) -> None:
     """Loss and PSNR so far, and the newest picture of a held-out photo."""
-    icon = pictures.curve_icon(job.id, job.curve)
+    icon = thumbnails.curve_icon(job.id, job.curve)
     if icon:
         layout.template_icon(icon_value=icon, scale=7.0)
     if job.latest:
@@ -106,7 +106,7 @@ def draw_curve(layout: UILayout, job: jobs.Job) -> None:
         row.label(text=t("PSNR –") if psnr is None else t("PSNR {:.1f} dB", psnr), icon="COLLECTION_COLOR_05")
         row.label(text=t("Loss –") if loss is None else t("Loss {:.4f}", loss), icon="COLLECTION_COLOR_02")
     if job.preview:
-        preview = pictures.picture(job.preview, job.preview_count)
+        preview = thumbnails.picture(job.preview, job.preview_count)
         if preview:
             layout.label(text=t("Render of a held-out photo"))
             layout.template_icon(icon_value=preview, scale=9.0)

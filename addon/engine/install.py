@@ -1,4 +1,4 @@
-"""How the engine's own Python gets to its place (see engine_place.py). Standard library only, no bpy: it runs in a
+"""How the engine's own Python gets to its place (see place.py). Standard library only, no bpy: it runs in a
 thread."""
 
 from __future__ import annotations

@@ -66,6 +66,7 @@ class Job:
     dismissed: bool = False  # its message was put away
     followed: bool = False  # runs in an engine that another Blender started
     events_read: int = 0
+    looked: float = 0.0  # when its files were read last, by the monotonic clock
 
     @property
     def title(self) -> str:

@@ -1,10 +1,11 @@
-"""The queue of jobs on Blender's side: one engine, one timer, one job at a time.
+"""The queue of jobs on Blender's side: one engine, one job at a time.
 
-The timer is persistent, so jobs survive loading another file, undo, and the operator that started them. Where
-there are no timers (`blender -b`, the `bpy` module) operators call `Queue.run` instead, which blocks.
+In a window the timer (timer.py) lets it work; it is persistent, so jobs survive loading another file, undo, and the
+operator that started them. Where there are no timers (`blender -b`, the `bpy` module) operators call `Queue.run`
+instead, which blocks.
 
-What a job has to do in Blender when it has ended may be a generator: the timer then runs it in slices, between which
-the window lives.
+What a job has to do in Blender when it has ended may be a generator: it is then run in slices, between which the window
+lives.
 
 Imported when the extension is enabled: what is needed only with a job is imported where it is used.
 """
@@ -21,23 +22,16 @@ import bpy
 
 from .. import machine
 from ..errors import EngineError, SceneError
-from ..project import region as crop
-from ..project import snapshot as state
 from ..text import t
 from . import redraw
 from .job import Done, Job, Steps
 
 if TYPE_CHECKING:
     from ..engine.install import Installer
-    from ..engine.link import Link
+    from ..engine.link import DONE, Link
 
-BUSY_PERIOD = 0.1  # seconds between two looks at the engine while something goes on
-IDLE_PERIOD = 0.5
-FOLLOW_PERIOD = 0.5  # seconds between two looks at the files of a job in another process
-DRAW_PERIOD = 0.4  # seconds between two drawings of the panels and the status bar while a job runs
 KEPT = 8  # finished jobs the panel remembers
 SLICE = 0.02  # seconds of bringing a result into the scene at a time
-SLICE_PERIOD = 0.01  # seconds between two slices
 
 
 def open_link(python: Path, log: Path) -> Link:
@@ -73,9 +67,8 @@ class Queue:
         self._edits_seen = 0
         self._loader: threading.Thread | None = None
         self._number = 0
-        self._looked = 0.0
         self._asked = 0.0
-        self._drawn = 0.0
+        self.drawn = 0.0  # when the panels were drawn, by the monotonic clock
         self._status_shown = ""  # id of the job that the status bar shows
 
     # For operators
@@ -139,12 +132,26 @@ class Queue:
         try:
             result = self._engine().run_blocking(job.verb, {**job.params, "job": job.id}, job.take)
         except EngineError as error:
-            self._finish(job, None, error)
+            self.finish(job, None, error)
             raise
-        self._finish(job, result, None)
+        self.finish(job, result, None)
         while self.bringing:
             self._bring(SLICE)
         return result
+
+    def ask(self, method: str, params: dict[str, Any], on_done: DONE | None = None) -> None:
+        """A request that the engine answers at once, also while a job runs. Raises EngineError."""
+        self._engine().request(method, params, on_done)
+
+    def ask_and_wait(self, method: str, params: dict[str, Any], on_done: DONE) -> None:
+        """`ask`, with the answer taken before this returns. Raises EngineError: there is no engine."""
+        engine = self._engine()
+        try:
+            result = engine.run_blocking(method, params)
+        except EngineError as error:
+            on_done(None, error)
+        else:
+            on_done(result, None)
 
     def cancel(self, job: Job | None = None) -> None:
         job = job or self.current
@@ -152,7 +159,7 @@ class Queue:
             return
         if job in self.waiting:
             self.waiting.remove(job)
-            self._finish(job, None, EngineError("cancelled", "Cancelled."))
+            self.finish(job, None, EngineError("cancelled", "Cancelled."))
         elif self.bringing and self.bringing[0] is job:
             self._brought(job, EngineError("cancelled", "Cancelled."))
         elif job.active:
@@ -176,7 +183,7 @@ class Queue:
         link.close(detach, timeout)
         job, self.running = self.running, None
         if job and not detach:
-            self._finish(job, None, EngineError("cancelled", "The engine was stopped.", "Run it again to resume."))
+            self.finish(job, None, EngineError("cancelled", "The engine was stopped.", "Run it again to resume."))
 
     def _hand_over(self, link: Link) -> None:
         """Give an engine that is to go on by itself what waits as well; what has no project cannot be found again."""
@@ -184,64 +191,34 @@ class Queue:
             link.request(job.verb, {**job.params, "detach": True, "job": job.id})
             self.waiting.remove(job)
 
-    def reattach(self, project: Path) -> None:
-        """Follow a job that another process runs on the project, and tell of one that died."""
-        if self.running and self.running.project == project:
-            return
-        from ...nerfcore.engine import status as st
+    # Work
 
-        self.followed = None
-        for status in reversed(st.list_jobs(project)):
-            if status.state == "running":
-                self.followed = Job(
-                    status.verb, status.params, status.id, project, state="running", followed=True,
-                    started=time.monotonic() - max(0.0, time.time() - (status.started or time.time())),
-                )  # fmt: skip
-                self._follow()
-                break
-            if status.state == "died" and all(job.id != status.id for job in self.finished):
-                job = Job(status.verb, status.params, status.id, project, state="failed", stage=status.stage)
-                error = status.error or {}
-                job.error = EngineError("died", error.get("message", ""), error.get("hint", ""))
-                self._remember(job)
-                break
-        self.redraw()
+    def work(self) -> None:
+        """Hear what the engine has to say, and do for a moment what is to be done in Blender."""
+        if self.link:
+            self.link.pump()
+        if self.running:
+            self.running.seconds = time.monotonic() - (self.running.started or time.monotonic())
+        self._prepare(SLICE)
+        self._start_next()
+        self._look_after_engine()
+        self._bring(SLICE)
 
-    # The timer
-
-    def tick(self) -> float:
-        """One look at the engine. Returns the seconds until the next."""
-        begin, busy_since = time.perf_counter(), time.thread_time()
-        doing = f"{self.current.stage} {self.current.message}" if self.current else ""
-        try:
-            state.write_classes()
-            if self.link:
-                self.link.pump()
-            if self.running:
-                self.running.seconds = time.monotonic() - (self.running.started or time.monotonic())
-            self._prepare(SLICE)
-            self._start_next()
-            self._follow()
-            self._look_after_engine()
-            self._bring(SLICE)
-            if not bpy.app.background:
-                crop.follow(bpy.context.scene)
-        except Exception:
-            # A timer that raises is dropped by Blender, and all jobs with it.
-            import logging
-
-            logging.getLogger("fieldwork.addon").exception("Fieldwork's timer failed")
+    @property
+    def busy(self) -> bool:
+        """Whether anything goes on that the panels show."""
         installing = self.installer is not None and self.installer.is_alive()
-        busy = self.current is not None or installing or (self.link is not None and self.link.busy)
-        due = busy and time.monotonic() - self._drawn > DRAW_PERIOD
-        if due or self._status_shown != self._current_id():
-            self.redraw()
-        seconds = time.perf_counter() - begin
-        self.slowest_cpu = max(self.slowest_cpu, time.thread_time() - busy_since)
-        if seconds > self.slowest_tick:
-            self.slowest_tick, self.slowest_step = seconds, doing
-        sliced = self.bringing or any(job.before for job in self.waiting)
-        return SLICE_PERIOD if sliced else BUSY_PERIOD if busy else IDLE_PERIOD
+        return self.current is not None or installing or (self.link is not None and self.link.busy)
+
+    @property
+    def sliced(self) -> bool:
+        """Whether there is work in Blender that is done in slices."""
+        return self.bringing is not None or any(job.before for job in self.waiting)
+
+    @property
+    def undrawn(self) -> bool:
+        """Whether the status bar shows another job than the one that runs."""
+        return self._status_shown != self._current_id()
 
     def _prepare(self, seconds: float) -> None:
         """Do what a waiting job needs of Blender, for that long: at once, not when its turn comes."""
@@ -256,7 +233,7 @@ class Queue:
             job.before, job.fraction, job.message = None, None, ""
         except Exception as error:
             self.waiting.remove(job)
-            self._finish(job, None, EngineError("scene", f"The scene cannot be read: {error}."))
+            self.finish(job, None, EngineError("scene", f"The scene cannot be read: {error}."))
             raise
 
     def _start_next(self) -> None:
@@ -270,11 +247,11 @@ class Queue:
             self._engine().request(
                 job.verb,
                 {**job.params, **detach, "job": job.id},
-                lambda result, error: self._finish(job, result, error),
+                lambda result, error: self.finish(job, result, error),
                 job.take,
             )
         except EngineError as error:
-            self._finish(job, None, error)
+            self.finish(job, None, error)
 
     def _engine(self) -> Link:
         if self.link is not None and not self.link.alive:
@@ -290,7 +267,8 @@ class Queue:
             self.link = open_link(python, machine.engine_log())
         return self.link
 
-    def _finish(self, job: Job, result: dict[str, Any] | None, error: EngineError | None) -> None:
+    def finish(self, job: Job, result: dict[str, Any] | None, error: EngineError | None) -> None:
+        """A job has ended in the engine: do what it has to do in Blender."""
         if self.running is job:
             self.running = None
         job.result, job.error, job.eta = result, error, None
@@ -301,7 +279,7 @@ class Queue:
             self.doctor = result
         steps = job.on_done(job) if job.on_done else None
         if steps is None:
-            self._remember(job)
+            self.remember(job)
         else:
             job.state, job.stage, job.fraction, job.message = "running", t("Updating the Scene"), None, ""
             self.bringing, self._edits_seen = (job, steps), self.edits
@@ -336,37 +314,12 @@ class Queue:
         self.bringing = None
         job.error, job.fraction, job.message = error, None, ""
         job.state = "done" if error is None else "cancelled" if error.kind == "cancelled" else "failed"
-        self._remember(job)
+        self.remember(job)
         self.redraw()
 
-    def _remember(self, job: Job) -> None:
+    def remember(self, job: Job) -> None:
+        """Keep what became of a job for the panels."""
         self.finished = [*self.finished, job][-KEPT:]
-
-    def _follow(self) -> None:
-        """Bring the job of another process up to date from its files."""
-        job = self.followed
-        if job is None or job.project is None or time.monotonic() - self._looked < FOLLOW_PERIOD:
-            return
-        self._looked = time.monotonic()
-        from ...nerfcore.engine import status as st
-
-        status = st.read_job(st.job_path(job.project, job.id))
-        events, job.events_read = st.read_events(job.project, job.id, job.events_read)
-        for event in events:
-            job.take_event(event)
-        job.seconds = time.monotonic() - (job.started or time.monotonic())
-        if status is not None and not status.finished:
-            job.stage, job.fraction = status.stage, status.fraction
-            job.message, job.eta = status.message, status.eta_s
-            return
-        self.followed = None
-        if status is not None and status.state == "done":
-            self._finish(job, status.result, None)
-            self.reattach(job.project)  # the next one of those that were left to the engine
-            return
-        error = (status.error if status else None) or {"code": "died", "message": "The job is gone."}
-        kind = "cancelled" if status and status.state == "cancelled" else error.get("code", "died")
-        self._finish(job, None, EngineError(kind, error.get("message", ""), error.get("hint", "")))
 
     def _look_after_engine(self) -> None:
         """Ask a living engine for its memory now and then; end one that was idle for long."""
@@ -393,7 +346,7 @@ class Queue:
         """Redraw what shows jobs: sidebars, preferences, the status bar."""
         if bpy.app.background:
             return
-        self._drawn = time.monotonic()
+        self.drawn = time.monotonic()
         if redraw.panels():
             self._status_shown = self._current_id()
 

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import bpy
 
-from ..roles import PROJECT, ROLE
+from ..roles import ROLE, Owner
 from .slot import MARK, load_render, render_slot
 
 OTHER_PASSES = ("_depth", "_labels", "_confidence", "_normal")
 
 
 def show_steps(
-    scene: bpy.types.Scene, files: list[Path], show_as: str, photos: bool, project: str
+    scene: bpy.types.Scene, files: list[Path], show_as: str, photos: bool, owner: Owner
 ) -> Generator[tuple[float, str], None, list[tuple[bpy.types.Object, bpy.types.Image]]]:
     """Load the rendered files, and put the colored ones where the user wants them, a step for each file.
 
@@ -22,7 +22,7 @@ def show_steps(
         files: what the engine wrote.
         show_as: "none", "background" or "plane".
         photos: whether they were rendered from the photos' cameras rather than the scene's.
-        project: name of the project whose cameras are meant.
+        owner: the project whose cameras are meant.
     Returns:
         the cameras that got an image, with it.
     """
@@ -37,7 +37,7 @@ def show_steps(
         cameras = {
             Path(obj[ROLE].removeprefix("camera:")).stem: obj
             for obj in scene.objects
-            if obj.type == "CAMERA" and obj.get(PROJECT) == project and str(obj.get(ROLE)).startswith("camera:")
+            if obj.type == "CAMERA" and str(obj.get(ROLE)).startswith("camera:") and owner.owns(obj)
         }
         pairs = [(cameras[path.stem], images[path]) for path in colored if path.stem in cameras]
     else:

@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import bpy
 from mathutils import Matrix
 
-from ..roles import PROJECT, ROLE
+from ..roles import ROLE, Owner
 
 
-def root_of(scene: bpy.types.Scene, project: Path | None) -> bpy.types.Object | None:
+def root_of(scene: bpy.types.Scene, owner: Owner | None) -> bpy.types.Object | None:
     """The empty under which everything of a project hangs in a scene; None where nothing was imported."""
-    if project is None:
+    if owner is None:
         return None
-    return next((o for o in scene.objects if o.get(ROLE) == "root" and o.get(PROJECT) == project.name), None)
+    return next((item for item in scene.objects if item.get(ROLE) == "root" and owner.owns(item)), None)
 
 
-def scene_from_capture(scene: bpy.types.Scene, project: Path | None) -> Matrix:
+def scene_from_capture(scene: bpy.types.Scene, owner: Owner | None) -> Matrix:
     """The matrix (4×4) from the capture's frame to the scene; only the units' factor where nothing was imported."""
-    root = root_of(scene, project)
+    root = root_of(scene, owner)
     return root.matrix_world.copy() if root is not None else Matrix.Scale(units_per_metre(scene), 4)
 
 

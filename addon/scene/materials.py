@@ -6,6 +6,9 @@ from typing import Any
 
 import bpy
 
+from ..roles import Owner
+from .owned import find
+
 SWITCH = "show_labels"  # custom property of the parent empty: 0 photo colour, 1 class colour
 COLOR_ATTRIBUTE = "Color"
 
@@ -15,15 +18,20 @@ def srgb_to_linear(value: float) -> float:
     return value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4
 
 
-def make_group(name: str, root: bpy.types.Object, texture: bpy.types.Image | None = None) -> Any:
-    """The node group shared by all classes: class colour in, the colour to show out, switched by `root`.
+def make_group(
+    owner: Owner, part: str, root: bpy.types.Object, texture: bpy.types.Image | None = None
+) -> bpy.types.NodeTree:
+    """The node group shared by all classes of a part ("mesh" or "points"): class colour in, the colour to show out,
+    switched by `root`.
 
-    The colour of the photos is that of `texture` by the mesh's UVs, or without one that of its colour attribute. A
-    group of that name is built anew.
+    The colour of the photos is that of `texture` by the mesh's UVs, or without one that of its colour attribute. One
+    that the project has already is built anew.
     """
-    tree = bpy.data.node_groups.get(name)
+    name, role = f"Fieldwork · {owner.name}" + (" · points" if part == "points" else ""), f"colors:{part}"
+    tree = find(bpy.data.node_groups, owner, role, name)
     if tree is None:
         tree = bpy.data.node_groups.new(name, "ShaderNodeTree")
+        owner.mark(tree, role)
         tree.interface.new_socket("Class Color", in_out="INPUT", socket_type="NodeSocketColor")
         tree.interface.new_socket("Color", in_out="OUTPUT", socket_type="NodeSocketColor")
     tree.animation_data_clear()
@@ -58,12 +66,15 @@ def make_group(name: str, root: bpy.types.Object, texture: bpy.types.Image | Non
     return tree
 
 
-def make_material(name: str, color: list[float], group: Any) -> bpy.types.Material:
-    """A class's material: `color` is sRGB in [0, 1]. An existing one of that name is given the colour anew."""
-    material = bpy.data.materials.get(name)
+def make_material(owner: Owner, label: str, color: list[float], group: Any) -> bpy.types.Material:
+    """The material of what is called `label`: `color` is sRGB in [0, 1]. One that the project has is given the colour
+    anew."""
+    name, role = f"{owner.name} · {label}", f"material:{label}"
+    material = find(bpy.data.materials, owner, role, name)
     linear = (*(srgb_to_linear(channel) for channel in color), 1.0)
     if material is None:
         material = bpy.data.materials.new(name)
+        owner.mark(material, role)
         material.use_nodes = True
         tree = material.node_tree
         tree.nodes.clear()

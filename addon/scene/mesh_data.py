@@ -33,7 +33,7 @@ class MeshData:
 
 @dataclass(frozen=True)
 class Part:
-    """One object of the surface: its role in the scene (see scene_import.py), its name and its mesh."""
+    """One object of the surface: its role in the scene (see build.py), its name and its mesh."""
 
     role: str
     name: str

@@ -1,4 +1,4 @@
-"""Reads the package that the engine prepares for Blender (see nerfcore/blend_package.py); no bpy here."""
+"""Reads the package that the engine prepares for Blender (see nerfcore/blender/package.py); no bpy here."""
 
 from __future__ import annotations
 
@@ -22,13 +22,14 @@ class PackageError(SceneError):
 
 @dataclass(frozen=True)
 class Package:
-    """One capture. Points: `xyz` (N, 3), `rgb` (N, 3) uint8. `mesh` holds the arrays of mesh.npz, or None.
+    """One capture: `name` of its folder and `uuid` (may be empty) of its project. Points: `xyz` (N, 3), `rgb` (N, 3) uint8. `mesh` holds the arrays of mesh.npz, or None.
 
     `texture` is a picture for the mesh's "uv" (F, 3, 2), v upwards; None where colours are the vertices'.
     """
 
     folder: Path
     name: str
+    uuid: str
     classes: list[dict[str, Any]]
     ignore_id: int
     cameras: list[dict[str, Any]]
@@ -91,6 +92,7 @@ def read_package(folder: Path | str) -> Package:
     return Package(
         folder=folder,
         name=value["name"],
+        uuid=value.get("uuid") or "",
         classes=value["classes"],
         ignore_id=value["ignore_id"],
         cameras=value["cameras"],

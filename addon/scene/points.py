@@ -1,12 +1,39 @@
-"""Makes loose vertices visible: a node group that draws each as a tiny coloured ball, in the viewport only."""
+"""The sparse points: loose vertices, and a node group that draws each as a tiny coloured ball, in the viewport only."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import bpy
+import numpy as np
+
+from .materials import make_group, make_material
+from .mesh_data import rgba
+from .owned import Owned
+from .package import Package
+from .surface import set_colors, set_values
 
 NAME = "Fieldwork Points"
+
+
+def sparse_points(owned: Owned, package: Package, root: bpy.types.Object) -> bpy.types.Object:
+    """The object of the package's points."""
+    # Vertices with a colour attribute work in every version, in every exporter, and stay in the file.
+    mesh = bpy.data.meshes.new("Sparse points")
+    fill_points(mesh, package.xyz, rgba(package.rgb))
+    item = owned.with_mesh("points", "Sparse points", mesh, root)
+    centers = np.array([np.array(c["camera_to_world"])[:3, 3] for c in package.cameras]).reshape(-1, 3)
+    material = make_material(owned.owner, "points", [0.8, 0.8, 0.8], make_group(owned.owner, "points", root))
+    show_points(item, float(np.ptp(centers, axis=0).max(initial=0.0)) / 600 or 0.005, material)
+    return item
+
+
+def fill_points(mesh: bpy.types.Mesh, xyz: np.ndarray, colors: np.ndarray) -> None:
+    """Fill an empty mesh with loose vertices (N, 3) in colours (N, 4), sRGB in [0, 1]."""
+    mesh.vertices.add(len(xyz))
+    set_values(mesh, "position", "vector", np.ascontiguousarray(xyz, np.float32))
+    set_colors(mesh, colors)
+    mesh.update()
 
 
 def show_points(item: bpy.types.Object, radius: float, material: bpy.types.Material) -> None:

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import bpy
 
-from ..roles import PROJECT, ROLE
+from ..roles import ROLE, Owner
 from .surface import CLASS_ATTRIBUTE
 
 NAME = "Fieldwork Classes"
 
 
-def meshes(project: str | None = None) -> list[bpy.types.Object]:
-    """The labelled meshes in the file, of one project or of all."""
-    found = [obj for obj in bpy.data.objects if obj.type == "MESH" and obj.get(ROLE) == "mesh"]
-    return [obj for obj in found if project is None or obj.get(PROJECT) == project]
+def meshes(owner: Owner) -> list[bpy.types.Object]:
+    """The labelled meshes of a project in the file."""
+    return [obj for obj in bpy.data.objects if obj.type == "MESH" and obj.get(ROLE) == "mesh" and owner.owns(obj)]
 
 
 def hide_classes(obj: bpy.types.Object, hidden: list[int]) -> None:

@@ -233,7 +233,7 @@ def _copy_texture(source: Path, folder: Path) -> bool:
 
 
 def package(params: PackageParams, report: Reporter) -> dict[str, Any]:
-    """Prepare the package of a project (see blend_package.py).
+    """Prepare the package of a project (see above).
 
     Returns:
         {"folder", "cameras": count, "points": count, "mesh": whether there is one}

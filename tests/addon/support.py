@@ -16,6 +16,31 @@ def attempt(call):
         return str(error)
 """
 
+# What the engine does with edits of a project, at once and in this process.
+ENGINE = """
+from fieldwork.addon.jobs.queue import queue
+from fieldwork.addon.project import edits
+asked = []
+def write(folder, **changes):
+    path = Path(folder) / "project.json"
+    value = json.loads(path.read_text()) | changes
+    path.with_name("part").write_text(json.dumps(value))
+    os.replace(path.with_name("part"), path)
+def stored(folder):
+    return json.loads((Path(folder) / "project.json").read_text())
+def engine(verb, params, on_done):
+    asked.append(verb)
+    folder = params["project"]
+    if verb == "classes":
+        write(folder, classes=params["classes"])
+    else:
+        write(folder, frame={**stored(folder).get("frame", {}), "bounds": params.get("bounds")})
+    on_done({}, None)
+def settle():
+    edits.send(engine, at_once=True)
+queue.ask_and_wait = engine
+"""
+
 
 def make_project(folder, **more):
     """A project as the panels see it."""

@@ -22,14 +22,14 @@ def test_cameras_points_and_region_are_those_of_the_capture(bpy_script, tmp_path
         SETUP
         + MOVED
         + """
-from fieldwork.addon.project import region as crop
+from fieldwork.addon.project import region, snapshot
 from fieldwork.operators.render import write_cameras
 # A camera, two points and a box, each given in the capture and put where they appear in the scene.
 pose = Matrix.LocRotScale(Vector((1, 2, 3)), Euler((1.1, 0.2, 0.4)), None)
 scene.camera.matrix_world = root.matrix_world @ pose
 bpy.context.view_layer.update()
 file = Path(project, "cameras.json")
-for _ in write_cameras(file, scene, False, (100, 50), Path(project)):
+for _ in write_cameras(file, scene, False, (100, 50), snapshot.owner(Path(project))):
     pass
 frame = json.loads(file.read_text())["frames"][0]
 settings.point_a, settings.point_b = (root.matrix_world @ Vector(p) for p in ((1, 0, 0), (1, 2, 0)))
@@ -39,13 +39,13 @@ class Operator:
     value = lambda self, context, name: getattr(context.scene.fieldwork, name)
     project_path = lambda self, context: project
 params = bpy.types.FIELDWORK_OT_align.parameters(Operator(), bpy.context)
-box = crop.add(scene, [[0, 0, 0], [1, 2, 4]])
+box = region.add(scene, [[0, 0, 0], [1, 2, 4]])
 bpy.context.view_layer.update()
-bounds = crop.bounds_of(scene, box)
+bounds = region.bounds_of(scene, box)
 root.location.x += 10
 bpy.context.view_layer.update()
 answer({"frame": frame["transform_matrix"], "pose": [list(r) for r in pose], "scale": params["scale"],
-        "bounds": bounds, "moved along": crop.bounds_of(scene, box)})
+        "bounds": bounds, "moved along": region.bounds_of(scene, box)})
 """,
         project=make_posed_project(tmp_path / "capture"),
     )

@@ -213,8 +213,8 @@ try:
     refused = ""
 except RuntimeError as error:
     refused = str(error)
-from fieldwork.addon.jobs import queue as jobs
-jobs.queue.stop_engine()
+from fieldwork.addon.jobs.queue import queue
+queue.stop_engine()
 answer({"result": list(result), "project": bpy.context.scene.fieldwork.project, "refused": refused, "left": os.listdir(bpy.app.tempdir)})
 """
 

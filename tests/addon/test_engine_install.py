@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 from fieldwork.addon.engine import install as module
-from fieldwork.addon.engine import place as place
+from fieldwork.addon.engine import place
 from fieldwork.addon.engine.install import InstallCancelled, InstallError, Options, install
 
 ROOT = Path(__file__).resolve().parents[2]

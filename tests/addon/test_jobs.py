@@ -14,8 +14,10 @@ bpy = pytest.importorskip("bpy")
 from fieldwork.addon import machine  # noqa: E402
 from fieldwork.addon.engine.link import Link  # noqa: E402
 from fieldwork.addon.errors import EngineError  # noqa: E402
-from fieldwork.addon.jobs import queue as jobs  # noqa: E402
+from fieldwork.addon.jobs.follow import reattach  # noqa: E402
 from fieldwork.addon.jobs.job import CURVE_POINTS  # noqa: E402
+from fieldwork.addon.jobs.queue import Queue  # noqa: E402
+from fieldwork.addon.jobs.timer import tick  # noqa: E402
 from fieldwork.nerfcore.engine import status as st  # noqa: E402
 
 ENGINE = [sys.executable, str(Path(__file__).resolve().parents[1] / "counting_engine.py")]
@@ -31,13 +33,13 @@ def settings(monkeypatch, tmp_path):
     monkeypatch.setattr(machine, "preferences", lambda: Settings)
     monkeypatch.setattr(machine, "user_folder", lambda *parts: Path(tmp_path, "user", *parts))
     monkeypatch.setattr(machine, "engine_python", lambda: Path(sys.executable))
-    monkeypatch.setattr(jobs, "open_link", lambda python, log: Link(python, log, ENGINE))
+    monkeypatch.setattr("fieldwork.addon.jobs.queue.open_link", lambda python, log: Link(python, log, ENGINE))
     return Settings
 
 
 @pytest.fixture
 def queue(settings):
-    queue = jobs.Queue()
+    queue = Queue()
     yield queue
     queue.stop_engine(timeout=2.0)
 
@@ -54,7 +56,7 @@ def tick_until(queue, condition, timeout=20.0):
     end = time.monotonic() + timeout
     while not condition():
         assert time.monotonic() < end, "nothing happened"
-        queue.tick()
+        tick(queue)
         time.sleep(0.02)
 
 
@@ -136,8 +138,8 @@ def test_reattach_follows_a_detached_job_to_its_end(queue, settings, project):
     assert queue.link is None
 
     # Another Blender opens the project.
-    other = jobs.Queue()
-    other.reattach(project)
+    other = Queue()
+    reattach(other, project)
     assert other.followed is not None
     assert other.followed.state == "running"
     followed = other.followed
@@ -151,8 +153,8 @@ def test_followed_job_can_be_cancelled(queue, settings, project):
     queue.submit(count(queue, project, steps=100_000))
     tick_until(queue, lambda: queue.running.fraction)
     queue.stop_engine(detach=True)
-    other = jobs.Queue()
-    other.reattach(project)
+    other = Queue()
+    reattach(other, project)
     followed = other.followed
     begin = time.monotonic()
     other.cancel()
@@ -166,11 +168,11 @@ def test_reattach_tells_of_a_job_whose_engine_died(queue, project):
     time.sleep(0.7)
     queue.link.process.kill()
     queue.link.process.wait()
-    other = jobs.Queue()
-    other.reattach(project)
+    other = Queue()
+    reattach(other, project)
     assert other.last.state == "failed"
     assert "unexpectedly" in other.last.error.message
-    other.reattach(project)
+    reattach(other, project)
     assert len(other.finished) == 1, "it is told once"
 
 
@@ -179,7 +181,7 @@ def test_idle_engine_is_released(queue, settings, project):
     tick_until(queue, lambda: queue.last is not None)
     process = queue.link.process
     queue.link.last_used -= 60 * settings.idle_minutes + 1
-    queue.tick()
+    tick(queue)
     assert queue.link is None
     assert process.wait(timeout=10) == 0
 
@@ -196,7 +198,7 @@ def test_curve_stays_bounded_and_keeps_its_ends(queue, project):
 
 def test_job_file_of_another_project_is_left_alone(queue, project, tmp_path):
     st.write_job(project, st.JobStatus("x", "count", {}, state="done"))
-    queue.reattach(project)
+    reattach(queue, project)
     assert queue.current is None
     assert queue.last is None
 
@@ -221,8 +223,8 @@ def test_what_waits_goes_on_without_blender_too(queue, project):
     tick_until(queue, lambda: queue.running.fraction)
     queue.stop_engine(detach=True)
     assert queue.waiting == []
-    other = jobs.Queue()
-    other.reattach(project)
+    other = Queue()
+    reattach(other, project)
     tick_until(other, lambda: len(other.finished) == 3 or (other.followed is None and other.finished))
     end = time.monotonic() + 20
     while (
@@ -239,7 +241,7 @@ def test_messages_stay_until_read_or_made_good(queue, project, tmp_path):
     def ended(verb, state, folder=project, warnings=()):
         job = queue.make(verb, {"project": str(folder)})
         job.state, job.warnings = state, list(warnings)
-        queue._remember(job)
+        queue.remember(job)
         return job
 
     assert queue.outcome is None

@@ -78,15 +78,16 @@ import time
 import numpy as np
 import fieldwork
 fieldwork.register()
-from fieldwork.addon.jobs import queue as jobs
+from fieldwork.addon.jobs.queue import queue
+from fieldwork.addon.jobs.timer import tick
 from fieldwork.operators.scene import import_result
-scene, queue = bpy.context.scene, jobs.queue
+scene = bpy.context.scene
 Path(project, "project.json").write_text(json.dumps({"format": "fieldwork-project"}))
 scene.fieldwork.project = project
 def finished():
     job = queue.make("package", {"project": project}, lambda job: import_result(job, "both", "Scene"))
     job.state = "running"
-    queue._finish(job, {"folder": package}, None)
+    queue.finish(job, {"folder": package}, None)
     assert queue.current is job
     return job
 """
@@ -100,7 +101,7 @@ def bring(job):
     count = 0
     while queue.bringing:
         # As long as the timer takes.
-        queue.tick()
+        tick(queue)
         count += 1
         time.sleep(0.005)
     assert job.state == "done", job.error
@@ -154,7 +155,7 @@ def part_of_it():
     return job
 def rest(job):
     while queue.bringing:
-        queue.tick()
+        tick(queue)
         time.sleep(0.002)
     return job.state
 
@@ -207,7 +208,7 @@ def test_a_package_that_lacks_files_is_told(bpy_script, tmp_path, cut):
         + """
 job = finished()
 while queue.bringing:
-    queue.tick()
+    tick(queue)
 answer([job.state, str(job.error)])
 """,
         project=tmp_path,

@@ -178,8 +178,7 @@ def test_a_button_cancels_only_its_own_job(bpy_script, tmp_path):
     facts = bpy_script(
         SETUP
         + """
-from fieldwork.addon.jobs import queue as jobs
-queue = jobs.queue
+from fieldwork.addon.jobs.queue import queue
 make = lambda: queue.make("count", {"project": folder})
 running, first, second = make(), make(), make()
 running.state, queue.running, queue.waiting = "running", running, [first, second]

@@ -43,7 +43,7 @@ def test_the_next_step_leads_from_nothing_to_the_model(bpy_script, tmp_path):
         """
 import fieldwork
 fieldwork.register()
-from fieldwork.addon.jobs import queue as jobs
+from fieldwork.addon.jobs.queue import queue
 from fieldwork.panels.main import next_step
 settings = bpy.context.scene.fieldwork
 folder = Path(project)
@@ -73,7 +73,7 @@ os.utime(folder / "project.json", (1, 1))
 look()
 settings.run = "second"
 look()
-jobs.queue.running = jobs.queue.make("train", {"project": project})
+queue.running = queue.make("train", {"project": project})
 look()
 answer(seen)
 """,
@@ -97,7 +97,7 @@ def test_quality_and_time_come_from_the_project(tmp_path, monkeypatch):
     from types import SimpleNamespace
 
     from fieldwork.addon import machine
-    from fieldwork.addon.project import snapshot as state
+    from fieldwork.addon.project import runs
 
     monkeypatch.setattr(machine, "user_folder", lambda *parts: tmp_path / "user")
 
@@ -112,17 +112,17 @@ def test_quality_and_time_come_from_the_project(tmp_path, monkeypatch):
     (tmp_path / "runs" / "main").mkdir(parents=True)
     (tmp_path / "runs" / "main" / "metrics.json").write_text(json.dumps({"test": {"psnr": 27.34, "miou": 0.871}}))
     settings = SimpleNamespace(time_limit=0.0, steps=0, preset="draft")
-    assert state.time_estimate(tmp_path, settings) == 90.0
+    assert runs.time_estimate(tmp_path, settings) == 90.0
     settings.preset = "high"
-    assert state.time_estimate(tmp_path, settings) is None
-    state.remember_time("high", 300.0)
-    state.remember_time("standard", 200.0)
-    assert state.time_estimate(tmp_path, settings) == 300.0, "from another project on this machine"
-    assert state.time_estimate(None, settings) == 300.0
+    assert runs.time_estimate(tmp_path, settings) is None
+    runs.remember_time("high", 300.0)
+    runs.remember_time("standard", 200.0)
+    assert runs.time_estimate(tmp_path, settings) == 300.0, "from another project on this machine"
+    assert runs.time_estimate(None, settings) == 300.0
     settings.steps = 10
-    assert state.time_estimate(tmp_path, settings) is None
-    assert state.quality(tmp_path, "main") == "27.3 dB, mIoU 0.87"
-    assert state.quality(tmp_path, "other") == ""
+    assert runs.time_estimate(tmp_path, settings) is None
+    assert runs.quality(tmp_path, "main") == "27.3 dB, mIoU 0.87"
+    assert runs.quality(tmp_path, "other") == ""
 
 
 def test_curve_picture_shows_both_lines():

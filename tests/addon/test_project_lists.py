@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 
 import pytest
-from fieldwork.tests.addon.support import SETUP, make_project
+from fieldwork.tests.addon.support import ENGINE, SETUP, make_project
 
 
 def test_new_reads_photos_and_fills_the_lists(bpy_script, shared_data, tmp_path):
@@ -30,22 +30,25 @@ def test_lists_follow_the_project_and_class_edits_go_back(bpy_script, tmp_path):
     folder = make_project(tmp_path / "capture")
     facts = bpy_script(
         SETUP
+        + ENGINE
         + """
-from fieldwork.addon.project import snapshot as state
 settings.project = project
 rows = [[i.name, i.status, i.reason, i.labelled] for i in settings.images]
 classes = [[c.id, c.name, round(c.priority, 3), round(c.area, 3)] for c in settings.classes]
 settings.classes[0].priority = 4.0
 settings.classes[1].name = "gilding"
-state.write_classes()
+before = stored(project)["classes"]
+bpy.ops.fieldwork.save_edits()
 settings.project = ""
-answer({"rows": rows, "classes": classes, "left": len(settings.images)})
+answer({"rows": rows, "classes": classes, "left": len(settings.images), "asked": asked, "before": before[0]["priority"]})
 """,
         project=folder,
     )
     assert facts["rows"] == [["a", "ok", "", True], ["b", "rejected", "It is blurred.", False]]
     assert facts["classes"] == [[1, "stone", 1.0, 0.0], [2, "gold", 2.0, 0.25]]
     assert facts["left"] == 0
+    assert facts["before"] == 1.0, "Blender itself writes nothing"
+    assert facts["asked"] == ["classes"], "one edit for both"
     classes = json.loads((folder / "project.json").read_text())["classes"]
     assert [(c["id"], c["name"], c["priority"]) for c in classes] == [(1, "stone", 4.0), (2, "gilding", 2.0)]
     assert classes[1]["color"] == pytest.approx([1.0, 0.8, 0.0], abs=1e-5)
@@ -112,33 +115,62 @@ answer({"counts": counts, "modifiers": len(obj.modifiers), "groups": len(bpy.dat
 
 
 def test_undo_leaves_the_lists_as_the_project_says(bpy_script, tmp_path):
-    """Undo brings back an edit of a class, in the project too, but not the lists of before a job."""
+    """Undo makes a new edit of the user's edits, and brings back neither the lists of before a job nor what others
+    have changed since."""
     folder = make_project(tmp_path / "capture")
     facts = bpy_script(
         SETUP
+        + ENGINE
         + """
-from fieldwork.addon.project import snapshot as state
+from fieldwork.addon.project import lists
 settings.project = project
-classes = lambda: [c["priority"] for c in json.loads((Path(project) / "project.json").read_text())["classes"]]
+fieldwork_of = lambda: bpy.context.scene.fieldwork
+shown = lambda: [[c.name, round(c.priority, 3)] for c in fieldwork_of().classes]
+def saved():
+    return [[c["name"], c["priority"]] for c in stored(project)["classes"]]
+seen = {}
+def look(name):
+    seen[name] = [shown(), saved(), list(asked)]
+    asked.clear()
 bpy.ops.ed.undo_push(message="project")
-bpy.context.scene.fieldwork.classes[0].priority = 4.0
-state.write_classes()
+fieldwork_of().classes[0].priority = 4.0
+settle()
 bpy.ops.ed.undo_push(message="priority")
-edited = classes()
-# A job adds a photo to the project.
-path = Path(project) / "project.json"
-value = json.loads(path.read_text())
-value["images"].append({"name": "c", "file": "images/c.jpg"})
-path.write_text(json.dumps(value))
-os.utime(path, (1, 1))
-state.refresh(bpy.context.scene.fieldwork)
+look("edited")
+# A job adds a photo; another program gives the other class another priority.
+value = stored(project)
+value["classes"][1]["priority"] = 7.0
+write(project, images=[*value["images"], {"name": "c", "file": "images/c.jpg"}], classes=value["classes"])
+lists.refresh(fieldwork_of())
+look("changed elsewhere")
 bpy.ops.ed.undo()
-now = bpy.context.scene.fieldwork
-answer({"edited": edited, "undone": classes(), "shown": [c.priority for c in now.classes],
-        "images": [i.name for i in now.images]})
+look("undone, not sent")
+images = [i.name for i in fieldwork_of().images]
+settle()
+look("undone")
+bpy.ops.ed.redo()
+settle()
+look("redone")
+# What is edited again elsewhere is not overwritten by an undo of something else.
+value = stored(project)
+value["classes"][0]["priority"] = 9.0
+write(project, classes=value["classes"])
+lists.refresh(fieldwork_of())
+bpy.ops.ed.undo()
+settle()
+look("undone over another's edit")
+answer({"seen": seen, "images": images})
 """,
         project=folder,
     )
-    assert facts["edited"] == [4.0, 2.0]
-    assert facts["undone"] == facts["shown"] == [1.0, 2.0]
+    seen = facts["seen"]
+    start, theirs = ["stone", 1.0], ["gold", 7.0]
+    edited = ["stone", 4.0]
+    assert seen["edited"] == [[edited, ["gold", 2.0]], [edited, ["gold", 2.0]], ["classes"]]
+    assert seen["changed elsewhere"] == [[edited, theirs], [edited, theirs], []]
+    assert seen["undone, not sent"] == [[start, theirs], [edited, theirs], []]
+    assert seen["undone"] == [[start, theirs], [start, theirs], ["classes"]]
+    assert seen["redone"] == [[edited, theirs], [edited, theirs], ["classes"]]
+    other = ["stone", 9.0]
+    assert seen["undone over another's edit"] == [[other, theirs], [other, theirs], []]
     assert facts["images"] == ["a", "b", "c"]

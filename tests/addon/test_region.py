@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import pytest
-from fieldwork.tests.addon.support import SETUP, make_posed_project
+from fieldwork.tests.addon.support import ENGINE, SETUP, make_posed_project
 
 BOX = (
     SETUP
+    + ENGINE
     + """
-from fieldwork.addon.project import region as crop
+from fieldwork.addon.project import region
+def bounds():
+    return stored(project).get("frame", {}).get("bounds")
 settings.project = project
 bpy.ops.fieldwork.crop_add()
-box = crop.find(scene)
+box = region.find(scene)
 """
 )
 
@@ -24,11 +27,11 @@ def test_crop_box_becomes_the_training_region(bpy_script, tmp_path):
 import math
 box.location, box.scale, box.rotation_euler = (1, 2, 3), (1, 2, 0.5), (0, 0, math.pi / 2)
 bpy.ops.fieldwork.crop_apply()
-written = crop.read_bounds(Path(project))
+written = bounds()
 box.scale.z = 0
 flat = attempt(lambda: bpy.ops.fieldwork.crop_apply())
 bpy.ops.fieldwork.crop_remove()
-answer({"written": written, "flat": flat, "after": crop.read_bounds(Path(project)), "box": crop.find(scene) is None})
+answer({"written": written, "flat": flat, "after": bounds(), "box": region.find(scene) is None})
 """,
         project=folder,
     )
@@ -46,7 +49,9 @@ def test_moving_the_region_box_edits_the_training_region(bpy_script, tmp_path):
         + """
 def look():
     bpy.context.view_layer.update()
-    return crop.follow(scene), crop.read_bounds(Path(project))
+    edited = region.follow(scene)
+    settle()
+    return edited, bounds()
 box.location, box.scale = (1, 2, 3), (1, 1, 1)
 seen = [look()]  # still moving, as far as is known
 seen.append(look())
@@ -75,18 +80,17 @@ def test_the_box_goes_where_the_project_says(bpy_script, tmp_path):
 box.location, box.scale = (1, 2, 3), (1, 1, 1)
 def look():
     bpy.context.view_layer.update()
-    written = crop.follow(scene)
+    edited = region.follow(scene)
+    settle()
     bpy.context.view_layer.update()
-    return written, crop.bounds_of(scene, box), crop.read_bounds(Path(project))
+    return edited, region.bounds_of(scene, box), bounds()
 seen = [look(), look()]
-crop.write_bounds(Path(project), [[0, 0, 0], [4, 2, 6]])  # as aligning does
-os.utime(Path(project) / "project.json", (1, 1))
+write(project, frame={"bounds": [[0, 0, 0], [4, 2, 6]]})  # as aligning does
 seen += [look(), look()]
-crop._seen.clear()  # another file is loaded
+region._seen.clear()  # another file is loaded
 box.location.x = 50
 seen += [look(), look()]
-crop.write_bounds(Path(project), None)
-os.utime(Path(project) / "project.json", (2, 2))
+write(project, frame={"bounds": None})
 seen += [look(), look()]
 box.location.x = 7
 seen += [look(), look()]
@@ -100,3 +104,43 @@ answer(seen)
         assert box == moved == project
     assert [project for _, _, project in facts[6:8]] == [None, None], "cleared elsewhere, it stays so"
     assert facts[9][2] == [[5, 0, 0], [9, 2, 6]]
+
+
+def test_undo_of_a_region_is_an_edit_only_where_the_user_had_made_one(bpy_script, tmp_path):
+    folder = make_posed_project(tmp_path / "capture")
+    facts = bpy_script(
+        BOX
+        + """
+box.location, box.scale = (1, 2, 3), (1, 1, 1)
+def look(times=3):
+    for _ in range(times):
+        bpy.context.view_layer.update()
+        region.follow(bpy.context.scene)
+        settle()
+    bpy.context.view_layer.update()
+    box = region.find(bpy.context.scene)
+    return [region.bounds_of(bpy.context.scene, box) if box else None, bounds()]
+seen = {"first": look()}
+bpy.ops.ed.undo_push(message="first")
+region.find(bpy.context.scene).location.x = 5
+seen["second"] = look()
+bpy.ops.ed.undo_push(message="second")
+bpy.ops.ed.undo()
+seen["undone"] = look()
+bpy.ops.ed.redo()
+seen["redone"] = look()
+# Aligning moves the region; undo of something else brings back a box of before.
+write(project, frame={"bounds": [[0, 0, 0], [4, 2, 6]]})
+seen["aligned"] = look()
+asked.clear()
+bpy.ops.ed.undo()
+seen["undone after"] = look()
+answer({"seen": seen, "asked": asked})
+""",
+        project=folder,
+    )
+    first, second, aligned = [[0, 1, 2], [2, 3, 4]], [[4, 1, 2], [6, 3, 4]], [[0, 0, 0], [4, 2, 6]]
+    wanted = {"first": first, "second": second, "undone": first, "redone": second}
+    wanted |= {"aligned": aligned, "undone after": aligned}
+    assert facts["seen"] == {name: [bounds, bounds] for name, bounds in wanted.items()}
+    assert facts["asked"] == [], "nothing was written after the undo"

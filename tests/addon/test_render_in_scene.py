@@ -71,7 +71,8 @@ def test_renders_appear_behind_their_cameras_or_on_planes_once(bpy_script, tmp_p
     facts = bpy_script(
         SETUP
         + """
-from fieldwork.addon.render import result as render_result
+from fieldwork.addon.render import result
+from fieldwork.addon.roles import Owner
 settings.project = project
 files = []
 for name in ("a", "a_depth", "b"):
@@ -86,7 +87,7 @@ for name in "ab":
     cameras[name]["fieldwork_role"], cameras[name]["fieldwork_project"] = f"camera:{name}.jpg", "capture"
     scene.collection.objects.link(cameras[name])
 def show(kind, photos):
-    steps = render_result.show_steps(scene, files, kind, photos, "capture")
+    steps = result.show_steps(scene, files, kind, photos, Owner("capture"))
     while True:
         try:
             next(steps)
@@ -116,11 +117,11 @@ def test_image_plane_covers_exactly_what_the_camera_sees(bpy_script, tmp_path):
         + """
 from bpy_extras.object_utils import world_to_camera_view
 from mathutils import Vector
-from fieldwork.addon.render import result as render_result
+from fieldwork.addon.render import result
 scene.render.resolution_x, scene.render.resolution_y = 200, 100
 scene.camera.data.shift_x = 0.2
 image = bpy.data.images.new("frame", 200, 100)
-render_result.plane(scene, scene.camera, image, 1)
+result.plane(scene, scene.camera, image, 1)
 bpy.context.view_layer.update()
 (empty,) = scene.camera.children
 half = empty.empty_display_size / 2

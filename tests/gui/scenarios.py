@@ -214,12 +214,11 @@ def interruptions(screen):
 
 def preferences(screen):
     """The preferences: without an engine, while it is installed, after a failure."""
-    jobs = screen.module("addon.jobs.queue")
-    prefs = screen.module("addon.machine")
+    machine = screen.module("addon.machine")
     yield from screen.show_sidebar()
     os.environ.pop("FIELDWORK_ENGINE_PYTHON", None)
     screen.shot("no-engine")
-    chosen = prefs.preferences()
+    chosen = machine.preferences()
     bpy.ops.screen.userpref_show("INVOKE_DEFAULT")
     yield 0.5
     bpy.ops.fieldwork.open_preferences()
@@ -229,8 +228,8 @@ def preferences(screen):
     bpy.ops.fieldwork.engine_install()
     yield 1.0
     screen.shot("installing")
-    yield from screen.wait(lambda: not jobs.queue.installer.is_alive(), 120, "installing")
-    screen.facts["failure"] = jobs.queue.installer.error
+    yield from screen.wait(lambda: not screen.queue.installer.is_alive(), 120, "installing")
+    screen.facts["failure"] = screen.queue.installer.error
     yield 0.5
     screen.shot("failed")
     yield from finish(screen)

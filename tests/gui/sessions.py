@@ -116,7 +116,7 @@ def back(screen):
     screen.facts["state"] = followed.state
     settings.run = "main"
     yield 1.0
-    screen.facts["runs"] = screen.module("addon.project.snapshot").runs(screen.folder / "project")
+    screen.facts["runs"] = screen.module("addon.project.runs").runs(screen.folder / "project")
     yield from screen.press_button("fieldwork.use_run", depth=2000)
     screen.facts["used"] = settings.run
     screen.shot("runs")
@@ -161,11 +161,13 @@ def tools(screen):
 
     # The box of the training region is an object like any other.
     bpy.ops.fieldwork.crop_add()
-    crop = screen.module("addon.project.region")
-    box = crop.find(bpy.context.scene)
+    region = screen.module("addon.project.region")
+    box = region.find(bpy.context.scene)
     box.location, box.scale = (1, 0, 1), (2, 2, 1)
+    edits = screen.module("addon.project.edits")
     yield 2.0
-    screen.facts["region"] = crop.read_bounds(screen.folder / "project")
+    yield from screen.wait(lambda: not edits.waiting(), 30, "the engine does not take the region")
+    screen.facts["region"] = region.bounds(screen.folder / "project")
     screen.shot("region")
     bpy.ops.fieldwork.crop_remove()
 

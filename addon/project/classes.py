@@ -1,0 +1,130 @@
+"""The classes of the project in the scene's list, and edits of the list back to the project."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from . import edits, snapshot
+
+VERB = "classes"
+FIELDS = ("name", "color", "priority")
+
+_quiet = False
+# project folder → (class id, field) → value that the user gave it here last
+_given: dict[Path, dict[tuple[int, str], Any]] = {}
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Inside, a changed list is no edit of the user."""
+    global _quiet
+    before, _quiet = _quiet, True
+    try:
+        yield
+    finally:
+        _quiet = before
+
+
+def shown(folder: Path | None) -> list[dict[str, Any]]:
+    """The classes of the project, with the edits that are under way."""
+    return _with_changes(folder, edits.pending(folder, VERB) or {})
+
+
+def fill(settings: Any) -> None:
+    """Let the scene's list show the classes."""
+    folder = snapshot.folder_of(settings)
+    areas = snapshot.last_result(folder, "mesh").get("classes") or {}
+    hidden = {entry.name for entry in settings.classes if not entry.visible}
+    with quiet():
+        settings.classes.clear()
+        for value in shown(folder):
+            entry = settings.classes.add()
+            entry.id, entry.name, entry.color = value["id"], value["name"], value["color"]
+            entry.priority = value["priority"]
+            entry.area = (areas.get(value["name"]) or {}).get("area") or 0.0
+            entry.visible = value["name"] not in hidden
+        settings.class_index = min(settings.class_index, max(0, len(settings.classes) - 1))
+
+
+def edited(settings: Any) -> None:
+    """The user changed the list: the timer takes it to the engine, so that dragging a color is one edit."""
+    folder = snapshot.folder_of(settings)
+    if _quiet or folder is None:
+        return
+    changes = _changes(settings, folder)
+    if changes:
+        _given.setdefault(folder, {}).update(changes)
+        _put(folder, changes)
+
+
+def undone(settings: Any) -> None:
+    """After an undo or redo the list may be an older one.
+
+    A value that the user gave is an edit of his to be undone: a new edit. Any other difference is not his doing, and
+    is put right by `fill`.
+    """
+    folder = snapshot.folder_of(settings)
+    if folder is None:
+        return
+    given = _given.get(folder, {})
+    now = {(value["id"], field): value[field] for value in shown(folder) for field in FIELDS}
+    changes = {
+        key: value for key, value in _changes(settings, folder).items() if key in given and _same(given[key], now[key])
+    }
+    if changes:
+        given.update(changes)
+        _put(folder, changes)
+
+
+def _changes(settings: Any, folder: Path) -> dict[tuple[int, str], Any]:
+    """(class id, field) → value in the scene's list, where it is not what is known of the project."""
+    known = {value["id"]: value for value in shown(folder)}
+    changes: dict[tuple[int, str], Any] = {}
+    for entry in settings.classes:
+        for field in FIELDS if entry.id in known else ():
+            value = getattr(entry, field)
+            value = [round(channel, 6) for channel in value] if field == "color" else value
+            if not _same(value, known[entry.id][field]):
+                changes[entry.id, field] = value
+    return changes
+
+
+def _put(folder: Path, changes: dict[tuple[int, str], Any]) -> None:
+    edits.put(folder, VERB, {**(edits.pending(folder, VERB) or {}), **changes}, _params)
+
+
+def _params(folder: Path, changes: dict[tuple[int, str], Any]) -> dict[str, Any]:
+    """All classes as they shall be: those of the project as it is when the edit is sent, changed."""
+    return {"classes": [{name: value[name] for name in ("id", *FIELDS)} for value in _with_changes(folder, changes)]}
+
+
+def _with_changes(folder: Path | None, changes: dict[tuple[int, str], Any]) -> list[dict[str, Any]]:
+    known = [{"priority": 1.0, **value} for value in (snapshot.project(folder) or {}).get("classes", [])]
+    changed = {field: {number: value for (number, name), value in changes.items() if name == field} for field in FIELDS}
+    return [
+        {**value, **{field: changed[field][value["id"]] for field in FIELDS if value["id"] in changed[field]}}
+        for value in known
+    ]
+
+
+def _same(a: Any, b: Any) -> bool:
+    """Whether values agree, as far as Blender's single precision goes."""
+    if isinstance(a, str):
+        return a == b
+    pairs = zip(a, b) if isinstance(a, (list, tuple)) else [(a, b)]
+    return all(abs(x - y) < 1e-5 * max(1.0, abs(x)) for x, y in pairs)
+
+
+def show(settings: Any) -> None:
+    """Show and hide the classes on the meshes of the project as the list says."""
+    folder = snapshot.folder_of(settings)
+    if _quiet or folder is None:
+        return
+    from ..scene import visibility
+
+    hidden = [entry.id for entry in settings.classes if not entry.visible]
+    for obj in visibility.meshes(snapshot.owner(folder)):
+        visibility.hide_classes(obj, hidden)

@@ -1,0 +1,48 @@
+"""The project in the scene's lists."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from . import classes, snapshot
+
+
+def refresh(settings: Any) -> None:
+    """Bring images and classes of the project into the scene's lists; those of a project that is away stay."""
+    if snapshot.absence(settings):
+        return
+    folder = snapshot.folder_of(settings)
+    project = snapshot.project(folder)
+    settings.project_key = snapshot.owner(folder).key if folder and project else ""
+    report = snapshot.cached_json(folder / snapshot.POSES_REPORT) if folder else None
+    agreement = {image["name"]: image for image in (report or {}).get("images", [])}
+    settings.images.clear()
+    for image in (project or {}).get("images", []):
+        entry = settings.images.add()
+        entry.name = image["name"]
+        entry.file = image.get("file", "")
+        entry.status, entry.reason = image.get("status", "ok"), image.get("reason", "")
+        entry.width, entry.height = image.get("width", 0), image.get("height", 0)
+        entry.sharpness = image.get("sharpness") or 0.0
+        checked = agreement.get(entry.name, {})
+        entry.points = checked.get("points") or 0
+        entry.error_px = checked.get("error_px") or 0.0
+        entry.labelled, entry.masked = bool(image.get("label")), bool(image.get("mask"))
+    settings.image_index = min(settings.image_index, max(0, len(settings.images) - 1))
+    classes.fill(settings)
+
+
+def undone(settings: Any) -> None:
+    """After an undo or redo the lists may be those of before a job: bring them up to date.
+
+    An edit of the classes that was undone is undone in the project too.
+    """
+    if snapshot.has_project(snapshot.folder_of(settings)) and not snapshot.absence(settings):
+        classes.undone(settings)
+        refresh(settings)
+
+
+def other_project(settings: Any) -> None:
+    """Another folder was chosen: what was known of the one before is no more."""
+    settings.project_key = ""
+    refresh(settings)

@@ -126,10 +126,9 @@ class FieldworkScene(PropertyGroup):
         subtype="DIR_PATH",
         update=_project_changed,
     )
-    project_key: StringProperty(
-        name="Project Seen", description="Which project was found in the folder when it was last there",
-        options={"HIDDEN"},
-    )  # fmt: skip
+    project_uuid: StringProperty(
+        name="Project UUID", description="Which project was in the folder when it was last there", options={"HIDDEN"}
+    )
 
     # Capture
     photos: StringProperty(name="Photos", description="Folder of photos, or a video file", subtype="FILE_PATH")

@@ -153,12 +153,15 @@ class VerbOperator(Operator):
     def edits_delivered(self, params: dict[str, Any]) -> bool:
         """Let the engine know of edits before the verb works with them; whether it may go on."""
         deliver_edits()
-        edit = edits.failed()
-        if edit is None or not bpy.app.background:
+        if not bpy.app.background:
             return True
-        own = str(edit.folder) in (params.get("project"), params.get("out"))
-        self.report({"ERROR" if own else "WARNING"}, t("An edit of {} is not saved. {}", edit.folder, str(edit.error)))
-        return not own
+        for edit in edits.failed():
+            own = str(edit.folder) in (params.get("project"), params.get("out"))
+            text = t("An edit of {} is not saved. {}", edit.folder, str(edit.error))
+            self.report({"ERROR" if own else "WARNING"}, text)
+            if own:
+                return False
+        return True
 
     def before(self, context: Context, params: dict[str, Any]) -> Steps | None:
         """Steps in Blender before the verb can start."""
@@ -169,8 +172,8 @@ class VerbOperator(Operator):
         return refresh_scenes
 
 
-class ProjectOperator(VerbOperator):
-    """A verb that works on a project."""
+class WithProject:
+    """What operators that work on a project have: its folder."""
 
     project: StringProperty(
         name="Project", description="Project folder; empty: that of the scene", subtype="DIR_PATH",
@@ -178,10 +181,15 @@ class ProjectOperator(VerbOperator):
     )  # fmt: skip
 
     def project_path(self, context: Context) -> str:
+        """The folder. Raises ValueError with a sentence for the user."""
         folder = absolute(self.project) or absolute(context.scene.fieldwork.project)
         if folder is None:
             raise ValueError(t("Choose a project folder first."))
         return folder
+
+
+class ProjectOperator(WithProject, VerbOperator):
+    """A verb that works on a project."""
 
 
 def deliver_edits() -> None:
@@ -196,7 +204,7 @@ def after_edits(steps: Steps | None) -> Steps | None:
 
     def wait() -> Steps:
         end = time.monotonic() + EDIT_SECONDS
-        while edits.waiting() and edits.failed() is None and time.monotonic() < end:
+        while edits.waiting() and not edits.failed() and time.monotonic() < end:
             yield 0.0, t("saving edits")
             time.sleep(0.005)
         if steps is not None:

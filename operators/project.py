@@ -7,12 +7,13 @@ from pathlib import Path
 import bpy
 from bpy.types import Context, Event, Operator
 
+from ..addon.errors import EngineError
 from ..addon.jobs.queue import queue
 from ..addon.project import edits, lists, snapshot
 from ..addon.props import StringProperty
 from ..addon.roles import Owner
 from ..addon.text import t
-from .base import deliver_edits
+from .base import WithProject, absolute, deliver_edits, refresh_scenes
 
 
 class FIELDWORK_OT_locate_project(Operator):
@@ -45,7 +46,7 @@ class FIELDWORK_OT_locate_project(Operator):
         from ..addon.scene.owned import hand_over  # not at the top: enabling the extension must be quick
 
         old = snapshot.folder_of(settings)
-        hand_over(Owner.of(old, settings.project_key), snapshot.owner(folder))
+        hand_over(Owner(old.name, settings.project_uuid), snapshot.owner(folder))
         edits.move(old, folder)
         settings.project = str(folder)
         return {"FINISHED"}
@@ -53,16 +54,9 @@ class FIELDWORK_OT_locate_project(Operator):
 
 def refusal(settings: bpy.types.PropertyGroup, folder: Path) -> str | None:
     """Why a folder does not hold the project that the scene knows, as a sentence; None when it does."""
-    project = snapshot.project(folder)
-    if project is None:
+    if snapshot.project(folder) is None:
         return t("There is no project in {}: choose the folder that holds its project.json.", folder)
-    if Path(settings.project_key).is_absolute():
-        # It had no UUID when it was seen last: it is known by its photos.
-        known = {image.name for image in settings.images}
-        same = not known or any(image["name"] in known for image in project.get("images", []))
-    else:
-        same = snapshot.owner(folder).known_as(settings.project_key)
-    if same:
+    if snapshot.owner(folder).uuid == settings.project_uuid:
         return None
     return t(
         "{} holds another project. To go on with that one, choose its folder in the field Project.",
@@ -85,9 +79,40 @@ class FIELDWORK_OT_save_edits(Operator):
 
     def execute(self, context: Context) -> set[str]:
         deliver_edits()
-        edit = edits.failed()
-        if edit is not None and edit.error is not None:
+        for edit in edits.failed():
             self.report({"ERROR"}, str(edit.error))
+        return {"CANCELLED"} if edits.failed() else {"FINISHED"}
+
+
+class FIELDWORK_OT_classes_apply(WithProject, Operator):
+    """Replace the classes of the project by those of a file"""
+
+    bl_idname = "fieldwork.classes_apply"
+    bl_label = "Classes from File"
+
+    file: StringProperty(
+        name="File", description="classes.json with all classes the project shall have", subtype="FILE_PATH",
+        options={"SKIP_SAVE"},
+    )  # fmt: skip
+
+    def execute(self, context: Context) -> set[str]:
+        try:
+            folder = self.project_path(context)
+        except ValueError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        if not self.file:
+            self.report({"ERROR"}, t("Choose a file of classes."))
+            return {"CANCELLED"}
+        job = queue.make("classes", {"project": folder, "file": absolute(self.file)}, refresh_scenes)
+        deliver_edits()  # those of before come first
+        try:
+            ask = queue.ask_and_wait if bpy.app.background else queue.ask
+            ask(job.verb, job.params, lambda result, error: queue.finish(job, result, error))
+        except EngineError as error:
+            queue.finish(job, None, error)
+        if job.error is not None:
+            self.report({"ERROR"}, str(job.error))
             return {"CANCELLED"}
         return {"FINISHED"}
 
@@ -100,7 +125,7 @@ class FIELDWORK_OT_discard_edits(Operator):
 
     @classmethod
     def poll(cls, context: Context) -> bool:
-        if edits.failed() is None:
+        if not edits.failed():
             cls.poll_message_set(t("All edits are saved"))
             return False
         return True
@@ -113,4 +138,9 @@ class FIELDWORK_OT_discard_edits(Operator):
         return {"FINISHED"}
 
 
-CLASSES = [FIELDWORK_OT_locate_project, FIELDWORK_OT_save_edits, FIELDWORK_OT_discard_edits]
+CLASSES = [
+    FIELDWORK_OT_locate_project,
+    FIELDWORK_OT_save_edits,
+    FIELDWORK_OT_discard_edits,
+    FIELDWORK_OT_classes_apply,
+]

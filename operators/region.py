@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import bpy
 from bpy.types import Context, Operator
 from mathutils import Vector
@@ -10,7 +12,7 @@ from ..addon.project import edits, region, snapshot
 from ..addon.roles import ROLE
 from ..addon.scene.frame import scene_from_capture
 from ..addon.text import t
-from .base import deliver_edits, need_poses
+from .base import WithProject, deliver_edits, need_poses
 
 
 class FIELDWORK_OT_crop_add(Operator):
@@ -37,7 +39,7 @@ class FIELDWORK_OT_crop_add(Operator):
         return {"FINISHED"}
 
 
-class FIELDWORK_OT_crop_apply(Operator):
+class FIELDWORK_OT_crop_apply(WithProject, Operator):
     """Train only what lies inside the box, from the next training on; in a window that goes without saying"""
 
     bl_idname = "fieldwork.crop_apply"
@@ -45,6 +47,9 @@ class FIELDWORK_OT_crop_apply(Operator):
 
     @classmethod
     def poll(cls, context: Context) -> bool:
+        # Without a window the caller may give the project as an argument, which poll cannot see.
+        if bpy.app.background:
+            return True
         reason = need_poses(context) or (None if region.find(context.scene) else t("Add a region box first"))
         if reason:
             cls.poll_message_set(reason)
@@ -52,9 +57,12 @@ class FIELDWORK_OT_crop_apply(Operator):
 
     def execute(self, context: Context) -> set[str]:
         context.view_layer.update()
+        box = region.find(context.scene)
         try:
-            bounds = region.bounds_of(context.scene, region.find(context.scene))
-            region.edit(snapshot.folder_of(context.scene.fieldwork), bounds)
+            folder = Path(self.project_path(context))
+            if box is None:
+                raise ValueError(t("Add a region box first."))
+            region.edit(folder, region.bounds_of(context.scene, box, folder))
         except ValueError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
@@ -91,11 +99,10 @@ class FIELDWORK_OT_crop_remove(Operator):
 def delivered(operator: Operator) -> bool:
     """Hand the region to the engine; without a window, whether it has taken it. Its refusal is reported."""
     deliver_edits()
-    edit = edits.failed()
-    if edit is None or not bpy.app.background:
-        return True
-    operator.report({"ERROR"}, str(edit.error))
-    return False
+    wrong = [edit for edit in edits.failed() if edit.verb == region.VERB] if bpy.app.background else []
+    for edit in wrong:
+        operator.report({"ERROR"}, str(edit.error))
+    return not wrong
 
 
 def default_bounds(scene: bpy.types.Scene) -> list[list[float]]:

@@ -81,9 +81,8 @@ def import_steps(job: Job, cameras: str, scene: bpy.types.Scene) -> Steps:
     from ..addon.scene import build
     from ..addon.scene.frame import root_of
 
-    owner = snapshot.owner(job.project)
-    first = root_of(scene, owner) is None
-    imported = yield from build.import_steps(scene, build.load(job.result["folder"]), cameras, owner)
+    first = root_of(scene, snapshot.owner(job.project)) is None
+    imported = yield from build.import_steps(scene, build.load(job.result["folder"]), cameras)
     job.warnings += imported.warnings
     classes.show(scene.fieldwork)
     if first:

@@ -62,9 +62,9 @@ class FIELDWORK_PT_main(FieldworkPanel):
             note = layout.row()
             note.active = False
             note.label(text=t("New project"))
-        edit = edits.failed()
-        if edit is not None:
-            draw_edit(layout, context, edit)
+        failed = edits.failed()
+        if failed:
+            draw_edits(layout, context, failed)
         job = queue.current
         if job is not None:
             draw_job(layout, job)
@@ -88,14 +88,16 @@ class FIELDWORK_PT_main(FieldworkPanel):
                 button.resume = True
 
 
-def draw_edit(layout: UILayout, context: Context, edit: edits.Edit) -> None:
-    """An edit that the engine could not take: why, and what to do."""
+def draw_edits(layout: UILayout, context: Context, failed: list[edits.Edit]) -> None:
+    """Edits that the engine could not take: why, and what to do."""
     texts = {
-        "classes": t("The edited classes of “{}” are not saved yet.", edit.folder.name),
-        "region": t("The training region of “{}” is not saved yet.", edit.folder.name),
+        "classes": t("The edited classes of “{}” are not saved yet."),
+        "region": t("The training region of “{}” is not saved yet."),
     }
     box = layout.box()
-    draw_wrapped(box, f"{texts[edit.verb]} {edit.error}", text_width(context) - 4, icon="ERROR")
+    for edit in failed:
+        text = f"{texts[edit.verb].format(edit.folder.name)} {edit.error}"
+        draw_wrapped(box, text, text_width(context) - 4, icon="ERROR")
     row = box.row()
     row.operator("fieldwork.save_edits", text=t("Try Again"))
     row.operator("fieldwork.discard_edits", text=t("Discard"))

@@ -36,6 +36,7 @@ TITLES = {
     "dataset": "Photographing the Scene",
     "package": "Preparing the Scene",
     "doctor": "Checking the Engine",
+    "classes": "Reading Classes",
 }
 
 

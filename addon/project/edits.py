@@ -62,9 +62,9 @@ def pending(folder: Path | None, verb: str) -> dict[Any, Any] | None:
     return edit.values if edit else None
 
 
-def failed() -> Edit | None:
-    """An edit that the engine could not take."""
-    return next((edit for edit in _pending.values() if edit.error is not None), None)
+def failed() -> list[Edit]:
+    """The edits that the engine could not take."""
+    return [edit for edit in _pending.values() if edit.error is not None]
 
 
 def waiting() -> bool:

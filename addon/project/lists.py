@@ -13,7 +13,7 @@ def refresh(settings: Any) -> None:
         return
     folder = snapshot.folder_of(settings)
     project = snapshot.project(folder)
-    settings.project_key = snapshot.owner(folder).key if folder and project else ""
+    settings.project_uuid = snapshot.owner(folder).uuid if folder else ""
     report = snapshot.cached_json(folder / snapshot.POSES_REPORT) if folder else None
     agreement = {image["name"]: image for image in (report or {}).get("images", [])}
     settings.images.clear()
@@ -44,5 +44,5 @@ def undone(settings: Any) -> None:
 
 def other_project(settings: Any) -> None:
     """Another folder was chosen: what was known of the one before is no more."""
-    settings.project_key = ""
+    settings.project_uuid = ""
     refresh(settings)

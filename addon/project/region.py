@@ -92,9 +92,10 @@ def add(scene: bpy.types.Scene, wanted: Bounds) -> bpy.types.Object:
     return box
 
 
-def bounds_of(scene: bpy.types.Scene, box: bpy.types.Object) -> Bounds:
-    """Axis-aligned bounds [min, max] of the box in the capture's frame, also of a rotated one."""
-    folder = snapshot.folder_of(scene.fieldwork)
+def bounds_of(scene: bpy.types.Scene, box: bpy.types.Object, folder: Path | None = None) -> Bounds:
+    """Axis-aligned bounds [min, max] of the box in the frame of the capture (None: of the scene's), also of a rotated
+    one."""
+    folder = folder or snapshot.folder_of(scene.fieldwork)
     capture_from_scene = scene_from_capture(scene, snapshot.owner(folder) if folder else None).inverted_safe()
     matrix = capture_from_scene @ box.matrix_world
     corners = [matrix @ (corner * box.empty_display_size) for corner in CORNERS]

@@ -55,7 +55,10 @@ def project(folder: Path | None) -> dict[str, Any] | None:
 
 def owner(folder: Path) -> Owner:
     """The project as scenes know it."""
-    return Owner.of(folder, (project(folder) or {}).get("uuid") or "")
+    from ...nerfcore.project.migrate import migrated  # not at the top: enabling the extension must be quick
+
+    known = project(folder)
+    return Owner(folder.name, migrated(known)["uuid"] if known else "")
 
 
 def has_project(folder: Path | None) -> bool:
@@ -81,12 +84,10 @@ def absence(settings: Any) -> str | None:
     """Why the project that the scene knows cannot be had at its folder, as a sentence; None when it can, or when the
     scene has not seen one there."""
     folder = folder_of(settings)
-    if folder is None or not settings.project_key:
+    if folder is None or not settings.project_uuid:
         return None
     if not has_project(folder):
         return t("The project is not at {}: it was moved, or its disk is not connected.", folder)
-    found = owner(folder)
-    # The key is a path where the project had no UUID when it was last seen.
-    if found.uuid and not found.known_as(settings.project_key) and not Path(settings.project_key).is_absolute():
+    if owner(folder).uuid not in ("", settings.project_uuid):
         return t("{} holds another project than the scene knows.", folder)
     return None

@@ -79,19 +79,15 @@ def load(folder: Path | str, split: bool = False) -> Callable[[], tuple[Package,
 
 
 def import_steps(
-    scene: bpy.types.Scene,
-    read: Callable[[], tuple[Package, list[Part]]],
-    cameras: Cameras = "both",
-    owner: Owner | None = None,
+    scene: bpy.types.Scene, read: Callable[[], tuple[Package, list[Part]]], cameras: Cameras = "both"
 ) -> Steps:
     """`import_package` step by step; `read` is called in a thread. Returns Imported.
 
-    `owner`: the project as the caller knows it; None: as the package says.
     Raises:
         PackageError: the package cannot be read.
     """
     package, pieces = yield from _in_thread(read)
-    owned = Owned(scene, owner or Owner(package.name, package.uuid))
+    owned = Owned(scene, Owner(package.name, package.uuid))
     root = owned.object("root", f"Fieldwork · {package.name}", None)
     root.empty_display_size = 0.2
     if root.scale == Vector((1.0, 1.0, 1.0)):

@@ -1,6 +1,6 @@
 """The package: what Blender needs of a capture, readable with numpy and JSON alone.
 
-package.json        name, classes, cameras (camera-to-world in the world frame, OpenGL axes), settings
+package.json        name and UUID of the project, classes, cameras (camera-to-world in the world frame, OpenGL axes)
 renders/            rendered photos, without lens distortion too, where there are any
 images/             the photos without lens distortion, in the size of their camera
 points.npz          xyz (N, 3) float32 world, rgb (N, 3) uint8 sRGB
@@ -27,6 +27,7 @@ from ..files import atomic_path, disk_errors, write_json
 from ..geometry.cameras import Camera, flip_camera_axes, pixel_centers, project, rays
 from ..params import PackageParams
 from ..progress import Reporter
+from ..project.store import is_project, load_project
 
 FORMAT, VERSION = "fieldwork-package", 1
 MESH_ARRAYS = ("vertices", "faces", "colors", "class_id", "face_class")
@@ -85,6 +86,7 @@ def write_package(
             "format": FORMAT,
             "version": VERSION,
             "name": name,
+            "uuid": load_project(project).uuid if is_project(project) else "",
             "run": run,
             "frame": "world",
             "ignore_id": scene.ignore_id,

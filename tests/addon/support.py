@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import uuid
 
 SETUP = """
 import fieldwork
@@ -47,7 +48,8 @@ def make_project(folder, **more):
     folder.mkdir(parents=True, exist_ok=True)
     project = {
         "format": "fieldwork-project",
-        "version": 1,
+        "version": 2,
+        "uuid": uuid.uuid4().hex,
         "images": [
             {"name": "a", "file": "images/a.jpg", "width": 640, "height": 480, "label": "labels/a.png"},
             {"name": "b", "file": "", "status": "rejected", "reason": "It is blurred."},

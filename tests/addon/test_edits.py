@@ -96,7 +96,7 @@ def test_what_cannot_be_taken_is_told_kept_and_sent_again(project, clock):
 
     put(project, 2.0)
     edits.send(missing)
-    assert "not installed" in str(edits.failed().error)
+    assert "not installed" in str(edits.failed()[0].error)
     assert priorities(project) == [2.0, 2.0]
     engine = Engine()
     edits.send(engine.ask)
@@ -104,11 +104,11 @@ def test_what_cannot_be_taken_is_told_kept_and_sent_again(project, clock):
     clock.seconds += edits.RETRY
     edits.send(engine.ask)
     engine.answer(EngineError("died", "The engine stopped unexpectedly."))
-    assert "unexpectedly" in str(edits.failed().error)
+    assert "unexpectedly" in str(edits.failed()[0].error)
     edits.send(engine.ask, at_once=True)
     engine.answer()
     assert not edits.waiting()
-    assert edits.failed() is None
+    assert edits.failed() == []
     assert snapshot.project(project)["classes"][0]["priority"] == 2.0
 
 
@@ -131,7 +131,7 @@ def test_an_unplugged_project_keeps_its_edit(project, clock):
     project.rename(away)
     edits.send(engine.ask)
     assert engine.requests == []
-    assert str(project) in str(edits.failed().error)
+    assert str(project) in str(edits.failed()[0].error)
     edits.move(project, away)
     edits.send(engine.ask)
     engine.answer()

@@ -143,8 +143,11 @@ RENAMED = {
     ("dataset", "blend"): None,  # the file that is open
     ("dataset", "path"): "path_kind",
     ("dataset", "center"): "around",
+    ("classes", "classes"): None,  # those of the list in the scene
+    ("region", "bounds"): None,  # those of the box in the scene
+    ("region", "clear"): None,  # crop_remove
 }
-OPERATORS = {"import": "import_dataset", "package": "import_scene"}
+OPERATORS = {"import": "import_dataset", "package": "import_scene", "classes": "classes_apply", "region": "crop_apply"}
 
 
 def test_every_verb_with_every_setting_is_an_operator(bpy_script):

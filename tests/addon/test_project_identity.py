@@ -1,0 +1,226 @@
+"""A scene knows its project by its UUID: not by the name of the folder, and wherever the folder is."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+from fieldwork.tests.addon.support import ENGINE, SETUP, make_posed_project, make_project
+from fieldwork.tests.addon.test_mesh_import import make_package
+
+IMPORT = """
+from fieldwork.addon.roles import Owner
+from fieldwork.addon.scene.build import import_package
+from fieldwork.addon.scene.package import read_package
+def package_of(project):
+    folder = Path(package)
+    value = json.loads((folder / "package.json").read_text())
+    uuid = json.loads((Path(project) / "project.json").read_text()).get("uuid", "")
+    (folder / "package.json").write_text(json.dumps(value | {"name": Path(project).name, "uuid": uuid}))
+    return read_package(folder)
+def roles(uuid):
+    return sorted(o["fieldwork_role"] for o in bpy.data.objects if o.get("fieldwork_uuid") == uuid)
+"""
+
+
+def uuid_of(folder):
+    return json.loads((folder / "project.json").read_text())["uuid"]
+
+
+def test_projects_whose_folders_have_one_name_stay_apart(bpy_script, tmp_path):
+    one, two = make_posed_project(tmp_path / "a/capture"), make_posed_project(tmp_path / "b/capture")
+    facts = bpy_script(
+        SETUP
+        + IMPORT
+        + """
+from fieldwork.addon.project import snapshot
+from fieldwork.addon.scene.frame import root_of
+first = import_package(scene, package_of(one))
+second = import_package(scene, package_of(two))
+again = import_package(scene, package_of(one))
+materials = [[m.name for m in result.meshes[0].data.materials] for result in (again, second)]
+settings.project = one
+settings.classes[0].visible = False
+owners = [snapshot.owner(Path(folder)) for folder in (one, two)]
+answer({
+    "apart": not {o.name for o in first.objects()} & {o.name for o in second.objects()},
+    "same": {o.name for o in first.objects()} == {o.name for o in again.objects()},
+    "roots": [root_of(scene, owner).name for owner in owners],
+    "materials": materials,
+    "groups": [{m.node_tree.nodes[0].node_tree.name for m in r.meshes[0].data.materials}.pop() for r in (again, second)],
+    "hidden": [len(result.meshes[0].modifiers) for result in (again, second)],
+    "collections": sorted(c.name for c in scene.collection.children if "fieldwork_uuid" in c),
+})
+""",
+        one=one,
+        two=two,
+        package=make_package(tmp_path / "package", 4, cameras=2, points=10),
+    )
+    assert facts["apart"]
+    assert facts["same"]
+    assert facts["roots"] == ["Fieldwork · capture", "Fieldwork · capture.001"]
+    assert facts["collections"] == facts["roots"]
+    assert not set(facts["materials"][0]) & set(facts["materials"][1])
+    assert facts["groups"][0] != facts["groups"][1]
+    assert facts["hidden"] == [1, 0]
+
+
+def test_a_scene_of_the_first_version_is_gone_on_with(bpy_script, tmp_path):
+    """It knows objects by the name of the project's folder, materials and groups by their own names."""
+    project = make_posed_project(tmp_path / "capture")
+    facts = bpy_script(
+        SETUP
+        + IMPORT
+        + """
+from fieldwork.addon.project import snapshot
+from fieldwork.addon.scene import visibility
+from fieldwork.addon.scene.frame import root_of
+old = import_package(scene, package_of(project))
+for items in (bpy.data.objects, bpy.data.collections, bpy.data.materials, bpy.data.node_groups):
+    for item in items:
+        if "fieldwork_uuid" in item:
+            del item["fieldwork_uuid"]
+            if items in (bpy.data.materials, bpy.data.node_groups):
+                del item["fieldwork_role"], item["fieldwork_project"]
+bpy.ops.wm.save_as_mainfile(filepath=blend)
+bpy.ops.wm.open_mainfile(filepath=blend)
+before = {name: sorted(getattr(bpy.data, name).keys()) for name in ("objects", "collections", "materials", "node_groups")}
+scene = bpy.context.scene
+scene.fieldwork.project = project
+owner = snapshot.owner(Path(project))
+known = [root_of(scene, owner).name, len(visibility.meshes(owner))]
+new = import_package(scene, package_of(project))
+after = {name: sorted(getattr(bpy.data, name).keys()) for name in before}
+answer({"before": before, "after": after, "known": known, "roles": roles(owner.uuid)})
+""",
+        project=project,
+        blend=tmp_path / "old.blend",
+        package=make_package(tmp_path / "package", 4, cameras=2, points=10),
+    )
+    assert facts["known"] == ["Fieldwork · capture", 1]
+    assert facts["after"] == facts["before"], "nothing is there twice"
+    assert facts["roles"] == ["camera path", "camera:view_000", "camera:view_001", "mesh", "points", "root"]
+
+
+def test_a_project_of_the_first_version_is_known_by_the_uuid_it_will_have(bpy_script, tmp_path):
+    from fieldwork.nerfcore.project.store import edit_project
+
+    folder = make_project(tmp_path / "capture")
+    value = json.loads((folder / "project.json").read_text())
+    del value["uuid"]
+    (folder / "project.json").write_text(json.dumps({**value, "version": 1, "created": "2026-11-01T10:00:00"}))
+    code = SETUP + "settings.project = project\nanswer(settings.project_uuid)"
+    seen = bpy_script(code, project=folder)
+    with edit_project(folder) as project:
+        project.ignore_id = 0
+    assert seen == uuid_of(folder) == bpy_script(code, project=folder)
+
+
+def test_a_project_that_is_away_is_told_and_found_again(bpy_script, tmp_path):
+    project, other = make_posed_project(tmp_path / "capture"), make_project(tmp_path / "other")
+    facts = bpy_script(
+        SETUP
+        + ENGINE
+        + IMPORT
+        + """
+import shutil
+from fieldwork.addon.jobs.timer import _file_loaded
+from fieldwork.addon.project import snapshot
+from fieldwork.addon.scene.frame import root_of
+from fieldwork.panels.main import next_step
+settings.project = project
+seen = {"there": snapshot.absence(settings)}
+import_package(scene, package_of(project))
+for item in bpy.data.objects:
+    if item.get("fieldwork_role") == "points":
+        del item["fieldwork_uuid"]  # of before projects had one
+settings.classes[0].name = "marble"
+shutil.move(project, moved)
+_file_loaded()
+seen["gone"] = snapshot.absence(settings)
+seen["lists"] = [len(settings.images), len(settings.classes)]
+seen["reasons"] = [getattr(bpy.types, f"FIELDWORK_OT_{name}").reason(bpy.context) for name in ("poses", "train")]
+seen["step"] = next_step(bpy.context).operator
+seen["none"] = attempt(lambda: bpy.ops.fieldwork.locate_project(directory=str(Path(moved).parent)))
+seen["other"] = attempt(lambda: bpy.ops.fieldwork.locate_project(directory=other))
+shutil.copytree(other, project)
+seen["replaced"] = snapshot.absence(settings)
+seen["found"] = attempt(lambda: bpy.ops.fieldwork.locate_project(directory=moved))
+seen["after"] = [settings.project, snapshot.absence(settings), [c.name for c in settings.classes]]
+bpy.ops.fieldwork.save_edits()
+seen["saved"] = stored(moved)["classes"][0]["name"]
+owner = snapshot.owner(Path(moved))
+seen["root"] = root_of(scene, owner).name
+seen["points"] = [owner.owns(o) for o in bpy.data.objects if o.get("fieldwork_role") == "points"]
+settings.project = other
+seen["chosen"] = snapshot.absence(settings)
+answer(seen)
+""",
+        project=project,
+        moved=tmp_path / "elsewhere" / "vase",
+        other=other,
+        package=make_package(tmp_path / "package", 4, cameras=2, points=10),
+    )
+    assert facts["there"] is None
+    assert str(project) in facts["gone"]
+    assert "moved" in facts["gone"]
+    assert facts["lists"] == [2, 2], "what is known of it stays"
+    assert facts["reasons"] == [facts["gone"]] * 2
+    assert facts["step"] == "fieldwork.locate_project"
+    assert "There is no project" in facts["none"]
+    assert "holds another project" in facts["other"]
+    assert "another project" in facts["replaced"]
+    assert facts["found"] == ["FINISHED"]
+    assert facts["after"] == [str(tmp_path / "elsewhere/vase"), None, ["marble", "gold"]]
+    assert facts["saved"] == "marble"
+    assert facts["root"] == "Fieldwork · capture"
+    assert facts["points"] == [True]
+    assert facts["chosen"] is None
+    shutil.rmtree(tmp_path / "elsewhere")
+
+
+def test_edits_without_a_window_wait_for_the_engine(bpy_script, tmp_path):
+    """The engine itself writes; what it refuses is an error and stays until it is discarded."""
+    project = make_posed_project(tmp_path / "capture")
+    (tmp_path / "classes.json").write_text(json.dumps({"classes": {"1": "stone", "7": "wood"}}))
+    facts = bpy_script(
+        SETUP
+        + """
+from fieldwork.addon.project import edits
+from fieldwork.addon.jobs.queue import queue
+stored = lambda: json.loads((Path(project) / "project.json").read_text())
+settings.project = project
+settings.classes[0].name, settings.classes[0].priority = "marble", 3.0
+bpy.ops.fieldwork.save_edits()
+seen = {"saved": [[c["name"], c["priority"]] for c in stored()["classes"]], "waiting": edits.waiting()}
+settings.classes[0].name = "gold"
+seen["refused"] = attempt(lambda: bpy.ops.fieldwork.save_edits())
+seen["verb"] = attempt(lambda: bpy.ops.fieldwork.train())
+seen["shown"] = [c.name for c in settings.classes]
+bpy.ops.fieldwork.discard_edits()
+seen["discarded"] = [c.name for c in settings.classes]
+bpy.ops.fieldwork.crop_add()
+settings.region_box.location, settings.region_box.scale = (1, 2, 3), (1, 1, 1)
+bpy.ops.fieldwork.crop_apply()
+seen["region"] = stored()["frame"]["bounds"]
+bpy.ops.fieldwork.crop_remove()
+seen["cleared"] = stored()["frame"]["bounds"]
+bpy.ops.fieldwork.classes_apply(file=classes)
+seen["from file"] = [[c.id, c.name] for c in settings.classes]
+seen["no file"] = attempt(lambda: bpy.ops.fieldwork.classes_apply(file=classes + "x"))
+queue.stop_engine(timeout=5.0)
+answer(seen)
+""",
+        project=project,
+        classes=tmp_path / "classes.json",
+    )
+    assert facts["saved"] == [["marble", 3.0], ["gold", 2.0]]
+    assert not facts["waiting"]
+    assert "gold" in facts["refused"]
+    assert "not saved" in facts["verb"]
+    assert facts["shown"] == ["gold", "gold"]
+    assert facts["discarded"] == ["marble", "gold"]
+    assert facts["region"] == [[0, 1, 2], [2, 3, 4]]
+    assert facts["cleared"] is None
+    assert facts["from file"] == [[1, "stone"], [7, "wood"]]
+    assert "classes.jsonx" in facts["no file"]

@@ -38,6 +38,12 @@ class SceneConfig(Stage):
         description="colour behind the field; auto: black or white where an object is photographed in front of that, else random",
     )
     margin: float = Field(default=1.05, gt=0, description="size of the box relative to what must fit in")
+    photo_memory: float | None = Field(
+        default=None,
+        ge=0,
+        description="GB of the device's memory for the training photos; larger ones stay in the host's memory, and lenses "
+        "are inverted for each batch; null: half of what is free",
+    )
 
 
 class FieldConfig(Stage):

@@ -1,7 +1,8 @@
-"""Training pixels of all photos, resident on the device as bytes, and the rays through them."""
+"""Training pixels of all photos as bytes, on the device or beside it, and the rays through them."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -21,6 +22,11 @@ def training_size(camera: Camera, longest: int) -> tuple[int, int]:
     """Width and height of an image limited to `longest` pixels a side, aspect kept."""
     scale = min(1.0, longest / max(camera.width, camera.height))
     return max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
+
+
+def home_of(size: int, budget: float, device: torch.device) -> torch.device:
+    """Where photos of `size` bytes stay: on the device if they are within the budget, else with the host."""
+    return device if size <= budget else torch.device("cpu")
 
 
 @dataclass(frozen=True)
@@ -51,7 +57,9 @@ class Batch:
 class PixelStore:
     """Photos, labels and masks of some views as flat byte tensors.
 
-    rgba (P, 4) uint8; label (P,) uint8 class index (VOID where unlabelled); first (V+1,) int64 first pixel of a view.
+    rgba (P, 4) uint8; label (P,) uint8 class index (VOID where unlabelled); usable: int64 positions of the pixels that
+    count, None where all do; first (V+1,) int64 first pixel of a view. All but `first` are at `home`: the device, or
+    the host's memory where they are larger than `budget` bytes; `at` reads them wherever they are.
 
     Args:
         scene: posed views in the world frame.
@@ -59,6 +67,7 @@ class PixelStore:
         class_ids: class id of each class index.
         box_from_world: similarity (4, 4) into the normalised frame.
         longest: limit of the image side in pixels.
+        budget: bytes on the device for the photos, and for what tells their rays.
     """
 
     def __init__(
@@ -70,6 +79,7 @@ class PixelStore:
         longest: int,
         device: torch.device,
         report: Reporter,
+        budget: float = math.inf,
     ) -> None:
         self.views = [scene.views[i] for i in indices]
         self.device = device
@@ -103,21 +113,31 @@ class PixelStore:
             labels.append(torch.from_numpy(label).reshape(-1))
             usable.append(torch.from_numpy(keep).reshape(-1))
         self.cameras = cameras
-        self.rgba = torch.cat(colours).to(device)
-        self.label = torch.cat(labels).to(device)
+        keep = torch.cat(usable)
         known = any(view.confidence is not None for view in self.views)
-        self.confidence = torch.cat(sure).to(device) if known else None
+        size = len(keep) * (5 + known + (0 if bool(keep.all()) else 8))
+        self.home = home_of(size, budget, device)
+        left = budget - size if size <= budget else budget
+        self.rgba = self._keep(torch.cat(colours))
+        self.label = self._keep(torch.cat(labels))
+        self.confidence = self._keep(torch.cat(sure)) if known else None
         sizes = torch.tensor([c.width * c.height for c in cameras])
         self.first = torch.cat([torch.zeros(1, dtype=torch.long), sizes.cumsum(0)]).to(device)
-        self.rays = CameraRays(cameras, box_poses(self.views, box_from_world), device)
-        keep = torch.cat(usable)
-        if self.rays.table is not None:
-            everywhere = torch.arange(len(keep))
-            image = torch.bucketize(everywhere, self.first[1:].cpu(), right=True).to(device)
-            directions = self.rays.camera_directions(image, everywhere.to(device) - self.first[image])
-            keep &= ~directions[:, 0].isnan().cpu()
-        # Positions of the pixels that count, only where not all do.
-        self.usable = None if bool(keep.all()) else keep.nonzero()[:, 0].to(device)
+        self.rays = CameraRays(cameras, box_poses(self.views, box_from_world), device, left)
+        for number in range(len(self.rays.distinct)):
+            report.check()
+            sees = ~self.rays.lens_directions(number)[:, 0].isnan().cpu()
+            for view in (self.rays.number == number).nonzero()[:, 0].tolist() if not bool(sees.all()) else []:
+                keep[int(self.first[view]) : int(self.first[view + 1])] &= sees
+        self.usable = None if bool(keep.all()) else self._keep(keep.nonzero()[:, 0])
+
+    def _keep(self, values: torch.Tensor) -> torch.Tensor:
+        """Values of pixels where they stay: on the device, or in memory that it copies from quickly."""
+        return values.to(self.home) if self.home == self.device or self.device.type != "cuda" else values.pin_memory()
+
+    def at(self, values: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
+        """`values` that are at `home`, at `places` (N,) int64 on the device: on the device."""
+        return values[places.to(values.device)].to(places.device)
 
     def __len__(self) -> int:
         return len(self.rgba)
@@ -127,9 +147,14 @@ class PixelStore:
         image = torch.bucketize(places, self.first[1:], right=True)
         pixel = places - self.first[image]
         origins, directions = self.rays(image, pixel)
-        value = self.rgba[places].float() / 255
-        sure = torch.ones_like(value[:, 3]) if self.confidence is None else self.confidence[places].float() / 255
-        rgb, alpha, label = value[:, :3], value[:, 3], self.label[places].long()
+        here = places.to(self.home)  # once: the host waits for it where the photos are there
+
+        def read(values: torch.Tensor) -> torch.Tensor:
+            return values[here].to(self.device)
+
+        value = read(self.rgba).float() / 255
+        sure = torch.ones_like(value[:, 3]) if self.confidence is None else read(self.confidence).float() / 255
+        rgb, alpha, label = value[:, :3], value[:, 3], read(self.label).long()
         return Batch(origins, directions, rgb, alpha, label, image, pixel, sure, torch.ones_like(sure))
 
     def labelled_share(self) -> float:
@@ -143,4 +168,4 @@ class PixelStore:
         """`count` flat positions of usable pixels, with repetition."""
         total = len(self) if self.usable is None else len(self.usable)
         chosen = torch.randint(0, total, (count,), device=self.device, generator=generator)
-        return chosen if self.usable is None else self.usable[chosen]
+        return chosen if self.usable is None else self.at(self.usable, chosen)

@@ -17,6 +17,7 @@ from ..field.blend import RESOLUTION
 from ..geometry.frames import focus_point
 from ..geometry.similarity import transform_points
 from ..images.working import read_label, read_photo
+from ..kernels.device import free_memory
 from ..progress import Reporter
 from ..project.store import load_project, load_visibility, world_from_sfm
 from ..render.run import CPU_IMAGE_SIZE, GPU_IMAGE_SIZE, RunInfo, new_model
@@ -128,7 +129,13 @@ def make_trainer(project_folder: Path, info: RunInfo, scene: Scene, device: torc
         info.image_size,
         device,
         report,
+        photo_budget(config, device),
     )
+    if store.home != device:
+        report.warn(
+            f"{len(store) / 1e6:.0f} million pixels are more than the device's memory has room for "
+            "(scene.photo_memory): they stay in the host's memory, which takes longer."
+        )
     degrade(store, config)
     counts, nearest = seen_cells(scene, trained, box, device)
     model = new_model(info, device, _refined(counts > 0, config.sampling.resolution).cpu())
@@ -143,6 +150,12 @@ def make_trainer(project_folder: Path, info: RunInfo, scene: Scene, device: torc
         if not len(trainer.depths):
             report.warn("loss.depth_weight has no effect: the project has neither depth maps nor points of its views.")
     return trainer
+
+
+def photo_budget(config: RunConfig, device: torch.device) -> float:
+    """Bytes of the device's memory that the training photos may take."""
+    given = config.scene.photo_memory
+    return free_memory(device) / 2 if given is None else given * 1e9
 
 
 def seen_cells(scene: Scene, trained: list[int], box: Box, device: torch.device) -> tuple[torch.Tensor, float]:
@@ -178,7 +191,7 @@ def degrade(store: PixelStore, config: RunConfig) -> None:
     if t.noise > 0:
         noise = torch.randn(len(store), 3, generator=generator) * (t.noise * 255)
         noisy = (store.rgba[:, :3].float().cpu() + noise).round().clamp(0, 255)
-        store.rgba[:, :3] = noisy.to(torch.uint8).to(store.device)
+        store.rgba[:, :3] = noisy.to(torch.uint8).to(store.home)
     if t.labelled_share < 1:
         count = len(store.views)
         keep = torch.randperm(count, generator=generator)[: max(1, round(count * t.labelled_share))].tolist()
@@ -189,4 +202,4 @@ def degrade(store: PixelStore, config: RunConfig) -> None:
         classes = max(int(store.label[store.label != 255].max()) + 1, 1) if bool((store.label != 255).any()) else 1
         wrong = torch.randint(0, classes, (len(store),), generator=generator).to(torch.uint8)
         flip &= store.label.cpu() != 255
-        store.label[flip.to(store.device)] = wrong[flip].to(store.device)
+        store.label[flip.to(store.home)] = wrong[flip].to(store.home)

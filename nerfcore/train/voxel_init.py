@@ -120,7 +120,7 @@ def reduce_photos(model: Model, store: PixelStore, check: Callable[[], None]) ->
         camera = store.cameras[index]
         small = camera.resized(*training_size(camera, SIDE))
         first = int(store.first[index])
-        rgba = store.rgba[first : first + camera.width * camera.height].float() / 255
+        rgba = store.rgba[first : first + camera.width * camera.height].to(store.device).float() / 255
         image = (rgba[:, :3] * rgba[:, 3:]).T.reshape(1, 3, camera.height, camera.width)
         color = nn.functional.interpolate(image, (small.height, small.width), mode="area")[0]
         rays = CameraRays([small], poses[index : index + 1].cpu().numpy(), store.device)

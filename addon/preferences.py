@@ -32,8 +32,8 @@ class FIELDWORK_AP_preferences(AddonPreferences):
         items=[
             ("auto", "Automatic", "The build that fits this machine"),
             ("cuda", "NVIDIA GPU (CUDA)", "For NVIDIA graphics cards"),
-            ("rocm", "AMD GPU (ROCm)", "For AMD graphics cards on Linux"),
-            ("mps", "Apple GPU (MPS)", "For Macs with Apple silicon"),
+            ("rocm", "AMD GPU (ROCm)", "For AMD graphics cards on Linux; slower than the kernels for NVIDIA"),
+            ("mps", "Apple GPU (MPS)", "For Macs with Apple silicon; slower than the kernels for NVIDIA"),
             ("cpu", "CPU", "No graphics card; the smallest download"),
         ],
     )

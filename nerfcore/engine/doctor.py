@@ -7,6 +7,7 @@ import os
 import platform
 import shutil
 import sys
+from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from typing import Any
 import psutil
 
 from .. import __version__
+from ..errors import SettingError
 from ..params import DoctorParams
 from ..progress import Reporter
 
@@ -45,7 +47,9 @@ def doctor(params: DoctorParams, report: Reporter) -> dict[str, Any]:
 
     Returns:
         ok, device, python, torch, warp, pycolmap, blender (versions; None when absent), problems (sentences that say
-        what is wrong and what to do), and more facts about the machine. Sizes in GB (10⁹ bytes).
+        what is wrong and what to do), and more facts about the machine: backend (warp-cuda, warp-cpu, torch) and
+        native_dtype (of matrix products) that training would use, notes (sentences about what is as it should be).
+        Sizes in GB (10⁹ bytes).
     """
     problems: list[str] = []
     result: dict[str, Any] = {
@@ -65,9 +69,12 @@ def doctor(params: DoctorParams, report: Reporter) -> dict[str, Any]:
     result["blender"] = _blender()
 
     report.stage("Checking the device")
-    result["device"], result["device_name"], result["gpu_memory_gb"], problem = _device()
-    problems += problem
+    device = _device()
+    result.update(device.facts)
+    result["notes"] = device.notes
+    problems += device.problems
     report.progress(0.5, "Warp kernels")
+    # Where torch's operations are the backend, Warp still makes the kernels of the CPU.
     result["warp_cache"], problem = _warp()
     problems += problem
 
@@ -101,34 +108,63 @@ def _blender() -> str | None:
         return shutil.which("blender")
 
 
-def _device() -> tuple[str, str, float | None, list[str]]:
-    """Device for training, its name, its memory in GB, and what is wrong with it (measured by using it)."""
+@dataclass
+class _Device:
+    """What is known of the device: facts are keys of the result, notes what is worth knowing, problems what is wrong."""
+
+    facts: dict[str, Any]
+    notes: list[str]
+    problems: list[str]
+
+
+def _device() -> _Device:
+    """The device that the engine would compute on, measured by using it."""
+    empty = {"device": "none", "device_name": "", "gpu_memory_gb": None}
+    found = _Device({**empty, "backend": None, "native_dtype": None, "free_memory_gb": None}, [], [])
     try:
         import torch
     except (ImportError, OSError):
-        return "none", "", None, []
-    name, memory, device = platform.processor() or platform.machine(), None, "cpu"
-    problems = []
-    if torch.cuda.is_available():
-        device = "rocm" if torch.version.hip else "cuda"
-        name = torch.cuda.get_device_name(0)
-        memory = round(torch.cuda.get_device_properties(0).total_memory / 1e9, 1)
+        return found
+    from ..kernels.device import backend_of, choose_device, free_memory, native_half
+
+    try:
+        device = choose_device()
+        backend = backend_of(device)
+    except SettingError as error:
+        found.problems.append(str(error))
+        return found
+    name, memory = platform.processor() or platform.machine(), None
+    kind = "rocm" if device.type == "cuda" and torch.version.hip else device.type
+    if device.type == "cuda":
+        properties = torch.cuda.get_device_properties(device)
+        name, memory = properties.name, round(properties.total_memory / 1e9, 1)
         if memory < MINIMUM_GPU_GB:
-            problems.append(f"{name} has {memory} GB of memory. Use the draft preset, or smaller images.")
-    elif torch.backends.mps.is_available():
-        device, name = "mps", "Apple GPU"
-    elif shutil.which("nvidia-smi"):
-        problems.append(
+            found.problems.append(f"{name} has {memory} GB of memory. Use the draft preset, or smaller images.")
+    elif device.type == "mps":
+        name = "Apple GPU"
+    elif shutil.which("nvidia-smi") and not torch.cuda.is_available():
+        found.problems.append(
             "There is an NVIDIA driver, but torch cannot use the GPU. Install the engine again with the CUDA build, "
             "or update the driver."
         )
+    elif torch.cuda.is_available() or torch.backends.mps.is_available():
+        found.notes.append("FIELDWORK_DEVICE asks for the CPU although there is a GPU that torch can use.")
+    found.facts |= {"device": kind, "device_name": name, "gpu_memory_gb": memory, "backend": backend.name}
+    if not backend.warp:
+        found.notes.append(
+            f"{name} computes with PyTorch's own operations (backend torch): training is complete but slower than with "
+            "the kernels for NVIDIA GPUs and CPUs."
+        )
     try:
-        a = torch.ones((64, 64), device="cuda" if device == "rocm" else device)
+        found.facts["free_memory_gb"] = round(free_memory(device) / 1e9, 1)
+        half = native_half(device)
+        found.facts["native_dtype"] = str(half or torch.float32).removeprefix("torch.")
+        a = torch.ones((64, 64), device=device)
         if float((a @ a)[0, 0]) != 64.0:
-            problems.append(f"{name} computes wrongly. Update its driver.")
+            found.problems.append(f"{name} computes wrongly. Update its driver.")
     except RuntimeError as error:
-        problems.append(f"{name} cannot be used: {str(error).splitlines()[0]} Update its driver.")
-    return device, name, memory, problems
+        found.problems.append(f"{name} cannot be used: {str(error).splitlines()[0]} Update its driver.")
+    return found
 
 
 def _warp() -> tuple[str | None, list[str]]:

@@ -51,3 +51,24 @@ def test_driver_without_torch_support_is_a_problem(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(module.shutil, "which", lambda name: f"/usr/bin/{name}")
     assert any("NVIDIA" in problem for problem in module.doctor(DoctorParams(), Reporter())["problems"])
+
+
+def test_doctor_names_the_backend_and_what_it_multiplies_in(monkeypatch):
+    from fieldwork.nerfcore.kernels.device import backend_of, choose_device
+
+    result = module.doctor(DoctorParams(), Reporter())
+    assert result["backend"] == backend_of(choose_device()).name
+    assert result["native_dtype"] in ("bfloat16", "float16", "float32")
+    assert result["free_memory_gb"] > 0
+    monkeypatch.setenv("FIELDWORK_BACKEND", "torch")
+    result = module.doctor(DoctorParams(), Reporter())
+    assert result["backend"] == "torch"
+    assert any("PyTorch's own operations" in note for note in result["notes"])
+    assert result["ok"] == (not result["problems"])
+
+
+def test_a_device_that_is_not_there_is_a_problem(monkeypatch):
+    monkeypatch.setenv("FIELDWORK_DEVICE", "cuda:99")
+    result = module.doctor(DoctorParams(), Reporter())
+    assert result["device"] == "none"
+    assert any("FIELDWORK_DEVICE" in problem for problem in result["problems"])

@@ -16,7 +16,7 @@ from PIL import Image
 
 from ..errors import InputError, ProjectError
 from ..files import atomic_path, file_hash, write_json
-from ..images.decode import FLOAT_SUFFIXES, float_exposure, read_photo
+from ..images.decode import float_exposure, is_linear, read_photo
 from ..images.labels import Colors, fit_to_photo, read_labels, read_mask
 from ..images.sharpness import sharpness, thumbnail
 from ..images.soft_labels import read_confidence
@@ -78,7 +78,7 @@ def new(params: NewParams, report: Reporter) -> dict[str, Any]:
     masks_folder = params.masks or subfolder(photos, "masks")
     kept = [record for record in previous.images if record.file] if previous and params.add else []
     sources = find_sources(paths, root, labels_folder, masks_folder, {record.name for record in kept})
-    floats = [path for path in paths if path.suffix.lower() in FLOAT_SUFFIXES]
+    floats = [path for path in paths if is_linear(path)]
     settings = Settings(folder, params.max_size, float_exposure(floats), colors or None, ignore_id)
 
     report.stage("Reading photos")

@@ -9,7 +9,8 @@ import numpy as np
 import torch
 
 from ..geometry.cameras import Camera
-from ..images.working import read_image, read_label, read_photo, resize
+from ..images.picture import cut_out, resized, with_alpha
+from ..images.working import nearest, read_image, read_label, read_picture
 from ..progress import Reporter
 from .box import box_poses
 from .camera_rays import CameraRays
@@ -87,29 +88,26 @@ class PixelStore:
         for index, class_id in enumerate(class_ids):
             lookup[class_id] = index
         cameras, colours, labels, usable, sure = [], [], [], [], []
-        self.transparent = False
         for number, view in enumerate(self.views):
             report.progress(number / len(self.views), view.name)
             width, height = training_size(view.camera, longest)
-            photo = resize(read_photo(view.image), width, height)
+            photo = resized(read_picture(view.image), width, height)
             label = np.full((height, width), VOID, np.uint8)
             if view.label is not None:
-                label = lookup[resize(read_label(view.label)[..., None], width, height, nearest=True)[..., 0]]
+                label = lookup[nearest(read_label(view.label), width, height)]
             confidence = np.full((height, width), 255, np.uint8)
             if view.confidence is not None:
-                confidence = resize(read_image(view.confidence)[..., :1], width, height, nearest=True)[..., 0]
+                confidence = nearest(read_image(view.confidence)[..., 0], width, height)
             sure.append(torch.from_numpy(np.ascontiguousarray(confidence)).reshape(-1))
             keep = np.ones((height, width), bool)
             if view.mask is not None:
-                inside = resize(read_image(view.mask)[..., :1], width, height, nearest=True)[..., 0] > 127
+                inside = nearest(read_image(view.mask)[..., 0], width, height) > 127
                 if scene.mask_mode == "empty":
-                    photo = photo.copy()
-                    photo[..., 3] = np.where(inside, photo[..., 3], 0)
+                    photo = cut_out(photo, inside)
                 else:
                     keep = inside
-            self.transparent |= bool((photo[..., 3] < 255).any())
             cameras.append(view.camera.resized(width, height))
-            colours.append(torch.from_numpy(np.ascontiguousarray(photo)).reshape(-1, 4))
+            colours.append(torch.from_numpy(np.ascontiguousarray(with_alpha(photo).pixels)).reshape(-1, 4))
             labels.append(torch.from_numpy(label).reshape(-1))
             usable.append(torch.from_numpy(keep).reshape(-1))
         self.cameras = cameras

@@ -15,8 +15,9 @@ from ..data.pixels import training_size
 from ..data.scene import Scene, View
 from ..errors import InputError
 from ..files import atomic_path, write_json
-from ..images.encode import to_bytes, write_picture
-from ..images.working import read_image, read_label, read_photo, resize
+from ..images.encode import write_picture
+from ..images.picture import cut_out, over, resized, to_bytes
+from ..images.working import nearest, read_image, read_label, read_picture
 from ..kernels.runtime import compile_seconds
 from ..params import EvaluateParams
 from ..progress import Reporter
@@ -119,18 +120,18 @@ def _truth(
     view: View, scene: Scene, width: int, height: int, background: float
 ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
     """Photo (H, W, 3) uint8 on the background, mask of pixels that count (or None), label ids (or None)."""
-    rgba = resize(read_photo(view.image), width, height).astype(np.float64) / 255
+    picture = resized(read_picture(view.image), width, height)
     keep = None
     if view.mask is not None:
-        inside = resize(read_image(view.mask)[..., :1], width, height, nearest=True)[..., 0] > 127
+        inside = nearest(read_image(view.mask)[..., 0], width, height) > 127
         if scene.mask_mode == "empty":
-            rgba[..., 3] = np.where(inside, rgba[..., 3], 0)
+            picture = cut_out(picture, inside)
         else:
             keep = inside
-    photo = to_bytes(rgba[..., :3] * rgba[..., 3:] + background * (1 - rgba[..., 3:]))
+    photo = to_bytes(over(picture, background).pixels)
     label = None
     if view.label is not None:
-        label = resize(read_label(view.label)[..., None], width, height, nearest=True)[..., 0]
+        label = nearest(read_label(view.label), width, height)
         if keep is not None:
             label = np.where(keep, label, scene.ignore_id)
     return photo, keep, label

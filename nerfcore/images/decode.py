@@ -1,20 +1,22 @@
-"""Decoding photos: every still format becomes upright 8-bit sRGB with its EXIF facts."""
+"""Decoding photos: every still format becomes upright 8-bit sRGB, alpha straight, with its EXIF facts."""
 
 from __future__ import annotations
 
 import io
 import struct
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import OpenImageIO as oiio
 import pillow_heif
 from PIL import Image, ImageCms, UnidentifiedImageError
 
 from ..errors import InputError
 from ..progress import log
 from .exif import photo_facts
+from .picture import Picture, associated, exposed, from_channels, from_image, resized, to_srgb8, without_unused_alpha
 
 pillow_heif.register_heif_opener()
 # Stitched panoramas are larger than Pillow's decompression-bomb limit; ours is what a decode may take in memory.
@@ -25,6 +27,8 @@ RAW_SUFFIXES = {
     ".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw", ".x3f",
 }  # fmt: skip
 FLOAT_SUFFIXES = {".exr", ".hdr"}
+TIFF_SUFFIXES = {".tif", ".tiff"}
+FLOAT_KINDS = ("half", "float", "double")
 PHOTO_SUFFIXES = RAW_SUFFIXES | FLOAT_SUFFIXES | {
     ".jpg", ".jpeg", ".jpe", ".png", ".tif", ".tiff", ".webp", ".bmp", ".heic", ".heif", ".hif", ".avif", ".ppm",
     ".jp2", ".tga",
@@ -44,16 +48,21 @@ ROTATE = {
 class Photo:
     """A decoded photo.
 
-    `image` is upright 8-bit RGB or RGBA, no larger than asked for; `full_size` the upright size of the original;
-    `orientation` the EXIF value that was applied (1 = none); `lossy` whether it came from a lossy format; `facts` are
-    those of `exif.photo_facts`.
+    `picture` is upright 8-bit sRGB without or with straight alpha, no larger than asked for; `full_size` the upright
+    size of the original; `orientation` the EXIF value that was applied (1 = none); `lossy` whether it came from a lossy
+    format; `facts` are those of `exif.photo_facts`.
     """
 
-    image: Image.Image
+    picture: Picture
     full_size: tuple[int, int]
     orientation: int = 1
     lossy: bool = False
     facts: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def image(self) -> Image.Image:
+        """The picture as Pillow's, RGB or RGBA."""
+        return Image.fromarray(self.picture.pixels)
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -62,9 +71,7 @@ def image_size(path: Path) -> tuple[int, int]:
     Raises:
         InputError: the file is not a readable image.
     """
-    if path.suffix.lower() in FLOAT_SUFFIXES:
-        import OpenImageIO as oiio
-
+    if path.suffix.lower() in FLOAT_SUFFIXES or is_linear(path):
         source = oiio.ImageInput.open(str(path))
         if source is None:
             raise InputError(f"{path} is not a readable image: {oiio.geterror()}.", "Replace or remove it.")
@@ -76,16 +83,19 @@ def image_size(path: Path) -> tuple[int, int]:
         raise InputError(f"{path} is not a readable image: {error}.", "Replace or remove it.") from error
 
 
-def read_photo(path: Path, max_size: int = 0, exposure: float = 1.0) -> Photo:
+def read_photo(path: Path, max_size: int = 0, exposure: float = 1.0, turn: bool = True) -> Photo:
     """Decode one photo.
 
     EXIF orientation is baked in, embedded colour profiles are turned into sRGB, 16-bit files become 8-bit, and float
-    images go through the sRGB curve after multiplication with `exposure`.
+    images (EXR, HDR, TIFF) go through the sRGB curve after multiplication with `exposure`. Colours of files with
+    associated alpha are freed of it.
 
     Args:
         path: any still image.
         max_size: the long side is shrunk to this many pixels; 0 keeps the size.
         exposure: factor for scene-linear images.
+        turn: False leaves the pixels as stored, whatever EXIF says. HEIF has no such pixels: turning is a part of
+            its decoding.
     Raises:
         InputError: it is empty, truncated, unreadable or no image; the message is one clause, fit as a reason.
     """
@@ -93,11 +103,11 @@ def read_photo(path: Path, max_size: int = 0, exposure: float = 1.0) -> Photo:
         if path.stat().st_size == 0:
             raise InputError("the file is empty (0 bytes)")
         suffix = path.suffix.lower()
-        if suffix in FLOAT_SUFFIXES:
-            return _fit(_read_float(path, exposure), max_size)
+        if is_linear(path):
+            return _fit(_read_float(path, exposure, turn), max_size)
         if suffix in RAW_SUFFIXES and suffix != ".raw":
-            return _fit(_read_raw(path), max_size)
-        return _fit(_read_pillow(path, max_size), max_size)
+            return _fit(_read_raw(path, turn), max_size)
+        return _fit(_read_pillow(path, max_size, turn), max_size)
     except PermissionError as error:
         raise InputError("the file cannot be read: permission denied") from error
     except UnidentifiedImageError as error:
@@ -112,19 +122,17 @@ def read_photo(path: Path, max_size: int = 0, exposure: float = 1.0) -> Photo:
 
 
 def _fit(photo: Photo, max_size: int) -> Photo:
-    image = photo.image
-    long_side = max(image.size)
-    if max_size and long_side > max_size:
-        scale = max_size / long_side
-        size = max(1, round(image.width * scale)), max(1, round(image.height * scale))
-        image = image.resize(size, Image.Resampling.LANCZOS, reducing_gap=3.0)
-    return Photo(image, photo.full_size, photo.orientation, photo.lossy, photo.facts)
+    width, height = photo.picture.size
+    if not max_size or max(width, height) <= max_size:
+        return photo
+    scale = max_size / max(width, height)
+    return replace(photo, picture=resized(photo.picture, max(1, round(width * scale)), max(1, round(height * scale))))
 
 
-def _read_pillow(path: Path, max_size: int) -> Photo:
+def _read_pillow(path: Path, max_size: int, turn: bool) -> Photo:
     with Image.open(path) as image:
         exif = image.getexif()
-        orientation = int(exif.get(0x0112, 1) or 1)
+        orientation = int(exif.get(0x0112, 1) or 1) if turn else 1
         stored_size = image.size
         facts = photo_facts(exif, stored_size)
         if "GPano:ProjectionType" in str(image.info.get("xmp", b"")[:20000]):
@@ -134,19 +142,22 @@ def _read_pillow(path: Path, max_size: int) -> Photo:
             scale = max_size / max(stored_size)
             if scale < 0.5:
                 image.draft("RGB", (round(stored_size[0] * scale), round(stored_size[1] * scale)))
-        if image.mode in ("I;16", "I;16B", "I;16L", "I", "F"):
-            pixels = _grey_to_8bit(np.asarray(image))
-            decoded = Image.fromarray(pixels).convert("RGB")
-        elif image.format == "TIFF" and _is_deep_tiff(image):
-            decoded = _read_deep(path)
+        lossy = image.format in ("JPEG", "MPO", "HEIF", "WEBP", "AVIF")
+        if _is_deep(image):
+            decoded = Image.fromarray(to_srgb8(_read_oiio(path)[0]).pixels)
+            decoded.info["icc_profile"] = image.info.get("icc_profile")
+            decoded = _to_srgb(decoded)
+        elif image.mode in ("I;16", "I;16B", "I;16L", "I", "F"):
+            decoded = Image.fromarray(_grey_to_8bit(np.asarray(image))).convert("RGB")
         else:
             image.load()
             decoded = _to_srgb(image)
-        decoded.info.clear()
-        lossy = image.format in ("JPEG", "MPO", "HEIF", "WEBP", "AVIF")
-    decoded = upright(decoded, orientation)
     full = (stored_size[1], stored_size[0]) if orientation >= 5 else stored_size
-    return Photo(decoded, full, orientation, lossy, facts)
+    return Photo(_upright_picture(decoded, orientation), full, orientation, lossy, facts)
+
+
+def _upright_picture(image: Image.Image, orientation: int) -> Picture:
+    return without_unused_alpha(from_image(upright(image, orientation)))
 
 
 def upright(image: Image.Image, orientation: int) -> Image.Image:
@@ -155,26 +166,34 @@ def upright(image: Image.Image, orientation: int) -> Image.Image:
 
 
 def _to_srgb(image: Image.Image) -> Image.Image:
-    """Convert any 8-bit mode to RGB or RGBA in sRGB."""
-    profile = image.info.get("icc_profile")
-    transparent = image.mode in ("RGBA", "LA", "PA") or (image.mode == "P" and "transparency" in image.info)
-    if image.mode in ("P", "PA", "LA", "1"):
-        image = image.convert("RGBA" if transparent else "RGB")
-    alpha = image.getchannel("A") if image.mode == "RGBA" else None
+    """Convert any 8-bit mode to RGB or RGBA in sRGB, alpha straight."""
+    if image.mode in ("RGBa", "La"):
+        image = image.convert(image.mode.upper())
+    # Also palettes, and PNGs in which one colour means transparent.
+    alpha = image.convert("RGBA").getchannel("A") if image.has_transparency_data else None
+    base = image
+    if image.mode in ("LA", "1"):
+        base = image.convert("L")
+    elif image.mode in ("P", "PA", "RGBA"):
+        base = image.convert("RGB")
+    image = _from_profile(base, image.info.get("icc_profile"))
+    if alpha is not None:
+        image.putalpha(alpha)
+    return image
+
+
+def _from_profile(image: Image.Image, profile: bytes | None) -> Image.Image:
+    """An image without alpha, in the colours of an embedded profile, as sRGB."""
     if profile:
         try:
             source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
             if "srgb" not in ImageCms.getProfileDescription(source).lower():
-                base = image.convert("RGB") if image.mode == "RGBA" else image
-                converted = ImageCms.profileToProfile(base, source, ImageCms.createProfile("sRGB"), outputMode="RGB")
+                converted = ImageCms.profileToProfile(image, source, ImageCms.createProfile("sRGB"), outputMode="RGB")
                 image = converted if converted is not None else image
         except (ImageCms.PyCMSError, OSError) as error:
             # A damaged profile only costs some colour accuracy; the pixels are good.
             log.info("embedded colour profile ignored: %s", error)
-    image = image.convert("RGB")
-    if alpha is not None and alpha.getextrema() != (255, 255):
-        image.putalpha(alpha)
-    return image
+    return image.convert("RGB")
 
 
 def _grey_to_8bit(values: np.ndarray) -> np.ndarray:
@@ -182,54 +201,56 @@ def _grey_to_8bit(values: np.ndarray) -> np.ndarray:
     return np.clip(values.astype(np.float64) / top * 255 + 0.5, 0, 255).astype(np.uint8)
 
 
-def _is_deep_tiff(image: Image.Image) -> bool:
-    bits = image.tag_v2.get(258, (8,)) if hasattr(image, "tag_v2") else (8,)  # type: ignore[attr-defined]
-    return max(bits if isinstance(bits, tuple) else (bits,)) > 8
+def _is_deep(image: Image.Image) -> bool:
+    """Whether a file has colours, or grey with alpha, of more bits than Pillow can hold."""
+    if image.mode.startswith("I"):
+        return False
+    if image.format == "TIFF":
+        bits = image.tag_v2.get(258, (8,))  # type: ignore[attr-defined]
+        return max(bits if isinstance(bits, tuple) else (bits,)) > 8
+    # The last part of a tile is its arguments: for PNG the mode of the rows as stored.
+    tile = getattr(image, "tile", None)
+    return image.format == "PNG" and bool(tile) and ";16" in str(tile[0][3])
 
 
-def _read_deep(path: Path) -> Image.Image:
-    """A 16-bit or float RGB(A) TIFF, which Pillow cannot hold, as 8-bit."""
-    pixels, _ = _read_oiio(path)
-    if pixels.dtype.kind == "f":
-        return Image.fromarray(linear_to_srgb8(pixels))
-    return Image.fromarray((pixels.astype(np.float32) / 65535 * 255 + 0.5).astype(np.uint8))
+def _read_oiio(path: Path) -> tuple[Picture, Any]:
+    """A picture in the file's own kind (uint16 sRGB, or float32 linear) and alpha, and its OpenImageIO spec.
 
-
-def _read_oiio(path: Path) -> tuple[np.ndarray, Any]:
-    """Pixels (H, W, 3 or 4) in the file's own kind (uint16 or float32) and its OpenImageIO spec."""
-    import OpenImageIO as oiio
-
-    source = oiio.ImageInput.open(str(path))
+    Raises:
+        ValueError: it cannot be read.
+    """
+    asked = oiio.ImageSpec()
+    asked["oiio:UnassociatedAlpha"] = 1  # as it is in the file, please
+    source = oiio.ImageInput.open(str(path), asked)
     if source is None:
         raise ValueError(oiio.geterror())
     spec = source.spec()
-    is_float = str(spec.format) in ("half", "float", "double")
+    is_float = str(spec.format) in FLOAT_KINDS
     pixels = source.read_image(0, 0, 0, spec.nchannels, "float" if is_float else "uint16")
     if pixels is None:
         raise ValueError(source.geterror())
     names = [name.split(".")[-1].upper() for name in spec.channelnames]
-    if all(c in names for c in "RGB"):
-        picked = [names.index(c) for c in "RGB"] + ([names.index("A")] if "A" in names else [])
-        pixels = pixels[..., picked]
-    elif spec.nchannels < 3:
-        pixels = np.repeat(pixels[..., :1], 3, axis=-1)
-    return pixels, spec
+    color = [names.index(c) for c in "RGB"] if all(c in names for c in "RGB") else [0, 1, 2][: len(names)]
+    color = color if len(color) == 3 else [0]
+    alpha = [names.index("A")] if "A" in names and names.index("A") not in color else []
+    kept = "straight" if spec.getattribute("oiio:UnassociatedAlpha") else "associated"
+    return from_channels(pixels[..., color + alpha], "linear" if is_float else "srgb", kept), spec
 
 
-def _read_float(path: Path, exposure: float) -> Photo:
-    pixels, spec = _read_oiio(path)
-    orientation = int(spec.getattribute("Orientation") or 1)
-    image = upright(Image.fromarray(linear_to_srgb8(pixels, exposure)), orientation)
-    return Photo(image, image.size, orientation)
+def _read_float(path: Path, exposure: float, turn: bool) -> Photo:
+    found, spec = _read_oiio(path)
+    orientation = int(spec.getattribute("Orientation") or 1) if turn else 1
+    picture = _upright_picture(Image.fromarray(to_srgb8(exposed(found, exposure)).pixels), orientation)
+    return Photo(picture, picture.size, orientation)
 
 
-def linear_to_srgb8(pixels: np.ndarray, exposure: float = 1.0) -> np.ndarray:
-    """Scene-linear float RGB(A) to 8-bit sRGB with IEC 61966-2-1's curve; alpha stays linear. NaN becomes black."""
-    color = np.clip(np.nan_to_num(pixels[..., :3] * exposure), 0, 1)
-    encoded = np.where(color <= 0.0031308, color * 12.92, 1.055 * color ** (1 / 2.4) - 0.055)
-    if pixels.shape[-1] == 4:
-        encoded = np.concatenate([encoded, np.clip(pixels[..., 3:], 0, 1)], -1)
-    return (encoded * 255 + 0.5).astype(np.uint8)
+def is_linear(path: Path) -> bool:
+    """Whether a file holds scene-linear light: EXR, HDR and float TIFF; False also where it cannot be read."""
+    suffix = path.suffix.lower()
+    if suffix not in TIFF_SUFFIXES:
+        return suffix in FLOAT_SUFFIXES
+    source = oiio.ImageInput.open(str(path))
+    return source is not None and str(source.spec().format) in FLOAT_KINDS
 
 
 def float_exposure(paths: list[Path]) -> float:
@@ -241,24 +262,26 @@ def float_exposure(paths: list[Path]) -> float:
     tops = []
     for path in paths[:: max(1, len(paths) // 12)]:
         try:
-            tops.append(float(np.nanpercentile(_read_oiio(path)[0][..., :3], 99)))
+            tops.append(float(np.nanpercentile(associated(_read_oiio(path)[0]).pixels[..., :3], 99)))
         except ValueError:
             continue  # the file gets its own reason when it is decoded
     top = float(np.median(tops)) if tops else 1.0
     return 1.0 if 0.2 <= top <= 1.5 or not np.isfinite(top) or top <= 0 else 1.0 / top
 
 
-def _read_raw(path: Path) -> Photo:
+def _read_raw(path: Path, turn: bool) -> Photo:
     import rawpy
 
     try:
         with rawpy.imread(str(path)) as raw:
             # Fixed brightness: an automatic one would differ from photo to photo of the same wall.
-            pixels = raw.postprocess(use_camera_wb=True, no_auto_bright=True, output_bps=8)
+            # Turning is part of developing unless another flip than the camera's is asked for.
+            flip = None if turn else 0
+            pixels = raw.postprocess(use_camera_wb=True, no_auto_bright=True, output_bps=8, user_flip=flip)
     except rawpy.LibRawError as error:
         raise InputError(f"the camera raw file cannot be developed: {error}") from error
-    image = Image.fromarray(pixels)
-    return Photo(image, image.size, 1, False, _raw_facts(path, image.size))
+    picture = Picture(pixels)
+    return Photo(picture, picture.size, 1, False, _raw_facts(path, picture.size))
 
 
 def _raw_facts(path: Path, size: tuple[int, int]) -> dict[str, Any]:

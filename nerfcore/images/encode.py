@@ -9,21 +9,44 @@ import OpenImageIO as oiio
 
 from ..errors import DiskError
 from ..files import atomic_path
+from .picture import Picture, to_bytes, to_srgb8
+
+SRGB_PRIMARIES = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)  # x, y of red, green, blue and white
 
 
-def to_bytes(color: np.ndarray) -> np.ndarray:
-    """Values in [0, 1] → uint8, rounded."""
-    return (color.clip(0, 1) * 255 + 0.5).astype(np.uint8)
-
-
-def write_picture(path: Path, color: np.ndarray) -> None:
-    """Write (H, W, 3 or 1) values in [0, 1], or uint8/uint16 as they are, in the format of the suffix.
+def write_picture(path: Path, picture: Picture | np.ndarray) -> None:
+    """Write a picture as 8-bit sRGB with straight alpha, if any; or (H, W, 3 or 1) values in [0, 1], or uint8/uint16 as
+    they are, in the format of the suffix.
 
     Raises:
         DiskError: the file cannot be written.
     """
-    pixels = to_bytes(color) if color.dtype.kind == "f" and path.suffix.lower() != ".exr" else color
-    buffer = oiio.ImageBuf(np.ascontiguousarray(pixels if pixels.ndim == 3 else pixels[..., None]))
+    if isinstance(picture, Picture):
+        pixels = to_srgb8(picture).pixels
+    else:
+        pixels = to_bytes(picture) if picture.dtype.kind == "f" else picture
+    pixels = np.ascontiguousarray(pixels if pixels.ndim == 3 else pixels[..., None])
+    buffer = oiio.ImageBuf(pixels)
+    buffer.specmod().attribute("oiio:UnassociatedAlpha", 1)  # else colours are divided by alpha once more
+    if not buffer.write(str(path)):
+        raise DiskError(
+            f"{path} cannot be written: {buffer.geterror()}.", "Check the disk and the folder's permissions."
+        )
+
+
+def write_layers(path: Path, layers: dict[str, np.ndarray]) -> None:
+    """One multilayer EXR with float channels (H, W) named as the keys, whose colours have the primaries of sRGB.
+
+    Raises:
+        DiskError: it cannot be written.
+    """
+    names = list(layers)
+    height, width = layers[names[0]].shape
+    spec = oiio.ImageSpec(width, height, len(names), oiio.FLOAT)
+    spec.channelnames = tuple(names)
+    spec.attribute("chromaticities", "float[8]", SRGB_PRIMARIES)
+    buffer = oiio.ImageBuf(spec)
+    buffer.set_pixels(spec.roi, np.ascontiguousarray(np.stack([layers[n] for n in names], -1), np.float32))
     if not buffer.write(str(path)):
         raise DiskError(
             f"{path} cannot be written: {buffer.geterror()}.", "Check the disk and the folder's permissions."

@@ -8,6 +8,7 @@ import numpy as np
 import OpenImageIO as oiio
 
 from ..errors import InputError
+from .picture import Picture, from_channels, is_transparent, to_srgb8
 
 
 def read_image(path: Path) -> np.ndarray:
@@ -19,20 +20,27 @@ def read_image(path: Path) -> np.ndarray:
     return pixels
 
 
-def read_photo(path: Path) -> np.ndarray:
-    """A photo as (H, W, 4) uint8 with straight alpha. Raises InputError naming the file."""
+def read_picture(path: Path) -> Picture:
+    """A photo as 8-bit sRGB, alpha straight if it has one. Raises InputError naming the file."""
     buffer = oiio.ImageBuf()
-    config = oiio.ImageSpec()
-    config["oiio:UnassociatedAlpha"] = 1
-    buffer.reset(str(path), 0, 0, config)
+    asked = oiio.ImageSpec()
+    asked["oiio:UnassociatedAlpha"] = 1  # as it is in the file, please
+    buffer.reset(str(path), 0, 0, asked)
     pixels = None if buffer.has_error else buffer.get_pixels(oiio.UINT8)
     if pixels is None:
         raise InputError(f"{path} cannot be read: {buffer.geterror() or 'no pixels'}.", "Replace or remove the file.")
-    if pixels.shape[2] <= 2:
-        pixels = np.concatenate([np.repeat(pixels[..., :1], 3, 2), pixels[..., 1:]], 2)
-    if pixels.shape[2] == 3:
-        pixels = np.concatenate([pixels, np.full_like(pixels[..., :1], 255)], 2)
-    return pixels
+    kept = "straight" if buffer.spec().getattribute("oiio:UnassociatedAlpha") else "associated"
+    return to_srgb8(from_channels(pixels, "srgb", kept))
+
+
+def shows_transparency(path: Path) -> bool:
+    """Whether a photo has pixels that are not opaque; those without alpha are not decoded.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    buffer = oiio.ImageBuf(str(path))
+    return (buffer.has_error or buffer.nchannels in (2, 4)) and is_transparent(read_picture(path))
 
 
 def read_label(path: Path) -> np.ndarray:
@@ -46,17 +54,13 @@ def read_label(path: Path) -> np.ndarray:
     return pixels[..., 0].astype(np.int64)
 
 
-def resize(pixels: np.ndarray, width: int, height: int, nearest: bool = False) -> np.ndarray:
-    """Resample (H, W, C) uint8 to width × height; box-like filtering unless `nearest`."""
-    if pixels.shape[1] == width and pixels.shape[0] == height:
-        return pixels
-    if nearest:
-        y = ((np.arange(height) + 0.5) * pixels.shape[0] / height).astype(int)
-        x = ((np.arange(width) + 0.5) * pixels.shape[1] / width).astype(int)
-        return pixels[y][:, x]
-    source = oiio.ImageBuf(np.ascontiguousarray(pixels))
-    result = oiio.ImageBufAlgo.resize(source, roi=oiio.ROI(0, width, 0, height, 0, 1, 0, pixels.shape[2]))
-    return np.asarray(result.get_pixels(oiio.UINT8))
+def nearest(values: np.ndarray, width: int, height: int) -> np.ndarray:
+    """A map (H, W) sampled at the pixel centres of width × height."""
+    if values.shape == (height, width):
+        return values
+    y = ((np.arange(height) + 0.5) * values.shape[0] / height).astype(int)
+    x = ((np.arange(width) + 0.5) * values.shape[1] / width).astype(int)
+    return values[y][:, x]
 
 
 def read_depth(path: Path) -> np.ndarray:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 import torch
 
 from ..data.camera_rays import CameraRays
 from ..geometry.cameras import Camera
+from ..images.picture import Picture, over
 from ..kernels.runtime import run_parallel
 from .fused import ray_renderer
 from .model import Model
@@ -23,15 +24,26 @@ CPU_RAYS = 8192
 class Frame:
     """One rendered view, numpy, (H, W, …).
 
-    color (3) sRGB in [0, 1] on the background; opacity; depth: distance along the optical axis in normalised units,
+    picture: sRGB float32 with associated alpha, nothing behind it; background: the grey that `color` has behind it;
+    opacity; depth: distance along the optical axis in normalised units,
     NaN where nothing is; probabilities (K) or None; position (3) expected surface point in the normalised frame.
     """
 
-    color: np.ndarray
-    opacity: np.ndarray
+    picture: Picture
+    background: float
     depth: np.ndarray
     probabilities: np.ndarray | None
     position: np.ndarray
+
+    @property
+    def opacity(self) -> np.ndarray:
+        """Opacity (H, W) in [0, 1]."""
+        return self.picture.pixels[..., 3]
+
+    @cached_property
+    def color(self) -> np.ndarray:
+        """sRGB (H, W, 3) in [0, 1] on the background."""
+        return over(self.picture, self.background).pixels.clip(0, 1)
 
     def label(self, class_ids: list[int], void: int = 0) -> np.ndarray:
         """Class id (H, W) of each pixel; `void` where more than half of the ray is void."""
@@ -92,8 +104,8 @@ def render_view(
         out = render(origins, directions, count)
         opacity = out.opacity * valid
         distance = torch.where(opacity > 1e-3, out.depth / out.opacity.clamp(min=1e-3), torch.nan)
-        color = out.color * valid[:, None] + background * (1 - opacity[:, None])
-        found = [color, opacity, distance * (directions @ axis), origins + directions * distance[:, None]]
+        color = torch.cat([out.color * valid[:, None], opacity[:, None]], 1)
+        found = [color, distance * (directions @ axis), origins + directions * distance[:, None]]
         return found if out.probabilities is None else [*found, out.probabilities]
 
     # The CPU renders small tiles side by side, each of which fits a core's cache.
@@ -101,5 +113,6 @@ def render_view(
     parts = run_parallel([partial(tile, pixel) for pixel in tiles], device)
     shape = (camera.height, camera.width)
     images = [torch.cat(column).cpu() for column in zip(*parts)]
-    color, opacity, depth, position, *classes = (i.reshape(*shape, *i.shape[1:]).numpy() for i in images)
-    return Frame(color.clip(0, 1), opacity, depth, classes[0] if classes else None, position)
+    color, depth, position, *classes = (i.reshape(*shape, *i.shape[1:]).numpy() for i in images)
+    picture = Picture(color, "srgb", "associated")
+    return Frame(picture, background, depth, classes[0] if classes else None, position)

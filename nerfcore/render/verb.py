@@ -8,18 +8,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import OpenImageIO as oiio
 
 from ..data.box import Box, box_poses
 from ..data.load import load_scene
 from ..data.pixels import training_size
 from ..data.scene import Scene, View
-from ..errors import DiskError, InputError
+from ..errors import InputError
 from ..files import atomic_path, disk_errors
 from ..geometry.cameras import Camera, flip_camera_axes
 from ..geometry.frames import focus_point
 from ..geometry.similarity import similarity_scale
-from ..images.encode import write_picture
+from ..images.encode import write_layers, write_picture
+from ..images.picture import to_linear
 from ..params import RenderParams
 from ..progress import Reporter
 from ..project.store import load_project
@@ -178,7 +178,11 @@ def write_frame(
     colors: dict[int, tuple[float, float, float]],
     box: Box,
 ) -> list[Path]:
-    """Write NAME.png, NAME_depth.png, … and NAME.exr with all asked passes. Returns the paths."""
+    """Write NAME.png, NAME_depth.png, … and NAME.exr with all asked passes. Returns the paths.
+
+    The PNG shows the field on its background; the EXR has the field alone, linear and with associated alpha, to be put
+    over anything.
+    """
     scale = similarity_scale(box.world_from_box)
     rotation = box.world_from_box[:3, :3] / scale
     label = frame.label(class_ids, void)
@@ -192,7 +196,7 @@ def write_frame(
     }
     layers: dict[str, np.ndarray] = {}
     values = {
-        "rgb": ("", ["R", "G", "B", "A"], np.concatenate([srgb_to_linear(frame.color), frame.opacity[..., None]], -1)),
+        "rgb": ("", ["R", "G", "B", "A"], to_linear(frame.picture).pixels),
         "depth": ("Depth.", ["Z"], np.nan_to_num(frame.depth * scale, nan=1e10)[..., None]),
         "semantic": ("Label.", ["ID"], label[..., None]),
         "confidence": ("Confidence.", ["V"], frame.confidence()[..., None]),
@@ -210,24 +214,5 @@ def write_frame(
             layers[prefix + channel] = value[..., index]
     path = out / f"{name}.exr"
     with atomic_path(path) as temporary:
-        write_exr(temporary, layers)
+        write_layers(temporary, layers)
     return [*written, path]
-
-
-def srgb_to_linear(color: np.ndarray) -> np.ndarray:
-    """sRGB in [0, 1] → linear (IEC 61966-2-1)."""
-    return np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
-
-
-def write_exr(path: Path, layers: dict[str, np.ndarray]) -> None:
-    """One multilayer EXR with float channels named as the keys. Raises DiskError when it cannot be written."""
-    names = list(layers)
-    height, width = layers[names[0]].shape
-    spec = oiio.ImageSpec(width, height, len(names), oiio.FLOAT)
-    spec.channelnames = tuple(names)
-    buffer = oiio.ImageBuf(spec)
-    buffer.set_pixels(spec.roi, np.ascontiguousarray(np.stack([layers[n] for n in names], -1), np.float32))
-    if not buffer.write(str(path)):
-        raise DiskError(
-            f"{path} cannot be written: {buffer.geterror()}.", "Check the disk and the folder's permissions."
-        )

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..data.box import looks_inward
 from ..data.scene import Scene
-from ..images.working import read_photo
+from ..images.working import read_picture
 
 Background = Literal["random", "white", "black"]
 LEVEL: dict[str, float] = {"white": 1.0, "black": 0.0}
@@ -30,7 +30,7 @@ def choose_background(scene: Scene, transparent: bool) -> Background:
     if transparent or any(view.mask is not None for view in scene.views) or not looks_inward(scene.views):
         return "random"
     chosen = np.unique(np.linspace(0, len(scene.train) - 1, LOOKED_AT).round().astype(int))
-    shares = [edge_shares(read_photo(scene.views[scene.train[i]].image)[..., :3]) for i in chosen]
+    shares = [edge_shares(read_picture(scene.views[scene.train[i]].image).pixels[..., :3]) for i in chosen]
     black, white = np.median(shares, axis=0)
     return "black" if black > SHARE else "white" if white > SHARE else "random"
 

@@ -16,7 +16,7 @@ from ..errors import TrainingError
 from ..field.blend import RESOLUTION
 from ..geometry.frames import focus_point
 from ..geometry.similarity import transform_points
-from ..images.working import read_label, read_photo
+from ..images.working import read_label, shows_transparency
 from ..kernels.device import free_memory
 from ..progress import Reporter
 from ..project.store import load_project, load_visibility, world_from_sfm
@@ -43,11 +43,11 @@ def present_classes(scene: Scene, indices: list[int]) -> list[int]:
 
 
 def has_transparency(scene: Scene) -> bool:
-    """Whether the photos have empty surroundings: an alpha channel in use, or masks that mean "empty"."""
-    view = scene.views[scene.train[0]]
-    if view.mask is not None and scene.mask_mode == "empty":
+    """Whether some training photo has empty surroundings: an alpha channel in use, or a mask that means "empty"."""
+    views = [scene.views[i] for i in scene.train]
+    if scene.mask_mode == "empty" and any(view.mask is not None for view in views):
         return True
-    return bool((read_photo(view.image)[..., 3] < 255).any())
+    return any(shows_transparency(view.image) for view in views)
 
 
 def pixels_across(scene: Scene, views: list[int], box: Box, image_size: int) -> int:

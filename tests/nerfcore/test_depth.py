@@ -11,7 +11,7 @@ import torch
 from fieldwork.nerfcore.config import make_config
 from fieldwork.nerfcore.data.box import box_poses
 from fieldwork.nerfcore.data.load import load_scene
-from fieldwork.nerfcore.images.working import read_photo
+from fieldwork.nerfcore.images.working import read_picture
 from fieldwork.nerfcore.params import TrainParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.render.image import render_view
@@ -80,7 +80,7 @@ def surface_error(folder: Path, run: str) -> float:
     pose = box_poses([view], np.linalg.inv(to_world))[0]
     frame = render_view(trained.model, view.camera, pose, 0.0, semantics=False)
     points = frame.position.reshape(-1, 3) @ to_world[:3, :3].T + to_world[:3, 3]
-    ball = (read_photo(view.image)[..., 3] > 127).ravel() & np.isfinite(points).all(1)
+    ball = (read_picture(view.image).pixels[..., 3] > 127).ravel() & np.isfinite(points).all(1)
     return float(np.abs(np.linalg.norm(points[ball], axis=1) - RADIUS).mean())
 
 

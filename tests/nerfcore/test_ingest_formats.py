@@ -10,7 +10,8 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 from fieldwork.nerfcore.errors import InputError
-from fieldwork.nerfcore.images.decode import linear_to_srgb8, read_photo
+from fieldwork.nerfcore.images.decode import read_photo
+from fieldwork.nerfcore.images.picture import Picture, to_srgb8
 from fieldwork.tests.nerfcore.support.photos import close, exif, new, picture
 from PIL import ExifTags, Image
 
@@ -40,11 +41,11 @@ def test_exr_goes_through_the_srgb_curve(tmp_path: Path) -> None:
     buffer.set_pixels(oiio.ROI(), linear)
     assert buffer.write(str(tmp_path / "a.exr"))
     pixels = np.asarray(read_photo(tmp_path / "a.exr").image)
-    assert np.array_equal(pixels, linear_to_srgb8(linear))
+    assert np.array_equal(pixels, to_srgb8(Picture(linear, "linear")).pixels)
     assert pixels[0, 0].tolist() == [0, 0, 0]
     assert pixels[3, 255].tolist() == [255, 255, 255]
     # 18 % grey is 118 in sRGB.
-    assert linear_to_srgb8(np.full((1, 1, 3), 0.18, np.float32))[0, 0, 0] == 118
+    assert to_srgb8(Picture(np.full((1, 1, 3), 0.18, np.float32), "linear")).pixels[0, 0, 0] == 118
 
 
 def test_grey_palette_cmyk_and_alpha(tmp_path: Path) -> None:

@@ -14,6 +14,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from .errors import SettingError
 
 PRESETS = Path(__file__).parent / "presets"
+# Earlier names of settings, still understood in `--set` and in presets, and mapped when a stored run is read.
+RENAMED = {"sampling.interest": "sampling.importance"}
 MOST_VERTICES = 2048  # along a side of the finest level that a run chooses by itself
 
 
@@ -101,13 +103,13 @@ class SamplingConfig(Stage):
         default=128, ge=8, le=512, multiple_of=4, description="cells along a side of the occupancy grid"
     )
     samples: int = Field(default=16, ge=1, le=512, description="samples a ray (M_f)")
-    bins_per_cell: float = Field(default=1.0, gt=0, description="bins of the coarse walk per grid cell")
+    bins_per_cell: float = Field(default=1.0, gt=0, description="bins of the coarse march per grid cell")
     pdf: Literal["default", "uniform", "literal"] = Field(default="default", description="distribution of the samples")
-    interest: Literal["priority", "boundary", "none"] = Field(
+    importance: Literal["priority", "boundary", "none"] = Field(
         default="priority", description="what draws samples besides density"
     )
-    beta: float = Field(default=1.0, ge=0, description="strength of the interest")
-    epsilon: float = Field(default=0.01, gt=0, description="weight every open bin keeps")
+    beta: float = Field(default=1.0, ge=0, description="strength of the importance")
+    epsilon: float = Field(default=0.01, gt=0, description="weight every occupied bin keeps")
     update_every: int = Field(default=16, ge=1, description="steps between updates of the occupancy grid")
     decay: float = Field(default=0.95, gt=0, lt=1, description="of the occupancy grid at each update")
     threshold: float = Field(default=0.01, gt=0, description="opacity of a bin below which its cell is closed")
@@ -138,7 +140,7 @@ class RenderConfig(Stage):
         default=1.25,
         ge=0,
         le=16,
-        description="samples for each open bin on a ray when rendering, at least 4 a ray; 0: `samples` on every ray",
+        description="samples for each occupied bin on a ray when rendering, at least 4 a ray; 0: `samples` on every ray",
     )
     refine: Literal[1, 2, 4] = Field(
         default=2,
@@ -231,7 +233,7 @@ def make_config(preset: str, settings: dict[str, str] | None = None) -> RunConfi
         raise SettingError(f"There is no preset “{preset}”.", f"Choose one of {', '.join(preset_names())}.")
     values: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     for name, text in (settings or {}).items():
-        stage, _, key = name.partition(".")
+        stage, _, key = RENAMED.get(name, name).partition(".")
         model = RunConfig.model_fields.get(stage)
         if model is None or key not in type(model.default).model_fields:
             raise SettingError(

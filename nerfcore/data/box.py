@@ -17,7 +17,7 @@ POINTS_MARGIN = 1.3  # surfaces reach beyond their points
 
 @dataclass(frozen=True)
 class Box:
-    """`world_from_box` (4, 4) maps the cube [−1, 1]³ to the region of interest; `contracted`: see kernels/walk."""
+    """`world_from_box` (4, 4) maps the cube [−1, 1]³ to the region of interest; `contracted`: see kernels/traversal.py."""
 
     world_from_box: np.ndarray
     contracted: bool

@@ -51,19 +51,19 @@ class CameraRays:
 
     def camera_directions(self, image: torch.Tensor, pixel: torch.Tensor) -> torch.Tensor:
         """Unit directions (N, 3) in camera axes of pixels y · width + x; NaN where the lens cannot be inverted."""
-        places = _centers(pixel, self.width[image])
+        centers = _centers(pixel, self.width[image])
         fx, fy, cx, cy = self.lens[image].unbind(1)
-        x, y = places.unbind(1)
+        x, y = centers.unbind(1)
         directions = torch.stack([(x - cx) / fx, (y - cy) / fy, torch.ones_like(x)], 1)
         directions = directions / directions.norm(dim=1, keepdim=True)
         if self.lenses is None:
             return directions
         number = self.number[image]
-        known = number.clamp(min=0)
+        lens = number.clamp(min=0)
         if self.table is None:
-            others = self.lenses.directions(known, places)
+            others = self.lenses.directions(lens, centers)
         else:
-            others = self.table[(self.table_start[known] + pixel).clamp(max=len(self.table) - 1)]
+            others = self.table[(self.table_start[lens] + pixel).clamp(max=len(self.table) - 1)]
         return torch.where((number >= 0)[:, None], others, directions)
 
     def __call__(self, image: torch.Tensor, pixel: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

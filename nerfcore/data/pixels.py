@@ -87,7 +87,7 @@ class PixelStore:
         lookup = np.full(65536, VOID, np.uint8)
         for index, class_id in enumerate(class_ids):
             lookup[class_id] = index
-        cameras, colours, labels, usable, sure = [], [], [], [], []
+        cameras, colours, labels, usable, confidences = [], [], [], [], []
         for number, view in enumerate(self.views):
             report.progress(number / len(self.views), view.name)
             width, height = training_size(view.camera, longest)
@@ -98,7 +98,7 @@ class PixelStore:
             confidence = np.full((height, width), 255, np.uint8)
             if view.confidence is not None:
                 confidence = nearest(read_image(view.confidence)[..., 0], width, height)
-            sure.append(torch.from_numpy(np.ascontiguousarray(confidence)).reshape(-1))
+            confidences.append(torch.from_numpy(np.ascontiguousarray(confidence)).reshape(-1))
             keep = np.ones((height, width), bool)
             if view.mask is not None:
                 inside = nearest(read_image(view.mask)[..., 0], width, height) > 127
@@ -112,13 +112,13 @@ class PixelStore:
             usable.append(torch.from_numpy(keep).reshape(-1))
         self.cameras = cameras
         keep = torch.cat(usable)
-        known = any(view.confidence is not None for view in self.views)
-        size = len(keep) * (5 + known + (0 if bool(keep.all()) else 8))
+        has_confidence = any(view.confidence is not None for view in self.views)
+        size = len(keep) * (5 + has_confidence + (0 if bool(keep.all()) else 8))
         self.home = home_of(size, budget, device)
         left = budget - size if size <= budget else budget
         self.rgba = self._keep(torch.cat(colours))
         self.label = self._keep(torch.cat(labels))
-        self.confidence = self._keep(torch.cat(sure)) if known else None
+        self.confidence = self._keep(torch.cat(confidences)) if has_confidence else None
         sizes = torch.tensor([c.width * c.height for c in cameras])
         self.first = torch.cat([torch.zeros(1, dtype=torch.long), sizes.cumsum(0)]).to(device)
         self.rays = CameraRays(cameras, box_poses(self.views, box_from_world), device, left)
@@ -133,37 +133,37 @@ class PixelStore:
         """Values of pixels where they stay: on the device, or in memory that it copies from quickly."""
         return values.to(self.home) if self.home == self.device or self.device.type != "cuda" else values.pin_memory()
 
-    def at(self, values: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
-        """`values` that are at `home`, at `places` (N,) int64 on the device: on the device."""
-        return values[places.to(values.device)].to(places.device)
+    def at(self, values: torch.Tensor, pixel_indices: torch.Tensor) -> torch.Tensor:
+        """`values` that are at `home`, at `pixel_indices` (N,) int64 on the device: on the device."""
+        return values[pixel_indices.to(values.device)].to(pixel_indices.device)
 
     def __len__(self) -> int:
         return len(self.rgba)
 
-    def batch(self, places: torch.Tensor) -> Batch:
-        """Rays and values of pixels at flat positions (R,) int64."""
-        image = torch.bucketize(places, self.first[1:], right=True)
-        pixel = places - self.first[image]
+    def batch(self, pixel_indices: torch.Tensor) -> Batch:
+        """Rays and values of pixels at flat indices (R,) int64."""
+        image = torch.bucketize(pixel_indices, self.first[1:], right=True)
+        pixel = pixel_indices - self.first[image]
         origins, directions = self.rays(image, pixel)
-        here = places.to(self.home)  # once: the host waits for it where the photos are there
+        home_indices = pixel_indices.to(self.home)  # once: the host waits for it where the photos are there
 
         def read(values: torch.Tensor) -> torch.Tensor:
-            return values[here].to(self.device)
+            return values[home_indices].to(self.device)
 
         value = read(self.rgba).float() / 255
-        sure = torch.ones_like(value[:, 3]) if self.confidence is None else read(self.confidence).float() / 255
+        confidences = torch.ones_like(value[:, 3]) if self.confidence is None else read(self.confidence).float() / 255
         rgb, alpha, label = value[:, :3], value[:, 3], read(self.label).long()
-        return Batch(origins, directions, rgb, alpha, label, image, pixel, sure, torch.ones_like(sure))
+        return Batch(origins, directions, rgb, alpha, label, image, pixel, confidences, torch.ones_like(confidences))
 
     def labelled_share(self) -> float:
         """Share of the usable pixels with something in them that have a label; 1 where there are no labels at all."""
-        places = slice(None) if self.usable is None else self.usable
-        shows = self.rgba[places, 3] > 127
-        labelled = (self.label[places] != VOID) & shows
-        return float(labelled.sum() / shows.sum().clamp(min=1)) or 1.0
+        usable = slice(None) if self.usable is None else self.usable
+        opaque = self.rgba[usable, 3] > 127
+        labelled = (self.label[usable] != VOID) & opaque
+        return float(labelled.sum() / opaque.sum().clamp(min=1)) or 1.0
 
-    def random_places(self, count: int, generator: torch.Generator) -> torch.Tensor:
-        """`count` flat positions of usable pixels, with repetition."""
+    def random_pixels(self, count: int, generator: torch.Generator) -> torch.Tensor:
+        """`count` flat indices of usable pixels, with repetition."""
         total = len(self) if self.usable is None else len(self.usable)
         chosen = torch.randint(0, total, (count,), device=self.device, generator=generator)
         return chosen if self.usable is None else self.at(self.usable, chosen)

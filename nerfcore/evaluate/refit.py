@@ -41,14 +41,14 @@ def refit_camera(
     refinement = PoseRefinement(rays, model.config.train, keep_rig=False)
     generator = torch.Generator(device).manual_seed(0)
     colors = torch.from_numpy(photo.reshape(-1, 3)).to(device).float() / 255
-    places = torch.arange(len(colors), device=device)
+    pixel_indices = torch.arange(len(colors), device=device)
     if keep is not None:
-        places = places[torch.from_numpy(keep.reshape(-1)).to(device)]
+        pixel_indices = pixel_indices[torch.from_numpy(keep.reshape(-1)).to(device)]
     count = model.config.sampling.samples
     grid = model.field.grid
-    for step in range(STEPS if len(places) else 0):
+    for step in range(STEPS if len(pixel_indices) else 0):
         check()
-        pixel = places[torch.randint(0, len(places), (RAYS,), device=device, generator=generator)]
+        pixel = pixel_indices[torch.randint(0, len(pixel_indices), (RAYS,), device=device, generator=generator)]
         image = torch.zeros_like(pixel)
         origins, directions = rays(image, pixel)
         valid = ~directions[:, 0].isnan()

@@ -46,7 +46,7 @@ def measure_speed(
     """Frames a second at side × side with colour and classes: warm, synchronised; median over `poses` of the views
     `indices`, by default five on a GPU and one on a CPU, where a frame takes seconds. A frame on a GPU ends on the GPU.
 
-    `ms_sampling` and `ms_network` split one frame: the coarse walk, and all that reads the field (the fused kernel
+    `ms_sampling` and `ms_network` split one frame: the coarse march, and all that reads the field (the fused kernel
     draws its samples there too); `spr` is the number of field samples per ray; `fused` says which kernels rendered.
     """
     model, device = trained.model, trained.device
@@ -108,7 +108,7 @@ def split_times(model: Model, rays: CameraRays, count: int, report: Reporter) ->
     device = rays.device
     renderer = ray_renderer(model, count)
     per_ray = model.config.render.samples or model.config.sampling.samples
-    sampling, network, samples = 0.0, 0.0, 0
+    sampling, network, total = 0.0, 0.0, 0
     for pixel in torch.arange(count, device=device).split(renderer.rays):
         report.check()
         origins, directions = rays(torch.zeros_like(pixel), pixel)
@@ -121,19 +121,19 @@ def split_times(model: Model, rays: CameraRays, count: int, report: Reporter) ->
             evaluated = renderer.fine(coarse, per_ray).evaluated
         else:
             g = model.render_grid()
-            drawn = sample(origins, directions, g.cells, g.reach, g.settings, per_ray)
+            samples = sample(origins, directions, g.cells, g.skip_distance, g.settings, per_ray)
             synchronize(device)
             middle = time.perf_counter()
-            geometry = model.field.geometry(drawn.points)
-            weights = render_weights(geometry.density, drawn.delta, drawn.packing)
+            geometry = model.field.geometry(samples.points)
+            weights = render_weights(geometry.density, samples.deltas, samples.packed_info)
             kept = (weights > model.config.render.cull).nonzero()[:, 0]
-            directional = spherical_harmonics(directions)[drawn.packing.ray[kept].long()]
+            directional = spherical_harmonics(directions)[samples.packed_info.ray_indices[kept].long()]
             model.field.color(geometry[kept], directional)
             if model.field.semantic_head is not None:
                 model.field.logits(geometry[kept])
-            evaluated = len(drawn)
+            evaluated = len(samples)
         synchronize(device)
         sampling += middle - begin
         network += time.perf_counter() - middle
-        samples += int(evaluated)
-    return sampling, network, samples, isinstance(renderer, FusedRenderer)
+        total += int(evaluated)
+    return sampling, network, total, isinstance(renderer, FusedRenderer)

@@ -111,8 +111,8 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
     if any("psnr_given_pose" in score for score in scores):
         result["psnr_given_poses"] = round(float(np.mean([score["psnr_given_pose"] for score in scores])), 3)
     path = run_folder(folder, params.run) / "metrics.json"
-    known = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-    write_json(path, {**known, params.split: result})
+    stored = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    write_json(path, {**stored, params.split: result})
     return result
 
 

@@ -115,7 +115,7 @@ class _Graph:
 
 
 def _grid_position(g: _Graph, box: Box) -> str:
-    """World points to grid coordinates in [0, 1]³ (as kernels/walk.py)."""
+    """World points to grid coordinates in [0, 1]³ (as kernels/traversal.py)."""
     matrix = box.box_from_world
     p = g.add("Add", g.add("MatMul", "points", g.const(matrix[:3, :3].T)), g.const(matrix[:3, 3]))
     if not box.contracted:

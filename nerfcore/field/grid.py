@@ -39,14 +39,14 @@ class _Encode(torch.autograd.Function):
     def forward(
         ctx,
         points: torch.Tensor,
-        known: torch.Tensor | None,
+        precomputed: torch.Tensor | None,
         anchor: torch.Tensor,
         grid: VertexGrid,
         gains: list[float],
     ):
         ctx.grid, ctx.gains, ctx.collected = grid, gains, grid.collected()
         ctx.save_for_backward(points)
-        return encode.forward(grid.table, grid.levels, gains, points) if known is None else known
+        return encode.forward(grid.table, grid.levels, gains, points) if precomputed is None else precomputed
 
     @staticmethod
     def backward(ctx, *grads):
@@ -57,11 +57,11 @@ class _Encode(torch.autograd.Function):
             grid.scatter([part], ctx.gains)
         else:
             ctx.collected.append(part)
-        moved = None
+        grad_points = None
         if ctx.needs_input_grad[0]:
             gains = [gain * weight for gain, weight in zip(ctx.gains, grid.point_gains)]
-            moved = backward_points(grid.table, grid.levels, gains, *part)
-        return moved, None, None, None, None
+            grad_points = backward_points(grid.table, grid.levels, gains, *part)
+        return grad_points, None, None, None, None
 
 
 class VertexGrid(nn.Module):
@@ -74,7 +74,7 @@ class VertexGrid(nn.Module):
         super().__init__()
         self.levels = levels
         self.point_gains = [1.0] * len(levels)  # weights of the levels in the gradient of the points
-        self._here = threading.local()
+        self._thread = threading.local()
         rows = levels[-1][1] + -(-levels[-1][2] // BLOCK) * BLOCK
         self.register_buffer("table", torch.empty(rows, FEATURES).uniform_(-initial, initial))
         self.register_buffer("mean", torch.zeros(rows, FEATURES))
@@ -100,30 +100,32 @@ class VertexGrid(nn.Module):
     def parameter_count(self) -> int:
         return sum(rows for _, _, rows in self.levels) * FEATURES
 
-    def forward(self, points: torch.Tensor, gains: list[float], known: torch.Tensor | None = None) -> torch.Tensor:
+    def forward(
+        self, points: torch.Tensor, gains: list[float], precomputed: torch.Tensor | None = None
+    ) -> torch.Tensor:
         """Encode points (N, 3) in [0, 1]³ → (N, width) float32; `gains` (one per level) fade levels in.
 
-        `known`: the result, when a pass without gradients computed it already; only its gradient is added.
+        `precomputed`: the result, when a pass without gradients computed it already; only its gradient is added.
         """
         if not torch.is_grad_enabled():
             return encode.forward(self.table, self.levels, gains, points)
         # The anchor only tells autograd that the result depends on something trainable.
-        return _Encode.apply(points, known, self.anchor.requires_grad_(), self, gains)  # type: ignore[no-any-return]
+        return _Encode.apply(points, precomputed, self.anchor.requires_grad_(), self, gains)  # type: ignore[no-any-return]
 
     def collected(self) -> list[Part] | None:
         """Where this thread's gradients go instead of the grid, see `collecting`."""
-        return getattr(self._here, "collected", None)
+        return getattr(self._thread, "collected", None)
 
     @contextmanager
     def collecting(self) -> Iterator[list[Part]]:
         """Gradients of what this thread encodes here are listed instead of added, for one `scatter` later on: threads
         that differentiate parts of a batch side by side must not write the same rows."""
         parts: list[Part] = []
-        self._here.collected = parts
+        self._thread.collected = parts
         try:
             yield parts
         finally:
-            self._here.collected = None
+            self._thread.collected = None
 
     def scatter(self, parts: list[Part], gains: list[float]) -> None:
         """Add the gradients of encoded points, (points (N, 3), gradient (N, width)) each, to the grid's."""

@@ -105,12 +105,12 @@ class HybridField(nn.Module):
         if self.blend is not None:
             self.blend.warming_up = step < self.config.blend_warmup
 
-    def geometry(self, points: torch.Tensor, known: torch.Tensor | None = None) -> Geometry:
+    def geometry(self, points: torch.Tensor, precomputed: torch.Tensor | None = None) -> Geometry:
         """Density and features of points (N, 3) in grid coordinates [0, 1]³; density per normalised unit length.
 
-        `known` (N, F): explicit features of these points from a pass without gradients.
+        `precomputed` (N, F): explicit features of these points, from a pass without gradients.
         """
-        explicit = self.grid(points, self.gains, known) if self.grid is not None else None
+        explicit = self.grid(points, self.gains, precomputed) if self.grid is not None else None
         implicit = None
         if self.implicit is not None:
             implicit = self.implicit(frequency_encoding(points, self.config.octaves).to(self.dtype), self.dtype)

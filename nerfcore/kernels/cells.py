@@ -11,7 +11,7 @@ import warp as wp
 from . import cells_torch
 from .device import backend_of
 from .runtime import array, init, launch
-from .walk import cell_index
+from .traversal import cell_index
 
 FIXED_POINT = wp.constant(cells_torch.FIXED_POINT)
 LARGEST = wp.constant(cells_torch.LARGEST)

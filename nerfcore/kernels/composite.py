@@ -11,26 +11,26 @@ import warp as wp
 
 from . import composite_torch
 from .device import backend_of
-from .packing import Packing
+from .packed_info import PackedInfo
 from .runtime import array, init, launch
 
 
 @wp.kernel(module="fieldwork_composite")
 def weights_forward(
     density: wp.array(dtype=float),
-    delta: wp.array(dtype=float),
-    start: wp.array(dtype=int),
-    count: wp.array(dtype=int),
+    deltas: wp.array(dtype=float),
+    starts: wp.array(dtype=int),
+    counts: wp.array(dtype=int),
     weights: wp.array(dtype=float),
     offset: int,
 ):
     r = wp.tid() + offset
-    base = start[r]
-    depth = float(0.0)
+    base = starts[r]
+    optical_depth = float(0.0)
     before = float(1.0)
-    for k in range(base, base + count[r]):
-        depth += density[k] * delta[k]
-        after = wp.exp(-depth)
+    for k in range(base, base + counts[r]):
+        optical_depth += density[k] * deltas[k]
+        after = wp.exp(-optical_depth)
         weights[k] = before - after
         before = after
 
@@ -38,44 +38,44 @@ def weights_forward(
 @wp.kernel(module="fieldwork_composite")
 def weights_backward(
     density: wp.array(dtype=float),
-    delta: wp.array(dtype=float),
-    start: wp.array(dtype=int),
-    count: wp.array(dtype=int),
+    deltas: wp.array(dtype=float),
+    starts: wp.array(dtype=int),
+    counts: wp.array(dtype=int),
     weights: wp.array(dtype=float),
     grad_weights: wp.array(dtype=float),
     grad_density: wp.array(dtype=float),
     offset: int,
 ):
     r = wp.tid() + offset
-    base = start[r]
+    base = starts[r]
     total = float(0.0)
-    for k in range(base, base + count[r]):
+    for k in range(base, base + counts[r]):
         total += grad_weights[k] * weights[k]
-    depth = float(0.0)
+    optical_depth = float(0.0)
     behind = total
-    for k in range(base, base + count[r]):
-        depth += density[k] * delta[k]
+    for k in range(base, base + counts[r]):
+        optical_depth += density[k] * deltas[k]
         behind -= grad_weights[k] * weights[k]
-        grad_density[k] = delta[k] * (grad_weights[k] * wp.exp(-depth) - behind)
+        grad_density[k] = deltas[k] * (grad_weights[k] * wp.exp(-optical_depth) - behind)
 
 
 @wp.kernel(module="fieldwork_composite")
 def sum_forward(
     values: wp.array(dtype=float, ndim=2),
     weights: wp.array(dtype=float),
-    start: wp.array(dtype=int),
-    count: wp.array(dtype=int),
+    starts: wp.array(dtype=int),
+    counts: wp.array(dtype=int),
     channels: int,
     out: wp.array(dtype=float, ndim=2),
     offset: int,
 ):
     r = wp.tid() + offset
-    base = start[r]
+    base = starts[r]
     for c in range(channels):
         out[r, c] = 0.0
     if base < 0:
         return
-    for k in range(base, base + count[r]):
+    for k in range(base, base + counts[r]):
         w = weights[k]
         for c in range(channels):
             out[r, c] = out[r, c] + w * values[k, c]
@@ -85,7 +85,7 @@ def sum_forward(
 def sum_backward(
     values: wp.array(dtype=float, ndim=2),
     weights: wp.array(dtype=float),
-    ray: wp.array(dtype=int),
+    ray_indices: wp.array(dtype=int),
     channels: int,
     grad_out: wp.array(dtype=float, ndim=2),
     grad_values: wp.array(dtype=float, ndim=2),
@@ -93,7 +93,7 @@ def sum_backward(
     offset: int,
 ):
     k = wp.tid() + offset
-    r = ray[k]
+    r = ray_indices[k]
     if r < 0:
         for c in range(channels):
             grad_values[k, c] = 0.0
@@ -109,38 +109,45 @@ def sum_backward(
 
 class _Weights(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, density: torch.Tensor, delta: torch.Tensor, packing: Packing) -> torch.Tensor:
+    def forward(ctx, density: torch.Tensor, deltas: torch.Tensor, packed_info: PackedInfo) -> torch.Tensor:
         init()
         density = density.contiguous()
         weights = torch.zeros_like(density)
-        inputs = [array(density), array(delta), array(packing.start), array(packing.count), array(weights)]
-        launch(weights_forward, len(packing.start), inputs, density.device)
-        ctx.packing = packing
-        ctx.save_for_backward(density, delta, weights)
+        inputs = [array(density), array(deltas), array(packed_info.starts), array(packed_info.counts), array(weights)]
+        launch(weights_forward, len(packed_info.starts), inputs, density.device)
+        ctx.packed_info = packed_info
+        ctx.save_for_backward(density, deltas, weights)
         return weights
 
     @staticmethod
     def backward(ctx, *grads):
-        density, delta, weights = ctx.saved_tensors
-        packing: Packing = ctx.packing
+        density, deltas, weights = ctx.saved_tensors
+        packed_info: PackedInfo = ctx.packed_info
         grad_density = torch.zeros_like(density)
-        inputs = [array(density), array(delta), array(packing.start), array(packing.count)]
+        inputs = [array(density), array(deltas), array(packed_info.starts), array(packed_info.counts)]
         inputs += [array(weights), array(grads[0].contiguous()), array(grad_density)]
-        launch(weights_backward, len(packing.start), inputs, density.device)
+        launch(weights_backward, len(packed_info.starts), inputs, density.device)
         return grad_density, None, None
 
 
 class _Sum(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, values: torch.Tensor, weights: torch.Tensor, packing: Packing) -> torch.Tensor:
+    def forward(ctx, values: torch.Tensor, weights: torch.Tensor, packed_info: PackedInfo) -> torch.Tensor:
         init()
         ctx.dtype = values.dtype
         values, weights = values.float().contiguous(), weights.contiguous()
         channels = values.shape[1]
-        out = torch.empty(len(packing.start), channels, device=values.device)
-        inputs = [array(values), array(weights), array(packing.start), array(packing.count), channels, array(out)]
-        launch(sum_forward, len(packing.start), inputs, values.device)
-        ctx.packing = packing
+        out = torch.empty(len(packed_info.starts), channels, device=values.device)
+        inputs = [
+            array(values),
+            array(weights),
+            array(packed_info.starts),
+            array(packed_info.counts),
+            channels,
+            array(out),
+        ]
+        launch(sum_forward, len(packed_info.starts), inputs, values.device)
+        ctx.packed_info = packed_info
         ctx.save_for_backward(values, weights)
         return out
 
@@ -148,21 +155,21 @@ class _Sum(torch.autograd.Function):
     def backward(ctx, *grads):
         values, weights = ctx.saved_tensors
         grad_values, grad_weights = torch.empty_like(values), torch.empty_like(weights)
-        inputs = [array(values), array(weights), array(ctx.packing.ray), values.shape[1]]
+        inputs = [array(values), array(weights), array(ctx.packed_info.ray_indices), values.shape[1]]
         inputs += [array(grads[0].contiguous()), array(grad_values), array(grad_weights)]
         launch(sum_backward, len(weights), inputs, values.device)
         return grad_values.to(ctx.dtype), grad_weights, None
 
 
-def render_weights(density: torch.Tensor, delta: torch.Tensor, packing: Packing) -> torch.Tensor:
+def render_weights(density: torch.Tensor, deltas: torch.Tensor, packed_info: PackedInfo) -> torch.Tensor:
     """Rendering weights (N,) of packed samples from their densities and lengths (N,); differentiable in `density`."""
     if not backend_of(density.device).warp:
-        return composite_torch.render_weights(density, delta, packing)
-    return _Weights.apply(density, delta, packing)  # type: ignore[no-any-return]
+        return composite_torch.render_weights(density, deltas, packed_info)
+    return _Weights.apply(density, deltas, packed_info)  # type: ignore[no-any-return]
 
 
-def weighted_sum(values: torch.Tensor, weights: torch.Tensor, packing: Packing) -> torch.Tensor:
+def weighted_sum(values: torch.Tensor, weights: torch.Tensor, packed_info: PackedInfo) -> torch.Tensor:
     """Σ_j w_j v_j per ray: values (N, C), weights (N,) → (R, C) float32, zero for rays without samples."""
     if not backend_of(weights.device).warp:
-        return composite_torch.weighted_sum(values, weights, packing)
-    return _Sum.apply(values, weights, packing)  # type: ignore[no-any-return]
+        return composite_torch.weighted_sum(values, weights, packed_info)
+    return _Sum.apply(values, weights, packed_info)  # type: ignore[no-any-return]

@@ -1,4 +1,4 @@
-"""Launching the fused renderer: the coarse walk of rays, and the fused kernel on those that meet something."""
+"""Launching the fused renderer: the coarse march of rays, and the fused kernel on those that meet something."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import torch
 import warp as wp
 
+from . import march
 from .blocks import launch_blocks
 from .fused_kernel import FusedShape, March, fused_kernel
 from .fused_network import half_feature
-from .march import coarse, sample_counts
 from .runtime import array, init
-from .walk import MarchSettings
+from .traversal import MarchSettings
 
 LANES = 64  # samples a block works on, on CUDA; two to eight blocks fit a multiprocessor of sm_75 and later
 BLOCKS_PER_MULTIPROCESSOR = 8
@@ -43,7 +43,7 @@ class FusedField:
 
 @dataclass(frozen=True)
 class FusedRays:
-    """Of R rays, as `train.model.Rendered`: color (R, 3), opacity (R,), depth (R,), probabilities (R, K) or None;
+    """Of R rays, as `render.model.Rendered`: color (R, 3), opacity (R,), depth (R,), probabilities (R, K) or None;
     evaluated: () int64 on the device, samples at which the field was read."""
 
     color: torch.Tensor
@@ -55,50 +55,50 @@ class FusedRays:
 
 @dataclass(frozen=True)
 class CoarseRays:
-    """What the coarse walk found: total weight, first open distance and number of open bins (R,), the rays that meet
-    something in `queue` (R,) int32 and their number `hits` (1,) int32, all on the device."""
+    """What the coarse march tells: total weight, distance of the first occupied bin and number of occupied bins (R,), the rays that meet
+    something in `queue` (R,) int32 and their number `ray_count` (1,) int32, all on the device."""
 
     origins: torch.Tensor
     directions: torch.Tensor
-    total: torch.Tensor
-    first: torch.Tensor
-    bins: torch.Tensor
+    total_weight: torch.Tensor
+    t_first: torch.Tensor
+    bin_counts: torch.Tensor
     queue: torch.Tensor
-    hits: torch.Tensor
+    ray_count: torch.Tensor
 
 
-def coarse_walk(
+def coarse_march(
     origins: torch.Tensor,
     directions: torch.Tensor,
     cells: torch.Tensor,
-    reach: torch.Tensor,
+    skip_distance: torch.Tensor,
     settings: MarchSettings,
 ) -> CoarseRays:
-    """Walk rays (R, 3) of the normalised frame through the occupancy grid; see `march.sample` for the arguments.
+    """March rays (R, 3) of the normalised frame through the occupancy grid; see `march.sample` for the arguments.
 
     Nothing is read back from the device.
     """
     device, rays = origins.device, len(origins)
-    total, first, _, bins = coarse(origins, directions, cells, reach, settings)
-    hit = total > 0
-    place = torch.cumsum(hit, 0)
-    # Rays that miss are written to a place behind the queue.
+    total_weight, t_first, _, bin_counts = march.coarse_march(origins, directions, cells, skip_distance, settings)
+    hit = total_weight > 0
+    rank = torch.cumsum(hit, 0)
+    # Rays that miss are written behind the queue.
     queue = torch.empty(rays + 1, dtype=torch.int32, device=device)
-    queue.scatter_(0, torch.where(hit, place - 1, rays), torch.arange(rays, dtype=torch.int32, device=device))
-    return CoarseRays(origins, directions, total, first, bins, queue, place[-1:].to(torch.int32))
+    queue.scatter_(0, torch.where(hit, rank - 1, rays), torch.arange(rays, dtype=torch.int32, device=device))
+    return CoarseRays(origins, directions, total_weight, t_first, bin_counts, queue, rank[-1:].to(torch.int32))
 
 
 def render_coarse(
     field: FusedField,
     rays: CoarseRays,
     cells: torch.Tensor,
-    reach: torch.Tensor,
+    skip_distance: torch.Tensor,
     settings: MarchSettings,
     count: int,
     cull: float,
     lanes: int | None = None,
 ) -> FusedRays:
-    """Colour, opacity, depth and class probabilities of rays after their coarse walk, at most `count` samples a ray.
+    """Colour, opacity, depth and class probabilities of rays after their coarse march, at most `count` samples a ray.
 
     `lanes`: samples a block, by default `LANES` on CUDA and 1 on the CPU, where more need Warp's `enable_cpu_blocks`.
     """
@@ -113,15 +113,28 @@ def render_coarse(
     resident = 2 if lanes > 1 else 1  # blocks at a time; more than one on the CPU only to test that they share
     if cuda:
         resident = torch.cuda.get_device_properties(device).multi_processor_count * BLOCKS_PER_MULTIPROCESSOR
-    counts = sample_counts(rays.bins, count, settings.per_bin)
+    counts = march.sample_counts(rays.bin_counts, count, settings.per_bin)
     groups = max(1, min(-(-number // lanes), resident))
     pixels = torch.zeros(number, 5, device=device)
     classes = field.class_count
     probabilities = torch.zeros(number, max(classes, 1), device=device)
-    taken = torch.zeros(1, dtype=torch.int32, device=device)
+    next_ray = torch.zeros(1, dtype=torch.int32, device=device)
     evaluated = torch.zeros(groups * lanes, dtype=torch.int32, device=device)
-    inputs = [array(rays.origins, wp.vec3), array(rays.directions, wp.vec3), array(rays.total), array(rays.first)]
-    inputs += [array(rays.queue), array(taken), array(rays.hits), array(counts), m, array(cells, wp.vec2), array(reach)]
+    inputs = [
+        array(rays.origins, wp.vec3),
+        array(rays.directions, wp.vec3),
+        array(rays.total_weight),
+        array(rays.t_first),
+    ]
+    inputs += [
+        array(rays.queue),
+        array(next_ray),
+        array(rays.ray_count),
+        array(counts),
+        m,
+        array(cells, wp.vec2),
+        array(skip_distance),
+    ]
     inputs += [array(field.table, half_feature), array(field.layout), array(field.gains), array(field.evidence)]
     inputs += [field.evidence_side, field.blend_floor, field.blend_rate, array(field.weights), array(field.code)]
     inputs += [field.density_shift, cull, classes, array(pixels), array(probabilities), array(evaluated)]

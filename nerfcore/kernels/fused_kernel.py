@@ -1,10 +1,10 @@
 """The kernel of the fused renderer: second march, encodings, networks and compositing of whole rays.
 
-The coarse walk (`march_weight`) says which rays meet open cells and how much weight their bins have; this kernel
+The coarse march (`march_weight`) says which rays meet occupied cells and how much weight their bins have; this kernel
 takes those rays from a queue. Every thread of a block follows one ray: it advances to the ray's next sample, the block
 evaluates its samples together on the matrix units (`fused_network`), and the thread composites its own. A ray that
 is used up, or opaque, makes room for the next one, so blocks stay full. Samples are those of `march.sample` with all
-shifts ½; the unfused path in `train/model.py` is the oracle (equal within half precision). `fused.py` launches it.
+shifts ½; the unfused path in `render/model.py` is the oracle (equal within half precision). `fused.py` launches it.
 
 The same source runs on the CPU for tests, on one thread and slowly.
 """
@@ -27,18 +27,18 @@ from .fused_network import (
     padded,
     spherical_harmonics,
 )
-from .walk import (
+from .traversal import (
     _DEFAULT,
+    EARLY_STOP,
     MAX_BINS,
-    STOP,
     bin_length,
     bin_weight,
     cell_index,
-    closed_length,
     grid_position,
     inside,
     ray_interval,
     reciprocal,
+    skip_length,
 )
 
 CERTAIN = wp.constant(0.999)  # blend weight from which the implicit branch no longer shows in half precision
@@ -119,11 +119,11 @@ class Ray:
     high: float
     share: float
     t: float
-    last: float  # distance of the last open bin
+    t_last: float  # distance of the last occupied bin
     transmittance: float
     below: float  # weight of the bins behind
     used: float  # part of the present bin given to intervals already
-    gathered: float  # open length of the next sample's interval so far
+    gathered: float  # occupied length of the next sample's interval so far
     sample: int
     count: int
     ended: int
@@ -142,53 +142,53 @@ class March:
 
 
 @wp.func
-def advanced(ray: Ray, m: March, cells: wp.array(dtype=wp.vec2), reach: wp.array(dtype=wp.uint8)):
+def advanced(ray: Ray, m: March, cells: wp.array(dtype=wp.vec2), skip_distance: wp.array(dtype=wp.uint8)):
     """The ray after its next sample, with the sample's distance and length."""
     target = (float(ray.sample) + 0.5) * ray.share
     edge = float(ray.sample + 1) * ray.share
-    place = float(-1.0)
+    t = float(-1.0)
     length = float(0.0)
-    found = int(0)
+    complete = int(0)
     for _ in range(MAX_BINS):
-        if found == 1 or ray.t >= ray.high:
+        if complete == 1 or ray.t >= ray.high:
             break
         p = ray.origin + ray.direction * ray.t
         width = bin_length(p, m.step, m.contracted)
         u = grid_position(p, m.contracted)
         cell = cells[cell_index(u, m.n)]
         if cell[0] > 0.0:
-            through = wp.exp(-cell[0] * width)
-            weight = bin_weight(cell, ray.transmittance, through, m.mode, m.beta, m.epsilon)
+            bin_transmittance = wp.exp(-cell[0] * width)
+            weight = bin_weight(cell, ray.transmittance, bin_transmittance, m.mode, m.beta, m.epsilon)
             above = ray.below + weight
-            ray.last = ray.t
-            if place < 0.0 and target <= above:
-                place = ray.t + ((target - ray.below) / weight - 0.5) * width
+            ray.t_last = ray.t
+            if t < 0.0 and target <= above:
+                t = ray.t + ((target - ray.below) / weight - 0.5) * width
             if edge <= above:
-                upto = (edge - ray.below) / weight
-                length = ray.gathered + (upto - ray.used) * width
+                fraction = (edge - ray.below) / weight
+                length = ray.gathered + (fraction - ray.used) * width
                 ray.gathered = 0.0
-                ray.used = upto
-                found = 1
+                ray.used = fraction
+                complete = 1
             else:
                 ray.gathered += (1.0 - ray.used) * width
                 ray.used = 0.0
                 ray.below = above
                 ray.t += width
                 if m.mode == _DEFAULT:
-                    ray.transmittance *= through
-                    if ray.transmittance < STOP:
+                    ray.transmittance *= bin_transmittance
+                    if ray.transmittance < EARLY_STOP:
                         ray.t = ray.high
         else:
-            ray.t += closed_length(u, ray.direction, ray.inverse, m.n, m.step, width, m.contracted, reach)
-    if found == 0:
+            ray.t += skip_length(u, ray.direction, ray.inverse, m.n, m.step, width, m.contracted, skip_distance)
+    if complete == 0:
         # Rounding left this interval just short of the total; nothing is behind it.
         length = ray.gathered
         ray.gathered = 0.0
         ray.ended = 1
-        if place < 0.0:
-            place = ray.last
+        if t < 0.0:
+            t = ray.t_last
     ray.sample += 1
-    return ray, place, length
+    return ray, t, length
 
 
 @cache
@@ -209,21 +209,21 @@ def fused_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
     semantic_network = network(shape.semantic, lanes) if classes else None
     semantic_input = half_vector(shape.semantic[0])
     density_input, branch_vector = half_vector(shape.density[0]), half_vector(features)
-    known_vector = half_vector(geometry)
-    explicit_place = geometry_rows + (features if octaves else 0)
+    geometry_vector = half_vector(geometry)
+    explicit_row = geometry_rows + (features if octaves else 0)
 
     def fused_render(
         origins: wp.array(dtype=wp.vec3),
         directions: wp.array(dtype=wp.vec3),
-        total: wp.array(dtype=float),
-        first: wp.array(dtype=float),
+        total_weight: wp.array(dtype=float),
+        t_first: wp.array(dtype=float),
         queue: wp.array(dtype=int),
-        taken: wp.array(dtype=int),
-        hits: wp.array(dtype=int),
+        next_ray: wp.array(dtype=int),
+        ray_count: wp.array(dtype=int),
         counts: wp.array(dtype=int),
         m: March,
         cells: wp.array(dtype=wp.vec2),
-        reach: wp.array(dtype=wp.uint8),
+        skip_distance: wp.array(dtype=wp.uint8),
         table: wp.array(dtype=half_feature),
         layout: wp.array2d(dtype=int),
         gains: wp.array(dtype=float),
@@ -243,7 +243,7 @@ def fused_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
         lane = wp.tid()
         ray = Ray()
         ray.index = -1
-        depth = float(0.0)
+        optical_depth = float(0.0)
         before = float(1.0)
         red = float(0.0)
         green = float(0.0)
@@ -251,12 +251,12 @@ def fused_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
         opacity = float(0.0)
         distance = float(0.0)
         samples = int(0)
-        working = int(1)
-        while working > 0:
+        active_lanes = int(1)
+        while active_lanes > 0:
             if ray.index < 0:
-                place = wp.atomic_add(taken, 0, 1)
-                if place < hits[0]:
-                    r = queue[place]
+                position = wp.atomic_add(next_ray, 0, 1)
+                if position < ray_count[0]:
+                    r = queue[position]
                     ray.index = r
                     ray.origin = origins[r]
                     ray.direction = directions[r]
@@ -264,16 +264,16 @@ def fused_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
                     _, high = ray_interval(ray.origin, ray.inverse, m.near, m.far, m.contracted)
                     ray.high = high
                     ray.count = counts[r]
-                    ray.share = total[r] / float(ray.count)
-                    ray.t = first[r]
-                    ray.last = first[r]
+                    ray.share = total_weight[r] / float(ray.count)
+                    ray.t = t_first[r]
+                    ray.t_last = t_first[r]
                     ray.transmittance = 1.0
                     ray.below = 0.0
                     ray.used = 0.0
                     ray.gathered = 0.0
                     ray.sample = 0
                     ray.ended = 0
-                    depth = 0.0
+                    optical_depth = 0.0
                     before = 1.0
                     red = 0.0
                     green = 0.0
@@ -281,13 +281,13 @@ def fused_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
                     opacity = 0.0
                     distance = 0.0
             active = wp.where(ray.index >= 0, 1, 0)
-            working = wp.tile_sum(wp.tile(active))[0]
-            if working > 0:
+            active_lanes = wp.tile_sum(wp.tile(active))[0]
+            if active_lanes > 0:
                 t = float(0.0)
                 length = float(0.0)
                 p = wp.vec3(0.5, 0.5, 0.5)
                 if active == 1:
-                    ray, t, length = advanced(ray, m, cells, reach)
+                    ray, t, length = advanced(ray, m, cells, skip_distance)
                     p = inside(grid_position(ray.origin + ray.direction * t, m.contracted))
                     samples += 1
                 explicit = grid(p, table, layout, gains)
@@ -299,9 +299,9 @@ def fused_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
                     w = float(1.0)
                     if active == 1 and evidence_side > 0:
                         w = 1.0 - (1.0 - blend_floor) * wp.exp(-blend_rate * trilinear_at(evidence, evidence_side, p))
-                    # Where the whole block is certain of its grid the implicit branch waits until someone asks.
-                    unsure = wp.tile_sum(wp.tile(wp.where(w < CERTAIN, 1, 0)))[0]
-                    if unsure > 0:
+                    # Where the whole block is certain of its grid the implicit branch is read only for classes.
+                    uncertain_lanes = wp.tile_sum(wp.tile(wp.where(w < CERTAIN, 1, 0)))[0]
+                    if uncertain_lanes > 0:
                         smooth = implicit_network(frequencies(p), weights, implicit_row)
                         for k in range(features):
                             implicit[k] = wp.float16(smooth[k])
@@ -311,27 +311,27 @@ def fused_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
                             else:
                                 hidden[k] = wp.float16(w * float(explicit[k]) + (1.0 - w) * smooth[k])
                 out = density_network(hidden, weights, density_row)
-                known = known_vector()
+                geometry_features = geometry_vector()
                 for k in range(geometry):
-                    known[k] = wp.float16(out[k])
+                    geometry_features[k] = wp.float16(out[k])
                 density = wp.exp(wp.clamp(out[0] + density_shift, -15.0, 11.0))
-                depth += density * length
-                after = wp.exp(-depth)
+                optical_depth += density * length
+                after = wp.exp(-optical_depth)
                 weight = before - after
                 before = after
-                shows = wp.where(active == 1 and weight > cull, 1, 0)
-                seen = wp.tile_sum(wp.tile(shows))[0]
-                if seen > 0:
+                visible = wp.where(active == 1 and weight > cull, 1, 0)
+                visible_lanes = wp.tile_sum(wp.tile(visible))[0]
+                if visible_lanes > 0:
                     x = color_input()
                     for k in range(geometry):
-                        x[k] = known[k]
+                        x[k] = geometry_features[k]
                     sh = spherical_harmonics(ray.direction)
                     for k in range(HARMONICS):
                         x[geometry + k] = wp.float16(sh[k])
                     for k in range(appearance):
                         x[color_code + k] = wp.float16(code[k])
                     color = color_network(x, weights, color_row)
-                    if shows == 1:
+                    if visible == 1:
                         red += weight / (1.0 + wp.exp(-color[0]))
                         green += weight / (1.0 + wp.exp(-color[1]))
                         blue += weight / (1.0 + wp.exp(-color[2]))
@@ -340,18 +340,18 @@ def fused_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
                     if wp.static(classes > 0):
                         y = semantic_input()
                         for k in range(geometry):
-                            y[k] = known[k]
+                            y[k] = geometry_features[k]
                         if wp.static(octaves > 0):
-                            if unsure == 0:
+                            if uncertain_lanes == 0:
                                 smooth = implicit_network(frequencies(p), weights, implicit_row)
                                 for k in range(features):
                                     implicit[k] = wp.float16(smooth[k])
                             for k in range(features):
                                 y[geometry_rows + k] = implicit[k]
                         for k in range(features):
-                            y[explicit_place + k] = explicit[k]
+                            y[explicit_row + k] = explicit[k]
                         scores = semantic_network(y, weights, semantic_row)
-                        if shows == 1:
+                        if visible == 1:
                             if wp.static(logits == 0):
                                 largest = float(-1.0e30)
                                 for k in range(classes):
@@ -365,7 +365,7 @@ def fused_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
                             for k in range(classes):
                                 if k < class_count:
                                     probabilities[ray.index, k] = probabilities[ray.index, k] + weight * scores[k]
-                if active == 1 and (ray.ended == 1 or ray.sample >= ray.count or before < STOP):
+                if active == 1 and (ray.ended == 1 or ray.sample >= ray.count or before < EARLY_STOP):
                     pixels[ray.index, 0] = red
                     pixels[ray.index, 1] = green
                     pixels[ray.index, 2] = blue

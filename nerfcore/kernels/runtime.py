@@ -34,18 +34,18 @@ def worker_count() -> int:
     return max(1, torch.get_num_threads())
 
 
-_here = threading.local()
+_thread = threading.local()
 
 
 def _enter_pool() -> None:
     # Each thread works on its own part; what it calls must not start threads of its own.
     torch.set_num_threads(1)
-    _here.in_pool = True
+    _thread.in_pool = True
 
 
 def in_pool() -> bool:
     """Whether this thread is one of `run_parallel`'s: launches and nested `run_parallel` calls then stay in it."""
-    return getattr(_here, "in_pool", False)
+    return getattr(_thread, "in_pool", False)
 
 
 @cache
@@ -109,7 +109,7 @@ def compile_seconds() -> float:
 def launch(kernel: wp.Kernel, count: int, inputs: list[Any], device: torch.device, serial: bool = False) -> None:
     """Run `kernel` for indices 0 … count−1 with `inputs` followed by the chunk's offset.
 
-    `serial` keeps a CPU launch in one thread, for kernels that write places which indices share.
+    `serial` keeps a CPU launch in one thread, for kernels that write entries that indices share.
     """
     if count <= 0:
         return

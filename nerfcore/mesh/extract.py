@@ -60,9 +60,9 @@ def density_volume(
     counts = np.maximum(np.ceil((high - low) / spacing).astype(int) + 1, 2)
     axes = [torch.arange(n, device=device, dtype=torch.float32) * spacing + float(a) for n, a in zip(counts, low)]
     n = model.occupancy.config.resolution
-    # An open cell opens its neighbours: the surface may lie on its border.
-    opened = model.occupancy.cells[:, 0].view(1, 1, n, n, n) > 0
-    opened = torch.nn.functional.max_pool3d(opened.float(), 3, 1, 1).reshape(-1) > 0
+    # An occupied cell occupies its neighbours: the surface may lie on its border.
+    occupied = model.occupancy.cells[:, 0].view(1, 1, n, n, n) > 0
+    occupied = torch.nn.functional.max_pool3d(occupied.float(), 3, 1, 1).reshape(-1) > 0
     volume = np.zeros(counts, np.float32)
     for index, x in enumerate(axes[0]):
         report.progress(index / counts[0])
@@ -70,7 +70,7 @@ def density_volume(
         points = torch.cat([torch.full_like(yz[:, :1], float(x)), yz], 1)
         u = grid_from_normalised(points, model.contracted).clamp(0, 1)
         cell = (u * n).long().clamp(max=n - 1)
-        inside = opened[(cell[:, 2] * n + cell[:, 1]) * n + cell[:, 0]].nonzero()[:, 0]
+        inside = occupied[(cell[:, 2] * n + cell[:, 1]) * n + cell[:, 0]].nonzero()[:, 0]
         plane = torch.zeros(len(points), device=device)
         for part in inside.split(CHUNK):
             plane[part] = model.field.density(u[part].contiguous())
@@ -164,8 +164,8 @@ def drop_parts(mesh: trimesh.Trimesh, visible: np.ndarray, share: float = 0.01) 
     less than a twentieth is visible (cavities inside solid things)."""
     labels = trimesh.graph.connected_component_labels(mesh.face_adjacency, node_count=len(mesh.faces))
     counts = np.bincount(labels)
-    shown = np.bincount(labels, visible) >= 0.05 * counts
-    good = shown & (counts >= max(share * counts[shown].max(initial=0), 16))
+    visible_enough = np.bincount(labels, visible) >= 0.05 * counts
+    good = visible_enough & (counts >= max(share * counts[visible_enough].max(initial=0), 16))
     if good.all() or not good.any():
         return mesh
     used, inverse = np.unique(mesh.faces[good[labels]], return_inverse=True)
@@ -189,8 +189,8 @@ def shade(
     step = float(offsets[0] - offsets[1])
     for index, (p, n) in enumerate(zip(where.split(CHUNK // 8), outward.split(CHUNK // 8))):
         report.progress(min(index * CHUNK / 8 / max(len(where), 1), 1.0))
-        places = p[:, None] + n[:, None] * offsets[:, None]
-        u = grid_from_normalised(places.reshape(-1, 3), model.contracted).clamp(0, 1).contiguous()
+        positions = p[:, None] + n[:, None] * offsets[:, None]
+        u = grid_from_normalised(positions.reshape(-1, 3), model.contracted).clamp(0, 1).contiguous()
         geometry = model.field.geometry(u)
         alpha = 1 - torch.exp(-geometry.density.view(len(p), -1) * step)
         before = torch.cumprod(torch.cat([torch.ones_like(alpha[:, :1]), 1 - alpha[:, :-1]], 1), 1)

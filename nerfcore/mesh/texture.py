@@ -68,10 +68,10 @@ def rasterize(uv: np.ndarray, faces: np.ndarray, size: int) -> tuple[np.ndarray,
             w = (ab[part, None, 0] * p[..., 1] - ab[part, None, 1] * p[..., 0]) / area[part, None]
             inside = (v >= -1e-6) & (w >= -1e-6) & (v + w <= 1 + 1e-6)
             inside &= (texel >= 0).all(-1) & (texel < size).all(-1)
-            row, place = np.nonzero(inside)
-            x, y = texel[row, place].T
+            row, column = np.nonzero(inside)
+            x, y = texel[row, column].T
             face[y, x] = part[row]
-            weights[y, x] = np.stack([v[row, place], w[row, place]], -1)
+            weights[y, x] = np.stack([v[row, column], w[row, column]], -1)
     return face, weights
 
 

@@ -9,7 +9,7 @@ import torch
 
 from ..field.hybrid import HybridField
 from ..field.mlp import MLP
-from ..kernels.fused import MOST_CLASSES, CoarseRays, FusedField, FusedRays, coarse_walk, render_coarse
+from ..kernels.fused import MOST_CLASSES, CoarseRays, FusedField, FusedRays, coarse_march, render_coarse
 from ..kernels.fused_kernel import FusedShape
 from ..kernels.fused_network import padded
 from ..kernels.runtime import small_tensor
@@ -85,8 +85,8 @@ def _spread(matrix: torch.Tensor, parts: list[tuple[int, int]], columns: int) ->
     """A first layer (out, in) with its inputs moved: each (width, padded width) part keeps its order and gets zero
     columns behind it; the whole is `columns` wide."""
     pieces, begin = [], 0
-    for width, room in parts:
-        pieces.append(torch.nn.functional.pad(matrix[:, begin : begin + width], (0, room - width)))
+    for width, padded_width in parts:
+        pieces.append(torch.nn.functional.pad(matrix[:, begin : begin + width], (0, padded_width - width)))
         begin += width
     joined = torch.cat(pieces, 1)
     return torch.nn.functional.pad(joined, (0, columns - joined.shape[1]))
@@ -159,14 +159,14 @@ class FusedRenderer:
         self.field = pack(model.field, semantics, self.config.render.accumulate == "logits")
 
     def coarse(self, origins: torch.Tensor, directions: torch.Tensor) -> CoarseRays:
-        """The coarse walk of rays (R, 3), on the grid alone."""
+        """The coarse march of rays (R, 3), on the grid alone."""
         g = self.grid
-        return coarse_walk(origins, directions, g.cells, g.reach, g.settings)
+        return coarse_march(origins, directions, g.cells, g.skip_distance, g.settings)
 
     def fine(self, rays: CoarseRays, count: int) -> FusedRays:
-        """Samples, field and compositing of rays after their coarse walk."""
+        """Samples, field and compositing of rays after their coarse march."""
         g = self.grid
-        out = render_coarse(self.field, rays, g.cells, g.reach, g.settings, count, self.config.render.cull)
+        out = render_coarse(self.field, rays, g.cells, g.skip_distance, g.settings, count, self.config.render.cull)
         if out.probabilities is None or self.config.render.accumulate == "probabilities":
             return out
         # Summed logits become probabilities of the ray once it is complete.

@@ -11,23 +11,24 @@ from torch import nn
 
 from ..config import RunConfig
 from ..field.encoding import spherical_harmonics
-from ..field.hybrid import HybridField
+from ..field.hybrid import Geometry, HybridField
 from ..geometry.contraction import grid_position
 from ..kernels.composite import render_weights, weighted_sum
 from ..kernels.march import Samples, sample
-from ..sampling.occupancy import OccupancyGrid, class_interest
+from ..kernels.packed_info import PackedInfo
+from ..sampling.occupancy import OccupancyGrid, class_importance
 from ..sampling.render_grid import RenderGrid, present_grid, refined_grid
 
 ONE_PASS_SHARE = 0.67
-ROOM = 1.6  # places for samples that show, as a multiple of how many did lately
+CAPACITY_FACTOR = 1.6  # entries for visible samples, as a multiple of how many there were lately
 
 
 @dataclass(frozen=True)
 class Rendered:
     """Of R rays: color (R, 3) without background, opacity (R,), depth (R,) expected distance (normalised units, not
-    divided by opacity), probabilities (R, K) or None; of the samples that show: weights (N,), density (N,), packed as
-    in `samples`; of all M samples the field was read at: `read_points` (M, 3) in grid coordinates and `read_density`,
-    −1 where a place is unused.
+    divided by opacity), probabilities (R, K) or None; of the visible samples: weights (N,), density (N,), packed as
+    in `samples`; of all M samples the field was evaluated at: `evaluated_points` (M, 3) in grid coordinates and
+    `evaluated_density`, −1 where an entry is unused.
     """
 
     color: torch.Tensor
@@ -37,13 +38,13 @@ class Rendered:
     weights: torch.Tensor
     density: torch.Tensor
     samples: Samples
-    read_points: torch.Tensor
-    read_density: torch.Tensor
+    evaluated_points: torch.Tensor
+    evaluated_density: torch.Tensor
 
     @property
     def evaluated(self) -> int:
-        """Number of places at which the field was evaluated."""
-        return len(self.read_density)
+        """Number of samples at which the field was evaluated."""
+        return len(self.evaluated_density)
 
 
 class Model(nn.Module):
@@ -75,33 +76,33 @@ class Model(nn.Module):
         self.priorities: torch.Tensor
         self.warming_up = False
         self.labelled = 1.0  # share of the training pixels that have a label
-        self.register_buffer("shown_share", torch.ones(()))
-        self.shown_share: torch.Tensor
+        self.register_buffer("visible_share", torch.ones(()))
+        self.visible_share: torch.Tensor
         self._refined: RenderGrid | None = None
-        # What is differentiated has places for as many samples as there may be, so that the host need not wait for
-        # their number; None: on devices that run behind the host.
-        self.fixed_places: bool | None = None
-        self.known_share = 1.0  # `shown_share` as the host last read it
+        # What is differentiated has a fixed capacity, so that the host need not wait for the number of samples; None:
+        # on devices that run behind the host.
+        self.fixed_capacity: bool | None = None
+        self.host_visible_share = 1.0  # `visible_share` as the host last read it
 
-    def has_fixed_places(self) -> bool:
+    def has_fixed_capacity(self) -> bool:
         """Whether `render` reads nothing back from the device where it keeps gradients."""
-        return self.priorities.device.type == "cuda" if self.fixed_places is None else self.fixed_places
+        return self.priorities.device.type == "cuda" if self.fixed_capacity is None else self.fixed_capacity
 
     def refresh(self) -> None:
-        """Read back how many of the samples show."""
-        self.known_share = float(self.shown_share)
+        """Read back how many of the samples are visible."""
+        self.host_visible_share = float(self.visible_share)
 
     @property
     def contracted(self) -> bool:
         return self.occupancy.contracted
 
-    def interest(self, points: torch.Tensor) -> torch.Tensor:
-        """Interest (N,) of points (N, 3) for the sampling PDF."""
-        kind = "literal" if self.config.sampling.pdf == "literal" else self.config.sampling.interest
+    def importance(self, points: torch.Tensor) -> torch.Tensor:
+        """Importance (N,) of points (N, 3) for the sampling PDF."""
+        kind = "literal" if self.config.sampling.pdf == "literal" else self.config.sampling.importance
         logits = self.field.logits(self.field.geometry(points))
-        return class_interest(torch.softmax(logits, 1), kind, self.priorities)
+        return class_importance(torch.softmax(logits, 1), kind, self.priorities)
 
-    def wants_interest(self) -> bool:
+    def wants_importance(self) -> bool:
         """Whether reading classes would change where samples go."""
         s = self.config.sampling
         if self.field.semantic_head is None or s.pdf == "uniform":
@@ -109,7 +110,7 @@ class Model(nn.Module):
         if s.pdf == "literal":
             return True
         flat = bool((self.priorities == self.priorities[0]).all())
-        return s.beta > 0 and (s.interest == "boundary" or (s.interest == "priority" and not flat))
+        return s.beta > 0 and (s.importance == "boundary" or (s.importance == "priority" and not flat))
 
     def refine(self, pixels: float = math.inf, check: Callable[[], None] | None = None) -> None:
         """Render from now on with a finer grid if it pays for so many pixels. Training leaves it behind: for fields that
@@ -125,7 +126,7 @@ class Model(nn.Module):
         return 0.0 if self.config.loss.detach_weights else self.labelled
 
     def render_grid(self) -> RenderGrid:
-        """What the rays of a picture walk."""
+        """What the rays of a picture traverse."""
         return self._refined or present_grid(self.occupancy, self.config.render.per_bin)
 
     def render(
@@ -141,77 +142,111 @@ class Model(nn.Module):
     ) -> Rendered:
         """Render rays (R, 3) of the normalised frame; differentiable in the field.
 
-        `grid`: what the rays walk, by default the occupancy grid, as in training; `jitter`, `shift`: see
+        `grid`: what the rays traverse, by default the occupancy grid, as in training; `jitter`, `shift`: see
         kernels.march.sample; `codes` (R, A): appearance code of each ray.
         """
         grid = grid or present_grid(self.occupancy, 0.0)
         learning = torch.is_grad_enabled()
-        fixed = learning and self.has_fixed_places()
+        fixed = learning and self.has_fixed_capacity()
         if not fixed:
             self.refresh()
-        capacity = len(origins) if fixed else None
-        s = sample(origins, directions, grid.cells, grid.reach, grid.settings, samples_per_ray, jitter, shift, capacity)
-        points = s.points
-        if origins.requires_grad:  # pose refinement: samples move with their ray
-            along = s.packing.ray.long()
-            moved = origins[along] + directions[along] * s.depth[:, None]
-            points = grid_position(moved, self.contracted).clamp(0, 1)
         # Where many samples turn out invisible, a first pass without gradients finds the others, and only those are
-        # differentiated; where nearly all show, one pass is cheaper (3k + 1 against 3 forward costs at share k).
-        first_look = not learning or self.known_share < ONE_PASS_SHARE
-        with torch.set_grad_enabled(learning and not first_look):
-            everywhere = self.field.geometry(points)
-            weights = render_weights(everywhere.density, s.delta, s.packing)
-        with torch.no_grad():
-            visible = weights > self.config.render.cull
-            room = math.ceil(len(s) * min(1.0, ROOM * self.known_share)) if fixed else None
-            kept, packing = s.packing.subset(visible, room)
-        delta = s.delta[kept]
-        if learning and first_look:
-            shown = self.field.geometry(
-                points[kept], everywhere.explicit[kept] if everywhere.explicit is not None else None
-            )
-            weight = render_weights(shown.density, delta, packing)
+        # differentiated; where nearly all are visible, one pass is cheaper (3k + 1 against 3 forward costs at share k).
+        two_passes = learning and self.host_visible_share < ONE_PASS_SHARE
+        samples, points = self._sample(origins, directions, grid, samples_per_ray, jitter, shift, fixed)
+        with torch.set_grad_enabled(learning and not two_passes):
+            geometry = self.field.geometry(points)
+            weights = render_weights(geometry.density, samples.deltas, samples.packed_info)
+        evaluated_density = geometry.density.detach()
+        indices, visible = self._select_visible(samples, weights, fixed)
+        if two_passes:
+            explicit = geometry.explicit[indices] if geometry.explicit is not None else None
+            geometry = self.field.geometry(points[indices], explicit)
+            weights = render_weights(geometry.density, visible.deltas, visible.packed_info)
         else:
-            shown, weight = everywhere[kept], weights[kept]
-            if fixed:
-                weight = torch.where(packing.ray < 0, 0.0, weight)
-        ray = packing.ray.long()
-        # Per ray first: a ray's samples share direction and code.
-        directional = spherical_harmonics(directions).to(self.field.dtype)
-        color = self.field.color(shown, directional[ray], None if codes is None else codes[ray])
-        depth = s.depth[kept]
-        values = torch.cat([color, torch.ones_like(weight)[:, None], depth[:, None]], 1)
-        summed = weighted_sum(values, weight, packing)
+            geometry, weights = geometry[indices], weights[indices]
+        density = geometry.density
+        if fixed:  # unused entries count for nothing
+            unused = visible.packed_info.ray_indices < 0
+            density = torch.where(unused, 0.0, density)
+            weights = weights if two_passes else torch.where(unused, 0.0, weights)
+            evaluated_density = torch.where(samples.packed_info.ray_indices < 0, -1.0, evaluated_density)
+        summed = self._composite(geometry, weights, visible, directions, codes)
         probabilities = None
         if semantics and self.field.semantic_head is not None:
-            probabilities = self._probabilities(self.field.logits(shown), weight, packing)
-        shown_samples = Samples(s.points[kept], depth, delta, packing, s.first, s.last)
+            probabilities = self._probabilities(self.field.logits(geometry), weights, visible.packed_info)
+        color, opacity, depth = summed[:, :3], summed[:, 3], summed[:, 4]
         return Rendered(
-            summed[:, :3],
-            summed[:, 3],
-            summed[:, 4],
-            probabilities,
-            weight,
-            torch.where(packing.ray < 0, 0.0, shown.density) if fixed else shown.density,
-            shown_samples,
-            s.points,
-            torch.where(s.packing.ray < 0, -1.0, everywhere.density.detach()) if fixed else everywhere.density.detach(),
+            color, opacity, depth, probabilities, weights, density, visible, samples.points, evaluated_density
         )
+
+    def _sample(
+        self,
+        origins: torch.Tensor,
+        directions: torch.Tensor,
+        grid: RenderGrid,
+        samples_per_ray: int,
+        jitter: torch.Tensor | None,
+        shift: torch.Tensor | None,
+        fixed: bool,
+    ) -> tuple[Samples, torch.Tensor]:
+        """Samples of the rays, and their points (N, 3) in grid coordinates as functions of the rays."""
+        samples = sample(
+            origins,
+            directions,
+            grid.cells,
+            grid.skip_distance,
+            grid.settings,
+            samples_per_ray,
+            jitter,
+            shift,
+            len(origins) if fixed else None,
+        )
+        if not origins.requires_grad:
+            return samples, samples.points
+        ray_indices = samples.packed_info.ray_indices.long()  # pose refinement: samples move with their ray
+        positions = origins[ray_indices] + directions[ray_indices] * samples.t[:, None]
+        return samples, grid_position(positions, self.contracted).clamp(0, 1)
+
+    @torch.no_grad()
+    def _select_visible(self, samples: Samples, weights: torch.Tensor, fixed: bool) -> tuple[torch.Tensor, Samples]:
+        """Indices (M,) of the samples whose rendering weight (N,) is worth shading, and those samples."""
+        capacity = None
+        if fixed:
+            capacity = math.ceil(len(samples) * min(1.0, CAPACITY_FACTOR * self.host_visible_share))
+        indices, packed_info = samples.packed_info.subset(weights > self.config.render.cull, capacity)
+        t, deltas = samples.t[indices], samples.deltas[indices]
+        return indices, Samples(samples.points[indices], t, deltas, packed_info, samples.t_first, samples.t_last)
+
+    def _composite(
+        self,
+        geometry: Geometry,
+        weights: torch.Tensor,
+        samples: Samples,
+        directions: torch.Tensor,
+        codes: torch.Tensor | None,
+    ) -> torch.Tensor:
+        """Colour, opacity and expected distance (R, 5) of rays from their visible samples' weights (M,)."""
+        ray_indices = samples.packed_info.ray_indices.long()
+        # Per ray first: a ray's samples share direction and code.
+        harmonics = spherical_harmonics(directions).to(self.field.dtype)
+        color = self.field.color(geometry, harmonics[ray_indices], None if codes is None else codes[ray_indices])
+        values = torch.cat([color, torch.ones_like(weights)[:, None], samples.t[:, None]], 1)
+        return weighted_sum(values, weights, samples.packed_info)
 
     @torch.no_grad()
     def observe(self, rendered: list[Rendered]) -> None:
-        """Let the occupancy grid see what a training step read, and note how much of it showed."""
-        points = torch.cat([r.read_points for r in rendered])
-        density = torch.cat([r.read_density for r in rendered])
+        """Let the occupancy grid see what a training step read, and note how much of it was visible."""
+        points = torch.cat([r.evaluated_points for r in rendered])
+        density = torch.cat([r.evaluated_density for r in rendered])
         self.occupancy.observe(points, density, self.warming_up)
-        shown = torch.stack([r.samples.packing.count.sum() for r in rendered]).sum()
-        self.shown_share += 0.05 * (shown / (density >= 0).sum().clamp(min=1) - self.shown_share)
+        visible = torch.stack([r.samples.packed_info.counts.sum() for r in rendered]).sum()
+        self.visible_share += 0.05 * (visible / (density >= 0).sum().clamp(min=1) - self.visible_share)
 
-    def _probabilities(self, logits: torch.Tensor, weight: torch.Tensor, packing) -> torch.Tensor:
+    def _probabilities(self, logits: torch.Tensor, weight: torch.Tensor, packed_info: PackedInfo) -> torch.Tensor:
         pull = self.label_pull
         weight = torch.lerp(weight.detach(), weight, pull) if pull > 0 else weight.detach()
         if self.config.render.accumulate == "probabilities":
-            return weighted_sum(torch.softmax(logits, 1), weight, packing)
-        total = weighted_sum(torch.cat([logits, torch.ones_like(weight)[:, None]], 1), weight, packing)
+            return weighted_sum(torch.softmax(logits, 1), weight, packed_info)
+        total = weighted_sum(torch.cat([logits, torch.ones_like(weight)[:, None]], 1), weight, packed_info)
         return torch.softmax(total[:, :-1], 1) * total[:, -1:]

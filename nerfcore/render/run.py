@@ -20,6 +20,7 @@ from ..geometry.similarity import transform_pose
 from ..kernels.device import use_device
 from ..project.schema import Poses, Project
 from ..project.store import world_from_sfm
+from .migration import migrate_info, migrate_tensors
 from .model import Model
 
 CPU_IMAGE_SIZE, GPU_IMAGE_SIZE = 800, 1600
@@ -33,7 +34,7 @@ class RunInfo(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    version: Literal[2] = 2
+    version: Literal[3] = 3
     preset: str
     config: RunConfig
     class_ids: list[int]
@@ -85,7 +86,7 @@ def load_info(project: Path, run: str) -> RunInfo:
     """Raises ProjectError when there is no such run or its config.json is damaged."""
     path = run_folder(project, run) / "config.json"
     try:
-        return RunInfo.model_validate(json.loads(path.read_text(encoding="utf-8")))
+        return RunInfo.model_validate(migrate_info(json.loads(path.read_text(encoding="utf-8"))))
     except FileNotFoundError as error:
         raise ProjectError(f"{project} has no run “{run}”.", "Run `fieldwork train` first.") from error
     except (json.JSONDecodeError, ValidationError) as error:
@@ -146,6 +147,6 @@ def read_checkpoint(path: Path, device: torch.device) -> tuple[dict[str, torch.T
         with safe_open(path, "pt", device=str(device)) as file:
             state = json.loads((file.metadata() or {})["fieldwork"])
             names = list(file.keys())
-            return {name: file.get_tensor(name) for name in names}, state
+            return migrate_tensors({name: file.get_tensor(name) for name in names}), state
     except (SafetensorError, KeyError, json.JSONDecodeError, OSError) as error:
         raise ProjectError(f"{path} is damaged: {error}.", "Train the run again.") from error

@@ -30,7 +30,7 @@ class CoarseCache:
         self.hit: torch.Tensor | None = None
 
     def _pixels(self, tiles: torch.Tensor, dx: torch.Tensor, dy: torch.Tensor) -> torch.Tensor:
-        """Flat pixel positions at offset (dx, dy) in [0, TILE) of tiles; clamped to the image."""
+        """Flat pixel indices at offset (dx, dy) in [0, TILE) of tiles; clamped to the image."""
         image = torch.bucketize(tiles, self.first[1:], right=True)
         local = tiles - self.first[image]
         x = (local % self.columns[image] * TILE + dx).minimum(self.width[image] - 1)
@@ -39,32 +39,32 @@ class CoarseCache:
 
     @torch.no_grad()
     def rebuild(self, model) -> None:
-        """Cast rays through nine places of every tile; a tile counts when one of them meets an open cell."""
+        """Cast rays through nine pixels of every tile; a tile counts when one of them meets an occupied cell."""
         device, count = self.store.device, int(self.first[-1])
         tiles = torch.arange(count, device=device)
         hit = torch.zeros(count, dtype=torch.bool, device=device)
         for dy in (0, TILE // 2, TILE - 1):
             for dx in (0, TILE // 2, TILE - 1):
-                waiting = tiles[~hit]
-                for part in waiting.split(RAYS):
+                unhit = tiles[~hit]
+                for part in unhit.split(RAYS):
                     offset = torch.full_like(part, dx), torch.full_like(part, dy)
                     batch = self.store.batch(self._pixels(part, *offset))
                     occupancy = model.occupancy
-                    met = sample(
+                    t_first = sample(
                         batch.origins,
                         batch.directions,
                         occupancy.cells,
-                        occupancy.reach,
+                        occupancy.skip_distance,
                         occupancy.march_settings(),
                         1,
-                    ).first
-                    hit[part] = met >= 0
+                    ).t_first
+                    hit[part] = t_first >= 0
         self.hit = tiles[hit] if bool((~hit).any()) and bool(hit.any()) else None
 
-    def places(self, count: int, everywhere: float, generator: torch.Generator) -> torch.Tensor:
-        """`count` flat pixel positions (R,): random pixels of hit tiles, and a share `everywhere` of any."""
+    def draw(self, count: int, everywhere: float, generator: torch.Generator) -> torch.Tensor:
+        """`count` flat pixel indices (R,): random pixels of hit tiles, and a share `everywhere` of any."""
         if self.hit is None or self.store.usable is not None:
-            return self.store.random_places(count, generator)
+            return self.store.random_pixels(count, generator)
         free = int(count * everywhere)
         device = self.store.device
 
@@ -72,4 +72,4 @@ class CoarseCache:
             return torch.randint(0, limit, (count - free,), device=device, generator=generator)
 
         chosen = self._pixels(self.hit[random(len(self.hit))], random(TILE), random(TILE))
-        return torch.cat([chosen, self.store.random_places(free, generator)])
+        return torch.cat([chosen, self.store.random_pixels(free, generator)])

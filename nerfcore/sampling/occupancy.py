@@ -10,23 +10,23 @@ from torch import nn
 
 from ..config import SamplingConfig
 from ..kernels.cells import MeanScratch, average, observe
-from ..kernels.walk import PDF_DEFAULT, PDF_LITERAL, PDF_UNIFORM, MarchSettings, closed_reach
+from ..kernels.traversal import PDF_DEFAULT, PDF_LITERAL, PDF_UNIFORM, MarchSettings, skip_distances
 
 MODES = {"default": PDF_DEFAULT, "uniform": PDF_UNIFORM, "literal": PDF_LITERAL}
 CHUNK = 1 << 16
 WARM_DECAY = 0.25
 MOST_OPTICAL_DEPTH = 1.0  # of a cell, for the sampling PDF
 MEAN_RATE = 0.1  # at which a cell's mean density follows each point read in it
-INTEREST_RATE = 0.2  # at which its interest does
+IMPORTANCE_RATE = 0.2  # at which its importance does
 SWEEPS = (1, 2, 4, 8, 12)  # updates of the warm-up at which the whole grid is read
-PROBES = 64  # one cell in so many is read at an update, and as many open ones
+PROBES = 64  # one cell in so many is read at an update, and as many occupied ones
 
 
 class OccupancyGrid(nn.Module):
     """Moving maximum and mean of the field's density in each cell of a resolution³ grid over the field's domain.
 
-    The maximum decides which cells are open. `cells` (resolution³, 2) is what rays read: mean density per normalised
-    unit length, 0 where the cell is closed, and interest in [0, 1]. Cells that no camera sees are never open.
+    The maximum decides which cells are occupied. `cells` (resolution³, 2) is what rays read: mean density per normalised
+    unit length, 0 where the cell is empty, and importance in [0, 1]. Cells that no camera sees are never occupied.
 
     Args:
         config: sampling settings.
@@ -40,27 +40,27 @@ class OccupancyGrid(nn.Module):
         n = config.resolution
         self.step = (4.0 if contracted else 2.0) / (n * config.bins_per_cell)
         seen = torch.ones(n**3, dtype=torch.bool) if seen is None else seen
-        # Every seen cell starts half-open: opacity 1 − e^−1 over a sixth of the domain.
+        # Every seen cell starts half opaque: opacity 1 − e^−1 over a sixth of the domain.
         self.register_buffer("density", torch.where(seen, 3.0, 0.0))
-        self.register_buffer("interest", torch.zeros(n**3))
+        self.register_buffer("importance", torch.zeros(n**3))
         self.register_buffer("seen", seen)
         # Rays read these; they follow the density at updates only, so they are part of a checkpoint.
-        self.register_buffer("cells", torch.stack([self.density, self.interest], 1))
+        self.register_buffer("cells", torch.stack([self.density, self.importance], 1))
         # How far from every camera of the capture nothing was seen: other cameras outside of the cube need not look.
-        self.register_buffer("empty", torch.zeros(()))
-        self.empty: torch.Tensor
-        self._empty = (-1, 0.0)
+        self.register_buffer("empty_distance", torch.zeros(()))
+        self.empty_distance: torch.Tensor
+        self._host_empty_distance = (-1, 0.0)
         self._scratch: MeanScratch | None = None
         self.register_buffer("mean", torch.where(seen, 3.0, 0.0))
         self.mean: torch.Tensor
         self.density: torch.Tensor
-        self.interest: torch.Tensor
+        self.importance: torch.Tensor
         self.seen: torch.Tensor
         self.register_buffer("scratch", torch.full((n**3,), -1.0), persistent=False)
         self.scratch: torch.Tensor
-        self.register_buffer("reach", torch.zeros((n // 4) ** 3, dtype=torch.uint8))
+        self.register_buffer("skip_distance", torch.zeros((n // 4) ** 3, dtype=torch.uint8))
         self.cells: torch.Tensor
-        self.reach: torch.Tensor
+        self.skip_distance: torch.Tensor
 
     def _mean_scratch(self) -> MeanScratch:
         if self._scratch is None or self._scratch.counts.device != self.mean.device:
@@ -69,34 +69,42 @@ class OccupancyGrid(nn.Module):
 
     def march_settings(self, near: float = 0.02) -> MarchSettings:
         c = self.config
-        if self._empty[0] != self.empty._version:  # reading it back from a device takes long
-            self._empty = (self.empty._version, float(self.empty))
-        beta = c.beta if c.interest != "none" else 0.0
+        if self._host_empty_distance[0] != self.empty_distance._version:  # reading it back from a device takes long
+            self._host_empty_distance = (self.empty_distance._version, float(self.empty_distance))
+        beta = c.beta if c.importance != "none" else 0.0
         return MarchSettings(
-            c.resolution, self.step, near, 1000.0, self.contracted, MODES[c.pdf], beta, c.epsilon, self._empty[1]
+            c.resolution,
+            self.step,
+            near,
+            1000.0,
+            self.contracted,
+            MODES[c.pdf],
+            beta,
+            c.epsilon,
+            self._host_empty_distance[1],
         )
 
     def rebuild(self) -> None:
-        """Recompute what rays read from densities and interest."""
+        """Recompute what rays read from densities and importance."""
         opacity = self.density * self.step
         threshold = min(float(opacity[self.seen].mean()), self.config.threshold) if bool(self.seen.any()) else 1.0
-        opened = (opacity > threshold) & self.seen
-        # Neighbours of open cells are open too, or rays would slip through where they only graze a thin shell of cells.
+        occupied = (opacity > threshold) & self.seen
+        # Neighbours of occupied cells count as occupied too, or rays would slip through where they only graze a thin shell of cells.
         n = self.config.resolution
-        grown = opened.view(n, n, n).clone()
+        grown = occupied.view(n, n, n).clone()
         for axis in range(3):
-            along = opened.view(n, n, n)
+            along = occupied.view(n, n, n)
             grown.narrow(axis, 1, n - 1).logical_or_(along.narrow(axis, 0, n - 1))
             grown.narrow(axis, 0, n - 1).logical_or_(along.narrow(axis, 1, n - 1))
-        opened = grown.view(-1) & self.seen
+        occupied = grown.view(-1) & self.seen
         # What a ray meets in a cell is rather its mean than its largest density, and even of that no cell may take all
         # the samples: the ray may pass through its empty part.
-        self.cells[:, 0] = torch.where(opened, self.mean.clamp(1e-3, MOST_OPTICAL_DEPTH / self.step), 0.0)
-        self.cells[:, 1] = self.interest
-        self.reach.copy_(closed_reach(opened.view(n, n, n)))
+        self.cells[:, 0] = torch.where(occupied, self.mean.clamp(1e-3, MOST_OPTICAL_DEPTH / self.step), 0.0)
+        self.cells[:, 1] = self.importance
+        self.skip_distance.copy_(skip_distances(occupied.view(n, n, n)))
 
-    def open_share(self) -> float:
-        """Share of the cells that are open."""
+    def occupied_share(self) -> float:
+        """Share of the cells that are occupied."""
         return float((self.cells[:, 0] > 0).float().mean())
 
     def positions(self, cells: torch.Tensor, generator: torch.Generator | None = None) -> torch.Tensor:
@@ -108,10 +116,10 @@ class OccupancyGrid(nn.Module):
     def _chosen(self, generator: torch.Generator | None) -> torch.Tensor:
         n3, device = self.config.resolution**3, self.density.device
         anywhere = torch.randint(0, n3, (n3 // PROBES,), device=device, generator=generator)
-        opened = (self.cells[:, 0] > 0).nonzero()[:, 0]
-        if len(opened) > n3 // PROBES:
-            opened = opened[torch.randint(0, len(opened), (n3 // PROBES,), device=device, generator=generator)]
-        return torch.cat([anywhere, opened])
+        occupied = (self.cells[:, 0] > 0).nonzero()[:, 0]
+        if len(occupied) > n3 // PROBES:
+            occupied = occupied[torch.randint(0, len(occupied), (n3 // PROBES,), device=device, generator=generator)]
+        return torch.cat([anywhere, occupied])
 
     def _sweep(self, density: Callable[[torch.Tensor], torch.Tensor], generator: torch.Generator | None) -> None:
         """Read one point in every block of 4³ cells, with quick forgetting of the initial guess."""
@@ -140,14 +148,14 @@ class OccupancyGrid(nn.Module):
         self,
         step: int,
         density: Callable[[torch.Tensor], torch.Tensor],
-        interest: Callable[[torch.Tensor], torch.Tensor] | None = None,
+        importance: Callable[[torch.Tensor], torch.Tensor] | None = None,
         generator: torch.Generator | None = None,
     ) -> None:
         """Read the field in some cells and rebuild the grid.
 
         Args:
             density: points (N, 3) → (N,), per normalised unit length.
-            interest: points (N, 3) → (N,) in [0, 1], asked for open cells only.
+            importance: points (N, 3) → (N,) in [0, 1], asked for occupied cells only.
         """
         if step < self.config.warmup:
             if step // self.config.update_every in SWEEPS:
@@ -162,15 +170,15 @@ class OccupancyGrid(nn.Module):
         n, scratch = self.config.resolution, self._mean_scratch()
         observe(self.density, self.scratch, n, points, fresh, self.config.decay)
         average(self.mean, scratch, n, points, fresh, MEAN_RATE)
-        if interest is not None:
+        if importance is not None:
             dense = fresh * self.step > self.config.threshold
             if bool(dense.any()):
-                value = torch.cat([interest(part) for part in points[dense].split(CHUNK)])
-                average(self.interest, scratch, n, points[dense].contiguous(), value, INTEREST_RATE)
+                value = torch.cat([importance(part) for part in points[dense].split(CHUNK)])
+                average(self.importance, scratch, n, points[dense].contiguous(), value, IMPORTANCE_RATE)
         self.rebuild()
 
 
-def class_interest(probabilities: torch.Tensor, kind: str, priorities: torch.Tensor) -> torch.Tensor:
+def class_importance(probabilities: torch.Tensor, kind: str, priorities: torch.Tensor) -> torch.Tensor:
     """Interest r (N,) in [0, 1] of points from class probabilities (N, K).
 
     "priority": Σ_k π_k p_k with priorities scaled to a maximum of 1; "boundary": H(p) / log K.

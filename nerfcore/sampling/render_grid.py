@@ -1,6 +1,6 @@
-"""The grid that rays walk when a trained field is rendered: the occupancy grid's open cells, cut finer and read anew.
+"""The grid that rays traverse when a trained field is rendered: the occupancy grid's occupied cells, cut finer and read anew.
 
-Fewer of its cells are open, and their densities are nearer to what a ray meets, so that a picture needs fewer samples.
+Fewer of its cells are occupied, and their densities are nearer to what a ray meets, so that a picture needs fewer samples.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from functools import partial
 import torch
 
 from ..kernels.runtime import run_parallel
-from ..kernels.walk import MarchSettings, closed_reach
+from ..kernels.traversal import MarchSettings, skip_distances
 from .occupancy import MOST_OPTICAL_DEPTH, OccupancyGrid
 
 PROBES = 4  # points read in each fine cell
@@ -22,17 +22,17 @@ CHUNK = 1 << 14
 
 @dataclass(frozen=True)
 class RenderGrid:
-    """What rays walk: cells (resolution³, 2) and reach as `kernels.march.sample` takes them, and the settings."""
+    """What rays traverse: cells (resolution³, 2) and skip_distance as `kernels.march.sample` takes them, and the settings."""
 
     cells: torch.Tensor
-    reach: torch.Tensor
+    skip_distance: torch.Tensor
     settings: MarchSettings
 
 
 def present_grid(occupancy: OccupancyGrid, per_bin: float) -> RenderGrid:
     """The occupancy grid as it is."""
     settings = replace(occupancy.march_settings(), per_bin=per_bin)
-    return RenderGrid(occupancy.cells, occupancy.reach, settings)
+    return RenderGrid(occupancy.cells, occupancy.skip_distance, settings)
 
 
 @torch.no_grad()
@@ -44,7 +44,7 @@ def refined_grid(
     pixels: float,
     check: Callable[[], None] | None = None,
 ) -> RenderGrid | None:
-    """Every open cell cut into factor³, of which those stay open where `density` (points (N, 3) in grid coordinates →
+    """Every occupied cell cut into factor³, of which those stay occupied where `density` (points (N, 3) in grid coordinates →
     (N,), per normalised unit length) is not negligible at one of a few random points; their mean is the density.
 
     None where reading the cells takes longer than it saves in rendering so many `pixels`.
@@ -70,14 +70,14 @@ def refined_grid(
 
     for _ in range(PROBES):
         points = (fine + torch.rand(fine.shape, device=device, generator=generator)) / side
-        found = torch.cat(run_parallel([partial(read, some) for some in points.split(CHUNK)], device))
-        mean += found / PROBES
-        torch.maximum(largest, found, out=largest)
+        fresh = torch.cat(run_parallel([partial(read, some) for some in points.split(CHUNK)], device))
+        mean += fresh / PROBES
+        torch.maximum(largest, fresh, out=largest)
     step = occupancy.step / factor
     row = (fine[:, 2] * side + fine[:, 1]) * side + fine[:, 0]
-    opened = largest * step > occupancy.config.threshold
+    occupied = largest * step > occupancy.config.threshold
     cells = torch.zeros(side**3, 2, device=device)
-    cells[row, 0] = torch.where(opened, mean.clamp(1e-3, MOST_OPTICAL_DEPTH / step), 0.0)
-    cells[row, 1] = occupancy.interest[coarse].repeat_interleave(factor**3)
+    cells[row, 0] = torch.where(occupied, mean.clamp(1e-3, MOST_OPTICAL_DEPTH / step), 0.0)
+    cells[row, 1] = occupancy.importance[coarse].repeat_interleave(factor**3)
     settings = replace(occupancy.march_settings(), per_bin=per_bin, resolution=side, step=step)
-    return RenderGrid(cells, closed_reach((cells[:, 0] > 0).view(side, side, side)), settings)
+    return RenderGrid(cells, skip_distances((cells[:, 0] > 0).view(side, side, side)), settings)

@@ -55,7 +55,7 @@ def _sees_everything(camera: Camera) -> bool:
 def _project(
     camera: Camera, pose: torch.Tensor, points: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Place (u, v) of points (N, 3) in the undistorted image as shares of its size, and depth."""
+    """Position (u, v) of points (N, 3) in the undistorted image as shares of its size, and depth."""
     x, y, z = ((points - pose[:3, 3]) @ pose[:3, :3]).unbind(1)
     depth = z.clamp(min=1e-6)
     u = (camera.fx * x / depth + camera.cx) / camera.width
@@ -65,9 +65,9 @@ def _project(
 
 def cells_at(points: torch.Tensor, resolution: int, contracted: bool) -> torch.Tensor:
     """Indices (M,) of the cells that hold those of the normalised positions (N, 3) that lie in the grid."""
-    place = (grid_position(points, contracted) * resolution).floor().long()
-    place = place[((place >= 0) & (place < resolution)).all(1)]
-    return (place[:, 2] * resolution + place[:, 1]) * resolution + place[:, 0]
+    cell = (grid_position(points, contracted) * resolution).floor().long()
+    cell = cell[((cell >= 0) & (cell < resolution)).all(1)]
+    return (cell[:, 2] * resolution + cell[:, 1]) * resolution + cell[:, 0]
 
 
 def _frustum(camera: Camera, pose: torch.Tensor, depth: float) -> torch.Tensor:

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 
 from ..config import LossConfig
 from ..data.pixels import VOID, Batch
-from ..kernels.packing import Packing
+from ..kernels.packed_info import PackedInfo
 
 
 def color_loss(predicted: torch.Tensor, target: torch.Tensor, config: LossConfig) -> torch.Tensor:
@@ -80,15 +80,17 @@ def opacity_entropy(opacity: torch.Tensor) -> torch.Tensor:
     return -(o * o.log() + (1 - o) * (1 - o).log()).mean()
 
 
-def distortion_loss(weights: torch.Tensor, place: torch.Tensor, delta: torch.Tensor, packing: Packing) -> torch.Tensor:
+def distortion_loss(
+    weights: torch.Tensor, t: torch.Tensor, deltas: torch.Tensor, packed_info: PackedInfo
+) -> torch.Tensor:
     """Σ_ij w_i w_j |s_i − s_j| + ⅓ Σ w_i² δ_i, mean over rays (Barron et al., "Mip-NeRF 360", 2022, eq. 15).
 
     Args:
-        weights (N,), place (N,): normalised distance of each sample along its ray, delta (N,): its extent.
+        weights (N,), t (N,): normalised distance of each sample along its ray, deltas (N,): its length there.
     """
     if len(weights) == 0:
         return weights.sum() * 0
-    first = packing.start.clamp(min=0).long()[packing.ray.long()]
+    first = packed_info.starts.clamp(min=0).long()[packed_info.ray_indices.long()]
 
     def before(values: torch.Tensor) -> torch.Tensor:
         """Sum of the values in front of each sample on its ray."""
@@ -96,8 +98,8 @@ def distortion_loss(weights: torch.Tensor, place: torch.Tensor, delta: torch.Ten
         return (running - running[first]).float()
 
     # Σ_i w_i (s_i W_<i − S_<i), twice, with running sums: linear in the samples.
-    pairs = 2 * weights * (place * before(weights) - before(weights * place))
-    return (pairs + weights * weights * delta / 3).sum() / (packing.count > 0).sum()
+    pairs = 2 * weights * (t * before(weights) - before(weights * t))
+    return (pairs + weights * weights * deltas / 3).sum() / (packed_info.counts > 0).sum()
 
 
 def psnr(mse: float) -> float:

@@ -32,14 +32,14 @@ VIEWS_ENOUGH = 8  # cells seen by this many cameras count fully as evidence
 
 def present_classes(scene: Scene, indices: list[int]) -> list[int]:
     """Ids of the classes that occur in the labels of some views, without void, ascending."""
-    found: set[int] = set()
+    present: set[int] = set()
     for index in indices:
         path = scene.views[index].label
         if path is not None:
-            found.update(np.unique(read_label(path)).tolist())
-    found.discard(scene.ignore_id)
-    known = {c.id for c in scene.classes}
-    return sorted(found & known) if known else sorted(found)
+            present.update(np.unique(read_label(path)).tolist())
+    present.discard(scene.ignore_id)
+    declared = {c.id for c in scene.classes}
+    return sorted(present & declared) if declared else sorted(present)
 
 
 def has_transparency(scene: Scene) -> bool:
@@ -139,7 +139,7 @@ def make_trainer(project_folder: Path, info: RunInfo, scene: Scene, device: torc
     degrade(store, config)
     counts, nearest = seen_cells(scene, trained, box, device)
     model = new_model(info, device, _refined(counts > 0, config.sampling.resolution).cpu())
-    model.occupancy.empty.fill_(nearest)
+    model.occupancy.empty_distance.fill_(nearest)
     if model.field.blend is not None:
         model.field.blend.views.copy_((counts / VIEWS_ENOUGH).clamp(max=1))
     trainer = Trainer(model, store, config, LEVEL.get(config.scene.background), report.check)
@@ -168,8 +168,8 @@ def seen_cells(scene: Scene, trained: list[int], box: Box, device: torch.device)
     focus = None
     if looks_inward(views):
         point = focus_point([view.camera_to_world for view in views])
-        place = transform_points(box.box_from_world, point[None])[0]
-        focus = torch.from_numpy(place).float().to(device)
+        center = transform_points(box.box_from_world, point[None])[0]
+        focus = torch.from_numpy(center).float().to(device)
     ranges = depth_ranges(cameras, poses, points, focus)
     counts = view_counts(cameras, poses, RESOLUTION, box.contracted, ranges)
     if focus is not None:

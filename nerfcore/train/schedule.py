@@ -9,7 +9,7 @@ from ..config import TrainConfig
 
 def rate_factor(progress: float, decay: float) -> float:
     """Learning-rate factor: × `decay` at ½, ¾ and 9/10."""
-    return decay ** sum(progress >= place for place in (0.5, 0.75, 0.9))
+    return decay ** sum(progress >= milestone for milestone in (0.5, 0.75, 0.9))
 
 
 def bias_correction(step: int, beta1: float = 0.9, beta2: float = 0.99) -> float:

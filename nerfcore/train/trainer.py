@@ -37,8 +37,8 @@ SHARD_SAMPLES = 12288  # fewer would take longer to hand out than to learn from
 
 
 @dataclass(frozen=True)
-class Learned:
-    """What one part of a batch taught: gradients of the model's parameters, in their order, and of encoded points;
+class ShardResult:
+    """What comes of one shard of a batch: gradients of the model's parameters, in their order, and of encoded points;
     its parts of the loss and of the squared error (scalars); what was rendered, if anything; gradients of the rays'
     origins and directions where cameras move."""
 
@@ -106,11 +106,11 @@ class Trainer:
         if s.coarse_cache and self.steps >= s.warmup and (self.steps - s.warmup) % s.cache_every == 0:
             self.cache.rebuild(self.model)
         count = round(self.rays * self.outlines.share) if self.outlines is not None else 0
-        places = self.cache.places(self.rays - count, s.empty_rays, self.generator)
+        pixel_indices = self.cache.draw(self.rays - count, s.empty_rays, self.generator)
         if self.outlines is not None and count > 0:
-            places = torch.cat([places, self.outlines.draw(count, self.generator)])
-            return replace(self.store.batch(places), weight=self.outlines.weight(places))
-        return self.store.batch(places)
+            pixel_indices = torch.cat([pixel_indices, self.outlines.draw(count, self.generator)])
+            return replace(self.store.batch(pixel_indices), weight=self.outlines.weight(pixel_indices))
+        return self.store.batch(pixel_indices)
 
     def step(self, progress: float) -> None:
         """One optimisation step at `progress` in [0, 1] of the schedule."""
@@ -120,8 +120,8 @@ class Trainer:
         if config.field.voxel_init != "none" and self.steps == config.field.voxel_init_step:
             self._initialise(progress)
         if self.steps % config.sampling.update_every == 0:
-            interest = model.interest if model.wants_interest() and self.steps >= config.sampling.warmup else None
-            model.occupancy.update(self.steps, model.field.density, interest, self.generator)
+            importance = model.importance if model.wants_importance() and self.steps >= config.sampling.warmup else None
+            model.occupancy.update(self.steps, model.field.density, importance, self.generator)
             model.refresh()
         batch, start = self.draw(), config.train.pose_start
         moving = self.poses if progress >= start else None
@@ -129,9 +129,9 @@ class Trainer:
             batch = moving.move(batch)
             if model.field.grid is not None:
                 model.field.grid.point_gains = level_weights(config.field.levels, progress)
-        learned = self._learn(batch, progress)
+        shards = self._accumulate_gradients(batch, progress)
         if moving is not None:
-            moving.step([part.rays for part in learned if part.rays], (progress - start) / (1 - start))
+            moving.step([part.rays for part in shards if part.rays], (progress - start) / (1 - start))
         self.steps += 1
         factor = rate_factor(progress, config.train.decay)
         for group in self.optimizer.param_groups:
@@ -139,7 +139,7 @@ class Trainer:
         self.optimizer.step()
         if model.field.grid is not None:
             model.field.grid.step(config.train.grid_rate * factor * bias_correction(self.steps, *BETAS), BETAS)
-        rendered = [part.rendered for part in learned if part.rendered is not None]
+        rendered = [part.rendered for part in shards if part.rendered is not None]
         model.observe(rendered)
         if model.field.blend is not None and self.steps % config.sampling.update_every == 0:
             model.field.blend.update(
@@ -154,12 +154,12 @@ class Trainer:
         measured, self.measured = self.measured, Measured()
 
         def learn() -> None:
-            self._learn(self.draw(), progress)
+            self._accumulate_gradients(self.draw(), progress)
 
         self.pixel_features = initialise(self.model, self.store, learn, self.check)
         self.measured = measured
 
-    def _learn(self, batch: Batch, progress: float) -> list[Learned]:
+    def _accumulate_gradients(self, batch: Batch, progress: float) -> list[ShardResult]:
         """Leave the gradient of the composite loss in the parameters and in the grid.
 
         The CPU works on shards of the rays side by side, few enough that threads do not wait for each other's interpreter
@@ -174,12 +174,12 @@ class Trainer:
             background = torch.full_like(batch.rgb, self.background)
         counted = label_weights(batch)
         labelled = counted.sum().clamp(min=1e-6)
-        shards = 1
+        shard_count = 1
         if self.device.type == "cpu":
-            shards = max(2, min(worker_count(), sample_budget(self.config.train, progress) // SHARD_SAMPLES))
-        size = -(-rays // shards)
+            shard_count = max(2, min(worker_count(), sample_budget(self.config.train, progress) // SHARD_SAMPLES))
+        size = -(-rays // shard_count)
 
-        def shard(begin: int) -> Learned:
+        def shard(begin: int) -> ShardResult:
             part = batch.part(slice(begin, begin + size))
             noise = jitter[begin : begin + size], shift[begin * per_ray : (begin + size) * per_ray]
 
@@ -191,7 +191,7 @@ class Trainer:
             moved = (part.origins, part.directions) if part.origins.requires_grad else ()
             return self._differentiate(loss, moved)
 
-        tasks: list[Callable[[], Learned]] = [partial(shard, begin) for begin in range(0, rays, size)]
+        tasks: list[Callable[[], ShardResult]] = [partial(shard, begin) for begin in range(0, rays, size)]
         c = self.config.loss
         if c.regularization * c.sparsity_weight > 0:
             points = torch.rand(1024, 3, device=self.device, generator=self.generator)
@@ -203,19 +203,19 @@ class Trainer:
             tasks.append(partial(self._differentiate, sparsity))
         if self.depths is not None and len(self.depths):
             tasks.append(self._depth_task(self.depths))
-        learned = run_parallel(tasks, self.device)
-        for parameter, *gradients in zip(self.model.parameters(), *(part.gradients for part in learned)):
-            found = [g for g in gradients if g is not None]
-            parameter.grad = torch.stack(found).sum(0) if found else None
+        shards = run_parallel(tasks, self.device)
+        for parameter, *gradients in zip(self.model.parameters(), *(part.gradients for part in shards)):
+            present = [g for g in gradients if g is not None]
+            parameter.grad = torch.stack(present).sum(0) if present else None
         grid = self.model.field.grid
         if grid is not None:
-            grid.scatter([pair for part in learned for pair in part.encoded], self.model.field.gains)
-        for part in learned:
+            grid.scatter([pair for part in shards for pair in part.encoded], self.model.field.gains)
+        for part in shards:
             self.measured.loss += part.loss
             self.measured.mse += part.squared_error
-        return learned
+        return shards
 
-    def _depth_task(self, depths: DepthRays) -> Callable[[], Learned]:
+    def _depth_task(self, depths: DepthRays) -> Callable[[], ShardResult]:
         """The task that learns from some of the rays of known length, drawn here."""
         rays, per_ray = self.store.rays, self.config.sampling.samples
         cameras = rays.rotation, rays.center
@@ -237,7 +237,7 @@ class Trainer:
         self,
         loss: Callable[[], tuple[torch.Tensor, torch.Tensor, Rendered | None]],
         rays: Sequence[torch.Tensor] = (),
-    ) -> Learned:
+    ) -> ShardResult:
         """Value and gradients of one part of the loss, without touching what other threads read; also those of
         `rays`, zero where the part met nothing."""
         grid = self.model.field.grid
@@ -251,8 +251,8 @@ class Trainer:
             if total.requires_grad:
                 gradients = torch.autograd.grad(total, wanted, allow_unused=True)
         own, moved = gradients[: len(parameters)], gradients[len(parameters) : len(parameters) + len(rays)]
-        turned = [torch.zeros_like(ray) if g is None else g for ray, g in zip(rays, moved)]
-        return Learned(own, encoded, total.detach(), squared_error.detach(), rendered, turned)
+        ray_gradients = [torch.zeros_like(ray) if g is None else g for ray, g in zip(rays, moved)]
+        return ShardResult(own, encoded, total.detach(), squared_error.detach(), rendered, ray_gradients)
 
     def _render(self, batch: Batch, jitter: torch.Tensor, shift: torch.Tensor) -> Rendered:
         appearance, semantics = self.model.field.appearance, self.config.loss.semantic_weight > 0
@@ -296,9 +296,9 @@ class Trainer:
         c, s = self.config.loss, rendered.samples
         total = rendered.opacity.sum() * 0
         if c.distortion_weight > 0 and progress >= c.distortion_start:
-            place = s.depth / (1 + s.depth) if self.model.contracted else s.depth
-            extent = s.delta / (1 + s.depth) ** 2 if self.model.contracted else s.delta
-            total = total + c.distortion_weight * distortion_loss(rendered.weights, place, extent, s.packing)
+            t = s.t / (1 + s.t) if self.model.contracted else s.t
+            deltas = s.deltas / (1 + s.t) ** 2 if self.model.contracted else s.deltas
+            total = total + c.distortion_weight * distortion_loss(rendered.weights, t, deltas, s.packed_info)
         if c.opacity_weight > 0:
             total = total + c.opacity_weight * opacity_entropy(rendered.opacity)
         return total

@@ -137,28 +137,28 @@ class _Loop:
 
     def run(self, preview: Callable[[], Path]) -> None:
         train = self.info.config.train
-        told = saved = shown = time.perf_counter()
+        last_event = last_checkpoint = last_preview = time.perf_counter()
         cost = 0.0  # seconds of the last preview
         with disk_errors(self.folder), open(self.folder / "events.jsonl", "a", encoding="utf-8") as events:
             while (progress := self.progress()) < 1:
                 self.trainer.step(progress)
                 self.state.update(progress=progress, seconds=self.clock.seconds())
                 now = time.perf_counter()
-                if now - told >= 0.5:
-                    self._tell(progress, now - told, events)
-                    told = now
-                if now - saved >= train.checkpoint_every:
+                if now - last_event >= 0.5:
+                    self._write_event(progress, now - last_event, events)
+                    last_event = now
+                if now - last_checkpoint >= train.checkpoint_every:
                     self.checkpoint()
-                    saved = time.perf_counter()
-                if now - shown >= max(train.preview_every, PREVIEW_PAUSE * cost):
+                    last_checkpoint = time.perf_counter()
+                if now - last_preview >= max(train.preview_every, PREVIEW_PAUSE * cost):
                     self.report.event("preview", path=str(preview()))
-                    shown = time.perf_counter()
-                    cost = shown - now
+                    last_preview = time.perf_counter()
+                    cost = last_preview - now
                 self.report.check()
             self.state["progress"] = 1.0
-            self._tell(1.0, max(time.perf_counter() - told, 1e-3), events)
+            self._write_event(1.0, max(time.perf_counter() - last_event, 1e-3), events)
 
-    def _tell(self, progress: float, elapsed: float, events: TextIO) -> None:
+    def _write_event(self, progress: float, elapsed: float, events: TextIO) -> None:
         measured = self.trainer.take_measured()
         loss = float(measured.loss)
         if measured.steps == 0:

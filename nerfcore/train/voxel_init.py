@@ -148,10 +148,10 @@ def sightings(photos: list[Reduced], points: torch.Tensor, tolerance: torch.Tens
         camera, rays = photo.rays.cameras[0], photo.rays
         local = (points - rays.center[0]) @ rays.rotation[0]
         with np.errstate(invalid="ignore", over="ignore"):
-            place = torch.from_numpy(project(camera, local.cpu().numpy())).to(points)
+            pixel_xy = torch.from_numpy(project(camera, local.cpu().numpy())).to(points)
         limit = torch.tensor([camera.width, camera.height], device=points.device)
-        inside = ((place >= 0) & (place < limit)).all(1).nonzero()[:, 0]  # NaN is not
-        x, y = place[inside].long().unbind(1)
+        inside = ((pixel_xy >= 0) & (pixel_xy < limit)).all(1).nonzero()[:, 0]  # NaN is not
+        x, y = pixel_xy[inside].long().unbind(1)
         pixel = y * camera.width + x
         length = local[inside].norm(dim=1)
         # A lens polynomial may fold over far outside of the photo: the pixel must look that way.
@@ -168,17 +168,17 @@ def statistics(features: list[torch.Tensor], seen: list[Sighting], count: int) -
     total, square = (torch.zeros(count, COLORS, device=device) for _ in range(2))
     views = torch.zeros(count, 1, device=device)
     for value, sighting in zip(features, seen):
-        shown = value.flatten(1).T[sighting.pixel]
-        total = total.index_add(0, sighting.vertex, shown)
-        square = square.index_add(0, sighting.vertex, shown * shown)
-        views = views.index_add(0, sighting.vertex, torch.ones_like(shown[:, :1]))
+        value_at = value.flatten(1).T[sighting.pixel]
+        total = total.index_add(0, sighting.vertex, value_at)
+        square = square.index_add(0, sighting.vertex, value_at * value_at)
+        views = views.index_add(0, sighting.vertex, torch.ones_like(value_at[:, :1]))
     mean = total / views.clamp(min=1)
     variance = (square / views.clamp(min=1) - mean * mean).clamp(min=0).mean(1, keepdim=True)
-    both, known = torch.cat([mean, variance], 1), views[:, 0] > 1
-    if not bool(known.any()):
-        return both * 0
-    middle, spread = both[known].mean(0), both[known].std(0, correction=0)
-    return torch.where(known[:, None], (both - middle) / (spread + 1e-6), 0.0)
+    statistic, seen_twice = torch.cat([mean, variance], 1), views[:, 0] > 1
+    if not bool(seen_twice.any()):
+        return statistic * 0
+    middle, spread = statistic[seen_twice].mean(0), statistic[seen_twice].std(0, correction=0)
+    return torch.where(seen_twice[:, None], (statistic - middle) / (spread + 1e-6), 0.0)
 
 
 def initialise(
@@ -214,19 +214,19 @@ def initialise(
         return [GAIN * statistics(features, s, r.stop - r.start) for r, s in zip(rows, seen)]
 
     if config.voxel_init == "rgb_stats":
-        for place, value in zip(rows, residual([photo.color for photo in photos])):
-            grid.table[place] += value
+        for span, value in zip(rows, residual([photo.color for photo in photos])):
+            grid.table[span] += value
         return None
     if config.voxel_init_weights is not None:
         network = load_features(Path(config.voxel_init_weights)).to(store.device)
         with torch.no_grad():
-            for place, value in zip(rows, residual([network(photo.color) for photo in photos])):
-                grid.table[place] += value
+            for span, value in zip(rows, residual([network(photo.color) for photo in photos])):
+                grid.table[span] += value
         return network
-    return _learned(grid, rows, photos, residual, learn, check)
+    return _train_features(grid, rows, photos, residual, learn, check)
 
 
-def _learned(
+def _train_features(
     grid: VertexGrid,
     rows: list[slice],
     photos: list[Reduced],
@@ -237,11 +237,11 @@ def _learned(
     """Train a network on what the field's loss says about the features that it writes; they stay in the grid."""
     network = PixelFeatures().to(grid.table.device)
     optimizer = torch.optim.Adam(network.parameters(), LEARNING_RATE)
-    before = [grid.table[place].clone() for place in rows]
+    before = [grid.table[span].clone() for span in rows]
 
     def write(values: list[torch.Tensor]) -> None:
-        for place, own, value in zip(rows, before, values):
-            grid.table[place] = own + value.detach()
+        for span, own, value in zip(rows, before, values):
+            grid.table[span] = own + value.detach()
 
     try:
         for _ in range(LEARNING):
@@ -251,7 +251,7 @@ def _learned(
             grid.clear()
             learn()
             optimizer.zero_grad(set_to_none=True)
-            torch.autograd.backward(values, [grid.gradient[place].clone() for place in rows])
+            torch.autograd.backward(values, [grid.gradient[span].clone() for span in rows])
             optimizer.step()
         with torch.no_grad():
             write(residual([network(photo.color) for photo in photos]))

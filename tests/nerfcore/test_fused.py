@@ -40,7 +40,7 @@ def random_model(
     settings: dict[str, str] | None = None,
     device: str = "cpu",
 ) -> Model:
-    """A field of random values in a ball of open cells; large ones, so that errors would show."""
+    """A field of random values in a ball of occupied cells; large ones, so that errors would show."""
     torch.manual_seed(3)
     values = {"field.precision": "float32", "field.table_log2": "12", "sampling.resolution": "64"}
     model = Model(make_config(preset, values | (settings or {})), classes, 5, contracted).eval().requires_grad_(False)
@@ -56,7 +56,7 @@ def random_model(
     center = (torch.stack([cell % n, cell // n % n, cell // n**2], 1) + 0.5) / n * 2 - 1
     occupancy.density.copy_(torch.where(center.norm(dim=1) < 0.7, 6.0, 0.0))
     occupancy.mean.copy_(occupancy.density)
-    occupancy.interest.uniform_()
+    occupancy.importance.uniform_()
     occupancy.rebuild()
     return model.to(device)
 
@@ -137,7 +137,7 @@ def test_threads_of_a_block_share_their_work(monkeypatch: pytest.MonkeyPatch) ->
         renderer.field,
         renderer.coarse(origins, directions),
         grid.cells,
-        grid.reach,
+        grid.skip_distance,
         grid.settings,
         COUNT,
         model.config.render.cull,

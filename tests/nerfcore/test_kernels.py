@@ -5,10 +5,10 @@ from __future__ import annotations
 
 import pytest
 import torch
-from fieldwork.nerfcore.kernels import cells, composite, encode, encode_points, march, walk
+from fieldwork.nerfcore.kernels import cells, composite, encode, encode_points, march, traversal
 from fieldwork.nerfcore.kernels.device import Kernels, backend_of, using_kernels
-from fieldwork.nerfcore.kernels.packing import Packing
-from fieldwork.nerfcore.kernels.walk import PDF_DEFAULT, PDF_LITERAL, PDF_UNIFORM, MarchSettings
+from fieldwork.nerfcore.kernels.packed_info import PackedInfo
+from fieldwork.nerfcore.kernels.traversal import PDF_DEFAULT, PDF_LITERAL, PDF_UNIFORM, MarchSettings
 from fieldwork.tests.nerfcore.support import (
     cells_reference,
     composite_reference,
@@ -27,12 +27,12 @@ def relative(a: torch.Tensor, b: torch.Tensor) -> float:
     return float((a - b).detach().abs().max() / b.detach().abs().max().clamp(min=1e-12))
 
 
-def random_packing(rays: int, generator: torch.Generator, device: torch.device) -> Packing:
+def random_packed_info(rays: int, generator: torch.Generator, device: torch.device) -> PackedInfo:
     count = torch.randint(0, 9, (rays,), generator=generator, dtype=torch.int32)
     count[0] = 0
     start = torch.cumsum(count, 0, dtype=torch.int32) - count
     ray = torch.repeat_interleave(torch.arange(rays, dtype=torch.int32), count.long())
-    return Packing(start.to(device), count.to(device), ray.to(device))
+    return PackedInfo(start.to(device), count.to(device), ray.to(device))
 
 
 def test_encode_equals_its_reference_and_so_does_its_gradient(device: torch.device) -> None:
@@ -128,16 +128,16 @@ def test_adam_moves_touched_rows_only(device: torch.device) -> None:
 
 def test_weights_and_sums_equal_their_references_and_so_do_their_gradients(device: torch.device) -> None:
     generator = torch.Generator().manual_seed(4)
-    packing = random_packing(60, generator, device)
-    n = len(packing.ray)
+    packed_info = random_packed_info(60, generator, device)
+    n = len(packed_info.ray_indices)
     density = (torch.rand(n, generator=generator) * 5).to(device).requires_grad_()
-    delta = torch.rand(n, generator=generator).to(device)
+    deltas = torch.rand(n, generator=generator).to(device)
     values = torch.randn(n, 7, generator=generator).to(device).requires_grad_()
     upstream = torch.randn(60, 7, generator=generator).to(device)
     results = []
     for module in (composite, composite_reference):
-        weights = module.render_weights(density, delta, packing)
-        total = module.weighted_sum(values, weights, packing)
+        weights = module.render_weights(density, deltas, packed_info)
+        total = module.weighted_sum(values, weights, packed_info)
         results.append((weights, total, *torch.autograd.grad((total * upstream).sum(), (density, values))))
     for ours, theirs in zip(*results):
         assert relative(ours, theirs) <= 1e-5 if ours.shape != density.shape else relative(ours, theirs) <= 1e-4
@@ -145,13 +145,13 @@ def test_weights_and_sums_equal_their_references_and_so_do_their_gradients(devic
 
 def test_weight_gradient_agrees_with_finite_differences(device: torch.device) -> None:
     start, count, ray = (torch.tensor(x, dtype=torch.int32, device=device) for x in ([0], [6], [0] * 6))
-    packing = Packing(start, count, ray)
+    packed_info = PackedInfo(start, count, ray)
     density = torch.tensor([0.1, 2.0, 0.5, 3.0, 0.0, 1.0], device=device, requires_grad=True)
-    delta = torch.tensor([0.3, 0.1, 0.4, 0.2, 0.5, 0.2], device=device)
+    deltas = torch.tensor([0.3, 0.1, 0.4, 0.2, 0.5, 0.2], device=device)
     upstream = torch.tensor([1.0, -2.0, 0.5, 3.0, 1.0, -1.0], device=device)
 
     def value(d: torch.Tensor) -> torch.Tensor:
-        return (composite.render_weights(d, delta, packing) * upstream).sum()
+        return (composite.render_weights(d, deltas, packed_info) * upstream).sum()
 
     (gradient,) = torch.autograd.grad(value(density), density)
     for k in range(6):
@@ -166,13 +166,13 @@ def test_weight_gradient_agrees_with_finite_differences(device: torch.device) ->
 @settings(max_examples=25, deadline=None)
 def test_weights_never_exceed_one_and_transmittance_falls(kernels: Kernels, seed: int) -> None:
     generator = torch.Generator().manual_seed(seed)
-    packing = random_packing(20, generator, torch.device("cpu"))
-    density = torch.rand(len(packing.ray), generator=generator) * 10 ** float(
+    packed_info = random_packed_info(20, generator, torch.device("cpu"))
+    density = torch.rand(len(packed_info.ray_indices), generator=generator) * 10 ** float(
         torch.randint(-3, 4, (1,), generator=generator)
     )
     with using_kernels(kernels):
-        weights = composite.render_weights(density, torch.rand(len(density), generator=generator), packing)
-        total = composite.weighted_sum(torch.ones(len(weights), 1), weights, packing)
+        weights = composite.render_weights(density, torch.rand(len(density), generator=generator), packed_info)
+        total = composite.weighted_sum(torch.ones(len(weights), 1), weights, packed_info)
     assert bool((weights >= 0).all())
     assert bool((total <= 1 + 1e-5).all())
 
@@ -187,11 +187,11 @@ def test_cell_reading_and_maxima_equal_their_references(device: torch.device) ->
 
 
 def random_cells(n: int, share: float, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
-    opened = torch.rand(n, n, n, generator=generator) < share
-    opened[: n // 2] = False  # whole blocks to skip
-    density = torch.where(opened, torch.rand(n, n, n, generator=generator) * 20, 0.0)
+    occupied = torch.rand(n, n, n, generator=generator) < share
+    occupied[: n // 2] = False  # whole blocks to skip
+    density = torch.where(occupied, torch.rand(n, n, n, generator=generator) * 20, 0.0)
     grid = torch.stack([density.reshape(-1), torch.rand(n**3, generator=generator)], 1).contiguous()
-    return grid, walk.closed_reach(opened)
+    return grid, traversal.skip_distances(occupied)
 
 
 def random_rays(count: int, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
@@ -206,23 +206,23 @@ def random_rays(count: int, generator: torch.Generator) -> tuple[torch.Tensor, t
 def test_marching_equals_its_reference(device: torch.device, mode: int, contracted: bool) -> None:
     generator = torch.Generator().manual_seed(6)
     n, count, rays = 16, 8, 40
-    grid, reach = random_cells(n, 0.3, generator)
+    grid, skip_distance = random_cells(n, 0.3, generator)
     origin, direction = random_rays(rays, generator)
     jitter, shift = torch.rand(rays, generator=generator), torch.rand(rays * count, generator=generator)
     s = MarchSettings(n, 0.06, far=50.0, contracted=contracted, mode=mode)
-    on = [x.to(device) for x in (origin, direction, grid, reach)]
+    on = [x.to(device) for x in (origin, direction, grid, skip_distance)]
     samples = march.sample(*on, s, count, jitter.to(device), shift.to(device))
-    depth, delta = samples.depth.cpu(), samples.delta.cpu()
+    t, deltas = samples.t.cpu(), samples.deltas.cpu()
     agreeing = hits = 0
     for r in range(rays):
-        bins = march_reference.walk(origin[r], direction[r], float(jitter[r]), grid, s)
-        assert (int(samples.packing.count[r]) > 0) == bool(bins)
+        bins = march_reference.traverse(origin[r], direction[r], float(jitter[r]), grid, s)
+        assert (int(samples.packed_info.counts[r]) > 0) == bool(bins)
         if not bins:
             continue
         hits += 1
-        base = int(samples.packing.start[r])
+        base = int(samples.packed_info.starts[r])
         expected = march_reference.sample_ray(bins, count, shift[base : base + count].tolist())
-        ours = depth[base : base + count], delta[base : base + count]
+        ours = t[base : base + count], deltas[base : base + count]
         agreeing += all(torch.allclose(o, torch.tensor(e), atol=2e-4, rtol=1e-3) for o, e in zip(ours, expected))
     # A ray that passes within rounding of a cell's edge may see one bin more or less.
     assert hits > 20
@@ -236,19 +236,19 @@ def test_samples_are_sorted_inside_the_open_interval_and_their_lengths_add_up(
     kernels: Kernels, seed: int, mode: int, count: int
 ) -> None:
     generator = torch.Generator().manual_seed(seed)
-    grid, reach = random_cells(16, 0.2, generator)
+    grid, skip_distance = random_cells(16, 0.2, generator)
     origin, direction = random_rays(50, generator)
     s = MarchSettings(16, 0.0625, mode=mode)
     with using_kernels(kernels):
-        samples = march.sample(origin, direction, grid, reach, s, count, torch.rand(50), torch.rand(50 * count))
-    hit = samples.packing.count > 0
-    depth, delta = samples.depth.view(-1, count), samples.delta.view(-1, count)
-    assert bool((depth.diff(dim=1) >= -1e-5).all())
-    assert bool((depth >= samples.first[hit, None] - s.step).all())
-    assert bool((depth <= samples.last[hit, None] + s.step).all())
-    assert bool((delta >= -1e-6).all())
-    bins = (delta.sum(1) / s.step).round()
-    assert torch.allclose(delta.sum(1), bins * s.step, atol=1e-4)
+        samples = march.sample(origin, direction, grid, skip_distance, s, count, torch.rand(50), torch.rand(50 * count))
+    hit = samples.packed_info.counts > 0
+    t, deltas = samples.t.view(-1, count), samples.deltas.view(-1, count)
+    assert bool((t.diff(dim=1) >= -1e-5).all())
+    assert bool((t >= samples.t_first[hit, None] - s.step).all())
+    assert bool((t <= samples.t_last[hit, None] + s.step).all())
+    assert bool((deltas >= -1e-6).all())
+    bins = (deltas.sum(1) / s.step).round()
+    assert torch.allclose(deltas.sum(1), bins * s.step, atol=1e-4)
     assert bool(((samples.points >= 0) & (samples.points <= 1)).all())
 
 
@@ -258,21 +258,21 @@ def test_an_empty_grid_gives_no_samples(device: torch.device) -> None:
     empty = torch.zeros(16**3, 2, device=device)
     samples = march.sample(origin, direction, empty, closed, MarchSettings(16, 0.06), 8)
     assert len(samples) == 0
-    assert bool((samples.packing.count == 0).all())
+    assert bool((samples.packed_info.counts == 0).all())
 
 
-def test_interest_and_density_draw_samples(device: torch.device) -> None:
+def test_importance_and_density_draw_samples(device: torch.device) -> None:
     n = 16
     grid = torch.zeros(n, n, n, 2)
     grid[:, :, 4:12, 0] = 0.5
-    grid[:, :, 8:10, 1] = 1.0  # an interesting slab
-    reach = torch.zeros((n // 4) ** 3, dtype=torch.uint8)
-    grid, reach = grid.view(-1, 2).contiguous().to(device), reach.to(device)
+    grid[:, :, 8:10, 1] = 1.0  # an important slab
+    skip_distance = torch.zeros((n // 4) ** 3, dtype=torch.uint8)
+    grid, skip_distance = grid.view(-1, 2).contiguous().to(device), skip_distance.to(device)
     origin, direction = (torch.tensor([x], device=device) for x in ([-3.0, 0.01, 0.01], [1.0, 0.0, 0.0]))
 
     def share(beta: float) -> float:
         s = MarchSettings(n, 0.125, beta=beta, epsilon=1e-4)
-        samples = march.sample(origin, direction, grid, reach, s, 64)
+        samples = march.sample(origin, direction, grid, skip_distance, s, 64)
         x = samples.points[:, 0] * n
         return float(((x >= 8) & (x < 10)).float().mean())
 
@@ -283,16 +283,16 @@ def test_rays_from_outside_start_where_nothing_was_seen_to_be(device: torch.devi
     """A cell in front of a far camera is passed over, the cube never is; reference and kernel agree."""
     n = 32
     grid = torch.full((n**3, 2), 1.0)
-    reach = torch.zeros((n // 4) ** 3, dtype=torch.uint8)
+    skip_distance = torch.zeros((n // 4) ** 3, dtype=torch.uint8)
     origins = torch.tensor([[0.1, -5.0, 0.2], [0.1, -1.5, 0.2], [0.0, 0.5, 0.0]])
     directions = torch.tensor([[0.0, 1.0, 0.0]]).expand(3, 3).contiguous()
-    s = MarchSettings(n, 0.125, far=50.0, contracted=True, empty=2.0)
-    on = [x.to(device) for x in (origins, directions, grid, reach)]
+    s = MarchSettings(n, 0.125, far=50.0, contracted=True, empty_distance=2.0)
+    on = [x.to(device) for x in (origins, directions, grid, skip_distance)]
     found = march.sample(*on, s, 4, torch.zeros(3, device=device))
-    assert torch.allclose(found.first.cpu(), torch.tensor([2.0, 0.4, 0.02]), atol=1e-5)
+    assert torch.allclose(found.t_first.cpu(), torch.tensor([2.0, 0.4, 0.02]), atol=1e-5)
     for i in range(3):
-        bins = march_reference.walk(origins[i], directions[i], 0.0, grid, s)
-        assert bins[0][0] == pytest.approx(float(found.first[i]), abs=1e-5)
+        bins = march_reference.traverse(origins[i], directions[i], 0.0, grid, s)
+        assert bins[0][0] == pytest.approx(float(found.t_first[i]), abs=1e-5)
 
 
 def test_cells_follow_the_mean_of_the_points_in_them(device: torch.device) -> None:

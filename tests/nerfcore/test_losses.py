@@ -8,7 +8,7 @@ import pytest
 import torch
 from fieldwork.nerfcore.config import LossConfig
 from fieldwork.nerfcore.data.pixels import VOID, Batch
-from fieldwork.nerfcore.kernels.packing import Packing
+from fieldwork.nerfcore.kernels.packed_info import PackedInfo
 from fieldwork.nerfcore.train import losses
 from fieldwork.nerfcore.train.schedule import bias_correction, rate_factor
 
@@ -84,13 +84,13 @@ def test_distortion_equals_its_double_sum() -> None:
     s = torch.rand(rays, count, generator=generator).sort(1).values.reshape(-1)
     d = torch.rand(rays * count, generator=generator) * 0.1
     start = torch.arange(rays, dtype=torch.int32) * count
-    packing = Packing(
+    packed_info = PackedInfo(
         start, torch.full((rays,), count, dtype=torch.int32), torch.repeat_interleave(torch.arange(rays), count).int()
     )
     W, S, D = (x.view(rays, count) for x in (w, s, d))
     pairs = (W[:, :, None] * W[:, None] * (S[:, :, None] - S[:, None]).abs()).sum((1, 2))
     expected = (pairs + (W * W * D).sum(1) / 3).mean()
-    assert float(losses.distortion_loss(w, s, d, packing)) == pytest.approx(float(expected), rel=1e-5)
+    assert float(losses.distortion_loss(w, s, d, packed_info)) == pytest.approx(float(expected), rel=1e-5)
 
 
 def test_schedule() -> None:

@@ -41,7 +41,7 @@ def test_unknown_pixels_are_never_drawn(tmp_path: Path) -> None:
     project = masked_project(tmp_path / "p", "ignore")
     store = store_of(project)
     assert not has_transparency(load_scene(project))
-    drawn = store.random_places(5000, torch.Generator().manual_seed(0))
+    drawn = store.random_pixels(5000, torch.Generator().manual_seed(0))
     assert set((drawn % 1600 // 40).tolist()) == set(range(20, 40))
     assert store.batch(drawn).alpha.min() == 1
 
@@ -50,7 +50,7 @@ def test_empty_pixels_are_drawn_and_transparent(tmp_path: Path) -> None:
     project = masked_project(tmp_path / "p", "empty")
     store = store_of(project)
     assert has_transparency(load_scene(project))
-    drawn = store.random_places(5000, torch.Generator().manual_seed(0))
+    drawn = store.random_pixels(5000, torch.Generator().manual_seed(0))
     rows = drawn % 1600 // 40
     assert set(rows.tolist()) == set(range(40))
     assert (store.batch(drawn).alpha == (rows >= 20)).all()

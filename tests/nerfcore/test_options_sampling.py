@@ -11,14 +11,14 @@ import torch
 from fieldwork.nerfcore.data.pixels import VOID
 from fieldwork.nerfcore.geometry.cameras import Camera
 from fieldwork.nerfcore.kernels.march import Samples, sample
-from fieldwork.nerfcore.kernels.packing import Packing
+from fieldwork.nerfcore.kernels.packed_info import PackedInfo
 from fieldwork.nerfcore.render.fused import wants_fused
 from fieldwork.nerfcore.render.image import render_view
 from fieldwork.nerfcore.render.model import Model
 from fieldwork.nerfcore.render.verb import look_at
 from fieldwork.nerfcore.sampling.cache import CoarseCache
-from fieldwork.nerfcore.sampling.occupancy import OccupancyGrid, class_interest
-from fieldwork.nerfcore.sampling.outlines import REACH, Outlines, outline_mask
+from fieldwork.nerfcore.sampling.occupancy import OccupancyGrid, class_importance
+from fieldwork.nerfcore.sampling.outlines import DISTANCE, Outlines, outline_mask
 from fieldwork.nerfcore.train.trainer import Trainer
 from fieldwork.tests.nerfcore.support.ball import ball_project
 from fieldwork.tests.nerfcore.support.settings import config_of, trainer_of
@@ -36,16 +36,16 @@ def model(**settings: str) -> Model:
     return Model(config_of(**settings), classes=3, images=2, contracted=False)
 
 
-def slab(density: float, interest: float = 0.0, **settings: str) -> tuple[OccupancyGrid, Samples]:
+def slab(density: float, importance: float = 0.0, **settings: str) -> tuple[OccupancyGrid, Samples]:
     """64 samples of a ray along x through a block whose cells from N/4 on are open; the third quarter is interesting."""
     grid = OccupancyGrid(config_of(**settings).sampling, contracted=False)
     n = grid.config.resolution
     cells = torch.zeros(n, n, n, 2)
     cells[..., n // 4 :, 0] = density
-    cells[..., n // 2 : 3 * n // 4, 1] = interest
+    cells[..., n // 2 : 3 * n // 4, 1] = importance
     grid.cells.copy_(cells.view(-1, 2))
     origin, direction = torch.tensor([[-3.0, 0.01, 0.01]]), torch.tensor([[1.0, 0.0, 0.0]])
-    return grid, sample(origin, direction, grid.cells, grid.reach, grid.march_settings(), 64)
+    return grid, sample(origin, direction, grid.cells, grid.skip_distance, grid.march_settings(), 64)
 
 
 def share(samples: Samples, low: float, high: float) -> float:
@@ -67,7 +67,7 @@ def test_a_ray_has_the_samples_asked_for(ball: Path) -> None:
         trainer = trainer_of(ball, **{"sampling.samples": str(count)})
         trainer.step(0.0)
         measured = trainer.take_measured()
-        assert measured.samples == measured.rays * count  # at first every ray meets open cells
+        assert measured.samples == measured.rays * count  # at first every ray meets occupied cells
 
 
 @pytest.mark.setting("sampling.pdf")
@@ -79,18 +79,20 @@ def test_samples_gather_at_surfaces_or_spread() -> None:
     assert share(slab(20.0, 1.0, **{"sampling.pdf": "literal"})[1], 0.5, 0.75) > 0.95
 
 
-@pytest.mark.setting("sampling.interest")
+@pytest.mark.setting("sampling.importance")
 def test_interest_is_priority_boundary_or_nothing() -> None:
     certain, torn = torch.tensor([[1.0, 0.0, 0.0]]), torch.full((1, 3), 1 / 3)
     priorities = torch.tensor([0.5, 2.0, 1.0])
-    assert float(class_interest(certain, "priority", priorities)) == pytest.approx(0.25)
-    assert float(class_interest(certain, "boundary", priorities)) == pytest.approx(0.0, abs=1e-5)
-    assert float(class_interest(torn, "boundary", priorities)) == pytest.approx(1.0, abs=1e-5)
-    assert not model(**{"sampling.interest": "priority"}).wants_interest()  # all priorities alike
-    assert model(**{"sampling.interest": "boundary"}).wants_interest()
-    assert not model(**{"sampling.interest": "none"}).wants_interest()
-    assert model(**{"sampling.pdf": "literal", "sampling.interest": "none"}).wants_interest()
-    drawn = {kind: share(slab(0.5, 1.0, **{"sampling.interest": kind})[1], 0.5, 0.75) for kind in ("priority", "none")}
+    assert float(class_importance(certain, "priority", priorities)) == pytest.approx(0.25)
+    assert float(class_importance(certain, "boundary", priorities)) == pytest.approx(0.0, abs=1e-5)
+    assert float(class_importance(torn, "boundary", priorities)) == pytest.approx(1.0, abs=1e-5)
+    assert not model(**{"sampling.importance": "priority"}).wants_importance()  # all priorities alike
+    assert model(**{"sampling.importance": "boundary"}).wants_importance()
+    assert not model(**{"sampling.importance": "none"}).wants_importance()
+    assert model(**{"sampling.pdf": "literal", "sampling.importance": "none"}).wants_importance()
+    drawn = {
+        kind: share(slab(0.5, 1.0, **{"sampling.importance": kind})[1], 0.5, 0.75) for kind in ("priority", "none")
+    }
     assert drawn["priority"] > 1.2 * drawn["none"]
 
 
@@ -138,8 +140,8 @@ def test_cells_close_below_the_threshold_after_decaying() -> None:
     grid = OccupancyGrid(config_of(**{"sampling.decay": "0.5", "sampling.threshold": "0.004"}).sampling, False)
     grid.density[0], grid.density[1:] = 0.005 / grid.step, 1.0
     grid.rebuild()
-    opened = (grid.cells[:, 0] > 0).view(N, N, N)
-    assert bool(opened.all())
+    occupied = (grid.cells[:, 0] > 0).view(N, N, N)
+    assert bool(occupied.all())
     grid.density[:] = 1.0
     generator = torch.Generator().manual_seed(0)
     grid.update(1000, lambda points: torch.zeros(len(points)), generator=generator)
@@ -158,14 +160,14 @@ def test_a_share_of_the_rays_comes_from_everywhere(ball: Path) -> None:
     cache = trainer.cache
     cache.hit = torch.tensor([0])  # the corner of the first image
     for free in (0.0, 0.4):
-        places = cache.places(5000, free, trainer.generator)
+        places = cache.draw(5000, free, trainer.generator)
         elsewhere = float((trainer.store.batch(places).image != 0).float().mean())
         assert elsewhere == pytest.approx(free * (1 - 1 / len(trainer.store.views)), abs=0.03)
 
 
 def near_another_class(label: torch.Tensor, y: int, x: int) -> bool:
     """The definition of an outline, looked up pixel by pixel."""
-    around = label[max(y - REACH, 0) : y + REACH + 1, max(x - REACH, 0) : x + REACH + 1]
+    around = label[max(y - DISTANCE, 0) : y + DISTANCE + 1, max(x - DISTANCE, 0) : x + DISTANCE + 1]
     return bool(label[y, x] != VOID) and bool(((around != label[y, x]) & (around != VOID)).any())
 
 
@@ -188,7 +190,7 @@ def test_outlines_are_where_classes_meet_and_get_their_share_of_the_rays(ball: P
     assert len(batch.rgb) == trainer.rays
     trainer = trainer_of(ball, **{"sampling.outline_rays": "0.5"})
     assert trainer.outlines is not None
-    inside = torch.isin(store.first[batch.image] + batch.pixel, trainer.outlines.places)
+    inside = torch.isin(store.first[batch.image] + batch.pixel, trainer.outlines.pixel_indices)
     assert trainer.outlines.share - 0.01 <= float(inside.float().mean()) < 0.8
     for settings in ({"sampling.outline_rays": "0"}, {"sampling.outline_rays": "0.5", "loss.semantic_weight": "0"}):
         assert trainer_of(ball, **settings).outlines is None
@@ -200,11 +202,11 @@ def test_rare_classes_have_more_than_their_share_of_the_outline_rays(ball: Path)
     width = store.cameras[0].width
     store.label[width * 10 + 10] = 1  # one pixel, with 24 of class 0 around it
     outlines = Outlines(store, 0.01)
-    assert outlines.places.tolist()[-1] == width * 10 + 10
-    assert len(outlines.places) == 25
+    assert outlines.pixel_indices.tolist()[-1] == width * 10 + 10
+    assert len(outlines.pixel_indices) == 25
     assert outlines.share == pytest.approx((4 + 0.01 * len(store) * 24**0.5 / (1 + 24**0.5)) / len(store), rel=1e-3)
     drawn = outlines.draw(20000, torch.Generator().manual_seed(0))
-    assert set(drawn.tolist()) == set(outlines.places.tolist())
+    assert set(drawn.tolist()) == set(outlines.pixel_indices.tolist())
     assert float((store.label[drawn] == 1).float().mean()) == pytest.approx(
         4 / outlines.share / len(store),
         abs=0.01,  # at most four times as often as any pixel
@@ -227,20 +229,22 @@ def test_what_is_drawn_more_often_counts_less(ball: Path) -> None:
     trainer.store.label[:] = torch.arange(len(trainer.store)) % 2  # nothing but outlines, and all rays on them
     everything = Outlines(trainer.store, 1.0)
     assert everything.share == pytest.approx(1)
-    assert everything.weight(everything.places).tolist() == pytest.approx([1.0] * len(everything.places), rel=1e-3)
+    assert everything.weight(everything.pixel_indices).tolist() == pytest.approx(
+        [1.0] * len(everything.pixel_indices), rel=1e-3
+    )
 
 
-def two_samples() -> tuple[torch.Tensor, torch.Tensor, Packing]:
+def two_samples() -> tuple[torch.Tensor, torch.Tensor, PackedInfo]:
     """A faint sample with huge logits for class 0 in front of a surface of class 1."""
-    packing = Packing(torch.tensor([0]).int(), torch.tensor([2]).int(), torch.tensor([0, 0]).int())
-    return torch.tensor([[60.0, 0.0, 0.0], [0.0, 4.0, 0.0]]), torch.tensor([0.1, 0.8], requires_grad=True), packing
+    packed_info = PackedInfo(torch.tensor([0]).int(), torch.tensor([2]).int(), torch.tensor([0, 0]).int())
+    return torch.tensor([[60.0, 0.0, 0.0], [0.0, 4.0, 0.0]]), torch.tensor([0.1, 0.8], requires_grad=True), packed_info
 
 
 @pytest.mark.setting("render.accumulate")
 def test_a_faint_sample_outvotes_a_surface_only_where_logits_are_summed() -> None:
-    logits, weights, packing = two_samples()
+    logits, weights, packed_info = two_samples()
     kept, summed = (
-        model(**{"render.accumulate": how})._probabilities(logits, weights, packing)[0]
+        model(**{"render.accumulate": how})._probabilities(logits, weights, packed_info)[0]
         for how in ("probabilities", "logits")
     )
     assert kept.argmax() == 1
@@ -251,9 +255,9 @@ def test_a_faint_sample_outvotes_a_surface_only_where_logits_are_summed() -> Non
 
 @pytest.mark.setting("loss.detach_weights")
 def test_labels_move_the_geometry_unless_told_not_to() -> None:
-    logits, weights, packing = two_samples()
-    held = model(**{"loss.detach_weights": "true"})._probabilities(logits, weights, packing)
-    moving = model()._probabilities(logits, weights, packing)
+    logits, weights, packed_info = two_samples()
+    held = model(**{"loss.detach_weights": "true"})._probabilities(logits, weights, packed_info)
+    moving = model()._probabilities(logits, weights, packed_info)
     assert torch.equal(held, moving)
     assert not held.requires_grad
     assert bool((torch.autograd.grad(moving[0, 1], weights)[0] != 0).any())
@@ -269,7 +273,9 @@ def test_labels_alone_never_change_how_opaque_a_ray_is(ball: Path, detached: str
     (moved,) = torch.autograd.grad(total, shown.weights, allow_unused=True)
     moved = torch.zeros_like(shown.weights) if moved is None else moved
     assert bool((moved != 0).any()) == (detached == "false")
-    push = torch.zeros(len(batch.rgb)).index_add(0, shown.samples.packing.ray.long(), moved * shown.weights.detach())
+    push = torch.zeros(len(batch.rgb)).index_add(
+        0, shown.samples.packed_info.ray_indices.long(), moved * shown.weights.detach()
+    )
     assert float(push.abs().max()) < 1e-6
 
 
@@ -279,10 +285,10 @@ def test_few_labels_pull_at_the_geometry_as_much_each_as_many_do(ball: Path) -> 
     views = len(part.store.cameras)
     labelled = sum(bool((part.store.label[a:b] != VOID).any()) for a, b in zip(part.store.first, part.store.first[1:]))
     assert part.model.label_pull == pytest.approx(whole.model.label_pull * labelled / views, rel=0.2)
-    logits, weights, packing = two_samples()
+    logits, weights, packed_info = two_samples()
     pulled = []
     for trainer in (whole, part):
-        moving = trainer.model._probabilities(logits, weights, packing)
+        moving = trainer.model._probabilities(logits, weights, packed_info)
         pulled.append(torch.autograd.grad(moving[0, 1], weights)[0] / trainer.model.label_pull)
     assert torch.allclose(*pulled)
 

@@ -90,7 +90,7 @@ def test_white_photos_are_learned_on_white(ball: Path) -> None:
             return _to(part, rendered, background, *rest)
 
         trainer.loss = spy  # type: ignore[method-assign]
-        trainer._learn(batch, 0.0)
+        trainer._accumulate_gradients(batch, 0.0)
         prices[choice] = float(torch.cat(seen).mean())
     assert prices == {"white": 1.0, "black": 0.0}
 
@@ -191,7 +191,7 @@ def test_without_semantics_there_are_no_classes(ball: Path) -> None:
 def test_density_at_random_points_has_a_price(ball: Path) -> None:
     def price(**settings: str) -> float:
         trainer = trainer_of(ball, **{f"loss.{name}": value for name, value in settings.items()})
-        trainer._learn(trainer.draw(), 0.0)
+        trainer._accumulate_gradients(trainer.draw(), 0.0)
         return float(trainer.measured.loss)
 
     free = price(sparsity_weight="0")

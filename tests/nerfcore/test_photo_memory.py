@@ -101,7 +101,7 @@ def test_a_tiny_budget_gives_the_same_batches(masked: Path) -> None:
     assert tiny.usable is not None
     assert torch.equal(plenty.usable, tiny.usable)
     assert len(plenty.usable) < 6 * 40 * 35  # masked, and where the lens folds over
-    drawn = [store.random_places(500, torch.Generator().manual_seed(1)) for store in (plenty, tiny)]
+    drawn = [store.random_pixels(500, torch.Generator().manual_seed(1)) for store in (plenty, tiny)]
     assert torch.equal(*drawn)
     one, other = (store.batch(places) for store, places in zip((plenty, tiny), drawn))
     for field in dataclasses.fields(one):

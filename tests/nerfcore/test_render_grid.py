@@ -9,9 +9,9 @@ import pytest
 import torch
 from fieldwork.nerfcore.config import SamplingConfig
 from fieldwork.nerfcore.errors import Cancelled
-from fieldwork.nerfcore.kernels.march import LEAST, sample, sample_counts
+from fieldwork.nerfcore.kernels.march import FEWEST_SAMPLES, sample, sample_counts
 from fieldwork.nerfcore.kernels.runtime import worker_count
-from fieldwork.nerfcore.kernels.walk import closed_reach
+from fieldwork.nerfcore.kernels.traversal import skip_distances
 from fieldwork.nerfcore.sampling import render_grid
 from fieldwork.nerfcore.sampling.occupancy import OccupancyGrid
 from fieldwork.nerfcore.sampling.render_grid import PROBES, SAVED, present_grid, refined_grid
@@ -50,21 +50,21 @@ def test_the_refined_grid_closes_what_is_empty_and_keeps_every_surface() -> None
     assert fine is not None
     assert fine.settings.resolution == 2 * N
     assert fine.settings.step == pytest.approx(coarse.step / 2)
-    opened = fine.cells[:, 0] > 0
-    assert float(opened.float().mean()) < 0.6 * coarse.open_share()
+    occupied = fine.cells[:, 0] > 0
+    assert float(occupied.float().mean()) < 0.6 * coarse.occupied_share()
     points = torch.nn.functional.normalize(torch.randn(2000, 3, generator=torch.Generator().manual_seed(1)), dim=1) / 4
     x, y, z = ((points + 0.5) * 2 * N).long().unbind(1)
-    assert float(opened[(z * 2 * N + y) * 2 * N + x].float().mean()) > 0.9
+    assert float(occupied[(z * 2 * N + y) * 2 * N + x].float().mean()) > 0.9
     origins, directions = parallel_rays()
-    found = sample(origins, directions, fine.cells, fine.reach, fine.settings, 16)
-    met = found.packing.count > 0
+    found = sample(origins, directions, fine.cells, fine.skip_distance, fine.settings, 16)
+    met = found.packed_info.counts > 0
     inside = origins[:, :2].norm(dim=1)
     assert bool(met[inside < 0.5].all())
     assert not bool(met[inside > 0.5 + 3 / N].any())
     # The first surface is at −√(¼ − r²), where half of the samples of the middle ray lie.
     middle = len(origins) // 2
-    begin, count = int(found.packing.start[middle]), int(found.packing.count[middle])
-    assert float((found.depth[begin : begin + count] - 1.5).abs().min()) < THICK
+    begin, count = int(found.packed_info.starts[middle]), int(found.packed_info.counts[middle])
+    assert float((found.t[begin : begin + count] - 1.5).abs().min()) < THICK
 
 
 def test_cells_are_not_refined_where_it_does_not_pay() -> None:
@@ -80,28 +80,30 @@ def test_cells_are_not_refined_where_it_does_not_pay() -> None:
 
 def test_rays_through_more_open_cells_get_more_samples() -> None:
     bins = torch.tensor([0, 1, 3, 10, 100])
-    assert sample_counts(bins, 32, 1.5).tolist() == [0, LEAST, 5, 15, 32]
+    assert sample_counts(bins, 32, 1.5).tolist() == [0, FEWEST_SAMPLES, 5, 15, 32]
     assert sample_counts(bins, 2, 1.5).tolist() == [0, 2, 2, 2, 2]
     assert sample_counts(bins, 32, 0.0).tolist() == [0, 32, 32, 32, 32]
     grid = shell_grid()
     origins, directions = parallel_rays()
     few, all_of_them = (
-        sample(origins, directions, g.cells, g.reach, g.settings, 32)
+        sample(origins, directions, g.cells, g.skip_distance, g.settings, 32)
         for g in (present_grid(grid, 0.5), present_grid(grid, 0.0))
     )
     assert len(few) < len(all_of_them)
-    assert bool(((few.packing.count > 0) == (all_of_them.packing.count > 0)).all())
-    # However few they are, a ray's samples stand for all of its open length.
-    lengths = [torch.zeros(len(origins)).index_add_(0, s.packing.ray.long(), s.delta) for s in (few, all_of_them)]
+    assert bool(((few.packed_info.counts > 0) == (all_of_them.packed_info.counts > 0)).all())
+    # However few they are, a ray's samples stand for all of its occupied length.
+    lengths = [
+        torch.zeros(len(origins)).index_add_(0, s.packed_info.ray_indices.long(), s.deltas) for s in (few, all_of_them)
+    ]
     assert torch.allclose(*lengths, atol=1e-4)
 
 
 def test_closed_reach_counts_closed_blocks_in_all_directions() -> None:
-    opened = torch.zeros(64, 64, 64, dtype=torch.bool)
-    opened[0, 0, 0] = True
-    reach = closed_reach(opened).view(16, 16, 16)
+    occupied = torch.zeros(64, 64, 64, dtype=torch.bool)
+    occupied[0, 0, 0] = True
+    skip_distance = skip_distances(occupied).view(16, 16, 16)
     for z, y, x in ((0, 0, 0), (0, 0, 1), (3, 2, 1), (7, 7, 0), (15, 15, 15)):
-        assert int(reach[z, y, x]) == min(max(z, y, x), 8)
+        assert int(skip_distance[z, y, x]) == min(max(z, y, x), 8)
 
 
 def test_reading_the_finer_cells_stops_as_soon_as_asked(monkeypatch: pytest.MonkeyPatch) -> None:

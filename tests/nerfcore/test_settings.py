@@ -10,7 +10,7 @@ import torch
 from fieldwork.nerfcore.bench.suites import ABLATION
 from fieldwork.nerfcore.config import RunConfig, make_config
 from fieldwork.nerfcore.field.hybrid import HybridField
-from fieldwork.nerfcore.kernels.walk import PDF_UNIFORM
+from fieldwork.nerfcore.kernels.traversal import PDF_UNIFORM
 from fieldwork.nerfcore.render.model import Model
 from fieldwork.nerfcore.sampling.occupancy import OccupancyGrid
 

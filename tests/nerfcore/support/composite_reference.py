@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 import torch
-from fieldwork.nerfcore.kernels.packing import Packing
+from fieldwork.nerfcore.kernels.packed_info import PackedInfo
 
 
-def render_weights(density: torch.Tensor, delta: torch.Tensor, packing: Packing) -> torch.Tensor:
+def render_weights(density: torch.Tensor, deltas: torch.Tensor, packed_info: PackedInfo) -> torch.Tensor:
     """As `composite.render_weights`, differentiable by autograd."""
     parts = []
-    for start, count in zip(packing.start.tolist(), packing.count.tolist()):
+    for start, count in zip(packed_info.starts.tolist(), packed_info.counts.tolist()):
         if count == 0:
             continue
-        tau = density[start : start + count] * delta[start : start + count]
+        tau = density[start : start + count] * deltas[start : start + count]
         after = torch.cumsum(tau, 0)
         parts.append(torch.exp(-(after - tau)) - torch.exp(-after))
     return torch.cat(parts) if parts else density * 0
 
 
-def weighted_sum(values: torch.Tensor, weights: torch.Tensor, packing: Packing) -> torch.Tensor:
+def weighted_sum(values: torch.Tensor, weights: torch.Tensor, packed_info: PackedInfo) -> torch.Tensor:
     """As `composite.weighted_sum`."""
     rows = []
-    for start, count in zip(packing.start.tolist(), packing.count.tolist()):
+    for start, count in zip(packed_info.starts.tolist(), packed_info.counts.tolist()):
         rows.append((values[start : start + count] * weights[start : start + count, None]).sum(0))
     return torch.stack(rows)

@@ -1,12 +1,12 @@
-"""How rays walk the occupancy grid, bin by bin: what the kernels of `march.py` and `fused_kernel.py` share.
+"""How rays traverse the occupancy grid, bin by bin: what the kernels of `march.py` and `fused_kernel.py` share.
 
 Positions are in the *normalised* frame, whose unit cube [−1, 1]³ is the region of interest. `contracted` maps all of
 space into the grid (Barron et al., "Mip-NeRF 360", 2022, eq. 10, with the infinity norm); otherwise the grid covers
-just the cube. A ray is walked in bins of about half a grid cell; bins in closed cells are skipped.
+just the cube. A ray is marched in bins of about half a grid cell; bins in empty cells are skipped.
 
 Bin weights (`mode`):
-  PDF_DEFAULT  T·α·(1 + β·interest) + ε        transmittance-weighted, ε keeps every open bin alive
-  PDF_UNIFORM  1                               the same number of samples spread over the open bins
+  PDF_DEFAULT  T·α·(1 + β·importance) + ε      transmittance-weighted, ε keeps every occupied bin alive
+  PDF_UNIFORM  1                               the same number of samples spread over the occupied bins
   PDF_LITERAL  σ·max softmax(s)                the original formulation: no transmittance
 The torch backend is in `march_torch.py`.
 """
@@ -21,18 +21,18 @@ import warp as wp
 PDF_DEFAULT, PDF_UNIFORM, PDF_LITERAL = 0, 1, 2
 _DEFAULT, _UNIFORM, _LITERAL = wp.constant(PDF_DEFAULT), wp.constant(PDF_UNIFORM), wp.constant(PDF_LITERAL)
 MAX_BINS = wp.constant(4096)
-MACRO = wp.constant(4)  # cells along a side of a block that can be skipped at once
+BLOCK = wp.constant(4)  # cells along a side of a block that can be skipped at once
 BEFORE_CUBE = wp.constant(0.8)  # share of the way to the cube that may be taken to be empty
-STOP = wp.constant(1.0e-4)  # transmittance below which the walk ends
-FARTHEST = 8  # blocks that can be skipped at once, from the middle one on
+EARLY_STOP = wp.constant(1.0e-4)  # transmittance below which a ray ends
+MAX_SKIP = 8  # blocks that can be skipped at once, from the middle one on
 
 
 @dataclass(frozen=True)
 class MarchSettings:
-    """How rays are walked. `step` is the bin length inside the cube; `near`, `far` clip the ray (normalised units).
+    """How rays are marched. `step` is the bin length inside the cube; `near`, `far` clip the ray (normalised units).
 
-    `empty`: where space is contracted, rays from outside of the cube start as far away as this, but before they reach
-    the cube. `per_bin`: samples for each open bin of a ray, at most the number asked for and at least `LEAST`; all
+    `empty_distance`: where space is contracted, rays from outside of the cube start as far away as this, but before they reach
+    the cube. `per_bin`: samples for each occupied bin of a ray, at most the number asked for and at least `LEAST`; all
     rays get the number asked for when it is 0.
     """
 
@@ -44,7 +44,7 @@ class MarchSettings:
     mode: int = PDF_DEFAULT
     beta: float = 1.0
     epsilon: float = 0.01
-    empty: float = 0.0
+    empty_distance: float = 0.0
     per_bin: float = 0.0
 
 
@@ -76,7 +76,7 @@ def cell_index(u: wp.vec3, n: int):
 
 @wp.func
 def ray_interval(o: wp.vec3, inverse: wp.vec3, near: float, far: float, contracted: int):
-    """Entry and exit distance of the walk."""
+    """Entry and exit distance of the march."""
     lo = near
     hi = far
     if contracted == 0:
@@ -109,26 +109,26 @@ def bin_length(p: wp.vec3, step: float, contracted: int):
 
 
 @wp.func
-def way_out(u: float, d: float, inverse: float, low: float, high: float):
-    """Way until a ray at u leaves the interval low … high of one axis."""
+def axis_exit(u: float, d: float, inverse: float, low: float, high: float):
+    """Distance until a ray at u leaves the interval low … high of one axis."""
     return (wp.where(d > 0.0, high, low) - u) * inverse
 
 
 @wp.func
-def leave_distance(u: wp.vec3, d: wp.vec3, inverse: wp.vec3, n: float, reach: float, border: float):
-    """Way, in grid coordinates, until a ray at grid position u leaves its cell of an n³ grid and the `reach` cells
+def exit_distance(u: wp.vec3, d: wp.vec3, inverse: wp.vec3, n: float, radius: float, border: float):
+    """Distance, in grid coordinates, until a ray at grid position u leaves its cell of an n³ grid and the `radius` cells
     around it, or the part of the grid that is `border` away from its sides."""
     away = float(1.0e9)
     for a in range(3):
         cell = wp.floor(u[a] * n)
-        low = wp.max((cell - reach) / n, border)
-        high = wp.min((cell + 1.0 + reach) / n, 1.0 - border)
-        away = wp.min(away, way_out(u[a], d[a], inverse[a], low, high))
+        low = wp.max((cell - radius) / n, border)
+        high = wp.min((cell + 1.0 + radius) / n, 1.0 - border)
+        away = wp.min(away, axis_exit(u[a], d[a], inverse[a], low, high))
     return wp.max(away, 0.0)
 
 
 @wp.func
-def closed_length(
+def skip_length(
     u: wp.vec3,
     d: wp.vec3,
     inverse: wp.vec3,
@@ -136,9 +136,9 @@ def closed_length(
     step: float,
     length: float,
     contracted: int,
-    reach: wp.array(dtype=wp.uint8),
+    skip_distance: wp.array(dtype=wp.uint8),
 ):
-    """How far to move from a closed cell: in whole steps until the ray leaves it, or the closed reach around it; one
+    """How far to move from an empty cell: in whole steps until the ray leaves it, or the empty blocks around it; one
     bin where space is contracted."""
     side = float(2.0)
     border = float(0.0)
@@ -149,11 +149,11 @@ def closed_length(
         if wp.max(wp.abs(c[0]), wp.max(wp.abs(c[1]), wp.abs(c[2]))) >= 0.25:
             return length
     leave = float(0.0)
-    closed = int(reach[cell_index(u, n / MACRO)])
-    if closed > 0:
-        leave = leave_distance(u, d, inverse, float(n / MACRO), float(closed - 1), border)
+    skip = int(skip_distance[cell_index(u, n / BLOCK)])
+    if skip > 0:
+        leave = exit_distance(u, d, inverse, float(n / BLOCK), float(skip - 1), border)
     else:
-        leave = leave_distance(u, d, inverse, float(n), 0.0, border)
+        leave = exit_distance(u, d, inverse, float(n), 0.0, border)
     return wp.max(1.0, wp.floor(leave * side / step + 0.5)) * step
 
 
@@ -167,22 +167,22 @@ def reciprocal(d: wp.vec3):
 
 
 @wp.func
-def bin_weight(cell: wp.vec2, transmittance: float, through: float, mode: int, beta: float, epsilon: float):
-    """Weight of one open bin; `cell` holds (density, interest), `through` is the bin's own transmittance."""
+def bin_weight(cell: wp.vec2, transmittance: float, bin_transmittance: float, mode: int, beta: float, epsilon: float):
+    """Weight of one occupied bin; `cell` holds (density, importance), `bin_transmittance` is the bin's own transmittance."""
     if mode == _UNIFORM:
         return 1.0
     if mode == _LITERAL:
         return cell[0] * cell[1] + 1.0e-6
-    return transmittance * (1.0 - through) * (1.0 + beta * cell[1]) + epsilon
+    return transmittance * (1.0 - bin_transmittance) * (1.0 + beta * cell[1]) + epsilon
 
 
-def closed_reach(opened: torch.Tensor) -> torch.Tensor:
-    """How many blocks of 4³ cells around one, itself included, are closed in all directions: ((n / 4)³,) uint8 from
-    the open cells (n, n, n) bool of a grid; 0 for blocks with an open cell."""
-    m = len(opened) // int(MACRO)
-    near = opened.view(m, int(MACRO), m, int(MACRO), m, int(MACRO)).any(5).any(3).any(1).float()[None]
-    closed = 1 - near
-    for _ in range(FARTHEST - 1):
+def skip_distances(occupied: torch.Tensor) -> torch.Tensor:
+    """How many blocks of 4³ cells around one, itself included, are empty in all directions: ((n / 4)³,) uint8 from
+    the occupied cells (n, n, n) bool of a grid; 0 for blocks with an occupied cell."""
+    m = len(occupied) // int(BLOCK)
+    near = occupied.view(m, int(BLOCK), m, int(BLOCK), m, int(BLOCK)).any(5).any(3).any(1).float()[None]
+    skip = 1 - near
+    for _ in range(MAX_SKIP - 1):
         near = torch.nn.functional.max_pool3d(near, 3, 1, 1)
-        closed += 1 - near
-    return closed.to(torch.uint8).reshape(-1)
+        skip += 1 - near
+    return skip.to(torch.uint8).reshape(-1)

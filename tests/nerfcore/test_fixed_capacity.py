@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from fieldwork.nerfcore.kernels.packing import Packing
+from fieldwork.nerfcore.kernels.packed_info import PackedInfo
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.render.model import Rendered
 from fieldwork.nerfcore.train.prepare import make_trainer, plan_run
@@ -57,29 +57,29 @@ def one_thread() -> Iterator[None]:
     torch.set_num_threads(before)
 
 
-def test_places_are_those_of_the_kept_samples_and_the_rest_is_marked() -> None:
+def test_indices_are_those_of_the_kept_samples_and_the_rest_is_marked() -> None:
     generator = torch.Generator().manual_seed(0)
     count = torch.randint(0, 6, (40,), generator=generator, dtype=torch.int32)
     start = torch.cumsum(count, 0, dtype=torch.int32) - count
-    packing = Packing(start, count, torch.repeat_interleave(torch.arange(40).int(), count.long()))
-    kept = torch.rand(len(packing.ray), generator=generator) < 0.4
-    places, exact = packing.subset(kept)
+    packed_info = PackedInfo(start, count, torch.repeat_interleave(torch.arange(40).int(), count.long()))
+    kept = torch.rand(len(packed_info.ray_indices), generator=generator) < 0.4
+    indices, exact = packed_info.subset(kept)
     with Waits() as waits:
-        fixed, padded = packing.subset(kept, len(places) + 7)
+        fixed, padded = packed_info.subset(kept, len(indices) + 7)
     assert waits.found == []
-    assert torch.equal(fixed[: len(places)], places)
-    assert torch.equal(padded.ray[: len(places)], exact.ray)
-    assert bool((padded.ray[len(places) :] == -1).all())
-    assert torch.equal(padded.count, exact.count)
-    assert torch.equal(padded.start[exact.count > 0], exact.start[exact.count > 0])
-    few, cut = packing.subset(kept, 9)
-    assert torch.equal(few, places[:9])
-    assert int(cut.count.sum()) == 9
-    assert bool((cut.start + cut.count <= 9).all())
+    assert torch.equal(fixed[: len(indices)], indices)
+    assert torch.equal(padded.ray_indices[: len(indices)], exact.ray_indices)
+    assert bool((padded.ray_indices[len(indices) :] == -1).all())
+    assert torch.equal(padded.counts, exact.counts)
+    assert torch.equal(padded.starts[exact.counts > 0], exact.starts[exact.counts > 0])
+    few, cut = packed_info.subset(kept, 9)
+    assert torch.equal(few, indices[:9])
+    assert int(cut.counts.sum()) == 9
+    assert bool((cut.starts + cut.counts <= 9).all())
 
 
 @pytest.mark.parametrize("share", [0.66, 1.0], ids=["two passes", "one pass"])
-def test_fixed_places_give_the_same_picture_gradients_and_grid(ball: Path, share: float) -> None:
+def test_a_fixed_capacity_gives_the_same_picture_gradients_and_grid(ball: Path, share: float) -> None:
     trainer = warm(ball, **{"field.appearance": "2"})
     model = trainer.model
     batch = trainer.store.batch(torch.arange(0, len(trainer.store), 3))
@@ -91,8 +91,8 @@ def test_fixed_places_give_the_same_picture_gradients_and_grid(ball: Path, share
     assert model.field.appearance is not None
 
     def result(fixed: bool) -> tuple[Rendered, list[torch.Tensor]]:
-        model.fixed_places = fixed
-        model.shown_share.fill_(share)
+        model.fixed_capacity = fixed
+        model.visible_share.fill_(share)
         model.refresh()
         grid.clear()
         codes = model.field.appearance[batch.image]
@@ -102,13 +102,13 @@ def test_fixed_places_give_the_same_picture_gradients_and_grid(ball: Path, share
         found = torch.autograd.grad(loss, [*model.parameters(), origins, directions])
         before = {name: value.clone() for name, value in model.occupancy.state_dict().items()}
         model.observe([out])
-        after = [model.occupancy.density.clone(), model.occupancy.mean.clone(), model.shown_share.clone()]
+        after = [model.occupancy.density.clone(), model.occupancy.mean.clone(), model.visible_share.clone()]
         model.occupancy.load_state_dict(before)
         return out, [*found, grid.gradient.clone(), *after]
 
     exact, padded = result(False), result(True)
-    live = exact[0].samples.packing.count.sum()
-    assert len(exact[0].read_density) < len(padded[0].read_density)  # some rays meet nothing
+    live = exact[0].samples.packed_info.counts.sum()
+    assert len(exact[0].evaluated_density) < len(padded[0].evaluated_density)  # some rays meet nothing
     assert len(exact[0].weights) == live < len(padded[0].weights)
     for name in ("color", "opacity", "depth", "probabilities"):
         assert torch.allclose(getattr(exact[0], name), getattr(padded[0], name), atol=1e-6), name
@@ -135,7 +135,7 @@ def test_an_ordinary_step_asks_the_device_for_nothing(
     one_thread: None,
 ) -> None:
     trainer = trainer_of(ball, **settings)
-    trainer.model.fixed_places = True
+    trainer.model.fixed_capacity = True
     waited: dict[int, list[str]] = {}
     for step in range(2 * UPDATE + 20):
         with Waits() as waits:
@@ -148,11 +148,11 @@ def test_an_ordinary_step_asks_the_device_for_nothing(
     assert all(bool(torch.isfinite(p).all()) for p in trainer.model.parameters())
 
 
-def test_training_with_fixed_places_learns_as_well(ball: Path) -> None:
+def test_training_with_a_fixed_capacity_learns_as_well(ball: Path) -> None:
     errors = {}
     for fixed in (False, True):
         trainer = trainer_of(ball)
-        trainer.model.fixed_places = fixed
+        trainer.model.fixed_capacity = fixed
         for step in range(150):
             trainer.step(step / 150)
         trainer.take_measured()

@@ -1,0 +1,35 @@
+"""Runs of earlier versions, read as runs of this one. Nothing is written: a run keeps its files until it is trained."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+from ..config import RENAMED
+
+# Names of a model's buffers before version 3.
+TENSORS = {
+    "model.shown_share": "model.visible_share",
+    "model.occupancy.interest": "model.occupancy.importance",
+    "model.occupancy.reach": "model.occupancy.skip_distance",
+    "model.occupancy.empty": "model.occupancy.empty_distance",
+}
+
+
+def migrate_info(values: Any) -> Any:
+    """What a run's config.json of version 2 holds, as version 3 has it; anything else as it is."""
+    if not isinstance(values, dict) or values.get("version") != 2 or not isinstance(values.get("config"), dict):
+        return values
+    config = {stage: dict(v) if isinstance(v, dict) else v for stage, v in values["config"].items()}
+    for old, new in RENAMED.items():
+        stage, name = old.split(".")
+        if isinstance(config.get(stage), dict) and name in config[stage]:
+            new_stage, new_name = new.split(".")
+            config.setdefault(new_stage, {})[new_name] = config[stage].pop(name)
+    return {**values, "version": 3, "config": config}
+
+
+def migrate_tensors(tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """A checkpoint's tensors under their present names."""
+    return {TENSORS.get(name, name): value for name, value in tensors.items()}

@@ -98,7 +98,7 @@ def test_rays_through_more_open_cells_get_more_samples() -> None:
     assert torch.allclose(*lengths, atol=1e-4)
 
 
-def test_closed_reach_counts_closed_blocks_in_all_directions() -> None:
+def test_skip_distances_count_empty_blocks_in_all_directions() -> None:
     occupied = torch.zeros(64, 64, 64, dtype=torch.bool)
     occupied[0, 0, 0] = True
     skip_distance = skip_distances(occupied).view(16, 16, 16)

@@ -274,7 +274,7 @@ def test_one_image_is_not_enough(tiny_project: Path, tmp_path: Path) -> None:
         {"field__appearance": "4"},
         {"sampling__pdf": "uniform"},
         {"sampling__pdf": "literal"},
-        {"sampling__interest": "boundary"},
+        {"sampling__importance": "boundary"},
         {"render__accumulate": "logits"},
         {"loss__rgb": "mse"},
         {"loss__sparsity": "cauchy"},

@@ -214,6 +214,12 @@ def training_curve(path: Path, points: int = 100) -> list[list[float]]:
     return [[event["seconds"], event["psnr"]] for event in events[::step]]
 
 
+def unknown_origin(results: Sequence[dict[str, Any]], out: Path) -> list[Path]:
+    """Files of finished runs that do not say with what they were measured: a version before that was recorded."""
+    names = [Job(**result["job"]).name for result in results if "error" not in result and not result.get("taken")]
+    return [out / "runs" / f"{name}.json" for name in names]
+
+
 def planned(jobs: Sequence[Job], out: Path) -> list[str]:
     """The plan in lines for the user: what is trained, what is there already, about how long it takes."""
     there = [load_result(job, out) is not None for job in jobs]

@@ -17,9 +17,9 @@ from ..errors import InputError
 from ..files import write_json, write_text
 from ..kernels.device import use_device
 from ..params import BenchParams
-from ..progress import Reporter
+from ..progress import Reporter, shortened
 from . import gpu, machine, tables
-from .jobs import run_all
+from .jobs import run_all, unknown_origin
 from .page import SUITES, check_page, figures_folder, write_page
 from .results import Asked, ResultSet, Row, grouped, write_set
 from .scenes import available, data_folder, is_labelled, prepare, scene_name
@@ -59,6 +59,10 @@ def bench(params: BenchParams, report: Reporter) -> dict[str, Any]:
     files = _write(params, out, rows, results, described, notes)
     if params.page is not None:
         files += _write_page(params, params.page, rows, results, notes, asked)
+        unknown = [str(path) for path in unknown_origin(results, out)]
+        if unknown:
+            hint = "Remove these files to measure them again"
+            report.warn(shortened(f"Runs whose machine and commit are not known are not on the page. {hint}", unknown))
     return {
         "suite": params.suite,
         "machine": described,

@@ -133,6 +133,18 @@ def test_a_page_gets_the_figures_of_a_suite(tiny_project: Path, tmp_path: Path) 
     assert page.read_text("utf-8") == text
 
 
+def test_runs_of_unknown_origin_are_named_and_not_on_the_page(tiny_project: Path, tmp_path: Path) -> None:  # noqa: F811
+    page, report = tmp_path / "docs" / "benchmarks.md", Recorder()
+    bench(tmp_path, tiny_project, "figures", steps=6, seeds=[0, 1])
+    first = sorted((tmp_path / "figures" / "runs").glob("*.json"))[0]
+    old = {key: value for key, value in json.loads(first.read_text("utf-8")).items() if key != "taken"}
+    first.write_text(json.dumps(old), encoding="utf-8")
+    bench(tmp_path, tiny_project, "figures", report, steps=6, seeds=[0, 1], page=page)
+    (measured,) = read_sets(figures_folder(page))
+    assert [row["seed"] for row in measured.rows] == [1]
+    assert any(str(first) in warning for warning in report.warnings)
+
+
 def test_a_page_that_somebody_wrote_is_not_overwritten(tiny_project: Path, tmp_path: Path) -> None:  # noqa: F811
     page = tmp_path / "README.md"
     page.write_text("# Mine\n", encoding="utf-8")

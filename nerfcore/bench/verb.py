@@ -20,7 +20,7 @@ from ..params import BenchParams
 from ..progress import Reporter, shortened
 from . import gpu, machine, tables
 from .jobs import run_all, unknown_origin
-from .page import SUITES, check_page, figures_folder, write_page
+from .page import check_page, figures_folder, write_page
 from .results import Asked, ResultSet, Row, grouped, write_set
 from .scenes import available, data_folder, is_labelled, prepare, scene_name
 from .suites import MISSING_BASELINES, PUBLISHED_DROPS, SCENES, SECONDS, plan
@@ -140,7 +140,7 @@ def _write_page(
     for taken, own in grouped(results, rows):
         result = ResultSet(
             suite=params.suite,
-            title=f"{SUITES[params.suite][0]}, {taken.date}",
+            title=f"{', '.join(dict.fromkeys(row['budget'] for row in own))} ({taken.date})",
             command="make gpu-check" if params.suite == "gpu" else command_of(params),
             source="bench",
             taken=taken,

@@ -124,6 +124,7 @@ def test_a_page_gets_the_figures_of_a_suite(tiny_project: Path, tmp_path: Path) 
     assert measured.taken.machine.threads == torch.get_num_threads()
     assert [row["psnr"] for row in measured.rows] == [row["psnr"] for row in result["rows"]]
     text = page.read_text("utf-8")
+    assert f"### 6 steps ({measured.taken.date})" in text
     assert measured.command in text
     assert measured.origin() in text
     again = Recorder()

@@ -101,6 +101,14 @@ def test_every_verb_is_explained() -> None:
     assert sorted(VERBS.keys() - keys) == []
 
 
+def test_experiments_are_dated_newest_first() -> None:
+    headings = re.findall(r"^## (.*)$", prose(ROOT / "docs" / "experiments.md"), flags=re.MULTILINE)
+    dates = [heading.split(": ")[0] for heading in headings]
+    assert all(re.fullmatch(r"\d{4}-\d{2}-\d{2}", date) for date in dates)
+    assert dates == sorted(dates, reverse=True)
+    assert len(set(headings)) == len(headings)
+
+
 def test_every_page_is_reached_from_the_readme() -> None:
     reached, waiting = set(), [ROOT / "README.md"]
     while waiting:

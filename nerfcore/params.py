@@ -6,12 +6,28 @@ Imports nothing heavy. The verbs themselves are listed in `verbs.py`.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 Preset = Literal["draft", "standard", "high"]
 Pass = Literal["rgb", "depth", "semantic", "confidence", "normal"]
+
+
+def _leaves_some(every: int) -> int:
+    if every == 1:
+        raise ValueError("1 would hold out every photo; give 0 for none, or 2 and more")
+    return every
+
+
+Holdout = Annotated[
+    int,
+    Field(
+        ge=0,
+        description="every so many photos, one is held out for `evaluate`; 0: all are trained on, for a final field",
+    ),
+    AfterValidator(_leaves_some),
+]
 
 
 class Params(BaseModel):
@@ -150,7 +166,8 @@ class RegionParams(Params):
 class TrainParams(Params):
     project: Path
     preset: Preset = "standard"
-    run: str = Field(default="main", pattern=r"^[\w.-]+$", description="name of the run")
+    run: str = Field(default="main", pattern=r"^[\w-][\w.-]*$", description="name of the run")
+    holdout: Holdout = 8
     time_limit: float | None = Field(default=None, gt=0, description="seconds of training")
     steps: int | None = Field(default=None, gt=0, description="optimisation steps")
     set: dict[str, str] = Field(default_factory=dict, description="settings by name, e.g. loss.semantic=0.1")
@@ -225,6 +242,7 @@ class ReconstructParams(Params):
     classes: Path | None = None
     blend: Path | None = None
     time_limit: float | None = Field(default=None, gt=0, description="seconds of training")
+    holdout: Holdout = 8
     set: dict[str, str] = Field(default_factory=dict)
     report: Path | None = Field(default=None, description="HTML report to write")
     renders: Path | None = Field(default=None, description="folder for renders of new views")

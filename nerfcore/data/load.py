@@ -7,15 +7,16 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import ProjectError
+from ..project.runs import HOLDOUT
 from ..project.store import load_points, load_poses, load_project, world_from_sfm
 from .scene import ClassInfo, Scene, View
 
 
-def load_scene(folder: Path) -> Scene:
+def load_scene(folder: Path, holdout: int = HOLDOUT) -> Scene:
     """The posed views of a project in the world frame, split into train and test.
 
-    Images whose split is "auto" are divided as usual for captures: every 8th one is held out, starting with the
-    first, unless the project names test images itself.
+    Images whose split is "auto" are divided as usual for captures: every `holdout`-th one is held out, starting with
+    the first, unless the project names test images itself. With 0 all views are there to train on.
     """
     folder = Path(folder)
     project, poses = load_project(folder), load_poses(folder)
@@ -40,7 +41,7 @@ def load_scene(folder: Path) -> Scene:
         splits.append(record.split)
     if not views:
         raise ProjectError(f"{folder} has no posed images.", "Run `fieldwork poses` again.")
-    train, test = split_views(splits)
+    train, test = split_views(splits, holdout)
     bounds = np.array(project.frame.bounds, np.float64) if project.frame.bounds else None
     scene = Scene(
         views=views,
@@ -54,10 +55,12 @@ def load_scene(folder: Path) -> Scene:
     return Scene(**{**vars(scene), "bounds": bounds})
 
 
-def split_views(splits: list[str]) -> tuple[list[int], list[int]]:
+def split_views(splits: list[str], holdout: int = HOLDOUT) -> tuple[list[int], list[int]]:
     """Indices of training and held-out views from the "train"/"test"/"auto" marks of all views, in name order."""
+    if holdout == 0:
+        return list(range(len(splits))), []
     if "test" in splits:
         return [i for i, s in enumerate(splits) if s != "test"], [i for i, s in enumerate(splits) if s == "test"]
     automatic = [i for i, s in enumerate(splits) if s == "auto"]
-    held_out = set(automatic[::8]) if len(automatic) >= 8 else set()
+    held_out = set(automatic[::holdout]) if len(automatic) >= holdout else set()
     return [i for i in range(len(splits)) if i not in held_out], sorted(held_out)

@@ -64,11 +64,18 @@ class Frame(Model):
 
 
 class ProvenanceStep(Model):
+    """What a verb did, in the project's provenance or beside the artefact it made.
+
+    `inputs` is the fingerprint of what it was made from (see fingerprints.py), `checkpoint` the field it was made of.
+    """
+
     verb: str
     time: str
     version: str
     settings: dict[str, Any] = {}
     result: dict[str, Any] = {}
+    inputs: dict[str, str] = {}
+    checkpoint: str = ""
 
 
 class Project(Model):
@@ -83,13 +90,36 @@ class Project(Model):
     frame: Frame = Frame()
     provenance: list[ProvenanceStep] = []
 
-    def record(self, verb: str, settings: dict[str, Any], result: dict[str, Any]) -> None:
+    def record(
+        self, verb: str, settings: dict[str, Any], result: dict[str, Any], inputs: dict[str, str] | None = None
+    ) -> None:
         """Append one step to the provenance."""
-        from .. import __version__
+        self.provenance.append(step(verb, settings, result, inputs))
 
-        self.provenance.append(
-            ProvenanceStep(verb=verb, time=now(), version=__version__, settings=settings, result=result)
-        )
+    def last(self, verb: str) -> ProvenanceStep | None:
+        """The newest step of a verb."""
+        return next((step for step in reversed(self.provenance) if step.verb == verb), None)
+
+
+def step(
+    verb: str,
+    settings: dict[str, Any],
+    result: dict[str, Any],
+    inputs: dict[str, str] | None = None,
+    checkpoint: str = "",
+) -> ProvenanceStep:
+    """A step that was done just now."""
+    from .. import __version__
+
+    return ProvenanceStep(
+        verb=verb,
+        time=now(),
+        version=__version__,
+        settings=settings,
+        result=result,
+        inputs=inputs or {},
+        checkpoint=checkpoint,
+    )
 
 
 class PosedImage(Model):

@@ -103,10 +103,16 @@ def save_project(folder: Path, project: Project) -> None:
     write_json(Path(folder) / PROJECT_FILE, project.model_dump(mode="json"))
 
 
-def record_step(folder: Path, verb: str, settings: dict[str, Any], result: dict[str, Any]) -> None:
+def record_step(
+    folder: Path,
+    verb: str,
+    settings: dict[str, Any],
+    result: dict[str, Any],
+    inputs: dict[str, str] | None = None,
+) -> None:
     """Append one step to the provenance of a project on disk, whatever else has changed in it meanwhile."""
     with edit_project(folder) as project:
-        project.record(verb, settings, result)
+        project.record(verb, settings, result, inputs)
 
 
 def is_project(folder: Path) -> bool:

@@ -18,15 +18,25 @@ from ..errors import ProjectError
 from ..files import write_json
 from ..geometry.similarity import transform_pose
 from ..kernels.device import use_device
+from ..project.runs import CHECKPOINT, HOLDOUT, INFO, run_folder, settle
 from ..project.schema import Poses, Project
 from ..project.store import world_from_sfm
 from .migration import migrate_info, migrate_tensors
 from .model import Model
 
 CPU_IMAGE_SIZE, GPU_IMAGE_SIZE = 800, 1600
-CHECKPOINT = "field.safetensors"
 REFINED_POSES = "poses.json"  # of a run with train.refine_poses
 PIXEL_FEATURES = "voxel_init.safetensors"  # of a run with field.voxel_init=cnn
+
+
+class Origin(BaseModel):
+    """What a run comes from; empty for runs of versions that did not note it."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    project: str = ""  # uuid
+    training: str = ""  # another one for each training from the start
+    inputs: dict[str, str] = {}  # fingerprint, with the settings as asked for
 
 
 class RunInfo(BaseModel):
@@ -43,6 +53,8 @@ class RunInfo(BaseModel):
     sfm_from_box: list[list[float]]
     contracted: bool
     transparent: bool
+    holdout: int = HOLDOUT  # every so many photos one was held out, where the project does not say which
+    origin: Origin = Origin()
 
     @field_validator("config")
     @classmethod
@@ -74,22 +86,25 @@ def settled_as(asked: RunConfig, settled: RunConfig) -> RunConfig:
     return config
 
 
-def run_folder(project: Path, run: str) -> Path:
-    return Path(project) / "runs" / run
-
-
-def save_info(project: Path, run: str, info: RunInfo) -> None:
-    write_json(run_folder(project, run) / "config.json", info.model_dump(mode="json"))
+def save_info(folder: Path, info: RunInfo) -> None:
+    """Write config.json into the folder of a run."""
+    write_json(folder / INFO, info.model_dump(mode="json"))
 
 
 def load_info(project: Path, run: str) -> RunInfo:
     """Raises ProjectError when there is no such run or its config.json is damaged."""
-    path = run_folder(project, run) / "config.json"
+    settle(project, run)
+    if not (run_folder(project, run) / INFO).is_file():
+        raise ProjectError(f"{project} has no run “{run}”.", "Run `fieldwork train` first.")
+    return read_info(run_folder(project, run))
+
+
+def read_info(folder: Path) -> RunInfo:
+    """config.json of the folder of a run. Raises ProjectError when it is missing or damaged."""
+    path = folder / INFO
     try:
         return RunInfo.model_validate(migrate_info(json.loads(path.read_text(encoding="utf-8"))))
-    except FileNotFoundError as error:
-        raise ProjectError(f"{project} has no run “{run}”.", "Run `fieldwork train` first.") from error
-    except (json.JSONDecodeError, ValidationError) as error:
+    except (OSError, json.JSONDecodeError, ValidationError) as error:
         raise ProjectError(f"{path} is damaged or from another version.", "Train the run again.") from error
 
 

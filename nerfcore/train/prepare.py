@@ -19,6 +19,7 @@ from ..geometry.similarity import transform_points
 from ..images.working import read_label, shows_transparency
 from ..kernels.device import free_memory
 from ..progress import Reporter
+from ..project.runs import HOLDOUT
 from ..project.store import load_project, load_visibility, world_from_sfm
 from ..render.run import CPU_IMAGE_SIZE, GPU_IMAGE_SIZE, RunInfo, new_model
 from ..sampling.path import cells_before_path
@@ -61,13 +62,15 @@ def pixels_across(scene: Scene, views: list[int], box: Box, image_size: int) -> 
     return round((4.0 if box.contracted else 2.0) / float(np.median(footprints)))
 
 
-def plan_run(project_folder: Path, preset: str, config: RunConfig, device: torch.device) -> tuple[RunInfo, Scene]:
+def plan_run(
+    project_folder: Path, preset: str, config: RunConfig, device: torch.device, holdout: int = HOLDOUT
+) -> tuple[RunInfo, Scene]:
     """Decide what a run will be: its views, classes and box, and the settings that follow from the photos.
 
     Raises:
         TrainingError: fewer than two posed training images.
     """
-    project, scene = load_project(project_folder), load_scene(project_folder)
+    project, scene = load_project(project_folder), load_scene(project_folder, holdout)
     train = training_views(scene, config)
     if len(train) < 2:
         raise TrainingError(
@@ -95,6 +98,7 @@ def plan_run(project_folder: Path, preset: str, config: RunConfig, device: torch
         sfm_from_box=(np.linalg.inv(world_from_sfm(project)) @ box.world_from_box).tolist(),
         contracted=box.contracted,
         transparent=transparent,
+        holdout=holdout,
     )
     return info, scene
 

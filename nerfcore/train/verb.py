@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import time
+import uuid
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import numpy as np
 
@@ -15,27 +16,41 @@ from ..data.box import box_poses
 from ..data.load import load_scene
 from ..data.pixels import training_size
 from ..data.scene import Scene
-from ..errors import Cancelled, TrainingError
+from ..errors import Cancelled, DiskError, ProjectError, TrainingError
 from ..files import atomic_path, disk_errors, write_json
 from ..images.encode import write_picture
 from ..kernels.device import use_device
 from ..kernels.runtime import compile_seconds
 from ..params import TrainParams
 from ..progress import Reporter
+from ..project.fingerprints import Earlier, compare, difference, digest
+from ..project.runs import (
+    CHECKPOINT,
+    EVENTS,
+    INFO,
+    METRICS,
+    TrainingFolder,
+    has_checkpoint,
+    read_metrics,
+    run_folder,
+    settle,
+)
+from ..project.schema import step
 from ..project.store import load_project, record_step
 from ..render.image import background_of, render_view
 from ..render.model import Model
 from ..render.run import (
-    CHECKPOINT,
     PIXEL_FEATURES,
     REFINED_POSES,
+    Origin,
     RunInfo,
-    load_info,
     read_checkpoint,
-    run_folder,
+    read_info,
     save_info,
+    settled_as,
 )
 from .checkpoint import restore, save_checkpoint
+from .inputs import data_inputs, training_inputs, training_length
 from .pose_refinement import write_poses
 from .prepare import make_trainer, plan_run
 from .trainer import Trainer
@@ -57,26 +72,35 @@ class _Clock:
 def train(params: TrainParams, report: Reporter) -> dict[str, Any]:
     """Train a run of a project until its steps or its time are used up.
 
+    A run that is there already stays as it is until the new training has a checkpoint; then it is replaced.
+
     Returns:
         {"run", "steps", "seconds", "psnr_train", "checkpoint", …}
     Raises:
         TrainingError, ProjectError, SettingError, DiskError, Cancelled (after writing a checkpoint).
     """
     project_folder = Path(params.project)
-    folder = run_folder(project_folder, params.run)
     device = use_device()
-    saved = None
-    if params.resume and (folder / CHECKPOINT).is_file():
-        info, scene = load_info(project_folder, params.run), load_scene(project_folder)
-        saved = read_checkpoint(folder / CHECKPOINT, device)
+    place = TrainingFolder.to_resume(project_folder, params.run) if params.resume else None
+    if place is not None:
+        info, scene = _resumable(place, params, report)
+        saved = read_checkpoint(place.folder / CHECKPOINT, device)
+        if saved[1].get("training", "") != info.origin.training:
+            raise ProjectError(
+                f"{place.folder / CHECKPOINT} is not of the training that {INFO} beside it describes.",
+                "Train the run anew, without --resume.",
+            )
     else:
-        info, scene = plan_run(project_folder, params.preset, make_config(params.preset, params.set), device)
-        with disk_errors(folder):
-            folder.mkdir(parents=True, exist_ok=True)
-        for stale in (CHECKPOINT, REFINED_POSES, PIXEL_FEATURES, "events.jsonl", "metrics.json"):
-            (folder / stale).unlink(missing_ok=True)
-        save_info(project_folder, params.run, info)
-    for half_written in folder.glob(".*.safetensors"):  # by a process that was killed
+        saved, config = None, make_config(params.preset, params.set)
+        info, scene = plan_run(project_folder, params.preset, config, device, params.holdout)
+        info.origin = Origin(
+            project=load_project(project_folder).uuid,
+            training=uuid.uuid4().hex,
+            inputs=training_inputs(project_folder, params, config),
+        )
+        place = TrainingFolder.anew(project_folder, params.run)
+    save_info(place.folder, info)
+    for half_written in place.folder.glob(".*.safetensors"):  # by a process that was killed
         half_written.unlink()
     trainer = make_trainer(project_folder, info, scene, device, report)
     state = {"seconds": 0.0, "progress": 0.0, "psnr": None}
@@ -84,30 +108,95 @@ def train(params: TrainParams, report: Reporter) -> dict[str, Any]:
         restore(trainer, *saved)
         state.update({key: saved[1][key] for key in state})
         del saved
-    limit = params.steps or (None if params.time_limit else info.config.train.steps)
+    limit = training_length(params.steps, params.time_limit, info.config)["steps"]
     report.stage("Training")
-    loop = _Loop(trainer, info, folder, state, limit, params.time_limit, report)
+    loop = _Loop(trainer, info, place, state, limit, params.time_limit, report)
     try:
-        loop.run(_preview(project_folder, folder, info, scene, trainer.model))
+        loop.run(_preview(project_folder, place, info, scene, trainer.model))
     except Cancelled:
         loop.checkpoint()
         raise
     loop.checkpoint()
+    loop.keep()
     result = {
         "run": params.run,
         "steps": trainer.steps,
         "seconds": round(loop.clock.seconds(), 2),
         "compile_seconds": round(compile_seconds(), 2),
         "psnr_train": loop.state["psnr"],
-        "checkpoint": str(folder / CHECKPOINT),
+        "checkpoint": str(place.folder / CHECKPOINT),
         "params_m": round(trainer.model.field.parameter_count() / 1e6, 2),
         "device": str(device),
     }
     if trainer.poses is not None:
         result["pose_shift"] = trainer.poses.shift(info.box(load_project(project_folder)).world_from_box)
-    write_json(folder / "metrics.json", {"train": result})
-    record_step(project_folder, "train", params.model_dump(mode="json"), result)
+    write_json(place.folder / METRICS, {"train": result})
+    # What was done: a resumed run keeps the settings it began with.
+    done = {"preset": info.preset, "holdout": info.holdout, "config": info.config.model_dump(mode="json")}
+    record_step(project_folder, "train", params.model_dump(mode="json") | done, result, info.origin.inputs)
     return result
+
+
+def finished(params: TrainParams) -> Earlier:
+    """Whether a run of just these settings and inputs was trained to its end; see also `unfinished`."""
+    folder = Path(params.project)
+    settle(folder, params.run)
+    place = run_folder(folder, params.run)
+    if not has_checkpoint(place):
+        return Earlier()
+    try:
+        origin = read_info(place).origin
+    except ProjectError as error:
+        return Earlier(reason=error.message)
+    done = step("train", {}, read_metrics(place).get("train") or {}, origin.inputs)
+    earlier = compare(done, training_inputs(folder, params, make_config(params.preset, params.set)))
+    if earlier.result is not None and origin.project != load_project(folder).uuid:
+        return Earlier(reason="trained in another project")
+    if earlier.result is not None and "steps" not in earlier.result:
+        return Earlier(reason="not finished")
+    return earlier
+
+
+def unfinished(params: TrainParams) -> bool:
+    """Whether a training of just these settings and inputs was stopped, so that it can go on."""
+    folder = Path(params.project)
+    place = TrainingFolder.to_resume(folder, params.run)
+    if place is None or "train" in read_metrics(place.folder):
+        return False
+    try:
+        origin = read_info(place.folder).origin
+    except ProjectError:
+        return False
+    wanted = training_inputs(folder, params, make_config(params.preset, params.set))
+    return origin.inputs == wanted and origin.project == load_project(folder).uuid
+
+
+def _resumable(place: TrainingFolder, params: TrainParams, report: Reporter) -> tuple[RunInfo, Scene]:
+    """The run to go on with, and its scene.
+
+    Raises:
+        ProjectError: it is of another project, or what it was trained on is no longer the same.
+    """
+    info = read_info(place.folder)
+    if info.origin.project and info.origin.project != load_project(place.project).uuid:
+        raise ProjectError(
+            f"The run “{place.run}” in {place.folder} was trained in another project.",
+            "Train it anew, without --resume.",
+        )
+    if info.origin.inputs:
+        now = data_inputs(place.project, info.holdout, info.config)
+        changed = difference({name: info.origin.inputs.get(name, "") for name in now}, now)
+        if changed:
+            raise ProjectError(
+                f"The run “{place.run}” cannot go on: since it began, these have {changed}.",
+                "Train it anew, without --resume.",
+            )
+        length = training_length(params.steps, params.time_limit, info.config)
+        info.origin.inputs["length of training"] = digest(length)
+    asked = make_config(params.preset, params.set) if params.set else None
+    if asked is not None and settled_as(asked, info.config) != info.config:
+        report.warn(f"The run “{place.run}” goes on with the settings it began with, not with those given now.")
+    return info, load_scene(place.project, info.holdout)
 
 
 class _Loop:
@@ -117,13 +206,13 @@ class _Loop:
         self,
         trainer: Trainer,
         info: RunInfo,
-        folder: Path,
+        place: TrainingFolder,
         state: dict[str, Any],
         steps: int | None,
         seconds: float | None,
         report: Reporter,
     ) -> None:
-        self.trainer, self.info, self.folder, self.state = trainer, info, folder, state
+        self.trainer, self.info, self.place, self.state = trainer, info, place, state
         self.step_limit, self.time_limit, self.report = steps, seconds, report
         self.clock = _Clock(state["seconds"])
 
@@ -139,26 +228,30 @@ class _Loop:
         train = self.info.config.train
         last_event = last_checkpoint = last_preview = time.perf_counter()
         cost = 0.0  # seconds of the last preview
-        with disk_errors(self.folder), open(self.folder / "events.jsonl", "a", encoding="utf-8") as events:
+        seen = False
+        with disk_errors(self.place.folder):
             while (progress := self.progress()) < 1:
                 self.trainer.step(progress)
                 self.state.update(progress=progress, seconds=self.clock.seconds())
                 now = time.perf_counter()
                 if now - last_event >= 0.5:
-                    self._write_event(progress, now - last_event, events)
+                    self._write_event(progress, now - last_event)
                     last_event = now
                 if now - last_checkpoint >= train.checkpoint_every:
                     self.checkpoint()
+                    if self._kept_early() and seen:
+                        self.report.event("preview", path=str(preview()))  # the one told of lay elsewhere
                     last_checkpoint = time.perf_counter()
                 if now - last_preview >= max(train.preview_every, PREVIEW_PAUSE * cost):
                     self.report.event("preview", path=str(preview()))
+                    seen = True
                     last_preview = time.perf_counter()
                     cost = last_preview - now
                 self.report.check()
             self.state["progress"] = 1.0
-            self._write_event(1.0, max(time.perf_counter() - last_event, 1e-3), events)
+            self._write_event(1.0, max(time.perf_counter() - last_event, 1e-3))
 
-    def _write_event(self, progress: float, elapsed: float, events: TextIO) -> None:
+    def _write_event(self, progress: float, elapsed: float) -> None:
         measured = self.trainer.take_measured()
         loss = float(measured.loss)
         if measured.steps == 0:
@@ -175,29 +268,46 @@ class _Loop:
             "psnr": self.state["psnr"],
             "rays_per_second": round(measured.rays / elapsed),
         }
-        events.write(json.dumps(values) + "\n")
-        events.flush()
+        with open(self.place.folder / EVENTS, "a", encoding="utf-8") as events:
+            events.write(json.dumps(values) + "\n")
         self.report.event("train", **values)
         self.report.progress(progress, f"step {values['step']}, {values['psnr']:.1f} dB")
 
     def checkpoint(self) -> None:
         trainer, info = self.trainer, self.info
-        save_checkpoint(self.folder / CHECKPOINT, trainer, self.state)
+        save_checkpoint(self.place.folder / CHECKPOINT, trainer, {**self.state, "training": info.origin.training})
         if trainer.poses is not None:
-            path = self.folder / REFINED_POSES
+            path = self.place.folder / REFINED_POSES
             write_poses(path, trainer.poses, trainer.store.rays, info.images, np.array(info.sfm_from_box))
         if trainer.pixel_features is not None:
-            save_features(self.folder / PIXEL_FEATURES, trainer.pixel_features)
+            save_features(self.place.folder / PIXEL_FEATURES, trainer.pixel_features)
+
+    def keep(self) -> None:
+        """Let the run take the place of the one before it. Raises DiskError."""
+        self.place.keep()
+
+    def _kept_early(self) -> bool:
+        """Replace the run that was there, now that there is a checkpoint; whether its folder is another one now."""
+        if not self.place.beside:
+            return False
+        try:
+            self.keep()
+        except DiskError as error:  # somebody reads the old one: the end of training tries again
+            self.report.warn(str(error))
+            return False
+        return True
 
 
-def _preview(project_folder: Path, folder: Path, info: RunInfo, scene: Scene, model: Model) -> Callable[[], Path]:
+def _preview(
+    project_folder: Path, place: TrainingFolder, info: RunInfo, scene: Scene, model: Model
+) -> Callable[[], Path]:
     """A function that renders a small held-out view to preview.png in the run's folder and returns its path."""
     view = scene.views[scene.test[len(scene.test) // 2] if scene.test else scene.train[0]]
     camera = view.camera.resized(*training_size(view.camera, 256))
     pose = box_poses([view], info.box(load_project(project_folder)).box_from_world)[0]
-    path = folder / "preview.png"
 
     def preview() -> Path:
+        path = place.folder / "preview.png"
         frame = render_view(model, camera, pose, background_of(info), semantics=False)
         with atomic_path(path) as temporary:
             write_picture(temporary, frame.color)

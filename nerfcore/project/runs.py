@@ -1,0 +1,161 @@
+"""The folders of runs, and how a new training takes the place of an old one.
+
+runs/<name>/        the field as everybody reads it
+runs/.new/<name>/   the same run being trained anew, until it has a checkpoint worth keeping
+runs/.old/<name>/   what was there before, for the moment of the exchange
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+from ..files import disk_errors
+from .fingerprints import digest
+
+CHECKPOINT = "field.safetensors"
+INFO = "config.json"
+EVENTS = "events.jsonl"
+METRICS = "metrics.json"
+NEW, OLD = ".new", ".old"
+HOLDOUT = 8  # every so many photos one is held out, unless a run says otherwise
+
+
+def run_folder(project: Path, run: str) -> Path:
+    return Path(project) / "runs" / run
+
+
+def fresh_folder(project: Path, run: str) -> Path:
+    """Where a run is written that is trained anew while the old one is still to be used."""
+    return Path(project) / "runs" / NEW / run
+
+
+def _old_folder(project: Path, run: str) -> Path:
+    return Path(project) / "runs" / OLD / run
+
+
+def has_checkpoint(folder: Path) -> bool:
+    return (folder / CHECKPOINT).is_file()
+
+
+def settle(project: Path, run: str) -> None:
+    """Bring an exchange that was cut off to its end: call it before a run is read or written, holding the project."""
+    folder, fresh, old = run_folder(project, run), fresh_folder(project, run), _old_folder(project, run)
+    if not old.is_dir():
+        return
+    with disk_errors(folder):
+        if not folder.is_dir():
+            os.rename(fresh if has_checkpoint(fresh) else old, folder)
+        shutil.rmtree(old, ignore_errors=True)
+
+
+def swap_in(project: Path, run: str) -> None:
+    """Put the run that was trained anew in the place of the old one.
+
+    Killed at any moment, it leaves one of the two, whole; `settle` finishes.
+
+    Raises:
+        DiskError: a file of the old run is held by another program (Windows); everything is as before.
+    """
+    folder, fresh, old = run_folder(project, run), fresh_folder(project, run), _old_folder(project, run)
+    settle(project, run)
+    with disk_errors(folder):
+        old.parent.mkdir(parents=True, exist_ok=True)
+        if folder.is_dir():
+            os.rename(folder, old)
+        try:
+            os.rename(fresh, folder)
+        except OSError:
+            if old.is_dir():
+                os.rename(old, folder)
+            raise
+        shutil.rmtree(old, ignore_errors=True)
+        for parent in (old.parent, fresh.parent):
+            if parent.is_dir() and not any(parent.iterdir()):
+                parent.rmdir()
+
+
+class TrainingFolder:
+    """Where a training writes: beside the run that is there, until `keep`."""
+
+    def __init__(self, project: Path, run: str, folder: Path) -> None:
+        self.project, self.run, self.folder = Path(project), run, folder
+
+    @classmethod
+    def anew(cls, project: Path, run: str) -> TrainingFolder:
+        """An empty folder for a training from the start. Raises DiskError."""
+        settle(project, run)
+        folder, fresh = run_folder(project, run), fresh_folder(project, run)
+        with disk_errors(folder):
+            if fresh.is_dir():
+                shutil.rmtree(fresh)
+            chosen = fresh if has_checkpoint(folder) else folder
+            if chosen.is_dir():
+                shutil.rmtree(chosen)
+            chosen.mkdir(parents=True)
+        return cls(project, run, chosen)
+
+    @classmethod
+    def to_resume(cls, project: Path, run: str) -> TrainingFolder | None:
+        """The folder of the newest checkpoint of a run; None when it has none."""
+        settle(project, run)
+        for folder in (fresh_folder(project, run), run_folder(project, run)):
+            if has_checkpoint(folder):
+                return cls(project, run, folder)
+        return None
+
+    @property
+    def beside(self) -> bool:
+        """Whether the old run is still in its place."""
+        return self.folder != run_folder(self.project, self.run)
+
+    def keep(self) -> None:
+        """Let the new training take the old one's place, now that it has a checkpoint. Raises DiskError."""
+        if self.beside:
+            swap_in(self.project, self.run)
+            self.folder = run_folder(self.project, self.run)
+
+
+def checkpoint_state(path: Path) -> dict[str, Any] | None:
+    """The numbers in a checkpoint's header (safetensors: 8 bytes of length, then JSON); None when it has none."""
+    try:
+        with open(path, "rb") as file:
+            size = int.from_bytes(file.read(8), "little")
+            header = json.loads(file.read(size)) if size < 1 << 27 else {}
+        state = json.loads(header["__metadata__"]["fieldwork"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return state if isinstance(state, dict) else None
+
+
+def checkpoint_id(project: Path, run: str) -> str:
+    """Which field a run holds: another one after each training and each further step; empty without a checkpoint."""
+    return state_id(checkpoint_state(run_folder(project, run) / CHECKPOINT))
+
+
+def state_id(state: dict[str, Any] | None) -> str:
+    """The identity of a checkpoint with this state."""
+    if state is None:
+        return ""
+    return digest([state["training"], state["steps"]] if state.get("training") else state)
+
+
+def holdout_of(project: Path, run: str) -> int:
+    """Every how manieth photo the run holds out; the usual number where there is no such run."""
+    try:
+        value = json.loads((run_folder(project, run) / INFO).read_text(encoding="utf-8")).get("holdout", HOLDOUT)
+    except (OSError, ValueError, AttributeError):
+        return HOLDOUT
+    return value if isinstance(value, int) else HOLDOUT
+
+
+def read_metrics(folder: Path) -> dict[str, Any]:
+    """What was measured of a run: results of train ("train") and evaluate (by split); empty when nothing was."""
+    try:
+        value = json.loads((folder / METRICS).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return value if isinstance(value, dict) else {}

@@ -174,7 +174,8 @@ def interrupted(job: Job, project: Path) -> bool:
 
 def _speeds(job: Job, project: Path, report: Reporter) -> list[dict[str, Any]]:
     """Frame times at every side of the job."""
-    scene, trained = load_scene(project), load_trained(project, job.name)
+    trained = load_trained(project, job.name)
+    scene = load_scene(project, trained.info.holdout)
     box = trained.info.box(load_project(project))
     views = scene.test or scene.train
     return [measure_speed(trained, scene, views, box.box_from_world, report, side) for side in job.sides]

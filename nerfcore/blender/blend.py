@@ -5,12 +5,14 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from ..data.load import load_scene
+from ..data.load import class_inputs, load_scene, view_inputs
 from ..errors import SettingError
 from ..params import BlendParams
 from ..progress import Reporter
-from ..project.store import record_step
-from .package import write_package
+from ..project.fingerprints import Earlier, Fingerprint, array_digest, compare, digest, files_digest, stamps_digest
+from ..project.runs import holdout_of
+from ..project.store import load_project, record_step
+from .package import photo_renders, stale, write_package
 from .process import write_in_blender
 
 
@@ -29,9 +31,10 @@ def blend(params: BlendParams, report: Reporter) -> dict[str, Any]:
     if out.suffix != ".blend":
         raise SettingError(f"{out} is no Blender file.", "Name a file that ends in .blend.")
     folder = params.project.absolute()
-    scene = load_scene(folder)
+    scene = load_scene(folder, holdout_of(folder, params.run))
+    inputs = blend_inputs(params)
     package = write_package(folder, params.run, scene, folder.name, report, params.renders)
-    warnings = []
+    warnings = stale(folder, params.run, params.renders)
     if not (package / "mesh.npz").is_file():
         warnings.append("There is no mesh yet: the .blend holds cameras and points only. Run `fieldwork mesh` first.")
     if not len(scene.points):
@@ -39,10 +42,31 @@ def blend(params: BlendParams, report: Reporter) -> dict[str, Any]:
     result = write_in_blender("blend", package, out, params.split == "classes", report)
     for warning in [*warnings, *result.pop("warnings")]:
         report.warn(warning)
-    record_step(folder, "blend", params.model_dump(mode="json"), {"file": str(out)})
+    done = {"file": str(out), **result, "seconds": round(time.monotonic() - started, 1)}
+    record_step(folder, "blend", params.model_dump(mode="json"), done, inputs)
+    return {**done, "warnings": report.warnings}
+
+
+def blend_inputs(params: BlendParams) -> Fingerprint:
+    """What a .blend depends on. Raises ProjectError."""
+    folder = params.project.absolute()
+    scene = load_scene(folder, holdout_of(folder, params.run))
+    exports = folder / "exports" / params.run
+    renders = photo_renders(folder, params.renders)
+    pictures = sorted(renders.glob("*.png")) if renders.is_dir() else []
     return {
-        "file": str(out),
-        **result,
-        "seconds": round(time.monotonic() - started, 1),
-        "warnings": report.warnings,
+        "mesh": files_digest((name, exports / name) for name in ("mesh.npz", "texture.png")),
+        "renders": stamps_digest(pictures),
+        "classes": class_inputs(scene),
+        "sparse points": array_digest(scene.points.xyz, scene.points.rgb),
+        "settings": digest([str(params.out.absolute()), params.run, params.split, scene.test]),
+        **view_inputs(scene, list(range(len(scene.views))), files=True),
     }
+
+
+def blended(params: BlendParams) -> Earlier:
+    """The .blend that is there, if it shows the present mesh and photos: what was changed in it since stays."""
+    steps = load_project(params.project).provenance
+    file = str(params.out.absolute())
+    made = next((s for s in reversed(steps) if s.verb == "blend" and s.result.get("file") == file), None)
+    return compare(made, blend_inputs(params), [params.out])

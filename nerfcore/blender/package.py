@@ -27,6 +27,17 @@ from ..files import atomic_path, disk_errors, write_json
 from ..geometry.cameras import Camera, flip_camera_axes, pixel_centers, project, rays
 from ..params import PackageParams
 from ..progress import Reporter
+from ..project.fingerprints import read_made
+from ..project.runs import (
+    CHECKPOINT,
+    MESH_RECORD,
+    RENDER_RECORD,
+    checkpoint_id,
+    checkpoint_state,
+    holdout_of,
+    run_folder,
+    state_id,
+)
 from ..project.store import is_project, load_project
 
 FORMAT, VERSION = "fieldwork-package", 1
@@ -66,7 +77,7 @@ def write_package(
         report.progress(index / len(scene.views), view.name)
         file = _write_photo(view, folder, grids, lenses)
         entry = camera_entry(view, f"images/{file.name}", "test" if index in test else "train")
-        render = _write_render(view, folder, renders or project / "exports" / "renders" / "photos", grids)
+        render = _write_render(view, folder, photo_renders(project, renders), grids)
         cameras.append(entry | ({"render": f"renders/{render.name}"} if render else {}))
     write_json(folder / "lenses.json", lenses)
     for part, key in (("images", "image"), ("renders", "render")):
@@ -78,6 +89,7 @@ def write_package(
     with atomic_path(folder / "points.npz") as temporary, open(temporary, "wb") as out:
         np.savez_compressed(out, xyz=points.xyz.astype(np.float32), rgb=points.rgb.astype(np.uint8))
     source = project / "exports" / run
+    made = read_made(source / MESH_RECORD)
     has_mesh = _copy_mesh(source / "mesh.npz", folder / "mesh.npz")
     has_texture = has_mesh and _copy_texture(source / "texture.png", folder)
     write_json(
@@ -94,9 +106,34 @@ def write_package(
             "cameras": cameras,
             "mesh": has_mesh,
             "texture": "texture.png" if has_texture else None,
+            "checkpoint": checkpoint_id(project, run),
+            "mesh_checkpoint": made.checkpoint if has_mesh and made else "",
         },
     )
     return folder
+
+
+def photo_renders(project: Path, renders: Path | None) -> Path:
+    """The folder of renders from the photos' cameras: the one given, else where Blender's panel puts them."""
+    return renders or project / "exports" / "renders" / "photos"
+
+
+def stale(project: Path, run: str, renders: Path | None = None, pictures: bool = True) -> list[str]:
+    """Warnings about what would be delivered of a run but was made from an earlier training of it."""
+    folder, state = project / "exports" / run, checkpoint_state(run_folder(project, run) / CHECKPOINT)
+    notes = []
+    if (folder / "mesh.npz").is_file() and state is not None:
+        made = read_made(folder / MESH_RECORD)
+        # Without a record it is of a version that wrote none; so may the field be.
+        older = made.checkpoint != state_id(state) if made is not None else bool(state.get("training"))
+        if older:
+            notes.append(f"The mesh is from an earlier training of the run “{run}”. Run `fieldwork mesh` again.")
+    shown = read_made(photo_renders(project, renders) / RENDER_RECORD) if pictures else None
+    if shown is not None and shown.settings.get("run") != run:
+        notes.append(f"The renders of the photos are of the run “{shown.settings.get('run')}”, not of “{run}”.")
+    elif shown is not None and state is not None and shown.checkpoint != state_id(state):
+        notes.append(f"The renders of the photos are from an earlier training of the run “{run}”. Render them again.")
+    return notes
 
 
 def camera_entry(view: View, image: str, split: str) -> dict[str, Any]:
@@ -244,7 +281,9 @@ def package(params: PackageParams, report: Reporter) -> dict[str, Any]:
         InputError: a photo is missing.
     """
     folder = params.project.absolute()
-    scene = load_scene(folder)
+    scene = load_scene(folder, holdout_of(folder, params.run))
+    for warning in stale(folder, params.run, params.renders):
+        report.warn(warning)
     target = write_package(folder, params.run, scene, folder.name, report, params.renders)
     return {
         "folder": str(target),

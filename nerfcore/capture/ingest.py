@@ -23,6 +23,7 @@ from ..images.soft_labels import read_confidence
 from ..params import NewParams
 from ..progress import Reporter, shortened
 from ..project.classes import make_classes, read_classes
+from ..project.fingerprints import Earlier, Fingerprint, compare, digest, files_digest, stamps_digest
 from ..project.schema import ImageRecord, Project
 from ..project.store import PROJECT_FILE, create_folder, edit_project, load_project
 from .find import Source, classes_beside, find_sources, list_photos, subfolder
@@ -60,6 +61,7 @@ def new(params: NewParams, report: Reporter) -> dict[str, Any]:
         DiskError: it cannot be written.
     """
     folder, photos = Path(params.project), Path(params.photos)
+    inputs = ingest_inputs(params)
     previous = _previous_project(params)
     names, ignore_id, colors = {}, 0, {}
     classes_file = params.classes or classes_beside(params.labels)
@@ -113,8 +115,57 @@ def new(params: NewParams, report: Reporter) -> dict[str, Any]:
     with edit_project(folder, Project(mask_mode=params.mask_mode)) as project:
         _put_in(project, records, present, (names, ignore_id, colors), params, previous is not None)
         result["classes"] = [c.name for c in project.classes]
-        project.record("new", params.model_dump(mode="json"), result | origin)
+        project.record("new", params.model_dump(mode="json"), result | origin, inputs)
     return result
+
+
+def ingest_inputs(params: NewParams) -> Fingerprint:
+    """What the working copies of a capture depend on, by the names, sizes and times of its files.
+
+    Raises:
+        InputError: there are no photos.
+    """
+    photos = Path(params.photos)
+    given = [params.labels, params.masks]
+    paths, root = [photos], photos.parent
+    if photos.suffix.lower() not in VIDEO_SUFFIXES or not photos.is_file():
+        paths, _, root = list_photos(photos, exclude=given)
+    labels = params.labels or subfolder(photos, "labels")
+    masks = params.masks or subfolder(photos, "masks")
+    sources = find_sources(paths, root, labels, masks, set())
+    if paths == [photos]:  # frames of a video are named later
+        sources_of = {
+            "labels": sorted(labels.rglob("*")) if labels else [],
+            "masks": sorted(masks.rglob("*")) if masks else [],
+        }
+    else:
+        sources_of = {
+            "labels": [f for s in sources for f in (s.label, s.confidence)],
+            "masks": [s.mask for s in sources],
+        }
+    classes_file = params.classes or classes_beside(params.labels)
+    chosen = params.model_dump(mode="json", include={"mask_mode", "max_size", "frames", "keep_blurry"})
+    return {
+        "photos": digest([[str(path.relative_to(root)) for path in paths], stamps_digest(paths)]),
+        **{name: stamps_digest(files) for name, files in sources_of.items()},
+        "classes file": files_digest([("classes", classes_file)]),
+        "settings": digest(chosen),
+    }
+
+
+def ingested(params: NewParams) -> Earlier:
+    """The working copies that are there, if they are of the present files.
+
+    Raises:
+        InputError: there are no photos. ProjectError: the folder holds another capture.
+    """
+    previous = _previous_project(params)
+    if previous is None:
+        return Earlier()
+    made = next((s for s in reversed(previous.provenance) if s.verb == "new" and not s.settings.get("add")), None)
+    folder = Path(params.project)
+    files = [folder / file for r in previous.images for file in (r.file, r.label, r.mask, r.confidence) if file]
+    return compare(made, ingest_inputs(params), files)
 
 
 def _previous_project(params: NewParams) -> Project | None:
@@ -128,11 +179,15 @@ def _previous_project(params: NewParams) -> Project | None:
     if params.add:
         return project
     first = project.provenance[0] if project.provenance else None
-    if first is None or first.verb != "new" or Path(str(first.settings.get("photos"))) != Path(params.photos):
+    if first is None or first.verb != "new" or not _same_place(first.settings.get("photos"), params.photos):
         raise ProjectError(
             f"{folder} already holds another capture.", "Choose a new folder, or --add to put these photos into it."
         )
     return project
+
+
+def _same_place(before: Any, now: Path) -> bool:
+    return Path(str(before)) == Path(now) or Path(str(before)).resolve() == Path(now).resolve()
 
 
 def _remove_halves(folder: Path) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import ProjectError
+from ..project.fingerprints import Fingerprint, digest, files_digest, rounded
 from ..project.runs import HOLDOUT
 from ..project.store import load_points, load_poses, load_project, world_from_sfm
 from .scene import ClassInfo, Scene, View
@@ -53,6 +54,25 @@ def load_scene(folder: Path, holdout: int = HOLDOUT) -> Scene:
         mask_mode=project.mask_mode,
     ).transformed(world_from_sfm(project), "world")
     return Scene(**{**vars(scene), "bounds": bounds})
+
+
+def view_inputs(scene: Scene, indices: list[int], files: bool) -> Fingerprint:
+    """Fingerprint of some views as they lie in the world: cameras, and with `files` photos, labels and masks too."""
+    views = [scene.views[i] for i in indices]
+    cameras = [[v.name, v.camera.model_dump(mode="json"), rounded(v.camera_to_world)] for v in views]
+    inputs = {"cameras": digest(cameras)}
+    if files:
+        inputs |= {
+            "photos": files_digest((v.name, v.image) for v in views),
+            "labels": files_digest((v.name, v.label) for v in views),
+            "masks": digest([scene.mask_mode, files_digest((v.name, v.mask) for v in views)]),
+        }
+    return inputs
+
+
+def class_inputs(scene: Scene) -> str:
+    """Digest of the classes as they are shown: ids, names, colours."""
+    return digest([scene.ignore_id, [[c.id, c.name, c.color] for c in scene.classes]])
 
 
 def split_views(splits: list[str], holdout: int = HOLDOUT) -> tuple[list[int], list[int]]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..data.box import box_poses
-from ..data.load import load_scene
+from ..data.load import class_inputs, load_scene, view_inputs
 from ..data.pixels import training_size
 from ..data.scene import Scene, View
 from ..errors import InputError
@@ -21,10 +21,13 @@ from ..images.working import nearest, read_image, read_label, read_picture
 from ..kernels.runtime import compile_seconds
 from ..params import EvaluateParams
 from ..progress import Reporter
+from ..project.fingerprints import Earlier, Fingerprint, compare, digest, read_made, write_made
+from ..project.runs import checkpoint_id, run_folder, state_id
+from ..project.schema import step
 from ..project.store import load_project
 from ..render.image import Frame, background_of, render_view
 from ..render.pictures import colorize_depth, colorize_labels, side_by_side
-from ..render.run import Trained, load_trained, refined_poses, run_folder
+from ..render.run import Trained, load_info, load_trained, refined_poses
 from .metrics import Confusion, psnr, ssim
 from .refit import refit_camera
 from .speed import SPEED_KEYS, measure_speed, peak_memory
@@ -42,11 +45,14 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
         ProjectError: no such run. InputError: nothing is held out, or a photo cannot be read.
     """
     folder = Path(params.project)
-    project, scene = load_project(folder), load_scene(folder)
-    trained = load_trained(folder, params.run)
+    project, trained = load_project(folder), load_trained(folder, params.run)
+    scene = load_scene(folder, trained.info.holdout)
     indices = scene.test if params.split == "test" else scene.train
     if not indices:
-        raise InputError(f"{folder} has no held-out images.", "Captures of 8 or more photos hold every 8th one out.")
+        raise InputError(
+            f"The run “{params.run}” has no held-out photos: all were trained on.",
+            "Train another run with --holdout 8 to measure, or measure the training photos (--split train).",
+        )
     # Views larger than the training images are compared at the training size.
     sizes = [training_size(scene.views[index].camera, trained.info.image_size) for index in indices]
     report.stage("Preparing")
@@ -113,7 +119,33 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
     path = run_folder(folder, params.run) / "metrics.json"
     stored = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     write_json(path, {**stored, params.split: result})
+    made = step("evaluate", params.model_dump(mode="json"), result, evaluation_inputs(params), state_id(trained.state))
+    write_made(_record(params), made)
     return result
+
+
+def _record(params: EvaluateParams) -> Path:
+    return run_folder(Path(params.project), params.run) / "evaluation" / f"{params.split}.json"
+
+
+def evaluation_inputs(params: EvaluateParams) -> Fingerprint:
+    """What an evaluation depends on. Raises ProjectError."""
+    folder = Path(params.project)
+    info = load_info(folder, params.run)
+    scene = load_scene(folder, info.holdout)
+    return {
+        "trained field": checkpoint_id(folder, params.run),
+        "classes": class_inputs(scene),
+        "settings": digest([params.split, params.speed, info.config.model_dump(mode="json")]),
+        **view_inputs(scene, scene.test if params.split == "test" else scene.train, files=True),
+    }
+
+
+def evaluated(params: EvaluateParams) -> Earlier:
+    """The evaluation that is there, if it is of the present field and photos."""
+    made = read_made(_record(params))
+    pictures = [Path(params.project) / name for name in made.result.get("pictures", [])] if made else []
+    return compare(made, evaluation_inputs(params), pictures)
 
 
 def _truth(

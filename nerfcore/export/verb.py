@@ -9,7 +9,7 @@ from zipfile import BadZipFile
 import numpy as np
 from PIL import Image
 
-from ..blender.package import write_package
+from ..blender.package import stale, write_package
 from ..blender.process import write_in_blender
 from ..data.load import load_scene
 from ..errors import ProjectError, SettingError
@@ -17,6 +17,7 @@ from ..mesh.extract import Surface
 from ..mesh.files import Texture, texture_of, write_surface
 from ..params import ExportParams
 from ..progress import Reporter
+from ..project.runs import holdout_of
 from ..project.store import load_project, record_step
 from ..render.run import load_trained
 
@@ -49,6 +50,9 @@ def export(params: ExportParams, report: Reporter) -> dict[str, Any]:
     out = params.out or folder / "exports" / params.run / f"{folder.name}{suffixes[0]}"
     if out.suffix.lower() not in suffixes:
         raise SettingError(f"{out}: {params.to} files end in {' or '.join(suffixes)}.", "Choose one of these endings.")
+    if params.to not in ("onnx", "voxels"):  # these are read from the field itself
+        for warning in stale(folder, params.run, pictures=False):
+            report.warn(warning)
     if params.to == "onnx":
         from .field_graph import write_onnx  # the library takes its time to load
 
@@ -96,7 +100,7 @@ def load_surface(folder: Path, run: str) -> tuple[Surface, Texture | None]:
 
 def _write_usd(out: Path, folder: Path, params: ExportParams, report: Reporter) -> Path:
     load_surface(folder, params.run)  # says so when there is none
-    package = write_package(folder, params.run, load_scene(folder), folder.name, report)
+    package = write_package(folder, params.run, load_scene(folder, holdout_of(folder, params.run)), folder.name, report)
     result = write_in_blender("usd", package, out, params.split == "classes", report)
     for warning in result["warnings"]:
         report.warn(warning)

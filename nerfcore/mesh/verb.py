@@ -9,7 +9,7 @@ import numpy as np
 import trimesh
 
 from ..data.box import box_poses
-from ..data.load import load_scene
+from ..data.load import class_inputs, load_scene, view_inputs
 from ..data.scene import Scene
 from ..files import atomic_path
 from ..geometry.cameras import Camera
@@ -17,8 +17,11 @@ from ..geometry.similarity import similarity_scale, transform_points
 from ..images.encode import write_picture
 from ..params import MeshParams
 from ..progress import Reporter
-from ..project.store import load_project, record_step
-from ..render.run import Trained, load_trained
+from ..project.fingerprints import Earlier, Fingerprint, compare, digest, read_made, rounded, write_made
+from ..project.runs import MESH_RECORD, checkpoint_id, state_id
+from ..project.schema import step
+from ..project.store import load_project, record_step, world_from_sfm
+from ..render.run import Trained, load_info, load_trained
 from .extract import Surface, extract, shade
 from .files import Texture, check_format, write_surface
 from .texture import bake, unwrap
@@ -35,8 +38,9 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
     folder = Path(params.project)
     if params.out is not None:
         check_format(params.out)
-    project, scene = load_project(folder), load_scene(folder)
-    trained = load_trained(folder, params.run)
+    project, trained = load_project(folder), load_trained(folder, params.run)
+    scene = load_scene(folder, trained.info.holdout)
+    inputs = mesh_inputs(params)
     surface, spacing = extract(
         trained.model,
         params.resolution,
@@ -52,6 +56,7 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
     if params.texture is not None:
         texture = bake_texture(trained, surface, spacing, params.texture, report)
     surface = to_world(surface, trained.info.box(project).world_from_box)
+    (target / MESH_RECORD).unlink(missing_ok=True)  # what it says is no longer true from here on
     with atomic_path(target / "mesh.npz") as temporary, open(temporary, "wb") as file:
         arrays = vars(surface) if texture is None else {**vars(surface), "uv": texture.corner_uv}
         np.savez(file, **arrays)
@@ -73,8 +78,38 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
         "classes": class_table(surface, names),
         "files": [str(path) for path in files],
     }
-    record_step(folder, "mesh", params.model_dump(mode="json"), result)
+    settings = params.model_dump(mode="json")
+    write_made(target / MESH_RECORD, step("mesh", settings, result, inputs, state_id(trained.state)))
+    record_step(folder, "mesh", settings, result, inputs)
     return result
+
+
+def mesh_inputs(params: MeshParams) -> Fingerprint:
+    """What a mesh depends on. Raises ProjectError."""
+    folder = Path(params.project)
+    scene = load_scene(folder, load_info(folder, params.run).holdout)
+    settings = params.model_dump(mode="json", exclude={"project", "run", "out"})
+    out = str(params.out.absolute()) if params.out else None
+    return {
+        "trained field": checkpoint_id(folder, params.run),
+        "alignment": digest(rounded(world_from_sfm(load_project(folder)))),
+        "classes": class_inputs(scene),
+        "settings": digest([settings, out]),
+        **view_inputs(scene, scene.train, files=False),
+    }
+
+
+def meshed(params: MeshParams) -> Earlier:
+    """The mesh that is there, if it is of the present field and settings."""
+    target = Path(params.project) / "exports" / params.run
+    made = read_made(target / MESH_RECORD)
+    if made is None:
+        return Earlier()
+    # The project may have been moved since; a file of the user's choice is where it was.
+    known = [Path(file) for file in made.result.get("files", [])]
+    files = [target / f.name if f.parent.parts[-2:] == target.parts[-2:] else f for f in known]
+    made.result["files"] = [str(path) for path in files]
+    return compare(made, mesh_inputs(params), files)
 
 
 def spread_views(scene: Scene, box_from_world: np.ndarray, most: int = 24) -> list[tuple[Camera, np.ndarray]]:

@@ -17,6 +17,7 @@ from ..geometry.frames import upright
 from ..geometry.points import Points
 from ..params import PosesParams
 from ..progress import Reporter, shortened
+from ..project.fingerprints import Earlier, Fingerprint, compare, digest, files_digest
 from ..project.schema import Frame, ImageRecord, PosedImage, Poses, Project
 from ..project.store import POSES_FILE, edit_project, load_poses, load_project, save_poses
 from .align import gps_frame
@@ -52,11 +53,14 @@ def estimate_poses(params: PosesParams, report: Reporter) -> dict[str, Any]:
             f"poses need at least {MIN_PHOTOS}.",
             "Add photos with `fieldwork new --add`; twenty to a hundred around the subject work well.",
         )
-    previous = None if params.restart or params.group else _extendable(folder, records)
+    inputs = posing_inputs(folder, project, params)
     work = folder / WORK_FOLDER
     with disk_errors(work):
         work.mkdir(parents=True, exist_ok=True)
-        _forget_changed(work, records)
+        same = _forget_changed(work, records)
+        # Where a photo that has a pose is another one now, the poses around it are worth nothing.
+        anew = params.restart or params.group or not same
+        previous = None if anew else _extendable(folder, records)
         masks = _prepare_masks(folder, work, records, report)
     result = run_worker(_job(folder, project, records, masks, params, extend=previous is not None), work, report)
     # Classes and region may have been edited meanwhile.
@@ -77,7 +81,8 @@ def estimate_poses(params: PosesParams, report: Reporter) -> dict[str, Any]:
                 for record, image in zip(records, result["images"])
             ],
         }
-        project.record("poses", params.model_dump(mode="json"), {k: v for k, v in answer.items() if k != "images"})
+        known = {k: v for k, v in answer.items() if k != "images"}
+        project.record("poses", params.model_dump(mode="json"), known, inputs)
     _write_report(folder, project, poses, points, records, result, report)
     missing = [f"{record.name} ({record.reason})" for record in records if record.status != "ok"]
     if missing:
@@ -97,22 +102,68 @@ def _extendable(folder: Path, records: list[ImageRecord]) -> Poses | None:
     return poses if poses.source == "sfm" and fresh and len(kept) >= MIN_PHOTOS else None
 
 
-def _forget_changed(work: Path, records: list[ImageRecord]) -> None:
-    """Throw away features of photos whose working copy or mask is another one than when they were found."""
-    now = {
+def posing_inputs(folder: Path, project: Project, params: PosesParams) -> Fingerprint:
+    """What poses depend on: the working copies, what is known of their lenses, masks, GPS."""
+    records = _usable(project)
+    return {
+        "photos": digest(
+            [
+                [r.name, r.camera_group, r.focal_px, files_digest([(r.file, folder / r.file)])]
+                for r in sorted(records, key=lambda record: record.name)
+            ]
+        ),
+        "masks": files_digest((r.name, folder / r.mask if r.mask else None) for r in records),
+        "GPS": digest([[r.name, r.exif.get("gps")] for r in records]),
+        "settings": digest([params.preset, params.group]),
+    }
+
+
+def posed(params: PosesParams) -> Earlier:
+    """The poses that are there, if they are of the present photos; settings chosen by hand count as wished for."""
+    folder = Path(params.project)
+    project = load_project(folder)
+    made = project.last("poses")
+    if made is None or not (folder / POSES_FILE).is_file():
+        return Earlier()
+    if not made.inputs:
+        # Made by version 0.1: the photos whose features were found are on record.
+        state = _state(folder / WORK_FOLDER)
+        same = state is not None and _photo_state(_usable(project)) == state
+        return Earlier(made.result) if same else Earlier(reason="made by an earlier version from other photos")
+    inputs = posing_inputs(folder, project, params)
+    return compare(made, inputs | {"settings": made.inputs.get("settings", "")})
+
+
+def _photo_state(records: list[ImageRecord]) -> dict[str, list[Any]]:
+    return {
         record.name: [record.file, record.sha256, record.width, record.height, record.camera_group, record.mask]
         for record in records
     }
-    state = work / STATE_FILE
+
+
+def _state(work: Path) -> dict[str, list[Any]] | None:
+    """The photos whose features were found; None where that is not known."""
     try:
-        before = json.loads(state.read_text(encoding="utf-8"))
+        value = json.loads((work / STATE_FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError):
-        before = None
+        return None
+    return value if isinstance(value, dict) else None
+
+
+def _forget_changed(work: Path, records: list[ImageRecord]) -> bool:
+    """Throw away features of photos whose working copy or mask is another one than when they were found.
+
+    Returns:
+        whether none was.
+    """
+    now, same = _photo_state(records), True
+    before = _state(work)
     if before is not None and any(before.get(name, value) != value for name, value in now.items()):
         shutil.rmtree(work)
         work.mkdir(parents=True)
-        before = None
-    write_json(state, {**(before or {}), **now})
+        before, same = None, False
+    write_json(work / STATE_FILE, {**(before or {}), **now})
+    return same
 
 
 def _prepare_masks(folder: Path, work: Path, records: list[ImageRecord], report: Reporter) -> Path | None:

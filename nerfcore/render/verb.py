@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..data.box import Box, box_poses
-from ..data.load import load_scene
+from ..data.load import class_inputs, load_scene, view_inputs
 from ..data.pixels import training_size
 from ..data.scene import Scene, View
 from ..errors import InputError
@@ -22,10 +22,22 @@ from ..images.encode import write_layers, write_picture
 from ..images.picture import to_linear
 from ..params import RenderParams
 from ..progress import Reporter
-from ..project.store import load_project
+from ..project.fingerprints import (
+    Earlier,
+    Fingerprint,
+    compare,
+    digest,
+    files_digest,
+    read_made,
+    rounded,
+    write_made,
+)
+from ..project.runs import RENDER_RECORD, checkpoint_id, state_id
+from ..project.schema import step
+from ..project.store import load_project, world_from_sfm
 from .image import Frame, background_of, render_view
 from .pictures import colorize_depth, colorize_labels
-from .run import load_trained
+from .run import load_info, load_trained
 
 ORBIT_PIXELS = 800  # longest side of orbit frames unless a size is asked for
 OPEN_ANGLE = np.pi / 2  # around the subject without a photo: from there on an orbit is an arc
@@ -43,8 +55,9 @@ def render(params: RenderParams, report: Reporter) -> dict[str, Any]:
         InputError: no cameras were asked for, or the camera file is unusable. ProjectError, DiskError.
     """
     folder, out = Path(params.project), Path(params.out)
-    project, scene = load_project(folder), load_scene(folder)
-    trained = load_trained(folder, params.run)
+    project, trained = load_project(folder), load_trained(folder, params.run)
+    scene = load_scene(folder, trained.info.holdout)
+    inputs = render_inputs(params)
     box = trained.info.box(project)
     cameras = chosen_cameras(params, scene)
     if params.size is not None:
@@ -74,7 +87,36 @@ def render(params: RenderParams, report: Reporter) -> dict[str, Any]:
         )
         seconds += time.perf_counter() - begin
         frames += write_frame(out, name, frame, params.passes, trained.info.class_ids, scene.ignore_id, colors, box)
-    return {"frames": [str(path) for path in frames], "ms_per_frame": round(seconds / max(len(cameras), 1) * 1e3, 1)}
+    result = {"frames": [str(path) for path in frames], "ms_per_frame": round(seconds / max(len(cameras), 1) * 1e3, 1)}
+    made = step("render", params.model_dump(mode="json"), result, inputs, state_id(trained.state))
+    write_made(out / RENDER_RECORD, made)
+    return result
+
+
+def render_inputs(params: RenderParams) -> Fingerprint:
+    """What renders depend on. Raises ProjectError."""
+    folder = Path(params.project)
+    info = load_info(folder, params.run)
+    scene = load_scene(folder, info.holdout)
+    chosen = params.model_dump(mode="json", exclude={"project", "run", "out"})
+    return {
+        "trained field": checkpoint_id(folder, params.run),
+        "alignment": digest(rounded(world_from_sfm(load_project(folder)))),
+        "classes": class_inputs(scene),
+        "settings": digest([chosen, info.config.render.model_dump(mode="json")]),
+        "camera file": files_digest([("camera", params.camera)]),
+        **view_inputs(scene, list(range(len(scene.views))), files=False),
+    }
+
+
+def rendered(params: RenderParams) -> Earlier:
+    """The renders that are there, if they are of the present field and cameras."""
+    made = read_made(params.out / RENDER_RECORD)
+    if made is None:
+        return Earlier()
+    frames = [params.out / Path(frame).name for frame in made.result.get("frames", [])]
+    made.result["frames"] = [str(path) for path in frames]
+    return compare(made, render_inputs(params), frames)
 
 
 def chosen_cameras(params: RenderParams, scene: Scene) -> list[tuple[str, Camera, np.ndarray]]:

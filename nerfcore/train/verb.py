@@ -44,6 +44,7 @@ from ..render.run import (
     REFINED_POSES,
     Origin,
     RunInfo,
+    load_info,
     read_checkpoint,
     read_info,
     save_info,
@@ -152,9 +153,11 @@ def finished(params: TrainParams) -> Earlier:
     earlier = compare(done, training_inputs(folder, params, make_config(params.preset, params.set)))
     if earlier.result is not None and origin.project != load_project(folder).uuid:
         return Earlier(reason="trained in another project")
-    if earlier.result is not None and "steps" not in earlier.result:
+    if earlier.result is None:
+        return earlier
+    if "checkpoint" not in earlier.result:
         return Earlier(reason="not finished")
-    return earlier
+    return Earlier({**earlier.result, "checkpoint": str(place / CHECKPOINT)})
 
 
 def unfinished(params: TrainParams) -> bool:
@@ -169,6 +172,11 @@ def unfinished(params: TrainParams) -> bool:
         return False
     wanted = training_inputs(folder, params, make_config(params.preset, params.set))
     return origin.inputs == wanted and origin.project == load_project(folder).uuid
+
+
+def held_out(project: Path, run: str) -> int:
+    """How many photos a run holds out. Raises ProjectError when there is no such run."""
+    return len(load_scene(project, load_info(project, run).holdout).test)
 
 
 def _resumable(place: TrainingFolder, params: TrainParams, report: Reporter) -> tuple[RunInfo, Scene]:

@@ -5,53 +5,75 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from .. import params as p
-from ..blender.blend import blend
-from ..capture.ingest import new
+from ..blender.blend import blend, blended
+from ..capture.ingest import ingested, new
 from ..errors import ProjectError
 from ..evaluate.report import write_report
-from ..evaluate.verb import evaluate
-from ..mesh.verb import mesh
-from ..poses.estimate import estimate_poses
+from ..evaluate.verb import evaluate, evaluated
+from ..mesh.verb import mesh, meshed
+from ..poses.estimate import estimate_poses, posed
 from ..progress import Reporter
+from ..project.fingerprints import Earlier
 from ..project.store import is_project, load_project
-from ..render.verb import render
-from ..train.verb import train
+from ..render.verb import render, rendered
+from ..train.verb import finished, held_out, train, unfinished
 
-STAGES: dict[str, Callable[[Any, Reporter], dict[str, Any]]] = {
-    "new": new,
-    "poses": estimate_poses,
-    "train": train,
-    "evaluate": evaluate,
-    "mesh": mesh,
-    "render": render,
-    "blend": blend,
+
+class Stage(NamedTuple):
+    """`earlier` says whether what an earlier call made may be used again."""
+
+    run: Callable[[Any, Reporter], dict[str, Any]]
+    earlier: Callable[[Any], Earlier]
+
+
+STAGES = {
+    "new": Stage(new, ingested),
+    "poses": Stage(estimate_poses, posed),
+    "train": Stage(train, finished),
+    "evaluate": Stage(evaluate, evaluated),
+    "mesh": Stage(mesh, meshed),
+    "render": Stage(render, rendered),
+    "blend": Stage(blend, blended),
 }
 
 
 def reconstruct(params: p.ReconstructParams, report: Reporter) -> dict[str, Any]:
     """Run new, poses, train, evaluate, mesh, render and blend one after the other.
 
-    An existing project at `out` is continued: what is done is not done again.
+    An existing project at `out` is continued: a stage is done again only where what it depends on has changed.
 
     Returns:
-        {"stages": {verb: seconds}, "new": {…}, "poses": {…}, "train": {…}, "evaluate": {…}, "mesh": {…}, "blend": {…}}
+        {"stages": {verb: seconds}, "reused": [verbs], "redone": {verb: why}, "new": {…}, "poses": {…}, "train": {…},
+        "evaluate": {…}, "mesh": {…}, "render": {…}, "blend": {…}}
     Raises:
         any verb's error; the project is left so that the same command goes on.
     """
     project, run = Path(params.out), "main"
     stages: dict[str, float] = {}
     results: dict[str, Any] = {}
+    reused: list[str] = []
+    redone: dict[str, str] = {}
 
     def do(verb: str, values: p.Params) -> None:
         begin = time.perf_counter()
-        results[verb] = STAGES[verb](values, report)
+        report.check()
+        stage = STAGES[verb]
+        earlier = stage.earlier(values) if is_project(project) else Earlier()
+        if earlier.result is not None:
+            results[verb], stages[verb] = earlier.result, 0.0
+            reused.append(verb)
+            report.stage(f"{verb}: nothing has changed, kept")
+            return
+        if earlier.reason:
+            redone[verb] = earlier.reason
+            report.stage(f"{verb}: done again ({earlier.reason})")
+        results[verb] = stage.run(values, report)
         stages[verb] = round(time.perf_counter() - begin, 1)
 
-    known = {step.verb: step.result for step in load_project(project).provenance} if is_project(project) else {}
-    if "import" in known:
+    if is_project(project) and load_project(project).last("import") is not None:
         raise ProjectError(f"{project} is an imported data set.", "Use train, mesh and blend on it.")
     do(
         "new",
@@ -59,24 +81,26 @@ def reconstruct(params: p.ReconstructParams, report: Reporter) -> dict[str, Any]
             project=project, photos=params.photos, labels=params.labels, masks=params.masks, classes=params.classes
         ),
     )
-    if "poses" in known and (project / "poses" / "poses.json").is_file():
-        results["poses"], stages["poses"] = known["poses"], 0.0
-    else:
-        do("poses", p.PosesParams(project=project))
-    do(
-        "train",
-        p.TrainParams(
-            project=project, preset=params.preset, run=run, time_limit=params.time_limit, set=params.set, resume=True
-        ),
+    do("poses", p.PosesParams(project=project))
+    training = p.TrainParams(
+        project=project,
+        preset=params.preset,
+        run=run,
+        time_limit=params.time_limit,
+        set=params.set,
+        holdout=params.holdout,
     )
-    if results["new"]["images"] >= 8:
+    do("train", training.model_copy(update={"resume": unfinished(training)}))
+    if held_out(project, run):
         do("evaluate", p.EvaluateParams(project=project, run=run))
+    else:
+        report.stage("evaluate: left out, no photos are held out")
     do("mesh", p.MeshParams(project=project, run=run))
     renders = params.renders or project / "exports" / run / "renders"
     do("render", p.RenderParams(project=project, run=run, out=renders, orbit=8, passes=["rgb", "depth", "semantic"]))
     if params.blend is not None:
         do("blend", p.BlendParams(project=project, out=params.blend, run=run))
-    result = {"project": str(project), "stages": stages, **results}
+    result = {"project": str(project), "stages": stages, "reused": reused, "redone": redone, **results}
     if params.report is not None:
         write_report(params.report, project, run, renders, result)
         result["report"] = str(params.report)

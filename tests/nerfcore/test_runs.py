@@ -1,0 +1,298 @@
+"""A run trained anew takes the place of the old one at once or not at all; a training goes on only with its own."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+from fieldwork.nerfcore.errors import Cancelled, DiskError, InputError, ProjectError
+from fieldwork.nerfcore.evaluate.verb import evaluate
+from fieldwork.nerfcore.params import EvaluateParams, RegionParams, TrainParams
+from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.project import runs
+from fieldwork.nerfcore.project.edit import region
+from fieldwork.nerfcore.project.runs import TrainingFolder, checkpoint_id, fresh_folder, run_folder, settle, swap_in
+from fieldwork.nerfcore.project.store import load_project
+from fieldwork.nerfcore.render.run import load_info, load_trained
+from fieldwork.nerfcore.train.verb import train
+from fieldwork.tests.nerfcore.support.ball import SMALL, ball_project
+from pydantic import ValidationError
+
+
+class Killed(BaseException):
+    """The process ends here."""
+
+
+def pretend(folder: Path, text: str) -> Path:
+    folder.mkdir(parents=True)
+    (folder / runs.CHECKPOINT).write_text(text)
+    (folder / runs.METRICS).write_text("{}")
+    return folder
+
+
+def content(project: Path) -> str:
+    return (run_folder(project, "main") / runs.CHECKPOINT).read_text()
+
+
+def test_swap(tmp_path: Path) -> None:
+    pretend(run_folder(tmp_path, "main"), "old")
+    pretend(fresh_folder(tmp_path, "main"), "new")
+    swap_in(tmp_path, "main")
+    assert content(tmp_path) == "new"
+    assert [path.name for path in (tmp_path / "runs").iterdir()] == ["main"]
+
+
+@pytest.mark.parametrize("moment", range(5))
+def test_killed_in_the_middle_of_the_exchange(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moment: int) -> None:
+    """Whichever step it comes to, one of the two runs is there afterwards, whole."""
+    pretend(run_folder(tmp_path, "main"), "old")
+    pretend(fresh_folder(tmp_path, "main"), "new")
+    calls = []
+
+    def dying(real):
+        def call(*arguments, **named):
+            calls.append(real.__name__)
+            if len(calls) > moment:
+                raise Killed
+            return real(*arguments, **named)
+
+        return call
+
+    with monkeypatch.context() as patch:
+        patch.setattr(runs.os, "rename", dying(os.rename))
+        patch.setattr(runs.shutil, "rmtree", dying(shutil.rmtree))
+        try:
+            swap_in(tmp_path, "main")
+        except Killed:
+            assert moment < 3
+    settle(tmp_path, "main")
+    assert content(tmp_path) == ("old" if moment == 0 else "new")
+    assert (run_folder(tmp_path, "main") / runs.METRICS).is_file()
+    assert not (tmp_path / "runs" / runs.OLD / "main").exists()
+    assert fresh_folder(tmp_path, "main").exists() == (moment == 0)
+
+
+def test_a_half_trained_run_does_not_take_the_place(tmp_path: Path) -> None:
+    """Killed after the old run was moved away, with a new one that has no checkpoint: the old one comes back."""
+    pretend(tmp_path / "runs" / runs.OLD / "main", "old")
+    fresh_folder(tmp_path, "main").mkdir(parents=True)
+    settle(tmp_path, "main")
+    assert content(tmp_path) == "old"
+
+
+def test_a_run_that_is_in_use_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On Windows a folder with an open file cannot be moved."""
+    pretend(run_folder(tmp_path, "main"), "old")
+    fresh = pretend(fresh_folder(tmp_path, "main"), "new")
+    real = os.rename
+
+    def refuse(source, target):
+        if Path(source) == fresh:
+            raise PermissionError(13, "in use")
+        real(source, target)
+
+    monkeypatch.setattr(runs.os, "rename", refuse)
+    with pytest.raises(DiskError, match="main"):
+        swap_in(tmp_path, "main")
+    assert content(tmp_path) == "old"
+    assert (fresh / runs.CHECKPOINT).read_text() == "new"
+
+
+def test_where_a_training_writes(tmp_path: Path) -> None:
+    first = TrainingFolder.anew(tmp_path, "main")
+    assert not first.beside
+    pretend(fresh_folder(tmp_path, "other"), "x")
+    (first.folder / runs.CHECKPOINT).write_text("old")
+    second = TrainingFolder.anew(tmp_path, "main")
+    assert second.beside
+    (second.folder / runs.EVENTS).write_text("half")
+    again = TrainingFolder.anew(tmp_path, "main")
+    assert list(again.folder.iterdir()) == []
+    resumed = TrainingFolder.to_resume(tmp_path, "main")
+    assert resumed is not None
+    assert resumed.folder == first.folder
+    assert TrainingFolder.to_resume(tmp_path, "none") is None
+
+
+@pytest.mark.parametrize("name", [".new", "..", ".", "", "a/b"])
+def test_names_of_runs(name: str, tmp_path: Path) -> None:
+    with pytest.raises(ValidationError):
+        TrainParams(project=tmp_path, run=name)
+
+
+class Stopping(Reporter):
+    """Cancels once training has done a step, or only watches."""
+
+    def __init__(self, stop: bool = True) -> None:
+        super().__init__()
+        self.stop, self.running = stop, False
+        self.previews: list[tuple[str, bool]] = []
+
+    def stage(self, name: str) -> None:
+        self.running = name == "Training"
+
+    def check(self) -> None:
+        if self.running and self.stop:
+            self.cancel()
+        super().check()
+
+    def event(self, kind: str, **data) -> None:
+        if kind == "preview":
+            self.previews.append((data["path"], Path(data["path"]).is_file()))
+
+
+def params(project: Path, **values) -> TrainParams:
+    settings = {**SMALL, **values.pop("set", {})}
+    return TrainParams.model_validate({"project": project, "preset": "draft", "steps": 12, "set": settings} | values)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    project = ball_project(tmp_path_factory.mktemp("runs") / "ball")
+    train(params(project), Reporter())
+    evaluate(EvaluateParams(project=project, speed=False), Reporter())
+    return project
+
+
+@pytest.fixture
+def project(trained: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(trained, tmp_path / "ball"))
+
+
+def test_a_cancelled_retraining_leaves_the_old_field(project: Path) -> None:
+    folder = run_folder(project, "main")
+    before = {path.name: path.read_bytes() for path in folder.glob("*.*")}
+    with pytest.raises(Cancelled):
+        train(params(project, steps=50), Stopping())
+    assert {path.name: path.read_bytes() for path in folder.glob("*.*")} == before
+    assert (folder / "evaluation").is_dir()
+    assert load_trained(project, "main").state["steps"] == 12
+    # And what was begun can go on.
+    result = train(params(project, steps=20, resume=True), Reporter())
+    assert result["steps"] == 20
+    assert load_trained(project, "main").state["steps"] == 20
+    assert not (folder / "evaluation").exists()
+    assert not (project / "runs" / runs.NEW).exists()
+
+
+def test_a_failed_retraining_leaves_the_old_field(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_):
+        raise OSError(28, "full")
+
+    before = checkpoint_id(project, "main")
+    with monkeypatch.context() as patch:
+        patch.setattr("fieldwork.nerfcore.train.verb.save_checkpoint", fail)
+        with pytest.raises(OSError, match="full"):
+            train(params(project), Reporter())
+    assert checkpoint_id(project, "main") == before
+    assert load_trained(project, "main").state["steps"] == 12
+
+
+def test_a_checkpoint_worth_keeping_takes_over_while_training_goes_on(project: Path) -> None:
+    report = Stopping(stop=False)
+    often = {"train.checkpoint_every": "0.05", "train.preview_every": "0.01"}
+    train(params(project, steps=40, set=often), report)
+    assert report.previews
+    assert all(there for _, there in report.previews)
+    assert report.previews[-1][0] == str(run_folder(project, "main") / "preview.png")
+    events = (run_folder(project, "main") / runs.EVENTS).read_text().splitlines()
+    assert json.loads(events[-1])["step"] == 40
+    assert "test" not in runs.read_metrics(run_folder(project, "main"))
+
+
+def test_each_field_has_an_identity(project: Path) -> None:
+    first = checkpoint_id(project, "main")
+    assert first
+    train(params(project, resume=True), Reporter())  # nothing is left to do
+    assert checkpoint_id(project, "main") == first
+    train(params(project, steps=14, resume=True), Reporter())
+    second = checkpoint_id(project, "main")
+    train(params(project, steps=14), Reporter())
+    assert len({first, second, checkpoint_id(project, "main")}) == 3
+
+
+def test_a_run_of_another_project_does_not_go_on(project: Path, tmp_path: Path) -> None:
+    other = ball_project(tmp_path / "other")
+    shutil.copytree(project / "runs", other / "runs")
+    with pytest.raises(ProjectError, match=r"trained in another project.*without --resume"):
+        train(params(other, resume=True), Reporter())
+
+
+def test_a_checkpoint_of_another_training_does_not_go_on(project: Path) -> None:
+    train(params(project, run="second"), Reporter())
+    shutil.copy(run_folder(project, "second") / runs.CHECKPOINT, run_folder(project, "main"))
+    with pytest.raises(ProjectError, match="is not of the training"):
+        train(params(project, steps=20, resume=True), Reporter())
+
+
+@pytest.mark.parametrize("what", ["labels", "photos", "region"])
+def test_a_training_does_not_go_on_with_other_inputs(project: Path, what: str) -> None:
+    if what == "region":
+        region(RegionParams(project=project, bounds=[[-1, -1, -1], [1, 1, 1]]), Reporter())
+    else:
+        folder = project / {"labels": "labels", "photos": "images"}[what]
+        shutil.copy(folder / "03.png", folder / "05.png")
+    with pytest.raises(ProjectError, match=rf"cannot go on: .*changed: {what}\."):
+        train(params(project, steps=20, resume=True), Reporter())
+
+
+def test_a_resumed_run_says_that_it_keeps_its_settings(project: Path) -> None:
+    report = Reporter()
+    train(params(project, steps=14, resume=True, set={"train.grid_rate": "0.5"}), report)
+    assert any("goes on with the settings it began with" in warning for warning in report.warnings)
+    step = load_project(project).provenance[-1]
+    assert step.settings["config"]["train"]["grid_rate"] != 0.5
+    assert step.settings["preset"] == "draft"
+
+
+def test_runs_of_before_go_on(project: Path) -> None:
+    """config.json and checkpoints without an origin, as version 0.1 wrote them."""
+    path = run_folder(project, "main") / "config.json"
+    value = json.loads(path.read_text())
+    del value["origin"], value["holdout"]
+    path.write_text(json.dumps(value))
+    checkpoint = run_folder(project, "main") / runs.CHECKPOINT
+    block = checkpoint.read_bytes()
+    size = int.from_bytes(block[:8], "little")
+    header = json.loads(block[8 : 8 + size])
+    state = json.loads(header["__metadata__"]["fieldwork"])
+    del state["training"]
+    header["__metadata__"]["fieldwork"] = json.dumps(state)
+    text = json.dumps(header).encode()
+    checkpoint.write_bytes(len(text).to_bytes(8, "little") + text + block[8 + size :])
+    assert train(params(project, steps=14, resume=True), Reporter())["steps"] == 14
+    assert checkpoint_id(project, "main")
+    assert load_info(project, "main").holdout == 8
+
+
+def test_holdout(project: Path) -> None:
+    every = [f"{i:02d}" for i in range(16)]
+    assert load_info(project, "main").images == [name for name in every if name not in ("00", "08")]
+    train(params(project, run="third", holdout=3), Reporter())
+    assert load_info(project, "third").images == [name for i, name in enumerate(every) if i % 3]
+    assert evaluate(EvaluateParams(project=project, run="third", speed=False), Reporter())["images"] == 6
+    train(params(project, run="all", holdout=0), Reporter())
+    assert load_info(project, "all").images == every
+    with pytest.raises(InputError, match="no held-out photos: all were trained on"):
+        evaluate(EvaluateParams(project=project, run="all"), Reporter())
+    # Resuming keeps the split of the run.
+    train(params(project, run="all", steps=14, resume=True), Reporter())
+    assert load_info(project, "all").images == every
+
+
+def test_hold_out_nothing_or_something(tmp_path: Path) -> None:
+    with pytest.raises(ValidationError, match="would hold out every photo"):
+        TrainParams(project=tmp_path, holdout=1)
+    with pytest.raises(ValidationError):
+        TrainParams(project=tmp_path, holdout=-1)
+
+
+def test_a_moved_project_works(project: Path, tmp_path: Path) -> None:
+    moved = project.rename(tmp_path / "moved")
+    assert train(params(moved, steps=14, resume=True), Reporter())["steps"] == 14
+    assert evaluate(EvaluateParams(project=moved, speed=False), Reporter())["images"] == 2
+    with pytest.raises(ProjectError, match=r"the folder is not there.*Connect the disk"):
+        train(params(project), Reporter())

@@ -149,9 +149,14 @@ def finished(params: TrainParams) -> Earlier:
         origin = read_info(place).origin
     except ProjectError as error:
         return Earlier(reason=error.message)
-    done = step("train", {}, read_metrics(place).get("train") or {}, origin.inputs)
+    project = load_project(folder)
+    result = read_metrics(place).get("train") or {}
+    if result and "checkpoint" not in result:  # `evaluate --split train` has written there since
+        steps = [s for s in project.provenance if s.verb == "train" and s.result.get("run") == params.run]
+        result = steps[-1].result if steps else {}
+    done = step("train", {}, result, origin.inputs)
     earlier = compare(done, training_inputs(folder, params, make_config(params.preset, params.set)))
-    if earlier.result is not None and origin.project != load_project(folder).uuid:
+    if earlier.result is not None and origin.project != project.uuid:
         return Earlier(reason="trained in another project")
     if earlier.result is None:
         return earlier

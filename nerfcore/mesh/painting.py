@@ -1,0 +1,159 @@
+"""Painting texels from chosen photos, with soft crossings where the choice changes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from ..kernels.triangles import triangle_texels
+from .facelets import Facelets
+from .photos import halvings, sample, to_linear
+from .visibility import DepthBuffer, PosedCamera, within
+
+BLOCK = 1 << 19  # texels painted at once
+
+
+@dataclass(frozen=True)
+class Jobs:
+    """Which view paints which facelet: face (J,), view (J,); weight (J, 3) at the facelet's corners; factor (J, 3, 3)
+    what multiplies the photo's linear colours there (corner, channel)."""
+
+    face: np.ndarray
+    view: np.ndarray
+    weight: np.ndarray
+    factor: np.ndarray
+
+
+def crossings(pieces: Facelets, view: np.ndarray, column: np.ndarray, keep: np.ndarray, log_factor: np.ndarray) -> Jobs:
+    """Every facelet from its chosen view, and beside a change of view from the neighbours' too.
+
+    A vertex mixes the views of the facelets around it in equal parts, and a facelet mixes its corners' mixtures, so the
+    colour does not jump where the choice changes. The factors are averaged at the vertices as well.
+
+    Args:
+        view (F, K): candidates; column (F,): the chosen one, −1 for none; keep (F, K): which may be used; log_factor
+            (F, K, 3): see `view_choice.towards_common`.
+    """
+    painted = np.flatnonzero(column >= 0)
+    chosen = np.full(len(pieces), -1, np.int64)
+    chosen[painted] = view[painted, column[painted]]
+    span = int(view.max(initial=0)) + 1
+    corner_key = pieces.faces[painted].astype(np.int64) * span + chosen[painted, None]
+    mixed, counts = np.unique(corner_key, return_counts=True)
+    vertex = mixed // span
+    around = np.bincount(vertex, counts, len(pieces.vertices))
+    share = counts / around[vertex]
+    # Facelets with a corner where several views meet, and all views at their corners.
+    several = np.bincount(vertex, minlength=len(pieces.vertices)) > 1
+    border = painted[several[pieces.faces[painted]].any(1)]
+    begin, end = np.searchsorted(vertex, pieces.faces[border]), np.searchsorted(vertex, pieces.faces[border], "right")
+    pairs = [np.stack([painted, chosen[painted]], 1)]
+    for step in range(int((end - begin).max(initial=0))):
+        row, corner = np.nonzero(begin + step < end)
+        pairs.append(np.stack([border[row], mixed[begin[row, corner] + step] % span], 1))
+    face, number = np.unique(np.concatenate(pairs), axis=0).T
+    match = (view[face] == number[:, None]) & keep[face]
+    usable = match.any(1)
+    face, number, at = face[usable], number[usable], match[usable].argmax(1)
+    keys = pieces.faces[face].astype(np.int64) * span + number[:, None]
+    place = np.minimum(np.searchsorted(mixed, keys), len(mixed) - 1)
+    weight = np.where(mixed[place] == keys, share[place], 0)
+    # The mean factor of each view at each vertex, over the facelets that it paints there.
+    unique, inverse = np.unique(keys, return_inverse=True)
+    inverse = inverse.reshape(-1)
+    mine = np.repeat(log_factor[face, at], 3, axis=0)
+    number_at = np.bincount(inverse)
+    mean = np.stack([np.bincount(inverse, mine[:, c], len(unique)) / number_at for c in range(3)], 1)
+    factor = np.exp(mean)[inverse].reshape(-1, 3, 3)
+    return Jobs(face.astype(np.int64), number.astype(np.int64), weight.astype(np.float32), factor.astype(np.float32))
+
+
+@dataclass(frozen=True)
+class Texels:
+    """The texels of a tile, facelet by facelet: first (F + 1,), place (N,) in the tile, barycentric (N, 2); texel (F,)
+    width of a texel on the surface."""
+
+    first: np.ndarray
+    place: np.ndarray
+    barycentric: np.ndarray
+    width: np.ndarray
+
+    def of(self, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Texels (N,) of facelets, and for each the row in `faces` (N,)."""
+        counts = self.first[faces + 1] - self.first[faces]
+        row = np.repeat(np.arange(len(faces)), counts)
+        return np.arange(len(row)) - np.repeat(np.cumsum(counts) - counts, counts) + self.first[faces][row], row
+
+    def points(self, pieces: Facelets, faces: np.ndarray, texel: np.ndarray) -> np.ndarray:
+        """Where texels (N,) of the facelets (N,) lie on the surface: (N, 3)."""
+        second, third = self.barycentric[texel].T[..., None]
+        a, b, c = (pieces.vertices[pieces.faces[faces, k]] for k in range(3))
+        return a + second * (b - a) + third * (c - a)
+
+
+def texels_of(pieces: Facelets, size: int, tile: tuple[int, int, int, int], device: torch.device) -> Texels:
+    """Texels of one tile (left, top, width, height) of a texture of `size`."""
+    assert pieces.corners is not None
+    corners = pieces.corners * [1, -1] * size + [0, size]
+    a, b, c = corners.transpose(1, 0, 2)
+    area = np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]) / 2
+    return Texels(*triangle_texels(corners, *tile, device), np.sqrt(pieces.areas / np.maximum(area, 1e-9)))
+
+
+def paint(
+    view: PosedCamera,
+    rgba: np.ndarray,
+    jobs: Jobs,
+    pieces: Facelets,
+    texels: Texels,
+    todo: np.ndarray,
+    careful: np.ndarray,
+    buffer: DepthBuffer | None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """What one photo gives: texels (N,) as places of the tile, and (N, 4) its linear colours times weight, and weight.
+
+    Args:
+        rgba: (H, W, 4) uint8. jobs: those of this photo. todo (tile area,): places that want paint.
+        careful (F,): facelets whose every texel has to be looked for in the depth buffer.
+    """
+    picture = torch.from_numpy(rgba[..., :3].astype(np.float32) / 255).permute(2, 0, 1)
+    levels = halvings(picture, 6)
+    masked = bool((rgba[..., 3] == 0).any())
+    places, values = [], []
+    texel, row = texels.of(jobs.face)
+    wanted = todo[texels.place[texel]]
+    texel, row = texel[wanted], row[wanted]
+    for begin in range(0, len(texel), BLOCK):
+        some, job = texel[begin : begin + BLOCK], row[begin : begin + BLOCK]
+        face = jobs.face[job]
+        points = texels.points(pieces, face, some)
+        local = view.local(points)
+        pixel, depth = view.pixels(local), view.depth(local)
+        good = within(pixel, view.camera.width, view.camera.height)
+        if buffer is not None:
+            check = np.flatnonzero(careful[face] & good)
+            towards = view.center - points[check]
+            cosine = np.einsum("ij,ij->i", towards, pieces.normals[face[check]]) / np.linalg.norm(towards, axis=1)
+            good[check] = buffer.sees(pixel[check], depth[check], np.maximum(cosine, 0.05))
+        if masked:
+            at = np.flatnonzero(good)
+            x, y = pixel[at].astype(int).T
+            good[at] = rgba[y, x, 3] > 0
+        some, job, face, pixel, depth = some[good], job[good], face[good], pixel[good], depth[good]
+        # A texel wider than a pixel takes the mean of what it covers.
+        level = np.round(np.log2(np.maximum(texels.width[face] / view.footprint(depth), 1))).astype(int)
+        # Interpolated as the photo is stored: in linear light a cubic would overshoot visibly beside highlights.
+        color = to_linear(sample(levels, pixel, level, "bicubic")).numpy()
+        second, third = texels.barycentric[some].T[..., None]
+        first = 1 - second - third
+        weight, factor = jobs.weight[job], jobs.factor[job]
+        weight = first[:, 0] * weight[:, 0] + second[:, 0] * weight[:, 1] + third[:, 0] * weight[:, 2]
+        factor = first * factor[:, 0] + second * factor[:, 1] + third * factor[:, 2]
+        weight = np.maximum(weight, 1e-4)
+        values.append(np.concatenate([color * factor * weight[:, None], weight[:, None]], 1).astype(np.float32))
+        places.append(texels.place[some])
+    if not places:
+        return np.zeros(0, np.int32), np.zeros((0, 4), np.float32)
+    return np.concatenate(places), np.concatenate(values)

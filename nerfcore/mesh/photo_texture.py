@@ -1,0 +1,276 @@
+"""A texture from the photos, at the resolution they have.
+
+For every small piece of the surface one photo is chosen, so that detail is not averaged away; its broad colours are
+brought to those that all photos of the place have in common, and its exposure to that of the others. What no photo sees
+has the field's colour. Photos are interpolated as they are stored (sRGB); gains, factors and mixtures are applied in
+linear light, where exposure is a product and a mixture of light is a sum.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import psutil
+import torch
+from scipy.ndimage import binary_dilation
+
+from ..errors import SettingError
+from ..images.encode import to_bytes
+from ..progress import Reporter
+from .facelets import Facelets, facelets
+from .painting import Jobs, Texels, crossings, paint, texels_of
+from .photos import Photo, to_srgb
+from .view_choice import agreeing, choose, look, matches, photo_gains, towards_common
+from .visibility import DepthBuffers, Observations, in_parallel, observe
+
+TILE = 4096  # texels a side that are worked on at once
+PIECE_TEXELS = 40  # longest edge of a piece for which one photo is chosen
+SECOND_BEST = 3  # further photos that are tried where the chosen one is hidden
+MARGIN = 4  # texels around charts that repeat their border
+BYTES_PER_TEXEL, BYTES_PER_TILE_TEXEL = 5, 70
+
+Fill = Callable[[np.ndarray, np.ndarray], np.ndarray]
+GAP, UNSEEN, PHOTO = 0, 1, 2  # what a texel holds
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A surface cut into pieces for a texture of `size`, and which photos see them."""
+
+    photos: list[Photo]
+    pieces: Facelets
+    buffers: DepthBuffers
+    seen: Observations
+    size: int
+
+
+@dataclass(frozen=True)
+class PhotoTexture:
+    """image (S, S, 3) uint8 sRGB, row 0 at the top (v = 1); unseen (S, S) uint8, 255 where the surface's colour is not a
+    photo's; seen: share of the surface that a photo painted; gains (photos, 3)."""
+
+    image: np.ndarray
+    unseen: np.ndarray
+    seen: float
+    gains: np.ndarray
+
+
+def check_memory(size: int) -> None:
+    """Raise SettingError when a texture of `size` does not fit into free memory."""
+    needed = BYTES_PER_TEXEL * size**2 + BYTES_PER_TILE_TEXEL * min(size, TILE) ** 2
+    free = psutil.virtual_memory().available
+    if needed > free:
+        raise SettingError(
+            f"A texture of {size}×{size} needs {needed / 1e9:.1f} GB of memory, and {free / 1e9:.1f} GB are free.",
+            f"Choose a size of {size // 2} or less, or close other programs.",
+        )
+
+
+def prepare(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    corners: np.ndarray,
+    photos: list[Photo],
+    size: int,
+    device: torch.device,
+    report: Reporter,
+) -> Prepared:
+    """Cut a mesh (V, 3), (F, 3) with UV (F, 3, 2) into pieces and find the photos that see them best.
+
+    Raises:
+        SettingError: there is no memory for a texture of that size.
+    """
+    check_memory(size)
+    report.stage("Finding what the photos see")
+    a, b, c = vertices[faces].transpose(1, 0, 2).astype(np.float64)
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+    u, v = (corners[:, 1] - corners[:, 0]).astype(np.float64), (corners[:, 2] - corners[:, 0]).astype(np.float64)
+    flat = np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]).sum()
+    texel = np.sqrt(area / max(flat * size**2, 1e-12))
+    pieces = facelets(vertices, faces, corners, PIECE_TEXELS * texel)
+    buffers = DepthBuffers([photo.view for photo in photos], pieces, device)
+    return Prepared(photos, pieces, buffers, observe(buffers, report), size)
+
+
+def photo_texture(prepared: Prepared, fill: Fill | None, report: Reporter) -> PhotoTexture:
+    """Paint the texture.
+
+    Args:
+        fill: points (N, 3) and normals (N, 3) → (N, 3) uint8 sRGB, for what no photo shows; None spreads what is
+            beside.
+    """
+    photos, pieces, seen, size = prepared.photos, prepared.pieces, prepared.seen, prepared.size
+    report.stage("Comparing the photos")
+    looks = look(photos, pieces, seen, report)
+    gains = photo_gains(seen.view, looks, len(photos))
+    looks.color[...] *= gains[np.maximum(seen.view, 0)]
+    keep = agreeing(pieces, seen.view, looks)
+    report.stage("Choosing photos")
+    same = matches(pieces, seen.view)
+    worth = np.where(keep, looks.worth, 0)
+    column = choose(pieces, same, worth, report)
+    log_factor = towards_common(pieces, same, looks, keep, seen.weight) + np.log(gains)[np.maximum(seen.view, 0)]
+    jobs = crossings(pieces, seen.view, column, keep, log_factor)
+    careful = np.ones(len(pieces), bool)
+    painted = column >= 0
+    careful[painted] = ~_whole_around(pieces, seen, column)[painted]
+    others = _second_best(seen, worth, column, log_factor)
+    report.stage("Painting the texture")
+    image, source = np.zeros((size, size, 3), np.uint8), np.full((size, size), GAP, np.uint8)
+    tiles = [(x, y) for y in range(0, size, TILE) for x in range(0, size, TILE)]
+    for number, (left, top) in enumerate(tiles):
+        tile = left, top, min(TILE, size - left), min(TILE, size - top)
+        part = _Part(report, number / len(tiles), 1 / len(tiles))
+        texels = texels_of(pieces, size, tile, prepared.buffers.device)
+        block = np.s_[top : top + tile[3], left : left + tile[2]]
+        image[block], source[block] = _tile(prepared, texels, tile, [jobs, *others], careful, fill, part)
+    report.stage("Spreading borders")
+    spread(image, source > (GAP if fill else UNSEEN))
+    painted = np.count_nonzero(source == PHOTO)
+    share = painted / max(np.count_nonzero(source), 1)
+    return PhotoTexture(image, np.where(source == UNSEEN, 255, 0).astype(np.uint8), share, gains)
+
+
+class _Part(Reporter):
+    """A stretch of another reporter's progress."""
+
+    def __init__(self, report: Reporter, begin: float, share: float) -> None:
+        super().__init__()
+        self.report, self.begin, self.share = report, begin, share
+
+    def progress(self, fraction: float, message: str = "") -> None:
+        self.report.progress(self.begin + self.share * fraction, message)
+
+    def check(self) -> None:
+        self.report.check()
+
+
+def _whole_around(pieces: Facelets, seen: Observations, column: np.ndarray) -> np.ndarray:
+    """Whether the chosen view sees each facelet as a whole, and its neighbours too: (F,)."""
+    rows = np.arange(len(pieces))
+    chosen = seen.view[rows, column]
+    whole = seen.whole[rows, column]
+    for edge in range(3):
+        other = pieces.neighbours[:, edge]
+        beside = ((seen.view[other] == chosen[:, None]) & seen.whole[other]).any(1)
+        whole &= beside | (other < 0)
+    return whole
+
+
+def _second_best(seen: Observations, worth: np.ndarray, column: np.ndarray, log_factor: np.ndarray) -> list[Jobs]:
+    """For where the chosen view turns out to be hidden: the others, from the best on."""
+    left = worth.copy()
+    left[column >= 0, column[column >= 0]] = 0
+    order = np.argsort(-left, axis=1)[:, :SECOND_BEST]
+    rounds = []
+    for turn in range(order.shape[1]):
+        at = order[:, turn]
+        face = np.flatnonzero(left[np.arange(len(left)), at] > 0)
+        factor = np.repeat(np.exp(log_factor[face, at[face]])[:, None], 3, axis=1)
+        view = seen.view[face, at[face]].astype(np.int64)
+        rounds.append(Jobs(face, view, np.ones((len(face), 3), np.float32), factor.astype(np.float32)))
+    return rounds
+
+
+def _tile(
+    prepared: Prepared,
+    texels: Texels,
+    tile: tuple[int, int, int, int],
+    rounds: list[Jobs],
+    careful: np.ndarray,
+    fill: Fill | None,
+    report: Reporter,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Colours (H, W, 3) uint8 of a tile and where they come from (H, W)."""
+    width, height = tile[2:]
+    photos, pieces, buffers = prepared.photos, prepared.pieces, prepared.buffers
+    total = np.zeros((width * height, 4), np.float32)
+    todo = np.zeros(width * height, bool)
+    todo[texels.place] = True
+    face_of = np.repeat(np.arange(len(pieces)), np.diff(texels.first))
+    lock = threading.Lock()
+    for turn, jobs in enumerate(rounds):
+        if turn:
+            open_ = np.zeros(len(pieces), bool)
+            open_[face_of[todo[texels.place]]] = True
+            chosen = open_[jobs.face]
+            jobs = Jobs(jobs.face[chosen], jobs.view[chosen], jobs.weight[chosen], jobs.factor[chosen])
+        order = np.argsort(jobs.view, kind="stable")
+        numbers, begins = np.unique(jobs.view[order], return_index=True)
+        strict = careful if turn == 0 else np.ones(len(pieces), bool)
+
+        def work(item: tuple[int, np.ndarray], jobs: Jobs = jobs, strict: np.ndarray = strict) -> None:
+            report.check()
+            number, rows = item
+            mine = Jobs(jobs.face[rows], jobs.view[rows], jobs.weight[rows], jobs.factor[rows])
+            rgba = photos[number].read()
+            buffer = buffers[number] if strict[mine.face].any() else None
+            place, value = paint(photos[number].view, rgba, mine, pieces, texels, todo, strict, buffer)
+            with lock:
+                total[place] += value
+
+        items = list(zip(numbers.tolist(), np.split(order, begins[1:]))) if len(numbers) else []
+        part = _Part(report, 0.6 if turn else 0, 0.1 if turn else 0.6)
+        for _ in in_parallel(work, items, part, "photos"):
+            continue
+        todo &= total[:, 3] == 0
+        if not todo.any():
+            break
+    report.progress(0.9)
+    image = np.zeros((width * height, 3), np.uint8)
+    source = np.full(width * height, GAP, np.uint8)
+    for begin in range(0, len(total), 1 << 22):
+        part_ = total[begin : begin + (1 << 22)]
+        good = part_[:, 3] > 0
+        linear = torch.from_numpy(part_[good, :3] / part_[good, 3:])
+        image[begin : begin + (1 << 22)][good] = to_bytes(to_srgb(linear).numpy())
+        source[begin : begin + (1 << 22)][good] = PHOTO
+    source[todo] = UNSEEN
+    if fill is not None and todo.any():
+        wanted = np.flatnonzero(todo[texels.place])
+        for some in np.array_split(wanted, -(-len(wanted) // (1 << 18))):
+            report.check()
+            face = face_of[some]
+            image[texels.place[some]] = fill(texels.points(pieces, face, some), pieces.normals[face])
+    return image.reshape(height, width, 3), source.reshape(height, width)
+
+
+def spread(image: np.ndarray, known: np.ndarray) -> None:
+    """Fill what is not `known` (S, S) of an image (S, S, C) in place: a margin from the texels beside it, so that
+    filtering at a chart's border finds its colours; the rest from means over growing squares."""
+    known = known.copy()
+    height, width = known.shape
+    for _ in range(MARGIN):
+        rows, columns = np.nonzero(binary_dilation(known, np.ones((3, 3), bool)) & ~known)
+        total, number = np.zeros((len(rows), image.shape[2]), np.float32), np.zeros(len(rows), np.float32)
+        for dy in (-1, 0, 1):
+            for dx in (-1, 0, 1):
+                y, x = np.clip(rows + dy, 0, height - 1), np.clip(columns + dx, 0, width - 1)
+                good = known[y, x]
+                total += image[y, x] * good[:, None]
+                number += good
+        image[rows, columns] = (total / np.maximum(number, 1)[:, None] + 0.5).astype(np.uint8)
+        known[rows, columns] = True
+    if known.all() or not known.any():
+        return
+    step = 4
+    small = torch.from_numpy(image[::step, ::step].astype(np.float32)).permute(2, 0, 1)
+    weight = torch.from_numpy(known[::step, ::step].astype(np.float32))[None]
+    filled = _pushed(small * weight, weight)
+    gaps = np.nonzero(~known)
+    values = filled[:, torch.from_numpy(gaps[0] // step), torch.from_numpy(gaps[1] // step)]
+    image[gaps] = values.T.clamp(0, 255).to(torch.uint8).numpy()
+
+
+def _pushed(values: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
+    """Values (C, H, W), premultiplied with a weight (1, H, W) in {0, 1}; where it is 0 the mean of larger squares."""
+    if min(values.shape[1:]) < 2 or bool((weight > 0).all()):
+        return values / weight.clamp(min=1e-6)
+    pool = torch.nn.functional.avg_pool2d
+    less, least = (pool(part[None], 2, ceil_mode=True, count_include_pad=False)[0] for part in (values, weight))
+    coarse = _pushed(less / least.clamp(min=1e-6) * (least > 0), (least > 0).float())
+    up = torch.nn.functional.interpolate(coarse[None], size=values.shape[1:], mode="nearest")[0]
+    return torch.where(weight > 0, values, up)

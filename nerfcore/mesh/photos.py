@@ -1,0 +1,102 @@
+"""Photos as a surface reads them: posed, without what a mask or transparency takes away, in several sizes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.ndimage import minimum_filter
+
+from ..data.scene import View
+from ..images.working import read_image, read_label, read_photo, resize
+from .visibility import PosedCamera
+
+# sRGB (IEC 61966-2-1) of a byte, as linear light.
+_BYTES = np.arange(256) / 255
+LINEAR = np.where(_BYTES <= 0.04045, _BYTES / 12.92, ((_BYTES + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Photo:
+    """A posed photo.
+
+    read: → (H, W, 4) uint8 sRGB of the camera's size; alpha 0 where nothing may be taken from it. labels: → class ids
+    (H, W) int64 and how sure they are (H, W) uint8, 255 for certain; None without a label map.
+    """
+
+    view: PosedCamera
+    read: Callable[[], np.ndarray]
+    labels: Callable[[], tuple[np.ndarray, np.ndarray]] | None = None
+
+
+def posed_photo(view: View, pose: np.ndarray) -> Photo:
+    """A photo of a project at the resolution of its working copy; `pose`: camera-to-mesh (4, 4)."""
+    size = view.camera.width, view.camera.height
+
+    def mask() -> np.ndarray | None:
+        return None if view.mask is None else resize(read_image(view.mask)[..., :1], *size, nearest=True)[..., 0] > 127
+
+    def read() -> np.ndarray:
+        rgba, inside = resize(read_photo(view.image), *size).copy(), mask()
+        rgba[..., 3] = np.where(rgba[..., 3] > 127, 255, 0)
+        if inside is not None:
+            rgba[..., 3][~inside] = 0
+        if (rgba[..., 3] == 0).any():
+            # What borders on nothing is mixed with it.
+            rgba[..., 3] = minimum_filter(rgba[..., 3], 3, mode="nearest")
+        return rgba
+
+    def labels() -> tuple[np.ndarray, np.ndarray]:
+        assert view.label is not None
+        ids = resize(read_label(view.label)[..., None], *size, nearest=True)[..., 0]
+        sure = np.full(ids.shape, 255, np.uint8)
+        if view.confidence is not None:
+            sure = resize(read_image(view.confidence)[..., :1], *size, nearest=True)[..., 0].copy()
+        inside = mask()
+        if inside is not None:
+            sure[~inside] = 0
+        return ids, sure
+
+    return Photo(PosedCamera(view.camera, np.asarray(pose, np.float64)), read, labels if view.label else None)
+
+
+def to_srgb(linear: torch.Tensor) -> torch.Tensor:
+    """Linear light in [0, 1] as sRGB in [0, 1]."""
+    linear = linear.clamp(0, 1)
+    return torch.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear.clamp(min=1e-6) ** (1 / 2.4) - 0.055)
+
+
+def to_linear(srgb: torch.Tensor) -> torch.Tensor:
+    """sRGB in [0, 1] as linear light."""
+    srgb = srgb.clamp(0, 1)
+    return torch.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
+def halvings(picture: torch.Tensor, levels: int) -> list[torch.Tensor]:
+    """A picture (C, H, W) and its means over squares of 2, 4, … pixels, `levels` in all."""
+    result = [picture]
+    for _ in range(levels - 1):
+        if min(result[-1].shape[1:]) < 2:
+            break
+        result.append(torch.nn.functional.avg_pool2d(result[-1][None], 2, ceil_mode=True, count_include_pad=False)[0])
+    return result
+
+
+def sample(levels: list[torch.Tensor], pixels: np.ndarray, level: np.ndarray, mode: str = "bilinear") -> torch.Tensor:
+    """Values (N, C) at pixel coordinates (N, 2) of the full size, each from the picture of its level (N,)."""
+    out = torch.empty((len(pixels), levels[0].shape[0]))
+    level = np.clip(level, 0, len(levels) - 1)
+    where = torch.from_numpy(np.asarray(pixels, np.float32))
+    for number in np.unique(level):
+        rows = torch.from_numpy(np.flatnonzero(level == number))
+        picture = levels[number]
+        size = torch.tensor([picture.shape[2], picture.shape[1]])
+        grid = where[rows] / (2.0**number) / size * 2 - 1
+        kind = mode if number == 0 else "bilinear"
+        found = torch.nn.functional.grid_sample(
+            picture[None], grid[None, None], mode=kind, padding_mode="border", align_corners=False
+        )
+        out[rows] = found[0, :, 0].T
+    return out

@@ -1,0 +1,202 @@
+"""Which photos see which part of a mesh: depth buffers of the mesh in each photo."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import torch
+from scipy.ndimage import minimum_filter
+
+from ..geometry.cameras import Camera, project, rays
+from ..kernels.runtime import run_parallel, worker_count
+from ..kernels.triangles import nearest_triangle
+from ..progress import Reporter
+from .facelets import Facelets
+
+STEEPEST = np.cos(np.radians(75))  # what is seen at a smaller cosine is not taken from a photo
+SLACK_PIXELS = 2.0  # how much nearer something may be before it hides a point, in footprints of a pixel
+PARTLY = 0.3  # weight of a facelet that something hides in part
+
+
+def _length(vectors: np.ndarray) -> np.ndarray:
+    return np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
+
+
+def within(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Whether pixel coordinates (N, 2) lie in a picture: (N,); not a number does not."""
+    x, y = pixels.T
+    with np.errstate(invalid="ignore"):
+        return (x >= 0) & (y >= 0) & (x < width) & (y < height)
+
+
+@dataclass(frozen=True)
+class PosedCamera:
+    """A camera and where it stands: camera-to-mesh (4, 4), OpenCV axes."""
+
+    camera: Camera
+    pose: np.ndarray
+
+    @property
+    def center(self) -> np.ndarray:
+        return self.pose[:3, 3]
+
+    def local(self, points: np.ndarray) -> np.ndarray:
+        """Points (N, 3) of the mesh's frame in camera axes."""
+        return (points - self.pose[:3, 3]) @ self.pose[:3, :3]
+
+    def depth(self, local: np.ndarray) -> np.ndarray:
+        """Depth (N,) of points (N, 3) in camera axes: along the optical axis, or the distance for lenses that look
+        sideways."""
+        wide = self.camera.model in ("EQUIRECTANGULAR", "OPENCV_FISHEYE")
+        return _length(local) if wide else local[:, 2]
+
+    def footprint(self, depth: np.ndarray) -> np.ndarray:
+        """Width of a pixel at a depth (N,), in units of the mesh."""
+        focal = self.camera.width / (2 * np.pi) if self.camera.model == "EQUIRECTANGULAR" else self.camera.fx
+        return depth / focal
+
+    def pixels(self, local: np.ndarray) -> np.ndarray:
+        """Pixel coordinates (N, 2) of points (N, 3) in camera axes; NaN where the lens does not see."""
+        pixel = project(self.camera, local)
+        limit = widest(self.camera)
+        if limit > -1:
+            # Beyond the angle where the lens polynomial turns back, a projection is a mirage.
+            outside = local[:, 2] < limit * _length(local)
+            pixel[outside] = np.nan
+        return pixel
+
+
+@lru_cache(maxsize=256)
+def widest(camera: Camera) -> float:
+    """Cosine of the largest angle to the optical axis that the picture shows, with a little room; −1 for all."""
+    if camera.model == "EQUIRECTANGULAR":
+        return -1.0
+    x, y = np.linspace(0, camera.width, 33), np.linspace(0, camera.height, 33)
+    grid = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+    directions, valid = rays(camera, grid)
+    return float(np.cos(min(np.arccos(np.clip(directions[valid, 2].min(initial=1.0), -1, 1)) * 1.02, np.pi)))
+
+
+@dataclass(frozen=True)
+class DepthBuffer:
+    """What a camera sees of a mesh: `face` (H, W) int32, −1 for nothing; `depth` (H, W) float32, inf there, and
+    `nearest` (H, W), the smallest depth among a pixel and its eight neighbours."""
+
+    view: PosedCamera
+    face: np.ndarray
+    depth: np.ndarray
+    nearest: np.ndarray
+
+    def sees(self, pixels: np.ndarray, depth: np.ndarray, cosine: np.ndarray) -> np.ndarray:
+        """Whether points are in the picture and nothing of the mesh is in front of them or of the pixels beside: (N,).
+
+        Args:
+            pixels: (N, 2) where they project; depth: (N,) theirs; cosine: (N,) of the angle at which they are seen.
+        """
+        height, width = self.depth.shape
+        inside = within(pixels, width, height) & (depth > 0)
+        x, y = np.where(inside[:, None], pixels, 0).astype(np.int32).T
+        # Across the pixels that are looked at, a slanted surface has different depths itself.
+        slope = np.sqrt(np.maximum(1 - cosine**2, 0)) / np.maximum(cosine, 0.1)
+        slack = self.view.footprint(depth) * (SLACK_PIXELS + 3 * slope)
+        return inside & (self.nearest[y, x] > depth - slack)
+
+
+def depth_buffer(view: PosedCamera, vertices: np.ndarray, faces: np.ndarray, device: torch.device) -> DepthBuffer:
+    """The mesh (V, 3), (F, 3) as a camera sees it, at one depth a pixel.
+
+    Triangles are drawn with straight edges between their projected corners, so with a distorting lens they should be
+    small. Those that reach behind the camera, or around a panorama's edge, are left out.
+    """
+    local = view.local(vertices)
+    size = view.camera.width, view.camera.height
+    widest = size[0] / 2 if view.camera.model == "EQUIRECTANGULAR" else 1e9
+    face, nearest = nearest_triangle(view.pixels(local), view.depth(local), faces, *size, device, widest)
+    return DepthBuffer(view, face, nearest, minimum_filter(nearest, 3, mode="nearest"))
+
+
+class DepthBuffers:
+    """Depth buffers of the same mesh in several views, kept as long as they take less than `most` bytes together."""
+
+    def __init__(self, views: Sequence[PosedCamera], pieces: Facelets, device: torch.device, most: int = 1 << 30) -> None:
+        self.views, self.pieces, self.device, self.left = views, pieces, device, most
+        self._kept: dict[int, DepthBuffer] = {}
+
+    def __getitem__(self, number: int) -> DepthBuffer:
+        """The buffer of view `number`; may be called from several threads."""
+        kept = self._kept.get(number)
+        if kept is None:
+            kept = depth_buffer(self.views[number], self.pieces.vertices, self.pieces.faces, self.device)
+            size = kept.face.nbytes + kept.depth.nbytes + kept.nearest.nbytes
+            if size <= self.left:
+                self.left -= size
+                self._kept[number] = kept
+        return kept
+
+
+@dataclass(frozen=True)
+class Observations:
+    """The best views of each of F facelets: view (F, K) int16, −1 for none; weight (F, K) float32: cosine² / footprint
+    of a pixel, less where a part is hidden; whole (F, K) bool: all its corners are seen too."""
+
+    view: np.ndarray
+    weight: np.ndarray
+    whole: np.ndarray
+
+    def of(self, number: int) -> tuple[np.ndarray, np.ndarray]:
+        """Facelets (N,) that view `number` is among the best for, and the column (N,) where it stands."""
+        return np.nonzero(self.view == number)
+
+
+def observe(buffers: DepthBuffers, report: Reporter, most: int = 8) -> Observations:
+    """Find the `most` best views of each facelet among all that see its middle."""
+    count = len(buffers.pieces)
+    best = np.full((count, most), -1, np.int16), np.zeros((count, most), np.float32), np.zeros((count, most), bool)
+    for number, (face, weight, whole) in in_parallel(
+        lambda number: _seen_by(buffers, number), range(len(buffers.views)), report, "views"
+    ):
+        worst = best[1][face].argmin(1)
+        better = weight > best[1][face, worst]
+        place = face[better], worst[better]
+        best[0][place], best[1][place], best[2][place] = number, weight[better], whole[better]
+    return Observations(*best)
+
+
+def in_parallel(work, items: Sequence, report: Reporter, noun: str) -> Iterator[tuple]:
+    """(number, work(item)) of every item, as many at once as there are threads; progress after each round."""
+    step = max(worker_count(), 1)
+    for begin in range(0, len(items), step):
+        report.progress(begin / len(items), f"{begin} of {len(items)} {noun}")
+        part = items[begin : begin + step]
+        yield from enumerate(run_parallel([lambda item=item: work(item) for item in part]), begin)
+
+
+def _seen_by(buffers: DepthBuffers, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Facelets (N,) that a view sees, their weight (N,) and whether they are seen as a whole (N,)."""
+    view, pieces = buffers.views[number], buffers.pieces
+    towards = view.center - pieces.centers
+    distance = _length(towards)
+    cosine = np.einsum("ij,ij->i", towards, pieces.normals) / np.maximum(distance, 1e-12)
+    face = np.flatnonzero(cosine > STEEPEST)
+    local = view.local(pieces.centers[face])
+    pixel, depth = view.pixels(local), view.depth(local)
+    shown = within(pixel, view.camera.width, view.camera.height)
+    face, pixel, depth = face[shown], pixel[shown], depth[shown]
+    if not len(face):
+        return face, np.zeros(0, np.float32), np.zeros(0, bool)
+    buffer = buffers[number]
+    seen = buffer.sees(pixel, depth, cosine[face])
+    face, depth = face[seen], depth[seen]
+    corner = np.unique(pieces.faces[face])
+    where = view.local(pieces.vertices[corner])
+    # The angle of the steepest facelet around a corner is what its slack has to allow for.
+    flattest = np.ones(len(pieces.vertices))
+    np.minimum.at(flattest, pieces.faces[face], cosine[face, None])
+    clear = np.zeros(len(pieces.vertices), bool)
+    clear[corner] = buffer.sees(view.pixels(where), view.depth(where), flattest[corner])
+    whole = clear[pieces.faces[face, 0]] & clear[pieces.faces[face, 1]] & clear[pieces.faces[face, 2]]
+    weight = cosine[face] ** 2 / view.footprint(depth) * np.where(whole, 1, PARTLY)
+    return face, weight.astype(np.float32), whole

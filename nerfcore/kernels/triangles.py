@@ -131,9 +131,7 @@ def nearest_triangle(
     indices = torch.from_numpy(np.ascontiguousarray(faces, np.int32)).to(device)
     inputs = [array(_on(pixels, device), wp.vec2), array(_on(depth, device)), array(indices)]
     # Triangles share pixels, and Warp's atomics on a CPU are plain reads and writes.
-    launch(
-        nearest_triangles, len(faces), [*inputs, widest, width, height, array(nearest)], device, serial=True
-    )
+    launch(nearest_triangles, len(faces), [*inputs, widest, width, height, array(nearest)], device, serial=True)
     keys = nearest.cpu().numpy().reshape(height, width)
     found = keys > 0
     inverse = (keys >> 32).astype(np.int32).view(np.float32)

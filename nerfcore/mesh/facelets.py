@@ -43,7 +43,7 @@ def facelets(
     parent = np.arange(len(faces))
     while True:
         ends = np.sort(np.stack([faces, faces[:, [1, 2, 0]]], -1).reshape(-1, 2), 1)
-        keys, first, which = np.unique(
+        _, first, which = np.unique(
             ends[:, 0].astype(np.int64) * len(vertices) + ends[:, 1], return_index=True, return_inverse=True
         )
         a, b = vertices[ends[first]].transpose(1, 0, 2)

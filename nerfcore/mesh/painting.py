@@ -7,10 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from ..images.picture import srgb_to_linear
 from ..kernels.triangles import triangle_texels
 from .facelets import Facelets
-from .photos import halvings, sample, to_linear
-from .visibility import DepthBuffer, PosedCamera, within
+from .photos import halvings, sample
+from .visibility import CPU, DepthBuffer, PosedCamera, within
 
 BLOCK = 1 << 19  # texels painted at once
 
@@ -93,13 +94,13 @@ class Texels:
         return a + second * (b - a) + third * (c - a)
 
 
-def texels_of(pieces: Facelets, size: int, tile: tuple[int, int, int, int], device: torch.device) -> Texels:
+def texels_of(pieces: Facelets, size: int, tile: tuple[int, int, int, int]) -> Texels:
     """Texels of one tile (left, top, width, height) of a texture of `size`."""
     assert pieces.corners is not None
     corners = pieces.corners * [1, -1] * size + [0, size]
     a, b, c = corners.transpose(1, 0, 2)
     area = np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]) / 2
-    return Texels(*triangle_texels(corners, *tile, device), np.sqrt(pieces.areas / np.maximum(area, 1e-9)))
+    return Texels(*triangle_texels(corners, *tile, CPU), np.sqrt(pieces.areas / np.maximum(area, 1e-9)))
 
 
 def paint(
@@ -145,7 +146,7 @@ def paint(
         # A texel wider than a pixel takes the mean of what it covers.
         level = np.round(np.log2(np.maximum(texels.width[face] / view.footprint(depth), 1))).astype(int)
         # Interpolated as the photo is stored: in linear light a cubic would overshoot visibly beside highlights.
-        color = to_linear(sample(levels, pixel, level, "bicubic")).numpy()
+        color = srgb_to_linear(sample(levels, pixel, level, "bicubic").numpy().clip(0, 1))
         second, third = texels.barycentric[some].T[..., None]
         first = 1 - second - third
         weight, factor = jobs.weight[job], jobs.factor[job]

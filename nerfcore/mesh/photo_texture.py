@@ -18,11 +18,11 @@ import torch
 from scipy.ndimage import binary_dilation
 
 from ..errors import SettingError
-from ..images.encode import to_bytes
+from ..images.picture import linear_to_srgb, to_bytes
 from ..progress import Reporter
 from .facelets import Facelets, facelets
 from .painting import Jobs, Texels, crossings, paint, texels_of
-from .photos import Photo, to_srgb
+from .photos import Photo
 from .view_choice import agreeing, choose, look, matches, photo_gains, towards_common
 from .visibility import DepthBuffers, Observations, in_parallel, observe
 
@@ -75,7 +75,6 @@ def prepare(
     corners: np.ndarray,
     photos: list[Photo],
     size: int,
-    device: torch.device,
     report: Reporter,
 ) -> Prepared:
     """Cut a mesh (V, 3), (F, 3) with UV (F, 3, 2) into pieces and find the photos that see them best.
@@ -91,7 +90,7 @@ def prepare(
     flat = np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]).sum()
     texel = np.sqrt(area / max(flat * size**2, 1e-12))
     pieces = facelets(vertices, faces, corners, PIECE_TEXELS * texel)
-    buffers = DepthBuffers([photo.view for photo in photos], pieces, device)
+    buffers = DepthBuffers([photo.view for photo in photos], pieces)
     return Prepared(photos, pieces, buffers, observe(buffers, report), size)
 
 
@@ -124,7 +123,7 @@ def photo_texture(prepared: Prepared, fill: Fill | None, report: Reporter) -> Ph
     for number, (left, top) in enumerate(tiles):
         tile = left, top, min(TILE, size - left), min(TILE, size - top)
         part = _Part(report, number / len(tiles), 1 / len(tiles))
-        texels = texels_of(pieces, size, tile, prepared.buffers.device)
+        texels = texels_of(pieces, size, tile)
         block = np.s_[top : top + tile[3], left : left + tile[2]]
         image[block], source[block] = _tile(prepared, texels, tile, [jobs, *others], careful, fill, part)
     report.stage("Spreading borders")
@@ -216,7 +215,7 @@ def _tile(
         part = _Part(report, 0.6 if turn else 0, 0.1 if turn else 0.6)
         for _ in in_parallel(work, items, part, "photos"):
             continue
-        todo &= total[:, 3] == 0
+        np.logical_and(todo, total[:, 3] == 0, out=todo)
         if not todo.any():
             break
     report.progress(0.9)
@@ -225,8 +224,8 @@ def _tile(
     for begin in range(0, len(total), 1 << 22):
         part_ = total[begin : begin + (1 << 22)]
         good = part_[:, 3] > 0
-        linear = torch.from_numpy(part_[good, :3] / part_[good, 3:])
-        image[begin : begin + (1 << 22)][good] = to_bytes(to_srgb(linear).numpy())
+        linear = part_[good, :3] / part_[good, 3:]
+        image[begin : begin + (1 << 22)][good] = to_bytes(linear_to_srgb(linear))
         source[begin : begin + (1 << 22)][good] = PHOTO
     source[todo] = UNSEEN
     if fill is not None and todo.any():
@@ -244,7 +243,8 @@ def spread(image: np.ndarray, known: np.ndarray) -> None:
     known = known.copy()
     height, width = known.shape
     for _ in range(MARGIN):
-        rows, columns = np.nonzero(binary_dilation(known, np.ones((3, 3), bool)) & ~known)
+        grown = np.asarray(binary_dilation(known, np.ones((3, 3), bool)))
+        rows, columns = np.nonzero(np.logical_and(grown, ~known))
         total, number = np.zeros((len(rows), image.shape[2]), np.float32), np.zeros(len(rows), np.float32)
         for dy in (-1, 0, 1):
             for dx in (-1, 0, 1):

@@ -10,12 +10,11 @@ import torch
 from scipy.ndimage import minimum_filter
 
 from ..data.scene import View
-from ..images.working import read_image, read_label, read_photo, resize
+from ..images.picture import resized, srgb_to_linear, with_alpha
+from ..images.working import nearest, read_image, read_label, read_picture
 from .visibility import PosedCamera
 
-# sRGB (IEC 61966-2-1) of a byte, as linear light.
-_BYTES = np.arange(256) / 255
-LINEAR = np.where(_BYTES <= 0.04045, _BYTES / 12.92, ((_BYTES + 0.055) / 1.055) ** 2.4).astype(np.float32)
+LINEAR = srgb_to_linear(np.arange(256) / 255).astype(np.float32)  # light of a byte of sRGB
 
 
 @dataclass(frozen=True)
@@ -36,10 +35,10 @@ def posed_photo(view: View, pose: np.ndarray) -> Photo:
     size = view.camera.width, view.camera.height
 
     def mask() -> np.ndarray | None:
-        return None if view.mask is None else resize(read_image(view.mask)[..., :1], *size, nearest=True)[..., 0] > 127
+        return None if view.mask is None else nearest(read_image(view.mask)[..., 0], *size) > 127
 
     def read() -> np.ndarray:
-        rgba, inside = resize(read_photo(view.image), *size).copy(), mask()
+        rgba, inside = with_alpha(resized(read_picture(view.image), *size)).pixels.copy(), mask()
         rgba[..., 3] = np.where(rgba[..., 3] > 127, 255, 0)
         if inside is not None:
             rgba[..., 3][~inside] = 0
@@ -50,28 +49,16 @@ def posed_photo(view: View, pose: np.ndarray) -> Photo:
 
     def labels() -> tuple[np.ndarray, np.ndarray]:
         assert view.label is not None
-        ids = resize(read_label(view.label)[..., None], *size, nearest=True)[..., 0]
+        ids = nearest(read_label(view.label), *size)
         sure = np.full(ids.shape, 255, np.uint8)
         if view.confidence is not None:
-            sure = resize(read_image(view.confidence)[..., :1], *size, nearest=True)[..., 0].copy()
+            sure = nearest(read_image(view.confidence)[..., 0], *size).copy()
         inside = mask()
         if inside is not None:
             sure[~inside] = 0
         return ids, sure
 
     return Photo(PosedCamera(view.camera, np.asarray(pose, np.float64)), read, labels if view.label else None)
-
-
-def to_srgb(linear: torch.Tensor) -> torch.Tensor:
-    """Linear light in [0, 1] as sRGB in [0, 1]."""
-    linear = linear.clamp(0, 1)
-    return torch.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear.clamp(min=1e-6) ** (1 / 2.4) - 0.055)
-
-
-def to_linear(srgb: torch.Tensor) -> torch.Tensor:
-    """sRGB in [0, 1] as linear light."""
-    srgb = srgb.clamp(0, 1)
-    return torch.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
 def halvings(picture: torch.Tensor, levels: int) -> list[torch.Tensor]:

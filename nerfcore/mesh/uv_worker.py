@@ -38,7 +38,7 @@ def pack(uv: np.ndarray, faces: np.ndarray, resolution: int, padding: int) -> di
     options.resolution, options.padding = resolution, padding
     atlas.generate(xatlas.ChartOptions(), options)
     _, corners, placed = atlas[0]
-    return {"corners": placed[corners].astype(np.float32), "utilization": np.float32(atlas.utilization)}
+    return {"corners": placed[corners].astype(np.float32), "utilization": np.array(atlas.utilization)}
 
 
 def _end_with_parent() -> None:

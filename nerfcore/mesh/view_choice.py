@@ -16,7 +16,9 @@ from .facelets import Facelets
 from .photos import LINEAR, Photo, halvings, sample
 from .visibility import Observations, in_parallel
 
-FLAT_GRADIENT = 0.02  # what a picture without any texture is worth; else near, frontal views of plain walls would count nothing
+FLAT_GRADIENT = (
+    0.02  # what a picture without any texture is worth; else near, frontal views of plain walls would count nothing
+)
 ENOUGH_VIEWS = 4  # fewer cannot say who is wrong
 AGREE = 0.06  # difference of sRGB values at which photos still agree
 SMOOTHNESS = 0.25  # cost of an edge between two photos; a photo without any worth costs 1

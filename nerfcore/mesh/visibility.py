@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property
 
 import numpy as np
 import torch
 from scipy.ndimage import minimum_filter
 
-from ..geometry.cameras import Camera, project, rays
+from ..geometry.cameras import Camera, project
 from ..kernels.runtime import run_parallel, worker_count
 from ..kernels.triangles import nearest_triangle
 from ..progress import Reporter
 from .facelets import Facelets
 
+CPU = torch.device("cpu")  # a thread draws one photo's buffer: there is one photo a core, and the rest is numpy
 STEEPEST = np.cos(np.radians(75))  # what is seen at a smaller cosine is not taken from a photo
 SLACK_PIXELS = 2.0  # how much nearer something may be before it hides a point, in footprints of a pixel
 PARTLY = 0.3  # weight of a facelet that something hides in part
@@ -61,23 +62,24 @@ class PosedCamera:
     def pixels(self, local: np.ndarray) -> np.ndarray:
         """Pixel coordinates (N, 2) of points (N, 3) in camera axes; NaN where the lens does not see."""
         pixel = project(self.camera, local)
-        limit = widest(self.camera)
-        if limit > -1:
+        if self.widest > -1:
             # Beyond the angle where the lens polynomial turns back, a projection is a mirage.
-            outside = local[:, 2] < limit * _length(local)
-            pixel[outside] = np.nan
+            pixel[local[:, 2] < self.widest * _length(local)] = np.nan
         return pixel
 
-
-@lru_cache(maxsize=256)
-def widest(camera: Camera) -> float:
-    """Cosine of the largest angle to the optical axis that the picture shows, with a little room; −1 for all."""
-    if camera.model == "EQUIRECTANGULAR":
-        return -1.0
-    x, y = np.linspace(0, camera.width, 33), np.linspace(0, camera.height, 33)
-    grid = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
-    directions, valid = rays(camera, grid)
-    return float(np.cos(min(np.arccos(np.clip(directions[valid, 2].min(initial=1.0), -1, 1)) * 1.02, np.pi)))
+    @cached_property
+    def widest(self) -> float:
+        """Cosine of the angle to the optical axis at which the lens polynomial turns back; −1 where it does not."""
+        camera = self.camera
+        if camera.model == "OPENCV_FISHEYE":
+            angle = np.linspace(0, np.pi, 1000)
+        elif camera.model == "OPENCV":
+            angle = np.arctan(np.linspace(0, 4 * max(camera.width / camera.fx, camera.height / camera.fy), 1000))
+        else:
+            return -1.0
+        along = np.stack([np.sin(angle), np.zeros_like(angle), np.cos(angle)], 1)
+        back = np.flatnonzero(np.diff(project(camera, along)[:, 0]) <= 0)
+        return float(np.cos(angle[back[0]])) if len(back) else -1.0
 
 
 @dataclass(frozen=True)
@@ -105,7 +107,7 @@ class DepthBuffer:
         return inside & (self.nearest[y, x] > depth - slack)
 
 
-def depth_buffer(view: PosedCamera, vertices: np.ndarray, faces: np.ndarray, device: torch.device) -> DepthBuffer:
+def depth_buffer(view: PosedCamera, vertices: np.ndarray, faces: np.ndarray) -> DepthBuffer:
     """The mesh (V, 3), (F, 3) as a camera sees it, at one depth a pixel.
 
     Triangles are drawn with straight edges between their projected corners, so with a distorting lens they should be
@@ -114,22 +116,22 @@ def depth_buffer(view: PosedCamera, vertices: np.ndarray, faces: np.ndarray, dev
     local = view.local(vertices)
     size = view.camera.width, view.camera.height
     widest = size[0] / 2 if view.camera.model == "EQUIRECTANGULAR" else 1e9
-    face, nearest = nearest_triangle(view.pixels(local), view.depth(local), faces, *size, device, widest)
+    face, nearest = nearest_triangle(view.pixels(local), view.depth(local), faces, *size, CPU, widest)
     return DepthBuffer(view, face, nearest, minimum_filter(nearest, 3, mode="nearest"))
 
 
 class DepthBuffers:
     """Depth buffers of the same mesh in several views, kept as long as they take less than `most` bytes together."""
 
-    def __init__(self, views: Sequence[PosedCamera], pieces: Facelets, device: torch.device, most: int = 1 << 30) -> None:
-        self.views, self.pieces, self.device, self.left = views, pieces, device, most
+    def __init__(self, views: Sequence[PosedCamera], pieces: Facelets, most: int = 1 << 30) -> None:
+        self.views, self.pieces, self.left = views, pieces, most
         self._kept: dict[int, DepthBuffer] = {}
 
     def __getitem__(self, number: int) -> DepthBuffer:
         """The buffer of view `number`; may be called from several threads."""
         kept = self._kept.get(number)
         if kept is None:
-            kept = depth_buffer(self.views[number], self.pieces.vertices, self.pieces.faces, self.device)
+            kept = depth_buffer(self.views[number], self.pieces.vertices, self.pieces.faces)
             size = kept.face.nbytes + kept.depth.nbytes + kept.nearest.nbytes
             if size <= self.left:
                 self.left -= size
@@ -148,7 +150,8 @@ class Observations:
 
     def of(self, number: int) -> tuple[np.ndarray, np.ndarray]:
         """Facelets (N,) that view `number` is among the best for, and the column (N,) where it stands."""
-        return np.nonzero(self.view == number)
+        face, column = np.nonzero(self.view == number)
+        return face, column
 
 
 def observe(buffers: DepthBuffers, report: Reporter, most: int = 8) -> Observations:
@@ -171,7 +174,7 @@ def in_parallel(work, items: Sequence, report: Reporter, noun: str) -> Iterator[
     for begin in range(0, len(items), step):
         report.progress(begin / len(items), f"{begin} of {len(items)} {noun}")
         part = items[begin : begin + step]
-        yield from enumerate(run_parallel([lambda item=item: work(item) for item in part]), begin)
+        yield from enumerate(run_parallel([lambda item=item: work(item) for item in part], CPU), begin)
 
 
 def _seen_by(buffers: DepthBuffers, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

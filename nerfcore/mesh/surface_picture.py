@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from ..images.encode import to_bytes
+from ..images.picture import linear_to_srgb, to_bytes
 from .facelets import facelets
-from .photos import halvings, sample, to_linear, to_srgb
+from .photos import LINEAR, halvings, sample
 from .visibility import PosedCamera, depth_buffer
 
 
@@ -19,7 +19,6 @@ def surface_picture(
     faces: np.ndarray,
     corners: np.ndarray,
     texture: np.ndarray,
-    device: torch.device,
     samples: int = 2,
 ) -> tuple[np.ndarray, np.ndarray]:
     """A mesh with its texture as a camera sees it, without any light but the texture's own.
@@ -36,7 +35,7 @@ def surface_picture(
     assert pieces.corners is not None
     vertices, faces, corners = pieces.vertices, pieces.faces, pieces.corners
     fine = replace(view, camera=view.camera.resized(width * samples, height * samples))
-    buffer = depth_buffer(fine, vertices, faces, device)
+    buffer = depth_buffer(fine, vertices, faces)
     rows, columns = np.nonzero(buffer.face >= 0)
     face = buffer.face[rows, columns]
     weights = _place(fine, vertices[faces[face]], np.stack([columns + 0.5, rows + 0.5], 1))
@@ -48,20 +47,20 @@ def surface_picture(
     texel = np.sqrt(surface / np.maximum(np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]), 1e-9))
     wide = fine.footprint(buffer.depth[rows, columns]) / np.maximum(texel[face], 1e-12)
     level = np.round(np.log2(np.maximum(wide, 1))).astype(int)
-    levels = halvings(to_linear(torch.from_numpy(texture).float().permute(2, 0, 1) / 255), 6)
+    levels = halvings(torch.from_numpy(LINEAR[texture].transpose(2, 0, 1)), 6)
     color = torch.zeros((height * samples, width * samples, 3))
     color[rows, columns] = sample(levels, uv * [size, -size] + [0, size], level)
     hit = torch.from_numpy((buffer.face >= 0).astype(np.float32))
     share = hit.view(height, samples, width, samples).mean((1, 3))
     mean = color.view(height, samples, width, samples, 3).mean((1, 3)) / share.clamp(min=1e-6)[..., None]
-    return to_bytes(to_srgb(mean).numpy()), share.numpy()
+    return to_bytes(linear_to_srgb(mean.numpy())), share.numpy()
 
 
 def _place(view: PosedCamera, triangles: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     """Weights (N, 3) of the corners of triangles (N, 3, 3) at the pixels (N, 2) that show them, true to perspective."""
     local = view.local(triangles.reshape(-1, 3))
     corner, depth = view.pixels(local).reshape(-1, 3, 2), view.depth(local).reshape(-1, 3)
-    a, ab, ac, p = corner[:, 0], corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0], pixels - corner[:, 0]
+    ab, ac, p = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0], pixels - corner[:, 0]
     area = ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]
     second = (p[:, 0] * ac[:, 1] - p[:, 1] * ac[:, 0]) / area
     third = (ab[:, 0] * p[:, 1] - ab[:, 1] * p[:, 0]) / area

@@ -1,0 +1,166 @@
+"""A wall textured from computed photos, compared with photos it was not made from."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from fieldwork.nerfcore.errors import Cancelled, SettingError
+from fieldwork.nerfcore.mesh import photo_texture as module
+from fieldwork.nerfcore.mesh.photo_texture import PhotoTexture, photo_texture, prepare
+from fieldwork.nerfcore.mesh.photos import Photo
+from fieldwork.nerfcore.mesh.surface_picture import surface_picture
+from fieldwork.nerfcore.mesh.visibility import PosedCamera
+from fieldwork.nerfcore.progress import Reporter
+from fieldwork.tests.nerfcore.support.flat import (
+    LENS,
+    looking,
+    on_plane,
+    pattern,
+    ring,
+    wall_mesh,
+    wall_photo,
+    wall_picture,
+)
+
+HELD_OUT = [looking((0, 0, 0), (0.3, 0.2, 1.9)), looking((0.1, 0, 0), (-0.5, 0.3, 2.2))]
+POSES = ring(9)
+EXPOSURES = [0.3, -0.3, 0.1, -0.2, 0.25, 0, -0.3, 0.15, 0]
+
+
+def textured(photos: list[Photo], size: int = 512, fill=None, mesh=None) -> PhotoTexture:
+    return photo_texture(prepare(*(mesh or wall_mesh()), photos, size, Reporter()), fill, Reporter())
+
+
+def psnr(texture: PhotoTexture, pose: np.ndarray, gain: float = 1.0) -> float:
+    """Against a photo of the bare wall, in its inner part."""
+    picture, hit = surface_picture(PosedCamera(LENS, pose), *wall_mesh(), texture.image)
+    inside = (np.abs(on_plane(LENS, pose)[0][:, :2]).max(1) < 0.55).reshape(hit.shape) & (hit > 0.99)
+    error = (picture.astype(float) - wall_picture(pose)[..., :3])[inside]
+    return float(10 * np.log10(255**2 / np.square(error).mean()))
+
+
+@pytest.fixture(scope="module")
+def plain() -> PhotoTexture:
+    return textured([wall_photo(pose) for pose in POSES])
+
+
+def test_held_out_photos_are_met(plain: PhotoTexture) -> None:
+    assert plain.seen == pytest.approx(1)
+    assert not plain.unseen.any()
+    assert min(psnr(plain, pose) for pose in HELD_OUT) > 36
+    # Detail is as strong as in the photos, not averaged away.
+    for pose in HELD_OUT:
+        picture, hit = surface_picture(PosedCamera(LENS, pose), *wall_mesh(), plain.image)
+        photo = wall_picture(pose)[..., :3]
+        energy = [np.hypot(*np.gradient(p.astype(float).mean(2)))[hit > 0.99].mean() for p in (picture, photo)]
+        assert energy[0] / energy[1] > 0.95
+
+
+def error(texture: PhotoTexture) -> np.ndarray:
+    """Largest difference (S, S) of a channel from the wall's true colour, of 255."""
+    size = len(texture.image)
+    x, y = np.meshgrid((np.arange(size) + 0.5) / size * 1.2 - 0.6, 0.6 - (np.arange(size) + 0.5) / size * 1.2)
+    truth = pattern(np.stack([x.ravel(), y.ravel()], 1)).reshape(size, size, 3) * 255
+    return np.abs(texture.image - truth).max(2)
+
+
+def test_texels_are_upright_and_in_place(plain: PhotoTexture) -> None:
+    assert error(plain).max() < 4
+
+
+def test_exposures_of_a_third_of_a_stop_cost_at_most_half_a_decibel(plain: PhotoTexture) -> None:
+    changed = textured([wall_photo(pose, exposure=stops) for pose, stops in zip(POSES, EXPOSURES)])
+    # All photos were exposed by what remains when their differences are taken away: compare up to that.
+    stops = np.log2(changed.gains)
+    left = np.array(EXPOSURES)[:, None] + stops
+    assert np.abs(left - left.mean()).max() < 0.03
+    assert abs(left.mean()) == pytest.approx(abs(np.mean(EXPOSURES)), abs=0.02)
+    for pose in HELD_OUT:
+        assert psnr(changed, pose) > psnr(plain, pose) - 0.5
+
+
+def test_without_gains_the_same_photos_would_cost_more(plain: PhotoTexture, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "photo_gains", lambda view, looks, count: np.ones((count, 3), np.float32))
+    monkeypatch.setattr(module, "towards_common", lambda pieces, same, looks, keep, weight: np.zeros((*keep.shape, 3)))
+    changed = textured([wall_photo(pose, exposure=stops) for pose, stops in zip(POSES, EXPOSURES)])
+    assert psnr(changed, HELD_OUT[0]) < psnr(plain, HELD_OUT[0]) - 3
+
+
+def test_what_stood_before_one_photo_leaves_no_ghost(monkeypatch: pytest.MonkeyPatch) -> None:
+    near = looking((0, 0, 0), (0.05, 0, 1.2))  # the best view of the middle, were it not for the board
+    photos = [wall_photo(near, board=(0.15, 0.3, 0.95)), *(wall_photo(pose) for pose in POSES)]
+    made = textured(photos)
+    assert (error(made) > 10).mean() < 1e-4
+    assert min(psnr(made, pose) for pose in HELD_OUT) > 36
+    monkeypatch.setattr(module, "agreeing", lambda pieces, view, looks: looks.worth > 0)
+    assert (error(textured(photos)) > 10).mean() > 0.02
+
+
+def test_masked_pixels_never_paint() -> None:
+    photos = []
+    for pose in POSES:
+        rgba = wall_picture(pose)
+        points = on_plane(LENS, pose)[0][:, :2].reshape(*rgba.shape[:2], 2)
+        hidden = points[..., 0] > 0.2
+        rgba[hidden] = [255, 0, 255, 0]
+        photos.append(wall_photo(pose, rgba=rgba))
+    made = textured(photos, fill=lambda points, normals: np.tile(np.uint8([10, 200, 30]), (len(points), 1)))
+    size = len(made.image)
+    edge = int((0.2 + 0.6) / 1.2 * size)
+    assert (made.image[:, edge + 8 :] == [10, 200, 30]).all()
+    assert (made.unseen[:, edge + 8 :] == 255).all()
+    assert not made.unseen[:, : edge - 16].any()
+    magenta = (made.image[..., 0] > 200) & (made.image[..., 1] < 60) & (made.image[..., 2] > 200)
+    assert not magenta.any()
+    assert made.seen == pytest.approx(edge / size, abs=0.03)
+
+
+def test_unseen_surface_without_a_field_takes_what_is_beside() -> None:
+    made = textured([wall_photo(looking((0, 0, 0), (0, 0.01, 0.8)))])
+    assert 0.05 < made.seen < 0.95
+    assert made.unseen.max() == 255
+    assert made.image.min(initial=255) >= 0
+    assert (made.image[made.unseen > 0].sum(1) > 0).all()
+
+
+def test_tiles_make_the_same_picture(plain: PhotoTexture, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "TILE", 200)
+    tiled = textured([wall_photo(pose) for pose in POSES])
+    assert np.abs(tiled.image.astype(int) - plain.image).max() <= 1
+
+
+def test_two_triangles_take_more_than_one_photo() -> None:
+    """No photo shows the whole wall, which is two triangles."""
+    poses = [looking((x, y, 0), (x, y + 0.01, 0.7)) for x in (-0.35, 0, 0.35) for y in (-0.35, 0, 0.35)]
+    mesh = wall_mesh(1)
+    made = textured([wall_photo(pose) for pose in poses], mesh=mesh)
+    assert made.seen > 0.99
+    assert min(psnr(made, pose) for pose in HELD_OUT) > 33
+
+
+def test_no_memory_is_said_before_the_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Little:
+        available = 1_000_000_000
+
+    monkeypatch.setattr(module.psutil, "virtual_memory", lambda: Little)
+    with pytest.raises(SettingError, match=r"16384×16384 needs .* GB of memory, and 1\.0 GB are free"):
+        prepare(*wall_mesh(), [], 16384, Reporter())
+
+
+def test_cancelled_at_every_stage() -> None:
+    photos = [wall_photo(pose) for pose in POSES[:4]]
+
+    class Stops(Reporter):
+        def __init__(self, at: int) -> None:
+            super().__init__()
+            self.left = at
+
+        def stage(self, name: str) -> None:
+            self.left -= 1
+            if self.left == 0:
+                self.cancel()
+
+    for at in (1, 2, 3, 4):
+        report = Stops(at)
+        with pytest.raises(Cancelled):
+            photo_texture(prepare(*wall_mesh(), photos, 128, report), None, report)

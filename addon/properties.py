@@ -197,6 +197,12 @@ class FieldworkScene(PropertyGroup):
     run: StringProperty(
         name="Run", description="Name of the training run; several runs may stand side by side", default="main"
     )
+    hold_out: BoolProperty(
+        name="Hold Out Photos",
+        description="Leave every eighth photo out of the training to measure the result with; off: train the final field "
+        "on all photos",
+        default=True,
+    )
     time_limit: FloatProperty(
         name="Time Limit",
         description="Training ends after so many seconds; 0: when the preset is done",

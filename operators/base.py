@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -16,7 +17,7 @@ from ..addon.jobs.job import Done, Job, Steps
 from ..addon.jobs.queue import queue
 from ..addon.project import edits, lists, runs, snapshot
 from ..addon.properties import FieldworkScene
-from ..addon.props import StringProperty
+from ..addon.props import IntProperty, StringProperty
 from ..addon.text import t
 
 EDIT_SECONDS = 15.0  # how long a job waits for edits: the engine may have to start first
@@ -35,6 +36,23 @@ def scene_settings(**names: str) -> Callable[[type], type]:
         return cls
 
     return decorate
+
+
+HoldoutProperty = partial(
+    IntProperty,
+    name="Hold Out",
+    description="Every so many photos one is left out of the training to measure it with; 0: none. Default: as the scene says",
+    default=8,
+    min=0,
+    options={"SKIP_SAVE"},
+)
+
+
+def hold_out(operator: Operator, context: Context) -> int:
+    """Every how many photos one is held out: as the caller says, else by the switch of the scene."""
+    if operator.properties.is_property_set("holdout"):
+        return operator.holdout
+    return runs.HOLDOUT if context.scene.fieldwork.hold_out else 0
 
 
 def engine_reason() -> str | None:
@@ -71,6 +89,13 @@ def need_run(context: Context) -> str | None:
         else t("Train the run “{}” first", settings.run)
     )
     return need_poses(context) or missing
+
+
+def need_held_out(context: Context) -> str | None:
+    settings = context.scene.fieldwork
+    if need_run(context) or runs.held_out(snapshot.folder_of(settings), settings.run):
+        return None
+    return t("The run “{}” was trained on all photos: none is left to measure it with", settings.run)
 
 
 def same_verb_active(verb: str, context: Context) -> str | None:

@@ -10,7 +10,7 @@ from bpy.types import Context
 from ..addon.properties import PRESETS
 from ..addon.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, IntVectorProperty, StringProperty
 from ..addon.text import t
-from .base import VerbOperator, absolute, scene_settings
+from .base import HoldoutProperty, VerbOperator, absolute, hold_out, scene_settings
 from .train import parse_settings
 
 
@@ -40,6 +40,8 @@ class FIELDWORK_OT_reconstruct(VerbOperator):
         options={"SKIP_SAVE"},
     )  # fmt: skip
 
+    holdout: HoldoutProperty()
+
     def parameters(self, context: Context) -> dict[str, Any]:
         photos, out = self.path(context, "photos"), absolute(self.out or context.scene.fieldwork.project)
         if photos is None:
@@ -52,6 +54,7 @@ class FIELDWORK_OT_reconstruct(VerbOperator):
             **{name: self.path(context, name) for name in ("labels", "masks", "classes")},
             "preset": self.value(context, "preset"),
             "time_limit": self.value(context, "time_limit") or None,
+            "holdout": hold_out(self, context),
             "set": parse_settings(self.value(context, "settings")),
             "blend": absolute(self.blend),
             "report": absolute(self.report_file),

@@ -17,7 +17,7 @@ from ..addon.roles import Owner
 from ..addon.scene.frame import scene_from_capture
 from ..addon.scene.lens import pinhole
 from ..addon.text import t
-from .base import ProjectOperator, absolute, need_run, refresh_scenes, scene_settings
+from .base import ProjectOperator, absolute, need_held_out, need_run, refresh_scenes, scene_settings
 
 
 def check_camera(scene: bpy.types.Scene) -> None:
@@ -98,6 +98,8 @@ class FIELDWORK_OT_render(ProjectOperator):
         settings = context.scene.fieldwork
         if settings.render_from in ("camera", "animation") and context.scene.camera is None:
             return t("The scene has no active camera")
+        if settings.render_from == "photos" and (reason := need_held_out(context)):
+            return reason
         return super().reason(context)
 
     def parameters(self, context: Context) -> dict[str, Any]:

@@ -11,7 +11,16 @@ from ..addon.jobs.job import Done, Job
 from ..addon.project import runs, snapshot
 from ..addon.props import BoolProperty, EnumProperty, StringProperty
 from ..addon.text import t
-from .base import ProjectOperator, need_poses, need_run, refresh_scenes, scene_settings
+from .base import (
+    HoldoutProperty,
+    ProjectOperator,
+    hold_out,
+    need_held_out,
+    need_poses,
+    need_run,
+    refresh_scenes,
+    scene_settings,
+)
 
 
 def parse_settings(text: str) -> dict[str, str]:
@@ -34,6 +43,7 @@ class FIELDWORK_OT_train(ProjectOperator):
     verb = "train"
     needs = (need_poses,)
 
+    holdout: HoldoutProperty()
     resume: BoolProperty(name="Resume", description="Go on from the last checkpoint of the run", options={"SKIP_SAVE"})
 
     @classmethod
@@ -48,7 +58,7 @@ class FIELDWORK_OT_train(ProjectOperator):
                 self,
                 event,
                 title=t("Train the run “{}” anew?", settings.run),
-                message=t("What it has learned is lost. Give it another name to keep both."),
+                message=t("The new training takes its place once it has a checkpoint. Another name keeps both."),
                 confirm_text=t("Train"),
             )
         return self.execute(context)
@@ -62,6 +72,7 @@ class FIELDWORK_OT_train(ProjectOperator):
             "project": self.project_path(context),
             "preset": self.value(context, "preset"),
             "run": run,
+            "holdout": hold_out(self, context),
             "time_limit": seconds if seconds > 0 else None,
             "steps": steps if steps > 0 else None,
             "set": parse_settings(self.value(context, "settings")),
@@ -86,7 +97,7 @@ class FIELDWORK_OT_evaluate(ProjectOperator):
     bl_idname = "fieldwork.evaluate"
     bl_label = "Measure Quality"
     verb = "evaluate"
-    needs = (need_run,)
+    needs = (need_run, need_held_out)
 
     split: EnumProperty(
         name="Photos",
@@ -130,7 +141,13 @@ class FIELDWORK_OT_train_preset_add(AddPresetBase, Operator):
     preset_menu = "FIELDWORK_MT_train_presets"
     preset_subdir = "fieldwork/train"
     preset_defines = ["fieldwork = bpy.context.scene.fieldwork"]
-    preset_values = ["fieldwork.preset", "fieldwork.time_limit", "fieldwork.steps", "fieldwork.settings"]
+    preset_values = [
+        "fieldwork.preset",
+        "fieldwork.hold_out",
+        "fieldwork.time_limit",
+        "fieldwork.steps",
+        "fieldwork.settings",
+    ]
 
 
 CLASSES = [

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from typing import Any
+
 from bpy.types import Context, Panel, UILayout
 
 from ..addon.jobs.job import Job
@@ -117,6 +120,28 @@ def draw_outcome(layout: UILayout, context: Context, job: Job) -> None:
     row = box.row()
     row.operator("fieldwork.copy_report", icon="COPYDOWN")
     row.operator("fieldwork.dismiss")
+
+
+STAGES = {
+    "new": "photos",
+    "poses": "poses",
+    "train": "training",
+    "evaluate": "measures",
+    "mesh": "mesh",
+    "render": "renders",
+    "blend": ".blend",
+}
+
+
+def reuse_text(result: dict[str, Any]) -> list[str]:
+    """What a reconstruction kept of an earlier one, and what it did anew and why, a sentence each."""
+
+    def stages(verbs: Iterable[str]) -> str:
+        return ", ".join(t(STAGES.get(verb, verb)) for verb in verbs)
+
+    reused, redone = result.get("reused") or [], result.get("redone") or {}
+    kept = [t("Kept from before: {}.", stages(reused))] if reused else []
+    return kept + [t("Done anew: {}: {}.", stages([verb]), why) for verb, why in redone.items()]
 
 
 def project_folder(context: Context):

@@ -11,7 +11,16 @@ from ..addon import machine
 from ..addon.jobs.queue import queue
 from ..addon.project import edits, runs, snapshot
 from ..addon.text import t
-from .base import FieldworkPanel, draw_job, draw_outcome, draw_wrapped, progress_text, project_folder, text_width
+from .base import (
+    FieldworkPanel,
+    draw_job,
+    draw_outcome,
+    draw_wrapped,
+    progress_text,
+    project_folder,
+    reuse_text,
+    text_width,
+)
 
 
 class Step(NamedTuple):
@@ -78,6 +87,10 @@ class FIELDWORK_PT_main(FieldworkPanel):
         outcome = queue.outcome
         if outcome is not None:
             draw_outcome(layout, context, outcome)
+        last = queue.last
+        if last is not None and last.verb == "reconstruct" and last.state == "done" and job is None:
+            for text in reuse_text(last.result or {}):
+                draw_wrapped(layout, text, text_width(context), icon="CHECKMARK")
         step = next_step(context)
         if step is not None:
             row = layout.row()

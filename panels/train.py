@@ -43,6 +43,7 @@ class FIELDWORK_PT_train(StepPanel):
         column = columns(layout)
         column.prop(settings, "preset")
         column.prop(settings, "run")
+        column.prop(settings, "hold_out")
         if not active:
             estimate = runs.time_estimate(folder, settings)
             text = t("About {}, as the last time", duration(estimate)) if estimate else ""
@@ -108,7 +109,8 @@ def draw_curve(layout: UILayout, job: Job) -> None:
     if job.preview:
         preview = thumbnails.picture(job.preview, job.preview_count)
         if preview:
-            layout.label(text=t("Render of a held-out photo"))
+            whole = job.params.get("holdout") == 0
+            layout.label(text=t("Render of a photo") if whole else t("Render of a held-out photo"))
             layout.template_icon(icon_value=preview, scale=9.0)
 
 

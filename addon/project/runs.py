@@ -8,6 +8,8 @@ from typing import Any
 from .. import machine
 from .snapshot import cached_json, project, read_json
 
+HOLDOUT = 8  # every so many photos one is held out, unless a run says otherwise
+RETRAINED = ".new"  # in runs: those that are trained anew, until they take the place of the old ones
 TIMES_FILE = "training_times.json"  # of the machine: seconds by preset
 
 
@@ -15,7 +17,7 @@ def runs(folder: Path | None) -> list[str]:
     """Names of the runs that have a trained field, newest last."""
     if folder is None:
         return []
-    found = [path.parent for path in (folder / "runs").glob("*/*.safetensors")]
+    found = [path.parent for path in (folder / "runs").glob("[!.]*/*.safetensors")]
     return list(dict.fromkeys(run.name for run in sorted(found, key=lambda run: run.stat().st_mtime)))
 
 
@@ -25,10 +27,23 @@ def has_run(folder: Path | None, run: str) -> bool:
 
 def can_resume(folder: Path | None, run: str) -> bool:
     """Whether a training of the run stopped before its end and left a checkpoint."""
-    if folder is None or not has_run(folder, run):
+    if folder is None:
+        return False
+    if has_run(folder, f"{RETRAINED}/{run}"):
+        return True
+    if not has_run(folder, run):
         return False
     # Training writes its metrics at the end, and removes those of before at the start.
     return "train" not in (cached_json(folder / "runs" / run / "metrics.json") or {})
+
+
+def held_out(folder: Path | None, run: str) -> bool:
+    """Whether the run left photos out of its training, to measure it with."""
+    info = cached_json(folder / "runs" / run / "config.json") if folder else None
+    every = info.get("holdout", HOLDOUT) if isinstance(info, dict) else HOLDOUT
+    placed = [image for image in (project(folder) or {}).get("images", []) if image.get("status", "ok") == "ok"]
+    splits = [image.get("split", "auto") for image in placed]
+    return every > 0 and ("test" in splits or splits.count("auto") >= every)
 
 
 def quality(folder: Path | None, run: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import subprocess
 import sys
 import threading
 import time
@@ -74,7 +75,7 @@ def test_offline_install_makes_an_environment_of_its_own(options, lock, tmp_path
     before = set(Path(sys.prefix).rglob("tiny*"))
     go(options, lock)
     python = module.python_in(options.folder / "venv")
-    run = module.subprocess.run([python, "-c", "import tiny; print(tiny.answer)"], capture_output=True, check=True)
+    run = subprocess.run([python, "-c", "import tiny; print(tiny.answer)"], capture_output=True, check=True)
     assert run.stdout.strip() == b"42"
     assert set(Path(sys.prefix).rglob("tiny*")) == before, "the base Python was touched"
     assert place.find_python("", options.folder, tmp_path) == python

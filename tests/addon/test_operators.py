@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
-from fieldwork.tests.addon.support import SETUP, make_project
+from fieldwork.tests.addon.support import SETUP, make_posed_project, make_project
 
 
 def test_failures_are_sentences(bpy_script, tmp_path):
@@ -202,3 +204,51 @@ answer(states)
         ["running", "queued", "cancelled"],
         ["cancelling", "queued", "cancelled"],
     ]
+
+
+def test_holding_out_is_a_switch_and_without_it_there_is_nothing_to_measure(bpy_script, tmp_path):
+    project = make_posed_project(tmp_path / "capture")
+    images = [{"name": str(number), "file": "", "status": "ok"} for number in range(9)]
+    value = json.loads((project / "project.json").read_text())
+    (project / "project.json").write_text(json.dumps({**value, "images": images}))
+    for run, info in {"whole": {"holdout": 0}, "usual": {"holdout": 8}, "older": {}, "few": {"holdout": 20}}.items():
+        (project / "runs" / run).mkdir(parents=True)
+        (project / "runs" / run / "field.safetensors").touch()
+        (project / "runs" / run / "config.json").write_text(json.dumps(info))
+    facts = bpy_script(
+        SETUP
+        + """
+from fieldwork.addon.jobs.queue import queue
+from fieldwork.panels.main import next_step
+seen = []
+queue.run = lambda job: seen.append(job.params["holdout"])
+settings.project = project
+for settings.hold_out in (True, False):
+    bpy.ops.fieldwork.train()
+    bpy.ops.fieldwork.reconstruct(photos=project)
+    bpy.ops.fieldwork.train(holdout=10)
+measure, render = bpy.types.FIELDWORK_OT_evaluate, bpy.types.FIELDWORK_OT_render
+settings.render_from = "photos"
+reasons = {}
+for settings.run in ("whole", "usual", "older", "few"):
+    reasons[settings.run] = [cls.reason(bpy.context) for cls in (measure, render)]
+settings.run, settings.render_from = "whole", "all"
+reasons["all photos"] = render.reason(bpy.context)
+answer({"seen": seen, "reasons": reasons})
+""",
+        project=project,
+    )
+    assert facts["seen"] == [8, 8, 10, 0, 0, 10]
+    for run, held_out in {"whole": False, "usual": True, "older": True, "few": False}.items():
+        for reason in facts["reasons"][run]:
+            assert reason is None if held_out else "all photos" in reason
+    assert facts["reasons"]["all photos"] is None
+
+
+def test_a_training_that_is_to_take_the_place_of_another_can_be_resumed(tmp_path):
+    from fieldwork.addon.project import runs
+
+    (tmp_path / "runs/.new/main").mkdir(parents=True)
+    (tmp_path / "runs/.new/main/field.safetensors").touch()
+    assert runs.can_resume(tmp_path, "main")
+    assert runs.runs(tmp_path) == []

@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("bpy")
 
 from fieldwork.addon.jobs.job import Job
-from fieldwork.panels.base import duration, progress_text, wrap
+from fieldwork.panels.base import duration, progress_text, reuse_text, wrap
 
 
 @pytest.mark.parametrize(
@@ -28,6 +28,12 @@ def test_progress_says_what_how_much_and_how_long():
     assert progress_text(job) == "Warming up · 25% · 1:35 min left"
     job.state = "cancelling"
     assert progress_text(job) == "Stopping…"
+
+
+def test_a_reconstruction_says_what_it_kept_and_why_not():
+    result = {"reused": ["poses", "mesh"], "redone": {"train": "other preset"}}
+    assert reuse_text(result) == ["Kept from before: poses, mesh.", "Done anew: training: other preset."]
+    assert reuse_text({}) == []
 
 
 def test_wrapped_text_keeps_its_words_and_breaks_long_paths():

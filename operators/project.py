@@ -45,10 +45,12 @@ class FIELDWORK_OT_locate_project(Operator):
             return {"CANCELLED"}
         from ..addon.scene.owned import hand_over  # not at the top: enabling the extension must be quick
 
-        old = snapshot.folder_of(settings)
-        hand_over(Owner(old.name, settings.project_uuid), snapshot.owner(folder))
+        old, uuid = snapshot.folder_of(settings), settings.project_uuid
+        hand_over(Owner(old.name, uuid), snapshot.owner(folder))
         edits.move(old, folder)
-        settings.project = str(folder)
+        for scene in bpy.data.scenes:
+            if scene.fieldwork.project_uuid == uuid and snapshot.folder_of(scene.fieldwork) == old:
+                scene.fieldwork.project = str(folder)
         return {"FINISHED"}
 
 

@@ -62,8 +62,9 @@ def _file_loaded(*_: Any) -> None:
     """Another file: its project may have a job that runs elsewhere."""
     queue.edits += 1
     for scene in bpy.data.scenes:
-        lists.refresh(scene.fieldwork)
-    folder = snapshot.folder_of(bpy.context.scene.fieldwork)
+        if scene.fieldwork.project:
+            lists.refresh(scene.fieldwork)
+    folder = snapshot.folder_of(bpy.context.scene.fieldwork) if bpy.context.scene else None
     if snapshot.has_project(folder) and not bpy.app.background:
         reattach(queue, folder)
 

@@ -18,7 +18,8 @@ from ..errors import EngineError
 from ..text import t
 from .snapshot import has_project
 
-RETRY = 10.0  # seconds until an edit that was refused, or not answered, is sent again
+RETRY = 10.0  # seconds until an edit that was not taken, or not answered, is sent again
+REFUSED = ("setting", "input", "refused")  # kinds of errors that the same values would meet again
 
 Answer = Callable[[dict[str, Any] | None, EngineError | None], None]
 Params = Callable[[Path, dict[Any, Any]], dict[str, Any]]
@@ -117,6 +118,8 @@ def _answered(edit: Edit, values: dict[Any, Any], error: EngineError | None) -> 
         edit.sent = None
     if edit.values is not values:
         edit.due = 0.0  # it was edited again meanwhile
+    elif error is not None and error.kind in REFUSED:
+        edit.due = float("inf")  # until the user says otherwise
     elif error is None and _pending.get((edit.folder, edit.verb)) is edit:
         del _pending[edit.folder, edit.verb]
     edit.error = error

@@ -112,6 +112,21 @@ def test_what_cannot_be_taken_is_told_kept_and_sent_again(project, clock):
     assert snapshot.project(project)["classes"][0]["priority"] == 2.0
 
 
+def test_what_the_engine_refuses_waits_for_the_user(project, clock):
+    engine = Engine()
+    put(project, 2.0)
+    edits.send(engine.ask)
+    engine.answer(EngineError("setting", "Two classes are called “gold”."))
+    clock.seconds += 100 * edits.RETRY
+    edits.send(engine.ask)
+    assert len(engine.requests) == 1
+    assert edits.failed()
+    put(project, 3.0)
+    edits.send(engine.ask)
+    engine.answer()
+    assert not edits.waiting()
+
+
 def test_an_edit_that_is_never_answered_is_sent_again(project, clock):
     """The engine was stopped with the request in its pipe."""
     engine = Engine()

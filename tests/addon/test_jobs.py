@@ -18,7 +18,9 @@ from fieldwork.addon.jobs.follow import reattach  # noqa: E402
 from fieldwork.addon.jobs.job import CURVE_POINTS  # noqa: E402
 from fieldwork.addon.jobs.queue import Queue  # noqa: E402
 from fieldwork.addon.jobs.timer import tick  # noqa: E402
+from fieldwork.addon.project import classes, edits, snapshot  # noqa: E402
 from fieldwork.nerfcore.engine import status as st  # noqa: E402
+from fieldwork.tests.addon.support import make_project  # noqa: E402
 
 ENGINE = [sys.executable, str(Path(__file__).resolve().parents[1] / "counting_engine.py")]
 
@@ -174,6 +176,33 @@ def test_reattach_tells_of_a_job_whose_engine_died(queue, project):
     assert "unexpectedly" in other.last.error.message
     reattach(other, project)
     assert len(other.finished) == 1, "it is told once"
+
+
+def test_an_edit_is_taken_while_a_job_runs(queue, tmp_path):
+    project = make_project(tmp_path / "edited")
+    edits.clear()
+    job = count(queue, project, steps=100_000)
+    queue.submit(job)
+    tick_until(queue, lambda: job.fraction)
+    classes._put(project, {(1, "priority"): 4.0})
+    tick_until(queue, lambda: not edits.waiting())
+    assert job.state == "running"
+    assert snapshot.project(project)["classes"][0]["priority"] == 4.0
+    assert snapshot.project(project)["classes"][1]["name"] == "gold"
+    queue.cancel()
+    tick_until(queue, lambda: job.state == "cancelled")
+
+
+def test_an_edit_of_the_last_moment_is_taken_after_blender_is_gone(queue, tmp_path):
+    project = make_project(tmp_path / "edited")
+    edits.clear()
+    classes._put(project, {(1, "priority"): 4.0})
+    edits.send(queue.ask, at_once=True)
+    process = queue.link.process
+    edits.clear()
+    queue.stop_engine()
+    process.wait(timeout=60)
+    assert snapshot.project(project)["classes"][0]["priority"] == 4.0
 
 
 def test_idle_engine_is_released(queue, settings, project):

@@ -65,6 +65,13 @@ def _project_changed(self: "FieldworkScene", context: Context) -> None:
         reattach(queue, folder)
 
 
+def _run_changed(self: "FieldworkScene", context: Context) -> None:
+    """Another run, another mesh: the areas of the classes are those of its mesh."""
+    from .project import classes
+
+    classes.fill(self)
+
+
 def _classes_edited(self: PropertyGroup, context: Context) -> None:
     from .project import classes
 
@@ -195,7 +202,10 @@ class FieldworkScene(PropertyGroup):
     # Training
     preset: EnumProperty(name="Preset", description="Trade quality for time", items=PRESETS, default="standard")
     run: StringProperty(
-        name="Run", description="Name of the training run; several runs may stand side by side", default="main"
+        name="Run",
+        description="Name of the training run; several runs may stand side by side",
+        default="main",
+        update=_run_changed,
     )
     hold_out: BoolProperty(
         name="Hold Out Photos",

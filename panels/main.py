@@ -48,7 +48,7 @@ def next_step(context: Context) -> Step | None:
         return Step("fieldwork.train", "PLAY", "Resume Training", resume=True)
     if not runs.has_run(folder, settings.run):
         return Step("fieldwork.train", "PLAY")
-    if not snapshot.last_result(folder, "mesh"):
+    if not snapshot.last_result(folder, "mesh", settings.run):
         return Step("fieldwork.mesh", "MESH_DATA")
     return Step("fieldwork.import_scene", "SCENE_DATA")
 

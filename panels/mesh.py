@@ -15,7 +15,7 @@ class FIELDWORK_PT_mesh(StepPanel):
     def draw(self, context: Context) -> None:
         layout, settings = self.layout, context.scene.fieldwork
         folder = project_folder(context)
-        result = snapshot.last_result(folder, "mesh")
+        result = snapshot.last_result(folder, "mesh", settings.run)
         if result:
             closed = t("{:,} triangles, closed") if result.get("watertight") else t("{:,} triangles, open")
             self.draw_state(True, closed.format(result.get("faces", 0)))

@@ -36,7 +36,7 @@ def shown(folder: Path | None) -> list[dict[str, Any]]:
 def fill(settings: Any) -> None:
     """Let the scene's list show the classes."""
     folder = snapshot.folder_of(settings)
-    areas = snapshot.last_result(folder, "mesh").get("classes") or {}
+    areas = snapshot.last_result(folder, "mesh", settings.run).get("classes") or {}
     hidden = {entry.name for entry in settings.classes if not entry.visible}
     with quiet():
         settings.classes.clear()

@@ -74,10 +74,13 @@ def frame(folder: Path | None) -> dict[str, Any]:
     return (project(folder) or {}).get("frame") or {}
 
 
-def last_result(folder: Path | None, verb: str) -> dict[str, Any]:
-    """What the last run of a verb returned, as the project recorded it."""
-    steps = [step for step in (project(folder) or {}).get("provenance", []) if step.get("verb") == verb]
-    return steps[-1].get("result") or {} if steps else {}
+def last_result(folder: Path | None, verb: str, run: str | None = None) -> dict[str, Any]:
+    """What a verb returned the last time (of a training run, where one is named), as the project recorded it."""
+    for step in reversed((project(folder) or {}).get("provenance", [])):
+        of = (step.get("settings") or {}).get("run", "main")
+        if step.get("verb") == verb and run in (None, of):
+            return step.get("result") or {}
+    return {}
 
 
 def absence(settings: Any) -> str | None:

@@ -39,14 +39,17 @@ settings.classes[0].priority = 4.0
 settings.classes[1].name = "gilding"
 before = stored(project)["classes"]
 bpy.ops.fieldwork.save_edits()
+settings.run = "second"
+areas = [c.area for c in settings.classes]
 settings.project = ""
-answer({"rows": rows, "classes": classes, "left": len(settings.images), "asked": asked, "before": before[0]["priority"]})
+answer({"rows": rows, "classes": classes, "left": len(settings.images), "asked": asked, "areas": areas, "before": before[0]["priority"]})
 """,
         project=folder,
     )
     assert facts["rows"] == [["a", "ok", "", True], ["b", "rejected", "It is blurred.", False]]
     assert facts["classes"] == [[1, "stone", 1.0, 0.0], [2, "gold", 2.0, 0.25]]
     assert facts["left"] == 0
+    assert facts["areas"] == [0.0, 0.0], "another run has a mesh of its own"
     assert facts["before"] == 1.0, "Blender itself writes nothing"
     assert facts["asked"] == ["classes"], "one edit for both"
     classes = json.loads((folder / "project.json").read_text())["classes"]

@@ -1,4 +1,7 @@
-"""Project files of earlier versions, brought to the present one."""
+"""Project files of earlier versions, brought to the present one.
+
+Standard library only: Blender's side imports this module too.
+"""
 
 from __future__ import annotations
 

@@ -50,6 +50,8 @@ def test_imports_run_downwards_without_circles(copy):
         ("addon/text.py", "from .jobs import queue as _spoiled\n"),
         ("nerfcore/errors.py", "from ..addon import roles as _spoiled\n"),
         ("addon/roles.py", "from ..panels import base as _spoiled\n"),
+        ("addon/project/snapshot.py", "from ...nerfcore.project import store as _spoiled\n"),
+        ("addon/engine/link.py", "import torch as _spoiled\n"),
     ],
 )
 def test_an_import_that_climbs_is_found(copy, file, line):

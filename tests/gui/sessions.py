@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+import shutil
 from pathlib import Path
 
 import bpy
@@ -173,6 +175,62 @@ def tools(screen):
 
     yield from data_set(screen)
     yield from translated(screen)
+    yield from finish(screen)
+
+
+def edits(screen):
+    """A class is edited, undone, edited without an engine; the project's folder is moved away and found again."""
+    project, moved = screen.folder / "vase", screen.folder / "elsewhere"
+    for folder in (project, moved):
+        shutil.rmtree(folder, ignore_errors=True)
+    project.mkdir()
+    classes = [
+        {"id": 1, "name": "stone", "color": [0.5, 0.5, 0.5], "priority": 1.0},
+        {"id": 2, "name": "gold", "color": [1.0, 0.8, 0.0], "priority": 2.0},
+    ]
+    value = {"format": "fieldwork-project", "version": 2, "uuid": "a" * 32, "created": "", "classes": classes}
+    (project / "project.json").write_text(json.dumps(value))
+    stored = lambda: json.loads((project / "project.json").read_text())["classes"][0]  # noqa: E731
+    under_way = screen.module("addon.project.edits")
+    settings = bpy.context.scene.fieldwork
+    settings.project = str(project)
+    yield from screen.show_sidebar()
+    bpy.ops.ed.undo_push(message="project")
+    settings.classes[0].priority = 4.0
+    bpy.ops.ed.undo_push(message="priority")
+    yield from screen.wait(lambda: stored()["priority"] == 4.0, 60, "the engine does not take the edit")
+    bpy.ops.ed.undo()
+    yield from screen.wait(lambda: stored()["priority"] == 1.0, 30, "undo is no edit")
+    screen.facts["undone"] = bpy.context.scene.fieldwork.classes[0].priority
+
+    engine, chosen = os.environ.pop("FIELDWORK_ENGINE_PYTHON"), screen.module("addon.machine").preferences()
+    chosen.engine_python = "/nowhere/python"
+    bpy.ops.fieldwork.stop_engine()
+    bpy.context.scene.fieldwork.classes[0].name = "marble"
+    yield from screen.wait(under_way.failed, 30, "nobody misses the engine")
+    screen.sidebar.tag_redraw()
+    yield 0.5
+    screen.shot("unsaved")
+    screen.facts["unsaved"] = [str(under_way.failed()[0].error), stored()["name"]]
+    os.environ["FIELDWORK_ENGINE_PYTHON"] = engine
+    yield from screen.wait(lambda: stored()["name"] == "marble", 60, "the edit was not tried again")
+    yield from screen.wait(lambda: not under_way.failed(), 10, "the message stays")
+    bpy.context.scene.fieldwork.classes[0].name = "gold"  # there is one already
+    yield from screen.wait(under_way.failed, 30, "the engine takes two classes of one name")
+    screen.facts["refused"] = str(under_way.failed()[0].error)
+    screen.sidebar.tag_redraw()
+    yield 0.5
+    yield from screen.press_button("fieldwork.discard_edits", depth=600)
+    yield from screen.wait(lambda: not under_way.failed(), 10, "the button did nothing")
+
+    project.rename(moved)
+    screen.sidebar.tag_redraw()
+    yield 0.5
+    screen.shot("gone")
+    bpy.ops.fieldwork.locate_project(directory=str(moved))
+    yield 0.5
+    screen.shot("found")
+    screen.facts["found"] = [bpy.context.scene.fieldwork.project, bpy.context.scene.fieldwork.classes[0].name]
     yield from finish(screen)
 
 

@@ -145,6 +145,20 @@ def test_keyboard_search_picked_points_region_and_data_set_of_the_scene(captured
     assert {"search", "picking", "align", "region", "dataset", "photographed"} <= shots("tools")
 
 
+def test_edits_wait_for_the_engine_and_a_moved_project_is_found():
+    facts = WINDOW("edits").play("edits", timeout=300)
+    assert facts["undone"] == 1.0
+    reason, name = facts["unsaved"]
+    assert "no engine" in reason
+    assert name == "stone", "nothing but the engine writes the project"
+    assert "gold" in facts["refused"]
+    project, name = facts["found"]
+    assert project.endswith("/elsewhere")
+    assert name == "marble"
+    assert_never_held_up(facts)
+    assert {"unsaved", "gone", "found"} <= shots("edits")
+
+
 def test_engine_is_installed_from_the_preferences():
     """Without network, from a folder that lacks the packages: it must fail with advice, and nothing must hang."""
     facts = WINDOW("preferences").play("preferences", timeout=300)

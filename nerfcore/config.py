@@ -114,6 +114,15 @@ class SamplingConfig(Stage):
     decay: float = Field(default=0.95, gt=0, lt=1, description="of the occupancy grid at each update")
     threshold: float = Field(default=0.01, gt=0, description="opacity of a bin below which its cell is closed")
     warmup: int = Field(default=256, ge=0, description="steps in which all cells are updated at once")
+    close_near_cameras: bool = Field(
+        default=True, description="cells nearer to a camera than anything in its photo stay empty"
+    )
+    close_single_views: bool = Field(
+        default=True, description="cells that one camera sees alone, nearer than most of its photo, stay empty"
+    )
+    close_between_cameras: bool = Field(
+        default=True, description="cells on the way between cameras around something, and right before it, stay empty"
+    )
     coarse_cache: bool = Field(default=True, description="choose training rays by which image tiles met the field")
     cache_every: int = Field(default=1000, ge=1, description="steps between updates of the coarse cache")
     outline_rays: float = Field(

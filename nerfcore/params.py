@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 Preset = Literal["draft", "standard", "high"]
-Pass = Literal["rgb", "depth", "semantic", "confidence", "normal"]
+Pass = Literal["rgb", "depth", "semantic", "confidence", "normal", "unknown"]
 
 
 def _leaves_some(every: int) -> int:

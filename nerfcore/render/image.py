@@ -13,6 +13,7 @@ from ..data.camera_rays import CameraRays
 from ..geometry.cameras import Camera
 from ..images.picture import Picture, over
 from ..kernels.runtime import run_parallel
+from ..sampling.space import unknown_share
 from .fused import ray_renderer
 from .model import Model
 from .run import RunInfo
@@ -26,7 +27,9 @@ class Frame:
 
     picture: sRGB float32 with associated alpha, nothing behind it; background: the grey that `color` has behind it;
     opacity; depth: distance along the optical axis in normalised units,
-    NaN where nothing is; probabilities (K) or None; position (3) expected surface point in the normalised frame.
+    NaN where nothing is; probabilities (K) or None; position (3) expected surface point in the normalised frame;
+    unknown: share of the ray's way, up to what it meets, that no training photo shows, or None where not asked for.
+    Where nothing is for a share above 0 the field does not say that there is nothing.
     """
 
     picture: Picture
@@ -34,6 +37,7 @@ class Frame:
     depth: np.ndarray
     probabilities: np.ndarray | None
     position: np.ndarray
+    unknown: np.ndarray | None = None
 
     @property
     def opacity(self) -> np.ndarray:
@@ -82,9 +86,11 @@ def render_view(
     background: float,
     semantics: bool = True,
     check: Callable[[], None] | None = None,
+    unknown: bool = False,
 ) -> Frame:
     """Render what a camera (pose (4, 4) in the normalised frame, OpenCV axes) sees.
 
+    `unknown`: also which share of each ray's way lies where no training photo looked.
     `check` is called before every tile, on the CPU by several threads, and may raise to stop.
     """
     device = model.priorities.device
@@ -93,6 +99,8 @@ def render_view(
     axis = rays.rotation[0, :, 2]
     pixels = torch.arange(camera.width * camera.height, device=device)
     render = ray_renderer(model, len(pixels), semantics)
+
+    states = model.occupancy.states() if unknown else None
 
     @torch.no_grad()
     def tile(pixel: torch.Tensor) -> list[torch.Tensor]:
@@ -106,6 +114,9 @@ def render_view(
         distance = torch.where(opacity > 1e-3, out.depth / out.opacity.clamp(min=1e-3), torch.nan)
         color = torch.cat([out.color * valid[:, None], opacity[:, None]], 1)
         found = [color, distance * (directions @ axis), origins + directions * distance[:, None]]
+        if states is not None:
+            solid = torch.where(opacity > 0.5, distance, torch.nan)
+            found.append(unknown_share(states, model.contracted, origins, directions, solid))
         return found if out.probabilities is None else [*found, out.probabilities]
 
     # The CPU renders small tiles side by side, each of which fits a core's cache.
@@ -113,6 +124,7 @@ def render_view(
     parts = run_parallel([partial(tile, pixel) for pixel in tiles], device)
     shape = (camera.height, camera.width)
     images = [torch.cat(column).cpu() for column in zip(*parts)]
-    color, depth, position, *classes = (i.reshape(*shape, *i.shape[1:]).numpy() for i in images)
+    color, depth, position, *more = (i.reshape(*shape, *i.shape[1:]).numpy() for i in images)
     picture = Picture(color, "srgb", "associated")
-    return Frame(picture, background, depth, classes[0] if classes else None, position)
+    hidden = more.pop(0) if unknown else None
+    return Frame(picture, background, depth, more[0] if more else None, position, hidden)

@@ -15,6 +15,7 @@ TENSORS = {
     "model.occupancy.reach": "model.occupancy.skip_distance",
     "model.occupancy.empty": "model.occupancy.empty_distance",
 }
+SEEN, UNKNOWN = "model.occupancy.seen", "model.occupancy.unknown"
 
 
 def migrate_info(values: Any) -> Any:
@@ -31,5 +32,9 @@ def migrate_info(values: Any) -> Any:
 
 
 def migrate_tensors(tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """A checkpoint's tensors under their present names."""
-    return {TENSORS.get(name, name): value for name, value in tensors.items()}
+    """A checkpoint's tensors under their present names. Before version 3 nothing was noted to be unknown: all that was
+    not seen counted as empty, and stays so."""
+    named = {TENSORS.get(name, name): value for name, value in tensors.items()}
+    if SEEN in named and UNKNOWN not in named:
+        named[UNKNOWN] = torch.zeros_like(named[SEEN])
+    return named

@@ -55,7 +55,7 @@ class Model(nn.Module):
         classes: number of classes; 0 without semantics.
         images: number of training images.
         contracted: the grid covers all of space.
-        seen: (resolution³,) bool or None, see OccupancyGrid.
+        seen, unknown: (resolution³,) bool or None, see OccupancyGrid.
         priorities: (K,) class priorities for the sampling PDF.
     """
 
@@ -67,11 +67,12 @@ class Model(nn.Module):
         contracted: bool,
         seen: torch.Tensor | None = None,
         priorities: torch.Tensor | None = None,
+        unknown: torch.Tensor | None = None,
     ) -> None:
         super().__init__()
         self.config = config
         self.field = HybridField(config.field, classes, images)
-        self.occupancy = OccupancyGrid(config.sampling, contracted, seen)
+        self.occupancy = OccupancyGrid(config.sampling, contracted, seen, unknown)
         self.register_buffer("priorities", torch.ones(max(classes, 1)) if priorities is None else priorities)
         self.priorities: torch.Tensor
         self.warming_up = False

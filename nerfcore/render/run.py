@@ -125,12 +125,14 @@ def refined_poses(project: Path, run: str, info: RunInfo) -> dict[str, np.ndarra
     return {image.name: transform_pose(box_from_sfm, np.array(image.camera_to_world)) for image in poses.images}
 
 
-def new_model(info: RunInfo, device: torch.device, seen: torch.Tensor | None = None) -> Model:
-    """An untrained model of the run's shape."""
+def new_model(
+    info: RunInfo, device: torch.device, seen: torch.Tensor | None = None, unknown: torch.Tensor | None = None
+) -> Model:
+    """An untrained model of the run's shape; `seen` and `unknown` cells as `OccupancyGrid` takes them."""
     torch.manual_seed(info.config.train.seed)
     classes = len(info.class_ids) if info.config.loss.semantic_weight > 0 else 0
     priorities = torch.tensor(info.priorities) if classes else None
-    return Model(info.config, classes, len(info.images), info.contracted, seen, priorities).to(device)
+    return Model(info.config, classes, len(info.images), info.contracted, seen, priorities, unknown).to(device)
 
 
 @dataclass(frozen=True)

@@ -84,6 +84,7 @@ def render(params: RenderParams, report: Reporter) -> dict[str, Any]:
             box_poses([view], box.box_from_world)[0],
             background_of(trained.info),
             check=report.check,
+            unknown="unknown" in params.passes,
         )
         seconds += time.perf_counter() - begin
         frames += write_frame(out, name, frame, params.passes, trained.info.class_ids, scene.ignore_id, colors, box)
@@ -228,6 +229,7 @@ def write_frame(
     scale = similarity_scale(box.world_from_box)
     rotation = box.world_from_box[:3, :3] / scale
     label = frame.label(class_ids, void)
+    unknown = np.zeros(frame.depth.shape, np.float32) if frame.unknown is None else frame.unknown
     world_normal = frame.normal() @ rotation.T
     pictures = {
         "rgb": ("", frame.color),
@@ -235,6 +237,7 @@ def write_frame(
         "semantic": ("_labels", colorize_labels(label, colors)),
         "confidence": ("_confidence", frame.confidence()[..., None]),
         "normal": ("_normal", world_normal * 0.5 + 0.5),
+        "unknown": ("_unknown", unknown[..., None]),
     }
     layers: dict[str, np.ndarray] = {}
     values = {
@@ -243,6 +246,7 @@ def write_frame(
         "semantic": ("Label.", ["ID"], label[..., None]),
         "confidence": ("Confidence.", ["V"], frame.confidence()[..., None]),
         "normal": ("Normal.", ["X", "Y", "Z"], world_normal),
+        "unknown": ("Unknown.", ["V"], unknown[..., None]),
     }
     written = []
     for kind in passes:

@@ -11,6 +11,7 @@ from torch import nn
 from ..config import SamplingConfig
 from ..kernels.cells import MeanScratch, average, observe
 from ..kernels.traversal import PDF_DEFAULT, PDF_LITERAL, PDF_UNIFORM, MarchSettings, skip_distances
+from .space import cell_states
 
 MODES = {"default": PDF_DEFAULT, "uniform": PDF_UNIFORM, "literal": PDF_LITERAL}
 CHUNK = 1 << 16
@@ -31,10 +32,17 @@ class OccupancyGrid(nn.Module):
     Args:
         config: sampling settings.
         contracted: the grid covers all of space instead of the cube [−1, 1]³.
-        seen: (resolution³,) bool, cells in some camera's view; None: all.
+        seen: (resolution³,) bool, cells in some camera's view that no rule closes; None: all.
+        unknown: (resolution³,) bool, cells that no photo shows; None: none.
     """
 
-    def __init__(self, config: SamplingConfig, contracted: bool, seen: torch.Tensor | None = None) -> None:
+    def __init__(
+        self,
+        config: SamplingConfig,
+        contracted: bool,
+        seen: torch.Tensor | None = None,
+        unknown: torch.Tensor | None = None,
+    ) -> None:
         super().__init__()
         self.config, self.contracted = config, contracted
         n = config.resolution
@@ -44,6 +52,8 @@ class OccupancyGrid(nn.Module):
         self.register_buffer("density", torch.where(seen, 3.0, 0.0))
         self.register_buffer("importance", torch.zeros(n**3))
         self.register_buffer("seen", seen)
+        self.register_buffer("unknown", torch.zeros_like(seen) if unknown is None else unknown)
+        self.unknown: torch.Tensor
         # Rays read these; they follow the density at updates only, so they are part of a checkpoint.
         self.register_buffer("cells", torch.stack([self.density, self.importance], 1))
         # How far from every camera of the capture nothing was seen: other cameras outside of the cube need not look.
@@ -102,6 +112,10 @@ class OccupancyGrid(nn.Module):
         self.cells[:, 0] = torch.where(occupied, self.mean.clamp(1e-3, MOST_OPTICAL_DEPTH / self.step), 0.0)
         self.cells[:, 1] = self.importance
         self.skip_distance.copy_(skip_distances(occupied.view(n, n, n)))
+
+    def states(self) -> torch.Tensor:
+        """State (resolution³,) uint8 of every cell: `space.UNKNOWN`, `EMPTY` or `OCCUPIED`."""
+        return cell_states(self.unknown, self.cells[:, 0] > 0)
 
     def occupied_share(self) -> float:
         """Share of the cells that are occupied."""

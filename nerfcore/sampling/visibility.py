@@ -99,21 +99,20 @@ def view_counts(
     camera_to_box: torch.Tensor,
     resolution: int,
     contracted: bool,
-    ranges: torch.Tensor | None = None,
+    middle: torch.Tensor,
     margin: float = 0.1,
-) -> torch.Tensor:
-    """How many cameras see each cell centre (resolution³,) float32; 0 for cells that must be empty.
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """How many cameras see each cell centre, (resolution³,) float32, and which centres (resolution³,) bool some camera
+    sees at least as far away as most of its photo, `middle` (V,) of `depth_ranges`.
 
     A camera sees what its undistorted image, widened by `margin` of its size, holds in front of it. Equirectangular
-    and fisheye cameras see everything. With `ranges` (V, 2) of `depth_ranges`, cells nearer to a camera than anything
-    in its photo are empty, and so are cells that only one camera sees, unless as far away as most of its photo:
-    either would let a field explain each photo by a curtain in front of its camera.
+    and fisheye cameras see everything. Cells that only one camera sees, nearer than most of its photo, would let a
+    field explain that photo by a curtain.
     """
     device = camera_to_box.device
     points = grid_centers(resolution, contracted, device)
     counts, beyond = torch.zeros(len(points), device=device), torch.zeros(len(points), dtype=torch.bool, device=device)
-    ranges = torch.zeros(len(cameras), 2, device=device) if ranges is None else ranges
-    for camera, pose, middle in zip(cameras, camera_to_box, ranges[:, 1]):
+    for camera, pose, depth in zip(cameras, camera_to_box, middle):
         if _sees_everything(camera):
             counts += 1
             beyond |= True
@@ -121,6 +120,5 @@ def view_counts(
         u, v, z = _project(camera, pose, points)
         seen = (z > 1e-6) & (u > -margin) & (u < 1 + margin) & (v > -margin) & (v < 1 + margin)
         counts += seen
-        beyond |= seen & (z >= middle)
-    counts[in_front(cameras, camera_to_box, resolution, contracted, ranges) | ((counts < 2) & ~beyond)] = 0
-    return counts
+        beyond |= seen & (z >= depth)
+    return counts, beyond

@@ -22,8 +22,7 @@ from ..progress import Reporter
 from ..project.runs import HOLDOUT
 from ..project.store import load_project, load_visibility, world_from_sfm
 from ..render.run import CPU_IMAGE_SIZE, GPU_IMAGE_SIZE, RunInfo, new_model
-from ..sampling.path import cells_before_path
-from ..sampling.visibility import depth_ranges, view_counts
+from ..sampling.known_space import KnownSpace, known_space
 from .background import LEVEL, choose_background
 from .depth import depth_scale, find_depths
 from .trainer import Trainer
@@ -141,12 +140,14 @@ def make_trainer(project_folder: Path, info: RunInfo, scene: Scene, device: torc
             "(scene.photo_memory): they stay in the host's memory, which takes longer."
         )
     degrade(store, config)
-    counts, nearest = seen_cells(scene, trained, box, device)
-    model = new_model(info, device, _refined(counts > 0, config.sampling.resolution).cpu())
-    model.occupancy.empty_distance.fill_(nearest)
+    space = space_of(scene, trained, box, config, device)
+    seen, unknown = (_refined(cells, config.sampling.resolution).cpu() for cells in (space.views > 0, space.unknown))
+    model = new_model(info, device, seen, unknown)
+    model.occupancy.empty_distance.fill_(space.empty_distance)
     if model.field.blend is not None:
-        model.field.blend.views.copy_((counts / VIEWS_ENOUGH).clamp(max=1))
+        model.field.blend.views.copy_((space.views / VIEWS_ENOUGH).clamp(max=1))
     trainer = Trainer(model, store, config, LEVEL.get(config.scene.background), report.check)
+    trainer.space = space
     if config.loss.depth_weight > 0:
         scale = depth_scale(world_from_sfm(project), box.box_from_world)
         visibility = load_visibility(project_folder)
@@ -162,11 +163,9 @@ def photo_budget(config: RunConfig, device: torch.device) -> float:
     return free_memory(device) / 2 if given is None else given * 1e9
 
 
-def seen_cells(scene: Scene, trained: list[int], box: Box, device: torch.device) -> tuple[torch.Tensor, float]:
-    """How many of the views `trained` see each cell of the grid of evidence, 0 for cells that must be
-    empty; and how far from every one of them nothing was seen (normalised units)."""
+def space_of(scene: Scene, trained: list[int], box: Box, config: RunConfig, device: torch.device) -> KnownSpace:
+    """What the views `trained` tell of the cells of the grid of evidence."""
     views = [scene.views[i] for i in trained]
-    cameras = [view.camera for view in views]
     poses = torch.from_numpy(box_poses(views, box.box_from_world)).float().to(device)
     points = torch.from_numpy(transform_points(box.box_from_world, scene.points.xyz)).float().to(device)
     focus = None
@@ -174,11 +173,8 @@ def seen_cells(scene: Scene, trained: list[int], box: Box, device: torch.device)
         point = focus_point([view.camera_to_world for view in views])
         center = transform_points(box.box_from_world, point[None])[0]
         focus = torch.from_numpy(center).float().to(device)
-    ranges = depth_ranges(cameras, poses, points, focus)
-    counts = view_counts(cameras, poses, RESOLUTION, box.contracted, ranges)
-    if focus is not None:
-        counts[cells_before_path(cameras, poses, focus, points, RESOLUTION, box.contracted)] = 0
-    return counts, float(ranges[:, 0].min())
+    cameras = [view.camera for view in views]
+    return known_space(cameras, poses, points, focus, RESOLUTION, box.contracted, config.sampling)
 
 
 def _refined(cells: torch.Tensor, resolution: int) -> torch.Tensor:

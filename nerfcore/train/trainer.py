@@ -15,6 +15,7 @@ from ..field.grid import Part
 from ..kernels.runtime import run_parallel, worker_count
 from ..render.model import Model, Rendered
 from ..sampling.cache import CoarseCache
+from ..sampling.known_space import KnownSpace
 from ..sampling.outlines import Outlines
 from .depth import DepthRays, depth_loss
 from .losses import (
@@ -94,6 +95,7 @@ class Trainer:
         self.cache = CoarseCache(store)
         self.poses = PoseRefinement(store.rays, config.train) if config.train.refine_poses else None
         self.depths: DepthRays | None = None
+        self.space: KnownSpace | None = None  # what the photos show, if that was asked
         self.check = check
         semantic = config.loss.semantic_weight > 0 and config.sampling.outline_rays > 0
         self.outlines = Outlines(store, config.sampling.outline_rays) if semantic else None

@@ -10,14 +10,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from ..config import make_config
-from ..data.box import box_poses
+from ..data.box import Box, box_poses
 from ..data.load import load_scene
 from ..data.pixels import training_size
 from ..data.scene import Scene
 from ..errors import Cancelled, DiskError, ProjectError, TrainingError
 from ..files import atomic_path, disk_errors, write_json
+from ..geometry.similarity import transform_points
 from ..images.encode import write_picture
 from ..kernels.device import use_device
 from ..kernels.runtime import compile_seconds
@@ -51,12 +53,14 @@ from ..render.run import (
     settled_as,
 )
 from .checkpoint import restore, save_checkpoint
+from .closed_picture import write_closed_picture
 from .inputs import data_inputs, training_inputs, training_length
 from .pose_refinement import write_poses
 from .prepare import make_trainer, plan_run
 from .trainer import Trainer
 from .voxel_init import save_features
 
+CLOSED_PICTURE = "closed.png"
 PREVIEW_PAUSE = 20  # times what a preview costs, before the next one
 
 
@@ -104,6 +108,7 @@ def train(params: TrainParams, report: Reporter) -> dict[str, Any]:
     for half_written in place.folder.glob(".*.safetensors"):  # by a process that was killed
         half_written.unlink()
     trainer = make_trainer(project_folder, info, scene, device, report)
+    _picture_closed(place.folder / CLOSED_PICTURE, trainer, scene, info.box(load_project(project_folder)))
     state = {"seconds": 0.0, "progress": 0.0, "psnr": None}
     if saved is not None:
         restore(trainer, *saved)
@@ -128,6 +133,7 @@ def train(params: TrainParams, report: Reporter) -> dict[str, Any]:
         "checkpoint": str(place.folder / CHECKPOINT),
         "params_m": round(trainer.model.field.parameter_count() / 1e6, 2),
         "device": str(device),
+        "closed_picture": closed_picture(place.folder),
     }
     if trainer.poses is not None:
         result["pose_shift"] = trainer.poses.shift(info.box(load_project(project_folder)).world_from_box)
@@ -162,7 +168,8 @@ def finished(params: TrainParams) -> Earlier:
         return earlier
     if "checkpoint" not in earlier.result:
         return Earlier(reason="not finished")
-    return Earlier({**earlier.result, "checkpoint": str(place / CHECKPOINT)})
+    paths = {"checkpoint": str(place / CHECKPOINT), "closed_picture": closed_picture(place)}
+    return Earlier({**earlier.result, **paths})
 
 
 def unfinished(params: TrainParams) -> bool:
@@ -210,6 +217,20 @@ def _resumable(place: TrainingFolder, params: TrainParams, report: Reporter) -> 
     if asked is not None and settled_as(asked, info.config) != info.config:
         report.warn(f"The run “{place.run}” goes on with the settings it began with, not with those given now.")
     return info, load_scene(place.project, info.holdout)
+
+
+def closed_picture(run: Path) -> str | None:
+    """Where a run's folder shows what rules closed before training; None where they closed nothing."""
+    path = run / CLOSED_PICTURE
+    return str(path) if path.is_file() else None
+
+
+def _picture_closed(path: Path, trainer: Trainer, scene: Scene, box: Box) -> None:
+    """Show which cells rules closed before training."""
+    path.unlink(missing_ok=True)
+    if trainer.space is not None:
+        points = torch.from_numpy(transform_points(box.box_from_world, scene.points.xyz)).float()
+        write_closed_picture(path, trainer.space, trainer.store.rays.center, points)
 
 
 class _Loop:

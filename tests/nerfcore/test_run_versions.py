@@ -49,7 +49,7 @@ def as_version_2(folder: Path) -> None:
     with safe_open(folder / "field.safetensors", "pt") as file:
         metadata, tensors = file.metadata(), {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     assert set(TENSORS) <= set(tensors)
-    old = {TENSORS.get(name, name): value for name, value in tensors.items()}
+    old = {TENSORS.get(name, name): v for name, v in tensors.items() if name != "model.occupancy.unknown"}
     save_file(old, folder / "field.safetensors", metadata=metadata)
 
 

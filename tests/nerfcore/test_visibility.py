@@ -5,14 +5,16 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from fieldwork.nerfcore.config import SceneConfig
+from fieldwork.nerfcore.config import SamplingConfig, SceneConfig
 from fieldwork.nerfcore.data.box import choose_box
 from fieldwork.nerfcore.data.scene import Scene, View
 from fieldwork.nerfcore.geometry.cameras import Camera
 from fieldwork.nerfcore.geometry.points import Points
+from fieldwork.nerfcore.sampling.known_space import KnownSpace, known_space
 from fieldwork.nerfcore.sampling.path import cells_before_path
-from fieldwork.nerfcore.sampling.visibility import cells_at, depth_ranges, grid_centers, view_counts
+from fieldwork.nerfcore.sampling.visibility import cells_at, depth_ranges, grid_centers
 
+OFF = {"close_near_cameras": False, "close_single_views": False, "close_between_cameras": False}
 CAMERA = Camera(model="PINHOLE", width=100, height=80, fx=80.0, fy=80.0, cx=50.0, cy=40.0)
 
 
@@ -36,6 +38,18 @@ def ball(count: int, radius: float) -> np.ndarray:
     return points / np.linalg.norm(points, axis=1, keepdims=True) * radius
 
 
+def space_of(
+    poses: torch.Tensor,
+    points: torch.Tensor,
+    resolution: int,
+    contracted: bool,
+    focus: torch.Tensor | None = None,
+    **rules: bool,
+) -> KnownSpace:
+    config = SamplingConfig.model_validate(rules)
+    return known_space([CAMERA] * len(poses), poses, points, focus, resolution, contracted, config)
+
+
 def test_depth_ranges_are_a_margin_before_the_points_in_view_and_their_median():
     poses = torch.from_numpy(half_ring(3, 0.9)).float()
     points = torch.from_numpy(ball(2000, 0.2)).float()
@@ -55,7 +69,7 @@ def test_nothing_may_hang_right_in_front_of_a_camera():
     points = torch.from_numpy(ball(2000, 0.2)).float()
     ranges = depth_ranges([CAMERA] * 5, poses, points)
     centers = grid_centers(32, False, poses.device)
-    free, bounded = (view_counts([CAMERA] * 5, poses, 32, False, r) > 0 for r in (None, ranges))
+    free, bounded = (space_of(poses, points, 32, False, **rules).views > 0 for rules in (OFF, {}))
     close = torch.stack([(centers - pose[:3, 3]) @ pose[:3, 2] for pose in poses])
     sideways = torch.stack([((centers - pose[:3, 3]) @ pose[:3, :2]).abs().amax(1) for pose in poses])
     in_front = ((close > 0.05) & (close < ranges[:, :1] * 0.9) & (sideways < close * 0.4)).any(0)
@@ -86,7 +100,7 @@ def test_the_cube_shrinks_to_the_points_where_cameras_stand_far_off():
 def test_the_large_cells_around_far_cameras_are_empty():
     poses = torch.from_numpy(half_ring(9, 6.0)).float()
     points = torch.from_numpy(ball(2000, 0.7)).float()
-    counts = view_counts([CAMERA] * 9, poses, 64, True, depth_ranges([CAMERA] * 9, poses, points))
+    counts = space_of(poses, points, 64, True).views
     near = poses[:, :3, 3] + 0.02 * poses[:, :3, 2]
     assert not counts[cells_at(near, 64, True)].any()
     assert (counts[cells_at(points, 64, True)] > 0).all()

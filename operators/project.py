@@ -48,10 +48,19 @@ class FIELDWORK_OT_locate_project(Operator):
         old, uuid = snapshot.folder_of(settings), settings.project_uuid
         hand_over(Owner(old.name, uuid), snapshot.owner(folder))
         edits.move(old, folder)
+        move_images(old, folder)
         for scene in bpy.data.scenes:
             if scene.fieldwork.project_uuid == uuid and snapshot.folder_of(scene.fieldwork) == old:
                 scene.fieldwork.project = str(folder)
         return {"FINISHED"}
+
+
+def move_images(old: Path, new: Path) -> None:
+    """Let images of the file that lie in a folder be read from another."""
+    for image in bpy.data.images:
+        path = Path(bpy.path.abspath(image.filepath, library=image.library)) if image.filepath else None
+        if path is not None and image.library is None and path.is_relative_to(old):
+            image.filepath = str(new / path.relative_to(old))
 
 
 def refusal(settings: bpy.types.PropertyGroup, folder: Path) -> str | None:

@@ -135,6 +135,10 @@ for item in bpy.data.objects:
     if item.get("fieldwork_role") == "points":
         del item["fieldwork_uuid"]  # of before projects had one
 settings.classes[0].name = "marble"
+images = [bpy.data.images.new(name, 4, 4) for name in ("photo", "own")]
+for image, folder in zip(images, (project, str(Path(project).parent))):
+    image.filepath_raw, image.file_format = f"{folder}/{image.name}.png", "PNG"
+    image.save()
 shutil.move(project, moved)
 _file_loaded()
 seen["gone"] = snapshot.absence(settings)
@@ -150,6 +154,7 @@ seen["after"] = [settings.project, snapshot.absence(settings), [c.name for c in 
 bpy.ops.fieldwork.save_edits()
 seen["saved"] = stored(moved)["classes"][0]["name"]
 owner = snapshot.owner(Path(moved))
+seen["images"] = [image.filepath for image in images]
 seen["root"] = root_of(scene, owner).name
 seen["points"] = [owner.owns(o) for o in bpy.data.objects if o.get("fieldwork_role") == "points"]
 settings.project = other
@@ -173,6 +178,7 @@ answer(seen)
     assert facts["found"] == ["FINISHED"]
     assert facts["after"] == [str(tmp_path / "elsewhere/vase"), None, ["marble", "gold"]]
     assert facts["saved"] == "marble"
+    assert facts["images"] == [str(tmp_path / "elsewhere/vase/photo.png"), str(tmp_path / "own.png")]
     assert facts["root"] == "Fieldwork · capture"
     assert facts["points"] == [True]
     assert facts["chosen"] is None

@@ -10,7 +10,7 @@ from pathlib import Path
 from ..errors import InputError
 from ..files import require_readable
 from ..images.decode import PHOTO_SUFFIXES
-from ..images.names import beside, unique_names
+from ..images.names import beside_all, companion_stems, unique_names
 from ..images.soft_labels import find_confidence, find_probabilities
 from .video import VIDEO_SUFFIXES
 
@@ -94,17 +94,15 @@ def find_sources(
         if folder is not None and not folder.is_dir():
             raise InputError(f"The {what} folder {folder} does not exist.", f"Choose the folder that holds the {what}.")
     names = unique_names(paths, root)
+    stems = companion_stems(paths, root, names)
+    pictures, drawn = beside_all(labels, stems, exact=False), beside_all(masks, stems, exact=False)
     sources = []
-    for path, name in zip(paths, names):
+    for path, name, own, picture, mask in zip(paths, names, stems, pictures, drawn):
         unique = name
         while unique in taken:
             unique += "_b"
         taken.add(unique)
-        label = confidence = None
-        if labels:
-            soft = find_probabilities(labels, name) or find_probabilities(labels, path.stem)
-            label = soft or beside(labels, name, False) or beside(labels, path.stem, False)
-            confidence = find_confidence(labels, name, label) or find_confidence(labels, path.stem, label)
-        mask = (beside(masks, name, False) or beside(masks, path.stem, False)) if masks else None
+        label = (find_probabilities(labels, own) or picture) if labels else None
+        confidence = find_confidence(labels, own, label) if labels else None
         sources.append(Source(unique, path, label, mask, confidence))
     return sources

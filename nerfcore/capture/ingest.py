@@ -17,7 +17,7 @@ from PIL import Image
 from ..errors import InputError, ProjectError
 from ..files import atomic_path, file_hash, write_json
 from ..images.decode import float_exposure, is_linear, read_photo
-from ..images.labels import Colors, fit_to_photo, read_labels, read_mask
+from ..images.labels import Colors, drawn_as_stored, fit_to_photo, read_labels, read_mask, turned_by_itself
 from ..images.sharpness import sharpness, thumbnail
 from ..images.soft_labels import read_confidence
 from ..params import NewParams
@@ -45,6 +45,8 @@ class Settings:
     exposure: float
     colors: Colors | None
     ignore_id: int
+    labels_as_stored: bool = True  # drawn on the stored pixels, where their proportions do not tell
+    masks_as_stored: bool = True
 
 
 def new(params: NewParams, report: Reporter) -> dict[str, Any]:
@@ -81,7 +83,11 @@ def new(params: NewParams, report: Reporter) -> dict[str, Any]:
     kept = [record for record in previous.images if record.file] if previous and params.add else []
     sources = find_sources(paths, root, labels_folder, masks_folder, {record.name for record in kept})
     floats = [path for path in paths if is_linear(path)]
-    settings = Settings(folder, params.max_size, float_exposure(floats), colors or None, ignore_id)
+    stored = [
+        _drawn_as_stored([(s.path, s.label) for s in sources], "label maps", report),
+        _drawn_as_stored([(s.path, s.mask) for s in sources], "masks", report),
+    ]
+    settings = Settings(folder, params.max_size, float_exposure(floats), colors or None, ignore_id, *stored)
 
     report.stage("Reading photos")
     records, pictures = _ingest_all(sources, settings, report)
@@ -168,6 +174,15 @@ def ingested(params: NewParams) -> Earlier:
     return compare(made, ingest_inputs(params), files)
 
 
+def _drawn_as_stored(pairs: list[tuple[Path, Path | None]], what: str, report: Reporter) -> bool:
+    """Whether maps were drawn on the stored pixels of photos, see `labels.drawn_as_stored`; a guess is said."""
+    stored, doubtful = drawn_as_stored(pairs)
+    if doubtful:
+        text = f"{what} of photos that EXIF turns over or mirrors are taken to show the photos as they are stored"
+        report.warn(shortened(text, doubtful))
+    return stored
+
+
 def _previous_project(params: NewParams) -> Project | None:
     """The project that is there already, if these photos may go into it."""
     folder = Path(params.project)
@@ -234,7 +249,8 @@ def _cache_key(source: Source, settings: Settings) -> list[Any]:
         stat = path.stat() if path else None
         stamps.append([str(path), stat.st_size, stat.st_mtime] if stat else None)
     colors = {str(i): list(color) for i, color in sorted((settings.colors or {}).items())}
-    return [stamps, settings.max_size, settings.exposure, colors, settings.ignore_id]
+    stored = [settings.labels_as_stored, settings.masks_as_stored]
+    return [stamps, settings.max_size, settings.exposure, colors, settings.ignore_id, stored]
 
 
 def _cache_entry(source: Source, settings: Settings, record: ImageRecord, picture: np.ndarray | None) -> dict[str, Any]:
@@ -303,7 +319,10 @@ def _ingest_one(source: Source, settings: Settings) -> tuple[ImageRecord, np.nda
                 values = read_labels(given, settings.colors, settings.ignore_id)
             else:
                 values = read_mask(given) if kind == "mask" else read_confidence(given)
-            fitted = fit_to_photo(values, photo.orientation, photo.full_size, image.size, f"{kind} {given.name}")
+            values, by_itself = turned_by_itself(values, given)
+            turned, named = 1 if by_itself else photo.orientation, f"{kind} {given.name}"
+            stored = settings.masks_as_stored if kind == "mask" else settings.labels_as_stored
+            fitted = fit_to_photo(values, turned, photo.full_size, image.size, named, stored)
         except InputError as error:
             problems.append(str(error))
             continue

@@ -21,7 +21,8 @@ def copy_photo(source: Path, folder: Path, name: str) -> Path:
     """Put a photo into `folder` as `name`.
 
     PNG, JPEG and WebP of 8 bits are copied as they are. Others become 8-bit PNG; so do photos with an EXIF
-    orientation, because poses are given for the pixels as stored: the tag is dropped, the pixels stay.
+    orientation, because poses are given for the pixels as stored: the tag is dropped, the pixels stay. Only HEIF is
+    turned, since its orientation is a part of the format that every decoder applies.
 
     Raises:
         InputError: it cannot be decoded.
@@ -40,19 +41,13 @@ def copy_photo(source: Path, folder: Path, name: str) -> Path:
     if target.is_file() and target.stat().st_mtime >= source.stat().st_mtime:
         return target
     with atomic_path(target) as temporary:
-        if suffix in PLAIN_SUFFIXES:
-            with Image.open(source) as image:
-                pixels = image if image.mode in PLAIN_MODES else read_photo(source).image
-                stripped = Image.fromarray(np.asarray(pixels.convert("RGBA" if "A" in pixels.getbands() else "RGB")))
-            stripped.save(temporary, compress_level=2)
-        else:
-            _decode(source, suffix).save(temporary, compress_level=2)
+        _decode(source, suffix).save(temporary, compress_level=2)
     return target
 
 
 def _decode(source: Path, suffix: str) -> Image.Image:
     try:
-        return read_photo(source).image
+        return read_photo(source, turn=False).image
     except InputError as error:
         kind = "raw photo" if suffix in RAW_SUFFIXES else "float image" if suffix in FLOAT_SUFFIXES else "photo"
         raise InputError(f"The {kind} {source} cannot be used: {error}.", "Replace or remove it.") from error

@@ -78,7 +78,7 @@ def image_size(path: Path) -> tuple[int, int]:
         return source.spec().width, source.spec().height
     try:
         with Image.open(path) as image:
-            return image.size
+            return _stored_size(image, orientation_of(image))
     except (OSError, UnidentifiedImageError, ValueError) as error:
         raise InputError(f"{path} is not a readable image: {error}.", "Replace or remove it.") from error
 
@@ -132,8 +132,9 @@ def _fit(photo: Photo, max_size: int) -> Photo:
 def _read_pillow(path: Path, max_size: int, turn: bool) -> Photo:
     with Image.open(path) as image:
         exif = image.getexif()
-        orientation = int(exif.get(0x0112, 1) or 1) if turn else 1
-        stored_size = image.size
+        tag = orientation_of(image)
+        orientation = tag if turn else 1
+        stored_size = _stored_size(image, tag)
         facts = photo_facts(exif, stored_size)
         if "GPano:ProjectionType" in str(image.info.get("xmp", b"")[:20000]):
             facts["panorama"] = True
@@ -148,16 +149,31 @@ def _read_pillow(path: Path, max_size: int, turn: bool) -> Photo:
             decoded.info["icc_profile"] = image.info.get("icc_profile")
             decoded = _to_srgb(decoded)
         elif image.mode in ("I;16", "I;16B", "I;16L", "I", "F"):
-            decoded = Image.fromarray(_grey_to_8bit(np.asarray(image))).convert("RGB")
+            decoded = stored_pixels(Image.fromarray(_grey_to_8bit(np.asarray(image))).convert("RGB"), image.format, tag)
         else:
             image.load()
-            decoded = _to_srgb(image)
+            decoded = stored_pixels(_to_srgb(image), image.format, tag)
     full = (stored_size[1], stored_size[0]) if orientation >= 5 else stored_size
     return Photo(_upright_picture(decoded, orientation), full, orientation, lossy, facts)
 
 
 def _upright_picture(image: Image.Image, orientation: int) -> Picture:
     return without_unused_alpha(from_image(upright(image, orientation)))
+
+
+def orientation_of(image: Image.Image) -> int:
+    """The EXIF orientation (1–8) of an image that was opened and not yet loaded; 1 where there is none."""
+    value = image.getexif().get(0x0112, 1)
+    return value if isinstance(value, int) and value in ROTATE else 1
+
+
+def stored_pixels(image: Image.Image, format: str | None, orientation: int) -> Image.Image:
+    """A loaded image as it is stored: Pillow has turned TIFFs by their orientation."""
+    return upright(image, {6: 8, 8: 6}.get(orientation, orientation)) if format == "TIFF" else image
+
+
+def _stored_size(image: Image.Image, orientation: int) -> tuple[int, int]:
+    return (image.height, image.width) if image.format == "TIFF" and orientation >= 5 else image.size
 
 
 def upright(image: Image.Image, orientation: int) -> Image.Image:

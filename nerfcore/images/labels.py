@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
 from ..errors import InputError
-from .decode import upright
+from .decode import TIFF_SUFFIXES, image_size, orientation_of, upright
 from .soft_labels import PROBABILITY_SUFFIXES, read_probabilities
 
 Colors = dict[int, tuple[int, int, int]]
+# Formats whose EXIF orientation is ours to apply: HEIF and raw decoders turn pictures themselves.
+TAGGED_SUFFIXES = {".jpg", ".jpeg", ".jpe", ".png", ".webp", ".tif", ".tiff"}
 
 
 def read_labels(path: Path, colors: Colors | None = None, ignore_id: int = 0) -> np.ndarray:
@@ -98,31 +101,93 @@ def read_mask(path: Path) -> np.ndarray:
 
 
 def fit_to_photo(
-    values: np.ndarray, orientation: int, full_size: tuple[int, int], size: tuple[int, int], name: str
+    values: np.ndarray,
+    orientation: int,
+    full_size: tuple[int, int],
+    size: tuple[int, int],
+    name: str,
+    as_stored: bool = True,
 ) -> np.ndarray:
     """Bring a map (H, W) to the photo's working copy, nearest neighbour.
 
+    Maps of the stored picture's proportions are turned as the photo was. Where proportions do not tell (orientations 2
+    to 4, and square photos), `as_stored` does.
+
     Args:
-        orientation: EXIF orientation of the photo; applied when the map was drawn on the unrotated picture.
+        orientation: EXIF orientation of the photo; 1 for maps that are upright for certain.
         full_size: upright width, height of the original photo.
         size: width, height of the working copy.
     Raises:
         InputError: its proportions are not those of the photo.
     """
     image = Image.fromarray(values.astype(np.uint8) * 255 if values.dtype == bool else values)
-    wanted = full_size[0] / full_size[1]
-    if (
-        orientation >= 5
-        and not _close(image.width / image.height, wanted)
-        and _close(image.height / image.width, wanted)
-    ):
+    drawn = _drawn_as_stored(image.size, orientation, full_size)
+    if orientation > 1 and (as_stored if drawn is None else drawn):
         image = upright(image, orientation)
-    if not _close(image.width / image.height, wanted):
+    if not _close(image.width / image.height, full_size[0] / full_size[1]):
         raise InputError(
             f"{name} is {image.width}×{image.height}, which is not the shape of the photo ({full_size[0]}×{full_size[1]})"
         )
     resized = image.resize(size, Image.Resampling.NEAREST) if image.size != size else image
     return np.asarray(resized)
+
+
+def own_orientation(path: Path) -> int:
+    """The EXIF orientation that a map's own file gives; 1 where there is none."""
+    if path.suffix.lower() in PROBABILITY_SUFFIXES:
+        return 1
+    try:
+        with Image.open(path) as image:
+            return orientation_of(image)
+    except (OSError, UnidentifiedImageError, SyntaxError, ValueError):
+        return 1  # it gets its own reason when it is read
+
+
+def turned_by_itself(values: np.ndarray, path: Path) -> tuple[np.ndarray, bool]:
+    """A map (H, W), turned by the orientation of its own file if that has one, and whether it has."""
+    orientation = own_orientation(path)
+    if orientation == 1:
+        return values, False
+    if path.suffix.lower() in TIFF_SUFFIXES:
+        return values, True  # Pillow has done so
+    return np.asarray(upright(Image.fromarray(values), orientation)), True
+
+
+def drawn_as_stored(pairs: Iterable[tuple[Path, Path | None]]) -> tuple[bool, list[str]]:
+    """Whether the maps of a capture were drawn on photos as stored, and for which photos that is a guess.
+
+    Photos lying on their side tell by the proportions of their maps, for one tool treats all photos alike. Without
+    any the answer is yes: what computes maps mostly reads the pixels as they are.
+
+    Args:
+        pairs: photos, and the map of each.
+    """
+    votes, doubtful = 0, []
+    for photo, path in pairs:
+        if path is None or photo.suffix.lower() not in TAGGED_SUFFIXES:
+            continue
+        orientation = own_orientation(photo)
+        if orientation == 1 or own_orientation(path) != 1:
+            continue
+        try:
+            (width, height), size = image_size(photo), image_size(path)
+        except InputError:
+            continue  # it gets its own reason when it is read
+        drawn = _drawn_as_stored(size, orientation, (height, width) if orientation >= 5 else (width, height))
+        if drawn is None:
+            doubtful.append(photo.name)
+        else:
+            votes += 1 if drawn else -1
+    return votes >= 0, [] if votes else doubtful
+
+
+def _drawn_as_stored(size: tuple[int, int], orientation: int, full_size: tuple[int, int]) -> bool | None:
+    """What the proportions of a map tell about the picture it was drawn on; None when they say nothing."""
+    if orientation < 5:
+        return None
+    aspect, wanted = size[0] / size[1], full_size[0] / full_size[1]
+    as_is, on_its_side = _close(aspect, wanted), _close(1 / aspect, wanted)
+    return None if as_is and on_its_side else not as_is and on_its_side
 
 
 def _close(a: float, b: float) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -48,6 +49,58 @@ def list_images(folder: Path) -> list[Path]:
     if not folder.is_dir():
         return []
     return sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file())
+
+
+def companion_stems(images: Sequence[Path], root: Path, names: Sequence[str]) -> list[list[str]]:
+    """Under which stems the label map, mask… of each image is looked for, best first; "/" separates folders.
+
+    The place below `root` with and without the image's own suffix, the image's name in the project, and its plain stem;
+    none of them is that of two images.
+
+    Args:
+        images, names: the images, and what `unique_names` calls them.
+    """
+    below = []
+    for image in images:
+        parts = _below(image, root).parts
+        below.append(Path(*(parts[1:] if parts[0] == "images" and len(parts) > 1 else parts)))
+    wanted = [
+        list(dict.fromkeys([place.as_posix(), place.with_suffix("").as_posix(), name, place.stem]))
+        for place, name in zip(below, names)
+    ]
+    count = Counter(stem for stems in dict(zip(images, wanted)).values() for stem in stems)
+    return [[stem for stem in stems if count[stem] == 1] for stems in wanted]
+
+
+def beside_all(folder: Path | None, stems: Sequence[Sequence[str]], exact: bool = True) -> list[Path | None]:
+    """The image in `folder` for each of `companion_stems`: `<stem>.png`, or when not `exact` also `<stem>_*.png|jpg`.
+
+    No image is given away that bears another's stem.
+    """
+    if folder is None or not folder.is_dir():
+        return [None] * len(stems)
+    found = [next((p for stem in each if (p := beside(folder, stem))), None) for each in stems]
+    if exact:
+        return found
+    owner = {stem: index for index, each in enumerate(stems) for stem in each}
+    taken = set(found)
+    for place in sorted({Path(stem).parent for stem in owner}):
+        for file in list_images(folder / place):
+            name = (place / file.name).as_posix()
+            # "<stem>_mask.png", "<stem>.JPG.png"; not "<stem>0.png", which belongs to another photo.
+            ends = (end for end in range(len(name) - 1, 0, -1) if name[:end] in owner and not name[end].isalnum())
+            index = next((owner[name[:end]] for end in ends), None)
+            if file not in taken and index is not None and found[index] is None:
+                found[index] = file
+    return found
+
+
+def labels_and_masks(
+    folder: Path, images: Sequence[Path], names: Sequence[str]
+) -> list[tuple[Path | None, Path | None]]:
+    """Label map and mask of each image of a data set, from the folders `labels` and `masks` in it."""
+    stems = companion_stems(images, folder, names)
+    return list(zip(beside_all(folder / "labels", stems), beside_all(folder / "masks", stems, exact=False)))
 
 
 def beside(folder: Path, stem: str, exact: bool = True) -> Path | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -16,16 +17,17 @@ from .names import beside
 PROBABILITY_SUFFIXES = (".npy", ".npz", ".exr")
 
 
-def find_probabilities(folder: Path, stem: str) -> Path | None:
-    """The probability map of a photo in a labels folder."""
-    return next((folder / f"{stem}{s}" for s in PROBABILITY_SUFFIXES if (folder / f"{stem}{s}").is_file()), None)
+def find_probabilities(folder: Path, stems: Sequence[str]) -> Path | None:
+    """The probability map of a photo in a labels folder, under one of its stems (`names.companion_stems`)."""
+    places = (folder / f"{stem}{suffix}" for stem in stems for suffix in PROBABILITY_SUFFIXES)
+    return next((place for place in places if place.is_file()), None)
 
 
-def find_confidence(folder: Path, stem: str, label: Path | None) -> Path | None:
+def find_confidence(folder: Path, stems: Sequence[str], label: Path | None) -> Path | None:
     """What says how sure a photo's labels are: the probability map itself, else `confidence/<stem>.png`."""
-    if label is not None and label.suffix.lower() in PROBABILITY_SUFFIXES:
+    if label is None or label.suffix.lower() in PROBABILITY_SUFFIXES:
         return label
-    return beside(folder / "confidence", stem) if label is not None else None
+    return next((path for stem in stems if (path := beside(folder / "confidence", stem))), None)
 
 
 def read_probabilities(path: Path) -> np.ndarray:

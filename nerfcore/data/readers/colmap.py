@@ -20,7 +20,7 @@ from ...geometry.colmap_cameras import MODELS, camera_from_colmap
 from ...geometry.frames import upright
 from ...geometry.points import Points
 from ...images.decode import image_size
-from ...images.names import beside, find_image, unique_names
+from ...images.names import find_image, labels_and_masks, unique_names
 from ..dataset import Dataset, DatasetView, require
 
 PLACES = ("sparse/0", "sparse", "colmap/sparse/0", "dense/sparse", ".")
@@ -65,7 +65,8 @@ def read(folder: Path) -> Dataset:
             found.append((path, image))
     names = unique_names([path for path, _ in found], folder / "images")
     views = []
-    for name, (path, image) in zip(names, found):
+    companions = labels_and_masks(folder, [path for path, _ in found], names)
+    for name, (path, image), (label, mask) in zip(names, found, companions):
         camera = cameras[image.camera]
         size = image_size(path)
         views.append(
@@ -74,8 +75,8 @@ def read(folder: Path) -> Dataset:
                 image=path,
                 camera=camera if size == (camera.width, camera.height) else camera.resized(*size),
                 camera_to_world=image.camera_to_world,
-                label=beside(folder / "labels", path.stem),
-                mask=beside(folder / "masks", path.stem, exact=False),
+                label=label,
+                mask=mask,
             )
         )
     require(views, folder, missing)

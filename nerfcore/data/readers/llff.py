@@ -16,7 +16,7 @@ from ...errors import InputError
 from ...geometry.cameras import Camera
 from ...geometry.frames import upright
 from ...images.decode import image_size
-from ...images.names import beside, list_images, unique_names
+from ...images.names import labels_and_masks, list_images, unique_names
 from ..dataset import Dataset, DatasetView, require
 
 FILE = "poses_bounds.npy"
@@ -62,7 +62,11 @@ def read(folder: Path) -> Dataset:
             "Both must be the same photos in name order.",
         )
     names = unique_names(images, folder)
-    views = [_view(folder, name, image, row[:15].reshape(3, 5)) for name, image, row in zip(names, images, rows)]
+    companions = labels_and_masks(folder, images, names)
+    views = [
+        _view(name, image, row[:15].reshape(3, 5), both)
+        for name, image, row, both in zip(names, images, rows, companions)
+    ]
     require(views, folder)
     world_from_sfm, confidence = upright([view.camera_to_world for view in views])
     return Dataset(
@@ -75,7 +79,7 @@ def read(folder: Path) -> Dataset:
     )
 
 
-def _view(folder: Path, name: str, image: Path, matrix: np.ndarray) -> DatasetView:
+def _view(name: str, image: Path, matrix: np.ndarray, companions: tuple[Path | None, Path | None]) -> DatasetView:
     down, right, backwards, center = matrix[:, 0], matrix[:, 1], matrix[:, 2], matrix[:, 3]
     u, _, vt = np.linalg.svd(np.stack([right, down, -backwards], -1))
     pose = np.eye(4)
@@ -89,6 +93,6 @@ def _view(folder: Path, name: str, image: Path, matrix: np.ndarray) -> DatasetVi
         image=image,
         camera=camera if size == (camera.width, camera.height) else camera.resized(*size),
         camera_to_world=pose,
-        label=beside(folder / "labels", image.stem),
-        mask=beside(folder / "masks", image.stem, exact=False),
+        label=companions[0],
+        mask=companions[1],
     )

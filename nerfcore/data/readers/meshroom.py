@@ -17,7 +17,7 @@ from ...errors import InputError
 from ...geometry.cameras import Camera
 from ...geometry.frames import upright
 from ...images.decode import image_size
-from ...images.names import beside, find_image, unique_names
+from ...images.names import find_image, labels_and_masks, unique_names
 from ..dataset import Dataset, DatasetView, require
 
 RADIAL = {"radial1": 1, "radial3": 3, "radialk1": 1, "radialk3": 3}
@@ -65,7 +65,8 @@ def read(folder: Path) -> Dataset:
     found.sort(key=lambda entry: entry[0])
     names = unique_names([image for image, *_ in found], folder)
     views = []
-    for name, (image, intrinsic, transform) in zip(names, found):
+    companions = labels_and_masks(folder, [image for image, *_ in found], names)
+    for name, (image, intrinsic, transform), (label, mask) in zip(names, found, companions):
         pose = np.eye(4)
         try:
             pose[:3, :3] = np.array([float(v) for v in transform["rotation"]]).reshape(3, 3)
@@ -79,8 +80,8 @@ def read(folder: Path) -> Dataset:
                 image=image,
                 camera=camera,
                 camera_to_world=pose,
-                label=beside(folder / "labels", image.stem),
-                mask=beside(folder / "masks", image.stem, exact=False),
+                label=label,
+                mask=mask,
             )
         )
     require(views, path, missing)

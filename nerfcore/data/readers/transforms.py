@@ -17,7 +17,7 @@ from ...errors import InputError
 from ...geometry.cameras import Camera, flip_camera_axes
 from ...geometry.points import Points
 from ...images.decode import image_size
-from ...images.names import beside, find_image, unique_names
+from ...images.names import find_image, labels_and_masks, unique_names
 from ...project.classes import read_classes
 from ..dataset import Y_UP, Dataset, DatasetView, require
 
@@ -70,7 +70,11 @@ def read(folder: Path) -> Dataset:
             else:
                 frames.append((image, {**head, **frame}, frame, frame_split))
     names = unique_names([image for image, *_ in frames], folder)
-    views = [_view(folder, name, image, merged, split) for name, (image, merged, _, split) in zip(names, frames)]
+    companions = labels_and_masks(folder, [image for image, *_ in frames], names)
+    views = [
+        _view(folder, name, image, merged, split, both)
+        for name, (image, merged, _, split), both in zip(names, frames, companions)
+    ]
     require(views, folder, missing)
     warnings = [f"{len(missing)} images named in the data set are missing (first: {missing[0]})."] if missing else []
     class_names, ignore_id, colors = {}, 0, {}
@@ -109,7 +113,14 @@ def _named_splits(head: dict[str, Any]) -> dict[str, Split]:
     return {**splits, **{Path(name).as_posix(): "test" for name in test}}
 
 
-def _view(folder: Path, name: str, image: Path, frame: dict[str, Any], split: Split) -> DatasetView:
+def _view(
+    folder: Path,
+    name: str,
+    image: Path,
+    frame: dict[str, Any],
+    split: Split,
+    companions: tuple[Path | None, Path | None],
+) -> DatasetView:
     width, height = image_size(image)
     try:
         matrix = np.array(frame.get("transform_matrix"), np.float64)
@@ -121,8 +132,8 @@ def _view(folder: Path, name: str, image: Path, frame: dict[str, Any], split: Sp
         raise InputError(f"The pose of {image.name} in {folder} is not a 4×4 matrix.", "Export the data set again.")
     label_path = frame.get("semantic_path") or frame.get("label_path")
     depth = _optional(folder, frame.get("depth_file_path") or frame.get("depth_path"))
-    label = _optional(folder, label_path) or beside(folder / "labels", image.stem)
-    mask = _optional(folder, frame.get("mask_path")) or beside(folder / "masks", image.stem, exact=False)
+    label = _optional(folder, label_path) or companions[0]
+    mask = _optional(folder, frame.get("mask_path")) or companions[1]
     return DatasetView(
         name=name,
         image=image,

@@ -13,6 +13,7 @@ from __future__ import annotations
 import json
 import shutil
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,9 @@ from ..data.scene import Scene, View
 from ..errors import InputError, ProjectError
 from ..files import atomic_path, disk_errors, write_json
 from ..geometry.cameras import Camera, flip_camera_axes, pixel_centers, project, rays
+from ..images.encode import write_picture
+from ..images.picture import Picture, as_float, associated, to_srgb8
+from ..images.working import read_picture, shows_transparency
 from ..params import PackageParams
 from ..progress import Reporter
 from ..project.fingerprints import read_made
@@ -170,11 +174,12 @@ def undistortion_grid(camera: Camera) -> torch.Tensor:
     return torch.from_numpy(grid.astype(np.float32)).reshape(1, camera.height, camera.width, 2)
 
 
-def undistort(pixels: np.ndarray, grid: torch.Tensor) -> np.ndarray:
-    """Resample a photo (H, W, C) uint8 along `undistortion_grid`; black where the lens saw nothing."""
-    photo = torch.from_numpy(pixels).permute(2, 0, 1)[None].float()
+def undistort(picture: Picture, grid: torch.Tensor) -> Picture:
+    """A picture resampled along `undistortion_grid` as 8-bit sRGB; black, or empty, where the lens saw nothing."""
+    weighed = as_float(associated(picture))  # as filters must see them
+    photo = torch.from_numpy(np.array(weighed.pixels)).permute(2, 0, 1)[None]
     out = torch.nn.functional.grid_sample(photo, grid, mode="bicubic", padding_mode="zeros", align_corners=False)
-    return out[0].clamp(0, 255).round().byte().permute(1, 2, 0).numpy()
+    return to_srgb8(replace(weighed, pixels=out[0].permute(1, 2, 0).numpy()))
 
 
 def _write_photo(view: View, folder: Path, grids: dict[str, torch.Tensor], lenses: dict[str, str]) -> Path:
@@ -182,9 +187,12 @@ def _write_photo(view: View, folder: Path, grids: dict[str, torch.Tensor], lense
     plain = camera.model in {"PINHOLE", "EQUIRECTANGULAR"} or (not any(camera.distortion) and camera.model == "OPENCV")
     suffix = view.image.suffix.lower()
     keep = plain and suffix in {".jpg", ".jpeg", ".png"}
-    target = folder / "images" / (view.name.replace("/", "_") + (suffix if keep else ".jpg"))
+    name = view.name.replace("/", "_")
     if not view.image.is_file():
         raise InputError(f"The photo {view.image} is missing.", "Restore it, or make the project again.")
+    # JPEG has no alpha.
+    made = ".png" if not keep and suffix not in {".jpg", ".jpeg"} and shows_transparency(view.image) else ".jpg"
+    target = folder / "images" / (name + (suffix if keep else made))
     key = json.dumps(camera.model_dump(mode="json"))
     if target.is_file() and target.stat().st_mtime >= view.image.stat().st_mtime and lenses.get(view.name) == key:
         return target
@@ -204,21 +212,17 @@ def _write_render(view: View, folder: Path, renders: Path, grids: dict[str, torc
     source = renders / f"{Path(view.name).stem}.png"
     if not source.is_file():
         return None
-    try:
-        with Image.open(source) as picture:
-            pixels = np.array(picture.convert("RGB"))
-    except OSError as error:
-        raise InputError(f"The render {source} cannot be read: {error}.", "Render it again.") from error
-    camera = view.camera.resized(pixels.shape[1], pixels.shape[0])
+    picture = read_picture(source)
+    camera = view.camera.resized(*picture.size)
     if any(camera.distortion) or camera.model not in {"PINHOLE", "EQUIRECTANGULAR", "OPENCV"}:
         key = json.dumps(camera.model_dump(mode="json"))
         if key not in grids:
             grids[key] = undistortion_grid(camera)
-        pixels = undistort(pixels, grids[key])
+        picture = undistort(picture, grids[key])
     target = folder / "renders" / (view.name.replace("/", "_") + ".png")
     target.parent.mkdir(exist_ok=True)
     with atomic_path(target) as temporary:
-        Image.fromarray(pixels).save(temporary, "PNG")
+        write_picture(temporary, picture)
     return target
 
 
@@ -232,14 +236,14 @@ def _lenses(folder: Path) -> dict[str, str]:
 
 
 def _develop(view: View, target: Path, grid: torch.Tensor | None) -> None:
-    try:
-        with Image.open(view.image) as picture:
-            pixels = np.array(picture.convert("RGB"))
-    except OSError as error:
-        raise InputError(f"The photo {view.image} cannot be read: {error}.", "Restore it.") from error
+    picture = read_picture(view.image)
     if grid is not None:
-        pixels = undistort(pixels, grid)
-    Image.fromarray(pixels).save(target, "JPEG", quality=92, subsampling=0)
+        picture = undistort(picture, grid)
+    if target.suffix == ".png":
+        write_picture(target, picture)
+    else:
+        color = np.ascontiguousarray(picture.pixels[..., :3])
+        Image.fromarray(color).save(target, "JPEG", quality=92, subsampling=0)
 
 
 def _copy_mesh(source: Path, target: Path) -> bool:

@@ -163,6 +163,8 @@ def _upright_picture(image: Image.Image, orientation: int) -> Picture:
 
 def orientation_of(image: Image.Image) -> int:
     """The EXIF orientation (1–8) of an image that was opened and not yet loaded; 1 where there is none."""
+    if image.format == "PNG" and "exif" not in image.info and "xmp" not in image.info:
+        return 1  # Pillow would decode the whole file in search of one
     value = image.getexif().get(0x0112, 1)
     return value if isinstance(value, int) and value in ROTATE else 1
 

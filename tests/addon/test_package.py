@@ -16,6 +16,7 @@ from fieldwork.nerfcore.blender.package import undistort, undistortion_grid, wri
 from fieldwork.nerfcore.data.scene import ClassInfo, Scene, View
 from fieldwork.nerfcore.geometry.cameras import Camera, flip_camera_axes, pixel_centers, project, rays
 from fieldwork.nerfcore.geometry.points import Points
+from fieldwork.nerfcore.images.picture import Picture
 from fieldwork.nerfcore.progress import Reporter
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -72,7 +73,7 @@ def test_undistorted_photos_show_every_direction_where_a_pinhole_would(camera):
         picture = np.stack([128 + 100 * np.sin(6 * x), 128 + 100 * np.sin(5 * y), 128 + 90 * np.cos(4 * (x + y))], -1)
         return np.where(valid[:, None], picture, 0).reshape(lens.height, lens.width, 3)
 
-    got = undistort(np.rint(view(camera)).astype(np.uint8), undistortion_grid(camera))
+    got = undistort(Picture(np.rint(view(camera)).astype(np.uint8)), undistortion_grid(camera)).pixels
     want = view(camera.undistorted())
     inside = np.abs(undistortion_grid(camera)[0].numpy()).max(-1) < 0.95
     assert inside.mean() > 0.5
@@ -203,7 +204,7 @@ def test_renders_of_photos_are_straightened_and_shown_by_their_camera(tmp_path, 
     assert got.shape == pixels.shape
     assert (got == pixels).all() == (not distortion)
     if distortion:
-        assert (got == undistort(pixels, undistortion_grid(lens.resized(30, 20)))).all()
+        assert (got == undistort(Picture(pixels), undistortion_grid(lens.resized(30, 20))).pixels).all()
     slots = bpy_script(
         """
 from fieldwork.addon.scene.package import read_package

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import OpenImageIO as oiio
 import pytest
 import torch
+from fieldwork.nerfcore.blender.package import write_package
 from fieldwork.nerfcore.data.box import Box
 from fieldwork.nerfcore.data.load import load_scene
 from fieldwork.nerfcore.data.pixels import PixelStore
@@ -277,3 +279,18 @@ def test_shrinking_opaque_pictures_keeps_levels() -> None:
     shown = resized(with_alpha(flat), 31, 40)
     assert (shown.pixels == (137, 137, 137, 255)).all()
     assert not is_transparent(shown)
+
+
+def test_transparent_photos_are_straightened_with_their_alpha(tmp_path: Path) -> None:
+    """Blender gets photos without lens distortion: a transparent one stays so, with the colour of its edges."""
+    scene = load_scene(ball_with(tmp_path / "p", cut_out()))
+    bent = scene.views[0].camera.model_copy(update={"model": "OPENCV", "distortion": (0.1, 0.02, 0.0, 0.0)})
+    scene.views[:] = [replace(scene.views[0], camera=bent)]
+    folder = write_package(tmp_path / "p", "main", scene, "p", Reporter())
+    (file,) = (folder / "images").iterdir()
+    with Image.open(file) as image:
+        assert image.mode == "RGBA"
+        rgba = np.asarray(image).reshape(-1, 4)
+    assert 0 < rgba[:, 3].astype(float).mean() < 255
+    assert ((rgba[:, 3] > 0) & (rgba[:, 3] < 255)).sum() > 10
+    assert (rgba[rgba[:, 3] > 8, :3] == 248).all()

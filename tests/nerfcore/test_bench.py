@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 import torch
 from click.testing import CliRunner
-from fieldwork.nerfcore.bench import gpu, tables
+from fieldwork.nerfcore.bench import gpu, machine, tables
 from fieldwork.nerfcore.bench.jobs import Job, interrupted
 from fieldwork.nerfcore.bench.machine import run_yardstick
 from fieldwork.nerfcore.bench.page import figures_folder
@@ -109,7 +109,12 @@ def test_fields_are_removed_unless_they_are_kept(ablation: tuple[Path, dict, Rec
     assert len(list((out / "projects").glob("*/runs/*/field.safetensors"))) == 1
 
 
-def test_a_page_gets_the_figures_of_a_suite(tiny_project: Path, tmp_path: Path) -> None:  # noqa: F811
+def test_a_page_gets_the_figures_of_a_suite(
+    tiny_project: Path,  # noqa: F811
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(machine, "checked_out", lambda: ("abc12345", False))
     page, report = tmp_path / "docs" / "benchmarks.md", Recorder()
     run = partial(bench, tmp_path, tiny_project, "figures", steps=6, page=page)
     result = run(report, seeds=[0, 3])
@@ -117,7 +122,7 @@ def test_a_page_gets_the_figures_of_a_suite(tiny_project: Path, tmp_path: Path) 
     assert any("2 seeds: PSNR" in note for note in result["notes"])
     assert report.notes[-1] == "2 of 2 runs to do, roughly 2 minutes."
     (measured,) = read_sets(figures_folder(page))
-    assert measured.source == "bench"
+    assert (measured.source, measured.taken.commit) == ("bench", "abc12345")
     assert measured.command.endswith(
         "--steps 6 --seeds 0,3 --preset draft" + "".join(f" --set {k}={v}" for k, v in TINY.items())
     )

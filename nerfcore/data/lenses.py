@@ -64,9 +64,8 @@ def _fisheye(uv: torch.Tensor, k: torch.Tensor) -> torch.Tensor:
     theta = radius.clamp(0, torch.pi)
 
     def value_and_slope(t: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        powers = torch.stack([t ** (2 * n) for n in range(1, 5)], 1) * k[:, :4]
-        odd = torch.tensor([3.0, 5.0, 7.0, 9.0], dtype=t.dtype, device=t.device)
-        return t * (1 + powers.sum(1)), 1 + (powers * odd).sum(1)
+        terms = [k[:, n - 1] * t ** (2 * n) for n in range(1, 5)]
+        return t * (1 + sum(terms)), 1 + sum((2 * n + 1) * term for n, term in enumerate(terms, 1))
 
     for _ in range(STEPS):
         value, slope = value_and_slope(theta)

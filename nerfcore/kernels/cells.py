@@ -13,6 +13,7 @@ from .device import backend_of
 from .runtime import array, init, launch
 from .traversal import cell_index
 
+MOST_CELLS_A_SIDE = 1290  # of a grid whose cells are numbered in 32 bits: 1290³ < 2³¹ < 1291³
 FIXED_POINT = wp.constant(cells_torch.FIXED_POINT)
 LARGEST = wp.constant(cells_torch.LARGEST)
 

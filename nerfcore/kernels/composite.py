@@ -168,6 +168,15 @@ def render_weights(density: torch.Tensor, deltas: torch.Tensor, packed_info: Pac
     return _Weights.apply(density, deltas, packed_info)  # type: ignore[no-any-return]
 
 
+def sums_in_front(values: torch.Tensor, packed_info: PackedInfo) -> torch.Tensor:
+    """Sum (N,) of the values (N,) in front of each sample on its ray; differentiable."""
+    if not backend_of(values.device).warp:
+        return composite_torch.sums_in_front(values, packed_info)
+    first = packed_info.starts.clamp(min=0).long()[packed_info.ray_indices.long()]
+    running = torch.cumsum(values.double(), 0) - values
+    return (running - running[first]).float()
+
+
 def weighted_sum(values: torch.Tensor, weights: torch.Tensor, packed_info: PackedInfo) -> torch.Tensor:
     """Σ_j w_j v_j per ray: values (N, C), weights (N,) → (R, C) float32, zero for rays without samples."""
     if not backend_of(weights.device).warp:

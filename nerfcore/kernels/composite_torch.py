@@ -38,3 +38,9 @@ def weighted_sum(values: torch.Tensor, weights: torch.Tensor, packed_info: Packe
     contribution = torch.where(used[:, None], values.float() * weights[:, None], 0.0)
     out = torch.zeros(len(packed_info.starts), values.shape[1], device=values.device)
     return out.index_add(0, packed_info.ray_indices.long().clamp(min=0), contribution)
+
+
+def sums_in_front(values: torch.Tensor, packed_info: PackedInfo) -> torch.Tensor:
+    """As `composite.sums_in_front`."""
+    table, used, indices = rows_of_rays(values, packed_info)
+    return torch.zeros_like(values).index_put((indices,), (torch.cumsum(table, 1) - table)[used])

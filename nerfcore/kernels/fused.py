@@ -9,6 +9,7 @@ import warp as wp
 
 from . import march
 from .blocks import launch_blocks
+from .device import backend_of
 from .fused_kernel import FusedShape, March, fused_kernel
 from .fused_network import half_feature
 from .runtime import array, init
@@ -104,7 +105,7 @@ def render_coarse(
     """
     init()
     device, number = rays.origins.device, len(rays.origins)
-    cuda = device.type == "cuda"
+    cuda = backend_of(device).fused
     lanes = lanes or (LANES if cuda else 1)
     kernel = fused_kernel(field.shape, lanes)
     m = March()

@@ -272,8 +272,8 @@ def sample(
         skip_distance: ((resolution / 4)³,) uint8, see `skip_distances`.
         jitter: (R,) in [0, 1) shift of the bins along the ray, in bins; 0.5 when None.
         shift: (R · count,) in [0, 1) position of each sample within its share of the PDF; 0.5 when None.
-        capacity: on CUDA, the fixed number of rays that may get samples, so that no count is read back; rays
-            beyond it get none, unused entries have ray index −1 and delta 0.
+        capacity: the fixed number of rays that may get samples, so that no count is read back from the device; rays
+            beyond it are dropped and counted, unused entries have ray index −1 and delta 0.
     """
     device, rays = origins.device, len(origins)
     jitter = torch.full((rays,), 0.5, device=device) if jitter is None else jitter
@@ -282,21 +282,24 @@ def sample(
     )
     counts = sample_counts(bin_counts, count, settings.per_bin)
     end = torch.cumsum(counts, 0, dtype=torch.int32)
-    starts = end - counts
+    starts, dropped = end - counts, None
     if capacity is None:
         n = int(end[-1]) if rays else 0
         ray_indices = torch.empty(n, dtype=torch.int32, device=device)
     else:
-        n = capacity * count
+        n, wanted = capacity * count, counts
         counts = torch.where(end <= n, counts, 0).to(torch.int32)
+        starts = torch.where(counts > 0, starts, 0)
+        dropped = ((wanted > 0) & (counts == 0)).sum()
         ray_indices = torch.full((n,), -1, dtype=torch.int32, device=device)
     shift = torch.full((n,), 0.5, device=device) if shift is None else shift[:n]
     fill = torch.empty if capacity is None else torch.zeros
     points, t, deltas = fill(n, 3, device=device), fill(n, device=device), fill(n, device=device)
+    packed_info = PackedInfo(starts, counts, ray_indices, dropped)
     if not backend_of(device).warp:
         out = points, t, deltas, ray_indices
         march_torch.draw(origins, directions, cells, settings, jitter, shift, starts, counts, out)
-        return Samples(points, t, deltas, PackedInfo(starts, counts, ray_indices), t_first, t_last)
+        return Samples(points, t, deltas, packed_info, t_first, t_last)
     launch(
         march_sample,
         rays,
@@ -312,4 +315,4 @@ def sample(
         + [array(points, wp.vec3), array(t), array(deltas), array(ray_indices)],
         device,
     )
-    return Samples(points, t, deltas, PackedInfo(starts, counts, ray_indices), t_first, t_last)
+    return Samples(points, t, deltas, packed_info, t_first, t_last)

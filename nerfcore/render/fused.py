@@ -9,6 +9,7 @@ import torch
 
 from ..field.hybrid import HybridField
 from ..field.mlp import MLP
+from ..kernels.device import backend_of
 from ..kernels.fused import MOST_CLASSES, CoarseRays, FusedField, FusedRays, coarse_march, render_coarse
 from ..kernels.fused_kernel import FusedShape
 from ..kernels.fused_network import padded
@@ -22,6 +23,8 @@ LEAST_RAYS = 1 << 17  # of a picture that "auto" renders fused: previews are not
 def unsupported(model: Model) -> str | None:
     """Why the fused kernel cannot render this model; None when it can."""
     field = model.field
+    if not backend_of(model.priorities.device).warp:
+        return "the torch backend has no such kernel"
     if not isinstance(field, HybridField):
         return f"the field is a {type(field).__name__}"
     c = field.config
@@ -51,8 +54,8 @@ def unsupported(model: Model) -> str | None:
 def wants_fused(model: Model, rays: int) -> bool:
     """Whether to render `rays` rays with the fused kernel: `render.fused` is on, or auto on CUDA for a picture large
     enough to be worth its compilation; and the model is one it supports."""
-    wanted = model.config.render.fused
-    if wanted == "off" or (wanted == "auto" and (model.priorities.device.type != "cuda" or rays < LEAST_RAYS)):
+    wanted, backend = model.config.render.fused, backend_of(model.priorities.device)
+    if wanted == "off" or (wanted == "auto" and (not backend.fused or rays < LEAST_RAYS)):
         return False
     reason = unsupported(model)
     if reason is not None:

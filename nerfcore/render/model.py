@@ -14,6 +14,7 @@ from ..field.encoding import spherical_harmonics
 from ..field.hybrid import Geometry, HybridField
 from ..geometry.contraction import grid_position
 from ..kernels.composite import render_weights, weighted_sum
+from ..kernels.device import backend_of
 from ..kernels.march import Samples, sample
 from ..kernels.packed_info import PackedInfo
 from ..sampling.occupancy import OccupancyGrid, class_importance
@@ -21,6 +22,7 @@ from ..sampling.render_grid import RenderGrid, present_grid, refined_grid
 
 ONE_PASS_SHARE = 0.67
 CAPACITY_FACTOR = 1.6  # entries for visible samples, as a multiple of how many there were lately
+LEAST_CAPACITY = 1 / 16  # of all samples, or nothing would be visible ever again after a while in which nothing was
 
 
 @dataclass(frozen=True)
@@ -28,7 +30,8 @@ class Rendered:
     """Of R rays: color (R, 3) without background, opacity (R,), depth (R,) expected distance (normalised units, not
     divided by opacity), probabilities (R, K) or None; of the visible samples: weights (N,), density (N,), packed as
     in `samples`; of all M samples the field was evaluated at: `evaluated_points` (M, 3) in grid coordinates and
-    `evaluated_density`, −1 where an entry is unused.
+    `evaluated_density`, −1 where an entry is unused; visible (): number of samples worth shading, also of the rays that
+    were left out for want of capacity.
     """
 
     color: torch.Tensor
@@ -40,10 +43,11 @@ class Rendered:
     samples: Samples
     evaluated_points: torch.Tensor
     evaluated_density: torch.Tensor
+    visible: torch.Tensor
 
     @property
     def evaluated(self) -> int:
-        """Number of samples at which the field was evaluated."""
+        """Number of entries at which the field was evaluated; with a fixed capacity some of them are unused."""
         return len(self.evaluated_density)
 
 
@@ -81,13 +85,13 @@ class Model(nn.Module):
         self.visible_share: torch.Tensor
         self._refined: RenderGrid | None = None
         # What is differentiated has a fixed capacity, so that the host need not wait for the number of samples; None:
-        # on devices that run behind the host.
+        # where the backend wants it.
         self.fixed_capacity: bool | None = None
         self.host_visible_share = 1.0  # `visible_share` as the host last read it
 
     def has_fixed_capacity(self) -> bool:
         """Whether `render` reads nothing back from the device where it keeps gradients."""
-        return self.priorities.device.type == "cuda" if self.fixed_capacity is None else self.fixed_capacity
+        return backend_of(self.priorities.device).fixed_capacity if self.fixed_capacity is None else self.fixed_capacity
 
     def refresh(self) -> None:
         """Read back how many of the samples are visible."""
@@ -140,11 +144,13 @@ class Model(nn.Module):
         codes: torch.Tensor | None = None,
         semantics: bool = True,
         grid: RenderGrid | None = None,
+        capacity: int | None = None,
     ) -> Rendered:
         """Render rays (R, 3) of the normalised frame; differentiable in the field.
 
         `grid`: what the rays traverse, by default the occupancy grid, as in training; `jitter`, `shift`: see
-        kernels.march.sample; `codes` (R, A): appearance code of each ray.
+        kernels.march.sample; `codes` (R, A): appearance code of each ray; `capacity`: the most rays that get samples
+        where the capacity is fixed, all when None.
         """
         grid = grid or present_grid(self.occupancy, 0.0)
         learning = torch.is_grad_enabled()
@@ -154,12 +160,15 @@ class Model(nn.Module):
         # Where many samples turn out invisible, a first pass without gradients finds the others, and only those are
         # differentiated; where nearly all are visible, one pass is cheaper (3k + 1 against 3 forward costs at share k).
         two_passes = learning and self.host_visible_share < ONE_PASS_SHARE
-        samples, points = self._sample(origins, directions, grid, samples_per_ray, jitter, shift, fixed)
+        capacity = min(len(origins), capacity or len(origins))
+        samples, points = self._sample(
+            origins, directions, grid, samples_per_ray, jitter, shift, capacity if fixed else None
+        )
         with torch.set_grad_enabled(learning and not two_passes):
             geometry = self.field.geometry(points)
             weights = render_weights(geometry.density, samples.deltas, samples.packed_info)
         evaluated_density = geometry.density.detach()
-        indices, visible = self._select_visible(samples, weights, fixed)
+        indices, visible, visible_count = self._select_visible(samples, weights, fixed)
         if two_passes:
             explicit = geometry.explicit[indices] if geometry.explicit is not None else None
             geometry = self.field.geometry(points[indices], explicit)
@@ -178,7 +187,16 @@ class Model(nn.Module):
             probabilities = self._probabilities(self.field.logits(geometry), weights, visible.packed_info)
         color, opacity, depth = summed[:, :3], summed[:, 3], summed[:, 4]
         return Rendered(
-            color, opacity, depth, probabilities, weights, density, visible, samples.points, evaluated_density
+            color,
+            opacity,
+            depth,
+            probabilities,
+            weights,
+            density,
+            visible,
+            samples.points,
+            evaluated_density,
+            visible_count,
         )
 
     def _sample(
@@ -189,7 +207,7 @@ class Model(nn.Module):
         samples_per_ray: int,
         jitter: torch.Tensor | None,
         shift: torch.Tensor | None,
-        fixed: bool,
+        capacity: int | None,
     ) -> tuple[Samples, torch.Tensor]:
         """Samples of the rays, and their points (N, 3) in grid coordinates as functions of the rays."""
         samples = sample(
@@ -201,7 +219,7 @@ class Model(nn.Module):
             samples_per_ray,
             jitter,
             shift,
-            len(origins) if fixed else None,
+            capacity,
         )
         if not origins.requires_grad:
             return samples, samples.points
@@ -210,14 +228,19 @@ class Model(nn.Module):
         return samples, grid_position(positions, self.contracted).clamp(0, 1)
 
     @torch.no_grad()
-    def _select_visible(self, samples: Samples, weights: torch.Tensor, fixed: bool) -> tuple[torch.Tensor, Samples]:
-        """Indices (M,) of the samples whose rendering weight (N,) is worth shading, and those samples."""
-        capacity = None
+    def _select_visible(
+        self, samples: Samples, weights: torch.Tensor, fixed: bool
+    ) -> tuple[torch.Tensor, Samples, torch.Tensor]:
+        """Indices (M,) of the samples whose rendering weight (N,) is worth shading, those samples, and how many would
+        be there if the capacity were unlimited ()."""
+        capacity, kept = None, weights > self.config.render.cull
         if fixed:
-            capacity = math.ceil(len(samples) * min(1.0, CAPACITY_FACTOR * self.host_visible_share))
-        indices, packed_info = samples.packed_info.subset(weights > self.config.render.cull, capacity)
+            share = min(1.0, max(LEAST_CAPACITY, CAPACITY_FACTOR * self.host_visible_share))
+            capacity = math.ceil(len(samples) * share)
+        indices, packed_info = samples.packed_info.subset(kept, capacity)
         t, deltas = samples.t[indices], samples.deltas[indices]
-        return indices, Samples(samples.points[indices], t, deltas, packed_info, samples.t_first, samples.t_last)
+        visible = Samples(samples.points[indices], t, deltas, packed_info, samples.t_first, samples.t_last)
+        return indices, visible, kept.sum()
 
     def _composite(
         self,
@@ -241,7 +264,7 @@ class Model(nn.Module):
         points = torch.cat([r.evaluated_points for r in rendered])
         density = torch.cat([r.evaluated_density for r in rendered])
         self.occupancy.observe(points, density, self.warming_up)
-        visible = torch.stack([r.samples.packed_info.counts.sum() for r in rendered]).sum()
+        visible = torch.stack([r.visible for r in rendered]).sum()
         self.visible_share += 0.05 * (visible / (density >= 0).sum().clamp(min=1) - self.visible_share)
 
     def _probabilities(self, logits: torch.Tensor, weight: torch.Tensor, packed_info: PackedInfo) -> torch.Tensor:

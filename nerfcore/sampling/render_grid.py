@@ -11,6 +11,7 @@ from functools import partial
 
 import torch
 
+from ..kernels.cells import MOST_CELLS_A_SIDE
 from ..kernels.runtime import run_parallel
 from ..kernels.traversal import MarchSettings, skip_distances
 from .occupancy import MOST_OPTICAL_DEPTH, OccupancyGrid
@@ -35,6 +36,13 @@ def present_grid(occupancy: OccupancyGrid, per_bin: float) -> RenderGrid:
     return RenderGrid(occupancy.cells, occupancy.skip_distance, settings)
 
 
+def largest_factor(resolution: int, factor: int) -> int:
+    """How many times finer a grid may be made, at most `factor`: kernels number its cells in 32 bits."""
+    while factor > 1 and resolution * factor > MOST_CELLS_A_SIDE:
+        factor //= 2
+    return factor
+
+
 @torch.no_grad()
 def refined_grid(
     occupancy: OccupancyGrid,
@@ -50,6 +58,7 @@ def refined_grid(
     None where reading the cells takes longer than it saves in rendering so many `pixels`.
     `check` is called often, on the CPU by several threads, and may raise to stop.
     """
+    factor = largest_factor(occupancy.config.resolution, factor)
     coarse = (occupancy.cells[:, 0] > 0).nonzero()[:, 0]
     if factor == 1 or len(coarse) * factor**3 * PROBES > pixels * SAVED:
         return None

@@ -24,6 +24,8 @@ def trainer_tensors(trainer: Trainer) -> dict[str, torch.Tensor]:
         for name, value in trainer.optimizer.state.get(parameter, {}).items():
             tensors[f"optimizer.{index}.{name}"] = value
     tensors["generator"] = trainer.generator.get_state()
+    if trainer.guard.scaling:
+        tensors["loss_scale"] = trainer.guard.scale
     if trainer.cache.hit is not None:
         tensors["cache.hit"] = trainer.cache.hit
     if trainer.poses is not None:
@@ -68,5 +70,6 @@ def restore(trainer: Trainer, tensors: dict[str, torch.Tensor], state: dict[str,
     if trainer.poses is not None:
         trainer.poses.restore({n.removeprefix("poses."): t for n, t in tensors.items() if n.startswith("poses.")})
     trainer.generator.set_state(tensors["generator"].cpu())
+    trainer.guard.scale = tensors.get("loss_scale", trainer.guard.scale)
     trainer.cache.hit = tensors.get("cache.hit")
     trainer.steps, trainer.rays = state["steps"], state["rays"]

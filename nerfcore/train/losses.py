@@ -9,6 +9,7 @@ import torch.nn.functional as F
 
 from ..config import LossConfig
 from ..data.pixels import VOID, Batch
+from ..kernels.composite import sums_in_front
 from ..kernels.packed_info import PackedInfo
 
 
@@ -90,16 +91,11 @@ def distortion_loss(
     """
     if len(weights) == 0:
         return weights.sum() * 0
-    first = packed_info.starts.clamp(min=0).long()[packed_info.ray_indices.long()]
-
-    def before(values: torch.Tensor) -> torch.Tensor:
-        """Sum of the values in front of each sample on its ray."""
-        running = torch.cumsum(values.double(), 0) - values
-        return (running - running[first]).float()
-
     # Σ_i w_i (s_i W_<i − S_<i), twice, with running sums: linear in the samples.
-    pairs = 2 * weights * (t * before(weights) - before(weights * t))
-    return (pairs + weights * weights * deltas / 3).sum() / (packed_info.counts > 0).sum()
+    in_front = sums_in_front(weights, packed_info), sums_in_front(weights * t, packed_info)
+    pairs = 2 * weights * (t * in_front[0] - in_front[1])
+    # With a fixed capacity there are entries even where no sample is visible.
+    return (pairs + weights * weights * deltas / 3).sum() / (packed_info.counts > 0).sum().clamp(min=1)
 
 
 def psnr(mse: float) -> float:

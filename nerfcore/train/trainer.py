@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
@@ -11,13 +12,16 @@ import torch
 
 from ..config import RunConfig
 from ..data.pixels import Batch, PixelStore
+from ..errors import TrainingError
 from ..field.grid import Part
+from ..kernels.device import backend_of
 from ..kernels.runtime import run_parallel, worker_count
 from ..render.model import Model, Rendered
 from ..sampling.cache import CoarseCache
 from ..sampling.known_space import KnownSpace
 from ..sampling.outlines import Outlines
 from .depth import DepthRays, depth_loss
+from .gradients import GradientGuard, only_finite
 from .losses import (
     at_given_opacity,
     color_loss,
@@ -34,6 +38,8 @@ from .schedule import bias_correction, rate_factor, sample_budget
 from .voxel_init import PixelFeatures, initialise
 
 BETAS = (0.9, 0.99)
+HEADROOM = 1.25  # capacity for samples, as a multiple of a step's budget of them
+NOT_FINITE_READINGS = 8  # in a row, of gradients that are not finite, until training is given up
 SHARD_SAMPLES = 12288  # fewer would take longer to hand out than to learn from
 
 
@@ -53,13 +59,20 @@ class ShardResult:
 
 @dataclass
 class Measured:
-    """Sums over the steps since the last reading; `loss` and `mse` stay on the device until they are read."""
+    """Sums over the steps since the last reading; `loss` and `mse` stay on the device until they are read.
+
+    With a fixed capacity, `dropped`: rays that were left out for want of it, as far as the device was asked; `skipped`:
+    steps without finite gradients, and `lost_rows`: rows of the grid that were left out for the same reason.
+    """
 
     loss: float | torch.Tensor = 0.0
     mse: float | torch.Tensor = 0.0
     steps: int = 0
     rays: int = 0
     samples: int = 0
+    dropped: int = 0
+    skipped: int = 0
+    lost_rows: int = 0
 
     @property
     def psnr(self) -> float:
@@ -86,9 +99,11 @@ class Trainer:
         self.background = background
         model.labelled = store.labelled_share()
         self.device = store.device
+        self.backend = backend_of(self.device)
         self.optimizer = torch.optim.Adam(
-            model.parameters(), config.train.network_rate, betas=BETAS, eps=1e-15, fused=self.device.type != "mps"
+            model.parameters(), config.train.network_rate, betas=BETAS, eps=1e-15, fused=self.backend.fused_optimizer
         )
+        self.guard = GradientGuard(model.field.dtype, self.device)
         self.generator = torch.Generator(self.device).manual_seed(config.train.seed)
         self.steps = 0
         self.rays = max(16, min(config.train.max_rays, config.train.batch_start // config.sampling.samples))
@@ -101,6 +116,10 @@ class Trainer:
         self.outlines = Outlines(store, config.sampling.outline_rays) if semantic else None
         self.pixel_features: PixelFeatures | None = None
         self.measured = Measured()
+        # Of the steps since the host last asked the device: samples evaluated and rays dropped (2,), and rays drawn.
+        self._counted = torch.zeros(2, device=self.device)
+        self._drawn = 0
+        self._not_finite = 0  # readings in a row that told of gradients that are not finite
 
     def draw(self) -> Batch:
         """Rays of this step: from image tiles that met the field, and some from everywhere."""
@@ -111,6 +130,11 @@ class Trainer:
         pixel_indices = self.cache.draw(self.rays - count, s.empty_rays, self.generator)
         if self.outlines is not None and count > 0:
             pixel_indices = torch.cat([pixel_indices, self.outlines.draw(count, self.generator)])
+        if self.model.has_fixed_capacity():
+            # Where the capacity does not last, the last rays are dropped: they must not be of one kind.
+            order = torch.randperm(len(pixel_indices), device=self.device, generator=self.generator)
+            pixel_indices = pixel_indices[order]
+        if self.outlines is not None and count > 0:
             return replace(self.store.batch(pixel_indices), weight=self.outlines.weight(pixel_indices))
         return self.store.batch(pixel_indices)
 
@@ -124,7 +148,7 @@ class Trainer:
         if self.steps % config.sampling.update_every == 0:
             importance = model.importance if model.wants_importance() and self.steps >= config.sampling.warmup else None
             model.occupancy.update(self.steps, model.field.density, importance, self.generator)
-            model.refresh()
+            self._ask_device(progress)
         batch, start = self.draw(), config.train.pose_start
         moving = self.poses if progress >= start else None
         if moving is not None:
@@ -138,7 +162,8 @@ class Trainer:
         factor = rate_factor(progress, config.train.decay)
         for group in self.optimizer.param_groups:
             group["lr"] = config.train.network_rate * factor
-        self.optimizer.step()
+        self.guard.step(self.optimizer)
+        self.guard.update()
         if model.field.grid is not None:
             model.field.grid.step(config.train.grid_rate * factor * bias_correction(self.steps, *BETAS), BETAS)
         rendered = [part.rendered for part in shards if part.rendered is not None]
@@ -177,16 +202,17 @@ class Trainer:
         counted = label_weights(batch)
         labelled = counted.sum().clamp(min=1e-6)
         shard_count = 1
-        if self.device.type == "cpu":
+        if self.backend.host_threads:
             shard_count = max(2, min(worker_count(), sample_budget(self.config.train, progress) // SHARD_SAMPLES))
         size = -(-rays // shard_count)
+        capacity = self._capacity(progress, shard_count)
 
         def shard(begin: int) -> ShardResult:
             part = batch.part(slice(begin, begin + size))
             noise = jitter[begin : begin + size], shift[begin * per_ray : (begin + size) * per_ray]
 
             def loss() -> tuple[torch.Tensor, torch.Tensor, Rendered]:
-                rendered = self._render(part, *noise)
+                rendered = self._render(part, *noise, capacity)
                 share = len(part.rgb) / rays, counted[begin : begin + size].sum() / labelled
                 return *self.loss(part, rendered, background[begin : begin + size], progress, share), rendered
 
@@ -208,10 +234,12 @@ class Trainer:
         shards = run_parallel(tasks, self.device)
         for parameter, *gradients in zip(self.model.parameters(), *(part.gradients for part in shards)):
             present = [g for g in gradients if g is not None]
-            parameter.grad = torch.stack(present).sum(0) if present else None
+            parameter.grad = self.guard.unscaled(torch.stack(present).sum(0)) if present else None
+        self.guard.inspect([p.grad for p in self.model.parameters() if p.grad is not None])
         grid = self.model.field.grid
         if grid is not None:
-            grid.scatter([pair for part in shards for pair in part.encoded], self.model.field.gains)
+            encoded = [(points, self.guard.unscaled(g)) for part in shards for points, g in part.encoded]
+            grid.scatter(encoded, self.model.field.gains)
         for part in shards:
             self.measured.loss += part.loss
             self.measured.mse += part.squared_error
@@ -251,16 +279,20 @@ class Trainer:
             # A part that met nothing has no gradient.
             gradients: Sequence[torch.Tensor | None] = [None] * len(wanted)
             if total.requires_grad:
-                gradients = torch.autograd.grad(total, wanted, allow_unused=True)
+                gradients = torch.autograd.grad(self.guard.scaled(total), wanted, allow_unused=True)
         own, moved = gradients[: len(parameters)], gradients[len(parameters) : len(parameters) + len(rays)]
-        ray_gradients = [torch.zeros_like(ray) if g is None else g for ray, g in zip(rays, moved)]
+        ray_gradients = [
+            torch.zeros_like(ray) if g is None else only_finite(self.guard.unscaled(g)) for ray, g in zip(rays, moved)
+        ]
         return ShardResult(own, encoded, total.detach(), squared_error.detach(), rendered, ray_gradients)
 
-    def _render(self, batch: Batch, jitter: torch.Tensor, shift: torch.Tensor) -> Rendered:
+    def _render(self, batch: Batch, jitter: torch.Tensor, shift: torch.Tensor, capacity: int) -> Rendered:
         appearance, semantics = self.model.field.appearance, self.config.loss.semantic_weight > 0
         codes = appearance[batch.image] if appearance is not None else None
         per_ray = self.config.sampling.samples
-        return self.model.render(batch.origins, batch.directions, per_ray, jitter, shift, codes, semantics)
+        return self.model.render(
+            batch.origins, batch.directions, per_ray, jitter, shift, codes, semantics, capacity=capacity
+        )
 
     def loss(
         self,
@@ -305,16 +337,64 @@ class Trainer:
             total = total + c.opacity_weight * opacity_entropy(rendered.opacity)
         return total
 
+    def _capacity(self, progress: float, shards: int) -> int:
+        """Rays of a shard that may get samples where the capacity is fixed: what the budget is enough for, and some."""
+        per_ray = self.config.sampling.samples
+        return max(16, math.ceil(HEADROOM * sample_budget(self.config.train, progress) / (per_ray * shards)))
+
     def _adapt(self, rays: int, rendered: list[Rendered], progress: float) -> None:
         """Keep the number of field samples a step near its budget, which grows with progress."""
-        m, train = self.measured, self.config.train
+        m = self.measured
         m.steps += 1
         m.rays += rays
+        if self.model.has_fixed_capacity():
+            # How many entries were used only the device knows; `_ask_device` reads it.
+            dropped = [r.samples.packed_info.dropped for r in rendered]
+            self._counted[0] += sum((r.evaluated_density >= 0).sum() for r in rendered)
+            self._counted[1] += sum(d for d in dropped if d is not None)
+            self._drawn += rays
+            return
         evaluated = sum(r.evaluated for r in rendered)
         m.samples += evaluated
         if self.steps % 8 == 0:
-            wanted = rays * sample_budget(train, progress) / max(evaluated, 1)
-            self.rays = int(min(max(wanted, rays * 0.5, 16), rays * 2, train.max_rays))
+            self._set_rays(rays, evaluated / max(rays, 1), progress)
+
+    def _set_rays(self, rays: int, per_ray: float, progress: float) -> None:
+        """Let the next steps have as many rays as the budget is enough for, at most twice and at least half `rays`."""
+        train = self.config.train
+        wanted = sample_budget(train, progress) / max(per_ray, 1 / max(rays, 1))
+        self.rays = int(min(max(wanted, rays * 0.5, 16), rays * 2, train.max_rays))
+
+    def _ask_device(self, progress: float) -> None:
+        """Read back what the device counted, all at once: each reading makes the host wait.
+
+        Raises:
+            TrainingError: gradients have not been finite for long.
+        """
+        grid, m = self.model.field.grid, self.measured
+        lost = self._counted.new_zeros(1) if grid is None else grid.lost.float()
+        numbers = [self._counted, self.guard.skipped.view(1), lost, self.model.visible_share.view(1)]
+        evaluated, dropped, skipped, lost_rows, visible_share = torch.cat(numbers).tolist()
+        self.model.host_visible_share = visible_share
+        m.samples += int(evaluated)
+        m.dropped += int(dropped)
+        if not self.guard.scaling:  # there some steps tell that the scale is too large
+            m.skipped += int(skipped)
+            m.lost_rows += int(lost_rows)
+        if self._drawn > 0:
+            self._set_rays(self.rays, evaluated / self._drawn, progress)
+        self._counted.zero_()
+        self.guard.skipped.zero_()
+        self._drawn = 0
+        if grid is not None:
+            grid.lost.zero_()
+        self._not_finite = self._not_finite + 1 if skipped + lost_rows > 0 else 0
+        if self._not_finite >= NOT_FINITE_READINGS:
+            raise TrainingError(
+                "Training diverged: gradients have not been finite for "
+                f"{NOT_FINITE_READINGS * self.config.sampling.update_every} steps.",
+                "Lower train.network_rate and train.grid_rate, or set field.precision to float32.",
+            )
 
     def take_measured(self) -> Measured:
         """Averages since the last call."""

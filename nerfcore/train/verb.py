@@ -57,10 +57,11 @@ from .closed_picture import write_closed_picture
 from .inputs import data_inputs, training_inputs, training_length
 from .pose_refinement import write_poses
 from .prepare import make_trainer, plan_run
-from .trainer import Trainer
+from .trainer import Measured, Trainer
 from .voxel_init import save_features
 
 CLOSED_PICTURE = "closed.png"
+MOST_DROPPED = 0.01  # share of the rays that may be left out without a word
 PREVIEW_PAUSE = 20  # times what a preview costs, before the next one
 
 
@@ -134,6 +135,8 @@ def train(params: TrainParams, report: Reporter) -> dict[str, Any]:
         "params_m": round(trainer.model.field.parameter_count() / 1e6, 2),
         "device": str(device),
         "closed_picture": closed_picture(place.folder),
+        "backend": trainer.backend.name,
+        "precision": str(trainer.model.field.dtype).removeprefix("torch."),
     }
     if trainer.poses is not None:
         result["pose_shift"] = trainer.poses.shift(info.box(load_project(project_folder)).world_from_box)
@@ -249,6 +252,7 @@ class _Loop:
         self.trainer, self.info, self.place, self.state = trainer, info, place, state
         self.step_limit, self.time_limit, self.report = steps, seconds, report
         self.clock = _Clock(state["seconds"])
+        self.warned: set[str] = set()
 
     def progress(self) -> float:
         """Position in the schedule, in [0, 1]: of the time limit when there is one, else of the steps."""
@@ -285,6 +289,22 @@ class _Loop:
             self.state["progress"] = 1.0
             self._write_event(1.0, max(time.perf_counter() - last_event, 1e-3))
 
+    def _warn(self, measured: Measured) -> None:
+        """Say once what keeps training from using all that it computes."""
+        told = {}
+        if measured.dropped > MOST_DROPPED * measured.rays:
+            share = measured.dropped / max(measured.rays, 1)
+            told["dropped"] = f"{share:.1%} of the rays were left out for want of capacity; their number follows soon."
+        if measured.skipped + measured.lost_rows > 0:
+            told["not finite"] = (
+                f"Gradients that were not finite were left out ({measured.skipped} steps, {measured.lost_rows} rows of "
+                "the grid). If it goes on, lower train.network_rate and train.grid_rate."
+            )
+        for name, text in told.items():
+            if name not in self.warned:
+                self.warned.add(name)
+                self.report.warn(text)
+
     def _write_event(self, progress: float, elapsed: float) -> None:
         measured = self.trainer.take_measured()
         loss = float(measured.loss)
@@ -302,6 +322,9 @@ class _Loop:
             "psnr": self.state["psnr"],
             "rays_per_second": round(measured.rays / elapsed),
         }
+        counts = {"dropped": measured.dropped, "skipped": measured.skipped, "lost_rows": measured.lost_rows}
+        values |= {name: count for name, count in counts.items() if count > 0}
+        self._warn(measured)
         with open(self.place.folder / EVENTS, "a", encoding="utf-8") as events:
             events.write(json.dumps(values) + "\n")
         self.report.event("train", **values)

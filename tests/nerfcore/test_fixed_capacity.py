@@ -7,10 +7,13 @@ from pathlib import Path
 
 import pytest
 import torch
+from fieldwork.nerfcore.kernels.device import Kernels, using_kernels
 from fieldwork.nerfcore.kernels.packed_info import PackedInfo
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.render.model import Rendered
+from fieldwork.nerfcore.train.losses import distortion_loss
 from fieldwork.nerfcore.train.prepare import make_trainer, plan_run
+from fieldwork.nerfcore.train.schedule import sample_budget
 from fieldwork.nerfcore.train.trainer import Trainer
 from fieldwork.tests.nerfcore.support.ball import ball_project
 from fieldwork.tests.nerfcore.support.settings import config_of, trainer_of
@@ -76,6 +79,15 @@ def test_indices_are_those_of_the_kept_samples_and_the_rest_is_marked() -> None:
     assert torch.equal(few, indices[:9])
     assert int(cut.counts.sum()) == 9
     assert bool((cut.starts + cut.counts <= 9).all())
+    for capacity in range(len(indices)):  # also where it ends within a ray, which is then dropped as a whole
+        few, cut = packed_info.subset(kept, capacity)
+        taken = int(cut.counts.sum())
+        assert taken <= capacity
+        assert bool(((cut.counts == 0) | (cut.counts == exact.counts)).all())
+        assert torch.equal(few[:taken], indices[:taken])
+        assert bool((cut.ray_indices[taken:] == -1).all())
+        assert cut.dropped is not None
+        assert int(cut.dropped) == int(((cut.counts == 0) & (exact.counts > 0)).sum()) > 0
 
 
 @pytest.mark.parametrize("share", [0.66, 1.0], ids=["two passes", "one pass"])
@@ -160,6 +172,98 @@ def test_training_with_a_fixed_capacity_learns_as_well(ball: Path) -> None:
             trainer.step(1.0)
         errors[fixed] = trainer.take_measured().psnr
     assert errors[True] == pytest.approx(errors[False], abs=1.0)
+
+
+def test_rays_beyond_the_capacity_are_counted_and_leave_the_others_alone(ball: Path) -> None:
+    model = warm(ball).model
+    model.fixed_capacity = True
+    rays = 200
+    origins = torch.tensor([[-1.5, 0.0, 0.0]]).repeat(rays, 1)
+    directions = torch.nn.functional.normalize(torch.tensor([[1.0, 0.0, 1e-3 * k] for k in range(rays)]), dim=1)
+    shift = torch.rand(rays * 12)
+    whole = model.render(origins, directions, 12, shift=shift)
+    cut = model.render(origins, directions, 12, shift=shift, capacity=50)
+    assert int(whole.samples.packed_info.dropped) == 0
+    met = (whole.samples.t_first >= 0).nonzero()[:, 0]
+    assert len(met) > 60
+    assert int(cut.samples.packed_info.dropped) == len(met) - 50
+    assert torch.allclose(cut.color[met[:50]], whole.color[met[:50]], atol=1e-6)
+    assert not cut.color[met[50:]].any()
+    # Rays that met nothing have starts too, which later steps look up.
+    assert int((cut.samples.packed_info.starts + cut.samples.packed_info.counts).max()) <= len(cut.weights)
+    assert distortion(cut).isfinite()
+
+
+def distortion(rendered: Rendered) -> torch.Tensor:
+    s = rendered.samples
+    return distortion_loss(rendered.weights, s.t, s.deltas, s.packed_info)
+
+
+@pytest.mark.parametrize("kernels", ["warp", "torch"])
+def test_nothing_visible_gives_numbers(ball: Path, kernels: Kernels) -> None:
+    trainer = warm(ball, steps=4, **{"loss.opacity_weight": "0.01"})
+    model = trainer.model
+    model.fixed_capacity = True
+    model.occupancy.cells.zero_()
+    batch = trainer.store.batch(torch.arange(64))
+    with using_kernels(kernels):
+        rendered = model.render(batch.origins, batch.directions, 12)
+        assert len(rendered.weights) > 0
+        assert not rendered.samples.packed_info.counts.any()
+        loss, error = trainer.loss(batch, rendered, torch.zeros(64, 3), 0.9)
+        assert float(distortion(rendered)) == 0
+        assert bool(torch.isfinite(loss))
+        assert bool(torch.isfinite(error))
+        gradients = torch.autograd.grad(loss, list(model.parameters()), allow_unused=True)
+    assert all(bool(torch.isfinite(g).all()) for g in gradients if g is not None)
+
+
+def test_what_becomes_visible_after_a_while_of_nothing_is_seen(ball: Path) -> None:
+    """A capacity that followed the share of visible samples down to nothing would hide all that comes later."""
+    trainer = warm(ball, steps=200)
+    model = trainer.model
+    model.fixed_capacity = True
+    model.visible_share.fill_(0)
+    trainer._ask_device(0.5)
+    batch = trainer.store.batch((trainer.store.rgba[:, 3] > 0).nonzero()[:256, 0])
+    rendered = model.render(batch.origins, batch.directions, 12)
+    assert int(rendered.visible) > len(rendered.weights) > 0  # more than there is room for now
+    for _ in range(60):
+        model.observe([rendered])
+    trainer._ask_device(0.5)
+    assert int(model.render(batch.origins, batch.directions, 12).samples.packed_info.dropped) == 0
+
+
+def test_the_number_of_rays_follows_the_samples_that_are_used(ball: Path) -> None:
+    trainer = trainer_of(ball, **{"sampling.coarse_cache": "false", "train.batch_start": "4096"})
+    trainer.model.fixed_capacity = True
+    for step in range(200):
+        trainer.step(0.5 + step / 1000)
+    trainer.take_measured()
+    for _ in range(64):
+        trainer.step(0.8)
+    measured = trainer.take_measured()
+    budget = sample_budget(trainer.config.train, 0.8)
+    # Many rays miss the ball: there must be more of them than the budget divided by the samples of a ray.
+    assert trainer.rays > 1.2 * budget / trainer.config.sampling.samples
+    assert measured.samples / measured.steps == pytest.approx(budget, rel=0.2)
+    assert measured.dropped < 0.02 * measured.rays
+
+
+def test_rays_are_shuffled_where_some_may_be_dropped(ball: Path) -> None:
+    trainer = trainer_of(ball, **{"sampling.outline_rays": "0.5"})
+    assert trainer.outlines is not None
+    outlines = trainer.outlines.mask
+    share = {}
+    for fixed in (False, True):
+        trainer.model.fixed_capacity = fixed
+        batches = [trainer.draw() for _ in range(20)]
+        flat = [trainer.store.first[b.image] + b.pixel for b in batches]
+        share[fixed] = torch.stack([outlines[f[: len(f) // 2]].float().mean() for f in flat]).mean()
+        whole = torch.stack([outlines[f].float().mean() for f in flat]).mean()
+        if fixed:
+            assert abs(float(share[True] - whole)) < 0.05
+    assert float(share[False]) < float(share[True]) - 0.1
 
 
 @pytest.mark.gpu

@@ -9,12 +9,13 @@ import pytest
 import torch
 from fieldwork.nerfcore.config import SamplingConfig
 from fieldwork.nerfcore.errors import Cancelled
+from fieldwork.nerfcore.kernels.cells import MOST_CELLS_A_SIDE
 from fieldwork.nerfcore.kernels.march import FEWEST_SAMPLES, sample, sample_counts
 from fieldwork.nerfcore.kernels.runtime import worker_count
 from fieldwork.nerfcore.kernels.traversal import skip_distances
 from fieldwork.nerfcore.sampling import render_grid
 from fieldwork.nerfcore.sampling.occupancy import OccupancyGrid
-from fieldwork.nerfcore.sampling.render_grid import PROBES, SAVED, present_grid, refined_grid
+from fieldwork.nerfcore.sampling.render_grid import PROBES, SAVED, largest_factor, present_grid, refined_grid
 
 N = 32
 THICK = 0.02
@@ -122,3 +123,13 @@ def test_reading_the_finer_cells_stops_as_soon_as_asked(monkeypatch: pytest.Monk
     with pytest.raises(Cancelled):
         refined_grid(shell_grid(), density, 2, 1.0, math.inf, check)
     assert len(read) <= worker_count()  # what was under way already
+
+
+def test_grids_are_not_made_finer_than_kernels_can_number_their_cells() -> None:
+    assert MOST_CELLS_A_SIDE**3 < 2**31 <= (MOST_CELLS_A_SIDE + 1) ** 3
+    assert largest_factor(128, 4) == 4
+    assert largest_factor(512, 4) == 2
+    assert largest_factor(512, 2) == 2
+    for resolution in range(8, 513, 4):
+        for factor in (1, 2, 4):
+            assert resolution * largest_factor(resolution, factor) <= MOST_CELLS_A_SIDE

@@ -1,0 +1,118 @@
+"""Gradients that are not finite or would vanish in half precision."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from fieldwork.nerfcore.errors import TrainingError
+from fieldwork.nerfcore.kernels.device import Kernels, using_kernels
+from fieldwork.nerfcore.train.gradients import FIRST_SCALE, GROWTH_STEPS, GradientGuard
+from fieldwork.nerfcore.train.trainer import Trainer
+from fieldwork.tests.nerfcore.support.ball import ball_project
+from fieldwork.tests.nerfcore.support.settings import trainer_of
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(scope="module")
+def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return ball_project(tmp_path_factory.mktemp("gradients") / "ball", views=6, side=24)
+
+
+def test_the_scale_halves_after_an_overflow_and_grows_again() -> None:
+    guard = GradientGuard(torch.float16, CPU)
+    for _ in range(3):
+        guard.inspect([torch.ones(3), torch.tensor([1.0, math.inf])])
+        guard.update()
+    assert float(guard.scale) == FIRST_SCALE / 8
+    assert int(guard.skipped) == 3
+    for _ in range(GROWTH_STEPS):
+        guard.inspect([torch.ones(3)])
+        guard.update()
+    assert float(guard.scale) == FIRST_SCALE / 4
+    other = GradientGuard(torch.bfloat16, CPU)
+    other.inspect([torch.tensor([math.nan])])
+    other.update()
+    assert float(other.scale) == 1.0
+
+
+@pytest.mark.parametrize("kernels", ["warp", "torch"])
+def test_a_step_without_finite_gradients_changes_nothing(kernels: Kernels) -> None:
+    parameter = torch.nn.Parameter(torch.ones(4))
+    with using_kernels(kernels):
+        guard = GradientGuard(torch.float32, CPU)
+    optimizer = torch.optim.Adam([parameter], 0.1, fused=True)
+    for value, moved in ((1.0, True), (math.nan, False), (math.inf, False), (1.0, True)):
+        before = parameter.detach().clone()
+        parameter.grad = torch.full((4,), value)
+        guard.inspect([parameter.grad])
+        guard.step(optimizer)
+        assert bool((parameter != before).all()) == moved
+        assert bool(torch.isfinite(parameter).all())
+
+
+def parameters(trainer: Trainer) -> torch.Tensor:
+    return torch.cat([p.detach().flatten().clone() for p in trainer.model.parameters()])
+
+
+def test_small_gradients_survive_half_precision(ball: Path) -> None:
+    """Losses so small that their gradients are below the smallest float16."""
+    weights = {"loss.rgb_weight": "1e-6", "loss.semantic_weight": "0", "loss.regularization": "0"}
+    found = {}
+    for precision in ("float32", "float16"):
+        trainer = trainer_of(ball, **weights, **{"field.precision": precision})
+        for step in range(3):
+            trainer.step(step / 3)
+        trainer._accumulate_gradients(trainer.draw(), 0.5)
+        found[precision] = trainer.model.field.color_head.weights[0].grad.abs()
+    assert int((found["float16"] > 0).sum()) > 0.9 * int((found["float32"] > 0).sum())
+    assert float(found["float16"].mean()) == pytest.approx(float(found["float32"].mean()), rel=0.3)
+
+
+def test_training_in_half_precision_learns_as_well(ball: Path) -> None:
+    errors = {}
+    for precision in ("float32", "float16"):
+        trainer = trainer_of(ball, **{"field.precision": precision})
+        for step in range(120):
+            trainer.step(step / 120)
+        trainer.take_measured()
+        for _ in range(10):
+            trainer.step(1.0)
+        errors[precision] = trainer.take_measured().psnr
+    assert errors["float16"] == pytest.approx(errors["float32"], abs=1.0)
+
+
+def test_training_survives_a_gradient_that_is_not_finite_and_gives_up_when_they_stay(ball: Path) -> None:
+    trainer = trainer_of(ball)
+    grid = trainer.model.field.grid
+    assert grid is not None
+    real = trainer._accumulate_gradients
+
+    def broken(batch, progress):
+        shards = real(batch, progress)
+        next(trainer.model.parameters()).grad[0, 0] = math.nan
+        trainer.guard.inspect([p.grad for p in trainer.model.parameters() if p.grad is not None])
+        grid.gradient[:5, 1] = math.nan
+        grid.touched[0] = 1
+        return shards
+
+    trainer.step(0.1)
+    trainer._accumulate_gradients = broken
+    before = parameters(trainer)
+    trainer.step(0.1)
+    assert torch.equal(parameters(trainer), before)
+    assert int(grid.lost) == 5
+    trainer._accumulate_gradients = real
+    for _ in range(20):
+        trainer.step(0.2)
+    measured = trainer.take_measured()
+    assert (measured.skipped, measured.lost_rows) == (1, 5)
+    assert bool(torch.isfinite(parameters(trainer)).all())
+    assert bool(torch.isfinite(grid.table).all())
+    trainer._accumulate_gradients = broken
+    with pytest.raises(TrainingError, match="not been finite"):
+        for _ in range(200):
+            trainer.step(0.3)

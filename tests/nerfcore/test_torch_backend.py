@@ -1,0 +1,102 @@
+"""Training through the torch backend, as on ROCm and MPS, on CPU tensors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from fieldwork.nerfcore.kernels import runtime
+from fieldwork.nerfcore.kernels.device import Kernels, using_kernels
+from fieldwork.nerfcore.render.fused import unsupported
+from fieldwork.nerfcore.train.trainer import Trainer
+from fieldwork.tests.nerfcore.support.ball import ball_project
+from fieldwork.tests.nerfcore.support.settings import trainer_of
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+
+
+@pytest.fixture(scope="module")
+def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return ball_project(tmp_path_factory.mktemp("torch") / "ball", views=9, side=32)
+
+
+class DoublePrecision(TorchDispatchMode):
+    """Lists the operations that give float64, which Apple's GPUs do not have."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        out = func(*args, **(kwargs or {}))
+        if any(isinstance(x, torch.Tensor) and x.dtype == torch.float64 and x.dim() > 0 for x in tree_leaves(out)):
+            self.found.append(func.overloadpacket.__name__)
+        return out
+
+
+def train(project: Path, kernels: Kernels, steps: int, **settings: str) -> Trainer:
+    with using_kernels(kernels):
+        trainer = trainer_of(project, **settings)
+        for step in range(steps):
+            trainer.step(step / steps)
+        return trainer
+
+
+def test_the_torch_backend_trains_as_well_as_warp(ball: Path) -> None:
+    found = {}
+    for kernels in ("warp", "torch"):
+        trainer = train(ball, kernels, 160)
+        trainer.take_measured()
+        with using_kernels(kernels):
+            for _ in range(10):
+                trainer.step(1.0)
+        found[kernels] = trainer.take_measured().psnr
+    assert found["warp"] > 17
+    assert found["torch"] == pytest.approx(found["warp"], abs=0.7)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"loss.distortion_start": "0", "loss.opacity_weight": "0.01", "sampling.outline_rays": "0.3"},
+        {"train.refine_poses": "true", "train.pose_start": "0", "scene.contraction": "on"},
+        {"field.fusion": "blend", "sampling.interest": "boundary", "sampling.pdf": "literal"},
+    ],
+    ids=["losses", "poses", "literal"],
+)
+def test_the_torch_backend_needs_neither_warp_nor_double_precision(
+    ball: Path, settings: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def launched(*args, **kwargs) -> None:
+        raise AssertionError("a Warp kernel was launched")
+
+    with using_kernels("torch"):
+        trainer = trainer_of(ball, **settings)
+        monkeypatch.setattr(runtime.wp, "launch", launched)
+        monkeypatch.setattr(runtime.wp, "from_torch", launched)
+        with DoublePrecision() as doubles:
+            for step in range(36):
+                trainer.step(0.5 + step / 100)
+            pictures = trainer.model.eval()
+            pictures.refine()
+            batch = trainer.store.batch(torch.arange(100))
+            with torch.no_grad():
+                out = pictures.render(batch.origins, batch.directions, 16, grid=pictures.render_grid())
+        assert unsupported(trainer.model) == "the torch backend has no such kernel"
+    assert doubles.found == []
+    assert bool(torch.isfinite(out.color).all())
+    assert trainer.take_measured().psnr > 5
+
+
+def test_both_backends_make_the_same_picture(ball: Path) -> None:
+    trainer = train(ball, "warp", 60)
+    batch = trainer.store.batch(torch.arange(0, len(trainer.store), 7))
+    found = {}
+    for kernels in ("warp", "torch"):
+        with using_kernels(kernels), torch.no_grad():
+            out = trainer.model.render(batch.origins, batch.directions, 16)
+            found[kernels] = torch.cat([out.color, out.opacity[:, None], out.depth[:, None], out.probabilities], 1)
+    difference = (found["warp"] - found["torch"]).abs()
+    assert float(difference.mean()) < 2e-3
+    assert float((difference.amax(1) > 0.02).float().mean()) < 0.02

@@ -211,7 +211,7 @@ def test_nothing_visible_gives_numbers(ball: Path, kernels: Kernels) -> None:
         assert len(rendered.weights) > 0
         assert not rendered.samples.packed_info.counts.any()
         loss, error = trainer.loss(batch, rendered, torch.zeros(64, 3), 0.9)
-        assert float(distortion(rendered)) == 0
+        assert float(distortion(rendered).detach()) == 0
         assert bool(torch.isfinite(loss))
         assert bool(torch.isfinite(error))
         gradients = torch.autograd.grad(loss, list(model.parameters()), allow_unused=True)
@@ -237,14 +237,17 @@ def test_what_becomes_visible_after_a_while_of_nothing_is_seen(ball: Path) -> No
 def test_the_number_of_rays_follows_the_samples_that_are_used(ball: Path) -> None:
     trainer = trainer_of(ball, **{"sampling.coarse_cache": "false", "train.batch_start": "4096"})
     trainer.model.fixed_capacity = True
-    for step in range(200):
+    grid = trainer.model.occupancy
+    for values in (grid.seen, grid.density, grid.mean):  # half of the cube is known to be empty
+        values[: len(values) // 2] = 0
+    for step in range(112):
         trainer.step(0.5 + step / 1000)
     trainer.take_measured()
-    for _ in range(64):
+    for _ in range(48):
         trainer.step(0.8)
     measured = trainer.take_measured()
     budget = sample_budget(trainer.config.train, 0.8)
-    # Many rays miss the ball: there must be more of them than the budget divided by the samples of a ray.
+    # Many rays meet nothing: there must be more of them than the budget divided by the samples of a ray.
     assert trainer.rays > 1.2 * budget / trainer.config.sampling.samples
     assert measured.samples / measured.steps == pytest.approx(budget, rel=0.2)
     assert measured.dropped < 0.02 * measured.rays

@@ -54,6 +54,11 @@ def test_a_step_without_finite_gradients_changes_nothing(kernels: Kernels) -> No
         assert bool(torch.isfinite(parameter).all())
 
 
+def many_steps(trainer: Trainer) -> None:
+    for _ in range(200):
+        trainer.step(0.3)
+
+
 def parameters(trainer: Trainer) -> torch.Tensor:
     return torch.cat([p.detach().flatten().clone() for p in trainer.model.parameters()])
 
@@ -114,5 +119,4 @@ def test_training_survives_a_gradient_that_is_not_finite_and_gives_up_when_they_
     assert bool(torch.isfinite(grid.table).all())
     trainer._accumulate_gradients = broken
     with pytest.raises(TrainingError, match="not been finite"):
-        for _ in range(200):
-            trainer.step(0.3)
+        many_steps(trainer)

@@ -65,7 +65,8 @@ def _fisheye(uv: torch.Tensor, k: torch.Tensor) -> torch.Tensor:
 
     def value_and_slope(t: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         terms = [k[:, n - 1] * t ** (2 * n) for n in range(1, 5)]
-        return t * (1 + sum(terms)), 1 + sum((2 * n + 1) * term for n, term in enumerate(terms, 1))
+        odd = [(2 * n + 1) * term for n, term in enumerate(terms, 1)]
+        return t * (1 + torch.stack(terms).sum(0)), 1 + torch.stack(odd).sum(0)
 
     for _ in range(STEPS):
         value, slope = value_and_slope(theta)

@@ -61,7 +61,7 @@ def test_the_torch_backend_trains_as_well_as_warp(ball: Path) -> None:
     [
         {"loss.distortion_start": "0", "loss.opacity_weight": "0.01", "sampling.outline_rays": "0.3"},
         {"train.refine_poses": "true", "train.pose_start": "0", "scene.contraction": "on"},
-        {"field.fusion": "blend", "sampling.interest": "boundary", "sampling.pdf": "literal"},
+        {"field.fusion": "blend", "sampling.importance": "boundary", "sampling.pdf": "literal"},
     ],
     ids=["losses", "poses", "literal"],
 )

@@ -153,7 +153,8 @@ class RenderConfig(Stage):
     )
     refine: Literal[1, 2, 4] = Field(
         default=2,
-        description="how many times finer than the occupancy grid the grid is that finished fields render with",
+        description="how many times finer than the occupancy grid the grid is that finished fields render with, up to "
+        "1290 cells a side",
     )
     fused: Literal["auto", "on", "off"] = Field(
         default="auto",

@@ -67,7 +67,9 @@ def reconstruct(params: p.ReconstructParams, report: Reporter) -> dict[str, Any]
             reused.append(verb)
             report.stage(f"{verb}: nothing has changed, kept")
             return
-        if earlier.reason:
+        if getattr(values, "resume", False):
+            report.stage(f"{verb}: goes on where it was stopped")
+        elif earlier.reason:
             redone[verb] = earlier.reason
             report.stage(f"{verb}: done again ({earlier.reason})")
         results[verb] = stage.run(values, report)

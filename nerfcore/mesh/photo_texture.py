@@ -30,7 +30,7 @@ TILE = 4096  # texels a side that are worked on at once
 PIECE_TEXELS = 40  # longest edge of a piece for which one photo is chosen
 SECOND_BEST = 3  # further photos that are tried where the chosen one is hidden
 MARGIN = 4  # texels around charts that repeat their border
-BYTES_PER_TEXEL, BYTES_PER_TILE_TEXEL = 5, 70
+BYTES_PER_TEXEL, BYTES_PER_TILE_TEXEL = 8, 70
 
 Fill = Callable[[np.ndarray, np.ndarray], np.ndarray]
 GAP, UNSEEN, PHOTO = 0, 1, 2  # what a texel holds
@@ -101,7 +101,7 @@ def photo_texture(prepared: Prepared, fill: Fill | None, report: Reporter) -> Ph
         fill: points (N, 3) and normals (N, 3) → (N, 3) uint8 sRGB, for what no photo shows; None spreads what is
             beside.
     """
-    photos, pieces, seen, size = prepared.photos, prepared.pieces, prepared.seen, prepared.size
+    photos, pieces, seen = prepared.photos, prepared.pieces, prepared.seen
     report.stage("Comparing the photos")
     looks = look(photos, pieces, seen, report)
     gains = photo_gains(seen.view, looks, len(photos))
@@ -118,19 +118,45 @@ def photo_texture(prepared: Prepared, fill: Fill | None, report: Reporter) -> Ph
     careful[painted] = ~_whole_around(pieces, seen, column)[painted]
     others = _second_best(seen, worth, column, log_factor)
     report.stage("Painting the texture")
+    image, source = _texture(prepared, [jobs, *others], careful, fill, report)
+    painted = np.count_nonzero(source == PHOTO)
+    share = painted / max(np.count_nonzero(source), 1)
+    return PhotoTexture(image, np.where(source == UNSEEN, 255, 0).astype(np.uint8), share, gains)
+
+
+def field_texture(
+    vertices: np.ndarray, faces: np.ndarray, corners: np.ndarray, size: int, fill: Fill, report: Reporter
+) -> np.ndarray:
+    """A texture (S, S, 3) uint8 of a mesh with UV (F, 3, 2), all of it `fill`'s colours.
+
+    Raises:
+        SettingError: there is no memory for a texture of that size.
+    """
+    check_memory(size)
+    report.stage("Painting the texture")
+    pieces = facelets(vertices, faces, corners)
+    nobody = np.full((len(pieces), 1), -1, np.int16)
+    seen = Observations(nobody, np.zeros(nobody.shape, np.float32), np.zeros(nobody.shape, bool))
+    prepared = Prepared([], pieces, DepthBuffers([], pieces), seen, size)
+    return _texture(prepared, [], np.zeros(len(pieces), bool), fill, report)[0]
+
+
+def _texture(
+    prepared: Prepared, rounds: list[Jobs], careful: np.ndarray, fill: Fill | None, report: Reporter
+) -> tuple[np.ndarray, np.ndarray]:
+    """Colours (S, S, 3) uint8, spread beyond the charts, and where they come from (S, S)."""
+    size = prepared.size
     image, source = np.zeros((size, size, 3), np.uint8), np.full((size, size), GAP, np.uint8)
     tiles = [(x, y) for y in range(0, size, TILE) for x in range(0, size, TILE)]
     for number, (left, top) in enumerate(tiles):
         tile = left, top, min(TILE, size - left), min(TILE, size - top)
         part = _Part(report, number / len(tiles), 1 / len(tiles))
-        texels = texels_of(pieces, size, tile)
+        texels = texels_of(prepared.pieces, size, tile)
         block = np.s_[top : top + tile[3], left : left + tile[2]]
-        image[block], source[block] = _tile(prepared, texels, tile, [jobs, *others], careful, fill, part)
+        image[block], source[block] = _tile(prepared, texels, tile, rounds, careful, fill, part)
     report.stage("Spreading borders")
     spread(image, source > (GAP if fill else UNSEEN))
-    painted = np.count_nonzero(source == PHOTO)
-    share = painted / max(np.count_nonzero(source), 1)
-    return PhotoTexture(image, np.where(source == UNSEEN, 255, 0).astype(np.uint8), share, gains)
+    return image, source
 
 
 class _Part(Reporter):

@@ -55,8 +55,8 @@ def training_photos(scene: Scene, box_from_world: np.ndarray, poses: dict[str, n
         poses: camera-to-box poses (4, 4) by name, instead of the scene's, of a run that refined them.
     """
     views = [scene.views[i] for i in scene.train]
-    known = box_poses(views, box_from_world)
-    return [posed_photo(view, poses[view.name] if view.name in poses else pose) for view, pose in zip(views, known)]
+    known = {view.name: pose for view, pose in zip(views, box_poses(views, box_from_world))} | poses
+    return [posed_photo(view, known[view.name]) for view in views]
 
 
 def paint_surface(

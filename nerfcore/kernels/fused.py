@@ -10,10 +10,10 @@ import warp as wp
 from . import march
 from .blocks import launch_blocks
 from .device import backend_of
-from .fused_kernel import FusedShape, March, fused_kernel
+from .fused_kernel import FusedShape, fused_kernel
 from .fused_network import half_feature
 from .runtime import array, init
-from .traversal import MarchSettings
+from .traversal import MarchSettings, march_params
 
 LANES = 64  # samples a block works on, on CUDA; two to eight blocks fit a multiprocessor of sm_75 and later
 BLOCKS_PER_MULTIPROCESSOR = 8
@@ -108,9 +108,6 @@ def render_coarse(
     cuda = backend_of(device).fused
     lanes = lanes or (LANES if cuda else 1)
     kernel = fused_kernel(field.shape, lanes)
-    m = March()
-    m.n, m.step, m.near, m.far = settings.resolution, settings.step, settings.near, settings.far
-    m.contracted, m.mode, m.beta, m.epsilon = int(settings.contracted), settings.mode, settings.beta, settings.epsilon
     resident = 2 if lanes > 1 else 1  # blocks at a time; more than one on the CPU only to test that they share
     if cuda:
         resident = torch.cuda.get_device_properties(device).multi_processor_count * BLOCKS_PER_MULTIPROCESSOR
@@ -132,7 +129,7 @@ def render_coarse(
         array(next_ray),
         array(rays.ray_count),
         array(counts),
-        m,
+        march_params(settings),
         array(cells, wp.vec2),
         array(skip_distance),
     ]

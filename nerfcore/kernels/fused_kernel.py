@@ -31,6 +31,7 @@ from .traversal import (
     _DEFAULT,
     EARLY_STOP,
     MAX_BINS,
+    MarchParams,
     bin_length,
     bin_weight,
     cell_index,
@@ -129,20 +130,28 @@ class Ray:
     ended: int
 
 
-@wp.struct
-class March:
-    n: int
-    step: float
-    near: float
-    far: float
-    contracted: int
-    mode: int
-    beta: float
-    epsilon: float
+@wp.func
+def started(
+    index: int, origin: wp.vec3, direction: wp.vec3, count: int, total_weight: float, t_first: float, m: MarchParams
+):
+    """A ray before its first sample."""
+    ray = Ray()
+    ray.index = index
+    ray.origin = origin
+    ray.direction = direction
+    ray.inverse = reciprocal(direction)
+    _, high = ray_interval(origin, ray.inverse, m)
+    ray.high = high
+    ray.count = count
+    ray.share = total_weight / float(count)
+    ray.t = t_first
+    ray.t_last = t_first
+    ray.transmittance = 1.0
+    return ray
 
 
 @wp.func
-def advanced(ray: Ray, m: March, cells: wp.array(dtype=wp.vec2), skip_distance: wp.array(dtype=wp.uint8)):
+def advanced(ray: Ray, m: MarchParams, cells: wp.array(dtype=wp.vec2), skip_distance: wp.array(dtype=wp.uint8)):
     """The ray after its next sample, with the sample's distance and length."""
     target = (float(ray.sample) + 0.5) * ray.share
     edge = float(ray.sample + 1) * ray.share
@@ -153,12 +162,12 @@ def advanced(ray: Ray, m: March, cells: wp.array(dtype=wp.vec2), skip_distance: 
         if complete == 1 or ray.t >= ray.high:
             break
         p = ray.origin + ray.direction * ray.t
-        width = bin_length(p, m.step, m.contracted)
+        width = bin_length(p, m)
         u = grid_position(p, m.contracted)
         cell = cells[cell_index(u, m.n)]
         if cell[0] > 0.0:
             bin_transmittance = wp.exp(-cell[0] * width)
-            weight = bin_weight(cell, ray.transmittance, bin_transmittance, m.mode, m.beta, m.epsilon)
+            weight = bin_weight(cell, ray.transmittance, bin_transmittance, m)
             above = ray.below + weight
             ray.t_last = ray.t
             if t < 0.0 and target <= above:
@@ -179,7 +188,7 @@ def advanced(ray: Ray, m: March, cells: wp.array(dtype=wp.vec2), skip_distance: 
                     if ray.transmittance < EARLY_STOP:
                         ray.t = ray.high
         else:
-            ray.t += skip_length(u, ray.direction, ray.inverse, m.n, m.step, width, m.contracted, skip_distance)
+            ray.t += skip_length(u, ray.direction, ray.inverse, width, m, skip_distance)
     if complete == 0:
         # Rounding left this interval just short of the total; nothing is behind it.
         length = ray.gathered
@@ -221,7 +230,7 @@ def fused_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
         next_ray: wp.array(dtype=int),
         ray_count: wp.array(dtype=int),
         counts: wp.array(dtype=int),
-        m: March,
+        m: MarchParams,
         cells: wp.array(dtype=wp.vec2),
         skip_distance: wp.array(dtype=wp.uint8),
         table: wp.array(dtype=half_feature),
@@ -257,22 +266,7 @@ def fused_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
                 position = wp.atomic_add(next_ray, 0, 1)
                 if position < ray_count[0]:
                     r = queue[position]
-                    ray.index = r
-                    ray.origin = origins[r]
-                    ray.direction = directions[r]
-                    ray.inverse = reciprocal(ray.direction)
-                    _, high = ray_interval(ray.origin, ray.inverse, m.near, m.far, m.contracted)
-                    ray.high = high
-                    ray.count = counts[r]
-                    ray.share = total_weight[r] / float(ray.count)
-                    ray.t = t_first[r]
-                    ray.t_last = t_first[r]
-                    ray.transmittance = 1.0
-                    ray.below = 0.0
-                    ray.used = 0.0
-                    ray.gathered = 0.0
-                    ray.sample = 0
-                    ray.ended = 0
+                    ray = started(r, origins[r], directions[r], counts[r], total_weight[r], t_first[r], m)
                     optical_depth = 0.0
                     before = 1.0
                     red = 0.0

@@ -19,6 +19,7 @@ from .traversal import (
     BEFORE_CUBE,
     EARLY_STOP,
     MAX_BINS,
+    MarchParams,
     MarchSettings,
     bin_length,
     bin_weight,
@@ -26,6 +27,7 @@ from .traversal import (
     cube_entry,
     grid_position,
     inside,
+    march_params,
     ray_interval,
     reciprocal,
     skip_length,
@@ -41,15 +43,7 @@ def march_weight(
     jitter: wp.array(dtype=float),
     cells: wp.array(dtype=wp.vec2),
     skip_distance: wp.array(dtype=wp.uint8),
-    n: int,
-    step: float,
-    near: float,
-    far: float,
-    contracted: int,
-    mode: int,
-    beta: float,
-    epsilon: float,
-    empty_distance: float,
+    m: MarchParams,
     total_weight: wp.array(dtype=float),
     t_first: wp.array(dtype=float),
     t_last: wp.array(dtype=float),
@@ -60,10 +54,10 @@ def march_weight(
     o = origins[r]
     d = directions[r]
     inverse = reciprocal(d)
-    lo, hi = ray_interval(o, inverse, near, far, contracted)
-    if contracted == 1 and empty_distance > 0.0:
-        lo = wp.max(lo, wp.min(empty_distance, BEFORE_CUBE * cube_entry(o, inverse)))
-    t = lo + jitter[r] * step
+    lo, hi = ray_interval(o, inverse, m)
+    if m.contracted == 1 and m.empty_distance > 0.0:
+        lo = wp.max(lo, wp.min(m.empty_distance, BEFORE_CUBE * cube_entry(o, inverse)))
+    t = lo + jitter[r] * m.step
     transmittance = float(1.0)
     weight = float(0.0)
     occupied = int(0)
@@ -73,53 +67,59 @@ def march_weight(
         if t >= hi:
             break
         p = o + d * t
-        length = bin_length(p, step, contracted)
-        u = grid_position(p, contracted)
-        cell = cells[cell_index(u, n)]
+        length = bin_length(p, m)
+        u = grid_position(p, m.contracted)
+        cell = cells[cell_index(u, m.n)]
         if cell[0] > 0.0:
             bin_transmittance = wp.exp(-cell[0] * length)
-            weight += bin_weight(cell, transmittance, bin_transmittance, mode, beta, epsilon)
+            weight += bin_weight(cell, transmittance, bin_transmittance, m)
             if front < 0.0:
                 front = t
             back = t
             occupied += 1
-            if mode == _DEFAULT:
+            if m.mode == _DEFAULT:
                 transmittance *= bin_transmittance
                 if transmittance < EARLY_STOP:
                     break
             t += length
         else:
-            t += skip_length(u, d, inverse, n, step, length, contracted, skip_distance)
+            t += skip_length(u, d, inverse, length, m, skip_distance)
     total_weight[r] = weight
     t_first[r] = front
     t_last[r] = back
     bin_counts[r] = occupied
 
 
+@wp.struct
+class SampleArrays:
+    """Where samples are written, see `Samples`."""
+
+    points: wp.array(dtype=wp.vec3)
+    t: wp.array(dtype=float)
+    deltas: wp.array(dtype=float)
+    ray_indices: wp.array(dtype=int)
+
+
+@wp.func
+def write_sample(out: SampleArrays, index: int, t: float, position: wp.vec3, ray: int, m: MarchParams):
+    out.t[index] = t
+    out.points[index] = inside(grid_position(position, m.contracted))
+    out.ray_indices[index] = ray
+
+
 @wp.kernel(module="fieldwork_march")
 def march_sample(
     origins: wp.array(dtype=wp.vec3),
     directions: wp.array(dtype=wp.vec3),
-    jitter: wp.array(dtype=float),
     shift: wp.array(dtype=float),
     cells: wp.array(dtype=wp.vec2),
     skip_distance: wp.array(dtype=wp.uint8),
-    n: int,
-    step: float,
-    near: float,
-    far: float,
-    contracted: int,
-    mode: int,
-    beta: float,
-    epsilon: float,
+    m: MarchParams,
     total_weight: wp.array(dtype=float),
     t_first: wp.array(dtype=float),
     starts: wp.array(dtype=int),
     counts: wp.array(dtype=int),
-    points: wp.array(dtype=wp.vec3),
-    sample_t: wp.array(dtype=float),
-    deltas: wp.array(dtype=float),
-    ray_indices: wp.array(dtype=int),
+    out: SampleArrays,
     offset: int,
 ):
     r = wp.tid() + offset
@@ -130,7 +130,7 @@ def march_sample(
     o = origins[r]
     d = directions[r]
     inverse = reciprocal(d)
-    _, hi = ray_interval(o, inverse, near, far, contracted)
+    _, hi = ray_interval(o, inverse, m)
     t = t_first[r]
     transmittance = float(1.0)
     below = float(0.0)  # weight of the bins behind us
@@ -145,25 +145,23 @@ def march_sample(
         if t >= hi or k_edge >= count:
             break
         p = o + d * t
-        length = bin_length(p, step, contracted)
-        u = grid_position(p, contracted)
-        cell = cells[cell_index(u, n)]
+        length = bin_length(p, m)
+        u = grid_position(p, m.contracted)
+        cell = cells[cell_index(u, m.n)]
         if cell[0] > 0.0:
             bin_transmittance = wp.exp(-cell[0] * length)
-            weight = bin_weight(cell, transmittance, bin_transmittance, mode, beta, epsilon)
+            weight = bin_weight(cell, transmittance, bin_transmittance, m)
             above = below + weight
             while k < count and target <= above:
                 tk = t + ((target - below) / weight - 0.5) * length
-                sample_t[base + k] = tk
-                points[base + k] = inside(grid_position(o + d * tk, contracted))
-                ray_indices[base + k] = r
+                write_sample(out, base + k, tk, o + d * tk, r, m)
                 k += 1
                 if k < count:
                     target = (float(k) + shift[base + k]) * share
             used = float(0.0)  # part of this bin already given to intervals
             while k_edge < count and edge <= above:
                 fraction = (edge - below) / weight
-                deltas[base + k_edge] = occupied_length + (fraction - used) * length
+                out.deltas[base + k_edge] = occupied_length + (fraction - used) * length
                 occupied_length = float(0.0)
                 used = fraction
                 k_edge += 1
@@ -171,21 +169,19 @@ def march_sample(
             occupied_length += (1.0 - used) * length
             t_end = t
             below = above
-            if mode == _DEFAULT:
+            if m.mode == _DEFAULT:
                 transmittance *= bin_transmittance
                 if transmittance < EARLY_STOP:
                     break
             t += length
         else:
-            t += skip_length(u, d, inverse, n, step, length, contracted, skip_distance)
+            t += skip_length(u, d, inverse, length, m, skip_distance)
     # Rounding can leave the last interval or sample just short of the total.
     while k < count:
-        sample_t[base + k] = t_end
-        points[base + k] = inside(grid_position(o + d * t_end, contracted))
-        ray_indices[base + k] = r
+        write_sample(out, base + k, t_end, o + d * t_end, r, m)
         k += 1
     while k_edge < count:
-        deltas[base + k_edge] = occupied_length
+        out.deltas[base + k_edge] = occupied_length
         occupied_length = float(0.0)
         k_edge += 1
 
@@ -208,11 +204,6 @@ class Samples:
 
     def __len__(self) -> int:
         return len(self.t)
-
-
-def _arguments(settings: MarchSettings) -> list:
-    s = settings
-    return [s.resolution, s.step, s.near, s.far, int(s.contracted), s.mode, s.beta, s.epsilon]
 
 
 def coarse_march(
@@ -239,8 +230,7 @@ def coarse_march(
         array(cells, wp.vec2),
         array(skip_distance),
     ]
-    inputs += [*_arguments(settings), settings.empty_distance, array(total_weight), array(t_first)]
-    inputs += [array(t_last), array(bin_counts)]
+    inputs += [march_params(settings), array(total_weight), array(t_first), array(t_last), array(bin_counts)]
     launch(march_weight, rays, inputs, device)
     return total_weight, t_first, t_last, bin_counts
 
@@ -300,19 +290,10 @@ def sample(
         out = points, t, deltas, ray_indices
         march_torch.draw(origins, directions, cells, settings, jitter, shift, starts, counts, out)
         return Samples(points, t, deltas, packed_info, t_first, t_last)
-    launch(
-        march_sample,
-        rays,
-        [array(origins, wp.vec3), array(directions, wp.vec3), array(jitter), array(shift), array(cells, wp.vec2)]
-        + [
-            array(skip_distance),
-            *_arguments(settings),
-            array(total_weight),
-            array(t_first),
-            array(starts),
-            array(counts),
-        ]
-        + [array(points, wp.vec3), array(t), array(deltas), array(ray_indices)],
-        device,
-    )
+    out = SampleArrays()
+    out.points, out.t, out.deltas = array(points, wp.vec3), array(t), array(deltas)
+    out.ray_indices = array(ray_indices)
+    inputs = [array(origins, wp.vec3), array(directions, wp.vec3), array(shift), array(cells, wp.vec2)]
+    inputs += [array(skip_distance), march_params(settings), array(total_weight), array(t_first), array(starts)]
+    launch(march_sample, rays, [*inputs, array(counts), out], device)
     return Samples(points, t, deltas, packed_info, t_first, t_last)

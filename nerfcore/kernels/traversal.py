@@ -14,6 +14,7 @@ The torch backend is in `march_torch.py`.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 import warp as wp
@@ -48,6 +49,31 @@ class MarchSettings:
     per_bin: float = 0.0
 
 
+@wp.struct
+class MarchParams:
+    """`MarchSettings` as kernels take them; n: cells along a side of the grid."""
+
+    n: int
+    step: float
+    near: float
+    far: float
+    contracted: int
+    mode: int
+    beta: float
+    epsilon: float
+    empty_distance: float
+
+
+@lru_cache(64)
+def march_params(settings: MarchSettings) -> MarchParams:
+    """The settings as kernels take them; made once, and never changed."""
+    m = MarchParams()
+    m.n, m.step, m.near, m.far = settings.resolution, settings.step, settings.near, settings.far
+    m.contracted, m.mode, m.beta, m.epsilon = int(settings.contracted), settings.mode, settings.beta, settings.epsilon
+    m.empty_distance = settings.empty_distance
+    return m
+
+
 @wp.func
 def grid_position(p: wp.vec3, contracted: int):
     """Normalised position → grid coordinates in [0, 1]³."""
@@ -75,11 +101,11 @@ def cell_index(u: wp.vec3, n: int):
 
 
 @wp.func
-def ray_interval(o: wp.vec3, inverse: wp.vec3, near: float, far: float, contracted: int):
+def ray_interval(o: wp.vec3, inverse: wp.vec3, m: MarchParams):
     """Entry and exit distance of the march."""
-    lo = near
-    hi = far
-    if contracted == 0:
+    lo = m.near
+    hi = m.far
+    if m.contracted == 0:
         for a in range(3):
             t0 = (-1.0 - o[a]) * inverse[a]
             t1 = (1.0 - o[a]) * inverse[a]
@@ -98,14 +124,14 @@ def cube_entry(o: wp.vec3, inverse: wp.vec3):
 
 
 @wp.func
-def bin_length(p: wp.vec3, step: float, contracted: int):
+def bin_length(p: wp.vec3, m: MarchParams):
     """Bins grow outside the cube, where the grid's cells do."""
-    if contracted == 0:
-        return step
+    if m.contracted == 0:
+        return m.step
     r = wp.max(wp.abs(p[0]), wp.max(wp.abs(p[1]), wp.abs(p[2])))
     if r <= 1.0:
-        return step
-    return step * r * wp.sqrt(r)
+        return m.step
+    return m.step * r * wp.sqrt(r)
 
 
 @wp.func
@@ -132,29 +158,27 @@ def skip_length(
     u: wp.vec3,
     d: wp.vec3,
     inverse: wp.vec3,
-    n: int,
-    step: float,
     length: float,
-    contracted: int,
+    m: MarchParams,
     skip_distance: wp.array(dtype=wp.uint8),
 ):
     """How far to move from an empty cell: in whole steps until the ray leaves it, or the empty blocks around it; one
     bin where space is contracted."""
     side = float(2.0)
     border = float(0.0)
-    if contracted == 1:
+    if m.contracted == 1:
         side = 4.0
         border = 0.25
         c = u - wp.vec3(0.5, 0.5, 0.5)
         if wp.max(wp.abs(c[0]), wp.max(wp.abs(c[1]), wp.abs(c[2]))) >= 0.25:
             return length
     leave = float(0.0)
-    skip = int(skip_distance[cell_index(u, n / BLOCK)])
+    skip = int(skip_distance[cell_index(u, m.n / BLOCK)])
     if skip > 0:
-        leave = exit_distance(u, d, inverse, float(n / BLOCK), float(skip - 1), border)
+        leave = exit_distance(u, d, inverse, float(m.n / BLOCK), float(skip - 1), border)
     else:
-        leave = exit_distance(u, d, inverse, float(n), 0.0, border)
-    return wp.max(1.0, wp.floor(leave * side / step + 0.5)) * step
+        leave = exit_distance(u, d, inverse, float(m.n), 0.0, border)
+    return wp.max(1.0, wp.floor(leave * side / m.step + 0.5)) * m.step
 
 
 @wp.func
@@ -167,13 +191,13 @@ def reciprocal(d: wp.vec3):
 
 
 @wp.func
-def bin_weight(cell: wp.vec2, transmittance: float, bin_transmittance: float, mode: int, beta: float, epsilon: float):
+def bin_weight(cell: wp.vec2, transmittance: float, bin_transmittance: float, m: MarchParams):
     """Weight of one occupied bin; `cell` holds (density, importance), `bin_transmittance` is the bin's own transmittance."""
-    if mode == _UNIFORM:
+    if m.mode == _UNIFORM:
         return 1.0
-    if mode == _LITERAL:
+    if m.mode == _LITERAL:
         return cell[0] * cell[1] + 1.0e-6
-    return transmittance * (1.0 - bin_transmittance) * (1.0 + beta * cell[1]) + epsilon
+    return transmittance * (1.0 - bin_transmittance) * (1.0 + m.beta * cell[1]) + m.epsilon
 
 
 def skip_distances(occupied: torch.Tensor) -> torch.Tensor:

@@ -31,7 +31,7 @@ def write_closed_picture(path: Path, space: KnownSpace, centers: torch.Tensor, p
     """
     if not any(bool(cells.any()) for cells in space.closed.values()):
         return False
-    figure = Figure(figsize=(9, 4.8), dpi=100, layout="constrained")
+    figure = Figure(figsize=(9, 5.2), dpi=100, layout="constrained")
     FigureCanvasAgg(figure)
     cameras, cloud = (
         grid_position(x, space.contracted).cpu().numpy() for x in (centers, points[:: 1 + len(points) // MOST_POINTS])
@@ -55,7 +55,7 @@ def write_closed_picture(path: Path, space: KnownSpace, centers: torch.Tensor, p
         Patch(color=color, label=f"closed: {rule} ({float(cells.float().mean()):.1%} of the cells)")
         for color, (rule, cells) in zip(COLORS, space.closed.items())
     ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize="small", frameon=False)
+    figure.legend(handles=handles, loc="outside lower center", ncols=1, fontsize="small", frameon=False)
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png")
     return True

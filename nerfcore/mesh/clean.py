@@ -1,0 +1,119 @@
+"""What a fused surface keeps: faces that views see, parts that are not scraps, small holes filled."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from ..kernels.surface import MapArrays, sight
+from ..progress import Reporter
+
+FEWEST_VIEWS = 2
+SCRAP = 1e-3  # of the area
+LONGEST_LOOP = 30  # edges of a hole that is filled
+CHUNK = 1 << 16
+
+
+def cross(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Normals (F, 3) of triangles, twice their area long."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    return np.cross(b - a, c - a)
+
+
+def areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(cross(vertices, faces), axis=1) / 2
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-20)
+
+
+def seen_by(points: np.ndarray, normals: np.ndarray, maps: MapArrays, tolerance: float, report: Reporter) -> np.ndarray:
+    """How many of the maps see each of the points (N, 3) with normals (N, 3)."""
+    device, counts = maps.depth.device, []
+    where, facing = (torch.from_numpy(np.asarray(a, np.float32)) for a in (points, normals))
+    for p, n in zip(where.split(CHUNK), facing.split(CHUNK)):
+        report.check()
+        counts.append((sight(p.to(device), n.to(device), maps, tolerance) > 0).sum(1).cpu().numpy())
+    return np.concatenate(counts) if counts else np.zeros(0, int)
+
+
+def clean(
+    vertices: np.ndarray, faces: np.ndarray, maps: MapArrays, tolerance: float, report: Reporter
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices, triangles, and which triangles (F,) bool fill a hole: without faces that fewer than two views see and
+    parts below a thousandth of the area; holes of at most 30 edges filled."""
+    views = seen_by(vertices[faces].mean(1), unit(cross(vertices, faces)), maps, tolerance, report)
+    faces = faces[views >= FEWEST_VIEWS]
+    faces = drop_scraps(vertices, faces)
+    report.check()
+    vertices, faces, filled = fill_holes(vertices, faces)
+    vertices, faces = compact(vertices, faces)
+    return vertices, faces, filled
+
+
+def drop_scraps(vertices: np.ndarray, faces: np.ndarray, share: float = SCRAP) -> np.ndarray:
+    """The triangles (F, 3) of connected parts that have at least `share` of the area."""
+    part = components(faces, len(vertices))
+    area = np.bincount(part, areas(vertices, faces))
+    return faces[area[part] >= share * area.sum()] if len(faces) else faces
+
+
+def components(faces: np.ndarray, count: int) -> np.ndarray:
+    """Number (F,) of the connected part of each triangle; triangles that share a vertex are connected."""
+    rows = np.concatenate([faces[:, 0], faces[:, 1]])
+    columns = np.concatenate([faces[:, 1], faces[:, 2]])
+    _, label = connected_components(coo_matrix((np.ones(len(rows), bool), (rows, columns)), (count, count)), False)
+    _, part = np.unique(label[faces[:, 0]], return_inverse=True)
+    return part
+
+
+def compact(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Only the vertices that are used."""
+    used, index = np.unique(faces, return_inverse=True)
+    return vertices[used], index.reshape(-1, 3)
+
+
+def border_edges(faces: np.ndarray) -> np.ndarray:
+    """Directed edges (E, 2) that have a triangle on one side only."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
+    stride = int(faces.max(initial=0)) + 1
+    forward, back = edges[:, 0] * stride + edges[:, 1], edges[:, 1] * stride + edges[:, 0]
+    return edges[~np.isin(forward, back)]
+
+
+def fill_holes(
+    vertices: np.ndarray, faces: np.ndarray, longest: int = LONGEST_LOOP
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Close border loops of at most `longest` edges by fans around their middle: vertices, triangles, and which of
+    these are new. Vertices where several loops meet are left alone."""
+    border = border_edges(faces)
+    starts, amount = np.unique(border[:, 0], return_counts=True)
+    simple = set(starts[amount == 1].tolist())
+    after = {int(a): int(b) for a, b in border if int(a) in simple}
+    middles, fans, visited = [], [], set()
+    for start in after:
+        if start in visited:
+            continue
+        loop, here = [], start
+        while here in after and here not in visited:
+            visited.add(here)
+            loop.append(here)
+            here = after[here]
+        if here != start or not 3 <= len(loop) <= longest:
+            continue
+        if len(loop) == 3:
+            fans.append(np.array([loop[::-1]]))
+            continue
+        center = len(vertices) + len(middles)
+        middles.append(vertices[loop].mean(0))
+        ring = np.array(loop)
+        fans.append(np.stack([np.roll(ring, -1), ring, np.full(len(ring), center)], 1))
+    if not fans:
+        return vertices, faces, np.zeros(len(faces), bool)
+    added = np.concatenate(fans)
+    if middles:
+        vertices = np.concatenate([vertices, np.array(middles)])
+    return vertices, np.concatenate([faces, added]), np.arange(len(faces) + len(added)) >= len(faces)

@@ -1,0 +1,255 @@
+"""Depth maps of a trained field: where rays become half opaque, and which of it other views confirm."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+import torch
+
+from ..data.box import box_poses
+from ..data.camera_rays import CameraRays
+from ..data.pixels import training_size
+from ..data.scene import View
+from ..geometry.cameras import Camera, pixel_centers, project, rays
+from ..kernels.march import sample
+from ..kernels.runtime import run_parallel
+from ..kernels.surface import FREE, MapArrays, agreement, depth_quantiles
+from ..progress import Reporter
+from ..render.model import Model
+
+CPU_PIXELS, GPU_PIXELS = 640, 1600  # longest side
+CPU_RAYS = 8192  # a tile that fits a core's cache
+MOST_VIEWS = 96
+OPAQUE, EMPTY = 0.5, 0.1  # opacities: something is there, nothing is there
+STEEPEST = np.cos(np.radians(80))
+EDGE = 0.03  # share by which the depth of neighbours differs at an outline
+NEIGHBOURS = 8  # views asked to confirm a depth
+CONFIRMED = 2  # of them that must
+AGREE, ROUND_TRIP = 0.01, 1.5  # of the depth; pixels
+SMALLEST_FACE = 0.05  # share of a cube's face that a photo must show
+
+
+@dataclass(frozen=True)
+class FlatView:
+    """A pinhole picture of what one photo shows: camera, camera-to-box pose (4, 4), index of the photo among the chosen
+    views, and inside (H, W): which pixels the photo covers."""
+
+    camera: Camera
+    pose: np.ndarray
+    photo: int
+    inside: np.ndarray
+
+
+@dataclass(frozen=True)
+class DepthMap:
+    """What one picture shows, (H, W) float32, along the optical axis in normalised units: depth (0 unknown, FREE where
+    nothing is), spread between transmittance 3/4 and 1/4, cosine of the angle between ray and normal."""
+
+    depth: np.ndarray
+    spread: np.ndarray
+    cosine: np.ndarray
+
+    @property
+    def hit(self) -> np.ndarray:
+        return (self.depth > 0) & (self.depth < FREE)
+
+
+def spread_views(views: list[View], most: int) -> list[View]:
+    """At most `most` views, well spread over places and directions: each next one is the farthest from those chosen."""
+    if len(views) <= most:
+        return views
+    centers = np.stack([v.camera_to_world[:3, 3] for v in views])
+    size = float(np.linalg.norm(centers - centers.mean(0), axis=1).mean()) or 1.0
+    places = np.concatenate([centers / size, np.stack([v.camera_to_world[:3, 2] for v in views])], 1)
+    chosen, gap = [0], np.linalg.norm(places - places[0], axis=1)
+    while len(chosen) < most:
+        chosen.append(int(gap.argmax()))
+        gap = np.minimum(gap, np.linalg.norm(places - places[chosen[-1]], axis=1))
+    return [views[i] for i in sorted(chosen)]
+
+
+def flat_views(views: list[View], box_from_world: np.ndarray, longest: int) -> list[FlatView]:
+    """Pinhole pictures that together show what the views do: lenses undistorted, wide ones cut into faces of a cube."""
+    made = []
+    for index, (view, pose) in enumerate(zip(views, box_poses(views, box_from_world))):
+        small = view.camera.resized(*training_size(view.camera, longest))
+        if view.camera.model in ("PINHOLE", "OPENCV"):
+            made.append(_flat(small, small.undistorted(), pose, np.eye(3), index))
+            continue
+        made += [_flat(small, face, pose, turn, index) for face, turn in cube_faces(small)]
+    return [view for view in made if view.inside.mean() >= SMALLEST_FACE]
+
+
+def cube_faces(camera: Camera) -> list[tuple[Camera, np.ndarray]]:
+    """Six square pinholes of 90° with the resolution of a wide camera's middle, and their rotations (3, 3) into its
+    axes."""
+    focal = camera.width / (2 * np.pi) if camera.model == "EQUIRECTANGULAR" else camera.fx
+    side = max(16, round(2 * focal))
+    face = Camera(width=side, height=side, fx=side / 2, fy=side / 2, cx=side / 2, cy=side / 2)
+    ahead = [(0, 0, 1), (1, 0, 0), (0, 0, -1), (-1, 0, 0), (0, 1, 0), (0, -1, 0)]
+    turns = []
+    for axis in np.array(ahead, float):
+        down = np.array([0.0, 0, -axis[1]]) if axis[1] else np.array([0.0, 1, 0])
+        turns.append(np.stack([np.cross(down, axis), down, axis], 1))
+    return [(face, turn) for turn in turns]
+
+
+def _flat(photo: Camera, flat: Camera, pose: np.ndarray, turn: np.ndarray, index: int) -> FlatView:
+    directions, _ = rays(flat, pixel_centers(flat.width, flat.height).reshape(-1, 2))
+    pixel = project(photo, directions @ turn.T)
+    with np.errstate(invalid="ignore"):
+        inside = (pixel >= 0).all(1) & (pixel <= [photo.width, photo.height]).all(1)
+    moved = pose.copy()
+    moved[:3, :3] = pose[:3, :3] @ turn
+    return FlatView(flat, moved, index, inside.reshape(flat.height, flat.width))
+
+
+def depth_maps(model: Model, views: list[FlatView], report: Reporter) -> list[DepthMap]:
+    """Depth maps of all views; the reporter hears how long it will take."""
+    model.refine(float(sum(v.inside.size for v in views)), report.check)
+    begin, maps = time.monotonic(), []
+    for number, view in enumerate(views):
+        left = (time.monotonic() - begin) / number * (len(views) - number) if number else 0.0
+        report.progress(number / len(views), f"{left:.0f} s left" if number else "")
+        maps.append(render_depth(model, view, report.check))
+    return maps
+
+
+@torch.no_grad()
+def render_depth(model: Model, view: FlatView, check: Callable[[], None]) -> DepthMap:
+    """The depth map of one view: the median along each ray, inside the sample in which transmittance passes 1/2."""
+    device, camera, grid = model.priorities.device, view.camera, model.render_grid()
+    through = CameraRays([camera], view.pose[None], device)
+    count = model.config.render.samples or model.config.sampling.samples
+    axis = through.rotation[0, :, 2]
+
+    @torch.no_grad()
+    def tile(pixel: torch.Tensor) -> torch.Tensor:
+        check()
+        origins, directions = through(torch.zeros_like(pixel), pixel)
+        s = sample(origins, directions, grid.cells, grid.reach, grid.settings, count)
+        density = model.field.density(s.points)
+        near, middle, far, opacity = depth_quantiles(density, s.delta, s.depth, s.packing)
+        along = directions @ axis
+        # A ray that stays more transparent than 1/4 has its spread up to its end unknown: three times the half.
+        spread = torch.where(far > 0, far - near, 3 * (middle - near))
+        depth = torch.where(opacity >= OPAQUE, middle * along, torch.where(opacity < EMPTY, FREE, 0.0))
+        return torch.stack([depth, spread * along], 1)
+
+    pixels = torch.arange(camera.width * camera.height, device=device)
+    tiles = pixels.split(CPU_RAYS if device.type == "cpu" else 1 << 18)
+    values = torch.cat(run_parallel([partial(tile, some) for some in tiles])).cpu().numpy()
+    shape = (camera.height, camera.width)
+    depth = np.where(view.inside, values[:, 0].reshape(shape), 0).astype(np.float32)
+    return DepthMap(depth, values[:, 1].reshape(shape), cosines(camera, depth))
+
+
+def cosines(camera: Camera, depth: np.ndarray) -> np.ndarray:
+    """Cosine (H, W) of the angle between each pixel's ray and the surface normal there, from depth differences over two
+    pixels each way; 0 where there is no surface or an outline."""
+    solid = (depth > 0) & (depth < FREE)
+    directions = np.concatenate(
+        [
+            (pixel_centers(camera.width, camera.height) - [camera.cx, camera.cy]) / [camera.fx, camera.fy],
+            np.ones((camera.height, camera.width, 1)),
+        ],
+        -1,
+    ).astype(np.float32)
+    points = directions * np.where(solid, depth, 1)[..., None]
+    dx, dy = _slope(points, solid, 1), _slope(points, solid, 0)
+    normal = np.cross(dx, dy)
+    length = np.linalg.norm(normal, axis=-1) * np.linalg.norm(points, axis=-1)
+    cosine = np.abs((normal * points).sum(-1)) / np.maximum(length, 1e-20)
+    return np.where(solid & (length > 0), cosine, 0).astype(np.float32)
+
+
+def _slope(points: np.ndarray, solid: np.ndarray, axis: int) -> np.ndarray:
+    """Difference of points (H, W, 3) to a neighbour along an axis: of the two sides, the one whose depth is nearer; 0
+    where neither is solid or continues the surface."""
+    out, best = np.zeros_like(points), np.full(solid.shape, np.inf, np.float32)
+    z = points[..., 2]
+    for step in (2, 1):
+        for sign in (-1, 1):
+            moved = np.roll(points, sign * step, axis)
+            change = np.abs(moved[..., 2] - z) / step
+            usable = solid & np.roll(solid, sign * step, axis) & (change < EDGE * z) & (change < 0.999 * best)
+            edge = [slice(None)] * 2
+            edge[axis] = slice(0, step) if sign > 0 else slice(-step, None)
+            usable[tuple(edge)] = False
+            out[usable] = (moved - points)[usable] * -sign / step
+            best[usable] = change[usable]
+    return out
+
+
+def confirmed_maps(views: list[FlatView], maps: list[DepthMap], device: torch.device, report: Reporter) -> MapArrays:
+    """The maps as the kernels read them, without what cannot be trusted: seen under less than 10°, at outlines, or not
+    confirmed by two other views."""
+    sizes = torch.tensor([[v.camera.width, v.camera.height] for v in views], dtype=torch.int32)
+    inverse = np.stack([np.linalg.inv(v.pose) for v in views]).astype(np.float32)
+
+    def flat(parts: list[np.ndarray]) -> torch.Tensor:
+        return torch.from_numpy(np.concatenate([p.reshape(-1) for p in parts]).astype(np.float32)).to(device)
+
+    arrays = MapArrays(
+        flat([np.where(m.hit & (m.cosine < STEEPEST), 0, m.depth) for m in maps]),
+        flat([np.where(m.hit, m.cosine, 1) for m in maps]),
+        flat([np.where(m.hit, m.spread, 0) for m in maps]),
+        torch.nn.functional.pad(sizes.prod(1).cumsum(0)[:-1], (1, 0)).int().to(device),
+        sizes.to(device),
+        torch.tensor([[v.camera.fx, v.camera.fy, v.camera.cx, v.camera.cy] for v in views]).float().to(device),
+        torch.from_numpy(np.ascontiguousarray(inverse[:, :3, :3])).to(device),
+        torch.from_numpy(np.ascontiguousarray(inverse[:, :3, 3])).to(device),
+    )
+    confirmed = []
+    for index, around in enumerate(neighbours(views, maps)):
+        report.progress(index / len(views))
+        near = torch.tensor(around, dtype=torch.int32, device=device)
+        confirmed.append(agreement(arrays, index, near, AGREE, ROUND_TRIP) >= CONFIRMED)
+    keep = torch.cat(confirmed) | (arrays.depth >= FREE)
+    return replace(arrays, depth=torch.where(keep, arrays.depth, 0.0))
+
+
+def hit_points(arrays: MapArrays, view: int) -> torch.Tensor:
+    """Points (N, 3) of the box frame that the pixels of one map show."""
+    begin, (width, height) = int(arrays.first[view]), arrays.size[view].tolist()
+    depth = arrays.depth[begin : begin + width * height]
+    place = ((depth > 0) & (depth < FREE)).nonzero()[:, 0]
+    z, (fx, fy, cx, cy) = depth[place], arrays.lens[view]
+    x, y = place % width + 0.5, torch.div(place, width, rounding_mode="floor") + 0.5
+    local = torch.stack([(x - cx) / fx * z, (y - cy) / fy * z, z], 1)
+    return (local - arrays.translation[view]) @ arrays.rotation[view]
+
+
+def neighbours(views: list[FlatView], maps: list[DepthMap], most: int = NEIGHBOURS) -> list[list[int]]:
+    """Of each view the others that show the same best: those that see most of its surface, at an angle that is not too
+    wide."""
+    centers = np.stack([v.pose[:3, 3] for v in views])
+    out = []
+    for index, (view, map_) in enumerate(zip(views, maps)):
+        rows, columns = np.nonzero(map_.hit)
+        some = slice(None, None, max(1, len(rows) // 500))
+        c, z = view.camera, map_.depth[rows[some], columns[some]]
+        local = np.stack([(columns[some] + 0.5 - c.cx) / c.fx * z, (rows[some] + 0.5 - c.cy) / c.fy * z, z], 1)
+        points = local @ view.pose[:3, :3].T + view.pose[:3, 3]
+        score = np.zeros(len(views))
+        mine = view.pose[:3, 3] - points
+        mine /= np.maximum(np.linalg.norm(mine, axis=1, keepdims=True), 1e-9)
+        for other, seen_by in enumerate(views):
+            if other == index or not len(points):
+                continue
+            place = (points - centers[other]) @ seen_by.pose[:3, :3]
+            with np.errstate(invalid="ignore"):
+                pixel = project(seen_by.camera, place)
+                inside = (pixel >= 0).all(1) & (pixel < [seen_by.camera.width, seen_by.camera.height]).all(1)
+            theirs = centers[other] - points
+            theirs /= np.maximum(np.linalg.norm(theirs, axis=1, keepdims=True), 1e-9)
+            angle = np.degrees(np.arccos(np.clip((mine * theirs).sum(1), -1, 1)))
+            # Best at 15°; the same place says nothing new, far around little is the same.
+            score[other] = (inside * np.exp(-((angle - 15) ** 2) / (2 * np.where(angle < 15, 6, 20) ** 2))).sum()
+        order = np.argsort(-score, kind="stable")[:most]
+        out.append([int(i) for i in order if score[i] > 0])
+    return out

@@ -1,0 +1,84 @@
+"""Depth maps fused into signed distances on a sparse grid: bricks of 8³ corners near what the maps show.
+
+Source: Curless and Levoy, "A volumetric method for building complex models from range images", 1996; the rule for thin
+sheets and the weights are in kernels/surface.py.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from ..kernels.surface import MapArrays, fuse
+from ..progress import Reporter
+from .depth_maps import hit_points
+from .region import Region
+
+BRICK = 8  # corners along each side of a brick
+TRUNCATION = 4.0  # voxels
+NEAR = 2.5  # voxels around a hit in which the surface may lie
+FREE_AT = 1.5  # voxels in front of a view's surface: it looks through
+GAP = 0.03  # share by which depths of one surface differ from pixel to pixel
+APART = float(np.cos(np.radians(3)))
+CHUNK = 256  # bricks
+
+
+@dataclass(frozen=True)
+class Bricks:
+    """Distances on a sparse grid. index (X, Y, Z) int32: place of each brick, −1 where there is none; distance
+    (B, 8, 8, 8) float32 in normalised units, negative inside, weight, and known (B, 8, 8, 8) bool, of the corners
+    origin + voxel · (8 · brick + (i, j, k))."""
+
+    origin: np.ndarray
+    voxel: float
+    index: np.ndarray
+    distance: np.ndarray
+    weight: np.ndarray
+    known: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.distance)
+
+
+def fuse_maps(maps: MapArrays, region: Region, report: Reporter) -> Bricks:
+    """Fuse depth maps within a region."""
+    h = region.voxel
+    cells = np.maximum(np.ceil((region.high - region.low) / h).astype(int), 1)
+    origin = (region.low + region.high) / 2 - cells * h / 2
+    index = _mark(maps, origin, h, -(-(cells + 1) // BRICK), report)
+    bricks = np.stack(np.nonzero(index >= 0), 1)
+    device = maps.depth.device
+    axis = torch.arange(BRICK, device=device)
+    inner = torch.cartesian_prod(axis, axis, axis)
+    start = torch.from_numpy(origin).float().to(device)
+    distance, weight, known = [], [], []
+    for begin in range(0, len(bricks), CHUNK):
+        report.progress(begin / len(bricks))
+        some = torch.from_numpy(bricks[begin : begin + CHUNK]).to(device)
+        points = (some[:, None] * BRICK + inner).reshape(-1, 3) * h + start
+        d, w, k = fuse(points.float(), maps, h, TRUNCATION * h, FREE_AT * h, GAP, APART)
+        for parts, values in ((distance, d), (weight, w), (known, k > 0)):
+            parts.append(values.view(-1, BRICK, BRICK, BRICK).cpu().numpy())
+    return Bricks(origin, h, index, np.concatenate(distance), np.concatenate(weight), np.concatenate(known))
+
+
+def _mark(maps: MapArrays, origin: np.ndarray, voxel: float, counts: np.ndarray, report: Reporter) -> np.ndarray:
+    """Number the bricks (X, Y, Z) that lie near a hit; −1 elsewhere."""
+    device = maps.depth.device
+    marked = torch.zeros(tuple(counts.tolist()), dtype=torch.bool, device=device)
+    start = torch.from_numpy(origin).float().to(device)
+    most = torch.from_numpy(counts).to(device)
+    for view in range(len(maps)):
+        report.progress(0.0)
+        place = (hit_points(maps, view) - start) / voxel
+        place = place[((place > -NEAR) & (place < most * BRICK + NEAR)).all(1)]
+        for corner in torch.cartesian_prod(*[torch.tensor([-NEAR, NEAR], device=device)] * 3):
+            brick = torch.div(place + corner, BRICK, rounding_mode="floor").long()
+            brick = torch.minimum(brick.clamp(min=0), most - 1)
+            marked[brick[:, 0], brick[:, 1], brick[:, 2]] = True
+    index = np.full(tuple(counts.tolist()), -1, np.int32)
+    found = marked.cpu().numpy()
+    index[found] = np.arange(int(found.sum()), dtype=np.int32)
+    return index

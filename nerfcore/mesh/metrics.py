@@ -1,0 +1,107 @@
+"""How close a mesh is to the true one: precision, recall, F-score, distances, area."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from scipy.spatial import KDTree
+from trimesh.triangles import closest_point
+
+from .clean import areas, cross, unit
+
+SAMPLES = 200_000
+
+
+@dataclass(frozen=True)
+class SurfaceScores:
+    """precision, recall, f: shares in [0, 1] within `threshold`; median and p95 of the distance from the mesh to the
+    truth; `area_ratio` to the truth's area; `normal_deg`: median angle to the true normals."""
+
+    threshold: float
+    precision: float
+    recall: float
+    f: float
+    median: float
+    p95: float
+    area_ratio: float
+    normal_deg: float
+
+    def as_dict(self) -> dict[str, float]:
+        return {name: round(float(value), 5) for name, value in asdict(self).items()}
+
+
+def sample_surface(
+    vertices: np.ndarray, faces: np.ndarray, count: int = SAMPLES, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points (N, 3) spread evenly over triangles, and the triangle (N,) of each."""
+    random = np.random.default_rng(seed)
+    area = areas(vertices, faces).cumsum()
+    # One point in each of `count` equal shares of the area: less noise than independent draws.
+    chosen = np.searchsorted(area, (np.arange(count) + random.random(count)) / count * area[-1])
+    chosen = np.minimum(chosen, len(faces) - 1)
+    u, v = random.random((2, count, 1))
+    flip = u + v > 1
+    u, v = np.where(flip, 1 - u, u), np.where(flip, 1 - v, v)
+    a, b, c = (vertices[faces[chosen, k]] for k in range(3))
+    return a + u * (b - a) + v * (c - a), chosen
+
+
+def compare(
+    mesh: tuple[np.ndarray, np.ndarray],
+    truth: tuple[np.ndarray, np.ndarray],
+    threshold: float,
+    visible: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
+    seed: int = 0,
+) -> SurfaceScores:
+    """Compare two meshes (vertices, faces) of one frame.
+
+    `visible`: points and normals (N, 3) of the truth → (N,) bool; recall and area count only these. Points are spread
+    evenly over both surfaces; distances are to the triangles near them.
+    """
+    points, face = sample_surface(*mesh, seed=seed)
+    true, true_face = sample_surface(*truth, count=2 * SAMPLES, seed=seed + 1)
+    true_normals = unit(cross(*truth))[true_face]
+    shown = np.ones(len(true), bool) if visible is None else visible(true, true_normals)
+    to_truth, nearest = _plane_distance(points, true, true_face, truth)
+    to_mesh, _ = _plane_distance(true[shown], points, face, mesh)
+    precision, recall = float((to_truth < threshold).mean()), float((to_mesh < threshold).mean())
+    normal = unit(cross(*mesh))[face]
+    angle = np.degrees(np.arccos(np.clip(np.abs((normal * true_normals[nearest]).sum(1)), 0, 1)))
+    true_area = areas(*truth).sum() * shown.mean()
+    return SurfaceScores(
+        threshold,
+        precision,
+        recall,
+        2 * precision * recall / max(precision + recall, 1e-9),
+        float(np.median(to_truth)),
+        float(np.quantile(to_truth, 0.95)),
+        float(areas(*mesh).sum() / true_area),
+        float(np.median(angle)),
+    )
+
+
+def _plane_distance(
+    points: np.ndarray, samples: np.ndarray, face: np.ndarray, mesh: tuple[np.ndarray, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Distance (N,) of points to a surface known by samples (M, 3), and the nearest sample: among the eight nearest
+    samples' triangles the least distance to the triangle's closest point."""
+    _, near = KDTree(samples).query(points, k=8, workers=-1)
+    vertices, faces = mesh
+    best = np.full(len(points), np.inf)
+    which = near[:, 0].copy()
+    for k in range(near.shape[1]):
+        corners = vertices[faces[face[near[:, k]]]]
+        distance = np.linalg.norm(closest_point(corners, points) - points, axis=1)
+        nearer = distance < best
+        best[nearer], which[nearer] = distance[nearer], near[nearer, k]
+    return best, which
+
+
+def on_border(vertices: np.ndarray, faces: np.ndarray, low: np.ndarray, high: np.ndarray, within: float) -> int:
+    """Number of triangles that lie in one of the sides of a box, to `within`."""
+    corners = vertices[faces]
+    near_low = (np.abs(corners - low) < within).all(1)
+    near_high = (np.abs(corners - high) < within).all(1)
+    return int((near_low | near_high).any(1).sum())

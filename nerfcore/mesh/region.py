@@ -1,0 +1,82 @@
+"""Where a surface is looked for, and how finely."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from ..errors import TrainingError
+from ..kernels.surface import FREE, MapArrays
+from .depth_maps import hit_points
+
+MARGIN = 0.02  # of the longest side
+INNER, REACH = (1.0, 99.0), 0.25  # percentiles of all hits; how far beyond them, as a share of their extent
+FEWEST_HITS = 200
+
+
+@dataclass(frozen=True)
+class Region:
+    """A box of the normalised frame between two corners (3,), cut into cubes of side `voxel`."""
+
+    low: np.ndarray
+    high: np.ndarray
+    voxel: float
+
+    @property
+    def size(self) -> float:
+        return float((self.high - self.low).max())
+
+
+def all_hits(maps: MapArrays, most: int = 1 << 20) -> torch.Tensor:
+    """Up to about `most` of the points (N, 3) that the maps show, evenly chosen."""
+    step = max(1, int(((maps.depth > 0) & (maps.depth < FREE)).sum()) // most)
+    return torch.cat([hit_points(maps, view)[::step] for view in range(len(maps))])
+
+
+def choose_region(
+    maps: MapArrays, bounds: tuple[np.ndarray, np.ndarray] | None, cells: int, voxel: float | None = None
+) -> Region:
+    """The box to look in: `bounds` (corners (3,)) cut to what is seen, or what the maps show without far outliers.
+
+    Args:
+        cells: voxels along the longest side; fewer where the pictures are coarser than that: a voxel is at least half
+            the median footprint of a pixel.
+        voxel: side of a voxel, instead of that.
+    Raises:
+        TrainingError: the maps show (almost) nothing, or nothing within the bounds.
+    """
+    points = all_hits(maps).cpu().numpy()
+    if len(points) < FEWEST_HITS:
+        raise TrainingError(
+            "The field shows no surface that several views agree on.",
+            "Train longer, or check the poses: `fieldwork evaluate` says how good the field is.",
+        )
+    if bounds is not None:
+        inside = ((points >= bounds[0]) & (points <= bounds[1])).all(1)
+        if inside.sum() < FEWEST_HITS * len(points) / len(all_hits(maps)):
+            raise TrainingError("The field has no surface in the region of interest.", "Train longer, or check the box.")
+        points = points[inside]
+        low, high = points.min(0), points.max(0)
+    else:
+        inner = np.percentile(points, INNER, axis=0)
+        room = REACH * (inner[1] - inner[0]).max()
+        low, high = np.maximum(points.min(0), inner[0] - room), np.minimum(points.max(0), inner[1] + room)
+    margin = MARGIN * (high - low).max()
+    low, high = low - margin, high + margin
+    if bounds is not None:
+        low, high = np.maximum(low, bounds[0]), np.minimum(high, bounds[1])
+    if voxel is None:
+        voxel = max(float((high - low).max()) / cells, 0.5 * footprint(maps))
+    return Region(low, high, voxel)
+
+
+def footprint(maps: MapArrays) -> float:
+    """Median size of a pixel at the surface, z / f."""
+    sizes = []
+    for view in range(len(maps)):
+        begin = int(maps.first[view])
+        depth = maps.depth[begin : begin + int(maps.size[view].prod())][::7]
+        sizes.append(depth[(depth > 0) & (depth < FREE)] / maps.lens[view, 0])
+    return float(torch.cat(sizes).median())

@@ -266,10 +266,10 @@ class FieldworkScene(PropertyGroup):
     # Mesh
     resolution: IntProperty(
         name="Resolution",
-        description="Cells along the longest side of the capture; memory grows with the third power",
-        default=256,
+        description="Cells along the longest side of what the photos show; memory grows with the square",
+        default=512,
         min=16,
-        max=1024,
+        max=2048,
     )
     faces: IntProperty(
         name="Faces", description="Target number of triangles; 0: keep all", default=0, min=0, soft_max=2_000_000

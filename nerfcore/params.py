@@ -200,7 +200,15 @@ class MeshParams(Params):
     run: str = "main"
     out: Path | None = None
     faces: int | None = Field(default=None, gt=0, description="target number of triangles")
-    resolution: int = Field(default=256, ge=16, le=1024, description="cells along the longest side of the box")
+    resolution: int = Field(default=512, ge=16, le=2048, description="cells along the longest side of the region")
+    detail: float | None = Field(
+        default=None, gt=0, description="side of a cell in millimetres, instead of resolution; needs a known scale"
+    )
+    region: str = Field(
+        default="auto",
+        description="where to look: auto (the region of interest, or what the photos show where there is none), photos "
+        "(what they show), or x0,y0,z0,x1,y1,z1 in the aligned world",
+    )
     texture: int | None = Field(default=None, ge=64, description="texture size in pixels; none: vertex colours only")
     split: Literal["none", "classes"] = "none"
 

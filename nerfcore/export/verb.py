@@ -13,8 +13,8 @@ from ..blender.package import stale, write_package
 from ..blender.process import write_in_blender
 from ..data.load import load_scene
 from ..errors import ProjectError, SettingError
-from ..mesh.extract import Surface
 from ..mesh.files import Texture, texture_of, write_surface
+from ..mesh.surface import Surface
 from ..params import ExportParams
 from ..progress import Reporter
 from ..project.runs import holdout_of

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..files import atomic_path
 from ..geometry.similarity import make_similarity, similarity_scale
-from ..mesh.extract import density_volume, shade, surface_level
+from ..mesh.field_values import density_volume, shade, surface_level
 from ..progress import Reporter
 from ..project.schema import Project
 from ..render.run import Trained
@@ -31,9 +31,11 @@ def write_voxels(path: Path, trained: Trained, project: Project, resolution: int
     if len(filled):
         slope = np.stack(np.gradient(np.log(volume + 1e-2)), -1)[tuple(filled.T)]
         normals = -slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-9)
-        ids = trained.info.class_ids if trained.model.field.classes else []
-        found = shade(trained.model, filled * spacing - 1.0, normals, ids, spacing, report)
-        color[tuple(filled.T)], class_id[tuple(filled.T)] = found
+        places, semantics = filled * spacing - 1.0, trained.model.field.classes > 0
+        found, probabilities = shade(trained.model, places, normals, semantics, spacing, report.progress)
+        color[tuple(filled.T)] = (found * 255).round()
+        if probabilities is not None:
+            class_id[tuple(filled.T)] = np.array(trained.info.class_ids, np.int32)[probabilities.argmax(1)]
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         np.savez_compressed(
             file,

@@ -1,29 +1,29 @@
 """From rays to a surface: depths at which rays end, depth maps that confirm each other, distances fused from them.
 
 Depth maps are pinhole images, one behind the other in flat arrays: `depth` (P,) along the optical axis, 0 where unknown
-and `FREE` where a ray meets nothing. The torch twins are in `surface_torch.py`.
+and `FREE` where a ray meets nothing. Devices without Warp leave all but the depths of rays to the host; the torch twins
+that tests compare with are in `surface_torch.py`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 import warp as wp
 
-from .packing import Packing
+from . import surface_torch
+from .depth_arrays import MapArrays
+from .device import backend_of
+from .packed_info import PackedInfo
 from .runtime import array, init, launch
-
-FREE = 1e30  # depth of a ray that meets nothing
 
 
 @wp.kernel(module="fieldwork_surface")
 def quantile_kernel(
     density: wp.array(dtype=float),
-    delta: wp.array(dtype=float),
-    depth: wp.array(dtype=float),
-    start: wp.array(dtype=int),
-    count: wp.array(dtype=int),
+    deltas: wp.array(dtype=float),
+    t: wp.array(dtype=float),
+    starts: wp.array(dtype=int),
+    counts: wp.array(dtype=int),
     out: wp.array(dtype=wp.vec4),
     offset: int,
 ):
@@ -32,10 +32,10 @@ def quantile_kernel(
     middle = float(0.0)
     far = float(0.0)
     passed = float(0.0)  # optical depth
-    base = start[r]
-    for k in range(base, base + count[r]):
-        own = density[k] * delta[k]
-        begin = depth[k] - 0.5 * delta[k]
+    base = starts[r]
+    for k in range(base, base + counts[r]):
+        own = density[k] * deltas[k]
+        begin = t[k] - 0.5 * deltas[k]
         if own > 0.0:
             # T falls to q at optical depth −ln q: 0.2877 at 3/4, 0.6931 at 1/2, 1.3863 at 1/4.
             if passed < 0.28768 and passed + own >= 0.28768:
@@ -49,55 +49,29 @@ def quantile_kernel(
 
 
 def depth_quantiles(
-    density: torch.Tensor, delta: torch.Tensor, depth: torch.Tensor, packing: Packing
+    density: torch.Tensor, deltas: torch.Tensor, t: torch.Tensor, packed_info: PackedInfo
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
     """Where the transmittance of rays passes 3/4, 1/2 and 1/4, and their opacity, each (R,).
 
-    density, delta, depth (N,) of packed samples as in `march.Samples`; a sample stands for the stretch `delta` around
-    it. Distances are 0 where the ray does not become so opaque.
+    density, deltas, t (N,) of packed samples as in `march.Samples`; a sample stands for the stretch `deltas` around it.
+    Distances are 0 where the ray does not become so opaque.
     """
+    if not backend_of(density.device).warp:
+        return surface_torch.depth_quantiles(density, deltas, t, packed_info)
     init()
-    rays = len(packing.start)
+    rays = len(packed_info.starts)
     out = torch.empty(rays, 4, device=density.device)
-    inputs = [array(density.contiguous()), array(delta), array(depth), array(packing.start), array(packing.count)]
-    launch(quantile_kernel, rays, [*inputs, array(out, wp.vec4)], density.device)
+    inputs = [array(density.contiguous()), array(deltas), array(t), array(packed_info.starts)]
+    launch(quantile_kernel, rays, [*inputs, array(packed_info.counts), array(out, wp.vec4)], density.device)
     near, middle, far, opacity = out.unbind(1)
     return near, middle, far, opacity
-
-
-@dataclass(frozen=True)
-class MapArrays:
-    """V depth maps in one frame, P pixels together.
-
-    depth (P,); cosine (P,) of the angle between ray and surface normal; spread (P,) between transmittance 3/4 and 1/4
-    along the axis; first (V,) int32 first pixel of a map; size (V, 2) int32 width and height; lens (V, 4) fx, fy, cx, cy; rotation (V, 3, 3) and
-    translation (V, 3): camera axes from the frame.
-    """
-
-    depth: torch.Tensor
-    cosine: torch.Tensor
-    spread: torch.Tensor
-    first: torch.Tensor
-    size: torch.Tensor
-    lens: torch.Tensor
-    rotation: torch.Tensor
-    translation: torch.Tensor
-
-    def __len__(self) -> int:
-        return len(self.first)
-
-    def cameras(self) -> list:
-        """Kernel arguments: where each map lies and how points get there."""
-        return [array(self.first), array(self.size), array(self.lens, wp.vec4)] + [
-            array(self.rotation, wp.mat33),
-            array(self.translation, wp.vec3),
-        ]
 
 
 @wp.func
 def read_depth(depth: wp.array(dtype=float), first: int, width: int, height: int, x: float, y: float, gap: float):
     """Depth at pixel coordinates: interpolated (in 1/z, in which planes are linear) where the four pixels around lie
-    within the share `gap` of each other, else the nearest pixel's. And the nearest pixel's place."""
+    within the share `gap` of each other; at an outline the nearest pixel's if it is in front, else unknown: half a pixel
+    beside an outline nobody knows what is behind. And the nearest pixel's place."""
     column = wp.clamp(int(wp.floor(x)), 0, width - 1)
     row = wp.clamp(int(wp.floor(y)), 0, height - 1)
     place = first + row * width + column
@@ -112,7 +86,9 @@ def read_depth(depth: wp.array(dtype=float), first: int, width: int, height: int
         d = depth[corner + width + 1]
         low = wp.min(wp.min(a, b), wp.min(c, d))
         high = wp.max(wp.max(a, b), wp.max(c, d))
-        if low > 0.0 and high - low < gap * low:
+        if value - low >= gap * low:
+            value = 0.0
+        elif low > 0.0 and high - low < gap * low:
             fx = x - 0.5 - float(x0)
             fy = y - 0.5 - float(y0)
             upper = (1.0 - fx) / a + fx / b
@@ -171,11 +147,13 @@ def fuse_kernel(
                         sure = wp.min(1.0, voxel / wp.max(spread[place], 1e-6))
                         w = sure * sure * cosine[place] * scale * scale
                         if d < 0.0:
-                            w *= 1.0 + d / truncation
+                            behind = 1.0 + d / truncation
+                            w *= behind * behind
                         d = wp.min(d, truncation)
                         seen += 1
                         if d > free_at:
                             free += 1
+                            w *= 0.1
                         total += w * d
                         total_weight += w
                         if d >= 0.0:
@@ -206,7 +184,8 @@ def fuse(
 
     A view's distance is (D − z) · ‖q‖/z · cos θ, from the point q in camera axes along the ray to the surface and from
     there to its plane; beyond `truncation` behind the surface the view says nothing. Weights: cos θ (f/z)² ·
-    min(1, voxel/spread)², falling off linearly behind the surface. Where at least two views and 15 % of those that see a point find it more
+    min(1, voxel/spread)², falling off quadratically behind the surface, a tenth where a view looks
+    through: that it does so says little about where the surface is. Where at least two views and 15 % of those that see a point find it more
     than `free_at` in front of their surface, only non-negative distances count: both sides of thin sheets remain.
     `gap`: share by which depths of neighbouring pixels may differ and still be interpolated.
     """
@@ -255,7 +234,7 @@ def agree_kernel(
             ox = m[0] * o[0] / o[2] + m[2]
             oy = m[1] * o[1] / o[2] + m[3]
             if ox >= 0.0 and oy >= 0.0 and ox < float(size[v, 0]) and oy < float(size[v, 1]):
-                value, place = read_depth(depth, first[v], size[v, 0], size[v, 1], ox, oy, 0.05)
+                value, _ = read_depth(depth, first[v], size[v, 0], size[v, 1], ox, oy, 0.05)
                 if value > 0.0 and value < 1e29 and wp.abs(value - o[2]) < share * o[2]:
                     back = wp.vec3((ox - m[2]) / m[0] * value, (oy - m[3]) / m[1] * value, value)
                     b = rotation[view] * (wp.transpose(rotation[v]) * (back - translation[v])) + translation[view]
@@ -306,7 +285,7 @@ def sight_kernel(
             width = size[v, 0]
             height = size[v, 1]
             if x >= 0.0 and y >= 0.0 and x < float(width) and y < float(height):
-                value, place = read_depth(depth, first[v], width, height, x, y, 0.05)
+                value, _ = read_depth(depth, first[v], width, height, x, y, 0.05)
                 far = wp.length(q)
                 facing = -wp.dot(n, wp.transpose(rotation[v]) * q) / far
                 if value > 0.0 and facing > 0.0 and wp.abs(q[2] - value) < tolerance:

@@ -7,7 +7,8 @@ import torch
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from ..kernels.surface import MapArrays, sight
+from ..kernels.depth_arrays import MapArrays
+from ..kernels.surface import sight
 from ..progress import Reporter
 
 FEWEST_VIEWS = 2

@@ -14,13 +14,11 @@ PASSES = 12
 AT_ONCE = 0.25  # share of a chunk's faces that at least remain in one pass: its border is kept as it is until the next
 
 
-def decimate(
-    vertices: np.ndarray, faces: np.ndarray, target: int, report: Reporter
-) -> tuple[np.ndarray, np.ndarray]:
-    """At most about `target` triangles of a mesh; its open borders keep their place.
+def decimate(vertices: np.ndarray, faces: np.ndarray, target: int, report: Reporter) -> tuple[np.ndarray, np.ndarray]:
+    """At most about `target` triangles of a mesh. Its open borders keep their place where they leave enough triangles to
+    collapse.
 
-    Chunks are slabs along the longest axis of what they divide; each pass cuts elsewhere, so that what was a border is
-    inside the next time.
+    Each pass cuts elsewhere, so that what was the border of a chunk is inside the next time.
     """
     total = max(len(faces) - target, 1)
     for number in range(PASSES):
@@ -29,14 +27,15 @@ def decimate(
         report.progress(min(1.0, 1 - (len(faces) - target) / total))
         before = len(faces)
         ratio = max(target / len(faces), AT_ONCE)
-        vertices, faces = _one_pass(vertices, faces, ratio, number, report)
-        if len(faces) > 0.98 * before:
-            break
+        keep = number < PASSES - 2
+        vertices, faces = _one_pass(vertices, faces, ratio, number, keep, report)
+        if keep and len(faces) > 0.98 * before:  # nothing but borders is left
+            vertices, faces = _one_pass(vertices, faces, ratio, number, False, report)
     return vertices, faces
 
 
 def _one_pass(
-    vertices: np.ndarray, faces: np.ndarray, ratio: float, number: int, report: Reporter
+    vertices: np.ndarray, faces: np.ndarray, ratio: float, number: int, keep_border: bool, report: Reporter
 ) -> tuple[np.ndarray, np.ndarray]:
     chunks = _chunks(vertices[faces].mean(1), number)
     made, corners, first = [], [], 0
@@ -49,7 +48,7 @@ def _one_pass(
                 np.ascontiguousarray(points, np.float64),
                 np.ascontiguousarray(triangles, np.int32),
                 target_count=wanted,
-                preserve_border=len(chunks) > 1 or number > 0,
+                preserve_border=keep_border or len(chunks) > 1,
             )
         made.append(np.asarray(points, np.float64))
         corners.append(np.asarray(triangles, np.int64) + first)

@@ -15,14 +15,17 @@ from ..data.camera_rays import CameraRays
 from ..data.pixels import training_size
 from ..data.scene import View
 from ..geometry.cameras import Camera, pixel_centers, project, rays
+from ..kernels.depth_arrays import FREE, MapArrays
+from ..kernels.device import backend_of
 from ..kernels.march import sample
 from ..kernels.runtime import run_parallel
-from ..kernels.surface import FREE, MapArrays, agreement, depth_quantiles
+from ..kernels.surface import agreement, depth_quantiles
 from ..progress import Reporter
 from ..render.model import Model
 
-CPU_PIXELS, GPU_PIXELS = 640, 1600  # longest side
-CPU_RAYS = 8192  # a tile that fits a core's cache
+CPU_SIDE, GPU_SIDE = 640, 1600  # longest side of a map
+CPU_PIXELS, GPU_PIXELS = 8e6, 2e8  # of all maps together
+CPU_RAYS, GPU_RAYS = 8192, 1 << 18  # a tile; the CPU's fits a core's cache
 MOST_VIEWS = 96
 OPAQUE, EMPTY = 0.5, 0.1  # opacities: something is there, nothing is there
 STEEPEST = np.cos(np.radians(80))
@@ -70,6 +73,14 @@ def spread_views(views: list[View], most: int) -> list[View]:
         chosen.append(int(gap.argmax()))
         gap = np.minimum(gap, np.linalg.norm(places - places[chosen[-1]], axis=1))
     return [views[i] for i in sorted(chosen)]
+
+
+def map_size(views: list[View], device: torch.device) -> int:
+    """Longest side of the depth maps, so that all together stay affordable."""
+    side, most = (CPU_SIDE, CPU_PIXELS) if device.type == "cpu" else (GPU_SIDE, GPU_PIXELS)
+    sizes = [training_size(view.camera, side) for view in views]
+    total = sum(width * height for width, height in sizes)
+    return max(64, int(side * min(1.0, (most / total) ** 0.5)))
 
 
 def flat_views(views: list[View], box_from_world: np.ndarray, longest: int) -> list[FlatView]:
@@ -131,9 +142,9 @@ def render_depth(model: Model, view: FlatView, check: Callable[[], None]) -> Dep
     def tile(pixel: torch.Tensor) -> torch.Tensor:
         check()
         origins, directions = through(torch.zeros_like(pixel), pixel)
-        s = sample(origins, directions, grid.cells, grid.reach, grid.settings, count)
+        s = sample(origins, directions, grid.cells, grid.skip_distance, grid.settings, count)
         density = model.field.density(s.points)
-        near, middle, far, opacity = depth_quantiles(density, s.delta, s.depth, s.packing)
+        near, middle, far, opacity = depth_quantiles(density, s.deltas, s.t, s.packed_info)
         along = directions @ axis
         # A ray that stays more transparent than 1/4 has its spread up to its end unknown: three times the half.
         spread = torch.where(far > 0, far - near, 3 * (middle - near))
@@ -141,8 +152,8 @@ def render_depth(model: Model, view: FlatView, check: Callable[[], None]) -> Dep
         return torch.stack([depth, spread * along], 1)
 
     pixels = torch.arange(camera.width * camera.height, device=device)
-    tiles = pixels.split(CPU_RAYS if device.type == "cpu" else 1 << 18)
-    values = torch.cat(run_parallel([partial(tile, some) for some in tiles])).cpu().numpy()
+    tiles = pixels.split(CPU_RAYS if device.type == "cpu" else GPU_RAYS)
+    values = torch.cat(run_parallel([partial(tile, some) for some in tiles], device)).cpu().numpy()
     shape = (camera.height, camera.width)
     depth = np.where(view.inside, values[:, 0].reshape(shape), 0).astype(np.float32)
     return DepthMap(depth, values[:, 1].reshape(shape), cosines(camera, depth))
@@ -187,7 +198,8 @@ def _slope(points: np.ndarray, solid: np.ndarray, axis: int) -> np.ndarray:
 
 def confirmed_maps(views: list[FlatView], maps: list[DepthMap], device: torch.device, report: Reporter) -> MapArrays:
     """The maps as the kernels read them, without what cannot be trusted: seen under less than 10°, at outlines, or not
-    confirmed by two other views."""
+    confirmed by two other views (by the other one where there are two). On the host where the device has no Warp."""
+    device = device if backend_of(device).warp else torch.device("cpu")
     sizes = torch.tensor([[v.camera.width, v.camera.height] for v in views], dtype=torch.int32)
     inverse = np.stack([np.linalg.inv(v.pose) for v in views]).astype(np.float32)
 
@@ -204,11 +216,11 @@ def confirmed_maps(views: list[FlatView], maps: list[DepthMap], device: torch.de
         torch.from_numpy(np.ascontiguousarray(inverse[:, :3, :3])).to(device),
         torch.from_numpy(np.ascontiguousarray(inverse[:, :3, 3])).to(device),
     )
-    confirmed = []
+    confirmed, needed = [], min(CONFIRMED, len({view.photo for view in views}) - 1)
     for index, around in enumerate(neighbours(views, maps)):
         report.progress(index / len(views))
         near = torch.tensor(around, dtype=torch.int32, device=device)
-        confirmed.append(agreement(arrays, index, near, AGREE, ROUND_TRIP) >= CONFIRMED)
+        confirmed.append(agreement(arrays, index, near, AGREE, ROUND_TRIP) >= needed)
     keep = torch.cat(confirmed) | (arrays.depth >= FREE)
     return replace(arrays, depth=torch.where(keep, arrays.depth, 0.0))
 

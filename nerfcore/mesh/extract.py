@@ -41,18 +41,15 @@ def _block(bricks: Bricks, corner: np.ndarray) -> tuple[np.ndarray, np.ndarray] 
     index = bricks.index[low[0] : high[0], low[1] : high[1], low[2] : high[2]]
     if not (index[:BLOCK, :BLOCK, :BLOCK] >= 0).any():
         return None
-    distance = _assemble(index, bricks.distance, np.float32(1)) / np.float32(bricks.voxel)
-    known = _assemble(index, bricks.known, False)
+    distance = _assemble(index, bricks.distance) / np.float32(bricks.voxel)
+    whole = _assemble(index, bricks.known)
     side = tuple(min(n, BLOCK * BRICK + 1) for n in distance.shape)
-    distance, known = (a[: side[0], : side[1], : side[2]] for a in (distance, known))
-    whole = known.copy()  # scikit-image looks at the cell before a corner where the mask of the corner is set
+    distance, whole = distance[: side[0], : side[1], : side[2]], whole[: side[0], : side[1], : side[2]]
+    # scikit-image looks at the cell before a corner where the mask of that corner is set.
     for axis in range(3):
-        behind = np.zeros_like(whole)
-        ahead = [slice(None)] * 3
-        back = [slice(None)] * 3
-        ahead[axis], back[axis] = slice(1, None), slice(None, -1)
-        behind[tuple(ahead)] = whole[tuple(ahead)] & whole[tuple(back)]
-        whole = behind
+        before = np.roll(whole, 1, axis)
+        before[(slice(None),) * axis + (0,)] = False
+        whole = whole & before
     # A crossing exactly at a corner would belong to several edges.
     distance = np.where(np.abs(distance) < 2 * LEAST, np.where(distance < 0, -2 * LEAST, 2 * LEAST), distance)
     inside = distance[whole]
@@ -65,9 +62,9 @@ def _block(bricks: Bricks, corner: np.ndarray) -> tuple[np.ndarray, np.ndarray] 
     return vertices.astype(np.float64) + corner * BRICK, faces.astype(np.int64)
 
 
-def _assemble(index: np.ndarray, values: np.ndarray, fill: float | bool) -> np.ndarray:
-    """Corners of a box of bricks (X, Y, Z) as one array (8X, 8Y, 8Z); `fill` where there is no brick."""
-    out = np.full((*index.shape, BRICK, BRICK, BRICK), fill, values.dtype)
+def _assemble(index: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Corners of a box of bricks (X, Y, Z) as one array (8X, 8Y, 8Z); 0 where there is no brick."""
+    out = np.zeros((*index.shape, BRICK, BRICK, BRICK), values.dtype)
     present = index >= 0
     out[present] = values[index[present]]
     return out.transpose(0, 3, 1, 4, 2, 5).reshape([n * BRICK for n in index.shape])

@@ -26,7 +26,7 @@ from trimesh.visual.material import PBRMaterial, SimpleMaterial
 from ..errors import SettingError
 from ..files import atomic_path
 from ..images.picture import srgb_to_linear
-from .extract import Surface
+from .surface import Surface
 from .texture import Unwrapped
 
 FORMATS = (".ply", ".obj", ".glb", ".stl")

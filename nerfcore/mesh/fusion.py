@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from ..kernels.surface import MapArrays, fuse
+from ..kernels.depth_arrays import MapArrays
+from ..kernels.surface import fuse
 from ..progress import Reporter
 from .depth_maps import hit_points
 from .region import Region

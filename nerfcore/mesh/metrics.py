@@ -87,7 +87,7 @@ def _plane_distance(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Distance (N,) of points to a surface known by samples (M, 3), and the nearest sample: among the eight nearest
     samples' triangles the least distance to the triangle's closest point."""
-    _, near = KDTree(samples).query(points, k=8, workers=-1)
+    near = np.asarray(KDTree(samples).query(points, k=8)[1])
     vertices, faces = mesh
     best = np.full(len(points), np.inf)
     which = near[:, 0].copy()

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from ..errors import TrainingError
-from ..kernels.surface import FREE, MapArrays
+from ..kernels.depth_arrays import FREE, MapArrays
 from .depth_maps import hit_points
 
 MARGIN = 0.02  # of the longest side
@@ -56,7 +56,9 @@ def choose_region(
     if bounds is not None:
         inside = ((points >= bounds[0]) & (points <= bounds[1])).all(1)
         if inside.sum() < FEWEST_HITS * len(points) / len(all_hits(maps)):
-            raise TrainingError("The field has no surface in the region of interest.", "Train longer, or check the box.")
+            raise TrainingError(
+                "The field has no surface in the region of interest.", "Train longer, or check the box."
+            )
         points = points[inside]
         low, high = points.min(0), points.max(0)
     else:

@@ -6,14 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
 
-from ..data.box import box_poses
 from ..data.load import class_inputs, load_scene, view_inputs
-from ..data.scene import Scene
 from ..files import atomic_path
-from ..geometry.cameras import Camera
-from ..geometry.similarity import similarity_scale, transform_points
+from ..geometry.similarity import similarity_scale
 from ..images.encode import write_picture
 from ..params import MeshParams
 from ..progress import Reporter
@@ -21,9 +17,10 @@ from ..project.fingerprints import Earlier, Fingerprint, compare, digest, read_m
 from ..project.runs import MESH_RECORD, checkpoint_id, state_id
 from ..project.schema import step
 from ..project.store import load_project, record_step, world_from_sfm
-from ..render.run import Trained, load_info, load_trained
-from .extract import Surface, extract, shade
+from ..render.run import load_info, load_trained
+from .build import Built, build
 from .files import Texture, check_format, write_surface
+from .surface import class_table, is_watertight, to_world
 from .texture import bake, unwrap
 
 
@@ -31,9 +28,9 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
     """Extract the surface of a run and write it to exports/<run>/ (and to `out`), in world units.
 
     Returns:
-        {"vertices", "faces", "watertight", "classes": {name: {"faces", "area"}}, "files"}
+        {"vertices", "faces", "watertight", "voxel": in world units, "classes": {name: {"faces", "area"}}, "files"}
     Raises:
-        SettingError: unknown format. ProjectError, TrainingError, DiskError.
+        SettingError: unknown format or impossible region. ProjectError, TrainingError, DiskError.
     """
     folder = Path(params.project)
     if params.out is not None:
@@ -41,28 +38,20 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
     project, trained = load_project(folder), load_trained(folder, params.run)
     scene = load_scene(folder, trained.info.holdout)
     inputs = mesh_inputs(params)
-    surface, spacing = extract(
-        trained.model,
-        params.resolution,
-        np.full(3, -1.0),
-        np.full(3, 1.0),
-        trained.info.class_ids if trained.model.field.classes else [],
-        report,
-        spread_views(scene, trained.info.box(project).box_from_world),
-        params.faces,
-    )
+    built = build(trained, project, scene, params, report)
     target = folder / "exports" / params.run
     texture = None
     if params.texture is not None:
-        texture = bake_texture(trained, surface, spacing, params.texture, report)
-    surface = to_world(surface, trained.info.box(project).world_from_box)
+        texture = bake_texture(built, params.texture, report)
+    world_from_box = trained.info.box(project).world_from_box
+    surface = to_world(built.surface, world_from_box)
+    report.stage("Writing")
     (target / MESH_RECORD).unlink(missing_ok=True)  # what it says is no longer true from here on
     with atomic_path(target / "mesh.npz") as temporary, open(temporary, "wb") as file:
         arrays = vars(surface) if texture is None else {**vars(surface), "uv": texture.corner_uv}
         np.savez(file, **arrays)
     names = {c.id: c.name for c in scene.classes}
     files = [target / "mesh.npz"]
-    report.stage("Writing")
     if texture is None:
         (target / "texture.png").unlink(missing_ok=True)
     else:
@@ -74,7 +63,8 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
     result = {
         "vertices": len(surface.vertices),
         "faces": len(surface.faces),
-        "watertight": bool(trimesh.Trimesh(surface.vertices, surface.faces, process=False).is_watertight),
+        "watertight": is_watertight(surface.faces),
+        "voxel": built.region.voxel * similarity_scale(world_from_box),
         "classes": class_table(surface, names),
         "files": [str(path) for path in files],
     }
@@ -95,7 +85,8 @@ def mesh_inputs(params: MeshParams) -> Fingerprint:
         "alignment": digest(rounded(world_from_sfm(load_project(folder)))),
         "classes": class_inputs(scene),
         "settings": digest([settings, out]),
-        **view_inputs(scene, scene.train, files=False),
+        "region": digest(None if scene.bounds is None else rounded(scene.bounds)),
+        **view_inputs(scene, scene.train, files=True),
     }
 
 
@@ -112,45 +103,15 @@ def meshed(params: MeshParams) -> Earlier:
     return compare(made, mesh_inputs(params), files)
 
 
-def spread_views(scene: Scene, box_from_world: np.ndarray, most: int = 24) -> list[tuple[Camera, np.ndarray]]:
-    """Up to `most` cameras with poses in the normalised frame, evenly chosen from the training views."""
-    chosen = np.linspace(0, len(scene.train) - 1, min(most, len(scene.train))).round().astype(int)
-    views = [scene.views[scene.train[i]] for i in chosen]
-    return [(view.camera, pose) for view, pose in zip(views, box_poses(views, box_from_world))]
-
-
-def bake_texture(trained: Trained, surface: Surface, spacing: float, size: int, report: Reporter) -> Texture:
+def bake_texture(built: Built, size: int, report: Reporter) -> Texture:
     """UVs and colours for a surface in the normalised frame."""
+    surface = built.surface
     report.stage("Unwrapping")
     unwrapped = unwrap(surface.vertices, surface.faces, size)
     report.stage("Baking the texture")
 
     def color(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        return shade(trained.model, points, normals, [], spacing, Reporter())[0]
+        report.check()
+        return built.colors(points, normals, Reporter())
 
     return Texture(bake(surface.vertices, surface.normals, unwrapped, size, color, report), unwrapped)
-
-
-def to_world(surface: Surface, world_from_box: np.ndarray) -> Surface:
-    """The surface carried by a similarity (4, 4)."""
-    rotation = world_from_box[:3, :3] / similarity_scale(world_from_box)
-    return Surface(
-        transform_points(world_from_box, surface.vertices).astype(np.float32),
-        surface.faces,
-        (surface.normals @ rotation.T).astype(np.float32),
-        surface.colors,
-        surface.class_id,
-        surface.face_class,
-    )
-
-
-def class_table(surface: Surface, names: dict[int, str]) -> dict[str, dict[str, float]]:
-    """Number of faces and area (world units²) of each class on the surface."""
-    areas = trimesh.triangles.area(surface.vertices[surface.faces].astype(np.float64))
-    return {
-        names.get(int(c), str(c)): {
-            "faces": int((surface.face_class == c).sum()),
-            "area": round(float(areas[surface.face_class == c].sum()), 6),
-        }
-        for c in np.unique(surface.face_class)
-    }

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from fieldwork.nerfcore.mesh.extract import Surface
 from fieldwork.nerfcore.mesh.files import texture_of, write_surface
+from fieldwork.nerfcore.mesh.surface import Surface
 from PIL import Image
 
 # sRGB → linear by IEC 61966-2-1, to six digits.

@@ -1,0 +1,211 @@
+"""From a trained field to a labelled surface: depth maps, fusion, extraction, cleaning, decimation, colours, labels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from ..data.box import Box
+from ..data.pixels import PixelStore
+from ..data.scene import Scene, View
+from ..errors import SettingError, TrainingError
+from ..geometry.similarity import similarity_scale, transform_points
+from ..kernels.depth_arrays import FREE, MapArrays
+from ..params import MeshParams
+from ..progress import Reporter
+from ..project.schema import Project
+from ..render.run import Trained
+from . import depth_maps as dm
+from .appearance import Observed, Photos, classify
+from .clean import areas, clean, compact, components
+from .decimate import decimate
+from .extract import extract
+from .field_values import shade
+from .fusion import TRUNCATION, fuse_maps
+from .region import Region, choose_region
+from .surface import Surface, face_classes, vertex_normals
+
+FEW_STEPS = 300  # of training, below which a field is a sketch
+LITTLE_AGREEMENT, LITTLE_IN_ONE = 0.3, 0.5  # shares below which the user is told
+
+
+@dataclass(frozen=True)
+class Built:
+    """A surface in the normalised frame, where it was looked for, and what gives other points of it their colours."""
+
+    surface: Surface
+    region: Region
+    maps: MapArrays
+    photos: Photos
+    trained: Trained
+
+    def colors(self, points: np.ndarray, normals: np.ndarray, report: Reporter) -> np.ndarray:
+        """Colours (N, 3) uint8 of surface points: the photos', and the field's where no photo shows them."""
+        return mixed_colors(self.trained, self.region, self.photos.observe(points, normals, report), points, normals)
+
+
+def build(trained: Trained, project: Project, scene: Scene, params: MeshParams, report: Reporter) -> Built:
+    """The surface of a run.
+
+    Raises:
+        TrainingError: fewer than two photos; the views agree on no surface, or there is none in the region.
+        SettingError: an impossible region, or `detail` without a known scale.
+    """
+    box = trained.info.box(project)
+    chosen = [scene.views[i] for i in scene.train]
+    if len(chosen) < 2:
+        raise TrainingError("A surface needs at least two posed photos.", "Add photos and run `fieldwork poses`.")
+    if trained.state["steps"] < FEW_STEPS:
+        report.warn(f"The field was trained for {trained.state['steps']} steps only: expect a sketch of the surface.")
+    views = dm.spread_views(chosen, dm.MOST_VIEWS)
+    flats = dm.flat_views(views, box.box_from_world, dm.map_size(views, trained.device))
+    report.stage("Rendering depth maps")
+    rendered = dm.depth_maps(trained.model, flats, report)
+    report.stage("Comparing views")
+    maps = dm.confirmed_maps(flats, rendered, trained.device, report)
+    check_agreement(rendered, maps, report)
+    bounds, voxel = wanted_bounds(params, scene, box), wanted_voxel(params, project, box)
+    region = choose_region(maps, bounds, params.resolution, voxel)
+    report.stage("Fusing")
+    bricks = fuse_maps(maps, region, report)
+    report.stage("Extracting the surface")
+    vertices, faces = extract(bricks, report)
+    report.stage("Cleaning the surface")
+    tolerance = TRUNCATION * region.voxel
+    if len(faces):
+        vertices, faces, _ = clean(vertices, faces, maps, tolerance, report)
+    if not len(faces):
+        raise TrainingError("The field has no surface in the region of interest.", "Train longer, or check the box.")
+    if params.faces is not None and len(faces) > params.faces:
+        report.stage("Simplifying")
+        vertices, faces = decimate(vertices, faces, params.faces, report)
+        vertices, faces = compact(vertices, faces)
+    check_parts(vertices, faces, report)
+    report.stage("Reading colours and classes")
+    photos = read_photos(trained, scene, views, flats, box, maps, tolerance, report)
+    surface = dressed(trained, scene, region, photos, vertices, faces, report)
+    return Built(surface, region, maps, photos, trained)
+
+
+def wanted_bounds(params: MeshParams, scene: Scene, box: Box) -> tuple[np.ndarray, np.ndarray] | None:
+    """Corners (3,) in the normalised frame of the region that was asked for; None: what the photos show.
+
+    Raises:
+        SettingError: it is not six numbers, or empty.
+    """
+    if params.region == "photos":
+        return None
+    if params.region == "auto":
+        if scene.bounds is None:
+            return None
+        low, high = scene.bounds
+    else:
+        try:
+            low, high = np.array([float(n) for n in params.region.split(",")]).reshape(2, 3)
+        except ValueError as error:
+            raise SettingError(
+                f"{params.region} is no region.", "Give auto, photos, or x0,y0,z0,x1,y1,z1 in the aligned world."
+            ) from error
+        if not (low < high).all():
+            raise SettingError(f"The region {params.region} is empty.", "Give x0 < x1, y0 < y1, z0 < z1.")
+    corners = np.stack(np.meshgrid(*zip(low, high), indexing="ij"), -1).reshape(-1, 3)
+    moved = transform_points(box.box_from_world, corners)
+    return moved.min(0), moved.max(0)
+
+
+def wanted_voxel(params: MeshParams, project: Project, box: Box) -> float | None:
+    """Side of a voxel in the normalised frame for the detail that was asked for; None without.
+
+    Raises:
+        SettingError: the scale is not known.
+    """
+    if params.detail is None:
+        return None
+    if not project.frame.scale_known:
+        raise SettingError(
+            "A detail in millimetres needs the scale of the capture.",
+            "Set it with `fieldwork align`, or use resolution.",
+        )
+    return params.detail / 1000 / similarity_scale(box.world_from_box)
+
+
+def check_agreement(rendered: list[dm.DepthMap], maps: MapArrays, report: Reporter) -> None:
+    """Warn where the views agree on little of what they show."""
+    hits = sum(int(m.hit.sum()) for m in rendered)
+    agreed = int(((maps.depth > 0) & (maps.depth < FREE)).sum())
+    if hits and agreed < LITTLE_AGREEMENT * hits:
+        report.warn(
+            f"The views agree on {100 * agreed / hits:.0f} % of what they show only: the surface will have holes. "
+            "Train longer, or check the poses."
+        )
+
+
+def check_parts(vertices: np.ndarray, faces: np.ndarray, report: Reporter) -> None:
+    """Warn where the surface is in scraps."""
+    part = components(faces, len(vertices))
+    area = np.bincount(part, areas(vertices, faces))
+    if area.max() < LITTLE_IN_ONE * area.sum():
+        report.warn(
+            f"The surface is in {len(area)} parts, the largest with {100 * area.max() / area.sum():.0f} % of the area. "
+            "More photos or longer training may join them."
+        )
+
+
+def read_photos(
+    trained: Trained,
+    scene: Scene,
+    views: list[View],
+    flats: list[dm.FlatView],
+    box: Box,
+    maps: MapArrays,
+    tolerance: float,
+    report: Reporter,
+) -> Photos:
+    """The pixels and labels of the chosen views, at the size they were trained with."""
+    place = {view.name: index for index, view in enumerate(scene.views)}
+    indices = [place[view.name] for view in views]
+    ids, device = trained.info.class_ids, torch.device("cpu")
+    store = PixelStore(scene, indices, ids, box.box_from_world, trained.info.image_size, device, report)
+    return Photos(store, maps, np.array([flat.photo for flat in flats]), len(ids), tolerance)
+
+
+def dressed(
+    trained: Trained,
+    scene: Scene,
+    region: Region,
+    photos: Photos,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    report: Reporter,
+) -> Surface:
+    """The surface with colours and classes at its vertices. Without labels everything is void."""
+    normals = vertex_normals(vertices, faces)
+    observed = photos.observe(vertices, normals, report)
+    ids = trained.info.class_ids if trained.model.field.classes else []
+    probabilities = None
+    if ids:
+        _, probabilities = shade(trained.model, vertices, normals, True, region.voxel, report.progress)
+    index, _ = classify(observed.votes, probabilities)
+    class_id = np.where(index < 0, scene.ignore_id, np.array([*ids, scene.ignore_id])[index]).astype(np.int32)
+    return Surface(
+        vertices.astype(np.float32),
+        faces.astype(np.int32),
+        normals.astype(np.float32),
+        mixed_colors(trained, region, observed, vertices, normals),
+        class_id,
+        face_classes(faces, class_id),
+    )
+
+
+def mixed_colors(
+    trained: Trained, region: Region, observed: Observed, points: np.ndarray, normals: np.ndarray
+) -> np.ndarray:
+    """Colours (N, 3) uint8: the photos', and the field's where no photo shows a point."""
+    color, missing = observed.color.copy(), ~observed.covered
+    if missing.any():
+        color[missing], _ = shade(
+            trained.model, points[missing], normals[missing], False, region.voxel, lambda share: None
+        )
+    return (color.clip(0, 1) * 255).round().astype(np.uint8)

@@ -1,0 +1,328 @@
+"""Depth maps of analytic shapes fused into surfaces: nothing is learned here, so that every error is the fusion's."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from fieldwork.nerfcore.data.scene import View
+from fieldwork.nerfcore.errors import Cancelled, TrainingError
+from fieldwork.nerfcore.geometry.cameras import Camera, pixel_centers, rays
+from fieldwork.nerfcore.kernels import surface as kernels
+from fieldwork.nerfcore.kernels import surface_torch as twins
+from fieldwork.nerfcore.kernels.depth_arrays import FREE, MapArrays
+from fieldwork.nerfcore.kernels.packed_info import PackedInfo
+from fieldwork.nerfcore.mesh import clean, depth_maps, metrics
+from fieldwork.nerfcore.mesh.decimate import decimate
+from fieldwork.nerfcore.mesh.extract import extract
+from fieldwork.nerfcore.mesh.fusion import fuse_maps
+from fieldwork.nerfcore.mesh.region import choose_region
+from fieldwork.nerfcore.mesh.surface import is_watertight
+from fieldwork.nerfcore.progress import Reporter
+
+# (origins (3,), directions (N, 3) of any length) → distance in units of the directions' length, inf where nothing is.
+Hit = Callable[[np.ndarray, np.ndarray], np.ndarray]
+CAMERA = Camera(width=120, height=90, fx=110.0, fy=112.0, cx=58.0, cy=46.0)
+CPU = torch.device("cpu")
+
+
+def look_at(place: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Camera-to-world (4, 4), OpenCV axes, z of the world upwards in the picture."""
+    ahead = (target - place) / np.linalg.norm(target - place)
+    right = np.cross(ahead, [0, 0, 1.0])
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3] = np.stack([right, np.cross(ahead, right), ahead, place], 1)
+    return pose
+
+
+def sphere(radius: float) -> Hit:
+    def hit(origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        a, b = (direction**2).sum(1), direction @ origin
+        root = b * b - a * (origin @ origin - radius**2)
+        t = (-b - np.sqrt(np.maximum(root, 0))) / a
+        inside = origin @ origin < radius**2
+        t = np.where(inside, (-b + np.sqrt(np.maximum(root, 0))) / a, t)
+        return np.where((root > 0) & (t > 0), t, np.inf)
+
+    return hit
+
+
+def box(low: np.ndarray, high: np.ndarray) -> Hit:
+    """A solid box from outside, its walls from inside."""
+
+    def hit(origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        with np.errstate(divide="ignore"):
+            t0, t1 = (low - origin) / direction, (high - origin) / direction
+        near, far = np.minimum(t0, t1).max(1), np.maximum(t0, t1).min(1)
+        if ((origin > low) & (origin < high)).all():
+            return far
+        return np.where((near < far) & (near > 0), near, np.inf)
+
+    return hit
+
+
+def orbit(count: int, radius: float, heights: tuple[float, ...] = (-0.6, 0.2, 0.9)) -> list[np.ndarray]:
+    poses = []
+    for k in range(count):
+        angle, z = 2 * np.pi * k * 0.381966, heights[k % len(heights)] * radius
+        flat = np.sqrt(max(radius**2 - z**2, 0.01))
+        poses.append(look_at(np.array([flat * np.cos(angle), flat * np.sin(angle), z]), np.zeros(3)))
+    return poses
+
+
+def maps_of(
+    hit: Hit, poses: list[np.ndarray], camera: Camera = CAMERA
+) -> tuple[list[depth_maps.FlatView], list[depth_maps.DepthMap]]:
+    """What depth_maps would read from a perfect field, for photos of a (possibly distorted) camera."""
+    views = [View(f"{k}", camera, pose, image=None) for k, pose in enumerate(poses)]  # type: ignore[arg-type]
+    flats = depth_maps.flat_views(views, np.eye(4), max(camera.width, camera.height))
+    made = []
+    for flat in flats:
+        c = flat.camera
+        local, _ = rays(c, pixel_centers(c.width, c.height).reshape(-1, 2))
+        far = hit(flat.pose[:3, 3], local @ flat.pose[:3, :3].T)
+        z = np.where(np.isfinite(far), far, 0) * local[:, 2]
+        depth = np.where(np.isfinite(far), z, FREE).astype(np.float32).reshape(c.height, c.width)
+        depth[~flat.inside] = 0
+        made.append(depth_maps.DepthMap(depth, np.full_like(depth, 1e-4), depth_maps.cosines(c, depth)))
+    return flats, made
+
+
+def surface_of(
+    hit: Hit, poses: list[np.ndarray], cells: int, camera: Camera = CAMERA, voxel: float | None = None
+) -> tuple[np.ndarray, np.ndarray, MapArrays, float]:
+    maps = depth_maps.confirmed_maps(*maps_of(hit, poses, camera), CPU, Reporter())
+    region = choose_region(maps, None, cells, voxel)
+    vertices, faces = extract(fuse_maps(maps, region, Reporter()), Reporter())
+    return vertices, faces, maps, region.voxel
+
+
+LENSES = {
+    "pinhole": CAMERA,
+    "distorted": CAMERA.model_copy(update={"model": "OPENCV", "distortion": (-0.25, 0.06, 0.002, -0.003)}),
+}
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_a_sphere_comes_back_as_a_closed_sphere(lens: str) -> None:
+    vertices, faces, _, voxel = surface_of(sphere(0.5), orbit(24, 1.8), 64, LENSES[lens])
+    assert is_watertight(faces)
+    radius = np.linalg.norm(vertices, axis=1)
+    # Half a pixel is 0.008 here: distances along the ray taken for depths, or corners for centres, would show.
+    assert np.median(radius) == pytest.approx(0.5, abs=0.0015)
+    assert np.quantile(np.abs(radius - 0.5), 0.95) < 0.25 * voxel
+    outward = (clean.cross(vertices, faces) * vertices[faces].mean(1)).sum(1)
+    assert (outward > 0).all()
+    assert clean.areas(vertices, faces).sum() == pytest.approx(np.pi, rel=0.01)
+
+
+def test_a_plate_of_two_voxels_keeps_both_sides() -> None:
+    voxel = 0.02
+    half = np.array([0.4, 0.4, voxel])
+    vertices, faces, maps, _ = surface_of(box(-half, half), orbit(30, 1.7), 64, voxel=voxel)
+    vertices, faces, _ = clean.clean(vertices, faces, maps, 4 * voxel, Reporter())
+    normal = clean.unit(clean.cross(vertices, faces))[:, 2]
+    center = vertices[faces].mean(1)
+    core = (np.abs(center[:, :2]) < 0.36).all(1)
+    area = clean.areas(vertices, faces)
+    for side in (-1, 1):
+        chosen = core & (side * normal > 0.8) & (side * center[:, 2] > 0)
+        assert area[chosen].sum() > 0.95 * 0.72**2
+        assert np.median(np.abs(center[chosen, 2])) == pytest.approx(voxel, abs=voxel)
+    assert not (core & (np.abs(center[:, 2]) < 0.3 * voxel)).any()
+
+
+def room_poses(count: int) -> list[np.ndarray]:
+    poses = []
+    for k in range(count):
+        angle = 2 * np.pi * k / count
+        place = 0.35 * np.array([np.cos(angle), np.sin(angle), 0.2 * (-1) ** k])
+        target = place + np.array([np.cos(2.4 * k), np.sin(2.4 * k), 0.9 * (k % 3 - 1)])
+        poses.append(look_at(place, target))
+    return poses
+
+
+def test_a_room_from_inside_keeps_its_walls_and_stays_open_outside() -> None:
+    wide = Camera(width=120, height=100, fx=60.0, fy=60.0, cx=60.0, cy=50.0)
+    high = np.array([1.0, 0.8, 0.5])
+    vertices, faces, maps, voxel = surface_of(box(-high, high), room_poses(40), 80, wide)
+    vertices, faces, _ = clean.clean(vertices, faces, maps, 4 * voxel, Reporter())
+    off = np.abs(np.abs(vertices) - high).min(1)
+    assert np.quantile(off, 0.95) < voxel  # no shell around the room, no cap at its region
+    normal, center = clean.unit(clean.cross(vertices, faces)), vertices[faces].mean(1)
+    area = clean.areas(vertices, faces)
+    for axis in range(3):
+        for side in (-1, 1):
+            wall = (side * center[:, axis] > 0.9 * high[axis]) & (side * normal[:, axis] < -0.8)  # facing inwards
+            assert area[wall].sum() > 0.9 * 4 * np.delete(high, axis).prod()
+
+
+def test_what_no_two_views_see_stays_open() -> None:
+    front = [pose for pose in orbit(40, 1.8) if pose[0, 3] > 0.5]
+    vertices, faces, maps, voxel = surface_of(sphere(0.5), front, 64)
+    vertices, faces, _ = clean.clean(vertices, faces, maps, 4 * voxel, Reporter())
+    assert not is_watertight(faces)
+    assert len(clean.border_edges(faces)) > 20
+    assert (vertices[:, 0] < -0.45).sum() == 0
+    assert np.abs(np.linalg.norm(vertices, axis=1) - 0.5).max() < 2 * voxel
+
+
+def test_the_region_follows_what_is_seen_and_leaves_out_what_is_far() -> None:
+    near = sphere(0.5)
+
+    def hit(origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        wall = sphere(30.0)(origin, direction)
+        found = near(origin, direction)
+        few = np.arange(len(direction)) % 211 == 0
+        return np.where(np.isfinite(found), found, np.where(few, wall, np.inf))
+
+    maps = depth_maps.confirmed_maps(*maps_of(hit, orbit(16, 1.8)), CPU, Reporter())
+    region = choose_region(maps, None, 64)
+    assert (region.high < 0.8).all()
+    assert (region.low > -0.8).all()
+    with pytest.raises(TrainingError, match="region of interest"):
+        choose_region(maps, (np.full(3, 2.0), np.full(3, 3.0)), 64)
+
+
+def test_views_that_agree_on_nothing_are_an_error() -> None:
+    flats, maps = maps_of(sphere(0.5), orbit(6, 1.8))
+    random = np.random.default_rng(0)
+    noisy = [
+        depth_maps.DepthMap(m.depth * random.uniform(0.5, 1.5, m.depth.shape).astype(np.float32), m.spread, m.cosine)
+        for m in maps
+    ]
+    arrays = depth_maps.confirmed_maps(flats, noisy, CPU, Reporter())
+    with pytest.raises(TrainingError, match="several views agree"):
+        choose_region(arrays, None, 64)
+
+
+def test_fusing_stops_when_asked() -> None:
+    maps = depth_maps.confirmed_maps(*maps_of(sphere(0.5), orbit(6, 1.8)), CPU, Reporter())
+    region = choose_region(maps, None, 64)
+    report = Reporter()
+    report.cancel()
+    with pytest.raises(Cancelled):
+        fuse_maps(maps, region, report)
+
+
+def test_a_wide_lens_is_cut_into_pinholes_that_cover_it() -> None:
+    around = Camera(model="EQUIRECTANGULAR", width=240, height=120, fx=1, fy=1, cx=0, cy=0)
+    poses = [
+        look_at(p, np.zeros(3)) for p in (np.array([0.3, 0, 0]), np.array([-0.3, 0.1, 0]), np.array([0, 0.3, 0.1]))
+    ]
+    views = [View(f"{k}", around, pose, image=None) for k, pose in enumerate(poses)]  # type: ignore[arg-type]
+    flats = depth_maps.flat_views(views, np.eye(4), 240)
+    assert len(flats) == 18
+    assert all(flat.inside.all() for flat in flats)
+    forward = np.stack([flat.pose[:3, 2] for flat in flats[:6]])
+    assert np.abs(forward @ forward.T).sum() == pytest.approx(6 + 6, abs=1e-9)  # six directions along three axes
+    assert all(np.linalg.det(flat.pose[:3, :3]) == pytest.approx(1) for flat in flats)
+    vertices, _, _, voxel = surface_of(box(np.full(3, -1.0), np.full(3, 1.0)), poses, 48, around)
+    off = np.abs(np.abs(vertices) - 1).min(1)
+    assert np.quantile(off, 0.9) < voxel
+
+
+def test_scraps_go_and_small_holes_are_filled() -> None:
+    vertices, faces, _, voxel = surface_of(sphere(0.5), orbit(24, 1.8), 64)
+    hole = np.linalg.norm(vertices[faces].mean(1) - [0.5, 0, 0], axis=1) < 2 * voxel
+    scrap = np.linalg.norm(vertices - [0, 0, 0.5], axis=1) < 1.5 * voxel
+    moved = np.concatenate([vertices, vertices[scrap] * 1.5])
+    inside = scrap[faces].all(1)
+    lookup = np.cumsum(scrap) - 1 + len(vertices)
+    broken = np.concatenate([faces[~hole], lookup[faces[inside]]])
+    kept = clean.drop_scraps(moved, broken, 0.01)
+    assert len(kept) == (~hole).sum()
+    points, filled, new = clean.fill_holes(moved, kept)
+    assert new.sum() >= 3
+    assert is_watertight(filled)
+    outward = (clean.cross(points, filled) * points[filled].mean(1)).sum(1)
+    assert (outward > 0).all()
+
+
+def test_fewer_triangles_keep_shape_and_border() -> None:
+    vertices, faces, *_ = surface_of(sphere(0.5), orbit(24, 1.8), 96)
+    faces = faces[vertices[faces].mean(1)[:, 2] < 0.2]
+    vertices, faces = clean.compact(vertices, faces)
+    border = {tuple(v) for v in vertices[np.unique(clean.border_edges(faces))].tolist()}
+    points, fewer = decimate(vertices, faces, len(faces) // 6, Reporter())
+    assert len(fewer) < len(faces) / 5
+    assert np.abs(np.linalg.norm(points[fewer].mean(1), axis=1) - 0.5).max() < 0.015
+    kept = {tuple(v) for v in points[np.unique(clean.border_edges(fewer))].tolist()}
+    assert kept == border
+
+
+def test_scores_of_known_shapes() -> None:
+    import trimesh
+
+    ball = trimesh.creation.icosphere(4, 1.0)
+    truth = np.asarray(ball.vertices), np.asarray(ball.faces)
+    same = metrics.compare(truth, truth, 0.01)
+    assert same.f == pytest.approx(1)
+    assert same.median < 1e-6
+    assert same.area_ratio == pytest.approx(1)
+    bigger = metrics.compare((truth[0] * 1.03, truth[1]), truth, 0.02)
+    assert bigger.f == 0
+    assert bigger.median == pytest.approx(0.03, abs=0.001)
+    assert bigger.area_ratio == pytest.approx(1.03**2, rel=0.001)
+    half = truth[1][truth[0][truth[1]].mean(1)[:, 2] > 0]
+    part = metrics.compare((truth[0], half), truth, 0.02)
+    assert part.precision == pytest.approx(1)
+    assert part.recall == pytest.approx(0.51, abs=0.02)
+    upper = metrics.compare((truth[0], half), truth, 0.02, visible=lambda points, normals: normals[:, 2] > 0)
+    assert upper.recall > 0.99
+    inner = truth[1] + len(truth[0])
+    doubled = metrics.compare(
+        (np.concatenate([truth[0], truth[0] * 0.9]), np.concatenate([truth[1], inner])), truth, 0.02
+    )
+    assert doubled.precision < 0.6
+
+
+def test_faces_on_the_border_of_a_box_are_counted() -> None:
+    vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 0.5], [0.5, 0.5, 0.5]])
+    faces = np.array([[0, 1, 2], [0, 1, 4], [1, 2, 3]])
+    assert metrics.on_border(vertices, faces, np.zeros(3), np.ones(3), 1e-3) == 1
+
+
+def test_depth_quantiles_equal_their_twin() -> None:
+    random = torch.Generator().manual_seed(0)
+    count = torch.tensor([0, 5, 17, 1], dtype=torch.int32)
+    start = torch.cat([torch.zeros(1, dtype=torch.int32), count.cumsum(0)[:-1].int()])
+    total = int(count.sum())
+    ray = torch.repeat_interleave(torch.arange(4), count.long()).int()
+    density, delta = 8 * torch.rand(total, generator=random), 0.2 * torch.rand(total, generator=random)
+    depth = torch.rand(total, generator=random).sort().values
+    packed_info = PackedInfo(start, count, ray)
+    for ours, twin in zip(
+        kernels.depth_quantiles(density, delta, depth, packed_info),
+        twins.depth_quantiles(density, delta, depth, packed_info),
+    ):
+        torch.testing.assert_close(ours, twin, atol=2e-5, rtol=1e-4)
+
+
+def test_the_median_depth_of_a_wall_is_where_half_is_absorbed() -> None:
+    density = torch.full((100,), 5.0)
+    delta = torch.full((100,), 0.01)
+    depth = 1 + 0.01 * (torch.arange(100) + 0.5)
+    packed_info = PackedInfo(
+        torch.zeros(1, dtype=torch.int32), torch.tensor([100], dtype=torch.int32), torch.zeros(100, dtype=torch.int32)
+    )
+    near, middle, far, opacity = (float(x) for x in kernels.depth_quantiles(density, delta, depth, packed_info))
+    assert [near, middle, far] == pytest.approx([1 + np.log(s) / 5 for s in (4 / 3, 2, 4)], abs=1e-4)
+    assert opacity == pytest.approx(1 - np.exp(-5), abs=1e-5)
+
+
+def test_fused_distances_equal_their_twin() -> None:
+    flats, maps = maps_of(sphere(0.5), orbit(9, 1.8))
+    arrays = depth_maps.confirmed_maps(flats, maps, CPU, Reporter())
+    points = torch.rand(4000, 3, generator=torch.Generator().manual_seed(1)) * 1.4 - 0.7
+    apart = float(np.cos(np.radians(3)))
+    ours = kernels.fuse(points, arrays, 0.02, 0.08, 0.03, 0.03, apart)
+    twin = twins.fuse(points, arrays, 0.02, 0.08, 0.03, 0.03, apart)
+    # A point that falls on the border of two pixels may take the other one: rounding differs.
+    same = (ours[0] - twin[0]).abs() < 1e-4
+    assert float(same.float().mean()) > 0.998
+    torch.testing.assert_close(ours[1][same], twin[1][same], rtol=1e-3, atol=1e-2)
+    assert float((ours[2] == twin[2]).float().mean()) > 0.998

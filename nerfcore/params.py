@@ -211,6 +211,9 @@ class MeshParams(Params):
     )
     texture: int | None = Field(default=None, ge=64, description="texture size in pixels; none: vertex colours only")
     split: Literal["none", "classes"] = "none"
+    turntable: Path | None = Field(
+        default=None, description="folder for pictures of the mesh from eight sides: its colours and its classes"
+    )
 
 
 class BlendParams(Params):

@@ -22,6 +22,7 @@ from .build import Built, build
 from .files import Texture, check_format, write_surface
 from .surface import class_table, is_watertight, to_world
 from .texture import bake, unwrap
+from .turntable import write_turntable
 
 
 def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
@@ -60,6 +61,9 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
         files.append(target / "texture.png")
     for path in [target / "mesh.ply", *([params.out] if params.out else [])]:
         files += write_surface(path, surface, names, params.split == "classes" and path == params.out, texture)
+    if params.turntable is not None:
+        report.stage("Looking at it")
+        files += write_turntable(params.turntable, surface, {c.id: c.color for c in scene.classes}, report)
     result = {
         "vertices": len(surface.vertices),
         "faces": len(surface.faces),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,8 +20,10 @@ from fieldwork.nerfcore.mesh.decimate import decimate
 from fieldwork.nerfcore.mesh.extract import extract
 from fieldwork.nerfcore.mesh.fusion import fuse_maps
 from fieldwork.nerfcore.mesh.region import choose_region
-from fieldwork.nerfcore.mesh.surface import is_watertight
+from fieldwork.nerfcore.mesh.surface import Surface, face_classes, is_watertight
+from fieldwork.nerfcore.mesh.turntable import write_turntable
 from fieldwork.nerfcore.progress import Reporter
+from PIL import Image
 
 # (origins (3,), directions (N, 3) of any length) → distance in units of the directions' length, inf where nothing is.
 Hit = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -326,3 +329,27 @@ def test_fused_distances_equal_their_twin() -> None:
     assert float(same.float().mean()) > 0.998
     torch.testing.assert_close(ours[1][same], twin[1][same], rtol=1e-3, atol=1e-2)
     assert float((ours[2] == twin[2]).float().mean()) > 0.998
+
+
+def test_a_turntable_shows_fronts_in_their_colours(tmp_path: Path) -> None:
+    import trimesh
+
+    ball = trimesh.creation.icosphere(3, 1.0)
+    vertices, faces = np.asarray(ball.vertices), np.asarray(ball.faces)
+    colors = np.where(vertices[:, 2:] > 0, [250, 10, 10], [10, 10, 250]).astype(np.uint8)
+    ids = np.where(vertices[:, 2] > 0, 3, 7)
+    surface = Surface(vertices, faces, vertices, colors, ids, face_classes(faces, ids))
+    paths = write_turntable(tmp_path, surface, {3: (0.0, 1.0, 0.0)}, Reporter())
+    assert len(paths) == 16
+    color, label = (np.array(Image.open(tmp_path / f"{name}_0.png")).astype(int) for name in ("color", "class"))
+    shown = (color != color[0, 0]).any(-1)
+    rows = np.flatnonzero(shown.any(1))
+    assert shown.mean() == pytest.approx(np.pi * (0.5 / 3**0.5) ** 2, abs=0.06)
+    upper, lower = color[rows[0] + 20, 320], color[rows[-1] - 20, 320]
+    assert upper[0] > 200 > upper[2]
+    assert lower[2] > 200 > lower[0]
+    assert label[rows[0] + 20, 320, 1] > 100 > label[rows[-1] - 20, 320, 1]
+    inside_out = Surface(vertices, faces[:, ::-1], -vertices, colors, ids, surface.face_class)
+    write_turntable(tmp_path, inside_out, {}, Reporter())
+    within = np.array(Image.open(tmp_path / "color_0.png")).astype(int)[rows[0] + 20, 320]
+    assert within[2] > 200 > within[0]  # through the near upper side, which is turned away, onto the far lower one

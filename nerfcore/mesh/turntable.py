@@ -1,0 +1,66 @@
+"""Pictures of a mesh from all around, to look at: its colours and its classes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ..files import atomic_path
+from ..geometry.cameras import Camera, pixel_centers, rays
+from ..images.encode import write_picture
+from ..kernels.raycast import FrontFaces
+from ..progress import Reporter
+from .surface import Surface
+
+VIEWS, SIDE = 8, 640
+ELEVATION = np.radians(30)
+LENS = 1.4  # focal length over the picture's side
+BACKGROUND = 70
+LIGHT = np.array([0.35, -0.5, 0.8]) / np.linalg.norm([0.35, -0.5, 0.8])
+
+
+def turntable_poses(vertices: np.ndarray, count: int) -> list[np.ndarray]:
+    """Camera-to-world poses (4, 4) in a ring around a mesh with z up, so far away that all of it is in the picture."""
+    low, high = vertices.min(0), vertices.max(0)
+    middle, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+    distance = radius / np.sin(np.arctan(0.5 / LENS))
+    poses = []
+    for angle in 2 * np.pi * np.arange(count) / count:
+        outward = np.array([np.cos(angle) * np.cos(ELEVATION), np.sin(angle) * np.cos(ELEVATION), np.sin(ELEVATION)])
+        ahead = -outward
+        right = np.cross(ahead, [0, 0, 1.0])
+        right /= np.linalg.norm(right)
+        pose = np.eye(4)
+        pose[:3] = np.stack([right, np.cross(ahead, right), ahead, middle + distance * outward], 1)
+        poses.append(pose)
+    return poses
+
+
+def write_turntable(
+    folder: Path, surface: Surface, colors: dict[int, tuple[float, float, float]], report: Reporter
+) -> list[Path]:
+    """Write color_0.png … and class_0.png …: eight views of a surface in the world, triangles seen from their front only,
+    as one looks into a room without its near walls. `colors`: sRGB in [0, 1] of each class id; others are dark."""
+    mesh = FrontFaces(surface.vertices, surface.faces)
+    camera = Camera(width=SIDE, height=SIDE, fx=LENS * SIDE, fy=LENS * SIDE, cx=SIDE / 2, cy=SIDE / 2)
+    local, _ = rays(camera, pixel_centers(SIDE, SIDE).reshape(-1, 2))
+    ids = np.unique(surface.face_class)
+    shades = np.array([colors.get(int(c), (0.15, 0.15, 0.15)) for c in ids]) * 255
+    paths = []
+    for number, pose in enumerate(turntable_poses(surface.vertices, VIEWS)):
+        report.progress(number / VIEWS)
+        face, corner = mesh.cast(np.broadcast_to(pose[:3, 3], local.shape), local @ pose[:3, :3].T)
+        hit = face >= 0
+        weights = np.concatenate([corner, 1 - corner.sum(1, keepdims=True)], 1)[hit, :, None]
+        corners = surface.faces[face[hit]]
+        color, label = (np.full((SIDE * SIDE, 3), BACKGROUND, np.uint8) for _ in range(2))
+        color[hit] = (surface.colors[corners] * weights).sum(1).clip(0, 255)
+        light = 0.55 + 0.45 * ((surface.normals[corners] * weights).sum(1) @ LIGHT)[:, None]
+        label[hit] = (shades[np.searchsorted(ids, surface.face_class[face[hit]])] * light).clip(0, 255)
+        for name, picture in (("color", color), ("class", label)):
+            path = folder / f"{name}_{number}.png"
+            with atomic_path(path) as temporary:
+                write_picture(temporary, picture.reshape(SIDE, SIDE, 3))
+            paths.append(path)
+    return paths

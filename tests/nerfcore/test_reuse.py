@@ -7,6 +7,7 @@ import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from fieldwork.nerfcore.errors import Cancelled
 from fieldwork.nerfcore.export.verb import export
 from fieldwork.nerfcore.geometry.cameras import Camera
 from fieldwork.nerfcore.geometry.points import Points
-from fieldwork.nerfcore.mesh.extract import Surface
+from fieldwork.nerfcore.mesh.surface import Surface
 from fieldwork.nerfcore.mesh.verb import mesh
 from fieldwork.nerfcore.params import (
     AlignParams,
@@ -87,7 +88,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def fake(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr("fieldwork.nerfcore.mesh.verb.extract", triangle)
+    patch.setattr("fieldwork.nerfcore.mesh.verb.build", triangle)
     patch.setitem(workflow.STAGES, "poses", workflow.Stage(known_poses, posed))
     # Small enough for a test; what is asked of each stage stays the same from call to call.
     small = {
@@ -99,13 +100,14 @@ def fake(patch: pytest.MonkeyPatch) -> None:
         patch.setitem(workflow.STAGES, verb, smaller(workflow.STAGES[verb], values))
 
 
-def triangle(*_: Any) -> tuple[Surface, float]:
+def triangle(*_: Any) -> SimpleNamespace:
     """Instead of a surface, for which a field would have to be trained for longer."""
     corners = np.eye(3, dtype=np.float32)
     face = np.array([[0, 1, 2]], np.int32)
-    return Surface(
+    surface = Surface(
         corners, face, corners, np.full((3, 3), 128, np.uint8), np.ones(3, np.int32), np.ones(1, np.int32)
-    ), 0.1
+    )
+    return SimpleNamespace(surface=surface, region=SimpleNamespace(voxel=0.1))
 
 
 def smaller(stage: workflow.Stage, values: dict[str, Any]) -> workflow.Stage:

@@ -276,12 +276,22 @@ class FieldworkScene(PropertyGroup):
     )
     texture: EnumProperty(
         name="Texture",
-        description="Size of the baked texture in pixels",
+        description="Size of the texture in pixels",
         items=[
             ("0", "None", "Vertex colors only"),
             ("1024", "1024", "1024 × 1024 pixels"),
             ("2048", "2048", "2048 × 2048 pixels"),
             ("4096", "4096", "4096 × 4096 pixels"),
+            ("8192", "8192", "8192 × 8192 pixels"),
+            ("16384", "16384", "16384 × 16384 pixels"),
+        ],
+    )
+    texture_kind: EnumProperty(
+        name="Texture From",
+        description="What the texture shows",
+        items=[
+            ("photo", "Photos", "The photos, as sharp as they are"),
+            ("field", "Field", "The field's colors, without what differs from photo to photo"),
         ],
     )
     mesh_file: StringProperty(

@@ -209,7 +209,12 @@ class MeshParams(Params):
         description="where to look: auto (the region of interest, or what the photos show where there is none), photos "
         "(what they show), or x0,y0,z0,x1,y1,z1 in the aligned world",
     )
-    texture: int | None = Field(default=None, ge=64, description="texture size in pixels; none: vertex colours only")
+    texture: int | None = Field(
+        default=None, ge=64, le=16384, description="texture size in pixels; none: vertex colours only"
+    )
+    texture_kind: Literal["photo", "field"] = Field(
+        default="photo", description="what the texture shows: the photos, or the field's colours"
+    )
     split: Literal["none", "classes"] = "none"
     turntable: Path | None = Field(
         default=None, description="folder for pictures of the mesh from eight sides: its colours and its classes"

@@ -9,7 +9,15 @@ from bpy.types import Context
 from .base import ProjectOperator, need_run, scene_settings
 
 
-@scene_settings(run="run", resolution="resolution", faces="faces", texture="texture", out="mesh_file", split="split")
+@scene_settings(
+    run="run",
+    resolution="resolution",
+    faces="faces",
+    texture="texture",
+    texture_kind="texture_kind",
+    out="mesh_file",
+    split="split",
+)
 class FIELDWORK_OT_mesh(ProjectOperator):
     """Extract the surface with its colors and labels"""
 
@@ -25,6 +33,7 @@ class FIELDWORK_OT_mesh(ProjectOperator):
             "resolution": self.value(context, "resolution"),
             "faces": self.value(context, "faces") or None,
             "texture": int(self.value(context, "texture")) or None,
+            "texture_kind": self.value(context, "texture_kind"),
             "out": self.path(context, "out"),
             "split": self.value(context, "split"),
         }

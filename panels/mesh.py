@@ -24,8 +24,11 @@ class FIELDWORK_PT_mesh(StepPanel):
         else:
             self.draw_state(False, t("Run “{}” is not trained yet", settings.run))
         column = columns(layout)
-        for name in ("resolution", "faces", "texture", "mesh_file"):
+        for name in ("resolution", "faces", "texture"):
             column.prop(settings, name)
+        if settings.texture != "0":
+            column.prop(settings, "texture_kind")
+        column.prop(settings, "mesh_file")
         if settings.mesh_file:
             column.prop(settings, "split")
         layout.operator("fieldwork.mesh", icon="MESH_DATA")

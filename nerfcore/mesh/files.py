@@ -27,7 +27,6 @@ from ..errors import SettingError
 from ..files import atomic_path
 from ..images.picture import srgb_to_linear
 from .surface import Surface
-from .texture import Unwrapped
 
 FORMATS = (".ply", ".obj", ".glb", ".stl")
 Y_UP = (".glb", ".obj")
@@ -37,15 +36,21 @@ LINEAR_COLOR = "_linear_color"
 
 
 @dataclass(frozen=True)
+class Unwrapped:
+    """A mesh whose vertices were split at UV seams: `source` (V,) original vertex, faces (F, 3), uv (V, 2) in [0, 1],
+    v upwards."""
+
+    source: np.ndarray
+    faces: np.ndarray
+    uv: np.ndarray
+
+
+@dataclass(frozen=True)
 class Texture:
-    """A baked texture: image (S, S, 3) uint8 sRGB, unwrapped mesh, corner_uv (F, 3, 2): UV of every face's corners."""
+    """A texture: image (S, S, 3) uint8 sRGB, and the mesh it belongs to."""
 
     image: np.ndarray
     unwrapped: Unwrapped
-
-    @property
-    def corner_uv(self) -> np.ndarray:
-        return self.unwrapped.uv[self.unwrapped.faces]
 
 
 def texture_of(faces: np.ndarray, corner_uv: np.ndarray, image: np.ndarray) -> Texture:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,18 +11,20 @@ import numpy as np
 from ..data.load import class_inputs, load_scene, view_inputs
 from ..files import atomic_path
 from ..geometry.similarity import similarity_scale
-from ..images.encode import write_picture
+from ..images.picture import to_bytes
 from ..params import MeshParams
 from ..progress import Reporter
 from ..project.fingerprints import Earlier, Fingerprint, compare, digest, read_made, rounded, write_made
 from ..project.runs import MESH_RECORD, checkpoint_id, state_id
 from ..project.schema import step
 from ..project.store import load_project, record_step, world_from_sfm
-from ..render.run import load_info, load_trained
+from ..render.run import load_info, load_trained, refined_poses
 from .build import Built, build
-from .files import Texture, check_format, write_surface
+from .field_values import shade
+from .files import check_format, texture_of, write_surface
+from .painted import Painted, paint_surface, training_photos, write_maps
+from .photos import Photo
 from .surface import class_table, is_watertight, to_world
-from .texture import bake, unwrap
 from .turntable import write_turntable
 
 
@@ -29,7 +32,8 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
     """Extract the surface of a run and write it to exports/<run>/ (and to `out`), in world units.
 
     Returns:
-        {"vertices", "faces", "watertight", "voxel": in world units, "classes": {name: {"faces", "area"}}, "files"}
+        {"vertices", "faces", "watertight", "voxel": in world units, "classes": {name: {"faces", "area"}}, "files"};
+        with a texture of photos "painted_by_photos", the share of its texels that a photo shows
     Raises:
         SettingError: unknown format or impossible region. ProjectError, TrainingError, DiskError.
     """
@@ -41,24 +45,22 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
     inputs = mesh_inputs(params)
     built = build(trained, project, scene, params, report)
     target = folder / "exports" / params.run
+    box = trained.info.box(project)
+    photos = training_photos(scene, box.box_from_world, refined_poses(folder, params.run, trained.info))
+    painted = paint(built, photos, params, scene.ignore_id, report)
     texture = None
-    if params.texture is not None:
-        texture = bake_texture(built, params.texture, report)
-    world_from_box = trained.info.box(project).world_from_box
-    surface = to_world(built.surface, world_from_box)
+    if painted.uv is not None and painted.image is not None:
+        texture = texture_of(built.surface.faces, painted.uv.corners, painted.image)
+    labelled = replace(built.surface, class_id=painted.classes.class_id, face_class=painted.classes.face_class)
+    surface = to_world(labelled, box.world_from_box)
     report.stage("Writing")
     (target / MESH_RECORD).unlink(missing_ok=True)  # what it says is no longer true from here on
     with atomic_path(target / "mesh.npz") as temporary, open(temporary, "wb") as file:
-        arrays = vars(surface) if texture is None else {**vars(surface), "uv": texture.corner_uv}
-        np.savez(file, **arrays)
-    names = {c.id: c.name for c in scene.classes}
-    files = [target / "mesh.npz"]
-    if texture is None:
-        (target / "texture.png").unlink(missing_ok=True)
-    else:
-        with atomic_path(target / "texture.png") as temporary:
-            write_picture(temporary, texture.image)
-        files.append(target / "texture.png")
+        sure = {"confidence": painted.classes.confidence, "face_confidence": painted.classes.face_confidence}
+        uv = {} if painted.uv is None else {"uv": painted.uv.corners}
+        np.savez(file, **vars(surface), **sure, **uv)
+    names = {scene.ignore_id: "void"} | {c.id: c.name for c in scene.classes}
+    files = [target / "mesh.npz", *write_maps(target, painted, {c.id: c.color for c in scene.classes})]
     for path in [target / "mesh.ply", *([params.out] if params.out else [])]:
         files += write_surface(path, surface, names, params.split == "classes" and path == params.out, texture)
     if params.turntable is not None:
@@ -68,10 +70,12 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
         "vertices": len(surface.vertices),
         "faces": len(surface.faces),
         "watertight": is_watertight(surface.faces),
-        "voxel": built.region.voxel * similarity_scale(world_from_box),
+        "voxel": built.region.voxel * similarity_scale(box.world_from_box),
         "classes": class_table(surface, names),
         "files": [str(path) for path in files],
     }
+    if painted.seen is not None:
+        result["painted_by_photos"] = round(painted.seen, 4)
     settings = params.model_dump(mode="json")
     write_made(target / MESH_RECORD, step("mesh", settings, result, inputs, state_id(trained.state)))
     record_step(folder, "mesh", settings, result, inputs)
@@ -107,15 +111,29 @@ def meshed(params: MeshParams) -> Earlier:
     return compare(made, mesh_inputs(params), files)
 
 
-def bake_texture(built: Built, size: int, report: Reporter) -> Texture:
-    """UVs and colours for a surface in the normalised frame."""
-    surface = built.surface
-    report.stage("Unwrapping")
-    unwrapped = unwrap(surface.vertices, surface.faces, size)
-    report.stage("Baking the texture")
+def paint(built: Built, photos: list[Photo], params: MeshParams, void: int, report: Reporter) -> Painted:
+    """Texture and classes for a surface in the normalised frame; what photos do not say is read from the field."""
+    model, voxel, surface = built.trained.model, built.region.voxel, built.surface
 
     def color(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        report.check()
-        return built.colors(points, normals, Reporter())
+        return to_bytes(shade(model, points, normals, False, voxel, lambda _: report.check())[0])
 
-    return Texture(bake(surface.vertices, surface.normals, unwrapped, size, color, report), unwrapped)
+    def classes(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        found = shade(model, points, normals, True, voxel, lambda _: report.check())[1]
+        assert found is not None
+        return found
+
+    ids = built.trained.info.class_ids if model.field.classes else []
+    return paint_surface(
+        surface.vertices,
+        surface.faces,
+        surface.colors,
+        photos,
+        params.texture,
+        params.texture_kind,
+        ids,
+        void,
+        color,
+        classes if ids else None,
+        report,
+    )

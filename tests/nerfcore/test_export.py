@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -20,11 +21,13 @@ from fieldwork.nerfcore.export.field_graph import field_model
 from fieldwork.nerfcore.field.encoding import spherical_harmonics
 from fieldwork.nerfcore.field.hybrid import HybridField
 from fieldwork.nerfcore.geometry.contraction import grid_position
+from fieldwork.nerfcore.mesh.painted import MAPS
 from fieldwork.nerfcore.params import ExportParams, MeshParams, TrainParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.verbs import run_verb
 from fieldwork.tests.nerfcore.support.ball import SMALL, ball_project
 from onnx.reference import ReferenceEvaluator
+from PIL import Image
 
 
 def has_blender() -> bool:
@@ -74,6 +77,43 @@ def test_glb_and_obj_stand_upright_with_texture(trained: Path, tmp_path: Path) -
         nearest = np.array([np.argmin(np.linalg.norm(mine - c, axis=1)) for c in centres[order[:20]]])
         assert np.abs(corner_uv[order[:20]].mean(1) - ours["uv"][nearest].mean(1)).max() < 1e-4
         assert {path.suffix for path in beside} == ({".mtl", ".png"} if kind == "obj" else set())
+
+
+def test_a_mesh_has_its_photos_on_it_and_maps_of_its_classes(trained: Path) -> None:
+    target = trained / "exports/main"
+    step = [s for s in json.loads((trained / "project.json").read_text())["provenance"] if s["verb"] == "mesh"][-1]
+    assert step["settings"]["texture_kind"] == "photo"
+    assert 0.5 < step["result"]["painted_by_photos"] <= 1
+    maps = {name: np.asarray(Image.open(target / name)) for name in ("texture.png", *MAPS)}
+    assert {m.shape[:2] for m in maps.values()} == {(128, 128)}
+    assert set(np.unique(maps["class_id.png"])) <= {0, 1, 2}
+    assert (maps["class_confidence.png"][maps["class_id.png"] == 0] == 0).all()
+    ours = surface(trained)
+    assert set(np.unique(ours["class_id"])) <= {0, 1, 2}
+    assert (ours["confidence"][ours["class_id"] == 0] == 0).all()
+    assert ours["confidence"].max() <= 1
+    # The ball is labelled by halves: what the maps say at a face's middle is what the face is.
+    middle = ours["uv"].mean(1)
+    x, y = (middle[:, 0] * 128).astype(int), ((1 - middle[:, 1]) * 128).astype(int)
+    height = ours["vertices"][ours["faces"]].mean(1)[:, 2]
+    clear = (np.abs(height) > 0.15) & (ours["face_class"] > 0)
+    assert (maps["class_id.png"][y, x] == ours["face_class"])[clear].mean() > 0.95
+    assert (np.where(height > 0, 1, 2) == ours["face_class"])[clear].mean() > 0.97
+
+
+def test_a_texture_of_the_field_and_none_leave_no_maps_behind(trained: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(trained, copy)
+    result = run_verb("mesh", MeshParams(project=copy, resolution=32, texture=64, texture_kind="field"), Reporter())
+    assert "painted_by_photos" not in result
+    assert (copy / "exports/main/class_id.png").is_file()
+    assert not (copy / "exports/main/texture_unseen.png").exists()
+    picture = np.asarray(Image.open(copy / "exports/main/texture.png"))
+    assert picture.shape == (64, 64, 3)
+    assert picture.std() > 5
+    run_verb("mesh", MeshParams(project=copy, resolution=32), Reporter())
+    assert not list((copy / "exports/main").glob("*.png"))
+    assert "uv" not in surface(copy)
 
 
 def test_ply_and_stl_keep_the_world_and_the_classes(trained: Path, tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from fieldwork.nerfcore.errors import Cancelled, SettingError
 from fieldwork.nerfcore.mesh import photo_texture as module
+from fieldwork.nerfcore.mesh.painting import crossings, texels_of
 from fieldwork.nerfcore.mesh.photo_texture import PhotoTexture, photo_texture, prepare
 from fieldwork.nerfcore.mesh.photos import Photo
 from fieldwork.nerfcore.mesh.surface_picture import surface_picture
@@ -21,6 +22,7 @@ from fieldwork.tests.nerfcore.support.flat import (
     wall_photo,
     wall_picture,
 )
+from skimage.color import rgb2lab
 
 HELD_OUT = [looking((0, 0, 0), (0.3, 0.2, 1.9)), looking((0.1, 0, 0), (-0.5, 0.3, 2.2))]
 POSES = ring(9)
@@ -77,6 +79,28 @@ def test_exposures_of_a_third_of_a_stop_cost_at_most_half_a_decibel(plain: Photo
     assert abs(left.mean()) == pytest.approx(abs(np.mean(EXPOSURES)), abs=0.02)
     for pose in HELD_OUT:
         assert psnr(changed, pose) > psnr(plain, pose) - 0.5
+
+
+def test_where_the_photo_changes_colours_do_not_jump(monkeypatch: pytest.MonkeyPatch) -> None:
+    chosen: list[np.ndarray] = []
+
+    def spy(pieces, view, column, keep, log_factor):
+        chosen.append(view[np.arange(len(view)), column])
+        return crossings(pieces, view, column, keep, log_factor)
+
+    monkeypatch.setattr(module, "crossings", spy)
+    photos = [wall_photo(pose, exposure=stops) for pose, stops in zip(POSES, EXPOSURES)]
+    prepared = prepare(*wall_mesh(), photos, 512, Reporter())
+    made = photo_texture(prepared, None, Reporter())
+    texels = texels_of(prepared.pieces, 512, (0, 0, 512, 512))
+    view = np.full(512 * 512, -1)
+    view[texels.place] = np.repeat(chosen[0], np.diff(texels.first))
+    lab = rgb2lab(made.image)
+    for axis in (0, 1):
+        difference = np.linalg.norm(np.diff(lab, axis=axis), axis=2)
+        seam = np.diff(view.reshape(512, 512), axis=axis) != 0
+        assert seam.sum() > 100
+        assert difference[seam].mean() < 1.5 * difference[~seam].mean()
 
 
 def test_without_gains_the_same_photos_would_cost_more(plain: PhotoTexture, monkeypatch: pytest.MonkeyPatch) -> None:

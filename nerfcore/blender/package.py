@@ -72,23 +72,9 @@ def write_package(
     folder = package_folder(project, run)
     with disk_errors(folder):
         (folder / "images").mkdir(parents=True, exist_ok=True)
-    cameras = []
     report.stage("Undistorting the photos")
-    grids: dict[str, torch.Tensor] = {}
-    lenses = _lenses(folder)
-    test = set(scene.test)
-    for index, view in enumerate(scene.views):
-        report.progress(index / len(scene.views), view.name)
-        file = _write_photo(view, folder, grids, lenses)
-        entry = camera_entry(view, f"images/{file.name}", "test" if index in test else "train")
-        render = _write_render(view, folder, photo_renders(project, renders), grids)
-        cameras.append(entry | ({"render": f"renders/{render.name}"} if render else {}))
-    write_json(folder / "lenses.json", lenses)
-    for part, key in (("images", "image"), ("renders", "render")):
-        kept = {Path(camera[key]).name for camera in cameras if key in camera}
-        for stale in (folder / part).glob("*"):
-            if stale.name not in kept:
-                stale.unlink()
+    cameras = _write_pictures(scene, folder, photo_renders(project, renders), report)
+    _remove_others(folder, cameras)
     points = scene.points
     with atomic_path(folder / "points.npz") as temporary, open(temporary, "wb") as out:
         np.savez_compressed(out, xyz=points.xyz.astype(np.float32), rgb=points.rgb.astype(np.uint8))
@@ -180,6 +166,31 @@ def undistort(picture: Picture, grid: torch.Tensor) -> Picture:
     photo = torch.from_numpy(np.array(weighed.pixels)).permute(2, 0, 1)[None]
     out = torch.nn.functional.grid_sample(photo, grid, mode="bicubic", padding_mode="zeros", align_corners=False)
     return to_srgb8(replace(weighed, pixels=out[0].permute(1, 2, 0).numpy()))
+
+
+def _write_pictures(scene: Scene, folder: Path, renders: Path, report: Reporter) -> list[dict[str, Any]]:
+    """Write the photos without lens distortion, the renders beside them and lenses.json; the cameras of package.json."""
+    cameras = []
+    grids: dict[str, torch.Tensor] = {}
+    lenses = _lenses(folder)
+    test = set(scene.test)
+    for index, view in enumerate(scene.views):
+        report.progress(index / len(scene.views), view.name)
+        file = _write_photo(view, folder, grids, lenses)
+        entry = camera_entry(view, f"images/{file.name}", "test" if index in test else "train")
+        render = _write_render(view, folder, renders, grids)
+        cameras.append(entry | ({"render": f"renders/{render.name}"} if render else {}))
+    write_json(folder / "lenses.json", lenses)
+    return cameras
+
+
+def _remove_others(folder: Path, cameras: list[dict[str, Any]]) -> None:
+    """Delete the pictures of an earlier package that no camera of this one names."""
+    for part, key in (("images", "image"), ("renders", "render")):
+        kept = {Path(camera[key]).name for camera in cameras if key in camera}
+        for other in (folder / part).glob("*"):
+            if other.name not in kept:
+                other.unlink()
 
 
 def _write_photo(view: View, folder: Path, grids: dict[str, torch.Tensor], lenses: dict[str, str]) -> Path:

@@ -2,12 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import os
-import time
-from collections.abc import Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +9,9 @@ import numpy as np
 from PIL import Image
 
 from ..errors import InputError, ProjectError
-from ..files import atomic_path, file_hash, write_json
-from ..images.decode import float_exposure, is_linear, read_photo
-from ..images.labels import Colors, drawn_as_stored, fit_to_photo, read_labels, read_mask, turned_by_itself
-from ..images.sharpness import sharpness, thumbnail
-from ..images.soft_labels import read_confidence
+from ..files import file_hash
+from ..images.decode import float_exposure, is_linear
+from ..images.labels import Colors, drawn_as_stored
 from ..params import NewParams
 from ..progress import Reporter, shortened
 from ..project.classes import make_classes, read_classes
@@ -29,24 +21,10 @@ from ..project.store import PROJECT_FILE, create_folder, edit_project, load_proj
 from .find import Source, classes_beside, find_sources, list_photos, subfolder
 from .select import reject_blurred, reject_duplicates
 from .video import VIDEO_SUFFIXES, extract_frames
+from .working_copies import Settings, make_working_copies
 
-CACHE_FILE = "jobs/ingested.json"
 FRAMES_FOLDER = "frames"
-MAX_ASPECT = 3.0
-SPHERE_WIDTH = 5000
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What decides how a working copy looks."""
-
-    folder: Path
-    max_size: int
-    exposure: float
-    colors: Colors | None
-    ignore_id: int
-    labels_as_stored: bool = True  # drawn on the stored pixels, where their proportions do not tell
-    masks_as_stored: bool = True
+Classes = tuple[dict[int, str], int, Colors]  # names, void id, colours
 
 
 def new(params: NewParams, report: Reporter) -> dict[str, Any]:
@@ -65,61 +43,31 @@ def new(params: NewParams, report: Reporter) -> dict[str, Any]:
     folder, photos = Path(params.project), Path(params.photos)
     inputs = ingest_inputs(params)
     previous = _previous_project(params)
-    names, ignore_id, colors = {}, 0, {}
     classes_file = params.classes or classes_beside(params.labels)
-    if classes_file:
-        names, ignore_id, colors = read_classes(classes_file)
+    classes: Classes = read_classes(classes_file) if classes_file else ({}, 0, {})
     create_folder(folder)
     _remove_halves(folder)
-    if photos.is_file() and photos.suffix.lower() in VIDEO_SUFFIXES:
-        report.stage("Choosing frames of the video")
-        paths = extract_frames(photos, folder / FRAMES_FOLDER, params.frames, report)
-        skipped: list[dict[str, str]] = []
-        root = folder / FRAMES_FOLDER
-    else:
-        paths, skipped, root = list_photos(photos, exclude=[params.labels, params.masks])
+    paths, skipped, root = _photos(params, report)
+    kept = [record for record in previous.images if record.file] if previous and params.add else []
     labels_folder = params.labels or subfolder(photos, "labels")
     masks_folder = params.masks or subfolder(photos, "masks")
-    kept = [record for record in previous.images if record.file] if previous and params.add else []
     sources = find_sources(paths, root, labels_folder, masks_folder, {record.name for record in kept})
-    floats = [path for path in paths if is_linear(path)]
-    stored = [
-        _drawn_as_stored([(s.path, s.label) for s in sources], "label maps", report),
-        _drawn_as_stored([(s.path, s.mask) for s in sources], "masks", report),
-    ]
-    settings = Settings(folder, params.max_size, float_exposure(floats), colors or None, ignore_id, *stored)
+    settings = _settings(params, paths, sources, classes, report)
 
     report.stage("Reading photos")
-    records, pictures = _ingest_all(sources, settings, report)
+    records, pictures = make_working_copies(sources, settings, report)
     # Video frames were chosen for sharpness, and a still camera on a tripod may well repeat itself there.
     reject_duplicates(records, pictures, kept)
     if not params.keep_blurry:
         reject_blurred(records)
     records = kept + records
     _check_usable(records, photos, skipped)
-    for record in records:
-        if record.status != "rejected" and record.reason:
-            report.warn(f"{record.name}: {record.reason}")
     present = _present_ids(folder, records, report)
-    rejected = skipped + [
-        {"file": Path(record.source).name, "reason": record.reason} for record in records if record.status == "rejected"
-    ]
-    used = [record for record in records if record.status != "rejected"]
-    if rejected:
-        reasons = [f"{item['file']} ({item['reason']})" for item in rejected]
-        report.warn(shortened(f"{len(rejected)} of {len(used) + len(rejected)} files were left out", reasons))
-    if len(used) < 3:
-        number = "one usable photo" if len(used) == 1 else f"{len(used)} usable photos"
-        report.warn(f"Only {number}: camera poses need at least three, better twenty.")
-    result: dict[str, Any] = {
-        "images": len(used),
-        "rejected": rejected,
-        "labelled": sum(record.label is not None for record in used),
-        "masked": sum(record.mask is not None for record in used),
-    }
+    result = _summary(records, skipped)
+    _warn(records, result["rejected"], report)
     origin = {"video_sha256": file_hash(photos)} if photos.is_file() else {}
     with edit_project(folder, Project(mask_mode=params.mask_mode)) as project:
-        _put_in(project, records, present, (names, ignore_id, colors), params, previous is not None)
+        _put_in(project, records, present, classes, params, previous is not None)
         result["classes"] = [c.name for c in project.classes]
         project.record("new", params.model_dump(mode="json"), result | origin, inputs)
     return result
@@ -174,6 +122,31 @@ def ingested(params: NewParams) -> Earlier:
     return compare(made, ingest_inputs(params), files)
 
 
+def _photos(params: NewParams, report: Reporter) -> tuple[list[Path], list[dict[str, str]], Path]:
+    """The photos, or frames of the video; files that are none, with the reason; the folder that names are relative to."""
+    photos = Path(params.photos)
+    if photos.is_file() and photos.suffix.lower() in VIDEO_SUFFIXES:
+        report.stage("Choosing frames of the video")
+        root = Path(params.project) / FRAMES_FOLDER
+        return extract_frames(photos, root, params.frames, report), [], root
+    return list_photos(photos, exclude=[params.labels, params.masks])
+
+
+def _settings(
+    params: NewParams, paths: list[Path], sources: list[Source], classes: Classes, report: Reporter
+) -> Settings:
+    _, ignore_id, colors = classes
+    return Settings(
+        folder=Path(params.project),
+        max_size=params.max_size,
+        exposure=float_exposure([path for path in paths if is_linear(path)]),
+        colors=colors or None,
+        ignore_id=ignore_id,
+        labels_as_stored=_drawn_as_stored([(s.path, s.label) for s in sources], "label maps", report),
+        masks_as_stored=_drawn_as_stored([(s.path, s.mask) for s in sources], "masks", report),
+    )
+
+
 def _drawn_as_stored(pairs: list[tuple[Path, Path | None]], what: str, report: Reporter) -> bool:
     """Whether maps were drawn on the stored pixels of photos, see `labels.drawn_as_stored`; a guess is said."""
     stored, doubtful = drawn_as_stored(pairs)
@@ -212,137 +185,6 @@ def _remove_halves(folder: Path) -> None:
             path.unlink(missing_ok=True)
 
 
-def _ingest_all(
-    sources: list[Source], settings: Settings, report: Reporter
-) -> tuple[list[ImageRecord], dict[str, np.ndarray]]:
-    """Ingest every photo on a few threads; finished ones are remembered in the project, so a rerun skips them."""
-    cache = _load_cache(settings.folder)
-    done: dict[str, tuple[ImageRecord, np.ndarray | None]] = {}
-    workers = max(1, min(4, os.cpu_count() or 1))
-    saved = time.monotonic()
-    try:
-        with ThreadPoolExecutor(workers) as pool:
-            queue: Iterator[Source] = iter(sources)
-            running: set[Future[tuple[Source, ImageRecord, np.ndarray | None]]] = set()
-            while len(done) < len(sources):
-                report.progress(len(done) / len(sources), f"{len(done)} of {len(sources)} photos")
-                while len(running) < workers and (source := next(queue, None)) is not None:
-                    running.add(pool.submit(_ingest_cached, source, settings, cache.get(source.name)))
-                finished, running = wait(running, timeout=0.3, return_when=FIRST_COMPLETED)
-                for future in finished:
-                    source, record, picture = future.result()
-                    done[source.name] = record, picture
-                    cache[source.name] = _cache_entry(source, settings, record, picture)
-                if time.monotonic() - saved > 3:
-                    write_json(settings.folder / CACHE_FILE, cache)
-                    saved = time.monotonic()
-    finally:
-        if done:
-            write_json(settings.folder / CACHE_FILE, cache)
-    records = [done[source.name][0] for source in sources]
-    return records, {name: picture for name, (_, picture) in done.items() if picture is not None}
-
-
-def _cache_key(source: Source, settings: Settings) -> list[Any]:
-    stamps = []
-    for path in (source.path, source.label, source.mask, source.confidence):
-        stat = path.stat() if path else None
-        stamps.append([str(path), stat.st_size, stat.st_mtime] if stat else None)
-    colors = {str(i): list(color) for i, color in sorted((settings.colors or {}).items())}
-    stored = [settings.labels_as_stored, settings.masks_as_stored]
-    return [stamps, settings.max_size, settings.exposure, colors, settings.ignore_id, stored]
-
-
-def _cache_entry(source: Source, settings: Settings, record: ImageRecord, picture: np.ndarray | None) -> dict[str, Any]:
-    small = None if picture is None else np.round(picture).astype(np.uint8).tobytes().hex()
-    return {"key": _cache_key(source, settings), "record": record.model_dump(mode="json"), "thumbnail": small}
-
-
-def _load_cache(folder: Path) -> dict[str, Any]:
-    """What an earlier run finished. Anything unreadable only costs doing it again."""
-    try:
-        cache = json.loads((folder / CACHE_FILE).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return cache if isinstance(cache, dict) else {}
-
-
-def _ingest_cached(
-    source: Source, settings: Settings, entry: dict[str, Any] | None
-) -> tuple[Source, ImageRecord, np.ndarray | None]:
-    if entry and entry.get("key") == json.loads(json.dumps(_cache_key(source, settings))):
-        record = ImageRecord.model_validate(entry["record"])
-        files = [file for file in (record.file, record.label, record.mask, record.confidence) if file]
-        if all((settings.folder / file).is_file() for file in files):
-            small = entry.get("thumbnail")
-            picture = (
-                np.frombuffer(bytes.fromhex(small), np.uint8).reshape(64, 64).astype(np.float32) if small else None
-            )
-            return source, record, picture
-    return source, *_ingest_one(source, settings)
-
-
-def _ingest_one(source: Source, settings: Settings) -> tuple[ImageRecord, np.ndarray | None]:
-    """Decode one photo, write its working copy, label and mask. A bad photo becomes a rejected record."""
-    record = ImageRecord(name=source.name, source=str(source.path))
-    try:
-        photo = read_photo(source.path, settings.max_size, settings.exposure)
-        width, height = photo.full_size
-        aspect = max(width, height) / min(width, height)
-        # Exactly 2:1 and large is how full spheres are stored.
-        sphere = aspect == 2 and max(width, height) >= SPHERE_WIDTH
-        if photo.facts.get("panorama") or aspect > MAX_ASPECT or sphere:
-            raise InputError(f"a panorama ({width}×{height}): poses need single photos, not stitched ones")
-        if min(width, height) < 64:
-            raise InputError(f"too small ({width}×{height} pixels)")
-    except InputError as error:
-        record.status, record.reason = "rejected", str(error)
-        return record, None
-    record.sha256 = file_hash(source.path)
-    image = photo.image
-    record.width, record.height = image.size
-    record.exif = {key: value for key, value in photo.facts.items() if key != "focal_px"}
-    focal = photo.facts.get("focal_px")
-    record.focal_px = focal * max(image.size) / max(photo.full_size) if focal else None
-    record.camera_group = camera_group(photo.facts, image.size)
-    record.sharpness = sharpness(image)
-    suffix = ".jpg" if photo.lossy and image.mode == "RGB" else ".png"
-    record.file = f"images/{source.name}{suffix}"
-    with atomic_path(settings.folder / record.file) as path:
-        image.save(path, quality=95, subsampling=0) if suffix == ".jpg" else image.save(path, compress_level=2)
-    problems = []
-    for kind, given in (("label", source.label), ("mask", source.mask), ("confidence", source.confidence)):
-        if given is None:
-            continue
-        try:
-            if kind == "label":
-                values = read_labels(given, settings.colors, settings.ignore_id)
-            else:
-                values = read_mask(given) if kind == "mask" else read_confidence(given)
-            values, by_itself = turned_by_itself(values, given)
-            turned, named = 1 if by_itself else photo.orientation, f"{kind} {given.name}"
-            stored = settings.masks_as_stored if kind == "mask" else settings.labels_as_stored
-            fitted = fit_to_photo(values, turned, photo.full_size, image.size, named, stored)
-        except InputError as error:
-            problems.append(str(error))
-            continue
-        file = f"{kind if kind == 'confidence' else kind + 's'}/{source.name}.png"
-        with atomic_path(settings.folder / file) as path:
-            small = fitted.astype(np.uint8) if fitted.max(initial=0) < 256 else fitted
-            Image.fromarray(small).save(path, compress_level=2)
-        setattr(record, kind, file)
-    record.reason = "; ".join(problems)
-    return record, thumbnail(image)
-
-
-def camera_group(facts: dict[str, Any], size: tuple[int, int]) -> str:
-    """Photos with equal groups share one camera model: same make, model, focal length and picture size."""
-    parts = [str(facts.get("make", "")), str(facts.get("model", ""))]
-    focal = facts.get("focal_mm")
-    parts.append(f"{focal:.1f}mm" if focal else "")
-    return " ".join([part for part in parts if part] + [f"{size[0]}x{size[1]}"])
-
-
 def _check_usable(records: list[ImageRecord], photos: Path, skipped: list[dict[str, str]]) -> None:
     if any(record.status != "rejected" for record in records):
         return
@@ -364,15 +206,41 @@ def _present_ids(folder: Path, records: list[ImageRecord], report: Reporter) -> 
     return present
 
 
+def _summary(records: list[ImageRecord], skipped: list[dict[str, str]]) -> dict[str, Any]:
+    """What the verb tells of the photos; `skipped`: files that are none."""
+    used = [record for record in records if record.status != "rejected"]
+    rejected = [record for record in records if record.status == "rejected"]
+    return {
+        "images": len(used),
+        "rejected": skipped + [{"file": Path(r.source).name, "reason": r.reason} for r in rejected],
+        "labelled": sum(record.label is not None for record in used),
+        "masked": sum(record.mask is not None for record in used),
+    }
+
+
+def _warn(records: list[ImageRecord], rejected: list[dict[str, str]], report: Reporter) -> None:
+    """Say what is wrong with photos that are used, which are not, and when there are too few."""
+    used = [record for record in records if record.status != "rejected"]
+    for record in used:
+        if record.reason:
+            report.warn(f"{record.name}: {record.reason}")
+    if rejected:
+        reasons = [f"{item['file']} ({item['reason']})" for item in rejected]
+        report.warn(shortened(f"{len(rejected)} of {len(used) + len(rejected)} files were left out", reasons))
+    if len(used) < 3:
+        number = "one usable photo" if len(used) == 1 else f"{len(used)} usable photos"
+        report.warn(f"Only {number}: camera poses need at least three, better twenty.")
+
+
 def _put_in(
     project: Project,
     records: list[ImageRecord],
     present: set[int],
-    classes: tuple[dict[int, str], int, Colors],
+    classes: Classes,
     params: NewParams,
     there: bool,
 ) -> None:
-    """Put the photos into the project, and the classes: those named (names, void id, colours), and those `present` in
+    """Put the photos into the project, and the classes: those named, and those `present` in
     the label maps without a name. `there`: the project was there before."""
     names, ignore_id, colors = classes
     if not params.add:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,7 @@ from ..data.pixels import training_size
 from ..data.scene import Scene, View
 from ..errors import InputError
 from ..files import atomic_path, write_json
+from ..geometry.cameras import Camera
 from ..images.encode import write_picture
 from ..images.picture import cut_out, over, resized, to_bytes
 from ..images.working import nearest, read_image, read_label, read_picture
@@ -31,6 +34,87 @@ from ..render.run import Trained, load_info, load_trained, refined_poses
 from .metrics import Confusion, psnr, ssim
 from .refit import refit_camera
 from .speed import SPEED_KEYS, measure_speed, peak_memory
+
+
+@dataclass
+class Comparison:
+    """Views of a run rendered and held against their photos; `scores`, `pictures`, `confusion`, and the rays and
+    seconds of rendering, grow with every view.
+
+    refined: camera-to-box poses (4, 4) by image of a run that refined them. out: folder of the pictures.
+    """
+
+    trained: Trained
+    scene: Scene
+    refined: dict[str, np.ndarray]
+    box_from_world: np.ndarray
+    out: Path
+    confusion: Confusion
+    scores: list[dict[str, Any]] = field(default_factory=list)
+    pictures: list[Path] = field(default_factory=list)
+    seconds: float = 0.0
+    rays: int = 0
+
+    @property
+    def background(self) -> float:
+        return background_of(self.trained.info)
+
+    def add(self, view: View, size: tuple[int, int], check: Callable[[], None]) -> None:
+        """Compare one view at a size (width, height)."""
+        model, background = self.trained.model, self.background
+        camera = view.camera.resized(*size)
+        photo, keep, label = _truth(view, self.scene, camera.width, camera.height, background)
+        pose, given = self._pose(view, camera, photo, keep, check)
+        begin, compiled = time.perf_counter(), compile_seconds()
+        frame = render_view(model, camera, pose, background, check=check)
+        self.seconds += time.perf_counter() - begin - (compile_seconds() - compiled)
+        self.rays += camera.width * camera.height
+        image = to_bytes(frame.color)
+        self.scores.append({"name": view.name, "psnr": psnr(image, photo, keep), "ssim": ssim(image, photo), **given})
+        if label is not None and self.confusion.class_ids:
+            self.confusion.add(label, frame.label(self.confusion.class_ids, self.scene.ignore_id))
+        self.pictures.append(_write_pictures(self.out, view.name, photo, frame, label, self.trained, self.scene))
+
+    def _pose(
+        self, view: View, camera: Camera, photo: np.ndarray, keep: np.ndarray | None, check: Callable[[], None]
+    ) -> tuple[np.ndarray, dict[str, float]]:
+        """Camera-to-box pose (4, 4) of a view and, where it was fitted to the photo, what the given one scores."""
+        pose = box_poses([view], self.box_from_world)[0]
+        if view.name in self.refined:
+            return self.refined[view.name], {}
+        if not self.refined:
+            return pose, {}
+        model, background = self.trained.model, self.background
+        before = render_view(model, camera, pose, background, semantics=False, check=check)
+        given = {"psnr_given_pose": psnr(to_bytes(before.color), photo, keep)}
+        return refit_camera(model, camera, pose, photo, keep, background, check), given
+
+    def means(self) -> dict[str, Any]:
+        """Scores over all views."""
+        names = {c.id: c.name for c in self.scene.classes}
+        miou = self.confusion.miou()
+        return {
+            "images": len(self.scores),
+            "psnr": self._mean("psnr", 3),
+            "ssim": self._mean("ssim", 4),
+            "lpips": None,
+            "miou": None if miou is None else round(miou, 4),
+            "per_class_iou": {names.get(c, str(c)): round(v, 4) for c, v in self.confusion.iou().items()},
+        }
+
+    def details(self, folder: Path) -> dict[str, Any]:
+        """Scores of each view, and the pictures by their path in the project's folder."""
+        rounded = [{k: (round(v, 4) if isinstance(v, float) else v) for k, v in s.items()} for s in self.scores]
+        result: dict[str, Any] = {
+            "per_image": rounded,
+            "pictures": [str(path.relative_to(folder)) for path in self.pictures],
+        }
+        if any("psnr_given_pose" in score for score in self.scores):
+            result["psnr_given_poses"] = self._mean("psnr_given_pose", 3)
+        return result
+
+    def _mean(self, key: str, digits: int) -> float:
+        return round(float(np.mean([score[key] for score in self.scores])), digits)
 
 
 def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
@@ -57,65 +141,36 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
     sizes = [training_size(scene.views[index].camera, trained.info.image_size) for index in indices]
     report.stage("Preparing")
     trained.model.refine(check=report.check)
-    box = trained.info.box(project)
-    background = background_of(trained.info)
-    out = run_folder(folder, params.run) / "evaluation"
-    confusion = Confusion(trained.info.class_ids if trained.model.field.classes else [])
-    names = {c.id: c.name for c in scene.classes}
-    refined = refined_poses(folder, params.run, trained.info)
-    scores: list[dict[str, Any]] = []
-    pictures = []
-    seconds, rays = 0.0, 0
+    box_from_world = trained.info.box(project).box_from_world
+    compared = Comparison(
+        trained,
+        scene,
+        refined_poses(folder, params.run, trained.info),
+        box_from_world,
+        run_folder(folder, params.run) / "evaluation",
+        Confusion(trained.info.class_ids if trained.model.field.classes else []),
+    )
     report.stage("Rendering held-out views" if params.split == "test" else "Rendering training views")
-    for number, index in enumerate(indices):
+    for number, (index, size) in enumerate(zip(indices, sizes)):
         view = scene.views[index]
         report.progress(number / len(indices), view.name)
-        pose = box_poses([view], box.box_from_world)[0]
-        camera = view.camera.resized(*sizes[number])
-        photo, keep, label = _truth(view, scene, camera.width, camera.height, background)
-        given: dict[str, float] = {}
-        if view.name in refined:
-            pose = refined[view.name]
-        elif refined:
-            before = render_view(trained.model, camera, pose, background, semantics=False, check=report.check)
-            given["psnr_given_pose"] = psnr(to_bytes(before.color), photo, keep)
-            pose = refit_camera(trained.model, camera, pose, photo, keep, background, report.check)
-        begin, compiled = time.perf_counter(), compile_seconds()
-        frame = render_view(trained.model, camera, pose, background, check=report.check)
-        seconds += time.perf_counter() - begin - (compile_seconds() - compiled)
-        rays += camera.width * camera.height
-        image = to_bytes(frame.color)
-        score = {"name": view.name, "psnr": psnr(image, photo, keep), "ssim": ssim(image, photo), **given}
-        if label is not None and confusion.class_ids:
-            present = frame.label(confusion.class_ids, scene.ignore_id)
-            confusion.add(label, present)
-        scores.append(score)
-        pictures.append(_write_pictures(out, view.name, photo, frame, label, trained, scene))
-    per_class = {names.get(c, str(c)): round(v, 4) for c, v in confusion.iou().items()}
+        compared.add(view, size, report.check)
     speed: dict[str, Any] = dict.fromkeys(SPEED_KEYS)
     if params.speed:
-        speed = measure_speed(trained, scene, indices, box.box_from_world, report)
+        speed = measure_speed(trained, scene, indices, box_from_world, report)
     result: dict[str, Any] = {
         "run": params.run,
         "split": params.split,
-        "images": len(indices),
-        "psnr": round(float(np.mean([s["psnr"] for s in scores])), 3),
-        "ssim": round(float(np.mean([s["ssim"] for s in scores])), 4),
-        "lpips": None,
-        "miou": None if confusion.miou() is None else round(confusion.miou() or 0.0, 4),
-        "per_class_iou": per_class,
+        **compared.means(),
         **speed,
-        "rps": round(rays / seconds),
-        "seconds_per_image": round(seconds / len(indices), 3),
+        "rps": round(compared.rays / compared.seconds),
+        "seconds_per_image": round(compared.seconds / len(indices), 3),
         "params_m": round(trained.model.field.parameter_count() / 1e6, 3),
         "memory_mb": round(peak_memory(trained.device)),
-        "background": "white" if background == 1 else "black",
+        "background": "white" if compared.background == 1 else "black",
         "device": str(trained.device),
-        "per_image": [{k: (round(v, 4) if isinstance(v, float) else v) for k, v in s.items()} for s in scores],
-        "pictures": [str(p.relative_to(folder)) for p in pictures],
+        **compared.details(folder),
     }
-    if any("psnr_given_pose" in score for score in scores):
-        result["psnr_given_poses"] = round(float(np.mean([score["psnr_given_pose"] for score in scores])), 3)
     path = run_folder(folder, params.run) / "metrics.json"
     stored = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     write_json(path, {**stored, params.split: result})

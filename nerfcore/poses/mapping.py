@@ -30,6 +30,22 @@ def mapper_options(relaxed: bool, count: int, names: list[str]) -> Any:
     return options
 
 
+class _Progress:
+    """Tells how many of `count` photos are placed; `registered` of them were before mapping began."""
+
+    def __init__(self, tell: Any, count: int, registered: int) -> None:
+        self.tell, self.count, self.registered = tell, count, registered
+        self.resumed = registered > 0
+
+    def place(self, photos: int = 1) -> None:
+        self.registered = min(self.registered + photos, self.count)  # a second model counts its photos again
+        self.tell.progress(self.registered / self.count, f"{self.registered} of {self.count} photos placed")
+
+    def first_pair(self) -> None:
+        self.place(0 if self.resumed else 2)  # it is called too when a model is taken up again
+        self.resumed = False
+
+
 def build(
     path: Path,
     image_folder: Path,
@@ -66,18 +82,7 @@ def build(
         first = resume.latest_snapshot(memory)
         if first is not None:
             registered = pycolmap.Reconstruction(str(first)).num_reg_images()
-    begun = registered > 0
-
-    def place(count: int) -> None:
-        nonlocal registered
-        registered = min(registered + count, len(names))  # a second model counts its photos again
-        tell.progress(registered / len(names), f"{registered} of {len(names)} photos placed")
-
-    def first_pair() -> None:
-        nonlocal begun
-        place(0 if begun else 2)  # it is called too when a model is taken up again
-        begun = False
-
+    progress = _Progress(tell, len(names), registered)
     tell.stage("Placing cameras")
     found = pycolmap.incremental_mapping(
         path,
@@ -85,8 +90,8 @@ def build(
         output,
         options,
         input_path=str(first) if first else "",
-        initial_image_pair_callback=first_pair,
-        next_image_callback=lambda: place(1),
+        initial_image_pair_callback=progress.first_pair,
+        next_image_callback=progress.place,
     )
     models = sorted(found.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
     if memory is not None:

@@ -51,6 +51,11 @@ class Rendered:
         return len(self.evaluated_density)
 
 
+def _where_used(samples: Samples, values: torch.Tensor, otherwise: float) -> torch.Tensor:
+    """Values (N,) of samples, and another one where an entry is unused."""
+    return torch.where(samples.packed_info.ray_indices < 0, otherwise, values)
+
+
 class Model(nn.Module):
     """The hybrid field with its occupancy grid.
 
@@ -165,39 +170,25 @@ class Model(nn.Module):
             origins, directions, grid, samples_per_ray, jitter, shift, capacity if fixed else None
         )
         with torch.set_grad_enabled(learning and not two_passes):
-            geometry = self.field.geometry(points)
-            weights = render_weights(geometry.density, samples.deltas, samples.packed_info)
+            geometry, weights = self._weighted(points, samples)
         evaluated_density = geometry.density.detach()
         indices, visible, visible_count = self._select_visible(samples, weights, fixed)
         if two_passes:
             explicit = geometry.explicit[indices] if geometry.explicit is not None else None
-            geometry = self.field.geometry(points[indices], explicit)
-            weights = render_weights(geometry.density, visible.deltas, visible.packed_info)
+            geometry, weights = self._weighted(points[indices], visible, explicit)
         else:
             geometry, weights = geometry[indices], weights[indices]
         density = geometry.density
         if fixed:  # unused entries count for nothing
-            unused = visible.packed_info.ray_indices < 0
-            density = torch.where(unused, 0.0, density)
-            weights = weights if two_passes else torch.where(unused, 0.0, weights)
-            evaluated_density = torch.where(samples.packed_info.ray_indices < 0, -1.0, evaluated_density)
+            density = _where_used(visible, density, 0.0)
+            weights = weights if two_passes else _where_used(visible, weights, 0.0)
+            evaluated_density = _where_used(samples, evaluated_density, -1.0)
         summed = self._composite(geometry, weights, visible, directions, codes)
         probabilities = None
         if semantics and self.field.semantic_head is not None:
             probabilities = self._probabilities(self.field.logits(geometry), weights, visible.packed_info)
-        color, opacity, depth = summed[:, :3], summed[:, 3], summed[:, 4]
-        return Rendered(
-            color,
-            opacity,
-            depth,
-            probabilities,
-            weights,
-            density,
-            visible,
-            samples.points,
-            evaluated_density,
-            visible_count,
-        )
+        shaded = (summed[:, :3], summed[:, 3], summed[:, 4], probabilities)
+        return Rendered(*shaded, weights, density, visible, samples.points, evaluated_density, visible_count)
 
     def _sample(
         self,
@@ -226,6 +217,14 @@ class Model(nn.Module):
         ray_indices = samples.packed_info.ray_indices.long()  # pose refinement: samples move with their ray
         positions = origins[ray_indices] + directions[ray_indices] * samples.t[:, None]
         return samples, grid_position(positions, self.contracted).clamp(0, 1)
+
+    def _weighted(
+        self, points: torch.Tensor, samples: Samples, explicit: torch.Tensor | None = None
+    ) -> tuple[Geometry, torch.Tensor]:
+        """Geometry at the points (N, 3) of samples and their rendering weights (N,); `explicit`: features of the grid
+        there, where they are known already."""
+        geometry = self.field.geometry(points, explicit)
+        return geometry, render_weights(geometry.density, samples.deltas, samples.packed_info)
 
     @torch.no_grad()
     def _select_visible(

@@ -88,22 +88,12 @@ def train(params: TrainParams, report: Reporter) -> dict[str, Any]:
     project_folder = Path(params.project)
     device = use_device()
     place = TrainingFolder.to_resume(project_folder, params.run) if params.resume else None
+    saved = None
     if place is not None:
         info, scene = _resumable(place, params, report)
-        saved = read_checkpoint(place.folder / CHECKPOINT, device)
-        if saved[1].get("training", "") != info.origin.training:
-            raise ProjectError(
-                f"{place.folder / CHECKPOINT} is not of the training that {INFO} beside it describes.",
-                "Train the run anew, without --resume.",
-            )
+        saved = _saved(place, info, device)
     else:
-        saved, config = None, make_config(params.preset, params.set)
-        info, scene = plan_run(project_folder, params.preset, config, device, params.holdout)
-        info.origin = Origin(
-            project=load_project(project_folder).uuid,
-            training=uuid.uuid4().hex,
-            inputs=training_inputs(project_folder, params, config),
-        )
+        info, scene = _planned(params, device)
         place = TrainingFolder.anew(project_folder, params.run)
     save_info(place.folder, info)
     for half_written in place.folder.glob(".*.safetensors"):  # by a process that was killed
@@ -125,19 +115,7 @@ def train(params: TrainParams, report: Reporter) -> dict[str, Any]:
         raise
     loop.checkpoint()
     loop.keep()
-    result = {
-        "run": params.run,
-        "steps": trainer.steps,
-        "seconds": round(loop.clock.seconds(), 2),
-        "compile_seconds": round(compile_seconds(), 2),
-        "psnr_train": loop.state["psnr"],
-        "checkpoint": str(place.folder / CHECKPOINT),
-        "params_m": round(trainer.model.field.parameter_count() / 1e6, 2),
-        "device": str(device),
-        "closed_picture": closed_picture(place.folder),
-        "backend": trainer.backend.name,
-        "precision": str(trainer.model.field.dtype).removeprefix("torch."),
-    }
+    result = {"run": params.run, **loop.result()}
     if trainer.poses is not None:
         result["pose_shift"] = trainer.poses.shift(info.box(load_project(project_folder)).world_from_box)
     write_json(place.folder / METRICS, {"train": result})
@@ -192,6 +170,35 @@ def unfinished(params: TrainParams) -> bool:
 def held_out(project: Path, run: str) -> int:
     """How many photos a run holds out. Raises ProjectError when there is no such run."""
     return len(load_scene(project, load_info(project, run).holdout).test)
+
+
+def _planned(params: TrainParams, device: torch.device) -> tuple[RunInfo, Scene]:
+    """A new run with the fingerprint of its inputs, and its scene. Raises ProjectError, SettingError, TrainingError."""
+    project, config = Path(params.project), make_config(params.preset, params.set)
+    info, scene = plan_run(project, params.preset, config, device, params.holdout)
+    info.origin = Origin(
+        project=load_project(project).uuid,
+        training=uuid.uuid4().hex,
+        inputs=training_inputs(project, params, config),
+    )
+    return info, scene
+
+
+def _saved(
+    place: TrainingFolder, info: RunInfo, device: torch.device
+) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+    """Tensors and state of the checkpoint to go on from.
+
+    Raises:
+        ProjectError: it is damaged, or of another training than config.json beside it.
+    """
+    saved = read_checkpoint(place.folder / CHECKPOINT, device)
+    if saved[1].get("training", "") != info.origin.training:
+        raise ProjectError(
+            f"{place.folder / CHECKPOINT} is not of the training that {INFO} beside it describes.",
+            "Train the run anew, without --resume.",
+        )
+    return saved
 
 
 def _resumable(place: TrainingFolder, params: TrainParams, report: Reporter) -> tuple[RunInfo, Scene]:
@@ -338,6 +345,22 @@ class _Loop:
             write_poses(path, trainer.poses, trainer.store.rays, info.images, np.array(info.sfm_from_box))
         if trainer.pixel_features is not None:
             save_features(self.place.folder / PIXEL_FEATURES, trainer.pixel_features)
+
+    def result(self) -> dict[str, Any]:
+        """What the verb tells of the training, after its end."""
+        trainer = self.trainer
+        return {
+            "steps": trainer.steps,
+            "seconds": round(self.clock.seconds(), 2),
+            "compile_seconds": round(compile_seconds(), 2),
+            "psnr_train": self.state["psnr"],
+            "checkpoint": str(self.place.folder / CHECKPOINT),
+            "params_m": round(trainer.model.field.parameter_count() / 1e6, 2),
+            "device": str(trainer.device),
+            "closed_picture": closed_picture(self.place.folder),
+            "backend": trainer.backend.name,
+            "precision": str(trainer.model.field.dtype).removeprefix("torch."),
+        }
 
     def keep(self) -> None:
         """Let the run take the place of the one before it. Raises DiskError."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -40,6 +41,38 @@ STAGES = {
 }
 
 
+@dataclass
+class Pipeline:
+    """The stages of one reconstruction, done in turn: seconds and results by verb, the verbs whose earlier results were
+    used again, and why others were done again."""
+
+    project: Path
+    report: Reporter
+    seconds: dict[str, float] = field(default_factory=dict)
+    results: dict[str, Any] = field(default_factory=dict)
+    reused: list[str] = field(default_factory=list)
+    redone: dict[str, str] = field(default_factory=dict)
+
+    def do(self, verb: str, values: p.Params) -> None:
+        """Run a stage, unless what an earlier call made of the same inputs is there."""
+        begin = time.perf_counter()
+        self.report.check()
+        stage = STAGES[verb]
+        earlier = stage.earlier(values) if is_project(self.project) else Earlier()
+        if earlier.result is not None:
+            self.results[verb], self.seconds[verb] = earlier.result, 0.0
+            self.reused.append(verb)
+            self.report.stage(f"{verb}: nothing has changed, kept")
+            return
+        if getattr(values, "resume", False):
+            self.report.stage(f"{verb}: goes on where it was stopped")
+        elif earlier.reason:
+            self.redone[verb] = earlier.reason
+            self.report.stage(f"{verb}: done again ({earlier.reason})")
+        self.results[verb] = stage.run(values, self.report)
+        self.seconds[verb] = round(time.perf_counter() - begin, 1)
+
+
 def reconstruct(params: p.ReconstructParams, report: Reporter) -> dict[str, Any]:
     """Run new, poses, train, evaluate, mesh, render and blend one after the other.
 
@@ -52,38 +85,16 @@ def reconstruct(params: p.ReconstructParams, report: Reporter) -> dict[str, Any]
         any verb's error; the project is left so that the same command goes on.
     """
     project, run = Path(params.out), "main"
-    stages: dict[str, float] = {}
-    results: dict[str, Any] = {}
-    reused: list[str] = []
-    redone: dict[str, str] = {}
-
-    def do(verb: str, values: p.Params) -> None:
-        begin = time.perf_counter()
-        report.check()
-        stage = STAGES[verb]
-        earlier = stage.earlier(values) if is_project(project) else Earlier()
-        if earlier.result is not None:
-            results[verb], stages[verb] = earlier.result, 0.0
-            reused.append(verb)
-            report.stage(f"{verb}: nothing has changed, kept")
-            return
-        if getattr(values, "resume", False):
-            report.stage(f"{verb}: goes on where it was stopped")
-        elif earlier.reason:
-            redone[verb] = earlier.reason
-            report.stage(f"{verb}: done again ({earlier.reason})")
-        results[verb] = stage.run(values, report)
-        stages[verb] = round(time.perf_counter() - begin, 1)
-
+    pipeline = Pipeline(project, report)
     if is_project(project) and load_project(project).last("import") is not None:
         raise ProjectError(f"{project} is an imported data set.", "Use train, mesh and blend on it.")
-    do(
+    pipeline.do(
         "new",
         p.NewParams(
             project=project, photos=params.photos, labels=params.labels, masks=params.masks, classes=params.classes
         ),
     )
-    do("poses", p.PosesParams(project=project))
+    pipeline.do("poses", p.PosesParams(project=project))
     training = p.TrainParams(
         project=project,
         preset=params.preset,
@@ -92,17 +103,25 @@ def reconstruct(params: p.ReconstructParams, report: Reporter) -> dict[str, Any]
         set=params.set,
         holdout=params.holdout,
     )
-    do("train", training.model_copy(update={"resume": unfinished(training)}))
+    pipeline.do("train", training.model_copy(update={"resume": unfinished(training)}))
     if held_out(project, run):
-        do("evaluate", p.EvaluateParams(project=project, run=run))
+        pipeline.do("evaluate", p.EvaluateParams(project=project, run=run))
     else:
         report.stage("evaluate: left out, no photos are held out")
-    do("mesh", p.MeshParams(project=project, run=run))
+    pipeline.do("mesh", p.MeshParams(project=project, run=run))
     renders = params.renders or project / "exports" / run / "renders"
-    do("render", p.RenderParams(project=project, run=run, out=renders, orbit=8, passes=["rgb", "depth", "semantic"]))
+    pipeline.do(
+        "render", p.RenderParams(project=project, run=run, out=renders, orbit=8, passes=["rgb", "depth", "semantic"])
+    )
     if params.blend is not None:
-        do("blend", p.BlendParams(project=project, out=params.blend, run=run))
-    result = {"project": str(project), "stages": stages, "reused": reused, "redone": redone, **results}
+        pipeline.do("blend", p.BlendParams(project=project, out=params.blend, run=run))
+    result = {
+        "project": str(project),
+        "stages": pipeline.seconds,
+        "reused": pipeline.reused,
+        "redone": pipeline.redone,
+        **pipeline.results,
+    }
     if params.report is not None:
         write_report(params.report, project, run, renders, result)
         result["report"] = str(params.report)

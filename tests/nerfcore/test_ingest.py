@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 import pytest
-from fieldwork.nerfcore.capture import ingest
+from fieldwork.nerfcore.capture import ingest, working_copies
 from fieldwork.nerfcore.capture.find import list_photos
 from fieldwork.nerfcore.errors import Cancelled, DiskError, InputError, ProjectError
 from fieldwork.nerfcore.images.decode import read_photo
@@ -178,7 +178,7 @@ def count_decodes(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         decoded.append(path.name)
         return read_photo(path, *rest)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(ingest, "read_photo", counted)
+    monkeypatch.setattr(working_copies, "read_photo", counted)
     return decoded
 
 
@@ -277,5 +277,5 @@ def test_full_disk(tmp_path: Path) -> None:
 def test_damaged_memory_of_earlier_runs_only_costs_time(tmp_path: Path) -> None:
     photos = folder_of(tmp_path / "photos")
     new(photos, tmp_path / "p")
-    (tmp_path / "p" / ingest.CACHE_FILE).write_text('{"p0": 3')
+    (tmp_path / "p" / working_copies.CACHE_FILE).write_text('{"p0": 3')
     assert new(photos, tmp_path / "p")["images"] == 3

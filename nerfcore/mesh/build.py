@@ -24,6 +24,7 @@ from .decimate import decimate
 from .extract import extract
 from .field_values import shade
 from .fusion import TRUNCATION, fuse_maps
+from .refine import refined_maps
 from .region import Region, choose_region
 from .surface import Surface, face_classes, vertex_normals
 
@@ -63,8 +64,9 @@ def build(trained: Trained, project: Project, scene: Scene, params: MeshParams, 
     flats = dm.flat_views(views, box.box_from_world, dm.map_size(views, trained.device))
     report.stage("Rendering depth maps")
     rendered = dm.depth_maps(trained.model, flats, report)
-    report.stage("Comparing views")
-    maps = dm.confirmed_maps(flats, rendered, trained.device, report)
+    report.stage("Comparing photos")
+    store = read_photos(trained, scene, views, box, report)
+    maps = refined_maps(flats, rendered, store, trained.device, report)
     check_agreement(rendered, maps, report)
     bounds, voxel = wanted_bounds(params, scene, box), wanted_voxel(params, project, box)
     region = choose_region(maps, bounds, params.resolution, voxel)
@@ -84,7 +86,7 @@ def build(trained: Trained, project: Project, scene: Scene, params: MeshParams, 
         vertices, faces = compact(vertices, faces)
     check_parts(vertices, faces, report)
     report.stage("Reading colours and classes")
-    photos = read_photos(trained, scene, views, flats, box, maps, tolerance, report)
+    photos = Photos(store, maps, np.array([flat.photo for flat in flats]), len(trained.info.class_ids), tolerance)
     surface = dressed(trained, scene, region, photos, vertices, faces, report)
     return Built(surface, region, maps, photos, trained)
 
@@ -153,22 +155,12 @@ def check_parts(vertices: np.ndarray, faces: np.ndarray, report: Reporter) -> No
         )
 
 
-def read_photos(
-    trained: Trained,
-    scene: Scene,
-    views: list[View],
-    flats: list[dm.FlatView],
-    box: Box,
-    maps: MapArrays,
-    tolerance: float,
-    report: Reporter,
-) -> Photos:
+def read_photos(trained: Trained, scene: Scene, views: list[View], box: Box, report: Reporter) -> PixelStore:
     """The pixels and labels of the chosen views, at the size they were trained with."""
-    place = {view.name: index for index, view in enumerate(scene.views)}
-    indices = [place[view.name] for view in views]
+    index = {view.name: number for number, view in enumerate(scene.views)}
+    indices = [index[view.name] for view in views]
     ids, device = trained.info.class_ids, torch.device("cpu")
-    store = PixelStore(scene, indices, ids, box.box_from_world, trained.info.image_size, device, report)
-    return Photos(store, maps, np.array([flat.photo for flat in flats]), len(ids), tolerance)
+    return PixelStore(scene, indices, ids, box.box_from_world, trained.info.image_size, device, report)
 
 
 def dressed(

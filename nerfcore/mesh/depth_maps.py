@@ -160,22 +160,29 @@ def render_depth(model: Model, view: FlatView, check: Callable[[], None]) -> Dep
 
 
 def cosines(camera: Camera, depth: np.ndarray) -> np.ndarray:
-    """Cosine (H, W) of the angle between each pixel's ray and the surface normal there, from depth differences over two
-    pixels each way; 0 where there is no surface or an outline."""
+    """Cosine (H, W) of the angle between each pixel's ray and the surface normal there; 0 where there is no surface or an
+    outline."""
+    directions = _directions(camera)
+    length = np.linalg.norm(directions, axis=-1)
+    return (np.abs((normals(camera, depth) * directions).sum(-1)) / length).astype(np.float32)
+
+
+def normals(camera: Camera, depth: np.ndarray) -> np.ndarray:
+    """Unit normals (H, W, 3) in camera axes, towards the camera, from depth differences over one or two pixels; 0 where
+    there is no surface or an outline."""
     solid = (depth > 0) & (depth < FREE)
-    directions = np.concatenate(
-        [
-            (pixel_centers(camera.width, camera.height) - [camera.cx, camera.cy]) / [camera.fx, camera.fy],
-            np.ones((camera.height, camera.width, 1)),
-        ],
-        -1,
-    ).astype(np.float32)
-    points = directions * np.where(solid, depth, 1)[..., None]
-    dx, dy = _slope(points, solid, 1), _slope(points, solid, 0)
-    normal = np.cross(dx, dy)
-    length = np.linalg.norm(normal, axis=-1) * np.linalg.norm(points, axis=-1)
-    cosine = np.abs((normal * points).sum(-1)) / np.maximum(length, 1e-20)
-    return np.where(solid & (length > 0), cosine, 0).astype(np.float32)
+    points = _directions(camera) * np.where(solid, depth, 1)[..., None]
+    normal = np.cross(_slope(points, solid, 1), _slope(points, solid, 0))
+    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    normal = np.where(solid[..., None] & (length > 0), normal / np.maximum(length, 1e-30), 0)
+    return -normal * np.sign((normal * points).sum(-1, keepdims=True))
+
+
+def _directions(camera: Camera) -> np.ndarray:
+    """Where the pixels (H, W, 3) of a pinhole look, in camera axes, with z = 1."""
+    place = pixel_centers(camera.width, camera.height)
+    flat = (place - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    return np.concatenate([flat, np.ones_like(flat[..., :1])], -1).astype(np.float32)
 
 
 def _slope(points: np.ndarray, solid: np.ndarray, axis: int) -> np.ndarray:
@@ -196,9 +203,9 @@ def _slope(points: np.ndarray, solid: np.ndarray, axis: int) -> np.ndarray:
     return out
 
 
-def confirmed_maps(views: list[FlatView], maps: list[DepthMap], device: torch.device, report: Reporter) -> MapArrays:
-    """The maps as the kernels read them, without what cannot be trusted: seen under less than 10°, at outlines, or not
-    confirmed by two other views (by the other one where there are two). On the host where the device has no Warp."""
+def map_arrays(views: list[FlatView], maps: list[DepthMap], device: torch.device) -> MapArrays:
+    """The maps as the kernels read them, without what is seen under less than 10° and without outlines; on the host where
+    the device has no Warp."""
     device = device if backend_of(device).warp else torch.device("cpu")
     sizes = torch.tensor([[v.camera.width, v.camera.height] for v in views], dtype=torch.int32)
     inverse = np.stack([np.linalg.inv(v.pose) for v in views]).astype(np.float32)
@@ -206,7 +213,7 @@ def confirmed_maps(views: list[FlatView], maps: list[DepthMap], device: torch.de
     def flat(parts: list[np.ndarray]) -> torch.Tensor:
         return torch.from_numpy(np.concatenate([p.reshape(-1) for p in parts]).astype(np.float32)).to(device)
 
-    arrays = MapArrays(
+    return MapArrays(
         flat([np.where(m.hit & (m.cosine < STEEPEST), 0, m.depth) for m in maps]),
         flat([np.where(m.hit, m.cosine, 1) for m in maps]),
         flat([np.where(m.hit, m.spread, 0) for m in maps]),
@@ -216,11 +223,23 @@ def confirmed_maps(views: list[FlatView], maps: list[DepthMap], device: torch.de
         torch.from_numpy(np.ascontiguousarray(inverse[:, :3, :3])).to(device),
         torch.from_numpy(np.ascontiguousarray(inverse[:, :3, 3])).to(device),
     )
+
+
+def confirmed_maps(
+    views: list[FlatView],
+    maps: list[DepthMap],
+    device: torch.device,
+    report: Reporter,
+    around: list[list[int]] | None = None,
+) -> MapArrays:
+    """The maps as the kernels read them, without what cannot be trusted: see `map_arrays`, and what two other views (the
+    other one where there are two) do not confirm. `around`: the neighbours of each view where they are known."""
+    arrays = map_arrays(views, maps, device)
     confirmed, needed = [], min(CONFIRMED, len({view.photo for view in views}) - 1)
-    for index, around in enumerate(neighbours(views, maps)):
+    for index, near in enumerate(around or neighbours(views, maps)):
         report.progress(index / len(views))
-        near = torch.tensor(around, dtype=torch.int32, device=device)
-        confirmed.append(agreement(arrays, index, near, AGREE, ROUND_TRIP) >= needed)
+        others = torch.tensor(near, dtype=torch.int32, device=arrays.depth.device)
+        confirmed.append(agreement(arrays, index, others, AGREE, ROUND_TRIP) >= needed)
     keep = torch.cat(confirmed) | (arrays.depth >= FREE)
     return replace(arrays, depth=torch.where(keep, arrays.depth, 0.0))
 

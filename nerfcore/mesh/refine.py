@@ -1,0 +1,86 @@
+"""Depth maps of the field moved to where the photos agree best.
+
+A field of few steps is soft: its surfaces are right to a few pixels, and what its views share is wrong in all of them, so
+that fusing cannot average it away. Photos tell more where they have texture (kernels/patches.py); elsewhere the field's
+depth stays.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from scipy import ndimage
+
+from ..data.pixels import PixelStore
+from ..geometry.cameras import pixel_centers, project, rays
+from ..kernels.depth_arrays import FREE, MapArrays
+from ..kernels.patches import refine
+from ..progress import Reporter
+from .depth_maps import DepthMap, FlatView, confirmed_maps, cosines, map_arrays, neighbours, normals
+
+VIEWS = 5  # neighbours whose photos are compared
+LEAST, GAIN = 0.6, 0.05  # correlation that is believed, and by how much it must exceed that of the field's depth
+SURE = 2.0  # pixels: the spread of a depth that photos confirm
+LUMA = np.array([0.299, 0.587, 0.114], np.float32)
+SMOOTH = 5  # pixels over which normals are averaged
+
+
+def grey_pictures(views: list[FlatView], store: PixelStore, report: Reporter) -> list[np.ndarray]:
+    """What each flat view shows of its photo, (H, W) float32 grey in [0, 1]."""
+    made = []
+    rgba, first = store.rgba.cpu().numpy(), store.first.cpu().numpy()
+    for number, view in enumerate(views):
+        report.progress(number / len(views))
+        photo, flat = store.cameras[view.photo], view.camera
+        pixels = rgba[first[view.photo] : first[view.photo + 1], :3].reshape(photo.height, photo.width, 3)
+        grey = pixels @ (LUMA / 255)
+        shrunk = flat.fx / photo.fx  # what is made smaller is smoothed before
+        if shrunk < 0.7:
+            grey = ndimage.gaussian_filter(grey, 0.5 / shrunk)
+        turn = store.rays.rotation[view.photo].cpu().numpy().T @ view.pose[:3, :3]
+        directions, _ = rays(flat, pixel_centers(flat.width, flat.height).reshape(-1, 2))
+        place = np.nan_to_num(project(photo, directions @ turn.T), nan=-1.0) - 0.5
+        shown = ndimage.map_coordinates(grey, place[:, ::-1].T, order=1, mode="nearest")
+        made.append(shown.reshape(flat.height, flat.width).astype(np.float32))
+    return made
+
+
+def refined_maps(
+    views: list[FlatView], maps: list[DepthMap], store: PixelStore, device: torch.device, report: Reporter
+) -> MapArrays:
+    """Confirmed maps (see `depth_maps.confirmed_maps`) whose depths photos have moved. Where views do not confirm a moved
+    depth, the field's is asked again."""
+    arrays = map_arrays(views, maps, device)
+    grey = torch.from_numpy(np.concatenate([g.reshape(-1) for g in grey_pictures(views, store, report)]))
+    grey = grey.to(arrays.depth.device)
+    around = neighbours(views, maps)
+    moved = []
+    for number, (view, map_) in enumerate(zip(views, maps)):
+        report.progress(number / len(views))
+        facing = torch.from_numpy(smooth_normals(view, map_).reshape(-1, 3)).to(grey.device)
+        near = torch.tensor(around[number][:VIEWS], dtype=torch.int32, device=grey.device)
+        depth, _ = refine(grey, facing, arrays, number, near, LEAST, GAIN)
+        moved.append(_with_depth(view, map_, depth.cpu().numpy().reshape(map_.depth.shape)))
+    believed = confirmed_maps(views, moved, device, report, around)
+    kept, begin, mixed = ((believed.depth > 0) & (believed.depth < FREE)).cpu().numpy(), 0, []
+    for view, old, new in zip(views, maps, moved):
+        sure = kept[begin : begin + old.depth.size].reshape(old.depth.shape) & (new.depth != old.depth)
+        begin += old.depth.size
+        depth = np.where(sure, new.depth, old.depth)
+        spread = np.where(sure, np.minimum(old.spread, SURE * depth / view.camera.fx), old.spread)
+        mixed.append(_with_depth(view, replace(old, spread=spread.astype(np.float32)), depth))
+    return confirmed_maps(views, mixed, device, report, around)
+
+
+def _with_depth(view: FlatView, map_: DepthMap, depth: np.ndarray) -> DepthMap:
+    return replace(map_, depth=depth, cosine=cosines(view.camera, depth))
+
+
+def smooth_normals(view: FlatView, map_: DepthMap) -> np.ndarray:
+    """Normals (H, W, 3) in camera axes, towards the camera, averaged over a few pixels; 0 where there is none."""
+    found = normals(view.camera, map_.depth)
+    mean = np.stack([ndimage.uniform_filter(found[..., k], SMOOTH) for k in range(3)], -1)
+    length = np.linalg.norm(mean, axis=-1, keepdims=True)
+    return np.where(length > 0.1, mean / np.maximum(length, 1e-9), 0).astype(np.float32)

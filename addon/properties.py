@@ -50,6 +50,7 @@ PASSES = [
     ("semantic", "Labels", "The class of each pixel"),
     ("confidence", "Confidence", "How certain the class is"),
     ("normal", "Normal", "Surface direction"),
+    ("unknown", "Unknown", "Share of the way that no photo shows"),
 ]
 
 

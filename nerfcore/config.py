@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from .errors import SettingError
 
 PRESETS = Path(__file__).parent / "presets"
-# Earlier names of settings, still understood in `--set` and in presets, and mapped when a stored run is read.
+# Earlier names of settings, still understood in `--set`, in preset files and in stored runs.
 RENAMED = {"sampling.interest": "sampling.importance"}
 MOST_VERTICES = 2048  # along a side of the finest level that a run chooses by itself
 
@@ -162,6 +162,10 @@ class RenderConfig(Stage):
     )
 
 
+# Settings of `render` that only pictures depend on: training reads the occupancy grid itself, without the fused kernel.
+ONLY_RENDERING = ("samples", "per_bin", "refine", "fused")
+
+
 class LossConfig(Stage):
     """What training minimises."""
 
@@ -232,6 +236,23 @@ def preset_names() -> list[str]:
     return sorted(path.stem for path in PRESETS.glob("*.json"))
 
 
+def with_present_names(values: dict[str, Any]) -> dict[str, Any]:
+    """{stage: {name: value}} with the settings that have earlier names under their present ones."""
+    found = {stage: dict(part) if isinstance(part, dict) else part for stage, part in values.items()}
+    for old, new in RENAMED.items():
+        stage, name = old.split(".")
+        if isinstance(found.get(stage), dict) and name in found[stage]:
+            new_stage, new_name = new.split(".")
+            found.setdefault(new_stage, {})[new_name] = found[stage].pop(name)
+    return found
+
+
+def with_rendering_of(config: RunConfig, asked: RunConfig) -> RunConfig:
+    """`config` with those settings of `asked` that only pictures depend on."""
+    rendering = {name: getattr(asked.render, name) for name in ONLY_RENDERING}
+    return config.model_copy(update={"render": config.render.model_copy(update=rendering)})
+
+
 def make_config(preset: str, settings: dict[str, str] | None = None) -> RunConfig:
     """A preset with single settings changed, e.g. {"field.branch": "explicit"}.
 
@@ -241,7 +262,7 @@ def make_config(preset: str, settings: dict[str, str] | None = None) -> RunConfi
     path = PRESETS / f"{preset}.json"
     if not path.is_file():
         raise SettingError(f"There is no preset “{preset}”.", f"Choose one of {', '.join(preset_names())}.")
-    values: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    values = with_present_names(json.loads(path.read_text(encoding="utf-8")))
     for name, text in (settings or {}).items():
         stage, _, key = RENAMED.get(name, name).partition(".")
         model = RunConfig.model_fields.get(stage)

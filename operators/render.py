@@ -12,6 +12,7 @@ from bpy.types import Context
 from ..addon.jobs.job import Done, Job, Steps
 from ..addon.jobs.queue import queue
 from ..addon.project import snapshot
+from ..addon.properties import PASSES
 from ..addon.props import StringProperty
 from ..addon.roles import Owner
 from ..addon.scene.frame import scene_from_capture
@@ -109,12 +110,11 @@ class FIELDWORK_OT_render(ProjectOperator):
         passes = self.value(context, "passes")
         if not passes:
             raise ValueError(t("Choose at least one pass."))
-        order = ("rgb", "depth", "semantic", "confidence", "normal")
         params: dict[str, Any] = {
             "project": project,
             "run": run,
             "out": str(folder),
-            "passes": [name for name in order if name in passes],
+            "passes": [name for name, *_ in PASSES if name in passes],
             "size": list(size) if all(size) else None,
         }
         if self.camera:

@@ -10,7 +10,7 @@ import bpy
 from ..roles import ROLE, Owner
 from .slot import MARK, load_render, render_slot
 
-OTHER_PASSES = ("_depth", "_labels", "_confidence", "_normal")
+OTHER_PASSES = ("_depth", "_labels", "_confidence", "_normal", "_unknown")  # file names of all but the color
 
 
 def show_steps(

@@ -85,14 +85,17 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
 def mesh_inputs(params: MeshParams) -> Fingerprint:
     """What a mesh depends on. Raises ProjectError."""
     folder = Path(params.project)
-    scene = load_scene(folder, load_info(folder, params.run).holdout)
+    info = load_info(folder, params.run)
+    scene = load_scene(folder, info.holdout)
     settings = params.model_dump(mode="json", exclude={"project", "run", "out"})
+    # Surfaces come from rendered depth maps. Defaults are left out, as in records that knew no others.
+    rendering = [changed] if (changed := info.config.render.model_dump(mode="json", exclude_defaults=True)) else []
     out = str(params.out.absolute()) if params.out else None
     return {
         "trained field": checkpoint_id(folder, params.run),
         "alignment": digest(rounded(world_from_sfm(load_project(folder)))),
         "classes": class_inputs(scene),
-        "settings": digest([settings, out]),
+        "settings": digest([settings, out, *rendering]),
         "region": digest(None if scene.bounds is None else rounded(scene.bounds)),
         **view_inputs(scene, scene.train, files=True),
     }

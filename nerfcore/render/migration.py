@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from ..config import RENAMED
+from ..config import with_present_names
 
 # Names of a model's buffers before version 3.
 TENSORS = {
@@ -22,13 +22,7 @@ def migrate_info(values: Any) -> Any:
     """What a run's config.json of version 2 holds, as version 3 has it; anything else as it is."""
     if not isinstance(values, dict) or values.get("version") != 2 or not isinstance(values.get("config"), dict):
         return values
-    config = {stage: dict(v) if isinstance(v, dict) else v for stage, v in values["config"].items()}
-    for old, new in RENAMED.items():
-        stage, name = old.split(".")
-        if isinstance(config.get(stage), dict) and name in config[stage]:
-            new_stage, new_name = new.split(".")
-            config.setdefault(new_stage, {})[new_name] = config[stage].pop(name)
-    return {**values, "version": 3, "config": config}
+    return {**values, "version": 3, "config": with_present_names(values["config"])}
 
 
 def migrate_tensors(tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:

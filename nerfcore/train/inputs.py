@@ -7,16 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from ..config import RunConfig
+from ..config import ONLY_RENDERING, RunConfig, make_config
 from ..data.load import load_scene
 from ..params import TrainParams
 from ..project.fingerprints import Fingerprint, array_digest, digest, files_digest, rounded
 from ..project.schema import Project
 from ..project.store import load_points, load_poses, load_project, load_visibility, world_from_sfm
+from ..render.run import RunInfo, settled_as
 from .prepare import training_views
 
 # Settings of `train` that decide when something is written, not what is learned.
 WITHOUT_EFFECT = {"steps", "checkpoint_every", "preview_every"}
+NOT_LEARNED = {"train": WITHOUT_EFFECT, "render": set(ONLY_RENDERING)}
 
 
 def training_inputs(folder: Path, params: TrainParams, config: RunConfig) -> Fingerprint:
@@ -25,13 +27,24 @@ def training_inputs(folder: Path, params: TrainParams, config: RunConfig) -> Fin
     Raises:
         ProjectError: the project has no poses.
     """
-    settings = config.model_dump(mode="json")
-    settings["train"] = {name: value for name, value in settings["train"].items() if name not in WITHOUT_EFFECT}
+    learned = config.model_dump(mode="json", exclude=NOT_LEARNED, exclude_defaults=True)
     return {
         **data_inputs(folder, params.holdout, config),
-        "settings": digest(settings),
+        # Without defaults, so that a setting which is new in a version is no change.
+        "settings": digest({stage: values for stage, values in learned.items() if values}),
         "length of training": digest(training_length(params.steps, params.time_limit, config)),
     }
+
+
+def wanted_inputs(folder: Path, params: TrainParams, info: RunInfo) -> Fingerprint:
+    """What `training_inputs` asks for, to be compared with the fingerprint of the run that `info` describes."""
+    asked = make_config(params.preset, params.set)
+    inputs, made = training_inputs(folder, params, asked), info.origin.inputs.get("settings")
+    # Defaults of this version may be others than those that the run was made with.
+    settled = settled_as(asked, info.config).model_dump(mode="json", exclude=NOT_LEARNED)
+    if made == inputs["settings"] and settled != info.config.model_dump(mode="json", exclude=NOT_LEARNED):
+        inputs["settings"] = digest(settled)
+    return inputs
 
 
 def training_length(steps: int | None, seconds: float | None, config: RunConfig) -> dict[str, Any]:

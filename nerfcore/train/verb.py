@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..config import make_config
+from ..config import make_config, with_rendering_of
 from ..data.box import Box, box_poses
 from ..data.load import load_scene
 from ..data.pixels import training_size
@@ -25,19 +25,14 @@ from ..kernels.device import use_device
 from ..kernels.runtime import compile_seconds
 from ..params import TrainParams
 from ..progress import Reporter
-from ..project.fingerprints import Earlier, compare, difference, digest
+from ..project.fingerprints import difference, digest
 from ..project.runs import (
     CHECKPOINT,
     EVENTS,
     INFO,
     METRICS,
     TrainingFolder,
-    has_checkpoint,
-    read_metrics,
-    run_folder,
-    settle,
 )
-from ..project.schema import step
 from ..project.store import load_project, record_step
 from ..render.image import background_of, render_view
 from ..render.model import Model
@@ -46,7 +41,6 @@ from ..render.run import (
     REFINED_POSES,
     Origin,
     RunInfo,
-    load_info,
     read_checkpoint,
     read_info,
     save_info,
@@ -125,53 +119,6 @@ def train(params: TrainParams, report: Reporter) -> dict[str, Any]:
     return result
 
 
-def finished(params: TrainParams) -> Earlier:
-    """Whether a run of just these settings and inputs was trained to its end; see also `unfinished`."""
-    folder = Path(params.project)
-    settle(folder, params.run)
-    place = run_folder(folder, params.run)
-    if not has_checkpoint(place):
-        return Earlier()
-    try:
-        origin = read_info(place).origin
-    except ProjectError as error:
-        return Earlier(reason=error.message)
-    project = load_project(folder)
-    result = read_metrics(place).get("train") or {}
-    if result and "checkpoint" not in result:  # `evaluate --split train` has written there since
-        steps = [s for s in project.provenance if s.verb == "train" and s.result.get("run") == params.run]
-        result = steps[-1].result if steps else {}
-    done = step("train", {}, result, origin.inputs)
-    earlier = compare(done, training_inputs(folder, params, make_config(params.preset, params.set)))
-    if earlier.result is not None and origin.project != project.uuid:
-        return Earlier(reason="trained in another project")
-    if earlier.result is None:
-        return earlier
-    if "checkpoint" not in earlier.result:
-        return Earlier(reason="not finished")
-    paths = {"checkpoint": str(place / CHECKPOINT), "closed_picture": closed_picture(place)}
-    return Earlier({**earlier.result, **paths})
-
-
-def unfinished(params: TrainParams) -> bool:
-    """Whether a training of just these settings and inputs was stopped, so that it can go on."""
-    folder = Path(params.project)
-    place = TrainingFolder.to_resume(folder, params.run)
-    if place is None or "train" in read_metrics(place.folder):
-        return False
-    try:
-        origin = read_info(place.folder).origin
-    except ProjectError:
-        return False
-    wanted = training_inputs(folder, params, make_config(params.preset, params.set))
-    return origin.inputs == wanted and origin.project == load_project(folder).uuid
-
-
-def held_out(project: Path, run: str) -> int:
-    """How many photos a run holds out. Raises ProjectError when there is no such run."""
-    return len(load_scene(project, load_info(project, run).holdout).test)
-
-
 def _planned(params: TrainParams, device: torch.device) -> tuple[RunInfo, Scene]:
     """A new run with the fingerprint of its inputs, and its scene. Raises ProjectError, SettingError, TrainingError."""
     project, config = Path(params.project), make_config(params.preset, params.set)
@@ -224,6 +171,8 @@ def _resumable(place: TrainingFolder, params: TrainParams, report: Reporter) -> 
         length = training_length(params.steps, params.time_limit, info.config)
         info.origin.inputs["length of training"] = digest(length)
     asked = make_config(params.preset, params.set) if params.set else None
+    if asked is not None:
+        info.config = with_rendering_of(info.config, asked)
     if asked is not None and settled_as(asked, info.config) != info.config:
         report.warn(f"The run “{place.run}” goes on with the settings it began with, not with those given now.")
     return info, load_scene(place.project, info.holdout)

@@ -20,7 +20,7 @@ from ..progress import Reporter
 from ..project.fingerprints import Earlier
 from ..project.store import is_project, load_project
 from ..render.verb import render, rendered
-from ..train.verb import finished, held_out, train, unfinished
+from ..train.reuse import finished, held_out, train_or_keep, unfinished
 
 
 class Stage(NamedTuple):
@@ -33,7 +33,7 @@ class Stage(NamedTuple):
 STAGES = {
     "new": Stage(new, ingested),
     "poses": Stage(estimate_poses, posed),
-    "train": Stage(train, finished),
+    "train": Stage(train_or_keep, finished),
     "evaluate": Stage(evaluate, evaluated),
     "mesh": Stage(mesh, meshed),
     "render": Stage(render, rendered),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import get_args
+
 import pytest
 from fieldwork.tests.addon.support import SETUP, make_project
 
@@ -75,7 +77,7 @@ from fieldwork.addon.render import result
 from fieldwork.addon.roles import Owner
 settings.project = project
 files = []
-for name in ("a", "a_depth", "b"):
+for name in ("a", "a_depth", "a_unknown", "b"):
     image = bpy.data.images.new(name, 64, 48)
     image.filepath_raw, image.file_format = f"{project}/{name}.png", "PNG"
     image.save()
@@ -105,7 +107,7 @@ answer({
 """,
         project=make_project(tmp_path / "capture"),
     )
-    assert facts["images"] == ["a.png", "a_depth.png", "b.png"]
+    assert facts["images"] == ["a.png", "a_depth.png", "a_unknown.png", "b.png"]
     assert facts["slots"] == {"a": ["a.png"], "b": ["b.png"]}
     assert facts["planes"] == {"a": ["a.png"], "b": ["b.png"]}
     assert facts["animation"] == [["Camera", "SEQUENCE"]]
@@ -130,3 +132,24 @@ answer([[round(v, 4) for v in world_to_camera_view(scene, scene.camera, c)[:2]] 
 """
     )
     assert facts == [[0, 0], [0, 1], [1, 0], [1, 1]]
+
+
+def test_every_pass_of_the_engine_is_offered_and_asked_for(bpy_script, tmp_path):
+    from fieldwork.nerfcore.params import Pass
+
+    facts = bpy_script(
+        SETUP
+        + """
+from fieldwork.operators.render import FIELDWORK_OT_render
+items = [item.identifier for item in settings.bl_rna.properties["passes"].enum_items]
+settings.project, settings.render_from = project, "orbit"
+settings.passes = set(items)
+class Asked:
+    out = camera = ""
+    value = lambda self, context, name: {"run": "main", "source": "orbit"}.get(name) or getattr(settings, name)
+    project_path = lambda self, context: project
+answer([items, FIELDWORK_OT_render.parameters(Asked(), bpy.context)["passes"]])
+""",
+        project=make_project(tmp_path / "capture"),
+    )
+    assert facts == [list(get_args(Pass))] * 2

@@ -39,7 +39,8 @@ from fieldwork.nerfcore.project.fingerprints import difference, digest, rounded
 from fieldwork.nerfcore.project.runs import MESH_RECORD, checkpoint_id, run_folder
 from fieldwork.nerfcore.project.schema import PosedImage, Poses
 from fieldwork.nerfcore.project.store import edit_project, load_project, save_poses
-from fieldwork.nerfcore.render.run import load_info
+from fieldwork.nerfcore.render import verb as render_verb
+from fieldwork.nerfcore.render.run import Trained, load_info
 from fieldwork.nerfcore.render.verb import render
 from fieldwork.nerfcore.train.verb import train
 from fieldwork.nerfcore.workflows import reconstruct as workflow
@@ -100,14 +101,14 @@ def fake(patch: pytest.MonkeyPatch) -> None:
         patch.setitem(workflow.STAGES, verb, smaller(workflow.STAGES[verb], values))
 
 
-def triangle(*_: Any) -> SimpleNamespace:
+def triangle(trained: Trained, *_: Any) -> SimpleNamespace:
     """Instead of a surface, for which a field would have to be trained for longer."""
     corners = np.eye(3, dtype=np.float32)
     face = np.array([[0, 1, 2]], np.int32)
     surface = Surface(
         corners, face, corners, np.full((3, 3), 128, np.uint8), np.ones(3, np.int32), np.ones(1, np.int32)
     )
-    return SimpleNamespace(surface=surface, region=SimpleNamespace(voxel=0.1))
+    return SimpleNamespace(trained=trained, surface=surface, region=SimpleNamespace(voxel=0.1))
 
 
 def smaller(stage: workflow.Stage, values: dict[str, Any]) -> workflow.Stage:
@@ -174,6 +175,66 @@ def test_what_training_depends_on(place: Path, values: dict[str, Any], reason: s
     assert step is not None
     assert step.settings["config"]["train"]["grid_rate"] == load_info(place / "p", "main").config.train.grid_rate
     assert call(place, **values)["reused"] == STAGES
+
+
+@pytest.mark.parametrize("setting", ["render.accumulate=logits", "render.cull=0.001"])
+def test_settings_of_rendering_that_training_reads(place: Path, setting: str) -> None:
+    result = call(place, set={**SETTINGS, **dict([setting.split("=")])})
+    assert redone(result) == ["train", "evaluate", "mesh", "render"]
+    assert result["redone"]["train"] == "changed: settings"
+
+
+def test_settings_that_only_pictures_depend_on(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before, they trained the field anew."""
+    rendered_with = []
+    load = render_verb.load_trained
+
+    def loaded(project: Path, run: str) -> Trained:
+        trained = load(project, run)
+        rendered_with.append(trained.model.config.render)
+        return trained
+
+    monkeypatch.setattr(render_verb, "load_trained", loaded)
+    field = checkpoint_id(place / "p", "main")
+    asked = {"render.samples": "5", "render.per_bin": "0", "render.refine": "1", "render.fused": "off"}
+    result = call(place, set={**SETTINGS, **asked})
+    assert redone(result) == ["train", "evaluate", "mesh", "render"]
+    assert result["redone"]["train"] == "changed: settings of rendering; the trained field is kept"
+    assert checkpoint_id(place / "p", "main") == field
+    assert result["train"]["steps"] == 8
+    config = load_info(place / "p", "main").config
+    made = [(c.samples, c.per_bin, c.refine, c.fused) for c in (config.render, *rendered_with)]
+    assert made == [(5, 0.0, 1, "off")] * 2
+    step = load_project(place / "p").last("train")
+    assert step is not None
+    assert step.settings["config"]["render"]["samples"] == 5
+    assert call(place, set={**SETTINGS, **asked})["reused"] == STAGES
+    assert redone(call(place)) == ["train", "evaluate", "mesh", "render"]
+    assert checkpoint_id(place / "p", "main") == field
+
+
+def test_a_stopped_training_goes_on_with_other_settings_of_rendering(place: Path) -> None:
+    settings = {**SETTINGS, "train.steps": "30"}
+    values = {"photos": place / "photos", "out": place / "p", "preset": "draft", "set": settings}
+    with pytest.raises(Cancelled):
+        reconstruct(ReconstructParams.model_validate(values), Stopping())
+    begun = json.loads((place / "p" / "runs" / ".new" / "main" / "config.json").read_text())["origin"]["training"]
+    call(place, set={**settings, "render.samples": "5"})
+    info = load_info(place / "p", "main")
+    assert (info.origin.training, info.config.render.samples) == (begun, 5)
+
+
+def test_defaults_of_another_version_train_anew(place: Path) -> None:
+    """A setting that is new with a default is none: what a run was trained with is in its config.json."""
+    path = place / "p" / "runs" / "main" / "config.json"
+    text = path.read_text()
+    value = json.loads(text)
+    del value["config"]["loss"]["huber_delta"]  # of a version that did not have it
+    path.write_text(json.dumps(value))
+    assert "train" in call(place)["reused"]
+    value["config"]["loss"]["huber_delta"] = 0.3
+    path.write_text(json.dumps(value))
+    assert call(place)["redone"]["train"] == "changed: settings"
 
 
 def test_settings_of_writing_change_nothing(place: Path) -> None:

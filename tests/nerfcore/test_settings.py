@@ -6,13 +6,17 @@ import json
 import re
 from pathlib import Path
 
+import pytest
 import torch
+from fieldwork.nerfcore import config as config_module
 from fieldwork.nerfcore.bench.suites import ABLATION
-from fieldwork.nerfcore.config import RunConfig, make_config
+from fieldwork.nerfcore.config import ONLY_RENDERING, RunConfig, make_config
 from fieldwork.nerfcore.field.hybrid import HybridField
 from fieldwork.nerfcore.kernels.traversal import PDF_UNIFORM
 from fieldwork.nerfcore.render.model import Model
 from fieldwork.nerfcore.sampling.occupancy import OccupancyGrid
+from fieldwork.tests.nerfcore.support.ball import ball_project
+from fieldwork.tests.nerfcore.support.settings import trainer_of
 
 NAMES = [
     f"{stage}.{name}" for stage, info in RunConfig.model_fields.items() for name in type(info.default).model_fields
@@ -44,6 +48,31 @@ def test_every_setting_is_reached_by_its_name() -> None:
         default = getattr(getattr(RunConfig(), stage), key)
         text = default if isinstance(default, str) else json.dumps(default)
         assert getattr(getattr(make_config("standard", {name: text}), stage), key) == default
+
+
+def test_earlier_names_are_understood_in_settings_and_presets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert make_config("draft", {"sampling.interest": "none"}).sampling.importance == "none"
+    (tmp_path / "old.json").write_text('{"sampling": {"interest": "boundary", "samples": 9}}')
+    monkeypatch.setattr(config_module, "PRESETS", tmp_path)
+    sampling = make_config("old").sampling
+    assert (sampling.importance, sampling.samples) == ("boundary", 9)
+
+
+def test_training_does_not_read_the_settings_of_pictures(tmp_path: Path) -> None:
+    """The same field to the bit, so that it need not be trained anew for other ones."""
+    project = ball_project(tmp_path / "ball", views=6, side=24)
+
+    def trained(**settings: str) -> list[torch.Tensor]:
+        trainer = trainer_of(project, **settings)
+        for step in range(12):
+            trainer.step(step / 12)
+        return list(trainer.model.state_dict().values())
+
+    other = {"render.samples": "5", "render.per_bin": "3", "render.refine": "4", "render.fused": "off"}
+    assert sorted(other) == sorted(f"render.{name}" for name in ONLY_RENDERING)
+    usual = trained()
+    assert all(torch.equal(a, b) for a, b in zip(usual, trained(**other)))
+    assert not all(torch.equal(a, b) for a, b in zip(usual, trained(**{"render.accumulate": "logits"})))
 
 
 def test_boundary_cases_are_settings_of_one_pipeline() -> None:

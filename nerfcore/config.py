@@ -112,6 +112,13 @@ class SamplingConfig(Stage):
     epsilon: float = Field(default=0.01, gt=0, description="weight every occupied bin keeps")
     update_every: int = Field(default=16, ge=1, description="steps between updates of the occupancy grid")
     decay: float = Field(default=0.95, gt=0, lt=1, description="of the occupancy grid at each update")
+    mean_rate: float = Field(
+        default=0.1, gt=0, le=1, description="at which a cell's mean density follows each point read in it"
+    )
+    optical_depth: float = Field(default=1.0, gt=0, description="most that a cell may have when samples are drawn")
+    warmup_decay: float = Field(
+        default=0.25, ge=0, lt=1, description="of the grid where the warm-up reads all of it, to forget the first guess"
+    )
     threshold: float = Field(default=0.01, gt=0, description="opacity of a bin below which its cell is closed")
     warmup: int = Field(default=256, ge=0, description="steps in which all cells are updated at once")
     close_near_cameras: bool = Field(

@@ -11,6 +11,7 @@ from ..geometry.frames import focus_point
 from ..geometry.similarity import make_similarity, similarity_scale
 from .scene import Scene, View
 
+# Not tuned: the next two.
 FEWEST_POINTS = 100  # sparse points that say where things are
 POINTS_MARGIN = 1.3  # surfaces reach beyond their points
 

@@ -8,7 +8,7 @@ from torch import nn
 from ..config import FieldConfig
 from ..kernels import cells
 
-RESOLUTION = 64
+RESOLUTION = 64  # cells along a side of the grid of evidence; not tuned
 
 
 class BlendWeight(nn.Module):

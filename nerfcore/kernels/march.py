@@ -33,7 +33,7 @@ from .traversal import (
     skip_length,
 )
 
-FEWEST_SAMPLES = 4  # samples on a ray whose number of samples follows that of its occupied bins
+FEWEST_SAMPLES = 4  # samples on a ray whose number of samples follows that of its occupied bins; not tuned
 
 
 @wp.kernel(module="fieldwork_march")

@@ -24,7 +24,7 @@ _DEFAULT, _UNIFORM, _LITERAL = wp.constant(PDF_DEFAULT), wp.constant(PDF_UNIFORM
 MAX_BINS = wp.constant(4096)
 BLOCK = wp.constant(4)  # cells along a side of a block that can be skipped at once
 BEFORE_CUBE = wp.constant(0.8)  # share of the way to the cube that may be taken to be empty
-EARLY_STOP = wp.constant(1.0e-4)  # transmittance below which a ray ends
+EARLY_STOP = wp.constant(1.0e-4)  # transmittance below which a ray ends; not tuned
 MAX_SKIP = 8  # blocks that can be skipped at once, from the middle one on
 
 

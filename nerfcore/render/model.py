@@ -20,7 +20,8 @@ from ..kernels.packed_info import PackedInfo
 from ..sampling.occupancy import OccupancyGrid, class_importance
 from ..sampling.render_grid import RenderGrid, present_grid, refined_grid
 
-ONE_PASS_SHARE = 0.67
+ONE_PASS_SHARE = 0.67  # of visible samples: 3k + 1 against 3 forward costs, equal at k = 2/3 (see `render`)
+# Not tuned: the next two.
 CAPACITY_FACTOR = 1.6  # entries for visible samples, as a multiple of how many there were lately
 LEAST_CAPACITY = 1 / 16  # of all samples, or nothing would be visible ever again after a while in which nothing was
 

@@ -18,7 +18,7 @@ from .visibility import cells_at, depth_ranges, in_front, view_counts
 NEAR, BETWEEN, SINGLE = "near cameras", "between cameras", "seen by one camera"
 # Sparse points that stand together are something: rules never close the cells around them. Single ones are mostly
 # wrong matches, of which a point cloud of thousands has some in front of cameras.
-CLUSTER = 5
+CLUSTER = 5  # not tuned
 
 
 @dataclass(frozen=True)

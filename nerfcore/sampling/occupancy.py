@@ -15,10 +15,8 @@ from .space import cell_states
 
 MODES = {"default": PDF_DEFAULT, "uniform": PDF_UNIFORM, "literal": PDF_LITERAL}
 CHUNK = 1 << 16
-WARM_DECAY = 0.25
-MOST_OPTICAL_DEPTH = 1.0  # of a cell, for the sampling PDF
-MEAN_RATE = 0.1  # at which a cell's mean density follows each point read in it
-IMPORTANCE_RATE = 0.2  # at which its importance does
+# Not tuned: the next three.
+IMPORTANCE_RATE = 0.2  # at which a cell's importance follows each point read in it
 SWEEPS = (1, 2, 4, 8, 12)  # updates of the warm-up at which the whole grid is read
 PROBES = 64  # one cell in so many is read at an update, and as many occupied ones
 
@@ -109,7 +107,7 @@ class OccupancyGrid(nn.Module):
         occupied = grown.view(-1) & self.seen
         # What a ray meets in a cell is rather its mean than its largest density, and even of that no cell may take all
         # the samples: the ray may pass through its empty part.
-        self.cells[:, 0] = torch.where(occupied, self.mean.clamp(1e-3, MOST_OPTICAL_DEPTH / self.step), 0.0)
+        self.cells[:, 0] = torch.where(occupied, self.mean.clamp(1e-3, self.config.optical_depth / self.step), 0.0)
         self.cells[:, 1] = self.importance
         self.skip_distance.copy_(skip_distances(occupied.view(n, n, n)))
 
@@ -144,7 +142,7 @@ class OccupancyGrid(nn.Module):
         points = (corner + torch.rand(corner.shape, device=corner.device, generator=generator)) / side
         fresh = torch.cat([density(part) for part in points.split(CHUNK)])
         blocks = fresh.view(side, 1, side, 1, side, 1).expand(side, 4, side, 4, side, 4).reshape(-1)
-        torch.maximum(self.density * WARM_DECAY, blocks, out=self.density)
+        torch.maximum(self.density * self.config.warmup_decay, blocks, out=self.density)
         self.density[~self.seen] = 0
 
     @torch.no_grad()
@@ -154,7 +152,7 @@ class OccupancyGrid(nn.Module):
         Points with a negative density were not read."""
         # A cell is observed at up to every step: its decay is spread over them.
         decay = 0.9 if warming_up else self.config.decay ** (1 / self.config.update_every)
-        average(self.mean, self._mean_scratch(), self.config.resolution, points, density, MEAN_RATE)
+        average(self.mean, self._mean_scratch(), self.config.resolution, points, density, self.config.mean_rate)
         observe(self.density, self.scratch, self.config.resolution, points, density, decay)
 
     @torch.no_grad()
@@ -183,7 +181,7 @@ class OccupancyGrid(nn.Module):
         # A cell may have been chosen twice.
         n, scratch = self.config.resolution, self._mean_scratch()
         observe(self.density, self.scratch, n, points, fresh, self.config.decay)
-        average(self.mean, scratch, n, points, fresh, MEAN_RATE)
+        average(self.mean, scratch, n, points, fresh, self.config.mean_rate)
         if importance is not None:
             dense = fresh * self.step > self.config.threshold
             if bool(dense.any()):

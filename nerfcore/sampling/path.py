@@ -16,6 +16,8 @@ from scipy.spatial import KDTree
 from ..geometry.cameras import Camera
 from .visibility import FEWEST_POINTS, cells_at, depth_ranges, grid_centers, in_front
 
+# Measured: docs/experiments.md, “What may be closed in front of and between cameras?” (clearance) and “How far apart may
+# neighbouring cameras look?” (angle). The other two are not tuned.
 CLEAR = 0.125  # of their distance to what they surround, that nothing comes nearer to the way between cameras
 NEIGHBOURS = 6  # of a camera, to which that way leads
 SAME_WAY = math.cos(math.radians(55))  # of viewing directions: a round of seven photos has ways between them

@@ -14,8 +14,9 @@ import torch
 from ..kernels.cells import MOST_CELLS_A_SIDE
 from ..kernels.runtime import run_parallel
 from ..kernels.traversal import MarchSettings, skip_distances
-from .occupancy import MOST_OPTICAL_DEPTH, OccupancyGrid
+from .occupancy import OccupancyGrid
 
+# Not tuned: the next two.
 PROBES = 4  # points read in each fine cell
 SAVED = 8  # samples that a pixel needs less with it
 CHUNK = 1 << 14
@@ -86,7 +87,7 @@ def refined_grid(
     row = (fine[:, 2] * side + fine[:, 1]) * side + fine[:, 0]
     occupied = largest * step > occupancy.config.threshold
     cells = torch.zeros(side**3, 2, device=device)
-    cells[row, 0] = torch.where(occupied, mean.clamp(1e-3, MOST_OPTICAL_DEPTH / step), 0.0)
+    cells[row, 0] = torch.where(occupied, mean.clamp(1e-3, occupancy.config.optical_depth / step), 0.0)
     cells[row, 1] = occupancy.importance[coarse].repeat_interleave(factor**3)
     settings = replace(occupancy.march_settings(), per_bin=per_bin, resolution=side, step=step)
     return RenderGrid(cells, skip_distances((cells[:, 0] > 0).view(side, side, side)), settings)

@@ -9,6 +9,7 @@ import torch
 from ..geometry.cameras import Camera
 from ..geometry.contraction import grid_position, uncontract
 
+# The width is measured (docs/experiments.md, “What may be closed in front of and between cameras?”), the number not tuned.
 FEWEST_POINTS = 20  # in a photo, from which its depths are believed
 WIDER = 2.0  # view that all of what is photographed from around it fits in, relative to the photos'
 

@@ -13,6 +13,7 @@ from ..images.working import read_picture
 Background = Literal["random", "white", "black"]
 LEVEL: dict[str, float] = {"white": 1.0, "black": 0.0}
 
+# Not tuned: the next four.
 LOOKED_AT = 12  # photos
 EDGE = 0.04  # of the sides: the strip along the borders that is looked at
 BLACK, WHITE = 8, 248  # of 255: all channels below, all channels above

@@ -17,6 +17,7 @@ from ..geometry.cameras import Camera, project, rays
 from ..geometry.similarity import similarity_scale, transform_points
 from ..images.working import read_depth
 
+# Not tuned: the next two.
 RAYS = 512  # a step
 MAP_PIXELS = 20000  # of one depth map
 

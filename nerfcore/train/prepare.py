@@ -27,7 +27,7 @@ from .background import LEVEL, choose_background
 from .depth import depth_scale, find_depths
 from .trainer import Trainer
 
-VIEWS_ENOUGH = 8  # cells seen by this many cameras count fully as evidence
+VIEWS_ENOUGH = 8  # cells seen by this many cameras count fully as evidence; not tuned
 
 
 def present_classes(scene: Scene, indices: list[int]) -> list[int]:

@@ -154,6 +154,24 @@ def test_cells_close_below_the_threshold_after_decaying() -> None:
         assert bool((grid.cells[-N * N * 4 :, 0] > 0).all()) == bool(share_open)
 
 
+@pytest.mark.setting("sampling.mean_rate", "sampling.optical_depth", "sampling.warmup_decay")
+def test_how_fast_cells_follow_and_how_dense_they_may_be() -> None:
+    point, density = torch.full((1, 3), 0.01), torch.tensor([13.0])
+    for rate in ("0.1", "0.5"):
+        grid = OccupancyGrid(config_of(**{"sampling.mean_rate": rate}).sampling, False)
+        grid.observe(point, density, False)
+        assert float(grid.mean[0]) == pytest.approx(3.0 + 10.0 * float(rate), rel=1e-4)
+    for depth in ("1.0", "0.125"):
+        grid = OccupancyGrid(config_of(**{"sampling.optical_depth": depth}).sampling, False)
+        grid.mean.fill_(1e6)
+        grid.rebuild()
+        assert float(grid.cells[:, 0].max()) == pytest.approx(float(depth) / grid.step)
+    for decay in ("0.25", "0.5"):
+        grid = OccupancyGrid(config_of(**{"sampling.warmup_decay": decay}).sampling, False)
+        grid.update(grid.config.update_every, lambda points: torch.zeros(len(points)))
+        assert grid.density.unique().tolist() == [3.0 * float(decay)]
+
+
 @pytest.mark.setting("sampling.empty_rays")
 def test_a_share_of_the_rays_comes_from_everywhere(ball: Path) -> None:
     trainer = trainer_of(ball)

@@ -17,8 +17,9 @@ from ..geometry.cameras import Camera
 from ..render.model import Model
 from ..train.pose_refinement import PoseRefinement, level_weights
 
+# Not tuned: the next two.
 STEPS = 120
-RAYS = 1024
+RAYS = 1024  # a step
 
 
 def refit_camera(

@@ -23,6 +23,7 @@ from .resume import mapping_folder
 from .validate import MIN_MATCHES, pair_images
 
 COUNTS = "contradicting.json"  # of pairs, by database
+# With these figures: docs/experiments.md, “Frames whose alike sides match”.
 NEIGHBOURS = 5  # frames to either side whose matches are believed
 TURNED = 30.0  # degrees: chains drift less over a walk, and repeated things are usually two- to sixfold
 

@@ -17,6 +17,7 @@ from ..kernels.runtime import small_tensor
 from .model import Model, Rendered
 
 log = logging.getLogger("fieldwork")
+# Not tuned.
 LEAST_RAYS = 1 << 17  # of a picture that "auto" renders fused: previews are not worth a minute of compilation
 
 

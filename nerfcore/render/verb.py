@@ -40,6 +40,7 @@ from .pictures import colorize_depth, colorize_labels
 from .run import load_info, load_trained
 
 ORBIT_PIXELS = 800  # longest side of orbit frames unless a size is asked for
+# Not tuned:
 OPEN_ANGLE = np.pi / 2  # around the subject without a photo: from there on an orbit is an arc
 
 

@@ -12,6 +12,7 @@ from ..geometry.contraction import grid_position
 from ..kernels.cells_torch import cell_index
 
 UNKNOWN, EMPTY, OCCUPIED = 0, 1, 2
+# Not tuned:
 STEPS = 96  # a ray is read at: half of them in the cube's neighbourhood, half beyond; a cell of 128³ is 1.3 steps long
 CUBE_WAY = 4.0  # normalised units: longer than the cube's diagonal
 FARTHEST = 1000.0  # where rays end, as in `MarchSettings.far`

@@ -11,6 +11,7 @@ import torch
 
 from ..kernels.device import backend_of
 
+# Not tuned: the next three.
 FIRST_SCALE, LARGEST_SCALE = 2.0**14, 2.0**24
 GROWTH_STEPS = 500  # finite steps after which the scale doubles; it halves after one that is not finite
 

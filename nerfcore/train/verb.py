@@ -55,6 +55,7 @@ from .trainer import Measured, Trainer
 from .voxel_init import save_features
 
 CLOSED_PICTURE = "closed.png"
+# Not tuned: the next two.
 MOST_DROPPED = 0.01  # share of the rays that may be left out without a word
 PREVIEW_PAUSE = 20  # times what a preview costs, before the next one
 

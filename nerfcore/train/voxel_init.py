@@ -31,6 +31,7 @@ from ..kernels.encode import FEATURES
 from ..kernels.runtime import run_parallel
 from ..render.model import Model
 
+# Not tuned: the next eight, but for COLORS, which follows from the field.
 SIDE = 96  # longest side of the reduced photos
 VIEWS = 48  # photos that are looked at, evenly spread
 RAYS = 2048

@@ -16,8 +16,8 @@ from ..kernels.runtime import run_parallel
 from ..kernels.traversal import MarchSettings, skip_distances
 from .occupancy import OccupancyGrid
 
-# Not tuned: the next two.
-PROBES = 4  # points read in each fine cell
+
+PROBES = 4  # points read in each fine cell; not tuned
 SAVED = 8  # samples that a pixel needs less with it
 CHUNK = 1 << 14
 

@@ -31,7 +31,7 @@ from ..kernels.encode import FEATURES
 from ..kernels.runtime import run_parallel
 from ..render.model import Model
 
-# Not tuned: the next eight, but for COLORS, which follows from the field.
+# Not tuned, but for the gain: five times as much was no better (docs/experiments.md, “A start of the grid from the photos”).
 SIDE = 96  # longest side of the reduced photos
 VIEWS = 48  # photos that are looked at, evenly spread
 RAYS = 2048

@@ -16,7 +16,6 @@ from ..kernels.runtime import run_parallel
 from ..kernels.traversal import MarchSettings, skip_distances
 from .occupancy import OccupancyGrid
 
-
 PROBES = 4  # points read in each fine cell; not tuned
 SAVED = 8  # samples that a pixel needs less with it
 CHUNK = 1 << 14

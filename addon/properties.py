@@ -272,6 +272,26 @@ class FieldworkScene(PropertyGroup):
         min=16,
         max=2048,
     )
+    detail: FloatProperty(
+        name="Detail",
+        description="Side of a cell in millimetres, instead of the resolution; needs a known scale. 0: the resolution",
+        default=0.0,
+        min=0.0,
+        soft_max=100.0,
+    )
+    mesh_region: EnumProperty(
+        name="Region",
+        description="What part of the capture becomes surface",
+        items=[
+            ("auto", "Automatic", "The training region, or what the photos show where there is none"),
+            ("photos", "All Photos Show", "Everything that the photos show, whatever the training region"),
+        ],
+    )
+    turntable: StringProperty(
+        name="Turntable",
+        description="Folder for pictures of the mesh from eight sides, its colors and its classes; empty: none",
+        subtype="DIR_PATH",
+    )
     faces: IntProperty(
         name="Faces", description="Target number of triangles; 0: keep all", default=0, min=0, soft_max=2_000_000
     )

@@ -24,13 +24,15 @@ class FIELDWORK_PT_mesh(StepPanel):
         else:
             self.draw_state(False, t("Run “{}” is not trained yet", settings.run))
         column = columns(layout)
-        for name in ("resolution", "faces", "texture"):
+        column.prop(settings, "mesh_region")
+        for name in ("resolution", "detail", "faces", "texture"):
             column.prop(settings, name)
         if settings.texture != "0":
             column.prop(settings, "texture_kind")
         column.prop(settings, "mesh_file")
         if settings.mesh_file:
             column.prop(settings, "split")
+        column.prop(settings, "turntable")
         layout.operator("fieldwork.mesh", icon="MESH_DATA")
         layout.operator("fieldwork.import_scene", icon="SCENE_DATA")
 

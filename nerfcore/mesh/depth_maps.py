@@ -29,10 +29,14 @@ CPU_RAYS, GPU_RAYS = 8192, 1 << 18  # a tile; the CPU's fits a core's cache
 MOST_VIEWS = 96
 OPAQUE, EMPTY = 0.5, 0.1  # opacities: something is there, nothing is there
 STEEPEST = np.cos(np.radians(80))
-EDGE = 0.03  # share by which the depth of neighbours differs at an outline
+EDGE, EDGE_PIXELS = 0.03, 5.5  # share, or footprints of a pixel, by which the depth of neighbours differs at an outline
 NEIGHBOURS = 8  # views asked to confirm a depth
 CONFIRMED = 2  # of them that must
-AGREE, ROUND_TRIP = 0.01, 1.5  # of the depth; pixels
+AGREE, AGREE_PIXELS, ROUND_TRIP = (
+    0.01,
+    1.65,
+    1.5,
+)  # of the depth, or footprints of a pixel where photos are small; pixels
 SMALLEST_FACE = 0.05  # share of a cube's face that a photo must show
 
 
@@ -172,7 +176,8 @@ def normals(camera: Camera, depth: np.ndarray) -> np.ndarray:
     there is no surface or an outline."""
     solid = (depth > 0) & (depth < FREE)
     points = _directions(camera) * np.where(solid, depth, 1)[..., None]
-    normal = np.cross(_slope(points, solid, 1), _slope(points, solid, 0))
+    edge = max(EDGE, EDGE_PIXELS / camera.fx)
+    normal = np.cross(_slope(points, solid, 1, edge), _slope(points, solid, 0, edge))
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
     normal = np.where(solid[..., None] & (length > 0), normal / np.maximum(length, 1e-30), 0)
     return -normal * np.sign((normal * points).sum(-1, keepdims=True))
@@ -185,16 +190,16 @@ def _directions(camera: Camera) -> np.ndarray:
     return np.concatenate([flat, np.ones_like(flat[..., :1])], -1).astype(np.float32)
 
 
-def _slope(points: np.ndarray, solid: np.ndarray, axis: int) -> np.ndarray:
+def _slope(points: np.ndarray, solid: np.ndarray, axis: int, jump: float) -> np.ndarray:
     """Difference of points (H, W, 3) to a neighbour along an axis: of the two sides, the one whose depth is nearer; 0
-    where neither is solid or continues the surface."""
+    where neither is solid or continues the surface: depths differ by less than the share `jump`."""
     out, best = np.zeros_like(points), np.full(solid.shape, np.inf, np.float32)
     z = points[..., 2]
     for step in (2, 1):
         for sign in (-1, 1):
             moved = np.roll(points, sign * step, axis)
             change = np.abs(moved[..., 2] - z) / step
-            usable = solid & np.roll(solid, sign * step, axis) & (change < EDGE * z) & (change < 0.999 * best)
+            usable = solid & np.roll(solid, sign * step, axis) & (change < jump * z) & (change < 0.999 * best)
             edge = [slice(None)] * 2
             edge[axis] = slice(0, step) if sign > 0 else slice(-step, None)
             usable[tuple(edge)] = False
@@ -239,7 +244,8 @@ def confirmed_maps(
     for index, near in enumerate(around or neighbours(views, maps)):
         report.progress(index / len(views))
         others = torch.tensor(near, dtype=torch.int32, device=arrays.depth.device)
-        confirmed.append(agreement(arrays, index, others, AGREE, ROUND_TRIP) >= needed)
+        share = max(AGREE, AGREE_PIXELS / views[index].camera.fx)
+        confirmed.append(agreement(arrays, index, others, share, ROUND_TRIP) >= needed)
     keep = torch.cat(confirmed) | (arrays.depth >= FREE)
     return replace(arrays, depth=torch.where(keep, arrays.depth, 0.0))
 

@@ -21,7 +21,10 @@ BRICK = 8  # corners along each side of a brick
 TRUNCATION = 4.0  # voxels
 NEAR = 2.5  # voxels around a hit in which the surface may lie
 FREE_AT = 1.5  # voxels in front of a view's surface: it looks through
-GAP = 0.03  # share by which depths of one surface differ from pixel to pixel
+GAP, GAP_PIXELS = (
+    0.03,
+    5.5,
+)  # share, or footprints of a pixel, by which depths of one surface differ from pixel to pixel
 APART = float(np.cos(np.radians(3)))
 CHUNK = 256  # bricks
 
@@ -54,12 +57,13 @@ def fuse_maps(maps: MapArrays, region: Region, report: Reporter) -> Bricks:
     axis = torch.arange(BRICK, device=device)
     inner = torch.cartesian_prod(axis, axis, axis)
     start = torch.from_numpy(origin).float().to(device)
+    gap = max(GAP, GAP_PIXELS / float(maps.lens[:, 0].min()))
     distance, weight, known = [], [], []
     for begin in range(0, len(bricks), CHUNK):
         report.progress(begin / len(bricks))
         some = torch.from_numpy(bricks[begin : begin + CHUNK]).to(device)
         points = (some[:, None] * BRICK + inner).reshape(-1, 3) * h + start
-        d, w, k = fuse(points.float(), maps, h, TRUNCATION * h, FREE_AT * h, GAP, APART)
+        d, w, k = fuse(points.float(), maps, h, TRUNCATION * h, FREE_AT * h, gap, APART)
         for parts, values in ((distance, d), (weight, w), (known, k > 0)):
             parts.append(values.view(-1, BRICK, BRICK, BRICK).cpu().numpy())
     return Bricks(origin, h, index, np.concatenate(distance), np.concatenate(weight), np.concatenate(known))

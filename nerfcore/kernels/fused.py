@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 import warp as wp
@@ -10,7 +11,7 @@ import warp as wp
 from . import march
 from .blocks import launch_blocks
 from .device import backend_of
-from .fused_kernel import FusedShape, fused_kernel
+from .fused_kernel import FieldArrays, FusedShape, RayQueue, RenderedArrays, fused_kernel
 from .fused_network import half_feature
 from .runtime import array, init
 from .traversal import MarchSettings, march_params
@@ -118,23 +119,22 @@ def render_coarse(
     probabilities = torch.zeros(number, max(classes, 1), device=device)
     next_ray = torch.zeros(1, dtype=torch.int32, device=device)
     evaluated = torch.zeros(groups * lanes, dtype=torch.int32, device=device)
-    inputs = [
-        array(rays.origins, wp.vec3),
-        array(rays.directions, wp.vec3),
-        array(rays.total_weight),
-        array(rays.t_first),
-    ]
-    inputs += [
-        array(rays.queue),
-        array(next_ray),
-        array(rays.ray_count),
-        array(counts),
-        march_params(settings),
-        array(cells, wp.vec2),
-        array(skip_distance),
-    ]
-    inputs += [array(field.table, half_feature), array(field.layout), array(field.gains), array(field.evidence)]
-    inputs += [field.evidence_side, field.blend_floor, field.blend_rate, array(field.weights), array(field.code)]
-    inputs += [field.density_shift, cull, classes, array(pixels), array(probabilities), array(evaluated)]
+    queue, out = RayQueue(), RenderedArrays()
+    queue.origins, queue.directions = array(rays.origins, wp.vec3), array(rays.directions, wp.vec3)
+    queue.total_weight, queue.t_first, queue.counts = array(rays.total_weight), array(rays.t_first), array(counts)
+    queue.queue, queue.next_ray, queue.ray_count = array(rays.queue), array(next_ray), array(rays.ray_count)
+    out.pixels, out.probabilities, out.evaluated = array(pixels), array(probabilities), array(evaluated)
+    grid = [array(cells, wp.vec2), array(skip_distance)]
+    inputs = [queue, march_params(settings), *grid, _field_arrays(field), cull, out]
     launch_blocks(kernel, groups, lanes, inputs, device)
     return FusedRays(pixels[:, :3], pixels[:, 3], pixels[:, 4], probabilities if classes else None, evaluated.sum())
+
+
+def _field_arrays(field: FusedField) -> Any:
+    out = FieldArrays()
+    out.table, out.layout, out.gains = array(field.table, half_feature), array(field.layout), array(field.gains)
+    out.evidence, out.evidence_side = array(field.evidence), field.evidence_side
+    out.blend_floor, out.blend_rate = field.blend_floor, field.blend_rate
+    out.weights, out.code = array(field.weights), array(field.code)
+    out.density_shift, out.class_count = field.density_shift, field.class_count
+    return out

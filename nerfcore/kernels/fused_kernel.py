@@ -130,22 +130,62 @@ class Ray:
     ended: int
 
 
+@wp.struct
+class RayQueue:
+    """Rays (R,) after the coarse march; `queue` holds those that meet something, `ray_count` (1,) their number, and
+    `next_ray` (1,) the place of the next one. counts: samples of each ray."""
+
+    origins: wp.array(dtype=wp.vec3)
+    directions: wp.array(dtype=wp.vec3)
+    total_weight: wp.array(dtype=float)
+    t_first: wp.array(dtype=float)
+    counts: wp.array(dtype=int)
+    queue: wp.array(dtype=int)
+    next_ray: wp.array(dtype=int)
+    ray_count: wp.array(dtype=int)
+
+
+@wp.struct
+class FieldArrays:
+    """A field as the kernel reads it, see `fused.FusedField`."""
+
+    table: wp.array(dtype=half_feature)
+    layout: wp.array2d(dtype=int)
+    gains: wp.array(dtype=float)
+    evidence: wp.array(dtype=float)
+    evidence_side: int
+    blend_floor: float
+    blend_rate: float
+    weights: wp.array2d(dtype=wp.float16)
+    code: wp.array(dtype=float)
+    density_shift: float
+    class_count: int
+
+
+@wp.struct
+class RenderedArrays:
+    """What is written: pixels (R, 5) red, green, blue, opacity and depth; probabilities (R, K); evaluated: samples of
+    each thread."""
+
+    pixels: wp.array2d(dtype=float)
+    probabilities: wp.array2d(dtype=float)
+    evaluated: wp.array(dtype=int)
+
+
 @wp.func
-def started(
-    index: int, origin: wp.vec3, direction: wp.vec3, count: int, total_weight: float, t_first: float, m: MarchParams
-):
+def started(rays: RayQueue, index: int, m: MarchParams):
     """A ray before its first sample."""
     ray = Ray()
     ray.index = index
-    ray.origin = origin
-    ray.direction = direction
-    ray.inverse = reciprocal(direction)
-    _, high = ray_interval(origin, ray.inverse, m)
+    ray.origin = rays.origins[index]
+    ray.direction = rays.directions[index]
+    ray.inverse = reciprocal(ray.direction)
+    _, high = ray_interval(ray.origin, ray.inverse, m)
     ray.high = high
-    ray.count = count
-    ray.share = total_weight / float(count)
-    ray.t = t_first
-    ray.t_last = t_first
+    ray.count = rays.counts[index]
+    ray.share = rays.total_weight[index] / float(ray.count)
+    ray.t = rays.t_first[index]
+    ray.t_last = ray.t
     ray.transmittance = 1.0
     return ray
 
@@ -222,32 +262,13 @@ def fused_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
     explicit_row = geometry_rows + (features if octaves else 0)
 
     def fused_render(
-        origins: wp.array(dtype=wp.vec3),
-        directions: wp.array(dtype=wp.vec3),
-        total_weight: wp.array(dtype=float),
-        t_first: wp.array(dtype=float),
-        queue: wp.array(dtype=int),
-        next_ray: wp.array(dtype=int),
-        ray_count: wp.array(dtype=int),
-        counts: wp.array(dtype=int),
+        rays: RayQueue,
         m: MarchParams,
         cells: wp.array(dtype=wp.vec2),
         skip_distance: wp.array(dtype=wp.uint8),
-        table: wp.array(dtype=half_feature),
-        layout: wp.array2d(dtype=int),
-        gains: wp.array(dtype=float),
-        evidence: wp.array(dtype=float),
-        evidence_side: int,
-        blend_floor: float,
-        blend_rate: float,
-        weights: wp.array2d(dtype=wp.float16),
-        code: wp.array(dtype=float),
-        density_shift: float,
+        field: FieldArrays,
         cull: float,
-        class_count: int,
-        pixels: wp.array2d(dtype=float),
-        probabilities: wp.array2d(dtype=float),
-        evaluated: wp.array(dtype=int),
+        out: RenderedArrays,
     ):
         lane = wp.tid()
         ray = Ray()
@@ -263,10 +284,10 @@ def fused_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
         active_lanes = int(1)
         while active_lanes > 0:
             if ray.index < 0:
-                position = wp.atomic_add(next_ray, 0, 1)
-                if position < ray_count[0]:
-                    r = queue[position]
-                    ray = started(r, origins[r], directions[r], counts[r], total_weight[r], t_first[r], m)
+                position = wp.atomic_add(rays.next_ray, 0, 1)
+                if position < rays.ray_count[0]:
+                    r = rays.queue[position]
+                    ray = started(rays, r, m)
                     optical_depth = 0.0
                     before = 1.0
                     red = 0.0
@@ -284,19 +305,20 @@ def fused_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
                     ray, t, length = advanced(ray, m, cells, skip_distance)
                     p = inside(grid_position(ray.origin + ray.direction * t, m.contracted))
                     samples += 1
-                explicit = grid(p, table, layout, gains)
+                explicit = grid(p, field.table, field.layout, field.gains)
                 implicit = branch_vector()
                 hidden = density_input()
                 for k in range(features):
                     hidden[k] = explicit[k]
                 if wp.static(octaves > 0):
                     w = float(1.0)
-                    if active == 1 and evidence_side > 0:
-                        w = 1.0 - (1.0 - blend_floor) * wp.exp(-blend_rate * trilinear_at(evidence, evidence_side, p))
+                    if active == 1 and field.evidence_side > 0:
+                        certainty = trilinear_at(field.evidence, field.evidence_side, p)
+                        w = 1.0 - (1.0 - field.blend_floor) * wp.exp(-field.blend_rate * certainty)
                     # Where the whole block is certain of its grid the implicit branch is read only for classes.
                     uncertain_lanes = wp.tile_sum(wp.tile(wp.where(w < CERTAIN, 1, 0)))[0]
                     if uncertain_lanes > 0:
-                        smooth = implicit_network(frequencies(p), weights, implicit_row)
+                        smooth = implicit_network(frequencies(p), field.weights, implicit_row)
                         for k in range(features):
                             implicit[k] = wp.float16(smooth[k])
                             if wp.static(concat):
@@ -304,11 +326,11 @@ def fused_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
                                 hidden[features + k] = wp.float16((1.0 - w) * smooth[k])
                             else:
                                 hidden[k] = wp.float16(w * float(explicit[k]) + (1.0 - w) * smooth[k])
-                out = density_network(hidden, weights, density_row)
+                head = density_network(hidden, field.weights, density_row)
                 geometry_features = geometry_vector()
                 for k in range(geometry):
-                    geometry_features[k] = wp.float16(out[k])
-                density = wp.exp(wp.clamp(out[0] + density_shift, -15.0, 11.0))
+                    geometry_features[k] = wp.float16(head[k])
+                density = wp.exp(wp.clamp(head[0] + field.density_shift, -15.0, 11.0))
                 optical_depth += density * length
                 after = wp.exp(-optical_depth)
                 weight = before - after
@@ -323,8 +345,8 @@ def fused_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
                     for k in range(HARMONICS):
                         x[geometry + k] = wp.float16(sh[k])
                     for k in range(appearance):
-                        x[color_code + k] = wp.float16(code[k])
-                    color = color_network(x, weights, color_row)
+                        x[color_code + k] = wp.float16(field.code[k])
+                    color = color_network(x, field.weights, color_row)
                     if visible == 1:
                         red += weight / (1.0 + wp.exp(-color[0]))
                         green += weight / (1.0 + wp.exp(-color[1]))
@@ -337,36 +359,38 @@ def fused_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
                             y[k] = geometry_features[k]
                         if wp.static(octaves > 0):
                             if uncertain_lanes == 0:
-                                smooth = implicit_network(frequencies(p), weights, implicit_row)
+                                smooth = implicit_network(frequencies(p), field.weights, implicit_row)
                                 for k in range(features):
                                     implicit[k] = wp.float16(smooth[k])
                             for k in range(features):
                                 y[geometry_rows + k] = implicit[k]
                         for k in range(features):
                             y[explicit_row + k] = explicit[k]
-                        scores = semantic_network(y, weights, semantic_row)
+                        scores = semantic_network(y, field.weights, semantic_row)
                         if visible == 1:
                             if wp.static(logits == 0):
                                 largest = float(-1.0e30)
                                 for k in range(classes):
-                                    largest = wp.where(k < class_count, wp.max(largest, scores[k]), largest)
+                                    largest = wp.where(k < field.class_count, wp.max(largest, scores[k]), largest)
                                 sum = float(0.0)
                                 for k in range(classes):
-                                    e = wp.where(k < class_count, wp.exp(scores[k] - largest), 0.0)
+                                    e = wp.where(k < field.class_count, wp.exp(scores[k] - largest), 0.0)
                                     scores[k] = e
                                     sum += e
                                 scores = scores / sum
                             for k in range(classes):
-                                if k < class_count:
-                                    probabilities[ray.index, k] = probabilities[ray.index, k] + weight * scores[k]
+                                if k < field.class_count:
+                                    out.probabilities[ray.index, k] = (
+                                        out.probabilities[ray.index, k] + weight * scores[k]
+                                    )
                 if active == 1 and (ray.ended == 1 or ray.sample >= ray.count or before < EARLY_STOP):
-                    pixels[ray.index, 0] = red
-                    pixels[ray.index, 1] = green
-                    pixels[ray.index, 2] = blue
-                    pixels[ray.index, 3] = opacity
-                    pixels[ray.index, 4] = distance
+                    out.pixels[ray.index, 0] = red
+                    out.pixels[ray.index, 1] = green
+                    out.pixels[ray.index, 2] = blue
+                    out.pixels[ray.index, 3] = opacity
+                    out.pixels[ray.index, 4] = distance
                     ray.index = -1
-        evaluated[lane] = samples
+        out.evaluated[lane] = samples
 
     classes_text = f"{classes}{'l' if logits else ''}"
     joined = f"{octaves}{'c' if concat else ''}"

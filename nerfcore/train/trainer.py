@@ -286,7 +286,7 @@ class Trainer:
         ]
         return ShardResult(own, encoded, total.detach(), squared_error.detach(), rendered, ray_gradients)
 
-    def _render(self, batch: Batch, jitter: torch.Tensor, shift: torch.Tensor, capacity: int) -> Rendered:
+    def _render(self, batch: Batch, jitter: torch.Tensor, shift: torch.Tensor, capacity: int | None = None) -> Rendered:
         appearance, semantics = self.model.field.appearance, self.config.loss.semantic_weight > 0
         codes = appearance[batch.image] if appearance is not None else None
         per_ray = self.config.sampling.samples

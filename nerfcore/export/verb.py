@@ -4,17 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
-
-import numpy as np
-from PIL import Image
 
 from ..blender.package import stale, write_package
 from ..blender.process import write_in_blender
 from ..data.load import load_scene
-from ..errors import ProjectError, SettingError
-from ..mesh.files import Texture, texture_of, write_surface
-from ..mesh.surface import Surface
+from ..errors import SettingError
+from ..mesh.files import write_surface
+from ..mesh.stored import load_surface
 from ..params import ExportParams
 from ..progress import Reporter
 from ..project.runs import holdout_of
@@ -74,28 +70,6 @@ def export(params: ExportParams, report: Reporter) -> dict[str, Any]:
     result = {"to": params.to, "files": [str(path) for path in files]}
     record_step(folder, "export", params.model_dump(mode="json"), result)
     return result
-
-
-def load_surface(folder: Path, run: str) -> tuple[Surface, Texture | None]:
-    """The surface of a run in the world, and its texture, as `mesh` left them.
-
-    Raises:
-        ProjectError: there is none, or its file is damaged.
-    """
-    path = folder / "exports" / run / "mesh.npz"
-    try:
-        with np.load(path, allow_pickle=False) as data:
-            surface = Surface(**{name: data[name] for name in Surface.__dataclass_fields__})
-            uv = data.get("uv", None)
-    except FileNotFoundError as error:
-        raise ProjectError(f"The run “{run}” has no mesh yet.", "Run `fieldwork mesh` first.") from error
-    except (OSError, ValueError, KeyError, BadZipFile) as error:
-        raise ProjectError(f"{path} is damaged: {error}.", "Run `fieldwork mesh` again.") from error
-    picture = path.with_name("texture.png")
-    if uv is None or not picture.is_file():
-        return surface, None
-    with Image.open(picture) as image:
-        return surface, texture_of(surface.faces, uv, np.array(image.convert("RGB")))
 
 
 def _write_usd(out: Path, folder: Path, params: ExportParams, report: Reporter) -> Path:

@@ -15,7 +15,7 @@ class Surface:
     """A triangle mesh with attributes.
 
     vertices (V, 3), faces (F, 3), normals (V, 3) unit, outward; colors (V, 3) uint8 sRGB; class_id (V,) and
-    face_class (F,) class ids.
+    face_class (F,) class ids; face_instance (F,) uint32 numbers of instances, 0 for none, None where nobody looked.
     """
 
     vertices: np.ndarray
@@ -24,6 +24,7 @@ class Surface:
     colors: np.ndarray
     class_id: np.ndarray
     face_class: np.ndarray
+    face_instance: np.ndarray | None = None
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

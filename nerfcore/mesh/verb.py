@@ -15,13 +15,14 @@ from ..images.picture import to_bytes
 from ..params import MeshParams
 from ..progress import Reporter
 from ..project.fingerprints import Earlier, Fingerprint, compare, digest, read_made, rounded, write_made
-from ..project.runs import MESH_RECORD, checkpoint_id, state_id
+from ..project.runs import MEASURES, MESH_RECORD, checkpoint_id, state_id
 from ..project.schema import step
 from ..project.store import load_project, record_step, world_from_sfm
 from ..render.run import load_info, load_trained, refined_poses
 from .build import Built, build
 from .field_values import shade
 from .files import check_format, texture_of, write_surface
+from .instances import GAP, find_instances, write_instances
 from .painted import Painted, paint_surface, training_photos, write_maps
 from .photos import Photo
 from .surface import class_table, is_watertight, to_world
@@ -32,7 +33,8 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
     """Extract the surface of a run and write it to exports/<run>/ (and to `out`), in world units.
 
     Returns:
-        {"vertices", "faces", "watertight", "voxel": in world units, "classes": {name: {"faces", "area"}}, "files"};
+        {"vertices", "faces", "watertight", "voxel": in world units, "classes": {name: {"faces", "area"}},
+        "instances": how many, "files"};
         with a texture of photos "painted_by_photos", the share of its texels that a photo shows
     Raises:
         SettingError: unknown format or impossible region. ProjectError, TrainingError, DiskError.
@@ -53,14 +55,21 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
         texture = texture_of(built.surface.faces, painted.uv.corners, painted.image)
     labelled = replace(built.surface, class_id=painted.classes.class_id, face_class=painted.classes.face_class)
     surface = to_world(labelled, box.world_from_box)
+    names = {scene.ignore_id: "void"} | {c.id: c.name for c in scene.classes}
+    voxel = built.region.voxel * similarity_scale(box.world_from_box)
+    face_instance, instances = find_instances(
+        surface.vertices, surface.faces, surface.face_class, names, scene.ignore_id, GAP * voxel
+    )
+    surface = replace(surface, face_instance=face_instance)
     report.stage("Writing")
-    (target / MESH_RECORD).unlink(missing_ok=True)  # what it says is no longer true from here on
+    for record in (MESH_RECORD, MEASURES):  # what they say is no longer true from here on
+        (target / record).unlink(missing_ok=True)
     with atomic_path(target / "mesh.npz") as temporary, open(temporary, "wb") as file:
         sure = {"confidence": painted.classes.confidence, "face_confidence": painted.classes.face_confidence}
         uv = {} if painted.uv is None else {"uv": painted.uv.corners}
         np.savez(file, **vars(surface), **sure, **uv)
-    names = {scene.ignore_id: "void"} | {c.id: c.name for c in scene.classes}
-    files = [target / "mesh.npz", *write_maps(target, painted, {c.id: c.color for c in scene.classes})]
+    files = [target / "mesh.npz", write_instances(target, instances)]
+    files += write_maps(target, painted, {c.id: c.color for c in scene.classes})
     for path in [target / "mesh.ply", *([params.out] if params.out else [])]:
         files += write_surface(path, surface, names, params.split == "classes" and path == params.out, texture)
     if params.turntable is not None:
@@ -70,8 +79,9 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
         "vertices": len(surface.vertices),
         "faces": len(surface.faces),
         "watertight": is_watertight(surface.faces),
-        "voxel": built.region.voxel * similarity_scale(box.world_from_box),
+        "voxel": voxel,
         "classes": class_table(surface, names),
+        "instances": len(instances),
         "files": [str(path) for path in files],
     }
     if painted.seen is not None:

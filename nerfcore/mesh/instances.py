@@ -1,0 +1,107 @@
+"""Instances: the separate things of one class on a surface, with names that stay the same from run to run."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
+
+from ..errors import ProjectError
+from ..files import write_json
+from .clean import areas, border_edges, components
+
+INSTANCES = "instances.json"  # beside mesh.npz
+GAP = 3.0  # voxels that a thing may be torn apart by: a crack of the reconstruction is one or two wide
+LEAST_SHARE = 0.01  # of the area of its class, below which a part is no instance
+SAME_SIZE = 0.05  # areas within one such step are told apart by where the things stand, not by their noise
+
+
+@dataclass(frozen=True)
+class Instance:
+    """A connected thing of one class: `id` as in the mesh's `face_instance`, its name (`plinth.001`) and class; area
+    (world units²) and the mean place of its surface."""
+
+    id: int
+    name: str
+    class_id: int
+    area: float
+    center: tuple[float, float, float]
+
+
+def find_instances(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    face_class: np.ndarray,
+    names: Mapping[int, str],
+    void: int,
+    gap: float,
+    least_share: float = LEAST_SHARE,
+) -> tuple[np.ndarray, list[Instance]]:
+    """The instance (F,) uint32 of each face (F, 3), 0 for none, and the instances in the order of their numbers.
+
+    Parts of a class whose borders come closer than `gap` are one instance. Void, and parts below `least_share` of the
+    area of their class, belong to none. Numbers go by class, in it by size, things of one size by where they stand.
+
+    Args:
+        vertices: (V, 3); names: of the class ids; gap: in units of the vertices.
+    """
+    vertices = np.asarray(vertices, np.float64)
+    area, middle = areas(vertices, faces), vertices[faces].mean(1)
+    face_instance, found = np.zeros(len(faces), np.uint32), []
+    for class_id in sorted(set(np.unique(face_class).tolist()) - {void}):
+        own = np.flatnonzero(face_class == class_id)
+        part = _joined(vertices, faces[own], gap)
+        size = np.bincount(part, area[own])
+        total = np.maximum(size, 1e-30)[:, None]
+        center = np.stack([np.bincount(part, area[own] * middle[own, k]) for k in range(3)], 1) / total
+        step = np.round(np.log(np.maximum(size, 1e-30)) / SAME_SIZE)
+        order = np.lexsort((*np.round(center / max(gap, 1e-9)).T[::-1], -step))
+        kept = [p for p in order.tolist() if size[p] >= least_share * size.sum() and size[p] > 0]
+        for number, p in enumerate(kept, 1):
+            name = f"{names.get(class_id, class_id)}.{number:03d}"
+            x, y, z = center[p].tolist()
+            found.append(Instance(len(found) + 1, name, class_id, float(size[p]), (x, y, z)))
+            face_instance[own[part == p]] = len(found)
+    return face_instance, found
+
+
+def _joined(vertices: np.ndarray, faces: np.ndarray, gap: float) -> np.ndarray:
+    """Number (F,) of the part of each face (F, 3), where parts with borders nearer than `gap` to each other are one."""
+    part = components(faces, len(vertices))
+    count = int(part.max(initial=-1)) + 1
+    at_border = np.unique(border_edges(faces))
+    if count < 2 or not len(at_border):
+        return part
+    of_vertex = np.zeros(len(vertices), np.int64)
+    of_vertex[faces] = part[:, None]
+    pairs = KDTree(vertices[at_border]).query_pairs(gap, output_type="ndarray")
+    a, b = of_vertex[at_border[pairs]].T
+    _, joined = connected_components(coo_matrix((np.ones(len(a), bool), (a, b)), (count, count)), False)
+    return joined[part]
+
+
+def write_instances(folder: Path, instances: list[Instance]) -> Path:
+    """Write instances.json into the folder of the mesh and return its path. Raises DiskError."""
+    write_json(folder / INSTANCES, [asdict(instance) for instance in instances])
+    return folder / INSTANCES
+
+
+def read_instances(folder: Path) -> list[Instance]:
+    """The instances that stand beside a mesh; none where it was made before there were any.
+
+    Raises:
+        ProjectError: the file is damaged.
+    """
+    path = folder / INSTANCES
+    try:
+        return [Instance(**value) for value in json.loads(path.read_text(encoding="utf-8"))]
+    except FileNotFoundError:
+        return []
+    except (OSError, ValueError, TypeError) as error:
+        raise ProjectError(f"{path} is damaged: {error}.", "Run `fieldwork mesh` again.") from error

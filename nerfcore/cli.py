@@ -22,7 +22,7 @@ from pydantic.fields import FieldInfo
 
 from . import __version__
 from .console import ConsoleReporter
-from .errors import Cancelled, FieldworkError
+from .errors import Cancelled, FieldworkError, wrong_value
 from .project.lock import lockable, project_lock
 from .verbs import VERBS, run_verb
 
@@ -149,8 +149,8 @@ def run_command(name: str, values: dict[str, Any], as_json: bool, quiet: bool, s
             values["set"] = dict(_assignment(text) for text in values["set"])
         params = verb.params.model_validate(values)
     except ValidationError as error:
-        first = error.errors()[0]
-        raise click.UsageError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from error
+        clauses = "; ".join(wrong_value(detail) for detail in error.errors())
+        raise click.UsageError(f"{name}: {clauses}.") from error
     with _stdout_for_results() as stdout, ConsoleReporter(quiet or as_json) as report, _interruptible(report):
         try:
             with nullcontext() if verb.immediate else project_lock(lockable(params), name):
@@ -234,6 +234,9 @@ def main(arguments: list[str] | None = None) -> int:
     except click.Abort:
         return 130
     except click.ClickException as error:
+        if "--json" in (sys.argv[1:] if arguments is None else arguments):
+            failure = {"code": "usage", "message": error.format_message(), "hint": "fieldwork --help"}
+            print(json.dumps({"error": failure}, ensure_ascii=False))
         error.show()
         return error.exit_code
     return code if isinstance(code, int) else 0

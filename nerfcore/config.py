@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from .errors import SettingError
+from .errors import SettingError, wrong_value
 
 PRESETS = Path(__file__).parent / "presets"
 # Earlier names of settings, still understood in `--set`, in preset files and in stored runs.
@@ -285,8 +285,6 @@ def make_config(preset: str, settings: dict[str, str] | None = None) -> RunConfi
     try:
         return RunConfig.model_validate(values)
     except ValidationError as error:
-        first = error.errors()[0]
-        name = ".".join(str(part) for part in first["loc"])
         raise SettingError(
-            f"Setting {name} = {first.get('input')!r}: {first['msg']}.", "docs/settings.md lists what it takes."
+            f"The setting {wrong_value(error.errors()[0])}.", "docs/settings.md lists what it takes."
         ) from error

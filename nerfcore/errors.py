@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
+
+LONGEST_VALUE = 60  # characters of a wrong value that are repeated to the user
 
 
 class FieldworkError(Exception):
@@ -68,3 +71,18 @@ class BlenderError(FieldworkError):
 
 class Cancelled(Exception):
     """Raised inside a long computation when its caller asked it to stop."""
+
+
+def wrong_value(detail: Mapping[str, Any]) -> str:
+    """A clause about one value that a pydantic model refused (an item of `ValidationError.errors()`)."""
+    name = ".".join(str(part) for part in detail["loc"])
+    if detail["type"] == "extra_forbidden":
+        return f"there is no setting “{name}”"
+    if detail["type"] == "missing":
+        return f"“{name}” is missing"
+    reason = str(detail.get("ctx", {}).get("error", "")) if detail["type"] == "value_error" else ""
+    if reason:
+        return f"“{name}”: {reason}" if name else reason
+    value = repr(detail["input"])
+    value = value if len(value) <= LONGEST_VALUE else value[:LONGEST_VALUE] + "…"
+    return f"“{name}”: {detail['msg'][:1].lower()}{detail['msg'][1:]} (it is {value})"

@@ -15,6 +15,41 @@ from typing import Any
 
 from .errors import DiskError, InputError
 
+LONGEST_NAME = 64  # characters of a name that the user gives, of a run for instance
+# Windows keeps these for devices, whatever comes behind a dot.
+_DEVICES = {"con", "prn", "aux", "nul", *(f"{kind}{i}" for kind in ("com", "lpt") for i in "0123456789¹²³")}
+
+
+def name_problem(name: str) -> str | None:
+    """What is wrong with a name that shall become a file or folder on any system; None for a good one."""
+    if not re.fullmatch(r"[\w-][\w.-]*", name) or name.endswith("."):
+        return f"“{printable(name)}” is no name: give letters, digits, “_” and “-”, with dots in between"
+    if len(name) > LONGEST_NAME:
+        return f"“{name[:20]}…” has {len(name)} characters: give at most {LONGEST_NAME}"
+    if name.split(".")[0].lower() in _DEVICES:
+        return f"“{name}” is no name: Windows keeps it for a device"
+    return None
+
+
+def is_text(name: str) -> bool:
+    """Whether a name from the file system is Unicode; Python carries other bytes along as lone surrogates."""
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def printable(name: str) -> str:
+    """A name from the file system as it can be shown: bytes that are no UTF-8 become “?”."""
+    return name.encode(errors="replace").decode()
+
+
+def leads_outside(path: str) -> bool:
+    """Whether a path, meant to be relative to some folder, leads out of it on any system."""
+    parts = path.replace("\\", "/").split("/")
+    return ".." in parts or (parts[0] == "" and len(parts) > 1) or parts[0].endswith(":")
+
 
 @contextmanager
 def disk_errors(path: Path) -> Iterator[None]:

@@ -6,9 +6,11 @@ Imports nothing heavy. The verbs themselves are listed in `verbs.py`.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+
+from .files import is_text, name_problem, printable
 
 Preset = Literal["draft", "standard", "high"]
 Pass = Literal["rgb", "depth", "semantic", "confidence", "normal", "unknown"]
@@ -30,8 +32,27 @@ Holdout = Annotated[
 ]
 
 
+def _checked_name(name: str) -> str:
+    problem = name_problem(name)
+    if problem:
+        raise ValueError(problem)
+    return name
+
+
+RunName = Annotated[str, Field(description="name of the run"), AfterValidator(_checked_name)]
+
+
 class Params(BaseModel):
     model_config = ConfigDict(extra="forbid")
+
+    @model_validator(mode="after")
+    def _paths_are_text(self) -> Self:
+        """project.json and what is printed are UTF-8: a path of other bytes could be read and never written down."""
+        for name in type(self).model_fields:
+            path = getattr(self, name)
+            if isinstance(path, Path) and not is_text(str(path)):
+                raise ValueError(f"the path {printable(str(path))} is not UTF-8: rename it")
+        return self
 
 
 class DoctorParams(Params):
@@ -166,7 +187,7 @@ class RegionParams(Params):
 class TrainParams(Params):
     project: Path
     preset: Preset = "standard"
-    run: str = Field(default="main", pattern=r"^[\w-][\w.-]*$", description="name of the run")
+    run: RunName = "main"
     holdout: Holdout = 8
     time_limit: float | None = Field(default=None, gt=0, description="seconds of training")
     steps: int | None = Field(default=None, gt=0, description="optimisation steps")
@@ -176,7 +197,7 @@ class TrainParams(Params):
 
 class EvaluateParams(Params):
     project: Path
-    run: str = "main"
+    run: RunName = "main"
     split: Literal["test", "train"] = "test"
     speed: bool = Field(default=True, description="measure frame times too")
 
@@ -184,7 +205,7 @@ class EvaluateParams(Params):
 class RenderParams(Params):
     project: Path
     out: Path
-    run: str = "main"
+    run: RunName = "main"
     test: bool = Field(default=False, description="from the held-out photos")
     all: bool = Field(default=False, description="from every photo, also those of training")
     camera: Path | None = None
@@ -197,7 +218,7 @@ class RenderParams(Params):
 
 class MeshParams(Params):
     project: Path
-    run: str = "main"
+    run: RunName = "main"
     out: Path | None = None
     faces: int | None = Field(default=None, gt=0, description="target number of triangles")
     resolution: int = Field(default=512, ge=16, le=2048, description="cells along the longest side of the region")
@@ -224,7 +245,7 @@ class MeshParams(Params):
 class BlendParams(Params):
     project: Path
     out: Path
-    run: str = "main"
+    run: RunName = "main"
     split: Literal["none", "classes"] = Field(default="none", description="classes: one mesh object for each class")
     renders: Path | None = Field(
         default=None,
@@ -235,7 +256,7 @@ class BlendParams(Params):
 class ExportParams(Params):
     project: Path
     to: Literal["glb", "obj", "ply", "stl", "usd", "onnx", "voxels"] = Field(description="format")
-    run: str = "main"
+    run: RunName = "main"
     out: Path | None = Field(default=None, description="file to write; default: exports/RUN/PROJECT of the project")
     split: Literal["none", "classes"] = Field(default="none", description="classes: one object for each class")
     resolution: int = Field(default=128, ge=8, le=512, description="voxels: cells along each side of the field's cube")
@@ -243,7 +264,7 @@ class ExportParams(Params):
 
 class PackageParams(Params):
     project: Path
-    run: str = "main"
+    run: RunName = "main"
     renders: Path | None = Field(
         default=None, description="folder of rendered photos; default: exports/renders/photos of the project"
     )

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from pydantic import ValidationError
 from pydantic_core import to_json
 
-from ..errors import Cancelled, FieldworkError
+from ..errors import Cancelled, FieldworkError, wrong_value
 from ..params import Params
 from ..verbs import VERBS
 
@@ -66,22 +66,13 @@ def parse_params(verb: str, values: dict[str, Any]) -> Params:
     """Validate the parameters of a verb.
 
     Raises:
-        RpcError: INVALID_PARAMS with one sentence for each thing that is wrong.
+        RpcError: INVALID_PARAMS with one clause for each thing that is wrong.
     """
     try:
         return VERBS[verb].params.model_validate(values)
     except ValidationError as error:
-        sentences = [_sentence(detail) for detail in error.errors(include_url=False)]
-        raise RpcError(INVALID_PARAMS, f"{verb}: {' '.join(sentences)}") from error
-
-
-def _sentence(detail: Any) -> str:
-    name = ".".join(str(part) for part in detail["loc"])
-    if detail["type"] == "extra_forbidden":
-        return f"there is no setting “{name}”."
-    if detail["type"] == "missing":
-        return f"“{name}” is missing."
-    return f"“{name}”: {detail['msg'][:1].lower()}{detail['msg'][1:]} (it is {detail['input']!r})."
+        clauses = [wrong_value(detail) for detail in error.errors(include_url=False)]
+        raise RpcError(INVALID_PARAMS, f"{verb}: {'; '.join(clauses)}.") from error
 
 
 def encode(message: dict[str, Any]) -> bytes:

@@ -15,7 +15,6 @@ from __future__ import annotations
 import logging
 import os
 import queue
-import re
 import signal
 import sys
 import threading
@@ -29,6 +28,7 @@ import psutil
 
 from .. import __version__
 from ..errors import Cancelled, FieldworkError
+from ..files import name_problem
 from ..progress import Reporter
 from ..project.lock import project_lock
 from ..verbs import VERBS, run_verb
@@ -108,8 +108,9 @@ class Server:
         name, detach = values.pop("job", None), values.pop("detach", False)
         if not isinstance(detach, bool):
             raise rpc.RpcError(rpc.INVALID_PARAMS, "“detach” is true or false.")
-        if name is not None and not (isinstance(name, str) and re.fullmatch(r"[\w-][\w.-]*", name)):
-            raise rpc.RpcError(rpc.INVALID_PARAMS, "“job” is a name of letters, digits, dots, dashes.")
+        wrong = name_problem(name) if isinstance(name, str) else name is not None and "it is text"
+        if wrong:
+            raise rpc.RpcError(rpc.INVALID_PARAMS, f"“job”: {wrong}.")
         params = rpc.parse_params(request.method, values)
         with self._jobs_lock:
             self._count += 1

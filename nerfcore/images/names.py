@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import hashlib
+import re
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".exr", ".bmp", ".ppm", ".heic", ".heif")
+# Bytes of a photo's name in the project: file systems take 255, and "_confidence.png" and temporary endings come behind.
+LONGEST = 200
 
 
 def unique_names(paths: Sequence[Path], root: Path) -> list[str]:
     """A name for each image: its stem, or its path below `root` with "_" for separators when stems repeat.
 
-    White space becomes "_": COLMAP's lists of names are split at it.
+    White space becomes "_", at which COLMAP's lists of names are split, and so do characters that Windows has no files
+    with. Long names are cut, with a digest of the whole behind.
     """
     names = [path.stem for path in paths]
     if len(set(map(_joined, names))) < len(names):
@@ -26,7 +31,10 @@ def unique_names(paths: Sequence[Path], root: Path) -> list[str]:
 
 
 def _joined(name: str) -> str:
-    return "_".join(name.replace("/", "_").split()) or "photo"
+    plain = "_".join(re.sub(r'[\\/:*?"<>|\x00-\x1f]', "_", name.replace("/", "_")).split()) or "photo"
+    if len(plain.encode()) <= LONGEST:
+        return plain
+    return plain.encode()[: LONGEST - 9].decode(errors="ignore") + "~" + hashlib.sha256(plain.encode()).hexdigest()[:8]
 
 
 def _below(path: Path, root: Path) -> Path:

@@ -4,15 +4,32 @@ from __future__ import annotations
 
 import uuid
 from datetime import UTC, datetime
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
+from ..files import leads_outside
 from ..geometry.cameras import Camera
 
 FORMAT = "fieldwork-project"
 VERSION = 2
 IDENTITY = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+
+
+def _own_name(name: str) -> str:
+    if name in (".", "..") or "/" in name or "\\" in name:
+        raise ValueError(f"“{name}” is no name of a photo")
+    return name
+
+
+def _own_file(path: str) -> str:
+    if leads_outside(path):
+        raise ValueError(f"“{path}” leads outside the project")
+    return path
+
+
+ImageName = Annotated[str, AfterValidator(_own_name)]
+OwnFile = Annotated[str, AfterValidator(_own_file)]  # relative to the project folder
 
 
 class Model(BaseModel):
@@ -26,8 +43,8 @@ class ImageRecord(Model):
     `source` is where the original came from, `sha256` its hash; `width`/`height` those of the working copy.
     """
 
-    name: str
-    file: str = ""
+    name: ImageName
+    file: OwnFile = ""
     source: str = ""
     sha256: str = ""
     width: int = 0
@@ -36,10 +53,10 @@ class ImageRecord(Model):
     focal_px: float | None = None
     exif: dict[str, Any] = {}
     sharpness: float | None = None
-    label: str | None = None
-    mask: str | None = None
-    confidence: str | None = None  # how sure the labels are, 8-bit grey
-    depth: str | None = None
+    label: OwnFile | None = None
+    mask: OwnFile | None = None
+    confidence: OwnFile | None = None  # how sure the labels are, 8-bit grey
+    depth: OwnFile | None = None
     split: Literal["train", "test", "auto"] = "auto"
     status: Literal["ok", "rejected", "unregistered"] = "ok"
     reason: str = ""
@@ -125,7 +142,7 @@ def step(
 class PosedImage(Model):
     """Pose of one registered image: camera-to-world 4×4 in the SfM frame, OpenCV axes."""
 
-    name: str
+    name: ImageName
     camera: int
     camera_to_world: list[list[float]]
 

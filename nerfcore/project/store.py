@@ -24,7 +24,7 @@ import numpy as np
 from filelock import FileLock, Timeout
 from pydantic import BaseModel, ValidationError
 
-from ..errors import ProjectError
+from ..errors import ProjectError, wrong_value
 from ..files import atomic_path, disk_errors, write_json
 from ..geometry.points import Points
 from .migrate import migrated
@@ -192,6 +192,5 @@ def _validated(model: type[M], value: Any, path: Path) -> M:
     try:
         return model.model_validate(value)
     except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
-        raise ProjectError(f"{path} is damaged: {place}: {first['msg']}.", "Restore it from a backup.") from error
+        what = wrong_value(error.errors()[0])
+        raise ProjectError(f"{path} is damaged: {what}.", "Restore it from a backup.") from error

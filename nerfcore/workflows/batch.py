@@ -11,7 +11,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from ..errors import Cancelled, FieldworkError, InputError, SettingError
+from ..errors import Cancelled, FieldworkError, InputError, SettingError, wrong_value
 from ..files import write_json
 from ..params import BatchParams, ReconstructParams
 from ..progress import Reporter
@@ -102,9 +102,8 @@ def read_list(path: Path) -> list[ReconstructParams]:
         try:
             captures.append(ReconstructParams.model_validate(values))
         except ValidationError as error:
-            first = error.errors()[0]
             raise SettingError(
-                f"{path}, capture {number}: {'.'.join(map(str, first['loc']))}: {first['msg']}.",
+                f"{path}, capture {number}: {wrong_value(error.errors()[0])}.",
                 "Columns are named like the options of `fieldwork reconstruct`.",
             ) from error
     if not captures:

@@ -129,7 +129,7 @@ def test_lists_of_both_kinds_say_the_same(tmp_path):
     ("name", "text", "error", "words"),
     [
         ("a.csv", "photos\n", InputError, "lists no captures"),
-        ("a.csv", "photos,speed\nx,1\n", SettingError, "capture 1: speed"),
+        ("a.csv", "photos,speed\nx,1\n", SettingError, "capture 1: there is no setting “speed”"),
         ("a.csv", "photos\nx,y,z\n", InputError, "more cells"),
         ("a.csv", "photos,out\nx,p\ny,p\n", SettingError, "two captures with the project"),
         ("a.csv", "photos,preset\nx,best\n", SettingError, "preset"),

@@ -1,0 +1,112 @@
+"""Names that become files and folders: refused where they would lead elsewhere or cannot exist on some platform."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+from fieldwork.nerfcore.cli import main
+from fieldwork.nerfcore.engine import protocol as rpc
+from fieldwork.nerfcore.files import name_problem
+from fieldwork.nerfcore.images.names import LONGEST, unique_names
+from fieldwork.nerfcore.params import (
+    BlendParams,
+    EvaluateParams,
+    ExportParams,
+    MeshParams,
+    PackageParams,
+    Params,
+    RenderParams,
+    TrainParams,
+)
+from fieldwork.nerfcore.project.schema import ImageRecord
+from fieldwork.nerfcore.verbs import VERBS
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+WITH_RUN: list[tuple[type[Params], dict[str, object]]] = [
+    (TrainParams, {}),
+    (EvaluateParams, {}),
+    (RenderParams, {"out": "r"}),
+    (MeshParams, {}),
+    (BlendParams, {"out": "a.blend"}),
+    (ExportParams, {"to": "ply"}),
+    (PackageParams, {}),
+]
+BAD = [
+    "", ".", "..", ".new", "../../b/runs/main", "a/b", "a\\b", "/tmp/x", "C:", "a:b", "con", "NUL", "com1.x", "a.", "a ",
+    " a", "x" * 65, "a\0b", "a\nb", "a?b", "\udce9",
+]  # fmt: skip
+
+
+def test_every_verb_with_a_run_is_among_them() -> None:
+    assert {verb.params for verb in VERBS.values() if "run" in verb.params.model_fields} == {p for p, _ in WITH_RUN}
+
+
+@pytest.mark.parametrize(("params", "values"), WITH_RUN)
+@pytest.mark.parametrize("name", BAD)
+def test_names_of_runs_that_are_refused(params: type[Params], values: dict[str, object], name: str) -> None:
+    with pytest.raises(ValidationError) as caught:
+        params.model_validate({"project": "p", "run": name, **values})
+    assert "pattern" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["main", "a-1", "Läufe_2", "v1.2", "-x", "x" * 64, "console", "試行"])
+def test_names_of_runs_that_are_taken(name: str) -> None:
+    assert TrainParams(project=Path("p"), run=name).run == name
+
+
+@given(st.text(max_size=80))
+def test_a_name_that_is_taken_is_a_folder_right_here(name: str) -> None:
+    if name_problem(name) is None:
+        place = os.path.normpath(os.path.join("/runs", name))
+        assert os.path.dirname(place) == "/runs"
+        assert os.path.basename(place) == name
+        assert not name.startswith(".")
+        name.encode()
+
+
+def test_the_command_line_says_what_a_name_may_be(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(["evaluate", str(tmp_path), "--run", "../../b/runs/main"]) == 2
+    said = capfd.readouterr().err
+    assert "“../../b/runs/main”" in said
+    assert "letters, digits" in said
+    assert "\\w" not in said
+
+
+def test_the_engine_says_what_a_name_may_be() -> None:
+    with pytest.raises(rpc.RpcError, match=r"mesh: “run”: “\.\.” is no name"):
+        rpc.parse_params("mesh", {"project": "p", "run": ".."})
+
+
+@pytest.mark.parametrize("field", ["name", "file", "label", "mask", "depth", "confidence"])
+@pytest.mark.parametrize("value", ["../other/images/a", "/etc/a", "images/../../a", "..\\a"])
+def test_a_project_file_names_only_files_of_its_own(field: str, value: str) -> None:
+    with pytest.raises(ValidationError, match=r"outside the project|is no name"):
+        ImageRecord.model_validate({"name": "a", field: value})
+
+
+def test_paths_that_cannot_be_written_down_are_refused(tmp_path: Path) -> None:
+    path = Path(os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9"))
+    with pytest.raises(ValidationError, match="not UTF-8"):
+        TrainParams(project=path)
+
+
+def test_long_names_of_photos_are_cut_and_stay_apart(tmp_path: Path) -> None:
+    names = unique_names([tmp_path / f"{'x' * 236}_{i}.jpg" for i in range(3)], tmp_path)
+    assert len(set(names)) == 3
+    assert all(len(name.encode()) <= LONGEST for name in names)
+    wide = unique_names([tmp_path / f"{'ü' * 110}{i}.jpg" for i in range(3)], tmp_path)
+    assert len(set(wide)) == 3
+    assert all(len(name.encode()) <= LONGEST for name in wide)
+    assert unique_names([tmp_path / "a.jpg"], tmp_path) == ["a"]
+
+
+def test_json_of_a_wrong_name(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(["train", str(tmp_path), "--run", "..", "--json"]) == 2
+    error = json.loads(capfd.readouterr().out)["error"]
+    assert error["code"] == "usage"
+    assert "“..” is no name" in error["message"]

@@ -35,7 +35,7 @@ def show_steps(
         return []
     if photos:
         cameras = {
-            Path(obj[ROLE].removeprefix("camera:")).stem: obj
+            obj[ROLE].removeprefix("camera:"): obj
             for obj in scene.objects
             if obj.type == "CAMERA" and str(obj.get(ROLE)).startswith("camera:") and owner.owns(obj)
         }

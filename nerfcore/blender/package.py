@@ -220,7 +220,7 @@ def _write_photo(view: View, folder: Path, grids: dict[str, torch.Tensor], lense
 
 def _write_render(view: View, folder: Path, renders: Path, grids: dict[str, torch.Tensor]) -> Path | None:
     """The rendered picture of a photo, straightened as the photo is; None when there is none."""
-    source = renders / f"{Path(view.name).stem}.png"
+    source = renders / f"{view.name}.png"
     if not source.is_file():
         return None
     picture = read_picture(source)

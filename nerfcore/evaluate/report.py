@@ -57,7 +57,7 @@ def write_report(path: Path, project_folder: Path, run: str, renders: Path, resu
         for name in evaluation.get("pictures", [])
         if (project_folder / name).is_file()
     ]
-    scores = {Path(s["name"]).stem: s for s in evaluation.get("per_image", [])}
+    scores = {s["name"]: s for s in evaluation.get("per_image", [])}
     html = (
         jinja2.Environment(autoescape=True)
         .from_string(TEMPLATE.read_text(encoding="utf-8"))

@@ -234,7 +234,7 @@ def _write_pictures(
         tiles.append(colorize_labels(frame.label(trained.info.class_ids, scene.ignore_id), colors))
         if label is not None:
             tiles.append(colorize_labels(label, colors))
-    path = out / f"{Path(name).stem}.png"
+    path = out / f"{name}.png"
     with atomic_path(path) as temporary:
         write_picture(temporary, side_by_side(tiles))
     return path

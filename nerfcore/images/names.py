@@ -30,6 +30,20 @@ def unique_names(paths: Sequence[Path], root: Path) -> list[str]:
     return names
 
 
+def frame_names(places: Sequence[str]) -> list[str]:
+    """A name for each frame of a cameras file by its `file_path`, which need not have a suffix: the last part of it, or
+    all of it with "_" for separators where last parts repeat."""
+    bare = [
+        place[: -len(Path(place).suffix)] if Path(place).suffix.lower() in IMAGE_SUFFIXES else place for place in places
+    ]
+    names = [_joined(Path(place).name) for place in bare]
+    if len(set(names)) < len(names):
+        names = [_joined("/".join(part for part in Path(place).parts if part.strip("./"))) for place in bare]
+    if len(set(names)) < len(names):
+        names = [f"{name}_{i}" for i, name in enumerate(names)]
+    return names
+
+
 def _joined(name: str) -> str:
     plain = "_".join(re.sub(r'[\\/:*?"<>|\x00-\x1f]', "_", name.replace("/", "_")).split()) or "photo"
     if len(plain.encode()) <= LONGEST:

@@ -19,6 +19,7 @@ from ..geometry.cameras import Camera, flip_camera_axes
 from ..geometry.frames import focus_point
 from ..geometry.similarity import similarity_scale
 from ..images.encode import write_layers, write_picture
+from ..images.names import frame_names
 from ..images.picture import to_linear
 from ..params import RenderParams
 from ..progress import Reporter
@@ -133,7 +134,7 @@ def chosen_cameras(params: RenderParams, scene: Scene) -> list[tuple[str, Camera
         raise InputError("No cameras to render from.", advice)
     size = 1600
     return [
-        (Path(v.name).stem, v.camera.resized(*training_size(v.camera, size)), v.camera_to_world)
+        (v.name, v.camera.resized(*training_size(v.camera, size)), v.camera_to_world)
         for v in (scene.views[i] for i in indices)
     ]
 
@@ -146,7 +147,7 @@ def read_cameras(path: Path) -> list[tuple[str, Camera, np.ndarray]]:
     """
     try:
         data = json.loads(Path(path).read_text(encoding="utf-8"))
-        cameras = []
+        places, poses = [], []
         for number, frame in enumerate(data["frames"]):
             lens = {**data, **frame}
             width, height = int(lens["w"]), int(lens["h"])
@@ -159,9 +160,9 @@ def read_cameras(path: Path) -> list[tuple[str, Camera, np.ndarray]]:
                 cx=lens.get("cx", width / 2),
                 cy=lens.get("cy", height / 2),
             )
-            name = Path(frame.get("file_path", f"{number:04d}")).stem
-            cameras.append((name, camera, flip_camera_axes(np.array(frame["transform_matrix"], np.float64))))
-        return cameras
+            places.append(str(frame.get("file_path", f"{number:04d}")))
+            poses.append((camera, flip_camera_axes(np.array(frame["transform_matrix"], np.float64))))
+        return [(name, *posed) for name, posed in zip(frame_names(places), poses)]
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}.", "Give a cameras file.") from error
     except (json.JSONDecodeError, KeyError, TypeError, ValueError) as error:

@@ -86,7 +86,7 @@ for name in ("a", "a_depth", "a_unknown", "b"):
 cameras = {}
 for name in "ab":
     cameras[name] = bpy.data.objects.new(name, bpy.data.cameras.new(name))
-    cameras[name]["fieldwork_role"], cameras[name]["fieldwork_project"] = f"camera:{name}.jpg", "capture"
+    cameras[name]["fieldwork_role"], cameras[name]["fieldwork_project"] = f"camera:{name}", "capture"
     scene.collection.objects.link(cameras[name])
 def show(kind, photos):
     steps = result.show_steps(scene, files, kind, photos, Owner("capture"))

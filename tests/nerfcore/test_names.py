@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 from fieldwork.nerfcore.cli import main
+from fieldwork.nerfcore.data.load import load_scene
 from fieldwork.nerfcore.engine import protocol as rpc
 from fieldwork.nerfcore.files import name_problem
-from fieldwork.nerfcore.images.names import LONGEST, unique_names
+from fieldwork.nerfcore.images.names import LONGEST, frame_names, unique_names
 from fieldwork.nerfcore.params import (
     BlendParams,
     EvaluateParams,
@@ -22,7 +23,10 @@ from fieldwork.nerfcore.params import (
     TrainParams,
 )
 from fieldwork.nerfcore.project.schema import ImageRecord
+from fieldwork.nerfcore.project.store import load_points, load_poses, load_project, save_poses, save_project
+from fieldwork.nerfcore.render.verb import chosen_cameras
 from fieldwork.nerfcore.verbs import VERBS
+from fieldwork.tests.nerfcore.support.ball import ball_project
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
@@ -110,3 +114,29 @@ def test_json_of_a_wrong_name(tmp_path: Path, capfd: pytest.CaptureFixture[str])
     error = json.loads(capfd.readouterr().out)["error"]
     assert error["code"] == "usage"
     assert "“..” is no name" in error["message"]
+
+
+@pytest.mark.parametrize(
+    ("places", "names"),
+    [
+        (["./train/r_0", "./train/r_1"], ["r_0", "r_1"]),
+        (["images/f.001.png", "images/f.002.png"], ["f.001", "f.002"]),
+        (["f.001", "f.002"], ["f.001", "f.002"]),
+        (["left/0.jpg", "../right/0.jpg"], ["left_0", "right_0"]),
+        (["a", "a"], ["a_0", "a_1"]),
+    ],
+)
+def test_no_two_frames_of_a_cameras_file_share_a_name(places: list[str], names: list[str]) -> None:
+    assert frame_names(places) == names
+
+
+def test_renders_of_photos_with_dots_in_their_names_stay_apart(tmp_path: Path) -> None:
+    project = ball_project(tmp_path / "p")
+    data = load_project(project)
+    poses = load_poses(project)
+    for record, posed in zip(data.images, poses.images):
+        record.name = posed.name = f"frame.{record.name}"
+    save_project(project, data)
+    save_poses(project, poses, load_points(project))
+    cameras = chosen_cameras(RenderParams(project=project, out=tmp_path, all=True), load_scene(project))
+    assert len({name for name, *_ in cameras}) == len(data.images)

@@ -199,7 +199,7 @@ class EvaluateParams(Params):
     project: Path
     run: RunName = "main"
     split: Literal["test", "train"] = "test"
-    speed: bool = Field(default=True, description="measure frame times too")
+    speed: bool = Field(default=False, description="measure frames of 800x800 too; on a CPU this can take minutes")
 
 
 class RenderParams(Params):

@@ -141,7 +141,7 @@ def run_job(job: Job, project: Path, out: Path, report: Reporter, keep: bool = F
     )
     memory = _peak(device)
     _reset_peak(device)
-    evaluated = evaluate(EvaluateParams(project=project, run=job.name, speed=False), report)
+    evaluated = evaluate(EvaluateParams(project=project, run=job.name), report)
     folder = run_folder(project, job.name)
     figures = {
         "job": _description(job),

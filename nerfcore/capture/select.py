@@ -10,9 +10,9 @@ import numpy as np
 from ..images.sharpness import same_picture
 from ..project.schema import ImageRecord
 
-# A photo is left out when its sharpness is below this share of the median of its neighbours in the capture.
-BLUR_SHARE = 0.1
-MIN_PHOTOS_TO_JUDGE = 8
+# Not tuned.
+BLUR_SHARE = 0.1  # of the median sharpness of a camera's photos, below which one is left out
+MIN_PHOTOS_TO_JUDGE = 8  # of a camera
 
 
 def reject_duplicates(

@@ -18,7 +18,7 @@ from ..progress import Reporter
 
 VIDEO_SUFFIXES = {".mp4", ".mov", ".m4v", ".webm", ".mkv", ".avi", ".mts", ".m2ts", ".3gp", ".mpg", ".mpeg"}
 INDEX_FILE = "frames.json"
-GREY_WIDTH = 640
+GREY_WIDTH = 640  # pixels, at which the sharpness of frames is compared; not tuned
 
 
 def extract_frames(video: Path, folder: Path, count: int, report: Reporter) -> list[Path]:

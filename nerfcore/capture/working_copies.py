@@ -25,8 +25,8 @@ from ..project.schema import ImageRecord
 from .find import Source
 
 CACHE_FILE = "jobs/ingested.json"
-MAX_ASPECT = 3.0
-SPHERE_WIDTH = 5000
+# Not tuned. Wider pictures are stitched ones; full spheres are exactly 2:1 and at least this wide.
+MAX_ASPECT, SPHERE_WIDTH = 3.0, 5000
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,6 @@ def _ingest_one(source: Source, settings: Settings) -> tuple[ImageRecord, np.nda
         photo = read_photo(source.path, settings.max_size, settings.exposure)
         width, height = photo.full_size
         aspect = max(width, height) / min(width, height)
-        # Exactly 2:1 and large is how full spheres are stored.
         sphere = aspect == 2 and max(width, height) >= SPHERE_WIDTH
         if photo.facts.get("panorama") or aspect > MAX_ASPECT or sphere:
             raise InputError(f"a panorama ({width}×{height}): poses need single photos, not stitched ones")

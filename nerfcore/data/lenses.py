@@ -8,7 +8,7 @@ from ..geometry.cameras import Camera
 from ..kernels.device import backend_of
 
 MODELS = ("PINHOLE", "OPENCV", "OPENCV_FISHEYE", "EQUIRECTANGULAR")
-STEPS = 25  # of Newton's method
+STEPS = 25  # of Newton's method; it doubles the correct digits in each, near the solution
 CHUNK = 1 << 18  # pixels that are worked on at once
 
 

@@ -122,7 +122,8 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
 
     Returns:
         {"psnr", "ssim", "lpips", "miou", "per_class_iou", "fps", "rps", "spr", "ms_sampling", "ms_network",
-        "params_m", "memory_mb", "images", "background", …}; what was not measured is None. Of runs with refined poses
+        "params_m", "memory_mb", "images", "background", …}; what was not measured is None, as "fps", "spr",
+        "ms_sampling" and "ms_network" are unless `params.speed` asks for them. Of runs with refined poses
         training views are rendered from those and held-out ones from poses fitted to their photos;
         "psnr_given_poses" is what the latter score without that.
     Raises:
@@ -191,7 +192,7 @@ def evaluation_inputs(params: EvaluateParams) -> Fingerprint:
     return {
         "trained field": checkpoint_id(folder, params.run),
         "classes": class_inputs(scene),
-        "settings": digest([params.split, params.speed, info.config.model_dump(mode="json")]),
+        "settings": digest([params.split, info.config.model_dump(mode="json")]),
         **view_inputs(scene, scene.test if params.split == "test" else scene.train, files=True),
     }
 

@@ -14,7 +14,7 @@ from .encoding import frequency_encoding
 from .grid import VertexGrid, level_layout
 from .mlp import MLP, compute_dtype
 
-DIRECTION_FEATURES = 16
+DIRECTION_FEATURES = 16  # spherical harmonics of degrees 0 to 3
 
 
 class _TruncatedExp(torch.autograd.Function):

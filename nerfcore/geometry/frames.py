@@ -8,6 +8,7 @@ import numpy as np
 
 from .similarity import make_similarity, transform_points
 
+# Not tuned.
 UNCERTAIN = 0.5  # confidence below which a level group of cameras is looked for
 GROUND_THICKNESS = 0.015  # of the height of the points
 GROUND_TILT = 6.0  # degrees from level

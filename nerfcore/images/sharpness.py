@@ -6,7 +6,7 @@ import numpy as np
 from PIL import Image
 from scipy import ndimage
 
-WORKING_SIZE = 1000
+WORKING_SIZE = 1000  # pixels of the long side; not tuned
 
 
 def sharpness(image: Image.Image) -> float:

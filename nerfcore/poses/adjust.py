@@ -11,12 +11,12 @@ import pycolmap
 
 from .features import FULL_MODEL_FROM, LONG_LENS
 
-PRINCIPAL_POINT_FROM = 10  # photos through one lens
-MAX_POINT_ERROR = 4.0  # pixels
-ROUNDS = 2  # the loss follows the residuals, which follow the loss
+PRINCIPAL_POINT_FROM = 10  # photos through one lens; not tuned
+MAX_POINT_ERROR = 4.0  # pixels; COLMAP's filter_max_reproj_error
+ROUNDS = 2  # not tuned: the loss follows the residuals, which follow the loss
 CAUCHY = 2.385  # of the noise: as good as least squares to 95 % if all matches were right (Holland and Welsch, 1977)
-RAYLEIGH = 1.1774  # median length of a vector whose two parts have unit variance
-TOLERANCE = 1e-6  # relative change of the cost; the default, none, takes five times as long for the same lens
+RAYLEIGH = 1.1774  # √(2 ln 2): median length of a vector whose two parts have unit variance
+TOLERANCE = 1e-6  # relative change of the cost; pycolmap's default, 0, takes five times as long for the same lens
 
 
 def has_long_lens(model: Any) -> bool:

@@ -29,6 +29,7 @@ REPORT_FILE = "poses/report.json"
 PICTURE_FILE = "poses/report.png"
 STATE_FILE = "state.json"
 MIN_PHOTOS = 3
+# By name, matched besides those that retrieval finds. Of video as in COLMAP's sequential matching; of photos not tuned.
 PHOTO_NEIGHBOURS, VIDEO_NEIGHBOURS = 3, 10
 
 

@@ -15,10 +15,11 @@ import pycolmap
 
 from .presets import Level
 
+# Not tuned, but for the last two: docs/experiments.md, “What the pose stage was made of”.
 FULL_MODEL_FROM = 15  # photos of one camera at which its lens is given all of OPENCV's parameters in the end
 LONG_LENS = 1.5  # focal length in long sides from which a lens counts as long (view narrower than 37°)
-FOCAL_GUESS = 0.85  # of the long side, where EXIF says nothing
-RETRIEVAL_FEATURES = 256
+FOCAL_GUESS = 0.85  # of the long side, where EXIF says nothing: 31 mm in terms of 35 mm film
+RETRIEVAL_FEATURES = 256  # of a photo; fewer where photos are many, which are all compared
 PAIRS_PER_IMAGE = 16
 
 

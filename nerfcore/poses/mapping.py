@@ -11,9 +11,9 @@ import pycolmap
 from . import resume
 from .validate import ImageCheck, check_images
 
-REPAIR_ROUNDS = 2
+REPAIR_ROUNDS = 2  # of taking out wrong poses and placing their photos again; not tuned
 SNAPSHOT_EVERY = 40  # photos
-SEED = 1
+SEED = 1  # of RANSAC
 
 
 def mapper_options(relaxed: bool, count: int, names: list[str]) -> Any:

@@ -22,9 +22,10 @@ from .resume import mapping_folder
 from .transfer import start_model
 from .validate import MIN_MATCHES, MIN_POINTS, ImageCheck, pair_images
 
+# Not tuned: the first two, which only choose the sentence that says why a photo has no pose.
 MIN_FEATURES = 100
 MIN_COMMON = 40
-MIN_REGISTERED = 3
+MIN_REGISTERED = 3  # photos of a model that is not given up
 LEVEL_FILE = "level.json"  # features of the model in poses/sparse
 
 

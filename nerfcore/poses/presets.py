@@ -41,6 +41,7 @@ LADDERS: dict[str, tuple[Level, ...]] = {
     "standard": (STANDARD, MORE_PAIRS, MORE_FEATURES, AFFINE),
     "robust": (MORE_FEATURES, AFFINE),
 }
+# Sizes, numbers of features and limits: docs/experiments.md, “What the pose stage was made of”; not tuned further.
 ENOUGH = 0.9  # share of photos with a pose at which the climbing stops
 EXHAUSTIVE_UP_TO = 40  # photos; beyond, pairs are chosen by retrieval
 EXHAUSTIVE_AT_MOST = 250  # photos; more pairs than that take hours even as a last resort

@@ -17,6 +17,7 @@ from .presets import AFFINE
 from .transfer import start_model
 from .validate import MIN_MATCHES, ImageCheck, check_images, pair_images
 
+# Not tuned; what they bring: docs/experiments.md, “A second look at photos that were left out”.
 NEIGHBOURS = 2  # by name, to either side
 MATES = 6  # by retrieval
 AT_MOST = 48  # photos that get further features: they take seconds each

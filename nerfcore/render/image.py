@@ -18,7 +18,7 @@ from .fused import ray_renderer
 from .model import Model
 from .run import RunInfo
 
-CPU_RAYS = 8192
+CPU_RAYS = 8192  # at once
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from ..project.store import world_from_sfm
 from .migration import migrate_info, migrate_tensors
 from .model import Model
 
-CPU_IMAGE_SIZE, GPU_IMAGE_SIZE = 800, 1600
+CPU_IMAGE_SIZE, GPU_IMAGE_SIZE = 800, 1600  # longest side of the photos in training; see `train.image_size`
 REFINED_POSES = "poses.json"  # of a run with train.refine_poses
 PIXEL_FEATURES = "voxel_init.safetensors"  # of a run with field.voxel_init=cnn
 

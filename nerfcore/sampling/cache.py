@@ -11,8 +11,8 @@ import torch
 from ..data.pixels import PixelStore
 from ..kernels.march import sample
 
-TILE = 16
-RAYS = 1 << 17
+TILE = 16  # pixels a side; not tuned
+RAYS = 1 << 17  # at once
 
 
 class CoarseCache:

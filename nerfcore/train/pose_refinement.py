@@ -24,8 +24,8 @@ from ..geometry.similarity import similarity_scale
 from ..kernels.device import backend_of
 from ..project.schema import PosedImage, Poses
 
-# Not tuned: the next four.
-BETAS = (0.9, 0.99)  # of Adam, as for the field
+BETAS = (0.9, 0.99)  # of Adam, as for the field: Müller et al., Instant Neural Graphics Primitives, 2022
+# Not tuned: the next three.
 LAST_RATE = 0.01  # of the first one, at the end of training
 ALL_LEVELS = 0.5  # progress from which the finest level moves cameras too
 FIRST_LEVELS = 0.375  # share of the levels that do so from the start

@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 from fieldwork.tests.nerfcore.support.backends import device
 from fieldwork.tests.nerfcore.support.captures import ingest, poses
+from fieldwork.tests.nerfcore.support.reconstructed import place, reconstructed
 
-__all__ = ["device", "fountain"]
+__all__ = ["device", "fountain", "place", "reconstructed"]
 
 Data = Callable[[str], Path]
 

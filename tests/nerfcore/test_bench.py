@@ -6,7 +6,6 @@ import json
 import re
 import threading
 import time
-import warnings
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -14,20 +13,16 @@ from pathlib import Path
 import pytest
 import torch
 from click.testing import CliRunner
-from fieldwork.nerfcore.bench import gpu, machine, tables
+from fieldwork.nerfcore.bench import machine
 from fieldwork.nerfcore.bench.jobs import Job, interrupted
 from fieldwork.nerfcore.bench.machine import run_yardstick
 from fieldwork.nerfcore.bench.page import figures_folder
-from fieldwork.nerfcore.bench.results import Asked, read_sets, write_set
-from fieldwork.nerfcore.bench.scenes import available
-from fieldwork.nerfcore.bench.suites import ABLATION, ROBUSTNESS, TIMED, baselines, plan
-from fieldwork.nerfcore.config import make_config
+from fieldwork.nerfcore.bench.results import read_sets
 from fieldwork.nerfcore.errors import Cancelled, InputError, SettingError
 from fieldwork.nerfcore.params import BenchParams, TrainParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.verbs import run_verb
 from fieldwork.tests.nerfcore.support.ball import SMALL
-from fieldwork.tests.nerfcore.test_bench_page import some_set
 from fieldwork.tests.nerfcore.test_training import tiny_project  # noqa: F401
 from PIL import Image
 
@@ -226,13 +221,6 @@ def test_two_scenes_of_one_name_are_refused(tiny_project: Path, tmp_path: Path) 
         run_verb("bench", params, Reporter())
 
 
-def test_a_variant_is_what_its_name_says() -> None:
-    (job,) = plan(
-        BenchParams(suite="ablation", steps=5, variants=["explicit"], set={"field.branch": "implicit"}), ["a"]
-    )
-    assert job.settings["field.branch"] == "explicit"
-
-
 def test_a_run_that_fails_does_not_stop_the_others(tiny_project: Path, tmp_path: Path) -> None:  # noqa: F811
     broken = {**TINY, "train.network_rate": "1e30", "train.grid_rate": "1e30"}
     report = Reporter()
@@ -253,58 +241,6 @@ def test_unknown_variants_and_scenes_are_named(tiny_project: Path, tmp_path: Pat
         run_verb("bench", BenchParams(suite="speed", out=tmp_path, data=tmp_path / "nowhere"), Reporter())
 
 
-def test_every_variant_is_made_of_settings_that_exist() -> None:
-    for settings in (*ABLATION.values(), *ROBUSTNESS.values(), *baselines().values()):
-        make_config("standard", settings)
-
-
-def test_simulated_scenes_need_no_data(tmp_path: Path) -> None:
-    assert available("museum", None)
-    assert available("facade", tmp_path)
-    assert not available("replica_room", None)
-    assert not available("replica_room", tmp_path)
-
-
-def test_the_plan_has_equal_steps_and_equal_time() -> None:
-    jobs = plan(BenchParams(suite="ablation"), ["museum"])
-    assert {job.variant for job in jobs if job.steps} >= set(ABLATION)
-    assert {job.variant for job in jobs if job.seconds} == set(TIMED)
-    assert len({job.name for job in jobs}) == len(jobs)
-    assert {job.seconds for job in plan(BenchParams(suite="speed"), ["lego_400"])} == {120.0, 600.0}
-    assert {(job.seconds, job.steps) for job in plan(BenchParams(suite="ablation", seconds=5), ["a"])} == {(5.0, None)}
-
-
-def test_the_figures_are_trained_with_two_seeds_unless_one_is_set() -> None:
-    jobs = plan(BenchParams(suite="figures"), ["museum"])
-    assert [(job.steps, job.seconds, job.seed, job.settings["train.seed"]) for job in jobs] == [
-        (600, None, 0, "0"),
-        (600, None, 1, "1"),
-    ]
-    assert len({job.name for job in jobs}) == 2
-    (job,) = plan(BenchParams(suite="figures", set={"train.seed": "7"}), ["museum"])
-    assert (job.seed, job.settings["train.seed"]) == (None, "7")
-    jobs = plan(BenchParams(suite="ablation", steps=5, seeds=[2, 3], variants=["hybrid", "explicit"]), ["museum"])
-    assert [(job.variant, job.settings["train.seed"]) for job in jobs] == [
-        ("hybrid", "2"),
-        ("hybrid", "3"),
-        ("explicit", "2"),
-        ("explicit", "3"),
-    ]
-
-
-def test_rows_of_several_seeds_are_compared_within_their_seed() -> None:
-    results = [
-        {"job": {"scene": "a", "variant": variant, "steps": 5, "seed": seed}, "psnr": psnr, "miou": None}
-        for variant, seed, psnr in (
-            ("hybrid", 0, 20.0),
-            ("hybrid", 1, 22.0),
-            ("explicit", 0, 19.0),
-            ("explicit", 1, 23.0),
-        )
-    ]
-    assert [row.get("psnr_gain") for row in tables.make_rows("ablation", results)] == [None, None, -1.0, 1.0]
-
-
 def test_the_yardstick_runs_beside_us(tmp_path: Path) -> None:
     script = tmp_path / "other.py"
     script.write_text(
@@ -314,83 +250,6 @@ def test_the_yardstick_runs_beside_us(tmp_path: Path) -> None:
     script.write_text("raise SystemExit('no data')\n")
     with pytest.raises(InputError, match="no data"):
         run_yardstick(script, 3, Reporter())
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
-def test_without_a_gpu_nothing_is_made_up(tmp_path: Path) -> None:
-    page = tmp_path / "benchmarks.md"
-    result = run_verb("bench", BenchParams(suite="gpu", out=tmp_path, page=page), Reporter())
-    assert set(result["figures"].values()) == {None}
-    assert "Not measured: no NVIDIA GPU" in page.read_text("utf-8")
-    assert not figures_folder(page).exists()
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
-def test_without_a_gpu_what_one_measured_stays(tmp_path: Path) -> None:
-    page = tmp_path / "benchmarks.md"
-    asked = Asked(figures={"800×800 colour (frames/s)": 75.0}, checks="12 of 12", waits={"model.py:12": 3})
-    write_set(figures_folder(page), some_set(suite="gpu", command="make gpu-check", asked=asked))
-    run_verb("bench", BenchParams(suite="gpu", out=tmp_path, page=page), Reporter())
-    text = page.read_text("utf-8")
-    assert "| 800×800 colour (frames/s) | ≥ 60 | 75 | met |" in text
-    assert "| lego_400: PSNR after 60 s (dB) | ≥ 33 | not measured |  |" in text
-    assert "Kernels: 12 of 12" in text
-    assert "no NVIDIA GPU was at hand" not in text
-
-
-def test_the_gpu_page_says_what_was_met_and_what_was_missed(tmp_path: Path) -> None:
-    rows = [
-        {
-            "scene": "lego_400",
-            "budget": "60 s",
-            "psnr": 33.4,
-            "miou": None,
-            "fps_800": 75.0,
-            "memory_training_mb": 900.0,
-        },
-        {
-            "scene": "replica_room",
-            "budget": "60 s",
-            "psnr": 29.0,
-            "miou": 0.9,
-            "fps_800": 50.0,
-            "memory_training_mb": 800.0,
-        },
-    ]
-    tests = tmp_path / "tests.xml"
-    tests.write_text('<testsuites><testsuite tests="14" skipped="2" failures="1" errors="0"/></testsuites>')
-    values = gpu.figures(rows, 3.0)
-    text = gpu.section("Some GPU", gpu.kernel_checks(tests), values, "TABLE", {"model.py:12": 3})
-    assert "11 of 12 agree with their twins" in text
-    assert "| lego_400: PSNR after 60 s (dB) | ≥ 33 | 33.4 | met |" in text
-    assert "| 800×800 colour and classes (frames/s) | ≥ 60 | 50 | missed |" in text
-    assert "| peak memory, rendering (MiB) | ≤ 1144 | not measured |  |" in text
-    assert "| host synchronisations in an ordinary step | ≤ 0 | 3 | missed |" in text
-    assert "`model.py:12` (3×)" in text
-
-
-def test_synchronisations_are_counted_in_ordinary_steps_only() -> None:
-    def step(index: int) -> None:
-        if index % 4 == 0 or index == 9:
-            warnings.warn("called a synchronizing CUDA operation (Triggered internally)", UserWarning, stacklevel=1)
-        warnings.warn("something else", UserWarning, stacklevel=1)
-
-    counted, places = gpu.count_synchronisations(step, 8, 8, 4)
-    assert counted == 6
-    assert sum(places.values()) == 1
-    assert next(iter(places)).startswith("nerfcore/test_bench.py:")
-
-
-def test_ablation_verdicts_follow_the_figures() -> None:
-    def row(variant: str, psnr: float, miou: float | None) -> dict:
-        return {"scene": "a", "budget": "10 steps", "variant": variant, "psnr": psnr, "miou": miou}
-
-    rows = [row("hybrid", 30, 0.9), row("explicit", 29, 0.8), row("implicit", 25, 0.85)]
-    assert "hybrid beats both" in tables.verdicts("ablation", rows)[0]
-    rows[1]["miou"] = 0.95
-    assert "hybrid does not beat both" in tables.verdicts("ablation", rows)[0]
-    rows[1]["miou"] = None
-    assert tables.verdicts("ablation", rows) == []
 
 
 def test_the_command_line_has_the_verb() -> None:

@@ -153,7 +153,7 @@ def params(project: Path, **values) -> TrainParams:
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     project = ball_project(tmp_path_factory.mktemp("runs") / "ball")
     train(params(project), Reporter())
-    evaluate(EvaluateParams(project=project, speed=False), Reporter())
+    evaluate(EvaluateParams(project=project), Reporter())
     return project
 
 
@@ -273,7 +273,7 @@ def test_holdout(project: Path) -> None:
     assert load_info(project, "main").images == [name for name in every if name not in ("00", "08")]
     train(params(project, run="third", holdout=3), Reporter())
     assert load_info(project, "third").images == [name for i, name in enumerate(every) if i % 3]
-    assert evaluate(EvaluateParams(project=project, run="third", speed=False), Reporter())["images"] == 6
+    assert evaluate(EvaluateParams(project=project, run="third"), Reporter())["images"] == 6
     train(params(project, run="all", holdout=0), Reporter())
     assert load_info(project, "all").images == every
     with pytest.raises(InputError, match="no held-out photos: all were trained on"):
@@ -293,6 +293,6 @@ def test_hold_out_nothing_or_something(tmp_path: Path) -> None:
 def test_a_moved_project_works(project: Path, tmp_path: Path) -> None:
     moved = project.rename(tmp_path / "moved")
     assert train(params(moved, steps=14, resume=True), Reporter())["steps"] == 14
-    assert evaluate(EvaluateParams(project=moved, speed=False), Reporter())["images"] == 2
+    assert evaluate(EvaluateParams(project=moved), Reporter())["images"] == 2
     with pytest.raises(ProjectError, match=r"the folder is not there.*Connect the disk"):
         train(params(project), Reporter())

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ import pytest
 import torch
 from fieldwork.nerfcore.config import make_config, preset_names
 from fieldwork.nerfcore.errors import Cancelled, DiskError, ProjectError, SettingError, TrainingError
+from fieldwork.nerfcore.evaluate.speed import measure_speed
 from fieldwork.nerfcore.geometry.cameras import Camera
 from fieldwork.nerfcore.geometry.points import Points
 from fieldwork.nerfcore.params import EvaluateParams, MeshParams, RenderParams, TrainParams
@@ -97,6 +99,7 @@ def test_a_short_training_learns_colours_classes_and_shape(trained: Path) -> Non
     assert result["psnr"] > 20
     assert result["miou"] > 0.85
     assert result["lpips"] is None
+    assert result["fps"] is result["ms_network"] is None  # a frame of 800×800 takes minutes of a large field on a CPU
     assert (trained / result["pictures"][0]).is_file()
     mesh = run_verb("mesh", MeshParams(project=trained, resolution=48), Reporter())
     assert set(mesh["classes"]) - {"void"} == {"top", "bottom"}
@@ -112,6 +115,13 @@ def test_a_short_training_learns_colours_classes_and_shape(trained: Path) -> Non
         assert (outward > 0).mean() > 0.9
         assert (data["class_id"][upper] == 1).mean() > 0.9
         assert data["colors"][upper].mean(0)[0] > data["colors"][upper].mean(0)[2]
+
+
+def test_speed_is_measured_on_request(trained: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fieldwork.nerfcore.evaluate.verb.measure_speed", partial(measure_speed, side=40))
+    result = run_verb("evaluate", EvaluateParams(project=trained, speed=True), Reporter())
+    assert result["fps_size"] == [40, 40]
+    assert all(result[key] > 0 for key in ("fps", "spr", "ms_sampling", "ms_network"))
 
 
 def test_a_textured_mesh_has_uvs_and_colours(trained: Path, tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from .errors import SettingError, wrong_value
 PRESETS = Path(__file__).parent / "presets"
 # Earlier names of settings, still understood in `--set`, in preset files and in stored runs.
 RENAMED = {"sampling.interest": "sampling.importance"}
-MOST_VERTICES = 2048  # along a side of the finest level that a run chooses by itself
+MOST_VERTICES = 2048  # along a side of the finest level that a run chooses by itself; not tuned
 
 
 class Stage(BaseModel):

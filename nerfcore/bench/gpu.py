@@ -24,7 +24,7 @@ ASKED = {
     "peak memory, rendering (MiB)": ("≤", 1.2e9 / 2**20),
     "host synchronisations in an ordinary step": ("≤", 0.0),
 }
-WARM_STEPS, COUNTED_STEPS = 300, 32
+WARM_STEPS, COUNTED_STEPS = 300, 32  # past the warm-up of the grid; two updates of it
 
 
 def located(caught: Sequence[Any]) -> Counter[str]:

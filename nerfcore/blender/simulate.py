@@ -32,7 +32,7 @@ from .process import run_in_blender
 SCENES = ("museum", "facade")
 SETTINGS = "simulate.json"
 START = datetime(2026, 5, 18, 10, 0, 0)
-FOCAL_MM = 28.0
+FOCAL_MM = 28.0  # of a 36 mm wide sensor, noted in the photos' EXIF
 
 
 def simulate(params: SimulateParams, report: Reporter) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from ..errors import SettingError
 from ..params import DoctorParams
 from ..progress import Reporter
 
+# Below these it warns; nothing is refused.
 MINIMUM_DISK_GB = 2.0
 MINIMUM_GPU_GB = 4.0
 INSTALL_HINT = "Repair the engine in the preferences, or run `make venv` again."

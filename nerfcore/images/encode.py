@@ -11,7 +11,7 @@ from ..errors import DiskError
 from ..files import atomic_path
 from .picture import Picture, to_bytes, to_srgb8
 
-SRGB_PRIMARIES = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)  # x, y of red, green, blue and white
+SRGB_PRIMARIES = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)  # x, y of red, green, blue and white: IEC 61966-2-1
 
 
 def write_picture(path: Path, picture: Picture | np.ndarray) -> None:

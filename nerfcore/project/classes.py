@@ -15,7 +15,7 @@ PALETTE = (
     "e69f00", "56b4e9", "009e73", "f0e442", "0072b2", "d55e00", "cc79a7", "8c564b", "7f7fff", "b2df8a", "17becf", "9467bd",
 )  # fmt: skip
 VOID_COLOR = (0.0, 0.0, 0.0)
-GOLDEN_ANGLE = 0.381966
+GOLDEN_ANGLE = 0.381966  # (3 − √5) / 2 of a turn: multiples of it stay apart
 MOST_CLASSES = 254  # ids go up to 65535, but pixels are kept as one byte of class index each, one of them for void
 
 

@@ -16,7 +16,7 @@ from .classes import MOST_CLASSES, class_color, read_classes
 from .schema import Project, SemanticClass
 from .store import edit_project, load_project
 
-MOST_ID = 65535
+MOST_ID = 65535  # label maps have at most 16 bits
 
 
 def classes(params: ClassesParams, report: Reporter) -> dict[str, Any]:

@@ -24,7 +24,8 @@ MESH_RECORD = "mesh.json"  # in exports/<run>: what the mesh beside it was made 
 MEASURES = "measures.json"  # in exports/<run>: areas and volumes of the mesh beside it
 RENDER_RECORD = "render.json"  # in a folder of renders: what they were made from
 NEW, OLD = ".new", ".old"
-HOLDOUT = 8  # every so many photos one is held out, unless a run says otherwise
+# Every so many photos one is held out, unless a run says otherwise: as usual since NeRF (Mildenhall et al., 2020).
+HOLDOUT = 8
 
 
 def run_folder(project: Path, run: str) -> Path:

@@ -1,4 +1,4 @@
-"""The pages name only what there is: links, files, functions, settings, rooms, verbs."""
+"""The pages name only what there is: links, files, functions, options, settings, packages, verbs."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+from fieldwork.nerfcore.cli import _command
 from fieldwork.nerfcore.config import RunConfig
 from fieldwork.nerfcore.verbs import VERBS
 
@@ -74,6 +75,25 @@ def test_files_and_functions_that_a_page_names_exist(page: Path) -> None:
 
 
 @NAMED
+def test_options_that_a_page_names_exist(page: Path) -> None:
+    known = {"--help", "--addons", "--python"}  # the last two are Blender's
+    for verb in VERBS:
+        known.update(option for param in _command(verb).params for option in (*param.opts, *param.secondary_opts))
+    named = re.findall(r"(?<![\w-])--[a-z][a-z-]+", page.read_text("utf-8"))
+    assert sorted(set(named) - known) == []
+
+
+def test_experiments_that_the_code_names_have_an_entry() -> None:
+    entries = (ROOT / "docs" / "experiments.md").read_text("utf-8")
+    named = set()
+    for file in (ROOT / "nerfcore").rglob("*.py"):
+        text = re.sub(r"\n\s*# ", " ", file.read_text("utf-8"))
+        named.update(re.findall(r"experiments\.md, “([^”]+)”", text))
+    assert named
+    assert sorted(name for name in named if f": {name}\n" not in entries) == []
+
+
+@NAMED
 def test_settings_that_a_page_names_exist(page: Path) -> None:
     stages = {stage: type(info.default).model_fields for stage, info in RunConfig.model_fields.items()}
     named = [re.match(r"(\w+)\.(\w+)(?:=|$)", text) for text in code(page)]
@@ -81,17 +101,17 @@ def test_settings_that_a_page_names_exist(page: Path) -> None:
     assert [f"{stage}.{name}" for stage, name in found if name not in stages[stage]] == []
 
 
-def test_every_room_is_on_the_map() -> None:
+def test_every_package_is_on_the_map() -> None:
     contracts = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["importlinter"]["contracts"]
-    rooms = {
-        room
+    packages = {
+        package
         for contract in contracts
         if contract["type"] == "layers"
-        for floor in contract["layers"]
-        for room in re.split(r" [|:] ", floor)
+        for layer in contract["layers"]
+        for package in re.split(r" [|:] ", layer)
     }
     named = {part for text in code(ROOT / "docs" / "architecture.md") for part in text.split(", ")}
-    assert sorted(rooms - named) == []
+    assert sorted(packages - named) == []
 
 
 def test_every_verb_is_explained() -> None:

@@ -21,7 +21,7 @@ from ...images.decode import image_size
 from ...images.names import beside, find_image, plain_name
 from ..dataset import Dataset, DatasetView, require
 
-EARTH = 5_000_000.0  # metres from the centre of the earth beyond which coordinates are geocentric
+EARTH = 5_000_000.0  # metres from the centre of the earth beyond which coordinates are geocentric: its radius is 6.4 million
 
 
 def matches(folder: Path) -> bool:

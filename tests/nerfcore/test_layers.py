@@ -1,4 +1,4 @@
-"""Rooms stand in floors: imports run downwards only, and there is no circle. The floors are in pyproject.toml."""
+"""Packages stand in layers: imports run downwards only, and there is no circle. The layers are in pyproject.toml."""
 
 from __future__ import annotations
 

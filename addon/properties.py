@@ -326,6 +326,28 @@ class FieldworkScene(PropertyGroup):
         items=[("none", "One", "One object"), ("classes", "One per Class", "One object for each class")],
     )
 
+    # Measure
+    distances: StringProperty(
+        name="Distances",
+        description="Table (.csv) of distances to measure, some known to scale by or to check with; empty: none",
+        subtype="FILE_PATH",
+    )
+    scale_error: FloatProperty(
+        name="Scale Error",
+        description="Standard uncertainty of the scale in percent; 0: by the distances, or by how the scale was set",
+        default=0.0,
+        min=0.0,
+        soft_max=5.0,
+    )
+    caps: FloatProperty(
+        name="Caps",
+        description="How much of its area caps over openings may have of a thing whose volume is given",
+        default=0.1,
+        min=0.0,
+        max=0.95,
+        subtype="FACTOR",
+    )
+
     # Export
     export_to: EnumProperty(name="Format", description="What is written", items=EXPORTS)
     export_split: EnumProperty(

@@ -242,6 +242,26 @@ class MeshParams(Params):
     )
 
 
+class MeasureParams(Params):
+    project: Path
+    run: RunName = "main"
+    distances: Path | None = Field(
+        default=None,
+        description="table (.csv: name,from,to,metres,u_mm,use) of distances to measure; known ones scale or check",
+    )
+    scale_error: float | None = Field(
+        default=None,
+        ge=0,
+        description="standard uncertainty of the scale in percent; default: by the distances, or how it was set",
+    )
+    caps: float = Field(
+        default=0.1,
+        ge=0,
+        lt=1,
+        description="share of its area that caps over openings may have of a thing with a volume",
+    )
+
+
 class BlendParams(Params):
     project: Path
     out: Path

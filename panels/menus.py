@@ -24,6 +24,7 @@ class FIELDWORK_MT_steps(Menu):
         layout.operator("fieldwork.evaluate")
         layout.operator("fieldwork.render")
         layout.operator("fieldwork.mesh")
+        layout.operator("fieldwork.measure")
         layout.operator("fieldwork.import_scene")
         layout.operator("fieldwork.blend")
         layout.operator("fieldwork.export")

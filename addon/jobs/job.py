@@ -27,6 +27,7 @@ TITLES = {
     "evaluate": "Measuring",
     "render": "Rendering",
     "mesh": "Extracting Mesh",
+    "measure": "Measuring the Mesh",
     "blend": "Writing .blend",
     "export": "Exporting",
     "batch": "Reconstructing Many",

@@ -23,7 +23,7 @@ from .clean import areas, clean, compact, components
 from .decimate import decimate
 from .extract import extract
 from .field_values import shade
-from .fusion import TRUNCATION, fuse_maps
+from .fusion import TRUNCATION, coarser, fuse_maps
 from .refine import refined_maps
 from .region import Region, choose_region
 from .surface import Surface, face_classes, vertex_normals
@@ -34,13 +34,15 @@ LITTLE_AGREEMENT, LITTLE_IN_ONE = 0.3, 0.5  # shares below which the user is tol
 
 @dataclass(frozen=True)
 class Built:
-    """A surface in the normalised frame, where it was looked for, and what gives other points of it their colours."""
+    """A surface in the normalised frame, where it was looked for, and what gives other points of it their colours.
+    coarse: vertices (V, 3) and faces (F, 3) of the same surface at voxels of twice the size, not cleaned."""
 
     surface: Surface
     region: Region
     maps: MapArrays
     photos: Photos
     trained: Trained
+    coarse: tuple[np.ndarray, np.ndarray]
 
     def colors(self, points: np.ndarray, normals: np.ndarray, report: Reporter) -> np.ndarray:
         """Colours (N, 3) uint8 of surface points: the photos', and the field's where no photo shows them."""
@@ -74,6 +76,7 @@ def build(trained: Trained, project: Project, scene: Scene, params: MeshParams, 
     bricks = fuse_maps(maps, region, report)
     report.stage("Extracting the surface")
     vertices, faces = extract(bricks, report)
+    coarse = extract(coarser(bricks), report)
     report.stage("Cleaning the surface")
     tolerance = TRUNCATION * region.voxel
     if len(faces):
@@ -88,7 +91,7 @@ def build(trained: Trained, project: Project, scene: Scene, params: MeshParams, 
     report.stage("Reading colours and classes")
     photos = Photos(store, maps, np.array([flat.photo for flat in flats]), len(trained.info.class_ids), tolerance)
     surface = dressed(trained, scene, region, photos, vertices, faces, report)
-    return Built(surface, region, maps, photos, trained)
+    return Built(surface, region, maps, photos, trained, coarse)
 
 
 def wanted_bounds(params: MeshParams, scene: Scene, box: Box) -> tuple[np.ndarray, np.ndarray] | None:

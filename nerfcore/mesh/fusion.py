@@ -69,6 +69,31 @@ def fuse_maps(maps: MapArrays, region: Region, report: Reporter) -> Bricks:
     return Bricks(origin, h, index, np.concatenate(distance), np.concatenate(weight), np.concatenate(known))
 
 
+def coarser(bricks: Bricks) -> Bricks:
+    """Every second corner: the grid that fusing with voxels of twice the size would give, but for its truncation, as
+    distances are those of single points."""
+    shape = np.array(bricks.index.shape)
+    padded = np.full(shape + shape % 2, -1, np.int32)
+    padded[: shape[0], : shape[1], : shape[2]] = bricks.index
+    x, y, z = (n // 2 for n in padded.shape)
+    children = padded.reshape(x, 2, y, 2, z, 2).transpose(0, 2, 4, 1, 3, 5).reshape(x, y, z, 8)
+    found = (children >= 0).any(-1)
+    index = np.full(found.shape, -1, np.int32)
+    index[found] = np.arange(int(found.sum()), dtype=np.int32)
+    made = [
+        np.zeros((int(found.sum()), BRICK, BRICK, BRICK), a.dtype)
+        for a in (bricks.distance, bricks.weight, bricks.known)
+    ]
+    half = BRICK // 2
+    for number, child in enumerate(children[found].T):
+        corner = np.array(np.unravel_index(number, (2, 2, 2))) * half
+        block = tuple(slice(c, c + half) for c in corner)
+        there = child >= 0
+        for new, old in zip(made, (bricks.distance, bricks.weight, bricks.known)):
+            new[(there, *block)] = old[child[there]][:, ::2, ::2, ::2]
+    return Bricks(bricks.origin, 2 * bricks.voxel, index, *made)
+
+
 def _mark(maps: MapArrays, origin: np.ndarray, voxel: float, counts: np.ndarray, report: Reporter) -> np.ndarray:
     """Number the bricks (X, Y, Z) that lie near a hit; −1 elsewhere."""
     device = maps.depth.device

@@ -10,10 +10,15 @@ import numpy as np
 from PIL import Image
 
 from ..errors import ProjectError
+from ..project.fingerprints import digest, read_made, rounded
+from ..project.runs import MESH_RECORD
+from ..project.schema import ProvenanceStep
+from ..project.store import load_project, world_from_sfm
 from .files import Texture, texture_of
 from .surface import Surface
 
 MESH = "mesh.npz"
+COARSE = "mesh_coarse.npz"  # the same surface at cells of twice the size
 TEXTURE = "texture.png"
 
 
@@ -42,3 +47,36 @@ def load_surface(project: Path, run: str) -> tuple[Surface, Texture | None]:
         return surface, None
     with Image.open(picture) as image:
         return surface, texture_of(surface.faces, uv, np.array(image.convert("RGB")))
+
+
+def load_coarse(project: Path, run: str) -> tuple[np.ndarray, np.ndarray]:
+    """The surface of a run at cells of twice the size, in the world: vertices (V, 3) and faces (F, 3).
+
+    Raises:
+        ProjectError: there is none, or its file is damaged.
+    """
+    path = mesh_folder(project, run) / COARSE
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            return data["vertices"].astype(np.float64), data["faces"]
+    except FileNotFoundError as error:
+        raise ProjectError(f"{path} is missing.", "Run `fieldwork mesh` again.") from error
+    except (OSError, ValueError, KeyError, BadZipFile) as error:
+        raise ProjectError(f"{path} is damaged: {error}.", "Run `fieldwork mesh` again.") from error
+
+
+def mesh_record(project: Path, run: str) -> ProvenanceStep:
+    """What the mesh of a run was made from, provided that it still lies where the project does.
+
+    Raises:
+        ProjectError: nothing is known of the mesh, or the project was turned, moved or scaled since.
+    """
+    made = read_made(mesh_folder(project, run) / MESH_RECORD)
+    if made is None:
+        raise ProjectError(f"The run “{run}” has no mesh, or an unfinished one.", "Run `fieldwork mesh` first.")
+    if made.inputs.get("alignment") != digest(rounded(world_from_sfm(load_project(project)))):
+        raise ProjectError(
+            "The project was aligned anew since its mesh was made: the mesh lies elsewhere, or is of another size.",
+            "Run `fieldwork mesh` again.",
+        )
+    return made

@@ -83,21 +83,10 @@ def class_evidence(
     """
     votes = np.zeros((len(pieces), len(class_ids)), np.float32)
     total, looked = np.zeros(len(pieces), np.float32), np.zeros(len(pieces), np.float32)
-    index = _index_of(class_ids)
-    # The middle, and half way to each corner.
-    corners = pieces.vertices[pieces.faces]
-    places = [pieces.centers, *((corners[:, k] + pieces.centers) / 2 for k in range(3))]
+    index = index_of(class_ids)
 
     def read(number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        face, column = seen.of(number)
-        photo, weight = photos[number], seen.weight[face, column]
-        if photo.labels is None or not len(face):
-            return face[:0], np.zeros((0, len(class_ids)), np.float32), np.zeros(0, np.float32)
-        labels, sure = photo.labels()
-        label = index[np.minimum(labels, len(index) - 1)]
-        local = [photo.view.local(place[face]) for place in places]
-        found = [read_votes(photo.view, part, label, sure, len(class_ids)) for part in local]
-        return face, sum(f[0] for f in found) * weight[:, None], sum(f[1] for f in found) * weight
+        return view_votes(photos[number], number, pieces, seen, index, len(class_ids))
 
     for _, (face, vote, amount) in in_parallel(read, range(len(photos)), report, "label maps"):
         votes[face] += vote
@@ -116,7 +105,29 @@ def class_evidence(
     return Evidence(_shared(pieces, own, colors, blank), own, bool(sparse))
 
 
-def _index_of(class_ids: Sequence[int]) -> np.ndarray:
+def view_votes(
+    photo: Photo, number: int, pieces: Facelets, seen: Observations, index: np.ndarray, classes: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What the label map of photo `number` says: facelets (N,) it is among the best for, their votes (N, C), and how much
+    of them is labelled at all (N,), both weighted by how well it sees them.
+
+    Args:
+        index: index of each class id, see `index_of`; classes: how many.
+    """
+    face, column = seen.of(number)
+    if photo.labels is None or not len(face):
+        return face[:0], np.zeros((0, classes), np.float32), np.zeros(0, np.float32)
+    weight = seen.weight[face, column]
+    labels, sure = photo.labels()
+    label = index[np.minimum(labels, len(index) - 1)]
+    center, corners = pieces.centers[face], pieces.vertices[pieces.faces[face]]
+    # The middle, and half way to each corner.
+    places = [center, *((corners[:, k] + center) / 2 for k in range(3))]
+    found = [read_votes(photo.view, photo.view.local(place), label, sure, classes) for place in places]
+    return face, sum(f[0] for f in found) * weight[:, None], sum(f[1] for f in found) * weight
+
+
+def index_of(class_ids: Sequence[int]) -> np.ndarray:
     """Index of each class id; −1 for ids of no class, with one more place for all that are larger."""
     index = np.full(max(class_ids, default=0) + 2, -1, np.int32)
     index[list(class_ids)] = np.arange(len(class_ids))
@@ -213,7 +224,7 @@ def class_maps(
     report: Reporter,
 ) -> ClassMaps:
     """Classes on a texture of `size`: facelets of one class are filled, in the others every texel asks the label maps."""
-    pieces, index = buffers.pieces, _index_of(class_ids)
+    pieces, index = buffers.pieces, index_of(class_ids)
     kind = np.uint8 if max([*class_ids, void]) < 256 else np.uint16
     ids, sure = np.full((size, size), void, kind), np.zeros((size, size), np.uint8)
     known = np.zeros((size, size), bool)

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..data.load import class_inputs, load_scene, view_inputs
 from ..files import atomic_path
-from ..geometry.similarity import similarity_scale
+from ..geometry.similarity import similarity_scale, transform_points
 from ..images.picture import to_bytes
 from ..params import MeshParams
 from ..progress import Reporter
@@ -25,6 +25,7 @@ from .files import check_format, texture_of, write_surface
 from .instances import GAP, find_instances, write_instances
 from .painted import Painted, paint_surface, training_photos, write_maps
 from .photos import Photo
+from .stored import COARSE
 from .surface import class_table, is_watertight, to_world
 from .turntable import write_turntable
 
@@ -68,7 +69,9 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
         sure = {"confidence": painted.classes.confidence, "face_confidence": painted.classes.face_confidence}
         uv = {} if painted.uv is None else {"uv": painted.uv.corners}
         np.savez(file, **vars(surface), **sure, **uv)
-    files = [target / "mesh.npz", write_instances(target, instances)]
+    with atomic_path(target / COARSE) as temporary, open(temporary, "wb") as file:
+        np.savez(file, vertices=transform_points(box.world_from_box, built.coarse[0]), faces=built.coarse[1])
+    files = [target / "mesh.npz", target / COARSE, write_instances(target, instances)]
     files += write_maps(target, painted, {c.id: c.color for c in scene.classes})
     for path in [target / "mesh.ply", *([params.out] if params.out else [])]:
         files += write_surface(path, surface, names, params.split == "classes" and path == params.out, texture)

@@ -102,14 +102,19 @@ def _scale_factor(scale: tuple[str, str, float], frame: np.ndarray, poses: Poses
     first, second, metres = scale
     if not np.isfinite(metres) or metres <= 0:
         raise SettingError(f"The distance {metres:g} is not positive.", "Give metres, such as 0.85.")
-    length = float(np.linalg.norm(_point(first, frame, poses) - _point(second, frame, poses)))
+    length = float(np.linalg.norm(placed_point(first, frame, poses) - placed_point(second, frame, poses)))
     if length < 1e-9:
         raise SettingError(f"{first} and {second} are the same place.", "Choose two that are well apart.")
     return metres / length
 
 
-def _point(text: str, frame: np.ndarray, poses: Poses) -> np.ndarray:
-    """A point of the world: three numbers, or the centre of the camera of that name."""
+def placed_point(text: str, frame: np.ndarray, poses: Poses) -> np.ndarray:
+    """A point (3,) of the world: three numbers with commas, or the centre of the camera of that name; `frame` (4, 4):
+    world from sfm.
+
+    Raises:
+        SettingError: it is neither.
+    """
     for image in poses.images:
         if image.name == text:
             return transform_pose(frame, np.array(image.camera_to_world))[:3, 3]

@@ -142,3 +142,12 @@ def test_curve_picture_shows_both_lines():
         left, right = rows[columns < 8].mean(), rows[columns >= 56].mean()
         assert (right - left) * slope > 10
     assert draw_curve([(0, 1.0, float("nan")), (1, 1.0, float("nan"))], 8, 8).shape == (8, 8, 4)
+
+
+def test_sizes_are_said_with_as_many_digits_as_they_are_sure():
+    from fieldwork.panels.measure import amount_text
+
+    row = {"area": 1.2384, "area_low": 1.21, "area_high": 1.27, "volume": None, "volume_low": None, "volume_high": None}
+    assert amount_text(row, "area", "m²") == "1.24 ± 0.03 m²"
+    assert amount_text(row | {"area": 140.2, "area_low": 120, "area_high": 160}, "area", "") == "140 ± 20"
+    assert amount_text(row, "volume", "m³") == ""

@@ -83,7 +83,7 @@ def triangle(trained: Trained, *_: Any) -> SimpleNamespace:
     surface = Surface(
         corners, face, corners, np.full((3, 3), 128, np.uint8), np.ones(3, np.int32), np.ones(1, np.int32)
     )
-    return SimpleNamespace(trained=trained, surface=surface, region=SimpleNamespace(voxel=0.1))
+    return SimpleNamespace(trained=trained, surface=surface, region=SimpleNamespace(voxel=0.1), coarse=(corners, face))
 
 
 def smaller(stage: workflow.Stage, values: dict[str, Any]) -> workflow.Stage:

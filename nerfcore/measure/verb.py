@@ -1,0 +1,187 @@
+"""The verb `measure`: areas, volumes and distances of a mesh, each with its uncertainty."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..data.load import load_scene
+from ..data.scene import Scene
+from ..files import write_json
+from ..geometry.similarity import transform_pose
+from ..mesh.facelets import Facelets, facelets
+from ..mesh.instances import Instance, read_instances
+from ..mesh.painted import LONGEST, training_photos
+from ..mesh.photos import Photo
+from ..mesh.stored import load_coarse, load_surface, mesh_folder, mesh_record
+from ..mesh.surface import Surface
+from ..mesh.surface_labels import index_of, view_votes
+from ..mesh.visibility import DepthBuffers, in_parallel, observe
+from ..params import MeasureParams
+from ..progress import Reporter
+from ..project.runs import MEASURES
+from ..project.store import load_poses, load_project, record_step, world_from_sfm
+from ..render.run import load_info, refined_poses
+from .amounts import Amount, K, Labelled, area_amounts, summed, transferred, volume_amount
+from .resampling import Pieces, Votes, area_deviations
+from .scale import Distance, Scale, read_distances, scale_of, u_measured
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Amounts by class and by instance, in their order; None for the volume of what is open."""
+
+    areas: list[Amount]
+    volumes: list[Amount | None]
+    instance_areas: list[Amount]
+    instance_volumes: list[Amount | None]
+
+
+def measure(params: MeasureParams, report: Reporter) -> dict[str, Any]:
+    """Measure the mesh of a run and write measures.json beside it.
+
+    Returns:
+        {"unit": "m" or "scene units", "scale": {"u_percent", "source", "factor"}, "classes" and "instances":
+        [{"id", "name", "area", "area_low", "area_high", "volume", "volume_low", "volume_high"}], "distances": [{"name",
+        "use", "length", "low", "high", "known", "difference"}], "file"}; lows and highs are the ends of 95 % intervals,
+        volumes None where a thing is open.
+    Raises:
+        ProjectError: there is no mesh, or the project was aligned anew since. InputError: the file of distances.
+    """
+    folder = Path(params.project)
+    project, poses = load_project(folder), load_poses(folder)
+    surface, _ = load_surface(folder, params.run)
+    voxel = float(mesh_record(folder, params.run).result["voxel"])
+    target = mesh_folder(folder, params.run)
+    distances = [] if params.distances is None else read_distances(params.distances, world_from_sfm(project), poses)
+    scale = scale_of(project, poses, distances, voxel, params.scale_error)
+    if abs(scale.factor - 1) > K * max(scale.u, 1e-6):
+        report.warn(
+            f"By the distances to scale by, lengths are {100 * (scale.factor - 1):+.2f} % off: set the scale with "
+            "`fieldwork align --scale`, then run `fieldwork mesh` and `fieldwork measure` again."
+        )
+    info = load_info(folder, params.run)
+    scene = load_scene(folder, info.holdout)
+    world_from_box = info.box(project).world_from_box
+    refined = {n: transform_pose(world_from_box, p) for n, p in refined_poses(folder, params.run, info).items()}
+    photos = training_photos(scene, np.eye(4), refined)
+    instances = read_instances(target)
+    coarse, known = load_coarse(folder, params.run), present(surface, scene)
+    pieces = facelets(surface.vertices, surface.faces, limit=float(np.ptp(surface.vertices, axis=0).max()) * LONGEST)
+    report.stage("Reading label maps")
+    votes = gathered_votes(photos, pieces, list(known), report)
+    if known and not len(votes.piece):
+        report.warn("No photo has a label map: how sure the borders of classes are is not known and not counted.")
+    report.stage("Measuring")
+    measured = amounts(surface, pieces, coarse, voxel, list(known), instances, votes, scale.u, params.caps, report)
+    result: dict[str, Any] = {
+        "unit": scale.unit,
+        "scale": {"u_percent": round(100 * scale.u, 4), "source": scale.source, "factor": round(scale.factor, 6)},
+        "classes": [
+            {"id": c, "name": name, **entries(area, volume)}
+            for (c, name), area, volume in zip(known.items(), measured.areas, measured.volumes)
+        ],
+        "instances": [
+            {"id": i.id, "name": i.name, "class_id": i.class_id, **entries(area, volume)}
+            for i, area, volume in zip(instances, measured.instance_areas, measured.instance_volumes)
+        ],
+        "distances": [distance_entry(d, scale, voxel) for d in distances],
+    }
+    report.stage("Writing")
+    write_json(target / MEASURES, result)
+    result["file"] = str(target / MEASURES)
+    record_step(folder, "measure", params.model_dump(mode="json"), result)
+    return result
+
+
+def present(surface: Surface, scene: Scene) -> dict[int, str]:
+    """Names of the classes on a surface by id; void is none."""
+    names = {c.id: c.name for c in scene.classes}
+    ids = sorted(set(np.unique(surface.face_class).tolist()) - {scene.ignore_id})
+    return {c: names.get(c, str(c)) for c in ids}
+
+
+def amounts(
+    surface: Surface,
+    pieces: Facelets,
+    coarse: tuple[np.ndarray, np.ndarray],
+    voxel: float,
+    class_ids: list[int],
+    instances: list[Instance],
+    votes: Votes,
+    u_scale: float,
+    most_capped: float,
+    report: Reporter,
+) -> Measured:
+    """Areas and volumes of the classes and instances of a surface.
+
+    Args:
+        pieces: of the surface; coarse: the surface (vertices, faces) at cells of twice the size; voxel: side of the
+            fine ones. votes: for `class_ids`. u_scale: relative uncertainty of lengths. most_capped: share of a closed
+            part's area that caps may have.
+    """
+    of_class = index_of(class_ids)[np.minimum(surface.face_class, max(class_ids, default=0) + 1)]
+    of_instance = np.zeros(len(surface.faces), np.int64)
+    if surface.face_instance is not None:
+        of_instance = surface.face_instance.astype(np.int64)
+    labels = Pieces(pieces.centers, pieces.areas, of_class[pieces.parent], of_instance[pieces.parent])
+    u_class, u_instance = area_deviations(labels, votes, len(instances))
+    vertices = surface.vertices.astype(np.float64)
+    fine = [Labelled(vertices, surface.faces, label) for label in (of_class + 1, of_instance)]
+    rough = transferred(coarse, pieces.centers, [labels.label + 1, labels.instance], voxel)
+    by_class, by_instance = (
+        area_amounts(f.areas(n)[1:], r.areas(n)[1:], u, u_scale)
+        for f, r, n, u in zip(fine, rough, (len(class_ids) + 1, len(instances) + 1), (u_class, u_instance))
+    )
+    volumes = []
+    for number, instance in enumerate(instances):
+        report.progress(number / len(instances), instance.name)
+        one, other = (part[1].closed(instance.id, most_capped) for part in (fine, rough))
+        volumes.append(volume_amount(one, other, by_instance[number].value, voxel, u_scale))
+    together = [
+        summed([volume for volume, i in zip(volumes, instances) if i.class_id == class_id]) for class_id in class_ids
+    ]
+    return Measured(by_class, together, by_instance, volumes)
+
+
+def gathered_votes(photos: list[Photo], pieces: Facelets, class_ids: list[int], report: Reporter) -> Votes:
+    """The votes of all photos with a label map for the pieces that they are among the best to see."""
+    classes, index = len(class_ids), index_of(class_ids)
+    labelled = [photo for photo in photos if photo.labels is not None]
+    if not labelled or not classes:
+        return Votes(0, np.zeros(0, int), np.zeros(0, int), np.zeros((0, classes)))
+    seen = observe(DepthBuffers([photo.view for photo in labelled], pieces), report)
+
+    def read(number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return view_votes(labelled[number], number, pieces, seen, index, classes)
+
+    found = [(n, face, vote) for n, (face, vote, _) in in_parallel(read, range(len(labelled)), report, "label maps")]
+    photo = np.repeat([n for n, *_ in found], [len(face) for _, face, _ in found])
+    return Votes(len(labelled), photo, np.concatenate([f for _, f, _ in found]), np.concatenate([v for *_, v in found]))
+
+
+def entries(area: Amount, volume: Amount | None) -> dict[str, Any]:
+    """An area and a volume as JSON, with what their uncertainties are made of."""
+    row: dict[str, Any] = {}
+    for name, amount in (("area", area), ("volume", volume)):
+        low, high = (None, None) if amount is None else amount.interval
+        row |= {name: None if amount is None else amount.value, f"{name}_low": low, f"{name}_high": high}
+    row["area_u"] = {"scale": area.u_scale, "photos": area.u_photos, "geometry": area.u_geometry}
+    return row
+
+
+def distance_entry(distance: Distance, scale: Scale, voxel: float) -> dict[str, Any]:
+    """A distance as JSON: measured, with its 95 % interval, and beside what is known of it."""
+    length, spread = distance.length, K * u_measured(distance, scale, voxel)
+    return {
+        "name": distance.name,
+        "use": distance.use,
+        "length": length,
+        "low": max(0.0, length - spread),
+        "high": length + spread,
+        "known": distance.known,
+        "difference": None if distance.known is None else length - distance.known,
+    }

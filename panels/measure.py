@@ -1,0 +1,60 @@
+"""The Measure panel."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from bpy.types import Context, UILayout
+
+from ..addon.project import snapshot
+from ..addon.text import t
+from .base import StepPanel, columns, project_folder
+
+MOST_ROWS = 12  # of what was measured
+
+
+class FIELDWORK_PT_measure(StepPanel):
+    bl_label = "Measure"
+
+    def draw(self, context: Context) -> None:
+        layout, settings = self.layout, context.scene.fieldwork
+        folder = project_folder(context)
+        path = folder / "exports" / settings.run / "measures.json" if folder else None
+        measures = snapshot.cached_json(path) if path else None
+        if measures:
+            self.draw_state(True, t("{} instances measured", len(measures.get("instances", []))))
+            draw_measures(layout, measures)
+        else:
+            self.draw_state(False, t("Not measured yet"))
+        column = columns(layout)
+        for name in ("distances", "scale_error", "caps"):
+            column.prop(settings, name)
+        layout.operator("fieldwork.measure", icon="DRIVER_DISTANCE")
+
+
+def draw_measures(layout: UILayout, measures: dict[str, Any]) -> None:
+    """Area and volume of each class with half their intervals."""
+    metric = measures.get("unit") == "m"
+    box = layout.box().column(align=True)
+    for row in measures.get("classes", [])[:MOST_ROWS]:
+        line = box.split(factor=0.3)
+        line.label(text=row["name"], translate=False)
+        parts = [amount_text(row, name, power if metric else "") for name, power in (("area", "m²"), ("volume", "m³"))]
+        line.label(text="   ".join(part for part in parts if part), translate=False)
+    if not metric:
+        box.label(text=t("In scene units: the scale is not known"))
+
+
+def amount_text(row: dict[str, Any], name: str, unit: str) -> str:
+    """A value with half of its 95 % interval, to the digits that this leaves: “1.24 ± 0.03 m²”; empty without one."""
+    value = row.get(name)
+    if value is None:
+        return ""
+    half = (row[f"{name}_high"] - row[f"{name}_low"]) / 2
+    digits = 0
+    while digits < 6 and half * 10**digits < 1:
+        digits += 1
+    return f"{value:.{digits}f} ± {half:.{digits}f} {unit}".rstrip()
+
+
+CLASSES = [FIELDWORK_PT_measure]

@@ -1,0 +1,223 @@
+"""Areas and volumes with their intervals: held against simulated surfaces whose true sizes are known."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from fieldwork.nerfcore.config import RunConfig
+from fieldwork.nerfcore.errors import InputError, ProjectError
+from fieldwork.nerfcore.measure.closing import border_loops, closed
+from fieldwork.nerfcore.measure.resampling import Votes
+from fieldwork.nerfcore.measure.scale import read_distances, scale_of
+from fieldwork.nerfcore.measure.verb import Measured, amounts, measure
+from fieldwork.nerfcore.mesh.facelets import facelets
+from fieldwork.nerfcore.mesh.instances import find_instances, write_instances
+from fieldwork.nerfcore.mesh.stored import COARSE, MESH, mesh_folder
+from fieldwork.nerfcore.mesh.surface import Surface, vertex_normals
+from fieldwork.nerfcore.params import MeasureParams
+from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.project.fingerprints import digest, rounded, write_made
+from fieldwork.nerfcore.project.runs import INFO, MEASURES, MESH_RECORD, run_folder
+from fieldwork.nerfcore.project.schema import Poses, Project, step
+from fieldwork.nerfcore.project.store import edit_project, load_project, world_from_sfm
+from fieldwork.nerfcore.render.run import RunInfo
+from fieldwork.tests.nerfcore.support.ball import RADIUS, ball_project
+from fieldwork.tests.nerfcore.support.flat import box_mesh, wall_mesh
+from skimage.measure import marching_cubes
+
+SIDE, ROUND = 33, 11.0  # corners of the grid, radius of the ball in its cells
+U_SCALE = 0.005
+RIM = 0.3  # height, in radii, of the border between the two classes
+
+
+def noisy_ball(random: np.random.Generator) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    """A ball of radius 1 as it comes out of noisy distances, at cells of h and of 2h: vertices and faces of each."""
+    axis = np.arange(SIDE) - SIDE // 2 + random.uniform(-0.5, 0.5, (3, 1))
+    distance = np.sqrt(sum(g**2 for g in np.meshgrid(*axis, indexing="ij"))) - ROUND
+    distance += random.normal(scale=0.1, size=distance.shape)
+    made = []
+    for every in (1, 2):
+        vertices, faces, *_ = marching_cubes(distance[::every, ::every, ::every], 0.0, gradient_direction="descent")
+        made.append(((vertices * every + axis[:, 0]) / ROUND, faces))
+    return made[0], made[1]
+
+
+def voted(centers: np.ndarray, random: np.random.Generator, photos: int = 12) -> Votes:
+    """Label maps of photos around the ball, each with its own error of where the border runs: 0 above it, 1 below."""
+    found = []
+    up = centers / np.linalg.norm(centers, axis=1, keepdims=True)
+    for number in range(photos):
+        angle = 2 * np.pi * number / photos
+        towards = np.array([np.cos(angle), np.sin(angle), random.uniform(-0.6, 0.6)])
+        seen = np.flatnonzero(up @ (towards / np.linalg.norm(towards)) > 0.2)
+        above = up[seen, 2] > RIM + random.normal(scale=0.04)
+        found.append((np.full(len(seen), number), seen, np.stack([above, ~above], 1).astype(float)))
+    return Votes(photos, *(np.concatenate(part) for part in zip(*found)))
+
+
+def simulated(seed: int) -> Measured:
+    """One capture of the ball, whose scale is off as well: what is measured of its two classes."""
+    random = np.random.default_rng(seed)
+    (vertices, faces), coarse = noisy_ball(random)
+    factor = 1 + random.normal(scale=U_SCALE)
+    vertices, coarse = vertices * factor, (coarse[0] * factor, coarse[1])
+    pieces = facelets(vertices, faces)
+    votes = voted(pieces.centers, random)
+    mass = np.zeros((len(faces), 2))
+    np.add.at(mass, votes.piece, votes.vote)
+    face_class = np.where(mass.any(1), mass.argmax(1) + 1, np.where(pieces.centers[:, 2] > 0, 1, 2))
+    face_instance, instances = find_instances(vertices, faces, face_class, {}, 0, 0.2)
+    surface = Surface(vertices, faces, vertices, vertices, face_class[:0], face_class, face_instance)
+    return amounts(surface, pieces, coarse, 1 / ROUND, [1, 2], instances, votes, U_SCALE, 0.9, Reporter())
+
+
+def test_true_sizes_lie_in_the_intervals() -> None:
+    """In at least 18 of 20 runs, and intervals are not so wide that they say nothing."""
+    truth = np.array([2 * np.pi * (1 - RIM), 2 * np.pi * (1 + RIM)])
+    cap = np.pi * (1 - RIM) ** 2 * (2 + RIM) / 3
+    solids = np.array([cap, 4 / 3 * np.pi - cap])
+    runs = [simulated(seed) for seed in range(20)]
+    for number in range(2):
+        intervals = np.array([run.areas[number].interval for run in runs])
+        inside = (intervals[:, 0] <= truth[number]) & (truth[number] <= intervals[:, 1])
+        assert inside.sum() >= 18
+        assert np.ptp(intervals, axis=1).mean() < 0.25 * truth[number]
+        bodies = [run.instance_volumes[number] for run in runs]
+        assert all(body is not None for body in bodies)
+        held = [body is not None and body.interval[0] <= solids[number] <= body.interval[1] for body in bodies]
+        assert sum(held) >= 18
+    # Photos matter: without them the border would be thought certain.
+    assert min(run.areas[0].u_photos for run in runs) > 0.003
+
+
+def test_the_volume_of_an_open_box_is_that_of_the_box_with_a_lid() -> None:
+    vertices, faces = box_mesh(0.5)
+    whole = closed(vertices, faces)
+    assert whole is not None
+    assert (whole.volume, whole.capped) == pytest.approx((1.0, 0.0))
+    top = (vertices[faces][..., 2] > 0).all(1)
+    assert closed(vertices, faces[~top]) is None  # a sixth is too much of a lid
+    lid = closed(vertices, faces[~top], 0.2)
+    assert lid is not None
+    assert (lid.volume, lid.capped, lid.uneven) == pytest.approx((1.0, 1 / 6, 0.0))
+    assert closed(vertices, faces[:, ::-1], 0.5) is None  # seen from inside it is a room
+    assert closed(*wall_mesh()[:2], most_capped=0.6) is None  # nothing is inside a wall
+    assert closed(vertices, faces[:0]) is None
+
+
+def test_openings_that_touch_at_a_vertex_are_two() -> None:
+    vertices, faces, _ = wall_mesh(4)
+    middle = vertices[faces].mean(1)
+    hole = (np.abs(middle - [0.15, 0.15, 0]).max(1) < 0.15) | (np.abs(middle + [0.15, 0.15, 0]).max(1) < 0.15)
+    assert sorted(len(loop) for loop in border_loops(faces[~hole])) == [4, 4, 16]
+    box = box_mesh()[1]
+    fin = np.array([[*box[0, :2], 8]])  # a third triangle at an edge
+    assert [len(loop) for loop in border_loops(np.concatenate([box, fin]))] == [3]
+
+
+@pytest.fixture
+def project(tmp_path: Path) -> Path:
+    """The ball, its mesh (two halves of two classes) and a run, as the verbs leave them; its scale is known."""
+    folder = ball_project(tmp_path / "ball", views=10, side=48)
+    with edit_project(folder) as edited:
+        edited.frame.scale_known = True
+    target = mesh_folder(folder, "main")
+    target.mkdir(parents=True)
+    info = RunInfo(
+        preset="draft", config=RunConfig.model_validate({"scene": {"image_size": 48}}), class_ids=[1, 2],
+        priorities=[1.0, 1.0], images=[], sfm_from_box=np.eye(4).tolist(), contracted=False, transparent=True,
+    )  # fmt: skip
+    run_folder(folder, "main").mkdir(parents=True)
+    (run_folder(folder, "main") / INFO).write_text(info.model_dump_json())
+    ball = trimesh.creation.icosphere(4, RADIUS)
+    vertices, faces = np.array(ball.vertices), np.array(ball.faces)
+    face_class = np.where(vertices[faces].mean(1)[:, 2] > 0, 1, 2)
+    face_instance, found = find_instances(vertices, faces, face_class, {1: "top", 2: "bottom"}, 0, 0.05)
+    write_instances(target, found)
+    normals = vertex_normals(vertices, faces)
+    colors, class_id = np.full((len(vertices), 3), 128, np.uint8), np.where(vertices[:, 2] > 0, 1, 2)
+    surface = Surface(vertices, faces, normals, colors, class_id, face_class, face_instance)
+    np.savez(target / MESH, **vars(surface))
+    coarse = trimesh.creation.icosphere(3, RADIUS)
+    np.savez(target / COARSE, vertices=coarse.vertices, faces=coarse.faces)
+    inputs = {"alignment": digest(rounded(world_from_sfm(load_project(folder))))}
+    write_made(target / MESH_RECORD, step("mesh", {}, {"voxel": 0.03}, inputs))
+    return folder
+
+
+def test_the_verb_measures_a_mesh_with_the_label_maps_of_its_photos(project: Path, tmp_path: Path) -> None:
+    table = tmp_path / "lengths.csv"
+    rows = [
+        ("across", "-0.5 0 0", "0.5 0 0", "1.0", "2", "scale"),
+        ("up", "0 0 -0.5", "0 0 0.5", "1.02", "", "check"),
+        ("camera to camera", "00", "01", "", "", ""),
+    ]
+    with open(table, "w", newline="") as file:
+        csv.writer(file).writerows([("name", "from", "to", "metres", "u_mm", "use"), *rows])
+    result = measure(MeasureParams(project=project, distances=table, caps=0.4), Reporter())
+    assert result["unit"] == "m"
+    assert json.loads((mesh_folder(project, "main") / MEASURES).read_text())["classes"] == result["classes"]
+    half, body = 2 * np.pi * RADIUS**2, 2 / 3 * np.pi * RADIUS**3
+    for row in [*result["classes"], *result["instances"]]:
+        assert row["area_low"] < half < row["area_high"]
+        assert row["volume_low"] < body < row["volume_high"]
+        assert row["area_u"]["photos"] > 0
+    assert [row["name"] for row in result["instances"]] == ["top.001", "bottom.001"]
+    across, up, between = result["distances"]
+    assert across["length"] == pytest.approx(1.0)
+    assert up["difference"] == pytest.approx(-0.02)
+    assert between["known"] is None
+    assert between["low"] < between["length"] < between["high"]
+    # One distance, known to 2 mm and picked to a voxel at both ends.
+    assert result["scale"]["u_percent"] == pytest.approx(100 * np.hypot(0.002, np.sqrt(2) * 0.03), rel=1e-3)
+
+
+def test_a_mesh_that_lies_elsewhere_is_not_measured(project: Path) -> None:
+    with edit_project(project) as edited:
+        edited.frame.world_from_sfm = (2 * np.eye(4)).tolist()
+    with pytest.raises(ProjectError, match="aligned anew"):
+        measure(MeasureParams(project=project), Reporter())
+    (mesh_folder(project, "main") / COARSE).unlink()
+    (mesh_folder(project, "main") / MESH_RECORD).unlink()
+    with pytest.raises(ProjectError, match="no mesh"):
+        measure(MeasureParams(project=project), Reporter())
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("name,from\na,b\n", "columns"),
+        ("name,from,to,metres\na,0 0 0,1 0 0,long\n", "line 2"),
+        ("name,from,to,metres,use\na,0 0 0,1 0 0,1,tell\n", "'tell'"),
+        ("name,from,to,metres,use\na,0 0 0,1 0 0,,scale\n", "metres ''"),
+        ("name,from,to,metres\na,0 0 0,1 0 0,-1\n", "positive"),
+        ("name,from,to\na,1 0 0,1 0 0\n", "same place"),
+    ],
+)
+def test_faults_in_the_table_of_distances_are_named(tmp_path: Path, text: str, words: str) -> None:
+    path = tmp_path / "lengths.csv"
+    path.write_text(text)
+    with pytest.raises(InputError, match=words):
+        read_distances(path, np.eye(4), Poses())
+
+
+def test_how_sure_the_scale_is(tmp_path: Path) -> None:
+    path = tmp_path / "lengths.csv"
+    path.write_text("name,from,to,metres,use\na,0 0 0,1 0 0,1.02,scale\nb,0 0 0,0 2 0,1.98,scale\n")
+    project = Project()
+    distances = read_distances(path, np.eye(4), Poses())
+    assert scale_of(project, Poses(), distances, 0.01, None).unit == "scene units"
+    project.frame.scale_known = True
+    assert scale_of(project, Poses(), [], 0.01, None).u == 0
+    assert scale_of(project, Poses(), [], 0.01, 0.5).u == 0.005
+    found = scale_of(project, Poses(), distances, 0.001, None)
+    # The longer one counts four times; the two differ by far more than a voxel would make them.
+    assert found.factor == pytest.approx((1.02 + 4 * 0.99) / 5)
+    assert found.u == pytest.approx(np.sqrt((0.024**2 + 4 * 0.006**2) / 5), rel=1e-6)
+    project.record("align", {"scale": ["a", "b", 0.5]}, {})
+    assert scale_of(project, Poses(), [], 0.001, None).u == pytest.approx(np.sqrt(2) * 0.002)

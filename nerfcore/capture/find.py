@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import stat
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import InputError
-from ..files import require_readable
+from ..files import is_text, printable, require_readable
 from ..images.decode import PHOTO_SUFFIXES
 from ..images.names import beside_all, companion_stems, unique_names
 from ..images.soft_labels import find_confidence, find_probabilities
@@ -48,12 +50,18 @@ def list_photos(folder: Path, exclude: Iterable[Path | None] = ()) -> tuple[list
     problems: list[OSError] = []
     for place, folders, files in os.walk(root, onerror=problems.append):
         here = Path(place)
-        folders[:] = sorted(f for f in folders if not f.startswith(".") and (here / f).resolve() not in skip_folders)
+        inner = sorted(f for f in folders if not f.startswith(".") and (here / f).resolve() not in skip_folders)
+        odd = {name: _odd_folder(here / name) for name in inner}
+        folders[:] = [name for name in inner if not odd[name]]
+        skipped += [{"file": printable(name), "reason": reason} for name, reason in odd.items() if reason]
         for name in sorted(files):
             suffix = Path(name).suffix.lower()
             if name.startswith(".") or suffix in SIDECARS:
                 continue
-            if suffix in PHOTO_SUFFIXES:
+            wrong = _odd_file(here / name)
+            if wrong:
+                skipped.append({"file": printable(name), "reason": wrong})
+            elif suffix in PHOTO_SUFFIXES:
                 photos.append(here / name)
             elif suffix in VIDEO_SUFFIXES:
                 skipped.append({"file": name, "reason": "a video among photos: give it alone as --photos"})
@@ -68,6 +76,27 @@ def list_photos(folder: Path, exclude: Iterable[Path | None] = ()) -> tuple[list
             f"There are no photos in {folder}.", "Choose a folder with JPEG, PNG, TIFF, HEIC or raw files."
         )
     return photos, skipped, root
+
+
+def _odd_folder(path: Path) -> str:
+    """Why a folder among photos is not looked into; empty for a good one."""
+    if not is_text(path.name):
+        return "its name is not UTF-8: rename it"
+    if path.is_symlink():
+        return "a link to a folder, which is not followed: give that folder instead"
+    return "a folder, whatever its name says" if path.suffix.lower() in PHOTO_SUFFIXES else ""
+
+
+def _odd_file(path: Path) -> str:
+    """Why something among photos is no file that could be read; empty for a good one."""
+    if not is_text(path.name):
+        return "its name is not UTF-8: rename it"
+    try:
+        mode = path.stat().st_mode
+    except OSError as error:
+        reasons = {errno.ENOENT: "a link that leads nowhere", errno.ELOOP: "a link that leads to itself"}
+        return reasons.get(error.errno or 0, f"it cannot be read: {error.strerror}")
+    return "" if stat.S_ISREG(mode) else "not a file: a pipe, socket or device"
 
 
 def classes_beside(labels: Path | None) -> Path | None:

@@ -43,14 +43,14 @@ def new(params: NewParams, report: Reporter) -> dict[str, Any]:
     folder, photos = Path(params.project), Path(params.photos)
     inputs = ingest_inputs(params)
     previous = _previous_project(params)
-    classes_file = params.classes or classes_beside(params.labels)
-    classes: Classes = read_classes(classes_file) if classes_file else ({}, 0, {})
+    labels_folder = params.labels or subfolder(photos, "labels")
+    masks_folder = params.masks or subfolder(photos, "masks")
+    classes_file = params.classes or classes_beside(labels_folder)
+    classes = _classes(classes_file, given=params.classes is not None)
     create_folder(folder)
     _remove_halves(folder)
     paths, skipped, root = _photos(params, report)
     kept = [record for record in previous.images if record.file] if previous and params.add else []
-    labels_folder = params.labels or subfolder(photos, "labels")
-    masks_folder = params.masks or subfolder(photos, "masks")
     sources = find_sources(paths, root, labels_folder, masks_folder, {record.name for record in kept})
     settings = _settings(params, paths, sources, classes, report)
 
@@ -65,9 +65,11 @@ def new(params: NewParams, report: Reporter) -> dict[str, Any]:
     present = _present_ids(folder, records, report)
     result = _summary(records, skipped)
     _warn(records, result["rejected"], report)
+    if classes_file and classes[0]:
+        _warn_unnamed(present, classes, classes_file, report)
     origin = {"video_sha256": file_hash(photos)} if photos.is_file() else {}
     with edit_project(folder, Project(mask_mode=params.mask_mode)) as project:
-        _put_in(project, records, present, classes, params, previous is not None)
+        _put_in(project, records, set(present), classes, params, previous is not None)
         result["classes"] = [c.name for c in project.classes]
         project.record("new", params.model_dump(mode="json"), result | origin, inputs)
     return result
@@ -97,7 +99,7 @@ def ingest_inputs(params: NewParams) -> Fingerprint:
             "labels": [f for s in sources for f in (s.label, s.confidence)],
             "masks": [s.mask for s in sources],
         }
-    classes_file = params.classes or classes_beside(params.labels)
+    classes_file = params.classes or classes_beside(labels)
     chosen = params.model_dump(mode="json", include={"mask_mode", "max_size", "frames", "keep_blurry"})
     return {
         "photos": digest([[str(path.relative_to(root)) for path in paths], stamps_digest(paths)]),
@@ -195,15 +197,39 @@ def _check_usable(records: list[ImageRecord], photos: Path, skipped: list[dict[s
     )
 
 
-def _present_ids(folder: Path, records: list[ImageRecord], report: Reporter) -> set[int]:
-    """Class ids that occur in the label maps of the project."""
-    present: set[int] = set()
+def _classes(file: Path | None, given: bool) -> Classes:
+    """What the classes file says; nothing without one. Raises InputError."""
+    if file is None:
+        return {}, 0, {}
+    try:
+        return read_classes(file)
+    except InputError as error:
+        found = "" if given else " The file was found by itself: rename it if it is something else."
+        raise InputError(error.message, error.hint + found) from error
+
+
+def _present_ids(folder: Path, records: list[ImageRecord], report: Reporter) -> dict[int, list[str]]:
+    """Class ids that occur in the label maps of the project, and the photos in whose maps they do."""
+    present: dict[int, list[str]] = {}
     for record in records:
         if record.label:
             report.check()
             with Image.open(folder / record.label) as image:
-                present |= set(np.unique(np.asarray(image)).tolist())
+                for value in np.unique(np.asarray(image)).tolist():
+                    present.setdefault(value, []).append(Path(record.label).name)
     return present
+
+
+def _warn_unnamed(present: dict[int, list[str]], classes: Classes, file: Path, report: Reporter) -> None:
+    """Say which values of label maps the classes file does not name, and what becomes of them."""
+    names, ignore_id, _ = classes
+    for value, maps in sorted(present.items()):
+        if value not in names and value != ignore_id:
+            where = maps[0] + (f" and {len(maps) - 1} more label maps" if len(maps) > 1 else "")
+            report.warn(
+                f"The value {value} in {where} is not named in {file}: it is trained as “class {value}”. Name it there, "
+                f"or give it the void id ({ignore_id}) in the maps."
+            )
 
 
 def _summary(records: list[ImageRecord], skipped: list[dict[str, str]]) -> dict[str, Any]:

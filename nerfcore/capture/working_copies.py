@@ -150,7 +150,10 @@ def _ingest_one(source: Source, settings: Settings) -> tuple[ImageRecord, np.nda
 
 
 def _write_maps(record: ImageRecord, source: Source, photo: Photo, settings: Settings) -> list[str]:
-    """Write the label map, mask and confidence map of a photo, fitted to its working copy; what is wrong with them."""
+    """Write the label map, mask and confidence map of a photo, fitted to its working copy; what is wrong with them.
+
+    A photo whose mask leaves nothing of it is marked as rejected.
+    """
     problems = []
     for kind, given in (("label", source.label), ("mask", source.mask), ("confidence", source.confidence)):
         if given is None:
@@ -167,6 +170,9 @@ def _write_maps(record: ImageRecord, source: Source, photo: Photo, settings: Set
         except InputError as error:
             problems.append(str(error))
             continue
+        if kind == "mask" and not fitted.any():
+            record.status = "rejected"
+            return [f"{named} is black everywhere: white marks what counts"]
         file = f"{kind if kind == 'confidence' else kind + 's'}/{source.name}.png"
         with atomic_path(settings.folder / file) as path:
             small = fitted.astype(np.uint8) if fitted.max(initial=0) < 256 else fitted

@@ -10,6 +10,7 @@ from PIL import Image
 
 from ..errors import InputError
 from ..files import atomic_path
+from ..images.arrays import read_array
 from ..images.decode import FLOAT_SUFFIXES, RAW_SUFFIXES, read_photo
 from ..images.labels import Colors, read_labels, read_mask
 
@@ -100,9 +101,9 @@ def copy_depth(source: Path, folder: Path, name: str, scale: float) -> Path:
 
     if source.suffix.lower() == ".npy":
         try:
-            values = np.load(source, allow_pickle=False)
-        except (OSError, ValueError) as error:
-            raise InputError(f"The depth map {source} cannot be read: {error}.", "Replace or remove it.") from error
+            values = read_array(source)
+        except InputError as error:
+            raise InputError(f"The depth map {source} is damaged: {error}.", "Replace or remove it.") from error
     else:
         pixels = oiio.ImageBuf(str(source))
         if pixels.has_error:

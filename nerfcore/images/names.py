@@ -8,6 +8,8 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
+from ..files import is_text
+
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".exr", ".bmp", ".ppm", ".heic", ".heif")
 # Bytes of a photo's name in the project: file systems take 255, and "_confidence.png" and temporary endings come behind.
 LONGEST = 200
@@ -70,7 +72,7 @@ def list_images(folder: Path) -> list[Path]:
     """Image files directly in `folder`, by name."""
     if not folder.is_dir():
         return []
-    return sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file())
+    return sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and is_text(p.name) and p.is_file())
 
 
 def companion_stems(images: Sequence[Path], root: Path, names: Sequence[str]) -> list[list[str]]:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 import OpenImageIO as oiio
-from numpy.lib.npyio import NpzFile
 from PIL import Image, UnidentifiedImageError
 
 from ..errors import InputError
+from .arrays import read_array
 from .names import beside
 
 PROBABILITY_SUFFIXES = (".npy", ".npz", ".exr")
@@ -38,17 +37,16 @@ def read_probabilities(path: Path) -> np.ndarray:
     Raises:
         InputError: it cannot be read, or holds no probabilities. One clause, fit as a reason.
     """
-    try:
-        if path.suffix.lower() == ".exr":
-            buffer = oiio.ImageBuf(str(path))
-            values = None if buffer.has_error else buffer.get_pixels(oiio.FLOAT)
-            if values is None:
-                raise InputError(f"probability map {path.name} cannot be read: {buffer.geterror() or 'no pixels'}")
-        else:
-            loaded = np.load(path, allow_pickle=False)
-            values = loaded[loaded.files[0]] if isinstance(loaded, NpzFile) else loaded
-    except (OSError, ValueError, IndexError, BadZipFile) as error:
-        raise InputError(f"probability map {path.name} cannot be read: {error}") from error
+    if path.suffix.lower() == ".exr":
+        buffer = oiio.ImageBuf(str(path))
+        values = None if buffer.has_error else buffer.get_pixels(oiio.FLOAT)
+        if values is None:
+            raise InputError(f"probability map {path.name} cannot be read: {buffer.geterror() or 'no pixels'}")
+    else:
+        try:
+            values = read_array(path)
+        except InputError as error:
+            raise InputError(f"probability map {error}") from error
     values = np.asarray(values, np.float32)
     if values.ndim != 3 or values.shape[2] < 2 or values.size == 0:
         raise InputError(

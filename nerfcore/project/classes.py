@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import colorsys
 import json
+from collections.abc import Hashable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from ..errors import InputError
 from .schema import SemanticClass
+
+T = TypeVar("T", bound=Hashable)
 
 # Twelve colours told apart at a glance, also by most colour-blind people (the first seven after Okabe and Ito).
 PALETTE = (
@@ -64,35 +67,70 @@ def read_classes(path: Path) -> tuple[dict[int, str], int, dict[int, tuple[int, 
     Returns:
         names by id (void left out), the ignore id, and RGB colours by id (where given).
     Raises:
-        InputError: the file is missing, not JSON or of another form.
+        InputError: the file is missing, not JSON or of another form, or an id or a name occurs twice.
     """
     hint = 'Write {"ignore_id": 0, "classes": {"1": "stone", "2": "wood"}} or a list of names.'
     try:
-        value: Any = json.loads(Path(path).read_text(encoding="utf-8-sig"))
+        value: Any = json.loads(Path(path).read_text(encoding="utf-8-sig"), object_pairs_hook=_without_repetition)
     except FileNotFoundError as error:
         raise InputError(f"The classes file {path} does not exist.", hint) from error
+    except RecursionError as error:
+        raise InputError(f"The classes file {path} is nested too deeply.", hint) from error
     except (OSError, ValueError) as error:
         raise InputError(f"The classes file {path} cannot be read: {error}.", hint) from error
     try:
-        if isinstance(value, list):
-            ignore_id, entries = 0, dict(enumerate(value))
-        elif isinstance(value, dict) and isinstance(value.get("classes"), list):
-            ignore_id = int(value.get("ignore_id", 0))
-            entries = {int(e.get("id", i)): e for i, e in enumerate(value["classes"])}
-        else:
-            ignore_id = int(value.get("ignore_id", 0))
-            entries = {int(i): entry for i, entry in value["classes"].items()}
-        names = {i: str(e["name"] if isinstance(e, dict) else e) for i, e in entries.items()}
-        colors: dict[int, tuple[int, int, int]] = {}
-        for i, entry in entries.items():
-            if isinstance(entry, dict) and "color" in entry:
-                red, green, blue = (int(c) for c in entry["color"])
-                if not all(0 <= c <= 255 for c in (red, green, blue)):
-                    raise ValueError(f"the colour of {names[i]} is not three numbers from 0 to 255")
-                colors[i] = (red, green, blue)
+        ignore_id, entries = _entries(value)
+        names = {i: _name(i, entry) for i, entry in entries}
+        colors = {i: _color(names[i], e["color"]) for i, e in entries if isinstance(e, dict) and "color" in e}
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"The classes file {path} has an unknown form ({error}).", hint) from error
     if any(i < 0 or i > 65535 for i in names):
         raise InputError(f"The classes file {path} has ids outside 0…65535.", hint)
     names.pop(ignore_id, None)
+    for what, twice in (("have the id", _repeated([i for i, _ in entries])), ("are called", _repeated(names.values()))):
+        if twice is not None:
+            which = f"“{twice}”" if isinstance(twice, str) else twice
+            raise InputError(f"In the classes file {path}, two classes {what} {which}.", "Give every class its own.")
     return names, ignore_id, colors
+
+
+def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """A JSON object whose keys all differ; of equal ones Python would keep the last without a word."""
+    twice = _repeated([key for key, _ in pairs])
+    if twice is not None:
+        raise ValueError(f"“{twice}” occurs twice")
+    return dict(pairs)
+
+
+def _repeated(values: Iterable[T]) -> T | None:
+    """The first value that was there before."""
+    seen: set[T] = set()
+    for value in values:
+        if value in seen:
+            return value
+        seen.add(value)
+    return None
+
+
+def _entries(value: Any) -> tuple[int, list[tuple[int, Any]]]:
+    """The void id, and (id, entry) of each class, of either form of the file."""
+    if isinstance(value, list):
+        return 0, list(enumerate(value))
+    ignore_id = int(value.get("ignore_id", 0))
+    if isinstance(value.get("classes"), list):
+        return ignore_id, [(int(e["id"]) if "id" in e else i, e) for i, e in enumerate(value["classes"])]
+    return ignore_id, [(int(i), entry) for i, entry in value["classes"].items()]
+
+
+def _name(class_id: int, entry: Any) -> str:
+    name = entry["name"] if isinstance(entry, dict) else entry
+    if not isinstance(name, str) or not name.strip():
+        raise ValueError(f"the class {class_id} has no name")
+    return name.strip()
+
+
+def _color(name: str, values: Any) -> tuple[int, int, int]:
+    color = [int(c) for c in values]
+    if len(color) != 3 or not all(0 <= c <= 255 for c in color):
+        raise ValueError(f"the colour of {name} is not three numbers from 0 to 255")
+    return color[0], color[1], color[2]

@@ -14,7 +14,7 @@ from ..images.decode import float_exposure, is_linear
 from ..images.labels import Colors, drawn_as_stored
 from ..params import NewParams
 from ..progress import Reporter, shortened
-from ..project.classes import make_classes, read_classes
+from ..project.classes import make_classes, read_classes, unnamed_values
 from ..project.fingerprints import Earlier, Fingerprint, compare, digest, files_digest, stamps_digest
 from ..project.schema import ImageRecord, Project
 from ..project.store import PROJECT_FILE, create_folder, edit_project, load_project
@@ -66,7 +66,8 @@ def new(params: NewParams, report: Reporter) -> dict[str, Any]:
     result = _summary(records, skipped)
     _warn(records, result["rejected"], report)
     if classes_file and classes[0]:
-        _warn_unnamed(present, classes, classes_file, report)
+        for text in unnamed_values(present, *classes[:2], classes_file):
+            report.warn(text)
     origin = {"video_sha256": file_hash(photos)} if photos.is_file() else {}
     with edit_project(folder, Project(mask_mode=params.mask_mode)) as project:
         _put_in(project, records, set(present), classes, params, previous is not None)
@@ -218,18 +219,6 @@ def _present_ids(folder: Path, records: list[ImageRecord], report: Reporter) -> 
                 for value in np.unique(np.asarray(image)).tolist():
                     present.setdefault(value, []).append(Path(record.label).name)
     return present
-
-
-def _warn_unnamed(present: dict[int, list[str]], classes: Classes, file: Path, report: Reporter) -> None:
-    """Say which values of label maps the classes file does not name, and what becomes of them."""
-    names, ignore_id, _ = classes
-    for value, maps in sorted(present.items()):
-        if value not in names and value != ignore_id:
-            where = maps[0] + (f" and {len(maps) - 1} more label maps" if len(maps) > 1 else "")
-            report.warn(
-                f"The value {value} in {where} is not named in {file}: it is trained as “class {value}”. Name it there, "
-                f"or give it the void id ({ignore_id}) in the maps."
-            )
 
 
 def _summary(records: list[ImageRecord], skipped: list[dict[str, str]]) -> dict[str, Any]:

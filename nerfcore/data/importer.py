@@ -12,13 +12,15 @@ import numpy as np
 from ..errors import InputError, ProjectError
 from ..files import file_hash, require_readable
 from ..geometry.cameras import Camera
+from ..images.labels import read_mask
 from ..params import ImportParams
-from ..progress import Reporter
-from ..project.classes import make_classes
+from ..progress import Reporter, shortened
+from ..project.classes import make_classes, unnamed_values
 from ..project.schema import Frame, ImageRecord, PosedImage, Poses, Project, SemanticClass
 from ..project.store import PROJECT_FILE, create_folder, edit_project, load_project, save_poses
 from .copying import copy_depth, copy_labels, copy_mask, copy_photo
 from .dataset import Dataset, DatasetView
+from .lens_check import lens_problem
 
 # In the order in which "auto" asks them: the more specific layouts first.
 FORMATS = (
@@ -45,13 +47,16 @@ def import_dataset(params: ImportParams, report: Reporter) -> dict[str, Any]:
         report.warn(message)
     create_folder(folder)
     report.stage("Copying images")
-    records, present = [], set()
+    records: list[ImageRecord] = []
+    present: dict[int, list[str]] = {}
     for i, view in enumerate(dataset.views):
         report.progress(i / len(dataset.views), view.name)
         record, ids = _copy_view(view, folder, dataset)
         records.append(record)
-        present |= ids
-    classes = _classes(dataset, present)
+        for value in ids:
+            present.setdefault(value, []).append(view.label.name if view.label else view.name)
+    _warn_of_maps(records, present, dataset, source, folder, report)
+    classes = _classes(dataset, set(present))
     cameras, images = _poses(dataset.views)
     result = {
         "format": dataset.format,
@@ -97,9 +102,16 @@ def read_dataset(source: Path, format: str = "auto") -> Dataset:
 
 
 def _checked(dataset: Dataset, source: Path) -> Dataset:
-    """The data set with exactly orthonormal rotations: files round them to a few digits, some carry a scale."""
+    """The data set with exactly orthonormal rotations: files round them to a few digits, some carry a scale.
+
+    Raises:
+        InputError: a pose is none, or a lens is impossible; it names the image.
+    """
     views = []
     for view in dataset.views:
+        problem = lens_problem(view.camera)
+        if problem:
+            raise InputError(f"The lens of {view.name} in {source} cannot be: {problem}.", "Export the data set again.")
         pose = np.array(view.camera_to_world, np.float64)
         singular = np.linalg.svd(pose[:3, :3], compute_uv=False) if np.isfinite(pose).all() else np.zeros(3)
         if singular.min() < 1e-6 or singular.max() / singular.min() > 1.05 or np.linalg.det(pose[:3, :3]) < 0:
@@ -154,6 +166,24 @@ def _copy_view(view: DatasetView, folder: Path, dataset: Dataset) -> tuple[Image
         split=view.split,
     )
     return record, ids
+
+
+def _warn_of_maps(
+    records: list[ImageRecord],
+    present: dict[int, list[str]],
+    dataset: Dataset,
+    source: Path,
+    folder: Path,
+    report: Reporter,
+) -> None:
+    """Say which values of label maps have no name where others have one, and which masks leave nothing of a photo."""
+    if dataset.class_names:
+        named = source / "classes.json" if (source / "classes.json").is_file() else source
+        for text in unnamed_values(present, dataset.class_names, dataset.ignore_id, named):
+            report.warn(text)
+    black = [record.name for record in records if record.mask and not read_mask(folder / record.mask).any()]
+    if black:
+        report.warn(shortened("Masks that are black everywhere leave nothing of these photos", black))
 
 
 def _relative(path: Path | None, folder: Path) -> str | None:

@@ -94,6 +94,24 @@ def read_classes(path: Path) -> tuple[dict[int, str], int, dict[int, tuple[int, 
     return names, ignore_id, colors
 
 
+def unnamed_values(present: dict[int, list[str]], names: dict[int, str], ignore_id: int, file: Path) -> list[str]:
+    """A sentence for each value of label maps that a classes file does not name.
+
+    Args:
+        present: the values that occur, each with the label maps in which it does.
+        file: where the names come from.
+    """
+    told = []
+    for value, maps in sorted(present.items()):
+        if value not in names and value != ignore_id:
+            where = maps[0] + (f" and {len(maps) - 1} more label maps" if len(maps) > 1 else "")
+            told.append(
+                f"The value {value} in {where} is not named in {file}: it is trained as “class {value}”. Name it there, "
+                f"or give it the void id ({ignore_id}) in the maps."
+            )
+    return told
+
+
 def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """A JSON object whose keys all differ; of equal ones Python would keep the last without a word."""
     twice = _repeated([key for key, _ in pairs])

@@ -1,7 +1,7 @@
 """transforms.json: NeRF's Blender scenes, Instant-NGP and nerfstudio.
 
-Poses are camera-to-world with OpenGL camera axes (x right, y up, looking along −z); the world has z up unless the
-file says otherwise. Intrinsics stand at the top or in each frame.
+Poses are camera-to-world with OpenGL camera axes (x right, y up, looking along −z); which way is up in their world,
+`up_axis` says. Intrinsics stand at the top or in each frame.
 """
 
 from __future__ import annotations
@@ -12,14 +12,16 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from pydantic import ValidationError
 
-from ...errors import InputError
+from ...errors import InputError, wrong_value
 from ...geometry.cameras import Camera, flip_camera_axes
 from ...geometry.points import Points
 from ...images.decode import image_size
 from ...images.names import find_image, labels_and_masks, unique_names
 from ...project.classes import read_classes
-from ..dataset import Y_UP, Dataset, DatasetView, require
+from ..dataset import Dataset, DatasetView, require
+from ..up_axis import choose_up
 
 SPLIT_FILES = {"transforms_train.json": "train", "transforms_test.json": "test", "transforms_val.json": "val"}
 Split = Literal["train", "test", "auto"]
@@ -81,22 +83,26 @@ def read(folder: Path) -> Dataset:
     if (folder / "classes.json").is_file():
         class_names, ignore_id, colors = read_classes(folder / "classes.json")
     convention = str(heads[0].get("camera_convention", "")).lower()
+    up = choose_up(heads[0], [view.camera_to_world for view in views], named_splits=files[0][0].name in SPLIT_FILES)
     return Dataset(
         format="transforms",
         views=views,
-        world_from_sfm=Y_UP.copy() if "y up" in convention or "y-up" in convention else np.eye(4),
+        world_from_sfm=up.world_from_sfm,
+        up_confidence=up.confidence,
         scale_known="metres" in convention or "meters" in convention,
         class_names=class_names,
         ignore_id=ignore_id,
         class_colors=colors,
         points=_points(folder, heads[0]),
-        warnings=warnings,
+        warnings=[*warnings, *up.warnings],
     )
 
 
 def _load(file: Path) -> dict[str, Any]:
     try:
         value = json.loads(file.read_text(encoding="utf-8-sig"))
+    except RecursionError as error:
+        raise InputError(f"{file} is nested too deeply.", "Choose another data set.") from error
     except (OSError, ValueError) as error:
         raise InputError(f"{file} cannot be read: {error}.", "Export the data set again.") from error
     if not isinstance(value, dict) or not isinstance(value.get("frames"), list):
@@ -137,7 +143,7 @@ def _view(
     return DatasetView(
         name=name,
         image=image,
-        camera=frame_camera(frame, width, height),
+        camera=_lens(frame, width, height, name, folder),
         camera_to_world=flip_camera_axes(matrix),
         label=label,
         mask=mask,
@@ -145,6 +151,19 @@ def _view(
         depth_scale=_depth_scale(frame, depth),
         split=split,
     )
+
+
+def _lens(frame: dict[str, Any], width: int, height: int, name: str, folder: Path) -> Camera:
+    """`frame_camera`, whose errors name the frame."""
+    try:
+        return frame_camera(frame, width, height)
+    except InputError as error:
+        raise InputError(f"The lens of {name} in {folder} cannot be read: {error.message}", error.hint) from error
+    except (TypeError, ValueError, OverflowError, ZeroDivisionError) as error:
+        reason = wrong_value(error.errors()[0]) if isinstance(error, ValidationError) else error
+        raise InputError(
+            f"The lens of {name} in {folder} cannot be read: {reason}.", "Export the data set again."
+        ) from error
 
 
 def _depth_scale(frame: dict[str, Any], depth: Path | None) -> float:

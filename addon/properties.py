@@ -39,7 +39,7 @@ EXPORTS = [
     ("glb", "glTF (.glb)", "The mesh with its colors or texture, for game engines and the web"),
     ("usd", "USD (.usdc)", "The mesh and the cameras, for other 3D programs"),
     ("obj", "Wavefront (.obj)", "The mesh with its texture, for nearly everything"),
-    ("ply", "Stanford (.ply)", "The mesh with colors and the class of each vertex"),
+    ("ply", "Stanford (.ply)", "The mesh with colors, classes and instances"),
     ("stl", "STL (.stl)", "The bare surface, for 3D printers"),
     ("onnx", "Field (.onnx)", "The trained field as a function of place and direction"),
     ("voxels", "Voxels (.npz)", "Density, color and class on a regular grid"),
@@ -317,7 +317,7 @@ class FieldworkScene(PropertyGroup):
     )
     mesh_file: StringProperty(
         name="Also Write",
-        description="File for other programs: .ply, .obj, .glb or .stl; empty: none",
+        description="File for other programs: .glb, .usdc, .obj, .ply or .stl; empty: none",
         subtype="FILE_PATH",
     )
     split: EnumProperty(

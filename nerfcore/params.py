@@ -13,6 +13,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validat
 from .files import is_text, name_problem, printable
 
 Preset = Literal["draft", "standard", "high"]
+Split = Literal["none", "classes", "instances"]
 Pass = Literal["rgb", "depth", "semantic", "confidence", "normal", "unknown"]
 
 
@@ -236,7 +237,7 @@ class MeshParams(Params):
     texture_kind: Literal["photo", "field"] = Field(
         default="photo", description="what the texture shows: the photos, or the field's colours"
     )
-    split: Literal["none", "classes"] = "none"
+    split: Split = Field(default="none", description="classes, instances: one object of each in the file of `out`")
     turntable: Path | None = Field(
         default=None, description="folder for pictures of the mesh from eight sides: its colours and its classes"
     )
@@ -278,7 +279,7 @@ class ExportParams(Params):
     to: Literal["glb", "obj", "ply", "stl", "usd", "onnx", "voxels"] = Field(description="format")
     run: RunName = "main"
     out: Path | None = Field(default=None, description="file to write; default: exports/RUN/PROJECT of the project")
-    split: Literal["none", "classes"] = Field(default="none", description="classes: one object for each class")
+    split: Split = Field(default="none", description="classes, instances: one object for each of them")
     resolution: int = Field(default=128, ge=8, le=512, description="voxels: cells along each side of the field's cube")
 
 

@@ -24,7 +24,6 @@ TASKS = {
     "simulate": "addon.simulate.task:simulate",
     "dataset": "addon.photograph.dataset:dataset",
     "blend": "addon.child.package:write_blend",
-    "usd": "addon.child.package:write_usd",
 }
 
 

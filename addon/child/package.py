@@ -1,16 +1,13 @@
-"""The child processes of `fieldwork blend` and `fieldwork export --to usd`: a package as a file of its own."""
+"""The child process of `fieldwork blend`: a package as a file of its own."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import bpy
 
-from ..errors import SceneError
 from ..scene.build import Imported, import_package
-from ..scene.materials import COLOR_ATTRIBUTE
 from ..scene.package import Package, read_package
 
 PACKED_LIMIT = 256 * 2**20  # bytes of photos above which they stay outside the .blend
@@ -41,52 +38,6 @@ def write_blend(request: dict[str, Any], emit: Callable[..., None]) -> dict[str,
         "mesh": len(package.mesh["faces"]) if package.mesh is not None else None,
         "warnings": warnings,
     }
-
-
-def write_usd(request: dict[str, Any], emit: Callable[..., None]) -> dict[str, Any]:
-    """Write the cameras and the mesh of the package as USD, z up, in metres.
-
-    The surface has the baked texture, else the colours of its classes; the photographed colours are its display
-    colours, the classes its primvar `class_id`.
-
-    Raises:
-        SceneError: this Blender cannot write USD.
-    """
-    if not bpy.app.build_options.usd:
-        raise SceneError(
-            f"This Blender {bpy.app.version_string} was built without USD. Set FIELDWORK_BLENDER to another one."
-        )
-    package, imported = _build(request, emit, "Building the scene")
-    for item in (imported.animated, imported.points):
-        if item is not None:  # one camera for each photo is enough, and loose points are no surface
-            bpy.data.objects.remove(item)
-    texture = bpy.data.images.load(str(package.texture), check_existing=True) if package.texture else None
-    for item in imported.meshes:
-        item.data.color_attributes[COLOR_ATTRIBUTE].name = "displayColor"  # USD's name of it
-        if texture is None and not package.classes:
-            item.data.materials.clear()  # readers show the display colours where there is no material
-        for material in item.data.materials:
-            _make_plain(material, texture)
-    emit(kind="stage", name="Writing")
-    bpy.ops.wm.usd_export(filepath=request["out"], overwrite_textures=True)
-    if not Path(request["out"]).stat().st_size:
-        raise SceneError(f"Blender could not write {request['out']}.")
-    return {"warnings": imported.warnings}
-
-
-def _make_plain(material: bpy.types.Material, texture: bpy.types.Image | None) -> None:
-    """A material that other programs know: the texture, or the colour of the class."""
-    material.use_nodes = True
-    tree = material.node_tree
-    tree.nodes.clear()
-    shader, output = tree.nodes.new("ShaderNodeBsdfPrincipled"), tree.nodes.new("ShaderNodeOutputMaterial")
-    tree.links.new(shader.outputs[0], output.inputs[0])
-    shader.inputs["Roughness"].default_value = 1.0
-    shader.inputs["Base Color"].default_value = material.diffuse_color
-    if texture is not None:
-        picture = tree.nodes.new("ShaderNodeTexImage")
-        picture.image = texture
-        tree.links.new(picture.outputs[0], shader.inputs["Base Color"])
 
 
 def _build(request: dict[str, Any], emit: Callable[..., None], stage: str) -> tuple[Package, Imported]:

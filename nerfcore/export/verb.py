@@ -5,12 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from ..blender.package import stale, write_package
-from ..blender.process import write_in_blender
+from ..blender.package import stale
 from ..data.load import load_scene
 from ..errors import SettingError
-from ..mesh.files import write_surface
-from ..mesh.stored import load_surface
+from ..mesh.features import features_of
+from ..mesh.files import USD, write_surface
+from ..mesh.instances import read_instances
+from ..mesh.stored import load_surface, mesh_folder
 from ..params import ExportParams
 from ..progress import Reporter
 from ..project.runs import holdout_of
@@ -22,7 +23,7 @@ SUFFIXES = {
     "obj": (".obj",),
     "ply": (".ply",),
     "stl": (".stl",),
-    "usd": (".usdc", ".usda", ".usd", ".usdz"),
+    "usd": USD,
     "onnx": (".onnx",),
     "voxels": (".npz",),
 }
@@ -31,14 +32,13 @@ SUFFIXES = {
 def export(params: ExportParams, report: Reporter) -> dict[str, Any]:
     """Write one format to `out`, or to exports/<run>/<project>.<suffix>.
 
-    Meshes (glb, obj, ply, stl) are the last one that the verb `mesh` extracted; usd has the cameras and the sparse
-    points as well; onnx is the trained field itself as a function, voxels its values on a regular grid.
+    Meshes (glb, usd, obj, ply, stl) are the last one that the verb `mesh` extracted; usd has the cameras as well; onnx is the trained field itself as a function, voxels its values on a regular grid.
 
     Returns:
         {"files": [paths], "to": format}
     Raises:
         SettingError: the file has another ending. ProjectError: there is no mesh or no trained run.
-        BlenderError: usd, and there is no Blender that can write it.
+        DiskError: a file cannot be written.
     """
     folder = Path(params.project).absolute()
     project = load_project(folder)
@@ -60,22 +60,13 @@ def export(params: ExportParams, report: Reporter) -> dict[str, Any]:
 
         write_voxels(out, load_trained(folder, params.run), project, params.resolution, report)
         files = [out]
-    elif params.to == "usd":
-        files = [_write_usd(out, folder, params, report)]
     else:
         report.stage("Writing")
         surface, texture = load_surface(folder, params.run)
-        names = {c.id: c.name for c in project.classes}
-        files = write_surface(out, surface, names, params.split == "classes", texture)
+        instances = read_instances(mesh_folder(folder, params.run))
+        features = features_of(surface, project.classes, project.ignore_id, instances)
+        views = load_scene(folder, holdout_of(folder, params.run)).views if params.to == "usd" else []
+        files = write_surface(out, surface, features, params.split, texture, views)
     result = {"to": params.to, "files": [str(path) for path in files]}
     record_step(folder, "export", params.model_dump(mode="json"), result)
     return result
-
-
-def _write_usd(out: Path, folder: Path, params: ExportParams, report: Reporter) -> Path:
-    load_surface(folder, params.run)  # says so when there is none
-    package = write_package(folder, params.run, load_scene(folder, holdout_of(folder, params.run)), folder.name, report)
-    result = write_in_blender("usd", package, out, params.split == "classes", report)
-    for warning in result["warnings"]:
-        report.warn(warning)
-    return out

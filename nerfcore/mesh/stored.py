@@ -14,7 +14,7 @@ from ..project.fingerprints import digest, read_made, rounded
 from ..project.runs import MESH_RECORD
 from ..project.schema import ProvenanceStep
 from ..project.store import load_project, world_from_sfm
-from .files import Texture, texture_of
+from .parts import Texture, texture_of
 from .surface import Surface
 
 MESH = "mesh.npz"

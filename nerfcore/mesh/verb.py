@@ -20,10 +20,12 @@ from ..project.schema import step
 from ..project.store import load_project, record_step, world_from_sfm
 from ..render.run import load_info, load_trained, refined_poses
 from .build import Built, build
+from .features import features_of
 from .field_values import shade
-from .files import check_format, texture_of, write_surface
+from .files import check_format, write_surface
 from .instances import GAP, find_instances, write_instances
 from .painted import Painted, paint_surface, training_photos, write_maps
+from .parts import texture_of
 from .photos import Photo
 from .stored import COARSE
 from .surface import class_table, is_watertight, to_world
@@ -73,8 +75,9 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
         np.savez(file, vertices=transform_points(box.world_from_box, built.coarse[0]), faces=built.coarse[1])
     files = [target / "mesh.npz", target / COARSE, write_instances(target, instances)]
     files += write_maps(target, painted, {c.id: c.color for c in scene.classes})
+    features = features_of(surface, scene.classes, scene.ignore_id, instances)
     for path in [target / "mesh.ply", *([params.out] if params.out else [])]:
-        files += write_surface(path, surface, names, params.split == "classes" and path == params.out, texture)
+        files += write_surface(path, surface, features, params.split if path == params.out else "none", texture)
     if params.turntable is not None:
         report.stage("Looking at it")
         files += write_turntable(params.turntable, surface, {c.id: c.color for c in scene.classes}, report)

@@ -9,7 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from fieldwork.nerfcore.mesh.files import texture_of, write_surface
+from fieldwork.nerfcore.data.scene import ClassInfo
+from fieldwork.nerfcore.mesh.features import features_of
+from fieldwork.nerfcore.mesh.files import write_surface
+from fieldwork.nerfcore.mesh.parts import texture_of
 from fieldwork.nerfcore.mesh.surface import Surface
 from PIL import Image
 
@@ -25,6 +28,10 @@ def square() -> Surface:
     normals = np.tile(np.array([0, 0, 1], np.float32), (4, 1))
     classes = np.array([1, 2, 1, 2], np.int32)
     return Surface(vertices, faces, normals, COLORS, classes, np.array([1, 2], np.int32))
+
+
+def plain(*names: str):
+    return features_of(square(), [ClassInfo(n, name, (0, 0, 0)) for n, name in enumerate(names, 1)], 0)
 
 
 def texture(level: int):
@@ -54,7 +61,7 @@ def accessor(tree: dict, blob: bytes, index: int) -> np.ndarray:
 
 @pytest.mark.parametrize("textured", [True, False])
 def test_glb_has_a_matt_material_of_the_plain_colour(tmp_path: Path, textured: bool) -> None:
-    (path,) = write_surface(tmp_path / "a.glb", square(), {}, False, texture(50) if textured else None)
+    (path,) = write_surface(tmp_path / "a.glb", square(), plain(), "none", texture(50) if textured else None)
     tree, _ = glb(path)
     (primitive,) = tree["meshes"][0]["primitives"]
     material = tree["materials"][primitive["material"]]["pbrMetallicRoughness"]
@@ -70,14 +77,14 @@ def test_glb_has_a_matt_material_of_the_plain_colour(tmp_path: Path, textured: b
         assert pixels[7, 7].tolist() == [50, 50, 50]
 
 
-@pytest.mark.parametrize("split", [False, True])
-def test_vertex_colours_are_linear_in_glb(tmp_path: Path, split: bool) -> None:
-    (path,) = write_surface(tmp_path / "a.glb", square(), {1: "a", 2: "b"}, split)
+@pytest.mark.parametrize("split", ["none", "classes"])
+def test_vertex_colours_are_linear_in_glb(tmp_path: Path, split: str) -> None:
+    (path,) = write_surface(tmp_path / "a.glb", square(), plain("a", "b"), split)
     tree, blob = glb(path)
-    assert len(tree["meshes"]) == 1 + split
+    assert len(tree["meshes"]) == 1 + (split == "classes")
     for mesh in tree["meshes"]:
         attributes = mesh["primitives"][0]["attributes"]
-        assert {"POSITION", "NORMAL", "COLOR_0", "_class_id"} <= set(attributes)
+        assert {"POSITION", "NORMAL", "COLOR_0", "_FEATURE_ID_0"} <= set(attributes)
         places = accessor(tree, blob, attributes["POSITION"])
         colors = accessor(tree, blob, attributes["COLOR_0"])[:, :3]
         for place, color in zip(places, colors):
@@ -87,15 +94,15 @@ def test_vertex_colours_are_linear_in_glb(tmp_path: Path, split: bool) -> None:
 
 def test_vertex_colours_are_srgb_in_ply_and_obj(tmp_path: Path) -> None:
     for kind in ("ply", "obj"):
-        path, *_ = write_surface(tmp_path / f"a.{kind}", square(), {}, False)
+        path, *_ = write_surface(tmp_path / f"a.{kind}", square(), plain(), "none")
         loaded = trimesh.load(path, process=False)
         assert loaded.visual.vertex_colors[:, :3].tolist() == COLORS.tolist()
 
 
 @pytest.mark.parametrize("name", ["b", "Kugel ü 2"])
 def test_two_textured_obj_in_one_folder(tmp_path: Path, name: str) -> None:
-    first = write_surface(tmp_path / "a.obj", square(), {}, False, texture(50))
-    second = write_surface(tmp_path / f"{name}.obj", square(), {}, False, texture(90))
+    first = write_surface(tmp_path / "a.obj", square(), plain(), "none", texture(50))
+    second = write_surface(tmp_path / f"{name}.obj", square(), plain(), "none", texture(90))
     assert len(first) == len(second) == 3
     assert not set(first) & set(second)
     for files, level in ((first, 50), (second, 90)):
@@ -111,7 +118,7 @@ def test_two_textured_obj_in_one_folder(tmp_path: Path, name: str) -> None:
 
 
 def test_split_obj_keeps_the_textures_of_its_parts(tmp_path: Path) -> None:
-    files = write_surface(tmp_path / "a.obj", square(), {1: "x", 2: "y"}, True, texture(50))
+    files = write_surface(tmp_path / "a.obj", square(), plain("x", "y"), "classes", texture(50))
     assert len(set(files)) == 6
     for path in files:
         if path.suffix == ".png":

@@ -44,6 +44,14 @@ EXPORTS = [
     ("onnx", "Field (.onnx)", "The trained field as a function of place and direction"),
     ("voxels", "Voxels (.npz)", "Density, color and class on a regular grid"),
 ]
+SIDES = [
+    ("top", "Plan", "From above"),
+    ("front", "Front", "From the negative Y side"),
+    ("right", "Right", "From the positive X side"),
+    ("back", "Back", "From the positive Y side"),
+    ("left", "Left", "From the negative X side"),
+    ("bottom", "From Below", "From below, such as a ceiling"),
+]
 PASSES = [
     ("rgb", "Color", "The photographed colors"),
     ("depth", "Depth", "Distance along the ray in meters"),
@@ -346,6 +354,35 @@ class FieldworkScene(PropertyGroup):
         min=0.0,
         max=0.95,
         subtype="FACTOR",
+    )
+    sides: EnumProperty(
+        name="Views",
+        description="Which sides are drawn",
+        items=SIDES,
+        options={"ENUM_FLAG"},
+        default={"top", "front", "right", "back", "left"},
+    )
+    turn: FloatProperty(
+        name="Turn",
+        description="Degrees about Z from the world to the front that is drawn, for slanted fronts",
+        default=0.0,
+        min=-180.0,
+        max=180.0,
+    )
+    paper_scale: FloatProperty(
+        name="Scale 1:",
+        description="Scale of drawings on paper; 0: the largest that fits on A3",
+        default=0.0,
+        min=0.0,
+        soft_max=1000.0,
+    )
+    section_plane: StringProperty(
+        name="Section", description="Plane of the section in the aligned world: x=…, y=… or z=…", default="z=1"
+    )
+    drawings: StringProperty(
+        name="Drawings",
+        description="Folder for drawings; empty: in the exports of the project",
+        subtype="DIR_PATH",
     )
 
     # Export

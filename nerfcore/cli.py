@@ -35,6 +35,8 @@ NAMED = {
     "new": {"photos"},
     "render": {"out"},
     "mesh": {"out"},
+    "plan": {"out"},
+    "section": {"out"},
     "reconstruct": {"out"},
     "bench": {"out"},
     "export": {"out"},

@@ -263,6 +263,37 @@ class MeasureParams(Params):
     )
 
 
+Side = Literal["top", "bottom", "front", "back", "left", "right"]
+Turn = Annotated[
+    float, Field(description="degrees about z from the world to the front that is drawn, for slanted fronts")
+]
+PaperScale = Annotated[
+    float | None, Field(gt=0, description="N of the scale 1:N on paper; default: the largest that fits on A3")
+]
+
+
+class PlanParams(Params):
+    project: Path
+    run: RunName = "main"
+    views: list[Side] = ["top", "front", "right", "back", "left"]
+    turn: Turn = 0.0
+    scale: PaperScale = None
+    out: Path | None = Field(
+        default=None, description="folder to write to; default: exports/RUN/drawings of the project"
+    )
+
+
+class SectionParams(Params):
+    project: Path
+    plane: str = Field(description="plane of the section in the aligned world: x=…, y=… or z=…")
+    run: RunName = "main"
+    turn: Turn = 0.0
+    scale: PaperScale = None
+    out: Path | None = Field(
+        default=None, description="folder to write to; default: exports/RUN/drawings of the project"
+    )
+
+
 class BlendParams(Params):
     project: Path
     out: Path

@@ -36,6 +36,8 @@ VERBS = {
     "render": Verb(p.RenderParams, "render.verb:render", "Render images from the field."),
     "mesh": Verb(p.MeshParams, "mesh.verb:mesh", "Extract the labelled surface."),
     "measure": Verb(p.MeasureParams, "measure.verb:measure", "Measure areas, volumes and distances on the mesh."),
+    "plan": Verb(p.PlanParams, "measure.drawings:plan", "Draw plans and elevations to scale."),
+    "section": Verb(p.SectionParams, "measure.drawings:section", "Draw a section of the mesh to scale."),
     "blend": Verb(p.BlendParams, "blender.blend:blend", "Write a .blend with cameras, points, mesh and materials."),
     "package": Verb(p.PackageParams, "blender.package:package", "Prepare cameras, points and mesh for Blender."),
     "export": Verb(p.ExportParams, "export.verb:export", "Write what other programs read."),

@@ -1,4 +1,4 @@
-"""Measure: sizes of what is on the mesh."""
+"""Measure: sizes of what is on the mesh, and drawings of it."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Any
 from bpy.types import Context
 
 from ..addon.project import snapshot
+from ..addon.properties import SIDES
 from ..addon.text import t
 from .base import ProjectOperator, need_project, scene_settings
 
@@ -37,4 +38,48 @@ class FIELDWORK_OT_measure(ProjectOperator):
         }
 
 
-CLASSES = [FIELDWORK_OT_measure]
+@scene_settings(run="run", views="sides", turn="turn", scale="paper_scale", out="drawings")
+class FIELDWORK_OT_plan(ProjectOperator):
+    """Draw plans and elevations of the mesh to scale, in its colors and as maps of its classes"""
+
+    bl_idname = "fieldwork.plan"
+    bl_label = "Draw Plans"
+    verb = "plan"
+    needs = (need_mesh,)
+
+    def parameters(self, context: Context) -> dict[str, Any]:
+        views = self.value(context, "views")
+        if not views:
+            raise ValueError(t("Choose at least one view."))
+        order = [name for name, *_ in SIDES]
+        return {
+            "project": self.project_path(context),
+            "run": self.value(context, "run"),
+            "views": sorted(views, key=order.index),
+            "turn": self.value(context, "turn"),
+            "scale": self.value(context, "scale") or None,
+            "out": self.path(context, "out"),
+        }
+
+
+@scene_settings(run="run", plane="section_plane", turn="turn", scale="paper_scale", out="drawings")
+class FIELDWORK_OT_section(ProjectOperator):
+    """Draw the section of the mesh by a plane to scale"""
+
+    bl_idname = "fieldwork.section"
+    bl_label = "Draw Section"
+    verb = "section"
+    needs = (need_mesh,)
+
+    def parameters(self, context: Context) -> dict[str, Any]:
+        return {
+            "project": self.project_path(context),
+            "run": self.value(context, "run"),
+            "plane": self.value(context, "plane"),
+            "turn": self.value(context, "turn"),
+            "scale": self.value(context, "scale") or None,
+            "out": self.path(context, "out"),
+        }
+
+
+CLASSES = [FIELDWORK_OT_measure, FIELDWORK_OT_plan, FIELDWORK_OT_section]

@@ -30,6 +30,12 @@ class FIELDWORK_PT_measure(StepPanel):
         for name in ("distances", "scale_error", "caps"):
             column.prop(settings, name)
         layout.operator("fieldwork.measure", icon="DRIVER_DISTANCE")
+        column = columns(layout)
+        for name in ("sides", "turn", "paper_scale", "drawings"):
+            column.prop(settings, name)
+        layout.operator("fieldwork.plan", icon="IMAGE_REFERENCE")
+        columns(layout).prop(settings, "section_plane")
+        layout.operator("fieldwork.section", icon="MOD_BOOLEAN")
 
 
 def draw_measures(layout: UILayout, measures: dict[str, Any]) -> None:

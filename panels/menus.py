@@ -25,6 +25,8 @@ class FIELDWORK_MT_steps(Menu):
         layout.operator("fieldwork.render")
         layout.operator("fieldwork.mesh")
         layout.operator("fieldwork.measure")
+        layout.operator("fieldwork.plan")
+        layout.operator("fieldwork.section")
         layout.operator("fieldwork.import_scene")
         layout.operator("fieldwork.blend")
         layout.operator("fieldwork.export")

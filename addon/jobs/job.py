@@ -28,6 +28,8 @@ TITLES = {
     "render": "Rendering",
     "mesh": "Extracting Mesh",
     "measure": "Measuring the Mesh",
+    "plan": "Drawing",
+    "section": "Drawing a Section",
     "blend": "Writing .blend",
     "export": "Exporting",
     "batch": "Reconstructing Many",

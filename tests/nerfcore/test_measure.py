@@ -9,25 +9,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from fieldwork.nerfcore.config import RunConfig
 from fieldwork.nerfcore.errors import InputError, ProjectError
 from fieldwork.nerfcore.measure.closing import border_loops, closed
 from fieldwork.nerfcore.measure.resampling import Votes
 from fieldwork.nerfcore.measure.scale import read_distances, scale_of
 from fieldwork.nerfcore.measure.verb import Measured, amounts, measure
 from fieldwork.nerfcore.mesh.facelets import facelets
-from fieldwork.nerfcore.mesh.instances import find_instances, write_instances
-from fieldwork.nerfcore.mesh.stored import COARSE, MESH, mesh_folder
-from fieldwork.nerfcore.mesh.surface import Surface, vertex_normals
+from fieldwork.nerfcore.mesh.instances import find_instances
+from fieldwork.nerfcore.mesh.stored import COARSE, mesh_folder
+from fieldwork.nerfcore.mesh.surface import Surface
 from fieldwork.nerfcore.params import MeasureParams
 from fieldwork.nerfcore.progress import Reporter
-from fieldwork.nerfcore.project.fingerprints import digest, rounded, write_made
-from fieldwork.nerfcore.project.runs import INFO, MEASURES, MESH_RECORD, run_folder
-from fieldwork.nerfcore.project.schema import Poses, Project, step
-from fieldwork.nerfcore.project.store import edit_project, load_project, world_from_sfm
-from fieldwork.nerfcore.render.run import RunInfo
+from fieldwork.nerfcore.project.runs import MEASURES, MESH_RECORD
+from fieldwork.nerfcore.project.schema import Poses, Project
+from fieldwork.nerfcore.project.store import edit_project
 from fieldwork.tests.nerfcore.support.ball import RADIUS, ball_project
 from fieldwork.tests.nerfcore.support.flat import box_mesh, wall_mesh
+from fieldwork.tests.nerfcore.support.meshed import store_mesh
 from skimage.measure import marching_cubes
 
 SIDE, ROUND = 33, 11.0  # corners of the grid, radius of the ball in its cells
@@ -122,31 +120,11 @@ def test_openings_that_touch_at_a_vertex_are_two() -> None:
 
 @pytest.fixture
 def project(tmp_path: Path) -> Path:
-    """The ball, its mesh (two halves of two classes) and a run, as the verbs leave them; its scale is known."""
+    """The ball with its mesh, two halves of two classes; its scale is known."""
     folder = ball_project(tmp_path / "ball", views=10, side=48)
-    with edit_project(folder) as edited:
-        edited.frame.scale_known = True
-    target = mesh_folder(folder, "main")
-    target.mkdir(parents=True)
-    info = RunInfo(
-        preset="draft", config=RunConfig.model_validate({"scene": {"image_size": 48}}), class_ids=[1, 2],
-        priorities=[1.0, 1.0], images=[], sfm_from_box=np.eye(4).tolist(), contracted=False, transparent=True,
-    )  # fmt: skip
-    run_folder(folder, "main").mkdir(parents=True)
-    (run_folder(folder, "main") / INFO).write_text(info.model_dump_json())
-    ball = trimesh.creation.icosphere(4, RADIUS)
-    vertices, faces = np.array(ball.vertices), np.array(ball.faces)
-    face_class = np.where(vertices[faces].mean(1)[:, 2] > 0, 1, 2)
-    face_instance, found = find_instances(vertices, faces, face_class, {1: "top", 2: "bottom"}, 0, 0.05)
-    write_instances(target, found)
-    normals = vertex_normals(vertices, faces)
-    colors, class_id = np.full((len(vertices), 3), 128, np.uint8), np.where(vertices[:, 2] > 0, 1, 2)
-    surface = Surface(vertices, faces, normals, colors, class_id, face_class, face_instance)
-    np.savez(target / MESH, **vars(surface))
-    coarse = trimesh.creation.icosphere(3, RADIUS)
-    np.savez(target / COARSE, vertices=coarse.vertices, faces=coarse.faces)
-    inputs = {"alignment": digest(rounded(world_from_sfm(load_project(folder))))}
-    write_made(target / MESH_RECORD, step("mesh", {}, {"voxel": 0.03}, inputs))
+    ball, coarse = trimesh.creation.icosphere(4, RADIUS), trimesh.creation.icosphere(3, RADIUS)
+    face_class = np.where(ball.triangles_center[:, 2] > 0, 1, 2)
+    store_mesh(folder, ball, face_class, coarse, voxel=0.03)
     return folder
 
 

@@ -1,0 +1,204 @@
+"""The verbs `plan` and `section`: orthographic drawings of the mesh at a stated scale."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import SettingError
+from ..mesh.clean import areas
+from ..mesh.parts import Texture
+from ..mesh.stored import load_surface, mesh_folder, mesh_record
+from ..mesh.surface import Surface
+from ..params import PlanParams, SectionParams
+from ..progress import Reporter
+from ..project.schema import Project
+from ..project.store import load_project, record_step
+from .sections import profile, write_profile
+from .sheet import DPI, MM, Color, Entry, Sheet, chosen_scale, write_sheet
+from .stored import read_measures
+from .views import Picture, Projection, Window, picture, plane, projection
+
+MARGIN = 0.02  # of the drawing's longer side, around it
+CLASS_SHARE = 0.6  # of a class's colour in a map of classes, over the grey picture
+PALE = 0.55  # share of white over what lies behind a section
+VOID = (0.35, 0.35, 0.35)
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What is drawn: the mesh of a run in the world, and how its classes are called and shown."""
+
+    title: str
+    surface: Surface
+    texture: Texture | None
+    names: dict[int, str]
+    colors: dict[int, Color]
+    metric: bool
+    measures: dict[int, dict[str, Any]]
+
+    def size_text(self, class_id: int) -> str:
+        """The area of a class, with half of its interval where it was measured."""
+        unit, row = "m²" if self.metric else "units²", self.measures.get(class_id)
+        if row is not None:
+            return f"{row['area']:.3g} ± {(row['area_high'] - row['area_low']) / 2:.1g} {unit}"
+        own = self.surface.faces[self.surface.face_class == class_id]
+        return f"{areas(self.surface.vertices.astype(np.float64), own).sum():.3g} {unit}"
+
+
+def load_subject(folder: Path, run: str) -> Subject:
+    """The mesh of a run as drawings need it. Raises ProjectError when there is none, or it lies elsewhere by now."""
+    project: Project = load_project(folder)
+    surface, texture = load_surface(folder, run)
+    mesh_record(folder, run)
+    measures = read_measures(folder, run) or {}
+    return Subject(
+        folder.absolute().name,
+        surface,
+        texture,
+        {project.ignore_id: "void"} | {c.id: c.name for c in project.classes},
+        {project.ignore_id: VOID} | {c.id: c.color for c in project.classes},
+        project.frame.scale_known,
+        {row["id"]: row for row in measures.get("classes", [])},
+    )
+
+
+def plan(params: PlanParams, report: Reporter) -> dict[str, Any]:
+    """Draw plans and elevations of the mesh, in its colours and as maps of its classes, to scale.
+
+    Returns:
+        {"scales": {view: N of 1:N, None while the scale is not known}, "files"}
+    Raises:
+        ProjectError: there is no mesh. SettingError: a scale that no paper is large enough for.
+    """
+    folder = Path(params.project)
+    subject = load_subject(folder, params.run)
+    target = params.out or mesh_folder(folder, params.run) / "drawings"
+    scales, files = {}, []
+    for name in params.views:
+        report.stage(f"Drawing: {name}")
+        view = projection(name, params.turn)
+        found = view(subject.surface.vertices)
+        window, scale = framed(found[:, :2], params.scale, subject.metric)
+        before = float(found[:, 2].max()) + window.pixel
+        seen = picture(subject.surface, subject.texture, view, window, before, report)
+        scales[name] = scale if subject.metric else None
+        title = f"{subject.title}: {name}"
+        sheet = Sheet(title, window.low, window.high, scale, subject.metric, seen.color, axis_names(view, params.turn))
+        files += write_sheet(target / name, sheet)
+        if set(np.unique(subject.surface.face_class)) - {0} or subject.measures:
+            files += write_sheet(target / f"{name}_classes", class_sheet(sheet, subject, seen))
+    result = {"scales": scales, "files": [str(path) for path in files]}
+    record_step(folder, "plan", params.model_dump(mode="json"), result)
+    return result
+
+
+def section(params: SectionParams, report: Reporter) -> dict[str, Any]:
+    """Draw the section of the mesh by a plane, over a pale picture of what lies behind it, to scale.
+
+    Returns:
+        {"scale": N of 1:N or None, "lengths": {class: length of the section}, "files"}
+    Raises:
+        ProjectError: there is no mesh. SettingError: no plane, it misses the mesh, or the scale is too large.
+    """
+    folder = Path(params.project)
+    subject = load_subject(folder, params.run)
+    view, at = plane(params.plane, params.turn)
+    report.stage("Cutting")
+    cut = profile(subject.surface, view, at)
+    if not len(cut.segments):
+        low, high = subject.surface.vertices.min(0), subject.surface.vertices.max(0)
+        spans = ", ".join(f"{axis} {a:.2f} to {b:.2f}" for axis, a, b in zip("xyz", low, high))
+        raise SettingError(f"The plane {params.plane} misses the mesh.", f"It spans {spans}.")
+    found = view(subject.surface.vertices)
+    window, scale = framed(found[:, :2], params.scale, subject.metric)
+    report.stage("Drawing")
+    seen = picture(subject.surface, subject.texture, view, window, at, report)
+    pale = (255 * PALE + seen.color * (1 - PALE)).astype(np.uint8)
+    lengths = cut.lengths()
+    unit = "m" if subject.metric else "units"
+    sheet = Sheet(
+        f"{subject.title}: section {params.plane}",
+        window.low,
+        window.high,
+        scale,
+        subject.metric,
+        pale,
+        axis_names(view, params.turn),
+        [
+            Entry(f"{subject.names.get(c, c)}  {length:.3g} {unit}", line_color(subject, c))
+            for c, length in lengths.items()
+        ],
+        "Length of the section",
+        view(cut.segments)[..., :2],
+        np.array([line_color(subject, c) for c in cut.label.tolist()]),
+    )
+    target = params.out or mesh_folder(folder, params.run) / "drawings"
+    stem = "section_" + params.plane.replace(" ", "").replace("=", "_")
+    files = write_sheet(target / stem, sheet)
+    files.append(target / f"{stem}.csv")
+    write_profile(files[-1], cut, subject.names)
+    named = {subject.names.get(c, str(c)): length for c, length in lengths.items()}
+    result = {
+        "scale": scale if subject.metric else None,
+        "lengths": named,
+        "files": [str(path) for path in files],
+    }
+    record_step(folder, "section", params.model_dump(mode="json"), result)
+    return result
+
+
+def framed(points: np.ndarray, scale: float | None, metric: bool) -> tuple[Window, float]:
+    """The window around points (N, 2) of a drawing, and its scale 1 : N. While the scale of the capture is not known, it
+    is drawn as large as the paper lets it."""
+    low, high = points.min(0), points.max(0)
+    margin = MARGIN * float((high - low).max())
+    low, high = low - margin, high + margin
+    stated = chosen_scale(high - low, scale if metric else None)
+    pixel = stated / 1000 / (DPI * MM)
+    return Window(low, high, pixel), stated
+
+
+def axis_names(view: Projection, turn: float) -> tuple[str, str]:
+    """What the coordinates at the sides of a drawing are: axes of the world, or turned ones."""
+    found = []
+    for axis in view.axes[:2]:
+        number = int(np.abs(axis).argmax())
+        straight = abs(axis[number]) > 1 - 1e-9
+        sign = "−" if axis[number] < 0 else ""
+        found.append(f"{sign}{'xyz'[number]}" if straight else f"along {turn:g}°")
+    return found[0], found[1]
+
+
+def class_sheet(sheet: Sheet, subject: Subject, seen: Picture) -> Sheet:
+    """The same sheet with classes in their colours over a grey picture, and their areas in the legend."""
+    ids = np.unique(subject.surface.face_class)
+    shades = np.array([subject.colors.get(int(c), VOID) for c in ids]) * 255
+    grey = np.repeat(seen.color.mean(-1, keepdims=True), 3, -1)
+    hit = seen.face >= 0
+    shown = seen.color.copy()
+    own = shades[np.searchsorted(ids, subject.surface.face_class[seen.face[hit]])]
+    shown[hit] = (CLASS_SHARE * own + (1 - CLASS_SHARE) * grey[hit]).astype(np.uint8)
+    legend = [
+        Entry(f"{subject.names.get(c, c)}  {subject.size_text(c)}", subject.colors.get(c, VOID)) for c in ids.tolist()
+    ]
+    return Sheet(
+        f"{sheet.title}, classes",
+        sheet.low,
+        sheet.high,
+        sheet.scale,
+        sheet.metric,
+        shown,
+        sheet.axes,
+        legend,
+        "Area on the whole surface" + (", 95 %" if subject.measures else ""),
+    )
+
+
+def line_color(subject: Subject, class_id: int) -> Color:
+    """The colour of a class, dark enough for a line on white."""
+    red, green, blue = (0.75 * value for value in subject.colors.get(class_id, VOID))
+    return red, green, blue

@@ -1,0 +1,153 @@
+"""A drawing on paper at a stated scale: picture, section lines, grid with coordinates, scale bar, legend."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from ..errors import SettingError
+from ..files import atomic_path
+
+MM = 1 / 25.4  # inches
+DPI = 200
+LEFT, RIGHT, TOP, BOTTOM = 18.0, 62.0, 14.0, 26.0  # margins in mm; the legend stands in the right one
+ROOM = 400.0, 280.0  # mm that a drawing may take where no scale is asked for: about A3 with its margins
+SMALLEST = 60.0  # mm, so that scale bar and title have room
+LARGEST = 2000.0  # mm
+SCALES = [n * 10**k for k in range(5) for n in (1, 2, 2.5, 5)]
+FORMATS = ("png", "svg", "pdf")
+Color = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A line of the legend."""
+
+    text: str
+    color: Color
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """What is drawn: the window low, high (2,) of the drawing in world units; image (H, W, 3) uint8 over all of it;
+    lines (S, 2, 2) with a colour (S, 3) each. scale: 1 : scale on paper; metric: whether a unit is a metre."""
+
+    title: str
+    low: np.ndarray
+    high: np.ndarray
+    scale: float
+    metric: bool
+    image: np.ndarray
+    axes: tuple[str, str]
+    legend: list[Entry] = field(default_factory=list)
+    heading: str = ""
+    lines: np.ndarray | None = None
+    line_colors: np.ndarray | None = None
+
+
+def chosen_scale(size: np.ndarray, asked: float | None) -> float:
+    """The scale 1 : N of a drawing of a size (2,) in world units: the one asked for, else the largest that fits.
+
+    Raises:
+        SettingError: the drawing would be too large for any paper.
+    """
+    paper = size * 1000
+    if asked is None:
+        return float(next((s for s in SCALES if (paper / s <= ROOM).all()), SCALES[-1]))
+    if (paper / asked > LARGEST).any():
+        width, height = paper / asked
+        raise SettingError(f"At 1:{asked:g} the drawing is {width:.0f} × {height:.0f} mm.", "Choose a smaller scale.")
+    return asked
+
+
+def nice_step(length: float, parts: int) -> float:
+    """A round number (1, 2 or 5 times a power of ten) that goes into a length about so many times."""
+    raw = max(length, 1e-9) / parts
+    power = 10.0 ** np.floor(np.log10(raw))
+    return float(next(n * power for n in (1, 2, 5, 10) if n * power >= raw * 0.999))
+
+
+def write_sheet(stem: Path, sheet: Sheet) -> list[Path]:
+    """Write a sheet as STEM.png, STEM.svg and STEM.pdf, each in its true size. Raises DiskError."""
+    figure = _figure(sheet)
+    paths = []
+    for kind in FORMATS:
+        path = stem.with_name(f"{stem.name}.{kind}")
+        with atomic_path(path) as temporary:
+            figure.savefig(temporary, format=kind, dpi=DPI, metadata=None if kind == "png" else {"Title": sheet.title})
+        paths.append(path)
+    return paths
+
+
+def _figure(sheet: Sheet) -> Figure:
+    """The sheet as a figure whose axes are as large on paper as the scale says."""
+    extent = sheet.high - sheet.low
+    drawn = extent * 1000 / sheet.scale
+    width, height = np.maximum(drawn, SMALLEST) + [LEFT + RIGHT, TOP + BOTTOM]
+    height = max(height, TOP + BOTTOM + 6.0 * (len(sheet.legend) + 2))
+    figure = Figure(figsize=(width * MM, height * MM))
+    FigureCanvasAgg(figure)
+    axes = figure.add_axes((LEFT / width, BOTTOM / height, drawn[0] / width, drawn[1] / height))
+    box = (sheet.low[0], sheet.high[0], sheet.low[1], sheet.high[1])
+    axes.imshow(sheet.image, extent=box, interpolation="none", aspect="auto")
+    if sheet.lines is not None and len(sheet.lines):
+        axes.add_collection(LineCollection(list(sheet.lines), colors=sheet.line_colors, linewidths=1.2))
+    axes.set(xlim=box[:2], ylim=box[2:])
+    step = nice_step(float(extent.max()), 10)
+    for axis, low, high in ((axes.xaxis, box[0], box[1]), (axes.yaxis, box[2], box[3])):
+        axis.set_ticks(np.arange(np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9) + 1) * step)
+    axes.grid(color="0.35", linewidth=0.25, alpha=0.6)
+    axes.tick_params(labelsize=6, length=2, width=0.4)
+    unit = "m" if sheet.metric else "units"
+    axes.set_xlabel(f"{sheet.axes[0]} ({unit})", fontsize=6, labelpad=1)
+    axes.set_ylabel(f"{sheet.axes[1]} ({unit})", fontsize=6, labelpad=1)
+    for spine in axes.spines.values():
+        spine.set_linewidth(0.4)
+    stated = f"1:{sheet.scale:g}" if sheet.metric else "not to scale: the scale of the capture is not known"
+    figure.text(LEFT / width, 1 - 9 / height, sheet.title, fontsize=10, weight="bold")
+    figure.text(LEFT / width, 3 / height, f"{stated} · grid {step:g} {unit}", fontsize=8)
+    _scale_bar(figure, sheet, float(width), float(height))
+    _legend(figure, sheet, float(width), float(height))
+    return figure
+
+
+def _scale_bar(figure: Figure, sheet: Sheet, width: float, height: float) -> None:
+    """Four alternating fields below the drawing, of a round length."""
+    length = nice_step(50.0 * sheet.scale / 1000, 1) / 4
+    if 4 * length * 1000 / sheet.scale > 60:
+        length /= 2
+    mm = length * 1000 / sheet.scale
+    for k in range(4):
+        shade = "black" if k % 2 == 0 else "white"
+        place = ((LEFT + k * mm) / width, 11 / height)
+        figure.patches.append(
+            Rectangle(
+                place, mm / width, 1.6 / height, facecolor=shade, edgecolor="black", linewidth=0.4,
+                transform=figure.transFigure, figure=figure,
+            )
+        )  # fmt: skip
+    for k in (0, 2, 4):
+        text = f"{k * length:g}" + ((" m" if sheet.metric else " units") if k == 4 else "")
+        figure.text((LEFT + k * mm) / width, 8 / height, text, fontsize=6, ha="center")
+
+
+def _legend(figure: Figure, sheet: Sheet, width: float, height: float) -> None:
+    left = (width - RIGHT + 4) / width
+    top = height - TOP
+    if sheet.heading:
+        figure.text(left, (top - 3) / height, sheet.heading, fontsize=7, weight="bold")
+    for number, entry in enumerate(sheet.legend, 1):
+        y = top - 3 - 6.0 * number
+        figure.patches.append(
+            Rectangle(
+                (left, y / height), 4 / width, 3 / height, facecolor=entry.color, edgecolor="black", linewidth=0.3,
+                transform=figure.transFigure, figure=figure,
+            )
+        )  # fmt: skip
+        figure.text(left + 5.5 / width, (y + 0.4) / height, entry.text, fontsize=6.5)

@@ -1,0 +1,131 @@
+"""Plans, elevations and sections: their sizes on paper, what they show, and what they say."""
+
+from __future__ import annotations
+
+import csv
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fieldwork.nerfcore.errors import ProjectError, SettingError
+from fieldwork.nerfcore.measure.drawings import axis_names, framed, load_subject, plan, section
+from fieldwork.nerfcore.measure.sections import profile
+from fieldwork.nerfcore.measure.sheet import DPI, chosen_scale, nice_step
+from fieldwork.nerfcore.measure.views import Window, picture, plane, projection
+from fieldwork.nerfcore.params import PlanParams, SectionParams
+from fieldwork.nerfcore.progress import Reporter
+from fieldwork.tests.nerfcore.support.meshed import court
+from PIL import Image
+
+
+@pytest.fixture(scope="module")
+def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return court(tmp_path_factory.mktemp("drawings") / "court")
+
+
+@pytest.mark.parametrize("name", ["top", "bottom", "front", "back", "left", "right"])
+def test_views_are_right_handed_and_look_from_where_they_say(name: str) -> None:
+    from_where = {"top": (0, 0, 1), "bottom": (0, 0, -1), "front": (0, -1, 0), "back": (0, 1, 0)}
+    from_where |= {"left": (-1, 0, 0), "right": (1, 0, 0)}
+    axes = projection(name).axes
+    np.testing.assert_allclose(axes[2], from_where[name])
+    assert np.linalg.det(axes) == pytest.approx(1)
+
+
+def test_a_turned_front_is_seen_squarely() -> None:
+    view = projection("front", 30)
+    along = np.array([np.cos(np.radians(30)), np.sin(np.radians(30)), 0])
+    np.testing.assert_allclose(view(along), (1, 0, 0), atol=1e-12)
+    assert axis_names(view, 30) == ("along 30°", "z")
+    assert axis_names(projection("back"), 0) == ("−x", "z")
+
+
+def test_a_picture_shows_each_thing_in_its_place(project: Path) -> None:
+    subject = load_subject(project, "main")
+    window = Window(np.array([0.0, 0]), np.array([4.0, 3]), 0.05)
+    seen = picture(subject.surface, None, projection("top"), window, 5.0, Reporter())
+    assert seen.color.shape == (60, 80, 3)
+    label = subject.surface.face_class[seen.face]
+    # Pixel (row, column) is at x = 0.05 (column + ½), y = 3 − 0.05 (row + ½).
+    assert (label[31:49, 11:29] == 3).all()
+    assert (label[31:39, 56:64] == 3).all()
+    label[30:50, 10:30] = label[30:40, 55:65] = 1
+    assert (label == 1).all()
+    # From the front, the plinths stand before the wall, and what is above is empty.
+    window = Window(np.array([0.0, 0]), np.array([4.0, 3]), 0.05)
+    seen = picture(subject.surface, None, projection("front"), window, 5.0, Reporter())
+    assert (seen.face[:10] < 0).all()
+    assert (seen.color[:9] == 255).all()
+    front = subject.surface.face_class[seen.face]
+    assert (front[41:59, 11:29] == 3).all()
+    assert (front[11:29] == 2).all()
+    # Behind a section through both plinths nothing of them is left but their backs, which are turned away.
+    seen = picture(subject.surface, None, projection("front"), window, -1.25, Reporter())
+    assert (subject.surface.face_class[seen.face][12:59] == 2).all()
+
+
+def test_a_section_is_as_long_as_what_it_cuts(project: Path) -> None:
+    subject = load_subject(project, "main")
+    view, at = plane("z = 0.5", 0)
+    lengths = profile(subject.surface, view, at).lengths()
+    assert lengths[3] == pytest.approx(4 * 1.0 + 4 * 0.5)
+    assert lengths[2] == pytest.approx(2 * 4 + 2 * 0.1)
+    view, at = plane("y=1.25", 0)
+    lengths = profile(subject.surface, view, at).lengths()
+    assert lengths[1] == pytest.approx(2 * 4 + 2 * 0.1)
+    assert lengths[3] == pytest.approx(2 * (1 + 0.999) + 2 * (0.5 + 1.499))
+
+
+def test_scales_are_round_and_fit_the_paper() -> None:
+    assert chosen_scale(np.array([4.0, 2.6]), None) == 10
+    assert chosen_scale(np.array([4.2, 2.6]), None) == 20
+    assert chosen_scale(np.array([40.0, 26]), 50) == 50
+    with pytest.raises(SettingError, match="1:1 the drawing is 40000"):
+        chosen_scale(np.array([40.0, 26]), 1)
+    assert [nice_step(x, 10) for x in (1.0, 4.2, 37.0)] == [0.1, 0.5, 5.0]
+    window, scale = framed(np.array([[0.0, 0], [4, 3]]), 20, True)
+    # A pixel of the picture is a dot of the printer.
+    assert window.pixel == pytest.approx(20 * 0.0254 / DPI)
+    assert scale == 20
+
+
+def test_plans_are_written_as_large_as_they_say(project: Path, tmp_path: Path) -> None:
+    result = plan(PlanParams(project=project, views=["top"], scale=50, out=tmp_path), Reporter())
+    assert result["scales"] == {"top": 50}
+    names = ["top.png", "top.svg", "top.pdf", "top_classes.png", "top_classes.svg", "top_classes.pdf"]
+    assert [Path(path).name for path in result["files"]] == names
+    svg = (tmp_path / "top.svg").read_text()
+    width = float(re.search(r'width="([\d.]+)pt"', svg).group(1)) / 72 * 25.4  # type: ignore[union-attr]
+    # 4 m and 2 % on both sides at 1:50, and the margins.
+    assert width == pytest.approx((4 * 1.04) * 1000 / 50 + 18 + 62, abs=0.2)
+    with Image.open(tmp_path / "top_classes.png") as image:
+        assert image.size[0] == pytest.approx(width / 25.4 * DPI, abs=2)
+        colors = {tuple(c) for c in np.array(image.convert("RGB")).reshape(-1, 3)[::7].tolist()}
+    assert (87, 181, 232) in colors  # the plinth's colour in the legend
+    assert (tmp_path / "top.pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_a_section_is_drawn_and_listed(project: Path, tmp_path: Path) -> None:
+    result = section(SectionParams(project=project, plane="z=0.5", scale=100, out=tmp_path), Reporter())
+    assert result["scale"] == 100
+    assert result["lengths"]["plinth"] == pytest.approx(6)
+    with open(tmp_path / "section_z_0.5.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert {row["class"] for row in rows} == {"wall", "plinth"}
+    assert all(float(row["z0"]) == 0.5 for row in rows)
+
+
+def test_impossible_sections_and_meshes_are_named(project: Path, tmp_path: Path) -> None:
+    for text in ("z", "up=1", "z=high"):
+        with pytest.raises(SettingError, match="no plane"):
+            section(SectionParams(project=project, plane=text), Reporter())
+    with pytest.raises(SettingError, match=r"misses the mesh\. It spans x 0\.00 to 4\.00"):
+        section(SectionParams(project=project, plane="z=9"), Reporter())
+    unknown = court(tmp_path / "unscaled", metric=False)
+    result = plan(PlanParams(project=unknown, views=["right"], scale=100), Reporter())
+    assert result["scales"] == {"right": None}
+    assert "scale of the capture is not known" in (Path(result["files"][0]).with_suffix(".svg")).read_text()
+    (unknown / "exports" / "main" / "mesh.npz").unlink()
+    with pytest.raises(ProjectError, match="no mesh"):
+        plan(PlanParams(project=unknown), Reporter())

@@ -1,13 +1,11 @@
-"""What the photos say about points of the surface: colours, and votes for classes."""
+"""Colours of points of the surface, from the photos that see them."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 import torch
 
-from ..data.pixels import VOID, PixelStore
+from ..data.pixels import PixelStore
 from ..geometry.cameras import Camera, project
 from ..kernels.depth_arrays import MapArrays
 from ..kernels.surface import sight
@@ -17,33 +15,21 @@ CHUNK = 1 << 15  # points at once: their colours in all photos are held together
 SHARPNESS = 2.0  # power of a view's weight: the views that see a point best decide
 OUTLIER = 0.1  # of the colour range: what differs more from the mean of all views counts less
 ROUNDS = 2
-FIELD_SHARE = 0.5  # weight of the field's class probabilities beside all votes of a point that is seen as often as most
-
-
-@dataclass(frozen=True)
-class Observed:
-    """Of N points: color (N, 3) float32 sRGB in [0, 1], covered (N,) bool: at least one photo shows the point; votes
-    (N, K) for each class, weighted by how well a photo sees the point."""
-
-    color: np.ndarray
-    covered: np.ndarray
-    votes: np.ndarray
 
 
 class Photos:
-    """The chosen photos with their labels, and the depth maps that say which points each of them sees.
+    """The chosen photos, and the depth maps that say which points each of them sees.
 
     Args:
         store: their pixels.
         maps: depth maps; `photo` (M,) says to which photo each belongs.
-        classes: number of classes.
         tolerance: how far from a map's surface a point may lie, normalised units.
     """
 
-    def __init__(self, store: PixelStore, maps: MapArrays, photo: np.ndarray, classes: int, tolerance: float) -> None:
+    def __init__(self, store: PixelStore, maps: MapArrays, photo: np.ndarray, tolerance: float) -> None:
         self.cameras: list[Camera] = store.cameras
         self.rotation, self.center = store.rays.rotation.cpu().numpy(), store.rays.center.cpu().numpy()
-        rgba, label, first = store.rgba.cpu().numpy(), store.label.cpu().numpy(), store.first.cpu().numpy()
+        rgba, first = store.rgba.cpu().numpy(), store.first.cpu().numpy()
         usable = np.ones(len(rgba), bool)
         if store.usable is not None:
             usable[:] = False
@@ -52,25 +38,21 @@ class Photos:
         spans = [slice(first[i], first[i + 1]) for i in range(len(shape))]
         self.rgb = [rgba[span, :3].reshape(*s, 3) for span, s in zip(spans, shape)]
         self.shows = [((rgba[span, 3] > 127) & usable[span]).reshape(s) for span, s in zip(spans, shape)]
-        self.label = [label[span].reshape(s) for span, s in zip(spans, shape)]
-        self.maps, self.photo, self.classes, self.tolerance = maps, photo, classes, tolerance
+        self.maps, self.photo, self.tolerance = maps, photo, tolerance
 
-    def observe(self, points: np.ndarray, normals: np.ndarray, report: Reporter) -> Observed:
-        """Colours and votes for surface points (N, 3) of the normalised frame with normals (N, 3)."""
-        parts = []
+    def observe(self, points: np.ndarray, normals: np.ndarray, report: Reporter) -> tuple[np.ndarray, np.ndarray]:
+        """sRGB colours (N, 3) float32 in [0, 1] of surface points (N, 3) of the normalised frame with normals (N, 3), and
+        whether at least one photo shows them: (N,) bool."""
+        color, covered = np.zeros((len(points), 3), np.float32), np.zeros(len(points), bool)
         for begin in range(0, len(points), CHUNK):
             report.progress(begin / len(points))
             part = slice(begin, begin + CHUNK)
-            parts.append(self._observe(np.asarray(points[part], np.float32), np.asarray(normals[part], np.float32)))
-        if not parts:
-            return Observed(np.zeros((0, 3), np.float32), np.zeros(0, bool), np.zeros((0, self.classes), np.float32))
-        return Observed(
-            np.concatenate([p.color for p in parts]),
-            np.concatenate([p.covered for p in parts]),
-            np.concatenate([p.votes for p in parts]),
-        )
+            color[part], covered[part] = self._observe(
+                np.asarray(points[part], np.float32), np.asarray(normals[part], np.float32)
+            )
+        return color, covered
 
-    def _observe(self, points: np.ndarray, normals: np.ndarray) -> Observed:
+    def _observe(self, points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         device = self.maps.depth.device
         seen = sight(
             torch.from_numpy(points).to(device), torch.from_numpy(normals).to(device), self.maps, self.tolerance
@@ -79,7 +61,6 @@ class Photos:
         count = len(points)
         colors = np.zeros((count, len(self.cameras), 3), np.float32)
         weights = np.zeros((count, len(self.cameras)), np.float32)
-        votes = np.zeros((count, self.classes), np.float32)
         for index, camera in enumerate(self.cameras):
             weight = seen[:, self.photo == index].max(1, initial=0)
             rows = np.flatnonzero(weight)
@@ -89,15 +70,10 @@ class Photos:
             rows, pixel = rows[inside], pixel[inside]
             x, y = pixel.astype(int).T
             shown = self.shows[index][y, x]
-            rows, pixel, x, y = rows[shown], pixel[shown], x[shown], y[shown]
+            rows, pixel = rows[shown], pixel[shown]
             colors[rows, index] = bilinear(self.rgb[index], pixel)
             weights[rows, index] = weight[rows]
-            label = self.label[index][y, x]
-            voted = label != VOID
-            if self.classes and voted.any():
-                np.add.at(votes, (rows[voted], label[voted]), weight[rows[voted]])
-        covered = weights.max(1, initial=0) > 0
-        return Observed(blend(colors, weights), covered, votes)
+        return blend(colors, weights), weights.max(1, initial=0) > 0
 
 
 def bilinear(image: np.ndarray, pixel: np.ndarray) -> np.ndarray:
@@ -123,13 +99,3 @@ def blend(colors: np.ndarray, weights: np.ndarray) -> np.ndarray:
         difference = ((colors - mean[:, None]) ** 2).sum(2)
         share = sharp / (1 + difference / OUTLIER**2)
     return mean
-
-
-def classify(votes: np.ndarray, field: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    """Class index (N,), −1 for void, and confidence (N,) from votes (N, K) and the field's probabilities (N, K)."""
-    total = votes.sum(1)
-    if field is None or not votes.shape[1]:
-        return np.full(len(votes), -1), np.zeros(len(votes))
-    usual = float(np.median(total[total > 0])) if (total > 0).any() else 1.0
-    probability = (votes + FIELD_SHARE * usual * field) / (total + FIELD_SHARE * usual)[:, None]
-    return probability.argmax(1), probability.max(1)

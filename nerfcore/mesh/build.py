@@ -1,4 +1,4 @@
-"""From a trained field to a labelled surface: depth maps, fusion, extraction, cleaning, decimation, colours, labels."""
+"""From a trained field to a coloured surface: depth maps, fusion, extraction, cleaning, decimation, colours."""
 
 from __future__ import annotations
 
@@ -12,13 +12,15 @@ from ..data.pixels import PixelStore
 from ..data.scene import Scene, View
 from ..errors import SettingError, TrainingError
 from ..geometry.similarity import similarity_scale, transform_points
+from ..images.picture import to_bytes
 from ..kernels.depth_arrays import FREE, MapArrays
 from ..params import MeshParams
 from ..progress import Reporter
 from ..project.schema import Project
+from ..render.model import Model
 from ..render.run import Trained
 from . import depth_maps as dm
-from .appearance import Observed, Photos, classify
+from .appearance import Photos
 from .clean import areas, clean, compact, components
 from .decimate import decimate
 from .extract import extract
@@ -26,7 +28,7 @@ from .field_values import shade
 from .fusion import TRUNCATION, coarser, fuse_maps
 from .refine import refined_maps
 from .region import Region, choose_region
-from .surface import Surface, face_classes, vertex_normals
+from .surface import vertex_normals
 
 FEW_STEPS = 300  # of training, below which a field is a sketch
 LITTLE_AGREEMENT, LITTLE_IN_ONE = 0.3, 0.5  # shares below which the user is told
@@ -34,19 +36,16 @@ LITTLE_AGREEMENT, LITTLE_IN_ONE = 0.3, 0.5  # shares below which the user is tol
 
 @dataclass(frozen=True)
 class Built:
-    """A surface in the normalised frame, where it was looked for, and what gives other points of it their colours.
-    coarse: vertices (V, 3) and faces (F, 3) of the same surface at voxels of twice the size, not cleaned."""
+    """A surface in the normalised frame, and the region in which it was looked for: vertices (V, 3) float32, faces (F, 3)
+    int32, normals (V, 3) unit, outward, colors (V, 3) uint8 sRGB; coarse: vertices (V', 3) and faces (F', 3) of the same
+    surface at voxels of twice the size, not cleaned."""
 
-    surface: Surface
+    vertices: np.ndarray
+    faces: np.ndarray
+    normals: np.ndarray
+    colors: np.ndarray
     region: Region
-    maps: MapArrays
-    photos: Photos
-    trained: Trained
     coarse: tuple[np.ndarray, np.ndarray]
-
-    def colors(self, points: np.ndarray, normals: np.ndarray, report: Reporter) -> np.ndarray:
-        """Colours (N, 3) uint8 of surface points: the photos', and the field's where no photo shows them."""
-        return mixed_colors(self.trained, self.region, self.photos.observe(points, normals, report), points, normals)
 
 
 def build(trained: Trained, project: Project, scene: Scene, params: MeshParams, report: Reporter) -> Built:
@@ -88,10 +87,12 @@ def build(trained: Trained, project: Project, scene: Scene, params: MeshParams, 
         vertices, faces = decimate(vertices, faces, params.faces, report)
         vertices, faces = compact(vertices, faces)
     check_parts(vertices, faces, report)
-    report.stage("Reading colours and classes")
-    photos = Photos(store, maps, np.array([flat.photo for flat in flats]), len(trained.info.class_ids), tolerance)
-    surface = dressed(trained, scene, region, photos, vertices, faces, report)
-    return Built(surface, region, maps, photos, trained, coarse)
+    report.stage("Reading colours")
+    vertices, faces = vertices.astype(np.float32), faces.astype(np.int32)
+    normals = vertex_normals(vertices, faces)
+    photos = Photos(store, maps, np.array([flat.photo for flat in flats]), tolerance)
+    colors = vertex_colors(trained.model, region, photos, vertices, normals, report)
+    return Built(vertices, faces, normals, colors, region, coarse)
 
 
 def wanted_bounds(params: MeshParams, scene: Scene, box: Box) -> tuple[np.ndarray, np.ndarray] | None:
@@ -166,41 +167,14 @@ def read_photos(trained: Trained, scene: Scene, views: list[View], box: Box, rep
     return PixelStore(scene, indices, ids, box.box_from_world, trained.info.image_size, device, report)
 
 
-def dressed(
-    trained: Trained,
-    scene: Scene,
-    region: Region,
-    photos: Photos,
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    report: Reporter,
-) -> Surface:
-    """The surface with colours and classes at its vertices. Without labels everything is void."""
-    normals = vertex_normals(vertices, faces)
-    observed = photos.observe(vertices, normals, report)
-    ids = trained.info.class_ids if trained.model.field.classes else []
-    probabilities = None
-    if ids:
-        _, probabilities = shade(trained.model, vertices, normals, True, region.voxel, report.progress)
-    index, _ = classify(observed.votes, probabilities)
-    class_id = np.where(index < 0, scene.ignore_id, np.array([*ids, scene.ignore_id])[index]).astype(np.int32)
-    return Surface(
-        vertices.astype(np.float32),
-        faces.astype(np.int32),
-        normals.astype(np.float32),
-        mixed_colors(trained, region, observed, vertices, normals),
-        class_id,
-        face_classes(faces, class_id),
-    )
-
-
-def mixed_colors(
-    trained: Trained, region: Region, observed: Observed, points: np.ndarray, normals: np.ndarray
+def vertex_colors(
+    model: Model, region: Region, photos: Photos, points: np.ndarray, normals: np.ndarray, report: Reporter
 ) -> np.ndarray:
-    """Colours (N, 3) uint8: the photos', and the field's where no photo shows a point."""
-    color, missing = observed.color.copy(), ~observed.covered
-    if missing.any():
-        color[missing], _ = shade(
-            trained.model, points[missing], normals[missing], False, region.voxel, lambda share: None
+    """Colours (N, 3) uint8 of surface points (N, 3) with normals (N, 3): the photos', and the field's where no photo
+    shows them."""
+    color, covered = photos.observe(points, normals, report)
+    if not covered.all():
+        color[~covered], _ = shade(
+            model, points[~covered], normals[~covered], False, region.voxel, lambda _: report.check()
         )
-    return (color.clip(0, 1) * 255).round().astype(np.uint8)
+    return to_bytes(color)

@@ -46,12 +46,6 @@ def to_world(surface: Surface, world_from_box: np.ndarray) -> Surface:
     )
 
 
-def face_classes(faces: np.ndarray, class_id: np.ndarray) -> np.ndarray:
-    """The class (F,) that most of a triangle's corners have (the first corner's when all differ)."""
-    a, b, c = class_id[faces].T
-    return np.where(b == c, b, a).astype(np.int32)
-
-
 def class_table(surface: Surface, names: dict[int, str]) -> dict[str, dict[str, float]]:
     """Number of faces and area (world units²) of each class on the surface."""
     area = areas(surface.vertices.astype(np.float64), surface.faces)

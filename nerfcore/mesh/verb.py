@@ -18,7 +18,7 @@ from ..project.fingerprints import Earlier, Fingerprint, compare, digest, read_m
 from ..project.runs import MEASURES, MESH_RECORD, checkpoint_id, state_id
 from ..project.schema import step
 from ..project.store import load_project, record_step, world_from_sfm
-from ..render.run import load_info, load_trained, refined_poses
+from ..render.run import Trained, load_info, load_trained, refined_poses
 from .build import Built, build
 from .features import features_of
 from .field_values import shade
@@ -28,7 +28,7 @@ from .painted import Painted, paint_surface, training_photos, write_maps
 from .parts import texture_of
 from .photos import Photo
 from .stored import COARSE
-from .surface import class_table, is_watertight, to_world
+from .surface import Surface, class_table, is_watertight, to_world
 from .turntable import write_turntable
 
 
@@ -52,12 +52,13 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
     target = folder / "exports" / params.run
     box = trained.info.box(project)
     photos = training_photos(scene, box.box_from_world, refined_poses(folder, params.run, trained.info))
-    painted = paint(built, photos, params, scene.ignore_id, report)
+    painted = paint(trained, built, photos, params, scene.ignore_id, report)
     texture = None
     if painted.uv is not None and painted.image is not None:
-        texture = texture_of(built.surface.faces, painted.uv.corners, painted.image)
-    labelled = replace(built.surface, class_id=painted.classes.class_id, face_class=painted.classes.face_class)
-    surface = to_world(labelled, box.world_from_box)
+        texture = texture_of(built.faces, painted.uv.corners, painted.image)
+    classes = painted.classes
+    made = Surface(built.vertices, built.faces, built.normals, built.colors, classes.class_id, classes.face_class)
+    surface = to_world(made, box.world_from_box)
     names = {scene.ignore_id: "void"} | {c.id: c.name for c in scene.classes}
     voxel = built.region.voxel * similarity_scale(box.world_from_box)
     face_instance, instances = find_instances(
@@ -68,7 +69,7 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
     for record in (MESH_RECORD, MEASURES):  # what they say is no longer true from here on
         (target / record).unlink(missing_ok=True)
     with atomic_path(target / "mesh.npz") as temporary, open(temporary, "wb") as file:
-        sure = {"confidence": painted.classes.confidence, "face_confidence": painted.classes.face_confidence}
+        sure = {"confidence": classes.confidence, "face_confidence": classes.face_confidence}
         uv = {} if painted.uv is None else {"uv": painted.uv.corners}
         np.savez(file, **vars(surface), **sure, **uv)
     with atomic_path(target / COARSE) as temporary, open(temporary, "wb") as file:
@@ -130,29 +131,31 @@ def meshed(params: MeshParams) -> Earlier:
     return compare(made, mesh_inputs(params), files)
 
 
-def paint(built: Built, photos: list[Photo], params: MeshParams, void: int, report: Reporter) -> Painted:
+def paint(
+    trained: Trained, built: Built, photos: list[Photo], params: MeshParams, void: int, report: Reporter
+) -> Painted:
     """Texture and classes for a surface in the normalised frame; what photos do not say is read from the field."""
-    model, voxel, surface = built.trained.model, built.region.voxel, built.surface
+    model, voxel = trained.model, built.region.voxel
 
     def color(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
         return to_bytes(shade(model, points, normals, False, voxel, lambda _: report.check())[0])
 
-    def classes(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    def probabilities(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
         found = shade(model, points, normals, True, voxel, lambda _: report.check())[1]
         assert found is not None
         return found
 
-    ids = built.trained.info.class_ids if model.field.classes else []
+    ids = trained.info.class_ids if model.field.classes else []
     return paint_surface(
-        surface.vertices,
-        surface.faces,
-        surface.colors,
+        built.vertices,
+        built.faces,
+        built.colors,
         photos,
         params.texture,
         params.texture_kind,
         ids,
         void,
         color,
-        classes if ids else None,
+        probabilities if ids else None,
         report,
     )

@@ -10,7 +10,7 @@ from fieldwork.nerfcore.data.box import Box
 from fieldwork.nerfcore.data.scene import Scene
 from fieldwork.nerfcore.errors import SettingError
 from fieldwork.nerfcore.geometry.similarity import make_similarity
-from fieldwork.nerfcore.mesh.appearance import bilinear, blend, classify
+from fieldwork.nerfcore.mesh.appearance import bilinear, blend
 from fieldwork.nerfcore.mesh.build import check_parts, wanted_bounds, wanted_voxel
 from fieldwork.nerfcore.params import MeshParams
 from fieldwork.nerfcore.progress import Reporter
@@ -47,20 +47,6 @@ def test_a_detail_in_millimetres_needs_a_scale() -> None:
         wanted_voxel(MeshParams(project=HERE, detail=5), project, BOX)
     project.frame.scale_known = True
     assert wanted_voxel(MeshParams(project=HERE, detail=5), project, BOX) == pytest.approx(0.0025)
-
-
-def test_without_labels_everything_is_void() -> None:
-    index, confidence = classify(np.zeros((4, 0), np.float32), None)
-    assert (index == -1).all()
-    assert (confidence == 0).all()
-
-
-def test_votes_decide_where_photos_say_something_and_the_field_elsewhere() -> None:
-    votes = np.array([[9.0, 1], [0, 10], [0, 0]], np.float32)
-    field = np.array([[0.1, 0.9], [0.9, 0.1], [0.8, 0.2]], np.float32)
-    index, confidence = classify(votes, field)
-    assert index.tolist() == [0, 1, 0]
-    assert confidence[2] == pytest.approx(0.8)
 
 
 def test_what_one_photo_alone_says_does_not_show() -> None:

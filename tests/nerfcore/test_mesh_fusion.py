@@ -22,7 +22,7 @@ from fieldwork.nerfcore.mesh.extract import extract
 from fieldwork.nerfcore.mesh.fusion import fuse_maps
 from fieldwork.nerfcore.mesh.refine import refined_maps
 from fieldwork.nerfcore.mesh.region import choose_region
-from fieldwork.nerfcore.mesh.surface import Surface, face_classes, is_watertight
+from fieldwork.nerfcore.mesh.surface import Surface, is_watertight
 from fieldwork.nerfcore.mesh.turntable import write_turntable
 from fieldwork.nerfcore.progress import Reporter
 from PIL import Image
@@ -340,7 +340,7 @@ def test_a_turntable_shows_fronts_in_their_colours(tmp_path: Path) -> None:
     vertices, faces = np.asarray(ball.vertices), np.asarray(ball.faces)
     colors = np.where(vertices[:, 2:] > 0, [250, 10, 10], [10, 10, 250]).astype(np.uint8)
     ids = np.where(vertices[:, 2] > 0, 3, 7)
-    surface = Surface(vertices, faces, vertices, colors, ids, face_classes(faces, ids))
+    surface = Surface(vertices, faces, vertices, colors, ids, ids[faces[:, 0]])
     paths = write_turntable(tmp_path, surface, {3: (0.0, 1.0, 0.0)}, Reporter())
     assert len(paths) == 16
     color, label = (np.array(Image.open(tmp_path / f"{name}_0.png")).astype(int) for name in ("color", "class"))

@@ -63,7 +63,9 @@ class DoctorParams(Params):
 class SimulateParams(Params):
     out: Path = Field(description="folder to write the simulated capture to")
     scene: str = Field(
-        default="museum", description="built-in scene: museum (exhibits in a room) or facade (weathered stone outdoors)"
+        default="museum",
+        description="built-in scene: museum (exhibits in a room), facade (weathered stone outdoors), fence (thin things: "
+        "wire, leaves, a sign) or vase (closed bodies on a table)",
     )
     views: int = Field(default=48, ge=4, description="number of photos")
     size: tuple[int, int] = Field(default=(480, 320), description="photo width and height in pixels")
@@ -344,11 +346,13 @@ class BatchParams(Params):
 
 
 class BenchParams(Params):
-    suite: Literal["figures", "speed", "ablation", "robustness", "baselines", "gpu"] = Field(description="which table")
+    suite: Literal["figures", "speed", "ablation", "robustness", "baselines", "gpu", "surface"] = Field(
+        description="which table"
+    )
     out: Path = Field(default=Path("build/bench"), description="folder for results and scenes; finished runs are kept")
     data: Path | None = Field(default=None, description="folder of data sets; default: ../shared/data when it is there")
     scenes: list[str] | None = Field(
-        default=None, description="data sets, museum or facade (simulated), or capture projects"
+        default=None, description="data sets, simulated scenes (museum, facade, fence, vase), or capture projects"
     )
     variants: list[str] | None = Field(default=None, description="only these variants of the suite")
     seconds: float | None = Field(default=None, gt=0, description="seconds of training a run, instead of the suite's")

@@ -106,12 +106,13 @@ class FIELDWORK_OT_bench(VerbOperator):
             ("robustness", "Robustness", "Noise, missing views, missing and wrong labels"),
             ("baselines", "Baselines", "Other methods as boundary cases of the field"),
             ("gpu", "GPU", "What is asked of a graphics card"),
+            ("surface", "Surfaces", "Textured meshes of simulated scenes beside their true surfaces"),
         ],
     )
     out: StringProperty(name="Folder", description="Folder for results and scenes", subtype="DIR_PATH")
     data: StringProperty(name="Data", description="Folder of data sets; empty: only simulated ones", subtype="DIR_PATH")
     scenes: StringProperty(
-        name="Scenes", description="Data sets, museum, facade, or capture projects, separated by commas"
+        name="Scenes", description="Data sets, simulated scenes, or capture projects, separated by commas"
     )
     variants: StringProperty(name="Variants", description="Only these variants of the suite, separated by commas")
     seconds: FloatProperty(name="Time", description="Seconds of training a run; 0: as the suite says", min=0.0)
@@ -170,6 +171,8 @@ class FIELDWORK_OT_simulate(VerbOperator):
         items=[
             ("museum", "Museum", "Exhibits on plinths, one of them gilded in part"),
             ("facade", "Facade", "A weathered piece of a church front in the open, with its damage as classes"),
+            ("fence", "Fence", "Thin things in a garden: a fence of wire, leaves, a sign"),
+            ("vase", "Vase", "A vase with its lid and a stone ball on a table: closed bodies"),
         ],
     )
     views: IntProperty(name="Photos", description="Number of photos", default=48, min=4, soft_max=200)

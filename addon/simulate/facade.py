@@ -62,7 +62,7 @@ def build(seed: int) -> bpy.types.Scene:
         materials.brick(5),
     ]
     iron = materials.iron(7)
-    _light(scene)
+    light(scene)
     _ground(materials.paving(8), materials.meadow(8), shift)
     masonry.build_wall(WALL, stone, shift, random)
     _ledges(stone, shift, random)
@@ -80,7 +80,8 @@ def poses(views: int, seed: int) -> list[np.ndarray]:
     return arc(views, LEVELS, TARGET, SPREAD, WANDER, seed)
 
 
-def _light(scene: bpy.types.Scene) -> None:
+def light(scene: bpy.types.Scene) -> None:
+    """Sun and clouds."""
     world = bpy.data.worlds.new("sky")
     materials.sky(world, 0.75)
     scene.world = world

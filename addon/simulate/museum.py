@@ -5,7 +5,6 @@ Metres, z up, the floor at z = 0. The gilding is painted on the same surfaces as
 
 from __future__ import annotations
 
-import itertools
 import math
 
 import bmesh
@@ -71,21 +70,6 @@ def _light(scene: bpy.types.Scene) -> None:
         light.location = position
         light.rotation_euler = (Vector((0, 0, 0.4)) - light.location).to_track_quat("-Z", "Y").to_euler()
         scene.collection.objects.link(light)
-
-
-def _lathe(profile: list[tuple[float, float]], steps: int = 64) -> bmesh.types.BMesh:
-    """Turn a profile of (radius, height) pairs around the z axis."""
-    bm = bmesh.new()
-    rows = [
-        [bm.verts.new((r * math.cos(a), r * math.sin(a), z)) for a in (2 * math.pi * i / steps for i in range(steps))]
-        for r, z in profile
-    ]
-    for below, above in itertools.pairwise(rows):
-        for i in range(steps):
-            bm.faces.new((below[i], below[(i + 1) % steps], above[(i + 1) % steps], above[i]))
-    bm.faces.new(reversed(rows[0]))
-    bm.faces.new(rows[-1])
-    return bm
 
 
 def _room(floor: bpy.types.Material, wall: bpy.types.Material) -> None:
@@ -200,7 +184,7 @@ def _vase(ceramic: bpy.types.Material, shift: Vector) -> None:
     points = np.array(profile)
     knots, fine = np.arange(len(points)), np.linspace(0, len(points) - 1, 70)
     smooth = [(float(np.interp(t, knots, points[:, 0])), float(np.interp(t, knots, points[:, 1]))) for t in fine]
-    vase = shapes.add("vase", shapes.from_bmesh("vase", _lathe(smooth), smooth=True), ceramic)
+    vase = shapes.add("vase", shapes.from_bmesh("vase", shapes.lathe(smooth), smooth=True), ceramic)
     vase.location, vase.rotation_euler = (-0.72, -0.3, 0.02), (0, 0, shift.x)
 
 

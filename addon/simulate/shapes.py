@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Sequence
 
 import bmesh
@@ -64,6 +65,21 @@ def grid(
     for below, above in itertools.pairwise(rows):
         for i in range(nx):
             bm.faces.new((below[i], below[i + 1], above[i + 1], above[i]))
+    return bm
+
+
+def lathe(profile: list[tuple[float, float]], steps: int = 64) -> bmesh.types.BMesh:
+    """A profile of (radius, height) pairs turned around the z axis, closed at both ends."""
+    bm = bmesh.new()
+    rows = [
+        [bm.verts.new((r * math.cos(a), r * math.sin(a), z)) for a in (2 * math.pi * i / steps for i in range(steps))]
+        for r, z in profile
+    ]
+    for below, above in itertools.pairwise(rows):
+        for i in range(steps):
+            bm.faces.new((below[i], below[(i + 1) % steps], above[(i + 1) % steps], above[i]))
+    bm.faces.new(reversed(rows[0]))
+    bm.faces.new(rows[-1])
     return bm
 
 

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from ..photograph.shoot import Lens, Shot, has_denoiser, photograph
-from . import facade, museum
+from . import facade, fence, museum, vase
 from .truth import write_truth
 
-SCENES = {"museum": museum, "facade": facade}
+SCENES = {"museum": museum, "facade": facade, "fence": fence, "vase": vase}
 ANGLE_OF_VIEW_FOCAL = 28 / 36  # focal length over sensor width: a 28 mm lens on full frame
 
 

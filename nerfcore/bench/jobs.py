@@ -8,7 +8,7 @@ import re
 import resource
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -75,6 +75,9 @@ class Job:
         return self.training_seconds + EVALUATION_SECONDS
 
 
+Measure = Callable[[Job, Path, Reporter], dict[str, Any]]  # of a job whose field is in a project
+
+
 class JobReporter(Reporter):
     """Turns the stages of one job into a share of the whole suite's progress."""
 
@@ -92,7 +95,8 @@ class JobReporter(Reporter):
 
     def stage(self, name: str) -> None:
         self.inner = name
-        self.span = self.stages.get(name.split(" ")[0], (0.0, 0.0))
+        # What has no share of its own goes on where the stage before ended.
+        self.span = self.stages.get(name.split(" ")[0], (self.span[1], self.span[1]))
 
     def progress(self, fraction: float, message: str = "") -> None:
         low, high = self.span
@@ -120,10 +124,13 @@ def _description(job: Job) -> dict[str, Any]:
     return {key: value for key, value in values.items() if key != "seed" or value is not None}
 
 
-def run_job(job: Job, project: Path, out: Path, report: Reporter, keep: bool = False) -> dict[str, Any]:
+def run_job(
+    job: Job, project: Path, out: Path, report: Reporter, keep: bool = False, more: Measure | None = None
+) -> dict[str, Any]:
     """Train and measure; returns and stores {"job": …, figures…}. A run that was interrupted goes on.
 
-    `keep`: the trained field stays in the project; else only its figures, pictures and curve do.
+    `keep`: the trained field stays in the project; else only its figures, pictures and curve do. `more`: measures what a
+    suite adds to the figures while the trained field is there.
     """
     device = use_device()
     _reset_peak(device)
@@ -156,6 +163,8 @@ def run_job(job: Job, project: Path, out: Path, report: Reporter, keep: bool = F
         "taken": taken().model_dump(mode="json"),
         "project": str(project),
     }
+    if more is not None:
+        figures |= more(job, project, report)
     write_json(out / "runs" / f"{job.name}.json", figures)
     if not keep:
         (folder / CHECKPOINT).unlink(missing_ok=True)
@@ -230,9 +239,17 @@ def planned(jobs: Sequence[Job], out: Path) -> list[str]:
 
 
 def run_all(
-    jobs: Sequence[Job], projects: dict[str, Path], out: Path, report: Reporter, keep: bool = False
+    jobs: Sequence[Job],
+    projects: dict[str, Path],
+    out: Path,
+    report: Reporter,
+    keep: bool = False,
+    more: Measure | None = None,
 ) -> list[dict[str, Any]]:
-    """Figures of all jobs in their order; finished ones are read, failed ones have only "job" and "error"."""
+    """Figures of all jobs in their order; finished ones are read, failed ones have only "job" and "error".
+
+    `keep`, `more`: see `run_job`.
+    """
     total = sum(job.expected_seconds for job in jobs) or 1.0
     done, results, begin = 0.0, [], time.monotonic()
     for line in planned(jobs, out):
@@ -244,7 +261,7 @@ def run_all(
         known = load_result(job, out)
         if known is None:
             try:
-                known = run_job(job, projects[job.scene], out, JobReporter(report, done, share, job, title), keep)
+                known = run_job(job, projects[job.scene], out, JobReporter(report, done, share, job, title), keep, more)
             except FieldworkError as error:
                 report.warn(f"{title} failed: {error}")
                 known = {"job": _description(job), "error": str(error)}

@@ -30,6 +30,11 @@ SUITES = {
     "robustness": ("Robustness", "Training on damaged photos or labels, measured on the undamaged held-out photos."),
     "baselines": ("Baselines", "Other methods as settings of the same field, from the same loader and rays."),
     "gpu": ("GPU", "What is asked of a GPU."),
+    "surface": (
+        "Surfaces",
+        "The textured mesh of 200 000 faces beside the true surface of simulated scenes. A pixel is the median footprint "
+        "of a photo's pixel on the surface, the size the longest side of what three cameras see.",
+    ),
 }
 # No suites of `bench`: figures that other verbs reported.
 OTHERS = {

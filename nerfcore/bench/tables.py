@@ -13,6 +13,7 @@ from ..files import atomic_path
 from .jobs import COUNTING_SIDE, Job
 from .results import Row
 from .suites import PUBLISHED_DROPS, REFERENCE
+from .surface_table import FIGURES, figure_table
 
 COLUMNS = {
     "scene": "scene",
@@ -33,6 +34,7 @@ COLUMNS = {
     "memory_rendering_mb": "peak memory, rendering (MiB)",
 }
 DIGITS = {"psnr": ".2f", "ssim": ".3f", "miou": ".3f", "psnr_gain": "+.2f", "miou_gain": "+.3f"}
+NAMES = {"psnr": "PSNR (dB)", "miou": "mIoU", "f_size": "F at 1 %", "f_pixel": "F at two pixels"}
 SPEED = {"fps": "frames/s", "ms_frame": "ms a frame", "ms_sampling": "ms sampling", "ms_network": "ms network"}
 
 
@@ -69,6 +71,7 @@ def make_rows(suite: str, results: Sequence[dict[str, Any]]) -> list[Row]:
             row["spr"], row["fused"] = speed["spr"], speed["fused"]
             values = {**speed, "ms_frame": round(1e3 / speed["fps"], 2)}
             row |= {f"{key}_{side}": values[key] for key in SPEED}
+        row |= {key: result[key] for key in (*FIGURES, "stages") if suite == "surface" and key in result}
         row["error"] = result.get("error")
         rows.append(row)
     reference = {_case(r): r for r in rows if r["variant"] == REFERENCE.get(suite)}
@@ -176,6 +179,8 @@ def markdown(suite: str, rows: Sequence[Row], machine: str, command: str, notes:
     present = [key for key in COLUMNS if any(row.get(key) is not None for row in rows) or key in ("psnr", "miou")]
     parts = [f"# Suite {suite}", "", f"Machine: {machine}. Command: `{command}`", ""]
     parts += [table({key: COLUMNS[key] for key in present}, rows), ""]
+    if suite == "surface":
+        parts += [table(*figure_table(rows)), ""]
     for side in frame_sides(rows):
         columns = {"scene": "scene", "variant": "variant", "budget": "budget"}
         columns |= {f"{key}_{side}": heading for key, heading in SPEED.items()}
@@ -191,7 +196,7 @@ def markdown(suite: str, rows: Sequence[Row], machine: str, command: str, notes:
 
 
 def plot(path: Path, suite: str, rows: Sequence[Row], results: Sequence[dict[str, Any]]) -> None:
-    """A picture of the suite: training curves for speed and gpu, bars of PSNR and mIoU for the rest."""
+    """A picture of the suite: training curves for speed and gpu, bars of two figures for the rest."""
     matplotlib.use("Agg")
     from matplotlib.figure import Figure
 
@@ -213,8 +218,9 @@ def plot(path: Path, suite: str, rows: Sequence[Row], results: Sequence[dict[str
         for (left, right), (case, found) in zip(
             figure.subplots(len(groups), 2, squeeze=False, sharey="row"), groups.items()
         ):
-            _bars(left, found, "psnr", f"{case}: PSNR (dB)")
-            _bars(right, found, "miou", "mIoU")
+            keys = ("f_size", "f_pixel") if suite == "surface" else ("psnr", "miou")
+            for axes, key in zip((left, right), keys):
+                _bars(axes, found, key, f"{case}: {NAMES[key]}")
     with atomic_path(path) as temporary:
         figure.savefig(temporary, dpi=120)
 
@@ -222,7 +228,7 @@ def plot(path: Path, suite: str, rows: Sequence[Row], results: Sequence[dict[str
 def _bars(axes: Any, found: dict[str, Row], key: str, title: str) -> None:
     """Horizontal bars, the first variant on top; missing figures leave a gap that says so."""
     names = list(found)[::-1]
-    values = [found[name][key] for name in names]
+    values = [found[name].get(key) for name in names]
     known = [v for v in values if v is not None]
     axes.barh(
         names, [v or 0.0 for v in values], color=["#2a6f97" if n == next(iter(found)) else "#89a9bd" for n in names]

@@ -8,6 +8,7 @@ With a page its result sets, figures/*.json beside it, get those of this command
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +19,13 @@ from ..files import write_json, write_text
 from ..kernels.device import use_device
 from ..params import BenchParams
 from ..progress import Reporter, shortened
-from . import gpu, machine, tables
+from . import gpu, machine, surface, tables
 from .jobs import run_all, unknown_origin
 from .page import check_page, figures_folder, write_page
 from .results import Asked, ResultSet, Row, grouped, write_set
 from .scenes import available, data_folder, is_labelled, prepare, scene_name
 from .suites import MISSING_BASELINES, PUBLISHED_DROPS, SCENES, SECONDS, plan
+from .surface_table import figure_table
 
 
 def bench(params: BenchParams, report: Reporter) -> dict[str, Any]:
@@ -43,7 +45,8 @@ def bench(params: BenchParams, report: Reporter) -> dict[str, Any]:
     data = data_folder(params.data)
     projects, notes = _scenes(params, data, root, report)
     jobs = plan(params, list(projects))
-    results = run_all(jobs, projects, out, report, keep=params.keep)
+    more = partial(surface.measure, root=root) if params.suite == "surface" else None
+    results = run_all(jobs, projects, out, report, params.keep, more)
     rows = tables.make_rows(params.suite, results)
     described = machine.describe()
     if params.yardstick is not None and params.suite == "speed":
@@ -82,6 +85,8 @@ def _scenes(params: BenchParams, data: Path | None, root: Path, report: Reporter
             notes.append(f"{scene} is left out: there is no such data set in {data or '../shared/data'}.")
             continue
         project = prepare(scene, data, root, report)
+        if params.suite == "surface":
+            surface.read_truth(root, scene_name(scene))  # before anything is trained for nothing
         if not params.scenes and params.suite in ("ablation", "robustness") and not is_labelled(project):
             notes.append(f"{scene} is left out: it has no labels.")
             continue
@@ -138,13 +143,15 @@ def _write_page(
     """Add the result sets of this command to the page's, one for each machine and commit, and write the page anew."""
     files = []
     for taken, own in grouped(results, rows):
+        columns, shown = figure_table(own) if params.suite == "surface" else (None, own)
         result = ResultSet(
             suite=params.suite,
             title=f"{', '.join(dict.fromkeys(row['budget'] for row in own))} ({taken.date})",
             command="make gpu-check" if params.suite == "gpu" else command_of(params),
             source="bench",
             taken=taken,
-            rows=own,
+            columns=columns,
+            rows=shown,
             notes=[*tables.verdicts(params.suite, own), *notes],
             asked=asked,
         )

@@ -29,7 +29,7 @@ from ..progress import Reporter
 from .folder import claim_folder
 from .process import run_in_blender
 
-SCENES = ("museum", "facade")
+SCENES = ("museum", "facade", "fence", "vase")
 SETTINGS = "simulate.json"
 START = datetime(2026, 5, 18, 10, 0, 0)
 FOCAL_MM = 28.0  # of a 36 mm wide sensor, noted in the photos' EXIF

@@ -48,38 +48,77 @@ def sample_surface(
     return a + u * (b - a) + v * (c - a), chosen
 
 
+@dataclass(frozen=True)
+class Distances:
+    """What lies between a mesh and the true one, sampled evenly by area.
+
+    face (N,) of the mesh and to_truth (N,) from there to the truth, whose nearest face is truth_face (N,); angle (N,)
+    between their normals, degrees, 0 to 90; true_face (M,) of the visible truth and to_mesh (M,) from there; area and
+    true_area: of the mesh, and of the visible truth.
+    """
+
+    face: np.ndarray
+    to_truth: np.ndarray
+    truth_face: np.ndarray
+    angle: np.ndarray
+    true_face: np.ndarray
+    to_mesh: np.ndarray
+    area: float
+    true_area: float
+
+    def scores(self, threshold: float) -> SurfaceScores:
+        precision, recall = float((self.to_truth < threshold).mean()), float((self.to_mesh < threshold).mean())
+        return SurfaceScores(
+            threshold,
+            precision,
+            recall,
+            2 * precision * recall / max(precision + recall, 1e-9),
+            float(np.median(self.to_truth)),
+            float(np.quantile(self.to_truth, 0.95)),
+            self.area / self.true_area,
+            float(np.median(self.angle)),
+        )
+
+
+def distances(
+    mesh: tuple[np.ndarray, np.ndarray],
+    truth: tuple[np.ndarray, np.ndarray],
+    visible: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
+    count: int = SAMPLES,
+    seed: int = 0,
+) -> Distances:
+    """Distances between two meshes (vertices, faces) of one frame, from `count` points of the mesh and twice as many of
+    the truth to the triangles near them.
+
+    `visible`: points and normals (N, 3) of the truth → (N,) bool; distances from the truth are those of visible points.
+    """
+    points, face = sample_surface(*mesh, count=count, seed=seed)
+    true, true_face = sample_surface(*truth, count=2 * count, seed=seed + 1)
+    true_normals = unit(cross(*truth))[true_face]
+    shown = np.ones(len(true), bool) if visible is None else visible(true, true_normals)
+    to_truth, nearest = _plane_distance(points, true, true_face, truth)
+    to_mesh, _ = _plane_distance(true[shown], points, face, mesh)
+    cosine = np.abs((unit(cross(*mesh))[face] * true_normals[nearest]).sum(1))
+    return Distances(
+        face,
+        to_truth,
+        true_face[nearest],
+        np.degrees(np.arccos(np.clip(cosine, 0, 1))),
+        true_face[shown],
+        to_mesh,
+        float(areas(*mesh).sum()),
+        float(areas(*truth).sum() * shown.mean()),
+    )
+
+
 def compare(
     mesh: tuple[np.ndarray, np.ndarray],
     truth: tuple[np.ndarray, np.ndarray],
     threshold: float,
     visible: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
-    seed: int = 0,
 ) -> SurfaceScores:
-    """Compare two meshes (vertices, faces) of one frame.
-
-    `visible`: points and normals (N, 3) of the truth → (N,) bool; recall and area count only these. Points are spread
-    evenly over both surfaces; distances are to the triangles near them.
-    """
-    points, face = sample_surface(*mesh, seed=seed)
-    true, true_face = sample_surface(*truth, count=2 * SAMPLES, seed=seed + 1)
-    true_normals = unit(cross(*truth))[true_face]
-    shown = np.ones(len(true), bool) if visible is None else visible(true, true_normals)
-    to_truth, nearest = _plane_distance(points, true, true_face, truth)
-    to_mesh, _ = _plane_distance(true[shown], points, face, mesh)
-    precision, recall = float((to_truth < threshold).mean()), float((to_mesh < threshold).mean())
-    normal = unit(cross(*mesh))[face]
-    angle = np.degrees(np.arccos(np.clip(np.abs((normal * true_normals[nearest]).sum(1)), 0, 1)))
-    true_area = areas(*truth).sum() * shown.mean()
-    return SurfaceScores(
-        threshold,
-        precision,
-        recall,
-        2 * precision * recall / max(precision + recall, 1e-9),
-        float(np.median(to_truth)),
-        float(np.quantile(to_truth, 0.95)),
-        float(areas(*mesh).sum() / true_area),
-        float(np.median(angle)),
-    )
+    """Scores of a mesh beside the true one; see `distances`."""
+    return distances(mesh, truth, visible).scores(threshold)
 
 
 def _plane_distance(

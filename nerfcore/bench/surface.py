@@ -1,0 +1,110 @@
+"""The suite `surface`: of each trained field the textured mesh that a user would ask for, and what it is worth.
+
+The mesh is compared with the true surface of the simulated scene (`surface_figures.py`) at the size it is delivered.
+"""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..data.load import load_scene
+from ..errors import InputError
+from ..mesh.build import build
+from ..mesh.metrics import on_border
+from ..mesh.painted import training_photos
+from ..mesh.surface import Surface, to_world
+from ..mesh.verb import paint
+from ..params import MeshParams
+from ..progress import Reporter
+from ..project.store import load_project
+from ..render.run import load_trained, refined_poses
+from .jobs import Job
+from .surface_figures import Truth, surface_figures
+
+FACES, TEXTURE = 200_000, 4096
+THIN = {"fence": 1}  # class of the plate whose two sides are looked for, by scene
+
+
+class StageClock(Reporter):
+    """Passes on what it hears, and adds up the seconds of each stage."""
+
+    def __init__(self, outer: Reporter) -> None:
+        super().__init__()
+        self.outer, self.seconds = outer, dict[str, float]()
+        self._name, self._begin = "Preparing", time.monotonic()
+
+    def stage(self, name: str) -> None:
+        self.stop()
+        self._name = name
+        self.outer.stage(name)
+
+    def stop(self) -> None:
+        now = time.monotonic()
+        self.seconds[self._name] = self.seconds.get(self._name, 0.0) + now - self._begin
+        self._begin = now
+
+    def progress(self, fraction: float, message: str = "") -> None:
+        self.outer.progress(fraction, message)
+
+    def warn(self, message: str) -> None:
+        self.outer.warn(message)
+
+    def check(self) -> None:
+        self.outer.check()
+
+
+def truth_folder(root: Path, scene: str) -> Path:
+    """Where `simulate` left the truth of a scene that `scenes.prepare` made in the folder of a benchmark."""
+    return root / "captures" / scene / "ground_truth"
+
+
+def read_truth(root: Path, scene: str) -> Truth:
+    """The true surface of a scene.
+
+    Raises:
+        InputError: it is not known: the scene was not simulated here.
+    """
+    path = truth_folder(root, scene) / "mesh.npz"
+    if not path.is_file():
+        raise InputError(
+            f"The true surface of {scene} is not known: {path} is not there.",
+            "Choose scenes that `fieldwork simulate` makes; remove the scene's folder in projects to make it again.",
+        )
+    with np.load(path, allow_pickle=False) as truth:
+        return Truth(truth["vertices"].astype(np.float64), truth["faces"], truth["face_class"])
+
+
+def measure(job: Job, project: Path, report: Reporter, root: Path) -> dict[str, Any]:
+    """Make the mesh of a job's field and compare it with the truth in the benchmark's folder `root`: the keys of `surface_table.FIGURES` but "psnr", and "stages" {name: seconds}.
+
+    Raises:
+        InputError: the true surface is not known. TrainingError: there is no surface.
+    """
+    truth = read_truth(root, job.scene)
+    clock = StageClock(report)
+    known, trained = load_project(project), load_trained(project, job.name)
+    scene, box = load_scene(project, trained.info.holdout), trained.info.box(known)
+    params = MeshParams(project=project, run=job.name, faces=FACES, texture=TEXTURE)
+    built = build(trained, known, scene, params, clock)
+    photos = training_photos(scene, box.box_from_world, refined_poses(project, job.name, trained.info))
+    painted = paint(trained, built, photos, params, scene.ignore_id, clock)
+    clock.stop()
+    report.stage("Measuring the surface")
+    classes, region = painted.classes, built.region
+    made = Surface(built.vertices, built.faces, built.normals, built.colors, classes.class_id, classes.face_class)
+    surface = to_world(made, box.world_from_box)
+    figures = surface_figures(surface, painted, truth, scene, THIN.get(job.scene))
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    figures |= {
+        "border_faces": on_border(built.vertices, built.faces, region.low, region.high, region.voxel / 2),
+        "faces": len(built.faces),
+        "mesh_seconds": sum(clock.seconds.values()),
+        "memory_mb": peak / (2**20 if sys.platform == "darwin" else 2**10),
+    }
+    return {**figures, "stages": {name: round(seconds, 1) for name, seconds in clock.seconds.items()}}

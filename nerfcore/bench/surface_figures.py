@@ -1,0 +1,201 @@
+"""Figures of a textured, labelled mesh beside the true surface and the photos that were held out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import minimum_filter
+from scipy.spatial import KDTree
+from skimage.color import deltaE_ciede2000, rgb2lab
+
+from ..data.scene import Scene, View
+from ..images.picture import resized
+from ..images.working import read_picture
+from ..mesh.clean import areas, cross, unit
+from ..mesh.facelets import Facelets, facelets
+from ..mesh.metrics import Distances, distances, sample_surface
+from ..mesh.painted import Painted
+from ..mesh.surface import Surface
+from ..mesh.surface_picture import surface_picture
+from ..mesh.visibility import DepthBuffer, PosedCamera, depth_buffer
+
+CLOSE = 0.01  # share of the size
+ENOUGH = 3  # cameras that see what a mesh is asked to hold
+FAR = 2.5  # of the median depth of the photos: what is farther is a background
+STEEPEST = 0.1  # cosine under which a camera is not said to see a place
+PIECES = 60  # pieces along the longest side: depth buffers leave out triangles that reach behind a camera
+SAMPLES = 100_000
+SAME_SIDE = np.cos(np.radians(60))
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The true surface of a simulated scene, in the world: vertices (V, 3), faces (F, 3), face_class (F,)."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    face_class: np.ndarray
+
+
+class Sight:
+    """What the photos of a scene show of the true surface.
+
+    pixel: median footprint of a photo's pixel there; far: depth beyond which things are background; size: longest side
+    of what enough cameras see. World units.
+    """
+
+    def __init__(self, truth: Truth, views: Sequence[View]) -> None:
+        self.cameras = posed(views)
+        pieces = small_pieces(truth.vertices, truth.faces)
+        self.buffers = [depth_buffer(camera, pieces.vertices, pieces.faces) for camera in self.cameras]
+        depths = [buffer.depth[buffer.face >= 0] for buffer in self.buffers]
+        self.far = FAR * float(np.median(np.concatenate(depths)))
+        near = [camera.footprint(z[z < self.far]) for camera, z in zip(self.cameras, depths)]
+        self.pixel = float(np.median(np.concatenate(near)))
+        points, face = sample_surface(truth.vertices, truth.faces, SAMPLES)
+        seen = points[self.visible(points, unit(cross(truth.vertices, truth.faces))[face])]
+        self.size = float(np.ptp(seen, axis=0).max())
+
+    def visible(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """Whether enough cameras see points (N, 3) with normals (N, 3): (N,)."""
+        seen = np.zeros(len(points), int)
+        for camera, buffer in zip(self.cameras, self.buffers):
+            towards = camera.center - points
+            cosine = (towards * normals).sum(1) / np.maximum(np.linalg.norm(towards, axis=1), 1e-12)
+            local = camera.local(points)
+            depth = camera.depth(local)
+            clear = buffer.sees(camera.pixels(local), depth, np.maximum(cosine, STEEPEST))
+            seen += clear & (cosine > STEEPEST) & (depth < self.far)
+        return seen >= ENOUGH
+
+
+def posed(views: Sequence[View]) -> list[PosedCamera]:
+    """The cameras of views in the world."""
+    return [PosedCamera(view.camera, np.asarray(view.camera_to_world, np.float64)) for view in views]
+
+
+def small_pieces(vertices: np.ndarray, faces: np.ndarray) -> Facelets:
+    return facelets(vertices, faces, None, float(np.ptp(vertices, axis=0).max()) / PIECES)
+
+
+def surface_figures(
+    surface: Surface, painted: Painted, truth: Truth, scene: Scene, thin: int | None
+) -> dict[str, float | None]:
+    """All figures of a textured mesh in the world but those of time and memory; None: there is nothing to measure.
+
+    Args:
+        thin: class of a plate whose two sides are looked for.
+    """
+    mesh = surface.vertices.astype(np.float64), surface.faces
+    sight = Sight(truth, [scene.views[i] for i in scene.train])
+    found = distances(mesh, (truth.vertices, truth.faces), sight.visible, SAMPLES)
+    coarse, fine = found.scores(CLOSE * sight.size), found.scores(2 * sight.pixel)
+    held_out = [scene.views[i] for i in scene.test]
+    return {
+        "f_size": coarse.f,
+        "f_pixel": fine.f,
+        "median_pixels": fine.median / sight.pixel,
+        "median_size": fine.median / sight.size,
+        "p95_pixels": fine.p95 / sight.pixel,
+        "completeness": coarse.recall,
+        "excess_area": 1 - coarse.precision,
+        "normal_deg": fine.normal_deg,
+        "both_sides": None if thin is None else both_sides(mesh, truth, sight, thin),
+        "hit_share": hit_share(mesh, truth, held_out, sight.far),
+        **class_figures(found, surface, truth, CLOSE * sight.size),
+        **picture_figures(mesh, painted, held_out),
+        "seams": seam_ratio(surface.faces, painted),
+    }
+
+
+def both_sides(mesh: tuple[np.ndarray, np.ndarray], truth: Truth, sight: Sight, thin: int) -> float:
+    """Of the two sides of a plate, of class `thin`, the share of the worse one that has a surface within two pixels which
+    looks the same way."""
+    plate = truth.faces[truth.face_class == thin]
+    points, face = sample_surface(truth.vertices, plate, SAMPLES // 10)
+    normals = unit(cross(truth.vertices, plate))[face]
+    seen = sight.visible(points, normals)
+    points, normals = points[seen], normals[seen]
+    axis = np.abs(normals).sum(0).argmax()
+    place, own = sample_surface(*mesh, count=4 * SAMPLES)
+    near, index = KDTree(place).query(points, k=16, distance_upper_bound=2 * sight.pixel)
+    facing = np.append(unit(cross(*mesh))[own], np.zeros((1, 3)), 0)[np.asarray(index)]
+    same = (np.isfinite(near) & (np.einsum("nkc,nc->nk", facing, normals) > SAME_SIDE)).any(1)
+    sides = [same[side * normals[:, axis] > SAME_SIDE] for side in (-1, 1)]
+    return min(float(side.mean()) if len(side) else 0.0 for side in sides)
+
+
+def hit_share(mesh: tuple[np.ndarray, np.ndarray], truth: Truth, views: Sequence[View], far: float) -> float:
+    """Of the pixels of views that show the truth, nearer than `far`, the share that hits the mesh."""
+    pieces, ours = small_pieces(truth.vertices, truth.faces), small_pieces(*mesh)
+
+    def drawn(camera: PosedCamera, made: Facelets) -> DepthBuffer:
+        return depth_buffer(camera, made.vertices, made.faces)
+
+    solid = hit = 0
+    for camera in posed(views):
+        shown = drawn(camera, pieces).depth < far
+        solid += int(shown.sum())
+        hit += int((shown & (drawn(camera, ours).face >= 0)).sum())
+    return hit / max(solid, 1)
+
+
+def class_figures(found: Distances, surface: Surface, truth: Truth, close: float) -> dict[str, float]:
+    """mIoU by area of the mesh where it is `close` to the truth, and by how much the area of the worst class is off, of
+    classes that have at least a hundredth of what is seen."""
+    near = found.to_truth < close
+    ours, theirs = surface.face_class[found.face[near]], truth.face_class[found.truth_face[near]]
+    area = areas(surface.vertices.astype(np.float64), surface.faces)
+    seen = truth.face_class[found.true_face]
+    ious, off = [], []
+    for number in np.unique(seen):
+        one, other = ours == number, theirs == number
+        if (one | other).any():
+            ious.append((one & other).sum() / (one | other).sum())
+        share = float((seen == number).mean())
+        if share >= 0.01:
+            off.append(abs(area[surface.face_class == number].sum() / (share * found.true_area) - 1))
+    return {"surface_miou": float(np.mean(ious)), "class_area_error": float(max(off))}
+
+
+def picture_figures(
+    mesh: tuple[np.ndarray, np.ndarray], painted: Painted, views: Sequence[View]
+) -> dict[str, float | None]:
+    """PSNR of the textured mesh against photos where it is hit, and its gradient energy over theirs."""
+    if painted.uv is None or painted.image is None or not views:
+        return {"mesh_psnr": None, "gradient": None}
+    psnr, energy = [], np.zeros(2)
+    for view, camera in zip(views, posed(views)):
+        picture, hit = surface_picture(camera, *mesh, painted.uv.corners, painted.image)
+        photo = resized(read_picture(view.image), view.camera.width, view.camera.height).pixels[..., :3]
+        covered = hit > 0.99
+        error = (picture.astype(float) - photo)[covered] / 255
+        psnr.append(-10 * np.log10(max(float((error**2).mean()), 1e-10)))
+        inner = minimum_filter(covered, 3)
+        energy += [(np.hypot(*np.gradient(p.astype(float).mean(2)))[inner] ** 2).sum() for p in (picture, photo)]
+    return {"mesh_psnr": float(np.mean(psnr)), "gradient": float(energy[0] / max(energy[1], 1e-9))}
+
+
+def seam_ratio(faces: np.ndarray, painted: Painted) -> float | None:
+    """Mean difference of colour (CIEDE2000) across the seams of a texture over that across other edges of the mesh, each
+    between places one texel and a half from the edge."""
+    if painted.uv is None or painted.image is None or not len(painted.uv.seams):
+        return None
+    corners, size = painted.uv.corners.astype(np.float64), painted.image.shape[0]
+    ends = np.sort(np.stack([faces, faces[:, [1, 2, 0]]], -1).reshape(-1, 2), 1)
+    middle = ((corners + corners[:, [1, 2, 0]]) / 2).reshape(-1, 2)
+    inward = np.repeat(corners.mean(1), 3, 0) - middle
+    place = middle + inward * np.minimum(1.5 / size / np.maximum(np.linalg.norm(inward, axis=1), 1e-12), 1)[:, None]
+    x, y = np.clip((place * [1, -1] + [0, 1]) * size, 0, size - 1).astype(int).T
+    lab = rgb2lab(painted.image[y, x] / 255.0)
+    span = int(faces.max()) + 1
+    key = ends[:, 0].astype(np.int64) * span + ends[:, 1]
+    order = np.argsort(key, kind="stable")
+    pair = np.flatnonzero(key[order[1:]] == key[order[:-1]])
+    one, two = order[pair], order[pair + 1]
+    off = deltaE_ciede2000(lab[one], lab[two])
+    cut = np.sort(painted.uv.seams, 1).astype(np.int64)
+    seam = np.isin(key[one], cut[:, 0] * span + cut[:, 1])
+    return float(off[seam].mean() / max(off[~seam].mean(), 1e-9)) if seam.any() else None

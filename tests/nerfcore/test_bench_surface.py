@@ -1,0 +1,128 @@
+"""Figures of a mesh beside the true one where they are known, and the suite's table."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fieldwork.nerfcore.bench import surface as suite
+from fieldwork.nerfcore.bench.surface_figures import Sight, Truth, both_sides, hit_share, seam_ratio, surface_figures
+from fieldwork.nerfcore.bench.surface_table import FIGURES, figure_table
+from fieldwork.nerfcore.data.scene import Scene, View
+from fieldwork.nerfcore.errors import InputError
+from fieldwork.nerfcore.geometry.cameras import Camera
+from fieldwork.nerfcore.mesh.clean import unit
+from fieldwork.nerfcore.mesh.painted import Painted
+from fieldwork.nerfcore.mesh.surface import Surface
+from fieldwork.nerfcore.mesh.surface_labels import SurfaceClasses
+from fieldwork.nerfcore.mesh.uv import UvMap
+from fieldwork.nerfcore.params import BenchParams
+from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.verbs import run_verb
+from fieldwork.tests.nerfcore.test_mesh_fusion import orbit
+from fieldwork.tests.nerfcore.test_training import tiny_project  # noqa: F401
+
+CAMERA = Camera(width=90, height=90, fx=100.0, fy=100.0, cx=45.0, cy=45.0)
+
+
+def ball_and_plate() -> Truth:
+    """A ball of class 1 above a plate of class 2, two hundredths thick."""
+    import trimesh
+
+    ball = trimesh.creation.icosphere(4, 0.3)
+    plate = trimesh.creation.box((0.8, 0.8, 0.02))
+    plate = plate.subdivide_to_size(0.1).apply_translation((0, 0, -0.45))
+    whole = trimesh.util.concatenate([ball, plate])
+    kinds = np.repeat([1, 2], [len(ball.faces), len(plate.faces)])
+    return Truth(np.asarray(whole.vertices), np.asarray(whole.faces), kinds)
+
+
+def scene_around() -> Scene:
+    views = [View(f"{k}", CAMERA, pose, image=None) for k, pose in enumerate(orbit(20, 2.0))]  # type: ignore[arg-type]
+    return Scene(views, list(range(18)), [18, 19])
+
+
+def as_surface(vertices: np.ndarray, faces: np.ndarray, kinds: np.ndarray) -> Surface:
+    nothing = np.zeros((len(vertices), 3))
+    return Surface(vertices, faces, nothing, nothing.astype(np.uint8), np.zeros(len(vertices), int), kinds)
+
+
+def unpainted() -> Painted:
+    none = np.zeros(0)
+    return Painted(SurfaceClasses(none, none, none, none))
+
+
+def test_the_truth_itself_has_no_fault() -> None:
+    truth, scene = ball_and_plate(), scene_around()
+    scene = Scene(scene.views, scene.train, [])  # pictures are measured with photos
+    mesh = as_surface(truth.vertices, truth.faces, truth.face_class)
+    found = surface_figures(mesh, unpainted(), truth, scene, 2)
+    assert found["f_size"] == found["f_pixel"] == found["both_sides"] == found["surface_miou"] == pytest.approx(1)
+    assert found["excess_area"] == 0
+    assert found["mesh_psnr"] is found["gradient"] is found["seams"] is None
+    assert 0.05 < found["class_area_error"] < 0.15  # no camera sees the rim of the plate, and little below it
+
+
+def test_a_plate_of_one_side_and_a_missing_ball_are_seen() -> None:
+    truth, scene = ball_and_plate(), scene_around()
+    sight = Sight(truth, [scene.views[i] for i in scene.train])
+    normal = unit(np.cross(*(truth.vertices[truth.faces[:, k]] - truth.vertices[truth.faces[:, 0]] for k in (1, 2))))
+    upper = truth.faces[(truth.face_class == 1) | (normal[:, 2] > 0.5)]
+    assert both_sides((truth.vertices, truth.faces), truth, sight, 2) > 0.99
+    assert both_sides((truth.vertices, upper), truth, sight, 2) < 0.1
+    held_out = [scene.views[i] for i in scene.test]
+    plate = truth.vertices, truth.faces[truth.face_class == 2]
+    assert hit_share((truth.vertices, truth.faces), truth, held_out, sight.far) == 1
+    assert 0.2 < hit_share(plate, truth, held_out, sight.far) < 0.9
+
+
+def test_seams_are_told_from_other_edges() -> None:
+    faces = np.array([[0, 1, 2], [0, 2, 3], [2, 1, 4]])
+    corners = np.array(
+        [[[0, 0], [0.4, 0], [0, 0.4]], [[0, 0], [0, 0.4], [-0.0, 0.4]], [[0.6, 0.9], [0.9, 0.6], [1, 1]]]
+    )
+    corners[1, 2] = [0.3, 0.8]
+    image = np.full((64, 64, 3), 90, np.uint8)
+    image[:, :] += (np.arange(64) // 2).astype(np.uint8)[None, :, None]
+    uv = UvMap(corners.astype(np.float32), np.zeros(3, int), np.array([[1, 2]]), 1.0)
+    smooth = seam_ratio(faces, Painted(unpainted().classes, uv, image))
+    image[:32, 32:] = 250  # the other chart
+    assert seam_ratio(faces, Painted(unpainted().classes, uv, image)) > 2 * smooth
+    assert seam_ratio(faces, unpainted()) is None
+
+
+def test_the_table_has_a_row_for_each_figure_and_stage() -> None:
+    rows = [{"scene": "museum", "f_size": 0.9512, "stages": {"Fusing": 6.2}}, {"scene": "vase", "both_sides": None}]
+    columns, made = figure_table(rows)
+    assert list(columns) == ["figure", "asked", "museum", "vase"]
+    assert made[0] == {"figure": "F at 1 % of the size", "asked": "≥ 0.97", "museum": "0.951", "vase": "–"}
+    assert made[-1] == {"figure": "Fusing (s)", "asked": "", "museum": "6", "vase": "–"}
+    assert len(made) == len(FIGURES) + 1
+
+
+def test_the_suite_measures_each_field_while_it_is_there(
+    tiny_project: Path,  # noqa: F811
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    seen = []
+
+    def measure(job, project, report, root) -> dict:
+        seen.append((project / "runs" / job.name / "field.safetensors").is_file())
+        return {"f_size": 0.5, "f_pixel": 0.25, "stages": {"Fusing": 1.0}}
+
+    params = BenchParams(suite="surface", out=tmp_path, scenes=[str(tiny_project)], steps=3)
+    with pytest.raises(InputError, match="true surface"):
+        run_verb("bench", params, Reporter())
+    monkeypatch.setattr(suite, "measure", measure)
+    monkeypatch.setattr(suite, "read_truth", lambda root, scene: None)
+    params = params.model_copy(update={"page": tmp_path / "page.md"})
+    result = run_verb("bench", params, Reporter())
+    assert result["failed"] == 0
+    assert result["rows"][0]["f_size"] == 0.5
+    assert (tmp_path / "surface" / "plot.png").is_file()
+    again = run_verb("bench", params, Reporter())
+    assert again["rows"] == result["rows"]
+    assert seen == [True]
+    assert "| F at two pixels | ≥ 0.90 | 0.250 |" in (tmp_path / "page.md").read_text("utf-8")

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from types import UnionType
-from typing import Any, Literal, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import click
 from pydantic import ValidationError
@@ -73,10 +73,10 @@ def _box(ctx: click.Context, param: click.Parameter, value: tuple[float, ...] | 
 
 
 def _plain(annotation: Any) -> Any:
-    """The type without None."""
+    """The type without None, and without the checks that come with it."""
     if get_origin(annotation) in (Union, UnionType):
-        return next(a for a in get_args(annotation) if a is not type(None))
-    return annotation
+        return _plain(next(a for a in get_args(annotation) if a is not type(None)))
+    return _plain(get_args(annotation)[0]) if get_origin(annotation) is Annotated else annotation
 
 
 def _option(name: str, info: FieldInfo) -> click.Option:

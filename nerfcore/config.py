@@ -16,11 +16,12 @@ from .errors import SettingError, wrong_value
 PRESETS = Path(__file__).parent / "presets"
 # Earlier names of settings, still understood in `--set`, in preset files and in stored runs.
 RENAMED = {"sampling.interest": "sampling.importance"}
+MANY = 1_000_000_000  # more steps or seconds than anybody waits for
 MOST_VERTICES = 2048  # along a side of the finest level that a run chooses by itself; not tuned
 
 
 class Stage(BaseModel):
-    model_config = ConfigDict(extra="forbid", validate_assignment=True)
+    model_config = ConfigDict(extra="forbid", validate_assignment=True, allow_inf_nan=False)
 
 
 class SceneConfig(Stage):
@@ -33,16 +34,18 @@ class SceneConfig(Stage):
     image_size: int | None = Field(
         default=None,
         ge=32,
+        le=16384,
         description="longest side of the training images in pixels; null: 1600 on a GPU, 800 on the CPU",
     )
     background: Literal["auto", "random", "white", "black"] = Field(
         default="auto",
         description="colour behind the field; auto: black or white where an object is photographed in front of that, else random",
     )
-    margin: float = Field(default=1.05, gt=0, description="size of the box relative to what must fit in")
+    margin: float = Field(default=1.05, gt=0, le=100, description="size of the box relative to what must fit in")
     photo_memory: float | None = Field(
         default=None,
         ge=0,
+        le=10_000,
         description="GB of the device's memory for the training photos; larger ones stay in the host's memory, and lenses "
         "are inverted for each batch; null: half of what is free",
     )
@@ -58,10 +61,11 @@ class FieldConfig(Stage):
         default="concat", description="how the two branches join: their weighted sum, or both weighted and side by side"
     )
     levels: int = Field(default=8, ge=1, le=16, description="levels of the vertex grid, 4 features each")
-    coarsest: int = Field(default=16, ge=2, description="vertices along a side of the coarsest level")
+    coarsest: int = Field(default=16, ge=2, le=1024, description="vertices along a side of the coarsest level")
     finest: int | None = Field(
         default=None,
         ge=2,
+        le=65536,
         description="vertices along a side of the finest level; null: one for each pixel of the photos, at most "
         f"{MOST_VERTICES}",
     )
@@ -69,28 +73,30 @@ class FieldConfig(Stage):
         default=19, ge=10, le=24, description="at most 2^this vertices a level; larger levels are hashed"
     )
     octaves: int = Field(default=8, ge=1, le=16, description="octaves of the implicit branch's frequency encoding")
-    width: int = Field(default=64, ge=8, description="width of the hidden layers")
-    implicit_layers: int = Field(default=2, ge=1, description="matrix products of the implicit branch")
-    color_layers: int = Field(default=3, ge=1, description="matrix products of the colour head")
-    semantic_layers: int = Field(default=2, ge=1, description="matrix products of the semantic head")
-    geometry_features: int = Field(default=15, ge=1, description="features the density head hands to the other heads")
+    width: int = Field(default=64, ge=8, le=1024, description="width of the hidden layers")
+    implicit_layers: int = Field(default=2, ge=1, le=16, description="matrix products of the implicit branch")
+    color_layers: int = Field(default=3, ge=1, le=16, description="matrix products of the colour head")
+    semantic_layers: int = Field(default=2, ge=1, le=16, description="matrix products of the semantic head")
+    geometry_features: int = Field(
+        default=15, ge=1, le=256, description="features the density head hands to the other heads"
+    )
     blend_by: Literal["evidence", "density"] = Field(
         default="evidence", description="density: the original, literal blend weight"
     )
     blend_floor: float = Field(default=0.5, ge=0, le=1, description="share of the grid where nothing was seen (w0)")
-    blend_rate: float = Field(default=8.0, gt=0, description="how fast evidence raises the grid's share (κ)")
-    blend_warmup: int = Field(default=0, ge=0, description="steps with the grid alone")
+    blend_rate: float = Field(default=8.0, gt=0, le=1000, description="how fast evidence raises the grid's share (κ)")
+    blend_warmup: int = Field(default=0, ge=0, le=MANY, description="steps with the grid alone")
     voxel_init: Literal["rgb_stats", "cnn", "none"] = Field(
         default="none",
         description="what is written into the dense levels after the coarse stage: mean and variance over the photos "
         "of what they show at a vertex, as colours or as features of a small network",
     )
-    voxel_init_step: int = Field(default=128, ge=1, description="steps of the coarse stage before voxel_init")
+    voxel_init_step: int = Field(default=128, ge=1, le=MANY, description="steps of the coarse stage before voxel_init")
     voxel_init_weights: str | None = Field(
         default=None, description="file with the weights of voxel_init=cnn; null: they are learned with the field"
     )
-    appearance: int = Field(default=0, ge=0, description="length of the per-image appearance code; 0: none")
-    density_shift: float = Field(default=-1.0, description="added to the raw density before exp")
+    appearance: int = Field(default=0, ge=0, le=256, description="length of the per-image appearance code; 0: none")
+    density_shift: float = Field(default=-1.0, ge=-20, le=20, description="added to the raw density before exp")
     precision: Literal["auto", "float32", "bfloat16", "float16"] = Field(
         default="auto", description="of matrix products"
     )
@@ -103,24 +109,26 @@ class SamplingConfig(Stage):
         default=128, ge=8, le=512, multiple_of=4, description="cells along a side of the occupancy grid"
     )
     samples: int = Field(default=16, ge=1, le=512, description="samples a ray (M_f)")
-    bins_per_cell: float = Field(default=1.0, gt=0, description="bins of the coarse march per grid cell")
+    bins_per_cell: float = Field(default=1.0, gt=0, le=16, description="bins of the coarse march per grid cell")
     pdf: Literal["default", "uniform", "literal"] = Field(default="default", description="distribution of the samples")
     importance: Literal["priority", "boundary", "none"] = Field(
         default="priority", description="what draws samples besides density"
     )
-    beta: float = Field(default=1.0, ge=0, description="strength of the importance")
-    epsilon: float = Field(default=0.01, gt=0, description="weight every occupied bin keeps")
-    update_every: int = Field(default=16, ge=1, description="steps between updates of the occupancy grid")
+    beta: float = Field(default=1.0, ge=0, le=1000, description="strength of the importance")
+    epsilon: float = Field(default=0.01, gt=0, le=1, description="weight every occupied bin keeps")
+    update_every: int = Field(default=16, ge=1, le=MANY, description="steps between updates of the occupancy grid")
     decay: float = Field(default=0.95, gt=0, lt=1, description="of the occupancy grid at each update")
     mean_rate: float = Field(
         default=0.1, gt=0, le=1, description="at which a cell's mean density follows each point read in it"
     )
-    optical_depth: float = Field(default=1.0, gt=0, description="most that a cell may have when samples are drawn")
+    optical_depth: float = Field(
+        default=1.0, gt=0, le=1000, description="most that a cell may have when samples are drawn"
+    )
     warmup_decay: float = Field(
         default=0.25, ge=0, lt=1, description="of the grid where the warm-up reads all of it, to forget the first guess"
     )
-    threshold: float = Field(default=0.01, gt=0, description="opacity of a bin below which its cell is closed")
-    warmup: int = Field(default=256, ge=0, description="steps in which all cells are updated at once")
+    threshold: float = Field(default=0.01, gt=0, lt=1, description="opacity of a bin below which its cell is closed")
+    warmup: int = Field(default=256, ge=0, le=MANY, description="steps in which all cells are updated at once")
     close_near_cameras: bool = Field(
         default=True, description="cells nearer to a camera than anything in its photo stay empty"
     )
@@ -131,7 +139,7 @@ class SamplingConfig(Stage):
         default=True, description="cells on the way between cameras around something, and right before it, stay empty"
     )
     coarse_cache: bool = Field(default=True, description="choose training rays by which image tiles met the field")
-    cache_every: int = Field(default=1000, ge=1, description="steps between updates of the coarse cache")
+    cache_every: int = Field(default=1000, ge=1, le=MANY, description="steps between updates of the coarse cache")
     outline_rays: float = Field(
         default=0.2, ge=0, le=1, description="share of rays drawn where classes meet in the labels"
     )
@@ -147,7 +155,7 @@ class RenderConfig(Stage):
         default="probabilities", description="what is summed along a ray for classes"
     )
     cull: float = Field(
-        default=1e-4, ge=0, description="rendering weight below which colour and classes are not computed"
+        default=1e-4, ge=0, lt=1, description="rendering weight below which colour and classes are not computed"
     )
     samples: int | None = Field(
         default=32, ge=1, le=512, description="most samples a ray when rendering; null: as in training"
@@ -177,51 +185,63 @@ class LossConfig(Stage):
     """What training minimises."""
 
     rgb: Literal["huber", "mse"] = Field(default="huber", description="price of colour errors; mse: squared")
-    rgb_weight: float = Field(default=1.0, ge=0, description="of colour errors")
-    huber_delta: float = Field(default=0.1, gt=0, description="colour error from which its price grows linearly")
-    semantic_weight: float = Field(default=0.04, ge=0, description="λ_sem; 0 trains without semantics")
+    rgb_weight: float = Field(default=1.0, ge=0, le=1000, description="of colour errors")
+    huber_delta: float = Field(default=0.1, gt=0, le=10, description="colour error from which its price grows linearly")
+    semantic_weight: float = Field(default=0.04, ge=0, le=1000, description="λ_sem; 0 trains without semantics")
     detach_weights: bool = Field(default=False, description="labels do not move the geometry")
-    regularization: float = Field(default=1.0, ge=0, description="λ_reg, factor of sparsity, distortion and entropy")
+    regularization: float = Field(
+        default=1.0, ge=0, le=1000, description="λ_reg, factor of sparsity, distortion and entropy"
+    )
     sparsity: Literal["exponential", "cauchy", "l1"] = Field(
         default="exponential", description="l1: the original, literal form"
     )
-    sparsity_weight: float = Field(default=1e-4, ge=0, description="of density at random points")
-    sparsity_scale: float = Field(default=0.05, gt=0, description="ℓ of 1−exp(−ℓσ)")
-    distortion_weight: float = Field(default=0.01, ge=0, description="against floaters and fog before surfaces")
-    distortion_start: float = Field(default=0.2, ge=0, le=1, description="share of training before that term")
-    opacity_weight: float = Field(default=0.0, ge=0, description="entropy of the ray's opacity")
-    depth_weight: float = Field(
-        default=0.0, ge=0, description="pulls surfaces to the sparse points of the poses and to depth maps; 0: off"
+    sparsity_weight: float = Field(default=1e-4, ge=0, le=1000, description="of density at random points")
+    sparsity_scale: float = Field(default=0.05, gt=0, le=1000, description="ℓ of 1−exp(−ℓσ)")
+    distortion_weight: float = Field(
+        default=0.01, ge=0, le=1000, description="against floaters and fog before surfaces"
     )
-    entropy_ratio: float = Field(default=0.02, ge=0, description="λ_ent / λ_sem; entropy is raised")
+    distortion_start: float = Field(default=0.2, ge=0, le=1, description="share of training before that term")
+    opacity_weight: float = Field(default=0.0, ge=0, le=1000, description="entropy of the ray's opacity")
+    depth_weight: float = Field(
+        default=0.0,
+        ge=0,
+        le=1000,
+        description="pulls surfaces to the sparse points of the poses and to depth maps; 0: off",
+    )
+    entropy_ratio: float = Field(default=0.02, ge=0, le=1000, description="λ_ent / λ_sem; entropy is raised")
     entropy_start: float = Field(default=0.2, ge=0, le=1, description="share of training before the entropy term")
 
 
 class TrainConfig(Stage):
     """The course of training."""
 
-    steps: int = Field(default=20000, gt=0, description="optimisation steps when there is no time limit")
-    batch_start: int = Field(default=1 << 14, ge=256, description="field samples of the first steps")
+    steps: int = Field(default=20000, gt=0, le=MANY, description="optimisation steps when there is no time limit")
+    batch_start: int = Field(default=1 << 14, ge=256, le=1 << 26, description="field samples of the first steps")
     batch_samples: int = Field(
-        default=1 << 17, ge=256, description="field samples of the last steps; grows geometrically"
+        default=1 << 17, ge=256, le=1 << 26, description="field samples of the last steps; grows geometrically"
     )
-    max_rays: int = Field(default=32768, ge=16, description="at most so many rays a step")
-    grid_rate: float = Field(default=0.03, gt=0, description="learning rate of the grid")
-    network_rate: float = Field(default=0.01, gt=0, description="learning rate of the networks")
+    max_rays: int = Field(default=32768, ge=16, le=1 << 24, description="at most so many rays a step")
+    grid_rate: float = Field(default=0.03, gt=0, le=10, description="learning rate of the grid")
+    network_rate: float = Field(default=0.01, gt=0, le=10, description="learning rate of the networks")
     decay: float = Field(default=0.33, gt=0, le=1, description="of the rates at ½, ¾ and 9/10")
     fade: float = Field(default=0.2, ge=0, lt=1, description="share of training over which finer levels appear")
     refine_poses: bool = Field(default=False, description="correct the cameras of the training photos while training")
     pose_rate: float = Field(
-        default=1e-3, gt=0, description="learning rate of the cameras, in radians and halves of the box; falls to 1 %"
+        default=1e-3,
+        gt=0,
+        le=1,
+        description="learning rate of the cameras, in radians and halves of the box; falls to 1 %",
     )
     pose_start: float = Field(default=0.05, ge=0, lt=1, description="share of training before cameras move")
-    checkpoint_every: float = Field(default=30.0, gt=0, description="seconds between checkpoints")
-    preview_every: float = Field(default=15.0, gt=0, description="seconds between preview pictures")
-    seed: int = Field(default=0, description="of all random numbers: the same one gives the same run")
+    checkpoint_every: float = Field(default=30.0, gt=0, le=MANY, description="seconds between checkpoints")
+    preview_every: float = Field(default=15.0, gt=0, le=MANY, description="seconds between preview pictures")
+    seed: int = Field(default=0, ge=0, lt=1 << 32, description="of all random numbers: the same one gives the same run")
     labelled_share: float = Field(
         default=1.0, ge=0, le=1, description="share of the training images whose labels are used"
     )
-    noise: float = Field(default=0.0, ge=0, description="σ of Gaussian noise added to the photos (robustness tests)")
+    noise: float = Field(
+        default=0.0, ge=0, le=10, description="σ of Gaussian noise added to the photos (robustness tests)"
+    )
     label_noise: float = Field(
         default=0.0, ge=0, le=1, description="share of labels replaced at random (robustness tests)"
     )

@@ -12,6 +12,11 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validat
 
 from .files import is_text, name_problem, printable
 
+# Bounds that only mistakes go beyond.
+LARGEST_PICTURE = 32768  # pixels on a side
+MANY = 1_000_000  # photos, frames
+LONGEST_RUN = 1_000_000_000  # steps or seconds
+
 Preset = Literal["draft", "standard", "high"]
 Split = Literal["none", "classes", "instances"]
 Pass = Literal["rgb", "depth", "semantic", "confidence", "normal", "unknown"]
@@ -27,6 +32,7 @@ Holdout = Annotated[
     int,
     Field(
         ge=0,
+        le=MANY,
         description="every so many photos, one is held out for `evaluate`; 0: all are trained on, for a final field",
     ),
     AfterValidator(_leaves_some),
@@ -43,8 +49,17 @@ def _checked_name(name: str) -> str:
 RunName = Annotated[str, Field(description="name of the run"), AfterValidator(_checked_name)]
 
 
+def _picture(size: tuple[int, int]) -> tuple[int, int]:
+    if not all(1 <= side <= LARGEST_PICTURE for side in size):
+        raise ValueError(f"{size[0]}x{size[1]} is no size of a picture: sides have 1 to {LARGEST_PICTURE} pixels")
+    return size
+
+
+PictureSize = Annotated[tuple[int, int], AfterValidator(_picture)]
+
+
 class Params(BaseModel):
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
     @model_validator(mode="after")
     def _paths_are_text(self) -> Self:
@@ -67,10 +82,10 @@ class SimulateParams(Params):
         description="built-in scene: museum (exhibits in a room), facade (weathered stone outdoors), fence (thin things: "
         "wire, leaves, a sign) or vase (closed bodies on a table)",
     )
-    views: int = Field(default=48, ge=4, description="number of photos")
-    size: tuple[int, int] = Field(default=(480, 320), description="photo width and height in pixels")
-    seed: int = Field(default=0, description="seed of the scene and of the camera path")
-    samples: int = Field(default=4, ge=1, description="Cycles samples per pixel")
+    views: int = Field(default=48, ge=4, le=MANY, description="number of photos")
+    size: PictureSize = Field(default=(480, 320), description="photo width and height in pixels")
+    seed: int = Field(default=0, ge=0, le=MANY, description="seed of the scene and of the camera path")
+    samples: int = Field(default=4, ge=1, le=65536, description="Cycles samples per pixel")
 
 
 class DatasetParams(Params):
@@ -80,18 +95,18 @@ class DatasetParams(Params):
         default="hemisphere",
         description="where the photos are taken from: around the scene, the scene's animated camera, a curve",
     )
-    views: int = Field(default=100, ge=1, description="number of photos (camera: at most; spread over the frame range)")
+    views: int = Field(
+        default=100, ge=1, le=MANY, description="number of photos (camera: at most; spread over the frame range)"
+    )
     center: tuple[float, float, float] | None = Field(
         default=None, description="what is looked at; default: the scene's middle"
     )
     radius: float | None = Field(
-        default=None, gt=0, description="distance from it; default: so that all is in the picture"
+        default=None, gt=0, le=1e9, description="distance from it; default: so that all is in the picture"
     )
     curve: str | None = Field(default=None, description="name of the curve object, for path=curve")
-    size: tuple[int, int] | None = Field(
-        default=None, description="photo width and height in pixels; default: the scene's"
-    )
-    samples: int = Field(default=32, ge=1, description="Cycles samples per pixel")
+    size: PictureSize | None = Field(default=None, description="photo width and height in pixels; default: the scene's")
+    samples: int = Field(default=32, ge=1, le=65536, description="Cycles samples per pixel")
     labels: Literal["material", "object", "collection", "none"] = Field(
         default="material",
         description="what tells classes apart: pass index (or name) of materials or objects, or collections",
@@ -113,8 +128,10 @@ class NewParams(Params):
     masks: Path | None = Field(default=None, description="folder of foreground masks named like the photos")
     classes: Path | None = Field(default=None, description="classes.json: names of the label ids")
     mask_mode: Literal["ignore", "empty"] = Field(default="ignore", description="what black mask pixels mean")
-    max_size: int = Field(default=1600, ge=64, description="long side of the working copies in pixels")
-    frames: int = Field(default=80, ge=4, description="number of frames taken from a video")
+    max_size: int = Field(
+        default=1600, ge=64, le=LARGEST_PICTURE, description="long side of the working copies in pixels"
+    )
+    frames: int = Field(default=80, ge=4, le=MANY, description="number of frames taken from a video")
     keep_blurry: bool = Field(default=False, description="use photos that look blurred too")
     add: bool = Field(default=False, description="add the photos to an existing project")
 
@@ -143,7 +160,10 @@ class PosesParams(Params):
     preset: Literal["fast", "standard", "robust"] = "standard"
     restart: bool = Field(default=False, description="place all photos anew, also those that have a pose")
     group: int = Field(
-        default=0, ge=0, description="where photos fall into separate groups: which to use, 0 being the largest"
+        default=0,
+        ge=0,
+        le=MANY,
+        description="where photos fall into separate groups: which to use, 0 being the largest",
     )
 
 
@@ -192,8 +212,8 @@ class TrainParams(Params):
     preset: Preset = "standard"
     run: RunName = "main"
     holdout: Holdout = 8
-    time_limit: float | None = Field(default=None, gt=0, description="seconds of training")
-    steps: int | None = Field(default=None, gt=0, description="optimisation steps")
+    time_limit: float | None = Field(default=None, gt=0, le=LONGEST_RUN, description="seconds of training")
+    steps: int | None = Field(default=None, gt=0, le=LONGEST_RUN, description="optimisation steps")
     set: dict[str, str] = Field(default_factory=dict, description="settings by name, e.g. loss.semantic=0.1")
     resume: bool = False
 
@@ -212,8 +232,8 @@ class RenderParams(Params):
     test: bool = Field(default=False, description="from the held-out photos")
     all: bool = Field(default=False, description="from every photo, also those of training")
     camera: Path | None = None
-    orbit: int | None = Field(default=None, gt=0)
-    size: tuple[int, int] | None = Field(
+    orbit: int | None = Field(default=None, gt=0, le=MANY)
+    size: PictureSize | None = Field(
         default=None, description="WxH; cut where a camera has other proportions (held-out and all photos: resampled)"
     )
     passes: list[Pass] = ["rgb", "depth", "semantic"]
@@ -223,10 +243,13 @@ class MeshParams(Params):
     project: Path
     run: RunName = "main"
     out: Path | None = None
-    faces: int | None = Field(default=None, gt=0, description="target number of triangles")
+    faces: int | None = Field(default=None, gt=0, le=1_000_000_000, description="target number of triangles")
     resolution: int = Field(default=512, ge=16, le=2048, description="cells along the longest side of the region")
     detail: float | None = Field(
-        default=None, gt=0, description="side of a cell in millimetres, instead of resolution; needs a known scale"
+        default=None,
+        gt=0,
+        le=1e9,
+        description="side of a cell in millimetres, instead of resolution; needs a known scale",
     )
     region: str = Field(
         default="auto",
@@ -255,6 +278,7 @@ class MeasureParams(Params):
     scale_error: float | None = Field(
         default=None,
         ge=0,
+        le=100,
         description="standard uncertainty of the scale in percent; default: by the distances, or how it was set",
     )
     caps: float = Field(
@@ -332,7 +356,7 @@ class ReconstructParams(Params):
     masks: Path | None = None
     classes: Path | None = None
     blend: Path | None = None
-    time_limit: float | None = Field(default=None, gt=0, description="seconds of training")
+    time_limit: float | None = Field(default=None, gt=0, le=LONGEST_RUN, description="seconds of training")
     holdout: Holdout = 8
     set: dict[str, str] = Field(default_factory=dict)
     report: Path | None = Field(default=None, description="HTML report to write")
@@ -341,7 +365,7 @@ class ReconstructParams(Params):
 
 class BatchParams(Params):
     list: Path = Field(description=".csv or .json file with one capture a row: the settings of reconstruct by name")
-    retries: int = Field(default=1, ge=0, description="how often a capture that failed is tried again")
+    retries: int = Field(default=1, ge=0, le=1000, description="how often a capture that failed is tried again")
     report: Path | None = Field(default=None, description="JSON report to write; default: LIST-report.json beside it")
 
 
@@ -355,8 +379,12 @@ class BenchParams(Params):
         default=None, description="data sets, simulated scenes (museum, facade, fence, vase), or capture projects"
     )
     variants: list[str] | None = Field(default=None, description="only these variants of the suite")
-    seconds: float | None = Field(default=None, gt=0, description="seconds of training a run, instead of the suite's")
-    steps: int | None = Field(default=None, gt=0, description="steps of training a run, instead of the suite's")
+    seconds: float | None = Field(
+        default=None, gt=0, le=LONGEST_RUN, description="seconds of training a run, instead of the suite's"
+    )
+    steps: int | None = Field(
+        default=None, gt=0, le=LONGEST_RUN, description="steps of training a run, instead of the suite's"
+    )
     seeds: list[int] | None = Field(default=None, description="a run for each of these seeds, instead of the suite's")
     preset: Preset = "standard"
     set: dict[str, str] = Field(

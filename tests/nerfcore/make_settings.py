@@ -7,11 +7,21 @@ from pathlib import Path
 
 from fieldwork.nerfcore.bench.suites import ABLATION
 from fieldwork.nerfcore.config import PRESETS, RunConfig
+from pydantic.fields import FieldInfo
 
 TARGET = Path(__file__).resolve().parents[2] / "docs" / "settings.md"
 
 
 BOUNDARIES = ("explicit", "implicit", "no semantics", "uniform pdf")
+
+
+def limits(setting: FieldInfo) -> str:
+    """The values that a number may have, as an interval: "[" includes the limit, "(" does not."""
+    found = {name: getattr(m, name) for m in setting.metadata for name in ("ge", "gt", "le", "lt") if hasattr(m, name)}
+    if not found:
+        return ""
+    low = f"[{found['ge']:g}" if "ge" in found else f"({found['gt']:g}"
+    return f"{low}, {found['le']:g}]" if "le" in found else f"{low}, {found['lt']:g})"
 
 
 def settings_page() -> str:
@@ -34,7 +44,7 @@ def settings_page() -> str:
         ]
         for name, setting in model.model_fields.items():
             kind = str(setting.annotation).replace("typing.Literal", "") if "Literal" in str(setting.annotation) else ""
-            text = (setting.description or "") + (f" {kind}" if kind else "")
+            text = " ".join(part for part in (setting.description or "", kind, limits(setting)) if part)
             text = text.replace("|", "\\|").strip()
             lines.append(f"| `{stage}.{name}` | `{json.dumps(setting.default)}` | {text} |")
     lines += [

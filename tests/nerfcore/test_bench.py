@@ -18,7 +18,7 @@ from fieldwork.nerfcore.bench.jobs import Job, interrupted
 from fieldwork.nerfcore.bench.machine import run_yardstick
 from fieldwork.nerfcore.bench.page import figures_folder
 from fieldwork.nerfcore.bench.results import read_sets
-from fieldwork.nerfcore.errors import Cancelled, InputError, SettingError
+from fieldwork.nerfcore.errors import Cancelled, InputError, SettingError, TrainingError
 from fieldwork.nerfcore.params import BenchParams, TrainParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.verbs import run_verb
@@ -221,10 +221,17 @@ def test_two_scenes_of_one_name_are_refused(tiny_project: Path, tmp_path: Path) 
         run_verb("bench", params, Reporter())
 
 
-def test_a_run_that_fails_does_not_stop_the_others(tiny_project: Path, tmp_path: Path) -> None:  # noqa: F811
-    broken = {**TINY, "train.network_rate": "1e30", "train.grid_rate": "1e30"}
+def test_a_run_that_fails_does_not_stop_the_others(
+    tiny_project: Path,  # noqa: F811
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def diverge(*_: object) -> None:
+        raise TrainingError("Training diverged: the loss is no longer a number.")
+
+    monkeypatch.setattr("fieldwork.nerfcore.train.verb._Loop.run", diverge)
     report = Reporter()
-    result = bench(tmp_path, tiny_project, "ablation", report, steps=30, variants=["hybrid", "explicit"], set=broken)
+    result = bench(tmp_path, tiny_project, "ablation", report, steps=30, variants=["hybrid", "explicit"], set=TINY)
     assert result["failed"] == 2
     assert result["rows"][0]["psnr"] is None
     assert "diverged" in (tmp_path / "ablation" / "table.md").read_text("utf-8")

@@ -10,13 +10,18 @@ import pytest
 import torch
 from fieldwork.nerfcore import config as config_module
 from fieldwork.nerfcore.bench.suites import ABLATION
+from fieldwork.nerfcore.cli import main
 from fieldwork.nerfcore.config import ONLY_RENDERING, RunConfig, make_config
+from fieldwork.nerfcore.errors import SettingError
 from fieldwork.nerfcore.field.hybrid import HybridField
 from fieldwork.nerfcore.kernels.traversal import PDF_UNIFORM
 from fieldwork.nerfcore.render.model import Model
 from fieldwork.nerfcore.sampling.occupancy import OccupancyGrid
+from fieldwork.nerfcore.verbs import VERBS
 from fieldwork.tests.nerfcore.support.ball import ball_project
 from fieldwork.tests.nerfcore.support.settings import trainer_of
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
 
 NAMES = [
     f"{stage}.{name}" for stage, info in RunConfig.model_fields.items() for name in type(info.default).model_fields
@@ -102,3 +107,50 @@ def test_presets_grow_and_the_standard_one_stays_within_its_parameters() -> None
     assert samples == sorted(samples)
     for name in ("draft", "standard", "high"):
         assert len(OccupancyGrid(make_config(name).sampling, False).cells) == make_config(name).sampling.resolution ** 3
+
+
+def limits(info: FieldInfo) -> tuple[list[float], list[float]]:
+    """Lower and upper limits of a number."""
+    lower = [getattr(m, name) for m in info.metadata for name in ("ge", "gt") if hasattr(m, name)]
+    return lower, [getattr(m, name) for m in info.metadata for name in ("le", "lt") if hasattr(m, name)]
+
+
+def numbers(model: type[BaseModel]) -> dict[str, FieldInfo]:
+    """The fields of a model that hold one number."""
+    kinds = (int, float, int | None, float | None)
+    return {name: info for name, info in model.model_fields.items() if info.annotation in kinds}
+
+
+@pytest.mark.parametrize("model", [type(info.default) for info in RunConfig.model_fields.values()])
+def test_every_number_has_limits(model: type[BaseModel]) -> None:
+    assert [name for name, info in numbers(model).items() if not all(limits(info))] == []
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_number_of_a_verb_has_limits(verb: str) -> None:
+    assert [name for name, info in numbers(VERBS[verb].params).items() if not all(limits(info))] == []
+
+
+@pytest.mark.parametrize(
+    "setting",
+    ["train.grid_rate=1e30", "scene.image_size=100000000", "train.network_rate=nan", "loss.rgb_weight=Infinity"],
+)
+def test_absurd_settings_are_refused(setting: str) -> None:
+    name, value = setting.split("=")
+    with pytest.raises(SettingError, match=name):
+        make_config("standard", {name: value})
+
+
+@pytest.mark.parametrize("size", ["0x0", "-5x-5", "100000x100000", "10x"])
+@pytest.mark.parametrize("verb", ["render", "simulate", "dataset"])
+def test_absurd_picture_sizes_are_refused(
+    tmp_path: Path, verb: str, size: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    positional = {"render": ["p", "--out", "o"], "simulate": ["o"], "dataset": ["--blend", "a.blend", "o"]}[verb]
+    assert main([verb, *positional, "--size", size]) == 2
+    assert "size" in capfd.readouterr().err
+
+
+def test_time_is_a_number(tmp_path: Path) -> None:
+    for limit in ("nan", "inf", "-1"):
+        assert main(["train", str(tmp_path), "--time-limit", limit]) == 2

@@ -16,6 +16,7 @@ from fieldwork.nerfcore.params import (
     BlendParams,
     EvaluateParams,
     ExportParams,
+    MeasureParams,
     MeshParams,
     PackageParams,
     Params,
@@ -39,6 +40,7 @@ WITH_RUN: list[tuple[type[Params], dict[str, object]]] = [
     (BlendParams, {"out": "a.blend"}),
     (ExportParams, {"to": "ply"}),
     (PackageParams, {}),
+    (MeasureParams, {}),
 ]
 BAD = [
     "", ".", "..", ".new", "../../b/runs/main", "a/b", "a\\b", "/tmp/x", "C:", "a:b", "con", "NUL", "com1.x", "a.", "a ",

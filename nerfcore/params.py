@@ -291,10 +291,11 @@ class MeasureParams(Params):
 
 Side = Literal["top", "bottom", "front", "back", "left", "right"]
 Turn = Annotated[
-    float, Field(description="degrees about z from the world to the front that is drawn, for slanted fronts")
+    float,
+    Field(ge=-360, le=360, description="degrees about z from the world to the front that is drawn, for slanted fronts"),
 ]
 PaperScale = Annotated[
-    float | None, Field(gt=0, description="N of the scale 1:N on paper; default: the largest that fits on A3")
+    float | None, Field(gt=0, le=1e9, description="N of the scale 1:N on paper; default: the largest that fits on A3")
 ]
 
 

@@ -13,12 +13,6 @@ from fieldwork.nerfcore.engine import protocol as rpc
 from fieldwork.nerfcore.files import name_problem
 from fieldwork.nerfcore.images.names import LONGEST, frame_names, unique_names
 from fieldwork.nerfcore.params import (
-    BlendParams,
-    EvaluateParams,
-    ExportParams,
-    MeasureParams,
-    MeshParams,
-    PackageParams,
     Params,
     RenderParams,
     TrainParams,
@@ -32,32 +26,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-WITH_RUN: list[tuple[type[Params], dict[str, object]]] = [
-    (TrainParams, {}),
-    (EvaluateParams, {}),
-    (RenderParams, {"out": "r"}),
-    (MeshParams, {}),
-    (BlendParams, {"out": "a.blend"}),
-    (ExportParams, {"to": "ply"}),
-    (PackageParams, {}),
-    (MeasureParams, {}),
-]
+WITH_RUN = [verb.params for verb in VERBS.values() if "run" in verb.params.model_fields]
 BAD = [
     "", ".", "..", ".new", "../../b/runs/main", "a/b", "a\\b", "/tmp/x", "C:", "a:b", "con", "NUL", "com1.x", "a.", "a ",
     " a", "x" * 65, "a\0b", "a\nb", "a?b", "\udce9",
 ]  # fmt: skip
 
 
-def test_every_verb_with_a_run_is_among_them() -> None:
-    assert {verb.params for verb in VERBS.values() if "run" in verb.params.model_fields} == {p for p, _ in WITH_RUN}
-
-
-@pytest.mark.parametrize(("params", "values"), WITH_RUN)
+@pytest.mark.parametrize("params", WITH_RUN)
 @pytest.mark.parametrize("name", BAD)
-def test_names_of_runs_that_are_refused(params: type[Params], values: dict[str, object], name: str) -> None:
+def test_names_of_runs_that_are_refused(params: type[Params], name: str) -> None:
     with pytest.raises(ValidationError) as caught:
-        params.model_validate({"project": "p", "run": name, **values})
-    assert "pattern" not in str(caught.value)
+        params.model_validate({"project": "p", "run": name})
+    (wrong,) = [detail for detail in caught.value.errors() if detail["loc"] == ("run",)]
+    assert wrong["type"] == "value_error"
 
 
 @pytest.mark.parametrize("name", ["main", "a-1", "Läufe_2", "v1.2", "-x", "x" * 64, "console", "試行"])

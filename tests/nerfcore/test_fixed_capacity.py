@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,13 +10,15 @@ import pytest
 import torch
 from fieldwork.nerfcore.kernels.device import Kernels, using_kernels
 from fieldwork.nerfcore.kernels.packed_info import PackedInfo
+from fieldwork.nerfcore.params import TrainParams
 from fieldwork.nerfcore.progress import Reporter
-from fieldwork.nerfcore.render.model import Rendered
+from fieldwork.nerfcore.render.model import Model, Rendered
 from fieldwork.nerfcore.train.losses import distortion_loss
 from fieldwork.nerfcore.train.prepare import make_trainer, plan_run
 from fieldwork.nerfcore.train.schedule import sample_budget
 from fieldwork.nerfcore.train.trainer import Trainer
-from fieldwork.tests.nerfcore.support.ball import ball_project
+from fieldwork.nerfcore.train.verb import train
+from fieldwork.tests.nerfcore.support.ball import SMALL, ball_project
 from fieldwork.tests.nerfcore.support.settings import config_of, trainer_of
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -192,6 +195,16 @@ def test_rays_beyond_the_capacity_are_counted_and_leave_the_others_alone(ball: P
     # Rays that met nothing have starts too, which later steps look up.
     assert int((cut.samples.packed_info.starts + cut.samples.packed_info.counts).max()) <= len(cut.weights)
     assert distortion(cut).isfinite()
+
+
+def test_rays_that_were_dropped_in_training_are_told(ball: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Model, "has_fixed_capacity", lambda model: True)
+    monkeypatch.setattr(Trainer, "_capacity", lambda trainer, progress, shards: 4)
+    report = Reporter()
+    train(TrainParams(project=ball, preset="draft", run="dropping", steps=UPDATE + 2, set=SMALL), report)
+    assert any("of the rays were left out for want of capacity" in warning for warning in report.warnings)
+    events = (ball / "runs" / "dropping" / "events.jsonl").read_text("utf-8").splitlines()
+    assert sum(json.loads(line).get("dropped", 0) for line in events) > 0
 
 
 def distortion(rendered: Rendered) -> torch.Tensor:

@@ -25,7 +25,7 @@ from .validate import MIN_MATCHES, pair_images
 COUNTS = "contradicting.json"  # of pairs, by database
 # With these figures: docs/experiments.md, “Frames whose alike sides match”.
 NEIGHBOURS = 5  # frames to either side whose matches are believed
-TURNED = 30.0  # degrees: chains drift less over a walk, and repeated things are usually two- to sixfold
+MOST_TURN = 30.0  # degrees: chains drift less over a walk, and repeated things are usually two- to sixfold
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ def reject_contradicting(path: Path, chain: Chain, names: list[str]) -> int:
             turn = relative_rotation(
                 (chain.cameras[a], keypoints[pair[0]]), (chain.cameras[b], keypoints[pair[1]]), geometry.inlier_matches
             )
-            if turn is not None and angle_between(turn, stretch[b] @ stretch[a].T) > TURNED:
+            if turn is not None and angle_between(turn, stretch[b] @ stretch[a].T) > MOST_TURN:
                 rejected.append(pair)
         for a, b in rejected:
             empty = pycolmap.TwoViewGeometry()

@@ -18,10 +18,10 @@ from .visibility import FEWEST_POINTS, cells_at, depth_ranges, grid_centers, in_
 
 # Measured: docs/experiments.md, “What may be closed in front of and between cameras?” (clearance) and “How far apart may
 # neighbouring cameras look?” (angle). The other two are not tuned.
-CLEAR = 0.125  # of their distance to what they surround, that nothing comes nearer to the way between cameras
+CLEARANCE = 0.125  # of their distance to what they surround, that nothing comes nearer to the way between cameras
 NEIGHBOURS = 6  # of a camera, to which that way leads
-SAME_WAY = math.cos(math.radians(55))  # of viewing directions: a round of seven photos has ways between them
-APART = 0.1  # of that distance: cameras nearer to others add nothing
+LEAST_COSINE = math.cos(math.radians(55))  # of viewing directions: a round of seven photos has ways between them
+LEAST_SPACING = 0.1  # of that distance: cameras nearer to others add nothing
 
 
 def cells_before_path(
@@ -59,7 +59,7 @@ def cameras_between(
         u, _, v = torch.linalg.svd(pose[:3, :3])
         pose[:3, :3] = u @ v  # the nearest rotation
         gap = (torch.stack(poses)[:, :3, 3] - pose[:3, 3]).norm(dim=1).min()
-        if gap > APART * (pose[:3, 3] - focus).norm():
+        if gap > LEAST_SPACING * (pose[:3, 3] - focus).norm():
             lenses.append(cameras[i])
             poses.append(pose)
     return lenses, torch.stack(poses)[len(camera_to_box) :]
@@ -67,7 +67,7 @@ def cameras_between(
 
 def _clearance(ends: torch.Tensor, focus: torch.Tensor, points: torch.Tensor) -> float:
     """How far around the line between two cameras (2, 3) there is nothing."""
-    radius = CLEAR * float((ends - focus).norm(dim=1).min())
+    radius = CLEARANCE * float((ends - focus).norm(dim=1).min())
     if len(points) < FEWEST_POINTS:
         return radius
     return min(radius, float(_distance_to(ends[0], ends[1], points).kthvalue(FEWEST_POINTS).values) / 2)
@@ -93,7 +93,7 @@ def _along(
 
 def _apart(centers: torch.Tensor, focus: torch.Tensor) -> list[int]:
     """Indices of cameras, in order, that are not near to one before."""
-    gap, least = torch.cdist(centers, centers), APART * (centers - focus).norm(dim=1)
+    gap, least = torch.cdist(centers, centers), LEAST_SPACING * (centers - focus).norm(dim=1)
     kept: list[int] = []
     for index in range(len(centers)):
         if not kept or bool(gap[index, kept].min() > least[index]):
@@ -106,7 +106,7 @@ def _neighbours(camera_to_box: torch.Tensor, focus: torch.Tensor) -> list[tuple[
     camera the nearest few."""
     centers, axes = camera_to_box[:, :3, 3], camera_to_box[:, :3, 2]
     gap = torch.cdist(centers, centers).fill_diagonal_(math.inf)
-    gap[(axes @ axes.T < SAME_WAY) | (gap > (centers - focus).norm(dim=1))] = math.inf
+    gap[(axes @ axes.T < LEAST_COSINE) | (gap > (centers - focus).norm(dim=1))] = math.inf
     nearest = gap.topk(min(NEIGHBOURS, len(gap)), largest=False)
     found = zip(nearest.indices.tolist(), nearest.values.isfinite().tolist())
     return sorted({(min(i, j), max(i, j)) for i, (row, near) in enumerate(found) for j, ok in zip(row, near) if ok})

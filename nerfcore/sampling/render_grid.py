@@ -17,7 +17,7 @@ from ..kernels.traversal import MarchSettings, skip_distances
 from .occupancy import OccupancyGrid
 
 PROBES = 4  # points read in each fine cell; not tuned
-SAVED = 8  # samples that a pixel needs less with it
+SAVED = 8  # samples that a pixel needs less with it, about; not tuned
 CHUNK = 1 << 14
 
 

@@ -14,7 +14,7 @@ from ..kernels.cells_torch import cell_index
 UNKNOWN, EMPTY, OCCUPIED = 0, 1, 2
 # Not tuned:
 STEPS = 96  # a ray is read at: half of them in the cube's neighbourhood, half beyond; a cell of 128³ is 1.3 steps long
-CUBE_WAY = 4.0  # normalised units: longer than the cube's diagonal
+CUBE_LENGTH = 4.0  # normalised units: longer than the cube's diagonal
 FARTHEST = 1000.0  # where rays end, as in `MarchSettings.far`
 RAYS = 1 << 15  # at once, for the sake of memory
 
@@ -55,7 +55,7 @@ def unknown_share(
         return torch.cat([unknown_share(states, contracted, *part) for part in parts])
     device, half = origins.device, STEPS // 2
     first = origins.norm(dim=1, keepdim=True).clamp(min=2.0) - 2.0  # the cube's corners are √3 from its centre
-    t = first + torch.linspace(0, CUBE_WAY, half + 1, device=device)
+    t = first + torch.linspace(0, CUBE_LENGTH, half + 1, device=device)
     if contracted:
         before = torch.linspace(0, 1, half // 2 + 1, device=device)[:-1] * first
         start = t[:, -1:]

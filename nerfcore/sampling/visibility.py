@@ -11,7 +11,7 @@ from ..geometry.contraction import grid_position, uncontract
 
 # The width is measured (docs/experiments.md, “What may be closed in front of and between cameras?”), the number not tuned.
 FEWEST_POINTS = 20  # in a photo, from which its depths are believed
-WIDER = 2.0  # view that all of what is photographed from around it fits in, relative to the photos'
+VIEW_SCALE = 2.0  # view that all of what is photographed from around it fits in, relative to the photos'
 
 
 def grid_centers(resolution: int, contracted: bool, device: torch.device) -> torch.Tensor:
@@ -43,7 +43,7 @@ def depth_ranges(
             ranges[index, 1] = middle
         elif focus is not None and not _sees_everything(camera):
             distance = (focus - pose[:3, 3]) @ pose[:3, 2]
-            slope = WIDER * max(camera.width / camera.fx, camera.height / camera.fy) / 2
+            slope = VIEW_SCALE * max(camera.width / camera.fx, camera.height / camera.fy) / 2
             ranges[index, 0] = (distance * (1 - slope / math.hypot(1, slope))).clamp(min=0)
             ranges[index, 1] = distance.clamp(min=0)
     return ranges

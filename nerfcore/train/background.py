@@ -14,7 +14,7 @@ Background = Literal["random", "white", "black"]
 LEVEL: dict[str, float] = {"white": 1.0, "black": 0.0}
 
 # Not tuned: the next four.
-LOOKED_AT = 12  # photos
+MOST_PHOTOS = 12  # that are looked at
 EDGE = 0.04  # of the sides: the strip along the borders that is looked at
 BLACK, WHITE = 8, 248  # of 255: all channels below, all channels above
 SHARE = 0.5  # of the strip
@@ -30,7 +30,7 @@ def choose_background(scene: Scene, transparent: bool) -> Background:
     """
     if transparent or any(view.mask is not None for view in scene.views) or not looks_inward(scene.views):
         return "random"
-    chosen = np.unique(np.linspace(0, len(scene.train) - 1, LOOKED_AT).round().astype(int))
+    chosen = np.unique(np.linspace(0, len(scene.train) - 1, MOST_PHOTOS).round().astype(int))
     shares = [edge_shares(read_picture(scene.views[scene.train[i]].image).pixels[..., :3]) for i in chosen]
     black, white = np.median(shares, axis=0)
     return "black" if black > SHARE else "white" if white > SHARE else "random"

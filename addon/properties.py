@@ -384,6 +384,11 @@ class FieldworkScene(PropertyGroup):
         description="Folder for drawings; empty: in the exports of the project",
         subtype="DIR_PATH",
     )
+    report_path: StringProperty(
+        name="Report",
+        description="Report to write, .html or .pdf; empty: report.html in the exports of the project",
+        subtype="FILE_PATH",
+    )
 
     # Export
     export_to: EnumProperty(name="Format", description="What is written", items=EXPORTS)

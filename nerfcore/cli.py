@@ -37,6 +37,7 @@ NAMED = {
     "mesh": {"out"},
     "plan": {"out"},
     "section": {"out"},
+    "report": {"out"},
     "reconstruct": {"out"},
     "bench": {"out"},
     "export": {"out"},

@@ -321,6 +321,14 @@ class SectionParams(Params):
     )
 
 
+class ReportParams(Params):
+    project: Path
+    run: RunName = "main"
+    out: Path | None = Field(
+        default=None, description=".html or .pdf file to write; default: exports/RUN/report.html of the project"
+    )
+
+
 class BlendParams(Params):
     project: Path
     out: Path
@@ -360,7 +368,7 @@ class ReconstructParams(Params):
     time_limit: float | None = Field(default=None, gt=0, le=LONGEST_RUN, description="seconds of training")
     holdout: Holdout = 8
     set: dict[str, str] = Field(default_factory=dict)
-    report: Path | None = Field(default=None, description="HTML report to write")
+    report: Path | None = Field(default=None, description="report to write, .html or .pdf")
     renders: Path | None = Field(default=None, description="folder for renders of new views")
 
 

@@ -9,7 +9,7 @@ from bpy.types import Context
 from ..addon.project import snapshot
 from ..addon.properties import SIDES
 from ..addon.text import t
-from .base import ProjectOperator, need_project, scene_settings
+from .base import ProjectOperator, need_poses, need_project, scene_settings
 
 
 def need_mesh(context: Context) -> str | None:
@@ -82,4 +82,21 @@ class FIELDWORK_OT_section(ProjectOperator):
         }
 
 
-CLASSES = [FIELDWORK_OT_measure, FIELDWORK_OT_plan, FIELDWORK_OT_section]
+@scene_settings(run="run", out="report_path")
+class FIELDWORK_OT_report(ProjectOperator):
+    """Write a report with photographs, calibration, accuracy and measures, by which others can check and repeat it"""
+
+    bl_idname = "fieldwork.report"
+    bl_label = "Write Report"
+    verb = "report"
+    needs = (need_poses,)
+
+    def parameters(self, context: Context) -> dict[str, Any]:
+        return {
+            "project": self.project_path(context),
+            "run": self.value(context, "run"),
+            "out": self.path(context, "out"),
+        }
+
+
+CLASSES = [FIELDWORK_OT_measure, FIELDWORK_OT_plan, FIELDWORK_OT_section, FIELDWORK_OT_report]

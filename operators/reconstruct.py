@@ -33,7 +33,10 @@ class FIELDWORK_OT_reconstruct(VerbOperator):
         name="Blender File", description=".blend to write; empty: none", subtype="FILE_PATH", options={"SKIP_SAVE"}
     )
     report_file: StringProperty(
-        name="Report", description="HTML report to write; empty: none", subtype="FILE_PATH", options={"SKIP_SAVE"}
+        name="Report",
+        description="Report to write, .html or .pdf; empty: none",
+        subtype="FILE_PATH",
+        options={"SKIP_SAVE"},
     )
     renders: StringProperty(
         name="Renders", description="Folder for renders of new views; empty: in the project", subtype="DIR_PATH",

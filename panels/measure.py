@@ -36,6 +36,8 @@ class FIELDWORK_PT_measure(StepPanel):
         layout.operator("fieldwork.plan", icon="IMAGE_REFERENCE")
         columns(layout).prop(settings, "section_plane")
         layout.operator("fieldwork.section", icon="MOD_BOOLEAN")
+        columns(layout).prop(settings, "report_path")
+        layout.operator("fieldwork.report", icon="FILE_TEXT")
 
 
 def draw_measures(layout: UILayout, measures: dict[str, Any]) -> None:

@@ -30,6 +30,7 @@ TITLES = {
     "measure": "Measuring the Mesh",
     "plan": "Drawing",
     "section": "Drawing a Section",
+    "report": "Writing the Report",
     "blend": "Writing .blend",
     "export": "Exporting",
     "batch": "Reconstructing Many",

@@ -1,4 +1,4 @@
-"""The HTML report of a reconstruction: numbers, timings and pictures in one file."""
+"""The report of a reconstruction, HTML or PDF: numbers, timings, tables and pictures in one file."""
 
 from __future__ import annotations
 
@@ -11,10 +11,19 @@ from typing import Any
 import jinja2
 import matplotlib
 
+from ..errors import SettingError
 from ..files import write_text
+from ..mesh.stored import mesh_folder
+from ..params import ReportParams
+from ..progress import Reporter
+from ..project.runs import read_metrics
 from ..project.store import load_project
 from ..render.run import run_folder
+from .documentation import Section, results_of, sections
+from .report_pdf import write_pdf
 
+FORMATS = (".html", ".pdf")
+HEAD = ("Result", "Time")  # tables that stand beside each other at the top
 TEMPLATE = Path(__file__).parent / "report.html.j2"
 
 
@@ -44,35 +53,76 @@ def training_curve(events: Path) -> str | None:
     return embedded(buffer.getvalue(), "svg+xml")
 
 
-def write_report(path: Path, project_folder: Path, run: str, renders: Path, result: dict[str, Any]) -> None:
-    """Write the report of a `reconstruct` result with the pictures of the folder `renders`.
+def check_report(path: Path) -> None:
+    """Raise SettingError unless the ending of a report is .html or .pdf."""
+    if path.suffix.lower() not in FORMATS:
+        raise SettingError(f"{path}: reports are written as {' or '.join(FORMATS)}.", "Choose one of these endings.")
+
+
+def report(params: ReportParams, reporter: Reporter) -> dict[str, Any]:
+    """Write the report of a run from what its verbs have left in the project.
+
+    Returns:
+        {"file", "sections": titles of its tables}
+    Raises:
+        SettingError: neither .html nor .pdf. ProjectError: there are no poses. DiskError.
+    """
+    folder = Path(params.project)
+    out = params.out or folder / "exports" / params.run / "report.html"
+    check_report(out)
+    results = results_of(load_project(folder), params.run)
+    results["evaluate"] = read_metrics(run_folder(folder, params.run)).get("test")
+    reporter.stage("Writing the report")
+    titles = write_report(out, folder, params.run, folder / "exports" / params.run / "renders", results)
+    return {"file": str(out), "sections": titles}
+
+
+def write_report(path: Path, folder: Path, run: str, renders: Path, result: dict[str, Any]) -> list[str]:
+    """Write the report of the verbs' results with the pictures of the folder `renders`, and return the titles of its
+    tables. `result` may have "stages", the seconds of each verb.
 
     Raises:
-        DiskError: `path` cannot be written.
+        SettingError: neither .html nor .pdf. ProjectError: there are no poses. DiskError: `path` cannot be written.
     """
-    project = load_project(project_folder)
+    check_report(path)
+    project = load_project(folder)
+    tables = sections(folder, run, result)
+    stages = result.get("stages") or {}
+    if stages:
+        seconds = [[stage, f"{value} s"] for stage, value in stages.items()]
+        tables.insert(1, Section("Time", [], [*seconds, ["all", f"{sum(stages.values()):.1f} s"]]))
     evaluation = result.get("evaluate") or {}
-    pictures = [
-        {"name": Path(name).stem, "data": embedded((project_folder / name).read_bytes())}
-        for name in evaluation.get("pictures", [])
-        if (project_folder / name).is_file()
-    ]
-    scores = {s["name"]: s for s in evaluation.get("per_image", [])}
+    compared = [folder / name for name in evaluation.get("pictures", []) if (folder / name).is_file()]
+    drawn, rendered = sorted((mesh_folder(folder, run) / "drawings").glob("*.png")), sorted(renders.glob("*.png"))
+    name = folder.resolve().name
+    if path.suffix.lower() == ".pdf":
+        captions = (("Drawing", drawn), ("Held-out photo and render", compared), ("Render", rendered))
+        pictures = [(f"{what}: {file.stem}", file) for what, files in captions for file in files]
+        write_pdf(path, name, tables, pictures)
+        return [table.title for table in tables]
+    scores = {Path(s["name"]).stem: s for s in evaluation.get("per_image", [])}
     html = (
         jinja2.Environment(autoescape=True)
         .from_string(TEMPLATE.read_text(encoding="utf-8"))
         .render(
-            name=project_folder.resolve().name,
-            result=result,
+            name=name,
+            head=[table for table in tables if table.title in HEAD],
+            tables=[table for table in tables if table.title not in HEAD],
+            areas=(result.get("mesh") or {}).get("classes") or {},
             evaluation=evaluation,
-            pictures=pictures,
+            pictures=pictures_of(compared),
             scores=scores,
-            renders=[{"name": r.stem, "data": embedded(r.read_bytes())} for r in sorted(renders.glob("*.png"))],
-            curve=training_curve(run_folder(project_folder, run) / "events.jsonl"),
+            drawings=pictures_of(drawn),
+            renders=pictures_of(rendered),
+            curve=training_curve(run_folder(folder, run) / "events.jsonl"),
             classes=project.classes,
-            rejected=[i for i in project.images if i.status != "ok"],
             labelled=bool(evaluation.get("per_class_iou")),
-            total=round(sum(result["stages"].values()), 1),
         )
     )
     write_text(path, html)
+    return [table.title for table in tables]
+
+
+def pictures_of(files: list[Path]) -> list[dict[str, str]]:
+    """Names and data: URLs of PNG files."""
+    return [{"name": file.stem, "data": embedded(file.read_bytes())} for file in files]

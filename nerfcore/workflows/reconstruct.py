@@ -12,7 +12,7 @@ from .. import params as p
 from ..blender.blend import blend, blended
 from ..capture.ingest import ingested, new
 from ..errors import ProjectError
-from ..evaluate.report import write_report
+from ..evaluate.report import check_report, write_report
 from ..evaluate.verb import evaluate, evaluated
 from ..mesh.verb import mesh, meshed
 from ..poses.estimate import estimate_poses, posed
@@ -84,6 +84,8 @@ def reconstruct(params: p.ReconstructParams, report: Reporter) -> dict[str, Any]
     Raises:
         any verb's error; the project is left so that the same command goes on.
     """
+    if params.report is not None:
+        check_report(params.report)
     project, run = Path(params.out), "main"
     pipeline = Pipeline(project, report)
     if is_project(project) and load_project(project).last("import") is not None:

@@ -1,0 +1,110 @@
+"""The report: what stands in its tables, as HTML and as PDF."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from fieldwork.nerfcore.errors import SettingError
+from fieldwork.nerfcore.evaluate.documentation import Section
+from fieldwork.nerfcore.evaluate.report import report
+from fieldwork.nerfcore.evaluate.report_pdf import write_pdf
+from fieldwork.nerfcore.files import write_json
+from fieldwork.nerfcore.params import ReconstructParams, ReportParams
+from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.project.runs import MEASURES, METRICS, run_folder
+from fieldwork.nerfcore.project.store import edit_project
+from fieldwork.nerfcore.workflows.reconstruct import reconstruct
+from fieldwork.tests.nerfcore.support.ball import RADIUS, ball_project
+from fieldwork.tests.nerfcore.support.meshed import store_mesh
+from PIL import Image
+
+AMOUNTS = {"area": 1.571, "area_low": 1.5, "area_high": 1.64, "volume": None, "volume_low": None, "volume_high": None}
+
+
+@pytest.fixture
+def project(tmp_path: Path) -> Path:
+    """The ball, posed, trained, evaluated, meshed and measured as far as a report can see."""
+    folder = ball_project(tmp_path / "ball", views=9)
+    ball = trimesh.creation.icosphere(2, RADIUS)
+    store_mesh(folder, ball, np.where(ball.triangles_center[:, 2] > 0, 1, 2), ball, 0.03)
+    with edit_project(folder) as edited:
+        for image in edited.images:
+            image.sha256, image.source = image.name.rjust(64, "a"), f"/home/somebody/{image.name}.jpg"
+        edited.images[3].status, edited.images[3].reason = "rejected", "it is blurred <very>"
+        mesh = {"faces": 320, "watertight": True, "voxel": 0.03, "classes": {"top": {"faces": 160, "area": 1.57}}}
+        edited.record("mesh", {"run": "main"}, mesh)
+        edited.record("mesh", {"run": "other"}, mesh | {"faces": 7})
+        edited.record("align", {"project": "/home/somebody/ball", "up": "z"}, {})
+    scores = [{"name": "00", "psnr": 31.25, "ssim": 0.91}]
+    test = {"images": 1, "psnr": 31.25, "ssim": 0.91, "miou": 0.987, "fps": None, "per_image": scores}
+    write_json(run_folder(folder, "main") / METRICS, {"test": test})
+    check = {
+        "name": "door",
+        "use": "check",
+        "length": 2.004,
+        "low": 1.99,
+        "high": 2.02,
+        "known": 2.0,
+        "difference": 0.004,
+    }
+    measures = {"unit": "m", "scale": {"u_percent": 0.4, "source": "1 control distance"}, "distances": [check]}
+    write_json(folder / "exports/main" / MEASURES, measures | {"classes": [{"name": "top"} | AMOUNTS], "instances": []})
+    drawings = folder / "exports/main/drawings"
+    drawings.mkdir()
+    Image.fromarray(np.full((30, 40, 3), 200, np.uint8)).save(drawings / "top.png")
+    return folder
+
+
+def test_another_person_finds_what_is_needed_to_repeat_it(project: Path) -> None:
+    result = report(ReportParams(project=project), Reporter())
+    html = Path(result["file"]).read_text("utf-8")
+    text = re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", re.sub(r'src="data:[^"]*"', "", html)))
+    for words in (
+        "Photos used 8",
+        "320 faces, closed, cells of 0.03 m",
+        "1.571 1.5 … 1.64 open",
+        "door check 2.0040 1.9900 … 2.0200 2.0000 +4.0 mm",
+        "Root mean square of their differences: 4.0 mm",
+        "uncertainty of the scale: 0.4 % (1 control distance)",
+        "00 31.25 0.910",
+        "0 PINHOLE 40 × 40 55.00, 55.00 20.00, 20.00 none 9",
+        "01 01.jpg 40 × 40 " + "01".rjust(64, "a"),
+        "it is blurred &lt;very&gt;",
+        "sampling.resolution",
+        "torch 2.",
+        "up=z",
+    ):
+        assert words in text, words
+    assert "somebody" not in html
+    assert html.count("data:image/png") == 1  # the drawing
+    assert "03.jpg" not in html
+
+
+def test_the_pdf_has_the_same_tables(project: Path, tmp_path: Path) -> None:
+    html = report(ReportParams(project=project), Reporter())
+    pdf = report(ReportParams(project=project, out=tmp_path / "r.pdf"), Reporter())
+    assert pdf["sections"] == html["sections"]
+    data = (tmp_path / "r.pdf").read_bytes()
+    assert data.startswith(b"%PDF")
+    assert len(re.findall(rb"/Type /Page\b", data)) >= 3
+
+
+def test_long_tables_go_on_on_the_next_page_and_pictures_keep_their_shape(tmp_path: Path) -> None:
+    Image.fromarray(np.zeros((400, 20, 3), np.uint8)).save(tmp_path / "tall.png")
+    rows = [[str(n), "$a_b$ " * 60] for n in range(60)]
+    write_pdf(
+        tmp_path / "r.pdf", "Übersicht", [Section("Many", ["n", "text"], rows)], [("tall", tmp_path / "tall.png")]
+    )
+    assert len(re.findall(rb"/Type /Page\b", (tmp_path / "r.pdf").read_bytes())) == 4
+
+
+def test_other_endings_are_refused_before_anything_is_done(project: Path, tmp_path: Path) -> None:
+    with pytest.raises(SettingError, match=r"\.html or \.pdf"):
+        report(ReportParams(project=project, out=tmp_path / "r.doc"), Reporter())
+    with pytest.raises(SettingError, match=r"\.html or \.pdf"):
+        reconstruct(ReconstructParams(photos=tmp_path, out=tmp_path / "p", report=tmp_path / "r.doc"), Reporter())
+    assert not (tmp_path / "p").exists()

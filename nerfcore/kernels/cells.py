@@ -98,46 +98,48 @@ def add_values(
     points: wp.array(dtype=wp.vec3),
     values: wp.array(dtype=float),
     n: int,
-    sums: wp.array(dtype=wp.int64),
-    counts: wp.array(dtype=int),
+    sums: wp.array(dtype=wp.int64, ndim=2),
     offset: int,
 ):
     i = wp.tid() + offset
     if values[i] >= 0.0:
         cell = cell_index(points[i], n)
-        wp.atomic_add(sums, cell, wp.int64(wp.min(values[i], LARGEST) * FIXED_POINT))
-        wp.atomic_add(counts, cell, 1)
+        wp.atomic_add(sums, cell, 0, wp.int64(wp.min(values[i], LARGEST) * FIXED_POINT))
+        wp.atomic_add(sums, cell, 1, wp.int64(1))
 
 
 @wp.kernel(module="fieldwork_cells")
 def take_mean(
     points: wp.array(dtype=wp.vec3),
+    values: wp.array(dtype=float),
     n: int,
     rate: float,
-    sums: wp.array(dtype=wp.int64),
-    counts: wp.array(dtype=int),
+    sums: wp.array(dtype=wp.int64, ndim=2),
     grid: wp.array(dtype=float),
     offset: int,
 ):
     i = wp.tid() + offset
-    cell = cell_index(points[i], n)
-    # One of the points in a cell takes their sum, whichever comes first.
-    count = wp.atomic_exch(counts, cell, 0)
-    if count > 0:
-        mean = float(sums[cell]) / FIXED_POINT / float(count)
-        sums[cell] = wp.int64(0)
-        grid[cell] = grid[cell] + (1.0 - wp.pow(1.0 - rate, float(count))) * (mean - grid[cell])
+    if values[i] >= 0.0:
+        cell = cell_index(points[i], n)
+        # One of the points in a cell takes their sum, whichever comes first.
+        count = float(wp.atomic_exch(sums, cell, 1, wp.int64(0)))
+        if count > 0.0:
+            mean = float(sums[cell, 0]) / FIXED_POINT / count
+            sums[cell, 0] = wp.int64(0)
+            share = rate
+            if count > 1.0:
+                share = 1.0 - wp.pow(1.0 - rate, count)
+            grid[cell] = grid[cell] + share * (mean - grid[cell])
 
 
 class MeanScratch:
-    """What `average` sums up in: sums (n³,) int64 in units of 2⁻²⁰, so that the order of the points changes nothing,
-    and counts (n³,) int32; both zero between calls."""
+    """What `average` sums up in: sums (n³, 2) int64, of values in units of 2⁻²⁰, so that the order of the points
+    changes nothing, and their number, side by side because memory is what it waits for; zero between calls."""
 
     def __init__(self, cells: int, device: torch.device) -> None:
         # Without 64-bit atomics (MPS) the sums are floats, whose last bits follow the order of the points.
         exact = torch.int64 if backend_of(device).has_float64 else torch.float32
-        self.sums = torch.zeros(cells, dtype=exact, device=device)
-        self.counts = torch.zeros(cells, dtype=torch.int32, device=device)
+        self.sums = torch.zeros(cells, 2, dtype=exact, device=device)
 
 
 def average(
@@ -154,12 +156,11 @@ def average(
     Points with negative values are passed over. The order of the points does not matter.
     """
     if not backend_of(points.device).warp:
-        return cells_torch.average(grid, scratch.sums, scratch.counts, resolution, points, values, rate)
+        return cells_torch.average(grid, scratch.sums, resolution, points, values, rate)
     init()
-    where, sums, counts = array(points, wp.vec3), array(scratch.sums), array(scratch.counts)
-    inputs = [where, array(values.contiguous()), resolution, sums, counts]
-    launch(add_values, len(points), inputs, points.device, serial=True)
-    launch(take_mean, len(points), [where, resolution, rate, sums, counts, array(grid)], points.device, serial=True)
+    read, sums = [array(points, wp.vec3), array(values.contiguous()), resolution], array(scratch.sums)
+    launch(add_values, len(points), [*read, sums], points.device, serial=True)
+    launch(take_mean, len(points), [*read, rate, sums, array(grid)], points.device, serial=True)
 
 
 def trilinear(grid: torch.Tensor, resolution: int, points: torch.Tensor) -> torch.Tensor:

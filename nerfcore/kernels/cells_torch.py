@@ -50,20 +50,18 @@ def observe(
 def average(
     grid: torch.Tensor,
     sums: torch.Tensor,
-    counts: torch.Tensor,
     resolution: int,
     points: torch.Tensor,
     values: torch.Tensor,
     rate: float,
 ) -> None:
-    """As `cells.average`; `sums` and `counts` as in `cells.MeanScratch`."""
+    """As `cells.average`; `sums` as in `cells.MeanScratch`."""
     cell, counted = cell_index(points, resolution), values >= 0
     scaled = values.clamp(0, LARGEST) * FIXED_POINT
-    sums.index_add_(0, cell, torch.where(counted, scaled, 0).to(sums.dtype))
-    counts.index_add_(0, cell, counted.to(counts.dtype))
-    count = counts[cell]
-    mean = sums[cell].float() / FIXED_POINT / count.clamp(min=1)
+    sums.index_add_(0, cell, torch.stack([torch.where(counted, scaled, 0), counted], 1).to(sums.dtype))
+    total, count = sums[cell].float().unbind(1)
+    mean = total / FIXED_POINT / count.clamp(min=1)
     before = grid[cell]
     # Points of one cell write the same number.
-    grid[cell] = before + (1 - (1 - rate) ** count.float()) * (mean - before)
-    sums[cell], counts[cell] = 0, 0
+    grid[cell] = before + (1 - (1 - rate) ** count) * (mean - before)
+    sums[cell] = 0

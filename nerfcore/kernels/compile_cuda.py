@@ -21,7 +21,8 @@ from ..files import write_json, write_section, write_text
 from . import cells, composite, encode, encode_points, march, patches, raycast, surface
 from .device import default_threads
 from .fused import LANES
-from .fused_kernel import FusedShape, fused_kernel
+from .fused_kernel import fused_kernel
+from .fused_shape import FusedShape
 from .resources import Resources, disassembler, markdown, read_resources
 from .runtime import CUDA_BLOCK, init
 

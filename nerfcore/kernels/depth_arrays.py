@@ -5,9 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-import warp as wp
-
-from .runtime import array
 
 FREE = 1e30  # depth of a ray that meets nothing
 
@@ -17,8 +14,8 @@ class MapArrays:
     """V depth maps in one frame, P pixels together.
 
     depth (P,); cosine (P,) of the angle between ray and surface normal; spread (P,) between transmittance 3/4 and 1/4
-    along the axis; first (V,) int32 first pixel of a map; size (V, 2) int32 width and height; lens (V, 4) fx, fy, cx, cy; rotation (V, 3, 3) and
-    translation (V, 3): camera axes from the frame.
+    along the axis; first (V,) int32 first pixel of a map; size (V, 2) int32 width and height; lens (V, 4) fx, fy,
+    cx, cy; rotation (V, 3, 3) and translation (V, 3): camera axes from the frame.
     """
 
     depth: torch.Tensor
@@ -32,10 +29,3 @@ class MapArrays:
 
     def __len__(self) -> int:
         return len(self.first)
-
-    def cameras(self) -> list:
-        """Kernel arguments: where each map lies and how points get there."""
-        return [array(self.first), array(self.size), array(self.lens, wp.vec4)] + [
-            array(self.rotation, wp.mat33),
-            array(self.translation, wp.vec3),
-        ]

@@ -6,15 +6,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-import warp as wp
 
 from . import march
 from .blocks import launch_blocks
 from .device import backend_of
-from .fused_kernel import FieldArrays, FusedShape, RayQueue, RenderedArrays, fused_kernel
+from .fused_field import FieldArrays
+from .fused_kernel import RayQueue, RenderedArrays, fused_kernel
 from .fused_network import half_feature
+from .fused_shape import FusedShape
 from .runtime import array, init
-from .traversal import MarchSettings, march_params
+from .traversal import MarchSettings, grid_arrays, march_params
 
 LANES = 64  # samples a block works on, on CUDA; two to eight blocks fit a multiprocessor of sm_75 and later
 BLOCKS_PER_MULTIPROCESSOR = 8
@@ -120,12 +121,11 @@ def render_coarse(
     next_ray = torch.zeros(1, dtype=torch.int32, device=device)
     evaluated = torch.zeros(groups * lanes, dtype=torch.int32, device=device)
     queue, out = RayQueue(), RenderedArrays()
-    queue.origins, queue.directions = array(rays.origins, wp.vec3), array(rays.directions, wp.vec3)
-    queue.total_weight, queue.t_first, queue.counts = array(rays.total_weight), array(rays.t_first), array(counts)
-    queue.queue, queue.next_ray, queue.ray_count = array(rays.queue), array(next_ray), array(rays.ray_count)
+    queue.indices, queue.next_ray, queue.ray_count = array(rays.queue), array(next_ray), array(rays.ray_count)
     out.pixels, out.probabilities, out.evaluated = array(pixels), array(probabilities), array(evaluated)
-    grid = [array(cells, wp.vec2), array(skip_distance)]
-    inputs = [queue, march_params(settings), *grid, _field_arrays(field), cull, out]
+    marched = march.marched_rays(rays.origins, rays.directions, rays.total_weight, rays.t_first, counts)
+    grid, params = grid_arrays(cells, skip_distance), march_params(settings)
+    inputs = [marched, queue, grid, params, _field_arrays(field), cull, out]
     launch_blocks(kernel, groups, lanes, inputs, device)
     return FusedRays(pixels[:, :3], pixels[:, 3], pixels[:, 4], probabilities if classes else None, evaluated.sum())
 

@@ -1,6 +1,7 @@
 """Two-stage ray sampling on the occupancy grid: a coarse march that reads the grid, then samples from its PDF.
 
-How rays traverse the grid is in `traversal.py`, the torch backend in `march_torch.py`.
+How rays traverse the grid is in `traversal.py`, how samples are drawn in `pdf_sampling.py`, the torch backend in
+`march_torch.py`.
 """
 
 from __future__ import annotations
@@ -13,18 +14,21 @@ import warp as wp
 from . import march_torch
 from .device import backend_of
 from .packed_info import PackedInfo
+from .pdf_sampling import MarchedRays, advanced, started
 from .runtime import array, init, launch
 from .traversal import (
     _DEFAULT,
     BEFORE_CUBE,
     EARLY_STOP,
     MAX_BINS,
+    GridArrays,
     MarchParams,
     MarchSettings,
     bin_length,
     bin_weight,
     cell_index,
     cube_entry,
+    grid_arrays,
     grid_position,
     inside,
     march_params,
@@ -36,18 +40,24 @@ from .traversal import (
 FEWEST_SAMPLES = 4  # samples on a ray whose number of samples follows that of its occupied bins; not tuned
 
 
+@wp.struct
+class CoarseArrays:
+    """Where the results of the coarse march are written, see `coarse_march`."""
+
+    total_weight: wp.array(dtype=float)
+    t_first: wp.array(dtype=float)
+    t_last: wp.array(dtype=float)
+    bin_counts: wp.array(dtype=int)
+
+
 @wp.kernel(module="fieldwork_march")
 def march_weight(
     origins: wp.array(dtype=wp.vec3),
     directions: wp.array(dtype=wp.vec3),
     jitter: wp.array(dtype=float),
-    cells: wp.array(dtype=wp.vec2),
-    skip_distance: wp.array(dtype=wp.uint8),
+    grid: GridArrays,
     m: MarchParams,
-    total_weight: wp.array(dtype=float),
-    t_first: wp.array(dtype=float),
-    t_last: wp.array(dtype=float),
-    bin_counts: wp.array(dtype=int),
+    out: CoarseArrays,
     offset: int,
 ):
     r = wp.tid() + offset
@@ -69,7 +79,7 @@ def march_weight(
         p = o + d * t
         length = bin_length(p, m)
         u = grid_position(p, m.contracted)
-        cell = cells[cell_index(u, m.n)]
+        cell = grid.cells[cell_index(u, m.n)]
         if cell[0] > 0.0:
             bin_transmittance = wp.exp(-cell[0] * length)
             weight += bin_weight(cell, transmittance, bin_transmittance, m)
@@ -83,107 +93,45 @@ def march_weight(
                     break
             t += length
         else:
-            t += skip_length(u, d, inverse, length, m, skip_distance)
-    total_weight[r] = weight
-    t_first[r] = front
-    t_last[r] = back
-    bin_counts[r] = occupied
+            t += skip_length(u, d, inverse, length, m, grid.skip_distance)
+    out.total_weight[r] = weight
+    out.t_first[r] = front
+    out.t_last[r] = back
+    out.bin_counts[r] = occupied
 
 
 @wp.struct
 class SampleArrays:
-    """Where samples are written, see `Samples`."""
+    """Where samples are written, see `Samples`; starts (R,): where those of a ray begin."""
 
+    starts: wp.array(dtype=int)
     points: wp.array(dtype=wp.vec3)
     t: wp.array(dtype=float)
     deltas: wp.array(dtype=float)
     ray_indices: wp.array(dtype=int)
 
 
-@wp.func
-def write_sample(out: SampleArrays, index: int, t: float, position: wp.vec3, ray: int, m: MarchParams):
-    out.t[index] = t
-    out.points[index] = inside(grid_position(position, m.contracted))
-    out.ray_indices[index] = ray
-
-
 @wp.kernel(module="fieldwork_march")
 def march_sample(
-    origins: wp.array(dtype=wp.vec3),
-    directions: wp.array(dtype=wp.vec3),
+    rays: MarchedRays,
     shift: wp.array(dtype=float),
-    cells: wp.array(dtype=wp.vec2),
-    skip_distance: wp.array(dtype=wp.uint8),
+    grid: GridArrays,
     m: MarchParams,
-    total_weight: wp.array(dtype=float),
-    t_first: wp.array(dtype=float),
-    starts: wp.array(dtype=int),
-    counts: wp.array(dtype=int),
     out: SampleArrays,
     offset: int,
 ):
     r = wp.tid() + offset
-    count = counts[r]
+    count = rays.counts[r]
     if count == 0:
         return
-    base = starts[r]
-    o = origins[r]
-    d = directions[r]
-    inverse = reciprocal(d)
-    _, hi = ray_interval(o, inverse, m)
-    t = t_first[r]
-    transmittance = float(1.0)
-    below = float(0.0)  # weight of the bins behind us
-    share = total_weight[r] / float(count)
-    k = int(0)  # the sample being looked for
-    target = shift[base] * share
-    edge = share  # weight at which sample k's interval ends
-    occupied_length = float(0.0)  # occupied length gathered for sample k's interval so far
-    k_edge = int(0)
-    t_end = t
-    for _ in range(MAX_BINS):
-        if t >= hi or k_edge >= count:
-            break
-        p = o + d * t
-        length = bin_length(p, m)
-        u = grid_position(p, m.contracted)
-        cell = cells[cell_index(u, m.n)]
-        if cell[0] > 0.0:
-            bin_transmittance = wp.exp(-cell[0] * length)
-            weight = bin_weight(cell, transmittance, bin_transmittance, m)
-            above = below + weight
-            while k < count and target <= above:
-                tk = t + ((target - below) / weight - 0.5) * length
-                write_sample(out, base + k, tk, o + d * tk, r, m)
-                k += 1
-                if k < count:
-                    target = (float(k) + shift[base + k]) * share
-            used = float(0.0)  # part of this bin already given to intervals
-            while k_edge < count and edge <= above:
-                fraction = (edge - below) / weight
-                out.deltas[base + k_edge] = occupied_length + (fraction - used) * length
-                occupied_length = float(0.0)
-                used = fraction
-                k_edge += 1
-                edge = float(k_edge + 1) * share
-            occupied_length += (1.0 - used) * length
-            t_end = t
-            below = above
-            if m.mode == _DEFAULT:
-                transmittance *= bin_transmittance
-                if transmittance < EARLY_STOP:
-                    break
-            t += length
-        else:
-            t += skip_length(u, d, inverse, length, m, skip_distance)
-    # Rounding can leave the last interval or sample just short of the total.
-    while k < count:
-        write_sample(out, base + k, t_end, o + d * t_end, r, m)
-        k += 1
-    while k_edge < count:
-        out.deltas[base + k_edge] = occupied_length
-        occupied_length = float(0.0)
-        k_edge += 1
+    ray = started(rays, r, m)
+    begin = out.starts[r]
+    for i in range(begin, begin + count):
+        ray, t, length = advanced(ray, shift[i], grid, m)
+        out.points[i] = inside(grid_position(ray.origin + ray.direction * t, m.contracted))
+        out.t[i] = t
+        out.deltas[i] = length
+        out.ray_indices[i] = r
 
 
 @dataclass(frozen=True)
@@ -223,15 +171,11 @@ def coarse_march(
     init()
     total_weight, t_first, t_last = (torch.empty(rays, device=device) for _ in range(3))
     bin_counts = torch.empty(rays, dtype=torch.int32, device=device)
-    inputs = [
-        array(origins, wp.vec3),
-        array(directions, wp.vec3),
-        array(jitter),
-        array(cells, wp.vec2),
-        array(skip_distance),
-    ]
-    inputs += [march_params(settings), array(total_weight), array(t_first), array(t_last), array(bin_counts)]
-    launch(march_weight, rays, inputs, device)
+    out = CoarseArrays()
+    out.total_weight, out.bin_counts = array(total_weight), array(bin_counts)
+    out.t_first, out.t_last = array(t_first), array(t_last)
+    inputs = [array(origins, wp.vec3), array(directions, wp.vec3), array(jitter), grid_arrays(cells, skip_distance)]
+    launch(march_weight, rays, [*inputs, march_params(settings), out], device)
     return total_weight, t_first, t_last, bin_counts
 
 
@@ -241,6 +185,20 @@ def sample_counts(bin_counts: torch.Tensor, most: int, per_bin: float) -> torch.
         return torch.where(bin_counts > 0, most, 0).to(torch.int32)
     wanted = torch.ceil(bin_counts * per_bin).clamp(min(FEWEST_SAMPLES, most), most)
     return torch.where(bin_counts > 0, wanted, 0.0).to(torch.int32)
+
+
+def marched_rays(
+    origins: torch.Tensor,
+    directions: torch.Tensor,
+    total_weight: torch.Tensor,
+    t_first: torch.Tensor,
+    counts: torch.Tensor,
+) -> MarchedRays:
+    """Rays after the coarse march as kernels take them."""
+    rays = MarchedRays()
+    rays.origins, rays.directions = array(origins, wp.vec3), array(directions, wp.vec3)
+    rays.total_weight, rays.t_first, rays.counts = array(total_weight), array(t_first), array(counts)
+    return rays
 
 
 def sample(
@@ -291,9 +249,9 @@ def sample(
         march_torch.draw(origins, directions, cells, settings, jitter, shift, starts, counts, out)
         return Samples(points, t, deltas, packed_info, t_first, t_last)
     out = SampleArrays()
+    out.starts, out.ray_indices = array(starts), array(ray_indices)
     out.points, out.t, out.deltas = array(points, wp.vec3), array(t), array(deltas)
-    out.ray_indices = array(ray_indices)
-    inputs = [array(origins, wp.vec3), array(directions, wp.vec3), array(shift), array(cells, wp.vec2)]
-    inputs += [array(skip_distance), march_params(settings), array(total_weight), array(t_first), array(starts)]
-    launch(march_sample, rays, [*inputs, array(counts), out], device)
+    marched = marched_rays(origins, directions, total_weight, t_first, counts)
+    inputs = [marched, array(shift), grid_arrays(cells, skip_distance), march_params(settings), out]
+    launch(march_sample, rays, inputs, device)
     return Samples(points, t, deltas, packed_info, t_first, t_last)

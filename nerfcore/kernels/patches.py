@@ -1,7 +1,8 @@
 """Depths that photos agree on best: small slanted patches compared between views by normalised cross-correlation.
 
 The idea is that of multi-view stereo by plane sweeping (Goesele et al., "Multi-view stereo for community photo
-collections", 2007), begun at the depth a field gives. Arrays are those of `surface.MapArrays`.
+collections", 2007), begun at the depth a field gives. A patch lies on the plane through a pixel's point with its normal;
+where it lies in another view is an affine map there. Cameras and depths are those of `projection.Maps`.
 """
 
 from __future__ import annotations
@@ -10,165 +11,253 @@ import torch
 import warp as wp
 
 from .depth_arrays import MapArrays
+from .projection import FARTHEST, NEAREST, Maps, map_struct, pixel_ray, project
 from .runtime import array, init, launch
 
 REACH = wp.constant(4)  # a patch has 5 × 5 pixels, two apart: it reaches four pixels from its middle
 FLAT = wp.constant(2.0e-5)  # variance of grey values in [0, 1] below which a patch shows nothing
+STEEPEST = wp.constant(1.0e-2)  # of the normal along the ray: a surface seen more along is not compared
+WIDEST = wp.constant(24.0)  # pixels a patch may reach in another view
+MIDDLE = wp.constant(6)  # of 13 depths that are tried
+UNSEEN = wp.constant(-2.0)  # correlation with a view that does not show the patch
 
 _patch = wp.types.vector(length=25, dtype=float)
 _tries = wp.types.vector(length=13, dtype=float)
 
 
+@wp.struct
+class RefineParams:
+    """See `refine`."""
+
+    view: int
+    neighbours: wp.array(dtype=int)
+    least: float
+    gain: float
+
+
+@wp.struct
+class Patch:
+    """Grey values around a pixel, row by row."""
+
+    values: _patch
+    mean: float
+    variance: float
+
+
+@wp.struct
+class Pixel:
+    """A pixel with the normal of its surface, in camera axes; along: of the normal on the ray, negative towards the
+    camera."""
+
+    x: float
+    y: float
+    lens: wp.vec4
+    normal: wp.vec3
+    along: float
+
+
+@wp.struct
+class Other:
+    """Another view: its lens, and how points get there from the axes of the first one."""
+
+    view: int
+    lens: wp.vec4
+    turn: wp.mat33
+    shift: wp.vec3
+
+
 @wp.func
-def _flow(
-    ray: wp.vec3, x: float, y: float, z: float, normal: wp.vec3, along: float, lens: wp.vec4, turn: wp.mat33,
-    shift: wp.vec3, other: wp.vec4,
-):  # fmt: skip
-    """Where a pixel of the plane through (ray · z) with a normal lies in another view; the third number is its depth."""
-    r = wp.vec3((x - lens[2]) / lens[0], (y - lens[3]) / lens[1], 1.0)
-    q = turn * (r * (z * along / wp.min(wp.dot(normal, r), -1e-3))) + shift
-    d = wp.max(q[2], 1e-6)
-    return wp.vec3(other[0] * q[0] / d + other[2], other[1] * q[1] / d + other[3], q[2])
+def read_patch(grey: wp.array(dtype=float), maps: Maps, view: int, column: int, row: int):
+    """The patch around a pixel of a view."""
+    patch = Patch()
+    mean = float(0.0)
+    square = float(0.0)
+    for k in range(25):
+        g = grey[maps.first[view] + (row + (k / 5 - 2) * 2) * maps.size[view, 0] + column + (k % 5 - 2) * 2]
+        patch.values[k] = g
+        mean += g
+        square += g * g
+    mean /= 25.0
+    patch.mean = mean
+    patch.variance = square / 25.0 - mean * mean
+    return patch
+
+
+@wp.func
+def other_view(maps: Maps, view: int, v: int):
+    other = Other()
+    other.view = v
+    other.lens = maps.lens[v]
+    other.turn = maps.rotation[v] * wp.transpose(maps.rotation[view])
+    other.shift = maps.translation[v] - other.turn * maps.translation[view]
+    return other
+
+
+@wp.func
+def flow(pixel: Pixel, other: Other, right: float, down: float, z: float):
+    """Where what lies `right` and `down` of a pixel appears in another view, on the plane through the pixel at depth z;
+    the third number is its depth there."""
+    r = pixel_ray(pixel.lens, pixel.x + right, pixel.y + down)
+    q = other.turn * (r * (z * pixel.along / wp.min(wp.dot(pixel.normal, r), -1e-3))) + other.shift
+    place = project(other.lens, wp.vec3(q[0], q[1], wp.max(q[2], 1e-6)))
+    return wp.vec3(place[0], place[1], q[2])
+
+
+@wp.func
+def pixels_per_depth(maps: Maps, params: RefineParams, pixel: Pixel, z: float):
+    """How many pixels a step in depth moves the point in other views, in the mean; 0 where that is not known."""
+    rate = float(0.0)
+    valid = float(0.0)
+    for m in range(params.neighbours.shape[0]):
+        other = other_view(maps, params.view, params.neighbours[m])
+        a = flow(pixel, other, 0.0, 0.0, z)
+        b = flow(pixel, other, 0.0, 0.0, z * 1.01)
+        if a[2] > NEAREST:
+            rate += wp.sqrt((a[0] - b[0]) * (a[0] - b[0]) + (a[1] - b[1]) * (a[1] - b[1])) / (0.01 * z)
+            valid += 1.0
+    mean = float(0.0)
+    if valid >= 1.0 and rate >= 1e-6:
+        mean = rate / valid
+    return mean
+
+
+@wp.func
+def bilinear(grey: wp.array(dtype=float), first: int, width: int, x: float, y: float):
+    """Grey value at x, y counted from the middle of a photo's first pixel."""
+    column = int(x)
+    row = int(y)
+    fx = x - float(column)
+    fy = y - float(row)
+    place = first + row * width + column
+    upper = grey[place] + fx * (grey[place + 1] - grey[place])
+    lower = grey[place + width] + fx * (grey[place + width + 1] - grey[place + width])
+    return upper + fy * (lower - upper)
+
+
+@wp.func
+def correlation(grey: wp.array(dtype=float), maps: Maps, patch: Patch, pixel: Pixel, other: Other, z: float):
+    """Normalised cross-correlation of a patch with another view, were the pixel's depth z; `UNSEEN` where the patch
+    leaves the picture or is stretched too far."""
+    middle = flow(pixel, other, 0.0, 0.0, z)
+    right = flow(pixel, other, 4.0, 0.0, z)
+    below = flow(pixel, other, 0.0, 4.0, z)
+    ax = (right[0] - middle[0]) * 0.5
+    ay = (right[1] - middle[1]) * 0.5
+    bx = (below[0] - middle[0]) * 0.5
+    by = (below[1] - middle[1]) * 0.5
+    reach_x = 2.0 * (wp.abs(ax) + wp.abs(bx)) + 1.0
+    reach_y = 2.0 * (wp.abs(ay) + wp.abs(by)) + 1.0
+    width = maps.size[other.view, 0]
+    height = maps.size[other.view, 1]
+    inside = middle[2] > NEAREST and middle[0] > reach_x and middle[1] > reach_y
+    inside = inside and middle[0] < float(width) - reach_x and middle[1] < float(height) - reach_y
+    result = float(UNSEEN)
+    if inside and reach_x < WIDEST and reach_y < WIDEST:
+        mean = float(0.0)
+        square = float(0.0)
+        product = float(0.0)
+        for k in range(25):
+            i = float(k % 5 - 2)
+            j = float(k / 5 - 2)
+            x = middle[0] + i * ax + j * bx - 0.5
+            y = middle[1] + i * ay + j * by - 0.5
+            g = bilinear(grey, maps.first[other.view], width, x, y)
+            mean += g
+            square += g * g
+            product += g * patch.values[k]
+        mean /= 25.0
+        variance = square / 25.0 - mean * mean
+        result = (product / 25.0 - mean * patch.mean) / wp.sqrt(wp.max(variance * patch.variance, 1e-14))
+    return result
+
+
+@wp.func
+def photo_agreement(
+    grey: wp.array(dtype=float), maps: Maps, params: RefineParams, patch: Patch, pixel: Pixel, z: float
+):
+    """Mean correlation of the three views that agree best, were the pixel's depth z; −1 for each that is missing."""
+    first = float(-1.0)
+    second = float(-1.0)
+    third = float(-1.0)
+    if z > NEAREST:
+        for m in range(params.neighbours.shape[0]):
+            other = other_view(maps, params.view, params.neighbours[m])
+            c = correlation(grey, maps, patch, pixel, other, z)
+            if c > first:
+                third = second
+                second = first
+                first = c
+            elif c > second:
+                third = second
+                second = c
+            elif c > third:
+                third = c
+    return (first + second + third) / 3.0
+
+
+@wp.func
+def best_try(tries: _tries, least: float, gain: float):
+    """The best of the depths tried, and how far from the middle one the peak lies, in steps: 0 where the photos do not
+    say it clearly (see `refine`)."""
+    best = int(MIDDLE)
+    for t in range(13):
+        if tries[t] > tries[best]:
+            best = t
+    peak = float(0.0)
+    moved = wp.abs(float(best - MIDDLE)) > 1.5
+    believed = tries[best] >= least and not (moved and tries[best] - tries[MIDDLE] < gain)
+    if believed and best > 0 and best < 12:
+        curve = tries[best - 1] - 2.0 * tries[best] + tries[best + 1]
+        fine = float(0.0)
+        if curve < -1e-6:
+            fine = wp.clamp(0.5 * (tries[best - 1] - tries[best + 1]) / curve, -0.5, 0.5)
+        peak = float(best - MIDDLE) + fine
+    return best, peak
 
 
 @wp.kernel(module="fieldwork_patches")
 def refine_kernel(
     grey: wp.array(dtype=float),
-    depth: wp.array(dtype=float),
     normals: wp.array(dtype=wp.vec3),
-    spread: wp.array(dtype=float),
-    first: wp.array(dtype=int),
-    size: wp.array(dtype=int, ndim=2),
-    lens: wp.array(dtype=wp.vec4),
-    rotation: wp.array(dtype=wp.mat33),
-    translation: wp.array(dtype=wp.vec3),
-    view: int,
-    neighbours: wp.array(dtype=int),
-    amount: int,
-    least: float,
-    gain: float,
+    maps: Maps,
+    params: RefineParams,
     out: wp.array(dtype=float),
     score: wp.array(dtype=float),
     offset: int,
 ):
     i = wp.tid() + offset
-    begin = first[view]
-    z0 = depth[begin + i]
-    out[i] = z0
+    view = params.view
+    z = maps.depth[maps.first[view] + i]
+    out[i] = z
     score[i] = -1.0
-    width = size[view, 0]
-    height = size[view, 1]
+    width = maps.size[view, 0]
+    height = maps.size[view, 1]
     column = i % width
     row = i / width
-    reach = REACH
-    if z0 <= 0.0 or z0 > 1e29 or column < reach or row < reach or column >= width - reach or row >= height - reach:
+    border = column < REACH or row < REACH or column >= width - REACH or row >= height - REACH
+    if z <= 0.0 or z > FARTHEST or border:
         return
-    patch = _patch()
-    mean = float(0.0)
-    square = float(0.0)
-    for k in range(25):
-        g = grey[begin + (row + (k / 5 - 2) * 2) * width + column + (k % 5 - 2) * 2]
-        patch[k] = g
-        mean += g
-        square += g * g
-    mean /= 25.0
-    variance = square / 25.0 - mean * mean
-    if variance < FLAT:
+    patch = read_patch(grey, maps, view, column, row)
+    if patch.variance < FLAT:
         return
-    l = lens[view]
-    x = float(column) + 0.5
-    y = float(row) + 0.5
-    ray = wp.vec3((x - l[2]) / l[0], (y - l[3]) / l[1], 1.0)
-    n = normals[i]
-    along = wp.dot(n, ray)
-    if along > -1e-2:
+    pixel = Pixel()
+    pixel.x = float(column) + 0.5
+    pixel.y = float(row) + 0.5
+    pixel.lens = maps.lens[view]
+    pixel.normal = normals[i]
+    pixel.along = wp.dot(pixel.normal, pixel_ray(pixel.lens, pixel.x, pixel.y))
+    if pixel.along > -STEEPEST:
         return
-    # How many pixels a step in depth moves the point, in the mean over the views.
-    rate = float(0.0)
-    valid = float(0.0)
-    for m in range(amount):
-        v = neighbours[m]
-        turn = rotation[v] * wp.transpose(rotation[view])
-        shift = translation[v] - turn * translation[view]
-        a = _flow(ray, x, y, z0, n, along, l, turn, shift, lens[v])
-        b = _flow(ray, x, y, z0 * 1.01, n, along, l, turn, shift, lens[v])
-        if a[2] > 1e-4:
-            rate += wp.sqrt((a[0] - b[0]) * (a[0] - b[0]) + (a[1] - b[1]) * (a[1] - b[1])) / (0.01 * z0)
-            valid += 1.0
-    if valid < 1.0 or rate < 1e-6:
+    rate = pixels_per_depth(maps, params, pixel, z)
+    if rate <= 0.0:
         return
-    rate /= valid
-    step = wp.clamp(spread[begin + i] / 3.0, 0.4 / rate, 1.2 / rate)
+    step = wp.clamp(maps.spread[maps.first[view] + i] / 3.0, 0.4 / rate, 1.2 / rate)
     tries = _tries()
     for t in range(13):
-        z = z0 + float(t - 6) * step
-        first_best = float(-1.0)
-        second_best = float(-1.0)
-        third_best = float(-1.0)
-        if z > 1e-4:
-            for m in range(amount):
-                v = neighbours[m]
-                turn = rotation[v] * wp.transpose(rotation[view])
-                shift = translation[v] - turn * translation[view]
-                middle = _flow(ray, x, y, z, n, along, l, turn, shift, lens[v])
-                right = _flow(ray, x + 4.0, y, z, n, along, l, turn, shift, lens[v])
-                below = _flow(ray, x, y + 4.0, z, n, along, l, turn, shift, lens[v])
-                ax = (right[0] - middle[0]) * 0.5
-                ay = (right[1] - middle[1]) * 0.5
-                bx = (below[0] - middle[0]) * 0.5
-                by = (below[1] - middle[1]) * 0.5
-                reach_x = 2.0 * (wp.abs(ax) + wp.abs(bx)) + 1.0
-                reach_y = 2.0 * (wp.abs(ay) + wp.abs(by)) + 1.0
-                inside = middle[2] > 1e-4 and middle[0] > reach_x and middle[1] > reach_y
-                inside = inside and middle[0] < float(size[v, 0]) - reach_x and middle[1] < float(size[v, 1]) - reach_y
-                if inside and reach_x < 24.0 and reach_y < 24.0:
-                    other = float(0.0)
-                    other_square = float(0.0)
-                    product = float(0.0)
-                    base = first[v]
-                    w = size[v, 0]
-                    for k in range(25):
-                        i0 = float(k % 5 - 2)
-                        j0 = float(k / 5 - 2)
-                        px = middle[0] + i0 * ax + j0 * bx - 0.5
-                        py = middle[1] + i0 * ay + j0 * by - 0.5
-                        cx = int(px)
-                        cy = int(py)
-                        fx = px - float(cx)
-                        fy = py - float(cy)
-                        place = base + cy * w + cx
-                        upper = grey[place] + fx * (grey[place + 1] - grey[place])
-                        lower = grey[place + w] + fx * (grey[place + w + 1] - grey[place + w])
-                        g = upper + fy * (lower - upper)
-                        other += g
-                        other_square += g * g
-                        product += g * patch[k]
-                    other /= 25.0
-                    spread_there = other_square / 25.0 - other * other
-                    c = (product / 25.0 - other * mean) / wp.sqrt(wp.max(spread_there * variance, 1e-14))
-                    if c > first_best:
-                        third_best = second_best
-                        second_best = first_best
-                        first_best = c
-                    elif c > second_best:
-                        third_best = second_best
-                        second_best = c
-                    elif c > third_best:
-                        third_best = c
-        tries[t] = (first_best + second_best + third_best) / 3.0
-    best = int(6)
-    for t in range(13):
-        if tries[t] > tries[best]:
-            best = t
+        tries[t] = photo_agreement(grey, maps, params, patch, pixel, z + float(t - MIDDLE) * step)
+    best, peak = best_try(tries, params.least, params.gain)
     score[i] = tries[best]
-    moved = wp.abs(float(best - 6)) > 1.5
-    if tries[best] < least or (moved and tries[best] - tries[6] < gain) or best == 0 or best == 12:
-        return
-    curve = tries[best - 1] - 2.0 * tries[best] + tries[best + 1]
-    fine = float(0.0)
-    if curve < -1e-6:
-        fine = wp.clamp(0.5 * (tries[best - 1] - tries[best + 1]) / curve, -0.5, 0.5)
-    out[i] = z0 + (float(best - 6) + fine) * step
+    out[i] = z + peak * step
 
 
 def refine(
@@ -186,7 +275,8 @@ def refine(
     init()
     count = int(maps.size[view].prod())
     out, score = torch.empty(count, device=grey.device), torch.empty(count, device=grey.device)
-    inputs = [array(grey), array(maps.depth), array(normals.contiguous(), wp.vec3), array(maps.spread)]
-    inputs += [*maps.cameras(), view, array(neighbours), len(neighbours), least, gain, array(out), array(score)]
+    params = RefineParams()
+    params.view, params.neighbours, params.least, params.gain = view, array(neighbours), least, gain
+    inputs = [array(grey), array(normals.contiguous(), wp.vec3), map_struct(maps), params, array(out), array(score)]
     launch(refine_kernel, count, inputs, grey.device)
     return out, score

@@ -14,7 +14,14 @@ from . import surface_torch
 from .depth_arrays import MapArrays
 from .device import backend_of
 from .packed_info import PackedInfo
+from .projection import FARTHEST, NEAREST, Maps, map_struct, pixel_ray, project, read_depth, seen_at
 from .runtime import array, init, launch
+
+NOWHERE = wp.constant(1.0e30)  # squared distance in pixels of what lies behind a camera
+GAP = wp.constant(0.05)  # share by which depths of neighbouring pixels may differ where a point is only looked up
+LOOKS_THROUGH = wp.constant(0.1)  # weight of a view that looks through a place, see `fuse`
+FEWEST_THROUGH = wp.constant(2)  # views that make a sheet thin, and
+THROUGH_SHARE = wp.constant(0.15)  # their share of those that see a place
 
 
 @wp.kernel(module="fieldwork_surface")
@@ -67,53 +74,83 @@ def depth_quantiles(
     return near, middle, far, opacity
 
 
+@wp.struct
+class FusionParams:
+    """See `fuse`."""
+
+    voxel: float
+    truncation: float
+    free_at: float
+    gap: float
+    apart: float
+
+
+@wp.struct
+class Fused:
+    """What the views said of a point so far."""
+
+    distance: float  # sum of weight times distance
+    weight: float
+    outer: float  # the same of non-negative distances alone
+    outer_weight: float
+    seen: int  # views
+    free: int  # views that look through
+    direction: wp.vec3  # from the first view
+    wide: int  # 1 where another view looks from far enough beside it
+
+
 @wp.func
-def read_depth(depth: wp.array(dtype=float), first: int, width: int, height: int, x: float, y: float, gap: float):
-    """Depth at pixel coordinates: interpolated (in 1/z, in which planes are linear) where the four pixels around lie
-    within the share `gap` of each other; at an outline the nearest pixel's if it is in front, else unknown: half a pixel
-    beside an outline nobody knows what is behind. And the nearest pixel's place."""
-    column = wp.clamp(int(wp.floor(x)), 0, width - 1)
-    row = wp.clamp(int(wp.floor(y)), 0, height - 1)
-    place = first + row * width + column
-    value = depth[place]
-    x0 = int(wp.floor(x - 0.5))
-    y0 = int(wp.floor(y - 0.5))
-    if x0 >= 0 and y0 >= 0 and x0 + 1 < width and y0 + 1 < height and value > 0.0:
-        corner = first + y0 * width + x0
-        a = depth[corner]
-        b = depth[corner + 1]
-        c = depth[corner + width]
-        d = depth[corner + width + 1]
-        low = wp.min(wp.min(a, b), wp.min(c, d))
-        high = wp.max(wp.max(a, b), wp.max(c, d))
-        if value - low >= gap * low:
-            value = 0.0
-        elif low > 0.0 and high - low < gap * low:
-            fx = x - 0.5 - float(x0)
-            fy = y - 0.5 - float(y0)
-            upper = (1.0 - fx) / a + fx / b
-            lower = (1.0 - fx) / c + fx / d
-            value = 1.0 / ((1.0 - fy) * upper + fy * lower)
-    return value, place
+def view_distance(maps: Maps, view: int, p: wp.vec3, f: FusionParams):
+    """Whether a view says something of a point of the frame (1 or 0), its distance, its weight, and the ray from the
+    camera."""
+    known = int(0)
+    distance = float(0.0)
+    weight = float(0.0)
+    ray = wp.vec3(0.0, 0.0, 0.0)
+    q, pixel, inside = seen_at(maps, view, p)
+    if inside:
+        depth, place = read_depth(maps, view, pixel, f.gap)
+        if depth > 0.0:
+            far = wp.length(q)
+            distance = (depth - q[2]) * far / q[2] * maps.cosine[place]
+            if distance > -f.truncation:
+                known = 1
+                scale = maps.lens[view][0] / q[2]
+                sure = wp.min(1.0, f.voxel / wp.max(maps.spread[place], 1e-6))
+                weight = sure * sure * maps.cosine[place] * scale * scale
+                if distance < 0.0:
+                    behind = 1.0 + distance / f.truncation
+                    weight *= behind * behind
+                distance = wp.min(distance, f.truncation)
+                ray = wp.transpose(maps.rotation[view]) * q / far
+    return known, distance, weight, ray
+
+
+@wp.func
+def with_view(fused: Fused, distance: float, weight: float, ray: wp.vec3, f: FusionParams):
+    """What is known of a point after one more view."""
+    w = float(weight)
+    fused.seen += 1
+    if distance > f.free_at:
+        fused.free += 1
+        w *= LOOKS_THROUGH
+    fused.distance += w * distance
+    fused.weight += w
+    if distance >= 0.0:
+        fused.outer += w * distance
+        fused.outer_weight += w
+    if fused.seen == 1:
+        fused.direction = ray
+    elif wp.dot(fused.direction, ray) < f.apart:
+        fused.wide = 1
+    return fused
 
 
 @wp.kernel(module="fieldwork_surface")
 def fuse_kernel(
     points: wp.array(dtype=wp.vec3),
-    depth: wp.array(dtype=float),
-    cosine: wp.array(dtype=float),
-    spread: wp.array(dtype=float),
-    first: wp.array(dtype=int),
-    size: wp.array(dtype=int, ndim=2),
-    lens: wp.array(dtype=wp.vec4),
-    rotation: wp.array(dtype=wp.mat33),
-    translation: wp.array(dtype=wp.vec3),
-    views: int,
-    voxel: float,
-    truncation: float,
-    free_at: float,
-    gap: float,
-    apart: float,
+    maps: Maps,
+    f: FusionParams,
     distance: wp.array(dtype=float),
     weight: wp.array(dtype=float),
     known: wp.array(dtype=wp.uint8),
@@ -121,59 +158,24 @@ def fuse_kernel(
 ):
     i = wp.tid() + offset
     p = points[i]
-    total = float(0.0)
-    total_weight = float(0.0)
-    outer = float(0.0)  # the same of non-negative distances alone
-    outer_weight = float(0.0)
-    seen = int(0)
-    free = int(0)
-    direction = wp.vec3(0.0, 0.0, 0.0)
-    wide = int(0)
-    for v in range(views):
-        q = rotation[v] * p + translation[v]
-        if q[2] > 1e-4:
-            l = lens[v]
-            x = l[0] * q[0] / q[2] + l[2]
-            y = l[1] * q[1] / q[2] + l[3]
-            width = size[v, 0]
-            height = size[v, 1]
-            if x >= 0.0 and y >= 0.0 and x < float(width) and y < float(height):
-                value, place = read_depth(depth, first[v], width, height, x, y, gap)
-                if value > 0.0:
-                    far = wp.length(q)
-                    d = (value - q[2]) * far / q[2] * cosine[place]
-                    if d > -truncation:
-                        scale = l[0] / q[2]
-                        sure = wp.min(1.0, voxel / wp.max(spread[place], 1e-6))
-                        w = sure * sure * cosine[place] * scale * scale
-                        if d < 0.0:
-                            behind = 1.0 + d / truncation
-                            w *= behind * behind
-                        d = wp.min(d, truncation)
-                        seen += 1
-                        if d > free_at:
-                            free += 1
-                            w *= 0.1
-                        total += w * d
-                        total_weight += w
-                        if d >= 0.0:
-                            outer += w * d
-                            outer_weight += w
-                        ray = wp.transpose(rotation[v]) * q / far
-                        if seen == 1:
-                            direction = ray
-                        elif wp.dot(direction, ray) < apart:
-                            wide = 1
+    fused = Fused()
+    for v in range(maps.first.shape[0]):
+        seen, d, w, ray = view_distance(maps, v, p, f)
+        if seen == 1:
+            fused = with_view(fused, d, w, ray, f)
+    total = fused.distance
+    total_weight = fused.weight
     # A thin sheet: enough views look through this place, so what others see behind it is another side.
-    if free >= 2 and float(free) >= 0.15 * float(seen) and outer_weight > 0.0:
-        total = outer
-        total_weight = outer_weight
-    value_out = float(0.0)
+    through = fused.free >= FEWEST_THROUGH and float(fused.free) >= THROUGH_SHARE * float(fused.seen)
+    if through and fused.outer_weight > 0.0:
+        total = fused.outer
+        total_weight = fused.outer_weight
+    mean = float(0.0)
     if total_weight > 0.0:
-        value_out = total / total_weight
-    distance[i] = value_out
+        mean = total / total_weight
+    distance[i] = mean
     weight[i] = total_weight
-    known[i] = wp.uint8(wide)
+    known[i] = wp.uint8(fused.wide)
 
 
 def fuse(
@@ -184,32 +186,44 @@ def fuse(
 
     A view's distance is (D − z) · ‖q‖/z · cos θ, from the point q in camera axes along the ray to the surface and from
     there to its plane; beyond `truncation` behind the surface the view says nothing. Weights: cos θ (f/z)² ·
-    min(1, voxel/spread)², falling off quadratically behind the surface, a tenth where a view looks
-    through: that it does so says little about where the surface is. Where at least two views and 15 % of those that see a point find it more
-    than `free_at` in front of their surface, only non-negative distances count: both sides of thin sheets remain.
+    min(1, voxel/spread)², falling off quadratically behind the surface, a tenth where a view looks through: that it
+    does so says little about where the surface is. Where at least two views and 15 % of those that see a point find it
+    more than `free_at` in front of their surface, only non-negative distances count: both sides of thin sheets remain.
     `gap`: share by which depths of neighbouring pixels may differ and still be interpolated.
     """
     init()
     device, count = points.device, len(points)
     distance, weight = torch.empty(count, device=device), torch.empty(count, device=device)
     known = torch.empty(count, dtype=torch.uint8, device=device)
-    inputs = [array(points.contiguous(), wp.vec3), array(maps.depth), array(maps.cosine), array(maps.spread)]
-    inputs += [*maps.cameras(), len(maps), voxel, truncation, free_at, gap, apart]
-    launch(fuse_kernel, count, [*inputs, array(distance), array(weight), array(known)], device)
+    f = FusionParams()
+    f.voxel, f.truncation, f.free_at, f.gap, f.apart = voxel, truncation, free_at, gap, apart
+    inputs = [array(points.contiguous(), wp.vec3), map_struct(maps), f, array(distance), array(weight), array(known)]
+    launch(fuse_kernel, count, inputs, device)
     return distance, weight, known
+
+
+@wp.func
+def returns_to(maps: Maps, view: int, pixel: wp.vec2, other: int, place: wp.vec2, depth: float):
+    """Distance in pixels, squared, of a view's pixel from where that view sees what another one shows at `place`,
+    `depth` from its camera."""
+    q = pixel_ray(maps.lens[other], place[0], place[1])
+    q = wp.vec3(q[0] * depth, q[1] * depth, depth)
+    p = wp.transpose(maps.rotation[other]) * (q - maps.translation[other])
+    back = maps.rotation[view] * p + maps.translation[view]
+    apart = float(NOWHERE)
+    if back[2] > NEAREST:
+        off = project(maps.lens[view], back)
+        dx = off[0] - pixel[0]
+        dy = off[1] - pixel[1]
+        apart = dx * dx + dy * dy
+    return apart
 
 
 @wp.kernel(module="fieldwork_surface")
 def agree_kernel(
-    depth: wp.array(dtype=float),
-    first: wp.array(dtype=int),
-    size: wp.array(dtype=int, ndim=2),
-    lens: wp.array(dtype=wp.vec4),
-    rotation: wp.array(dtype=wp.mat33),
-    translation: wp.array(dtype=wp.vec3),
+    maps: Maps,
     view: int,
     neighbours: wp.array(dtype=int),
-    amount: int,
     share: float,
     pixels: float,
     out: wp.array(dtype=int),
@@ -217,32 +231,22 @@ def agree_kernel(
 ):
     i = wp.tid() + offset
     out[i] = 0
-    z = depth[first[view] + i]
-    if z <= 0.0 or z > 1e29:
+    z = maps.depth[maps.first[view] + i]
+    if z <= 0.0 or z > FARTHEST:
         return
-    l = lens[view]
-    x = float(i % size[view, 0]) + 0.5
-    y = float(i / size[view, 0]) + 0.5
-    q = wp.vec3((x - l[2]) / l[0] * z, (y - l[3]) / l[1] * z, z)
-    p = wp.transpose(rotation[view]) * (q - translation[view])
+    pixel = wp.vec2(float(i % maps.size[view, 0]) + 0.5, float(i / maps.size[view, 0]) + 0.5)
+    ray = pixel_ray(maps.lens[view], pixel[0], pixel[1])
+    q = wp.vec3(ray[0] * z, ray[1] * z, z)
+    p = wp.transpose(maps.rotation[view]) * (q - maps.translation[view])
     found = int(0)
-    for n in range(amount):
+    for n in range(neighbours.shape[0]):
         v = neighbours[n]
-        o = rotation[v] * p + translation[v]
-        if o[2] > 1e-4:
-            m = lens[v]
-            ox = m[0] * o[0] / o[2] + m[2]
-            oy = m[1] * o[1] / o[2] + m[3]
-            if ox >= 0.0 and oy >= 0.0 and ox < float(size[v, 0]) and oy < float(size[v, 1]):
-                value, _ = read_depth(depth, first[v], size[v, 0], size[v, 1], ox, oy, 0.05)
-                if value > 0.0 and value < 1e29 and wp.abs(value - o[2]) < share * o[2]:
-                    back = wp.vec3((ox - m[2]) / m[0] * value, (oy - m[3]) / m[1] * value, value)
-                    b = rotation[view] * (wp.transpose(rotation[v]) * (back - translation[v])) + translation[view]
-                    if b[2] > 1e-4:
-                        bx = l[0] * b[0] / b[2] + l[2] - x
-                        by = l[1] * b[1] / b[2] + l[3] - y
-                        if bx * bx + by * by < pixels * pixels:
-                            found += 1
+        o, place, inside = seen_at(maps, v, p)
+        if inside:
+            depth, _ = read_depth(maps, v, place, GAP)
+            same = depth > 0.0 and depth < FARTHEST and wp.abs(depth - o[2]) < share * o[2]
+            if same and returns_to(maps, view, pixel, v, place, depth) < pixels * pixels:
+                found += 1
     out[i] = found
 
 
@@ -252,7 +256,7 @@ def agreement(maps: MapArrays, view: int, neighbours: torch.Tensor, share: float
     init()
     count = int(maps.size[view].prod())
     out = torch.empty(count, dtype=torch.int32, device=maps.depth.device)
-    inputs = [array(maps.depth), *maps.cameras(), view, array(neighbours), len(neighbours), share, pixels, array(out)]
+    inputs = [map_struct(maps), view, array(neighbours), share, pixels, array(out)]
     launch(agree_kernel, count, inputs, maps.depth.device)
     return out
 
@@ -261,13 +265,7 @@ def agreement(maps: MapArrays, view: int, neighbours: torch.Tensor, share: float
 def sight_kernel(
     points: wp.array(dtype=wp.vec3),
     normals: wp.array(dtype=wp.vec3),
-    depth: wp.array(dtype=float),
-    first: wp.array(dtype=int),
-    size: wp.array(dtype=int, ndim=2),
-    lens: wp.array(dtype=wp.vec4),
-    rotation: wp.array(dtype=wp.mat33),
-    translation: wp.array(dtype=wp.vec3),
-    views: int,
+    maps: Maps,
     tolerance: float,
     out: wp.array(dtype=float, ndim=2),
     offset: int,
@@ -275,22 +273,15 @@ def sight_kernel(
     i = wp.tid() + offset
     p = points[i]
     n = normals[i]
-    for v in range(views):
+    for v in range(maps.first.shape[0]):
         out[i, v] = 0.0
-        q = rotation[v] * p + translation[v]
-        if q[2] > 1e-4:
-            l = lens[v]
-            x = l[0] * q[0] / q[2] + l[2]
-            y = l[1] * q[1] / q[2] + l[3]
-            width = size[v, 0]
-            height = size[v, 1]
-            if x >= 0.0 and y >= 0.0 and x < float(width) and y < float(height):
-                value, _ = read_depth(depth, first[v], width, height, x, y, 0.05)
-                far = wp.length(q)
-                facing = -wp.dot(n, wp.transpose(rotation[v]) * q) / far
-                if value > 0.0 and facing > 0.0 and wp.abs(q[2] - value) < tolerance:
-                    scale = l[0] / q[2]
-                    out[i, v] = facing * scale * scale
+        q, pixel, inside = seen_at(maps, v, p)
+        if inside:
+            depth, _ = read_depth(maps, v, pixel, GAP)
+            facing = -wp.dot(n, wp.transpose(maps.rotation[v]) * q) / wp.length(q)
+            if depth > 0.0 and facing > 0.0 and wp.abs(q[2] - depth) < tolerance:
+                scale = maps.lens[v][0] / q[2]
+                out[i, v] = facing * scale * scale
 
 
 def sight(points: torch.Tensor, normals: torch.Tensor, maps: MapArrays, tolerance: float) -> torch.Tensor:
@@ -298,6 +289,6 @@ def sight(points: torch.Tensor, normals: torch.Tensor, maps: MapArrays, toleranc
     point faces away, lies outside the picture or not within `tolerance` of what the view shows."""
     init()
     out = torch.empty(len(points), len(maps), device=points.device)
-    inputs = [array(points.contiguous(), wp.vec3), array(normals.contiguous(), wp.vec3), array(maps.depth)]
-    launch(sight_kernel, len(points), [*inputs, *maps.cameras(), len(maps), tolerance, array(out)], points.device)
+    inputs = [array(points.contiguous(), wp.vec3), array(normals.contiguous(), wp.vec3)]
+    launch(sight_kernel, len(points), [*inputs, map_struct(maps), tolerance, array(out)], points.device)
     return out

@@ -1,4 +1,4 @@
-"""How rays traverse the occupancy grid, bin by bin: what the kernels of `march.py` and `fused_kernel.py` share.
+"""How rays traverse the occupancy grid, bin by bin: what the coarse march and `pdf_sampling.py` share.
 
 Positions are in the *normalised* frame, whose unit cube [−1, 1]³ is the region of interest. `contracted` maps all of
 space into the grid (Barron et al., "Mip-NeRF 360", 2022, eq. 10, with the infinity norm); otherwise the grid covers
@@ -18,6 +18,8 @@ from functools import lru_cache
 
 import torch
 import warp as wp
+
+from .runtime import array
 
 PDF_DEFAULT, PDF_UNIFORM, PDF_LITERAL = 0, 1, 2
 _DEFAULT, _UNIFORM, _LITERAL = wp.constant(PDF_DEFAULT), wp.constant(PDF_UNIFORM), wp.constant(PDF_LITERAL)
@@ -47,6 +49,21 @@ class MarchSettings:
     epsilon: float = 0.01
     empty_distance: float = 0.0
     per_bin: float = 0.0
+
+
+@wp.struct
+class GridArrays:
+    """An occupancy grid, see `march.sample`."""
+
+    cells: wp.array(dtype=wp.vec2)
+    skip_distance: wp.array(dtype=wp.uint8)
+
+
+def grid_arrays(cells: torch.Tensor, skip_distance: torch.Tensor) -> GridArrays:
+    """The grid as kernels take it."""
+    grid = GridArrays()
+    grid.cells, grid.skip_distance = array(cells, wp.vec2), array(skip_distance)
+    return grid
 
 
 @wp.struct

@@ -11,8 +11,8 @@ from ..field.hybrid import HybridField
 from ..field.mlp import MLP
 from ..kernels.device import backend_of
 from ..kernels.fused import MOST_CLASSES, CoarseRays, FusedField, FusedRays, coarse_march, render_coarse
-from ..kernels.fused_kernel import FusedShape
 from ..kernels.fused_network import padded
+from ..kernels.fused_shape import FusedShape
 from ..kernels.runtime import small_tensor
 from .model import Model, Rendered
 

@@ -71,7 +71,7 @@ class OccupancyGrid(nn.Module):
         self.skip_distance: torch.Tensor
 
     def _mean_scratch(self) -> MeanScratch:
-        if self._scratch is None or self._scratch.counts.device != self.mean.device:
+        if self._scratch is None or self._scratch.sums.device != self.mean.device:
             self._scratch = MeanScratch(len(self.mean), self.mean.device)
         return self._scratch
 

@@ -20,19 +20,10 @@ from ..render.model import Model, Rendered
 from ..sampling.cache import CoarseCache
 from ..sampling.known_space import KnownSpace
 from ..sampling.outlines import Outlines
+from .composite_loss import composite_loss
 from .depth import DepthRays, depth_loss
 from .gradients import GradientGuard, only_finite
-from .losses import (
-    at_given_opacity,
-    color_loss,
-    distortion_loss,
-    entropy_loss,
-    label_weights,
-    opacity_entropy,
-    psnr,
-    semantic_loss,
-    sparsity_loss,
-)
+from .losses import label_weights, psnr, sparsity_loss
 from .pose_refinement import PoseRefinement, level_weights
 from .schedule import bias_correction, rate_factor, sample_budget
 from .voxel_init import PixelFeatures, initialise
@@ -187,48 +178,11 @@ class Trainer:
         self.measured = measured
 
     def _accumulate_gradients(self, batch: Batch, progress: float) -> list[ShardResult]:
-        """Leave the gradient of the composite loss in the parameters and in the grid.
-
-        The CPU works on shards of the rays side by side, few enough that threads do not wait for each other's interpreter
-        lock; a shard's loss is its part of the whole batch's loss, and gradients are summed in the order of the shards.
-        """
-        per_ray, rays = self.config.sampling.samples, len(batch.rgb)
-        jitter = torch.rand(rays, device=self.device, generator=self.generator)
-        shift = torch.rand(rays * per_ray, device=self.device, generator=self.generator)
-        if self.background is None:
-            background = torch.rand(batch.rgb.shape, device=self.device, generator=self.generator)
-        else:
-            background = torch.full_like(batch.rgb, self.background)
-        counted = label_weights(batch)
-        labelled = counted.sum().clamp(min=1e-6)
-        shard_count = 1
-        if self.backend.host_threads:
-            shard_count = max(2, min(worker_count(), sample_budget(self.config.train, progress) // SHARD_SAMPLES))
-        size = -(-rays // shard_count)
-        capacity = self._capacity(progress, shard_count)
-
-        def shard(begin: int) -> ShardResult:
-            part = batch.part(slice(begin, begin + size))
-            noise = jitter[begin : begin + size], shift[begin * per_ray : (begin + size) * per_ray]
-
-            def loss() -> tuple[torch.Tensor, torch.Tensor, Rendered]:
-                rendered = self._render(part, *noise, capacity)
-                share = len(part.rgb) / rays, counted[begin : begin + size].sum() / labelled
-                return *self.loss(part, rendered, background[begin : begin + size], progress, share), rendered
-
-            moved = (part.origins, part.directions) if part.origins.requires_grad else ()
-            return self._differentiate(loss, moved)
-
-        tasks: list[Callable[[], ShardResult]] = [partial(shard, begin) for begin in range(0, rays, size)]
-        c = self.config.loss
-        if c.regularization * c.sparsity_weight > 0:
-            points = torch.rand(1024, 3, device=self.device, generator=self.generator)
-
-            def sparsity() -> tuple[torch.Tensor, torch.Tensor, None]:
-                price = c.regularization * c.sparsity_weight * sparsity_loss(self.model.field.density(points), c)
-                return price, torch.zeros_like(price), None
-
-            tasks.append(partial(self._differentiate, sparsity))
+        """Leave the gradient of the composite loss in the parameters and in the grid; gradients are summed in the order
+        of the shards."""
+        tasks = self._shard_tasks(batch, progress)
+        if self.config.loss.regularization * self.config.loss.sparsity_weight > 0:
+            tasks.append(self._sparsity_task())
         if self.depths is not None and len(self.depths):
             tasks.append(self._depth_task(self.depths))
         shards = run_parallel(tasks, self.device)
@@ -244,6 +198,53 @@ class Trainer:
             self.measured.loss += part.loss
             self.measured.mse += part.squared_error
         return shards
+
+    def _shard_tasks(self, batch: Batch, progress: float) -> list[Callable[[], ShardResult]]:
+        """Tasks that learn from the rays of a batch.
+
+        The CPU works on shards of the rays side by side, few enough that threads do not wait for each other's interpreter
+        lock; a shard's loss is its part of the whole batch's loss.
+        """
+        config, per_ray, rays = self.config, self.config.sampling.samples, len(batch.rgb)
+        jitter = torch.rand(rays, device=self.device, generator=self.generator)
+        shift = torch.rand(rays * per_ray, device=self.device, generator=self.generator)
+        if self.background is None:
+            background = torch.rand(batch.rgb.shape, device=self.device, generator=self.generator)
+        else:
+            background = torch.full_like(batch.rgb, self.background)
+        counted = label_weights(batch)
+        labelled = counted.sum().clamp(min=1e-6)
+        shard_count = 1
+        if self.backend.host_threads:
+            shard_count = max(2, min(worker_count(), sample_budget(config.train, progress) // SHARD_SAMPLES))
+        size = -(-rays // shard_count)
+        capacity = self._capacity(progress, shard_count)
+
+        def shard(begin: int) -> ShardResult:
+            part = batch.part(slice(begin, begin + size))
+            noise = jitter[begin : begin + size], shift[begin * per_ray : (begin + size) * per_ray]
+
+            def loss() -> tuple[torch.Tensor, torch.Tensor, Rendered]:
+                rendered = self._render(part, *noise, capacity)
+                share = len(part.rgb) / rays, counted[begin : begin + size].sum() / labelled
+                behind = background[begin : begin + size]
+                return *composite_loss(part, rendered, behind, progress, config.loss, self.model, share), rendered
+
+            moved = (part.origins, part.directions) if part.origins.requires_grad else ()
+            return self._differentiate(loss, moved)
+
+        return [partial(shard, begin) for begin in range(0, rays, size)]
+
+    def _sparsity_task(self) -> Callable[[], ShardResult]:
+        """The task that keeps the density low at points drawn here."""
+        c = self.config.loss
+        points = torch.rand(1024, 3, device=self.device, generator=self.generator)
+
+        def loss() -> tuple[torch.Tensor, torch.Tensor, None]:
+            price = c.regularization * c.sparsity_weight * sparsity_loss(self.model.field.density(points), c)
+            return price, torch.zeros_like(price), None
+
+        return partial(self._differentiate, loss)
 
     def _depth_task(self, depths: DepthRays) -> Callable[[], ShardResult]:
         """The task that learns from some of the rays of known length, drawn here."""
@@ -293,49 +294,6 @@ class Trainer:
         return self.model.render(
             batch.origins, batch.directions, per_ray, jitter, shift, codes, semantics, capacity=capacity
         )
-
-    def loss(
-        self,
-        batch: Batch,
-        rendered: Rendered,
-        background: torch.Tensor,
-        progress: float,
-        share: tuple[float, float | torch.Tensor] = (1.0, 1.0),
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """The composite loss of rays in front of `background` (R, 3), and their mean squared colour error.
-
-        `share`: the part of the whole batch's rays and of its labelled rays that these are; both results are scaled
-        so that those of all parts sum to the batch's.
-        """
-        c = self.config.loss
-        rays, labels = share
-        alpha = batch.alpha[:, None]
-        target = batch.rgb * alpha + background * (1 - alpha)
-        predicted = rendered.color + background * (1 - rendered.opacity[:, None])
-        total = rays * c.rgb_weight * color_loss(predicted, target, c)
-        if rendered.probabilities is not None:
-            counted = label_weights(batch)
-            opacity = torch.lerp(rendered.opacity.detach(), rendered.opacity, self.model.label_pull)
-            probabilities = at_given_opacity(rendered.probabilities, opacity)
-            price = semantic_loss(probabilities, batch.label, counted, batch.confidence)
-            total = total + labels * c.semantic_weight * price
-            if c.entropy_ratio > 0 and c.regularization > 0 and progress >= c.entropy_start:
-                weight = c.regularization * c.entropy_ratio * c.semantic_weight
-                total = total + labels * weight * entropy_loss(probabilities, counted)
-        if c.regularization > 0:
-            total = total + rays * c.regularization * self._regularizers(rendered, progress)
-        return total, rays * ((predicted.detach() - target) ** 2 * batch.weight[:, None]).mean()
-
-    def _regularizers(self, rendered: Rendered, progress: float) -> torch.Tensor:
-        c, s = self.config.loss, rendered.samples
-        total = rendered.opacity.sum() * 0
-        if c.distortion_weight > 0 and progress >= c.distortion_start:
-            t = s.t / (1 + s.t) if self.model.contracted else s.t
-            deltas = s.deltas / (1 + s.t) ** 2 if self.model.contracted else s.deltas
-            total = total + c.distortion_weight * distortion_loss(rendered.weights, t, deltas, s.packed_info)
-        if c.opacity_weight > 0:
-            total = total + c.opacity_weight * opacity_entropy(rendered.opacity)
-        return total
 
     def _capacity(self, progress: float, shards: int) -> int:
         """Rays of a shard that may get samples where the capacity is fixed: what the budget is enough for, and some."""

@@ -13,6 +13,7 @@ from fieldwork.nerfcore.kernels.packed_info import PackedInfo
 from fieldwork.nerfcore.params import TrainParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.render.model import Model, Rendered
+from fieldwork.nerfcore.train.composite_loss import composite_loss
 from fieldwork.nerfcore.train.losses import distortion_loss
 from fieldwork.nerfcore.train.prepare import make_trainer, plan_run
 from fieldwork.nerfcore.train.schedule import sample_budget
@@ -223,7 +224,7 @@ def test_nothing_visible_gives_numbers(ball: Path, kernels: Kernels) -> None:
         rendered = model.render(batch.origins, batch.directions, 12)
         assert len(rendered.weights) > 0
         assert not rendered.samples.packed_info.counts.any()
-        loss, error = trainer.loss(batch, rendered, torch.zeros(64, 3), 0.9)
+        loss, error = composite_loss(batch, rendered, torch.zeros(64, 3), 0.9, trainer.config.loss, model)
         assert float(distortion(rendered).detach()) == 0
         assert bool(torch.isfinite(loss))
         assert bool(torch.isfinite(error))

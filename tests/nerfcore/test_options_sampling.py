@@ -19,6 +19,7 @@ from fieldwork.nerfcore.render.verb import look_at
 from fieldwork.nerfcore.sampling.cache import CoarseCache
 from fieldwork.nerfcore.sampling.occupancy import OccupancyGrid, class_importance
 from fieldwork.nerfcore.sampling.outlines import DISTANCE, Outlines, outline_mask
+from fieldwork.nerfcore.train.composite_loss import composite_loss
 from fieldwork.nerfcore.train.trainer import Trainer
 from fieldwork.tests.nerfcore.support.ball import ball_project
 from fieldwork.tests.nerfcore.support.settings import config_of, trainer_of
@@ -287,7 +288,7 @@ def test_labels_alone_never_change_how_opaque_a_ray_is(ball: Path, detached: str
     trainer = trainer_of(ball, **settings)
     batch = trainer.store.batch(torch.arange(0, len(trainer.store), 7))
     shown = trainer._render(batch, torch.full((len(batch.rgb),), 0.5), torch.full((len(batch.rgb) * 12,), 0.5))
-    total, _ = trainer.loss(batch, shown, torch.ones_like(batch.rgb), 0.0)
+    total, _ = composite_loss(batch, shown, torch.ones_like(batch.rgb), 0.0, trainer.config.loss, trainer.model)
     (moved,) = torch.autograd.grad(total, shown.weights, allow_unused=True)
     moved = torch.zeros_like(shown.weights) if moved is None else moved
     assert bool((moved != 0).any()) == (detached == "false")

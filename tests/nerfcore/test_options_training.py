@@ -19,6 +19,8 @@ from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.render.image import background_of
 from fieldwork.nerfcore.render.run import CPU_IMAGE_SIZE, GPU_IMAGE_SIZE, RunInfo
 from fieldwork.nerfcore.train import losses, verb
+from fieldwork.nerfcore.train import trainer as trainer_module
+from fieldwork.nerfcore.train.composite_loss import composite_loss
 from fieldwork.nerfcore.train.prepare import plan_run
 from fieldwork.nerfcore.train.schedule import bias_correction
 from fieldwork.nerfcore.train.trainer import Trainer
@@ -75,7 +77,7 @@ def test_the_background_of_training_and_of_pictures(ball: Path) -> None:
 
 
 @pytest.mark.setting("scene.background")
-def test_white_photos_are_learned_on_white(ball: Path) -> None:
+def test_white_photos_are_learned_on_white(ball: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What shows in empty pixels is the background that pictures will have."""
     prices = {}
     for choice in ("white", "black"):
@@ -83,13 +85,12 @@ def test_white_photos_are_learned_on_white(ball: Path) -> None:
         empty = (trainer.store.rgba[:, 3] == 0).nonzero()[:64, 0]
         batch = trainer.store.batch(empty)
         seen: list[torch.Tensor] = []
-        original = trainer.loss
 
-        def spy(part: Any, rendered: Any, background: torch.Tensor, *rest: Any, _to=original, _seen=seen) -> Any:
+        def spy(part: Any, rendered: Any, background: torch.Tensor, *rest: Any, _seen=seen) -> Any:
             _seen.append(background)
-            return _to(part, rendered, background, *rest)
+            return composite_loss(part, rendered, background, *rest)
 
-        trainer.loss = spy  # type: ignore[method-assign]
+        monkeypatch.setattr(trainer_module, "composite_loss", spy)
         trainer._accumulate_gradients(batch, 0.0)
         prices[choice] = float(torch.cat(seen).mean())
     assert prices == {"white": 1.0, "black": 0.0}
@@ -128,12 +129,10 @@ def priced(ball: Path) -> Callable[..., float]:
     batch = trainer.store.batch(torch.arange(0, len(trainer.store), 7))
     rendered = trainer._render(batch, torch.full((len(batch.rgb),), 0.5), torch.full((len(batch.rgb) * 12,), 0.5))
     assert bool((batch.label != VOID).any())
-    original = trainer.config.loss.model_copy()
 
     def price(progress: float = 1.0, **changes: Any) -> float:
-        trainer.config.loss = original.model_copy(update=changes)
-        total, _ = trainer.loss(batch, rendered, torch.ones_like(batch.rgb), progress)
-        trainer.config.loss = original
+        config = trainer.config.loss.model_copy(update=changes)
+        total, _ = composite_loss(batch, rendered, torch.ones_like(batch.rgb), progress, config, trainer.model)
         return float(total.detach())
 
     return price

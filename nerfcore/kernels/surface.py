@@ -1,8 +1,8 @@
 """From rays to a surface: depths at which rays end, depth maps that confirm each other, distances fused from them.
 
 Depth maps are pinhole images, one behind the other in flat arrays: `depth` (P,) along the optical axis, 0 where unknown
-and `FREE` where a ray meets nothing. Devices without Warp leave all but the depths of rays to the host; the torch twins
-that tests compare with are in `surface_torch.py`.
+and `FREE` where a ray meets nothing. Devices without Warp leave all but the depths of rays (`surface_torch.py`) to the
+host.
 """
 
 from __future__ import annotations

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -12,10 +11,7 @@ import torch
 from fieldwork.nerfcore.data.scene import View
 from fieldwork.nerfcore.errors import Cancelled, TrainingError
 from fieldwork.nerfcore.geometry.cameras import Camera, pixel_centers, rays
-from fieldwork.nerfcore.kernels import surface as kernels
-from fieldwork.nerfcore.kernels import surface_torch as twins
 from fieldwork.nerfcore.kernels.depth_arrays import FREE, MapArrays
-from fieldwork.nerfcore.kernels.packed_info import PackedInfo
 from fieldwork.nerfcore.mesh import clean, depth_maps, metrics
 from fieldwork.nerfcore.mesh.decimate import decimate
 from fieldwork.nerfcore.mesh.extract import extract
@@ -25,75 +21,10 @@ from fieldwork.nerfcore.mesh.region import choose_region
 from fieldwork.nerfcore.mesh.surface import Surface, is_watertight
 from fieldwork.nerfcore.mesh.turntable import write_turntable
 from fieldwork.nerfcore.progress import Reporter
+from fieldwork.tests.nerfcore.support.depth_views import CAMERA, Hit, box, look_at, maps_of, orbit, sphere
 from PIL import Image
 
-# (origins (3,), directions (N, 3) of any length) → distance in units of the directions' length, inf where nothing is.
-Hit = Callable[[np.ndarray, np.ndarray], np.ndarray]
-CAMERA = Camera(width=120, height=90, fx=110.0, fy=112.0, cx=58.0, cy=46.0)
 CPU = torch.device("cpu")
-
-
-def look_at(place: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Camera-to-world (4, 4), OpenCV axes, z of the world upwards in the picture."""
-    ahead = (target - place) / np.linalg.norm(target - place)
-    right = np.cross(ahead, [0, 0, 1.0])
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3] = np.stack([right, np.cross(ahead, right), ahead, place], 1)
-    return pose
-
-
-def sphere(radius: float) -> Hit:
-    def hit(origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        a, b = (direction**2).sum(1), direction @ origin
-        root = b * b - a * (origin @ origin - radius**2)
-        t = (-b - np.sqrt(np.maximum(root, 0))) / a
-        inside = origin @ origin < radius**2
-        t = np.where(inside, (-b + np.sqrt(np.maximum(root, 0))) / a, t)
-        return np.where((root > 0) & (t > 0), t, np.inf)
-
-    return hit
-
-
-def box(low: np.ndarray, high: np.ndarray) -> Hit:
-    """A solid box from outside, its walls from inside."""
-
-    def hit(origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        with np.errstate(divide="ignore"):
-            t0, t1 = (low - origin) / direction, (high - origin) / direction
-        near, far = np.minimum(t0, t1).max(1), np.maximum(t0, t1).min(1)
-        if ((origin > low) & (origin < high)).all():
-            return far
-        return np.where((near < far) & (near > 0), near, np.inf)
-
-    return hit
-
-
-def orbit(count: int, radius: float, heights: tuple[float, ...] = (-0.6, 0.2, 0.9)) -> list[np.ndarray]:
-    poses = []
-    for k in range(count):
-        angle, z = 2 * np.pi * k * 0.381966, heights[k % len(heights)] * radius
-        flat = np.sqrt(max(radius**2 - z**2, 0.01))
-        poses.append(look_at(np.array([flat * np.cos(angle), flat * np.sin(angle), z]), np.zeros(3)))
-    return poses
-
-
-def maps_of(
-    hit: Hit, poses: list[np.ndarray], camera: Camera = CAMERA
-) -> tuple[list[depth_maps.FlatView], list[depth_maps.DepthMap]]:
-    """What depth_maps would read from a perfect field, for photos of a (possibly distorted) camera."""
-    views = [View(f"{k}", camera, pose, image=None) for k, pose in enumerate(poses)]  # type: ignore[arg-type]
-    flats = depth_maps.flat_views(views, np.eye(4), max(camera.width, camera.height))
-    made = []
-    for flat in flats:
-        c = flat.camera
-        local, _ = rays(c, pixel_centers(c.width, c.height).reshape(-1, 2))
-        far = hit(flat.pose[:3, 3], local @ flat.pose[:3, :3].T)
-        z = np.where(np.isfinite(far), far, 0) * local[:, 2]
-        depth = np.where(np.isfinite(far), z, FREE).astype(np.float32).reshape(c.height, c.width)
-        depth[~flat.inside] = 0
-        made.append(depth_maps.DepthMap(depth, np.full_like(depth, 1e-4), depth_maps.cosines(c, depth)))
-    return flats, made
 
 
 def surface_of(
@@ -289,48 +220,6 @@ def test_faces_on_the_border_of_a_box_are_counted() -> None:
     vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 0.5], [0.5, 0.5, 0.5]])
     faces = np.array([[0, 1, 2], [0, 1, 4], [1, 2, 3]])
     assert metrics.on_border(vertices, faces, np.zeros(3), np.ones(3), 1e-3) == 1
-
-
-def test_depth_quantiles_equal_their_twin() -> None:
-    random = torch.Generator().manual_seed(0)
-    count = torch.tensor([0, 5, 17, 1], dtype=torch.int32)
-    start = torch.cat([torch.zeros(1, dtype=torch.int32), count.cumsum(0)[:-1].int()])
-    total = int(count.sum())
-    ray = torch.repeat_interleave(torch.arange(4), count.long()).int()
-    density, delta = 8 * torch.rand(total, generator=random), 0.2 * torch.rand(total, generator=random)
-    depth = torch.rand(total, generator=random).sort().values
-    packed_info = PackedInfo(start, count, ray)
-    for ours, twin in zip(
-        kernels.depth_quantiles(density, delta, depth, packed_info),
-        twins.depth_quantiles(density, delta, depth, packed_info),
-    ):
-        torch.testing.assert_close(ours, twin, atol=2e-5, rtol=1e-4)
-
-
-def test_the_median_depth_of_a_wall_is_where_half_is_absorbed() -> None:
-    density = torch.full((100,), 5.0)
-    delta = torch.full((100,), 0.01)
-    depth = 1 + 0.01 * (torch.arange(100) + 0.5)
-    packed_info = PackedInfo(
-        torch.zeros(1, dtype=torch.int32), torch.tensor([100], dtype=torch.int32), torch.zeros(100, dtype=torch.int32)
-    )
-    near, middle, far, opacity = (float(x) for x in kernels.depth_quantiles(density, delta, depth, packed_info))
-    assert [near, middle, far] == pytest.approx([1 + np.log(s) / 5 for s in (4 / 3, 2, 4)], abs=1e-4)
-    assert opacity == pytest.approx(1 - np.exp(-5), abs=1e-5)
-
-
-def test_fused_distances_equal_their_twin() -> None:
-    flats, maps = maps_of(sphere(0.5), orbit(9, 1.8))
-    arrays = depth_maps.confirmed_maps(flats, maps, CPU, Reporter())
-    points = torch.rand(4000, 3, generator=torch.Generator().manual_seed(1)) * 1.4 - 0.7
-    apart = float(np.cos(np.radians(3)))
-    ours = kernels.fuse(points, arrays, 0.02, 0.08, 0.03, 0.03, apart)
-    twin = twins.fuse(points, arrays, 0.02, 0.08, 0.03, 0.03, apart)
-    # A point that falls on the border of two pixels may take the other one: rounding differs.
-    same = (ours[0] - twin[0]).abs() < 1e-4
-    assert float(same.float().mean()) > 0.998
-    torch.testing.assert_close(ours[1][same], twin[1][same], rtol=1e-3, atol=1e-2)
-    assert float((ours[2] == twin[2]).float().mean()) > 0.998
 
 
 def test_a_turntable_shows_fronts_in_their_colours(tmp_path: Path) -> None:

@@ -16,6 +16,8 @@ BACKENDS = [
     pytest.param(("cuda", "warp"), id="warp-cuda", marks=[pytest.mark.gpu, _CUDA]),
     pytest.param(("cuda", "torch"), id="torch on CUDA", marks=[pytest.mark.gpu, _CUDA]),
 ]
+# Kernels of surfaces run on Warp alone.
+WARP_DEVICES = ["cpu", pytest.param("cuda", marks=[pytest.mark.gpu, _CUDA])]
 if torch.version.hip is not None and torch.cuda.is_available():
     BACKENDS.append(pytest.param(("cuda", "torch"), id="torch on ROCm"))
 if torch.backends.mps.is_available():

@@ -46,16 +46,15 @@ class FieldArrays:
 class FieldFunctions:
     """Device functions of one shape; each takes the field's arrays last.
 
-    grid: point in [0, 1]³ → features of the grid. smooth: point → features of the implicit branch; None without one.
-    blended: point, active, features of the grid → input of the density head, features of the implicit branch and the
-    number of the block's samples for which it was read; where that is 0 the features are 0. density: its input →
-    features for the other heads, and density per normalised unit length. color: those features and the ray's direction
-    → logits of red, green and blue. classes: features for the heads, of the grid and of the implicit branch → scores;
+    grid: point in [0, 1]³ → features of the grid. blended: point, active, features of the grid → input of the density
+    head, features of the implicit branch and the number of the block's samples that need them; where that is 0 they
+    were not read; None without an implicit branch. density: its input → features for the other heads, and density per
+    normalised unit length. color: those features and the ray's direction → logits of red, green and blue. classes:
+    features for the heads, of the grid and of the implicit branch, whether those were read, and the point → scores;
     None without classes.
     """
 
     grid: Any
-    smooth: Any
     blended: Any
     density: Any
     color: Any
@@ -79,11 +78,10 @@ def field_functions(shape: FusedShape, lanes: int) -> FieldFunctions:
     blended = _blended(shape, lanes, smooth) if shape.octaves else None
     return FieldFunctions(
         _grid(shape, lanes),
-        smooth,
         blended,
         _density(shape, lanes),
         _color(shape, lanes),
-        _classes(shape, lanes) if shape.classes else None,
+        _classes(shape, lanes, smooth) if shape.classes else None,
     )
 
 
@@ -176,21 +174,28 @@ def _color(shape: FusedShape, lanes: int) -> Any:
     return wp.func(color, name=f"color_{shape_name(shape, lanes)}")
 
 
-def _classes(shape: FusedShape, lanes: int) -> Any:
+def _classes(shape: FusedShape, lanes: int, smooth_features: Any) -> Any:
     head_network, row, vector = network(shape.semantic, lanes), shape.rows()["semantic"], half_vector(shape.semantic[0])
     geometry, features, logits, classes = shape.geometry, shape.features, shape.logits, shape.classes
     implicit_row, branches = padded(geometry), bool(shape.octaves)
     explicit_row = implicit_row + (features if branches else 0)
     geometry_vector, branch = half_vector(geometry), half_vector(features)
 
-    def class_scores(head: geometry_vector, explicit: branch, implicit: branch, field: FieldArrays):
+    def class_scores(
+        head: geometry_vector, explicit: branch, implicit: branch, was_read: int, p: wp.vec3, field: FieldArrays
+    ):
         x = vector()
         for k in range(geometry):
             x[k] = head[k]
         for k in range(features):
-            if wp.static(branches):
-                x[implicit_row + k] = implicit[k]
             x[explicit_row + k] = explicit[k]
+        if wp.static(branches):
+            for k in range(features):
+                x[implicit_row + k] = implicit[k]
+            if was_read == 0:
+                smooth = smooth_features(p, field)
+                for k in range(features):
+                    x[implicit_row + k] = wp.float16(smooth[k])
         scores = head_network(x, field.weights, row)
         if wp.static(not logits):
             largest = float(-1.0e30)

@@ -87,10 +87,10 @@ def write_pixel(out: RenderedArrays, index: int, pixel: Pixel):
 def fused_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
     """The kernel for fields of a shape; `lanes` samples a block (1 on the CPU)."""
     read = field_functions(shape, lanes)
-    grid_features, smooth_features, blended_features = read.grid, read.smooth, read.blended
+    grid_features, blended_features = read.grid, read.blended
     density_at, color_at, class_scores = read.density, read.color, read.classes
-    features, octaves, classes = shape.features, shape.octaves, shape.classes
-    branch, density_input = half_vector(features), half_vector(shape.density[0])
+    octaves, classes = shape.octaves, shape.classes
+    branch, density_input = half_vector(shape.features), half_vector(shape.density[0])
 
     def fused_render(
         rays: MarchedRays,
@@ -142,12 +142,7 @@ def fused_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
                     if visible == 1:
                         pixel = with_color(pixel, weight, logits, t)
                     if wp.static(classes > 0):
-                        if wp.static(octaves > 0):  # noqa: SIM102 - what is not there must not be compiled
-                            if uncertain_lanes == 0:
-                                smooth = smooth_features(p, field)
-                                for k in range(features):
-                                    implicit[k] = wp.float16(smooth[k])
-                        scores = class_scores(head, explicit, implicit, field)
+                        scores = class_scores(head, explicit, implicit, uncertain_lanes, p, field)
                         if visible == 1:
                             for k in range(classes):
                                 if k < field.class_count:

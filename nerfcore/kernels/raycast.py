@@ -8,7 +8,7 @@ import warp as wp
 
 from .runtime import array, init, launch
 
-MOST_LAYERS = 64  # triangles seen from behind that a ray passes at most
+MOST_LAYERS = wp.constant(64)  # triangles seen from behind that a ray passes at most
 
 
 @wp.kernel(module="fieldwork_raycast")
@@ -25,7 +25,7 @@ def cast_kernel(
     o = origins[i]
     d = directions[i]
     done = int(0)
-    for _ in range(64):
+    for _ in range(MOST_LAYERS):
         if done == 0:
             query = wp.mesh_query_ray(mesh, o, d, 1.0e6)
             if not query.result:

@@ -20,7 +20,7 @@ from fieldwork.nerfcore.mesh.uv import UvMap
 from fieldwork.nerfcore.params import BenchParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.verbs import run_verb
-from fieldwork.tests.nerfcore.test_mesh_fusion import orbit
+from fieldwork.tests.nerfcore.support.depth_views import orbit
 from fieldwork.tests.nerfcore.test_training import tiny_project  # noqa: F401
 
 CAMERA = Camera(width=90, height=90, fx=100.0, fy=100.0, cx=45.0, cy=45.0)

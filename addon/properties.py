@@ -303,6 +303,13 @@ class FieldworkScene(PropertyGroup):
     faces: IntProperty(
         name="Faces", description="Target number of triangles; 0: keep all", default=0, min=0, soft_max=2_000_000
     )
+    lods: IntProperty(
+        name="Levels of Detail",
+        description="Coarser meshes to write as well, each with a quarter of the triangles",
+        default=0,
+        min=0,
+        max=6,
+    )
     texture: EnumProperty(
         name="Texture",
         description="Size of the texture in pixels",

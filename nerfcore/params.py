@@ -263,6 +263,9 @@ class MeshParams(Params):
         default="photo", description="what the texture shows: the photos, or the field's colours"
     )
     split: Split = Field(default="none", description="classes, instances: one object of each in the file of `out`")
+    lods: int = Field(
+        default=0, ge=0, le=6, description="levels of detail to write as well, each with a quarter of the triangles"
+    )
     turntable: Path | None = Field(
         default=None, description="folder for pictures of the mesh from eight sides: its colours and its classes"
     )

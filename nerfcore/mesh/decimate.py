@@ -20,6 +20,23 @@ def decimate(vertices: np.ndarray, faces: np.ndarray, target: int, report: Repor
 
     Each pass cuts elsewhere, so that what was the border of a chunk is inside the next time.
     """
+    patch = np.zeros(len(faces), np.int64)
+    vertices, faces, _ = _passes(vertices, faces, patch, target, True, report)
+    return vertices, faces
+
+
+def decimate_patches(
+    vertices: np.ndarray, faces: np.ndarray, patch: np.ndarray, target: int, report: Reporter
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """As `decimate`, with triangles of different patches (F,) never merged: the vertices of all borders between patches,
+    and of open ones, stay where they are, so that more triangles than `target` may remain. Returns the patch of each
+    triangle too."""
+    return _passes(vertices, faces, patch, target, False, report)
+
+
+def _passes(
+    vertices: np.ndarray, faces: np.ndarray, patch: np.ndarray, target: int, move_borders: bool, report: Reporter
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     total = max(len(faces) - target, 1)
     for number in range(PASSES):
         if len(faces) <= target:
@@ -27,33 +44,68 @@ def decimate(vertices: np.ndarray, faces: np.ndarray, target: int, report: Repor
         report.progress(min(1.0, 1 - (len(faces) - target) / total))
         before = len(faces)
         ratio = max(target / len(faces), AT_ONCE)
-        keep = number < PASSES - 2
-        vertices, faces = _one_pass(vertices, faces, ratio, number, keep, report)
-        if keep and len(faces) > 0.98 * before:  # nothing but borders is left
-            vertices, faces = _one_pass(vertices, faces, ratio, number, False, report)
-    return vertices, faces
+        keep = not move_borders or number < PASSES - 2
+        vertices, faces, patch = _one_pass(vertices, faces, patch, ratio, number, keep, report)
+        if len(faces) > 0.98 * before:  # nothing but borders is left
+            if not move_borders:
+                break
+            if keep:
+                vertices, faces, patch = _one_pass(vertices, faces, patch, ratio, number, False, report)
+    return vertices, faces, patch
 
 
 def _one_pass(
-    vertices: np.ndarray, faces: np.ndarray, ratio: float, number: int, keep_border: bool, report: Reporter
-) -> tuple[np.ndarray, np.ndarray]:
-    chunks = _chunks(vertices[faces].mean(1), number)
-    made, corners, first = [], [], 0
-    for chunk in chunks:
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    patch: np.ndarray,
+    ratio: float,
+    number: int,
+    keep_border: bool,
+    report: Reporter,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    centers = vertices[faces].mean(1)
+    chunks = [
+        own[part]
+        for own in (np.flatnonzero(patch == p) for p in np.unique(patch))
+        for part in _chunks(centers[own], number)
+    ]
+    whole = [compact(vertices, faces[chunk]) for chunk in chunks]
+    made = []
+    for points, triangles in whole:
         report.check()
-        points, triangles = compact(vertices, faces[chunk])
-        wanted = max(4, round(len(triangles) * ratio))
-        if wanted < len(triangles):
-            points, triangles, *_ = fast_simplification.simplify(
-                np.ascontiguousarray(points, np.float64),
-                np.ascontiguousarray(triangles, np.int32),
-                target_count=wanted,
-                preserve_border=keep_border or len(chunks) > 1,
-            )
-        made.append(np.asarray(points, np.float64))
-        corners.append(np.asarray(triangles, np.int64) + first)
-        first += len(points)
-    return _join(np.concatenate(made), np.concatenate(corners))
+        made.append(_simplified(points, triangles, ratio, keep_border or len(chunks) > 1))
+    of_chunk = [int(patch[chunk[0]]) for chunk in chunks]
+    kept: set[int] = set()
+    while True:
+        joined, corners, chunk = _join(made)
+        folded = set(chunk[_folded(corners)].tolist()) - kept
+        if not folded:
+            return joined, corners, np.array(of_chunk)[chunk]
+        # Collapses on two sides of a border, or in a thin thing, may have made an edge of more than two triangles.
+        for index in folded:
+            made[index] = whole[index]
+        kept |= folded
+
+
+def _simplified(points: np.ndarray, triangles: np.ndarray, ratio: float, keep_border: bool) -> tuple:
+    wanted = max(4, round(len(triangles) * ratio))
+    if wanted >= len(triangles):
+        return points, triangles
+    points, triangles, *_ = fast_simplification.simplify(
+        np.ascontiguousarray(points, np.float64),
+        np.ascontiguousarray(triangles, np.int32),
+        target_count=wanted,
+        preserve_border=keep_border,
+    )
+    return points, triangles
+
+
+def _folded(faces: np.ndarray) -> np.ndarray:
+    """Which triangles (F,) bool lie at an edge of more than two."""
+    edges = np.sort(np.stack([faces, np.roll(faces, -1, 1)], -1), -1).reshape(-1, 2).astype(np.int64)
+    keys = edges[:, 0] * (int(faces.max(initial=0)) + 1) + edges[:, 1]
+    _, index, count = np.unique(keys, return_inverse=True, return_counts=True)
+    return (count[index.reshape(-1)] > 2).reshape(-1, 3).any(1)
 
 
 def _chunks(centers: np.ndarray, number: int) -> list[np.ndarray]:
@@ -73,9 +125,14 @@ def _chunks(centers: np.ndarray, number: int) -> list[np.ndarray]:
     return done
 
 
-def _join(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Weld the borders that chunks kept: their vertices are equal to the last bit."""
+def _join(parts: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Chunks as one mesh, with the number of the chunk of each triangle, welded at the borders they kept: their vertices
+    are equal to the last bit."""
+    first = np.cumsum([0, *(len(points) for points, _ in parts)])
+    vertices = np.concatenate([np.asarray(points, np.float64) for points, _ in parts])
+    faces = np.concatenate([np.asarray(f, np.int64) + begin for (_, f), begin in zip(parts, first)])
+    chunk = np.repeat(np.arange(len(parts)), [len(f) for _, f in parts])
     places, index = np.unique(vertices, axis=0, return_inverse=True)
     faces = index.reshape(-1)[faces]
     proper = (faces != np.roll(faces, 1, axis=1)).all(1)
-    return compact(places, faces[proper])
+    return (*compact(places, faces[proper]), chunk[proper])

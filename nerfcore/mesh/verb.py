@@ -24,6 +24,7 @@ from .features import features_of
 from .field_values import shade
 from .files import check_format, write_surface
 from .instances import GAP, find_instances, write_instances
+from .lods import make_levels, remove_levels, write_level
 from .painted import Painted, paint_surface, training_photos, write_maps
 from .parts import texture_of
 from .photos import Photo
@@ -37,7 +38,7 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
 
     Returns:
         {"vertices", "faces", "watertight", "voxel": in world units, "classes": {name: {"faces", "area"}},
-        "instances": how many, "files"};
+        "instances": how many, "lods": [{"faces", "deviation": in world units}], "files"};
         with a texture of photos "painted_by_photos", the share of its texels that a photo shows
     Raises:
         SettingError: unknown format or impossible region. ProjectError, TrainingError, DiskError.
@@ -79,6 +80,14 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
     features = features_of(surface, scene.classes, scene.ignore_id, instances)
     for path in [target / "mesh.ply", *([params.out] if params.out else [])]:
         files += write_surface(path, surface, features, params.split if path == params.out else "none", texture)
+    remove_levels(target)
+    levels = make_levels(surface, texture, params.lods, report)
+    base = params.out or target / "mesh.glb"
+    for number, level in enumerate(levels, 1):
+        files += write_level(target, number, level)
+        features = features_of(level.surface, scene.classes, scene.ignore_id, instances)
+        path = base.with_name(f"{base.stem}_lod{number}{base.suffix}")
+        files += write_surface(path, level.surface, features, params.split, level.texture)
     if params.turntable is not None:
         report.stage("Looking at it")
         files += write_turntable(params.turntable, surface, {c.id: c.color for c in scene.classes}, report)
@@ -89,6 +98,7 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
         "voxel": voxel,
         "classes": class_table(surface, names),
         "instances": len(instances),
+        "lods": [{"faces": len(level.surface.faces), "deviation": level.deviation} for level in levels],
         "files": [str(path) for path in files],
     }
     if painted.seen is not None:

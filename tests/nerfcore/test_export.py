@@ -94,7 +94,10 @@ def test_a_mesh_has_its_photos_on_it_and_maps_of_its_classes(trained: Path) -> N
 def test_a_texture_of_the_field_and_none_leave_no_maps_behind(trained: Path, tmp_path: Path) -> None:
     copy = tmp_path / "copy"
     shutil.copytree(trained, copy)
-    result = run_verb("mesh", MeshParams(project=copy, resolution=32, texture=64, texture_kind="field"), Reporter())
+    params = MeshParams(project=copy, resolution=32, texture=64, texture_kind="field", lods=1)
+    result = run_verb("mesh", params, Reporter())
+    assert result["lods"][0]["faces"] < 0.6 * result["faces"]
+    assert len(trimesh.load(copy / "exports/main/mesh_lod1.glb", force="mesh").faces) == result["lods"][0]["faces"]
     assert "painted_by_photos" not in result
     assert (copy / "exports/main/class_id.png").is_file()
     assert not (copy / "exports/main/texture_unseen.png").exists()
@@ -103,6 +106,7 @@ def test_a_texture_of_the_field_and_none_leave_no_maps_behind(trained: Path, tmp
     assert picture.std() > 5
     run_verb("mesh", MeshParams(project=copy, resolution=32), Reporter())
     assert not list((copy / "exports/main").glob("*.png"))
+    assert not list((copy / "exports/main").glob("*lod*"))
     assert "uv" not in surface(copy)
 
 

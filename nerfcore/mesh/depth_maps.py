@@ -9,6 +9,7 @@ from functools import partial
 
 import numpy as np
 import torch
+from scipy.ndimage import map_coordinates, maximum_filter, minimum_filter
 
 from ..data.box import box_poses
 from ..data.camera_rays import CameraRays
@@ -26,6 +27,7 @@ from ..render.model import Model
 CPU_SIDE, GPU_SIDE = 640, 1600  # longest side of a map
 CPU_PIXELS, GPU_PIXELS = 8e6, 2e8  # of all maps together
 CPU_RAYS, GPU_RAYS = 8192, 1 << 18  # a tile; the CPU's fits a core's cache
+FIELD_SHARE, FIELD_SIDE = 0.5, 160  # of a map's side on a CPU, and pixels at least: a field is soft, photos refine it
 MOST_VIEWS = 96
 OPAQUE, EMPTY = 0.5, 0.1  # opacities: something is there, nothing is there
 STEEPEST = np.cos(np.radians(80))
@@ -125,13 +127,53 @@ def _flat(photo: Camera, flat: Camera, pose: np.ndarray, turn: np.ndarray, index
 
 def depth_maps(model: Model, views: list[FlatView], report: Reporter) -> list[DepthMap]:
     """Depth maps of all views; the reporter hears how long it will take."""
-    model.refine(float(sum(v.inside.size for v in views)), report.check)
+    small = [reduced(view) if model.priorities.device.type == "cpu" else view for view in views]
+    model.refine(float(sum(v.inside.size for v in small)), report.check)
     begin, maps = time.monotonic(), []
-    for number, view in enumerate(views):
+    for number, (view, rendered) in enumerate(zip(views, small)):
         left = (time.monotonic() - begin) / number * (len(views) - number) if number else 0.0
         report.progress(number / len(views), f"{left:.0f} s left" if number else "")
-        maps.append(render_depth(model, view, report.check))
+        maps.append(enlarged(render_depth(model, rendered, report.check), view))
     return maps
+
+
+def reduced(view: FlatView) -> FlatView:
+    """The view at `FIELD_SHARE` of its size, but at least `FIELD_SIDE` pixels long unless it is smaller itself."""
+    width, height = view.camera.width, view.camera.height
+    longest = max(width, height)
+    share = min(1.0, max(FIELD_SHARE, FIELD_SIDE / longest))
+    if share == 1:
+        return view
+    camera = view.camera.resized(max(1, round(share * width)), max(1, round(share * height)))
+    rows, columns = _nearest(camera.width, camera.height, width, height)
+    return replace(view, camera=camera, inside=view.inside[rows, columns])
+
+
+def enlarged(small: DepthMap, view: FlatView) -> DepthMap:
+    """A depth map at the size of a view: inverse depths, in which planes are linear, interpolated within a surface, those
+    of the nearest pixel at outlines."""
+    height, width = small.depth.shape
+    camera = view.camera
+    if (camera.width, camera.height) == (width, height):
+        return small
+    nearest = _nearest(camera.width, camera.height, width, height)
+    inverse = np.where(small.hit, 1 / np.where(small.hit, small.depth, 1), 0)
+    low = minimum_filter(inverse, 3, mode="nearest")
+    high = maximum_filter(inverse, 3, mode="nearest")
+    place = np.meshgrid(*((np.arange(n) + 0.5) * m / n - 0.5 for n, m in ((camera.height, height), (camera.width, width))),
+                        indexing="ij")  # fmt: skip
+    between = map_coordinates(inverse, place, order=1, mode="nearest")
+    edge = max(EDGE, EDGE_PIXELS / (camera.fx * width / camera.width))
+    smooth = ((low > 0) & (high - low < 2 * edge * low))[nearest]
+    depth = np.where(smooth, 1 / np.where(smooth, between, 1), small.depth[nearest])
+    depth = np.where(view.inside, depth, 0).astype(np.float32)
+    return DepthMap(depth, small.spread[nearest], cosines(camera, depth))
+
+
+def _nearest(width: int, height: int, from_width: int, from_height: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (H, 1) and columns (1, W) of a picture of another size that are nearest to the pixels of one (H, W)."""
+    rows = ((np.arange(height) + 0.5) * from_height / height).astype(int)
+    return rows[:, None], ((np.arange(width) + 0.5) * from_width / width).astype(int)[None]
 
 
 @torch.no_grad()

@@ -2,7 +2,7 @@
 
 A field of few steps is soft: its surfaces are right to a few pixels, and what its views share is wrong in all of them, so
 that fusing cannot average it away. Photos tell more where they have texture (kernels/patches.py); elsewhere the field's
-depth stays.
+depth stays, or gives way to the plane through what is known around it.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from ..kernels.depth_arrays import FREE, MapArrays
 from ..kernels.patches import refine
 from ..progress import Reporter
 from .depth_maps import DepthMap, FlatView, confirmed_maps, cosines, map_arrays, neighbours, normals
+from .planes import with_planes
 
 VIEWS = 5  # neighbours whose photos are compared
 LEAST, GAIN = 0.6, 0.05  # correlation that is believed, and by how much it must exceed that of the field's depth
@@ -51,7 +52,7 @@ def refined_maps(
     views: list[FlatView], maps: list[DepthMap], store: PixelStore, device: torch.device, report: Reporter
 ) -> MapArrays:
     """Confirmed maps (see `depth_maps.confirmed_maps`) whose depths photos have moved. Where views do not confirm a moved
-    depth, the field's is asked again."""
+    depth, the field's is asked again, or the plane through what is known around (planes.py)."""
     arrays = map_arrays(views, maps, device)
     grey = torch.from_numpy(np.concatenate([g.reshape(-1) for g in grey_pictures(views, store, report)]))
     grey = grey.to(arrays.depth.device)
@@ -70,7 +71,7 @@ def refined_maps(
         begin += old.depth.size
         depth = np.where(sure, new.depth, old.depth)
         spread = np.where(sure, np.minimum(old.spread, SURE * depth / view.camera.fx), old.spread)
-        mixed.append(_with_depth(view, replace(old, spread=spread.astype(np.float32)), depth))
+        mixed.append(with_planes(view, replace(old, depth=depth, spread=spread.astype(np.float32)), sure))
     return confirmed_maps(views, mixed, device, report, around)
 
 

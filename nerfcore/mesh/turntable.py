@@ -16,25 +16,28 @@ from .surface import Surface
 VIEWS, SIDE = 8, 640
 ELEVATION = np.radians(30)
 LENS = 1.4  # focal length over the picture's side
+MARGIN = 0.03  # of the picture's side, left free around the mesh
 BACKGROUND = 70
 LIGHT = np.array([0.35, -0.5, 0.8]) / np.linalg.norm([0.35, -0.5, 0.8])
 
 
 def turntable_poses(vertices: np.ndarray, count: int) -> list[np.ndarray]:
-    """Camera-to-world poses (4, 4) in a ring around a mesh with z up, so far away that all of it is in the picture."""
-    low, high = vertices.min(0), vertices.max(0)
-    middle, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
-    distance = radius / np.sin(np.arctan(0.5 / LENS))
-    poses = []
+    """Camera-to-world poses (4, 4) in a ring around a mesh with z up, as near as all of it is in every picture."""
+    middle = (vertices.min(0) + vertices.max(0)) / 2
+    turns, distance = [], 0.0
     for angle in 2 * np.pi * np.arange(count) / count:
         outward = np.array([np.cos(angle) * np.cos(ELEVATION), np.sin(angle) * np.cos(ELEVATION), np.sin(ELEVATION)])
-        ahead = -outward
-        right = np.cross(ahead, [0, 0, 1.0])
-        right /= np.linalg.norm(right)
-        pose = np.eye(4)
-        pose[:3] = np.stack([right, np.cross(ahead, right), ahead, middle + distance * outward], 1)
-        poses.append(pose)
-    return poses
+        right = np.array([-np.sin(angle), np.cos(angle), 0])
+        turn = np.stack([right, np.cross(-outward, right), -outward], 1)
+        x, y, z = ((vertices - middle) @ turn).T
+        # LENS · |x| / (distance + z) is at most half the picture's side, less its margin.
+        needed = np.maximum(np.abs(x), np.abs(y)) * LENS / (0.5 - MARGIN) - z
+        distance = max(distance, float(needed.max()))
+        turns.append(turn)
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, :3] = turns
+    poses[:, :3, 3] = middle - distance * poses[:, :3, 2]
+    return list(poses)
 
 
 def write_turntable(

@@ -5,20 +5,19 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from fieldwork.nerfcore.geometry.cameras import Camera
 from fieldwork.nerfcore.geometry.points import Points
-from fieldwork.nerfcore.mesh.surface import Surface
+from fieldwork.nerfcore.mesh.build import Built
+from fieldwork.nerfcore.mesh.region import Region
 from fieldwork.nerfcore.params import PosesParams, ReconstructParams
 from fieldwork.nerfcore.poses.estimate import posed, posing_inputs
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.schema import PosedImage, Poses
 from fieldwork.nerfcore.project.store import edit_project, save_poses
-from fieldwork.nerfcore.render.run import Trained
 from fieldwork.nerfcore.workflows import reconstruct as workflow
 from fieldwork.nerfcore.workflows.reconstruct import reconstruct
 from fieldwork.tests.nerfcore.support.ball import SMALL, camera_poses, draw
@@ -76,14 +75,11 @@ def fake(patch: pytest.MonkeyPatch) -> None:
         patch.setitem(workflow.STAGES, verb, smaller(workflow.STAGES[verb], values))
 
 
-def triangle(trained: Trained, *_: Any) -> SimpleNamespace:
+def triangle(*_: Any) -> Built:
     """Instead of a surface, for which a field would have to be trained for longer."""
-    corners = np.eye(3, dtype=np.float32)
-    face = np.array([[0, 1, 2]], np.int32)
-    surface = Surface(
-        corners, face, corners, np.full((3, 3), 128, np.uint8), np.ones(3, np.int32), np.ones(1, np.int32)
-    )
-    return SimpleNamespace(trained=trained, surface=surface, region=SimpleNamespace(voxel=0.1), coarse=(corners, face))
+    corners, face = np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32)
+    region = Region(np.zeros(3), np.ones(3), 0.1)
+    return Built(corners, face, corners, np.full((3, 3), 128, np.uint8), region, (corners, face))
 
 
 def smaller(stage: workflow.Stage, values: dict[str, Any]) -> workflow.Stage:

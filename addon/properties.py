@@ -391,6 +391,27 @@ class FieldworkScene(PropertyGroup):
         description="Folder for drawings; empty: in the exports of the project",
         subtype="DIR_PATH",
     )
+    other_project: StringProperty(
+        name="Earlier Epoch", description="Project of an earlier epoch of the same object", subtype="DIR_PATH"
+    )
+    other_run: StringProperty(name="Its Run", description="Training run of the earlier epoch", default="main")
+    common_points: StringProperty(
+        name="Common Points",
+        description="Table (.csv) of points in both worlds; empty: the surfaces themselves say how they lie",
+        subtype="FILE_PATH",
+    )
+    compare_limit: FloatProperty(
+        name="Limit",
+        description="Distance beyond which surfaces do not belong together; 0: 20 cells of the mesh",
+        default=0.0,
+        min=0.0,
+        unit="LENGTH",
+    )
+    compare_path: StringProperty(
+        name="Comparison",
+        description="Folder for the comparison; empty: in the exports of the project",
+        subtype="DIR_PATH",
+    )
     report_path: StringProperty(
         name="Report",
         description="Report to write, .html or .pdf; empty: report.html in the exports of the project",

@@ -37,12 +37,13 @@ NAMED = {
     "mesh": {"out"},
     "plan": {"out"},
     "section": {"out"},
+    "compare": {"out"},
     "report": {"out"},
     "reconstruct": {"out"},
     "bench": {"out"},
     "export": {"out"},
 }
-ORDER = {"import": ["dataset", "project"]}
+ORDER = {"import": ["dataset", "project"], "compare": ["project", "other"]}
 # Parameters that the command line takes from a file only.
 FILES = {"classes": {"classes"}}
 # Whether a path can be read is for the verb to say, in its own words and with exit code 1.

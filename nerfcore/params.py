@@ -324,6 +324,28 @@ class SectionParams(Params):
     )
 
 
+class CompareParams(Params):
+    project: Path
+    other: Path = Field(description="project of an earlier epoch of the same object")
+    run: RunName = "main"
+    other_run: RunName = "main"
+    points: Path | None = Field(
+        default=None,
+        description="table (.csv: name,x,y,z,other_x,other_y,other_z) of points in both worlds; default: by the surfaces",
+    )
+    limit: float | None = Field(
+        default=None,
+        gt=0,
+        le=1e9,
+        description="distance beyond which surfaces do not belong together, world units; default: 20 cells of the mesh",
+    )
+    views: list[Side] = ["top", "front", "right", "back", "left"]
+    scale: PaperScale = None
+    out: Path | None = Field(
+        default=None, description="folder to write to; default: exports/RUN/compare of the project"
+    )
+
+
 class ReportParams(Params):
     project: Path
     run: RunName = "main"

@@ -38,6 +38,7 @@ VERBS = {
     "measure": Verb(p.MeasureParams, "measure.verb:measure", "Measure areas, volumes and distances on the mesh."),
     "plan": Verb(p.PlanParams, "measure.drawings:plan", "Draw plans and elevations to scale."),
     "section": Verb(p.SectionParams, "measure.drawings:section", "Draw a section of the mesh to scale."),
+    "compare": Verb(p.CompareParams, "measure.epochs:compare", "Compare the meshes of two epochs of one object."),
     "report": Verb(p.ReportParams, "evaluate.report:report", "Write a report by which others can check and repeat it."),
     "blend": Verb(p.BlendParams, "blender.blend:blend", "Write a .blend with cameras, points, mesh and materials."),
     "package": Verb(p.PackageParams, "blender.package:package", "Prepare cameras, points and mesh for Blender."),

@@ -19,6 +19,11 @@ def need_mesh(context: Context) -> str | None:
     return need_project(context) or (None if there else t("Extract the mesh first"))
 
 
+def ordered(views: set[str]) -> list[str]:
+    """Sides in the order in which the panel shows them."""
+    return [name for name, *_ in SIDES if name in views]
+
+
 @scene_settings(run="run", distances="distances", scale_error="scale_error", caps="caps")
 class FIELDWORK_OT_measure(ProjectOperator):
     """Measure areas and volumes of classes and instances, and distances, with their uncertainty"""
@@ -51,11 +56,10 @@ class FIELDWORK_OT_plan(ProjectOperator):
         views = self.value(context, "views")
         if not views:
             raise ValueError(t("Choose at least one view."))
-        order = [name for name, *_ in SIDES]
         return {
             "project": self.project_path(context),
             "run": self.value(context, "run"),
-            "views": sorted(views, key=order.index),
+            "views": ordered(views),
             "turn": self.value(context, "turn"),
             "scale": self.value(context, "scale") or None,
             "out": self.path(context, "out"),
@@ -82,6 +86,41 @@ class FIELDWORK_OT_section(ProjectOperator):
         }
 
 
+@scene_settings(
+    run="run",
+    other="other_project",
+    other_run="other_run",
+    points="common_points",
+    limit="compare_limit",
+    views="sides",
+    scale="paper_scale",
+    out="compare_path",
+)
+class FIELDWORK_OT_compare(ProjectOperator):
+    """Compare the mesh with that of an earlier epoch of the same object: distances, and areas that changed"""
+
+    bl_idname = "fieldwork.compare"
+    bl_label = "Compare"
+    verb = "compare"
+    needs = (need_mesh,)
+
+    def parameters(self, context: Context) -> dict[str, Any]:
+        other = self.path(context, "other")
+        if other is None:
+            raise ValueError(t("Choose the project of the earlier epoch."))
+        return {
+            "project": self.project_path(context),
+            "other": other,
+            "run": self.value(context, "run"),
+            "other_run": self.value(context, "other_run"),
+            "points": self.path(context, "points"),
+            "limit": self.value(context, "limit") or None,
+            "views": ordered(self.value(context, "views")),
+            "scale": self.value(context, "scale") or None,
+            "out": self.path(context, "out"),
+        }
+
+
 @scene_settings(run="run", out="report_path")
 class FIELDWORK_OT_report(ProjectOperator):
     """Write a report with photographs, calibration, accuracy and measures, by which others can check and repeat it"""
@@ -99,4 +138,4 @@ class FIELDWORK_OT_report(ProjectOperator):
         }
 
 
-CLASSES = [FIELDWORK_OT_measure, FIELDWORK_OT_plan, FIELDWORK_OT_section, FIELDWORK_OT_report]
+CLASSES = [FIELDWORK_OT_measure, FIELDWORK_OT_plan, FIELDWORK_OT_section, FIELDWORK_OT_compare, FIELDWORK_OT_report]

@@ -36,6 +36,12 @@ class FIELDWORK_PT_measure(StepPanel):
         layout.operator("fieldwork.plan", icon="IMAGE_REFERENCE")
         columns(layout).prop(settings, "section_plane")
         layout.operator("fieldwork.section", icon="MOD_BOOLEAN")
+        column = columns(layout)
+        column.prop(settings, "other_project")
+        if settings.other_project:
+            for name in ("other_run", "common_points", "compare_limit", "compare_path"):
+                column.prop(settings, name)
+            layout.operator("fieldwork.compare", icon="MOD_MASK")
         columns(layout).prop(settings, "report_path")
         layout.operator("fieldwork.report", icon="FILE_TEXT")
 

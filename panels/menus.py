@@ -27,6 +27,7 @@ class FIELDWORK_MT_steps(Menu):
         layout.operator("fieldwork.measure")
         layout.operator("fieldwork.plan")
         layout.operator("fieldwork.section")
+        layout.operator("fieldwork.compare")
         layout.operator("fieldwork.report")
         layout.operator("fieldwork.import_scene")
         layout.operator("fieldwork.blend")

@@ -30,6 +30,7 @@ TITLES = {
     "measure": "Measuring the Mesh",
     "plan": "Drawing",
     "section": "Drawing a Section",
+    "compare": "Comparing Epochs",
     "report": "Writing the Report",
     "blend": "Writing .blend",
     "export": "Exporting",

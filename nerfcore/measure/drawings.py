@@ -39,14 +39,22 @@ class Subject:
     colors: dict[int, Color]
     metric: bool
     measures: dict[int, dict[str, Any]]
+    void: int
+
+    def class_ids(self) -> list[int]:
+        """The classes that occur; void is none."""
+        return sorted(set(np.unique(self.surface.face_class).tolist()) - {self.void})
+
+    def area(self, class_id: int) -> float:
+        own = self.surface.faces[self.surface.face_class == class_id]
+        return float(areas(self.surface.vertices.astype(np.float64), own).sum())
 
     def size_text(self, class_id: int) -> str:
         """The area of a class, with half of its interval where it was measured."""
         unit, row = "m²" if self.metric else "units²", self.measures.get(class_id)
         if row is not None:
             return f"{row['area']:.3g} ± {(row['area_high'] - row['area_low']) / 2:.1g} {unit}"
-        own = self.surface.faces[self.surface.face_class == class_id]
-        return f"{areas(self.surface.vertices.astype(np.float64), own).sum():.3g} {unit}"
+        return f"{self.area(class_id):.3g} {unit}"
 
 
 def load_subject(folder: Path, run: str) -> Subject:
@@ -63,6 +71,7 @@ def load_subject(folder: Path, run: str) -> Subject:
         {project.ignore_id: VOID} | {c.id: c.color for c in project.classes},
         project.frame.scale_known,
         {row["id"]: row for row in measures.get("classes", [])},
+        project.ignore_id,
     )
 
 
@@ -89,7 +98,7 @@ def plan(params: PlanParams, report: Reporter) -> dict[str, Any]:
         title = f"{subject.title}: {name}"
         sheet = Sheet(title, window.low, window.high, scale, subject.metric, seen.color, axis_names(view, params.turn))
         files += write_sheet(target / name, sheet)
-        if set(np.unique(subject.surface.face_class)) - {0} or subject.measures:
+        if subject.class_ids():
             files += write_sheet(target / f"{name}_classes", class_sheet(sheet, subject, seen))
     result = {"scales": scales, "files": [str(path) for path in files]}
     record_step(folder, "plan", params.model_dump(mode="json"), result)

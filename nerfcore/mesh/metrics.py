@@ -96,8 +96,8 @@ def distances(
     true, true_face = sample_surface(*truth, count=2 * count, seed=seed + 1)
     true_normals = unit(cross(*truth))[true_face]
     shown = np.ones(len(true), bool) if visible is None else visible(true, true_normals)
-    to_truth, nearest = _plane_distance(points, true, true_face, truth)
-    to_mesh, _ = _plane_distance(true[shown], points, face, mesh)
+    to_truth, nearest = plane_distance(points, true, true_face, truth)
+    to_mesh, _ = plane_distance(true[shown], points, face, mesh)
     cosine = np.abs((unit(cross(*mesh))[face] * true_normals[nearest]).sum(1))
     return Distances(
         face,
@@ -121,7 +121,7 @@ def compare(
     return distances(mesh, truth, visible).scores(threshold)
 
 
-def _plane_distance(
+def plane_distance(
     points: np.ndarray, samples: np.ndarray, face: np.ndarray, mesh: tuple[np.ndarray, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Distance (N,) of points to a surface known by samples (M, 3), and the nearest sample: among the eight nearest

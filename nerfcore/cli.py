@@ -8,13 +8,11 @@ from __future__ import annotations
 import json
 import logging
 import os
-import signal
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from pathlib import Path
 from types import UnionType
-from typing import Annotated, Any, Literal, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, TextIO, Union, get_args, get_origin
 
 import click
 from pydantic import ValidationError
@@ -22,8 +20,9 @@ from pydantic.fields import FieldInfo
 
 from . import __version__
 from .console import ConsoleReporter
-from .errors import Cancelled, FieldworkError, wrong_value
-from .project.lock import lockable, project_lock
+from .errors import Cancelled, explained, wrong_value
+from .project.lock import lockable, project_lock, project_of
+from .streams import NoReader, interruptible, open_standard_streams, print_json, stdout_for_results, write_log
 from .verbs import VERBS, run_verb
 
 # Worker threads that spin while they wait take the cores other programs need; read when OpenMP starts.
@@ -155,28 +154,42 @@ def run_command(name: str, values: dict[str, Any], as_json: bool, quiet: bool, s
     except ValidationError as error:
         clauses = "; ".join(wrong_value(detail) for detail in error.errors())
         raise click.UsageError(f"{name}: {clauses}.") from error
-    with _stdout_for_results() as stdout, ConsoleReporter(quiet or as_json) as report, _interruptible(report):
+    with stdout_for_results() as stdout, ConsoleReporter(quiet or as_json) as report, interruptible(report):
         try:
             with nullcontext() if verb.immediate else project_lock(lockable(params), name):
                 result = run_verb(name, params, report)
-        except Cancelled:
+            report.close()
+            if as_json:
+                print_json({**result, "warnings": report.warnings}, stdout)
+            else:
+                report.table(name, result, stdout)
+            stdout.flush()
+        except (Cancelled, KeyboardInterrupt):
             click.echo("Cancelled. Run the same command again to go on.", err=True)
             return 130
-        except FieldworkError as error:
-            if as_json:
-                value = {**error.result, "error": {"code": error.code, "message": error.message, "hint": error.hint}}
-                print(json.dumps(value, ensure_ascii=False), file=stdout)
-            click.secho(f"{error.message}", fg="red", err=True)
-            if error.hint:
-                click.echo(error.hint, err=True)
-            return 1
-        warnings = list(report.warnings)
-        report.close()
-        if as_json:
-            print(json.dumps({**result, "warnings": warnings}, ensure_ascii=False), file=stdout)
-        else:
-            report.table(name, result, stdout)
-        return 3 if strict and warnings else 0
+        except Exception as error:  # noqa: BLE001 - the boundary: whatever happened becomes a sentence
+            return _failed(error, name, project_of(params), as_json, stdout)
+        return 3 if strict and report.warnings else 0
+
+
+def _failed(error: Exception, verb: str, project: Path | None, as_json: bool, stdout: TextIO) -> int:
+    """Tell of a failure in a sentence; the traceback of one that nobody foresaw goes into a log file."""
+    known = explained(error)
+    told: dict[str, Any] = {"code": known.code, "message": known.message, "hint": known.hint}
+    lines = [known.hint] if known.hint else []
+    if known is not error:
+        told["log"] = str(write_log(error, verb, project))
+        lines.append(f"Details are in {told['log']}.")
+    click.secho(known.message, fg="red", err=True)
+    for line in lines:
+        click.echo(line, err=True)
+    if as_json and not isinstance(error, NoReader):
+        try:
+            print_json({**known.result, "error": told}, stdout)
+            stdout.flush()
+        except NoReader as silent:
+            click.echo(silent.message, err=True)
+    return 1
 
 
 def _assignment(text: str) -> tuple[str, str]:
@@ -186,39 +199,9 @@ def _assignment(text: str) -> tuple[str, str]:
     return key.strip(), value.strip()
 
 
-@contextmanager
-def _stdout_for_results() -> Iterator[Any]:
-    """Keep stdout for results: everything else that prints there, native libraries too, goes to stderr."""
-    sys.stdout.flush()
-    kept = os.dup(1)
-    os.dup2(2, 1)
-    try:
-        with os.fdopen(kept, "w", encoding="utf-8", closefd=False) as stream:
-            yield stream
-    finally:
-        sys.stdout.flush()
-        os.dup2(kept, 1)
-        os.close(kept)
-
-
-@contextmanager
-def _interruptible(report: ConsoleReporter) -> Iterator[None]:
-    """The first Ctrl-C (or SIGTERM) asks the work to stop, the second one ends the process."""
-
-    def stop(number: int, frame: Any) -> None:
-        report.cancel()
-        signal.signal(number, signal.SIG_DFL)
-
-    before = {n: signal.signal(n, stop) for n in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
+    open_standard_streams()
     logging.basicConfig(level=logging.ERROR, format="%(message)s", stream=sys.stderr)
     group = _Commands("fieldwork", help="Photos to a semantic radiance field, and the field into labelled meshes.")
     group.params.append(

@@ -24,6 +24,7 @@ class ConsoleReporter(Reporter):
         self.bar: Progress | None = None
         self.task: TaskID | None = None
         self.name, self.begin, self.told = "", time.monotonic(), 0.0
+        self.begun = False  # whether the work has told of anything
 
     def __enter__(self) -> ConsoleReporter:
         if not self.quiet and self.console.is_terminal:
@@ -50,6 +51,7 @@ class ConsoleReporter(Reporter):
 
     def stage(self, name: str) -> None:
         super().stage(name)
+        self.begun = True
         self.name, self.begin, self.told = name, time.monotonic(), time.monotonic()
         if self.bar is not None:
             if self.task is not None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from collections.abc import Mapping
 from typing import Any
 
@@ -69,6 +71,18 @@ class BlenderError(FieldworkError):
     code = "blender"
 
 
+class MemoryExhausted(FieldworkError):
+    """The memory of the machine, or of its GPU, does not suffice."""
+
+    code = "memory"
+
+
+class UnexpectedError(FieldworkError):
+    """Nobody foresaw this: a fault of Fieldwork or of a library."""
+
+    code = "internal"
+
+
 class Cancelled(Exception):
     """Raised inside a long computation when its caller asked it to stop."""
 
@@ -86,3 +100,43 @@ def wrong_value(detail: Mapping[str, Any]) -> str:
     value = repr(detail["input"])
     value = value if len(value) <= LONGEST_VALUE else value[:LONGEST_VALUE] + "…"
     return f"“{name}”: {detail['msg'][:1].lower()}{detail['msg'][1:]} (it is {value})"
+
+
+def disk_refusal(error: OSError, path: object) -> FieldworkError | None:
+    """What the operating system's refusal to write `path` means; None where it is none of those known."""
+    number = error.errno
+    if number in (errno.ENOSPC, errno.EDQUOT):
+        return DiskError(f"No space left on the disk while writing {path}.", "Free some space and run it again.")
+    if number in (errno.EACCES, errno.EPERM, errno.EROFS):
+        return DiskError(f"{path} cannot be written: {os.strerror(number)}.", "Choose a folder you may write to.")
+    if number == errno.EFBIG:
+        return DiskError(
+            f"{path} would be larger than files may be here.", "Raise the limit (ulimit -f), or the disk's."
+        )
+    if number in (errno.EEXIST, errno.ENOTDIR, errno.EISDIR):
+        return DiskError(f"{path} cannot be written: a file is in its way, or a folder.", "Choose another name.")
+    if number == errno.ENAMETOOLONG:
+        return DiskError(f"{path} cannot be written: the name is too long.", "Choose a shorter one.")
+    return None
+
+
+def explained(error: BaseException) -> FieldworkError:
+    """Any failure as a sentence: what is known of it, else `UnexpectedError`."""
+    if isinstance(error, FieldworkError):
+        return error
+    text = str(error)
+    if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError" or "allocate memory" in text:
+        return MemoryExhausted(
+            "The memory is exhausted.", "Close other programs, or choose a smaller preset or smaller images."
+        )
+    if isinstance(error, RecursionError):
+        return InputError("A file or a request is nested too deeply.", "Look at the files that were given.")
+    if isinstance(error, OSError):
+        known = disk_refusal(error, error.filename or "a file")
+        if known is not None:
+            return known
+        if error.filename:
+            return DiskError(f"{error.filename} cannot be used: {error.strerror}.", "Look whether it is there.")
+    return UnexpectedError(
+        f"Fieldwork failed unexpectedly: {type(error).__name__}: {text}.", "Run it again; if it stays, report it."
+    )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import json
 import os
@@ -13,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from .errors import DiskError, InputError
+from .errors import InputError, disk_refusal
 
 LONGEST_NAME = 64  # characters of a name that the user gives, of a run for instance
 # Windows keeps these for devices, whatever comes behind a dot.
@@ -57,15 +56,10 @@ def disk_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            raise DiskError(
-                f"No space left on the disk while writing {path}.", "Free some space and run it again."
-            ) from error
-        if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
-            raise DiskError(
-                f"{path} cannot be written: {os.strerror(error.errno)}.", "Choose a folder you may write to."
-            ) from error
-        raise
+        refusal = disk_refusal(error, path)
+        if refusal is None:
+            raise
+        raise refusal from error
 
 
 def require_readable(folder: Path) -> None:

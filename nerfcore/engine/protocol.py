@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from pydantic import ValidationError
 from pydantic_core import to_json
 
-from ..errors import Cancelled, FieldworkError, wrong_value
+from ..errors import Cancelled, UnexpectedError, explained, wrong_value
 from ..params import Params
 from ..verbs import VERBS
 
@@ -49,6 +49,8 @@ def parse_request(line: bytes) -> Request:
         value = json.loads(line)
     except (UnicodeDecodeError, json.JSONDecodeError) as error:
         raise RpcError(PARSE_ERROR, f"This line is not JSON: {error}.") from error
+    except RecursionError as error:
+        raise RpcError(PARSE_ERROR, "This line is nested too deeply.") from error
     if not isinstance(value, dict):
         raise RpcError(INVALID_REQUEST, "A request is a JSON object; batches are not supported.")
     request = value.get("id")
@@ -110,16 +112,8 @@ def as_rpc_error(error: BaseException, log: str | None, tail: list[str]) -> RpcE
     """The typed answer for what a verb raised. `log` is where the traceback went, `tail` its last lines."""
     if isinstance(error, Cancelled):
         return RpcError(CANCELLED, "Cancelled.")
-    if isinstance(error, FieldworkError):
-        data = {"code": error.code, "message": error.message, "hint": error.hint}
-        return RpcError(FAILED, str(error), data)
-    if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
-        data = {
-            "code": "memory",
-            "message": "The memory is exhausted.",
-            "hint": "Close other programs, or choose a smaller preset or smaller images.",
-            "log": log,
-        }
-        return RpcError(FAILED, f"{data['message']} {data['hint']}", data)
-    message = f"The engine failed unexpectedly: {type(error).__name__}: {error}"
-    return RpcError(INTERNAL_ERROR, message, {"code": "internal", "log": log, "traceback": tail})
+    known = explained(error)
+    data = {"code": known.code, "message": known.message, "hint": known.hint}
+    if isinstance(known, UnexpectedError):
+        return RpcError(INTERNAL_ERROR, str(known), {**data, "log": log, "traceback": tail})
+    return RpcError(FAILED, str(known), data if known is error else {**data, "log": log})

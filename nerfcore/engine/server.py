@@ -102,6 +102,11 @@ class Server:
         except rpc.RpcError as error:
             self.send(rpc.failure(request.id if request else error.request, error))
             return True
+        except Exception as error:
+            log.exception("a request failed")
+            tail = traceback.format_exception(error)[-6:]
+            self.send(rpc.failure(request.id if request else None, rpc.as_rpc_error(error, None, tail)))
+            return True
 
     def _enqueue(self, request: rpc.Request) -> None:
         values = dict(request.params)

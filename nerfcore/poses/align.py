@@ -85,8 +85,10 @@ def _numbers(text: str, count: int, what: str) -> np.ndarray:
         values = np.array([float(part) for part in text.split(",")])
     except ValueError as error:
         raise SettingError(f"{what} {text!r} is not understood.", f"Give {count} numbers with commas.") from error
-    if len(values) != count or not np.isfinite(values).all():
-        raise SettingError(f"{what} {text!r} has {len(values)} numbers.", f"Give {count} finite numbers with commas.")
+    if len(values) != count:
+        raise SettingError(f"{what} {text!r} has {len(values)} numbers.", f"Give {count} numbers with commas.")
+    if not np.isfinite(values).all():
+        raise SettingError(f"{what} {text!r} has numbers that are not finite.", f"Give {count} finite numbers.")
     return values
 
 

@@ -17,11 +17,16 @@ import time
 from pathlib import Path
 from typing import Any
 
-from ..errors import DiskError, FieldworkError, InputError, PosesError
+from ..errors import DiskError, FieldworkError, InputError, MemoryExhausted, PosesError
 from ..progress import Reporter, log
 
 MIN_FREE_BYTES = 20_000_000
-ERRORS: dict[str, type[FieldworkError]] = {"input": InputError, "disk": DiskError, "poses": PosesError}
+ERRORS: dict[str, type[FieldworkError]] = {
+    "input": InputError,
+    "disk": DiskError,
+    "poses": PosesError,
+    "memory": MemoryExhausted,
+}
 
 
 def run_worker(job: dict[str, Any], work: Path, report: Reporter) -> dict[str, Any]:

@@ -13,7 +13,7 @@ import traceback
 from pathlib import Path
 from typing import IO, Any
 
-from ..errors import FieldworkError
+from ..errors import FieldworkError, UnexpectedError, explained
 
 
 class Channel:
@@ -77,16 +77,26 @@ def _answer(job: dict[str, Any], channel: Channel) -> None:
         from .pipeline import run
 
         channel.send("result", value=run(job, channel))
-    except FieldworkError as error:
-        channel.send("error", code=error.code, message=error.message, hint=error.hint)
     except Exception as error:  # noqa: BLE001  (the boundary of the process: everything must reach the user)
-        traceback.print_exc()
-        full = isinstance(error, (OSError, RuntimeError)) and _is_full(error)
-        message = (
-            f"No space left on the disk in {Path(job['work'])}." if full else f"Pose estimation failed: {error!r}."
+        if not isinstance(error, FieldworkError):
+            traceback.print_exc()
+        channel.send("error", **answer_to(error, Path(job["work"])))
+
+
+def answer_to(error: Exception, work: Path) -> dict[str, str]:
+    """Code, message and hint of a failure in the folder `work`."""
+    if isinstance(error, (OSError, RuntimeError)) and _is_full(error):
+        message, hint = (
+            f"No space left on the disk in {work}.",
+            "Free some space and run it again: finished work is kept.",
         )
-        hint = "Free some space and run it again: finished work is kept." if full else "Run it again."
-        channel.send("error", code="disk" if full else "poses", message=message, hint=hint)
+        return {"code": "disk", "message": message, "hint": hint}
+    known = explained(error)
+    if isinstance(known, UnexpectedError):
+        # Native code whose allocation failed returns without saying so.
+        hint = "Memory may have run out: close other programs, or use --preset fast. Finished work is kept."
+        return {"code": "poses", "message": f"Pose estimation failed: {type(error).__name__}: {error}.", "hint": hint}
+    return {"code": known.code, "message": known.message, "hint": known.hint}
 
 
 def _is_full(error: Exception) -> bool:

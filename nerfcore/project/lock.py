@@ -58,11 +58,8 @@ def project_lock(project: Path | None, owner: str) -> Iterator[None]:
     folder = project / FOLDER
     made = [place for place in (project, *project.parents) if not place.exists()]
     before = set(os.listdir(project)) if project.is_dir() else set()
-    try:
-        with disk_errors(folder):
-            folder.mkdir(parents=True, exist_ok=True)
-    except (FileExistsError, NotADirectoryError) as error:
-        raise ProjectError(f"{folder} cannot be a folder: a file is in its way.", "Choose another folder.") from error
+    with disk_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
     note = folder / OWNER_FILE
     lock = FileLock(folder / LOCK_FILE, thread_local=False)
     try:

@@ -151,7 +151,13 @@ def load_trained(project: Path, run: str) -> Trained:
     path = run_folder(project, run) / CHECKPOINT
     tensors, state = read_checkpoint(path, device)
     model = new_model(info, device)
-    model.load_state_dict({name.removeprefix("model."): t for name, t in tensors.items() if name.startswith("model.")})
+    own = {name.removeprefix("model."): t for name, t in tensors.items() if name.startswith("model.")}
+    try:
+        model.load_state_dict(own)
+    except RuntimeError as error:
+        raise ProjectError(
+            f"{path} holds a field of another shape than {INFO} beside it describes.", "Train the run again."
+        ) from error
     model.field.set_progress(state["progress"], info.config.train.fade, state["steps"])
     return Trained(model.eval().requires_grad_(False), info, state, device)
 

@@ -396,5 +396,5 @@ def test_unwritable_project_is_an_error_that_names_it(start, tmp_path):
     (blocked / "jobs").write_text("a file where a folder must be")
     client = start()
     error = client.answer(client.send("count", project=blocked, steps=1))["error"]
-    assert error["data"]["code"] == "project"
+    assert error["data"]["code"] == "disk"
     assert "jobs" in error["message"]

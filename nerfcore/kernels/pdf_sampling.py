@@ -52,6 +52,9 @@ class Ray:
     t_last: float  # distance of the last occupied bin
     transmittance: float
     below: float  # weight of the bins behind
+    width: float  # of the present bin; 0 until it is read
+    weight: float  # of the present bin
+    bin_transmittance: float  # of the present bin alone
     used: float  # part of the present bin given to intervals already
     gathered: float  # occupied length of the next sample's interval so far
     sample: int
@@ -89,34 +92,38 @@ def advanced(ray: Ray, shift: float, grid: GridArrays, m: MarchParams):
     for _ in range(MAX_BINS):
         if complete == 1 or ray.t >= ray.high:
             break
-        p = ray.origin + ray.direction * ray.t
-        width = bin_length(p, m)
-        u = grid_position(p, m.contracted)
-        cell = grid.cells[cell_index(u, m.n)]
-        if cell[0] > 0.0:
-            bin_transmittance = wp.exp(-cell[0] * width)
-            weight = bin_weight(cell, ray.transmittance, bin_transmittance, m)
-            above = ray.below + weight
-            ray.t_last = ray.t
+        if ray.width == 0.0:
+            p = ray.origin + ray.direction * ray.t
+            width = bin_length(p, m)
+            u = grid_position(p, m.contracted)
+            cell = grid.cells[cell_index(u, m.n)]
+            if cell[0] > 0.0:
+                ray.width = width
+                ray.bin_transmittance = wp.exp(-cell[0] * width)
+                ray.weight = bin_weight(cell, ray.transmittance, ray.bin_transmittance, m)
+                ray.t_last = ray.t
+            else:
+                ray.t += skip_length(u, ray.direction, ray.inverse, width, m, grid.skip_distance)
+        if ray.width > 0.0:
+            above = ray.below + ray.weight
             if t == NOT_FOUND and target <= above:
-                t = ray.t + ((target - ray.below) / weight - 0.5) * width
+                t = ray.t + ((target - ray.below) / ray.weight - 0.5) * ray.width
             if edge <= above:
-                fraction = (edge - ray.below) / weight
-                length = ray.gathered + (fraction - ray.used) * width
+                fraction = (edge - ray.below) / ray.weight
+                length = ray.gathered + (fraction - ray.used) * ray.width
                 ray.gathered = 0.0
                 ray.used = fraction
                 complete = 1
             else:
-                ray.gathered += (1.0 - ray.used) * width
+                ray.gathered += (1.0 - ray.used) * ray.width
                 ray.used = 0.0
                 ray.below = above
-                ray.t += width
+                ray.t += ray.width
+                ray.width = 0.0
                 if m.mode == _DEFAULT:
-                    ray.transmittance *= bin_transmittance
+                    ray.transmittance *= ray.bin_transmittance
                     if ray.transmittance < EARLY_STOP:
                         ray.t = ray.high
-        else:
-            ray.t += skip_length(u, ray.direction, ray.inverse, width, m, grid.skip_distance)
     if complete == 0:
         # Rounding left this interval just short of the total; nothing is behind it.
         length = ray.gathered

@@ -310,6 +310,10 @@ class FieldworkScene(PropertyGroup):
         min=0,
         max=6,
     )
+    watertight: BoolProperty(
+        name="Watertight",
+        description="Close the surface: what no photo shows counts as inside, and its faces are marked as unseen",
+    )
     texture: EnumProperty(
         name="Texture",
         description="Size of the texture in pixels",

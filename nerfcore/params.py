@@ -259,6 +259,9 @@ class MeshParams(Params):
     texture: int | None = Field(
         default=None, ge=64, le=16384, description="texture size in pixels; none: vertex colours only"
     )
+    watertight: bool = Field(
+        default=False, description="close the surface: what no photo shows counts as inside, and its faces are marked"
+    )
     texture_kind: Literal["photo", "field"] = Field(
         default="photo", description="what the texture shows: the photos, or the field's colours"
     )

@@ -19,6 +19,7 @@ from .base import ProjectOperator, need_run, scene_settings
     lods="lods",
     texture="texture",
     texture_kind="texture_kind",
+    watertight="watertight",
     out="mesh_file",
     split="split",
 )
@@ -41,6 +42,7 @@ class FIELDWORK_OT_mesh(ProjectOperator):
             "faces": self.value(context, "faces") or None,
             "lods": self.value(context, "lods"),
             "texture": int(self.value(context, "texture")) or None,
+            "watertight": self.value(context, "watertight"),
             "texture_kind": self.value(context, "texture_kind"),
             "out": self.path(context, "out"),
             "split": self.value(context, "split"),

@@ -25,7 +25,7 @@ class FIELDWORK_PT_mesh(StepPanel):
             self.draw_state(False, t("Run “{}” is not trained yet", settings.run))
         column = columns(layout)
         column.prop(settings, "mesh_region")
-        for name in ("resolution", "detail", "faces", "lods", "texture"):
+        for name in ("resolution", "detail", "watertight", "faces", "lods", "texture"):
             column.prop(settings, name)
         if settings.texture != "0":
             column.prop(settings, "texture_kind")

@@ -21,7 +21,8 @@ from ..render.model import Model
 from ..render.run import Trained
 from . import depth_maps as dm
 from .appearance import Photos
-from .clean import areas, clean, compact, components
+from .clean import areas, clean, compact, components, drop_scraps
+from .closed import decimate_closed, extract_closed, unseen_faces
 from .decimate import decimate
 from .extract import extract
 from .field_values import shade
@@ -38,7 +39,8 @@ LITTLE_AGREEMENT, LITTLE_IN_ONE = 0.3, 0.5  # shares below which the user is tol
 class Built:
     """A surface in the normalised frame, and the region in which it was looked for: vertices (V, 3) float32, faces (F, 3)
     int32, normals (V, 3) unit, outward, colors (V, 3) uint8 sRGB; coarse: vertices (V', 3) and faces (F', 3) of the same
-    surface at voxels of twice the size, not cleaned."""
+    surface at voxels of twice the size, not cleaned; unseen (F,) bool: triangles that close a surface which was asked to
+    be watertight."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -46,6 +48,7 @@ class Built:
     colors: np.ndarray
     region: Region
     coarse: tuple[np.ndarray, np.ndarray]
+    unseen: np.ndarray | None = None
 
 
 def build(trained: Trained, project: Project, scene: Scene, params: MeshParams, report: Reporter) -> Built:
@@ -74,25 +77,28 @@ def build(trained: Trained, project: Project, scene: Scene, params: MeshParams, 
     report.stage("Fusing")
     bricks = fuse_maps(maps, region, report)
     report.stage("Extracting the surface")
-    vertices, faces = extract(bricks, report)
+    vertices, faces = extract_closed(bricks, maps, report) if params.watertight else extract(bricks, report)
     coarse = extract(coarser(bricks), report)
     report.stage("Cleaning the surface")
     tolerance = TRUNCATION * region.voxel
-    if len(faces):
+    if params.watertight:
+        vertices, faces = compact(vertices, drop_scraps(vertices, faces))
+    elif len(faces):
         vertices, faces, _ = clean(vertices, faces, maps, tolerance, report)
     if not len(faces):
         raise TrainingError("The field has no surface in the region of interest.", "Train longer, or check the box.")
     if params.faces is not None and len(faces) > params.faces:
         report.stage("Simplifying")
-        vertices, faces = decimate(vertices, faces, params.faces, report)
-        vertices, faces = compact(vertices, faces)
+        fewer = decimate_closed if params.watertight else decimate
+        vertices, faces = compact(*fewer(vertices, faces, params.faces, report))
     check_parts(vertices, faces, report)
     report.stage("Reading colours")
     vertices, faces = vertices.astype(np.float32), faces.astype(np.int32)
     normals = vertex_normals(vertices, faces)
     photos = Photos(store, maps, np.array([flat.photo for flat in flats]), tolerance)
     colors = vertex_colors(trained.model, region, photos, vertices, normals, report)
-    return Built(vertices, faces, normals, colors, region, coarse)
+    unseen = unseen_faces(vertices, faces, maps, tolerance, report) if params.watertight else None
+    return Built(vertices, faces, normals, colors, region, coarse, unseen)
 
 
 def wanted_bounds(params: MeshParams, scene: Scene, box: Box) -> tuple[np.ndarray, np.ndarray] | None:

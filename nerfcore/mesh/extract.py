@@ -41,8 +41,8 @@ def _block(bricks: Bricks, corner: np.ndarray) -> tuple[np.ndarray, np.ndarray] 
     index = bricks.index[low[0] : high[0], low[1] : high[1], low[2] : high[2]]
     if not (index[:BLOCK, :BLOCK, :BLOCK] >= 0).any():
         return None
-    distance = _assemble(index, bricks.distance) / np.float32(bricks.voxel)
-    whole = _assemble(index, bricks.known)
+    distance = assemble(index, bricks.distance) / np.float32(bricks.voxel)
+    whole = assemble(index, bricks.known)
     side = tuple(min(n, BLOCK * BRICK + 1) for n in distance.shape)
     distance, whole = distance[: side[0], : side[1], : side[2]], whole[: side[0], : side[1], : side[2]]
     # scikit-image looks at the cell before a corner where the mask of that corner is set.
@@ -50,8 +50,7 @@ def _block(bricks: Bricks, corner: np.ndarray) -> tuple[np.ndarray, np.ndarray] 
         before = np.roll(whole, 1, axis)
         before[(slice(None),) * axis + (0,)] = False
         whole = whole & before
-    # A crossing exactly at a corner would belong to several edges.
-    distance = np.where(np.abs(distance) < 2 * LEAST, np.where(distance < 0, -2 * LEAST, 2 * LEAST), distance)
+    distance = off_corners(distance)
     inside = distance[whole]
     if min(side) < 2 or not len(inside) or inside.min() > 0 or inside.max() < 0:
         return None
@@ -62,7 +61,12 @@ def _block(bricks: Bricks, corner: np.ndarray) -> tuple[np.ndarray, np.ndarray] 
     return vertices.astype(np.float64) + corner * BRICK, faces.astype(np.int64)
 
 
-def _assemble(index: np.ndarray, values: np.ndarray) -> np.ndarray:
+def off_corners(distance: np.ndarray) -> np.ndarray:
+    """Distances in voxels that are nowhere zero: a crossing exactly at a corner would belong to several edges."""
+    return np.where(np.abs(distance) < 2 * LEAST, np.where(distance < 0, -2 * LEAST, 2 * LEAST), distance)
+
+
+def assemble(index: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Corners of a box of bricks (X, Y, Z) as one array (8X, 8Y, 8Z); 0 where there is no brick."""
     out = np.zeros((*index.shape, BRICK, BRICK, BRICK), values.dtype)
     present = index >= 0

@@ -57,16 +57,20 @@ def fuse_maps(maps: MapArrays, region: Region, report: Reporter) -> Bricks:
     axis = torch.arange(BRICK, device=device)
     inner = torch.cartesian_prod(axis, axis, axis)
     start = torch.from_numpy(origin).float().to(device)
-    gap = max(GAP, GAP_PIXELS / float(maps.lens[:, 0].min()))
     distance, weight, known = [], [], []
     for begin in range(0, len(bricks), CHUNK):
         report.progress(begin / len(bricks))
         some = torch.from_numpy(bricks[begin : begin + CHUNK]).to(device)
         points = (some[:, None] * BRICK + inner).reshape(-1, 3) * h + start
-        d, w, k = fuse(points.float(), maps, h, TRUNCATION * h, FREE_AT * h, gap, APART)
+        d, w, k = fuse(points.float(), maps, h, TRUNCATION * h, FREE_AT * h, depth_gap(maps), APART)
         for parts, values in ((distance, d), (weight, w), (known, k > 0)):
             parts.append(values.view(-1, BRICK, BRICK, BRICK).cpu().numpy())
     return Bricks(origin, h, index, np.concatenate(distance), np.concatenate(weight), np.concatenate(known))
+
+
+def depth_gap(maps: MapArrays) -> float:
+    """Share by which depths of neighbouring pixels of one surface may differ."""
+    return max(GAP, GAP_PIXELS / float(maps.lens[:, 0].min()))
 
 
 def coarser(bricks: Bricks) -> Bricks:

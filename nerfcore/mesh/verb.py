@@ -72,7 +72,8 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
     with atomic_path(target / "mesh.npz") as temporary, open(temporary, "wb") as file:
         sure = {"confidence": classes.confidence, "face_confidence": classes.face_confidence}
         uv = {} if painted.uv is None else {"uv": painted.uv.corners}
-        np.savez(file, **vars(surface), **sure, **uv)
+        unseen = {} if built.unseen is None else {"unseen": built.unseen}
+        np.savez(file, **vars(surface), **sure, **uv, **unseen)
     with atomic_path(target / COARSE) as temporary, open(temporary, "wb") as file:
         np.savez(file, vertices=transform_points(box.world_from_box, built.coarse[0]), faces=built.coarse[1])
     files = [target / "mesh.npz", target / COARSE, write_instances(target, instances)]

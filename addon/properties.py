@@ -52,6 +52,11 @@ SIDES = [
     ("left", "Left", "From the negative X side"),
     ("bottom", "From Below", "From below, such as a ceiling"),
 ]
+SPLITS = [
+    ("none", "One", "One object"),
+    ("classes", "One per Class", "One object for each class"),
+    ("instances", "One per Instance", "One object for each connected thing of a class"),
+]
 PASSES = [
     ("rgb", "Color", "The photographed colors"),
     ("depth", "Depth", "Distance along the ray in meters"),
@@ -341,8 +346,8 @@ class FieldworkScene(PropertyGroup):
     )
     split: EnumProperty(
         name="Objects",
-        description="What the file holds: one object, or one for each class",
-        items=[("none", "One", "One object"), ("classes", "One per Class", "One object for each class")],
+        description="What the file holds: one object, or one for each class or instance",
+        items=SPLITS,
     )
 
     # Measure
@@ -426,8 +431,8 @@ class FieldworkScene(PropertyGroup):
     export_to: EnumProperty(name="Format", description="What is written", items=EXPORTS)
     export_split: EnumProperty(
         name="Objects",
-        description="What the file holds: one object, or one for each class",
-        items=[("none", "One", "One object"), ("classes", "One per Class", "One object for each class")],
+        description="What the file holds: one object, or one for each class or instance",
+        items=SPLITS,
     )
     voxels: IntProperty(
         name="Voxels", description="Cells along each side of the field's cube", default=128, min=8, max=512

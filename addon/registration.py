@@ -30,6 +30,7 @@ MODULES = (
     "operators.capture",
     "operators.dataset",
     "operators.poses",
+    "operators.picking",
     "operators.region",
     "operators.train",
     "operators.render",

@@ -361,7 +361,7 @@ class BlendParams(Params):
     project: Path
     out: Path
     run: RunName = "main"
-    split: Literal["none", "classes"] = Field(default="none", description="classes: one mesh object for each class")
+    split: Split = Field(default="none", description="classes, instances: one mesh object for each of them")
     renders: Path | None = Field(
         default=None,
         description="folder of rendered photos to show behind their cameras; default: those Blender's panel rendered",

@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import bpy
-from bpy.types import Context, Event, Operator
+from bpy.types import Context
 from mathutils import Vector
 
 from ..addon.jobs.job import Done, Job
 from ..addon.project import snapshot
-from ..addon.props import BoolProperty, EnumProperty, StringProperty
+from ..addon.props import BoolProperty, StringProperty
 from ..addon.scene.frame import scene_from_capture
 from ..addon.text import t
 from .base import ProjectOperator, need_poses, need_project, refresh_scenes, scene_settings
@@ -113,61 +113,4 @@ def aligned(job: Job) -> None:
             update_scene(job, scene)
 
 
-class FIELDWORK_OT_pick_point(Operator):
-    """Click one end of a known distance in the viewport, on a sparse point or on a surface"""
-
-    bl_idname = "fieldwork.pick_point"
-    bl_label = "Pick Point"
-    bl_options = {"REGISTER", "UNDO"}
-
-    end: EnumProperty(items=[("A", "A", "First point"), ("B", "B", "Second point")], options={"SKIP_SAVE"})
-    use_cursor: BoolProperty(
-        name="3D Cursor", description="Take the place of the 3D cursor instead of a click", options={"SKIP_SAVE"}
-    )
-
-    @classmethod
-    def description(cls, context: Context, properties: Any) -> str:
-        return t("Take the place of the 3D cursor") if properties.use_cursor else t(cls.__doc__ or "")
-
-    def execute(self, context: Context) -> set[str]:
-        """Without a mouse, the place of the 3D cursor."""
-        setattr(context.scene.fieldwork, f"point_{self.end.lower()}", context.scene.cursor.location)
-        return {"FINISHED"}
-
-    def invoke(self, context: Context, event: Event) -> set[str]:
-        if self.use_cursor or context.area is None or context.area.type != "VIEW_3D":
-            return self.execute(context)
-        self._area = context.area
-        context.window.cursor_modal_set("EYEDROPPER")
-        context.workspace.status_text_set(
-            t("Point {}: click a sparse point or a surface. Esc or right-click: cancel", self.end)
-        )
-        context.window_manager.modal_handler_add(self)
-        return {"RUNNING_MODAL"}
-
-    def modal(self, context: Context, event: Event) -> set[str]:
-        if event.type in {"ESC", "RIGHTMOUSE"} and event.value == "PRESS":
-            return self._end(context, {"CANCELLED"})
-        if event.type == "LEFTMOUSE" and event.value == "PRESS":
-            from ..addon.scene import (
-                picking,  # not at the top: it needs numpy, and enabling the extension must be quick
-            )
-
-            point = picking.point_under(context, self._area, event.mouse_x, event.mouse_y)
-            if point is None:
-                self.report({"WARNING"}, t("There is neither a point nor a surface here"))
-                return {"RUNNING_MODAL"}
-            context.scene.cursor.location = point
-            self.execute(context)
-            return self._end(context, {"FINISHED"})
-        # The view can be turned meanwhile.
-        return {"RUNNING_MODAL"} if event.type in {"LEFTMOUSE", "RIGHTMOUSE"} else {"PASS_THROUGH"}
-
-    def _end(self, context: Context, result: set[str]) -> set[str]:
-        context.window.cursor_modal_restore()
-        context.workspace.status_text_set(None)
-        self._area.tag_redraw()
-        return result
-
-
-CLASSES = [FIELDWORK_OT_poses, FIELDWORK_OT_align, FIELDWORK_OT_pick_point]
+CLASSES = [FIELDWORK_OT_poses, FIELDWORK_OT_align]

@@ -10,9 +10,12 @@ from bpy.types import Context
 from ..addon.jobs.job import Done, Job, Steps
 from ..addon.jobs.queue import queue
 from ..addon.project import classes, snapshot
+from ..addon.properties import SPLITS
 from ..addon.props import EnumProperty, StringProperty
 from ..addon.roles import ROLE
 from .base import ProjectOperator, absolute, need_poses, refresh_scenes, scene_settings, set_if_empty
+
+SPLIT_ROLES = {"instance:": "instances", "class:": "classes"}  # how roles of the surface's objects begin
 
 
 @scene_settings(run="run")
@@ -34,6 +37,7 @@ class FIELDWORK_OT_import_scene(ProjectOperator):
         ],
         options={"SKIP_SAVE"},
     )
+    split: EnumProperty(name="Objects", description="How the surface appears", items=SPLITS, options={"SKIP_SAVE"})
     renders: StringProperty(
         name="Renders",
         description="Folder of rendered photos to show behind their cameras; empty: those of the panel",
@@ -47,8 +51,8 @@ class FIELDWORK_OT_import_scene(ProjectOperator):
         return {"project": project, "run": self.value(context, "run"), "renders": absolute(self.renders)}
 
     def after(self) -> Done:
-        cameras, name = self.cameras, bpy.context.scene.name
-        return lambda job: import_result(job, cameras, name)
+        cameras, split, name = self.cameras, self.split, bpy.context.scene.name
+        return lambda job: import_result(job, cameras, name, split)
 
 
 def update_scene(job: Job, scene: bpy.types.Scene) -> None:
@@ -60,10 +64,11 @@ def update_scene(job: Job, scene: bpy.types.Scene) -> None:
     many, animated = any(role.startswith("camera:") for role in roles), "camera path" in roles
     cameras, name = "both" if many == animated else "many" if many else "animated", scene.name
     params = {"project": str(job.project), "run": scene.fieldwork.run}
-    queue.follow_up(queue.make("package", params, lambda done: import_result(done, cameras, name)))
+    split = next((kind for start, kind in SPLIT_ROLES.items() if any(r.startswith(start) for r in roles)), "none")
+    queue.follow_up(queue.make("package", params, lambda done: import_result(done, cameras, name, split)))
 
 
-def import_result(job: Job, cameras: str, scene_name: str) -> Steps | None:
+def import_result(job: Job, cameras: str, scene_name: str, split: str = "none") -> Steps | None:
     """Import what the engine prepared, as one step of undo."""
     refresh_scenes(job)
     if job.state != "done" or not job.result:
@@ -73,16 +78,16 @@ def import_result(job: Job, cameras: str, scene_name: str) -> Steps | None:
     if snapshot.folder_of(scene.fieldwork) != job.project and not bpy.app.background:
         job.warnings.append("The scene shows another project by now: press Update Scene there.")
         return None
-    return import_steps(job, cameras, scene)
+    return import_steps(job, cameras, scene, split)
 
 
-def import_steps(job: Job, cameras: str, scene: bpy.types.Scene) -> Steps:
+def import_steps(job: Job, cameras: str, scene: bpy.types.Scene, split: str) -> Steps:
     # Not at the top: enabling the extension must be quick.
     from ..addon.scene import build
     from ..addon.scene.frame import root_of
 
     first = root_of(scene, snapshot.owner(job.project)) is None
-    imported = yield from build.import_steps(scene, build.load(job.result["folder"]), cameras)
+    imported = yield from build.import_steps(scene, build.load(job.result["folder"], split), cameras)
     job.warnings += imported.warnings
     classes.show(scene.fieldwork)
     if first:

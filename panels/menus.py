@@ -30,6 +30,7 @@ class FIELDWORK_MT_steps(Menu):
         layout.operator("fieldwork.compare")
         layout.operator("fieldwork.report")
         layout.operator("fieldwork.import_scene")
+        layout.operator("fieldwork.pick_surface")
         layout.operator("fieldwork.blend")
         layout.operator("fieldwork.export")
         layout.separator()

@@ -34,7 +34,9 @@ class FIELDWORK_PT_mesh(StepPanel):
             column.prop(settings, "split")
         column.prop(settings, "turntable")
         layout.operator("fieldwork.mesh", icon="MESH_DATA")
-        layout.operator("fieldwork.import_scene", icon="SCENE_DATA")
+        row = layout.row(align=True)
+        row.operator("fieldwork.import_scene", icon="SCENE_DATA")
+        row.operator("fieldwork.pick_surface", icon="EYEDROPPER")
 
 
 CLASSES = [FIELDWORK_PT_mesh]

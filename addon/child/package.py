@@ -16,7 +16,7 @@ PACKED_LIMIT = 256 * 2**20  # bytes of photos above which they stay outside the 
 def write_blend(request: dict[str, Any], emit: Callable[..., None]) -> dict[str, Any]:
     """Build the package folder `request["package"]` in a new file and save it as `request["out"]`.
 
-    `request["split"]`: one mesh object for each class.
+    `request["split"]`: "none", "classes" or "instances", one mesh object for each of them.
     """
     package, imported = _build(request, emit, "Building the Blender file")
     prepare_scene(bpy.context.scene, len(package.cameras))

@@ -21,7 +21,7 @@ from mathutils import Vector
 from ..roles import Owner
 from .cameras import SIZE, animated_camera, display_size, photo_camera, use_size_of
 from .frame import units_per_metre
-from .materials import SWITCH, make_group
+from .look import set_switch, shader_group, viewport_group
 from .mesh_data import Part, parts
 from .owned import Owned, Steps
 from .package import Package, read_package
@@ -56,10 +56,10 @@ def import_package(
     scene: bpy.types.Scene,
     package: Package,
     cameras: Cameras = "both",
-    split: bool = False,
+    split: str = "none",
     progress: Callable[[float, str], None] = lambda fraction, message: None,
 ) -> Imported:
-    """Build or update everything of a package in a scene and return it; `split`: one mesh object for each class."""
+    """Build or update everything of a package in a scene and return it; `split`: see `parts`."""
     steps = import_steps(scene, lambda: (package, parts(package, split)), cameras)
     while True:
         try:
@@ -68,7 +68,7 @@ def import_package(
             return end.value
 
 
-def load(folder: Path | str, split: bool = False) -> Callable[[], tuple[Package, list[Part]]]:
+def load(folder: Path | str, split: str = "none") -> Callable[[], tuple[Package, list[Part]]]:
     """For `import_steps`: reads a package and prepares its surface."""
 
     def read() -> tuple[Package, list[Part]]:
@@ -92,9 +92,7 @@ def import_steps(
     root.empty_display_size = 0.2
     if root.scale == Vector((1.0, 1.0, 1.0)):
         root.scale = [units_per_metre(scene)] * 3
-    if SWITCH not in root:
-        root[SWITCH] = 0.0
-        root.id_properties_ui(SWITCH).update(min=0.0, max=1.0, description="0: colours of the photos, 1: class colours")
+    set_switch(root)
     result = Imported(root)
     size = display_size(package)
     if cameras in {"many", "both"}:
@@ -108,9 +106,9 @@ def import_steps(
         result.points = sparse_points(owned, package, root)
     yield 0.8, "mesh"
     if pieces:
-        group = make_group(owned.owner, "mesh", root, _texture(package))
+        groups = shader_group(owned.owner, "mesh", root, _texture(package)), viewport_group(owned.owner, root)
         for part in pieces:
-            result.meshes.append((yield from surface(owned, package, root, part, group)))
+            result.meshes.append((yield from surface(owned, package, root, part, *groups)))
     owned.remove_unused()
     if package.cameras:
         _frame_scene(scene, package, result)

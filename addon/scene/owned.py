@@ -32,27 +32,34 @@ class Owned:
         parent.children.link(made)
         return made
 
-    def object(self, role: str, name: str, data: Any, parent: bpy.types.Object | None = None) -> bpy.types.Object:
-        """The object of a role, with `data` if it is new."""
+    def object(
+        self, role: str, name: str, data: Any, parent: bpy.types.Object | None = None, group: str = ""
+    ) -> bpy.types.Object:
+        """The object of a role, with `data` if it is new; `group`: the collection it stands in then, of this name."""
         self.used.add(role)
         item = self.known.get(role)
         if item is None:
             item = bpy.data.objects.new(name, data)
-            (self.camera_collection if role.startswith("camera") else self.collection).objects.link(item)
+            self._place(role, group).objects.link(item)
             item.parent = parent
         self.owner.mark(item, role)
         return item
+
+    def _place(self, role: str, group: str) -> bpy.types.Collection:
+        if role.startswith("camera"):
+            return self.camera_collection
+        return self._collection(self.collection, group, f"group:{group}") if group else self.collection
 
     def existing(self, role: str) -> bpy.types.Object | None:
         return self.known.get(role)
 
     def with_mesh(
-        self, role: str, name: str, mesh: bpy.types.Mesh, parent: bpy.types.Object | None
+        self, role: str, name: str, mesh: bpy.types.Mesh, parent: bpy.types.Object | None, group: str = ""
     ) -> bpy.types.Object:
         """The object of a role with this mesh, in place of the one an earlier import made, wherever that is used."""
         item = self.existing(role)
         if item is None:
-            return self.object(role, name, mesh, parent)
+            return self.object(role, name, mesh, parent, group)
         self.object(role, name, mesh)
         before, kept = item.data, item.data.name
         before.user_remap(mesh)
@@ -65,6 +72,9 @@ class Owned:
         for role, item in self.known.items():
             if role not in self.used:
                 bpy.data.objects.remove(item)
+        for child in list(self.collection.children):
+            if str(child.get(ROLE, "")).startswith("group:") and not child.all_objects and not child.children:
+                bpy.data.collections.remove(child)
 
 
 def find(items: Any, owner: Owner, role: str, name: str) -> Any:

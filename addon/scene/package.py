@@ -24,7 +24,8 @@ class PackageError(SceneError):
 class Package:
     """One capture: `name` of its folder and `uuid` (may be empty) of its project. Points: `xyz` (N, 3), `rgb` (N, 3) uint8. `mesh` holds the arrays of mesh.npz, or None.
 
-    `texture` is a picture for the mesh's "uv" (F, 3, 2), v upwards; None where colours are the vertices'.
+    `texture` is a picture for the mesh's "uv" (F, 3, 2), v upwards; None where colours are the vertices'. `instances` are
+    the entries {"id", "name", "class_id"} for the mesh's "face_instance", `measures` the areas and volumes of measures.json.
     """
 
     folder: Path
@@ -37,6 +38,8 @@ class Package:
     rgb: np.ndarray
     mesh: dict[str, np.ndarray] | None
     texture: Path | None
+    instances: list[dict[str, Any]]
+    measures: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -100,6 +103,8 @@ def read_package(folder: Path | str) -> Package:
         rgb=points["rgb"],
         mesh=mesh,
         texture=folder / value["texture"] if value.get("texture") else None,
+        instances=value.get("instances") or [],
+        measures=value.get("measures") or {},
     )
 
 

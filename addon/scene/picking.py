@@ -1,4 +1,4 @@
-"""The point of the capture under the mouse."""
+"""The point of the capture, or the place of its surface, under the mouse."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from bpy_extras import view3d_utils
 from mathutils import Vector
 
 from ..roles import ROLE
+from .spot import Spot, spot_at
 
 REACH = 14  # pixels
 
@@ -20,9 +21,8 @@ def point_under(context: bpy.types.Context, area: bpy.types.Area, x: float, y: f
     Returns:
         a place in the world.
     """
-    region = next((r for r in area.regions if r.type == "WINDOW" and _inside(r, x, y)), None)
-    # The sidebar lies over the view.
-    if region is None or any(_inside(r, x, y) for r in area.regions if r.type in ("UI", "TOOLS", "HEADER")):
+    region = _region_under(area, x, y)
+    if region is None:
         return None
     view = area.spaces.active.region_3d
     mouse = Vector((x - region.x, y - region.y))
@@ -33,6 +33,25 @@ def point_under(context: bpy.types.Context, area: bpy.types.Area, x: float, y: f
     direction = view3d_utils.region_2d_to_vector_3d(region, view, mouse)
     hit, place, *_ = context.scene.ray_cast(context.evaluated_depsgraph_get(), origin, direction)
     return place if hit else None
+
+
+def spot_under(context: bpy.types.Context, area: bpy.types.Area, x: float, y: float) -> Spot | None:
+    """What is known of the surface under the mouse (see `point_under`); None where there is none."""
+    region = _region_under(area, x, y)
+    if region is None:
+        return None
+    view, mouse = area.spaces.active.region_3d, Vector((x - region.x, y - region.y))
+    origin = view3d_utils.region_2d_to_origin_3d(region, view, mouse)
+    direction = view3d_utils.region_2d_to_vector_3d(region, view, mouse)
+    return spot_at(context.scene, context.evaluated_depsgraph_get(), origin, direction)
+
+
+def _region_under(area: bpy.types.Area, x: float, y: float) -> bpy.types.Region | None:
+    """The view of a 3D viewport under the mouse; the sidebar lies over it."""
+    region = next((r for r in area.regions if r.type == "WINDOW" and _inside(r, x, y)), None)
+    if any(_inside(r, x, y) for r in area.regions if r.type in ("UI", "TOOLS", "HEADER")):
+        return None
+    return region
 
 
 def _inside(region: bpy.types.Region, x: float, y: float) -> bool:

@@ -7,7 +7,8 @@ from typing import Any
 import bpy
 import numpy as np
 
-from .materials import make_group, make_material
+from .look import shader_group
+from .materials import make_material
 from .mesh_data import rgba
 from .owned import Owned
 from .package import Package
@@ -23,7 +24,7 @@ def sparse_points(owned: Owned, package: Package, root: bpy.types.Object) -> bpy
     fill_points(mesh, package.xyz, rgba(package.rgb))
     item = owned.with_mesh("points", "Sparse points", mesh, root)
     centers = np.array([np.array(c["camera_to_world"])[:3, 3] for c in package.cameras]).reshape(-1, 3)
-    material = make_material(owned.owner, "points", [0.8, 0.8, 0.8], make_group(owned.owner, "points", root))
+    material = make_material(owned.owner, "points", [0.8, 0.8, 0.8], shader_group(owned.owner, "points", root))
     show_points(item, float(np.ptp(centers, axis=0).max(initial=0.0)) / 600 or 0.005, material)
     return item
 

@@ -13,25 +13,58 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
-from .materials import COLOR_ATTRIBUTE, make_material
-from .mesh_data import MeshData, Part, slot_classes
+from .look import (
+    CLASS_COLOR_ATTRIBUTE,
+    COLOR_ATTRIBUTE,
+    CONFIDENCE_ATTRIBUTE,
+    SHOWN_ATTRIBUTE,
+    add_viewport_colors,
+)
+from .materials import make_material
+from .mesh_data import MeshData, Part, measured_of, slot_classes
 from .owned import Owned, Steps
 from .package import Package
 
 CLASS_ATTRIBUTE, VERTEX_CLASS_ATTRIBUTE = "class_id", "vertex_class_id"
+INSTANCE_ATTRIBUTE = "instance_id"
+INSTANCE_NAMES = "instances"  # custom property of the objects: names by the numbers of the attribute
 UV_MAP = "UVMap"
+# Custom properties, in `unit`² and `unit`³: the value and the ends of its 95 % interval.
+MEASURED = tuple(f"{name}{end}" for name in ("area", "volume") for end in ("", "_low", "_high"))
+UNIT = "unit"
 
 
-def surface(owned: Owned, package: Package, root: bpy.types.Object, part: Part, group: Any) -> Steps:
-    """One object of the surface, its materials colored through `group`; returns it."""
+def surface(owned: Owned, package: Package, root: bpy.types.Object, part: Part, group: Any, viewport: Any) -> Steps:
+    """One object of the surface, its materials colored through the shader group `group`, the solid viewport through the
+    geometry-nodes group `viewport`; returns it."""
     mesh = bpy.data.meshes.new(part.name)
     for _ in fill_surface(mesh, part.data):
         yield 0.9, "mesh"
     for entry in slot_classes(package):
-        mesh.materials.append(make_material(owned.owner, entry["name"], entry["color"], group))
-    item = owned.with_mesh(part.role, part.name, mesh, root)
+        material = make_material(owned.owner, entry["name"], entry["color"], group)
+        describe(material, measured_of(package, "classes", entry["id"]), package.measures)
+        mesh.materials.append(material)
+    item = owned.with_mesh(part.role, part.name, mesh, root, part.group)
     item.matrix_parent_inverse = item.matrix_basis = Matrix.Identity(4)
+    add_viewport_colors(item, viewport)
+    item[INSTANCE_NAMES] = {str(entry["id"]): entry["name"] for entry in package.instances}
+    describe(item, part.measured, package.measures)
     return item
+
+
+def describe(item: Any, measured: dict[str, Any], measures: dict[str, Any]) -> None:
+    """Note what was measured of a class or instance, with the ends of its 95 % intervals, as custom properties of its
+    object or material."""
+    for name in MEASURED:
+        value = measured.get(name)
+        if value is not None:
+            item[name] = float(value)
+        elif name in item:
+            del item[name]
+    if measured:
+        item[UNIT] = str(measures.get("unit", ""))
+    elif UNIT in item:
+        del item[UNIT]
 
 
 def fill_surface(mesh: bpy.types.Mesh, data: MeshData) -> Iterator[None]:
@@ -52,13 +85,25 @@ def fill_surface(mesh: bpy.types.Mesh, data: MeshData) -> Iterator[None]:
     yield
     for name, domain, values in (
         (CLASS_ATTRIBUTE, "FACE", data.face_class),
+        (INSTANCE_ATTRIBUTE, "FACE", data.face_instance),
         (VERTEX_CLASS_ATTRIBUTE, "POINT", data.vertex_class),
         ("material_index", "FACE", data.material),
     ):
         mesh.attributes.new(name, "INT", domain)
         set_values(mesh, name, "value", values)
     yield
+    mesh.attributes.new(CONFIDENCE_ATTRIBUTE, "FLOAT", "POINT")
+    set_values(mesh, CONFIDENCE_ATTRIBUTE, "value", data.confidence)
+    for name, domain, colors in (
+        (CLASS_COLOR_ATTRIBUTE, "FACE", data.face_colors),
+        (SHOWN_ATTRIBUTE, "CORNER", data.colors[data.corners]),
+    ):
+        yield
+        mesh.attributes.new(name, "BYTE_COLOR", domain)
+        set_values(mesh, name, "color_srgb", colors)
+    yield
     set_colors(mesh, data.colors)
+    mesh.color_attributes.active_color_name = SHOWN_ATTRIBUTE
     yield
     if data.uv is not None:
         mesh.uv_layers.new(name=UV_MAP)

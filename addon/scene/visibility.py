@@ -12,7 +12,13 @@ NAME = "Fieldwork Classes"
 
 def meshes(owner: Owner) -> list[bpy.types.Object]:
     """The labelled meshes of a project in the file."""
-    return [obj for obj in bpy.data.objects if obj.type == "MESH" and obj.get(ROLE) == "mesh" and owner.owns(obj)]
+    return [obj for obj in bpy.data.objects if obj.type == "MESH" and is_surface(obj) and owner.owns(obj)]
+
+
+def is_surface(obj: bpy.types.Object) -> bool:
+    """Whether an object is the labelled mesh of some project, or one class or instance of it."""
+    role = str(obj.get(ROLE, ""))
+    return role == "mesh" or role.startswith(("class:", "instance:"))
 
 
 def hide_classes(obj: bpy.types.Object, hidden: list[int]) -> None:

@@ -10,7 +10,7 @@ from ..errors import SettingError
 from ..params import BlendParams
 from ..progress import Reporter
 from ..project.fingerprints import Earlier, Fingerprint, array_digest, compare, digest, files_digest, stamps_digest
-from ..project.runs import holdout_of
+from ..project.runs import INSTANCES, MEASURES, holdout_of
 from ..project.store import load_project, record_step
 from .package import photo_renders, stale, write_package
 from .process import write_in_blender
@@ -39,7 +39,7 @@ def blend(params: BlendParams, report: Reporter) -> dict[str, Any]:
         warnings.append("There is no mesh yet: the .blend holds cameras and points only. Run `fieldwork mesh` first.")
     if not len(scene.points):
         warnings.append("The project has no sparse points.")
-    result = write_in_blender("blend", package, out, params.split == "classes", report)
+    result = write_in_blender(package, out, params.split, report)
     for warning in [*warnings, *result.pop("warnings")]:
         report.warn(warning)
     done = {"file": str(out), **result, "seconds": round(time.monotonic() - started, 1)}
@@ -55,7 +55,7 @@ def blend_inputs(params: BlendParams) -> Fingerprint:
     renders = photo_renders(folder, params.renders)
     pictures = sorted(renders.glob("*.png")) if renders.is_dir() else []
     return {
-        "mesh": files_digest((name, exports / name) for name in ("mesh.npz", "texture.png")),
+        "mesh": files_digest((name, exports / name) for name in ("mesh.npz", "texture.png", INSTANCES, MEASURES)),
         "renders": stamps_digest(pictures),
         "classes": class_inputs(scene),
         "sparse points": array_digest(scene.points.xyz, scene.points.rgb),

@@ -1,11 +1,13 @@
 """The package: what Blender needs of a capture, readable with numpy and JSON alone.
 
-package.json        name and UUID of the project, classes, cameras (camera-to-world in the world frame, OpenGL axes)
+package.json        name and UUID of the project, classes, cameras (camera-to-world in the world frame, OpenGL axes);
+                    instances and measures of the mesh, empty where there are none
 renders/            rendered photos, without lens distortion too, where there are any
 images/             the photos without lens distortion, in the size of their camera
 points.npz          xyz (N, 3) float32 world, rgb (N, 3) uint8 sRGB
 lenses.json         which lens each photo was undistorted for
-mesh.npz            only when there is a mesh: vertices, faces, normals, colors, class_id, face_class
+mesh.npz            only when there is a mesh: vertices, faces, normals, colors, class_id, face_class, face_instance,
+                    confidence of the vertices
 """
 
 from __future__ import annotations
@@ -34,6 +36,8 @@ from ..progress import Reporter
 from ..project.fingerprints import read_made
 from ..project.runs import (
     CHECKPOINT,
+    INSTANCES,
+    MEASURES,
     MESH_RECORD,
     RENDER_RECORD,
     checkpoint_id,
@@ -96,6 +100,8 @@ def write_package(
             "cameras": cameras,
             "mesh": has_mesh,
             "texture": "texture.png" if has_texture else None,
+            "instances": _beside(source / INSTANCES, []) if has_mesh else [],
+            "measures": _beside(source / MEASURES, {}) if has_mesh else {},
             "checkpoint": checkpoint_id(project, run),
             "mesh_checkpoint": made.checkpoint if has_mesh and made else "",
         },
@@ -272,6 +278,16 @@ def _copy_mesh(source: Path, target: Path) -> bool:
     with atomic_path(target) as temporary:
         shutil.copyfile(source, temporary)
     return True
+
+
+def _beside(path: Path, missing: Any) -> Any:
+    """The JSON value of a file that stands beside the mesh; `missing` where there is none."""
+    if not path.is_file():
+        return missing
+    try:
+        return json.loads(path.read_text("utf-8"))
+    except (OSError, ValueError) as error:
+        raise ProjectError(f"{path} is damaged: {error}.", "Run `fieldwork mesh` again.") from error
 
 
 def _copy_texture(source: Path, folder: Path) -> bool:

@@ -14,9 +14,9 @@ from scipy.spatial import KDTree
 
 from ..errors import ProjectError
 from ..files import write_json
+from ..project.runs import INSTANCES
 from .clean import areas, border_edges, components
 
-INSTANCES = "instances.json"  # beside mesh.npz
 GAP = 3.0  # voxels that a thing may be torn apart by: a crack of the reconstruction is one or two wide
 LEAST_SHARE = 0.01  # of the area of its class, below which a part is no instance
 SAME_SIZE = 0.05  # areas within one such step are told apart by where the things stand, not by their noise

@@ -21,6 +21,7 @@ INFO = "config.json"
 EVENTS = "events.jsonl"
 METRICS = "metrics.json"
 MESH_RECORD = "mesh.json"  # in exports/<run>: what the mesh beside it was made from
+INSTANCES = "instances.json"  # in exports/<run>: what the numbers of instances on the mesh beside it mean
 MEASURES = "measures.json"  # in exports/<run>: areas and volumes of the mesh beside it
 RENDER_RECORD = "render.json"  # in a folder of renders: what they were made from
 NEW, OLD = ".new", ".old"

@@ -214,8 +214,8 @@ def test_a_textured_mesh_and_class_objects_lie_on_the_photo_too(split, tmp_path,
     np.savez(tmp_path / "p/exports/main/mesh.npz", **arrays)
     Image.fromarray(texture).save(tmp_path / "p/exports/main/texture.png")
     result = blend(BlendParams(project=tmp_path / "p", out=tmp_path / "scene.blend", split=split), Reporter())
-    surfaces = [name for name in result["objects"] if name.startswith("Surface")]
-    assert surfaces == {"none": ["Surface"], "classes": ["Surface · floor", "Surface · ball"]}[split]
+    surfaces = [name for name in result["objects"] if name in ("Surface", "floor", "ball")]
+    assert surfaces == {"none": ["Surface"], "classes": ["floor", "ball"]}[split]
     bpy_script(RENDER, blend=tmp_path / "scene.blend", out=tmp_path)
     photo = np.asarray(Image.open(tmp_path / "p/images/view_0.png")).astype(int)
     render = np.asarray(Image.open(tmp_path / "photo.png").convert("RGB"))

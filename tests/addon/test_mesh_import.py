@@ -67,7 +67,7 @@ def test_edges_are_those_of_the_triangles():
 def test_triangles_without_area_are_left_out():
     arrays = sheet(3)
     arrays["faces"][2] = [4, 4, 5]
-    data = mesh_data(arrays, {0: 0, 1: 1})
+    data = mesh_data(arrays, {0: 0, 1: 1}, np.eye(2, 4, dtype=np.float32))
     assert len(data.material) == len(arrays["faces"]) - 1
     assert len(data.corners) == len(data.corner_edges) == 3 * len(data.material)
     assert set(data.material.tolist()) == {0, 1}, "an unknown class gets the first slot"

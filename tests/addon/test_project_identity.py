@@ -48,7 +48,7 @@ answer({
     "roots": [root_of(scene, owner).name for owner in owners],
     "materials": materials,
     "groups": [{m.node_tree.nodes[0].node_tree.name for m in r.meshes[0].data.materials}.pop() for r in (again, second)],
-    "hidden": [len(result.meshes[0].modifiers) for result in (again, second)],
+    "hidden": [sum(m.name == "Fieldwork Classes" for m in result.meshes[0].modifiers) for result in (again, second)],
     "collections": sorted(c.name for c in scene.collection.children if "fieldwork_uuid" in c),
 })
 """,
@@ -76,6 +76,8 @@ from fieldwork.addon.project import snapshot
 from fieldwork.addon.scene import visibility
 from fieldwork.addon.scene.frame import root_of
 old = import_package(scene, package_of(project))
+for group in bpy.data.node_groups:
+    group.name = group.name.replace("Fieldwork Surface", "Fieldwork")  # as they were called then
 for items in (bpy.data.objects, bpy.data.collections, bpy.data.materials, bpy.data.node_groups):
     for item in items:
         if "fieldwork_uuid" in item:
@@ -85,6 +87,7 @@ for items in (bpy.data.objects, bpy.data.collections, bpy.data.materials, bpy.da
 bpy.ops.wm.save_as_mainfile(filepath=blend)
 bpy.ops.wm.open_mainfile(filepath=blend)
 before = {name: sorted(getattr(bpy.data, name).keys()) for name in ("objects", "collections", "materials", "node_groups")}
+before["node_groups"] = sorted(n.replace("Fieldwork · ", "Fieldwork Surface · ") for n in before["node_groups"])
 scene = bpy.context.scene
 scene.fieldwork.project = project
 owner = snapshot.owner(Path(project))

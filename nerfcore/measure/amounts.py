@@ -16,10 +16,13 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from ..mesh.clean import areas
+from ..mesh.facelets import facelets
 from .closing import Closed, closed
 
 K = 1.96  # normal deviates on either side of 95 %
 FAR = 2.0  # coarse cells: what of the coarse surface is farther from the fine one was cleaned away there
+
+FINE = 1.5  # fine cells: longest edge of the pieces of the coarse surface that are labelled
 
 
 @dataclass(frozen=True)
@@ -65,11 +68,11 @@ def transferred(
     Args:
         voxel: side of a fine cell.
     """
-    vertices, faces = coarse
-    found = KDTree(centers).query(vertices[faces].mean(1))
+    pieces = facelets(*coarse, limit=FINE * voxel)  # as a face may lie on both sides of a border
+    found = KDTree(centers).query(pieces.centers)
     far, nearest = np.asarray(found[0]), np.asarray(found[1])
     near = far < FAR * 2 * voxel
-    return [Labelled(vertices, faces[near], label[nearest[near]]) for label in labels]
+    return [Labelled(pieces.vertices, pieces.faces[near], label[nearest[near]]) for label in labels]
 
 
 def area_amounts(fine: np.ndarray, coarse: np.ndarray, u_boot: np.ndarray, scale: float) -> list[Amount]:

@@ -45,6 +45,8 @@ NAMED = {
 ORDER = {"import": ["dataset", "project"], "compare": ["project", "other"]}
 # Parameters that the command line takes from a file only.
 FILES = {"classes": {"classes"}}
+COLORS = {"weak": "yellow", "failed": "red"}
+GOOD = {"level": "good", "reasons": []}
 # Whether a path can be read is for the verb to say, in its own words and with exit code 1.
 PATH = click.Path(path_type=Path, readable=False)
 
@@ -169,7 +171,10 @@ def run_command(name: str, values: dict[str, Any], as_json: bool, quiet: bool, s
             return 130
         except Exception as error:  # noqa: BLE001 - the boundary: whatever happened becomes a sentence
             return _failed(error, name, project_of(params), as_json, stdout)
-        return 3 if strict and report.warnings else 0
+        judged = result.get("verdict", GOOD)
+        if judged["level"] != "good":
+            click.secho(f"{judged['level']}: {' '.join(judged['reasons'])}", fg=COLORS[judged["level"]], err=True)
+        return 3 if strict and (report.warnings or judged["level"] != "good") else 0
 
 
 def _failed(error: Exception, verb: str, project: Path | None, as_json: bool, stdout: TextIO) -> int:

@@ -105,6 +105,22 @@ def text_width(context: Context) -> int:
     return max(20, int((context.region.width / scale - 60) / 6.3)) if context.region else 40
 
 
+def verdict_of(result: dict[str, Any]) -> tuple[str, bool] | None:
+    """What a stage says against its own result: the first sentence, and whether it failed; None for a good one."""
+    judged = result.get("verdict") or {}
+    reasons = judged.get("reasons") or []
+    return (str(reasons[0]), judged.get("level") == "failed") if reasons else None
+
+
+def draw_verdict(layout: UILayout, context: Context, result: dict[str, Any]) -> None:
+    """What a stage says against its own result, red where that failed."""
+    judged = verdict_of(result)
+    if judged is not None:
+        box = layout.box()
+        box.alert = judged[1]
+        draw_wrapped(box, judged[0], text_width(context) - 4, icon="ERROR" if judged[1] else "INFO")
+
+
 def draw_outcome(layout: UILayout, context: Context, job: Job) -> None:
     """A job that failed, or has something to say: what happened, what to do, and the report."""
     width, box = text_width(context) - 4, layout.box()

@@ -6,7 +6,7 @@ from bpy.types import Context
 
 from ..addon.project import runs, snapshot
 from ..addon.text import t
-from .base import StepPanel, columns, project_folder
+from .base import StepPanel, columns, draw_verdict, project_folder
 
 
 class FIELDWORK_PT_mesh(StepPanel):
@@ -19,6 +19,7 @@ class FIELDWORK_PT_mesh(StepPanel):
         if result:
             closed = t("{:,} triangles, closed") if result.get("watertight") else t("{:,} triangles, open")
             self.draw_state(True, closed.format(result.get("faces", 0)))
+            draw_verdict(layout, context, result)
         elif runs.has_run(folder, settings.run):
             self.draw_state(False, t("Ready to extract"))
         else:

@@ -7,9 +7,9 @@ from bpy.types import Context, UILayout
 from ..addon.jobs.job import Job
 from ..addon.jobs.queue import queue
 from ..addon.pictures import thumbnails
-from ..addon.project import runs
+from ..addon.project import runs, snapshot
 from ..addon.text import t
-from .base import FieldworkPanel, StepPanel, columns, duration, project_folder
+from .base import FieldworkPanel, StepPanel, columns, draw_verdict, duration, project_folder
 
 
 def training_job(context: Context) -> Job | None:
@@ -34,6 +34,7 @@ class FIELDWORK_PT_train(StepPanel):
             self.draw_state(False, t("Run “{}” is paused", settings.run))
         elif runs.has_run(folder, settings.run):
             self.draw_state(True, t("Run “{}” is trained", settings.run))
+            draw_verdict(layout, context, snapshot.last_result(folder, "train", settings.run))
         else:
             self.draw_state(False, t("Run “{}” is not trained yet", settings.run))
         row = layout.row(align=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import io
-import json
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from ..files import write_text
 from ..mesh.stored import mesh_folder
 from ..params import ReportParams
 from ..progress import Reporter
-from ..project.runs import read_metrics
+from ..project.runs import read_events, read_metrics
 from ..project.store import load_project
 from ..render.run import run_folder
 from .documentation import Section, results_of, sections
@@ -32,11 +31,9 @@ def embedded(data: bytes, kind: str = "png") -> str:
     return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
 
 
-def training_curve(events: Path) -> str | None:
+def training_curve(run: Path) -> str | None:
     """Training PSNR over time as an embedded SVG picture; None without events."""
-    if not events.is_file():
-        return None
-    rows = [json.loads(line) for line in events.read_text(encoding="utf-8").splitlines() if line.endswith("}")]
+    rows = read_events(run)
     if len(rows) < 2:
         return None
     matplotlib.use("Agg")
@@ -114,7 +111,7 @@ def write_report(path: Path, folder: Path, run: str, renders: Path, result: dict
             scores=scores,
             drawings=pictures_of(drawn),
             renders=pictures_of(rendered),
-            curve=training_curve(run_folder(folder, run) / "events.jsonl"),
+            curve=training_curve(run_folder(folder, run)),
             classes=project.classes,
             labelled=bool(evaluation.get("per_class_iou")),
         )

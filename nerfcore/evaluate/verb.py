@@ -25,12 +25,13 @@ from ..kernels.runtime import compile_seconds
 from ..params import EvaluateParams
 from ..progress import Reporter
 from ..project.fingerprints import Earlier, Fingerprint, compare, digest, read_made, write_made
-from ..project.runs import checkpoint_id, run_folder, state_id
+from ..project.runs import checkpoint_id, read_metrics, run_folder, state_id
 from ..project.schema import step
 from ..project.store import load_project
 from ..render.image import Frame, background_of, render_view
 from ..render.pictures import colorize_depth, colorize_labels, side_by_side
 from ..render.run import Trained, load_info, load_trained, refined_poses
+from ..verdict import evaluate_verdict
 from .metrics import Confusion, psnr, ssim
 from .refit import refit_camera
 from .speed import SPEED_KEYS, measure_speed, peak_memory
@@ -52,6 +53,8 @@ class Comparison:
     confusion: Confusion
     scores: list[dict[str, Any]] = field(default_factory=list)
     pictures: list[Path] = field(default_factory=list)
+    opacity: list[float] = field(default_factory=list)
+    spread: list[float] = field(default_factory=list)  # 95th percentile of depth over the 5th
     seconds: float = 0.0
     rays: int = 0
 
@@ -70,6 +73,9 @@ class Comparison:
         self.seconds += time.perf_counter() - begin - (compile_seconds() - compiled)
         self.rays += camera.width * camera.height
         image = to_bytes(frame.color)
+        self.opacity.append(float(frame.opacity.mean()))
+        solid = frame.depth[np.isfinite(frame.depth) & (frame.opacity > 0.5)]
+        self.spread.append(float(np.divide(*np.percentile(solid, [95, 5]))) if solid.size else 1.0)
         self.scores.append({"name": view.name, "psnr": psnr(image, photo, keep), "ssim": ssim(image, photo), **given})
         if label is not None and self.confusion.class_ids:
             self.confusion.add(label, frame.label(self.confusion.class_ids, self.scene.ignore_id))
@@ -95,6 +101,8 @@ class Comparison:
         miou = self.confusion.miou()
         return {
             "images": len(self.scores),
+            "opacity": round(float(np.mean(self.opacity)), 4),
+            "depth_spread": round(float(np.median(self.spread)), 4),
             "psnr": self._mean("psnr", 3),
             "ssim": self._mean("ssim", 4),
             "lpips": None,
@@ -172,6 +180,9 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
         "device": str(trained.device),
         **compared.details(folder),
     }
+    psnr_train = (read_metrics(run_folder(folder, params.run)).get("train") or {}).get("psnr_train")
+    opaque = not trained.info.transparent and not (scene.mask_mode == "empty" and any(v.mask for v in scene.views))
+    result["verdict"] = evaluate_verdict(result, psnr_train, opaque, bool(compared.confusion.class_ids))
     path = run_folder(folder, params.run) / "metrics.json"
     stored = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     write_json(path, {**stored, params.split: result})

@@ -19,6 +19,7 @@ from ..project.runs import MEASURES, MESH_RECORD, checkpoint_id, state_id
 from ..project.schema import step
 from ..project.store import load_project, record_step, world_from_sfm
 from ..render.run import Trained, load_info, load_trained, refined_poses
+from ..verdict import mesh_verdict
 from .build import Built, build
 from .features import features_of
 from .field_values import shade
@@ -28,6 +29,7 @@ from .lods import make_levels, remove_levels, write_level
 from .painted import Painted, paint_surface, training_photos, write_maps
 from .parts import texture_of
 from .photos import Photo
+from .shown import shown_share
 from .stored import COARSE
 from .surface import Surface, class_table, is_watertight, to_world
 from .turntable import write_turntable
@@ -39,6 +41,7 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
     Returns:
         {"vertices", "faces", "watertight", "voxel": in world units, "classes": {name: {"faces", "area"}},
         "instances": how many, "lods": [{"faces", "deviation": in world units}], "files"};
+        "shown": the share of the photos' pixels that show the mesh, "verdict";
         with a texture of photos "painted_by_photos", the share of its texels that a photo shows
     Raises:
         SettingError: unknown format or impossible region. ProjectError, TrainingError, DiskError.
@@ -102,6 +105,8 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
         "lods": [{"faces": len(level.surface.faces), "deviation": level.deviation} for level in levels],
         "files": [str(path) for path in files],
     }
+    shown = shown_share(photos, built.vertices, built.faces)
+    result |= {"shown": round(shown, 4), "verdict": mesh_verdict(shown)}
     if painted.seen is not None:
         result["painted_by_photos"] = round(painted.seen, 4)
     settings = params.model_dump(mode="json")

@@ -20,6 +20,7 @@ from ..progress import Reporter, shortened
 from ..project.fingerprints import Earlier, Fingerprint, compare, digest, files_digest
 from ..project.schema import Frame, ImageRecord, PosedImage, Poses, Project
 from ..project.store import POSES_FILE, edit_project, load_poses, load_project, save_poses
+from ..verdict import poses_verdict
 from .align import gps_frame
 from .process import run_worker
 
@@ -77,6 +78,7 @@ def estimate_poses(params: PosesParams, report: Reporter) -> dict[str, Any]:
             "up_confidence": project.frame.up_confidence,
             "level": result["level"],
             "groups": result["groups"],
+            "verdict": poses_verdict(len(poses.images), len(records)),
             "images": [
                 {"name": record.name, "status": image["status"], "reason": image["reason"]}
                 for record, image in zip(records, result["images"])

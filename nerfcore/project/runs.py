@@ -157,6 +157,15 @@ def holdout_of(project: Path, run: str) -> int:
     return value if isinstance(value, int) else HOLDOUT
 
 
+def read_events(folder: Path) -> list[dict[str, Any]]:
+    """The course of a training as its events tell it; a line that a kill cut off is left out."""
+    try:
+        text = (folder / EVENTS).read_text(encoding="utf-8")
+    except OSError:
+        return []
+    return [json.loads(line) for line in text.splitlines() if line.endswith("}")]
+
+
 def read_metrics(folder: Path) -> dict[str, Any]:
     """What was measured of a run: results of train ("train") and evaluate (by split); empty when nothing was."""
     try:

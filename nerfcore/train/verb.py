@@ -32,6 +32,7 @@ from ..project.runs import (
     INFO,
     METRICS,
     TrainingFolder,
+    read_events,
 )
 from ..project.store import load_project, record_step
 from ..render.image import background_of, render_view
@@ -46,6 +47,7 @@ from ..render.run import (
     save_info,
     settled_as,
 )
+from ..verdict import train_verdict
 from .checkpoint import restore, save_checkpoint
 from .closed_picture import write_closed_picture
 from .inputs import data_inputs, training_inputs, training_length
@@ -76,7 +78,7 @@ def train(params: TrainParams, report: Reporter) -> dict[str, Any]:
     A run that is there already stays as it is until the new training has a checkpoint; then it is replaced.
 
     Returns:
-        {"run", "steps", "seconds", "psnr_train", "checkpoint", …}
+        {"run", "steps", "seconds", "psnr_train", "checkpoint", "verdict", …}
     Raises:
         TrainingError, ProjectError, SettingError, DiskError, Cancelled (after writing a checkpoint).
     """
@@ -111,6 +113,9 @@ def train(params: TrainParams, report: Reporter) -> dict[str, Any]:
     loop.checkpoint()
     loop.keep()
     result = {"run": params.run, **loop.result()}
+    config = info.config
+    curve = read_events(place.folder)
+    result["verdict"] = train_verdict(result, curve, config.sampling.warmup, config.train.steps)
     if trainer.poses is not None:
         result["pose_shift"] = trainer.poses.shift(info.box(load_project(project_folder)).world_from_box)
     write_json(place.folder / METRICS, {"train": result})

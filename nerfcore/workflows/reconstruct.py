@@ -21,6 +21,7 @@ from ..project.fingerprints import Earlier
 from ..project.store import is_project, load_project
 from ..render.verb import render, rendered
 from ..train.reuse import finished, held_out, train_or_keep, unfinished
+from ..verdict import worst
 
 
 class Stage(NamedTuple):
@@ -122,6 +123,7 @@ def reconstruct(params: p.ReconstructParams, report: Reporter) -> dict[str, Any]
         "stages": pipeline.seconds,
         "reused": pipeline.reused,
         "redone": pipeline.redone,
+        "verdict": worst({verb: made.get("verdict") for verb, made in pipeline.results.items()}),
         **pipeline.results,
     }
     if params.report is not None:

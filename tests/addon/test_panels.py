@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("bpy")
 
 from fieldwork.addon.jobs.job import Job
-from fieldwork.panels.base import duration, progress_text, reuse_text, wrap
+from fieldwork.panels.base import duration, progress_text, reuse_text, verdict_of, wrap
 
 
 @pytest.mark.parametrize(
@@ -34,6 +34,13 @@ def test_a_reconstruction_says_what_it_kept_and_why_not():
     result = {"reused": ["poses", "mesh"], "redone": {"train": "other preset"}}
     assert reuse_text(result) == ["Kept from before: poses, mesh.", "Done anew: training: other preset."]
     assert reuse_text({}) == []
+
+
+def test_a_stage_says_what_is_wrong_with_its_result():
+    assert verdict_of({}) is None
+    assert verdict_of({"verdict": {"level": "good", "reasons": []}}) is None
+    assert verdict_of({"verdict": {"level": "weak", "reasons": ["Coarse.", "Fog."]}}) == ("Coarse.", False)
+    assert verdict_of({"verdict": {"level": "failed", "reasons": ["Scraps."]}}) == ("Scraps.", True)
 
 
 def test_wrapped_text_keeps_its_words_and_breaks_long_paths():

@@ -1,0 +1,139 @@
+"""What a stage's own figures say of its result: good, weak or failed, in sentences that name a way out.
+
+The limits are not tuned: they tell scraps from surfaces, not good from better.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+LEVELS = ("good", "weak", "failed")
+UNRECOGNISABLE, POOR = 12.0, 18.0  # dB; a picture of one colour, the photo's mean, has about 12
+STILL_RISING = 1.0  # dB over the second half of the steps
+UNSEEN = 6.0  # dB that photos held out may be worse than those trained on
+THIN, EMPTY = 0.6, 0.2  # mean opacity of renders of opaque photos
+FLAT = 1.02  # 95th percentile of depth over the 5th
+MISSED, PARTLY = 0.02, 0.1  # share of the photos' pixels that show the mesh
+FEW_LABELS_RIGHT = 0.3  # mIoU
+PLACED, HALF = 0.9, 0.5  # share of the photos with a pose
+
+Verdict = dict[str, Any]  # {"level": one of LEVELS, "reasons": [sentences]}
+
+
+def verdict(findings: Sequence[tuple[str, str]]) -> Verdict:
+    """The worst level of (level, sentence) findings, and their sentences, worst first."""
+    ordered = sorted(findings, key=lambda finding: -LEVELS.index(finding[0]))
+    return {"level": ordered[0][0] if ordered else "good", "reasons": [text for _, text in ordered]}
+
+
+def poses_verdict(registered: int, total: int) -> Verdict:
+    """Of `poses`: how many of the photos have one."""
+    share = registered / max(total, 1)
+    if share >= PLACED:
+        return verdict([])
+    text = f"Only {registered} of {total} photos have a pose: add photos between those that do not overlap."
+    return verdict([("failed" if share < HALF else "weak", text)])
+
+
+def train_verdict(result: Mapping[str, Any], curve: Sequence[Mapping[str, float]], warmup: int, steps: int) -> Verdict:
+    """Of `train`: its length and its curve.
+
+    Args:
+        result: what `train` returns. curve: "step" and "psnr" in the course of training.
+        warmup: steps until the occupancy grid is known. steps: of a training without limits.
+    """
+    done, psnr = result["steps"], result["psnr_train"]
+    each = result["seconds"] / max(done, 1)
+    if done < warmup:
+        text = (
+            f"Only {done} steps were trained; a field takes shape after {warmup}, and the settings plan {steps}. Here that "
+            f"is about {_duration(each * warmup)} and {_duration(each * steps)}: raise --time-limit or --steps, or choose "
+            "smaller images (--set scene.image_size=400)."
+        )
+        return verdict([("failed", text)])
+    found = []
+    if psnr is None or psnr < UNRECOGNISABLE:
+        text = f"Renders of the training photos do not resemble them ({psnr} dB): look at poses and masks."
+        found.append(("failed", text))
+    elif psnr < POOR:
+        found.append(
+            ("weak", f"Renders of the training photos are coarse ({psnr:.1f} dB): train longer, look at poses.")
+        )
+    rise = _rise(curve)
+    if rise > STILL_RISING and done < steps:
+        text = (
+            f"Training ended while it still improved ({rise:.1f} dB over its second half): twice as long takes about "
+            f"{_duration(each * done)} more here (train --resume with a higher --time-limit or --steps)."
+        )
+        found.append(("weak", text))
+    return verdict(found)
+
+
+def evaluate_verdict(result: Mapping[str, Any], psnr_train: float | None, opaque: bool, labelled: bool) -> Verdict:
+    """Of `evaluate`: photos held out against those trained on, opacity, depth, labels.
+
+    Args:
+        result: what `evaluate` returns; "opacity" is the mean of the renders, "depth_spread" the 95th percentile of
+            their depths over the 5th.
+        opaque: whether the photos fill their frames, without masks or transparency.
+    """
+    found, psnr = [], result["psnr"]
+    if psnr < UNRECOGNISABLE:
+        found.append(
+            ("failed", f"Renders do not resemble the photos ({psnr:.1f} dB): train longer, look at the poses.")
+        )
+    elif result["split"] == "test" and psnr_train is not None and psnr < psnr_train - UNSEEN:
+        text = (
+            f"Photos held out are {psnr_train - psnr:.1f} dB worse than those trained on: too few photos from too few "
+            "places, or wrong poses."
+        )
+        found.append(("weak", text))
+    opacity = result.get("opacity")
+    if opaque and opacity is not None and opacity < THIN:
+        text = f"The field is fog: renders are {opacity:.0%} opaque. Train longer, or look at the poses."
+        found.append(("failed" if opacity < EMPTY else "weak", text))
+    spread = result.get("depth_spread")
+    if spread is not None and spread < FLAT:
+        found.append(("weak", "The depths of renders hardly differ: the field may be a picture before each camera."))
+    if labelled and result["miou"] is not None and result["miou"] < FEW_LABELS_RIGHT:
+        text = f"Classes are mostly wrong (mIoU {result['miou']:.2f}): label more photos, and check that labels agree."
+        found.append(("weak", text))
+    return verdict(found)
+
+
+def mesh_verdict(hit: float) -> Verdict:
+    """Of `mesh`: the share of the photos' pixels that show it."""
+    if hit >= PARTLY:
+        return verdict([])
+    text = (
+        f"The mesh fills {hit:.1%} of the photos: the rest of what they show is missing. Train longer, or enlarge the "
+        "region (mesh --region photos)."
+    )
+    return verdict([("failed" if hit < MISSED else "weak", text)])
+
+
+def worst(verdicts: Mapping[str, Verdict | None]) -> Verdict:
+    """The verdict on a chain of stages, by verb; sentences begin with the verb."""
+    found = [
+        (each["level"], f"{verb}: {reason}") for verb, each in verdicts.items() if each for reason in each["reasons"]
+    ]
+    return verdict(found)
+
+
+def _rise(curve: Sequence[Mapping[str, float]]) -> float:
+    """PSNR gained over the second half of the steps: mean of the last tenth against that about the middle."""
+    if len(curve) < 10:
+        return 0.0
+    step, psnr = np.array([row["step"] for row in curve]), np.array([row["psnr"] for row in curve])
+    share = step / step[-1]
+    middle = psnr[(share > 0.45) & (share < 0.55)]
+    return float(psnr[share > 0.9].mean() - middle.mean()) if len(middle) else 0.0
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

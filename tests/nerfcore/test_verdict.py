@@ -1,0 +1,105 @@
+"""Scraps are not shown as success: every stage judges what it made."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fieldwork.nerfcore.cli import main
+from fieldwork.nerfcore.geometry.cameras import Camera
+from fieldwork.nerfcore.mesh.photos import Photo
+from fieldwork.nerfcore.mesh.shown import shown_share
+from fieldwork.nerfcore.mesh.visibility import PosedCamera
+from fieldwork.nerfcore.verdict import (
+    evaluate_verdict,
+    mesh_verdict,
+    poses_verdict,
+    train_verdict,
+    verdict,
+    worst,
+)
+from fieldwork.tests.nerfcore.support.ball import SMALL, ball_project
+
+
+def curve(*psnr: float) -> list[dict[str, float]]:
+    return [{"step": i + 1, "psnr": value} for i, value in enumerate(np.interp(np.arange(100) / 99, [0, 0.5, 1], psnr))]
+
+
+def test_the_worst_finding_comes_first() -> None:
+    assert verdict([]) == {"level": "good", "reasons": []}
+    assert verdict([("weak", "a"), ("failed", "b")]) == {"level": "failed", "reasons": ["b", "a"]}
+    chain = {"poses": verdict([]), "train": verdict([("weak", "a")]), "new": None, "mesh": verdict([("failed", "b")])}
+    assert worst(chain) == {"level": "failed", "reasons": ["mesh: b", "train: a"]}
+
+
+def test_a_training_that_hardly_began() -> None:
+    result = {"steps": 72, "seconds": 90.0, "psnr_train": 15.0}
+    found = train_verdict(result, curve(8, 12, 15), warmup=256, steps=20000)
+    assert found["level"] == "failed"
+    assert all(words in found["reasons"][0] for words in ("72 steps", "256", "5 min", "6.9 h", "--time-limit"))
+
+
+def test_a_training_that_was_cut_off() -> None:
+    result = {"steps": 3000, "seconds": 240.0, "psnr_train": 25.0}
+    found = train_verdict(result, curve(10, 22, 26), 256, 20000)
+    assert found["level"] == "weak"
+    assert "4 min more" in found["reasons"][0]
+    assert train_verdict(result, curve(10, 25, 25.5), 256, 20000)["level"] == "good"
+    assert train_verdict({**result, "steps": 20000}, curve(10, 22, 26), 256, 20000)["level"] == "good"
+    assert train_verdict({**result, "psnr_train": 5.8}, [], 256, 20000)["level"] == "failed"
+    assert train_verdict({**result, "psnr_train": 16.0}, [], 256, 20000)["level"] == "weak"
+
+
+def test_held_out_photos() -> None:
+    good = {"split": "test", "psnr": 27.0, "opacity": 0.98, "depth_spread": 2.0, "miou": 0.8}
+    assert evaluate_verdict(good, 29.0, opaque=True, labelled=True)["level"] == "good"
+    for change, words, level in (
+        ({"psnr": 9.0}, "do not resemble", "failed"),
+        ({"psnr": 20.0}, "9.0 dB worse", "weak"),
+        ({"opacity": 0.4}, "fog", "weak"),
+        ({"opacity": 0.1}, "fog", "failed"),
+        ({"depth_spread": 1.001}, "hardly differ", "weak"),
+        ({"miou": 0.1}, "mIoU 0.10", "weak"),
+    ):
+        found = evaluate_verdict({**good, **change}, 29.0, opaque=True, labelled=True)
+        assert found["level"] == level
+        assert words in found["reasons"][0]
+    assert (
+        evaluate_verdict({**good, "opacity": 0.1, "miou": None}, 29.0, opaque=False, labelled=False)["level"] == "good"
+    )
+    assert evaluate_verdict({**good, "split": "train", "psnr": 20.0}, 29.0, True, True)["level"] == "good"
+
+
+def test_meshes_and_poses() -> None:
+    assert [mesh_verdict(share)["level"] for share in (0.001, 0.05, 0.5)] == ["failed", "weak", "good"]
+    assert [poses_verdict(n, 60)["level"] for n in (20, 49, 60)] == ["failed", "weak", "good"]
+    assert "49 of 60" in poses_verdict(49, 60)["reasons"][0]
+
+
+@pytest.mark.parametrize(("side", "share"), [(1.0, 0.25), (2.0, 1.0), (0.0, 0.0)])
+def test_the_share_of_a_photo_that_shows_a_mesh(side: float, share: float) -> None:
+    """A square before a camera whose view is 2 × 2 at its distance."""
+    camera = Camera(width=100, height=100, fx=50, fy=50, cx=50, cy=50)
+    photo = Photo(PosedCamera(camera, np.eye(4)), lambda: np.zeros((100, 100, 4), np.uint8))
+    h = side / 2
+    vertices = np.array([[-h, -h, 1], [h, -h, 1], [h, h, 1], [-h, h, 1]])
+    faces = np.array([[0, 2, 1], [0, 3, 2]]) if side else np.zeros((0, 3), int)
+    assert shown_share([photo], vertices, faces) == pytest.approx(share, abs=0.03)
+    assert shown_share([photo], vertices, faces[:, ::-1]) == 0  # seen from behind
+
+
+def test_scraps_are_told_at_the_command_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    project = ball_project(tmp_path / "p")
+    settings = [part for name, value in SMALL.items() for part in ("--set", f"{name}={value}")]
+    assert main(["train", str(project), "--steps", "2", *settings, "--json", "--strict"]) == 3
+    out, err = capfd.readouterr()
+    answer = json.loads(out)
+    assert answer["verdict"]["level"] == "failed"
+    assert "Only 2 steps" in answer["verdict"]["reasons"][0]
+    assert "Only 2 steps" in err
+    assert main(["evaluate", str(project), "--json"]) == 0
+    answer = json.loads(capfd.readouterr().out)
+    assert answer["verdict"]["level"] in ("weak", "failed")
+    assert 0 <= answer["opacity"] <= 1

@@ -391,6 +391,7 @@ class ReconstructParams(Params):
     preset: Preset = "standard"
     labels: Path | None = None
     masks: Path | None = None
+    mask_mode: Literal["ignore", "empty"] = Field(default="ignore", description="what black mask pixels mean")
     classes: Path | None = None
     blend: Path | None = None
     time_limit: float | None = Field(default=None, gt=0, le=LONGEST_RUN, description="seconds of training")

@@ -15,7 +15,7 @@ from .train import parse_settings
 
 
 @scene_settings(
-    photos="photos", labels="labels", masks="masks", classes="class_file", preset="preset",
+    photos="photos", labels="labels", masks="masks", classes="class_file", mask_mode="mask_mode", preset="preset",
     time_limit="time_limit", settings="settings",
 )  # fmt: skip
 class FIELDWORK_OT_reconstruct(VerbOperator):
@@ -55,6 +55,7 @@ class FIELDWORK_OT_reconstruct(VerbOperator):
             "photos": photos,
             "out": out,
             **{name: self.path(context, name) for name in ("labels", "masks", "classes")},
+            "mask_mode": self.value(context, "mask_mode"),
             "preset": self.value(context, "preset"),
             "time_limit": self.value(context, "time_limit") or None,
             "holdout": hold_out(self, context),

@@ -268,7 +268,7 @@ def _put_in(
                 if record.status == "ok" and before.status == "unregistered":
                     record.status, record.reason = before.status, before.reason
     project.images = records
-    if params.masks or not there:
+    if params.masks or not params.add or not there:
         project.mask_mode = params.mask_mode
     known = {c.id: c for c in project.classes}
     if names or not known:

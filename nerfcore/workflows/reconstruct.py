@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 from .. import params as p
 from ..blender.blend import blend, blended
 from ..capture.ingest import ingested, new
+from ..data.readers import colmap, transforms
 from ..errors import ProjectError
 from ..evaluate.report import check_report, write_report
 from ..evaluate.verb import evaluate, evaluated
@@ -91,10 +92,16 @@ def reconstruct(params: p.ReconstructParams, report: Reporter) -> dict[str, Any]
     pipeline = Pipeline(project, report)
     if is_project(project) and load_project(project).last("import") is not None:
         raise ProjectError(f"{project} is an imported data set.", "Use train, mesh and blend on it.")
+    _offer_poses(params.photos, report)
     pipeline.do(
         "new",
         p.NewParams(
-            project=project, photos=params.photos, labels=params.labels, masks=params.masks, classes=params.classes
+            project=project,
+            photos=params.photos,
+            labels=params.labels,
+            masks=params.masks,
+            classes=params.classes,
+            mask_mode=params.mask_mode,
         ),
     )
     pipeline.do("poses", p.PosesParams(project=project))
@@ -130,3 +137,15 @@ def reconstruct(params: p.ReconstructParams, report: Reporter) -> dict[str, Any]
         write_report(params.report, project, run, renders, result)
         result["report"] = str(params.report)
     return result
+
+
+def _offer_poses(photos: Path, report: Reporter) -> None:
+    """Say that poses which lie beside the photos are not used: `import` is what reads them."""
+    for folder in (photos, photos.parent):
+        kind = "transforms.json" if transforms.matches(folder) else "a COLMAP model" if colmap.matches(folder) else None
+        if folder.is_dir() and kind:
+            report.warn(
+                f"{folder} has {kind} with camera poses, which are estimated anew here. To keep those, use `fieldwork "
+                f"import {folder} PROJECT`, then train and mesh."
+            )
+            return

@@ -1,0 +1,64 @@
+"""What `reconstruct` hands on, and what it says about poses that are there already."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from fieldwork.nerfcore.capture.ingest import new
+from fieldwork.nerfcore.params import NewParams, ReconstructParams
+from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.project.store import load_project
+from fieldwork.nerfcore.workflows import reconstruct as module
+from fieldwork.tests.nerfcore.support.photos import folder_of
+from PIL import Image
+
+
+class Reached(Exception):
+    """The first stage began."""
+
+
+def first_stage(monkeypatch: pytest.MonkeyPatch, params: ReconstructParams) -> tuple[NewParams, list[str]]:
+    """The parameters of the first stage of a reconstruction, and what was said before it."""
+    seen: list[NewParams] = []
+
+    def do(self: module.Pipeline, verb: str, values: NewParams) -> None:
+        seen.append(values)
+        raise Reached
+
+    monkeypatch.setattr(module.Pipeline, "do", do)
+    report = Reporter()
+    with pytest.raises(Reached):
+        module.reconstruct(params, report)
+    return seen[0], report.warnings
+
+
+@pytest.mark.parametrize(("file", "kind"), [("transforms.json", "transforms.json"), ("sparse/0/cameras.txt", "COLMAP")])
+@pytest.mark.parametrize("inside", [True, False])
+def test_poses_that_are_there_are_offered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, file: str, kind: str, inside: bool
+) -> None:
+    root = tmp_path / "capture"
+    photos = folder_of(root / "images", 3)
+    for name in {file, file.replace("cameras", "images")}:
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text("{}")
+    _, (warning,) = first_stage(monkeypatch, ReconstructParams(photos=photos if inside else root, out=tmp_path / "p"))
+    assert kind in warning
+    assert f"fieldwork import {root}" in warning
+
+
+def test_nothing_is_said_of_photos_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    photos = folder_of(tmp_path / "capture" / "photos", 3)
+    values, warnings = first_stage(monkeypatch, ReconstructParams(photos=photos, out=tmp_path / "p", mask_mode="empty"))
+    assert warnings == []
+    assert values.mask_mode == "empty"
+
+
+def test_the_meaning_of_masks_can_be_changed(tmp_path: Path) -> None:
+    photos = folder_of(tmp_path / "photos", 3)
+    (photos / "masks").mkdir()
+    Image.new("L", (320, 200), 255).save(photos / "masks" / "p0.png")
+    for mode in ("ignore", "empty", "ignore"):
+        new(NewParams(photos=photos, project=tmp_path / "p", mask_mode=mode), Reporter())
+        assert load_project(tmp_path / "p").mask_mode == mode

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from scipy import ndimage
 
-from ..data.pixels import PixelStore
+from ..data.pixels import VOID, PixelStore
 from ..geometry.cameras import pixel_centers, project, rays
 from ..kernels.depth_arrays import FREE, MapArrays
 from ..kernels.patches import refine
@@ -25,6 +25,7 @@ VIEWS = 5  # neighbours whose photos are compared
 LEAST, GAIN = 0.6, 0.05  # correlation that is believed, and by how much it must exceed that of the field's depth
 SURE = 2.0  # pixels: the spread of a depth that photos confirm
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
+NAMED = 0.5  # share of the pixels that label maps name, from which on what they leave out is mostly nothing
 SMOOTH = 5  # pixels over which normals are averaged
 
 
@@ -40,19 +41,39 @@ def grey_pictures(views: list[FlatView], store: PixelStore, report: Reporter) ->
         shrunk = flat.fx / photo.fx  # what is made smaller is smoothed before
         if shrunk < 0.7:
             grey = ndimage.gaussian_filter(grey, 0.5 / shrunk)
-        turn = store.rays.rotation[view.photo].cpu().numpy().T @ view.pose[:3, :3]
-        directions, _ = rays(flat, pixel_centers(flat.width, flat.height).reshape(-1, 2))
-        place = np.nan_to_num(project(photo, directions @ turn.T), nan=-1.0) - 0.5
+        place = np.nan_to_num(photo_pixels(view, store), nan=-1.0) - 0.5
         shown = ndimage.map_coordinates(grey, place[:, ::-1].T, order=1, mode="nearest")
         made.append(shown.reshape(flat.height, flat.width).astype(np.float32))
     return made
+
+
+def photo_pixels(view: FlatView, store: PixelStore) -> np.ndarray:
+    """Pixel coordinates (H·W, 2) in its photo of what a flat view shows; NaN where the lens does not see."""
+    turn = store.rays.rotation[view.photo].cpu().numpy().T @ view.pose[:3, :3]
+    directions, _ = rays(view.camera, pixel_centers(view.camera.width, view.camera.height).reshape(-1, 2))
+    return project(store.cameras[view.photo], directions @ turn.T)
+
+
+def nameless(view: FlatView, store: PixelStore) -> np.ndarray:
+    """Which pixels (H, W) of a flat view the label map of its photo leaves out; none where there is no label map."""
+    camera, shape = store.cameras[view.photo], (view.camera.height, view.camera.width)
+    begin, end = int(store.first[view.photo]), int(store.first[view.photo + 1])
+    left_out = (store.label[begin:end].cpu().numpy() == VOID).reshape(camera.height, camera.width)
+    if left_out.all():
+        return np.zeros(shape, bool)
+    x, y = np.nan_to_num(photo_pixels(view, store)).clip(0, [camera.width - 1, camera.height - 1]).astype(int).T
+    return left_out[y, x].reshape(shape)
 
 
 def refined_maps(
     views: list[FlatView], maps: list[DepthMap], store: PixelStore, device: torch.device, report: Reporter
 ) -> MapArrays:
     """Confirmed maps (see `depth_maps.confirmed_maps`) whose depths photos have moved. Where views do not confirm a moved
-    depth, the field's is asked again, or the plane through what is known around (planes.py)."""
+    depth, the field's is asked again, or the plane through what is known around (planes.py).
+
+    Sky has no depth, but a field puts it somewhere. Where label maps name most of what photos show, depths that neither
+    photos confirm nor a label map names are unknown.
+    """
     arrays = map_arrays(views, maps, device)
     grey = torch.from_numpy(np.concatenate([g.reshape(-1) for g in grey_pictures(views, store, report)]))
     grey = grey.to(arrays.depth.device)
@@ -65,11 +86,14 @@ def refined_maps(
         depth, _ = refine(grey, facing, arrays, number, near, LEAST, GAIN)
         moved.append(_with_depth(view, map_, depth.cpu().numpy().reshape(map_.depth.shape)))
     believed = confirmed_maps(views, moved, device, report, around)
+    named = store.labelled_share() >= NAMED
     kept, begin, mixed = ((believed.depth > 0) & (believed.depth < FREE)).cpu().numpy(), 0, []
     for view, old, new in zip(views, maps, moved):
         sure = kept[begin : begin + old.depth.size].reshape(old.depth.shape) & (new.depth != old.depth)
         begin += old.depth.size
         depth = np.where(sure, new.depth, old.depth)
+        if named:
+            depth = np.where(nameless(view, store) & ~sure & old.hit, 0, depth)
         spread = np.where(sure, np.minimum(old.spread, SURE * depth / view.camera.fx), old.spread)
         mixed.append(with_planes(view, replace(old, depth=depth, spread=spread.astype(np.float32)), sure))
     return confirmed_maps(views, mixed, device, report, around)

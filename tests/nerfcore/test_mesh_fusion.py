@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from fieldwork.nerfcore.data.pixels import VOID
 from fieldwork.nerfcore.data.scene import View
 from fieldwork.nerfcore.errors import Cancelled, TrainingError
 from fieldwork.nerfcore.geometry.cameras import Camera, pixel_centers, rays
@@ -265,6 +266,8 @@ def test_photos_move_soft_depths_onto_the_surface() -> None:
         first=torch.arange(len(flats) + 1) * len(rgba[0]),
         cameras=[flat.camera for flat in flats],
         rays=SimpleNamespace(rotation=torch.from_numpy(pose[:, :3, :3])),
+        label=torch.zeros(sum(map(len, rgba)), dtype=torch.uint8),
+        labelled_share=lambda: 0.8,
     )
     soft = []
     for number, (flat, map_) in enumerate(zip(flats, true)):
@@ -285,6 +288,16 @@ def test_photos_move_soft_depths_onto_the_surface() -> None:
     assert float(((after.depth > 0) & (after.depth < FREE)).float().mean()) > 0.9 * float(
         ((before.depth > 0) & (before.depth < FREE)).float().mean()
     )
+    # What label maps leave out is only there where photos say so.
+    upper = torch.arange(CAMERA.height * CAMERA.width) < CAMERA.height * CAMERA.width // 2
+    store.label = torch.where(upper, VOID, 0).to(torch.uint8).repeat(len(flats))
+    named = refined_maps(flats, soft, store, CPU, Reporter())  # type: ignore[arg-type]
+    field = torch.from_numpy(np.concatenate([m.depth.reshape(-1) for m in soft]))
+    left_out = upper.repeat(len(flats)) & (named.depth > 0) & (named.depth < FREE)
+    assert int(left_out.sum()) > 1000
+    assert bool((named.depth != field)[left_out].all())
+    store.labelled_share = lambda: 0.3  # label maps that name little say nothing of the rest
+    torch.testing.assert_close(refined_maps(flats, soft, store, CPU, Reporter()).depth, after.depth)  # type: ignore[arg-type]
 
 
 def wall_maps(camera: Camera) -> tuple[depth_maps.FlatView, depth_maps.DepthMap]:

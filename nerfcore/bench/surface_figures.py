@@ -9,6 +9,7 @@ import numpy as np
 from scipy.ndimage import minimum_filter
 from scipy.spatial import KDTree
 from skimage.color import deltaE_ciede2000, rgb2lab
+from trimesh.triangles import points_to_barycentric
 
 from ..data.scene import Scene, View
 from ..images.picture import resized
@@ -19,11 +20,12 @@ from ..mesh.metrics import Distances, distances, sample_surface
 from ..mesh.painted import Painted
 from ..mesh.surface import Surface
 from ..mesh.surface_picture import surface_picture
-from ..mesh.visibility import DepthBuffer, PosedCamera, depth_buffer
+from ..mesh.visibility import DepthBuffer, PosedCamera, depth_buffer, within
 
 CLOSE = 0.01  # share of the size
 ENOUGH = 3  # cameras that see what a mesh is asked to hold
 FAR = 2.5  # of the median depth of the photos: what is farther is a background
+HIDDEN = 0.5  # footprints of a pixel that something lies in front of what it hides
 STEEPEST = 0.1  # cosine under which a camera is not said to see a place
 PIECES = 60  # pieces along the longest side: depth buffers leave out triangles that reach behind a camera
 SAMPLES = 100_000
@@ -48,7 +50,7 @@ class Sight:
 
     def __init__(self, truth: Truth, views: Sequence[View]) -> None:
         self.cameras = posed(views)
-        pieces = small_pieces(truth.vertices, truth.faces)
+        self.pieces = pieces = small_pieces(truth.vertices, truth.faces)
         self.buffers = [depth_buffer(camera, pieces.vertices, pieces.faces) for camera in self.cameras]
         depths = [buffer.depth[buffer.face >= 0] for buffer in self.buffers]
         self.far = FAR * float(np.median(np.concatenate(depths)))
@@ -59,15 +61,27 @@ class Sight:
         self.size = float(np.ptp(seen, axis=0).max())
 
     def visible(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """Whether enough cameras see points (N, 3) with normals (N, 3): (N,)."""
-        seen = np.zeros(len(points), int)
+        """Whether enough cameras see points (N, 3) of the truth with normals (N, 3): (N,).
+
+        What hides a point is the plane of the face that its pixel shows, cut with the ray to the point: a floor just under
+        a carpet is hidden, however flat the camera looks on it.
+        """
+        seen, pieces = np.zeros(len(points), int), self.pieces
         for camera, buffer in zip(self.cameras, self.buffers):
-            towards = camera.center - points
-            cosine = (towards * normals).sum(1) / np.maximum(np.linalg.norm(towards, axis=1), 1e-12)
+            ray = points - camera.center
+            distance = np.maximum(np.linalg.norm(ray, axis=1), 1e-12)
             local = camera.local(points)
-            depth = camera.depth(local)
-            clear = buffer.sees(camera.pixels(local), depth, np.maximum(cosine, STEEPEST))
-            seen += clear & (cosine > STEEPEST) & (depth < self.far)
+            pixel, depth = camera.pixels(local), camera.depth(local)
+            good = within(pixel, camera.camera.width, camera.camera.height) & (depth > 0) & (depth < self.far)
+            good &= -(ray * normals).sum(1) > STEEPEST * distance
+            rows = np.flatnonzero(good)
+            x, y = pixel[rows].astype(int).T
+            face = buffer.face[y, x]
+            normal, corner = pieces.normals[face], pieces.vertices[pieces.faces[face, 0]]
+            with np.errstate(divide="ignore", invalid="ignore"):
+                reached = ((corner - camera.center) * normal).sum(1) / (ray[rows] * normal).sum(1)
+            slack = HIDDEN * camera.footprint(depth[rows]) / distance[rows]
+            seen[rows] += ~((face >= 0) & (reached > 0) & (reached < 1 - slack))
         return seen >= ENOUGH
 
 
@@ -104,7 +118,7 @@ def surface_figures(
         "normal_deg": fine.normal_deg,
         "both_sides": None if thin is None else both_sides(mesh, truth, sight, thin),
         "hit_share": hit_share(mesh, truth, held_out, sight.far),
-        **class_figures(found, surface, truth, CLOSE * sight.size),
+        **class_figures(found, surface, painted, truth, CLOSE * sight.size),
         **picture_figures(mesh, painted, held_out),
         "seams": seam_ratio(surface.faces, painted),
     }
@@ -142,11 +156,13 @@ def hit_share(mesh: tuple[np.ndarray, np.ndarray], truth: Truth, views: Sequence
     return hit / max(solid, 1)
 
 
-def class_figures(found: Distances, surface: Surface, truth: Truth, close: float) -> dict[str, float]:
-    """mIoU by area of the mesh where it is `close` to the truth, and by how much the area of the worst class is off, of
-    classes that have at least a hundredth of what is seen."""
+def class_figures(
+    found: Distances, surface: Surface, painted: Painted, truth: Truth, close: float
+) -> dict[str, float | None]:
+    """mIoU by area of the texture's classes (of the faces', without a texture) where the mesh is `close` to the truth, and
+    by how much the area of the worst class is off, of classes that have at least a hundredth of what is seen."""
     near = found.to_truth < close
-    ours, theirs = surface.face_class[found.face[near]], truth.face_class[found.truth_face[near]]
+    ours, theirs = classes_at(surface, painted, found.face)[near], truth.face_class[found.truth_face[near]]
     area = areas(surface.vertices.astype(np.float64), surface.faces)
     seen = truth.face_class[found.true_face]
     ious, off = [], []
@@ -157,7 +173,23 @@ def class_figures(found: Distances, surface: Surface, truth: Truth, close: float
         share = float((seen == number).mean())
         if share >= 0.01:
             off.append(abs(area[surface.face_class == number].sum() / (share * found.true_area) - 1))
-    return {"surface_miou": float(np.mean(ious)), "class_area_error": float(max(off))}
+    return {
+        "surface_miou": float(np.mean(ious)) if ious else None,
+        "class_area_error": float(max(off)) if off else None,
+    }
+
+
+def classes_at(surface: Surface, painted: Painted, face: np.ndarray) -> np.ndarray:
+    """Class (N,) at the points that `metrics.distances` took from the mesh, which lie in the faces (N,)."""
+    if painted.maps is None or painted.uv is None:
+        return surface.face_class[face]
+    vertices = surface.vertices.astype(np.float64)
+    points, _ = sample_surface(vertices, surface.faces, len(face))
+    weights = points_to_barycentric(vertices[surface.faces[face]], points)
+    uv = np.einsum("nk,nkc->nc", weights, painted.uv.corners[face])
+    size = len(painted.maps.ids)
+    x, y = np.clip((uv * [1, -1] + [0, 1]) * size, 0, size - 1).astype(int).T
+    return painted.maps.ids[y, x]
 
 
 def picture_figures(

@@ -75,16 +75,20 @@ def _one_pass(
         report.check()
         made.append(_simplified(points, triangles, ratio, keep_border or len(chunks) > 1))
     of_chunk = [int(patch[chunk[0]]) for chunk in chunks]
+    folded = _folded(faces)
+    before = np.array([np.count_nonzero(folded[chunk]) for chunk in chunks])
     kept: set[int] = set()
     while True:
         joined, corners, chunk = _join(made)
-        folded = set(chunk[_folded(corners)].tolist()) - kept
-        if not folded:
+        # Collapses on two sides of a border, or in a thin thing, may have made an edge of more than two triangles. Where
+        # the surface had such edges itself, the chunk may keep as many.
+        worse = np.bincount(chunk[_folded(corners)], minlength=len(chunks)) > before
+        undone = set(np.flatnonzero(worse).tolist()) - kept
+        if not undone:
             return joined, corners, np.array(of_chunk)[chunk]
-        # Collapses on two sides of a border, or in a thin thing, may have made an edge of more than two triangles.
-        for index in folded:
+        for index in undone:
             made[index] = whole[index]
-        kept |= folded
+        kept |= undone
 
 
 def _simplified(points: np.ndarray, triangles: np.ndarray, ratio: float, keep_border: bool) -> tuple:

@@ -191,6 +191,16 @@ def test_fewer_triangles_keep_shape_and_border() -> None:
     assert kept == border
 
 
+def test_edges_of_three_triangles_do_not_keep_a_mesh_from_getting_smaller() -> None:
+    vertices, faces, *_ = surface_of(sphere(0.5), orbit(24, 1.8), 96)
+    some = faces[::40]
+    flaps = np.stack([some[:, 0], some[:, 1], len(vertices) + np.arange(len(some))], 1)
+    vertices = np.concatenate([vertices, vertices[some].mean(1) * 1.1])
+    faces = np.concatenate([faces, flaps])
+    _, fewer = decimate(vertices, faces, len(faces) // 6, Reporter())
+    assert len(fewer) < len(faces) / 4
+
+
 def test_scores_of_known_shapes() -> None:
     import trimesh
 

@@ -6,7 +6,9 @@ import hashlib
 import json
 import os
 import re
+import sys
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,6 +16,8 @@ from typing import Any
 
 from .errors import InputError, disk_refusal
 
+WINDOWS = sys.platform == "win32"
+READERS_TAKE = 5.0  # seconds at most that a file which is to be replaced may stay open in another program
 LONGEST_NAME = 64  # characters of a name that the user gives, of a run for instance
 # Windows keeps these for devices, whatever comes behind a dot.
 _DEVICES = {"con", "prn", "aux", "nul", *(f"{kind}{i}" for kind in ("com", "lpt") for i in "0123456789¹²³")}
@@ -90,12 +94,30 @@ def atomic_path(path: Path) -> Iterator[Path]:
         temporary = Path(name)
         try:
             yield temporary
-            with open(temporary, "rb") as written:
+            with open(temporary, "rb+") as written:  # Windows syncs only what is open for writing
                 os.fsync(written.fileno())
             temporary.chmod(0o644)
-            os.replace(temporary, path)
+            replace(temporary, path)
         finally:
             temporary.unlink(missing_ok=True)
+
+
+def replace(source: Path, target: Path) -> None:
+    """Move a file into the place of another.
+
+    Windows refuses while another program has one of them open, a reader or a virus scanner: it is waited for.
+
+    Raises:
+        PermissionError: it is still open after `READERS_TAKE`, or the folder is not writable.
+    """
+    deadline = time.monotonic() + READERS_TAKE
+    while True:
+        try:
+            return os.replace(source, target)
+        except PermissionError:
+            if not WINDOWS or time.monotonic() > deadline:
+                raise
+            time.sleep(0.02)
 
 
 def write_text(path: Path, text: str) -> None:

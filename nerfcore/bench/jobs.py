@@ -5,8 +5,6 @@ from __future__ import annotations
 import gc
 import json
 import re
-import resource
-import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
@@ -27,7 +25,7 @@ from ..progress import Reporter
 from ..project.store import load_project
 from ..render.run import CHECKPOINT, load_info, load_trained, run_folder, settled_as
 from ..train.verb import train
-from .machine import taken
+from .machine import peak_memory, taken
 
 COUNTING_SIDE = 200  # of a frame that only counts samples per ray
 # Guesses, only for the estimate of the time left.
@@ -201,8 +199,7 @@ def _peak(device: torch.device) -> float | None:
     """Peak memory in MiB: on a GPU since the last reset, on a CPU of the process so far."""
     if device.type == "cuda":
         return round(torch.cuda.max_memory_allocated(device) / 2**20, 1)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return round(peak / (2**20 if sys.platform == "darwin" else 2**10), 1)
+    return round(peak_memory(), 1)
 
 
 def _events(path: Path) -> list[dict[str, Any]]:

@@ -47,6 +47,16 @@ def taken() -> Taken:
     return Taken(machine=machine, date=datetime.now(UTC).date().isoformat(), commit=commit, modified=modified)
 
 
+def peak_memory() -> float:
+    """Most memory of the main store that this process has held so far, in MiB."""
+    if sys.platform == "win32":
+        return psutil.Process().memory_info().peak_wset / 2**20
+    import resource  # not on Windows
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (2**20 if sys.platform == "darwin" else 2**10)
+
+
 def checked_out(root: Path = ROOT) -> tuple[str | None, bool]:
     """Commit of the checkout at `root`, and whether its code differs from it; (None, False) where there is none."""
 

@@ -5,8 +5,6 @@ The mesh is compared with the true surface of the simulated scene (`surface_figu
 
 from __future__ import annotations
 
-import resource
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -25,6 +23,7 @@ from ..progress import Reporter
 from ..project.store import load_project
 from ..render.run import load_trained, refined_poses
 from .jobs import Job
+from .machine import peak_memory
 from .surface_figures import Truth, surface_figures
 
 FACES, TEXTURE = 200_000, 4096
@@ -100,11 +99,10 @@ def measure(job: Job, project: Path, report: Reporter, root: Path) -> dict[str, 
     made = Surface(built.vertices, built.faces, built.normals, built.colors, classes.class_id, classes.face_class)
     surface = to_world(made, box.world_from_box)
     figures = surface_figures(surface, painted, truth, scene, THIN.get(job.scene))
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     figures |= {
         "border_faces": on_border(built.vertices, built.faces, region.low, region.high, region.voxel / 2),
         "faces": len(built.faces),
         "mesh_seconds": sum(clock.seconds.values()),
-        "memory_mb": peak / (2**20 if sys.platform == "darwin" else 2**10),
+        "memory_mb": peak_memory(),
     }
     return {**figures, "stages": {name: round(seconds, 1) for name, seconds in clock.seconds.items()}}

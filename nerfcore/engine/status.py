@@ -144,7 +144,7 @@ def engine_alive(status: JobStatus) -> bool:
 
 def process_start(pid: int) -> float | None:
     """When a process started, in seconds since the epoch; None where that cannot be read."""
-    if not sys.platform.startswith("linux"):
+    if sys.platform != "linux":
         return None
     try:
         # The name of the program stands in parentheses and may hold blanks.

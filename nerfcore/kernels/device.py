@@ -13,6 +13,7 @@ FIELDWORK_BACKEND (warp, torch) overrides which kernels run on it.
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -124,7 +125,7 @@ def default_threads() -> int:
 
     FIELDWORK_THREADS overrides it.
     """
-    available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
+    available = len(os.sched_getaffinity(0)) if sys.platform == "linux" else (os.cpu_count() or 1)
     return int(os.environ.get("FIELDWORK_THREADS", 0)) or max(1, available - 1)
 
 

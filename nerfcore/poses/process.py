@@ -171,7 +171,7 @@ def _death(returncode: int, work: Path, tail: collections.deque[str]) -> Fieldwo
             f"No space left on the disk while estimating poses in {work} ({free // 1_000_000} MB free).",
             "Free some space and run it again: finished work is kept.",
         )
-    if returncode == -signal.SIGKILL:
+    if sys.platform != "win32" and returncode == -signal.SIGKILL:
         return PosesError(
             "The pose process was killed, probably because memory ran out.",
             "Close other programs or use --preset fast, then run it again: finished work is kept.",

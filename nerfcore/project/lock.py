@@ -85,8 +85,9 @@ def project_lock(project: Path | None, owner: str) -> Iterator[None]:
             shutil.rmtree(folder, ignore_errors=True)
         lock.release()
         if nothing_came:
-            for place in (folder, *made):
-                with suppress(OSError):  # somebody else has put something there
+            with suppress(OSError):  # somebody else has taken the lock, or put something there
+                shutil.rmtree(folder, ignore_errors=True)
+                for place in made:
                     place.rmdir()
 
 

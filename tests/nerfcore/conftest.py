@@ -9,8 +9,9 @@ import pytest
 from fieldwork.tests.nerfcore.support.backends import device
 from fieldwork.tests.nerfcore.support.captures import ingest, poses
 from fieldwork.tests.nerfcore.support.reconstructed import place, reconstructed
+from fieldwork.tests.nerfcore.support.windows_files import each_file_system
 
-__all__ = ["device", "fountain", "place", "reconstructed"]
+__all__ = ["device", "each_file_system", "fountain", "place", "reconstructed"]
 
 Data = Callable[[str], Path]
 

@@ -11,6 +11,8 @@ import pytest
 from fieldwork.nerfcore.errors import DiskError
 from fieldwork.nerfcore.files import atomic_path, write_json, write_section, write_text
 
+pytestmark = pytest.mark.usefixtures("each_file_system")
+
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:

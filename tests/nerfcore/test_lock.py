@@ -18,6 +18,8 @@ from fieldwork.nerfcore.project.schema import Project
 from fieldwork.nerfcore.project.store import save_project
 from PIL import Image
 
+pytestmark = pytest.mark.usefixtures("each_file_system")
+
 ROOT = Path(__file__).resolve().parents[2]
 HOLD = (
     "import sys; from pathlib import Path; from nerfcore.project.lock import project_lock\n"

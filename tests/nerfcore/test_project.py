@@ -21,6 +21,8 @@ from fieldwork.nerfcore.project.store import (
     save_project,
 )
 
+pytestmark = pytest.mark.usefixtures("each_file_system")
+
 
 def sample(folder: Path, count: int = 3) -> Project:
     """A project of `count` cameras on the x axis, with two points, in a frame scaled by two."""

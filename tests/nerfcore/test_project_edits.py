@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from fieldwork.nerfcore.cli import main
 from fieldwork.nerfcore.errors import FieldworkError, ProjectError, SettingError
-from fieldwork.nerfcore.params import AlignParams, ClassesParams, RegionParams
+from fieldwork.nerfcore.params import AlignParams, ClassesParams, Params, RegionParams
 from fieldwork.nerfcore.poses.align import align
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project import store
@@ -21,6 +21,9 @@ from fieldwork.nerfcore.project.schema import IDENTITY, ImageRecord, Project, Se
 from fieldwork.nerfcore.project.store import edit_project, load_project, record_step, save_project
 from fieldwork.tests.nerfcore.test_engine import project as engine_project  # noqa: F401
 from fieldwork.tests.nerfcore.test_engine import start  # noqa: F401
+from pydantic import ValidationError
+
+pytestmark = pytest.mark.usefixtures("each_file_system")
 
 BOX = [[-1.0, -2.0, 0.0], [1.0, 2.0, 3.0]]
 
@@ -106,8 +109,6 @@ def test_classes(folder: Path) -> None:
         ([{"id": -1, "name": "a"}], "id -1"),
         ([{"id": 2, "name": ""}], "no name"),
         ([{"id": 2, "name": "a", "color": [2, 0, 0]}], "colour of “a”"),
-        ([{"id": 2, "name": "a", "color": [float("nan"), 0, 0]}], "colour of “a”"),
-        ([{"id": 2, "name": "a", "priority": float("inf")}], "priority of “a”"),
         ([{"id": i, "name": str(i)} for i in range(1, 257)], "256 classes are too many"),
     ],
 )
@@ -116,6 +117,20 @@ def test_classes_that_contradict_are_refused(folder: Path, entries: list[dict], 
     with pytest.raises(SettingError, match=sentence):
         classes(ClassesParams.model_validate({"project": folder, "classes": entries}), Reporter())
     assert (folder / "project.json").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("verb", "values"),
+    [
+        (ClassesParams, {"classes": [{"id": 2, "name": "a", "color": [float("nan"), 0, 0]}]}),
+        (ClassesParams, {"classes": [{"id": 2, "name": "a", "priority": float("inf")}]}),
+        (RegionParams, {"bounds": [[0, 0, 0], [1, 1, float("inf")]]}),
+        (RegionParams, {"bounds": [[0, 0, float("nan")], [1, 1, 1]]}),
+    ],
+)
+def test_numbers_that_are_none_are_refused(folder: Path, verb: type[Params], values: dict) -> None:
+    with pytest.raises(ValidationError, match="finite number"):
+        verb.model_validate({"project": folder, **values})
 
 
 def test_classes_of_a_file(folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
@@ -149,8 +164,6 @@ def test_region(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
     [
         [[0, 0, 0], [1, 1, 0]],
         [[0, 0, 0], [1, -1, 1]],
-        [[0, 0, 0], [1, 1, float("inf")]],
-        [[0, 0, float("nan")], [1, 1, 1]],
         [[0, 0], [1, 1]],
         [[0, 0, 0]],
         [],

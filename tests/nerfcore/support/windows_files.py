@@ -1,0 +1,77 @@
+"""A file system with the manners of Windows, for tests on Linux.
+
+Windows syncs only files that are open for writing, and neither replaces, renames nor deletes what a program has open
+(Python opens without the right to delete). Only what this process has open counts here.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fieldwork.nerfcore import files
+
+OPEN_FILES = Path("/proc/self/fd")
+
+
+@pytest.fixture(params=["posix", "windows"])
+def each_file_system(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """Run a test on the file system as it is, and on one that behaves like Windows'."""
+    if request.param == "windows":
+        if not OPEN_FILES.is_dir():
+            pytest.skip("what a process has open is read from /proc")
+        behave_like_windows(monkeypatch)
+    return request.param
+
+
+def behave_like_windows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Until the end of the test, os.fsync, replace, rename, remove and rmdir refuse what Windows refuses."""
+    monkeypatch.setattr(files, "WINDOWS", True)
+    fsync = os.fsync
+
+    def sync(file: Any) -> None:
+        number = file if isinstance(file, int) else file.fileno()
+        if fcntl.fcntl(number, fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDONLY:
+            raise OSError(9, "Bad file descriptor")
+        fsync(number)
+
+    monkeypatch.setattr(os, "fsync", sync)
+    for name in ("replace", "rename", "remove", "unlink", "rmdir"):
+        monkeypatch.setattr(os, name, _refusing(getattr(os, name)))
+    # The fast way of rmtree works on open folders, which Windows has no such functions for.
+    monkeypatch.setattr(shutil, "_use_fd_functions", False)
+
+
+def _refusing(call: Callable[..., None]) -> Callable[..., None]:
+    def refuse_what_is_open(*paths: Any, **options: Any) -> None:
+        for path in paths:
+            if options.get("dir_fd") is None and (held := _open_below(os.fspath(path))):
+                raise PermissionError(13, "The process cannot access the file: it is in use", held)
+        call(*paths, **options)
+
+    return refuse_what_is_open
+
+
+def _open_below(path: Any) -> str | None:
+    """A file that this process has open at `path` or in it."""
+    wanted = os.path.realpath(os.fsdecode(path))
+    for number in os.listdir(OPEN_FILES):
+        try:
+            held = os.readlink(OPEN_FILES / number)
+        except OSError:  # the handle of this very listing
+            continue
+        if held == wanted or held.startswith(wanted + os.sep):
+            return held
+    return None
+
+
+def closes_after(file: Any, seconds: float) -> None:
+    """Close an open file a while later, as a reader does."""
+    time.sleep(seconds)
+    file.close()

@@ -1,0 +1,72 @@
+"""What is written as Windows wants it: on a file system that behaves like its own."""
+
+from __future__ import annotations
+
+import os
+import threading
+from pathlib import Path
+
+import pytest
+from fieldwork.nerfcore import files
+from fieldwork.nerfcore.errors import DiskError
+from fieldwork.nerfcore.files import write_json, write_text
+from fieldwork.nerfcore.project.runs import fresh_folder, run_folder, swap_in
+from fieldwork.tests.nerfcore.support.windows_files import behave_like_windows, closes_after
+
+pytestmark = pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="what is open is read from /proc")
+
+
+@pytest.fixture(autouse=True)
+def windows(monkeypatch: pytest.MonkeyPatch) -> None:
+    behave_like_windows(monkeypatch)
+
+
+def test_the_stand_in_refuses_what_windows_refuses(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    path.write_text("a")
+    with open(path, "rb") as held:
+        with pytest.raises(OSError, match="Bad file descriptor"):
+            os.fsync(held.fileno())
+        for refused in (path.unlink, lambda: os.replace(path, tmp_path / "b"), lambda: os.rename(tmp_path, tmp_path)):
+            with pytest.raises(PermissionError, match="in use"):
+                refused()
+    os.replace(path, tmp_path / "b")
+    assert (tmp_path / "b").read_text() == "a"
+
+
+def test_files_are_written(tmp_path: Path) -> None:
+    write_json(tmp_path / "project.json", {"a": 1})
+    write_json(tmp_path / "project.json", {"a": 2})
+    assert os.listdir(tmp_path) == ["project.json"]
+
+
+def test_a_file_that_is_being_read_is_replaced_when_its_reader_is_done(tmp_path: Path) -> None:
+    path = tmp_path / "project.json"
+    write_text(path, "old")
+    reader = threading.Thread(target=closes_after, args=(open(path), 0.2))  # noqa: SIM115
+    reader.start()
+    write_text(path, "new")
+    reader.join()
+    assert path.read_text() == "new"
+
+
+def test_a_file_that_stays_open_is_told_and_left_as_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(files, "READERS_TAKE", 0.1)
+    path = tmp_path / "project.json"
+    write_text(path, "old")
+    with open(path), pytest.raises(DiskError, match=r"project\.json"):
+        write_text(path, "new")
+    assert path.read_text() == "old"
+    assert os.listdir(tmp_path) == ["project.json"]
+
+
+def test_a_run_whose_file_is_open_elsewhere_keeps_its_place(tmp_path: Path) -> None:
+    run, fresh = run_folder(tmp_path, "main"), fresh_folder(tmp_path, "main")
+    for folder, text in ((run, "old"), (fresh, "new")):
+        folder.mkdir(parents=True)
+        (folder / "field.safetensors").write_text(text)
+    with open(run / "field.safetensors"), pytest.raises(DiskError):
+        swap_in(tmp_path, "main")
+    assert (run / "field.safetensors").read_text() == "old"
+    swap_in(tmp_path, "main")
+    assert (run / "field.safetensors").read_text() == "new"

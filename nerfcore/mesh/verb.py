@@ -8,7 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from ..data.box import Box
 from ..data.load import class_inputs, load_scene, view_inputs
+from ..data.scene import Scene
 from ..files import atomic_path
 from ..geometry.similarity import similarity_scale, transform_points
 from ..images.picture import to_bytes
@@ -24,10 +26,10 @@ from .build import Built, build
 from .features import features_of
 from .field_values import shade
 from .files import check_format, write_surface
-from .instances import GAP, find_instances, write_instances
-from .lods import make_levels, remove_levels, write_level
+from .instances import GAP, Instance, find_instances, write_instances
+from .lods import Level, make_levels, remove_levels, write_level
 from .painted import Painted, paint_surface, training_photos, write_maps
-from .parts import texture_of
+from .parts import Texture, texture_of
 from .photos import Photo
 from .shown import shown_share
 from .stored import COARSE
@@ -72,26 +74,11 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
     report.stage("Writing")
     for record in (MESH_RECORD, MEASURES):  # what they say is no longer true from here on
         (target / record).unlink(missing_ok=True)
-    with atomic_path(target / "mesh.npz") as temporary, open(temporary, "wb") as file:
-        sure = {"confidence": classes.confidence, "face_confidence": classes.face_confidence}
-        uv = {} if painted.uv is None else {"uv": painted.uv.corners}
-        unseen = {} if built.unseen is None else {"unseen": built.unseen}
-        np.savez(file, **vars(surface), **sure, **uv, **unseen)
-    with atomic_path(target / COARSE) as temporary, open(temporary, "wb") as file:
-        np.savez(file, vertices=transform_points(box.world_from_box, built.coarse[0]), faces=built.coarse[1])
+    _write_arrays(target, surface, painted, built, box)
     files = [target / "mesh.npz", target / COARSE, write_instances(target, instances)]
     files += write_maps(target, painted, {c.id: c.color for c in scene.classes})
-    features = features_of(surface, scene.classes, scene.ignore_id, instances)
-    for path in [target / "mesh.ply", *([params.out] if params.out else [])]:
-        files += write_surface(path, surface, features, params.split if path == params.out else "none", texture)
-    remove_levels(target)
-    levels = make_levels(surface, texture, params.lods, report)
-    base = params.out or target / "mesh.glb"
-    for number, level in enumerate(levels, 1):
-        files += write_level(target, number, level)
-        features = features_of(level.surface, scene.classes, scene.ignore_id, instances)
-        path = base.with_name(f"{base.stem}_lod{number}{base.suffix}")
-        files += write_surface(path, level.surface, features, params.split, level.texture)
+    written, levels = _write_meshes(target, surface, texture, scene, instances, params, report)
+    files += written
     if params.turntable is not None:
         report.stage("Looking at it")
         files += write_turntable(params.turntable, surface, {c.id: c.color for c in scene.classes}, report)
@@ -113,6 +100,42 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
     write_made(target / MESH_RECORD, step("mesh", settings, result, inputs, state_id(trained.state)))
     record_step(folder, "mesh", settings, result, inputs)
     return result
+
+
+def _write_arrays(target: Path, surface: Surface, painted: Painted, built: Built, box: Box) -> None:
+    """Write mesh.npz, and the coarse surface that `measure` compares it with."""
+    with atomic_path(target / "mesh.npz") as temporary, open(temporary, "wb") as file:
+        sure = {"confidence": painted.classes.confidence, "face_confidence": painted.classes.face_confidence}
+        uv = {} if painted.uv is None else {"uv": painted.uv.corners}
+        unseen = {} if built.unseen is None else {"unseen": built.unseen}
+        np.savez(file, **vars(surface), **sure, **uv, **unseen)
+    with atomic_path(target / COARSE) as temporary, open(temporary, "wb") as file:
+        np.savez(file, vertices=transform_points(box.world_from_box, built.coarse[0]), faces=built.coarse[1])
+
+
+def _write_meshes(
+    target: Path,
+    surface: Surface,
+    texture: Texture | None,
+    scene: Scene,
+    instances: list[Instance],
+    params: MeshParams,
+    report: Reporter,
+) -> tuple[list[Path], list[Level]]:
+    """Write mesh.ply, the file that was asked for, and the levels of detail; the files, and the levels."""
+    files: list[Path] = []
+    features = features_of(surface, scene.classes, scene.ignore_id, instances)
+    for path in [target / "mesh.ply", *([params.out] if params.out else [])]:
+        files += write_surface(path, surface, features, params.split if path == params.out else "none", texture)
+    remove_levels(target)
+    levels = make_levels(surface, texture, params.lods, report)
+    base = params.out or target / "mesh.glb"
+    for number, level in enumerate(levels, 1):
+        files += write_level(target, number, level)
+        features = features_of(level.surface, scene.classes, scene.ignore_id, instances)
+        path = base.with_name(f"{base.stem}_lod{number}{base.suffix}")
+        files += write_surface(path, level.surface, features, params.split, level.texture)
+    return files, levels
 
 
 def mesh_inputs(params: MeshParams) -> Fingerprint:

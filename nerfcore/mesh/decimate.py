@@ -29,8 +29,8 @@ def decimate_patches(
     vertices: np.ndarray, faces: np.ndarray, patch: np.ndarray, target: int, report: Reporter
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """As `decimate`, with triangles of different patches (F,) never merged: the vertices of all borders between patches,
-    and of open ones, stay where they are, so that more triangles than `target` may remain. Returns the patch of each
-    triangle too."""
+    and of open ones, stay where they are, and what was manifold remains so, so that more triangles than `target` may
+    remain. Returns the patch of each triangle too."""
     return _passes(vertices, faces, patch, target, False, report)
 
 
@@ -45,12 +45,12 @@ def _passes(
         before = len(faces)
         ratio = max(target / len(faces), AT_ONCE)
         keep = not move_borders or number < PASSES - 2
-        vertices, faces, patch = _one_pass(vertices, faces, patch, ratio, number, keep, report)
+        vertices, faces, patch = _one_pass(vertices, faces, patch, ratio, number, keep, not move_borders, report)
         if len(faces) > 0.98 * before:  # nothing but borders is left
             if not move_borders:
                 break
             if keep:
-                vertices, faces, patch = _one_pass(vertices, faces, patch, ratio, number, False, report)
+                vertices, faces, patch = _one_pass(vertices, faces, patch, ratio, number, False, False, report)
     return vertices, faces, patch
 
 
@@ -61,6 +61,7 @@ def _one_pass(
     ratio: float,
     number: int,
     keep_border: bool,
+    keep_manifold: bool,
     report: Reporter,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     centers = vertices[faces].mean(1)
@@ -75,16 +76,13 @@ def _one_pass(
         report.check()
         made.append(_simplified(points, triangles, ratio, keep_border or len(chunks) > 1))
     of_chunk = [int(patch[chunk[0]]) for chunk in chunks]
-    folded = _folded(faces)
-    before = np.array([np.count_nonzero(folded[chunk]) for chunk in chunks])
-    kept: set[int] = set()
+    folded, kept = _folded(faces), set[int]()
+    manifold = np.array([not folded[chunk].any() for chunk in chunks])
     while True:
         joined, corners, chunk = _join(made)
-        # Collapses on two sides of a border, or in a thin thing, may have made an edge of more than two triangles. Where
-        # the surface had such edges itself, the chunk may keep as many.
-        worse = np.bincount(chunk[_folded(corners)], minlength=len(chunks)) > before
-        undone = set(np.flatnonzero(worse).tolist()) - kept
-        if not undone:
+        # Collapses on two sides of a border, or in a thin thing, may have made an edge of more than two triangles.
+        undone = {i for i in np.unique(chunk[_folded(corners)]).tolist() if manifold[i]} - kept
+        if not undone or not keep_manifold:
             return joined, corners, np.array(of_chunk)[chunk]
         for index in undone:
             made[index] = whole[index]

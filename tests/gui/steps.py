@@ -82,9 +82,9 @@ def drop(screen, folder):
     screen.shot("dragging")
     screen.window.event_simulate(type="LEFTMOUSE", value="RELEASE", x=int(target[0]), y=int(target[1]))
     yield 1.0
-    # Blender itself can make an image of the photo: a menu asks, with our entry under the mouse.
+    # Blender itself can make an image of the photo: a menu asks. Which entry is under the mouse depends on its version.
     screen.shot("drop-menu")
-    screen.press("RET", *target)
+    screen.press("O", *target)  # the underlined letter of “Open Photos or Project”
     yield 0.5
     browser.type = "PROPERTIES"
     yield 0.5

@@ -50,8 +50,8 @@ def train_verdict(result: Mapping[str, Any], curve: Sequence[Mapping[str, float]
     if done < warmup:
         text = (
             f"Only {done} steps were trained; a field takes shape after {warmup}, and the settings plan {steps}. Here that "
-            f"is about {_duration(each * warmup)} and {_duration(each * steps)}: raise --time-limit or --steps, or choose "
-            "smaller images (--set scene.image_size=400)."
+            f"is about {_duration(each * warmup)} and {_duration(each * steps)}: raise the limit of time or steps, or choose "
+            "smaller images (setting scene.image_size)."
         )
         return verdict([("failed", text)])
     found = []
@@ -66,7 +66,7 @@ def train_verdict(result: Mapping[str, Any], curve: Sequence[Mapping[str, float]
     if rise > STILL_RISING and done < steps:
         text = (
             f"Training ended while it still improved ({rise:.1f} dB over its second half): twice as long takes about "
-            f"{_duration(each * done)} more here (train --resume with a higher --time-limit or --steps)."
+            f"{_duration(each * done)} more here (resume it with a higher limit of time or steps)."
         )
         found.append(("weak", text))
     return verdict(found)
@@ -110,7 +110,7 @@ def mesh_verdict(hit: float) -> Verdict:
         return verdict([])
     text = (
         f"The mesh fills {hit:.1%} of the photos: the rest of what they show is missing. Train longer, or enlarge the "
-        "region (mesh --region photos)."
+        "region (“photos” takes in all they show)."
     )
     return verdict([("failed" if hit < MISSED else "weak", text)])
 

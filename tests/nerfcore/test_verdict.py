@@ -38,7 +38,7 @@ def test_a_training_that_hardly_began() -> None:
     result = {"steps": 72, "seconds": 90.0, "psnr_train": 15.0}
     found = train_verdict(result, curve(8, 12, 15), warmup=256, steps=20000)
     assert found["level"] == "failed"
-    assert all(words in found["reasons"][0] for words in ("72 steps", "256", "5 min", "6.9 h", "--time-limit"))
+    assert all(words in found["reasons"][0] for words in ("72 steps", "256", "5 min", "6.9 h", "limit of time"))
 
 
 def test_a_training_that_was_cut_off() -> None:

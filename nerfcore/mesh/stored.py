@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import MISSING, fields
 from pathlib import Path
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -33,15 +36,10 @@ def load_surface(project: Path, run: str) -> tuple[Surface, Texture | None]:
         ProjectError: there is none, or its file is damaged.
     """
     path = mesh_folder(project, run) / MESH
-    try:
-        with np.load(path, allow_pickle=False) as data:
-            stored = [field for field in fields(Surface) if field.name in data or field.default is MISSING]
-            surface = Surface(**{field.name: data[field.name] for field in stored})
-            uv = data.get("uv", None)
-    except FileNotFoundError as error:
-        raise ProjectError(f"The run “{run}” has no mesh yet.", "Run `fieldwork mesh` first.") from error
-    except (OSError, ValueError, KeyError, BadZipFile) as error:
-        raise ProjectError(f"{path} is damaged: {error}.", "Run `fieldwork mesh` again.") from error
+    with _reading(path, f"The run “{run}” has no mesh yet.") as data:
+        stored = [field for field in fields(Surface) if field.name in data or field.default is MISSING]
+        surface = Surface(**{field.name: data[field.name] for field in stored})
+        uv = data.get("uv", None)
     picture = path.with_name(TEXTURE)
     if uv is None or not picture.is_file():
         return surface, None
@@ -56,11 +54,18 @@ def load_coarse(project: Path, run: str) -> tuple[np.ndarray, np.ndarray]:
         ProjectError: there is none, or its file is damaged.
     """
     path = mesh_folder(project, run) / COARSE
+    with _reading(path, f"{path} is missing.") as data:
+        return data["vertices"].astype(np.float64), data["faces"]
+
+
+@contextmanager
+def _reading(path: Path, missing: str) -> Iterator[Any]:
+    """The arrays of an .npz that `mesh` wrote; `missing` says that it is not there. Raises ProjectError."""
     try:
         with np.load(path, allow_pickle=False) as data:
-            return data["vertices"].astype(np.float64), data["faces"]
+            yield data
     except FileNotFoundError as error:
-        raise ProjectError(f"{path} is missing.", "Run `fieldwork mesh` again.") from error
+        raise ProjectError(missing, "Run `fieldwork mesh`.") from error
     except (OSError, ValueError, KeyError, BadZipFile) as error:
         raise ProjectError(f"{path} is damaged: {error}.", "Run `fieldwork mesh` again.") from error
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fieldwork.nerfcore.capture import ingest
+from fieldwork.nerfcore.data.readers import llff
 from fieldwork.nerfcore.errors import InputError
 from fieldwork.nerfcore.images.arrays import read_array
 from fieldwork.nerfcore.params import NewParams
@@ -117,6 +118,12 @@ def test_an_array_that_claims_more_than_there_is(tmp_path: Path, suffix: str, sh
     result = ingest.new(NewParams(photos=photos, project=tmp_path / "p"), report)
     assert (result["images"], result["labelled"]) == (3, 0)
     assert any(f"p1.{suffix}" in text and "bytes" in text for text in report.warnings)
+
+
+def test_poses_that_claim_more_than_there_are(tmp_path: Path) -> None:
+    (tmp_path / "poses_bounds.npy").write_bytes(lying((10**12, 17)))
+    with pytest.raises(InputError, match=r"poses_bounds\.npy claims"):
+        llff.read(tmp_path)
 
 
 def test_arrays_are_read(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from ...capture.video import VIDEO_SUFFIXES, every_nth, save_every_nth
 from ...errors import InputError
 from ...geometry.cameras import Camera
 from ...geometry.frames import upright
+from ...images.arrays import read_array
 from ...images.decode import image_size
 from ...images.names import labels_and_masks, list_images, unique_names
 from ..dataset import Dataset, DatasetView, require
@@ -35,9 +36,9 @@ def read(folder: Path) -> Dataset:
     """
     path = folder / FILE
     try:
-        rows = np.load(path, allow_pickle=False)
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path} cannot be read: {error}.", "Export the poses again.") from error
+        rows = read_array(path)
+    except InputError as error:
+        raise InputError(f"{folder}: {error}.", "Export the poses again.") from error
     if rows.ndim != 2 or rows.shape[1] != 17 or not np.isfinite(rows).all():
         raise InputError(f"{path} has shape {rows.shape}, not (N, 17).", "Export the poses again.")
     images = next((found for name in ("images", ".") if (found := list_images(folder / name))), [])

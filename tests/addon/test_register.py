@@ -13,10 +13,15 @@ import pytest
 pytest.importorskip("bpy")
 
 
-def run(script: str) -> dict:
+def run(script: str, **environment: str) -> dict:
     """What a fresh Blender prints: bpy cannot be loaded twice in one process."""
     done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, timeout=120, check=False
+        [sys.executable, "-c", textwrap.dedent(script)],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+        env=os.environ | environment,
     )
     assert done.returncode == 0, done.stderr
     # Blender goes on without a property that it refuses.
@@ -28,30 +33,28 @@ REGISTER = """
     import json, os, sys, time
     import bpy
     before = set(sys.modules)
-    begin, busy_since = time.perf_counter(), time.process_time()
+    busy_since = time.process_time()
     import fieldwork
     fieldwork.register()
-    seconds, busy = time.perf_counter() - begin, time.process_time() - busy_since
-    print(json.dumps({"seconds": seconds, "busy": busy, "new": sorted(set(sys.modules) - before)}))
+    busy = time.process_time() - busy_since
+    print(json.dumps({"busy": busy, "new": sorted(set(sys.modules) - before)}))
     sys.stdout.flush()
     os._exit(0)
     """
 
 
-def test_enabling_takes_less_than_50_ms_and_imports_nothing_heavy():
+def test_enabling_takes_less_than_50_ms_and_imports_nothing_heavy(tmp_path):
     """From nothing to registered, in a fresh Blender, as when the extension is enabled or Blender starts."""
-    runs = [run(REGISTER) for _ in range(5)]
+    # Blender keeps compiled modules, whatever the environment of the tests asks for; the first run only makes them.
+    kept = {"PYTHONDONTWRITEBYTECODE": "", "PYTHONPYCACHEPREFIX": str(tmp_path)}
+    runs = [run(REGISTER, **kept) for _ in range(5)][1:]
     for facts in runs:
         # What a bare Blender has not loaded itself yet would come on top of Fieldwork's own modules.
         foreign = {name.partition(".")[0] for name in facts["new"]} - {"fieldwork", "bpy"}
         assert foreign & {"torch", "pycolmap", "OpenImageIO", "pydantic", "warp", "av", "PIL", "scipy"} == set()
         assert foreign & {"numpy", "subprocess", "tempfile", "logging", "urllib", "hashlib", "ssl"} == set()
-    # Another program may have had the processor in the other runs.
-    if os.getloadavg()[0] <= (os.cpu_count() or 1):
-        assert min(facts["seconds"] for facts in runs) < 0.05
-    else:
-        # The limit is for a processor of one's own; one that is shared is half as fast.
-        assert min(facts["busy"] for facts in runs) < 0.1
+    # Processor time: other programs on the machine do not count.
+    assert min(facts["busy"] for facts in runs) < 0.05
 
 
 def test_nothing_is_left_after_unregister():

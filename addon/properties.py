@@ -20,6 +20,14 @@ PRESETS = [
     ("standard", "Standard", "Good quality in reasonable time"),
     ("high", "High", "Best quality; takes several times longer"),
 ]
+MASK_MODES = [
+    ("ignore", "Unknown", "Nothing is learned from these pixels: for masks that hide people or reflections"),
+    (
+        "empty",
+        "Empty Space",
+        "There is nothing along these rays: for masks around an object, on a turntable for instance",
+    ),
+]
 POSE_PRESETS = [
     ("fast", "Fast", "Smaller images and fewer features; for overlapping, sharp photos"),
     ("standard", "Standard", "For most captures"),
@@ -165,14 +173,7 @@ class FieldworkScene(PropertyGroup):
     mask_mode: EnumProperty(
         name="Black in Masks",
         description="What black pixels of a mask mean",
-        items=[
-            ("ignore", "Unknown", "Nothing is learned from these pixels: for masks that hide people or reflections"),
-            (
-                "empty",
-                "Empty Space",
-                "There is nothing along these rays: for masks around an object, on a turntable for instance",
-            ),
-        ],
+        items=MASK_MODES,
     )
     max_size: IntProperty(
         name="Working Size",

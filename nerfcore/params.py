@@ -153,6 +153,7 @@ class ImportParams(Params):
         "realityscan",
         "meshroom",
     ] = "auto"
+    mask_mode: Literal["ignore", "empty"] = Field(default="ignore", description="what black mask pixels mean")
 
 
 class PosesParams(Params):

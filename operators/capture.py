@@ -9,6 +9,7 @@ import bpy
 from bpy.types import Context, FileHandler, Operator, OperatorFileListElement
 
 from ..addon.project import snapshot
+from ..addon.properties import MASK_MODES
 from ..addon.props import BoolProperty, CollectionProperty, EnumProperty, StringProperty
 from ..addon.text import t
 from .base import ProjectOperator, need_photos, need_project_folder, scene_settings, set_if_empty
@@ -111,6 +112,9 @@ class FIELDWORK_OT_import_dataset(ProjectOperator):
         name="Data Set", description="Folder of the data set", subtype="DIR_PATH", options={"SKIP_SAVE"}
     )
     format: EnumProperty(name="Format", description="Kind of the data set", items=FORMATS, options={"SKIP_SAVE"})
+    mask_mode: EnumProperty(
+        name="Black in Masks", description="What black pixels of a mask mean", items=MASK_MODES, options={"SKIP_SAVE"}
+    )
 
     def invoke(self, context: Context, event: bpy.types.Event) -> set[str]:
         context.window_manager.fileselect_add(self)
@@ -124,7 +128,7 @@ class FIELDWORK_OT_import_dataset(ProjectOperator):
         given = self.properties.is_property_set("project") and bool(self.project)
         project = Path(self.project_path(context)) if given else project_for(source)
         context.scene.fieldwork.project = str(project)
-        return {"dataset": str(source), "project": str(project), "format": self.format}
+        return {"dataset": str(source), "project": str(project), "format": self.format, "mask_mode": self.mask_mode}
 
 
 class FIELDWORK_OT_open(Operator):

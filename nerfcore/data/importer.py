@@ -73,7 +73,7 @@ def import_dataset(params: ImportParams, report: Reporter) -> dict[str, Any]:
             scale_known=dataset.scale_known,
             bounds=None if dataset.bounds is None else dataset.bounds.tolist(),
         )
-        project.mask_mode, project.provenance = "ignore", []
+        project.mask_mode, project.provenance = params.mask_mode, []
         project.record("import", params.model_dump(mode="json"), result)
     return result
 

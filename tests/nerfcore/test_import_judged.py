@@ -147,6 +147,12 @@ def test_labels_and_masks_of_data_sets_are_judged_too(tmp_path: Path) -> None:
     assert any("f1" in text and "black everywhere" in text for text in report.warnings)
 
 
+def test_what_black_in_masks_means_can_be_said_of_a_data_set(tmp_path: Path) -> None:
+    folder = data_set(tmp_path / "d", {"aabb_scale": 1})
+    import_dataset(ImportParams(dataset=folder, project=tmp_path / "p", mask_mode="empty"), Reporter())
+    assert load_project(tmp_path / "p").mask_mode == "empty"
+
+
 def test_deeply_nested_json_is_no_data_set(tmp_path: Path) -> None:
     (tmp_path / "transforms.json").write_text("[" * 200_000)
     with pytest.raises(InputError, match="nested"):

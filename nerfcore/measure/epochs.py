@@ -14,8 +14,9 @@ from trimesh.exchange.ply import export_ply
 from ..errors import ProjectError
 from ..files import atomic_path, write_json
 from ..geometry.similarity import similarity_scale
+from ..kernels.closest import ClosestPoints
 from ..mesh.clean import areas, cross, unit
-from ..mesh.metrics import plane_distance, sample_surface
+from ..mesh.metrics import sample_surface
 from ..mesh.stored import mesh_folder, mesh_record
 from ..mesh.surface import Surface, to_world
 from ..params import CompareParams
@@ -87,17 +88,16 @@ def register(now: Subject, before: Subject, points: Path | None, report: Reporte
 
 def signed_distances(points: np.ndarray, surface: Surface, report: Reporter) -> np.ndarray:
     """Distance (N,) of points (N, 3) from a surface, negative behind it."""
-    mesh = surface.vertices.astype(np.float64), surface.faces
-    samples, face = sample_surface(*mesh, SAMPLES)
-    # Beside an edge the nearest triangle may be seen from the side: what is around it says which side is out.
-    around = unit(surface.normals[surface.faces].mean(1).astype(np.float64))
-    normals, parts = around[face], []
+    mesh, parts = ClosestPoints(surface.vertices, surface.faces), []
     for begin in range(0, len(points), CHUNK):
         report.progress(begin / len(points))
         some = np.asarray(points[begin : begin + CHUNK], np.float64)
-        far, nearest = plane_distance(some, samples, face, mesh)
-        side = ((some - samples[nearest]) * normals[nearest]).sum(1)
-        parts.append(np.where(side < 0, -far, far))
+        face, weights, far = mesh.find(some)
+        corners = surface.faces[face]
+        closest = np.einsum("nk,nkc->nc", weights, surface.vertices[corners])
+        # Beside an edge the closest triangle may be seen from the side: normals of corners say which side is out.
+        normal = np.einsum("nk,nkc->nc", weights, surface.normals[corners])
+        parts.append(np.where(((some - closest) * normal).sum(1) < 0, -far, far))
     return np.concatenate(parts)
 
 

@@ -6,9 +6,8 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 
 import numpy as np
-from scipy.spatial import KDTree
-from trimesh.triangles import closest_point
 
+from ..kernels.closest import ClosestPoints
 from .clean import areas, cross, unit
 
 SAMPLES = 200_000
@@ -88,21 +87,21 @@ def distances(
     seed: int = 0,
 ) -> Distances:
     """Distances between two meshes (vertices, faces) of one frame, from `count` points of the mesh and twice as many of
-    the truth to the triangles near them.
+    the truth to the closest triangle of the other.
 
     `visible`: points and normals (N, 3) of the truth → (N,) bool; distances from the truth are those of visible points.
     """
     points, face = sample_surface(*mesh, count=count, seed=seed)
     true, true_face = sample_surface(*truth, count=2 * count, seed=seed + 1)
-    true_normals = unit(cross(*truth))[true_face]
-    shown = np.ones(len(true), bool) if visible is None else visible(true, true_normals)
-    to_truth, nearest = plane_distance(points, true, true_face, truth)
-    to_mesh, _ = plane_distance(true[shown], points, face, mesh)
-    cosine = np.abs((unit(cross(*mesh))[face] * true_normals[nearest]).sum(1))
+    normals = unit(cross(*truth))
+    shown = np.ones(len(true), bool) if visible is None else visible(true, normals[true_face])
+    truth_face, _, to_truth = ClosestPoints(*truth).find(points)
+    to_mesh = ClosestPoints(*mesh).find(true[shown])[2]
+    cosine = np.abs((unit(cross(*mesh))[face] * normals[truth_face]).sum(1))
     return Distances(
         face,
         to_truth,
-        true_face[nearest],
+        truth_face,
         np.degrees(np.arccos(np.clip(cosine, 0, 1))),
         true_face[shown],
         to_mesh,
@@ -119,23 +118,6 @@ def compare(
 ) -> SurfaceScores:
     """Scores of a mesh beside the true one; see `distances`."""
     return distances(mesh, truth, visible).scores(threshold)
-
-
-def plane_distance(
-    points: np.ndarray, samples: np.ndarray, face: np.ndarray, mesh: tuple[np.ndarray, np.ndarray]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Distance (N,) of points to a surface known by samples (M, 3), and the nearest sample: among the eight nearest
-    samples' triangles the least distance to the triangle's closest point."""
-    near = np.asarray(KDTree(samples).query(points, k=8)[1])
-    vertices, faces = mesh
-    best = np.full(len(points), np.inf)
-    which = near[:, 0].copy()
-    for k in range(near.shape[1]):
-        corners = vertices[faces[face[near[:, k]]]]
-        distance = np.linalg.norm(closest_point(corners, points) - points, axis=1)
-        nearer = distance < best
-        best[nearer], which[nearer] = distance[nearer], near[nearer, k]
-    return best, which
 
 
 def on_border(vertices: np.ndarray, faces: np.ndarray, low: np.ndarray, high: np.ndarray, within: float) -> int:

@@ -227,6 +227,15 @@ def test_scores_of_known_shapes() -> None:
     assert doubled.precision < 0.6
 
 
+def test_small_triangles_among_large_ones_are_what_is_closest() -> None:
+    """No sample of the truth need lie in them."""
+    vertices = np.array([[-500.0, -500, 0], [500, -500, 0], [0, 500, 0], [0, 0, 1], [1, 0, 1], [0, 1, 1]])
+    small = np.array([[3, 4, 5]])
+    found = metrics.distances((vertices, small), (vertices, np.concatenate([small[:, ::-1] - 3, small])), count=200)
+    assert (found.truth_face == 1).all()
+    assert found.to_truth.max() < 1e-6
+
+
 def test_faces_on_the_border_of_a_box_are_counted() -> None:
     vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 0.5], [0.5, 0.5, 0.5]])
     faces = np.array([[0, 1, 2], [0, 1, 4], [1, 2, 3]])

@@ -28,6 +28,7 @@ from .surface_figures import Truth, surface_figures
 
 FACES, TEXTURE = 200_000, 4096
 THIN = {"fence": 1}  # class of the plate whose two sides are looked for, by scene
+BODIES = {"vase": ((1, 2), (3,))}  # classes of the closed bodies whose volumes are compared, by scene
 
 
 class StageClock(Reporter):
@@ -98,7 +99,7 @@ def measure(job: Job, project: Path, report: Reporter, root: Path) -> dict[str, 
     classes, region = painted.classes, built.region
     made = Surface(built.vertices, built.faces, built.normals, built.colors, classes.class_id, classes.face_class)
     surface = to_world(made, box.world_from_box)
-    figures = surface_figures(surface, painted, truth, scene, THIN.get(job.scene))
+    figures = surface_figures(surface, painted, truth, scene, THIN.get(job.scene), BODIES.get(job.scene, ()))
     figures |= {
         "border_faces": on_border(built.vertices, built.faces, region.low, region.high, region.voxel / 2),
         "faces": len(built.faces),

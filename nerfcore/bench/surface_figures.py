@@ -14,17 +14,20 @@ from trimesh.triangles import points_to_barycentric
 from ..data.scene import Scene, View
 from ..images.picture import resized
 from ..images.working import read_picture
-from ..mesh.clean import areas, cross, unit
+from ..measure.closing import closed
+from ..mesh.clean import areas, components, cross, unit
 from ..mesh.facelets import Facelets, facelets
 from ..mesh.metrics import Distances, distances, sample_surface
 from ..mesh.painted import Painted
 from ..mesh.surface import Surface
 from ..mesh.surface_picture import surface_picture
 from ..mesh.visibility import DepthBuffer, PosedCamera, depth_buffer, within
+from .surface_outlines import outline_texels, true_outline
 
 CLOSE = 0.01  # share of the size
 ENOUGH = 3  # cameras that see what a mesh is asked to hold
 FAR = 2.5  # of the median depth of the photos: what is farther is a background
+MOST_CAPPED = 0.25  # share of a body's area that may stand on something
 HIDDEN = 0.5  # footprints of a pixel that something lies in front of what it hides
 STEEPEST = 0.1  # cosine under which a camera is not said to see a place
 PIECES = 60  # pieces along the longest side: depth buffers leave out triangles that reach behind a camera
@@ -59,6 +62,12 @@ class Sight:
         points, face = sample_surface(truth.vertices, truth.faces, SAMPLES)
         seen = points[self.visible(points, unit(cross(truth.vertices, truth.faces))[face])]
         self.size = float(np.ptp(seen, axis=0).max())
+        self.truth = truth
+
+    def outline(self) -> np.ndarray:
+        """Ends (E, 2, 3) of the edges that are seen and at which the true class changes."""
+        edges, normals = true_outline(self.truth.vertices, self.truth.faces, self.truth.face_class)
+        return edges[self.visible(edges.mean(1), normals)]
 
     def visible(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """Whether enough cameras see points (N, 3) of the truth with normals (N, 3): (N,).
@@ -95,12 +104,17 @@ def small_pieces(vertices: np.ndarray, faces: np.ndarray) -> Facelets:
 
 
 def surface_figures(
-    surface: Surface, painted: Painted, truth: Truth, scene: Scene, thin: int | None
+    surface: Surface,
+    painted: Painted,
+    truth: Truth,
+    scene: Scene,
+    thin: int | None = None,
+    bodies: Sequence[tuple[int, ...]] = (),
 ) -> dict[str, float | None]:
     """All figures of a textured mesh in the world but those of time and memory; None: there is nothing to measure.
 
     Args:
-        thin: class of a plate whose two sides are looked for.
+        thin: class of a plate whose two sides are looked for. bodies: classes of each body whose volume is compared.
     """
     mesh = surface.vertices.astype(np.float64), surface.faces
     sight = Sight(truth, [scene.views[i] for i in scene.train])
@@ -119,6 +133,8 @@ def surface_figures(
         "both_sides": None if thin is None else both_sides(mesh, truth, sight, thin),
         "hit_share": hit_share(mesh, truth, held_out, sight.far),
         **class_figures(found, surface, painted, truth, CLOSE * sight.size),
+        "outline_texels": outline_texels(*mesh, painted, sight.outline(), CLOSE * sight.size),
+        "volume_error": volume_error(mesh, surface.face_class, truth, bodies) if bodies else None,
         **picture_figures(mesh, painted, held_out),
         "seams": seam_ratio(surface.faces, painted),
     }
@@ -139,6 +155,26 @@ def both_sides(mesh: tuple[np.ndarray, np.ndarray], truth: Truth, sight: Sight, 
     same = (np.isfinite(near) & (np.einsum("nkc,nc->nk", facing, normals) > SAME_SIDE)).any(1)
     sides = [same[side * normals[:, axis] > SAME_SIDE] for side in (-1, 1)]
     return min(float(side.mean()) if len(side) else 0.0 for side in sides)
+
+
+def volume_error(
+    mesh: tuple[np.ndarray, np.ndarray], face_class: np.ndarray, truth: Truth, bodies: Sequence[tuple[int, ...]]
+) -> float | None:
+    """By how much the volume of the worst of some bodies is off, openings capped; None where one has no inside. A body is
+    the largest part of the faces of its classes."""
+    worst = 0.0
+    for kinds in bodies:
+        volumes = []
+        for (vertices, faces), own in ((mesh, face_class), ((truth.vertices, truth.faces), truth.face_class)):
+            chosen = faces[np.isin(own, kinds)]
+            part = components(chosen, len(vertices))
+            area = np.bincount(part, areas(vertices, chosen)) if len(chosen) else np.zeros(1)
+            body = closed(vertices, chosen[part == area.argmax()], MOST_CAPPED)
+            if body is None:
+                return None
+            volumes.append(body.volume)
+        worst = max(worst, abs(volumes[0] / volumes[1] - 1))
+    return worst
 
 
 def hit_share(mesh: tuple[np.ndarray, np.ndarray], truth: Truth, views: Sequence[View], far: float) -> float:

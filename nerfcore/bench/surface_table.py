@@ -25,6 +25,8 @@ FIGURES = {
     "seams": ("seams, ΔE over that of other edges", "≤ 1.5", 2),
     "surface_miou": ("mIoU on the surface", "≥ 0.95", 3),
     "class_area_error": ("area of the worst class, off by", "≤ 0.03", 3),
+    "outline_texels": ("outlines of painted classes, off by (texels, median)", "≤ 2", 1),
+    "volume_error": ("volume of the worst closed body, off by", "", 3),
     "faces": ("faces", "", 0),
     "mesh_seconds": ("mesh (s)", "≤ 360 on two cores", 0),
     "memory_mb": ("peak memory (MiB)", "≤ 6144", 0),

@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from fieldwork.nerfcore.bench import surface as suite
-from fieldwork.nerfcore.bench.surface_figures import Sight, Truth, both_sides, hit_share, seam_ratio, surface_figures
+from fieldwork.nerfcore.bench.surface_figures import (
+    Sight,
+    Truth,
+    both_sides,
+    hit_share,
+    seam_ratio,
+    surface_figures,
+    volume_error,
+)
+from fieldwork.nerfcore.bench.surface_outlines import outline_texels, true_outline
 from fieldwork.nerfcore.bench.surface_table import FIGURES, figure_table
 from fieldwork.nerfcore.data.scene import Scene, View
 from fieldwork.nerfcore.errors import InputError
@@ -15,7 +25,7 @@ from fieldwork.nerfcore.geometry.cameras import Camera
 from fieldwork.nerfcore.mesh.clean import unit
 from fieldwork.nerfcore.mesh.painted import Painted
 from fieldwork.nerfcore.mesh.surface import Surface
-from fieldwork.nerfcore.mesh.surface_labels import SurfaceClasses
+from fieldwork.nerfcore.mesh.surface_labels import ClassMaps, SurfaceClasses
 from fieldwork.nerfcore.mesh.uv import UvMap
 from fieldwork.nerfcore.params import BenchParams
 from fieldwork.nerfcore.progress import Reporter
@@ -75,6 +85,36 @@ def test_a_plate_of_one_side_and_a_missing_ball_are_seen() -> None:
     plate = truth.vertices, truth.faces[truth.face_class == 2]
     assert hit_share((truth.vertices, truth.faces), truth, held_out, sight.far) == 1
     assert 0.2 < hit_share(plate, truth, held_out, sight.far) < 0.9
+
+
+def test_volumes_of_bodies_are_compared() -> None:
+    truth = ball_and_plate()
+    ball = truth.faces[truth.face_class == 1]
+    kinds = np.ones(len(ball), int)
+    assert volume_error((truth.vertices * 1.1, ball), kinds, truth, [(1,)]) == pytest.approx(1.1**3 - 1, rel=1e-6)
+    standing = ball[truth.vertices[ball].mean(1)[:, 2] > -0.27]  # its foot is not seen
+    assert volume_error((truth.vertices, standing), kinds[: len(standing)], truth, [(1,)]) < 0.02
+    half = ball[truth.vertices[ball].mean(1)[:, 2] > 0]
+    assert volume_error((truth.vertices, half), kinds[: len(half)], truth, [(1,)]) is None
+    assert volume_error((truth.vertices, ball), kinds, truth, [(1,), (2,)]) is None  # no plate
+
+
+def test_the_outline_of_a_class_map_is_measured_in_texels() -> None:
+    """A square of two triangles with 64 texels a side, whose class changes at column 40."""
+    vertices = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    uv = UvMap(vertices[faces][..., :2].astype(np.float32), np.zeros(2, np.int32), np.zeros((0, 2), int), 1.0)
+    ids = np.where(np.arange(64) < 40, 1, 2).astype(np.uint8)[None].repeat(64, 0)
+    painted = replace(unpainted(), uv=uv, maps=ClassMaps(ids, np.full((64, 64), 255, np.uint8)))
+    for texels in (0, 3):
+        x = (40 + texels) / 64
+        line = np.array([[[x, 0.1, 0], [x, 0.9, 0]]])
+        assert outline_texels(vertices, faces, painted, line, 1.0) == pytest.approx(texels, abs=0.3)  # between texels
+    assert outline_texels(vertices, faces, painted, line + 5, 1.0) is None  # a place that the mesh lacks
+    assert outline_texels(vertices, faces, unpainted(), line, 1.0) is None
+    edges, normals = true_outline(vertices, faces, np.array([1, 2]))
+    assert edges.tolist() == [[[0, 0, 0], [1, 1, 0]]]
+    assert normals.tolist() == [[0, 0, 1]]
 
 
 def test_seams_are_told_from_other_edges() -> None:

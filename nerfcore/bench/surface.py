@@ -5,6 +5,7 @@ The mesh is compared with the true surface of the simulated scene (`surface_figu
 
 from __future__ import annotations
 
+import os
 import time
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from ..mesh.build import build
 from ..mesh.metrics import on_border
 from ..mesh.painted import training_photos
 from ..mesh.surface import Surface, to_world
+from ..mesh.turntable import write_turntable
 from ..mesh.verb import paint
 from ..params import MeshParams
 from ..progress import Reporter
@@ -32,12 +34,12 @@ BODIES = {"vase": ((1, 2), (3,))}  # classes of the closed bodies whose volumes 
 
 
 class StageClock(Reporter):
-    """Passes on what it hears, and adds up the seconds of each stage."""
+    """Passes on what it hears, and adds up the processor seconds of each stage, those of ended child processes included."""
 
     def __init__(self, outer: Reporter) -> None:
         super().__init__()
         self.outer, self.seconds = outer, dict[str, float]()
-        self._name, self._begin = "Preparing", time.monotonic()
+        self._name, self._begin = "Preparing", processor_seconds()
 
     def stage(self, name: str) -> None:
         self.stop()
@@ -45,7 +47,7 @@ class StageClock(Reporter):
         self.outer.stage(name)
 
     def stop(self) -> None:
-        now = time.monotonic()
+        now = processor_seconds()
         self.seconds[self._name] = self.seconds.get(self._name, 0.0) + now - self._begin
         self._begin = now
 
@@ -57,6 +59,11 @@ class StageClock(Reporter):
 
     def check(self) -> None:
         self.outer.check()
+
+
+def processor_seconds() -> float:
+    """Of this process and its ended children so far."""
+    return sum(os.times()[:4])
 
 
 def truth_folder(root: Path, scene: str) -> Path:
@@ -81,13 +88,15 @@ def read_truth(root: Path, scene: str) -> Truth:
 
 
 def measure(job: Job, project: Path, report: Reporter, root: Path) -> dict[str, Any]:
-    """Make the mesh of a job's field and compare it with the truth in the benchmark's folder `root`: the keys of `surface_table.FIGURES` but "psnr", and "stages" {name: seconds}.
+    """Make the mesh of a job's field and compare it with the truth in the benchmark's folder `root`: the keys of
+    `surface_table.FIGURES` but "psnr", and "stages" {name: processor seconds}. Pictures of it from all around are left in
+    root/surface/pictures.
 
     Raises:
         InputError: the true surface is not known. TrainingError: there is no surface.
     """
     truth = read_truth(root, job.scene)
-    clock = StageClock(report)
+    clock, begin = StageClock(report), time.monotonic()
     known, trained = load_project(project), load_trained(project, job.name)
     scene, box = load_scene(project, trained.info.holdout), trained.info.box(known)
     params = MeshParams(project=project, run=job.name, faces=FACES, texture=TEXTURE)
@@ -95,15 +104,19 @@ def measure(job: Job, project: Path, report: Reporter, root: Path) -> dict[str, 
     photos = training_photos(scene, box.box_from_world, refined_poses(project, job.name, trained.info))
     painted = paint(trained, built, photos, params, scene.ignore_id, clock)
     clock.stop()
+    duration = time.monotonic() - begin
     report.stage("Measuring the surface")
     classes, region = painted.classes, built.region
     made = Surface(built.vertices, built.faces, built.normals, built.colors, classes.class_id, classes.face_class)
     surface = to_world(made, box.world_from_box)
     figures = surface_figures(surface, painted, truth, scene, THIN.get(job.scene), BODIES.get(job.scene, ()))
+    pictures = root / "surface" / "pictures" / job.name
+    write_turntable(pictures, surface, {c.id: c.color for c in scene.classes}, report)
     figures |= {
         "border_faces": on_border(built.vertices, built.faces, region.low, region.high, region.voxel / 2),
         "faces": len(built.faces),
-        "mesh_seconds": sum(clock.seconds.values()),
+        "mesh_seconds": duration,
+        "mesh_processor": sum(clock.seconds.values()),
         "memory_mb": peak_memory(),
     }
     return {**figures, "stages": {name: round(seconds, 1) for name, seconds in clock.seconds.items()}}

@@ -137,7 +137,7 @@ def test_the_table_has_a_row_for_each_figure_and_stage() -> None:
     columns, made = figure_table(rows)
     assert list(columns) == ["figure", "asked", "museum", "vase"]
     assert made[0] == {"figure": "F at 1 % of the size", "asked": "≥ 0.97", "museum": "0.951", "vase": "–"}
-    assert made[-1] == {"figure": "Fusing (s)", "asked": "", "museum": "6", "vase": "–"}
+    assert made[-1] == {"figure": "Fusing (processor s)", "asked": "", "museum": "6", "vase": "–"}
     assert len(made) == len(FIGURES) + 1
 
 

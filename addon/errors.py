@@ -7,6 +7,10 @@ class SceneError(Exception):
     for_user = True
 
 
+class SceneChanged(SceneError):
+    """What was being worked on in the scene is gone."""
+
+
 class EngineError(Exception):
     """What the engine answered instead of a result.
 

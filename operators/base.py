@@ -248,6 +248,15 @@ def refresh_scenes(job: Job) -> None:
                 lists.refresh(scene.fieldwork)
 
 
+def scene_of(project: Path, name: str = "") -> bpy.types.Scene | None:
+    """A scene that shows a project, rather the one of this name; None where none does: another file was loaded. Without
+    a window the scene that is open, whatever it shows."""
+    if bpy.app.background:
+        return bpy.data.scenes.get(name) or bpy.context.scene
+    scenes = [scene for scene in bpy.data.scenes if snapshot.folder_of(scene.fieldwork) == project]
+    return next((scene for scene in scenes if scene.name == name), scenes[0] if scenes else None)
+
+
 def set_if_empty(scene: bpy.types.Scene, folder: str) -> None:
     """Let the scene show the project it was just given."""
     if not scene.fieldwork.project:

@@ -122,6 +122,8 @@ class FIELDWORK_OT_classes_apply(WithProject, Operator):
             ask(job.verb, job.params, lambda result, error: queue.finish(job, result, error))
         except EngineError as error:
             queue.finish(job, None, error)
+        if bpy.app.background:
+            queue.landing.settle()
         if job.error is not None:
             self.report({"ERROR"}, str(job.error))
             return {"CANCELLED"}

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import bpy
 from bpy.types import Context
 
+from ..addon.errors import SceneError
 from ..addon.jobs.job import Done, Job, Steps
 from ..addon.jobs.queue import queue
 from ..addon.project import snapshot
@@ -17,8 +19,9 @@ from ..addon.props import StringProperty
 from ..addon.roles import Owner
 from ..addon.scene.frame import scene_from_capture
 from ..addon.scene.lens import pinhole
+from ..addon.scene.slices import Held
 from ..addon.text import t
-from .base import ProjectOperator, absolute, need_held_out, need_run, refresh_scenes, scene_settings
+from .base import ProjectOperator, absolute, need_held_out, need_run, refresh_scenes, scene_of, scene_settings
 
 
 def check_camera(scene: bpy.types.Scene) -> None:
@@ -39,38 +42,49 @@ def write_cameras(
     """
     from ..nerfcore.files import write_json  # not at the top: enabling the extension must be quick
 
-    percent = scene.render.resolution_percentage / 100
-    width = size[0] or round(scene.render.resolution_x * percent)
-    height = size[1] or round(scene.render.resolution_y * percent)
+    place, render = Held(bpy.data.scenes, scene), scene.render
+    width = size[0] or round(render.resolution_x * render.resolution_percentage / 100)
+    height = size[1] or round(render.resolution_y * render.resolution_percentage / 100)
     numbers = [scene.frame_current]
     if animated:
         numbers = list(range(scene.frame_start, scene.frame_end + 1, scene.frame_step))
     frames = []
     for number in numbers:
-        current = scene.frame_current
-        if number != current:
-            scene.frame_set(number)
-        evaluated = scene.camera.evaluated_get(bpy.context.evaluated_depsgraph_get())
+        frames.append({"file_path": f"frame_{number:04}", **camera_at(place(), number, width, height, owner)})
+        yield len(frames) / len(numbers), t("frame {}", number)
+    write_json(path, {"frames": frames})
+
+
+def camera_at(scene: bpy.types.Scene, number: int, width: int, height: int, owner: Owner | None) -> dict[str, Any]:
+    """Pose and intrinsics of the scene's camera in a frame, as transforms.json has them; the scene stays in its frame.
+
+    Raises SceneError: the scene has no camera any more.
+    """
+    if scene.camera is None:
+        raise SceneError(t("The scene has no active camera."))
+    current = scene.frame_current
+    if number != current:
+        scene.frame_set(number)
+    try:
+        evaluated = scene.camera.evaluated_get(scene.view_layers[0].depsgraph)
         # A scaled parent must not scale the camera's axes.
         capture_from_scene = scene_from_capture(scene, owner).inverted_safe()
         location, rotation, _ = (capture_from_scene @ evaluated.matrix_world).decompose()
         matrix = rotation.to_matrix().to_4x4()
         matrix.translation = location
-        frames.append(
-            {"file_path": f"frame_{number:04}", "transform_matrix": [list(row) for row in matrix]}
-            | intrinsics(evaluated.data, width, height)
-        )
+        aspect = scene.render.pixel_aspect_x, scene.render.pixel_aspect_y
+        lens = intrinsics(evaluated.data, width, height, aspect)
+    finally:
         if number != current:
             scene.frame_set(current)  # the window may be drawn between two steps
-        yield len(frames) / len(numbers), t("frame {}", number)
-    write_json(path, {"frames": frames})
+    return {"transform_matrix": [list(row) for row in matrix], **lens}
 
 
-def intrinsics(camera: bpy.types.Camera, width: int, height: int) -> dict[str, float]:
-    """Pinhole intrinsics of a Blender camera as transforms.json has them."""
-    focal, cx, cy = pinhole(camera, width, height)
-    angle = 2 * math.atan(width / 2 / focal)
-    return {"w": width, "h": height, "fl_x": focal, "fl_y": focal, "cx": cx, "cy": cy, "camera_angle_x": angle}
+def intrinsics(camera: bpy.types.Camera, width: int, height: int, aspect: Sequence[float]) -> dict[str, float]:
+    """Pinhole intrinsics of a Blender camera as transforms.json has them; `aspect`: width and height of a pixel."""
+    fx, fy, cx, cy = pinhole(camera, width, height, aspect)
+    angle = 2 * math.atan(width / 2 / fx)
+    return {"w": width, "h": height, "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "camera_angle_x": angle}
 
 
 CAMERAS = "cameras.json"  # beside the images
@@ -146,22 +160,21 @@ def show_result(job: Job) -> Steps | None:
     # Not at the top: enabling the extension must be quick.
     from ..addon.render.result import show_steps
 
-    scene = next((s for s in bpy.data.scenes if snapshot.folder_of(s.fieldwork) == job.project), bpy.context.scene)
-    files = [Path(path) for path in job.result["frames"]]
+    scene, files = scene_of(job.project), [Path(path) for path in job.result["frames"]]
     # An orbit has no camera in the scene.
-    show_as = scene.fieldwork.show_as if "orbit" not in job.params else "none"
+    show_as = scene.fieldwork.show_as if scene is not None and "orbit" not in job.params else "none"
     photos = "test" in job.params or "all" in job.params
     if photos and show_as != "none":
-        _show_straightened(job, scene.name, show_as)
+        _show_straightened(job, show_as)
         show_as = "none"
     return show_steps(scene, files, show_as, photos, snapshot.owner(job.project))
 
 
-def _show_straightened(job: Job, scene_name: str, show_as: str) -> None:
+def _show_straightened(job: Job, show_as: str) -> None:
     """Blender's cameras know no lens distortion: the engine takes it out of the renders before they are shown."""
 
     def show(done: Job) -> Steps | None:
-        scene = bpy.data.scenes.get(scene_name)  # another file may have been loaded meanwhile
+        scene = scene_of(done.project) if done.project else None
         if done.state != "done" or not done.result or scene is None:
             return None
         from ..addon.render.result import show_steps

@@ -13,7 +13,8 @@ from ..addon.project import classes, snapshot
 from ..addon.properties import SPLITS
 from ..addon.props import EnumProperty, StringProperty
 from ..addon.roles import ROLE
-from .base import ProjectOperator, absolute, need_poses, refresh_scenes, scene_settings, set_if_empty
+from ..addon.text import t
+from .base import ProjectOperator, absolute, need_poses, refresh_scenes, scene_of, scene_settings, set_if_empty
 
 SPLIT_ROLES = {"instance:": "instances", "class:": "classes"}  # how roles of the surface's objects begin
 
@@ -73,10 +74,9 @@ def import_result(job: Job, cameras: str, scene_name: str, split: str = "none") 
     refresh_scenes(job)
     if job.state != "done" or not job.result:
         return None
-    # Another file may have been loaded meanwhile.
-    scene = bpy.data.scenes.get(scene_name) or bpy.context.scene
-    if snapshot.folder_of(scene.fieldwork) != job.project and not bpy.app.background:
-        job.warnings.append("The scene shows another project by now: press Update Scene there.")
+    scene = scene_of(job.project, scene_name)
+    if scene is None:
+        job.warnings.append(t("No scene shows the project by now: press Update Scene in one that does."))
         return None
     return import_steps(job, cameras, scene, split)
 
@@ -85,11 +85,12 @@ def import_steps(job: Job, cameras: str, scene: bpy.types.Scene, split: str) -> 
     # Not at the top: enabling the extension must be quick.
     from ..addon.scene import build
     from ..addon.scene.frame import root_of
+    from ..addon.scene.slices import Held
 
-    first = root_of(scene, snapshot.owner(job.project)) is None
+    place, first = Held(bpy.data.scenes, scene), root_of(scene, snapshot.owner(job.project)) is None
     imported = yield from build.import_steps(scene, build.load(job.result["folder"], split), cameras)
     job.warnings += imported.warnings
-    classes.show(scene.fieldwork)
+    classes.show(place().fieldwork)
     if first:
         show_colors()
     yield 1.0, ""

@@ -42,6 +42,7 @@ TITLES = {
     "package": "Preparing the Scene",
     "doctor": "Checking the Engine",
     "classes": "Reading Classes",
+    "timer": "Watching",
 }
 
 

@@ -4,8 +4,8 @@ In a window the timer (timer.py) lets it work; it is persistent, so jobs survive
 operator that started them. Where there are no timers (`blender -b`, the `bpy` module) operators call `Queue.run`
 instead, which blocks.
 
-What a job has to do in Blender when it has ended may be a generator: it is then run in slices, between which the window
-lives.
+What a job has to do in Blender before it starts and when it has ended (landing.py) waits until the scene may be touched.
+It may be a generator: it is then run in slices, between which the window lives.
 
 Imported when the extension is enabled: what is needed only with a job is imported where it is used.
 """
@@ -21,17 +21,16 @@ from typing import TYPE_CHECKING, Any
 import bpy
 
 from .. import machine
-from ..errors import EngineError, SceneError
-from ..text import t
-from . import redraw
+from ..errors import EngineError
+from . import gate, redraw
 from .job import Done, Job, Steps
+from .landing import SLICE, Landing, scene_error
 
 if TYPE_CHECKING:
     from ..engine.install import Installer
     from ..engine.link import DONE, Link
 
 KEPT = 8  # finished jobs the panel remembers
-SLICE = 0.02  # seconds of bringing a result into the scene at a time
 
 
 def open_link(python: Path, log: Path) -> Link:
@@ -59,12 +58,10 @@ class Queue:
         self.facts: dict[str, Any] = {}  # what the engine last said of itself
         self.doctor: dict[str, Any] = {}  # what the doctor last found
         self.installer: Installer | None = None
-        self.bringing: tuple[Job, Steps] | None = None  # a job whose result comes into the scene
+        self.landing = Landing(self.brought)
         self.slowest_tick = 0.0  # seconds of the longest time Blender was held up
         self.slowest_step = ""  # what that was
         self.slowest_cpu = 0.0  # the same in seconds of the processor, which other programs do not lengthen
-        self.edits = 0  # files loaded, undone and redone steps: what was held of the scene is stale
-        self._edits_seen = 0
         self._loader: threading.Thread | None = None
         self._number = 0
         self._asked = 0.0
@@ -76,8 +73,9 @@ class Queue:
     @property
     def current(self) -> Job | None:
         """The job the panels show."""
-        bringing = self.bringing[0] if self.bringing else None
-        return bringing or self.running or self.followed or (self.waiting[0] if self.waiting else None)
+        landing = self.landing.jobs
+        candidates = (*landing[:1], self.running, self.followed, *self.waiting)
+        return next((job for job in candidates if job is not None), None)
 
     @property
     def last(self) -> Job | None:
@@ -133,10 +131,10 @@ class Queue:
             result = self._engine().run_blocking(job.verb, {**job.params, "job": job.id}, job.take)
         except EngineError as error:
             self.finish(job, None, error)
+            self.landing.settle()
             raise
         self.finish(job, result, None)
-        while self.bringing:
-            self._bring(SLICE)
+        self.landing.settle()
         return result
 
     def ask(self, method: str, params: dict[str, Any], on_done: DONE | None = None) -> None:
@@ -160,8 +158,8 @@ class Queue:
         if job in self.waiting:
             self.waiting.remove(job)
             self.finish(job, None, EngineError("cancelled", "Cancelled."))
-        elif self.bringing and self.bringing[0] is job:
-            self._brought(job, EngineError("cancelled", "Cancelled."))
+        elif job in self.landing.jobs:
+            self.landing.cancel(job)
         elif job.active:
             job.state = "cancelling"
             if job.followed and job.project:
@@ -202,7 +200,8 @@ class Queue:
         self._prepare(SLICE)
         self._start_next()
         self._look_after_engine()
-        self._bring(SLICE)
+        self.landing.land()
+        self.landing.bring(SLICE)
 
     @property
     def busy(self) -> bool:
@@ -213,7 +212,7 @@ class Queue:
     @property
     def sliced(self) -> bool:
         """Whether there is work in Blender that is done in slices."""
-        return self.bringing is not None or any(job.before for job in self.waiting)
+        return self.landing.current is not None or any(job.before for job in self.waiting)
 
     @property
     def undrawn(self) -> bool:
@@ -225,16 +224,18 @@ class Queue:
         job = next((job for job in self.waiting if job.before is not None), None)
         if job is None or job.before is None:
             return
+        if reason := gate.closed():
+            job.message = reason
+            return
         end = time.perf_counter() + seconds
         try:
             while time.perf_counter() < end:
                 job.fraction, job.message = next(job.before)
         except StopIteration:
             job.before, job.fraction, job.message = None, None, ""
-        except Exception as error:
+        except Exception as error:  # noqa: BLE001 - the job and its report tell it
             self.waiting.remove(job)
-            self.finish(job, None, EngineError("scene", f"The scene cannot be read: {error}."))
-            raise
+            self.finish(job, None, scene_error("The scene cannot be read", error))
 
     def _start_next(self) -> None:
         if self.running is not None or not self.waiting or self.waiting[0].before is not None:
@@ -274,48 +275,22 @@ class Queue:
         job.result, job.error, job.eta = result, error, None
         if job.started:
             job.seconds = time.monotonic() - job.started
-        job.state = "done" if error is None else "cancelled" if error.kind == "cancelled" else "failed"
         if job.verb == "doctor" and result:
             self.doctor = result
-        steps = job.on_done(job) if job.on_done else None
-        if steps is None:
-            self.remember(job)
-        else:
-            job.state, job.stage, job.fraction, job.message = "running", t("Updating the Scene"), None, ""
-            self.bringing, self._edits_seen = (job, steps), self.edits
+        self.landing.add(job)
         self.redraw()
 
-    def _bring(self, seconds: float) -> None:
-        """Bring a result into the scene for that long."""
-        if self.bringing is None:
-            return
-        job, steps = self.bringing
-        end = time.perf_counter() + seconds
-        try:
-            if self._edits_seen != self.edits and job.on_done:
-                # What the steps hold of the scene may be gone. Made again, they go on with what is there.
-                self._edits_seen, job.state = self.edits, "done"
-                again = job.on_done(job)
-                if again is None:
-                    self._brought(job, None)
-                    return
-                job.state, self.bringing, steps = "running", (job, again), again
-            while time.perf_counter() < end:
-                job.fraction, job.message = next(steps)
-        except StopIteration:
-            self._brought(job, None)
-        except SceneError as error:
-            self._brought(job, EngineError("scene", str(error)))
-        except Exception as error:
-            self._brought(job, EngineError("scene", f"The result could not be brought into the scene: {error}."))
-            raise
-
-    def _brought(self, job: Job, error: EngineError | None) -> None:
-        self.bringing = None
-        job.error, job.fraction, job.message = error, None, ""
-        job.state = "done" if error is None else "cancelled" if error.kind == "cancelled" else "failed"
+    def brought(self, job: Job) -> None:
+        """What a job had to do in Blender is done."""
         self.remember(job)
         self.redraw()
+
+    def tell(self, error: Exception) -> None:
+        """Let the panel show what went wrong in Blender itself, once."""
+        shown = scene_error("Something went wrong in Fieldwork", error)
+        if not any(job.verb == "timer" and job.error.message == shown.message for job in self.finished):
+            self.remember(Job("timer", {}, f"timer-{time.strftime('%Y%m%d-%H%M%S')}", state="failed", error=shown))
+            self.redraw()
 
     def remember(self, job: Job) -> None:
         """Keep what became of a job for the panels."""

@@ -4,12 +4,15 @@ other files, undo and redo."""
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import bpy
 
 from .. import machine
 from ..project import edits, lists, region, snapshot
+from . import gate
 from .follow import follow, reattach
 from .queue import Queue, queue
 
@@ -23,18 +26,12 @@ def tick(queue: Queue) -> float:
     """One look at the engine, and at what the scene says of its project. Returns the seconds until the next."""
     begin, busy_since = time.perf_counter(), time.thread_time()
     doing = f"{queue.current.stage} {queue.current.message}" if queue.current else ""
-    try:
-        # Edits before jobs: a training that starts now is to know of them.
-        if not bpy.app.background:
-            region.follow(bpy.context.scene)
-        edits.send(queue.ask)
-        follow(queue)
-        queue.work()
-    except Exception:
-        # A timer that raises is dropped by Blender, and all jobs with it.
-        import logging
-
-        logging.getLogger("fieldwork.addon").exception("Fieldwork's timer failed")
+    # Edits before jobs: a training that starts now is to know of them.
+    for part in (_follow_region, lambda: edits.send(queue.ask), lambda: follow(queue), queue.work):
+        try:
+            part()
+        except Exception as error:  # noqa: BLE001 - a timer that raises is dropped by Blender, and all jobs with it
+            queue.tell(error)
     due = queue.busy and time.monotonic() - queue.drawn > DRAW_PERIOD
     if due or queue.undrawn:
         queue.redraw()
@@ -45,34 +42,70 @@ def tick(queue: Queue) -> float:
     return SLICE_PERIOD if queue.sliced else BUSY_PERIOD if queue.busy else IDLE_PERIOD
 
 
+def _follow_region() -> None:
+    if not bpy.app.background and gate.closed() is None:
+        region.follow(bpy.context.scene)
+
+
 def _tick() -> float:
     return tick(queue)
 
 
 @bpy.app.handlers.persistent
 def _undone(*_: Any) -> None:
-    queue.edits += 1
-    for scene in bpy.data.scenes:
-        lists.undone(scene.fieldwork)
-        region.undone(scene)
+    queue.landing.edits += 1
+    with _told():
+        for scene in bpy.data.scenes:
+            lists.undone(scene.fieldwork)
+            region.undone(scene)
+
+
+@bpy.app.handlers.persistent
+def _file_loading(*_: Any) -> None:
+    gate.set_loading(True)
+
+
+@bpy.app.handlers.persistent
+def _file_not_loaded(*_: Any) -> None:
+    gate.set_loading(False)
 
 
 @bpy.app.handlers.persistent
 def _file_loaded(*_: Any) -> None:
     """Another file: its project may have a job that runs elsewhere."""
-    queue.edits += 1
-    for scene in bpy.data.scenes:
-        if scene.fieldwork.project:
-            lists.refresh(scene.fieldwork)
-    folder = snapshot.folder_of(bpy.context.scene.fieldwork) if bpy.context.scene else None
-    if snapshot.has_project(folder) and not bpy.app.background:
-        reattach(queue, folder)
+    gate.set_loading(False)
+    queue.landing.edits += 1
+    with _told():
+        region.forget()
+        for scene in bpy.data.scenes:
+            if scene.fieldwork.project:
+                lists.refresh(scene.fieldwork)
+        folder = snapshot.folder_of(bpy.context.scene.fieldwork) if bpy.context.scene else None
+        if snapshot.has_project(folder) and not bpy.app.background:
+            reattach(queue, folder)
+
+
+@contextmanager
+def _told() -> Iterator[None]:
+    """What goes wrong inside is shown in the panel: of errors in handlers only a terminal would hear."""
+    try:
+        yield
+    except Exception as error:  # noqa: BLE001 - see above
+        queue.tell(error)
+
+
+HANDLERS = (
+    ("load_pre", _file_loading),
+    ("load_post", _file_loaded),
+    ("load_post_fail", _file_not_loaded),
+    ("undo_post", _undone),
+    ("redo_post", _undone),
+)
 
 
 def register() -> None:
-    bpy.app.handlers.load_post.append(_file_loaded)
-    bpy.app.handlers.undo_post.append(_undone)
-    bpy.app.handlers.redo_post.append(_undone)
+    for name, handler in HANDLERS:
+        getattr(bpy.app.handlers, name).append(handler)
     if not bpy.app.background:
         bpy.app.timers.register(_tick, first_interval=IDLE_PERIOD, persistent=True)
 
@@ -80,9 +113,9 @@ def register() -> None:
 def unregister() -> None:
     if bpy.app.timers.is_registered(_tick):
         bpy.app.timers.unregister(_tick)
-    bpy.app.handlers.load_post.remove(_file_loaded)
-    bpy.app.handlers.undo_post.remove(_undone)
-    bpy.app.handlers.redo_post.remove(_undone)
+    for name, handler in HANDLERS:
+        getattr(bpy.app.handlers, name).remove(handler)
+    gate.set_loading(False)
     # What the engine has been told before its input ends it does.
     edits.send(queue.ask, at_once=True)
     edits.clear()

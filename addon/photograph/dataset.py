@@ -99,7 +99,7 @@ def scene_lens(scene: bpy.types.Scene, size: list[int] | None) -> Lens:
 def camera_lens(camera: bpy.types.Camera, width: int, height: int) -> Lens:
     """A Blender camera's focal length and principal point in pixels."""
     found = pinhole(camera, width, height)
-    return Lens(width, height, found.focal, (found.cx, found.cy))
+    return Lens(width, height, found.fx, (found.cx, found.cy))
 
 
 def camera_shots(scene: bpy.types.Scene, views: int, size: list[int] | None) -> list[Shot]:

@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from . import edits, snapshot
+from .history import History
 
 VERB = "classes"
 FIELDS = ("name", "color", "priority")
 
 _quiet = False
-# project folder → (class id, field) → value that the user gave it here last
-_given: dict[Path, dict[tuple[int, str], Any]] = {}
 
 
 @contextmanager
@@ -38,10 +37,10 @@ def fill(settings: Any) -> None:
     folder = snapshot.folder_of(settings)
     areas = snapshot.last_result(folder, "mesh", settings.run).get("classes") or {}
     hidden = {entry.name for entry in settings.classes if not entry.visible}
+    values = shown(folder)
     with quiet():
-        settings.classes.clear()
-        for value in shown(folder):
-            entry = settings.classes.add()
+        resize(settings.classes, len(values))
+        for entry, value in zip(settings.classes, values):
             entry.id, entry.name, entry.color = value["id"], value["name"], value["color"]
             entry.priority = value["priority"]
             entry.area = (areas.get(value["name"]) or {}).get("area") or 0.0
@@ -54,29 +53,47 @@ def edited(settings: Any) -> None:
     folder = snapshot.folder_of(settings)
     if _quiet or folder is None:
         return
-    changes = _changes(settings, folder)
+    changes, known = _changes(settings, folder), _known(folder)
+    for key, value in changes.items():
+        _history.give(_key(folder, key), known[key], value)
     if changes:
-        _given.setdefault(folder, {}).update(changes)
         _put(folder, changes)
 
 
 def undone(settings: Any) -> None:
     """After an undo or redo the list may be an older one.
 
-    A value that the user gave is an edit of his to be undone: a new edit. Any other difference is not his doing, and
-    is put right by `fill`.
+    Where undo went along the user's edits, it is an edit itself. Any other difference is old news, and is put right by
+    `fill`.
     """
     folder = snapshot.folder_of(settings)
     if folder is None:
         return
-    given = _given.get(folder, {})
-    now = {(value["id"], field): value[field] for value in shown(folder) for field in FIELDS}
+    known = _known(folder)
     changes = {
-        key: value for key, value in _changes(settings, folder).items() if key in given and _same(given[key], now[key])
+        key: value
+        for key, value in _changes(settings, folder).items()
+        if _history.go_back(_key(folder, key), known[key], value)
     }
     if changes:
-        given.update(changes)
         _put(folder, changes)
+
+
+def resize(collection: Any, count: int) -> None:
+    """Make a list of the scene as long as this. The entries stay where they are: the user may be typing into one."""
+    while len(collection) > count:
+        collection.remove(len(collection) - 1)
+    while len(collection) < count:
+        collection.add()
+
+
+def _known(folder: Path) -> dict[tuple[int, str], Any]:
+    """(class id, field) → value, as it is known of the project."""
+    return {(value["id"], field): value[field] for value in shown(folder) for field in FIELDS}
+
+
+def _key(folder: Path, key: tuple[int, str]) -> tuple[Any, ...]:
+    return (folder, snapshot.owner(folder).uuid, *key)
 
 
 def _changes(settings: Any, folder: Path) -> dict[tuple[int, str], Any]:
@@ -116,6 +133,9 @@ def _same(a: Any, b: Any) -> bool:
         return a == b
     pairs = zip(a, b) if isinstance(a, (list, tuple)) else [(a, b)]
     return all(abs(x - y) < 1e-5 * max(1.0, abs(x)) for x, y in pairs)
+
+
+_history = History(_same)
 
 
 def show(settings: Any) -> None:

@@ -16,9 +16,9 @@ def refresh(settings: Any) -> None:
     settings.project_uuid = snapshot.owner(folder).uuid if folder else ""
     report = snapshot.cached_json(folder / snapshot.POSES_REPORT) if folder else None
     agreement = {image["name"]: image for image in (report or {}).get("images", [])}
-    settings.images.clear()
-    for image in (project or {}).get("images", []):
-        entry = settings.images.add()
+    images = (project or {}).get("images", [])
+    classes.resize(settings.images, len(images))
+    for entry, image in zip(settings.images, images):
         entry.name = image["name"]
         entry.file = image.get("file", "")
         entry.status, entry.reason = image.get("status", "ok"), image.get("reason", "")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,15 +11,26 @@ from mathutils import Matrix, Vector
 
 from ..scene.frame import root_of, scene_from_capture
 from . import edits, snapshot
+from .history import History
 
 VERB = "region"
 CORNERS = [Vector((x, y, z)) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
 Bounds = list[list[float]]  # [min, max] in the capture's frame, metres
 
-# scene → bounds of its box and of its project at the last look, and whether the box was moved since they agreed
-_seen: dict[str, tuple[Bounds, Bounds | None, bool]] = {}
+
+@dataclass(frozen=True)
+class Look:
+    """What was seen of a scene's box: its bounds, those of the project, whether the box was moved since they agreed, and
+    whether by undo."""
+
+    box: Bounds
+    project: Bounds | None
+    moved: bool = False
+    by_undo: bool = False
+
+
+_seen: dict[str, Look] = {}  # by the names of the scenes of this file
 _undone: set[str] = set()  # scenes whose box may be an older one
-_given: dict[Path, Bounds | None] = {}  # project folder → bounds that the user gave it here last
 
 
 def find(scene: bpy.types.Scene) -> bpy.types.Object | None:
@@ -38,33 +50,40 @@ def follow(scene: bpy.types.Scene) -> bool:
     """Keep the box and the project alike; whether the project is edited.
 
     A box that was moved goes to the project once it rests. Where the project has changed by itself (it was aligned, or
-    the file with the box is an old one), the box goes to it.
+    the file with the box is an old one), the box goes to it. A box that nobody moved changes nothing.
     """
-    box, folder = find(scene), snapshot.folder_of(scene.fieldwork)
+    box, folder, undone = find(scene), snapshot.folder_of(scene.fieldwork), scene.name in _undone
+    _undone.discard(scene.name)
     if box is None or folder is None or not snapshot.has_project(folder) or snapshot.absence(scene.fieldwork):
         _seen.pop(scene.name, None)
-        _undone.discard(scene.name)
         return False
     now, wanted = bounds_of(scene, box), bounds(folder)
-    new = scene.name not in _seen
-    before, known, moved = _seen.get(scene.name, (now, wanted, wanted is None))
-    # What undo did to a region that came from elsewhere is no edit of the user.
-    if scene.name in _undone and not (folder in _given and _agree(_given[folder], wanted)):
-        before, new, moved = now, True, False
-    _undone.discard(scene.name)
-    if not _same(now, before):
-        _seen[scene.name] = now, wanted, True
+    last = _seen.get(scene.name)
+    if undone:
+        # What undo did to a region that came from elsewhere is no edit of the user.
+        if not _agree(now, wanted) and _history.go_back(_key(folder), wanted, now):
+            _seen[scene.name] = Look(now, wanted, moved=True, by_undo=True)
+            return False
+        last = None
+    if last is not None and not _same(now, last.box):
+        _seen[scene.name] = Look(now, wanted, moved=True)
         return False
-    if new or wanted != known:
-        _seen[scene.name] = now, wanted, new and moved
+    if last is None or not _agree(wanted, last.project):
+        _seen[scene.name] = Look(now, wanted)
         if wanted is not None and not _same(now, wanted):
             add(scene, wanted)
         return False
-    if not moved or _flat(now) or _same(now, wanted):
+    if not last.moved or _flat(now) or _same(now, wanted):
         return False
-    edit(folder, now)
-    _seen[scene.name] = now, now, False
+    edit(folder, now, last.by_undo)
+    _seen[scene.name] = Look(now, now)
     return True
+
+
+def forget() -> None:
+    """Another file was loaded: its scenes may be called like those of before."""
+    _seen.clear()
+    _undone.clear()
 
 
 def undone(scene: bpy.types.Scene) -> None:
@@ -88,7 +107,7 @@ def add(scene: bpy.types.Scene, wanted: Bounds) -> bpy.types.Object:
         box.parent = root_of(scene, owner)  # so that it goes where the capture goes
     box.matrix_world = scene_from_capture(scene, owner) @ Matrix.LocRotScale((low + high) / 2, None, (high - low) / 2)
     known = bounds(folder)
-    _seen[scene.name] = bounds_of(scene, box), known, known is None
+    _seen[scene.name] = Look(bounds_of(scene, box), known, moved=known is None)
     return box
 
 
@@ -102,15 +121,16 @@ def bounds_of(scene: bpy.types.Scene, box: bpy.types.Object, folder: Path | None
     return [[float(pick(c[i] for c in corners)) for i in range(3)] for pick in (min, max)]
 
 
-def edit(folder: Path, wanted: Bounds | None) -> None:
-    """Set or clear the training region of the project, by way of the engine.
+def edit(folder: Path, wanted: Bounds | None, by_undo: bool = False) -> None:
+    """Set or clear the training region of the project, by way of the engine; `by_undo`: as it was before.
 
     Raises:
         ValueError: the box is flat.
     """
     if wanted is not None and _flat(wanted):
         raise ValueError("The training region is flat: scale its box.")
-    _given[folder] = wanted
+    if not by_undo:
+        _history.give(_key(folder), bounds(folder), wanted)
     edits.put(folder, VERB, {"bounds": wanted}, _params)
 
 
@@ -128,6 +148,13 @@ def _same(a: Bounds, b: Bounds | None) -> bool:
 
 def _agree(a: Bounds | None, b: Bounds | None) -> bool:
     return a is b or (a is not None and _same(a, b))
+
+
+_history = History(_agree)
+
+
+def _key(folder: Path) -> tuple[Path, str]:
+    return folder, snapshot.owner(folder).uuid
 
 
 def _flat(bounds: Bounds) -> bool:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import shutil
 from collections.abc import Generator
 from pathlib import Path
 
@@ -10,15 +12,17 @@ import bpy
 from ..roles import ROLE, Owner
 from .slot import MARK, load_render, render_slot
 
+EVERY_FRAME = "every_frame"  # folder beside the pictures of an animation
 OTHER_PASSES = ("_depth", "_labels", "_confidence", "_normal", "_unknown")  # file names of all but the color
 
 
 def show_steps(
-    scene: bpy.types.Scene, files: list[Path], show_as: str, photos: bool, owner: Owner
+    scene: bpy.types.Scene | None, files: list[Path], show_as: str, photos: bool, owner: Owner
 ) -> Generator[tuple[float, str], None, list[tuple[bpy.types.Object, bpy.types.Image]]]:
     """Load the rendered files, and put the colored ones where the user wants them, a step for each file.
 
     Args:
+        scene: may be None where `show_as` is "none".
         files: what the engine wrote.
         show_as: "none", "background" or "plane".
         photos: whether they were rendered from the photos' cameras rather than the scene's.
@@ -26,43 +30,83 @@ def show_steps(
     Returns:
         the cameras that got an image, with it.
     """
-    images = {}
+    name = scene.name if scene is not None else ""
     for number, path in enumerate(files):
         yield number / len(files), path.name
-        images[path] = load_render(path)
+        load_render(path)
     colored = [path for path in files if path.suffix == ".png" and not path.stem.endswith(OTHER_PASSES)]
     if show_as == "none" or not colored:
         return []
-    if photos:
-        cameras = {
-            obj[ROLE].removeprefix("camera:"): obj
-            for obj in scene.objects
-            if obj.type == "CAMERA" and str(obj.get(ROLE)).startswith("camera:") and owner.owns(obj)
-        }
-        pairs = [(cameras[path.stem], images[path]) for path in colored if path.stem in cameras]
-    else:
-        image = images[colored[0]]
-        if len(colored) > 1:
+    pairs = []
+    for camera_name, path in _places(bpy.data.scenes[name], colored, photos, owner):
+        yield 1.0, camera_name
+        # Looked up again in each step: between two the user may do anything.
+        scene = bpy.data.scenes.get(name)
+        camera = scene.objects.get(camera_name) if scene is not None else None
+        if camera is None:
+            continue
+        shown = [path] if photos else every_frame(colored)
+        image = load_render(shown[0])
+        if len(shown) > 1:
             image.source = "SEQUENCE"
-        pairs = [(scene.camera, image)] if scene.camera else []
-    for camera, image in pairs:
-        yield 1.0, camera.name
-        if show_as == "background":
-            background(scene, camera, image, len(colored))
-        else:
-            plane(scene, camera, image, len(colored))
+        put = background if show_as == "background" else plane
+        put(scene, camera, image, frame_number(shown[0]), len(shown))
+        pairs.append((camera, image))
     return pairs
 
 
-def background(scene: bpy.types.Scene, camera: bpy.types.Object, image: bpy.types.Image, frames: int) -> None:
-    """Put the image over the camera's view, in place of an earlier one; photos behind it stay."""
+def _places(scene: bpy.types.Scene, colored: list[Path], photos: bool, owner: Owner) -> list[tuple[str, Path]]:
+    """Which cameras get which pictures, by their names."""
+    if not photos:
+        return [(scene.camera.name, colored[0])] if scene.camera else []
+    cameras = {
+        obj[ROLE].removeprefix("camera:"): obj.name
+        for obj in scene.objects
+        if obj.type == "CAMERA" and str(obj.get(ROLE)).startswith("camera:") and owner.owns(obj)
+    }
+    return [(cameras[path.stem], path) for path in colored if path.stem in cameras]
+
+
+def frame_number(path: Path) -> int:
+    """The number at the end of a picture's name, 1 where there is none."""
+    found = re.search(r"(\d+)$", path.stem)
+    return int(found[1]) if found else 1
+
+
+def every_frame(files: list[Path]) -> list[Path]:
+    """The pictures of an animation with one for each frame.
+
+    Blender plays pictures by their numbers, and shows nothing where one is missing. Where only every so many frames
+    were rendered, a folder beside them gets a picture for each: the last one that was rendered.
+    """
+    numbers = [frame_number(path) for path in files]
+    steps = {after - before for before, after in zip(numbers, numbers[1:])}
+    step = min(steps, default=1)
+    if len(steps) != 1 or step <= 1:
+        return files
+    folder = files[0].parent / EVERY_FRAME
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    held = []
+    for path, number in zip(files, numbers):
+        for frame in range(number, number + step):
+            held.append(folder / f"frame_{frame:04}{path.suffix}")
+            shutil.copyfile(path, held[-1])
+    return held
+
+
+def background(
+    scene: bpy.types.Scene, camera: bpy.types.Object, image: bpy.types.Image, first: int, frames: int
+) -> None:
+    """Put the image over the camera's view, in place of an earlier one; photos behind it stay. A sequence of so many
+    frames begins at the frame `first`."""
     slot = render_slot(camera.data)
     slot.image, slot.alpha, slot.display_depth, slot.frame_method = image, 1.0, "FRONT", "STRETCH"
-    _play(scene, slot.image_user, image, frames)
+    _play(slot.image_user, image, first, frames)
     camera.data.show_background_images = True
 
 
-def plane(scene: bpy.types.Scene, camera: bpy.types.Object, image: bpy.types.Image, frames: int) -> None:
+def plane(scene: bpy.types.Scene, camera: bpy.types.Object, image: bpy.types.Image, first: int, frames: int) -> None:
     """An image that fills the camera's view at the distance at which the camera itself is drawn; one for a camera."""
     empty = next((child for child in camera.children if MARK in child), None)
     if empty is None:
@@ -71,7 +115,7 @@ def plane(scene: bpy.types.Scene, camera: bpy.types.Object, image: bpy.types.Ima
         scene.collection.objects.link(empty)
         empty.parent = camera
     empty.empty_display_type, empty.data = "IMAGE", image
-    _play(scene, empty.image_user, image, frames)
+    _play(empty.image_user, image, first, frames)
     corners = camera.data.view_frame(scene=scene)
     depth = -corners[0].z
     # An image empty's longer side has the display size.
@@ -83,8 +127,8 @@ def plane(scene: bpy.types.Scene, camera: bpy.types.Object, image: bpy.types.Ima
     empty.rotation_euler = (0.0, 0.0, 0.0)
 
 
-def _play(scene: bpy.types.Scene, user: bpy.types.ImageUser, image: bpy.types.Image, frames: int) -> None:
+def _play(user: bpy.types.ImageUser, image: bpy.types.Image, first: int, frames: int) -> None:
     if image.source == "SEQUENCE":
-        user.frame_start, user.frame_duration = scene.frame_start, frames
-        user.frame_offset = scene.frame_start - 1
+        user.frame_start, user.frame_duration = first, frames
+        user.frame_offset = first - 1
         user.use_auto_refresh = True

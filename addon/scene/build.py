@@ -1,7 +1,7 @@
 """Builds a package (see package.py) in a scene, or brings what an earlier import built up to date.
 
 Everything hangs under one empty. What was built is recognised by custom properties, not by names, so that objects may
-be renamed; transforms given to the parent are kept.
+be renamed; transforms given to the parent are kept. What the user edited stays as it is (edited.py).
 
 The work is cut into steps of a few milliseconds, between which Blender's window can draw; what needs no Blender is done
 in a thread meanwhile. A step may leave a part unfinished, but nothing that Blender could trip over.
@@ -16,16 +16,18 @@ from pathlib import Path
 from typing import Any, Literal
 
 import bpy
-from mathutils import Vector
 
+from ..render.slot import load_image
 from ..roles import Owner
 from .cameras import SIZE, animated_camera, display_size, photo_camera, use_size_of
+from .edited import CAMERA_PATH, Steps
 from .frame import units_per_metre
-from .look import set_switch, shader_group, viewport_group
+from .look import TEXTURE, set_switch, shader_group, viewport_group
 from .mesh_data import Part, parts
-from .owned import Owned, Steps
+from .owned import Owned
 from .package import Package, read_package
 from .points import sparse_points
+from .slices import Held
 from .surface import surface
 
 Cameras = Literal["many", "animated", "both"]
@@ -86,33 +88,60 @@ def import_steps(
     Raises:
         PackageError: the package cannot be read.
     """
+    place = Held(bpy.data.scenes, scene)
     package, pieces = yield from _in_thread(read)
-    owned = Owned(scene, Owner(package.name, package.uuid))
-    root = owned.object("root", f"Fieldwork · {package.name}", None)
-    root.empty_display_size = 0.2
-    if root.scale == Vector((1.0, 1.0, 1.0)):
-        root.scale = [units_per_metre(scene)] * 3
-    set_switch(root)
-    result = Imported(root)
+    owned = Owned(place(), Owner(package.name, package.uuid))
+    _parent(owned, package)
     size = display_size(package)
+    roles: list[str] = []
     if cameras in {"many", "both"}:
         for index, entry in enumerate(package.cameras):
             yield 0.1 + 0.5 * index / len(package.cameras), entry["name"]
-            result.cameras.append(photo_camera(owned, entry, package, root, size))
+            photo_camera(owned, entry, package, size)
     if cameras in {"animated", "both"} and package.cameras:
-        result.animated = yield from animated_camera(owned, package, root, size)
+        yield from animated_camera(owned, package, size)
     yield 0.7, "points"
     if len(package.xyz):
-        result.points = sparse_points(owned, package, root)
+        yield from sparse_points(owned, package)
     yield 0.8, "mesh"
     if pieces:
-        groups = shader_group(owned.owner, "mesh", root, _texture(package)), viewport_group(owned.owner, root)
+        texture = _texture(package)
+        group = shader_group(owned.owner, "mesh", owned.root, texture)
+        trees = [Held(bpy.data.node_groups, tree) for tree in (group, viewport_group(owned.owner, owned.root))]
         for part in pieces:
-            result.meshes.append((yield from surface(owned, package, root, part, *groups)))
-    owned.remove_unused()
+            yield from surface(owned, package, part, lambda: (trees[0](), trees[1]()))
+            roles.append(part.role)
+    yield from owned.remove_unused()
+    result = _imported(owned, package, cameras, roles)
     if package.cameras:
-        _frame_scene(scene, package, result)
+        _frame_scene(owned.scene, package, result)
+    result.warnings += [
+        f"“{name}” was edited: it stays as it is, and what is new stands beside it." for name in owned.kept
+    ]
     return result
+
+
+def _parent(owned: Owned, package: Package) -> None:
+    """The empty that all of the capture hangs under."""
+    new = owned.existing("root") is None
+    root = owned.object("root", f"Fieldwork · {package.name}", None)
+    if new:
+        root.empty_display_size = 0.2
+        root.scale = [units_per_metre(owned.scene)] * 3
+    set_switch(root)
+
+
+def _imported(owned: Owned, package: Package, cameras: Cameras, roles: list[str]) -> Imported:
+    """What was built, found again."""
+    known = owned.known
+    names = [f"camera:{entry['name']}" for entry in package.cameras] if cameras != "animated" else []
+    return Imported(
+        owned.root,
+        [known[name] for name in names if name in known],
+        known.get(CAMERA_PATH) if cameras != "many" else None,
+        known.get("points"),
+        [known[role] for role in roles if role in known],
+    )
 
 
 def _in_thread(function: Callable[[], Any]) -> Steps:
@@ -139,8 +168,8 @@ def _in_thread(function: Callable[[], Any]) -> Steps:
 def _texture(package: Package) -> bpy.types.Image | None:
     if package.texture is None:
         return None
-    texture = bpy.data.images.load(str(package.texture), check_existing=True)
-    texture.reload()
+    texture = load_image(package.texture)
+    texture[TEXTURE] = True
     return texture
 
 
@@ -152,7 +181,6 @@ def _frame_scene(scene: bpy.types.Scene, package: Package, result: Imported) -> 
             "The photos differ in size or pixel shape: set the render resolution to that of a camera (its custom "
             f"property {SIZE}) before rendering through it."
         )
-    own = {item.name for item in result.objects()}
-    if scene.camera is None or scene.camera.name in own:
+    if scene.camera is None:
         scene.camera = result.cameras[0] if result.cameras else result.animated
         use_size_of(scene, package.cameras[0])

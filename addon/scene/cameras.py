@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import bpy
 import numpy as np
 from mathutils import Matrix
 
-from ..render.slot import load_render, render_slot
-from .owned import Owned, Steps
+from ..render.slot import is_of, load_image, load_render, render_slot
+from .edited import CAMERA_PATH, WRITTEN, Steps, camera_edited, camera_fingerprint, keys_fingerprint, write_once
+from .owned import Owned
 from .package import SENSOR_MM, Package, blender_camera
 
 SIZE = "fieldwork_size"  # photo size in pixels, on camera objects
+ASPECT = "fieldwork_aspect"  # width and height of the photo's pixels, on camera objects
+PHOTO = "fieldwork_photo"  # marks the images that are photos
 
 
 def display_size(package: Package) -> float:
@@ -26,52 +30,74 @@ def use_size_of(scene: bpy.types.Scene, entry: dict[str, Any]) -> None:
     """Set resolution and pixel aspect so that a render through this camera has the pixels of its photo."""
     render = scene.render
     render.resolution_x, render.resolution_y, render.resolution_percentage = entry["width"], entry["height"], 100
-    if entry["model"] == "PINHOLE":
-        render.pixel_aspect_x, render.pixel_aspect_y = blender_camera(entry).aspect
+    render.pixel_aspect_x, render.pixel_aspect_y = pixel_aspect(entry)
 
 
-def photo_camera(
-    owned: Owned, entry: dict[str, Any], package: Package, root: bpy.types.Object, size: float
-) -> bpy.types.Object:
-    """The camera of a photo, with the photo and what was rendered of it behind it."""
+def pixel_aspect(entry: dict[str, Any]) -> tuple[float, float]:
+    """Width and height of a photo's pixels, as Blender's render settings have them."""
+    return blender_camera(entry).aspect if entry["model"] == "PINHOLE" else (1.0, 1.0)
+
+
+def photo_camera(owned: Owned, entry: dict[str, Any], package: Package, size: float) -> bpy.types.Object:
+    """The camera of a photo, with the photo and what was rendered of it behind it; beside one that the user moved."""
     role = f"camera:{entry['name']}"
-    found = owned.existing(role)
-    data = found.data if found else bpy.data.cameras.new(entry["name"])
-    item = owned.object(role, entry["name"], data, root)
+    item = _camera(owned, role, entry["name"], size)
+    data = item.data
     _set_lens(data, entry)
-    data.display_size, data.clip_start, data.clip_end = size, 0.01, 1000.0
     item.matrix_parent_inverse = Matrix.Identity(4)
     item.matrix_basis = Matrix(entry["camera_to_world"])
+    item[WRITTEN] = camera_fingerprint(item)
     item[SIZE] = [entry["width"], entry["height"]]
-    path = str(package.folder / entry["image"])
-    background = data.background_images[0] if data.background_images else data.background_images.new()
-    if background.image is None or background.image.filepath != path:
-        background.image = bpy.data.images.load(path, check_existing=True)
-    else:
-        background.image.reload()
-    background.frame_method, background.display_depth, background.alpha = "STRETCH", "BACK", 1.0
-    data.show_background_images = True
+    item[ASPECT] = pixel_aspect(entry)
+    _show_photo(data, package.folder / entry["image"])
     if entry.get("render"):
         slot = render_slot(data)
-        slot.image, slot.frame_method = load_render(package.folder / entry["render"]), "STRETCH"
-        slot.display_depth, slot.alpha = "BACK", 1.0
+        new = slot.image is None
+        slot.image = load_render(package.folder / entry["render"])
+        if new:
+            slot.frame_method, slot.display_depth, slot.alpha = "STRETCH", "BACK", 1.0
     return item
 
 
-def animated_camera(owned: Owned, package: Package, root: bpy.types.Object, size: float) -> Steps:
-    """One camera that stands at the n-th photo's place in frame n; returns it."""
-    role = "camera path"
+def _camera(owned: Owned, role: str, name: str, size: float) -> bpy.types.Object:
+    """The camera of a role, if need be a new one, drawn in this size."""
     found = owned.existing(role)
-    data = found.data if found else bpy.data.cameras.new("Photographer")
-    item = owned.object(role, "Photographer", data, root)
+    if found is not None and camera_edited(found):
+        owned.leave(role)
+        found = None
+    data = found.data if found else bpy.data.cameras.new(name)
+    write_once(data, "display_size", size)
+    if found is None:
+        data.clip_start, data.clip_end = 0.01, 1000.0
+    return owned.object(role, name, data)
+
+
+def _show_photo(data: bpy.types.Camera, path: Path) -> None:
+    """Put the photo behind its camera; backgrounds of the user's own stay."""
+    slots = data.background_images
+    slot = next((slot for slot in slots if slot.image and (PHOTO in slot.image or is_of(slot.image, path))), None)
+    if slot is None:
+        slot = slots.new()
+        slot.frame_method, slot.display_depth, slot.alpha = "STRETCH", "BACK", 1.0
+        data.show_background_images = True
+    slot.image = load_image(path)
+    slot.image[PHOTO] = True
+
+
+def animated_camera(owned: Owned, package: Package, size: float) -> Steps:
+    """One camera that stands at the n-th photo's place in frame n; beside one whose keys the user changed. Returns it."""
+    item = _camera(owned, CAMERA_PATH, "Photographer", size)
     item.animation_data_clear()
-    data.animation_data_clear()
+    item.data.animation_data_clear()
     item.rotation_mode = "QUATERNION"
     item.matrix_parent_inverse = Matrix.Identity(4)
+    if WRITTEN in item:
+        del item[WRITTEN]  # until all keys are there
     before = None
     for frame, entry in enumerate(package.cameras, 1):
         yield 0.6 + 0.1 * frame / len(package.cameras), entry["name"]
-        _set_lens(data, entry)
+        item = owned.object(CAMERA_PATH, "Photographer", None)
+        _set_lens(item.data, entry)
         position, rotation, _ = Matrix(entry["camera_to_world"]).decompose()
         if before is not None:
             rotation.make_compatible(before)
@@ -79,8 +105,8 @@ def animated_camera(owned: Owned, package: Package, root: bpy.types.Object, size
         item.keyframe_insert("location", frame=frame)
         item.keyframe_insert("rotation_quaternion", frame=frame)
         for path in ("lens", "shift_x", "shift_y"):
-            data.keyframe_insert(path, frame=frame)
-    data.display_size, data.clip_start, data.clip_end = size, 0.01, 1000.0
+            item.data.keyframe_insert(path, frame=frame)
+    item[WRITTEN] = keys_fingerprint(item)
     return item
 
 

@@ -2,30 +2,34 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import bpy
 
 
 class Pinhole(NamedTuple):
-    """Focal length and principal point in pixels, from the upper left corner; square pixels."""
+    """Focal lengths and principal point in pixels, from the upper left corner."""
 
-    focal: float
+    fx: float
+    fy: float
     cx: float
     cy: float
 
 
-def pinhole(camera: bpy.types.Camera, width: int, height: int) -> Pinhole:
-    """A perspective camera at a picture size in pixels.
+def pinhole(camera: bpy.types.Camera, width: int, height: int, aspect: Sequence[float] = (1.0, 1.0)) -> Pinhole:
+    """A perspective camera at a picture size in pixels, which are as wide and as high as `aspect` says.
 
-    Blender measures the angle and the shifts along the side that `sensor_fit` names, or along the longer one.
+    Blender measures the angle and the shifts along the side that `sensor_fit` names, or along the longer one
+    (BKE_camera_params_compute_viewplane).
     """
+    tall = aspect[1] / aspect[0]
     fit = camera.sensor_fit
     if fit == "AUTO":
-        fit = "HORIZONTAL" if width >= height else "VERTICAL"
+        fit = "HORIZONTAL" if width >= tall * height else "VERTICAL"
         sensor = camera.sensor_width
     else:
         sensor = camera.sensor_width if fit == "HORIZONTAL" else camera.sensor_height
-    side = width if fit == "HORIZONTAL" else height
+    side = width if fit == "HORIZONTAL" else tall * height
     focal = camera.lens / sensor * side
-    return Pinhole(focal, width / 2 - camera.shift_x * side, height / 2 + camera.shift_y * side)
+    return Pinhole(focal, focal / tall, width / 2 - camera.shift_x * side, height / 2 + camera.shift_y * side / tall)

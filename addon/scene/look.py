@@ -12,6 +12,7 @@ from typing import Any
 import bpy
 
 from ..roles import Owner
+from .edited import WRITTEN, tree_fingerprint
 from .owned import find
 
 SWITCH = "show_labels"  # custom property of the parent empty: 0 photo colour, 1 class colour, 2 confidence
@@ -21,6 +22,7 @@ CONFIDENCE_ATTRIBUTE = "confidence"  # at the vertices
 SHOWN_ATTRIBUTE = "Shown"  # what Workbench draws, at the corners
 MODIFIER = "Fieldwork Viewport Colors"
 GROUP, VIEWPORT_GROUP = "Fieldwork Surface", "Fieldwork Viewport Colors"
+TEXTURE = "fieldwork_texture"  # marks the images that are textures of a surface
 FIRST_GROUP = "Fieldwork"  # what the shader group was called at first
 # From unsure to sure, linear: viridis at quarters (van der Walt and Smith, 2015), which is even to the eye and safe for
 # the colour-blind.
@@ -47,7 +49,7 @@ def shader_group(
     """The shader group shared by all classes of a part ("mesh" or "points"): class colour in, the colour to show out.
 
     The colour of the photos is that of `texture` by the mesh's UVs, or without one that of its colour attribute. One
-    that the project has already is built anew.
+    that the project has already is built anew, unless the user changed its nodes.
     """
     ending = " · points" if part == "points" else ""
     role = f"colors:{part}"
@@ -59,6 +61,8 @@ def shader_group(
         owner.mark(tree, role)
         tree.interface.new_socket("Class Color", in_out="INPUT", socket_type="NodeSocketColor")
         tree.interface.new_socket("Color", in_out="OUTPUT", socket_type="NodeSocketColor")
+    elif _kept(tree, root, texture):
+        return tree
     _clear(tree)
     given, result = tree.nodes.new("NodeGroupInput"), tree.nodes.new("NodeGroupOutput")
     if texture is None:
@@ -72,11 +76,13 @@ def shader_group(
     mixed = _blend(tree, root, photo.outputs["Color"], given.outputs[0], sure.outputs["Fac"])
     tree.links.new(mixed, result.inputs[0])
     _place(tree)
+    tree[WRITTEN] = tree_fingerprint(tree)
     return tree
 
 
 def viewport_group(owner: Owner, root: bpy.types.Object) -> bpy.types.NodeTree:
-    """The geometry-nodes group that fills the attribute which Workbench draws; built anew where the project has it."""
+    """The geometry-nodes group that fills the attribute which Workbench draws; built anew where the project has it,
+    unless the user changed its nodes."""
     role = "colors:viewport"
     tree = find(bpy.data.node_groups, owner, role, f"{VIEWPORT_GROUP} · {owner.name}")
     if tree is None:
@@ -84,6 +90,8 @@ def viewport_group(owner: Owner, root: bpy.types.Object) -> bpy.types.NodeTree:
         owner.mark(tree, role)
         for side in ("INPUT", "OUTPUT"):
             tree.interface.new_socket("Geometry", in_out=side, socket_type="NodeSocketGeometry")
+    elif _kept(tree, root):
+        return tree
     _clear(tree)
     given, result = tree.nodes.new("NodeGroupInput"), tree.nodes.new("NodeGroupOutput")
     photo = _attribute(tree, COLOR_ATTRIBUTE, "FLOAT_COLOR")
@@ -96,6 +104,7 @@ def viewport_group(owner: Owner, root: bpy.types.Object) -> bpy.types.NodeTree:
     tree.links.new(mixed, next(s for s in store.inputs if s.enabled and s.name == "Value"))
     tree.links.new(store.outputs[0], result.inputs[0])
     _place(tree)
+    tree[WRITTEN] = tree_fingerprint(tree)
     return tree
 
 
@@ -103,6 +112,20 @@ def add_viewport_colors(item: bpy.types.Object, tree: bpy.types.NodeTree) -> Non
     """Let Workbench draw a surface by the slider, in the viewport and in renders of its own."""
     modifier = item.modifiers.get(MODIFIER) or item.modifiers.new(MODIFIER, "NODES")
     modifier.node_group = tree
+
+
+def _kept(tree: bpy.types.NodeTree, root: bpy.types.Object, texture: bpy.types.Image | None = None) -> bool:
+    """Whether a group has nodes that the user changed: then it only follows the parent and the texture."""
+    if WRITTEN not in tree or tree[WRITTEN] == tree_fingerprint(tree):
+        return False
+    for curve in tree.animation_data.drivers if tree.animation_data else ():
+        for variable in curve.driver.variables:
+            if variable.targets[0].data_path == f'["{SWITCH}"]':
+                variable.targets[0].id = root
+    for node in tree.nodes:
+        if node.type == "TEX_IMAGE" and texture is not None and (node.image is None or TEXTURE in node.image):
+            node.image = texture
+    return True
 
 
 def _clear(tree: bpy.types.NodeTree) -> None:

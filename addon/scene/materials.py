@@ -6,7 +6,7 @@ from typing import Any
 
 import bpy
 
-from ..roles import Owner
+from ..roles import ROLE, Owner
 from .owned import find
 
 
@@ -36,8 +36,14 @@ def make_material(owner: Owner, label: str, color: list[float], group: Any) -> b
         tree.links.new(emission.outputs[0], output.inputs[0])
         for column, node in enumerate((chooser, emission, output)):
             node.location = (220 * column, 0)
-    chooser = next(node for node in material.node_tree.nodes if node.type == "GROUP")
-    chooser.node_tree = group
-    chooser.inputs[0].default_value = linear
+    chooser = next((node for node in material.node_tree.nodes if _is_ours(node)), None)
+    if chooser is not None:  # else the user made another material of it
+        chooser.node_tree = group
+        chooser.inputs[0].default_value = linear
     material.diffuse_color = linear
     return material
+
+
+def _is_ours(node: bpy.types.Node) -> bool:
+    """Whether a node is the one that chooses the colour to show."""
+    return node.type == "GROUP" and (node.node_tree is None or str(node.node_tree.get(ROLE, "")).startswith("colors:"))

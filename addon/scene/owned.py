@@ -1,26 +1,48 @@
-"""What an earlier import made for a project in a scene, found by its role, and what is missing, made."""
+"""What an earlier import made for a project in a scene, found by its role, and what is missing, made.
+
+What the user changed since is left to him (edited.py), and what is new comes beside it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Generator
 from typing import Any
 
 import bpy
 
+from ..errors import SceneChanged
 from ..roles import ROLE, UUID, Owner
-
-Steps = Generator[tuple[float, str], None, Any]  # yields the share that is done and what is next
+from . import slices
+from .edited import Steps, mesh_edited, object_changed, release
+from .slices import Held
 
 
 class Owned:
-    """The collections and objects of one project in one scene."""
+    """The collections and objects of one project in one scene, looked up again in every slice."""
 
     def __init__(self, scene: bpy.types.Scene, owner: Owner) -> None:
         self.owner = owner
-        self.collection = self._collection(scene.collection, f"Fieldwork · {owner.name}", "all")
-        self.camera_collection = self._collection(self.collection, f"Cameras · {owner.name}", "cameras")
-        self.known = {item[ROLE]: item for item in self.collection.all_objects if ROLE in item and owner.owns(item)}
         self.used: set[str] = set()
+        self.kept: list[str] = []  # names of what the user had changed and has now for himself
+        self._scene = Held(bpy.data.scenes, scene)
+        self._slice = -1
+        self._known: dict[str, bpy.types.Object] = {}
+
+    @property
+    def scene(self) -> bpy.types.Scene:
+        return self._scene()
+
+    @property
+    def collection(self) -> bpy.types.Collection:
+        return self._collection(self.scene.collection, f"Fieldwork · {self.owner.name}", "all")
+
+    @property
+    def known(self) -> dict[str, bpy.types.Object]:
+        """The objects that are there by their roles."""
+        if self._slice != slices.number():
+            self._slice = slices.number()
+            objects = self.collection.all_objects
+            self._known = {item[ROLE]: item for item in objects if ROLE in item and self.owner.owns(item)}
+        return self._known
 
     def _collection(self, parent: bpy.types.Collection, name: str, role: str) -> bpy.types.Collection:
         for child in parent.children:
@@ -32,45 +54,67 @@ class Owned:
         parent.children.link(made)
         return made
 
-    def object(
-        self, role: str, name: str, data: Any, parent: bpy.types.Object | None = None, group: str = ""
-    ) -> bpy.types.Object:
+    def object(self, role: str, name: str, data: Any, group: str = "") -> bpy.types.Object:
         """The object of a role, with `data` if it is new; `group`: the collection it stands in then, of this name."""
         self.used.add(role)
         item = self.known.get(role)
         if item is None:
             item = bpy.data.objects.new(name, data)
             self._place(role, group).objects.link(item)
-            item.parent = parent
+            item.parent = self.existing("root")
+            self.known[role] = item
         self.owner.mark(item, role)
         return item
 
     def _place(self, role: str, group: str) -> bpy.types.Collection:
         if role.startswith("camera"):
-            return self.camera_collection
+            return self._collection(self.collection, f"Cameras · {self.owner.name}", "cameras")
         return self._collection(self.collection, group, f"group:{group}") if group else self.collection
 
     def existing(self, role: str) -> bpy.types.Object | None:
         return self.known.get(role)
 
-    def with_mesh(
-        self, role: str, name: str, mesh: bpy.types.Mesh, parent: bpy.types.Object | None, group: str = ""
-    ) -> bpy.types.Object:
-        """The object of a role with this mesh, in place of the one an earlier import made, wherever that is used."""
-        item = self.existing(role)
-        if item is None:
-            return self.object(role, name, mesh, parent, group)
-        self.object(role, name, mesh)
-        before, kept = item.data, item.data.name
-        before.user_remap(mesh)
-        bpy.data.meshes.remove(before)
-        mesh.name = kept
+    @property
+    def root(self) -> bpy.types.Object:
+        """The parent of everything. Raises SceneChanged: it is gone."""
+        root = self.existing("root")
+        if root is None:
+            raise SceneChanged("The parent of the capture was deleted meanwhile.")
+        return root
+
+    def leave(self, role: str) -> None:
+        """Let the user have the object of a role as it is; the next `object` is a new one."""
+        item = self.known.pop(role)
+        release(item)
+        self.kept.append(item.name)
+
+    def with_mesh(self, role: str, name: str, held: Held, group: str = "") -> Steps:
+        """The object of a role with this mesh, in place of the one an earlier import made, wherever that is used; beside
+        one that the user edited. Returns it."""
+        before = self.existing(role)
+        if before is not None and (yield from mesh_edited(Held(bpy.data.meshes, before.data), self.owner)):
+            self.leave(role)
+        before = self.existing(role)
+        item = self.object(role, name, held(), group)
+        if before is not None:
+            old, kept = before.data, before.data.name
+            old.user_remap(held())
+            bpy.data.meshes.remove(old)
+            held().name = kept
         return item
 
-    def remove_unused(self) -> None:
-        """Take away what the package no longer has."""
-        for role, item in self.known.items():
-            if role not in self.used:
+    def remove_unused(self) -> Steps:
+        """Take away what the package no longer has; what the user changed stays, as his own."""
+        for role in [role for role in self.known if role not in self.used]:
+            item = self.existing(role)
+            changed = item is not None and object_changed(item)
+            if item is not None and item.type == "MESH" and not changed:
+                changed = yield from mesh_edited(Held(bpy.data.meshes, item.data), self.owner)
+            item = self.existing(role)
+            if item is not None and changed:
+                self.leave(role)
+            elif item is not None:
+                del self.known[role]
                 bpy.data.objects.remove(item)
         for child in list(self.collection.children):
             if str(child.get(ROLE, "")).startswith("group:") and not child.all_objects and not child.children:

@@ -7,24 +7,29 @@ from typing import Any
 import bpy
 import numpy as np
 
+from .edited import WRITTEN, Steps, mesh_fingerprint
 from .look import shader_group
 from .materials import make_material
 from .mesh_data import rgba
 from .owned import Owned
 from .package import Package
+from .slices import Held
 from .surface import set_colors, set_values
 
 NAME = "Fieldwork Points"
+RADIUS = "fieldwork_radius"  # of the balls, as it was written: the user may choose another
 
 
-def sparse_points(owned: Owned, package: Package, root: bpy.types.Object) -> bpy.types.Object:
-    """The object of the package's points."""
+def sparse_points(owned: Owned, package: Package) -> Steps:
+    """The object of the package's points; beside one whose points the user edited. Returns it."""
     # Vertices with a colour attribute work in every version, in every exporter, and stay in the file.
-    mesh = bpy.data.meshes.new("Sparse points")
-    fill_points(mesh, package.xyz, rgba(package.rgb))
-    item = owned.with_mesh("points", "Sparse points", mesh, root)
+    held = Held(bpy.data.meshes, bpy.data.meshes.new("Sparse points"))
+    fill_points(held(), package.xyz, rgba(package.rgb))
+    fingerprint = yield from mesh_fingerprint(held)
+    held()[WRITTEN] = fingerprint
+    item = yield from owned.with_mesh("points", "Sparse points", held)
     centers = np.array([np.array(c["camera_to_world"])[:3, 3] for c in package.cameras]).reshape(-1, 3)
-    material = make_material(owned.owner, "points", [0.8, 0.8, 0.8], shader_group(owned.owner, "points", root))
+    material = make_material(owned.owner, "points", [0.8, 0.8, 0.8], shader_group(owned.owner, "points", owned.root))
     show_points(item, float(np.ptp(centers, axis=0).max(initial=0.0)) / 600 or 0.005, material)
     return item
 
@@ -42,11 +47,11 @@ def show_points(item: bpy.types.Object, radius: float, material: bpy.types.Mater
 
     The object's data stay plain vertices with a colour attribute.
     """
-    modifier = next((m for m in item.modifiers if m.type == "NODES"), None)
+    modifier = next((m for m in item.modifiers if m.type == "NODES" and m.name.startswith(NAME)), None)
     if modifier is None:
         modifier = item.modifiers.new(NAME, "NODES")
+        modifier.show_render = False
     modifier.node_group = _group(item.name, radius, material, modifier.node_group)
-    modifier.show_render = False
 
 
 def _group(name: str, radius: float, material: bpy.types.Material, tree: Any) -> Any:
@@ -68,7 +73,12 @@ def _group(name: str, radius: float, material: bpy.types.Material, tree: Any) ->
         tree.links.new(ball.outputs[0], nodes[1].inputs["Instance"])
     for node in tree.nodes:
         if node.type == "MESH_PRIMITIVE_ICO_SPHERE":
-            node.inputs["Radius"].default_value = radius
+            if (
+                abs(node.inputs["Radius"].default_value - tree.get(RADIUS, radius)) < 1e-5 * radius
+                or RADIUS not in tree
+            ):
+                node.inputs["Radius"].default_value = radius
+                tree[RADIUS] = radius
         elif node.type == "SET_MATERIAL":
             node.inputs["Material"].default_value = material
     return tree

@@ -9,7 +9,7 @@ import bpy
 from mathutils import Vector
 
 from ..roles import PROJECT, ROLE, UUID, Owner
-from .cameras import SIZE
+from .cameras import ASPECT, SIZE
 from .lens import pinhole
 from .look import CONFIDENCE_ATTRIBUTE
 from .surface import CLASS_ATTRIBUTE, INSTANCE_ATTRIBUTE, INSTANCE_NAMES
@@ -94,9 +94,9 @@ def _pixels_per_unit(camera: bpy.types.Object, place: Vector) -> float | None:
         return width / (2 * math.pi * at.length)
     if at.z >= 0:
         return None
-    lens = pinhole(camera.data, width, height)
-    x, y = lens.cx - lens.focal * at.x / at.z, lens.cy + lens.focal * at.y / at.z
-    return -lens.focal / at.z if 0 <= x < width and 0 <= y < height else None
+    lens = pinhole(camera.data, width, height, camera.get(ASPECT, (1.0, 1.0)))
+    x, y = lens.cx - lens.fx * at.x / at.z, lens.cy + lens.fy * at.y / at.z
+    return -lens.fx / at.z if 0 <= x < width and 0 <= y < height else None
 
 
 def _cast(

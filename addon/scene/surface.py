@@ -6,13 +6,13 @@ and the like) Blender converts one value at a time, fifty times slower.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from typing import Any
 
 import bpy
 import numpy as np
-from mathutils import Matrix
 
+from .edited import WRITTEN, Steps, mesh_fingerprint
 from .look import (
     CLASS_COLOR_ATTRIBUTE,
     COLOR_ATTRIBUTE,
@@ -22,8 +22,9 @@ from .look import (
 )
 from .materials import make_material
 from .mesh_data import MeshData, Part, measured_of, slot_classes
-from .owned import Owned, Steps
+from .owned import Owned
 from .package import Package
+from .slices import Held
 
 CLASS_ATTRIBUTE, VERTEX_CLASS_ATTRIBUTE = "class_id", "vertex_class_id"
 INSTANCE_ATTRIBUTE = "instance_id"
@@ -32,21 +33,22 @@ UV_MAP = "UVMap"
 # Custom properties, in `unit`² and `unit`³: the value and the ends of its 95 % interval.
 MEASURED = tuple(f"{name}{end}" for name in ("area", "volume") for end in ("", "_low", "_high"))
 UNIT = "unit"
+STEP = (0.9, "mesh")
 
 
-def surface(owned: Owned, package: Package, root: bpy.types.Object, part: Part, group: Any, viewport: Any) -> Steps:
-    """One object of the surface, its materials colored through the shader group `group`, the solid viewport through the
-    geometry-nodes group `viewport`; returns it."""
-    mesh = bpy.data.meshes.new(part.name)
-    for _ in fill_surface(mesh, part.data):
-        yield 0.9, "mesh"
+def surface(owned: Owned, package: Package, part: Part, groups: Callable[[], tuple[Any, Any]]) -> Steps:
+    """One object of the surface, its materials colored through the shader group, the solid viewport through the
+    geometry-nodes group that `groups` finds; returns it."""
+    held = Held(bpy.data.meshes, bpy.data.meshes.new(part.name))
+    yield from fill_surface(held, part.data)
     for entry in slot_classes(package):
-        material = make_material(owned.owner, entry["name"], entry["color"], group)
+        material = make_material(owned.owner, entry["name"], entry["color"], groups()[0])
         describe(material, measured_of(package, "classes", entry["id"]), package.measures)
-        mesh.materials.append(material)
-    item = owned.with_mesh(part.role, part.name, mesh, root, part.group)
-    item.matrix_parent_inverse = item.matrix_basis = Matrix.Identity(4)
-    add_viewport_colors(item, viewport)
+        held().materials.append(material)
+    fingerprint = yield from mesh_fingerprint(held)
+    held()[WRITTEN] = fingerprint
+    item = yield from owned.with_mesh(part.role, part.name, held, part.group)
+    add_viewport_colors(item, groups()[1])
     item[INSTANCE_NAMES] = {str(entry["id"]): entry["name"] for entry in package.instances}
     describe(item, part.measured, package.measures)
     return item
@@ -67,22 +69,23 @@ def describe(item: Any, measured: dict[str, Any], measures: dict[str, Any]) -> N
         del item[UNIT]
 
 
-def fill_surface(mesh: bpy.types.Mesh, data: MeshData) -> Iterator[None]:
+def fill_surface(held: Held, data: MeshData) -> Steps:
     """Fill an empty mesh that no object shows yet; a step of each array."""
-    faces = len(data.material)
+    mesh, faces = held(), len(data.material)
     mesh.vertices.add(len(data.vertices))
     mesh.edges.add(len(data.edges))
     mesh.loops.add(3 * faces)
     mesh.polygons.add(faces)
-    yield
-    mesh.polygons.foreach_set("loop_start", np.arange(0, 3 * faces, 3, dtype=np.int32))
-    yield
-    set_values(mesh, "position", "vector", data.vertices)
-    set_values(mesh, ".edge_verts", "value", data.edges)
-    yield
-    set_values(mesh, ".corner_vert", "value", data.corners)
-    set_values(mesh, ".corner_edge", "value", data.corner_edges)
-    yield
+    yield STEP
+    held().polygons.foreach_set("loop_start", np.arange(0, 3 * faces, 3, dtype=np.int32))
+    yield STEP
+    set_values(held(), "position", "vector", data.vertices)
+    set_values(held(), ".edge_verts", "value", data.edges)
+    yield STEP
+    set_values(held(), ".corner_vert", "value", data.corners)
+    set_values(held(), ".corner_edge", "value", data.corner_edges)
+    yield STEP
+    mesh = held()
     for name, domain, values in (
         (CLASS_ATTRIBUTE, "FACE", data.face_class),
         (INSTANCE_ATTRIBUTE, "FACE", data.face_instance),
@@ -91,26 +94,29 @@ def fill_surface(mesh: bpy.types.Mesh, data: MeshData) -> Iterator[None]:
     ):
         mesh.attributes.new(name, "INT", domain)
         set_values(mesh, name, "value", values)
-    yield
+    yield STEP
+    mesh = held()
     mesh.attributes.new(CONFIDENCE_ATTRIBUTE, "FLOAT", "POINT")
     set_values(mesh, CONFIDENCE_ATTRIBUTE, "value", data.confidence)
     for name, domain, colors in (
         (CLASS_COLOR_ATTRIBUTE, "FACE", data.face_colors),
         (SHOWN_ATTRIBUTE, "CORNER", data.colors[data.corners]),
     ):
-        yield
+        yield STEP
+        mesh = held()
         mesh.attributes.new(name, "BYTE_COLOR", domain)
         set_values(mesh, name, "color_srgb", colors)
-    yield
+    yield STEP
+    mesh = held()
     set_colors(mesh, data.colors)
     mesh.color_attributes.active_color_name = SHOWN_ATTRIBUTE
-    yield
+    yield STEP
     if data.uv is not None:
-        mesh.uv_layers.new(name=UV_MAP)
-        yield
-        set_values(mesh, UV_MAP, "vector", data.uv)
-        yield
-    mesh.update()
+        held().uv_layers.new(name=UV_MAP)
+        yield STEP
+        set_values(held(), UV_MAP, "vector", data.uv)
+        yield STEP
+    held().update()
 
 
 def set_colors(mesh: bpy.types.Mesh, colors: np.ndarray) -> None:

@@ -289,7 +289,6 @@ count = [len(bpy.data.objects), len(bpy.data.meshes), len(bpy.data.materials), l
          len(bpy.data.node_groups), len(bpy.data.images), len(bpy.data.collections)]
 first.root.location = (5, 0, 0)
 first.meshes[0].name = "Renamed"
-first.cameras[0].location.x += 3
 faces = len(first.meshes[0].data.polygons)
 value = json.loads((Path(package) / "package.json").read_text())
 del value["cameras"][2]

@@ -320,3 +320,49 @@ def test_what_a_job_needs_of_the_scene_is_done_in_slices_and_at_once(queue, proj
     queue.submit(third)
     tick_until(queue, lambda: third.state == "failed")
     assert "the scene is gone" in third.error.message
+
+
+def test_what_fails_in_blender_reaches_the_panel_and_stops_nothing_else(queue, project, monkeypatch):
+    def broken(ask):
+        raise ZeroDivisionError("the edits are broken")
+
+    monkeypatch.setattr(edits, "send", broken)
+    job = count(queue, project, steps=2)
+    queue.submit(job)
+    tick_until(queue, lambda: job.state == "done")
+    told = queue.outcome
+    assert told is not None
+    assert "the edits are broken" in told.error.message
+    assert "test_jobs.py" in told.report(), "the report holds the place"
+    assert sum(other.verb == "timer" for other in queue.finished) == 1, "once, not at every tick"
+
+
+def test_a_job_whose_result_cannot_be_taken_fails_and_is_not_lost(queue, project):
+    def broken(job):
+        raise KeyError("files")
+
+    job, after = queue.make("count", {"project": str(project), "steps": 2}, broken), count(queue, project, steps=2)
+    queue.submit(job)
+    queue.submit(after)
+    tick_until(queue, lambda: after.state == "done")
+    assert job.state == "failed"
+    assert "files" in job.error.message
+    assert "test_jobs.py" in job.report()
+    assert [job, after] == queue.finished
+
+
+def test_results_come_into_the_scene_one_after_the_other(queue, project):
+    order = []
+
+    def slowly(job):
+        for _ in range(3):
+            order.append(job.id)
+            time.sleep(0.02)
+            yield 0.5, ""
+
+    jobs = [queue.make("count", {"project": str(project)}, slowly) for _ in range(3)]
+    for job in jobs:
+        queue.finish(job, {}, None)
+    tick_until(queue, lambda: queue.current is None)
+    assert order == [job.id for job in jobs for _ in range(3)]
+    assert [job.state for job in jobs] == ["done"] * 3

@@ -99,7 +99,7 @@ def test_a_large_result_holds_the_window_up_for_less_than_100_ms(bpy_script, tmp
         + """
 def bring(job):
     count = 0
-    while queue.bringing:
+    while queue.landing.jobs:
         # As long as the timer takes.
         tick(queue)
         count += 1
@@ -150,17 +150,17 @@ def test_loading_a_file_undoing_and_cancelling_in_the_middle(bpy_script, tmp_pat
 def part_of_it():
     job = finished()
     while not job.message.startswith("view_02"):
-        queue._bring(0.0001)
+        queue.landing.bring(0.0001)
     assert queue.current is job
     return job
 def rest(job):
-    while queue.bringing:
+    while queue.landing.jobs:
         tick(queue)
         time.sleep(0.002)
     return job.state
 
 job = part_of_it()
-queue.edits += 1  # what undo does
+queue.landing.edits += 1  # what undo does
 undone = rest(job)
 mesh = next(o for o in bpy.data.objects if o.get("fieldwork_role") == "mesh").data
 faces, cameras = len(mesh.polygons), sum(o.type == "CAMERA" for o in bpy.data.objects)
@@ -207,7 +207,7 @@ def test_a_package_that_lacks_files_is_told(bpy_script, tmp_path, cut):
         SETUP
         + """
 job = finished()
-while queue.bringing:
+while queue.landing.jobs:
     tick(queue)
 answer([job.state, str(job.error)])
 """,

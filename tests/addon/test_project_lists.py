@@ -177,3 +177,43 @@ answer({"seen": seen, "images": images})
     other = ["stone", 9.0]
     assert seen["undone over another's edit"] == [[other, theirs], [other, theirs], []]
     assert facts["images"] == ["a", "b", "c"]
+
+
+def test_undo_goes_back_along_the_users_own_edits_only(bpy_script, tmp_path):
+    """A name that a job gave between two edits of the user is newer than what he had before it."""
+    folder = make_project(tmp_path / "capture")
+    facts = bpy_script(
+        SETUP
+        + ENGINE
+        + """
+from fieldwork.addon.project import lists
+settings.project = project
+name = lambda: bpy.context.scene.fieldwork.classes[0].name
+saved = lambda: stored(project)["classes"][0]["name"]
+def give(value):
+    bpy.context.scene.fieldwork.classes[0].name = value
+    settle()
+    bpy.ops.ed.undo_push(message=value)
+def undo():
+    bpy.ops.ed.undo()
+    settle()
+    return [name(), saved()]
+bpy.ops.ed.undo_push(message="project")
+give("marble")
+value = stored(project)
+value["classes"][0]["name"] = "granite"  # by a job, from a file of classes
+write(project, classes=value["classes"])
+lists.refresh(bpy.context.scene.fieldwork)
+bpy.ops.ed.undo_push(message="cube")
+give("basalt")
+give("slate")
+seen = [undo(), undo(), undo(), undo()]
+bpy.ops.ed.redo()
+settle()
+answer([*seen, [name(), saved()]])
+""",
+        project=folder,
+    )
+    assert facts[:2] == [["basalt", "basalt"], ["granite", "granite"]]
+    assert facts[2:4] == [["granite", "granite"]] * 2, "neither marble nor stone comes back over what the job gave"
+    assert facts[4] == ["granite", "granite"]

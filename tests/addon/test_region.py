@@ -144,3 +144,83 @@ answer({"seen": seen, "asked": asked})
     wanted |= {"aligned": aligned, "undone after": aligned}
     assert facts["seen"] == {name: [bounds, bounds] for name, bounds in wanted.items()}
     assert facts["asked"] == [], "nothing was written after the undo"
+
+
+def test_loading_a_file_changes_no_region(bpy_script, tmp_path):
+    """Neither where the file's box is an old one, nor where the project's region was cleared since."""
+    folder = make_posed_project(tmp_path / "capture")
+    facts = bpy_script(
+        BOX
+        + """
+def look(times=4):
+    for _ in range(times):
+        bpy.context.view_layer.update()
+        region.follow(bpy.context.scene)
+        settle()
+    bpy.context.view_layer.update()
+    box = region.find(bpy.context.scene)
+    return [bounds(), region.bounds_of(bpy.context.scene, box)]
+def load():
+    bpy.ops.wm.open_mainfile(filepath=file)
+    asked.clear()
+    return [*look(), list(asked)]
+file = folder + "/old.blend"
+bpy.context.preferences.filepaths.save_version = 0
+box.location, box.scale = (1, 2, 3), (1, 1, 1)
+seen = {"saved": look()}
+bpy.ops.wm.save_as_mainfile(filepath=file)
+region.find(bpy.context.scene).location.x = 5
+seen["newer"] = look()
+seen["loaded"] = load()
+write(project, frame={"bounds": None})
+seen["cleared"] = load()
+region.find(bpy.context.scene).location.x = 7
+seen["moved"] = look()
+answer(seen)
+""",
+        project=folder,
+        folder=tmp_path,
+    )
+    first, second, third = ([[x - 1, 1, 2], [x + 1, 3, 4]] for x in (1, 5, 7))
+    assert facts["saved"] == [first, first]
+    assert facts["newer"] == [second, second]
+    assert facts["loaded"] == [second, second, []], "the box goes to the region"
+    assert facts["cleared"] == [None, first, []]
+    assert facts["moved"] == [third, third], "moving it says that it is meant"
+
+
+def test_undo_of_regions_goes_back_along_the_users_own_edits_only(bpy_script, tmp_path):
+    folder = make_posed_project(tmp_path / "capture")
+    facts = bpy_script(
+        BOX
+        + """
+def look(times=4):
+    for _ in range(times):
+        bpy.context.view_layer.update()
+        region.follow(bpy.context.scene)
+        settle()
+    return bounds()
+def put(x):
+    region.find(bpy.context.scene).location.x = x
+    found = look()
+    bpy.ops.ed.undo_push(message=str(x))
+    return found
+def undo():
+    bpy.ops.ed.undo()
+    return look()
+bpy.ops.ed.undo_push(message="start")
+put(1), put(2)
+write(project, frame={"bounds": [[0, 0, 0], [4, 2, 6]]})  # as aligning does
+look()
+bpy.ops.ed.undo_push(message="something else")
+put(7), put(8), put(9)
+seen = [undo() for _ in range(5)]
+bpy.ops.ed.redo()
+answer([*seen, look()])
+""",
+        project=folder,
+    )
+    aligned = [[0, 0, 0], [4, 2, 6]]
+    assert [bounds[0][0] for bounds in facts[:2]] == [6, 5]
+    assert facts[2] == aligned
+    assert facts[3:] == [aligned] * 3, "what was there before aligning does not come back"

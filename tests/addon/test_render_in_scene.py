@@ -11,7 +11,8 @@ from fieldwork.tests.addon.support import SETUP, make_project
 @pytest.mark.parametrize(("width", "height"), [(640, 480), (480, 640)])
 @pytest.mark.parametrize("fit", ["AUTO", "HORIZONTAL", "VERTICAL"])
 def test_scene_camera_as_pixels_agrees_with_blender(bpy_script, tmp_path, width, height, fit):
-    """Blender's own projection of a point, and that through the exported intrinsics, meet."""
+    """Blender's own projection of a point, and that through the exported intrinsics, meet, also where pixels are not
+    square."""
     facts = bpy_script(
         SETUP
         + """
@@ -25,15 +26,17 @@ camera.data.shift_x, camera.data.shift_y = 0.11, -0.07
 camera.scale = (2, 2, 2)
 bpy.context.view_layer.update()
 file = Path(folder, "cameras.json")
-for _ in write_cameras(file, scene, False, (0, 0)):
-    pass
-frame = json.loads(file.read_text())["frames"][0]
 seen = []
-for point in (Vector((0, 0, 0)), Vector((1, 0.5, -0.3)), Vector((-0.8, 0.2, 1.0))):
-    x, y, _ = world_to_camera_view(scene, camera, point)
-    p = Matrix(frame["transform_matrix"]).inverted() @ point
-    mine = [frame["cx"] + frame["fl_x"] * p.x / -p.z, frame["cy"] - frame["fl_y"] * p.y / -p.z]
-    seen.append([[x * width, (1 - y) * height], mine])
+for aspect in ((1, 1), (2, 1), (1, 1.5)):
+    scene.render.pixel_aspect_x, scene.render.pixel_aspect_y = aspect
+    for _ in write_cameras(file, scene, False, (0, 0)):
+        pass
+    frame = json.loads(file.read_text())["frames"][0]
+    for point in (Vector((0, 0, 0)), Vector((1, 0.5, -0.3)), Vector((-0.8, 0.2, 1.0))):
+        x, y, _ = world_to_camera_view(scene, camera, point)
+        p = Matrix(frame["transform_matrix"]).inverted() @ point
+        mine = [frame["cx"] + frame["fl_x"] * p.x / -p.z, frame["cy"] - frame["fl_y"] * p.y / -p.z]
+        seen.append([[x * width, (1 - y) * height], mine])
 answer(seen)
 """,
         width=width,
@@ -123,7 +126,7 @@ from fieldwork.addon.render import result
 scene.render.resolution_x, scene.render.resolution_y = 200, 100
 scene.camera.data.shift_x = 0.2
 image = bpy.data.images.new("frame", 200, 100)
-result.plane(scene, scene.camera, image, 1)
+result.plane(scene, scene.camera, image, 1, 1)
 bpy.context.view_layer.update()
 (empty,) = scene.camera.children
 half = empty.empty_display_size / 2

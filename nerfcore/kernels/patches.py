@@ -18,7 +18,7 @@ REACH = wp.constant(4)  # a patch has 5 × 5 pixels, two apart: it reaches four 
 FLAT = wp.constant(2.0e-5)  # variance of grey values in [0, 1] below which a patch shows nothing
 STEEPEST = wp.constant(1.0e-2)  # of the normal along the ray: a surface seen more along is not compared
 WIDEST = wp.constant(24.0)  # pixels a patch may reach in another view
-MIDDLE = wp.constant(6)  # of 13 depths that are tried
+MIDDLE = wp.constant(6)  # of 13 depths, every second of which is tried, and both beside the best of these
 UNSEEN = wp.constant(-2.0)  # correlation with a view that does not show the patch
 
 _patch = wp.types.vector(length=25, dtype=float)
@@ -254,7 +254,16 @@ def refine_kernel(
     step = wp.clamp(maps.spread[maps.first[view] + i] / 3.0, 0.4 / rate, 1.2 / rate)
     tries = _tries()
     for t in range(13):
-        tries[t] = photo_agreement(grey, maps, params, patch, pixel, z + float(t - MIDDLE) * step)
+        tries[t] = -1.0
+    coarse = int(MIDDLE)
+    for n in range(9):
+        t = 2 * n
+        if n >= 7:
+            t = coarse + 2 * (n - 7) - 1
+        if t >= 0 and t <= 12:
+            tries[t] = photo_agreement(grey, maps, params, patch, pixel, z + float(t - MIDDLE) * step)
+            if n < 7 and tries[t] > tries[coarse]:
+                coarse = t
     best, peak = best_try(tries, params.least, params.gain)
     score[i] = tries[best]
     out[i] = z + peak * step
@@ -267,9 +276,9 @@ def refine(
     """Depths (H·W,) of one map moved to where its photo agrees best with those of the maps `neighbours` (K,) int32, and
     how well (H·W,) they agree there, −1 where that is not known.
 
-    grey (P,) in [0, 1]: the photos as the maps see them; normals (H·W, 3) in camera axes, towards the camera. Thirteen
-    depths around each pixel's, about half its spread apart but 0.4 to 1.2 pixels, are rated by the mean correlation
-    of the three best views. The best one counts if it reaches `least`, exceeds the present one's by `gain` and is not the
+    grey (P,) in [0, 1]: the photos as the maps see them; normals (H·W, 3) in camera axes, towards the camera. Of thirteen
+    depths around each pixel's, about half its spread apart but 0.4 to 1.2 pixels, every second and both beside the best of
+    these are rated by the mean correlation of the three best views. The best one counts if it reaches `least`, exceeds the present one's by `gain` and is not the
     outermost; a parabola places it between its neighbours.
     """
     init()

@@ -7,7 +7,6 @@ from fieldwork.nerfcore.kernels.depth_arrays import FREE, MapArrays
 from scipy.ndimage import map_coordinates
 
 GRID = np.stack(np.meshgrid(np.arange(-2, 3), np.arange(-2, 3)), -1).reshape(25, 2)  # x fastest
-TRIES = np.arange(-6, 7)
 FLATTEST = 2e-5
 
 
@@ -81,10 +80,17 @@ def refined(
         return z, -1.0
     rate = np.mean(rates)
     step = np.clip(views.spread[view][row, column] / 3, 0.4 / rate, 1.2 / rate)
-    found = []
-    for depth in z + TRIES * step:
-        agreed = [views.correlation(view, other, pixel, normal, depth) if depth > 1e-4 else -1 for other in neighbours]
-        found.append(np.mean(sorted([*agreed, -1, -1, -1], reverse=True)[:3]))
+    found = np.full(13, -1.0)
+
+    def rate_tries(numbers: list[int]) -> None:
+        for number in numbers:
+            depth = z + (number - 6) * step
+            agreed = [views.correlation(view, v, pixel, normal, depth) if depth > 1e-4 else -1 for v in neighbours]
+            found[number] = np.mean(sorted([*agreed, -1, -1, -1], reverse=True)[:3])
+
+    rate_tries([*range(0, 13, 2)])
+    coarse = int(np.argmax(found))
+    rate_tries([number for number in (coarse - 1, coarse + 1) if 0 <= number <= 12])
     # The middle one where several are equal.
     best = int(np.argmax(found)) if max(found) > found[6] else 6
     if found[best] < least or best in (0, 12) or (abs(best - 6) > 1 and found[best] - found[6] < gain):

@@ -117,6 +117,8 @@ class Landing:
         new_slice()
         end = time.perf_counter() + seconds
         try:
+            # A step at least, however short the time: else a slow machine gets nowhere.
+            job.fraction, job.message = next(steps)
             while time.perf_counter() < end:
                 job.fraction, job.message = next(steps)
         except StopIteration:

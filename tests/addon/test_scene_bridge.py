@@ -227,9 +227,11 @@ def test_the_scene_is_left_alone_until_object_mode(bpy_script, package, tmp_path
 import time
 import fieldwork
 fieldwork.register()
+from fieldwork.addon.jobs import queue as module
 from fieldwork.addon.jobs.queue import queue
 from fieldwork.addon.jobs.timer import tick
 from fieldwork.operators.scene import import_result
+module.SLICE = 0  # one step a tick, on a fast machine too
 Path(project, "project.json").write_text(json.dumps({"format": "fieldwork-project"}))
 bpy.context.scene.fieldwork.project = project
 def finished():

@@ -14,6 +14,7 @@ from trimesh.triangles import points_to_barycentric
 from ..data.scene import Scene, View
 from ..images.picture import resized
 from ..images.working import read_picture
+from ..kernels.closest import ClosestPoints
 from ..measure.closing import closed
 from ..mesh.clean import areas, components, cross, unit
 from ..mesh.facelets import Facelets, facelets
@@ -69,7 +70,15 @@ class Sight:
         edges, normals = true_outline(self.truth.vertices, self.truth.faces, self.truth.face_class)
         return edges[self.visible(edges.mean(1), normals)]
 
-    def visible(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    def class_near(self, points: np.ndarray) -> np.ndarray:
+        """True class (N,) of what is closest to points (N, 3), of all that some camera sees: where one thing lies on
+        another, the faces between them are nobody's."""
+        pieces = self.pieces
+        seen = np.flatnonzero(self.visible(pieces.centers, pieces.normals, enough=1))
+        closest = ClosestPoints(pieces.vertices, pieces.faces[seen]).find(points)[0]
+        return self.truth.face_class[pieces.parent[seen[closest]]]
+
+    def visible(self, points: np.ndarray, normals: np.ndarray, enough: int = ENOUGH) -> np.ndarray:
         """Whether enough cameras see points (N, 3) of the truth with normals (N, 3): (N,).
 
         What hides a point is the plane of the face that its pixel shows, cut with the ray to the point: a floor just under
@@ -91,7 +100,7 @@ class Sight:
                 reached = ((corner - camera.center) * normal).sum(1) / (ray[rows] * normal).sum(1)
             slack = HIDDEN * camera.footprint(depth[rows]) / distance[rows]
             seen[rows] += ~((face >= 0) & (reached > 0) & (reached < 1 - slack))
-        return seen >= ENOUGH
+        return seen >= enough
 
 
 def posed(views: Sequence[View]) -> list[PosedCamera]:
@@ -132,7 +141,7 @@ def surface_figures(
         "normal_deg": fine.normal_deg,
         "both_sides": None if thin is None else both_sides(mesh, truth, sight, thin),
         "hit_share": hit_share(mesh, truth, held_out, sight.far),
-        **class_figures(found, surface, painted, truth, CLOSE * sight.size),
+        **class_figures(found, surface, painted, sight),
         "outline_texels": outline_texels(*mesh, painted, sight.outline(), CLOSE * sight.size),
         "volume_error": volume_error(mesh, surface.face_class, truth, bodies) if bodies else None,
         **picture_figures(mesh, painted, held_out),
@@ -192,15 +201,14 @@ def hit_share(mesh: tuple[np.ndarray, np.ndarray], truth: Truth, views: Sequence
     return hit / max(solid, 1)
 
 
-def class_figures(
-    found: Distances, surface: Surface, painted: Painted, truth: Truth, close: float
-) -> dict[str, float | None]:
-    """mIoU by area of the texture's classes (of the faces', without a texture) where the mesh is `close` to the truth, and
+def class_figures(found: Distances, surface: Surface, painted: Painted, sight: Sight) -> dict[str, float | None]:
+    """mIoU by area of the texture's classes (of the faces', without a texture) where the mesh is close to the truth, and
     by how much the area of the worst class is off, of classes that have at least a hundredth of what is seen."""
-    near = found.to_truth < close
-    ours, theirs = classes_at(surface, painted, found.face)[near], truth.face_class[found.truth_face[near]]
+    near = found.to_truth < CLOSE * sight.size
+    points, _ = sample_surface(surface.vertices.astype(np.float64), surface.faces, len(found.face))
+    ours, theirs = classes_at(surface, painted, points, found.face)[near], sight.class_near(points[near])
     area = areas(surface.vertices.astype(np.float64), surface.faces)
-    seen = truth.face_class[found.true_face]
+    seen = sight.truth.face_class[found.true_face]
     ious, off = [], []
     for number in np.unique(seen):
         one, other = ours == number, theirs == number
@@ -215,13 +223,11 @@ def class_figures(
     }
 
 
-def classes_at(surface: Surface, painted: Painted, face: np.ndarray) -> np.ndarray:
-    """Class (N,) at the points that `metrics.distances` took from the mesh, which lie in the faces (N,)."""
+def classes_at(surface: Surface, painted: Painted, points: np.ndarray, face: np.ndarray) -> np.ndarray:
+    """Class (N,) at points (N, 3) of a mesh, which lie in its faces (N,)."""
     if painted.maps is None or painted.uv is None:
         return surface.face_class[face]
-    vertices = surface.vertices.astype(np.float64)
-    points, _ = sample_surface(vertices, surface.faces, len(face))
-    weights = points_to_barycentric(vertices[surface.faces[face]], points)
+    weights = points_to_barycentric(surface.vertices.astype(np.float64)[surface.faces[face]], points)
     uv = np.einsum("nk,nkc->nc", weights, painted.uv.corners[face])
     size = len(painted.maps.ids)
     x, y = np.clip((uv * [1, -1] + [0, 1]) * size, 0, size - 1).astype(int).T
@@ -231,19 +237,25 @@ def classes_at(surface: Surface, painted: Painted, face: np.ndarray) -> np.ndarr
 def picture_figures(
     mesh: tuple[np.ndarray, np.ndarray], painted: Painted, views: Sequence[View]
 ) -> dict[str, float | None]:
-    """PSNR of the textured mesh against photos where it is hit, and its gradient energy over theirs."""
+    """PSNR of the textured mesh against photos where it is hit, the median difference of colour (CIEDE2000), and its gradient
+    energy over theirs."""
     if painted.uv is None or painted.image is None or not views:
-        return {"mesh_psnr": None, "gradient": None}
-    psnr, energy = [], np.zeros(2)
+        return {"mesh_psnr": None, "delta_e": None, "gradient": None}
+    psnr, off, energy = [], [], np.zeros(2)
     for view, camera in zip(views, posed(views)):
         picture, hit = surface_picture(camera, *mesh, painted.uv.corners, painted.image)
         photo = resized(read_picture(view.image), view.camera.width, view.camera.height).pixels[..., :3]
         covered = hit > 0.99
         error = (picture.astype(float) - photo)[covered] / 255
         psnr.append(-10 * np.log10(max(float((error**2).mean()), 1e-10)))
+        off.append(deltaE_ciede2000(*(rgb2lab(p[covered] / 255.0) for p in (picture, photo))))
         inner = minimum_filter(covered, 3)
         energy += [(np.hypot(*np.gradient(p.astype(float).mean(2)))[inner] ** 2).sum() for p in (picture, photo)]
-    return {"mesh_psnr": float(np.mean(psnr)), "gradient": float(energy[0] / max(energy[1], 1e-9))}
+    return {
+        "mesh_psnr": float(np.mean(psnr)),
+        "delta_e": float(np.median(np.concatenate(off))),
+        "gradient": float(energy[0] / max(energy[1], 1e-9)),
+    }
 
 
 def seam_ratio(faces: np.ndarray, painted: Painted) -> float | None:

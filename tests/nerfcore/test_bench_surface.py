@@ -70,7 +70,7 @@ def test_the_truth_itself_has_no_fault() -> None:
     found = surface_figures(mesh, unpainted(), truth, scene, 2)
     assert found["f_size"] == found["f_pixel"] == found["both_sides"] == found["surface_miou"] == pytest.approx(1)
     assert found["excess_area"] == 0
-    assert found["mesh_psnr"] is found["gradient"] is found["seams"] is None
+    assert found["mesh_psnr"] is found["delta_e"] is found["gradient"] is found["seams"] is None
     assert 0.05 < found["class_area_error"] < 0.15  # no camera sees the rim of the plate, and little below it
 
 
@@ -85,6 +85,20 @@ def test_a_plate_of_one_side_and_a_missing_ball_are_seen() -> None:
     plate = truth.vertices, truth.faces[truth.face_class == 2]
     assert hit_share((truth.vertices, truth.faces), truth, held_out, sight.far) == 1
     assert 0.2 < hit_share(plate, truth, held_out, sight.far) < 0.9
+
+
+def test_classes_are_those_of_what_can_be_seen() -> None:
+    """A box that stands on a plate: what touches is nobody's."""
+    import trimesh
+
+    box = trimesh.creation.box((0.2, 0.2, 0.06)).subdivide_to_size(0.1).apply_translation((0, 0, 0.03))
+    plate = trimesh.creation.box((0.8, 0.8, 0.2)).subdivide_to_size(0.1).apply_translation((0, 0, -0.1))
+    whole = trimesh.util.concatenate([plate, box])
+    kinds = np.repeat([2, 1], [len(plate.faces), len(box.faces)])
+    scene = scene_around()
+    sight = Sight(Truth(np.asarray(whole.vertices), np.asarray(whole.faces), kinds), scene.views)
+    inside = np.array([[0, 0, -0.002], [0.02, 0.01, 0.004], [0.3, 0.3, 0.001]])
+    assert sight.class_near(inside).tolist() == [1, 1, 2]
 
 
 def test_volumes_of_bodies_are_compared() -> None:

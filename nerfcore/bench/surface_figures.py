@@ -71,14 +71,14 @@ class Sight:
         return edges[self.visible(edges.mean(1), normals)]
 
     def class_near(self, points: np.ndarray) -> np.ndarray:
-        """True class (N,) of what is closest to points (N, 3), of all that some camera sees: where one thing lies on
+        """True class (N,) of what is closest to points (N, 3), of all that enough cameras see: where one thing lies on
         another, the faces between them are nobody's."""
         pieces = self.pieces
-        seen = np.flatnonzero(self.visible(pieces.centers, pieces.normals, enough=1))
+        seen = np.flatnonzero(self.visible(pieces.centers, pieces.normals))
         closest = ClosestPoints(pieces.vertices, pieces.faces[seen]).find(points)[0]
         return self.truth.face_class[pieces.parent[seen[closest]]]
 
-    def visible(self, points: np.ndarray, normals: np.ndarray, enough: int = ENOUGH) -> np.ndarray:
+    def visible(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """Whether enough cameras see points (N, 3) of the truth with normals (N, 3): (N,).
 
         What hides a point is the plane of the face that its pixel shows, cut with the ray to the point: a floor just under
@@ -100,7 +100,7 @@ class Sight:
                 reached = ((corner - camera.center) * normal).sum(1) / (ray[rows] * normal).sum(1)
             slack = HIDDEN * camera.footprint(depth[rows]) / distance[rows]
             seen[rows] += ~((face >= 0) & (reached > 0) & (reached < 1 - slack))
-        return seen >= enough
+        return seen >= ENOUGH
 
 
 def posed(views: Sequence[View]) -> list[PosedCamera]:
@@ -248,7 +248,8 @@ def picture_figures(
         covered = hit > 0.99
         error = (picture.astype(float) - photo)[covered] / 255
         psnr.append(-10 * np.log10(max(float((error**2).mean()), 1e-10)))
-        off.append(deltaE_ciede2000(*(rgb2lab(p[covered] / 255.0) for p in (picture, photo))))
+        ours, theirs = (rgb2lab(p[covered] / 255.0) for p in (picture, photo))
+        off.append(deltaE_ciede2000(ours, theirs))
         inner = minimum_filter(covered, 3)
         energy += [(np.hypot(*np.gradient(p.astype(float).mean(2)))[inner] ** 2).sum() for p in (picture, photo)]
     return {

@@ -68,7 +68,8 @@ def test_the_truth_itself_has_no_fault() -> None:
     scene = Scene(scene.views, scene.train, [])  # pictures are measured with photos
     mesh = as_surface(truth.vertices, truth.faces, truth.face_class)
     found = surface_figures(mesh, unpainted(), truth, scene, 2)
-    assert found["f_size"] == found["f_pixel"] == found["both_sides"] == found["surface_miou"] == pytest.approx(1)
+    assert found["f_size"] == found["f_pixel"] == found["both_sides"] == pytest.approx(1)
+    assert found["surface_miou"] > 0.999  # what no camera sees has the class of what one does
     assert found["excess_area"] == 0
     assert found["mesh_psnr"] is found["delta_e"] is found["gradient"] is found["seams"] is None
     assert 0.05 < found["class_area_error"] < 0.15  # no camera sees the rim of the plate, and little below it

@@ -307,7 +307,7 @@ class FieldworkScene(PropertyGroup):
         subtype="DIR_PATH",
     )
     faces: IntProperty(
-        name="Faces", description="Target number of triangles; 0: keep all", default=0, min=0, soft_max=2_000_000
+        name="Faces", description="Target number of triangles; 0: keep all", default=200_000, min=0, soft_max=2_000_000
     )
     lods: IntProperty(
         name="Levels of Detail",
@@ -331,6 +331,7 @@ class FieldworkScene(PropertyGroup):
             ("8192", "8192", "8192 × 8192 pixels"),
             ("16384", "16384", "16384 × 16384 pixels"),
         ],
+        default="4096",
     )
     texture_kind: EnumProperty(
         name="Texture From",

@@ -398,6 +398,10 @@ class ReconstructParams(Params):
     time_limit: float | None = Field(default=None, gt=0, le=LONGEST_RUN, description="seconds of training")
     holdout: Holdout = 8
     set: dict[str, str] = Field(default_factory=dict)
+    faces: int = Field(default=200_000, ge=0, le=1_000_000_000, description="triangles of the mesh; 0: all there are")
+    texture: int = Field(
+        default=4096, ge=0, le=16384, description="size of the mesh's texture in pixels; 0: vertex colours only"
+    )
     report: Path | None = Field(default=None, description="report to write, .html or .pdf")
     renders: Path | None = Field(default=None, description="folder for renders of new views")
 

@@ -16,7 +16,7 @@ from .train import parse_settings
 
 @scene_settings(
     photos="photos", labels="labels", masks="masks", classes="class_file", mask_mode="mask_mode", preset="preset",
-    time_limit="time_limit", settings="settings",
+    time_limit="time_limit", settings="settings", faces="faces", texture="texture",
 )  # fmt: skip
 class FIELDWORK_OT_reconstruct(VerbOperator):
     """Take photos all the way to a labelled mesh: read, estimate poses, train, extract the mesh, write a .blend"""
@@ -60,6 +60,8 @@ class FIELDWORK_OT_reconstruct(VerbOperator):
             "time_limit": self.value(context, "time_limit") or None,
             "holdout": hold_out(self, context),
             "set": parse_settings(self.value(context, "settings")),
+            "faces": self.value(context, "faces"),
+            "texture": int(self.value(context, "texture")),
             "blend": absolute(self.blend),
             "report": absolute(self.report_file),
             "renders": absolute(self.renders),

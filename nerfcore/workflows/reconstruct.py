@@ -118,7 +118,9 @@ def reconstruct(params: p.ReconstructParams, report: Reporter) -> dict[str, Any]
         pipeline.do("evaluate", p.EvaluateParams(project=project, run=run))
     else:
         report.stage("evaluate: left out, no photos are held out")
-    pipeline.do("mesh", p.MeshParams(project=project, run=run))
+    pipeline.do(
+        "mesh", p.MeshParams(project=project, run=run, faces=params.faces or None, texture=params.texture or None)
+    )
     renders = params.renders or project / "exports" / run / "renders"
     pipeline.do(
         "render", p.RenderParams(project=project, run=run, out=renders, orbit=8, passes=["rgb", "depth", "semantic"])

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from fieldwork.nerfcore.capture.ingest import new
-from fieldwork.nerfcore.params import NewParams, ReconstructParams
+from fieldwork.nerfcore.params import NewParams, Params, ReconstructParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.store import load_project
 from fieldwork.nerfcore.workflows import reconstruct as module
@@ -53,6 +53,22 @@ def test_nothing_is_said_of_photos_alone(tmp_path: Path, monkeypatch: pytest.Mon
     values, warnings = first_stage(monkeypatch, ReconstructParams(photos=photos, out=tmp_path / "p", mask_mode="empty"))
     assert warnings == []
     assert values.mask_mode == "empty"
+
+
+@pytest.mark.parametrize(("asked", "made"), [({}, (200_000, 4096)), ({"faces": 0, "texture": 0}, (None, None))])
+def test_the_mesh_is_of_a_size_one_can_use(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, asked: dict[str, int], made: tuple[int | None, int | None]
+) -> None:
+    photos, seen = folder_of(tmp_path / "photos", 3), {}
+
+    def do(self: module.Pipeline, verb: str, values: Params) -> None:
+        seen[verb] = values
+        self.results[verb], self.seconds[verb] = {}, 0.0
+
+    monkeypatch.setattr(module.Pipeline, "do", do)
+    monkeypatch.setattr(module, "held_out", lambda project, run: False)
+    module.reconstruct(ReconstructParams(photos=photos, out=tmp_path / "p", **asked), Reporter())
+    assert (seen["mesh"].faces, seen["mesh"].texture) == made
 
 
 def test_the_meaning_of_masks_can_be_changed(tmp_path: Path) -> None:

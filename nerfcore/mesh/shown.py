@@ -1,14 +1,50 @@
-"""How much of the photos a mesh fills."""
+"""How much of the photos a mesh fills, and whether its silhouettes are those that masks cut out."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
+from ..data.scene import Scene, View
 from ..geometry.cameras import rays
+from ..images.picture import resized
+from ..images.working import nearest, read_image, read_picture
 from ..kernels.raycast import FrontFaces
+from .facelets import facelets
 from .photos import Photo
+from .visibility import PosedCamera, depth_buffer
 
 MOST_PHOTOS, ACROSS = 16, 48  # photos that are asked, evenly spread, and rays across each
+PIECES = 60  # pieces along the longest side: depth buffers leave out triangles that reach behind a camera
+
+
+def cut_out(view: View, mask_mode: str) -> np.ndarray | None:
+    """Which pixels (H, W) bool of a photo show the object that its mask or its transparency cuts out; None without."""
+    width, height = view.camera.width, view.camera.height
+    if view.mask is not None and mask_mode == "empty":
+        return nearest(read_image(view.mask)[..., 0], width, height) > 127
+    pixels = resized(read_picture(view.image), width, height).pixels
+    if pixels.shape[2] < 4 or (pixels[..., 3] > 127).all():
+        return None
+    return pixels[..., 3] > 127
+
+
+def silhouette(scene: Scene, vertices: np.ndarray, faces: np.ndarray, check: Callable[[], None]) -> float | None:
+    """Intersection over union of what held-out photos cut out (of all photos where none is held out) and what a mesh,
+    vertices (V, 3) and faces (F, 3) in the scene's frame, covers there; None where nothing is cut out."""
+    views = [scene.views[i] for i in scene.test or scene.train][:MOST_PHOTOS]
+    pieces = facelets(vertices, faces, None, float(np.ptp(vertices, axis=0).max()) / PIECES)
+    both = either = 0
+    for view in views:
+        check()
+        shown = cut_out(view, scene.mask_mode)
+        if shown is None:
+            continue
+        camera = PosedCamera(view.camera, np.asarray(view.camera_to_world, np.float64))
+        hit = depth_buffer(camera, pieces.vertices, pieces.faces).face >= 0
+        both, either = both + int((hit & shown).sum()), either + int((hit | shown).sum())
+    return both / either if either else None
 
 
 def shown_share(photos: list[Photo], vertices: np.ndarray, faces: np.ndarray) -> float:

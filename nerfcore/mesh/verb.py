@@ -31,7 +31,7 @@ from .lods import Level, make_levels, remove_levels, write_level
 from .painted import Painted, paint_surface, training_photos, write_maps
 from .parts import Texture, texture_of
 from .photos import Photo
-from .shown import shown_share
+from .shown import shown_share, silhouette
 from .stored import COARSE
 from .surface import Surface, class_table, is_watertight, to_world
 from .turntable import write_turntable
@@ -44,6 +44,7 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
         {"vertices", "faces", "watertight", "voxel": in world units, "classes": {name: {"faces", "area"}},
         "instances": how many, "lods": [{"faces", "deviation": in world units}], "files"};
         "shown": the share of the photos' pixels that show the mesh, "verdict";
+        "silhouette" of a capture with masks: see `shown.silhouette`;
         with a texture of photos "painted_by_photos", the share of its texels that a photo shows
     Raises:
         SettingError: unknown format or impossible region. ProjectError, TrainingError, DiskError.
@@ -94,6 +95,9 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
     }
     shown = shown_share(photos, built.vertices, built.faces)
     result |= {"shown": round(shown, 4), "verdict": mesh_verdict(shown)}
+    outlines = silhouette(scene, surface.vertices, surface.faces, report.check)
+    if outlines is not None:
+        result["silhouette"] = round(outlines, 4)
     if painted.seen is not None:
         result["painted_by_photos"] = round(painted.seen, 4)
     settings = params.model_dump(mode="json")

@@ -1,0 +1,57 @@
+"""Whether the silhouettes of a mesh are those that masks cut out of photos."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from fieldwork.nerfcore.data.scene import Scene, View
+from fieldwork.nerfcore.geometry.cameras import Camera, pixel_centers, rays
+from fieldwork.nerfcore.mesh.shown import silhouette
+from fieldwork.tests.nerfcore.support.depth_views import orbit
+from PIL import Image
+
+CAMERA = Camera(width=120, height=120, fx=150.0, fy=150.0, cx=60.0, cy=60.0)
+RADIUS = 0.4
+
+
+def nothing() -> None:
+    pass
+
+
+def ball_views(folder: Path, masks: bool) -> list[View]:
+    """Photos of a ball, cut out by masks or by their transparency."""
+    views = []
+    local, _ = rays(CAMERA, pixel_centers(120, 120).reshape(-1, 2))
+    for number, pose in enumerate(orbit(6, 2.0)):
+        along = local @ pose[:3, :3].T
+        along /= np.linalg.norm(along, axis=1, keepdims=True)
+        near = -(along @ pose[:3, 3])[:, None] * along + pose[:3, 3]
+        ball = (np.linalg.norm(near, axis=1) < RADIUS).reshape(120, 120)
+        photo, mask = folder / f"{number}.png", folder / f"{number}_mask.png"
+        grey = np.full((120, 120, 3), 128, np.uint8)
+        alpha = (ball * 255).astype(np.uint8)[..., None]
+        Image.fromarray(grey if masks else np.concatenate([grey, alpha], 2)).save(photo)
+        Image.fromarray(alpha[..., 0]).save(mask)
+        views.append(View(str(number), CAMERA, pose, photo, mask=mask if masks else None))
+    return views
+
+
+@pytest.mark.parametrize("masks", [True, False])
+def test_a_silhouette_is_held_against_what_is_cut_out(tmp_path: Path, masks: bool) -> None:
+    views = ball_views(tmp_path, masks)
+    scene = Scene(views, [0, 1, 2, 3], [4, 5], mask_mode="empty")
+    ball = trimesh.creation.icosphere(4, RADIUS)
+    faces = np.asarray(ball.faces)
+    assert silhouette(scene, ball.vertices, faces, nothing) > 0.97
+    assert silhouette(scene, ball.vertices * 1.2, faces, nothing) == pytest.approx(1 / 1.2**2, abs=0.03)
+    assert silhouette(scene, ball.vertices + 5, faces, nothing) == 0
+
+
+def test_photos_that_cut_nothing_out_say_nothing(tmp_path: Path) -> None:
+    views = ball_views(tmp_path, True)
+    ball = trimesh.creation.icosphere(2, RADIUS)
+    scene = Scene(views, [0, 1, 2, 3], [4, 5], mask_mode="ignore")  # black is what one must not look at
+    assert silhouette(scene, ball.vertices, np.asarray(ball.faces), nothing) is None

@@ -13,7 +13,6 @@ from ..data.scene import Scene, View
 from ..errors import SettingError, TrainingError
 from ..geometry.similarity import similarity_scale, transform_points
 from ..images.picture import to_bytes
-from ..kernels.depth_arrays import FREE, MapArrays
 from ..params import MeshParams
 from ..progress import Reporter
 from ..project.schema import Project
@@ -70,8 +69,8 @@ def build(trained: Trained, project: Project, scene: Scene, params: MeshParams, 
     rendered = dm.depth_maps(trained.model, flats, report)
     report.stage("Comparing photos")
     store = read_photos(trained, scene, views, box, report)
-    maps = refined_maps(flats, rendered, store, trained.device, report)
-    check_agreement(rendered, maps, report)
+    maps, agreed = refined_maps(flats, rendered, store, trained.device, report)
+    check_agreement(agreed, report)
     bounds, voxel = wanted_bounds(params, scene, box), wanted_voxel(params, project, box)
     region = choose_region(maps, bounds, params.resolution, voxel)
     report.stage("Fusing")
@@ -143,13 +142,11 @@ def wanted_voxel(params: MeshParams, project: Project, box: Box) -> float | None
     return params.detail / 1000 / similarity_scale(box.world_from_box)
 
 
-def check_agreement(rendered: list[dm.DepthMap], maps: MapArrays, report: Reporter) -> None:
+def check_agreement(share: float, report: Reporter) -> None:
     """Warn where the views agree on little of what they show."""
-    hits = sum(int(m.hit.sum()) for m in rendered)
-    agreed = int(((maps.depth > 0) & (maps.depth < FREE)).sum())
-    if hits and agreed < LITTLE_AGREEMENT * hits:
+    if share < LITTLE_AGREEMENT:
         report.warn(
-            f"The views agree on {100 * agreed / hits:.0f} % of what they show only: the surface will have holes. "
+            f"The views agree on {100 * share:.0f} % of what they show only: the surface will have holes. "
             "Train longer, or check the poses."
         )
 

@@ -20,12 +20,12 @@ from ..kernels.patches import refine
 from ..progress import Reporter
 from .depth_maps import DepthMap, FlatView, confirmed_maps, cosines, map_arrays, neighbours, normals
 from .planes import with_planes
+from .sky import labels_tell, nothing
 
 VIEWS = 5  # neighbours whose photos are compared
 LEAST, GAIN = 0.6, 0.05  # correlation that is believed, and by how much it must exceed that of the field's depth
 SURE = 2.0  # pixels: the spread of a depth that photos confirm
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
-NAMED = 0.5  # share of the pixels that label maps name, from which on what they leave out is mostly nothing
 SMOOTH = 5  # pixels over which normals are averaged
 
 
@@ -54,25 +54,23 @@ def photo_pixels(view: FlatView, store: PixelStore) -> np.ndarray:
     return project(store.cameras[view.photo], directions @ turn.T)
 
 
-def nameless(view: FlatView, store: PixelStore) -> np.ndarray:
-    """Which pixels (H, W) of a flat view the label map of its photo leaves out; none where there is no label map."""
+def nameless(view: FlatView, store: PixelStore) -> np.ndarray | None:
+    """Which pixels (H, W) of a flat view the label map of its photo leaves out; None without a label map."""
     camera, shape = store.cameras[view.photo], (view.camera.height, view.camera.width)
     begin, end = int(store.first[view.photo]), int(store.first[view.photo + 1])
     left_out = (store.label[begin:end].cpu().numpy() == VOID).reshape(camera.height, camera.width)
     if left_out.all():
-        return np.zeros(shape, bool)
+        return None
     x, y = np.nan_to_num(photo_pixels(view, store)).clip(0, [camera.width - 1, camera.height - 1]).astype(int).T
     return left_out[y, x].reshape(shape)
 
 
 def refined_maps(
     views: list[FlatView], maps: list[DepthMap], store: PixelStore, device: torch.device, report: Reporter
-) -> MapArrays:
-    """Confirmed maps (see `depth_maps.confirmed_maps`) whose depths photos have moved. Where views do not confirm a moved
-    depth, the field's is asked again, or the plane through what is known around (planes.py).
-
-    Sky has no depth, but a field puts it somewhere. Where label maps name most of what photos show, depths that neither
-    photos confirm nor a label map names are unknown.
+) -> tuple[MapArrays, float]:
+    """Confirmed maps (see `depth_maps.confirmed_maps`) whose depths photos have moved, and the share of their depths that
+    views do confirm. Where views do not confirm a moved depth, the field's is asked again, or the plane through what is
+    known around (planes.py). What label maps say is nothing (sky.py) has an unknown depth.
     """
     arrays = map_arrays(views, maps, device)
     grey = torch.from_numpy(np.concatenate([g.reshape(-1) for g in grey_pictures(views, store, report)]))
@@ -86,17 +84,27 @@ def refined_maps(
         depth, _ = refine(grey, facing, arrays, number, near, LEAST, GAIN)
         moved.append(_with_depth(view, map_, depth.cpu().numpy().reshape(map_.depth.shape)))
     believed = confirmed_maps(views, moved, device, report, around)
-    named = store.labelled_share() >= NAMED
-    kept, begin, mixed = ((believed.depth > 0) & (believed.depth < FREE)).cpu().numpy(), 0, []
-    for view, old, new in zip(views, maps, moved):
-        sure = kept[begin : begin + old.depth.size].reshape(old.depth.shape) & (new.depth != old.depth)
-        begin += old.depth.size
-        depth = np.where(sure, new.depth, old.depth)
-        if named:
-            depth = np.where(nameless(view, store) & ~sure & old.hit, 0, depth)
-        spread = np.where(sure, np.minimum(old.spread, SURE * depth / view.camera.fx), old.spread)
-        mixed.append(with_planes(view, replace(old, depth=depth, spread=spread.astype(np.float32)), sure))
-    return confirmed_maps(views, mixed, device, report, around)
+    sure = [kept & (new.depth != old.depth) for kept, old, new in zip(hits(believed, maps), maps, moved)]
+    left_out = [nameless(view, store) for view in views]
+    told = labels_tell(sure, left_out)
+    mixed = []
+    for view, old, new, safe, unnamed in zip(views, maps, moved, sure, left_out):
+        depth = np.where(safe, new.depth, old.depth)
+        if told and unnamed is not None:
+            empty = nothing(unnamed, safe)
+            depth, safe = np.where(empty & old.hit, 0, depth), safe & ~empty
+        spread = np.where(safe, np.minimum(old.spread, SURE * depth / view.camera.fx), old.spread)
+        mixed.append(with_planes(view, replace(old, depth=depth, spread=spread.astype(np.float32)), safe))
+    final = confirmed_maps(views, mixed, device, report, around)
+    asked = sum(int(map_.hit.sum()) for map_ in mixed)
+    return final, sum(int(part.sum()) for part in hits(final, mixed)) / max(asked, 1)
+
+
+def hits(arrays: MapArrays, maps: list[DepthMap]) -> list[np.ndarray]:
+    """Where (H, W) each of the maps shows something."""
+    shown = ((arrays.depth > 0) & (arrays.depth < FREE)).cpu().numpy()
+    ends = np.cumsum([m.depth.size for m in maps])
+    return [part.reshape(m.depth.shape) for part, m in zip(np.split(shown, ends[:-1]), maps)]
 
 
 def _with_depth(view: FlatView, map_: DepthMap, depth: np.ndarray) -> DepthMap:

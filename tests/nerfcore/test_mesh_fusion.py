@@ -286,7 +286,6 @@ def test_photos_move_soft_depths_onto_the_surface() -> None:
         cameras=[flat.camera for flat in flats],
         rays=SimpleNamespace(rotation=torch.from_numpy(pose[:, :3, :3])),
         label=torch.zeros(sum(map(len, rgba)), dtype=torch.uint8),
-        labelled_share=lambda: 0.8,
     )
     soft = []
     for number, (flat, map_) in enumerate(zip(flats, true)):
@@ -295,7 +294,8 @@ def test_photos_move_soft_depths_onto_the_surface() -> None:
         cosine = depth_maps.cosines(flat.camera, depth)
         soft.append(depth_maps.DepthMap(depth, np.where(map_.hit, 0.05, 0).astype(np.float32), cosine))
     before = depth_maps.confirmed_maps(flats, soft, CPU, Reporter())
-    after = refined_maps(flats, soft, store, CPU, Reporter())  # type: ignore[arg-type]
+    after, share = refined_maps(flats, soft, store, CPU, Reporter())  # type: ignore[arg-type]
+    assert share > 0.9
     truth = torch.from_numpy(np.concatenate([m.depth.reshape(-1) for m in true]))
 
     def error(maps: MapArrays) -> float:
@@ -308,15 +308,20 @@ def test_photos_move_soft_depths_onto_the_surface() -> None:
         ((before.depth > 0) & (before.depth < FREE)).float().mean()
     )
     # What label maps leave out is only there where photos say so.
-    upper = torch.arange(CAMERA.height * CAMERA.width) < CAMERA.height * CAMERA.width // 2
-    store.label = torch.where(upper, VOID, 0).to(torch.uint8).repeat(len(flats))
-    named = refined_maps(flats, soft, store, CPU, Reporter())  # type: ignore[arg-type]
+    row = torch.arange(CAMERA.height * CAMERA.width) // CAMERA.width
+
+    def labelled_below(share: float) -> MapArrays:
+        left_out = row < share * CAMERA.height
+        store.label = torch.where(left_out, VOID, 0).to(torch.uint8).repeat(len(flats))
+        return refined_maps(flats, soft, store, CPU, Reporter())[0]  # type: ignore[arg-type]
+
+    named = labelled_below(0.4)
     field = torch.from_numpy(np.concatenate([m.depth.reshape(-1) for m in soft]))
-    left_out = upper.repeat(len(flats)) & (named.depth > 0) & (named.depth < FREE)
+    left_out = (row < 0.4 * CAMERA.height).repeat(len(flats)) & (named.depth > 0) & (named.depth < FREE)
     assert int(left_out.sum()) > 1000
     assert bool((named.depth != field)[left_out].all())
-    store.labelled_share = lambda: 0.3  # label maps that name little say nothing of the rest
-    torch.testing.assert_close(refined_maps(flats, soft, store, CPU, Reporter()).depth, after.depth)  # type: ignore[arg-type]
+    # Label maps that name little of what photos confirm say nothing of the rest.
+    torch.testing.assert_close(labelled_below(0.7).depth, after.depth)
 
 
 def wall_maps(camera: Camera) -> tuple[depth_maps.FlatView, depth_maps.DepthMap]:

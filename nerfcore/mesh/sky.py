@@ -1,0 +1,34 @@
+"""Depths of places that label maps leave out. Sky has no depth, but a field puts it somewhere."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt, uniform_filter
+
+NAMED = 0.5  # share of what photos confirm that label maps name, from which on what they leave out is mostly nothing
+RIM = 5.0  # pixels around what is named to which comparing photos spreads its depth
+WINDOW = 31  # pixels around a place in which what is left out is looked at
+CONFIRMED = 0.2  # share of it that photos must confirm, to be a thing without a name and not sky
+
+
+def labels_tell(sure: list[np.ndarray], left_out: list[np.ndarray | None]) -> bool:
+    """Whether what label maps leave out may be taken for nothing: they name most of what is surely there.
+
+    Args:
+        sure: which pixels (H, W) of each view have a depth that photos confirm; left_out: which its label map leaves out,
+            None for a view without one.
+    """
+    labelled = [(part, out) for part, out in zip(sure, left_out) if out is not None]
+    total = sum(int(part.sum()) for part, _ in labelled)
+    return total > 0 and sum(int((part & ~out).sum()) for part, out in labelled) >= NAMED * total
+
+
+def nothing(left_out: np.ndarray, sure: np.ndarray) -> np.ndarray:
+    """Which pixels (H, W) show nothing that has a depth: those left out by the label map that photos do not confirm, and
+    those beside a named thing whose surroundings photos do not confirm: windows of pixels that reach over an outline find
+    the thing's depth outside of it."""
+    away = left_out & (np.asarray(distance_transform_edt(left_out)) > RIM)
+    around = uniform_filter(away.astype(np.float32), WINDOW)
+    confirmed = uniform_filter((away & sure).astype(np.float32), WINDOW)
+    rim = left_out & ~away & (around > 1e-4) & (confirmed < CONFIRMED * around)
+    return (left_out & ~sure) | rim

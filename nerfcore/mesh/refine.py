@@ -20,7 +20,7 @@ from ..kernels.patches import refine
 from ..progress import Reporter
 from .depth_maps import DepthMap, FlatView, confirmed_maps, cosines, map_arrays, neighbours, normals
 from .planes import with_planes
-from .sky import labels_tell, nothing
+from .sky import backdrop, labels_tell, nothing
 
 VIEWS = 5  # neighbours whose photos are compared
 LEAST, GAIN = 0.6, 0.05  # correlation that is believed, and by how much it must exceed that of the field's depth
@@ -93,6 +93,7 @@ def refined_maps(
         if told and unnamed is not None:
             empty = nothing(unnamed, safe)
             depth, safe = np.where(empty & old.hit, 0, depth), safe & ~empty
+        depth = np.where(backdrop(depth, safe), 0, depth)
         spread = np.where(safe, np.minimum(old.spread, SURE * depth / view.camera.fx), old.spread)
         mixed.append(with_planes(view, replace(old, depth=depth, spread=spread.astype(np.float32)), safe))
     final = confirmed_maps(views, mixed, device, report, around)

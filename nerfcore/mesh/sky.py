@@ -5,9 +5,17 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import distance_transform_edt, uniform_filter
 
+from ..kernels.depth_arrays import FREE
+
 NAMED = 0.5  # share of what photos confirm that label maps name, from which on what they leave out is mostly nothing
 RIM = 5.0  # pixels around what is named to which comparing photos spreads its depth
 WINDOW = 31  # pixels around a place in which what is left out is looked at
+FARTHEST, FAR = (
+    95,
+    1.2,
+)  # percentile of the depths that photos confirm in a view, beyond which, times this, things are far
+AROUND = 0.125  # of the picture's width: window in which far things need depths that photos confirm
+SIMILAR, SUPPORT = 0.12, 0.05  # share by which depths there may differ, and share of them that must be confirmed
 CONFIRMED = 0.2  # share of it that photos must confirm, to be a thing without a name and not sky
 
 
@@ -32,3 +40,25 @@ def nothing(left_out: np.ndarray, sure: np.ndarray) -> np.ndarray:
     confirmed = uniform_filter((away & sure).astype(np.float32), WINDOW)
     rim = left_out & ~away & (around > 1e-4) & (confirmed < CONFIRMED * around)
     return (left_out & ~sure) | rim
+
+
+def backdrop(depth: np.ndarray, sure: np.ndarray) -> np.ndarray:
+    """Which pixels (H, W) of a depth map show a backdrop without a depth of its own, label maps or not: farther than what
+    photos confirm in this view, and nothing of about the same depth is confirmed around.
+
+    Args:
+        depth: (H, W), 0 or FREE where there is none; sure: which of them photos confirm.
+    """
+    hit = (depth > 0) & (depth < FREE)
+    if not (hit & sure).any():
+        return np.zeros(depth.shape, bool)
+    far = hit & ~sure & (depth > FAR * np.percentile(depth[hit & sure], FARTHEST))
+    size = int(AROUND * depth.shape[1]) | 1
+    step = np.full(depth.shape, -(1 << 20))
+    step[hit] = np.floor(np.log(depth[hit]) / SIMILAR)
+    out = np.zeros(depth.shape, bool)
+    for number in np.unique(step[far]):
+        near = hit & (np.abs(step - number) <= 1)
+        there, confirmed = (uniform_filter(m.astype(np.float32), size, mode="constant") for m in (near, near & sure))
+        out |= far & (step == number) & (confirmed < SUPPORT * there)
+    return out

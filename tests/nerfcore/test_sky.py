@@ -1,0 +1,59 @@
+"""What no surface is made of: places that label maps leave out, and backdrops."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from fieldwork.nerfcore.kernels.depth_arrays import FREE
+from fieldwork.nerfcore.mesh.sky import backdrop, labels_tell, nothing
+
+SHAPE = (96, 128)
+
+
+def half(columns: int) -> np.ndarray:
+    """The columns from this one on."""
+    out = np.zeros(SHAPE, bool)
+    out[:, columns:] = True
+    return out
+
+
+@pytest.mark.parametrize(("named", "tell"), [(100, True), (40, False)])
+def test_label_maps_tell_where_they_name_what_is_surely_there(named: int, tell: bool) -> None:
+    everywhere = np.ones(SHAPE, bool)
+    assert labels_tell([everywhere], [half(named)]) is tell
+    # A photo without a label map says nothing of those that have one.
+    assert labels_tell([everywhere] * 4, [half(named), None, None, None]) is tell
+    assert labels_tell([everywhere], [None]) is False
+
+
+def test_a_depth_that_spreads_over_an_outline_into_the_sky_is_left_out() -> None:
+    left_out = half(64)
+    spread = ~half(68)  # the thing, and four pixels beside it
+    empty = nothing(left_out, spread)
+    assert empty[:, 64:].all()
+    assert not empty[:, :64].any()
+
+
+def test_a_thing_without_a_name_is_kept_where_photos_confirm_it() -> None:
+    left_out, sure = half(64), np.ones(SHAPE, bool)
+    assert not nothing(left_out, sure).any()
+    line = np.zeros(SHAPE, bool)
+    line[:, 64:67] = True  # what an annotator leaves between two classes
+    assert not nothing(line, sure).any()
+
+
+def test_a_backdrop_is_far_and_nothing_near_it_is_confirmed() -> None:
+    depth = np.where(half(64), 8.0, 2.0).astype(np.float32)
+    depth[:8] = FREE
+    sure = ~half(64)
+    found = backdrop(depth, sure)
+    assert found[8:, 64:].all()
+    assert not found[:, :64].any()
+    assert not found[:8].any()
+    # A far hill with something to compare on it stays, and so does a wall no farther than the rest.
+    hill = sure.copy()
+    hill[8::3, 64::3] = True
+    assert not backdrop(depth, hill).any()
+    assert not backdrop(np.where(half(64), 2.2, depth).astype(np.float32), sure).any()
+    # Where nothing is confirmed at all, nothing is known of what is far.
+    assert not backdrop(depth, np.zeros(SHAPE, bool)).any()

@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 SHELL := /bin/bash
 export OMP_WAIT_POLICY := passive
 
-.PHONY: venv demo test test-all lint matrix gui gpu-compile gpu-check bench benchmarks-page repository clean
+.PHONY: venv demo test test-all faults lint matrix gui gpu-compile gpu-check bench benchmarks-page repository clean
 
 venv: $(VENV)/.ready
 
@@ -42,6 +42,11 @@ test: venv
 
 test-all: venv
 	$(BIN)/python -m pytest $(PYTEST)
+
+# Hundreds of faults (kills, damaged files, full disks, garbage), in 20 minutes; writes the table of docs/reliability.md.
+SEED ?= 1
+faults: venv
+	$(BIN)/python -m fieldwork.tests.faults.campaign --seed $(SEED) --page docs/reliability.md $(FAULTS)
 
 lint: venv
 	$(BIN)/ruff check .

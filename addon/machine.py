@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +47,8 @@ def engine_folder() -> Path:
 
 
 def engine_log() -> Path:
-    return user_folder("logs") / "engine.log"
+    """What this Blender's engine says; other Blenders have theirs."""
+    return user_folder("logs") / f"engine-{os.getpid()}.log"
 
 
 def engine_python() -> Path | None:

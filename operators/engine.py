@@ -98,7 +98,7 @@ class FIELDWORK_OT_engine_remove(Operator):
         folder = machine.engine_folder()
         if installing():
             cls.poll_message_set(t("The installation is under way"))
-        elif not (folder / "venv").exists() and not (folder / "cache").exists():
+        elif not any((folder / name).exists() for name in (*place.ENVIRONMENTS, "cache")):
             cls.poll_message_set(t("There is no engine to remove"))
         else:
             return True
@@ -111,7 +111,11 @@ class FIELDWORK_OT_engine_remove(Operator):
         from ..addon.engine import install
 
         queue.stop_engine(timeout=5.0)
-        install.remove(machine.engine_folder())
+        try:
+            install.remove(machine.engine_folder())
+        except install.InstallError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
         queue.installer = None
         return {"FINISHED"}
 

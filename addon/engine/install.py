@@ -16,7 +16,19 @@ from typing import Any
 
 from ..errors import EngineError
 from .link import Link
-from .place import COMPLETE, LOCK, LOG, lock_hash, python_in
+from .only_one import forget, only_one
+from .place import (
+    COMPLETE,
+    ENVIRONMENTS,
+    LOCK,
+    LOG,
+    STAGING,
+    environment,
+    installed,
+    lock_hash,
+    next_environment,
+    python_in,
+)
 from .tools import InstallCancelled, InstallError, Report, Runner
 
 NEEDED_GB = {"cpu": 4.0, "mps": 4.0}  # free disk; builds for graphics cards bring their libraries along
@@ -36,14 +48,16 @@ class Options:
 
 
 def remove(folder: Path) -> None:
-    """Remove the engine and its downloads."""
-    (folder / COMPLETE).unlink(missing_ok=True)
-    for name in ("venv", "tools", "cache"):
-        shutil.rmtree(folder / name, ignore_errors=True)
+    """Remove the engine and its downloads. Raises InstallError while another Blender installs it."""
+    with only_one(folder):
+        for name in (COMPLETE, STAGING):
+            (folder / name).unlink(missing_ok=True)
+        for name in (*ENVIRONMENTS, "tools", "cache"):
+            shutil.rmtree(folder / name, ignore_errors=True)
 
 
 def install(options: Options, report: Report, cancelled: threading.Event, lock: Path = LOCK) -> dict[str, Any]:
-    """Install or repair the engine; what is there already is kept.
+    """Install or repair the engine. One that works stays in its place until the new one does.
 
     Returns:
         what the doctor found.
@@ -51,42 +65,58 @@ def install(options: Options, report: Report, cancelled: threading.Event, lock: 
         InstallError: with what to do about it.
         InstallCancelled: `cancelled` was set; running it again goes on.
     """
+    with only_one(options.folder):
+        return _install(options, report, cancelled, lock)
+
+
+def _install(options: Options, report: Report, cancelled: threading.Event, lock: Path) -> dict[str, Any]:
     folder = options.folder
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / COMPLETE).unlink(missing_ok=True)
     _check_disk(options)
+    venv, before = next_environment(folder), environment(folder)
     with open(folder / LOG, "w", encoding="utf-8") as log:
         run = Runner(log, cancelled, report)
         report(0.01, "Looking at Python")
         _check_device(options.device)
         _check_base(options.base, run)
         uv = _find_uv(options, run)
-        venv = folder / "venv"
-        if not python_in(venv).is_file():
-            report(0.08, "Making the environment")
-            shutil.rmtree(venv, ignore_errors=True)
-            if uv:
-                run([uv, "venv", "--no-config", "--python", options.base, venv], "The environment cannot be made")
-            else:
-                run([options.base, "-m", "venv", venv], "The environment cannot be made")
+        _make_environment(options, venv, uv, run)
         report(0.1, "Loading packages")
-        run(_install_command(options, uv, lock), "The packages could not be installed", packages=_count(lock))
+        run(_install_command(options, uv, lock, venv), "The packages could not be installed", packages=_count(lock))
         report(0.92, "Checking the engine")
         result = _doctor(python_in(venv), folder)
         _check_doctor(result, options)
-    text = {"lock": lock_hash(lock), "time": time.time(), "doctor": result}
+    text = {"lock": lock_hash(lock), "time": time.time(), "venv": venv.name, "doctor": result}
     temporary = folder / (COMPLETE + ".part")
     temporary.write_text(json.dumps(text, indent=1), encoding="utf-8")
     os.replace(temporary, folder / COMPLETE)
+    (folder / STAGING).unlink(missing_ok=True)
+    if before != venv:
+        forget(before)
     report(1.0, "The engine is installed")
     return result
+
+
+def _make_environment(options: Options, venv: Path, uv: Path | None, run: Runner) -> None:
+    """An empty environment, or the one of an installation that broke off."""
+    note = options.folder / STAGING
+    if note.is_file() and python_in(venv).is_file():
+        return
+    run.report(0.08, "Making the environment")
+    shutil.rmtree(venv, ignore_errors=True)
+    if venv.exists():
+        raise InstallError(f"{venv} is in use. Close other Blenders, then press Repair again.")
+    note.write_text("{}", encoding="utf-8")
+    how = [uv, "venv", "--no-config", "--python", options.base] if uv else [options.base, "-m", "venv"]
+    run([*how, venv], "The environment cannot be made")
 
 
 def _check_disk(options: Options) -> None:
     free = shutil.disk_usage(options.folder).free / 1e9
     needed = NEEDED_GB.get(options.device, 4.0 if options.device == "auto" and not _has_gpu() else NEEDED_GPU_GB)
-    # What a broken installation has loaded already counts.
-    there = sum(f.stat().st_size for f in options.folder.rglob("*") if f.is_file() and not f.is_symlink()) / 1e9
+    # What a broken installation has loaded already counts; one that works stays beside the new one.
+    works = environment(options.folder) if installed(options.folder) else None
+    files = (f for f in options.folder.rglob("*") if f.is_file() and not f.is_symlink())
+    there = sum(f.stat().st_size for f in files if works is None or works not in f.parents) / 1e9
     if free + there < needed:
         raise InstallError(
             f"The disk of {options.folder} has {free:.1f} GB free; the engine needs about {needed:.0f} GB. Free some "
@@ -162,8 +192,8 @@ def pip_can(device: str) -> bool:
     return device in ("cpu", "cuda") or (device == "auto" and not Path("/dev/kfd").exists())
 
 
-def _install_command(options: Options, uv: Path | None, lock: Path) -> list[Any]:
-    python = python_in(options.folder / "venv")
+def _install_command(options: Options, uv: Path | None, lock: Path, venv: Path) -> list[Any]:
+    python = python_in(venv)
     if uv is None:
         if not options.wheels and not pip_can(options.device):
             raise InstallError(

@@ -24,6 +24,7 @@ from .place import ROOT, tail
 
 # Lines of a log that say why a process ended.
 _TELLING = re.compile(r"error|exception|fatal|abort|terminat|assert|no module|cannot|out of memory", re.IGNORECASE)
+LOGS_KEPT = 8  # of earlier engines
 EVENT = Callable[[str, dict[str, Any]], None]
 DONE = Callable[[dict[str, Any] | None, EngineError | None], None]
 
@@ -49,6 +50,14 @@ def engine_environment(base: dict[str, str] | None = None) -> dict[str, str]:
 
 def _positive(text: str | None) -> int | None:
     return int(text) if text and text.isdecimal() and int(text) > 0 else None
+
+
+def _prune(log: Path) -> None:
+    """Remove logs of earlier processes beside this one, but for the newest few."""
+    with contextlib.suppress(OSError):  # another process removes them too
+        others = [path for path in log.parent.glob(f"{log.stem.split('-')[0]}-*") if path.stem != log.stem]
+        for path in sorted(others, key=os.path.getmtime)[:-LOGS_KEPT]:
+            path.unlink(missing_ok=True)
 
 
 class Link:
@@ -88,6 +97,7 @@ class Link:
                 "missing", f"There is no engine at {self.python}.", "Install the engine in the preferences."
             )
         self.log.parent.mkdir(parents=True, exist_ok=True)
+        _prune(self.log)
         with contextlib.suppress(OSError):  # no older log, or it is being looked at
             os.replace(self.log, self.log.with_suffix(".old"))
         # A queue of its own: a late message of a dead engine must not reach the new one's requests.

@@ -1,9 +1,11 @@
 """Where the engine's own Python lives, and what is known of it. Standard library only, no bpy.
 
-ENGINE/venv/           the environment, made from Blender's Python or a chosen one, which stays untouched
+ENGINE/venv/, venv-2/  the environment, made from Blender's Python or a chosen one, which stays untouched. One of them is
+                       installed; the next one is made in the other, and takes its place once the doctor is content
+ENGINE/staging.json    is there while one is made; one that broke off goes on
 ENGINE/tools/          the installer `uv`, where the machine has none
 ENGINE/cache/          downloads; an installation that broke off goes on from here
-ENGINE/complete.json   written last, when the doctor was content
+ENGINE/complete.json   written last, when the doctor was content; names the environment that is installed
 ENGINE/install.log     everything the tools said
 
 Imported when the extension is enabled, so it imports little.
@@ -20,6 +22,8 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[2]
 ENVIRONMENT = "FIELDWORK_ENGINE_PYTHON"
 COMPLETE = "complete.json"
+STAGING = "staging.json"
+ENVIRONMENTS = ("venv", "venv-2")
 LOG = "install.log"
 LOCK = Path(__file__).with_name("engine.lock")
 
@@ -39,7 +43,7 @@ def find_python(chosen: str, engine_folder: Path, root: Path) -> Path | None:
         path = Path(chosen).expanduser()
         return python_in(path) if path.is_dir() else path
     if installed(engine_folder):
-        return python_in(engine_folder / "venv")
+        return python_in(environment(engine_folder))
     checkout = python_in(root / ".venv")
     return checkout if checkout.is_file() else None
 
@@ -50,7 +54,24 @@ def installed(folder: Path) -> dict[str, Any] | None:
         value = json.loads((folder / COMPLETE).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    return value if python_in(folder / "venv").is_file() else None
+    return value if isinstance(value, dict) and python_in(folder / _name(value)).is_file() else None
+
+
+def environment(folder: Path) -> Path:
+    """The environment that is installed, or the first place for one."""
+    return folder / _name(installed(folder) or {})
+
+
+def next_environment(folder: Path) -> Path:
+    """Where the next one is made: beside the one that is installed."""
+    if installed(folder) is None:
+        return folder / ENVIRONMENTS[0]
+    return folder / next(name for name in ENVIRONMENTS if name != environment(folder).name)
+
+
+def _name(value: dict[str, Any]) -> str:
+    name = value.get("venv", ENVIRONMENTS[0])
+    return name if name in ENVIRONMENTS else ENVIRONMENTS[0]
 
 
 def lock_hash(lock: Path = LOCK) -> str:

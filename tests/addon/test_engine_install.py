@@ -204,7 +204,7 @@ def test_each_device_gets_its_build_of_pytorch_or_a_sentence(options, lock, monk
             module._check_device(device)
         return
     module._check_device(device)
-    command = [str(word) for word in module._install_command(chosen, Path("uv"), lock)]
+    command = [str(word) for word in module._install_command(chosen, Path("uv"), lock, options.folder / "venv")]
     backend = command[command.index("--torch-backend") + 1] if "--torch-backend" in command else None
     assert backend == {"darwin": None}.get(system, "cpu" if device == "cpu" else "auto")
     assert command[-2:] == ["-r", str(lock)], "locked versions"
@@ -234,15 +234,17 @@ def test_without_uv_only_a_build_that_suits_is_taken(options, lock, monkeypatch,
     monkeypatch.setattr(module.shutil, "which", lambda name: "/bin/x" if nvidia and name == "nvidia-smi" else None)
     chosen = Options(**{**vars(options), "device": device, "wheels": "", "online": True})
     if can:
-        assert "pip" in module._install_command(chosen, None, lock)
+        assert "pip" in module._install_command(chosen, None, lock, options.folder / "venv")
     else:
         with pytest.raises(InstallError, match="needs the installer uv"):
-            module._install_command(chosen, None, lock)
+            module._install_command(chosen, None, lock, options.folder / "venv")
 
 
 def test_wheels_on_the_disk_are_taken_as_they_are(options, lock):
     for uv in (Path("uv"), None):
-        command = module._install_command(Options(**{**vars(options), "device": "rocm"}), uv, lock)
+        command = module._install_command(
+            Options(**{**vars(options), "device": "rocm"}), uv, lock, options.folder / "venv"
+        )
         assert "--torch-backend" not in command
         assert "--no-index" in command
         assert command[command.index("--find-links") + 1] == options.wheels
@@ -266,3 +268,75 @@ def test_state_of_a_half_installed_engine(options):
     assert place.installed(options.folder) is None, "the environment is gone"
     (options.folder / place.COMPLETE).write_text("{")
     assert place.installed(options.folder) is None
+
+
+def test_repair_keeps_the_working_engine_until_the_new_one_runs(options, lock, tmp_path, content_doctor, monkeypatch):
+    make_wheel(tmp_path / "wheels")
+    go(options, lock)
+    first = place.find_python("", options.folder, tmp_path)
+    make_wheel(tmp_path / "wheels", "more")
+    lock.write_text("tiny==1.0\nmore==1.0\n")
+
+    def fails(python, folder):
+        assert python != first, "the new one is looked at"
+        assert place.find_python("", options.folder, tmp_path) == first, "the old one serves meanwhile"
+        raise InstallError("The engine does not run.")
+
+    monkeypatch.setattr(module, "_doctor", fails)
+    with pytest.raises(InstallError, match="does not run"):
+        go(options, lock)
+    assert place.find_python("", options.folder, tmp_path) == first
+    assert not place.up_to_date(options.folder)
+    subprocess.run([first, "-c", "import tiny"], check=True)
+    monkeypatch.setattr(module, "_doctor", lambda python, folder: content_doctor)
+    go(options, lock)
+    second = place.find_python("", options.folder, tmp_path)
+    assert second != first
+    assert not first.exists(), "the old one is gone"
+    subprocess.run([second, "-c", "import tiny, more"], check=True)
+    assert not [path for path in options.folder.iterdir() if "old" in path.name or path.name == place.STAGING]
+
+
+def test_a_repair_begins_with_an_empty_environment(options, lock, tmp_path, content_doctor):
+    make_wheel(tmp_path / "wheels")
+    go(options, lock)
+    left = options.folder / place.ENVIRONMENTS[1]
+    python = module.python_in(left)
+    python.parent.mkdir(parents=True)
+    python.write_text("what could not be removed the last time")
+    go(options, lock)
+    subprocess.run([python, "-c", "import tiny"], check=True)
+
+
+HOLDS = """
+import sys, time
+from pathlib import Path
+from fieldwork.addon.engine.only_one import only_one
+with only_one(Path(sys.argv[1])):
+    print("held", flush=True)
+    time.sleep(60)
+"""
+
+
+def test_one_installation_at_a_time(options, lock, tmp_path, content_doctor):
+    make_wheel(tmp_path / "wheels")
+    command = [sys.executable, "-c", HOLDS, options.folder]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as other:
+        try:
+            assert other.stdout.readline().strip() == b"held"
+            for change in (lambda: go(options, lock), lambda: module.remove(options.folder)):
+                with pytest.raises(InstallError, match="Another Blender"):
+                    change()
+        finally:
+            other.kill()
+    go(options, lock)
+    assert place.installed(options.folder)
+
+
+def test_an_engine_installed_before_there_were_two_places_is_found(options):
+    python = module.python_in(options.folder / "venv")
+    python.parent.mkdir(parents=True)
+    python.touch()
+    (options.folder / place.COMPLETE).write_text(json.dumps({"lock": "x"}))
+    assert place.environment(options.folder) == options.folder / "venv"
+    assert place.next_environment(options.folder) == options.folder / "venv-2"

@@ -154,3 +154,17 @@ def test_environment_of_the_engine(monkeypatch):
     assert engine_environment({})["OMP_NUM_THREADS"] == "7"
     monkeypatch.setattr(os, "cpu_count", lambda: 1)
     assert engine_environment({})["OMP_NUM_THREADS"] == "1"
+
+
+def test_each_process_has_a_log_and_old_ones_go(tmp_path):
+    for number in range(12):
+        path = tmp_path / f"engine-{number}.log"
+        path.write_text("x")
+        os.utime(path, (number + 1, number + 1))
+    (tmp_path / "doctor.log").write_text("x")
+    link = Link(sys.executable, tmp_path / "engine-99.log", ENGINE)
+    link.start()
+    link.close()
+    kept = sorted(int(path.stem.split("-")[1]) for path in tmp_path.glob("engine-*.log"))
+    assert kept == [*range(4, 12), 99]
+    assert (tmp_path / "doctor.log").exists()

@@ -16,6 +16,8 @@ from ..geometry.points import Points
 # A world with y up, turned so that z is up.
 Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 
+FARTHEST = 1e12  # units of a data set's frame: a million times what geographic coordinates in metres reach
+
 
 @dataclass(frozen=True)
 class DatasetView:
@@ -55,9 +57,17 @@ class Dataset:
 
 
 def require(views: Iterable[DatasetView], source: Path, missing: Sequence[str] = ()) -> list[DatasetView]:
-    """The views as a list. Raises InputError when there is none, naming missing image files if that is why."""
+    """The views as a list.
+
+    Raises:
+        InputError: there is none, naming missing image files if that is why; a pose is not of finite numbers.
+    """
     found = list(views)
     if not found:
         why = f"none of its images exists (for example {missing[0]})" if missing else "it has no images"
         raise InputError(f"{source} cannot be imported: {why}.", "Choose the folder that holds the images and poses.")
+    for view in found:
+        pose = np.asarray(view.camera_to_world, np.float64)
+        if not (np.abs(pose) < FARTHEST).all():  # false for NaN too
+            raise InputError(f"The pose of {view.name} in {source} is no rotation and position.", "Export it again.")
     return found

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import math
 import shutil
 import subprocess
 import sys
@@ -61,3 +63,23 @@ def test_import_killed_and_run_again(shared_data: Data, tmp_path: Path) -> None:
     for view in load_scene(project).views:
         with Image.open(view.image) as image:
             image.load()
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, 1e308])
+def test_a_pose_that_is_no_place(tmp_path: Path, value: float) -> None:
+    """It is told before the direction up is sought among all poses."""
+    Image.new("RGB", (40, 30)).save(tmp_path / "a.png")
+    pose = np.eye(4)
+    pose[0, 3] = value
+    frame = {"file_path": "a.png", "transform_matrix": pose.tolist()}
+    (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 40, "ply_file_path": "", "frames": [frame]}))
+    with pytest.raises(InputError, match=r"pose of a .* is no rotation and position"):
+        read_dataset(tmp_path)
+
+
+def test_an_image_whose_camera_is_not_there(tmp_path: Path) -> None:
+    Image.new("RGB", (40, 30)).save(tmp_path / "a.png")
+    (tmp_path / "cameras.txt").write_text("7 PINHOLE 40 30 40 40 20 15\n")
+    (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n\n")
+    with pytest.raises(InputError, match=r"cameras\.txt is damaged: it lacks camera 1 of a\.png"):
+        read_dataset(tmp_path)

@@ -110,6 +110,12 @@ def read_model(model: Path) -> tuple[dict[int, Camera], list[ColmapImage], Point
         except (OSError, ValueError, IndexError, KeyError, struct.error) as error:
             raise InputError(f"{path} is damaged: {error}.", "Export the model from COLMAP again.") from error
     cameras, images, points = parts
+    without = next((image for image in images if image.camera not in cameras), None)
+    if without is not None:
+        raise InputError(
+            f"{model / f'cameras{suffix}'} is damaged: it lacks camera {without.camera} of {without.name}.",
+            "Export the model from COLMAP again.",
+        )
     return cameras, sorted(images, key=lambda image: image.name), points
 
 

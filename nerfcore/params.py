@@ -17,6 +17,10 @@ LARGEST_PICTURE = 32768  # pixels on a side
 MANY = 1_000_000  # photos, frames
 LONGEST_RUN = 1_000_000_000  # steps or seconds
 
+MASK_MODE = (
+    "what black mask pixels mean; default: empty where masks cut an object out of nearly all photos, else ignore"
+)
+
 Preset = Literal["draft", "standard", "high"]
 Split = Literal["none", "classes", "instances"]
 Pass = Literal["rgb", "depth", "semantic", "confidence", "normal", "unknown"]
@@ -127,7 +131,7 @@ class NewParams(Params):
     )
     masks: Path | None = Field(default=None, description="folder of foreground masks named like the photos")
     classes: Path | None = Field(default=None, description="classes.json: names of the label ids")
-    mask_mode: Literal["ignore", "empty"] = Field(default="ignore", description="what black mask pixels mean")
+    mask_mode: Literal["ignore", "empty"] | None = Field(default=None, description=MASK_MODE)
     max_size: int = Field(
         default=1600, ge=64, le=LARGEST_PICTURE, description="long side of the working copies in pixels"
     )
@@ -392,7 +396,7 @@ class ReconstructParams(Params):
     preset: Preset = "standard"
     labels: Path | None = None
     masks: Path | None = None
-    mask_mode: Literal["ignore", "empty"] = Field(default="ignore", description="what black mask pixels mean")
+    mask_mode: Literal["ignore", "empty"] | None = Field(default=None, description=MASK_MODE)
     classes: Path | None = None
     blend: Path | None = None
     time_limit: float | None = Field(default=None, gt=0, le=LONGEST_RUN, description="seconds of training")
@@ -404,6 +408,9 @@ class ReconstructParams(Params):
     )
     report: Path | None = Field(default=None, description="report to write, .html or .pdf")
     renders: Path | None = Field(default=None, description="folder for renders of new views")
+    render_count: int = Field(
+        default=8, ge=1, le=MANY, description="number of renders of new views, around the subject"
+    )
 
 
 class BatchParams(Params):

@@ -11,7 +11,7 @@ from ..params import BlendParams
 from ..progress import Reporter
 from ..project.fingerprints import Earlier, Fingerprint, array_digest, compare, digest, files_digest, stamps_digest
 from ..project.runs import INSTANCES, MEASURES, holdout_of
-from ..project.store import load_project, record_step
+from ..project.store import load_poses, load_project, record_step
 from .package import photo_renders, stale, write_package
 from .process import write_in_blender
 
@@ -37,8 +37,8 @@ def blend(params: BlendParams, report: Reporter) -> dict[str, Any]:
     warnings = stale(folder, params.run, params.renders)
     if not (package / "mesh.npz").is_file():
         warnings.append("There is no mesh yet: the .blend holds cameras and points only. Run `fieldwork mesh` first.")
-    if not len(scene.points):
-        warnings.append("The project has no sparse points.")
+    if not len(scene.points) and load_poses(folder).source == "sfm":  # poses of data sets often come without
+        warnings.append("The project has no sparse points: its cameras come without them. Run `fieldwork poses` again.")
     result = write_in_blender(package, out, params.split, report)
     for warning in [*warnings, *result.pop("warnings")]:
         report.warn(warning)

@@ -19,6 +19,7 @@ from ..project.fingerprints import Earlier, Fingerprint, compare, digest, files_
 from ..project.schema import ImageRecord, Project
 from ..project.store import PROJECT_FILE, create_folder, edit_project, load_project
 from .find import Source, classes_beside, find_sources, list_photos, subfolder
+from .mask_mode import MaskMode, guess_mask_mode
 from .select import reject_blurred, reject_duplicates
 from .video import VIDEO_SUFFIXES, extract_frames
 from .working_copies import Settings, make_working_copies
@@ -59,7 +60,7 @@ def new(params: NewParams, report: Reporter) -> dict[str, Any]:
     # Video frames were chosen for sharpness, and a still camera on a tripod may well repeat itself there.
     reject_duplicates(records, pictures, kept)
     if not params.keep_blurry:
-        reject_blurred(records)
+        reject_blurred(records, folder)
     records = kept + records
     _check_usable(records, photos, skipped)
     present = _present_ids(folder, records, report)
@@ -69,8 +70,10 @@ def new(params: NewParams, report: Reporter) -> dict[str, Any]:
         for text in unnamed_values(present, *classes[:2], classes_file):
             report.warn(text)
     origin = {"video_sha256": file_hash(photos)} if photos.is_file() else {}
-    with edit_project(folder, Project(mask_mode=params.mask_mode)) as project:
+    mask_mode = _mask_mode(params, previous, folder, records, report)
+    with edit_project(folder, Project()) as project:
         _put_in(project, records, set(present), classes, params, previous is not None)
+        project.mask_mode = mask_mode
         result["classes"] = [c.name for c in project.classes]
         project.record("new", params.model_dump(mode="json"), result | origin, inputs)
     return result
@@ -247,6 +250,25 @@ def _warn(records: list[ImageRecord], rejected: list[dict[str, str]], report: Re
         report.warn(f"Only {number}: camera poses need at least three, better twenty.")
 
 
+def _mask_mode(
+    params: NewParams, previous: Project | None, folder: Path, records: list[ImageRecord], report: Reporter
+) -> MaskMode:
+    """What black in masks means: as asked for, as before where photos are added, else guessed, which is said."""
+    if previous is not None and params.add and (params.mask_mode is None or not params.masks):
+        return previous.mask_mode
+    if params.mask_mode is not None:
+        return params.mask_mode
+    used = [record for record in records if record.status != "rejected"]
+    masks = [folder / record.mask for record in used if record.mask]
+    mode = guess_mask_mode(masks, len(used))
+    if mode == "empty":
+        report.note(
+            f"The masks cut an object out of nearly all {len(used)} photos: what is black in them is taken as empty space "
+            "(--mask-mode empty). Where there is something that only shall not count, use --mask-mode ignore."
+        )
+    return mode
+
+
 def _put_in(
     project: Project,
     records: list[ImageRecord],
@@ -268,8 +290,6 @@ def _put_in(
                 if record.status == "ok" and before.status == "unregistered":
                     record.status, record.reason = before.status, before.reason
     project.images = records
-    if params.masks or not params.add or not there:
-        project.mask_mode = params.mask_mode
     known = {c.id: c for c in project.classes}
     if names or not known:
         project.ignore_id = ignore_id

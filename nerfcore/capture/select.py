@@ -6,13 +6,16 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
-from ..images.sharpness import same_picture
+from ..images.sharpness import focus, same_picture
 from ..project.schema import ImageRecord
 
 # Not tuned.
 BLUR_SHARE = 0.1  # of the median sharpness of a camera's photos, below which one is left out
 MIN_PHOTOS_TO_JUDGE = 8  # of a camera
+FOCUS_SHARE = 0.3  # of the median focus of photos of the camera that are not doubtful
+COMPARED = 8  # of those at most: each is decoded once more
 
 
 def reject_duplicates(
@@ -40,10 +43,12 @@ def _same(a: ImageRecord, b: ImageRecord, pictures: dict[str, np.ndarray]) -> bo
     return same_picture(pictures[a.name], pictures[b.name])
 
 
-def reject_blurred(records: Sequence[ImageRecord]) -> None:
+def reject_blurred(records: Sequence[ImageRecord], folder: Path) -> None:
     """Mark photos far less sharp than the rest of the capture as rejected.
 
-    Each is compared with the median of the photos of its own camera, because lenses and subjects differ.
+    Each is compared with the median of the photos of its own camera, because lenses and subjects differ. Where little
+    is seen, as on a plain wall, little is sharp: such a photo is kept where its finest structures are as strong beside
+    its coarser ones as those of the others. `folder`: the project, which has the working copies.
     """
     groups: dict[str, list[ImageRecord]] = {}
     for record in records:
@@ -53,7 +58,17 @@ def reject_blurred(records: Sequence[ImageRecord]) -> None:
         if len(group) < MIN_PHOTOS_TO_JUDGE:
             continue
         median = float(np.median([record.sharpness or 0.0 for record in group]))
-        for record in group:
-            if (record.sharpness or 0.0) < BLUR_SHARE * median:
+        doubtful = [record for record in group if (record.sharpness or 0.0) < BLUR_SHARE * median]
+        if not doubtful:
+            continue
+        clear = [record for record in group if record not in doubtful]
+        usual = float(np.median([_focus(record, folder) for record in clear[:: -(-len(clear) // COMPARED)]]))
+        for record in doubtful:
+            if _focus(record, folder) < FOCUS_SHARE * usual:
                 record.status = "rejected"
-                record.reason = f"blurred: sharpness {record.sharpness:.0f}, the others have about {median:.0f}"
+                record.reason = f"blurred: sharpness {record.sharpness:.0f}, the others have about {median:.0f}; --keep-blurry keeps it"
+
+
+def _focus(record: ImageRecord, folder: Path) -> float:
+    with Image.open(folder / record.file) as image:
+        return focus(image)

@@ -172,11 +172,12 @@ def _warp() -> tuple[str | None, list[str]]:
     """Where Warp keeps compiled kernels; compiles and runs one."""
     try:
         import warp as wp
+
+        from ..kernels.runtime import init
     except (ImportError, OSError):
         return None, []
     try:
-        wp.config.log_level = 30  # warnings; its greeting would go to stdout
-        wp.init()
+        init()
         from ..kernels.probe import check_warp
 
         wrong = check_warp()

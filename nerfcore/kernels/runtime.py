@@ -7,12 +7,17 @@ and begin with `i = wp.tid() + offset`. On CUDA the whole range is one launch on
 
 from __future__ import annotations
 
+import os
+import shutil
 import sys
+import tempfile
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import contextmanager, nullcontext
 from functools import cache
+from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
@@ -25,6 +30,8 @@ wp.config.log_level = 30  # warnings; stdout belongs to results
 wp.config.enable_backward = False
 
 _MINIMUM_CHUNK = 256
+NVIDIA = "0x10de"  # vendor number of PCI
+NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
 CUDA_BLOCK = 256  # threads a block, Warp's default
 Result = TypeVar("Result")
 
@@ -67,8 +74,34 @@ def init() -> None:
             # Kernel threads hold the interpreter lock for microseconds; at the default 5 ms they would wait for each
             # other.
             sys.setswitchinterval(1e-4)
-            wp.init()
+            with nullcontext() if nvidia_gpu() else _without_note_of_driver():
+                wp.init()
             _started = True
+
+
+def nvidia_gpu() -> bool:
+    """Whether the machine has an NVIDIA GPU, as far as can be told without its driver."""
+    if torch.cuda.is_available() or shutil.which("nvidia-smi"):
+        return True
+    return any(path.read_text().strip() == NVIDIA for path in Path("/sys/bus/pci/devices").glob("*/vendor"))
+
+
+@contextmanager
+def _without_note_of_driver() -> Iterator[None]:
+    """Leave out the line that Warp's native code writes to stderr where there is no NVIDIA driver."""
+    sys.stderr.flush()
+    with tempfile.TemporaryFile() as held:
+        kept = os.dup(2)
+        os.dup2(held.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+            held.seek(0)
+            rest = b"".join(line for line in held if NO_DRIVER not in line)
+            if rest:
+                os.write(2, rest)
 
 
 def array(tensor: torch.Tensor, dtype: Any = None) -> wp.array:

@@ -87,11 +87,23 @@ def estimate_poses(params: PosesParams, report: Reporter) -> dict[str, Any]:
         known = {k: v for k, v in answer.items() if k != "images"}
         project.record("poses", params.model_dump(mode="json"), known, inputs)
     _write_report(folder, project, poses, points, records, result, report)
+    if len(result["groups"]) > 1:
+        report.warn(in_groups(result["groups"], params.group))
     missing = [f"{record.name} ({record.reason})" for record in records if record.status != "ok"]
     if missing:
         where = f"{len(missing)} of {answer['total']} photos have no pose"
         report.warn(f"{shortened(where, missing)} {folder / REPORT_FILE} says why.")
     return answer
+
+
+def in_groups(groups: list[int], used: int) -> str:
+    """That photos fall into groups of these sizes, of which the first is used; by --group it was number `used`."""
+    sizes = f"{', '.join(map(str, groups[:-1]))} and {groups[-1]}"
+    other = "--group 1 uses the next one" if used == 0 else "--group 0 uses the largest"
+    return (
+        f"The photos fall into {len(groups)} groups of {sizes} that share too little to be joined; the poses are those of the "
+        f"first. Photos between them would join them; {other}."
+    )
 
 
 def _extendable(folder: Path, records: list[ImageRecord]) -> Poses | None:

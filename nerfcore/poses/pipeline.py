@@ -75,7 +75,7 @@ def run(job: dict[str, Any], tell: Any) -> dict[str, Any]:
             continue
         tried.add(signature)
         if best is not None:
-            tell.warn(f"{best.registered} of {len(names)} photos placed: trying again ({level.name}).")
+            tell.warn(f"{_placed(best, names)}: trying again ({level.name}).")
         attempt = _attempt(job, level, names, exhaustive, tell)
         if best is None or attempt.registered > best.registered:
             best = attempt
@@ -106,6 +106,13 @@ def run(job: dict[str, Any], tell: Any) -> dict[str, Any]:
     temporary.rename(sparse)
     write_json(work / LEVEL_FILE, asdict(best.level))
     return _result(best, names, work / "points.npz")
+
+
+def _placed(best: Attempt, names: list[str]) -> str:
+    """How many photos have a pose; separate models of photos are said as groups."""
+    text = f"{best.registered} of {len(names)} photos placed"
+    sizes = [str(model.num_reg_images()) for model in best.models]
+    return f"{text}, in one of the separate groups of {' and '.join(sizes)}" if len(sizes) > 1 else text
 
 
 def _attempt(job: dict[str, Any], level: Level, names: list[str], exhaustive: bool, tell: Any) -> Attempt:

@@ -9,14 +9,27 @@ VOID_COLOR = (0.0, 0.0, 0.0)
 
 
 def colorize_depth(depth: np.ndarray, opacity: np.ndarray) -> np.ndarray:
-    """Depth (H, W) → (H, W, 3) uint8, near bright and far dark (turbo over the 2–98 % range); empty is black."""
-    solid = np.isfinite(depth) & (opacity > 0.5)
-    if not solid.any():
+    """Depth (H, W) → (H, W, 3) uint8 in turbo's colours, near red and far blue over `depth_range`; empty is black."""
+    drawn = depth_range(depth, opacity)
+    if drawn is None:
         return np.zeros((*depth.shape, 3), np.uint8)
-    near, far = np.percentile(depth[solid], [2, 98])
+    solid, (near, far) = _solid(depth, opacity), drawn
     value = 1 - (np.nan_to_num(depth, nan=far) - near) / max(far - near, 1e-9)
     picture = colormaps["turbo"](value.clip(0, 1))[..., :3]
     return (np.where(solid[..., None], picture, 0) * 255 + 0.5).astype(np.uint8)
+
+
+def depth_range(depth: np.ndarray, opacity: np.ndarray) -> tuple[float, float] | None:
+    """Nearest and farthest depth that are told apart in a depth picture (2–98 % of the pixels); None where all is empty."""
+    solid = _solid(depth, opacity)
+    if not solid.any():
+        return None
+    near, far = np.percentile(depth[solid], [2, 98])
+    return float(near), float(far)
+
+
+def _solid(depth: np.ndarray, opacity: np.ndarray) -> np.ndarray:
+    return np.isfinite(depth) & (opacity > 0.5)
 
 
 def colorize_labels(label: np.ndarray, colors: dict[int, tuple[float, float, float]]) -> np.ndarray:

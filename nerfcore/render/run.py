@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +27,7 @@ from .model import Model
 
 CPU_IMAGE_SIZE, GPU_IMAGE_SIZE = 800, 1600  # longest side of the photos in training; see `train.image_size`
 REFINED_POSES = "poses.json"  # of a run with train.refine_poses
+LIMITS = {"greater_than", "greater_than_equal", "less_than", "less_than_equal"}  # as pydantic names what is beyond them
 PIXEL_FEATURES = "voxel_init.safetensors"  # of a run with field.voxel_init=cnn
 
 
@@ -103,9 +105,34 @@ def read_info(folder: Path) -> RunInfo:
     """config.json of the folder of a run. Raises ProjectError when it is missing or damaged."""
     path = folder / INFO
     try:
-        return RunInfo.model_validate(migrate_info(json.loads(path.read_text(encoding="utf-8"))))
+        return _as_trained(migrate_info(json.loads(path.read_text(encoding="utf-8"))))
     except (OSError, json.JSONDecodeError, ValidationError) as error:
         raise ProjectError(f"{path} is damaged or from another version.", "Train the run again.") from error
+
+
+def _as_trained(value: Any) -> RunInfo:
+    """A run with its settings as they were when it was trained, also where they are beyond today's limits.
+
+    Raises:
+        ValidationError: it is damaged.
+    """
+    try:
+        return RunInfo.model_validate(value)
+    except ValidationError as error:
+        details = error.errors()
+        if any(
+            detail["type"] not in LIMITS or detail["loc"][0] != "config" or len(detail["loc"]) != 3
+            for detail in details
+        ):
+            raise
+    allowed = copy.deepcopy(value)
+    for detail in details:
+        del allowed["config"][detail["loc"][1]][detail["loc"][2]]
+    info = RunInfo.model_validate(allowed)
+    for detail in details:
+        stage = getattr(info.config, str(detail["loc"][1]))
+        vars(stage)[str(detail["loc"][2])] = detail["input"]  # not checked again
+    return info
 
 
 def refined_poses(project: Path, run: str, info: RunInfo) -> dict[str, np.ndarray]:

@@ -14,7 +14,7 @@ from ..data.load import class_inputs, load_scene, view_inputs
 from ..data.pixels import training_size
 from ..data.scene import Scene, View
 from ..errors import InputError
-from ..files import atomic_path, disk_errors
+from ..files import atomic_path, disk_errors, write_json
 from ..geometry.cameras import Camera, flip_camera_axes
 from ..geometry.frames import focus_point
 from ..geometry.similarity import similarity_scale
@@ -37,7 +37,7 @@ from ..project.runs import RENDER_RECORD, checkpoint_id, state_id
 from ..project.schema import step
 from ..project.store import load_project, world_from_sfm
 from .image import Frame, background_of, render_view
-from .pictures import colorize_depth, colorize_labels
+from .pictures import colorize_depth, colorize_labels, depth_range
 from .run import load_info, load_trained
 
 ORBIT_PIXELS = 800  # longest side of orbit frames unless a size is asked for
@@ -48,7 +48,7 @@ OPEN_ANGLE = np.pi / 2  # around the subject without a photo: from there on an o
 def render(params: RenderParams, report: Reporter) -> dict[str, Any]:
     """Render a run from some cameras; existing frames are overwritten.
 
-    Depth PNGs are coloured for viewing; the EXR holds the values: depth in world units along the optical axis, class
+    Depth PNGs are coloured for viewing, and NAME_depth.json says what the colours mean; the EXR holds the values: depth in world units along the optical axis, class
     ids, confidence, world-space normals.
 
     Returns:
@@ -213,6 +213,13 @@ def look_at(center: np.ndarray, target: np.ndarray, up: np.ndarray | None = None
     return pose
 
 
+def depth_legend(frame: Frame, scale: float) -> dict[str, Any]:
+    """What the colours of a depth picture mean: depths in world units that are drawn red and dark blue."""
+    drawn = depth_range(frame.depth, frame.opacity)
+    near, far = (None, None) if drawn is None else (round(drawn[0] * scale, 6), round(drawn[1] * scale, 6))
+    return {"near": near, "far": far, "near_color": "red", "far_color": "blue", "colors": "turbo", "empty": "black"}
+
+
 def write_frame(
     out: Path,
     name: str,
@@ -223,7 +230,7 @@ def write_frame(
     colors: dict[int, tuple[float, float, float]],
     box: Box,
 ) -> list[Path]:
-    """Write NAME.png, NAME_depth.png, … and NAME.exr with all asked passes. Returns the paths.
+    """Write NAME.png, NAME_depth.png, … and NAME.exr with all asked passes. Returns the paths of these pictures.
 
     The PNG shows the field on its background; the EXR has the field alone, linear and with associated alpha, to be put
     over anything.
@@ -257,6 +264,8 @@ def write_frame(
         with atomic_path(path) as temporary:
             write_picture(temporary, picture)
         written.append(path)
+        if kind == "depth":
+            write_json(path.with_suffix(".json"), depth_legend(frame, scale))
         prefix, channels, value = values[kind]
         for index, channel in enumerate(channels):
             layers[prefix + channel] = value[..., index]

@@ -123,7 +123,10 @@ def reconstruct(params: p.ReconstructParams, report: Reporter) -> dict[str, Any]
     )
     renders = params.renders or project / "exports" / run / "renders"
     pipeline.do(
-        "render", p.RenderParams(project=project, run=run, out=renders, orbit=8, passes=["rgb", "depth", "semantic"])
+        "render",
+        p.RenderParams(
+            project=project, run=run, out=renders, orbit=params.render_count, passes=["rgb", "depth", "semantic"]
+        ),
     )
     if params.blend is not None:
         pipeline.do("blend", p.BlendParams(project=project, out=params.blend, run=run))

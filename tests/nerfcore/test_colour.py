@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -294,3 +295,21 @@ def test_transparent_photos_are_straightened_with_their_alpha(tmp_path: Path) ->
     assert 0 < rgba[:, 3].astype(float).mean() < 255
     assert ((rgba[:, 3] > 0) & (rgba[:, 3] < 255)).sum() > 10
     assert (rgba[rgba[:, 3] > 8, :3] == 248).all()
+
+
+def test_a_depth_picture_has_a_legend(tmp_path: Path) -> None:
+    depth = np.linspace(1, 3, 400, dtype=np.float32).reshape(20, 20)
+    frame = Frame(
+        Picture(np.ones((20, 20, 4), np.float32), "srgb", "associated"), 1.0, depth, None, np.ones((20, 20, 3))
+    )
+    box = Box(np.diag([2.0, 2, 2, 1]), False)
+    picture, _ = write_frame(tmp_path, "a", frame, ["depth"], [], 0, {}, box)
+    legend = json.loads(picture.with_suffix(".json").read_text())
+    assert (legend["near"], legend["far"]) == pytest.approx((2 * 1.04, 2 * 2.96), abs=0.01)
+    with Image.open(picture) as image:
+        near, far = image.getpixel((0, 0)), image.getpixel((19, 19))
+    assert near[0] > near[2], "near is red"
+    assert far[2] > far[0], "far is blue"
+    nothing = np.full_like(depth, np.nan)
+    write_frame(tmp_path, "b", replace(frame, depth=nothing), ["depth"], [], 0, {}, box)
+    assert json.loads((tmp_path / "b_depth.json").read_text())["near"] is None

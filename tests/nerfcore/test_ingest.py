@@ -11,6 +11,7 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from fieldwork.nerfcore.capture import ingest, working_copies
 from fieldwork.nerfcore.capture.find import list_photos
@@ -279,3 +280,18 @@ def test_damaged_memory_of_earlier_runs_only_costs_time(tmp_path: Path) -> None:
     new(photos, tmp_path / "p")
     (tmp_path / "p" / working_copies.CACHE_FILE).write_text('{"p0": 3')
     assert new(photos, tmp_path / "p")["images"] == 3
+
+
+def test_a_sharp_photo_of_a_plain_wall_is_no_blur(tmp_path: Path) -> None:
+    """Its fine structures are weak, but as strong beside its coarse ones as those of the other photos."""
+    photos = folder_of(tmp_path / "photos", 9)
+    sharp = np.asarray(picture(20)).astype(float)
+    for name, pixels in {
+        "wall": sharp,
+        "shaky": np.asarray(picture(21).filter(ImageFilter.GaussianBlur(4))).astype(float),
+    }.items():
+        plain = 128 + (pixels - pixels.mean()) * 0.22
+        Image.fromarray(plain.clip(0, 255).astype(np.uint8)).save(photos / f"{name}.png")
+    rejected = new(photos, tmp_path / "p")["rejected"]
+    assert [entry["file"] for entry in rejected] == ["shaky.png"]
+    assert "--keep-blurry" in rejected[0]["reason"]

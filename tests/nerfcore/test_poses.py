@@ -6,6 +6,7 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from fieldwork.nerfcore.data.load import load_scene
 from fieldwork.nerfcore.errors import DiskError, FieldworkError, PosesError
 from fieldwork.nerfcore.geometry.similarity import transform_points
 from fieldwork.nerfcore.poses import estimate, process
+from fieldwork.nerfcore.poses.estimate import in_groups
 from fieldwork.nerfcore.project.schema import SemanticClass
 from fieldwork.nerfcore.project.store import load_points, load_poses, load_project, load_visibility, save_project
 from fieldwork.tests.nerfcore.support.captures import centre_errors, ingest, poses, rotation_errors, view_errors
@@ -356,3 +358,23 @@ def test_object_captures(shared_data: Data, tmp_path: Path, name: str, least: in
 def test_errors_are_the_kind_the_user_reads() -> None:
     assert issubclass(PosesError, FieldworkError)
     assert process.ERRORS["disk"] is DiskError
+
+
+def test_groups_are_said_as_groups() -> None:
+    said = in_groups([49, 11], 0)
+    assert "2 groups of 49 and 11" in said
+    assert "--group 1" in said
+    assert "--group 0" in in_groups([11, 49, 5], 1)
+
+
+def test_a_further_try_says_which_groups_there_are() -> None:
+    import zlib  # noqa: F401 - before pycolmap
+
+    from fieldwork.nerfcore.poses import pipeline
+
+    model = lambda count: SimpleNamespace(num_reg_images=lambda: count)  # noqa: E731
+    one = SimpleNamespace(registered=49, models=[model(49)])
+    two = SimpleNamespace(registered=49, models=[model(49), model(11)])
+    names = ["x"] * 60
+    assert pipeline._placed(one, names) == "49 of 60 photos placed"  # type: ignore[arg-type]
+    assert pipeline._placed(two, names).endswith("groups of 49 and 11")  # type: ignore[arg-type]

@@ -78,3 +78,51 @@ def test_the_meaning_of_masks_can_be_changed(tmp_path: Path) -> None:
     for mode in ("ignore", "empty", "ignore"):
         new(NewParams(photos=photos, project=tmp_path / "p", mask_mode=mode), Reporter())
         assert load_project(tmp_path / "p").mask_mode == mode
+
+
+def mask(kind: str) -> Image.Image:
+    """A mask around an object, one of an object that stands on the lower border, one that hides a passer-by, or the sky."""
+    picture = Image.new("L", (320, 200), 0 if kind in ("object", "standing") else 255)
+    boxes = {"object": (90, 40, 230, 160), "standing": (90, 40, 230, 200), "passer-by": (0, 40, 60, 200)}
+    box = boxes.get(kind, (0, 0, 320, 70))
+    picture.paste(255 - picture.getpixel((160, 195) if kind != "standing" else (0, 0)), box)
+    return picture
+
+
+@pytest.mark.parametrize(
+    ("kinds", "mode"),
+    [
+        (["object"] * 4, "empty"),
+        (["standing"] * 4, "empty"),
+        (["passer-by"] * 4, "ignore"),
+        (["sky"] * 4, "ignore"),
+        (["object", "object", "object"], "ignore"),
+        (["object", "object", "object", "sky"], "ignore"),
+    ],
+)
+def test_masks_say_what_black_means(tmp_path: Path, kinds: list[str], mode: str) -> None:
+    photos = folder_of(tmp_path / "photos", 4)
+    (photos / "masks").mkdir()
+    for i, kind in enumerate(kinds):
+        mask(kind).save(photos / "masks" / f"p{i}.png")
+
+    class Notes(Reporter):
+        notes: list[str]
+
+        def note(self, message: str) -> None:
+            self.notes.append(message)
+
+    report = Notes()
+    report.notes = []
+    new(NewParams(photos=photos, project=tmp_path / "p"), report)
+    assert load_project(tmp_path / "p").mask_mode == mode
+    assert any("--mask-mode ignore" in note for note in report.notes) == (mode == "empty")
+
+
+def test_added_photos_do_not_change_what_masks_mean(tmp_path: Path) -> None:
+    photos, more = folder_of(tmp_path / "photos", 3), tmp_path / "more"
+    more.mkdir()
+    (photos / "p2.jpg").rename(more / "p2.jpg")
+    new(NewParams(photos=photos, project=tmp_path / "p", mask_mode="empty"), Reporter())
+    new(NewParams(photos=more, project=tmp_path / "p", add=True), Reporter())
+    assert load_project(tmp_path / "p").mask_mode == "empty"

@@ -82,3 +82,18 @@ def test_a_run_of_version_2_without_settings_is_called_damaged(tmp_path: Path) -
 
 def test_settings_are_known_by_their_earlier_names() -> None:
     assert make_config("draft", {"sampling.interest": "boundary"}).sampling.importance == "boundary"
+
+
+def test_a_run_beyond_the_limits_of_settings_is_read_as_it_was_trained(tmp_path: Path) -> None:
+    project = ball_project(tmp_path / "p", views=4, side=24)
+    train(project, steps=2)
+    path = project / "runs" / "main" / "config.json"
+    value = json.loads(path.read_text(encoding="utf-8"))
+    value["config"]["train"]["grid_rate"], value["config"]["render"]["samples"] = 1e30, 10**9
+    path.write_text(json.dumps(value), encoding="utf-8")
+    config = load_trained(project, "main").info.config
+    assert (config.train.grid_rate, config.render.samples) == (1e30, 10**9)
+    value["config"]["train"]["grid_rate"] = "fast"
+    path.write_text(json.dumps(value), encoding="utf-8")
+    with pytest.raises(ProjectError, match="damaged"):
+        load_info(project, "main")

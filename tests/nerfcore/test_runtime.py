@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import pytest
+
 FIRST_USE = """
 import threading, torch
 torch.set_num_threads(4)
@@ -72,3 +74,24 @@ def test_host_threads_serve_the_cpu_only():
             assert threads(torch.device("cpu")) == {threading.get_ident()}
     finally:
         torch.set_num_threads(before)
+
+
+QUIET = """
+import os
+from fieldwork.nerfcore.kernels import runtime
+runtime.nvidia_gpu = lambda: {gpu}
+real = runtime.wp.init
+def told():
+    real()
+    os.write(2, b"Warp CUDA warning: Could not find or load the NVIDIA CUDA driver. GPU execution ...\\nanother line\\n")
+runtime.wp.init = told
+runtime.init()
+os.write(2, b"afterwards\\n")
+"""
+
+
+@pytest.mark.parametrize("gpu", [False, True])
+def test_a_machine_without_a_gpu_is_not_told_that_its_driver_is_missing(gpu: bool):
+    done = subprocess.run([sys.executable, "-c", QUIET.format(gpu=gpu)], capture_output=True, text=True, check=True)
+    assert ("CUDA driver" in done.stderr) == gpu
+    assert done.stderr.splitlines()[-2:] == ["another line", "afterwards"]

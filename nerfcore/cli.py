@@ -238,7 +238,3 @@ def _print_version(ctx: click.Context, param: click.Parameter, value: bool) -> N
     if value and not ctx.resilient_parsing:
         click.echo(__version__)
         ctx.exit()
-
-
-def entry_point() -> None:
-    sys.exit(main())

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import signal
 import sys
 import tempfile
 import time
@@ -77,6 +78,8 @@ def main() -> int:
     parser.add_argument("--page", type=Path)
     parser.add_argument("--out", type=Path, help="file for every case, as JSON lines")
     given = parser.parse_args()
+    # A shell that starts this in the background has it ignored, which the commands would inherit.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     begin = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="faults-") as folder:
         done = run(Path(folder), given.seed, given.share, given.areas.split(","))

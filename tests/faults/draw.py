@@ -106,8 +106,8 @@ MUTATIONS = st.tuples(
 
 
 def fresh(folder: Path) -> Path:
-    """The folder's place, empty: what an earlier case left there is removed."""
-    if folder.is_dir():
-        shutil.rmtree(folder)
+    """The folder's place, empty: what an earlier case left there is removed, also while an engine lets go of it."""
+    while folder.is_dir():
+        shutil.rmtree(folder, ignore_errors=True)
     folder.parent.mkdir(parents=True, exist_ok=True)
     return folder

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import queue
+import resource
 import signal
 import subprocess
 import sys
@@ -20,6 +21,7 @@ from .outcome import Reply
 ROOT = Path(__file__).resolve().parents[2]
 COMMAND = [sys.executable, "-m", "fieldwork.nerfcore"]
 PATIENCE = 120.0  # seconds after which a request counts as never answered
+MOST_ADDRESSES = 16 * 2**30  # bytes, so that a setting that asks for more does not take the whole machine
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT.parent)}
 
 
@@ -40,6 +42,7 @@ class Engine:
             self.process = subprocess.Popen(
                 self.command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=stderr, env=ENVIRONMENT, cwd="/"
             )
+        resource.prlimit(self.process.pid, resource.RLIMIT_AS, (MOST_ADDRESSES, MOST_ADDRESSES))
         self.messages = queue.Queue()
         threading.Thread(target=self._read, args=(self.process, self.messages), daemon=True).start()
         return self.process

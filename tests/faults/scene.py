@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
+import time
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from .engine import Engine
 
 STEPS = 160  # of training, after which the ball has a surface
 TRAINING = {"preset": "draft", "steps": STEPS, "set": SMALL}
+LETTING_GO = 1.0  # seconds
 MESHING = {"resolution": 32}
 
 
@@ -129,12 +131,16 @@ def _load_run(project: Path) -> Any:
 
 
 def held(project: Path) -> str:
-    """Whether somebody still holds the lock of a project, as a sentence."""
-    try:
-        with project_lock(project, "campaign"):
-            return ""
-    except FieldworkError as error:
-        return f"the lock is still held: {error.message}"
+    """Whether somebody still holds the lock of a project, as a sentence; the answer comes a moment before it is free."""
+    deadline = time.monotonic() + LETTING_GO
+    while True:
+        try:
+            with project_lock(project, "campaign"):
+                return ""
+        except FieldworkError as error:
+            if time.monotonic() > deadline:
+                return f"the lock is still held: {error.message}"
+        time.sleep(0.02)
 
 
 def half_written(project: Path) -> list[str]:

@@ -16,24 +16,41 @@ from .scene import Scene
 
 AREA = "settings"
 SECONDS = 3.0  # after which an accepted training is cancelled, however large it was set
-NAMES = [
-    f"{stage}.{name}" for stage, info in RunConfig.model_fields.items() for name in type(info.default).model_fields
-]
-VALUES = st.one_of(
-    st.sampled_from(
-        ["0", "-1", "1e30", "nan", "inf", "-inf", "", "null", "true", "[]", "{}", "0x10", "1_000", "١", "1e-300"]
-    ),
-    st.integers(-(2**40), 2**40).map(str),
-    st.floats(0, 2).map(str),
-    st.sampled_from(["auto", "none", "off", "float32", "bfloat16", "empty"]),
+FIELDS = {
+    f"{stage}.{name}": field
+    for stage, info in RunConfig.model_fields.items()
+    for name, field in type(info.default).model_fields.items()
+}
+ANY_TEXT = st.one_of(
+    st.sampled_from(["0", "-1", "1e30", "nan", "inf", "-inf", "", "null", "true", "[]", "{}", "0x10", "1_000", "١"]),
+    st.sampled_from(["auto", "none", "off", "float32", "bfloat16", "empty", "1e-300", "0.5", "2"]),
     st.text(max_size=12),
 )
 WRONG_NAMES = st.one_of(
     st.sampled_from(["train.stepz", "train", ".", "a.b.c", "train.", "__class__.x"]), st.text(max_size=9)
 )
-SETTINGS = st.dictionaries(
-    st.one_of(st.sampled_from(NAMES), st.sampled_from(NAMES), WRONG_NAMES), VALUES, min_size=1, max_size=2
-)
+
+
+def near(name: str) -> list[str]:
+    """Values of a number at its limits, beyond them, and around its default."""
+    field = FIELDS[name]
+    limits = [getattr(m, key) for m in field.metadata for key in ("ge", "gt", "le", "lt") if hasattr(m, key)]
+    usual = [field.default] if isinstance(field.default, (int, float)) and not isinstance(field.default, bool) else []
+    whole = all(isinstance(value, int) for value in usual)
+    values = [
+        *limits,
+        *(v + d for v in limits for d in (-1, 1, 1e-6)),
+        *(v * f for v in usual for f in (0.1, 0.5, 2, 10)),
+    ]
+    return [str(round(value)) if whole else repr(float(value)) for value in values] or ["0", "1"]
+
+
+def valued(name: str) -> st.SearchStrategy[tuple[str, str]]:
+    return st.tuples(st.just(name), st.one_of(st.sampled_from(near(name)), st.sampled_from(near(name)), ANY_TEXT))
+
+
+KNOWN = st.sampled_from(sorted(FIELDS)).flatmap(valued)
+SETTINGS = st.lists(st.one_of(KNOWN, KNOWN, KNOWN, st.tuples(WRONG_NAMES, ANY_TEXT)), min_size=1, max_size=2).map(dict)
 
 
 def attempt(scene: Scene, settings: dict[str, str]) -> Outcome:

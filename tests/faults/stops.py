@@ -17,6 +17,8 @@ from .engine import command
 from .outcome import Case, Outcome, outcome
 from .scene import STEPS, Scene, content, held, lost
 
+# Seconds that a command takes where nothing else runs, until Python itself is there, and until libraries are loaded.
+PYTHON, LIBRARIES = 0.15, 3.3
 KILLS, CANCELS = "killed (SIGKILL)", "cancelled (SIGINT, requests)"
 
 
@@ -86,8 +88,7 @@ def signalled(scene: Scene, number: int, stopped: tuple[str, float]) -> Outcome:
     values = stage.made(scene)
     project = Path(values["project"])
     before = content(project) if project.is_dir() else {}
-    start = 3.5  # seconds to begin work, where nothing else runs
-    moment = stopped[1] * (start + stage.seconds)
+    moment = PYTHON + stopped[1] * (LIBRARIES + stage.seconds)
     reply = command(stage.verb, *options(values), stop=(number, lambda passed: passed >= moment))
     return checked(scene, stage, values, before, reply)
 

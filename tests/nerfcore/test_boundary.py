@@ -210,3 +210,19 @@ def test_cancelled_while_libraries_load(tmp_path: Path) -> None:
     assert time.monotonic() - begin < 2.5
     assert process.stderr is not None
     assert b"Cancelled" in process.stderr.read()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+def test_cancelled_while_the_command_line_itself_loads(tmp_path: Path) -> None:
+    """The line that Python prints of each module it imports says when it is there."""
+    project = ball_project(tmp_path / "p")
+    command = [sys.executable, "-v", *COMMAND[1:], "classes", str(project)]
+    process = subprocess.Popen(command, env=ENVIRONMENT, cwd=ROOT.parent, stderr=subprocess.PIPE)
+    assert process.stderr is not None
+    for line in process.stderr:
+        if line.startswith(b"import 'pydantic"):
+            break
+    process.send_signal(signal.SIGINT)
+    rest = process.stderr.read()
+    assert process.wait(30) == 130
+    assert b"Traceback" not in rest

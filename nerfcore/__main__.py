@@ -4,6 +4,8 @@ import os
 import signal
 import sys
 
+CANCELLED = 130  # exit code
+
 
 def main() -> None:
     if sys.argv[1:2] == ["serve"]:
@@ -11,10 +13,16 @@ def main() -> None:
 
         sys.exit(serve())
     # Ctrl-C while modules load, before anything has begun; a verb then asks for it in its own way.
-    signal.signal(signal.SIGINT, lambda *_: os._exit(130))
+    signal.signal(signal.SIGINT, lambda *_: os._exit(CANCELLED))
     from .cli import main as command_line
 
-    sys.exit(command_line())
+    code = command_line()
+    if code == CANCELLED:
+        # Whoever cancels does not wait for native libraries to be taken down: what is on disk is whole.
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+    sys.exit(code)
 
 
 if __name__ == "__main__":

@@ -22,7 +22,15 @@ from . import __version__
 from .console import ConsoleReporter
 from .errors import Cancelled, explained, wrong_value
 from .project.lock import lockable, project_lock, project_of
-from .streams import NoReader, interruptible, open_standard_streams, print_json, stdout_for_results, write_log
+from .streams import (
+    NoReader,
+    interruptible,
+    keep_quiet_about_destructors,
+    open_standard_streams,
+    print_json,
+    stdout_for_results,
+    write_log,
+)
 from .verbs import VERBS, run_verb
 
 # Worker threads that spin while they wait take the cores other programs need; read when OpenMP starts.
@@ -207,6 +215,7 @@ def _assignment(text: str) -> tuple[str, str]:
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     open_standard_streams()
+    keep_quiet_about_destructors()
     logging.basicConfig(level=logging.ERROR, format="%(message)s", stream=sys.stderr)
     group = _Commands("fieldwork", help="Photos to a semantic radiance field, and the field into labelled meshes.")
     group.params.append(

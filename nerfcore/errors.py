@@ -129,6 +129,11 @@ def explained(error: BaseException) -> FieldworkError:
         return MemoryExhausted(
             "The memory is exhausted.", "Close other programs, or choose a smaller preset or smaller images."
         )
+    if isinstance(error, ImportError) and "failed to map segment" in text:
+        return MemoryExhausted(
+            "The memory does not suffice to load the libraries.",
+            "Close other programs, or raise the limit of this shell (ulimit -v).",
+        )
     if isinstance(error, RecursionError):
         return InputError("A file or a request is nested too deeply.", "Look at the files that were given.")
     if isinstance(error, OSError):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import logging
 import os
 import signal
 import sys
@@ -19,6 +20,8 @@ import click
 
 from .console import ConsoleReporter
 from .errors import FieldworkError
+
+log = logging.getLogger("fieldwork")
 
 PATIENCE = 1.5  # seconds that loading libraries may go on after Ctrl-C
 
@@ -95,6 +98,16 @@ def stdout_for_results() -> Iterator[TextIO]:
         with suppress(OSError):  # what could not be written has been told of
             stream.close()
         os.close(kept)
+
+
+def keep_quiet_about_destructors() -> None:
+    """Log what fails while objects are thrown away, as archives do whose file could not be written: the error itself has
+    been told."""
+
+    def hook(unraisable: Any) -> None:
+        log.debug("while %r was thrown away", unraisable.object, exc_info=unraisable.exc_value)
+
+    sys.unraisablehook = hook
 
 
 def print_json(value: dict[str, Any], stream: TextIO) -> None:

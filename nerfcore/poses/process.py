@@ -169,7 +169,8 @@ def _death(returncode: int, work: Path, tail: collections.deque[str]) -> Fieldwo
     if "disk is full" in text or "No space left" in text or "disk I/O error" in text or free < MIN_FREE_BYTES:
         return DiskError(
             f"No space left on the disk while estimating poses in {work} ({free // 1_000_000} MB free).",
-            "Free some space and run it again: finished work is kept.",
+            "Free some space, or raise the limit of file sizes (ulimit -f) if there is one, and run it again: finished work "
+            "is kept.",
         )
     if sys.platform != "win32" and returncode == -signal.SIGKILL:
         return PosesError(

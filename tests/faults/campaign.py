@@ -37,7 +37,7 @@ AREAS = {
     "state": Area(state.cases, 60, 10),
     "requests": Area(rpc.cases, 60, 25),
     "stops": Area(stops.cases, 72, 3, stops.quick_cases),
-    "limits": Area(limits.cases, 48, 3, limits.quick_cases),
+    "limits": Area(limits.cases, 42, 3, limits.quick_cases),
     "sharing": Area(sharing.cases, 20, 0),
     "clocks": Area(clocks.cases, 12, 2, clocks.quick_cases),
     "folders": Area(folders.cases, 28, 4),

@@ -19,6 +19,7 @@ from .scene import STEPS, Scene, content, held, lost
 
 # Seconds that a command takes where nothing else runs, until Python itself is there, and until libraries are loaded.
 PYTHON, LIBRARIES = 0.15, 3.3
+MORE = 60  # steps of training
 KILLS, CANCELS = "killed (SIGKILL)", "cancelled (SIGINT, requests)"
 
 
@@ -46,7 +47,7 @@ def _training(scene: Scene, resume: bool = False) -> dict[str, Any]:
     return {
         "project": project,
         "preset": "draft",
-        "steps": STEPS * (2 if resume else 1),
+        "steps": STEPS + MORE if resume else MORE,
         "set": SMALL,
         "resume": resume,
     }

@@ -43,6 +43,7 @@ RAISED = [
     (OSError(errno.EFBIG, "File too large", "/p/a.png"), "disk", "/p/a.png"),
     (OSError(errno.ENOSPC, "No space left on device"), "disk", "No space"),
     (OSError(errno.ENAMETOOLONG, "File name too long", "/p/xx"), "disk", "too long"),
+    (ImportError("libtorch_cpu.so: failed to map segment from shared object"), "memory", "load the libraries"),
     (RecursionError("maximum recursion depth exceeded"), "input", "nested"),
     (KeyError("lens"), "internal", "KeyError"),
     (SystemError("error return without exception set"), "internal", "SystemError"),
@@ -226,3 +227,22 @@ def test_cancelled_while_the_command_line_itself_loads(tmp_path: Path) -> None:
     rest = process.stderr.read()
     assert process.wait(30) == 130
     assert b"Traceback" not in rest
+
+
+ARCHIVE = """
+import sys
+from fieldwork.nerfcore.streams import keep_quiet_about_destructors
+class Archive:
+    def __del__(self):
+        raise ValueError("seek of closed file")
+if sys.argv[1] == "quiet":
+    keep_quiet_about_destructors()
+Archive()
+"""
+
+
+@pytest.mark.parametrize("quiet", [True, False])
+def test_what_fails_while_objects_are_thrown_away_is_not_shown(quiet: bool) -> None:
+    command = [sys.executable, "-c", ARCHIVE, "quiet" if quiet else "as usual"]
+    done = subprocess.run(command, env=ENVIRONMENT, cwd=ROOT.parent, capture_output=True, text=True, check=True)
+    assert ("Traceback" in done.stderr) != quiet

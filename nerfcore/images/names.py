@@ -130,7 +130,7 @@ def labels_and_masks(
 def beside(folder: Path, stem: str, exact: bool = True) -> Path | None:
     """The image in `folder` for a photo called `stem`: `<stem>.png`, or when not `exact` also `<stem>*.png|jpg`."""
     for suffix in (".png", ".PNG", ".tif", ".tiff", ".exr", ".jpg", ".JPG", ".jpeg"):
-        if (folder / f"{stem}{suffix}").is_file():
+        if (folder / f"{stem}{suffix}").exists():  # a folder of that name is told of by who reads it
             return folder / f"{stem}{suffix}"
     if exact or not folder.is_dir():
         return None

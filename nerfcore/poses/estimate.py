@@ -87,9 +87,9 @@ def estimate_poses(params: PosesParams, report: Reporter) -> dict[str, Any]:
         known = {k: v for k, v in answer.items() if k != "images"}
         project.record("poses", params.model_dump(mode="json"), known, inputs)
     _write_report(folder, project, poses, points, records, result, report)
-    if len(result["groups"]) > 1:
-        report.warn(in_groups(result["groups"], params.group))
     missing = [f"{record.name} ({record.reason})" for record in records if record.status != "ok"]
+    if missing and len(result["groups"]) > 1:
+        report.warn(in_groups(result["groups"], params.group))
     if missing:
         where = f"{len(missing)} of {answer['total']} photos have no pose"
         report.warn(f"{shortened(where, missing)} {folder / REPORT_FILE} says why.")

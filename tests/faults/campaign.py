@@ -36,11 +36,11 @@ AREAS = {
     "settings": Area(settings.cases, 40, 4),
     "state": Area(state.cases, 60, 10),
     "requests": Area(rpc.cases, 60, 25),
-    "stops": Area(stops.cases, 72, 3, stops.quick_cases),
-    "limits": Area(limits.cases, 42, 3, limits.quick_cases),
-    "sharing": Area(sharing.cases, 20, 0),
-    "clocks": Area(clocks.cases, 12, 2, clocks.quick_cases),
-    "folders": Area(folders.cases, 28, 4),
+    "stops": Area(stops.cases, 54, 3, stops.quick_cases),
+    "limits": Area(limits.cases, 30, 3, limits.quick_cases),
+    "sharing": Area(sharing.cases, 14, 0),
+    "clocks": Area(clocks.cases, 8, 2, clocks.quick_cases),
+    "folders": Area(folders.cases, 20, 4),
 }
 
 

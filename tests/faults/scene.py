@@ -18,7 +18,7 @@ from fieldwork.nerfcore.project.runs import run_folder
 from fieldwork.nerfcore.project.store import POSES_FILE, load_points, load_poses, load_project
 from fieldwork.nerfcore.render.run import load_trained
 from fieldwork.tests.nerfcore.support.ball import SMALL, ball_project, camera_poses, draw
-from fieldwork.tests.nerfcore.support.flat import LENS, ring, wall_picture
+from fieldwork.tests.nerfcore.support.flat import LENS, on_plane, ring
 from fieldwork.tests.nerfcore.support.photos import picture
 from PIL import Image
 
@@ -66,12 +66,25 @@ def _photos(folder: Path) -> Path:
 
 
 def _wall(folder: Path) -> Path:
-    """Photos that poses can be estimated of."""
+    """Photos that poses can be estimated of: boards before a wall, all of them painted."""
     folder.mkdir()
-    for i, pose in enumerate(ring(6)):
-        board = wall_picture(pose, LENS, board=(0.25, 0.4, 0.6))
-        Image.fromarray(board[..., :3]).save(folder / f"w{i}.jpg", quality=95)
+    boards = [(-0.5, -0.3, 0.25, 0.5), (0.45, 0.35, 0.22, 0.8), (0.1, -0.5, 0.2, 0.3)]  # x, y, half side, from the wall
+    for i, pose in enumerate(ring(8, radius=0.35)):
+        color = tiles(on_plane(LENS, pose)[0][:, :2])
+        for x, y, half, away in boards:
+            place = on_plane(LENS, pose, away)[0][:, :2] - [x, y]
+            hit = np.abs(place).max(1) < half
+            color[hit] = tiles(place[hit] + 7 * away)
+        pixels = (255 * color + 0.5).astype(np.uint8).reshape(LENS.height, LENS.width, 3)
+        Image.fromarray(pixels).save(folder / f"w{i}.jpg", quality=95)
     return folder
+
+
+def tiles(xy: np.ndarray) -> np.ndarray:
+    """sRGB (N, 3) in [0, 1] of a wall of tiles at (N, 2), each of a colour of its own."""
+    table = np.random.default_rng(0).uniform(0.05, 0.95, (128, 128, 3))
+    x, y = (np.floor(9 * xy).astype(int) % 128).T
+    return table[x, y]
 
 
 def _dataset(folder: Path) -> Path:

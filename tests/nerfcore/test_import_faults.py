@@ -83,3 +83,15 @@ def test_an_image_whose_camera_is_not_there(tmp_path: Path) -> None:
     (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n\n")
     with pytest.raises(InputError, match=r"cameras\.txt is damaged: it lacks camera 1 of a\.png"):
         read_dataset(tmp_path)
+
+
+def test_photos_that_a_model_does_not_place_are_named(tmp_path: Path) -> None:
+    """They were not placed, or the model is cut short."""
+    (tmp_path / "images").mkdir()
+    for name in "abc":
+        Image.new("RGB", (40, 30)).save(tmp_path / "images" / f"{name}.png")
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 40 30 40 40 20 15\n")
+    (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n\n2 1 0 0 0 0 0 1 1 b.png\n\n")
+    (warning,) = read_dataset(tmp_path).warnings
+    assert "1 photos have no pose" in warning
+    assert "c.png" in warning

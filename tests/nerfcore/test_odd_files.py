@@ -152,3 +152,12 @@ def test_black_masks_are_named_as_such(tmp_path: Path) -> None:
         Image.new("L", (320, 200), 0).save(photos / "masks" / f"p{i}.png")
     with pytest.raises(InputError, match=r"None of the 4 files.*black everywhere"):
         ingest.new(NewParams(photos=photos, project=tmp_path / "q"), Reporter())
+
+
+def test_a_folder_named_like_a_label_map_is_named(tmp_path: Path) -> None:
+    photos = folder_of(tmp_path / "photos", 3)
+    (photos / "labels" / "p1.png").mkdir(parents=True)
+    report = Reporter()
+    result = ingest.new(NewParams(photos=photos, project=tmp_path / "p"), report)
+    assert (result["images"], result["labelled"]) == (3, 0)
+    assert any("p1.png" in text for text in report.warnings)

@@ -20,7 +20,8 @@ from ...geometry.colmap_cameras import MODELS, camera_from_colmap
 from ...geometry.frames import upright
 from ...geometry.points import Points
 from ...images.decode import image_size
-from ...images.names import find_image, labels_and_masks, unique_names
+from ...images.names import find_image, labels_and_masks, list_images, unique_names
+from ...progress import shortened
 from ..dataset import Dataset, DatasetView, require
 
 PLACES = ("sparse/0", "sparse", "colmap/sparse/0", "dense/sparse", ".")
@@ -82,6 +83,10 @@ def read(folder: Path) -> Dataset:
     require(views, folder, missing)
     frame, confidence = upright([view.camera_to_world for view in views], points.xyz)
     warnings = [f"{len(missing)} images of the model are missing (first: {missing[0]})."] if missing else []
+    placed = {path.resolve() for path, _ in found}
+    without = [path.name for path in list_images(folder / "images") if path.resolve() not in placed]
+    if without:
+        warnings.append(shortened(f"{len(without)} photos have no pose in {model} and were not imported", without))
     return Dataset(
         format="colmap",
         views=views,

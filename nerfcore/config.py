@@ -301,6 +301,8 @@ def make_config(preset: str, settings: dict[str, str] | None = None) -> RunConfi
             value = json.loads(text)
         except json.JSONDecodeError:
             value = text
+        if isinstance(value, bool) and type(model.default).model_fields[key].annotation is not bool:
+            value = text  # which is no number, where pydantic would take true for 1
         values.setdefault(stage, {})[key] = value
     try:
         return RunConfig.model_validate(values)

@@ -91,6 +91,10 @@ def answer_to(error: Exception, work: Path) -> dict[str, str]:
             "Free some space and run it again: finished work is kept.",
         )
         return {"code": "disk", "message": message, "hint": hint}
+    if "database factory" in str(error):  # all that pycolmap says
+        message = f"The database of features in {work} cannot be opened or made."
+        hint = "Look at the folder's permissions, the free space and the limit of file sizes (ulimit -f), then run it again."
+        return {"code": "disk", "message": message, "hint": hint}
     known = explained(error)
     if isinstance(known, UnexpectedError):
         # Native code whose allocation failed returns without saying so.

@@ -79,7 +79,7 @@ def taken(project, settings: dict[str, str]) -> str:
             try:
                 asked = float(text)
             except ValueError:
-                continue
+                return f"{name} became {value} of “{text}”"
             if key != "steps" and not math.isclose(asked, value, rel_tol=1e-6, abs_tol=1e-12):
                 return f"{name} became {value}, though {text} was asked for"
     return ""

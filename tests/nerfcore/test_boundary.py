@@ -100,6 +100,7 @@ def test_the_engine_says_the_same() -> None:
 def test_pose_worker_names_what_failed() -> None:
     assert answer_to(MemoryError(), Path("w"))["code"] == "memory"
     assert answer_to(RuntimeError("database or disk is full"), Path("w"))["code"] == "disk"
+    assert answer_to(RuntimeError("No registered database factory succeeded."), Path("w"))["code"] == "disk"
     lost = answer_to(SystemError("<built-in method> error return without exception set"), Path("w"))
     assert (lost["code"], "Memory" in lost["hint"]) == ("poses", True)
 

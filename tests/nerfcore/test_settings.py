@@ -154,3 +154,9 @@ def test_absurd_picture_sizes_are_refused(
 def test_time_is_a_number(tmp_path: Path) -> None:
     for limit in ("nan", "inf", "-1"):
         assert main(["train", str(tmp_path), "--time-limit", limit]) == 2
+
+
+@pytest.mark.parametrize("name", ["field.appearance", "train.grid_rate"])
+def test_true_is_no_number(name: str) -> None:
+    with pytest.raises(SettingError, match=name):
+        make_config("draft", {name: "true"})

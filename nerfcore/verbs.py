@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+from types import ModuleType
 from typing import Any, NamedTuple
 
 from . import params as p
@@ -56,5 +57,10 @@ def run_verb(name: str, params: p.Params, report: Reporter) -> dict[str, Any]:
         FieldworkError: a failure the user can act on.
         Cancelled: the reporter was asked to stop; the project is left resumable.
     """
-    module, function = VERBS[name].function.split(":")
-    return getattr(importlib.import_module(f".{module}", __package__), function)(params, report)
+    _, function = VERBS[name].function.split(":")
+    return getattr(load_verb(name), function)(params, report)
+
+
+def load_verb(name: str) -> ModuleType:
+    """The module of a verb. The first time its libraries load, which takes seconds."""
+    return importlib.import_module(f".{VERBS[name].function.split(':')[0]}", __package__)

@@ -4,6 +4,7 @@ python tests/counting_engine.py [SECONDS OF GRACE FOR A CANCELLED JOB]      (rep
 """
 
 import ctypes
+import importlib.util
 import subprocess
 import sys
 import time
@@ -51,6 +52,26 @@ def count(p, report):
 module = types.ModuleType("nerfcore.counting")
 module.count = count
 sys.modules["nerfcore.counting"] = module
+
+
+class SlowToLoad:
+    """A module whose libraries take three seconds to load."""
+
+    def find_spec(self, name, path=None, target=None):
+        if name != "nerfcore.slow":
+            return None
+        return importlib.util.spec_from_loader(name, self)
+
+    def create_module(self, spec):
+        return None
+
+    def exec_module(self, loaded):
+        time.sleep(3)
+        loaded.count = count
+
+
+sys.meta_path.insert(0, SlowToLoad())
+verbs.VERBS["slow_to_load"] = verbs.Verb(CountParams, "slow:count", "Count, later.")
 verbs.VERBS["count"] = verbs.Verb(CountParams, "counting:count", "Count.")
 if len(sys.argv) > 1:
     from nerfcore.engine import server

@@ -31,7 +31,7 @@ from ..errors import Cancelled, FieldworkError
 from ..files import name_problem
 from ..progress import Reporter
 from ..project.lock import project_lock
-from ..verbs import VERBS, run_verb
+from ..verbs import VERBS, load_verb, run_verb
 from . import protocol as rpc
 from .jobs import Job
 
@@ -202,6 +202,7 @@ class Server:
             with project_lock(job.lockable, job.verb):
                 job.begin()
                 with _logged(job):
+                    _loaded(job)
                     self._answer(job, "done", result=run_verb(job.verb, job.params, job))
         except BaseException as error:  # noqa: BLE001 - everything a job raises is answered
             self._fail(job, error)
@@ -275,6 +276,20 @@ def gpu_memory_mb() -> int | None:
     if torch is None or not hasattr(torch, "cuda") or not torch.cuda.is_initialized():
         return None
     return round(torch.cuda.memory_reserved() / 2**20)
+
+
+def _loaded(job: Job) -> None:
+    """Load the libraries of the job's verb in a thread of their own, which a cancel need not wait for."""
+
+    def load() -> None:
+        with suppress(Exception):  # the verb itself tells of it
+            load_verb(job.verb)
+
+    loading = threading.Thread(target=load, name="loading", daemon=True)
+    loading.start()
+    while loading.is_alive():
+        job.check()
+        loading.join(0.05)
 
 
 @contextmanager

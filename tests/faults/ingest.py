@@ -164,7 +164,8 @@ def silent(photos: Path, project: Path, told: str) -> str:
         if (path.is_dir() or not whole(path)) and path.name not in told:
             return f"{path.name} is no whole photo, which nothing says"
     for path in sorted((photos / "labels").glob("*.png")):
-        if (photos / f"{path.stem}.jpg").is_file() and not whole(path) and path.name not in told:
+        photo = photos / f"{path.stem}.jpg"
+        if photo.is_file() and whole(photo) and not whole(path) and path.name not in told:
             return f"the label map {path.name} is no whole picture, which nothing says"
     return ""
 

@@ -398,3 +398,15 @@ def test_unwritable_project_is_an_error_that_names_it(start, tmp_path):
     error = client.answer(client.send("count", project=blocked, steps=1))["error"]
     assert error["data"]["code"] == "disk"
     assert "jobs" in error["message"]
+
+
+def test_cancel_does_not_wait_for_libraries_that_load(start, project):
+    client = start()
+    request = client.send("slow_to_load", project=project)
+    time.sleep(0.3)
+    asked = time.monotonic()
+    client.send("cancel")
+    assert client.answer(request)["error"]["code"] == -32001
+    assert time.monotonic() - asked < 1.0
+    # They go on loading, and the next job has them.
+    assert client.answer(client.send("slow_to_load", project=project, steps=1))["result"]["steps"] == 1

@@ -65,6 +65,7 @@ SPLITS = [
     ("classes", "One per Class", "One object for each class"),
     ("instances", "One per Instance", "One object for each connected thing of a class"),
 ]
+SOME_FACES = 200_000  # where the user wants fewer than all, at first
 PASSES = [
     ("rgb", "Color", "The photographed colors"),
     ("depth", "Depth", "Distance along the ray in meters"),
@@ -79,12 +80,31 @@ def _project_changed(self: "FieldworkScene", context: Context) -> None:
     """Another project folder was chosen."""
     from .jobs.follow import reattach
     from .jobs.queue import queue
-    from .project import lists, snapshot
+    from .project import lists, recent, snapshot
 
     lists.other_project(self)
     folder = snapshot.folder_of(self)
     if folder is not None and not bpy.app.background:
         reattach(queue, folder)
+        if snapshot.has_project(folder):
+            recent.remember(folder)
+
+
+def _row_chosen(self: "FieldworkScene", context: Context) -> None:
+    """A click on a photo in the table of poses looks through its camera, where it is in the scene."""
+    from .project import snapshot
+    from .scene import viewing
+
+    folder = snapshot.folder_of(self)
+    if bpy.app.background or folder is None or not 0 <= self.pose_index < len(self.images):
+        return
+    camera = viewing.photo_camera_of(self.id_data, snapshot.owner(folder), self.images[self.pose_index].name)
+    if camera is not None:
+        viewing.look_through(self.id_data, camera)
+
+
+def _keep_all_faces(self: "FieldworkScene", keep: bool) -> None:
+    self.faces = 0 if keep else SOME_FACES
 
 
 def _run_changed(self: "FieldworkScene", context: Context) -> None:
@@ -189,6 +209,7 @@ class FieldworkScene(PropertyGroup):
     keep_blurry: BoolProperty(name="Keep Blurry Photos", description="Use photos that look blurred too")
     images: CollectionProperty(type=FieldworkImage)
     image_index: IntProperty(name="Image", description="Selected photo")
+    pose_index: IntProperty(name="Camera", description="The photo whose camera is looked through", update=_row_chosen)
 
     # Poses
     pose_preset: EnumProperty(name="Preset", description="How hard to try", items=POSE_PRESETS, default="standard")
@@ -308,6 +329,12 @@ class FieldworkScene(PropertyGroup):
     )
     faces: IntProperty(
         name="Faces", description="Target number of triangles; 0: keep all", default=200_000, min=0, soft_max=2_000_000
+    )
+    all_faces: BoolProperty(
+        name="All",
+        description="Keep all triangles, however many",
+        get=lambda self: self.faces == 0,
+        set=_keep_all_faces,
     )
     lods: IntProperty(
         name="Levels of Detail",

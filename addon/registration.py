@@ -23,6 +23,7 @@ MODULES = (
     "addon.preferences",
     "addon.pictures.thumbnails",
     "addon.jobs.timer",
+    "addon.scene.measured_line",
     "addon.commands",
     "operators.engine",
     "operators.job",

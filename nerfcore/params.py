@@ -277,6 +277,10 @@ class MeshParams(Params):
     turntable: Path | None = Field(
         default=None, description="folder for pictures of the mesh from eight sides: its colours and its classes"
     )
+    preview: bool = Field(
+        default=False,
+        description="only a first look, in seconds: exports/RUN/preview.npz; the mesh that is there stays",
+    )
 
 
 class MeasureParams(Params):

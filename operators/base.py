@@ -15,7 +15,7 @@ from ..addon import machine
 from ..addon.errors import EngineError
 from ..addon.jobs.job import Done, Job, Steps
 from ..addon.jobs.queue import queue
-from ..addon.project import edits, lists, runs, snapshot
+from ..addon.project import edits, lists, recent, runs, snapshot
 from ..addon.properties import FieldworkScene
 from ..addon.props import IntProperty, StringProperty
 from ..addon.text import t
@@ -244,6 +244,8 @@ def refresh_scenes(job: Job) -> None:
         if job.project is not None and snapshot.folder_of(scene.fieldwork) == job.project:
             if job.verb in ("new", "import", "reconstruct") and job.state == "done":
                 lists.other_project(scene.fieldwork)  # it may have been made anew
+                if not bpy.app.background:
+                    recent.remember(job.project)
             else:
                 lists.refresh(scene.fieldwork)
 

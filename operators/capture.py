@@ -186,16 +186,44 @@ def show_sidebar(context: Context) -> None:
                 region.active_panel_category = "Fieldwork"
 
 
+def shows_fieldwork(area: bpy.types.Area | None) -> bool:
+    """Whether an area is a 3D viewport whose sidebar is open at Fieldwork's tab."""
+    if area is None or area.type != "VIEW_3D" or not area.spaces.active.show_region_ui:
+        return False
+    return any(region.type == "UI" and region.active_panel_category == "Fieldwork" for region in area.regions)
+
+
 class FIELDWORK_FH_capture(FileHandler):
+    """A photo stands for its folder. Only where Fieldwork is open: elsewhere Blender makes of a picture what it always
+    does, without asking."""
+
     bl_idname = "FIELDWORK_FH_capture"
-    bl_label = "Fieldwork Photos, Video or Project"
+    bl_label = "Fieldwork Photos or Video"
     bl_import_operator = "fieldwork.open"
-    # project.json stands for a project; a photo stands for its folder.
-    bl_file_extensions = ";".join([*sorted(PHOTOS | VIDEOS), ".json"])
+    bl_file_extensions = ";".join(sorted(PHOTOS | VIDEOS))
+
+    @classmethod
+    def poll_drop(cls, context: Context) -> bool:
+        return shows_fieldwork(context.area)
+
+
+class FIELDWORK_FH_project(FileHandler):
+    """A project.json stands for its project."""
+
+    bl_idname = "FIELDWORK_FH_project"
+    bl_label = "Fieldwork Project"
+    bl_import_operator = "fieldwork.open"
+    bl_file_extensions = ".json"
 
     @classmethod
     def poll_drop(cls, context: Context) -> bool:
         return context.area is not None and context.area.type == "VIEW_3D"
 
 
-CLASSES = [FIELDWORK_OT_new, FIELDWORK_OT_import_dataset, FIELDWORK_OT_open, FIELDWORK_FH_capture]
+CLASSES = [
+    FIELDWORK_OT_new,
+    FIELDWORK_OT_import_dataset,
+    FIELDWORK_OT_open,
+    FIELDWORK_FH_capture,
+    FIELDWORK_FH_project,
+]

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
+import bpy
 from bpy.types import Context
 
+from ..addon.jobs.job import Done, Job
 from ..addon.project import snapshot
 from ..addon.properties import SIDES
 from ..addon.text import t
-from .base import ProjectOperator, need_poses, need_project, scene_settings
+from .base import ProjectOperator, need_poses, need_project, refresh_scenes, scene_settings
+from .scene import show_image
 
 
 def need_mesh(context: Context) -> str | None:
@@ -65,6 +69,9 @@ class FIELDWORK_OT_plan(ProjectOperator):
             "out": self.path(context, "out"),
         }
 
+    def after(self) -> Done:
+        return show_drawing
+
 
 @scene_settings(run="run", plane="section_plane", turn="turn", scale="paper_scale", out="drawings")
 class FIELDWORK_OT_section(ProjectOperator):
@@ -84,6 +91,9 @@ class FIELDWORK_OT_section(ProjectOperator):
             "scale": self.value(context, "scale") or None,
             "out": self.path(context, "out"),
         }
+
+    def after(self) -> Done:
+        return show_drawing
 
 
 @scene_settings(
@@ -120,6 +130,9 @@ class FIELDWORK_OT_compare(ProjectOperator):
             "out": self.path(context, "out"),
         }
 
+    def after(self) -> Done:
+        return show_drawing
+
 
 @scene_settings(run="run", out="report_path")
 class FIELDWORK_OT_report(ProjectOperator):
@@ -136,6 +149,15 @@ class FIELDWORK_OT_report(ProjectOperator):
             "run": self.value(context, "run"),
             "out": self.path(context, "out"),
         }
+
+
+def show_drawing(job: Job) -> None:
+    """Show the first drawing in an image editor."""
+    refresh_scenes(job)
+    files = [Path(path) for path in (job.result or {}).get("files", [])]
+    first = next((path for path in files if path.suffix == ".png"), None)
+    if job.state == "done" and first is not None and not bpy.app.background:
+        show_image(first)
 
 
 CLASSES = [FIELDWORK_OT_measure, FIELDWORK_OT_plan, FIELDWORK_OT_section, FIELDWORK_OT_compare, FIELDWORK_OT_report]

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
+import bpy
 from bpy.types import Context
 
-from .base import ProjectOperator, need_run, scene_settings
+from ..addon.jobs.job import Done, Job, Steps
+from ..addon.project import snapshot
+from ..addon.props import BoolProperty
+from ..addon.roles import ROLE
+from .base import ProjectOperator, need_run, refresh_scenes, scene_of, scene_settings
+from .scene import SPLIT_ROLES, show_colors, update_scene
 
 
 @scene_settings(
@@ -31,6 +38,23 @@ class FIELDWORK_OT_mesh(ProjectOperator):
     verb = "mesh"
     needs = (need_run,)
 
+    preview: BoolProperty(
+        name="Preview",
+        description="Only a first look, in seconds; in a window it comes by itself where the scene has no mesh yet",
+        options={"SKIP_SAVE"},
+    )
+
+    def execute(self, context: Context) -> set[str]:
+        settings = context.scene.fieldwork
+        folder = snapshot.folder_of(settings)
+        if not bpy.app.background and not self.preview and folder is not None and not shows_mesh(context.scene, folder):
+            bpy.ops.fieldwork.mesh(preview=True)
+        return super().execute(context)
+
+    def after(self) -> Done:
+        preview, name = self.preview, bpy.context.scene.name
+        return lambda job: show_preview(job, name) if preview else show_mesh(job, name)
+
     def parameters(self, context: Context) -> dict[str, Any]:
         return {
             "project": self.project_path(context),
@@ -46,7 +70,39 @@ class FIELDWORK_OT_mesh(ProjectOperator):
             "texture_kind": self.value(context, "texture_kind"),
             "out": self.path(context, "out"),
             "split": self.value(context, "split"),
+            "preview": self.preview,
         }
+
+
+def shows_mesh(scene: bpy.types.Scene, folder: Path) -> bool:
+    """Whether a surface of the project is in the scene."""
+    owner = snapshot.owner(folder)
+    starts = ("mesh", *SPLIT_ROLES)
+    return any(str(item.get(ROLE, "")).startswith(starts) and owner.owns(item) for item in scene.objects)
+
+
+def show_preview(job: Job, scene_name: str) -> Steps | None:
+    """Bring the first look into the scene, unless the mesh itself is there by now."""
+    scene = scene_of(job.project, scene_name)
+    if job.state != "done" or not job.result or scene is None or bpy.app.background or shows_mesh(scene, job.project):
+        return None
+    return preview_steps(job, scene)
+
+
+def preview_steps(job: Job, scene: bpy.types.Scene) -> Steps:
+    from ..addon.scene import build  # not at the top: enabling the extension must be quick
+
+    known = snapshot.project(job.project) or {}
+    yield from build.preview_steps(scene, snapshot.owner(job.project), known, job.result["preview"])
+    show_colors()
+
+
+def show_mesh(job: Job, scene_name: str) -> None:
+    """Bring the mesh into the scene, in a window: it takes the place of the one before, or of the first look."""
+    refresh_scenes(job)
+    scene = scene_of(job.project, scene_name)
+    if job.state == "done" and scene is not None and not bpy.app.background:
+        update_scene(job, scene, always=True)
 
 
 CLASSES = [FIELDWORK_OT_mesh]

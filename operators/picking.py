@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 from bpy.types import Area, Context, Event, Operator, UILayout
 
 from ..addon.props import BoolProperty, EnumProperty, StringProperty
+from ..addon.scene import viewing
 from ..addon.text import t
 
 if TYPE_CHECKING:
@@ -150,13 +151,7 @@ class FIELDWORK_OT_show_photo(Operator):
         if camera is None or camera.type != "CAMERA":
             self.report({"ERROR"}, t("There is no camera “{}” in the scene", self.camera))
             return {"CANCELLED"}
-        context.scene.camera = camera
-        images = [entry.image for entry in camera.data.background_images if entry.image is not None]
-        for area in context.screen.areas if context.screen is not None else ():
-            if area.type == "VIEW_3D":
-                area.spaces.active.region_3d.view_perspective = "CAMERA"
-            elif area.type == "IMAGE_EDITOR" and images:
-                area.spaces.active.image = images[0]
+        viewing.look_through(context.scene, camera)
         return {"FINISHED"}
 
 

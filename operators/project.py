@@ -75,6 +75,27 @@ def refusal(settings: bpy.types.PropertyGroup, folder: Path) -> str | None:
     )
 
 
+class FIELDWORK_OT_open_recent(Operator):
+    """Open a project that was open before"""
+
+    bl_idname = "fieldwork.open_recent"
+    bl_label = "Open Recent Project"
+    bl_options = {"UNDO"}
+
+    folder: StringProperty(name="Folder", description="Folder of the project", subtype="DIR_PATH")
+
+    @classmethod
+    def description(cls, context: Context, properties: bpy.types.OperatorProperties) -> str:
+        return properties.folder or t(cls.__doc__ or "")
+
+    def execute(self, context: Context) -> set[str]:
+        if not snapshot.has_project(Path(self.folder)):
+            self.report({"ERROR"}, t("There is no project in {}.", self.folder))
+            return {"CANCELLED"}
+        context.scene.fieldwork.project = self.folder
+        return {"FINISHED"}
+
+
 class FIELDWORK_OT_save_edits(Operator):
     """Let the engine write edited classes and the training region into the project now"""
 
@@ -152,6 +173,7 @@ class FIELDWORK_OT_discard_edits(Operator):
 
 
 CLASSES = [
+    FIELDWORK_OT_open_recent,
     FIELDWORK_OT_locate_project,
     FIELDWORK_OT_save_edits,
     FIELDWORK_OT_discard_edits,

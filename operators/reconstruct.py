@@ -2,16 +2,39 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import bpy
 from bpy.types import Context
 
+from ..addon.jobs.job import Done, Job
+from ..addon.jobs.queue import queue
+from ..addon.project import snapshot
 from ..addon.properties import PRESETS
 from ..addon.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, IntVectorProperty, StringProperty
 from ..addon.text import t
-from .base import HoldoutProperty, VerbOperator, absolute, hold_out, scene_settings
+from .base import (
+    HoldoutProperty,
+    VerbOperator,
+    absolute,
+    hold_out,
+    need_project_folder,
+    refresh_scenes,
+    scene_of,
+    scene_settings,
+)
+from .scene import import_result
 from .train import parse_settings
+
+
+def need_source(context: Context) -> str | None:
+    settings = context.scene.fieldwork
+    folder = snapshot.folder_of(settings)
+    if snapshot.imported(folder):
+        return t("The poses of this project were imported: train and mesh it step by step")
+    known = settings.photos or snapshot.source(folder).get("photos")
+    return snapshot.absence(settings) or (None if known else t("Choose a folder of photos, or a video, first"))
 
 
 @scene_settings(
@@ -24,6 +47,7 @@ class FIELDWORK_OT_reconstruct(VerbOperator):
     bl_idname = "fieldwork.reconstruct"
     bl_label = "Reconstruct"
     verb = "reconstruct"
+    needs = (need_project_folder, need_source)
 
     out: StringProperty(
         name="Project", description="Project folder; empty: that of the scene", subtype="DIR_PATH",
@@ -46,16 +70,20 @@ class FIELDWORK_OT_reconstruct(VerbOperator):
     holdout: HoldoutProperty()
 
     def parameters(self, context: Context) -> dict[str, Any]:
-        photos, out = self.path(context, "photos"), absolute(self.out or context.scene.fieldwork.project)
-        if photos is None:
+        out = absolute(self.out or context.scene.fieldwork.project)
+        given = {name: self.path(context, name) for name in ("photos", "labels", "masks", "classes")}
+        given["mask_mode"] = self.value(context, "mask_mode")
+        if given["photos"] is None and out:
+            # A project that was opened knows its photos.
+            known = snapshot.source(Path(out))
+            given = {name: known.get(name) for name in given}
+        if not given["photos"]:
             raise ValueError(t("Choose a folder of photos, or a video, first."))
         if not out:
             raise ValueError(t("Choose a project folder first."))
         return {
-            "photos": photos,
+            **given,
             "out": out,
-            **{name: self.path(context, name) for name in ("labels", "masks", "classes")},
-            "mask_mode": self.value(context, "mask_mode"),
             "preset": self.value(context, "preset"),
             "time_limit": self.value(context, "time_limit") or None,
             "holdout": hold_out(self, context),
@@ -66,6 +94,19 @@ class FIELDWORK_OT_reconstruct(VerbOperator):
             "report": absolute(self.report_file),
             "renders": absolute(self.renders),
         }
+
+    def after(self) -> Done:
+        name = bpy.context.scene.name
+        return lambda job: reconstructed(job, name)
+
+
+def reconstructed(job: Job, scene_name: str) -> None:
+    """Bring what was made into the scene, in a window."""
+    refresh_scenes(job)
+    if job.state != "done" or bpy.app.background or scene_of(job.project, scene_name) is None:
+        return
+    params = {"project": str(job.project), "run": "main"}
+    queue.follow_up(queue.make("package", params, lambda done: import_result(done, "both", scene_name)))
 
 
 class FIELDWORK_OT_batch(VerbOperator):

@@ -22,6 +22,7 @@ from ..addon.scene.lens import pinhole
 from ..addon.scene.slices import Held
 from ..addon.text import t
 from .base import ProjectOperator, absolute, need_held_out, need_run, refresh_scenes, scene_of, scene_settings
+from .scene import show_image
 
 
 def check_camera(scene: bpy.types.Scene) -> None:
@@ -167,7 +168,15 @@ def show_result(job: Job) -> Steps | None:
     if photos and show_as != "none":
         _show_straightened(job, show_as)
         show_as = "none"
-    return show_steps(scene, files, show_as, photos, snapshot.owner(job.project))
+    return then_shown(show_steps(scene, files, show_as, photos, snapshot.owner(job.project)), files)
+
+
+def then_shown(steps: Steps, files: list[Path]) -> Steps:
+    """Steps after which the first picture is shown in an image editor."""
+    yield from steps
+    first = next((path for path in files if path.suffix == ".png"), None)
+    if first is not None and not bpy.app.background:
+        show_image(first)
 
 
 def _show_straightened(job: Job, show_as: str) -> None:

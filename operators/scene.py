@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import bpy
-from bpy.types import Context
+from bpy.types import Context, Operator
 
 from ..addon.jobs.job import Done, Job, Steps
 from ..addon.jobs.queue import queue
@@ -13,6 +14,7 @@ from ..addon.project import classes, snapshot
 from ..addon.properties import SPLITS
 from ..addon.props import EnumProperty, StringProperty
 from ..addon.roles import ROLE
+from ..addon.scene import viewing
 from ..addon.text import t
 from .base import ProjectOperator, absolute, need_poses, refresh_scenes, scene_of, scene_settings, set_if_empty
 
@@ -56,11 +58,12 @@ class FIELDWORK_OT_import_scene(ProjectOperator):
         return lambda job: import_result(job, cameras, name, split)
 
 
-def update_scene(job: Job, scene: bpy.types.Scene) -> None:
-    """After a job that moved everything: update what an earlier import put into the scene; nothing where none did."""
+def update_scene(job: Job, scene: bpy.types.Scene, always: bool = False) -> None:
+    """After a job that changed what stands in the scene: update what an earlier import put there; nothing where none did,
+    unless `always`."""
     owner = snapshot.owner(job.project)
     roles = {str(item[ROLE]) for item in scene.objects if ROLE in item and owner.owns(item)}
-    if not roles:
+    if not roles and not always:
         return
     many, animated = any(role.startswith("camera:") for role in roles), "camera path" in roles
     cameras, name = "both" if many == animated else "many" if many else "animated", scene.name
@@ -106,4 +109,29 @@ def show_colors() -> None:
                 area.spaces.active.shading.color_type = "VERTEX"
 
 
-CLASSES = [FIELDWORK_OT_import_scene]
+class FIELDWORK_OT_show_image(Operator):
+    """Show a picture in an image editor; where none is open, one opens as the preferences say for renders"""
+
+    bl_idname = "fieldwork.show_image"
+    bl_label = "Show Picture"
+
+    filepath: StringProperty(name="File", description="The picture", subtype="FILE_PATH", options={"SKIP_SAVE"})
+
+    def execute(self, context: Context) -> set[str]:
+        path = Path(bpy.path.abspath(self.filepath))
+        if not path.is_file():
+            self.report({"ERROR"}, t("There is nothing at {}.", path))
+            return {"CANCELLED"}
+        if not show_image(path):
+            self.report({"INFO"}, t("See “{}” in an image editor", path.name))
+        return {"FINISHED"}
+
+
+def show_image(path: Path) -> bool:
+    """Show a picture in an image editor; whether there is one."""
+    from ..addon.render.slot import load_image  # not at the top: enabling the extension must be quick
+
+    return viewing.show_image(load_image(path))
+
+
+CLASSES = [FIELDWORK_OT_import_scene, FIELDWORK_OT_show_image]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from bl_operators.presets import AddPresetBase
-from bpy.types import Context, Event, Menu, Operator
+from bpy.types import Context, Event, Operator
 
 from ..addon.jobs.job import Done, Job
 from ..addon.project import runs, snapshot
@@ -131,19 +131,12 @@ class FIELDWORK_OT_use_run(Operator):
         return {"FINISHED"}
 
 
-class FIELDWORK_MT_train_presets(Menu):
-    bl_label = "Training Presets"
-    preset_subdir = "fieldwork/train"
-    preset_operator = "script.execute_preset"
-    draw = Menu.draw_preset
-
-
 class FIELDWORK_OT_train_preset_add(AddPresetBase, Operator):
     """Add or remove a preset of the training settings"""
 
     bl_idname = "fieldwork.train_preset_add"
     bl_label = "Add Training Preset"
-    preset_menu = "FIELDWORK_MT_train_presets"
+    preset_menu = "FIELDWORK_PT_train_presets"
     preset_subdir = "fieldwork/train"
     preset_defines = ["fieldwork = bpy.context.scene.fieldwork"]
     preset_values = [
@@ -159,6 +152,5 @@ CLASSES = [
     FIELDWORK_OT_train,
     FIELDWORK_OT_evaluate,
     FIELDWORK_OT_use_run,
-    FIELDWORK_MT_train_presets,
     FIELDWORK_OT_train_preset_add,
 ]

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 from bpy.types import Context, Panel, UILayout
 
 from ..addon.jobs.job import Job
-from ..addon.project import snapshot
 from ..addon.text import t
+from .states import State
 
 MOST_WARNINGS = 3  # of a job in the panel
 
@@ -26,10 +28,20 @@ class StepPanel(FieldworkPanel):
     bl_parent_id = "FIELDWORK_PT_main"
     bl_options = {"DEFAULT_CLOSED"}
 
-    def draw_state(self, done: bool, text: str) -> None:
-        row = self.layout.row()
-        row.active = done
-        row.label(text=text, icon="CHECKMARK" if done else "RADIOBUT_OFF")
+    @staticmethod
+    def state(context: Context) -> State:
+        """What the header says of the step."""
+        raise NotImplementedError
+
+    def draw_header_preset(self, context: Context) -> None:
+        draw_state(self.layout, self.state(context))
+
+
+def draw_state(layout: UILayout, state: State) -> None:
+    """The state of a step at the right of its header."""
+    row = layout.row(align=True)
+    row.active = state.done
+    row.label(text=state.text, icon="CHECKMARK" if state.done else "NONE", translate=False)
 
 
 def columns(layout: UILayout) -> UILayout:
@@ -80,23 +92,8 @@ def draw_wrapped(layout: UILayout, text: str, width: int, icon: str = "NONE") ->
     """A text over several lines: labels do not wrap."""
     column = layout.column(align=True)
     column.scale_y = 0.8
-    for number, line in enumerate(wrap(text, width)):
+    for number, line in enumerate(textwrap.wrap(text, width)):
         column.label(text=line, icon=icon if number == 0 else "BLANK1" if icon != "NONE" else "NONE")
-
-
-def wrap(text: str, width: int) -> list[str]:
-    """Lines of at most about `width` characters; a long word such as a path is broken after a separator."""
-    lines = [""]
-    for word in text.split():
-        while len(word) > width:
-            cut = max(word.rfind(mark, 1, width) for mark in "/\\-_.") + 1 or width
-            lines.append(word[:cut])
-            word = word[cut:]
-        if lines[-1] and len(lines[-1]) + 1 + len(word) > width:
-            lines.append(word)
-        else:
-            lines[-1] = f"{lines[-1]} {word}".strip()
-    return [line for line in lines if line]
 
 
 def text_width(context: Context) -> int:
@@ -160,5 +157,7 @@ def reuse_text(result: dict[str, Any]) -> list[str]:
     return kept + [t("Done anew: {}: {}.", stages([verb]), why) for verb, why in redone.items()]
 
 
-def project_folder(context: Context):
-    return snapshot.folder_of(context.scene.fieldwork)
+def open_folder(layout: UILayout, folder: Path | None) -> None:
+    """A button that shows a folder in the system's file browser, where there is one."""
+    if folder is not None and folder.is_dir():
+        layout.operator("wm.path_open", text=t("Open Folder"), icon="FILE_FOLDER").filepath = str(folder)

@@ -7,7 +7,9 @@ from bpy.types import Context, Panel, UIList
 from ..addon.pictures import thumbnails
 from ..addon.project import snapshot
 from ..addon.text import t
-from .base import FieldworkPanel, StepPanel, columns, draw_wrapped, project_folder, text_width
+from . import states
+from .base import FieldworkPanel, StepPanel, columns, draw_wrapped, text_width
+from .states import project_folder
 
 STATUS_ICONS = {"ok": "CHECKMARK", "rejected": "CANCEL", "unregistered": "ERROR"}
 
@@ -32,20 +34,16 @@ class FIELDWORK_UL_images(UIList):
 
 class FIELDWORK_PT_capture(StepPanel):
     bl_label = "Capture"
+    state = staticmethod(states.capture)
 
     def draw(self, context: Context) -> None:
         layout, settings = self.layout, context.scene.fieldwork
         folder = project_folder(context)
-        rejected = sum(image.status == "rejected" for image in settings.images)
-        if snapshot.has_project(folder):
-            count = len(settings.images) - rejected
-            self.draw_state(True, t("{} photos, {} rejected", count, rejected) if rejected else t("{} photos", count))
-        else:
-            self.draw_state(False, t("No photos yet"))
         row = layout.row(align=True)
         row.operator("fieldwork.open", text=t("Open…"), icon="FILE_FOLDER")
         row.operator("fieldwork.import_dataset", text=t("Import Posed…"), icon="IMPORT")
         column = columns(layout)
+        column.enabled = not states.training(context)
         for name in ("photos", "labels", "masks", "class_file"):
             column.prop(settings, name)
         row = layout.row(align=True)
@@ -63,6 +61,7 @@ class FIELDWORK_PT_capture_options(FieldworkPanel, Panel):
 
     def draw(self, context: Context) -> None:
         column = columns(self.layout)
+        column.enabled = not states.training(context)
         for name in ("max_size", "frames", "mask_mode", "keep_blurry"):
             column.prop(context.scene.fieldwork, name)
 

@@ -6,7 +6,9 @@ from bpy.types import Context, UIList
 
 from ..addon.project import snapshot
 from ..addon.text import t
-from .base import StepPanel, columns, project_folder
+from . import states
+from .base import StepPanel, columns
+from .states import project_folder
 
 
 class FIELDWORK_UL_classes(UIList):
@@ -31,18 +33,18 @@ class FIELDWORK_UL_classes(UIList):
 
 class FIELDWORK_PT_classes(StepPanel):
     bl_label = "Classes"
+    state = staticmethod(states.classes)
 
     def draw(self, context: Context) -> None:
         layout, settings = self.layout, context.scene.fieldwork
         count = len(settings.classes)
         if not count:
-            self.draw_state(False, t("No label maps"))
             note = layout.row()
             note.active = False
             note.label(text=t("Choose a folder of labels under Capture"))
             return
         labelled = sum(image.labelled for image in settings.images)
-        self.draw_state(True, t("{} classes on {} photos", count, labelled))
+        layout.label(text=t("{} classes on {} photos", count, labelled))
         layout.template_list("FIELDWORK_UL_classes", "", settings, "classes", settings, "class_index", rows=4)
         if 0 <= settings.class_index < count:
             entry = settings.classes[settings.class_index]

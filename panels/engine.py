@@ -7,19 +7,19 @@ from bpy.types import Context
 from ..addon import machine
 from ..addon.jobs.queue import queue
 from ..addon.text import t
+from . import states
 from .base import StepPanel, draw_wrapped, text_width
 
 
 class FIELDWORK_PT_engine(StepPanel):
     bl_label = "Engine"
+    state = staticmethod(states.engine)
 
     def draw(self, context: Context) -> None:
         layout = self.layout
         running = queue.link is not None and queue.link.alive
-        if machine.engine_python() is None:
-            self.draw_state(False, t("Not installed"))
-        else:
-            self.draw_state(running, t("Running") if running else t("Starts when needed"))
+        if not running:
+            layout.label(text=t("Starts when needed") if machine.engine_python() else t("Not installed"))
         if running and queue.facts:
             memory = t("Memory {:.1f} GB", queue.facts.get("memory_mb", 0) / 1000)
             gpu = queue.facts.get("gpu_memory_mb")

@@ -10,17 +10,16 @@ from bpy.types import Context, STATUSBAR_HT_header, UILayout
 from ..addon import machine
 from ..addon.jobs.queue import queue
 from ..addon.project import edits, runs, snapshot
+from ..addon.project.recent import recent
 from ..addon.text import t
-from .base import (
-    FieldworkPanel,
-    draw_job,
-    draw_outcome,
-    draw_wrapped,
-    progress_text,
-    project_folder,
-    reuse_text,
-    text_width,
-)
+from ..operators.base import need_project_folder
+from ..operators.reconstruct import need_source
+from .base import FieldworkPanel, draw_job, draw_outcome, draw_wrapped, progress_text, reuse_text, text_width
+from .menus import draw_recent
+from .states import project_folder
+
+BIG = 1.5  # height of the button that leads on, in rows
+FEW = 5  # recent projects shown where none is open
 
 
 class Step(NamedTuple):
@@ -53,6 +52,14 @@ def next_step(context: Context) -> Step | None:
     return Step("fieldwork.import_scene", "SCENE_DATA")
 
 
+def offers_reconstruct(context: Context) -> bool:
+    """Whether one button can take the photos all the way: until there is a mesh, and where the photos are known."""
+    settings = context.scene.fieldwork
+    folder = snapshot.folder_of(settings)
+    idle = queue.current is None and need_project_folder(context) is None
+    return idle and need_source(context) is None and not snapshot.last_result(folder, "mesh", settings.run)
+
+
 class FIELDWORK_PT_main(FieldworkPanel):
     bl_label = "Fieldwork"
 
@@ -62,8 +69,12 @@ class FIELDWORK_PT_main(FieldworkPanel):
             box = layout.box()
             draw_wrapped(box, t("The engine is not installed yet."), text_width(context), icon="INFO")
             box.operator("fieldwork.open_preferences", text=t("Install Engine…"), icon="IMPORT")
+        folder = project_folder(context)
         row = layout.row(align=True)
+        row.menu("FIELDWORK_MT_recent", text="", icon="DOWNARROW_HLT")
         row.prop(settings, "project", text="")
+        if snapshot.has_project(folder):
+            row.operator("wm.path_open", text="", icon="WINDOW").filepath = str(folder)
         absence = snapshot.absence(settings)
         if absence:
             draw_wrapped(layout, absence, text_width(context), icon="ERROR")
@@ -92,13 +103,22 @@ class FIELDWORK_PT_main(FieldworkPanel):
             for text in reuse_text(last.result or {}):
                 draw_wrapped(layout, text, text_width(context), icon="CHECKMARK")
         step = next_step(context)
-        if step is not None:
+        if step is None:
+            return
+        whole = offers_reconstruct(context)
+        if whole:
             row = layout.row()
-            row.scale_y = 1.5
-            text = {"text": step.text} if step.text else {}
-            button = row.operator(step.operator, icon=step.icon, **text)
-            if step.resume:
-                button.resume = True
+            row.scale_y = BIG
+            row.operator("fieldwork.reconstruct", icon="SHADERFX")
+        row = layout.row()
+        row.scale_y = 1.0 if whole else BIG
+        text = {"text": step.text} if step.text else {}
+        button = row.operator(step.operator, icon=step.icon, **text)
+        if step.resume:
+            button.resume = True
+        if not settings.project and recent():
+            layout.label(text=t("Recent Projects"))
+            draw_recent(layout.column(align=True), FEW)
 
 
 def draw_edits(layout: UILayout, context: Context, failed: list[edits.Edit]) -> None:

@@ -6,26 +6,24 @@ from typing import Any
 
 from bpy.types import Context, UILayout
 
-from ..addon.project import snapshot
 from ..addon.text import t
-from .base import StepPanel, columns, project_folder
+from . import states
+from .base import StepPanel, columns, open_folder
+from .states import project_folder
 
 MOST_ROWS = 12  # of what was measured
 
 
 class FIELDWORK_PT_measure(StepPanel):
     bl_label = "Measure"
+    state = staticmethod(states.measure)
 
     def draw(self, context: Context) -> None:
         layout, settings = self.layout, context.scene.fieldwork
         folder = project_folder(context)
-        path = folder / "exports" / settings.run / "measures.json" if folder else None
-        measures = snapshot.cached_json(path) if path else None
+        measures = states.measures(context)
         if measures:
-            self.draw_state(True, t("{} instances measured", len(measures.get("instances", []))))
             draw_measures(layout, measures)
-        else:
-            self.draw_state(False, t("Not measured yet"))
         column = columns(layout)
         for name in ("distances", "scale_error", "caps"):
             column.prop(settings, name)
@@ -43,7 +41,13 @@ class FIELDWORK_PT_measure(StepPanel):
                 column.prop(settings, name)
             layout.operator("fieldwork.compare", icon="MOD_MASK")
         columns(layout).prop(settings, "report_path")
-        layout.operator("fieldwork.report", icon="FILE_TEXT")
+        row = layout.row(align=True)
+        row.operator("fieldwork.report", icon="FILE_TEXT")
+        written = states.last_done(context, "report")
+        if written is not None:
+            row.operator("wm.path_open", text=t("Open"), icon="URL").filepath = str(written.result["file"])
+        if folder is not None:
+            open_folder(layout, folder / "exports" / settings.run)
 
 
 def draw_measures(layout: UILayout, measures: dict[str, Any]) -> None:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import bpy
-from bpy.types import Context, Menu
+from bpy.types import Context, Menu, UILayout
 
+from ..addon.project.recent import MOST, recent
 from ..addon.text import t
 
 
@@ -14,8 +15,10 @@ class FIELDWORK_MT_steps(Menu):
     def draw(self, context: Context) -> None:
         layout = self.layout
         layout.operator("fieldwork.open", text=t("Open Photos or Project…"), icon="FILE_FOLDER")
+        layout.menu("FIELDWORK_MT_recent")
         layout.operator("fieldwork.import_dataset", text=t("Import Posed Data Set…"))
         layout.separator()
+        layout.operator("fieldwork.reconstruct")
         layout.operator("fieldwork.new")
         layout.operator("fieldwork.poses")
         layout.operator("fieldwork.align")
@@ -43,6 +46,23 @@ class FIELDWORK_MT_steps(Menu):
         layout.operator("fieldwork.open_preferences", text=t("Preferences…"))
 
 
+class FIELDWORK_MT_recent(Menu):
+    bl_label = "Recent Projects"
+
+    def draw(self, context: Context) -> None:
+        draw_recent(self.layout, MOST)
+
+
+def draw_recent(layout: UILayout, most: int) -> None:
+    """A button for each of the projects that were open last."""
+    folders = recent()[:most]
+    for folder in folders:
+        button = layout.operator("fieldwork.open_recent", text=folder.name, icon="FILE_FOLDER", translate=False)
+        button.folder = str(folder)
+    if not folders:
+        layout.label(text=t("No projects yet"))
+
+
 def draw_object_menu(self: Menu, context: Context) -> None:
     self.layout.separator()
     self.layout.menu("FIELDWORK_MT_steps")
@@ -56,7 +76,7 @@ def draw_export(self: Menu, context: Context) -> None:
     self.layout.operator("fieldwork.blend", text=t("Capture as .blend (Fieldwork)"))
 
 
-CLASSES = [FIELDWORK_MT_steps]
+CLASSES = [FIELDWORK_MT_steps, FIELDWORK_MT_recent]
 _ENTRIES = [
     ("VIEW3D_MT_object", draw_object_menu),
     ("TOPBAR_MT_file_import", draw_import),

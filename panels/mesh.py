@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from bpy.types import Context
 
-from ..addon.project import runs, snapshot
+from ..addon.project import snapshot
 from ..addon.text import t
-from .base import StepPanel, columns, draw_verdict, project_folder
+from . import states
+from .base import StepPanel, columns, draw_verdict, open_folder
+from .states import project_folder
 
 
 class FIELDWORK_PT_mesh(StepPanel):
     bl_label = "Mesh"
+    state = staticmethod(states.mesh)
 
     def draw(self, context: Context) -> None:
         layout, settings = self.layout, context.scene.fieldwork
@@ -18,15 +21,17 @@ class FIELDWORK_PT_mesh(StepPanel):
         result = snapshot.last_result(folder, "mesh", settings.run)
         if result:
             closed = t("{:,} triangles, closed") if result.get("watertight") else t("{:,} triangles, open")
-            self.draw_state(True, closed.format(result.get("faces", 0)))
+            layout.label(text=closed.format(result.get("faces", 0)))
             draw_verdict(layout, context, result)
-        elif runs.has_run(folder, settings.run):
-            self.draw_state(False, t("Ready to extract"))
-        else:
-            self.draw_state(False, t("Run “{}” is not trained yet", settings.run))
         column = columns(layout)
         column.prop(settings, "mesh_region")
-        for name in ("resolution", "detail", "watertight", "faces", "lods", "texture"):
+        for name in ("resolution", "detail", "watertight"):
+            column.prop(settings, name)
+        row = column.row(align=True, heading=t("Faces"))
+        row.prop(settings, "all_faces", toggle=True)
+        if not settings.all_faces:
+            row.prop(settings, "faces", text="")
+        for name in ("lods", "texture"):
             column.prop(settings, name)
         if settings.texture != "0":
             column.prop(settings, "texture_kind")
@@ -38,6 +43,8 @@ class FIELDWORK_PT_mesh(StepPanel):
         row = layout.row(align=True)
         row.operator("fieldwork.import_scene", icon="SCENE_DATA")
         row.operator("fieldwork.pick_surface", icon="EYEDROPPER")
+        if folder is not None:
+            open_folder(layout, folder / "exports" / settings.run)
 
 
 CLASSES = [FIELDWORK_PT_mesh]

@@ -5,9 +5,12 @@ from __future__ import annotations
 from bpy.types import Context, UIList
 
 from ..addon.project import region, snapshot
+from ..addon.scene import measured_line
 from ..addon.text import t
-from .base import FieldworkPanel, StepPanel, columns, draw_wrapped, project_folder, text_width
+from . import states
+from .base import FieldworkPanel, StepPanel, columns, draw_wrapped, text_width
 from .capture import STATUS_ICONS
+from .states import project_folder
 
 
 class FIELDWORK_UL_poses(UIList):
@@ -27,24 +30,24 @@ class FIELDWORK_UL_poses(UIList):
 
 class FIELDWORK_PT_poses(StepPanel):
     bl_label = "Poses"
+    state = staticmethod(states.poses)
 
     def draw(self, context: Context) -> None:
         layout, settings = self.layout, context.scene.fieldwork
         folder = project_folder(context)
         done = snapshot.has_poses(folder)
-        placed = sum(image.status == "ok" for image in settings.images)
-        usable = sum(image.status != "rejected" for image in settings.images)
-        self.draw_state(done, t("{} of {} photos placed", placed, usable) if done else t("No poses yet"))
-        columns(layout).prop(settings, "pose_preset")
+        column = columns(layout)
+        column.enabled = not states.training(context)
+        column.prop(settings, "pose_preset")
         row = layout.row(align=True)
         row.operator("fieldwork.poses", icon="CAMERA_DATA").restart = False
         if done:
             row.operator("fieldwork.poses", text=t("Start Over"), icon="FILE_REFRESH").restart = True
         if not (done and folder):
             return
-        layout.template_list("FIELDWORK_UL_poses", "poses", settings, "images", settings, "image_index", rows=4)
-        if 0 <= settings.image_index < len(settings.images) and settings.images[settings.image_index].reason:
-            draw_wrapped(layout, settings.images[settings.image_index].reason, text_width(context), icon="INFO")
+        layout.template_list("FIELDWORK_UL_poses", "poses", settings, "images", settings, "pose_index", rows=4)
+        if 0 <= settings.pose_index < len(settings.images) and settings.images[settings.pose_index].reason:
+            draw_wrapped(layout, settings.images[settings.pose_index].reason, text_width(context), icon="INFO")
         layout.operator("fieldwork.import_scene", text=t("Show in Scene"), icon="OUTLINER_OB_CAMERA")
 
 
@@ -76,10 +79,16 @@ class FIELDWORK_PT_align(FieldworkPanel):
         columns(layout).prop(settings, "up")
         for end in "ab":
             row = layout.row(align=True)
+            name = row.row()
+            name.ui_units_x = 0.8
+            name.label(text=end.upper(), translate=False)
             row.prop(settings, f"point_{end}", text="")
             row.operator("fieldwork.pick_point", text="", icon="EYEDROPPER").end = end.upper()
             cursor = row.operator("fieldwork.pick_point", text="", icon="PIVOT_CURSOR")
             cursor.end, cursor.use_cursor = end.upper(), True
+        now = measured_line.length(context.scene)
+        if now is not None:
+            layout.label(text=t("A to B as it is now: {:.4g} m", now), icon="DRIVER_DISTANCE")
         columns(layout).prop(settings, "distance")
         layout.operator("fieldwork.align", icon="ORIENTATION_GLOBAL")
         row = layout.row(align=True)

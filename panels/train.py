@@ -2,65 +2,59 @@
 
 from __future__ import annotations
 
-from bpy.types import Context, UILayout
+from pathlib import Path
 
+from bl_ui.utils import PresetPanel
+from bpy.types import Context, Panel, UILayout
+
+from ..addon.jobs import computer
 from ..addon.jobs.job import Job
-from ..addon.jobs.queue import queue
 from ..addon.pictures import thumbnails
 from ..addon.project import runs, snapshot
 from ..addon.text import t
-from .base import FieldworkPanel, StepPanel, columns, draw_verdict, duration, project_folder
+from . import states
+from .base import FieldworkPanel, StepPanel, columns, draw_verdict, duration
+from .states import project_folder
 
 
-def training_job(context: Context) -> Job | None:
-    """The training of this scene's project: the one under way, else the last that ended."""
-    folder = project_folder(context)
-    candidates = [queue.running, queue.followed, *reversed(queue.finished)]
-    return next((j for j in candidates if j and j.verb in ("train", "reconstruct") and j.project == folder), None)
+class FIELDWORK_PT_train_presets(PresetPanel, Panel):
+    bl_label = "Training Presets"
+    preset_subdir = "fieldwork/train"
+    preset_operator = "script.execute_preset"
+    preset_add_operator = "fieldwork.train_preset_add"
 
 
 class FIELDWORK_PT_train(StepPanel):
     bl_label = "Train"
+    state = staticmethod(states.train)
+
+    def draw_header_preset(self, context: Context) -> None:
+        super().draw_header_preset(context)
+        FIELDWORK_PT_train_presets.draw_panel_header(self.layout)
 
     def draw(self, context: Context) -> None:
         layout, settings = self.layout, context.scene.fieldwork
         folder = project_folder(context)
-        job = training_job(context)
+        job = states.training_job(context)
         active = job is not None and job.active
         checkpoint = runs.can_resume(folder, settings.run)
-        if active:
-            self.draw_state(True, t("Run “{}” is training", settings.run))
-        elif checkpoint:
-            self.draw_state(False, t("Run “{}” is paused", settings.run))
-        elif runs.has_run(folder, settings.run):
-            self.draw_state(True, t("Run “{}” is trained", settings.run))
+        if not active and not checkpoint and runs.has_run(folder, settings.run):
             draw_verdict(layout, context, snapshot.last_result(folder, "train", settings.run))
-        else:
-            self.draw_state(False, t("Run “{}” is not trained yet", settings.run))
-        row = layout.row(align=True)
-        row.menu("FIELDWORK_MT_train_presets", text=t("My Presets"))
-        row.operator("fieldwork.train_preset_add", text="", icon="ADD")
-        row.operator("fieldwork.train_preset_add", text="", icon="REMOVE").remove_active = True
         column = columns(layout)
+        column.enabled = not active
         column.prop(settings, "preset")
         column.prop(settings, "run")
         column.prop(settings, "hold_out")
         if not active:
-            estimate = runs.time_estimate(folder, settings)
-            text = t("About {}, as the last time", duration(estimate)) if estimate else ""
-            if settings.time_limit > 0:
-                text = t("Ends after {}", duration(settings.time_limit))
-            if text:
-                note = layout.row()
-                note.active = False
-                note.label(text=text, icon="TIME")
+            draw_estimate(layout, context)
         if active:
             layout.operator("fieldwork.cancel", text=t("Pause"), icon="PAUSE").job = job.id
         else:
             row = layout.row(align=True)
-            row.operator("fieldwork.train", text=t("Restart") if checkpoint else t("Train"), icon="PLAY").resume = False
             if checkpoint:
                 row.operator("fieldwork.train", text=t("Resume"), icon="PLAY").resume = True
+            again, icon = (t("Restart"), "FILE_REFRESH") if checkpoint else (t("Train"), "PLAY")
+            row.operator("fieldwork.train", text=again, icon=icon).resume = False
         if job is not None:
             draw_curve(layout, job)
 
@@ -72,6 +66,7 @@ class FIELDWORK_PT_train_options(FieldworkPanel):
 
     def draw(self, context: Context) -> None:
         column = columns(self.layout)
+        column.enabled = not states.training(context)
         for name in ("time_limit", "steps", "settings"):
             column.prop(context.scene.fieldwork, name)
 
@@ -95,11 +90,29 @@ class FIELDWORK_PT_runs(FieldworkPanel):
         layout.operator("fieldwork.evaluate", icon="VIEWZOOM")
 
 
+def draw_estimate(layout: UILayout, context: Context) -> None:
+    """Before a training: on what, and about how long."""
+    settings, facts = context.scene.fieldwork, computer.known()
+    lines = [(t("On {}", computer.title(facts)), "DESKTOP")] if facts else []
+    if settings.time_limit > 0:
+        lines.append((t("Ends after {}", duration(settings.time_limit)), "TIME"))
+    elif estimate := runs.time_estimate(project_folder(context), settings):
+        lines.append((t("About {}, as the last time", duration(estimate)), "TIME"))
+    elif rough := computer.rough_seconds(facts, settings.preset, settings.steps):
+        lines.append((t("Roughly {}", duration(rough)), "TIME"))
+    column = layout.column(align=True)
+    column.active = False
+    for text, icon in lines:
+        column.label(text=text, icon=icon)
+    if not facts:
+        layout.operator("fieldwork.doctor", text=t("How Fast Is This Computer?"), icon="DESKTOP")
+
+
 def draw_curve(layout: UILayout, job: Job) -> None:
     """Loss and PSNR so far, and the newest picture of a held-out photo."""
     icon = thumbnails.curve_icon(job.id, job.curve)
     if icon:
-        layout.template_icon(icon_value=icon, scale=7.0)
+        layout.template_icon(icon_value=icon, scale=10.0)
     if job.latest:
         layout.label(text=t("Step {:,}", job.latest.get("step", 0)))
         row = layout.row()
@@ -107,7 +120,8 @@ def draw_curve(layout: UILayout, job: Job) -> None:
         # The colors are those of the two lines.
         row.label(text=t("PSNR –") if psnr is None else t("PSNR {:.1f} dB", psnr), icon="COLLECTION_COLOR_05")
         row.label(text=t("Loss –") if loss is None else t("Loss {:.4f}", loss), icon="COLLECTION_COLOR_02")
-    if job.preview:
+    # A reconstruction has other pictures too, such as that of the cameras.
+    if job.preview and "runs" in Path(job.preview).parts:
         preview = thumbnails.picture(job.preview, job.preview_count)
         if preview:
             whole = job.params.get("holdout") == 0
@@ -115,4 +129,4 @@ def draw_curve(layout: UILayout, job: Job) -> None:
             layout.template_icon(icon_value=preview, scale=9.0)
 
 
-CLASSES = [FIELDWORK_PT_train, FIELDWORK_PT_train_options, FIELDWORK_PT_runs]
+CLASSES = [FIELDWORK_PT_train_presets, FIELDWORK_PT_train, FIELDWORK_PT_train_options, FIELDWORK_PT_runs]

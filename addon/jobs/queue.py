@@ -22,7 +22,7 @@ import bpy
 
 from .. import machine
 from ..errors import EngineError
-from . import gate, redraw
+from . import computer, gate, redraw
 from .job import Done, Job, Steps
 from .landing import SLICE, Landing, scene_error
 
@@ -277,6 +277,8 @@ class Queue:
             job.seconds = time.monotonic() - job.started
         if job.verb == "doctor" and result:
             self.doctor = result
+            if not bpy.app.background:
+                computer.remember(result)
         self.landing.add(job)
         self.redraw()
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import bpy
 import bpy.utils.previews
 
-WIDTH, HEIGHT = 256, 176  # of the curve, in pixels
+WIDTH, HEIGHT = 448, 320  # of the curve, in pixels
 
 _previews: bpy.utils.previews.ImagePreviewCollection | None = None
 _curve_drawn: tuple[str, int] = ("", 0)

@@ -83,6 +83,19 @@ def last_result(folder: Path | None, verb: str, run: str | None = None) -> dict[
     return {}
 
 
+def source(folder: Path | None) -> dict[str, Any]:
+    """The parameters with which photos were read into the project; empty where none were, or cameras came with them."""
+    for step in (project(folder) or {}).get("provenance", []):
+        if step.get("verb") == "new":
+            return step.get("settings") or {}
+    return {}
+
+
+def imported(folder: Path | None) -> bool:
+    """Whether the project was made of photos whose poses were known."""
+    return any(step.get("verb") == "import" for step in (project(folder) or {}).get("provenance", []))
+
+
 def absence(settings: Any) -> str | None:
     """Why the project that the scene knows cannot be had at its folder, as a sentence; None when it can, or when the
     scene has not seen one there."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -25,12 +25,13 @@ from .frame import units_per_metre
 from .look import TEXTURE, set_switch, shader_group, viewport_group
 from .mesh_data import Part, parts
 from .owned import Owned
-from .package import Package, read_package
+from .package import Package, read_package, sketch_package
 from .points import sparse_points
 from .slices import Held
 from .surface import surface
 
 Cameras = Literal["many", "animated", "both"]
+PREVIEW = "preview"  # role of the first look at the surface
 
 
 @dataclass
@@ -119,6 +120,30 @@ def import_steps(
         f"“{name}” was edited: it stays as it is, and what is new stands beside it." for name in owned.kept
     ]
     return result
+
+
+def preview_steps(scene: bpy.types.Scene, owner: Owner, project: dict[str, Any], path: Path | str) -> Steps:
+    """A first look at the surface (preview.npz of the exports) as an object of its own, step by step; what else belongs to
+    the project stays, and the next import takes it away. Returns it.
+
+    Args:
+        project: what the project file says.
+
+    Raises:
+        PackageError: the file cannot be read.
+    """
+    place = Held(bpy.data.scenes, scene)
+
+    def read() -> tuple[Package, Part]:
+        package = sketch_package(Path(path), owner, project)
+        return package, replace(parts(package, "none")[0], role=PREVIEW, name="Preview")
+
+    package, part = yield from _in_thread(read)
+    owned = Owned(place(), owner)
+    _parent(owned, package)
+    group = shader_group(owner, "mesh", owned.root)
+    trees = [Held(bpy.data.node_groups, tree) for tree in (group, viewport_group(owner, owned.root))]
+    return (yield from surface(owned, package, part, lambda: (trees[0](), trees[1]())))
 
 
 def _parent(owned: Owned, package: Package) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import SceneError
+from ..roles import Owner
 
 FORMAT, VERSION = "fieldwork-package", 1
 SENSOR_MM = 36.0
@@ -105,6 +106,28 @@ def read_package(folder: Path | str) -> Package:
         texture=folder / value["texture"] if value.get("texture") else None,
         instances=value.get("instances") or [],
         measures=value.get("measures") or {},
+    )
+
+
+def sketch_package(path: Path, owner: Owner, project: dict[str, Any]) -> Package:
+    """A first look at the surface, as a package of nothing else; `project`: what the project file says.
+
+    Raises:
+        PackageError: it cannot be read.
+    """
+    return Package(
+        folder=path.parent,
+        name=owner.name,
+        uuid=owner.uuid,
+        classes=project.get("classes", []),
+        ignore_id=project.get("ignore_id", 0),
+        cameras=[],
+        xyz=np.zeros((0, 3), np.float32),
+        rgb=np.zeros((0, 3), np.uint8),
+        mesh=_arrays(path),
+        texture=None,
+        instances=[],
+        measures={},
     )
 
 

@@ -31,6 +31,7 @@ from .lods import Level, make_levels, remove_levels, write_level
 from .painted import Painted, paint_surface, training_photos, write_maps
 from .parts import Texture, texture_of
 from .photos import Photo
+from .preview import preview
 from .shown import shown_share, silhouette
 from .stored import COARSE
 from .surface import Surface, class_table, is_watertight, to_world
@@ -45,10 +46,13 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
         "instances": how many, "lods": [{"faces", "deviation": in world units}], "files"};
         "shown": the share of the photos' pixels that show the mesh, "verdict";
         "silhouette" of a capture with masks: see `shown.silhouette`;
+        for a preview see `preview.preview`;
         with a texture of photos "painted_by_photos", the share of its texels that a photo shows
     Raises:
         SettingError: unknown format or impossible region. ProjectError, TrainingError, DiskError.
     """
+    if params.preview:
+        return preview(params, report)
     folder = Path(params.project)
     if params.out is not None:
         check_format(params.out)
@@ -147,7 +151,7 @@ def mesh_inputs(params: MeshParams) -> Fingerprint:
     folder = Path(params.project)
     info = load_info(folder, params.run)
     scene = load_scene(folder, info.holdout)
-    settings = params.model_dump(mode="json", exclude={"project", "run", "out"})
+    settings = params.model_dump(mode="json", exclude={"project", "run", "out", "preview"})
     # Surfaces come from rendered depth maps. Defaults are left out, as in records that knew no others.
     rendering = [changed] if (changed := info.config.render.model_dump(mode="json", exclude_defaults=True)) else []
     out = str(params.out.absolute()) if params.out else None

@@ -216,3 +216,41 @@ answer([job.state, str(job.error)])
     )
     assert state == "failed"
     assert ("view_001.png" in message) if cut == "images" else ("points.npz cannot be read" in message)
+
+
+def test_a_first_look_gives_way_to_the_mesh_and_leaves_cameras_alone(bpy_script, tmp_path):
+    folder = make_package(tmp_path / "package", 12, cameras=3, points=50)
+    np.savez(tmp_path / "preview.npz", **{name: values for name, values in sheet(6).items() if name != "uv"})
+    facts = bpy_script(
+        SETUP
+        + """
+from fieldwork.addon.roles import Owner
+from fieldwork.addon.scene import build
+def look():
+    meshes = {o["fieldwork_role"]: len(o.data.polygons) for o in bpy.data.objects if o.type == "MESH"}
+    return [meshes, sum(o.type == "CAMERA" for o in bpy.data.objects)]
+def preview():
+    known = {"classes": [{"id": 1, "name": "stone", "color": [0.5, 0.2, 0.1]}], "ignore_id": 0}
+    for _ in build.preview_steps(scene, Owner("capture"), known, Path(project, "preview.npz")):
+        pass
+scene.camera = None
+for item in list(bpy.data.objects):
+    bpy.data.objects.remove(item)
+preview()
+seen = [look()]
+preview()
+seen.append(look())
+finished()
+queue.landing.settle()
+seen.append(look())
+answer(seen)
+""",
+        project=tmp_path,
+        package=folder,
+    )
+    first, again, full = facts
+    assert first == [{"preview": 50}, 0]
+    assert again == first, "nothing piles up"
+    assert full[0]["mesh"] == 242
+    assert "preview" not in full[0]
+    assert full[1] == 4  # one for each photo, and the animated one

@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("bpy")
 
 from fieldwork.addon.jobs.job import Job
-from fieldwork.panels.base import duration, progress_text, reuse_text, verdict_of, wrap
+from fieldwork.panels.base import duration, progress_text, reuse_text, verdict_of
 
 
 @pytest.mark.parametrize(
@@ -41,14 +41,6 @@ def test_a_stage_says_what_is_wrong_with_its_result():
     assert verdict_of({"verdict": {"level": "good", "reasons": []}}) is None
     assert verdict_of({"verdict": {"level": "weak", "reasons": ["Coarse.", "Fog."]}}) == ("Coarse.", False)
     assert verdict_of({"verdict": {"level": "failed", "reasons": ["Scraps."]}}) == ("Scraps.", True)
-
-
-def test_wrapped_text_keeps_its_words_and_breaks_long_paths():
-    text = "Nothing could be read from /home/somebody/a/very/long/path/that/never/ends/photo.jpg at all"
-    lines = wrap(text, 24)
-    assert all(len(line) <= 25 for line in lines)
-    assert "".join(lines).replace(" ", "") == text.replace(" ", "")
-    assert wrap("", 10) == []
 
 
 def test_the_next_step_leads_from_nothing_to_the_model(bpy_script, tmp_path):
@@ -142,13 +134,33 @@ def test_curve_picture_shows_both_lines():
     from fieldwork.addon.pictures.curve import LOSS_COLOR, PSNR_COLOR, draw_curve
 
     curve = [(step, math.exp(-step / 50), 10 + step / 10) for step in range(100)]
-    image = draw_curve(curve, 64, 32)
-    assert image.shape == (32, 64, 4)
+    image = draw_curve(curve, 256, 128)
+    assert image.shape == (128, 256, 4)
     for color, slope in ((PSNR_COLOR, 1), (LOSS_COLOR, -1)):
         rows, columns = (abs(image[..., :3] - color).max(-1) < 1e-6).nonzero()
-        left, right = rows[columns < 8].mean(), rows[columns >= 56].mean()
-        assert (right - left) * slope > 10
-    assert draw_curve([(0, 1.0, float("nan")), (1, 1.0, float("nan"))], 8, 8).shape == (8, 8, 4)
+        inside = (columns >= 72) & (columns < 184)
+        rows, columns = rows[inside], columns[inside]
+        left, right = rows[columns < 84].mean(), rows[columns >= 172].mean()
+        assert (right - left) * slope > 50
+    assert draw_curve([(0, 1.0, float("nan")), (1, 1.0, float("nan"))], 64, 32).shape == (32, 64, 4)
+
+
+def test_axes_of_the_curve_are_numbered():
+    from fieldwork.addon.pictures.curve import PSNR_COLOR, amount, count, draw_curve
+
+    assert [amount(value) for value in (3.14159, 0.5, 0.0219, 0.00042)] == ["3.14", "0.50", ".022", ".0004"]
+    assert [count(value) for value in (0, 950, 4000, 12500, 2_000_000)] == ["0", "950", "4k", "12.5k", "2M"]
+
+    def letters(top):
+        """What stands to the left of the axis: the PSNR's largest and smallest value."""
+        image = draw_curve([(0, 1.0, 10.0), (100, 0.5, top)], 448, 320)
+        return (abs(image[:, :72, :3] - PSNR_COLOR).max(-1) < 1e-6).sum(1)
+
+    rows = letters(20.0)
+    assert rows[300:].any()  # at the top
+    assert rows[28:48].any()  # at the bottom
+    assert not rows[48:300].any()
+    assert (letters(25.0)[300:] != rows[300:]).any(), "another number, other letters"
 
 
 def test_sizes_are_said_with_as_many_digits_as_they_are_sure():
@@ -158,3 +170,197 @@ def test_sizes_are_said_with_as_many_digits_as_they_are_sure():
     assert amount_text(row, "area", "m²") == "1.24 ± 0.03 m²"
     assert amount_text(row | {"area": 140.2, "area_low": 120, "area_high": 160}, "area", "") == "140 ± 20"
     assert amount_text(row, "volume", "m³") == ""
+
+
+def test_headers_say_the_state_of_each_step(bpy_script, tmp_path):
+    facts = bpy_script(
+        """
+import fieldwork
+fieldwork.register()
+from fieldwork.addon.jobs.queue import queue
+from fieldwork.panels import states
+settings = bpy.context.scene.fieldwork
+folder = Path(project)
+names = ("capture", "poses", "classes", "train", "render", "mesh", "measure", "export")
+def look():
+    return {name: list(getattr(states, name)(bpy.context)) for name in names}
+def write(name, value):
+    (folder / name).parent.mkdir(parents=True, exist_ok=True)
+    (folder / name).write_text(json.dumps(value))
+empty = look()
+images = [{"name": str(n), "status": "ok" if n else "unregistered"} for n in range(3)]
+images.append({"name": "d", "status": "rejected"})
+write("project.json", {
+    "format": "fieldwork-project", "version": 2, "uuid": "a" * 32, "images": images,
+    "provenance": [{"verb": "mesh", "result": {"faces": 54368}}],
+    "classes": [{"id": 1, "name": "stone", "color": [0, 0, 0], "priority": 1.0}],
+})
+write("poses/poses.json", {})
+write("runs/main/field.safetensors", "")
+write("runs/main/metrics.json", {"train": {"psnr": 30}, "test": {"psnr": 27.34, "miou": 0.9}})
+write("exports/main/measures.json", {"classes": [{"name": "stone"}]})
+settings.project = project
+rendered = queue.make("render", {"project": project})
+rendered.state, rendered.result = "done", {"frames": ["a.png", "a.exr"]}
+written = queue.make("blend", {"project": project})
+written.state, written.result = "done", {"file": "/out/museum.blend"}
+queue.finished = [rendered, written]
+full = look()
+queue.running = queue.make("train", {"project": project})
+queue.running.state, queue.running.fraction = "running", 0.34
+answer({"empty": empty, "full": full, "training": look()["train"], "locked": states.training(bpy.context)})
+""",
+        project=tmp_path / "project",
+    )
+    assert all(not done and not text for done, text in facts["empty"].values())
+    assert facts["full"] == {
+        "capture": [True, "3 of 4 photos"],
+        "poses": [True, "2/3"],
+        "classes": [True, "1"],
+        "train": [True, "27.3 dB"],
+        "render": [True, "1 image"],
+        "mesh": [True, "54 k faces"],
+        "measure": [True, "1 class"],
+        "export": [True, "museum.blend"],
+    }
+    assert facts["training"] == [False, "34%"]
+    assert facts["locked"]
+
+
+def test_one_button_takes_known_photos_all_the_way(bpy_script, tmp_path):
+    facts = bpy_script(
+        """
+import fieldwork
+fieldwork.register()
+from fieldwork.addon.jobs.queue import queue
+from fieldwork.panels.main import offers_reconstruct
+settings = bpy.context.scene.fieldwork
+seen, asked = [], []
+class Link:
+    alive = True
+    def run_blocking(self, verb, params, take=None):
+        asked.append([verb, params])
+        return {}
+queue._engine = Link
+def look():
+    seen.append(offers_reconstruct(bpy.context))
+def provenance(*steps):
+    Path(project).mkdir(exist_ok=True)
+    value = {"format": "fieldwork-project", "version": 2, "uuid": "a" * 32, "provenance": steps}
+    Path(project, "part").write_text(json.dumps(value))
+    os.replace(Path(project, "part"), Path(project, "project.json"))
+look()
+settings.photos = "/photos"
+look()
+settings.project = project
+look()
+settings.photos = ""
+read = {"verb": "new", "settings": {"photos": "/first", "labels": "/labels", "mask_mode": "empty"}}
+provenance(read)
+look()
+bpy.ops.fieldwork.reconstruct()
+provenance(read, {"verb": "mesh", "result": {"faces": 8}})
+look()
+provenance({"verb": "import", "settings": {"dataset": "/set"}})
+settings.photos = "/photos"
+look()
+verb, params = asked[0]
+names = ("photos", "labels", "masks", "mask_mode", "out")
+answer({"seen": seen, "verb": verb, "params": {name: params.get(name) for name in names}})
+""",
+        project=tmp_path / "project",
+    )
+    # Nothing known; no project; both; a project that was opened; its mesh is there; its cameras came with it.
+    assert facts["seen"] == [False, False, True, True, False, False]
+    assert facts["verb"] == "reconstruct"
+    assert facts["params"] == {
+        "photos": "/first",
+        "labels": "/labels",
+        "masks": None,
+        "mask_mode": "empty",
+        "out": str(tmp_path / "project"),
+    }
+
+
+def test_recent_projects_are_remembered_and_opened(bpy_script, tmp_path):
+    facts = bpy_script(
+        """
+import fieldwork
+fieldwork.register()
+from fieldwork.addon import machine
+from fieldwork.addon.project import recent
+machine.user_folder = lambda *parts: Path(user)
+Path(user).mkdir()
+before = [str(p) for p in recent.recent()]
+for name in ("a", "b", "gone", "a"):
+    folder = Path(user, name)
+    folder.mkdir(exist_ok=True)
+    value = {"format": "fieldwork-project", "version": 2, "uuid": "a" * 32}
+    (folder / "project.json").write_text(json.dumps(value))
+    recent.remember(folder)
+(Path(user) / "gone" / "project.json").unlink()
+bpy.ops.fieldwork.open_recent(folder=str(Path(user, "b")))
+try:
+    bpy.ops.fieldwork.open_recent(folder=str(Path(user, "gone")))
+except RuntimeError as error:
+    refused = str(error)
+after = [path.name for path in recent.recent()]
+answer({"before": before, "after": after, "open": bpy.context.scene.fieldwork.project, "refused": refused})
+""",
+        user=tmp_path / "user",
+    )
+    assert facts["before"] == []
+    assert facts["after"] == ["a", "b"]
+    assert facts["open"] == str(tmp_path / "user" / "b")
+    assert "There is no project in" in facts["refused"]
+
+
+def test_no_limit_of_faces_reads_all(bpy_script):
+    facts = bpy_script(
+        """
+import fieldwork
+fieldwork.register()
+settings = bpy.context.scene.fieldwork
+seen = [[settings.all_faces, settings.faces]]
+for keep in (True, False):
+    settings.all_faces = keep
+    seen.append([settings.all_faces, settings.faces])
+answer(seen)
+"""
+    )
+    assert facts == [[False, 200_000], [True, 0], [False, 200_000]]
+
+
+def test_device_and_rough_time_are_known_before_the_first_training(tmp_path, monkeypatch):
+    from fieldwork.addon import machine
+    from fieldwork.addon.jobs import computer
+
+    monkeypatch.setattr(machine, "user_folder", lambda *parts: tmp_path)
+    assert computer.known() == {}
+    computer.remember({"device": "cpu", "cores": 4})
+    assert computer.title(computer.known()) == "CPU, 4 cores"
+    assert computer.rough_seconds(computer.known(), "standard", 1000) == pytest.approx(115)
+    assert computer.rough_seconds({}, "standard") is None
+    card = {"device": "cuda", "device_name": "NVIDIA H100", "gpu_memory_gb": 79.6}
+    assert computer.title(card) == "NVIDIA H100, 80 GB"
+    assert computer.rough_seconds(card, "standard") is None
+
+
+def test_measured_line_knows_its_ends_and_length(bpy_script):
+    facts = bpy_script(
+        """
+import fieldwork
+fieldwork.register()
+from fieldwork.addon.scene import measured_line
+scene = bpy.context.scene
+seen = [measured_line.length(scene)]
+scene.fieldwork.point_a = (1, 0, 0)
+seen.append(sorted(measured_line.ends(scene.fieldwork)))
+scene.fieldwork.point_b = (1, 3, 4)
+seen.append(measured_line.length(scene))
+scene.unit_settings.scale_length = 0.01
+seen.append(measured_line.length(scene))
+answer(seen)
+"""
+    )
+    assert facts == [None, ["A"], pytest.approx(5.0), pytest.approx(0.05)]

@@ -23,7 +23,7 @@ import bpy
 Steps = Iterator[float | None]
 TICK = 0.03
 PATIENCE = float(os.environ.get("FIELDWORK_GUI_PATIENCE", "1"))  # factor of all waiting, for a machine under load
-PANELS = ["capture", "poses", "classes", "train", "render", "mesh", "export", "engine"]
+PANELS = ["capture", "poses", "classes", "train", "render", "mesh", "measure", "export", "engine"]
 PACKAGE = "bl_ext.user_default.fieldwork"
 BARE = {"life"}  # scenarios that install and enable the extension themselves
 
@@ -109,10 +109,12 @@ class Screen:
             found = yield from self.buttons(depth=260)
             main = [place for place in found if place[0].startswith("bpy.ops.fieldwork.")]
             assert main, "the main panel has no button"
-            # Below the big button of the next step, or the bar of the job and its message, come the headers.
+            # Below the button of the next step, or the bar of the job and its message, come the headers.
             job = self.queue.current
-            below = self.unit * 1.8 if job else 24 + self.unit / 2
-            self.headers = (state, max(y for _, _, y in main) - below)
+            rows = sorted(main, key=lambda place: -place[2])
+            whole = rows[0][0].startswith("bpy.ops.fieldwork.reconstruct(")
+            below = self.unit * 1.8 if job else (16 if whole else 24) + self.unit / 2
+            self.headers = (state, rows[1 if whole else 0][2] - below)
         yield from self.click(self.sidebar.x + 60, self.headers[1] - PANELS.index(panel) * self.unit)
 
     @property
@@ -200,7 +202,7 @@ def main() -> None:
     if name not in BARE:
         bpy.ops.preferences.addon_enable(module=PACKAGE)
     sys.path.insert(0, str(Path(__file__).parent))
-    modules = [importlib.import_module(module) for module in ("scenarios", "sessions")]
+    modules = [importlib.import_module(module) for module in ("scenarios", "sessions", "panels")]
     scenario = next(getattr(module, name) for module in modules if hasattr(module, name))
     screen = Screen(Path(folder))
     run(scenario(screen), screen)

@@ -18,22 +18,25 @@ SIDEBAR = (1288, 84, 1548, None)
 VIEW = (0, 50, 1576, 980)
 # name: (screenshot, part of it, width in the guide)
 IMAGES = {
+    "reconstruct": ("panels/one-button", SIDEBAR, 260),
+    "line": ("panels/measured-line", VIEW, 900),
+    "measure": ("panels/measured", SIDEBAR, 260),
     "preferences": ("preferences/preferences", (280, 362, 968, 690), 688),
     "drop": ("capture/drop-menu", (300, 300, 1000, 620), 480),
-    "capture": ("capture/posed-capture", SIDEBAR, 260),
+    "capture": ("panels/all-capture", SIDEBAR, 260),
     "posing": ("capture/posing", SIDEBAR, 260),
-    "poses": ("capture/posed-poses", SIDEBAR, 260),
+    "poses": ("panels/all-poses", SIDEBAR, 260),
     "scene": ("capture/scene", VIEW, 900),
     "align": ("tools/align", SIDEBAR, 260),
-    "classes": ("labelled/labelled-classes", SIDEBAR, 260),
-    "training": ("train/training", SIDEBAR, 260),
-    "trained": ("labelled/labelled-train", SIDEBAR, 260),
+    "classes": ("panels/all-classes", SIDEBAR, 260),
+    "training": ("panels/locked", SIDEBAR, 260),
+    "trained": ("panels/all-train", SIDEBAR, 260),
     "paused": ("interruptions/paused", SIDEBAR, 260),
     "died": ("interruptions/died", SIDEBAR, 260),
-    "render": ("labelled/labelled-render", SIDEBAR, 260),
-    "mesh": ("labelled/labelled-mesh", SIDEBAR, 260),
-    "export": ("labelled/labelled-export", SIDEBAR, 260),
-    "engine": ("labelled/labelled-engine", SIDEBAR, 260),
+    "render": ("panels/all-render", SIDEBAR, 260),
+    "mesh": ("panels/all-mesh", SIDEBAR, 260),
+    "export": ("panels/all-export", SIDEBAR, 260),
+    "engine": ("panels/all-engine", SIDEBAR, 260),
 }
 
 

@@ -133,7 +133,7 @@ def labelled(screen):
     settings.time_limit, settings.steps = 0.0, 0
     folder = next(path for path in bpy.utils.preset_paths("fieldwork/train"))
     preset = next(Path(folder).glob("*.py"))
-    bpy.ops.script.execute_preset(filepath=str(preset), menu_idname="FIELDWORK_MT_train_presets")
+    bpy.ops.script.execute_preset(filepath=str(preset), menu_idname="FIELDWORK_PT_train_presets")
     screen.facts["preset"] = [preset.name, settings.time_limit, settings.steps]
     yield from every_panel(screen, "labelled")
 

@@ -17,7 +17,7 @@ def faces(obj):
 
 def every_panel(screen, name):
     """Open the sub-panels one by one."""
-    for panel in ("capture", "poses", "classes", "train", "render", "mesh", "export", "engine"):
+    for panel in ("capture", "poses", "classes", "train", "render", "mesh", "measure", "export", "engine"):
         yield from screen.toggle(panel)
         yield 0.4
         screen.shot(f"{name}-{panel}")
@@ -53,7 +53,23 @@ def training(screen, operator, resume=False):
 
 
 def drop(screen, folder):
-    """Drag a photo from a file browser onto the viewport."""
+    """Drag a photo from a file browser onto the viewport, and open it in Fieldwork."""
+    target = yield from drag_photo(screen, folder)
+    # Blender itself can make an image of the photo: a menu asks. Which entry is under the mouse depends on its version.
+    screen.shot("drop-menu")
+    screen.press("O", *target)  # the underlined letter of “Open Photos or Project”
+    yield 0.5
+    yield from close_browser(screen)
+
+
+def close_browser(screen):
+    """Let the file browser be the properties again."""
+    next(area for area in screen.window.screen.areas if area.type == "FILE_BROWSER").type = "PROPERTIES"
+    yield 0.5
+
+
+def drag_photo(screen, folder):
+    """Drag a photo from a file browser onto the viewport; returns where it was let go."""
     browser = next(area for area in screen.window.screen.areas if area.type == "PROPERTIES")
     browser.type = "FILE_BROWSER"
     yield 1.0
@@ -82,12 +98,7 @@ def drop(screen, folder):
     screen.shot("dragging")
     screen.window.event_simulate(type="LEFTMOUSE", value="RELEASE", x=int(target[0]), y=int(target[1]))
     yield 1.0
-    # Blender itself can make an image of the photo: a menu asks. Which entry is under the mouse depends on its version.
-    screen.shot("drop-menu")
-    screen.press("O", *target)  # the underlined letter of “Open Photos or Project”
-    yield 0.5
-    browser.type = "PROPERTIES"
-    yield 0.5
+    return target
 
 
 def finish(screen):

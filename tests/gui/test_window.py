@@ -66,6 +66,47 @@ def test_photos_are_dropped_read_placed_and_shown(captured):
     assert {"empty", "dropped", "reading", "posing", "scene", "posed-capture", "posed-poses"} <= shots("capture")
 
 
+def test_panels_say_where_things_stand_and_lead_to_results():
+    window.simulate()
+    session = WINDOW("panels")
+    facts = session.play("panels", timeout=1100)
+    photos, empties = facts["without tab"]
+    assert photos == "", "a picture dropped where Fieldwork is not open is Blender's"
+    assert empties == 1
+    assert facts["verbs"][-2:] == ["reconstruct", "package"]
+    assert facts["meshes"] == 1, "what was reconstructed comes into the scene"
+    assert_never_held_up(facts)
+    facts = session.play("documents", timeout=900)
+    camera, row, perspective = facts["looked through"]
+    assert camera == row
+    assert perspective == "CAMERA"
+    assert facts["editors before"] == 0
+    assert facts["rendered"], "a render opens in an image editor"
+    assert any("top" in name or "plan" in name for name in facts["drawn"]), facts["drawn"]
+    assert facts["recent"].endswith("museum_fieldwork")
+    assert_never_held_up(facts)
+    assert {"one-button", "locked", "measured-line", "rendered", "recent", "all-measure"} <= shots("panels")
+
+
+def test_a_first_look_at_the_mesh_comes_soon_and_gives_way_to_it():
+    window.simulate()
+    project = window.BUILD / "trained"
+    shutil.rmtree(project, ignore_errors=True)
+    for arguments in (
+        ["import", window.MUSEUM / "ground_truth", project],
+        ["train", project, "--preset", "draft", "--steps", "300"],
+    ):
+        window.subprocess.run([sys.executable, "-m", "fieldwork.nerfcore", *arguments], check=True)
+    session = WINDOW("preview")
+    session.environment["FIELDWORK_TRAINED"] = str(project)
+    facts = session.play("preview", timeout=700)
+    assert facts["preview faces"] > 1000
+    assert facts["roles"] == ["mesh"]
+    if os.getloadavg()[0] <= (os.cpu_count() or 1):
+        assert facts["seconds"] < 20
+    assert_never_held_up(facts)
+
+
 def test_training_shows_its_curve_and_ends_as_a_mesh_in_the_scene(captured):
     facts = WINDOW("train").play("train", timeout=900)
     assert facts["curve"] > 10

@@ -22,7 +22,7 @@ from fieldwork.nerfcore.geometry.points import Points
 from fieldwork.nerfcore.params import EvaluateParams, MeshParams, RenderParams, TrainParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.schema import ImageRecord, PosedImage, Poses, Project, SemanticClass
-from fieldwork.nerfcore.project.store import save_poses, save_project
+from fieldwork.nerfcore.project.store import load_project, save_poses, save_project
 from fieldwork.nerfcore.render.run import read_checkpoint
 from fieldwork.nerfcore.render.verb import look_at
 from fieldwork.nerfcore.verbs import run_verb
@@ -139,6 +139,23 @@ def test_a_textured_mesh_has_uvs_and_colours(trained: Path, tmp_path: Path) -> N
     assert texture.shape == (128, 128, 3)
     red, blue = (texture[..., 0] > texture[..., 2] + 50).mean(), (texture[..., 2] > texture[..., 0] + 50).mean()
     assert min(red, blue) > 0.2
+
+
+def test_a_first_look_at_the_mesh_leaves_the_mesh_alone(trained: Path) -> None:
+    record = trained / "exports" / "main" / "mesh.json"
+    before = record.read_bytes() if record.is_file() else None
+    steps = len(load_project(trained).provenance)
+    result = run_verb("mesh", MeshParams(project=trained, preview=True), Reporter())
+    with np.load(result["preview"]) as data:
+        assert len(data["faces"]) == result["faces"] > 500
+        radius = np.linalg.norm(data["vertices"], axis=1)
+        assert abs(np.median(radius) - 0.5) < 3 * result["voxel"]
+        sure = np.abs(data["vertices"][:, 2]) > 0.15
+        ids = data["class_id"][sure]
+        assert (np.where(data["vertices"][sure, 2] > 0, 1, 2) == ids).mean() > 0.9
+        assert data["confidence"].min() > 0.3
+    assert (record.read_bytes() if record.is_file() else None) == before
+    assert len(load_project(trained).provenance) == steps
 
 
 def test_split_meshes_have_one_part_a_class(trained: Path, tmp_path: Path) -> None:

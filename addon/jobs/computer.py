@@ -1,0 +1,51 @@
+"""What is known of the computer that trains, before anything was trained on it."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+from .. import machine
+from ..engine import place
+from ..project.snapshot import cached_json
+
+FILE = "computer.json"  # of the machine: what the doctor found last
+STEPS = {"draft": 4000, "standard": 20000, "high": 60000}  # of the presets
+# Seconds of one core that a step takes on a CPU: of 5 185 steps on replica_room, see docs/benchmarks.md.
+CORE_SECONDS = {"standard": 0.46}
+
+
+def known() -> dict[str, Any]:
+    """What the doctor found last on this computer, when it was asked or the engine was installed; empty where it never
+    looked."""
+    found = cached_json(machine.user_folder() / FILE)
+    if isinstance(found, dict):
+        return found
+    return (place.installed(machine.engine_folder()) or {}).get("doctor") or {}
+
+
+def remember(found: dict[str, Any]) -> None:
+    """Keep what the doctor found."""
+    from ...nerfcore.files import write_json  # not at the top: enabling the extension must be quick
+
+    write_json(machine.user_folder() / FILE, found)
+
+
+def title(facts: dict[str, Any]) -> str:
+    """The device in a few words: “CPU, 4 cores”, “NVIDIA H100, 80 GB”."""
+    if facts.get("device") == "cpu":
+        return f"CPU, {facts.get('cores') or os.cpu_count()} cores"
+    name = facts.get("device_name") or str(facts.get("device", "?")).upper()
+    memory = facts.get("gpu_memory_gb")
+    return f"{name}, {memory:.0f} GB" if memory else name
+
+
+def rough_seconds(facts: dict[str, Any], preset: str, steps: int = 0) -> float | None:
+    """About how long a training takes on a CPU that none was timed on; None for graphics cards.
+
+    Args:
+        steps: of the training; 0: as many as the preset has.
+    """
+    if facts.get("device") != "cpu" or preset not in CORE_SECONDS:
+        return None
+    return (steps or STEPS[preset]) * CORE_SECONDS[preset] / max(1, facts.get("cores") or os.cpu_count() or 1)

@@ -49,8 +49,8 @@ def train_verdict(result: Mapping[str, Any], curve: Sequence[Mapping[str, float]
     each = result["seconds"] / max(done, 1)
     if done < warmup:
         text = (
-            f"Only {done} steps were trained; a field takes shape after {warmup}, and the settings plan {steps}. Here that "
-            f"is about {_duration(each * warmup)} and {_duration(each * steps)}: raise the limit of time or steps, or choose "
+            f"Only {done} steps were trained; a field takes shape after {warmup} (about {_duration(each * warmup)} here), and "
+            f"the settings plan {steps} (about {_duration(each * steps)}): raise the limit of time or steps, or choose "
             "smaller images (setting scene.image_size)."
         )
         return verdict([("failed", text)])

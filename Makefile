@@ -35,8 +35,8 @@ endif
 		--time-limit $(TRAIN_SECONDS) --blend $(DEMO)/scene.blend --report $(DEMO)/report.html --renders $(DEMO)/renders
 	@echo "Look at $(DEMO)/report.html, $(DEMO)/scene.blend and $(DEMO)/renders."
 
-# A file's tests share what they set up, so a worker takes whole files.
-WORKERS ?= 2
+# WORKERS=2: in two processes. A file's tests share what they set up, so a worker takes whole files.
+WORKERS ?= 0
 test: venv
 	$(BIN)/python -m pytest -m "not slow and not gui and not gpu" -n $(WORKERS) --dist loadfile $(PYTEST)
 

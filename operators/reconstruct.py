@@ -67,6 +67,11 @@ class FIELDWORK_OT_reconstruct(VerbOperator):
         options={"SKIP_SAVE"},
     )  # fmt: skip
 
+    render_count: IntProperty(
+        name="Render Count", description="Number of renders of new views, around the subject", default=8, min=1,
+        soft_max=120, options={"SKIP_SAVE"},
+    )  # fmt: skip
+
     holdout: HoldoutProperty()
 
     def parameters(self, context: Context) -> dict[str, Any]:
@@ -93,6 +98,7 @@ class FIELDWORK_OT_reconstruct(VerbOperator):
             "blend": absolute(self.blend),
             "report": absolute(self.report_file),
             "renders": absolute(self.renders),
+            "render_count": self.render_count,
         }
 
     def after(self) -> Done:

@@ -11,7 +11,7 @@ import torch
 import warp as wp
 from fieldwork.nerfcore.config import make_config
 from fieldwork.nerfcore.kernels.fused import render_coarse
-from fieldwork.nerfcore.render.fused import FusedRenderer, UnfusedRenderer, ray_renderer, unsupported
+from fieldwork.nerfcore.render.fused import FusedRenderer, UnfusedRenderer, _log_once, ray_renderer, unsupported
 from fieldwork.nerfcore.render.model import Model
 
 DEVICES = [
@@ -172,6 +172,7 @@ def test_the_setting_chooses_the_kernel_and_says_why_not(caplog: pytest.LogCaptu
     assert chosen(render__fused="on") is FusedRenderer
     assert chosen(render__fused="auto") is UnfusedRenderer  # no GPU
     assert chosen(render__fused="off") is UnfusedRenderer
+    _log_once.cache_clear()  # another test may have heard it
     with caplog.at_level(logging.WARNING, "fieldwork"):
         assert chosen(render__fused="on", field__implicit_layers="3") is UnfusedRenderer
     assert "field.implicit_layers is 3" in caplog.text

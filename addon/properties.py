@@ -20,12 +20,22 @@ PRESETS = [
     ("standard", "Standard", "Good quality in reasonable time"),
     ("high", "High", "Best quality; takes several times longer"),
 ]
+# Numbered, as files that were saved before "automatic" was there hold the numbers.
 MASK_MODES = [
-    ("ignore", "Unknown", "Nothing is learned from these pixels: for masks that hide people or reflections"),
+    (
+        "automatic",
+        "Automatic",
+        "Empty space where masks cut an object out of nearly all photos, else unknown",
+        "NONE",
+        2,
+    ),
+    ("ignore", "Unknown", "Nothing is learned from these pixels: for masks that hide people or reflections", "NONE", 0),
     (
         "empty",
         "Empty Space",
         "There is nothing along these rays: for masks around an object, on a turntable for instance",
+        "NONE",
+        1,
     ),
 ]
 POSE_PRESETS = [
@@ -194,6 +204,7 @@ class FieldworkScene(PropertyGroup):
         name="Black in Masks",
         description="What black pixels of a mask mean",
         items=MASK_MODES,
+        default="automatic",
     )
     max_size: IntProperty(
         name="Working Size",

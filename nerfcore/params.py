@@ -157,7 +157,7 @@ class ImportParams(Params):
         "realityscan",
         "meshroom",
     ] = "auto"
-    mask_mode: Literal["ignore", "empty"] = Field(default="ignore", description="what black mask pixels mean")
+    mask_mode: Literal["ignore", "empty"] | None = Field(default=None, description=MASK_MODE)
 
 
 class PosesParams(Params):

@@ -55,6 +55,11 @@ def hold_out(operator: Operator, context: Context) -> int:
     return runs.HOLDOUT if context.scene.fieldwork.hold_out else 0
 
 
+def mask_mode(chosen: str) -> str | None:
+    """What black in masks means, as the verbs take it; None: the engine looks at the masks."""
+    return None if chosen == "automatic" else chosen
+
+
 def engine_reason() -> str | None:
     """Why no engine can be started, None when one can."""
     if machine.engine_python() is None:

@@ -12,7 +12,7 @@ from ..addon.project import snapshot
 from ..addon.properties import MASK_MODES
 from ..addon.props import BoolProperty, CollectionProperty, EnumProperty, StringProperty
 from ..addon.text import t
-from .base import ProjectOperator, need_photos, need_project_folder, scene_settings, set_if_empty
+from .base import ProjectOperator, mask_mode, need_photos, need_project_folder, scene_settings, set_if_empty
 
 PHOTOS = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".heic", ".heif", ".webp", ".exr", ".dng", ".bmp"}
 VIDEOS = {".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v"}
@@ -91,11 +91,12 @@ class FIELDWORK_OT_new(ProjectOperator):
             raise ValueError(t("Choose a folder of photos, or a video, first."))
         project = self.project_path(context)
         set_if_empty(context.scene, project)
-        plain = ("mask_mode", "max_size", "frames", "keep_blurry")
+        plain = ("max_size", "frames", "keep_blurry")
         return {
             "project": project,
             "photos": photos,
             **{name: self.path(context, name) for name in ("labels", "masks", "classes")},
+            "mask_mode": mask_mode(self.value(context, "mask_mode")),
             **{name: self.value(context, name) for name in plain},
             "add": self.add,
         }
@@ -113,7 +114,11 @@ class FIELDWORK_OT_import_dataset(ProjectOperator):
     )
     format: EnumProperty(name="Format", description="Kind of the data set", items=FORMATS, options={"SKIP_SAVE"})
     mask_mode: EnumProperty(
-        name="Black in Masks", description="What black pixels of a mask mean", items=MASK_MODES, options={"SKIP_SAVE"}
+        name="Black in Masks",
+        description="What black pixels of a mask mean",
+        items=MASK_MODES,
+        default="automatic",
+        options={"SKIP_SAVE"},
     )
 
     def invoke(self, context: Context, event: bpy.types.Event) -> set[str]:
@@ -128,7 +133,12 @@ class FIELDWORK_OT_import_dataset(ProjectOperator):
         given = self.properties.is_property_set("project") and bool(self.project)
         project = Path(self.project_path(context)) if given else project_for(source)
         context.scene.fieldwork.project = str(project)
-        return {"dataset": str(source), "project": str(project), "format": self.format, "mask_mode": self.mask_mode}
+        return {
+            "dataset": str(source),
+            "project": str(project),
+            "format": self.format,
+            "mask_mode": mask_mode(self.mask_mode),
+        }
 
 
 class FIELDWORK_OT_open(Operator):

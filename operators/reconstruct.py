@@ -19,6 +19,7 @@ from .base import (
     VerbOperator,
     absolute,
     hold_out,
+    mask_mode,
     need_project_folder,
     refresh_scenes,
     scene_of,
@@ -77,7 +78,7 @@ class FIELDWORK_OT_reconstruct(VerbOperator):
     def parameters(self, context: Context) -> dict[str, Any]:
         out = absolute(self.out or context.scene.fieldwork.project)
         given = {name: self.path(context, name) for name in ("photos", "labels", "masks", "classes")}
-        given["mask_mode"] = self.value(context, "mask_mode")
+        given["mask_mode"] = mask_mode(self.value(context, "mask_mode"))
         if given["photos"] is None and out:
             # A project that was opened knows its photos.
             known = snapshot.source(Path(out))

@@ -17,7 +17,7 @@ from ..images.working import read_picture
 from ..kernels.closest import ClosestPoints
 from ..measure.closing import closed
 from ..mesh.clean import areas, components, cross, unit
-from ..mesh.facelets import Facelets, facelets
+from ..mesh.facelets import Facelets, small_pieces
 from ..mesh.metrics import Distances, distances, sample_surface
 from ..mesh.painted import Painted
 from ..mesh.surface import Surface
@@ -31,7 +31,6 @@ FAR = 2.5  # of the median depth of the photos: what is farther is a background
 MOST_CAPPED = 0.25  # share of a body's area that may stand on something
 HIDDEN = 0.5  # footprints of a pixel that something lies in front of what it hides
 STEEPEST = 0.1  # cosine under which a camera is not said to see a place
-PIECES = 60  # pieces along the longest side: depth buffers leave out triangles that reach behind a camera
 SAMPLES = 100_000
 SAME_SIDE = np.cos(np.radians(60))
 
@@ -106,10 +105,6 @@ class Sight:
 def posed(views: Sequence[View]) -> list[PosedCamera]:
     """The cameras of views in the world."""
     return [PosedCamera(view.camera, np.asarray(view.camera_to_world, np.float64)) for view in views]
-
-
-def small_pieces(vertices: np.ndarray, faces: np.ndarray) -> Facelets:
-    return facelets(vertices, faces, None, float(np.ptp(vertices, axis=0).max()) / PIECES)
 
 
 def surface_figures(

@@ -19,7 +19,7 @@ from ..project.fingerprints import Earlier, Fingerprint, compare, digest, files_
 from ..project.schema import ImageRecord, Project
 from ..project.store import PROJECT_FILE, create_folder, edit_project, load_project
 from .find import Source, classes_beside, find_sources, list_photos, subfolder
-from .mask_mode import MaskMode, guess_mask_mode
+from .mask_mode import MaskMode, chosen_mask_mode
 from .select import reject_blurred, reject_duplicates
 from .video import VIDEO_SUFFIXES, extract_frames
 from .working_copies import Settings, make_working_copies
@@ -253,20 +253,13 @@ def _warn(records: list[ImageRecord], rejected: list[dict[str, str]], report: Re
 def _mask_mode(
     params: NewParams, previous: Project | None, folder: Path, records: list[ImageRecord], report: Reporter
 ) -> MaskMode:
-    """What black in masks means: as asked for, as before where photos are added, else guessed, which is said."""
+    """What black in masks means: as before where photos are added, else as asked for or as it looks."""
     if previous is not None and params.add and (params.mask_mode is None or not params.masks):
         return previous.mask_mode
-    if params.mask_mode is not None:
-        return params.mask_mode
     used = [record for record in records if record.status != "rejected"]
-    masks = [folder / record.mask for record in used if record.mask]
-    mode = guess_mask_mode(masks, len(used))
-    if mode == "empty":
-        report.note(
-            f"The masks cut an object out of nearly all {len(used)} photos: what is black in them is taken as empty space "
-            "(--mask-mode empty). Where there is something that only shall not count, use --mask-mode ignore."
-        )
-    return mode
+    return chosen_mask_mode(
+        params.mask_mode, [folder / record.mask for record in used if record.mask], len(used), report
+    )
 
 
 def _put_in(

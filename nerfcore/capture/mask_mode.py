@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 
 from ..images.labels import read_mask
+from ..progress import Reporter
 
 MaskMode = Literal["ignore", "empty"]
 # Not tuned. A mask that hides passers-by, the sky or a tripod is white along most of the border of its photo, or black
@@ -16,6 +17,17 @@ MaskMode = Literal["ignore", "empty"]
 NEARLY_ALL = 0.9  # of the photos have such a mask
 BORDER = 0.8  # of its border is black
 SIDE = 0.5  # of each of three sides at least; objects stand on the fourth
+
+
+def chosen_mask_mode(asked: MaskMode | None, masks: Sequence[Path], photos: int, report: Reporter) -> MaskMode:
+    """What was asked for, else a guess, of which a note tells where it changes anything; see `guess_mask_mode`."""
+    mode = asked or guess_mask_mode(masks, photos)
+    if asked is None and mode == "empty":
+        report.note(
+            f"The masks cut an object out of nearly all {photos} photos: what is black in them is taken as empty space "
+            "(--mask-mode empty). Where there is something that only shall not count, use --mask-mode ignore."
+        )
+    return mode
 
 
 def guess_mask_mode(masks: Sequence[Path], photos: int) -> MaskMode:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ..capture.mask_mode import chosen_mask_mode
 from ..errors import InputError, ProjectError
 from ..files import file_hash, require_readable
 from ..geometry.cameras import Camera
@@ -64,6 +65,8 @@ def import_dataset(params: ImportParams, report: Reporter) -> dict[str, Any]:
         "labelled": sum(record.label is not None for record in records),
         "classes": [c.name for c in classes],
     }
+    masks = [folder / record.mask for record in records if record.mask]
+    mask_mode = chosen_mask_mode(params.mask_mode, masks, len(records), report)
     save_poses(folder, Poses(source=dataset.format, cameras=cameras, images=images), dataset.points)
     with edit_project(folder, Project()) as project:
         project.images, project.classes, project.ignore_id = records, classes, dataset.ignore_id
@@ -73,7 +76,7 @@ def import_dataset(params: ImportParams, report: Reporter) -> dict[str, Any]:
             scale_known=dataset.scale_known,
             bounds=None if dataset.bounds is None else dataset.bounds.tolist(),
         )
-        project.mask_mode, project.provenance = params.mask_mode, []
+        project.mask_mode, project.provenance = mask_mode, []
         project.record("import", params.model_dump(mode="json"), result)
     return result
 

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+PIECES = 60  # for depth buffers, along the longest side of a mesh
+
 
 @dataclass(frozen=True)
 class Facelets:
@@ -67,6 +69,11 @@ def facelets(
         neighbours,
         opposite,
     )
+
+
+def small_pieces(vertices: np.ndarray, faces: np.ndarray, corners: np.ndarray | None = None) -> Facelets:
+    """A mesh in pieces for a depth buffer, which leaves out triangles that reach behind the camera; see `facelets`."""
+    return facelets(vertices, faces, corners, float(np.ptp(vertices, axis=0).max()) / PIECES)
 
 
 def _halved(

@@ -11,12 +11,11 @@ from ..geometry.cameras import rays
 from ..images.picture import resized
 from ..images.working import nearest, read_image, read_picture
 from ..kernels.raycast import FrontFaces
-from .facelets import facelets
+from .facelets import small_pieces
 from .photos import Photo
 from .visibility import PosedCamera, depth_buffer
 
 MOST_PHOTOS, ACROSS = 16, 48  # photos that are asked, evenly spread, and rays across each
-PIECES = 60  # pieces along the longest side: depth buffers leave out triangles that reach behind a camera
 
 
 def cut_out(view: View, mask_mode: str) -> np.ndarray | None:
@@ -34,7 +33,7 @@ def silhouette(scene: Scene, vertices: np.ndarray, faces: np.ndarray, check: Cal
     """Intersection over union of what held-out photos cut out (of all photos where none is held out) and what a mesh,
     vertices (V, 3) and faces (F, 3) in the scene's frame, covers there; None where nothing is cut out."""
     views = [scene.views[i] for i in scene.test or scene.train][:MOST_PHOTOS]
-    pieces = facelets(vertices, faces, None, float(np.ptp(vertices, axis=0).max()) / PIECES)
+    pieces = small_pieces(vertices, faces)
     both = either = 0
     for view in views:
         check()

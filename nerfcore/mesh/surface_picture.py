@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from ..images.picture import linear_to_srgb, to_bytes
-from .facelets import facelets
+from .facelets import small_pieces
 from .photos import LINEAR, halvings, sample
 from .visibility import PosedCamera, depth_buffer
 
@@ -30,8 +30,7 @@ def surface_picture(
         (H, W, 3) uint8, black where there is no surface, and (H, W) float32: share of the pixel that hits the surface.
     """
     width, height = view.camera.width, view.camera.height
-    # Triangles that reach behind the camera are not drawn: they should be small.
-    pieces = facelets(vertices, faces, corners, float(np.ptp(vertices, axis=0).max()) / 60)
+    pieces = small_pieces(vertices, faces, corners)
     assert pieces.corners is not None
     vertices, faces, corners = pieces.vertices, pieces.faces, pieces.corners
     fine = replace(view, camera=view.camera.resized(width * samples, height * samples))

@@ -266,7 +266,12 @@ settings.photos = "/photos"
 look()
 verb, params = asked[0]
 names = ("photos", "labels", "masks", "mask_mode", "out")
-answer({"seen": seen, "verb": verb, "params": {name: params.get(name) for name in names}})
+settings.project = project + "2"
+bpy.ops.fieldwork.reconstruct()
+settings.mask_mode = "ignore"
+bpy.ops.fieldwork.reconstruct()
+modes = [given["mask_mode"] for _, given in asked[1:]]
+answer({"seen": seen, "verb": verb, "params": {name: params.get(name) for name in names}, "modes": modes})
 """,
         project=tmp_path / "project",
     )
@@ -280,6 +285,7 @@ answer({"seen": seen, "verb": verb, "params": {name: params.get(name) for name i
         "mask_mode": "empty",
         "out": str(tmp_path / "project"),
     }
+    assert facts["modes"] == [None, "ignore"]  # "Automatic" leaves it to the engine
 
 
 def test_recent_projects_are_remembered_and_opened(bpy_script, tmp_path):

@@ -16,22 +16,8 @@ from fieldwork.nerfcore.geometry.cameras import Camera
 from fieldwork.nerfcore.params import ImportParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.store import load_project
-from fieldwork.tests.nerfcore.support.photos import picture
+from fieldwork.tests.nerfcore.support.writers import data_set
 from PIL import Image
-
-
-def data_set(folder: Path, head: dict[str, Any] | None = None, count: int = 3, **frame: Any) -> Path:
-    """Photos in a row with a transforms.json; what is given by name stands in the second frame."""
-    (folder / "images").mkdir(parents=True)
-    frames = []
-    for i in range(count):
-        picture(i).save(folder / "images" / f"f{i}.png")
-        pose = np.eye(4)
-        pose[0, 3] = i
-        frames.append({"file_path": f"images/f{i}.png", "transform_matrix": pose.tolist(), **(frame if i == 1 else {})})
-    text = json.dumps({"fl_x": 300.0, **(head or {}), "frames": frames})
-    (folder / "transforms.json").write_text(text)
-    return folder
 
 
 @pytest.mark.parametrize(
@@ -151,6 +137,18 @@ def test_what_black_in_masks_means_can_be_said_of_a_data_set(tmp_path: Path) -> 
     folder = data_set(tmp_path / "d", {"aabb_scale": 1})
     import_dataset(ImportParams(dataset=folder, project=tmp_path / "p", mask_mode="empty"), Reporter())
     assert load_project(tmp_path / "p").mask_mode == "empty"
+
+
+@pytest.mark.parametrize(("white", "mode"), [((90, 40, 230, 160), "empty"), ((0, 60, 320, 200), "ignore")])
+def test_masks_of_a_data_set_say_what_black_means(tmp_path: Path, white: tuple[int, int, int, int], mode: str) -> None:
+    folder = data_set(tmp_path / "d", {"aabb_scale": 1})
+    (folder / "masks").mkdir()
+    for image in (folder / "images").iterdir():
+        mask = Image.new("L", (320, 200), 0)
+        mask.paste(255, white)
+        mask.save(folder / "masks" / f"{image.stem}.png")
+    import_dataset(ImportParams(dataset=folder, project=tmp_path / "p"), Reporter())
+    assert load_project(tmp_path / "p").mask_mode == mode
 
 
 def test_deeply_nested_json_is_no_data_set(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 import pycolmap
 from fieldwork.nerfcore.data.dataset import DatasetView
 from fieldwork.nerfcore.geometry.cameras import Camera, flip_camera_axes, project, rays
+from fieldwork.tests.nerfcore.support.photos import picture
 from PIL import Image
 
 
@@ -267,3 +268,17 @@ def write_llff(views: list[DatasetView], folder: Path) -> None:
         matrix = np.stack([down, right, -ahead, view.camera_to_world[:3, 3], [660, 1000, view.camera.fx]], -1)
         rows.append([*matrix.ravel(), 1.0, 10.0])
     np.save(folder / "poses_bounds.npy", np.array(rows))
+
+
+def data_set(folder: Path, head: dict[str, Any] | None = None, count: int = 3, **frame: Any) -> Path:
+    """Photos in a row with a transforms.json; what is given by name stands in the second frame."""
+    (folder / "images").mkdir(parents=True)
+    frames = []
+    for i in range(count):
+        picture(i).save(folder / "images" / f"f{i}.png")
+        pose = np.eye(4)
+        pose[0, 3] = i
+        frames.append({"file_path": f"images/f{i}.png", "transform_matrix": pose.tolist(), **(frame if i == 1 else {})})
+    text = json.dumps({"fl_x": 300.0, **(head or {}), "frames": frames})
+    (folder / "transforms.json").write_text(text)
+    return folder

@@ -25,7 +25,8 @@ DRAW_PERIOD = 0.4  # seconds between two drawings of the panels and the status b
 def tick(queue: Queue) -> float:
     """One look at the engine, and at what the scene says of its project. Returns the seconds until the next."""
     begin, busy_since = time.perf_counter(), time.thread_time()
-    doing = f"{queue.current.stage} {queue.current.message}" if queue.current else ""
+    job = queue.current
+    doing = f"{job.verb}: {job.stage} {job.message}" if job else ""
     # Edits before jobs: a training that starts now is to know of them.
     for part in (_follow_region, lambda: edits.send(queue.ask), lambda: follow(queue), queue.work):
         try:

@@ -86,6 +86,16 @@ class Screen:
         self.press("LEFTMOUSE", x + 1, y)
         yield 0.2
 
+    def scroll_down(self, notches: int) -> Steps:
+        """Turn the wheel over the sidebar."""
+        x, y = (int(middle) for middle in (self.sidebar.x + 60, self.sidebar.y + self.sidebar.height / 2))
+        self.move(x, y)
+        yield 0.1
+        for _ in range(notches):
+            self.window.event_simulate(type="WHEELDOWNMOUSE", value="PRESS", x=x, y=y)
+            yield 0.05
+        yield 0.3
+
     def shot(self, name: str) -> None:
         bpy.ops.wm.redraw_timer(type="DRAW_WIN_SWAP", iterations=1)
         subprocess.run(["import", "-window", "root", str(self.folder / f"{name}.png")], check=True)

@@ -119,6 +119,7 @@ def back(screen):
     settings.run = "main"
     yield 1.0
     screen.facts["runs"] = screen.module("addon.project.runs").runs(screen.folder / "project")
+    yield from screen.scroll_down(40)  # the runs are the last in the panel
     yield from screen.press_button("fieldwork.use_run", depth=2000)
     screen.facts["used"] = settings.run
     screen.shot("runs")
@@ -145,11 +146,11 @@ def tools(screen):
     screen.facts["searched"] = queue.current.verb
     yield from screen.idle(60)
 
-    # The menu, walked with the arrow keys: three below the first entry comes that of the poses.
+    # The menu, walked with the arrow keys: four below the first entry comes that of the poses.
     with bpy.context.temp_override(window=screen.window, area=screen.area, region=screen.view):
         bpy.ops.wm.call_menu("INVOKE_DEFAULT", name="FIELDWORK_MT_steps")
     yield 0.5
-    for _ in range(3):
+    for _ in range(4):
         screen.press("DOWN_ARROW", x, y)
         yield 0.2
     screen.shot("menu")

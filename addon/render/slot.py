@@ -7,7 +7,7 @@ from pathlib import Path
 import bpy
 
 MARK = "fieldwork_render"
-BYTES = "fieldwork_bytes"  # of the file, as the image was read from it
+BYTES, MODIFIED = "fieldwork_bytes", "fieldwork_modified"  # of the file, as the image was read from it
 
 
 def load_image(path: Path) -> bpy.types.Image:
@@ -15,15 +15,17 @@ def load_image(path: Path) -> bpy.types.Image:
 
     One the user painted on stays for him, and a new one comes beside it.
     """
-    count = len(bpy.data.images)
+    count, file = len(bpy.data.images), path.stat()
     image = bpy.data.images.load(str(path), check_existing=True)
     if len(bpy.data.images) == count:
         if painted(image):
             image.use_fake_user = True
             others = (other for other in bpy.data.images if is_of(other, path) and not painted(other))
             image = next(others, None) or bpy.data.images.load(str(path), check_existing=False)
-        image.reload()
-    image[BYTES] = path.stat().st_size
+        # A large texture holds the window up while it is given up.
+        if (image.get(BYTES), image.get(MODIFIED)) != (file.st_size, file.st_mtime):
+            image.reload()
+    image[BYTES], image[MODIFIED] = file.st_size, file.st_mtime
     return image
 
 

@@ -221,6 +221,25 @@ answer(seen)
     assert second == first, "nothing piles up"
 
 
+def test_pictures_are_read_again_only_when_their_files_changed(bpy_script, package):
+    facts = bpy_script(
+        IMPORT
+        + """
+image = made.cameras[0].data.background_images[0].image
+seen = []
+for change in (False, True):
+    if change:
+        os.utime(f"{package}/images/view_000.png", (1, 1))
+    image.pixels[0]
+    update()
+    seen.append(image.has_data)
+answer(seen)
+""",
+        package=package,
+    )
+    assert facts == [True, False]
+
+
 def test_the_scene_is_left_alone_until_object_mode(bpy_script, package, tmp_path):
     facts = bpy_script(
         """

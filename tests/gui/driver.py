@@ -124,7 +124,8 @@ class Screen:
             rows = sorted(main, key=lambda place: -place[2])
             whole = rows[0][0].startswith("bpy.ops.fieldwork.reconstruct(")
             below = self.unit * 1.8 if job else (16 if whole else 24) + self.unit / 2
-            self.headers = (state, rows[1 if whole else 0][2] - below)
+            others = (place for place in rows if not place[0].startswith("bpy.ops.fieldwork.reconstruct("))
+            self.headers = (state, next(others, rows[0])[2] - below)
         yield from self.click(self.sidebar.x + 60, self.headers[1] - PANELS.index(panel) * self.unit)
 
     @property

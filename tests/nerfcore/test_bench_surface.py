@@ -30,6 +30,7 @@ from fieldwork.nerfcore.mesh.uv import UvMap
 from fieldwork.nerfcore.params import BenchParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.verbs import run_verb
+from fieldwork.tests.nerfcore.support.ball import SMALL
 from fieldwork.tests.nerfcore.support.depth_views import orbit
 from fieldwork.tests.nerfcore.test_training import tiny_project  # noqa: F401
 
@@ -167,7 +168,9 @@ def test_the_suite_measures_each_field_while_it_is_there(
         seen.append((project / "runs" / job.name / "field.safetensors").is_file())
         return {"f_size": 0.5, "f_pixel": 0.25, "stages": {"Fusing": 1.0}}
 
-    params = BenchParams(suite="surface", out=tmp_path, scenes=[str(tiny_project)], steps=3)
+    params = BenchParams(
+        suite="surface", out=tmp_path, scenes=[str(tiny_project)], steps=3, preset="draft", set=SMALL
+    )
     with pytest.raises(InputError, match="true surface"):
         run_verb("bench", params, Reporter())
     monkeypatch.setattr(suite, "measure", measure)

@@ -168,9 +168,7 @@ def test_the_suite_measures_each_field_while_it_is_there(
         seen.append((project / "runs" / job.name / "field.safetensors").is_file())
         return {"f_size": 0.5, "f_pixel": 0.25, "stages": {"Fusing": 1.0}}
 
-    params = BenchParams(
-        suite="surface", out=tmp_path, scenes=[str(tiny_project)], steps=3, preset="draft", set=TINY
-    )
+    params = BenchParams(suite="surface", out=tmp_path, scenes=[str(tiny_project)], steps=3, preset="draft", set=TINY)
     with pytest.raises(InputError, match="true surface"):
         run_verb("bench", params, Reporter())
     monkeypatch.setattr(suite, "measure", measure)

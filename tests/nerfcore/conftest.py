@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,9 +18,14 @@ Data = Callable[[str], Path]
 
 
 @pytest.fixture(scope="session")
-def fountain(shared_data: Data, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The fountain, ingested at 1000 pixels and posed; tests that change it copy it."""
-    project = tmp_path_factory.mktemp("poses") / "Brunnen ü"
-    ingest(shared_data("fountain_p11"), project, max_size=1000)
+def unposed_fountain(shared_data: Data, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The fountain, ingested at 1000 pixels; tests copy it."""
+    return ingest(shared_data("fountain_p11"), tmp_path_factory.mktemp("ingested") / "p", max_size=1000)
+
+
+@pytest.fixture(scope="session")
+def fountain(unposed_fountain: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The fountain with poses; tests that change it copy it."""
+    project = Path(shutil.copytree(unposed_fountain, tmp_path_factory.mktemp("poses") / "Brunnen ü"))
     poses(project)
     return project

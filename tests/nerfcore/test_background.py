@@ -86,7 +86,7 @@ def test_nothing_is_put_around_an_object(tmp_path: Path, value: int, name: str) 
     project = on_background(ball_project(tmp_path / "p"), value)
     found = {}
     for run, settings in (("main", SMALL), ("filled", {**SMALL, "scene.background": "random"})):
-        run_verb("train", TrainParams(project=project, preset="draft", run=run, steps=500, set=settings), Reporter())
+        run_verb("train", TrainParams(project=project, preset="draft", run=run, steps=250, set=settings), Reporter())
         found[run] = opacities(project, run, value)
     config = json.loads((project / "runs" / "main" / "config.json").read_text())
     assert config["config"]["scene"]["background"] == name

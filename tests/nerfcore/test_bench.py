@@ -6,6 +6,7 @@ import json
 import re
 import threading
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,7 +14,7 @@ from pathlib import Path
 import pytest
 import torch
 from click.testing import CliRunner
-from fieldwork.nerfcore.bench import machine
+from fieldwork.nerfcore.bench import machine, suites, tables
 from fieldwork.nerfcore.bench.jobs import Job, interrupted
 from fieldwork.nerfcore.bench.machine import run_yardstick
 from fieldwork.nerfcore.bench.page import figures_folder
@@ -27,6 +28,15 @@ from fieldwork.tests.nerfcore.test_training import tiny_project  # noqa: F401
 from PIL import Image
 
 TINY = {**SMALL, "sampling.samples": "4", "render.samples": "4"}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_frames() -> Iterator[None]:
+    """Frames that only count samples are of 40×40."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (suites, tables):
+            patch.setattr(module, "COUNTING_SIDE", 40)
+        yield
 
 
 class Recorder(Reporter):

@@ -31,6 +31,7 @@ from fieldwork.nerfcore.params import BenchParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.verbs import run_verb
 from fieldwork.tests.nerfcore.support.depth_views import orbit
+from fieldwork.tests.nerfcore.test_bench import TINY
 from fieldwork.tests.nerfcore.test_training import tiny_project  # noqa: F401
 
 CAMERA = Camera(width=90, height=90, fx=100.0, fy=100.0, cx=45.0, cy=45.0)
@@ -167,7 +168,7 @@ def test_the_suite_measures_each_field_while_it_is_there(
         seen.append((project / "runs" / job.name / "field.safetensors").is_file())
         return {"f_size": 0.5, "f_pixel": 0.25, "stages": {"Fusing": 1.0}}
 
-    params = BenchParams(suite="surface", out=tmp_path, scenes=[str(tiny_project)], steps=3)
+    params = BenchParams(suite="surface", out=tmp_path, scenes=[str(tiny_project)], steps=3, preset="draft", set=TINY)
     with pytest.raises(InputError, match="true surface"):
         run_verb("bench", params, Reporter())
     monkeypatch.setattr(suite, "measure", measure)

@@ -81,19 +81,29 @@ def test_report(fountain: Path) -> None:
         assert np.asarray(picture.convert("L")).std() > 10
 
 
-@pytest.mark.parametrize("later", ["same", "other preset", "features lost"])
-def test_adding_photos_keeps_old_cameras(shared_data: Data, tmp_path: Path, later: str) -> None:
-    """Whatever features the first run used, and whether they are still there."""
-    photos = sorted((shared_data("fountain_p11") / "images").iterdir())
-    (tmp_path / "first").mkdir()
-    (tmp_path / "later").mkdir()
-    for i, photo in enumerate(photos):
-        shutil.copy(photo, tmp_path / ("later" if i in (3, 8) else "first"))
-    project = ingest(tmp_path / "first", tmp_path / "p", max_size=1000)
+@pytest.fixture(scope="module")
+def nine_and_two(shared_data: Data, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A project with nine posed photos of the fountain, and a folder with the other two."""
+    place = tmp_path_factory.mktemp("nine")
+    (place / "first").mkdir()
+    (place / "later").mkdir()
+    for i, photo in enumerate(sorted((shared_data("fountain_p11") / "images").iterdir())):
+        shutil.copy(photo, place / ("later" if i in (3, 8) else "first"))
+    project = ingest(place / "first", place / "p", max_size=1000)
     assert poses(project)["registered"] == 9
+    return project, place / "later"
+
+
+@pytest.mark.parametrize("later", ["same", "other preset", "features lost"])
+def test_adding_photos_keeps_old_cameras(
+    shared_data: Data, nine_and_two: tuple[Path, Path], tmp_path: Path, later: str
+) -> None:
+    """Whatever features the first run used, and whether they are still there."""
+    first, more = nine_and_two
+    project = Path(shutil.copytree(first, tmp_path / "p"))
     before = {image.name: image.camera_to_world for image in load_poses(project).images}
     frame = load_project(project).frame
-    ingest(tmp_path / "later", project, add=True, max_size=1000)
+    ingest(more, project, add=True, max_size=1000)
     if later == "features lost":
         shutil.rmtree(project / "poses" / "sfm")
     assert poses(project, "standard" if later == "other preset" else "fast")["registered"] == 11

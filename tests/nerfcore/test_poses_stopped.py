@@ -10,7 +10,6 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -19,9 +18,7 @@ from fieldwork.nerfcore.params import PosesParams
 from fieldwork.nerfcore.poses import process
 from fieldwork.nerfcore.poses.estimate import estimate_poses
 from fieldwork.nerfcore.progress import Reporter
-from fieldwork.tests.nerfcore.support.captures import ingest, poses
-
-Data = Callable[[str], Path]
+from fieldwork.tests.nerfcore.support.captures import poses
 
 
 def verified_pairs(project: Path) -> int:
@@ -31,8 +28,8 @@ def verified_pairs(project: Path) -> int:
 
 
 @pytest.mark.parametrize("stage", ["Finding features", "Matching features", "Placing cameras"])
-def test_cancel_is_prompt_and_work_is_kept(shared_data: Data, tmp_path: Path, stage: str) -> None:
-    project = ingest(shared_data("fountain_p11"), tmp_path / "p", max_size=1000)
+def test_cancel_is_prompt_and_work_is_kept(unposed_fountain: Path, tmp_path: Path, stage: str) -> None:
+    project = Path(shutil.copytree(unposed_fountain, tmp_path / "p"))
 
     class Stops(Reporter):
         asked = 0.0
@@ -61,9 +58,9 @@ def test_cancel_is_prompt_and_work_is_kept(shared_data: Data, tmp_path: Path, st
     "stage", ["Finding features", "Matching features", "Placing cameras", "Checking poses", "Final adjustment"]
 )
 def test_killed_in_each_stage_then_run_again(
-    shared_data: Data, tmp_path: Path, stage: str, monkeypatch: pytest.MonkeyPatch
+    unposed_fountain: Path, tmp_path: Path, stage: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    project = ingest(shared_data("fountain_p11"), tmp_path / "p", max_size=1000)
+    project = Path(shutil.copytree(unposed_fountain, tmp_path / "p"))
     started: list[subprocess.Popen] = []
     popen = subprocess.Popen
 
@@ -124,8 +121,8 @@ def test_mapping_goes_on_from_a_snapshot(fountain: Path, tmp_path: Path) -> None
     assert not (memory / "snapshots").exists()
 
 
-def test_worker_ends_with_its_parent(shared_data: Data, tmp_path: Path) -> None:
-    project = ingest(shared_data("fountain_p11"), tmp_path / "p", max_size=1000)
+def test_worker_ends_with_its_parent(unposed_fountain: Path, tmp_path: Path) -> None:
+    project = Path(shutil.copytree(unposed_fountain, tmp_path / "p"))
     code = (
         "import sys; from pathlib import Path; from fieldwork.nerfcore.poses import process; import subprocess\n"
         "popen = subprocess.Popen\n"
@@ -151,10 +148,10 @@ def test_worker_ends_with_its_parent(shared_data: Data, tmp_path: Path) -> None:
         assert not Path(f"/proc/{worker}").exists()
 
 
-def test_full_disk_while_matching(shared_data: Data, tmp_path: Path) -> None:
+def test_full_disk_while_matching(unposed_fountain: Path, tmp_path: Path) -> None:
     disk = tmp_path / "disk"
     disk.mkdir()
-    project = ingest(shared_data("fountain_p11"), disk / "p", max_size=1000)
+    project = Path(shutil.copytree(unposed_fountain, disk / "p"))
     command = ["mount", "-t", "tmpfs", "-o", "size=3m", "tmpfs", str(project / "poses")]
     (project / "poses").mkdir()
     mounted = subprocess.run(command, capture_output=True, text=True, check=False) if shutil.which("mount") else None

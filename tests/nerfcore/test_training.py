@@ -323,8 +323,8 @@ def test_one_image_is_not_enough(tiny_project: Path, tmp_path: Path) -> None:
 )
 def test_every_choice_changes_what_is_learned_and_stays_finite(tiny_project: Path, setting: dict[str, str]) -> None:
     if not (tiny_project / "runs" / "default" / "field.safetensors").is_file():
-        train(tiny_project, "default", 60)
-    result = train(tiny_project, "choice", 60, **setting)
+        train(tiny_project, "default", 40)
+    result = train(tiny_project, "choice", 40, **setting)
     assert math.isfinite(result["psnr_train"])
     ours, default = tensors(tiny_project, "choice"), tensors(tiny_project, "default")
     assert all(bool(torch.isfinite(t).all()) for t in ours.values() if t.is_floating_point())

@@ -66,9 +66,9 @@ def reconstructed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def fake(patch: pytest.MonkeyPatch) -> None:
     patch.setattr("fieldwork.nerfcore.mesh.verb.build", triangle)
     patch.setitem(workflow.STAGES, "poses", workflow.Stage(known_poses, posed))
-    # Small enough for a test; what is asked of each stage stays the same from call to call.
+    # Small enough for a test (a texture of 4096 takes 20 s); what is asked of each stage stays the same from call to call.
     small = {
-        "mesh": {"resolution": 24},
+        "mesh": {"resolution": 24, "texture": 64},
         "render": {"orbit": 1, "size": (16, 16), "passes": ["rgb"]},
     }
     for verb, values in small.items():

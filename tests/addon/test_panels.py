@@ -270,7 +270,7 @@ settings.project = project + "2"
 bpy.ops.fieldwork.reconstruct()
 settings.mask_mode = "ignore"
 bpy.ops.fieldwork.reconstruct()
-modes = [given["mask_mode"] for _, given in asked[1:]]
+modes = [given.get("mask_mode") for asked_verb, given in asked if asked_verb == "reconstruct"][1:]
 answer({"seen": seen, "verb": verb, "params": {name: params.get(name) for name in names}, "modes": modes})
 """,
         project=tmp_path / "project",

@@ -17,14 +17,19 @@ def start_model(model: Any, path: Path, image_folder: Path, folder: Path) -> Pat
     A model of other features than the database's keeps its poses and lenses, and gets points from the database's
     features.
     """
+    taken_to(model, path, image_folder, folder).write(str(folder))
+    return folder
+
+
+def taken_to(model: Any, path: Path, image_folder: Path, folder: Path) -> Any:
+    """The model with the ids and features of the database `path`: itself where it has them; `folder` is made anew."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    if not belongs_to(model, path):
-        bare = posed_model(model, path)
-        bare.write(str(folder))
-        model = pycolmap.triangulate_points(bare, path, image_folder, folder, clear_points=True)
-    model.write(str(folder))
-    return folder
+    if belongs_to(model, path):
+        return model
+    bare = posed_model(model, path)
+    bare.write(str(folder))
+    return pycolmap.triangulate_points(bare, path, image_folder, folder, clear_points=True)
 
 
 def belongs_to(model: Any, path: Path) -> bool:

@@ -18,6 +18,7 @@ import pycolmap
 
 from . import features, mapping, second_look
 from .adjust import bundle_adjust
+from .transfer import set_lens_models
 from .validate import GOOD_AGREEMENT, MIN_MATCHES, check_images, pair_agreements, pair_images
 
 # What COLMAP asks of one photo that is placed by known points (abs_pose_min_num_inliers, abs_pose_min_inlier_ratio,
@@ -128,6 +129,7 @@ def similarity(ties: Ties, small: Any, large: Any) -> tuple[Any, np.ndarray] | N
     found: Any = pycolmap.estimate_sim3d_robust(ties.xyz[distinct, 0], ties.xyz[distinct, 1], options)
     if found is None:
         return None
+    large_from_small = found["tgt_from_src"]  # the stub of pycolmap says that this is all that comes back
     there, back = large_from_small.matrix(), large_from_small.inverse().matrix()
     moved = ties.xyz[:, 0] @ there[:, :3].T + there[:, 3]
     returned = ties.xyz[:, 1] @ back[:, :3].T + back[:, 3]
@@ -186,6 +188,7 @@ def _settled(model: Any, path: Path, image_folder: Path, folder: Path) -> Any:
     bundle_adjust(model, full=False)
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
+    set_lens_models(path, model)
     model = pycolmap.triangulate_points(model, path, image_folder, folder, clear_points=False)
     shutil.rmtree(folder)
     bundle_adjust(model, full=False)

@@ -26,10 +26,23 @@ def taken_to(model: Any, path: Path, image_folder: Path, folder: Path) -> Any:
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     if belongs_to(model, path):
+        set_lens_models(path, model)
         return model
     bare = posed_model(model, path)
+    set_lens_models(path, bare)
     bare.write(str(folder))
     return pycolmap.triangulate_points(bare, path, image_folder, folder, clear_points=True)
+
+
+def set_lens_models(path: Path, model: Any) -> None:
+    """Give the lenses in the database `path` the lens models that those of `model` have: COLMAP refuses to go on from a
+    model with others, and the database has those of the last attempt."""
+    with database(path) as db:
+        for camera in db.read_all_cameras():
+            if model.exists_camera(camera.camera_id) and model.camera(camera.camera_id).model != camera.model:
+                camera.model = model.camera(camera.camera_id).model
+                camera.params = model.camera(camera.camera_id).params
+                db.update_camera(camera)
 
 
 def belongs_to(model: Any, path: Path) -> bool:

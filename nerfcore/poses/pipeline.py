@@ -83,8 +83,6 @@ def run(job: dict[str, Any], tell: Any) -> dict[str, Any]:
         if best.registered >= ENOUGH * len(names) or (job["group"] and best.registered):
             break
     assert best is not None
-    for sentence in best.joined:
-        tell.warn(sentence)
     if job["group"] and not best.registered:
         raise PosesError(f"The photos do not fall into {job['group'] + 1} groups.", "Choose a smaller --group.")
     if best.registered < MIN_REGISTERED:
@@ -92,6 +90,8 @@ def run(job: dict[str, Any], tell: Any) -> dict[str, Any]:
             _why_nothing(best, names), "Take more photos that overlap by two thirds, with texture in view."
         )
     if not job["group"]:
+        for sentence in best.joined:
+            tell.warn(sentence)
         best = _second_look(best, job, names, tell)
     tell.stage("Final adjustment")
     model = best.models[0] = adjust(best.models[0], keep_cameras=job["start"] is not None)

@@ -12,8 +12,8 @@ import numpy as np
 import pycolmap
 import pytest
 from fieldwork.nerfcore.geometry.similarity import fit_similarity, transform_points
-from fieldwork.nerfcore.poses import features, mapping, merge, pipeline
-from fieldwork.nerfcore.poses.presets import FAST
+from fieldwork.nerfcore.poses import features, mapping, merge, pipeline, second_look
+from fieldwork.nerfcore.poses.presets import FAST, STANDARD, Level
 from fieldwork.nerfcore.poses.validate import check_images, pair_images
 
 FRAMES, OF_SMALL, POINTS, STRAY = 16, 6, 250, 120
@@ -50,15 +50,18 @@ class Scene:
     def merged(self, folder: Path) -> tuple[list[Any], list[str]]:
         return merge.merge_models([self.large, self.small], self.database, folder, folder / "work", Told())
 
+    def names(self) -> list[str]:
+        return sorted(self.true.image(i).name for i in self.true.reg_image_ids())
+
     def across(self) -> list[tuple[int, int]]:
         """Pairs of an image of the large model alone and one of the small one alone."""
         large, small = set(self.large.reg_image_ids()), set(self.small.reg_image_ids())
         return [(a, b) for a in sorted(large - small) for b in sorted(small - large)]
 
 
-def make_scene(folder: Path, common: int = 0) -> Scene:
+def make_scene(folder: Path, common: int = 0, level: Level = FAST) -> Scene:
     """Sixteen photos around points; the last six are the small model, which holds `common` photos of the large one."""
-    path = folder / FAST.database
+    path = folder / level.database
     options = pycolmap.SyntheticDatasetOptions()
     options.num_rigs, options.num_frames_per_rig = 1, FRAMES
     options.num_points3D, options.num_points2D_without_point3D = POINTS, STRAY
@@ -196,47 +199,72 @@ def test_matches_that_contradict_the_joined_model(tmp_path: Path) -> None:
     assert [model.num_reg_images() for model in models] == [10, 6]
 
 
-def test_joined_groups_end_the_climb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The pipeline on a mapper that finds two models."""
-    scene = make_scene(tmp_path)
+def run_pipeline(scene: Scene, folder: Path, preset: str, monkeypatch: pytest.MonkeyPatch) -> tuple[dict, Told]:
+    """The pipeline's result on a mapper that finds the two models, and what it said."""
     build = mapping.build
 
     def two_models(*arguments: Any, **further: Any) -> list[Any]:
         return build(*arguments, **further) if "start" in further else [scene.large, scene.small]
 
     monkeypatch.setattr(mapping, "build", two_models)
-    names = sorted(scene.true.image(i).name for i in scene.true.reg_image_ids())
     camera = scene.true.image(scene.true.reg_image_ids()[0]).camera
     size = {"width": camera.width, "height": camera.height, "focal_px": camera.mean_focal_length()}
     told = Told()
     job = {
-        "image_folder": str(tmp_path),
+        "image_folder": str(folder),
         "masks": None,
-        "work": str(tmp_path),
-        "sparse": str(tmp_path / "sparse"),
-        "preset": "fast",
+        "work": str(folder),
+        "sparse": str(folder / "sparse"),
+        "preset": preset,
         "neighbours": 3,
         "video": False,
         "restart": False,
         "group": 0,
         "start": None,
-        "images": [{"file": name, "group": "all", **size} for name in names],
+        "images": [{"file": name, "group": "all", **size} for name in scene.names()],
     }
-    result = pipeline.run(job, told)
+    return pipeline.run(job, told), told
+
+
+def test_joined_groups_end_the_climb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = make_scene(tmp_path)
+    result, told = run_pipeline(scene, tmp_path, "fast", monkeypatch)
     assert result["groups"] == [FRAMES]
     assert [image["status"] for image in result["images"]] == ["ok"] * FRAMES
     assert len(told.warnings) == 1
     assert "groups of 10 and 6 photos were joined" in told.warnings[0]
     centres = np.stack([np.array(image["camera_to_world"])[:3, 3] for image in result["images"]])
-    asked = np.stack([scene.true.find_image_with_name(name).projection_center() for name in names])
+    asked = np.stack([scene.true.find_image_with_name(name).projection_center() for name in scene.names()])
     misfit = transform_points(fit_similarity(centres, asked), centres) - asked
     assert np.linalg.norm(misfit, axis=1).max() < 0.002 * np.linalg.norm(np.ptp(asked, axis=0))
 
 
+def test_affine_features_join_groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing matches across the groups but what a second database of further features has."""
+    scene = make_scene(tmp_path, level=STANDARD)
+    further = features.copy_database(scene.database, tmp_path / "further.db")
+    write_matches(scene.database, {pair: np.zeros((0, 2)) for pair in scene.across()})
+    asked_for: list[list[set[str]]] = []
+
+    def found(clusters: list[set[str]], path: Path, joined: Path, *_: Any) -> bool:
+        asked_for.append(clusters)
+        second_look.join(path, further, joined)
+        return True
+
+    monkeypatch.setattr(second_look, "add_affine_features", found)
+    result, told = run_pipeline(scene, tmp_path, "standard", monkeypatch)
+    assert len(asked_for) == 1
+    assert result["groups"] == [FRAMES]
+    assert [image["status"] for image in result["images"]] == ["ok"] * FRAMES
+    assert "separate groups of 10 and 6: looking for affine features" in told.warnings[0]
+    assert "were joined" in told.warnings[1]
+    assert len(told.warnings) == 2
+    assert result["level"] == "standard, groups joined"
+
+
 def test_bridges_are_photos_of_both_models(tmp_path: Path) -> None:
     scene = make_scene(tmp_path)
-    names = [scene.true.image(i).name for i in scene.true.reg_image_ids()]
-    clusters = merge.bridges([scene.large, scene.small], scene.database, names)
+    clusters = merge.bridges([scene.large, scene.small], scene.database, scene.names())
     first = {scene.large.image(i).name for i in scene.large.reg_image_ids()}
     assert len(clusters) == OF_SMALL
     assert all(cluster & first and cluster - first for cluster in clusters)

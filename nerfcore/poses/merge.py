@@ -42,7 +42,9 @@ class Ties:
     pixels: np.ndarray
 
 
-def merge_models(models: list[Any], path: Path, image_folder: Path, work: Path, tell: Any) -> tuple[list[Any], list[str]]:
+def merge_models(
+    models: list[Any], path: Path, image_folder: Path, work: Path, tell: Any
+) -> tuple[list[Any], list[str]]:
     """Join to the first of the models, the largest, those that share enough with it by the matches in `path`.
 
     Returns:
@@ -207,7 +209,9 @@ def _holds(joined: Any, large: Any, fresh: set[int], only_large: set[int], path:
             total += count
     if agreed < GOOD_AGREEMENT * total:
         return False
-    stood, stand = ({i for i, check in check_images(model, path)[0].items() if not check.bad} for model in (large, joined))
+    stood, stand = (
+        {i for i, check in check_images(model, path)[0].items() if not check.bad} for model in (large, joined)
+    )
     return stood <= stand and 2 * len(fresh & stand) >= len(fresh)
 
 

@@ -105,9 +105,7 @@ def _lacking_and_mates(model: Any, path: Path, names: list[str]) -> list[set[str
     for name in ordered:
         if name in placed:
             continue
-        scores = {
-            other: features.mutual_matches(largest[name], largest[other]) for other in ordered if other != name
-        }
+        scores = {other: features.mutual_matches(largest[name], largest[other]) for other in ordered if other != name}
         best = sorted(scores, key=lambda other: -scores[other])[:MATES]
         clusters.append({name, *neighbours(name, ordered), *(other for other in best if scores[other] > 0)})
     return not_too_many(clusters)

@@ -59,14 +59,18 @@ def adjust(model: Any, keep_cameras: bool) -> Any:
         return model
     if not has_long_lens(model):
         freed = copy.deepcopy(model)
-        _adjust(freed, full=True)
+        bundle_adjust(freed, full=True)
         if not has_odd_lens(freed):
             return freed
-    _adjust(model, full=False)
+    bundle_adjust(model, full=False)
     return model
 
 
-def _adjust(model: Any, full: bool) -> None:
+def bundle_adjust(model: Any, full: bool) -> None:
+    """Bundle adjustment in place, with Cauchy's loss; points that miss by more than four pixels are taken out.
+
+    `full` gives lenses of many photos all of OPENCV's parameters, and refines a principal point that can be seen.
+    """
     taken = collections.Counter(model.image(i).camera_id for i in model.reg_image_ids())
     for camera_id, count in taken.items():
         camera = model.camera(camera_id)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import zlib  # noqa: F401  (must be loaded before pycolmap, which exports a static zlib)
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +15,11 @@ import pycolmap
 from ..errors import PosesError
 from ..files import write_json
 from ..geometry.colmap_cameras import camera_from_colmap
-from . import chain, features, mapping, second_look
+from . import chain, features, mapping, merge, second_look
 from .adjust import adjust, has_long_lens, has_odd_lens
 from .presets import ENOUGH, EXHAUSTIVE_AT_MOST, EXHAUSTIVE_UP_TO, LADDERS, Level
 from .resume import mapping_folder
-from .transfer import start_model
+from .transfer import start_model, taken_to
 from .validate import MIN_MATCHES, MIN_POINTS, ImageCheck, pair_images
 
 # Not tuned: the first two, which only choose the sentence that says why a photo has no pose.
@@ -32,7 +32,7 @@ LEVEL_FILE = "level.json"  # features of the model in poses/sparse
 @dataclass
 class Attempt:
     """The outcome of one level: its models (largest first), and what validation says of the first one; `contradicting`:
-    pairs of frames whose matches were taken out, see `chain`."""
+    pairs of frames whose matches were taken out, see `chain`; `joined`: sentences about separate models that became one."""
 
     level: Level
     database: Path
@@ -41,6 +41,7 @@ class Attempt:
     links: dict[tuple[int, int], int]
     dropped: dict[int, ImageCheck]
     contradicting: int = 0
+    joined: list[str] = field(default_factory=list)
 
     @property
     def registered(self) -> int:
@@ -76,7 +77,7 @@ def run(job: dict[str, Any], tell: Any) -> dict[str, Any]:
         tried.add(signature)
         if best is not None:
             tell.warn(f"{_placed(best, names)}: trying again ({level.name}).")
-        attempt = _attempt(job, level, names, exhaustive, tell)
+        attempt = _join_groups(_attempt(job, level, names, exhaustive, tell), job, names, tell)
         if best is None or attempt.registered > best.registered:
             best = attempt
         if best.registered >= ENOUGH * len(names) or (job["group"] and best.registered):
@@ -89,6 +90,8 @@ def run(job: dict[str, Any], tell: Any) -> dict[str, Any]:
             _why_nothing(best, names), "Take more photos that overlap by two thirds, with texture in view."
         )
     if not job["group"]:
+        for sentence in best.joined:
+            tell.warn(sentence)
         best = _second_look(best, job, names, tell)
     tell.stage("Final adjustment")
     model = best.models[0] = adjust(best.models[0], keep_cameras=job["start"] is not None)
@@ -139,6 +142,7 @@ def _attempt(job: dict[str, Any], level: Level, names: list[str], exhaustive: bo
             continue  # lenses are those of the model that is extended
         memory = mapping_folder(work, path, full, relaxed, names) if start is None else None
         models = mapping.build(path, image_folder, work / "models", relaxed, names, tell, start, memory)
+        models, joined = merge.merge_models(models, path, image_folder, work, tell)
         if len(models) <= job["group"]:
             continue
         models.insert(0, models.pop(job["group"]))
@@ -151,7 +155,7 @@ def _attempt(job: dict[str, Any], level: Level, names: list[str], exhaustive: bo
         doubtful = full and (has_long_lens(model) or has_odd_lens(model))
         if model.num_reg_images() > best.registered or (best_doubtful and model.num_reg_images() >= MIN_REGISTERED):
             best, best_doubtful = (
-                replace(best, models=[model, *models[1:]], checks=checks, links=links, dropped=dropped),
+                Attempt(level, path, [model, *models[1:]], checks, links, dropped, contradicting, joined),
                 doubtful,
             )
         if best_doubtful:
@@ -159,6 +163,36 @@ def _attempt(job: dict[str, Any], level: Level, names: list[str], exhaustive: bo
         if best.registered >= ENOUGH * len(names):
             break
     return best
+
+
+def _join_groups(found: Attempt, job: dict[str, Any], names: list[str], tell: Any) -> Attempt:
+    """Join separate models by affine features between them, where they would be enough together."""
+    work, image_folder = Path(job["work"]), Path(job["image_folder"])
+    masks = Path(job["masks"]) if job["masks"] else None
+    together = set().union(*({model.image(i).name for i in model.reg_image_ids()} for model in found.models))
+    if len(found.models) < 2 or job["group"] or not found.registered < ENOUGH * len(names) <= len(together):
+        return found
+    if found.level.affine or job["preset"] == "fast":
+        return found
+    level = replace(found.level, name=f"{found.level.name}, groups joined", joined=True)
+    path = work / level.database
+    clusters = merge.bridges(found.models, found.database, names)
+    if not clusters:
+        return found
+    tell.warn(f"{_placed(found, names)}: looking for affine features that join them.")
+    second_look.add_affine_features(clusters, found.database, path, image_folder, masks, job["images"], tell)
+    _tell_apart(job, path, names, tell)
+    models = [taken_to(model, path, image_folder, work / "groups") for model in found.models]
+    models, joined = merge.merge_models(models, path, image_folder, work, tell)
+    if not joined:
+        return found
+    tell.stage("Checking poses")
+    model, checks, links, dropped = mapping.repair(models[0], path, image_folder, work, False, names, tell)
+    if model is None or model.num_reg_images() <= found.registered:
+        return found
+    return Attempt(
+        level, path, [model, *models[1:]], checks, links, dropped, found.contradicting, [*found.joined, *joined]
+    )
 
 
 def _tell_apart(job: dict[str, Any], path: Path, names: list[str], tell: Any) -> int:

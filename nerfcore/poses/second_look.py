@@ -66,15 +66,31 @@ def with_affine_features(
     Returns:
         whether there is anything new in it.
     """
-    names = [image["file"] for image in images]
-    groups = _lacking_and_mates(model, path, names)
-    touched = sorted(set().union(*groups))
+    clusters = _lacking_and_mates(model, path, [image["file"] for image in images])
+    return add_affine_features(clusters, path, joined, image_folder, masks, images, tell)
+
+
+def add_affine_features(
+    clusters: list[set[str]],
+    path: Path,
+    joined: Path,
+    image_folder: Path,
+    masks: Path | None,
+    images: list[dict[str, Any]],
+    tell: Any,
+) -> bool:
+    """Make the database `joined`: that of `path`, and affine features of clusters of photos, by name, matched within each.
+
+    Returns:
+        whether there is anything new in it.
+    """
+    touched = sorted(set().union(*clusters))
     if not touched:
         return False
     affine = path.with_name(AFFINE.database)
     features.add_images(affine, image_folder, [image for image in images if image["file"] in touched])
     features.extract(affine, image_folder, masks, touched, AFFINE, tell)
-    pairs = sorted({pair for group in groups for pair in features.all_pairs(sorted(group))})
+    pairs = sorted({pair for cluster in clusters for pair in features.all_pairs(sorted(cluster))})
     features.match(affine, pairs, path.with_name("pairs.txt"), tell)
     join(path, affine, joined)
     return True
@@ -82,30 +98,44 @@ def with_affine_features(
 
 def _lacking_and_mates(model: Any, path: Path, names: list[str]) -> list[set[str]]:
     """For each photo without a pose: itself and its likely mates, as long as not too many come together."""
-    ordered = sorted(names)
     placed = {model.image(i).name for i in model.reg_image_ids()}
-    groups: list[set[str]] = []
-    touched: set[str] = set()
-    with features.database(path) as db:
-        ids = {image.name: image.image_id for image in db.read_all_images()}
-        largest = {
-            name: features.largest_features(db, ids[name], features.RETRIEVAL_FEATURES)
-            for name in ordered
-            if name in ids and db.exists_keypoints(ids[name])
-        }
-    for k, name in enumerate(ordered):
-        if name in placed or name not in largest:
+    largest = retrieval_features(path)
+    ordered = sorted(set(names) & set(largest))
+    clusters: list[set[str]] = []
+    for name in ordered:
+        if name in placed:
             continue
-        scores = {
-            other: features.mutual_matches(largest[name], values) for other, values in largest.items() if other != name
-        }
+        scores = {other: features.mutual_matches(largest[name], largest[other]) for other in ordered if other != name}
         best = sorted(scores, key=lambda other: -scores[other])[:MATES]
-        near = [other for other in ordered[max(0, k - NEIGHBOURS) : k + NEIGHBOURS + 1] if other in largest]
-        group = {name, *near, *(other for other in best if scores[other] > 0)}
-        if len(touched | group) <= AT_MOST:
-            groups.append(group)
-            touched |= group
-    return groups
+        clusters.append({name, *neighbours(name, ordered), *(other for other in best if scores[other] > 0)})
+    return not_too_many(clusters)
+
+
+def retrieval_features(path: Path) -> dict[str, np.ndarray]:
+    """By name of the photo, descriptors of its features of largest scale, of all photos that have features."""
+    with features.database(path) as db:
+        return {
+            image.name: features.largest_features(db, image.image_id, features.RETRIEVAL_FEATURES)
+            for image in db.read_all_images()
+            if db.exists_keypoints(image.image_id)
+        }
+
+
+def neighbours(name: str, ordered: list[str]) -> list[str]:
+    """The nearest photos by name, to either side."""
+    k = ordered.index(name)
+    return ordered[max(0, k - NEIGHBOURS) : k] + ordered[k + 1 : k + NEIGHBOURS + 1]
+
+
+def not_too_many(clusters: list[set[str]]) -> list[set[str]]:
+    """The first clusters of photos, and those after them that fit into the limit of photos in all."""
+    chosen: list[set[str]] = []
+    touched: set[str] = set()
+    for cluster in clusters:
+        if len(touched | cluster) <= AT_MOST:
+            chosen.append(cluster)
+            touched |= cluster
+    return chosen
 
 
 def join(path: Path, other: Path, joined: Path) -> None:

@@ -17,14 +17,32 @@ def start_model(model: Any, path: Path, image_folder: Path, folder: Path) -> Pat
     A model of other features than the database's keeps its poses and lenses, and gets points from the database's
     features.
     """
+    taken_to(model, path, image_folder, folder).write(str(folder))
+    return folder
+
+
+def taken_to(model: Any, path: Path, image_folder: Path, folder: Path) -> Any:
+    """The model with the ids and features of the database `path`: itself where it has them; `folder` is made anew."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    if not belongs_to(model, path):
-        bare = posed_model(model, path)
-        bare.write(str(folder))
-        model = pycolmap.triangulate_points(bare, path, image_folder, folder, clear_points=True)
-    model.write(str(folder))
-    return folder
+    if belongs_to(model, path):
+        set_lens_models(path, model)
+        return model
+    bare = posed_model(model, path)
+    set_lens_models(path, bare)
+    bare.write(str(folder))
+    return pycolmap.triangulate_points(bare, path, image_folder, folder, clear_points=True)
+
+
+def set_lens_models(path: Path, model: Any) -> None:
+    """Give the lenses in the database `path` the lens models that those of `model` have: COLMAP refuses to go on from a
+    model with others, and the database has those of the last attempt."""
+    with database(path) as db:
+        for camera in db.read_all_cameras():
+            if model.exists_camera(camera.camera_id) and model.camera(camera.camera_id).model != camera.model:
+                camera.model = model.camera(camera.camera_id).model
+                camera.params = model.camera(camera.camera_id).params
+                db.update_camera(camera)
 
 
 def belongs_to(model: Any, path: Path) -> bool:

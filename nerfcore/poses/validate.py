@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -43,36 +44,19 @@ def check_images(reconstruction: Any, path: Path) -> tuple[dict[int, ImageCheck]
         checks by image id, and the number of inlier matches of each verified pair of registered images.
     """
     registered = set(reconstruction.reg_image_ids())
-    with database(path) as db:
-        pair_ids, geometries = db.read_two_view_geometries()
-        keypoints = {i: np.asarray(db.read_keypoints(i))[:, :2] for i in registered}
-    images = {i: reconstruction.image(i) for i in registered}
-    normalised = {i: _normalised(images[i].camera, keypoints[i]) for i in registered}
-    focal = {i: images[i].camera.mean_focal_length() for i in registered}
-    poses = {i: images[i].cam_from_world().matrix() for i in registered}
     good = dict.fromkeys(registered, 0.0)
     total = dict.fromkeys(registered, 0.0)
     mates = dict.fromkeys(registered, 0)
     links: dict[tuple[int, int], int] = {}
-    for pair_id, geometry in zip(pair_ids, geometries):
-        a, b = pair_images(pair_id)
-        matches = np.asarray(geometry.inlier_matches)
-        if a not in registered or b not in registered or len(matches) < MIN_MATCHES:
-            continue
-        links[a, b] = len(matches)
-        if len(matches) > MATCHES_PER_PAIR:
-            picked = matches[np.linspace(0, len(matches) - 1, MATCHES_PER_PAIR).astype(int)]
-        else:
-            picked = matches
-        distance = sampson_distance(poses[a], poses[b], normalised[a][picked[:, 0]], normalised[b][picked[:, 1]])
-        share = float((distance * (focal[a] + focal[b]) / 2 <= TOLERANCE_PX).mean())
+    for a, b, share, count in pair_agreements(reconstruction, path):
+        links[a, b] = count
         for image in (a, b):
-            good[image] += share * len(matches)
-            total[image] += len(matches)
+            good[image] += share * count
+            total[image] += count
             mates[image] += 1
     checks = {}
     for i in registered:
-        observed = [point.point3D_id for point in images[i].get_observation_points2D()]
+        observed = [point.point3D_id for point in reconstruction.image(i).get_observation_points2D()]
         errors = [reconstruction.point3D(point).error for point in observed]
         checks[i] = ImageCheck(
             agreement=good[i] / total[i] if total[i] else None,
@@ -81,6 +65,30 @@ def check_images(reconstruction: Any, path: Path) -> tuple[dict[int, ImageCheck]
             mates=mates[i],
         )
     return checks, links
+
+
+def pair_agreements(reconstruction: Any, path: Path) -> Iterator[tuple[int, int, float, int]]:
+    """Of every verified pair of registered images: their ids, the share of its matches within 4 px of the epipolar
+    lines, and the number of its matches."""
+    registered = set(reconstruction.reg_image_ids())
+    with database(path) as db:
+        pair_ids, geometries = db.read_two_view_geometries()
+        keypoints = {i: np.asarray(db.read_keypoints(i))[:, :2] for i in registered}
+    images = {i: reconstruction.image(i) for i in registered}
+    normalised = {i: _normalised(images[i].camera, keypoints[i]) for i in registered}
+    focal = {i: images[i].camera.mean_focal_length() for i in registered}
+    poses = {i: images[i].cam_from_world().matrix() for i in registered}
+    for pair_id, geometry in zip(pair_ids, geometries):
+        a, b = pair_images(pair_id)
+        matches = np.asarray(geometry.inlier_matches)
+        if a not in registered or b not in registered or len(matches) < MIN_MATCHES:
+            continue
+        if len(matches) > MATCHES_PER_PAIR:
+            picked = matches[np.linspace(0, len(matches) - 1, MATCHES_PER_PAIR).astype(int)]
+        else:
+            picked = matches
+        distance = sampson_distance(poses[a], poses[b], normalised[a][picked[:, 0]], normalised[b][picked[:, 1]])
+        yield a, b, float((distance * (focal[a] + focal[b]) / 2 <= TOLERANCE_PX).mean()), len(matches)
 
 
 def pair_images(pair_id: int) -> tuple[int, int]:

@@ -35,8 +35,9 @@ endif
 		--time-limit $(TRAIN_SECONDS) --blend $(DEMO)/scene.blend --report $(DEMO)/report.html --renders $(DEMO)/renders
 	@echo "Look at $(DEMO)/report.html, $(DEMO)/scene.blend and $(DEMO)/renders."
 
-# WORKERS=2: in two processes. A file's tests share what they set up, so a worker takes whole files.
-WORKERS ?= 0
+# In two processes of 2.5 GB where there are two cores, WORKERS=0: in one. A worker takes whole files, whose tests share what
+# they set up.
+WORKERS ?= $(if $(filter 1,$(shell nproc 2>/dev/null || echo 1)),0,2)
 test: venv
 	$(BIN)/python -m pytest -m "not slow and not gui and not gpu" -n $(WORKERS) --dist loadfile $(PYTEST)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import time
 import zlib  # noqa: F401  (must be loaded before pycolmap, which exports a static zlib)
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,16 +22,29 @@ LONG_LENS = 1.5  # focal length in long sides from which a lens counts as long (
 FOCAL_GUESS = 0.85  # of the long side, where EXIF says nothing: 31 mm in terms of 35 mm film
 RETRIEVAL_FEATURES = 256  # of a photo; fewer where photos are many, which are all compared
 PAIRS_PER_IMAGE = 16
+BUSY_SECONDS = 5.0  # how long a database may be in another process' hands
 
 
 @contextmanager
 def database(path: Path) -> Iterator[Any]:
     """An open pycolmap database, closed afterwards."""
-    opened = pycolmap.Database.open(str(path))
+    opened = _opened(path)
     try:
         yield opened
     finally:
         opened.close()
+
+
+def _opened(path: Path) -> Any:
+    """A database, which the process that counts its rows may hold for a moment: COLMAP does not wait for it."""
+    end = time.monotonic() + BUSY_SECONDS
+    while True:
+        try:
+            return pycolmap.Database.open(str(path))
+        except RuntimeError as error:
+            if time.monotonic() > end or not path.is_file() or "database factory" not in str(error):
+                raise
+        time.sleep(0.05)
 
 
 @contextmanager
@@ -39,11 +53,12 @@ def watched(path: Path, table: str, total: int, tell: Any, noun: str) -> Iterato
 
     The parent process counts them: two copies of SQLite (Python's and COLMAP's) in one process undo each other's locks.
     """
-    tell.watch(str(path), table, total, noun)
-    try:
-        yield
-    finally:
-        tell.watch_end()
+    with database(path):  # while it is open here, COLMAP's own opening meets no lock of the parent
+        tell.watch(str(path), table, total, noun)
+        try:
+            yield
+        finally:
+            tell.watch_end()
 
 
 def copy_database(path: Path, target: Path) -> Path:

@@ -27,7 +27,7 @@ IMAGES = {
     "posing": ("capture/posing", SIDEBAR, 260),
     "poses": ("panels/all-poses", SIDEBAR, 260),
     "scene": ("capture/scene", VIEW, 900),
-    "align": ("tools/align", SIDEBAR, 260),
+    "align": ("panels/measured-line", SIDEBAR, 260),
     "classes": ("panels/all-classes", SIDEBAR, 260),
     "training": ("panels/locked", SIDEBAR, 260),
     "trained": ("panels/all-train", SIDEBAR, 260),

@@ -23,6 +23,7 @@ FOCAL_GUESS = 0.85  # of the long side, where EXIF says nothing: 31 mm in terms 
 RETRIEVAL_FEATURES = 256  # of a photo; fewer where photos are many, which are all compared
 PAIRS_PER_IMAGE = 16
 BUSY_SECONDS = 5.0  # how long a database may be in another process' hands
+SQLITE_HEADER = b"SQLite format 3\0"  # sqlite.org/fileformat.html, section 1.3
 
 
 @contextmanager
@@ -42,9 +43,18 @@ def _opened(path: Path) -> Any:
         try:
             return pycolmap.Database.open(str(path))
         except RuntimeError as error:
-            if time.monotonic() > end or not path.is_file() or "database factory" not in str(error):
+            if time.monotonic() > end or not _is_database(path) or "database factory" not in str(error):
                 raise
         time.sleep(0.05)
+
+
+def _is_database(path: Path) -> bool:
+    """Whether a file begins as SQLite's do: what does not is damaged, and waiting would not help."""
+    try:
+        with path.open("rb") as file:
+            return file.read(len(SQLITE_HEADER)) == SQLITE_HEADER
+    except OSError:
+        return False
 
 
 @contextmanager

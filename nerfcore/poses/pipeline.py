@@ -228,9 +228,8 @@ def _second_look(best: Attempt, job: dict[str, Any], names: list[str], tell: Any
         return best
     level = replace(best.level, name=f"{best.level.name}, second look", joined=True)
     joined = work / level.database
-    if not second_look.with_affine_features(
-        best.models[0], best.database, joined, image_folder, masks, job["images"], tell
-    ):
+    clusters = second_look.lacking_and_mates(best.models[0], best.database, names)
+    if not second_look.add_affine_features(clusters, best.database, joined, image_folder, masks, job["images"], tell):
         return best
     _tell_apart(job, joined, names, tell)
     placed = second_look.place_rest(best.models[0], joined, image_folder, work, names, tell)

@@ -52,24 +52,6 @@ def place_rest(
     return larger, checks, links, dropped
 
 
-def with_affine_features(
-    model: Any,
-    path: Path,
-    joined: Path,
-    image_folder: Path,
-    masks: Path | None,
-    images: list[dict[str, Any]],
-    tell: Any,
-) -> bool:
-    """Make the database `joined`: that of `path`, and affine features around the photos that `model` lacks.
-
-    Returns:
-        whether there is anything new in it.
-    """
-    clusters = _lacking_and_mates(model, path, [image["file"] for image in images])
-    return add_affine_features(clusters, path, joined, image_folder, masks, images, tell)
-
-
 def add_affine_features(
     clusters: list[set[str]],
     path: Path,
@@ -96,7 +78,7 @@ def add_affine_features(
     return True
 
 
-def _lacking_and_mates(model: Any, path: Path, names: list[str]) -> list[set[str]]:
+def lacking_and_mates(model: Any, path: Path, names: list[str]) -> list[set[str]]:
     """For each photo without a pose: itself and its likely mates, as long as not too many come together."""
     placed = {model.image(i).name for i in model.reg_image_ids()}
     largest = retrieval_features(path)

@@ -46,3 +46,12 @@ def test_one_that_stays_in_other_hands_is_told(tmp_path: Path, monkeypatch: pyte
     with held(path, 2) as holder, pytest.raises(RuntimeError, match="factory"), features.database(path):
         pass
     assert holder.wait() == 0
+
+
+def test_a_damaged_one_is_told_at_once(tmp_path: Path) -> None:
+    path = tmp_path / "features.db"
+    path.write_bytes(b"not a database" * 100)
+    begin = time.monotonic()
+    with pytest.raises(RuntimeError, match="factory"), features.database(path):
+        pass
+    assert time.monotonic() - begin < 1

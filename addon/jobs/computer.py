@@ -11,8 +11,9 @@ from ..project.snapshot import cached_json
 
 FILE = "computer.json"  # of the machine: what the doctor found last
 STEPS = {"draft": 4000, "standard": 20000, "high": 60000}  # of the presets
-# Seconds of one core that a step takes on a CPU: of 5 185 steps on replica_room, see docs/benchmarks.md.
-CORE_SECONDS = {"standard": 0.46}
+# Seconds of one core that a step takes on a CPU: standard of 5 185 steps on replica_room (docs/benchmarks.md), the others by
+# their ratio to it in 150 steps there (0.78 and 1.68, AMD EPYC, one thread).
+CORE_SECONDS = {"draft": 0.36, "standard": 0.46, "high": 0.77}
 
 
 def known() -> dict[str, Any]:
@@ -46,6 +47,6 @@ def rough_seconds(facts: dict[str, Any], preset: str, steps: int = 0) -> float |
     Args:
         steps: of the training; 0: as many as the preset has.
     """
-    if facts.get("device") != "cpu" or preset not in CORE_SECONDS:
+    if facts.get("device") != "cpu":
         return None
     return (steps or STEPS[preset]) * CORE_SECONDS[preset] / max(1, facts.get("cores") or os.cpu_count() or 1)

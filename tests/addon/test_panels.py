@@ -346,6 +346,7 @@ def test_device_and_rough_time_are_known_before_the_first_training(tmp_path, mon
     computer.remember({"device": "cpu", "cores": 4})
     assert computer.title(computer.known()) == "CPU, 4 cores"
     assert computer.rough_seconds(computer.known(), "standard", 1000) == pytest.approx(115)
+    assert computer.rough_seconds(computer.known(), "draft", 1000) == pytest.approx(90)
     assert computer.rough_seconds({}, "standard") is None
     card = {"device": "cuda", "device_name": "NVIDIA H100", "gpu_memory_gb": 79.6}
     assert computer.title(card) == "NVIDIA H100, 80 GB"

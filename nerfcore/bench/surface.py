@@ -17,6 +17,7 @@ from ..errors import InputError
 from ..mesh.build import build
 from ..mesh.metrics import on_border
 from ..mesh.painted import training_photos
+from ..mesh.parts import texture_of
 from ..mesh.surface import Surface, to_world
 from ..mesh.turntable import write_turntable
 from ..mesh.verb import paint
@@ -111,7 +112,10 @@ def measure(job: Job, project: Path, report: Reporter, root: Path) -> dict[str, 
     surface = to_world(made, box.world_from_box)
     figures = surface_figures(surface, painted, truth, scene, THIN.get(job.scene), BODIES.get(job.scene, ()))
     pictures = root / "surface" / "pictures" / job.name
-    write_turntable(pictures, surface, {c.id: c.color for c in scene.classes}, report)
+    assert painted.uv is not None
+    assert painted.image is not None
+    texture = texture_of(built.faces, painted.uv.corners, painted.image)
+    write_turntable(pictures, surface, texture, {c.id: c.color for c in scene.classes}, report)
     figures |= {
         "border_faces": on_border(built.vertices, built.faces, region.low, region.high, region.voxel / 2),
         "faces": len(built.faces),

@@ -13,6 +13,27 @@ from .photos import LINEAR, halvings, sample
 from .visibility import PosedCamera, depth_buffer
 
 
+class TexturedMesh:
+    """A mesh (V, 3), (F, 3) whose colours are looked up in its texture (S, S, 3) uint8 sRGB by the UV (F, 3, 2) of its
+    faces' corners, v upwards."""
+
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray, corners: np.ndarray, texture: np.ndarray) -> None:
+        self._corners, self._size = corners, texture.shape[0]
+        a, b, c = (vertices[faces[:, k]].astype(np.float64) for k in range(3))
+        surface = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+        u, v = ((corners[:, k] - corners[:, 0]).astype(np.float64) * self._size for k in (1, 2))
+        self._texel = np.sqrt(surface / np.maximum(np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]), 1e-9))
+        self._levels = halvings(torch.from_numpy(LINEAR[texture].transpose(2, 0, 1)), 6)
+
+    def light(self, face: np.ndarray, weights: np.ndarray, footprint: np.ndarray) -> torch.Tensor:
+        """Linear colours (N, 3) at places of faces (N,) with weights (N, 3) of their corners, each the mean over about as
+        much as a pixel shows: footprint (N,), its width in units of the mesh."""
+        uv = np.einsum("nk,nkc->nc", weights, self._corners[face].astype(np.float64))
+        wide = footprint / np.maximum(self._texel[face], 1e-12)
+        level = np.round(np.log2(np.maximum(wide, 1))).astype(int)
+        return sample(self._levels, uv * [self._size, -self._size] + [0, self._size], level)
+
+
 def surface_picture(
     view: PosedCamera,
     vertices: np.ndarray,
@@ -38,17 +59,9 @@ def surface_picture(
     rows, columns = np.nonzero(buffer.face >= 0)
     face = buffer.face[rows, columns]
     weights = _place(fine, vertices[faces[face]], np.stack([columns + 0.5, rows + 0.5], 1))
-    uv = np.einsum("nk,nkc->nc", weights, corners[face].astype(np.float64))
-    size = texture.shape[0]
-    a, b, c = (vertices[faces[:, k]].astype(np.float64) for k in range(3))
-    surface = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    u, v = ((corners[:, k] - corners[:, 0]).astype(np.float64) * size for k in (1, 2))
-    texel = np.sqrt(surface / np.maximum(np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]), 1e-9))
-    wide = fine.footprint(buffer.depth[rows, columns]) / np.maximum(texel[face], 1e-12)
-    level = np.round(np.log2(np.maximum(wide, 1))).astype(int)
-    levels = halvings(torch.from_numpy(LINEAR[texture].transpose(2, 0, 1)), 6)
     color = torch.zeros((height * samples, width * samples, 3))
-    color[rows, columns] = sample(levels, uv * [size, -size] + [0, size], level)
+    shown = TexturedMesh(vertices, faces, corners, texture)
+    color[rows, columns] = shown.light(face, weights, fine.footprint(buffer.depth[rows, columns]))
     hit = torch.from_numpy((buffer.face >= 0).astype(np.float32))
     share = hit.view(height, samples, width, samples).mean((1, 3))
     mean = color.view(height, samples, width, samples, 3).mean((1, 3)) / share.clamp(min=1e-6)[..., None]

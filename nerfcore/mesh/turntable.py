@@ -9,9 +9,12 @@ import numpy as np
 from ..files import atomic_path
 from ..geometry.cameras import Camera, pixel_centers, rays
 from ..images.encode import write_picture
+from ..images.picture import linear_to_srgb, to_bytes
 from ..kernels.raycast import FrontFaces
 from ..progress import Reporter
+from .parts import Texture
 from .surface import Surface
+from .surface_picture import TexturedMesh
 
 VIEWS, SIDE = 8, 640
 ELEVATION = np.radians(30)
@@ -41,11 +44,26 @@ def turntable_poses(vertices: np.ndarray, count: int) -> list[np.ndarray]:
 
 
 def write_turntable(
-    folder: Path, surface: Surface, colors: dict[int, tuple[float, float, float]], report: Reporter
+    folder: Path,
+    surface: Surface,
+    texture: Texture | None,
+    colors: dict[int, tuple[float, float, float]],
+    report: Reporter,
 ) -> list[Path]:
     """Write color_0.png … and class_0.png …: eight views of a surface in the world, triangles seen from their front only,
-    as one looks into a room without its near walls. `colors`: sRGB in [0, 1] of each class id; others are dark."""
+    as one looks into a room without its near walls.
+
+    Args:
+        texture: of the surface; without one its vertices' colours are shown. colors: sRGB in [0, 1] of each class id;
+            others are dark.
+    Returns:
+        the files written.
+    """
     mesh = FrontFaces(surface.vertices, surface.faces)
+    textured = None
+    if texture is not None:
+        corners = texture.unwrapped.uv[texture.unwrapped.faces]
+        textured = TexturedMesh(surface.vertices, surface.faces, corners, texture.image)
     camera = Camera(width=SIDE, height=SIDE, fx=LENS * SIDE, fy=LENS * SIDE, cx=SIDE / 2, cy=SIDE / 2)
     local, _ = rays(camera, pixel_centers(SIDE, SIDE).reshape(-1, 2))
     ids = np.unique(surface.face_class)
@@ -55,11 +73,15 @@ def write_turntable(
         report.progress(number / VIEWS)
         face, corner = mesh.cast(np.broadcast_to(pose[:3, 3], local.shape), local @ pose[:3, :3].T)
         hit = face >= 0
-        weights = np.concatenate([corner, 1 - corner.sum(1, keepdims=True)], 1)[hit, :, None]
+        weights = np.concatenate([corner, 1 - corner.sum(1, keepdims=True)], 1)[hit]
         corners = surface.faces[face[hit]]
         color, label = (np.full((SIDE * SIDE, 3), BACKGROUND, np.uint8) for _ in range(2))
-        color[hit] = (surface.colors[corners] * weights).sum(1).clip(0, 255)
-        light = 0.55 + 0.45 * ((surface.normals[corners] * weights).sum(1) @ LIGHT)[:, None]
+        if textured is None:
+            color[hit] = _mixed(surface.colors[corners], weights).clip(0, 255)
+        else:
+            away = np.linalg.norm(_mixed(surface.vertices[corners], weights) - pose[:3, 3], axis=1)
+            color[hit] = to_bytes(linear_to_srgb(textured.light(face[hit], weights, away / camera.fx).numpy()))
+        light = 0.55 + 0.45 * (_mixed(surface.normals[corners], weights) @ LIGHT)[:, None]
         label[hit] = (shades[np.searchsorted(ids, surface.face_class[face[hit]])] * light).clip(0, 255)
         for name, picture in (("color", color), ("class", label)):
             path = folder / f"{name}_{number}.png"
@@ -67,3 +89,8 @@ def write_turntable(
                 write_picture(temporary, picture.reshape(SIDE, SIDE, 3))
             paths.append(path)
     return paths
+
+
+def _mixed(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Means (N, C) of the corners' values (N, 3, C) by their weights (N, 3)."""
+    return np.einsum("nkc,nk->nc", values, weights)

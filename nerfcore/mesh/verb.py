@@ -86,7 +86,7 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
     files += written
     if params.turntable is not None:
         report.stage("Looking at it")
-        files += write_turntable(params.turntable, surface, {c.id: c.color for c in scene.classes}, report)
+        files += write_turntable(params.turntable, surface, texture, {c.id: c.color for c in scene.classes}, report)
     result = {
         "vertices": len(surface.vertices),
         "faces": len(surface.faces),

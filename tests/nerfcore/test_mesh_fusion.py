@@ -17,6 +17,7 @@ from fieldwork.nerfcore.mesh import clean, depth_maps, metrics, planes
 from fieldwork.nerfcore.mesh.decimate import decimate
 from fieldwork.nerfcore.mesh.extract import extract
 from fieldwork.nerfcore.mesh.fusion import fuse_maps
+from fieldwork.nerfcore.mesh.parts import texture_of
 from fieldwork.nerfcore.mesh.refine import refined_maps
 from fieldwork.nerfcore.mesh.region import choose_region
 from fieldwork.nerfcore.mesh.surface import Surface, is_watertight
@@ -250,7 +251,7 @@ def test_a_turntable_shows_fronts_in_their_colours(tmp_path: Path) -> None:
     colors = np.where(vertices[:, 2:] > 0, [250, 10, 10], [10, 10, 250]).astype(np.uint8)
     ids = np.where(vertices[:, 2] > 0, 3, 7)
     surface = Surface(vertices, faces, vertices, colors, ids, ids[faces[:, 0]])
-    paths = write_turntable(tmp_path, surface, {3: (0.0, 1.0, 0.0)}, Reporter())
+    paths = write_turntable(tmp_path, surface, None, {3: (0.0, 1.0, 0.0)}, Reporter())
     assert len(paths) == 16
     color, label = (np.array(Image.open(tmp_path / f"{name}_0.png")).astype(int) for name in ("color", "class"))
     shown = (color != color[0, 0]).any(-1)
@@ -261,10 +262,18 @@ def test_a_turntable_shows_fronts_in_their_colours(tmp_path: Path) -> None:
     assert lower[2] > 200 > lower[0]
     assert label[rows[0] + 20, 320, 1] > 100 > label[rows[-1] - 20, 320, 1]
     inside_out = Surface(vertices, faces[:, ::-1], -vertices, colors, ids, surface.face_class)
-    write_turntable(tmp_path, inside_out, {}, Reporter())
+    write_turntable(tmp_path, inside_out, None, {}, Reporter())
     within = np.array(Image.open(tmp_path / "color_0.png")).astype(int)
     assert color[320, 320, 0] > 200 > color[320, 320, 2]
     assert within[320, 320, 2] > 200 > within[320, 320, 0]  # through the near upper side, onto the far lower one
+    image = np.zeros((8, 8, 3), np.uint8)
+    image[:, :4, 1] = image[:, 4:, 0] = 200  # green on the left, red on the right
+    left = np.broadcast_to(np.where(vertices[faces].mean(1)[:, :1, None] > 0, 0.25, 0.75), (len(faces), 3, 1))
+    texture = texture_of(faces, np.concatenate([left, np.full_like(left, 0.5)], 2), image)
+    write_turntable(tmp_path, surface, texture, {}, Reporter())
+    front, back = (np.array(Image.open(tmp_path / f"color_{number}.png")).astype(int) for number in (0, 4))
+    assert front[320, 320] == pytest.approx([0, 200, 0], abs=2)
+    assert back[320, 320] == pytest.approx([200, 0, 0], abs=2)
 
 
 def test_photos_move_soft_depths_onto_the_surface() -> None:

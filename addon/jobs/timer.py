@@ -36,6 +36,8 @@ def tick(queue: Queue) -> float:
     due = queue.busy and time.monotonic() - queue.drawn > DRAW_PERIOD
     if due or queue.undrawn:
         queue.redraw()
+    if job:
+        doing += f" to {job.message}"
     seconds = time.perf_counter() - begin
     queue.slowest_cpu = max(queue.slowest_cpu, time.thread_time() - busy_since)
     if seconds > queue.slowest_tick:

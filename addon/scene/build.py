@@ -107,7 +107,8 @@ def import_steps(
     yield 0.8, "mesh"
     if pieces:
         texture = _texture(package)
-        group = shader_group(owned.owner, "mesh", owned.root, texture)
+        yield 0.8, "materials"  # the first picture of its kind takes Blender long: it gets ready to read such
+        group = shader_group(owned.owner, "mesh", owned.root, texture and texture())
         trees = [Held(bpy.data.node_groups, tree) for tree in (group, viewport_group(owned.owner, owned.root))]
         for part in pieces:
             yield from surface(owned, package, part, lambda: (trees[0](), trees[1]()))
@@ -190,12 +191,12 @@ def _in_thread(function: Callable[[], Any]) -> Steps:
     return values[0]
 
 
-def _texture(package: Package) -> bpy.types.Image | None:
+def _texture(package: Package) -> Held | None:
     if package.texture is None:
         return None
     texture = load_image(package.texture)
     texture[TEXTURE] = True
-    return texture
+    return Held(bpy.data.images, texture)
 
 
 def _frame_scene(scene: bpy.types.Scene, package: Package, result: Imported) -> None:

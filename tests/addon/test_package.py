@@ -12,12 +12,16 @@ import pytest
 from fieldwork.addon.photograph import orbit
 from fieldwork.addon.photograph.pixels import read_exr, write_index_png
 from fieldwork.addon.scene.package import SENSOR_MM, PackageError, blender_camera, read_package
-from fieldwork.nerfcore.blender.package import undistort, undistortion_grid, write_package
+from fieldwork.nerfcore.blender.package import photo_renders, stale, undistort, undistortion_grid, write_package
 from fieldwork.nerfcore.data.scene import ClassInfo, Scene, View
 from fieldwork.nerfcore.geometry.cameras import Camera, flip_camera_axes, pixel_centers, project, rays
 from fieldwork.nerfcore.geometry.points import Points
 from fieldwork.nerfcore.images.picture import Picture
 from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.project.fingerprints import write_made
+from fieldwork.nerfcore.project.runs import RENDER_RECORD
+from fieldwork.nerfcore.project.schema import Project, step
+from fieldwork.nerfcore.project.store import load_project, save_project
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
@@ -105,6 +109,21 @@ def test_a_package_is_read_as_it_was_written(tmp_path):
     # Blender's camera looks along its −z: the OpenCV camera's y and z axes are turned.
     np.testing.assert_array_equal(camera["camera_to_world"], [[1, 0, 0, 1], [0, -1, 0, 2], [0, 0, -1, 3], [0, 0, 0, 1]])
     assert (folder / camera["image"]).read_bytes() == (tmp_path / "a.png").read_bytes()
+
+
+def test_a_package_says_of_which_project_it_is(tmp_path):
+    lens = Camera(width=60, height=40, fx=50, fy=50, cx=29, cy=22)
+    save_project(tmp_path, Project())
+    folder = write_package(tmp_path, "main", scene(tmp_path, lens), "Büste", Reporter())
+    assert read_package(folder).uuid == load_project(tmp_path).uuid
+
+
+def test_renders_of_the_photos_that_are_of_another_run_are_told(tmp_path):
+    made = photo_renders(tmp_path, None) / RENDER_RECORD
+    made.parent.mkdir(parents=True)
+    write_made(made, step("render", {"run": "second"}, {}))
+    assert stale(tmp_path, "second") == []
+    assert stale(tmp_path, "main") == ["The renders of the photos are of the run “second”, not of “main”."]
 
 
 def test_photos_are_undistorted_again_only_when_the_lens_or_the_photo_changed(tmp_path):

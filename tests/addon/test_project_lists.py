@@ -35,12 +35,13 @@ def test_lists_follow_the_project_and_class_edits_go_back(bpy_script, tmp_path):
 settings.project = project
 rows = [[i.name, i.status, i.reason, i.labelled] for i in settings.images]
 classes = [[c.id, c.name, round(c.priority, 3), round(c.area, 3)] for c in settings.classes]
+settings.run = "second"
+areas = [c.area for c in settings.classes]
+settings.run = "main"
 settings.classes[0].priority = 4.0
 settings.classes[1].name = "gilding"
 before = stored(project)["classes"]
 bpy.ops.fieldwork.save_edits()
-settings.run = "second"
-areas = [c.area for c in settings.classes]
 settings.project = ""
 answer({"rows": rows, "classes": classes, "left": len(settings.images), "asked": asked, "areas": areas, "before": before[0]["priority"]})
 """,

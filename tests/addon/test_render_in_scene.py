@@ -116,6 +116,33 @@ answer({
     assert facts["animation"] == [["Camera", "SEQUENCE"]]
 
 
+def test_renders_go_to_the_cameras_of_their_own_project(bpy_script, tmp_path):
+    """Another capture, in a folder of the same name, has a camera of the same name."""
+    facts = bpy_script(
+        SETUP
+        + """
+from fieldwork.addon.render import result
+from fieldwork.addon.roles import Owner
+image = bpy.data.images.new("a", 8, 8)
+image.filepath_raw, image.file_format = f"{folder}/a.png", "PNG"
+image.save()
+cameras, owners = {}, {uuid: Owner("capture", uuid) for uuid in ("first", "second")}
+for uuid, owner in owners.items():
+    cameras[uuid] = bpy.data.objects.new(uuid, bpy.data.cameras.new("a"))
+    owner.mark(cameras[uuid], "camera:a")
+    scene.collection.objects.link(cameras[uuid])
+seen = []
+for owner in owners.values():
+    for _ in result.show_steps(scene, [Path(folder) / "a.png"], "background", True, owner):
+        pass
+    seen.append([len(camera.data.background_images) for camera in cameras.values()])
+answer(seen)
+""",
+        folder=tmp_path,
+    )
+    assert facts == [[1, 0], [1, 1]]
+
+
 def test_image_plane_covers_exactly_what_the_camera_sees(bpy_script, tmp_path):
     facts = bpy_script(
         SETUP

@@ -53,6 +53,15 @@ def test_encode_equals_its_reference_and_so_does_its_gradient(device: torch.devi
     assert torch.equal(touched.bool() & blocks, blocks)
 
 
+def test_a_level_of_more_vertices_than_32_bits_number_is_hashed(device: torch.device) -> None:
+    generator = torch.Generator().manual_seed(13)
+    levels = [(1300, 0, 1 << 21)]  # 1300³ is beyond 2³¹
+    table = torch.randn(1 << 21, encode.FEATURES, generator=generator).to(device)
+    points = (torch.rand(200, 3, generator=generator) / 1300).to(device)
+    expected = encode_reference.forward(table, levels, [1.0], points)
+    assert relative(encode.forward(table, levels, [1.0], points), expected) <= 1e-5
+
+
 def test_the_gradient_of_encoded_points_equals_its_reference(device: torch.device) -> None:
     generator = torch.Generator().manual_seed(11)
     table = torch.randn(ROWS, encode.FEATURES, generator=generator).to(device)

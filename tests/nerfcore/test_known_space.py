@@ -122,6 +122,7 @@ def test_unknown_cells_never_become_occupied_and_are_told_from_empty_ones() -> N
         grid.update(step, lambda p: torch.where(p[:, 0] > 0.5, 50.0, 0.0), None, generator)
     points = torch.tensor([[0.9, 0.5, 0.2], [0.9, 0.5, 0.8], [0.1, 0.5, 0.8], [0.1, 0.5, 1.2]])
     assert state_at(grid.states(), points).tolist() == [UNKNOWN, OCCUPIED, EMPTY, UNKNOWN]
+    assert not grid.cells[unknown, 0].any()  # beside occupied ones neither
 
 
 @pytest.mark.parametrize("contracted", [False, True], ids=["box", "contracted"])

@@ -16,7 +16,7 @@ from fieldwork.nerfcore.kernels.depth_arrays import FREE, MapArrays
 from fieldwork.nerfcore.mesh import clean, depth_maps, metrics, planes
 from fieldwork.nerfcore.mesh.decimate import decimate
 from fieldwork.nerfcore.mesh.extract import extract
-from fieldwork.nerfcore.mesh.fusion import fuse_maps
+from fieldwork.nerfcore.mesh.fusion import BRICK, Bricks, fuse_maps
 from fieldwork.nerfcore.mesh.parts import texture_of
 from fieldwork.nerfcore.mesh.refine import refined_maps
 from fieldwork.nerfcore.mesh.region import choose_region
@@ -106,6 +106,17 @@ def test_what_no_two_views_see_stays_open() -> None:
     assert len(clean.border_edges(faces)) > 20
     assert (vertices[:, 0] < -0.45).sum() == 0
     assert np.abs(np.linalg.norm(vertices, axis=1) - 0.5).max() < 2 * voxel
+
+
+def test_the_surface_ends_where_the_grid_knows_nothing() -> None:
+    axis = np.arange(BRICK) - 3.5
+    x, y, z = np.meshgrid(axis, axis, axis, indexing="ij")
+    distance = (np.sqrt(x * x + y * y + z * z) - 2.5).astype(np.float32)[None]
+    one = np.zeros((1, 1, 1), np.int32)
+    bricks = Bricks(np.full(3, -3.5), 1.0, one, distance, np.ones_like(distance), (x > 0)[None])
+    vertices, faces = extract(bricks, Reporter())
+    assert len(faces) > 20
+    assert vertices.min(0) == pytest.approx([0.5, -2.5, -2.5], abs=0.15)
 
 
 def test_the_region_follows_what_is_seen_and_leaves_out_what_is_far() -> None:

@@ -120,6 +120,14 @@ def test_photos_stay_with_the_host_where_the_device_has_no_room() -> None:
     assert home_of(1001, 1000.0, CPU) == CPU
 
 
+def test_a_store_larger_than_its_budget_keeps_its_photos_with_the_host(tmp_path: Path) -> None:
+    scene = load_scene(ball_project(tmp_path / "ball", views=6, side=40))
+    elsewhere, size = torch.device("meta"), 2 * 40 * 40 * 5  # a device that holds no numbers; colours, alpha and labels
+    for budget, home in ((size, elsewhere), (size - 1, CPU)):
+        store = PixelStore(scene, [0, 1], [1, 2], np.eye(4), 40, elsewhere, Reporter(), budget)
+        assert {store.home, store.rgba.device, store.label.device} == {home}
+
+
 @pytest.mark.setting("scene.photo_memory")
 def test_the_setting_is_the_budget(masked: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from fieldwork.nerfcore.train import prepare

@@ -129,3 +129,4 @@ def test_splits() -> None:
     assert split_views(["auto"] * 7) == (list(range(7)), [])
     assert split_views(["auto"] * 17)[1] == [0, 8, 16]
     assert split_views(["train", "test", "auto", "test"]) == ([0, 2], [1, 3])
+    assert split_views(["train", "test", "auto", "test"], holdout=0) == ([0, 1, 2, 3], [])

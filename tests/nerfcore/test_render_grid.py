@@ -133,3 +133,10 @@ def test_grids_are_not_made_finer_than_kernels_can_number_their_cells() -> None:
     for resolution in range(8, 513, 4):
         for factor in (1, 2, 4):
             assert resolution * largest_factor(resolution, factor) <= MOST_CELLS_A_SIDE
+
+
+def test_a_grid_is_refined_as_far_as_its_cells_can_be_numbered(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(render_grid, "MOST_CELLS_A_SIDE", 3 * N)
+    fine = refined_grid(shell_grid(), shell, 4, 1.0, math.inf)
+    assert fine is not None
+    assert fine.settings.resolution == 2 * N

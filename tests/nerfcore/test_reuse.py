@@ -195,7 +195,7 @@ def test_a_project_of_before_keeps_its_poses(place: Path) -> None:
     result = call(place)
     assert "poses" in result["reused"]
     assert "earlier version" in result["redone"]["new"]
-    assert result["redone"]["train"] == "trained in another project" or "train" in result["reused"]
+    assert result["redone"].get("train") == "trained in another project"
     assert call(place)["reused"] == STAGES
 
 

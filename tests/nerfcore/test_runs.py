@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from fieldwork.nerfcore.errors import Cancelled, DiskError, InputError, ProjectError
-from fieldwork.nerfcore.evaluate.verb import evaluate
+from fieldwork.nerfcore.evaluate.verb import evaluate, evaluated
 from fieldwork.nerfcore.params import EvaluateParams, RegionParams, TrainParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project import runs
@@ -214,6 +214,13 @@ def test_each_field_has_an_identity(project: Path) -> None:
     assert len({first, second, checkpoint_id(project, "main")}) == 3
 
 
+def test_an_evaluation_is_of_the_field_that_was_measured(project: Path) -> None:
+    asked = EvaluateParams(project=project)
+    assert evaluated(asked).result is not None
+    train(params(project, steps=14, resume=True), Reporter())
+    assert evaluated(asked).reason == "changed: trained field"
+
+
 def test_a_run_of_another_project_does_not_go_on(project: Path, tmp_path: Path) -> None:
     other = ball_project(tmp_path / "other")
     shutil.copytree(project / "runs", other / "runs")
@@ -241,7 +248,7 @@ def test_a_training_does_not_go_on_with_other_inputs(project: Path, what: str) -
 
 def test_a_resumed_run_says_that_it_keeps_its_settings(project: Path) -> None:
     report = Reporter()
-    train(params(project, steps=14, resume=True, set={"train.grid_rate": "0.5"}), report)
+    train(params(project, steps=14, resume=True, preset="standard", set={"train.grid_rate": "0.5"}), report)
     assert any("goes on with the settings it began with" in warning for warning in report.warnings)
     step = load_project(project).provenance[-1]
     assert step.settings["config"]["train"]["grid_rate"] != 0.5

@@ -89,6 +89,15 @@ def test_the_torch_backend_needs_neither_warp_nor_double_precision(
     assert trainer.take_measured().psnr > 5
 
 
+@pytest.mark.parametrize(("kernels", "cut"), [("warp", True), ("torch", False)])
+def test_a_batch_is_cut_into_shards_where_host_threads_share_it(ball: Path, kernels: Kernels, cut: bool) -> None:
+    """Elsewhere each shard would wait for the one before it."""
+    with using_kernels(kernels):
+        trainer = trainer_of(ball)
+        shards = trainer._shard_tasks(trainer.draw(), 0.5)
+    assert (len(shards) > 1) == cut
+
+
 def test_both_backends_make_the_same_picture(ball: Path) -> None:
     trainer = train(ball, "warp", 60)
     batch = trainer.store.batch(torch.arange(0, len(trainer.store), 7))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from ..files import is_text
@@ -22,12 +22,12 @@ def unique_names(paths: Sequence[Path], root: Path) -> list[str]:
     with. Long names are cut, with a digest of the whole behind.
     """
     names = [path.stem for path in paths]
-    if len(set(map(_joined, names))) < len(names):
+    if _alike(map(_joined, names)):
         names = ["/".join(_below(path, root).with_suffix("").parts) for path in paths]
     names = [_joined(name) for name in names]
-    if len(set(names)) < len(names):  # a.jpg beside a.png
+    if _alike(names):  # a.jpg beside a.png
         names = [f"{name}_{path.suffix[1:].lower()}" for name, path in zip(names, paths)]
-    if len(set(names)) < len(names):
+    if _alike(names):
         names = [f"{name}_{i}" for i, name in enumerate(names)]
     return names
 
@@ -39,11 +39,17 @@ def frame_names(places: Sequence[str]) -> list[str]:
         place[: -len(Path(place).suffix)] if Path(place).suffix.lower() in IMAGE_SUFFIXES else place for place in places
     ]
     names = [_joined(Path(place).name) for place in bare]
-    if len(set(names)) < len(names):
+    if _alike(names):
         names = [_joined("/".join(part for part in Path(place).parts if part.strip("./"))) for place in bare]
-    if len(set(names)) < len(names):
+    if _alike(names):
         names = [f"{name}_{i}" for i, name in enumerate(names)]
     return names
+
+
+def _alike(names: Iterable[str]) -> bool:
+    """Whether two names would be one file on Windows or macOS, which do not tell capitals apart."""
+    folded = [name.casefold() for name in names]
+    return len(set(folded)) < len(folded)
 
 
 def _joined(name: str) -> str:

@@ -10,10 +10,11 @@ import time
 import tomllib
 import zipfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from fieldwork.addon.engine import install as module
-from fieldwork.addon.engine import place
+from fieldwork.addon.engine import place, tools
 from fieldwork.addon.engine.install import InstallCancelled, InstallError, Options, install
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -157,6 +158,33 @@ def test_unsuitable_base_python_is_refused(options, lock, tmp_path, version, rea
     old.chmod(0o755)
     with pytest.raises(InstallError, match=reason):
         go(Options(**{**vars(options), "base": old}), lock)
+
+
+def test_an_intel_mac_is_told(options, lock, tmp_path, monkeypatch):
+    intel = tmp_path / "python"
+    intel.write_text("#!/bin/sh\necho 3 12 64 x86_64\n")
+    intel.chmod(0o755)
+    monkeypatch.setattr(module.sys, "platform", "darwin")
+    with pytest.raises(InstallError, match="Macs with Intel processors"):
+        go(Options(**{**vars(options), "base": intel}), lock)
+
+
+def test_tools_on_windows_have_no_window_and_end_with_their_children(tmp_path, monkeypatch):
+    started, ended = [], []
+
+    def popen(words, **how):
+        started.append(how)
+        raise OSError("there is no such tool")
+
+    monkeypatch.setattr(tools.sys, "platform", "win32")
+    monkeypatch.setattr(tools.subprocess, "CREATE_NO_WINDOW", 8, raising=False)
+    monkeypatch.setattr(tools.subprocess, "Popen", popen)
+    monkeypatch.setattr(tools.subprocess, "run", lambda words, **how: ended.append((words, how["creationflags"])))
+    with open(tmp_path / "log", "w") as log, pytest.raises(InstallError, match="no such tool"):
+        tools.Runner(log, threading.Event(), lambda *_: None)(["tool"], "It failed")
+    tools._kill_tree(SimpleNamespace(pid=7))
+    assert started[0]["creationflags"] == 8
+    assert ended == [(["taskkill", "/F", "/T", "/PID", "7"], 8)]
 
 
 def test_full_disk_is_told_before_anything_is_loaded(options, lock, monkeypatch):

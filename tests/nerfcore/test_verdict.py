@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,11 @@ from fieldwork.nerfcore.cli import main
 from fieldwork.nerfcore.geometry.cameras import Camera
 from fieldwork.nerfcore.mesh.photos import Photo
 from fieldwork.nerfcore.mesh.shown import shown_share
+from fieldwork.nerfcore.mesh.verb import mesh
 from fieldwork.nerfcore.mesh.visibility import PosedCamera
+from fieldwork.nerfcore.params import MeshParams, TrainParams
+from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.train.verb import train
 from fieldwork.nerfcore.verdict import (
     evaluate_verdict,
     mesh_verdict,
@@ -21,6 +26,7 @@ from fieldwork.nerfcore.verdict import (
     worst,
 )
 from fieldwork.tests.nerfcore.support.ball import SMALL, ball_project
+from fieldwork.tests.nerfcore.support.reconstructed import triangle
 
 
 def curve(*psnr: float) -> list[dict[str, float]]:
@@ -103,3 +109,15 @@ def test_scraps_are_told_at_the_command_line(tmp_path: Path, capfd: pytest.Captu
     answer = json.loads(capfd.readouterr().out)
     assert answer["verdict"]["level"] in ("weak", "failed")
     assert 0 <= answer["opacity"] <= 1
+
+
+def test_a_mesh_of_scraps_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    project = ball_project(tmp_path / "p")
+    train(TrainParams(project=project, preset="draft", steps=2, set=SMALL), Reporter())
+    whole = triangle()
+    scraps = replace(whole, vertices=whole.vertices * np.float32(0.01))
+    monkeypatch.setattr("fieldwork.nerfcore.mesh.verb.build", lambda *_: scraps)
+    result = mesh(MeshParams(project=project), Reporter())
+    assert result["shown"] < 0.02
+    assert result["verdict"]["level"] == "failed"
+    assert "The mesh fills" in result["verdict"]["reasons"][0]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -65,11 +66,11 @@ def _below(path: Path, root: Path) -> Path:
 
 def find_image(path: Path) -> Path | None:
     """The image file at `path`, or with a usual image suffix appended when the path has none."""
-    if path.is_file():
+    if os.path.isfile(path):  # False, and no error, for names that are too long
         return path
     for suffix in IMAGE_SUFFIXES:
         for candidate in (path.with_name(path.name + suffix), path.with_name(path.name + suffix.upper())):
-            if candidate.is_file():
+            if os.path.isfile(candidate):
                 return candidate
     return None
 
@@ -136,7 +137,7 @@ def labels_and_masks(
 def beside(folder: Path, stem: str, exact: bool = True) -> Path | None:
     """The image in `folder` for a photo called `stem`: `<stem>.png`, or when not `exact` also `<stem>*.png|jpg`."""
     for suffix in (".png", ".PNG", ".tif", ".tiff", ".exr", ".jpg", ".JPG", ".jpeg"):
-        if (folder / f"{stem}{suffix}").exists():  # a folder of that name is told of by who reads it
+        if os.path.exists(folder / f"{stem}{suffix}"):  # a folder of that name is told of by who reads it
             return folder / f"{stem}{suffix}"
     if exact or not folder.is_dir():
         return None

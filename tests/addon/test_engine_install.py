@@ -103,6 +103,7 @@ def test_offline_install_makes_an_environment_of_its_own(options, lock, tmp_path
     assert not (options.folder / "venv").exists()
 
 
+@pytest.mark.usefixtures("each_file_system")
 def test_broken_package_says_so_and_the_next_try_goes_on(options, lock, tmp_path, content_doctor):
     broken = make_wheel(tmp_path / "wheels")
     whole = broken.read_bytes()
@@ -313,6 +314,7 @@ def test_state_of_a_half_installed_engine(options):
     assert place.installed(options.folder) is None
 
 
+@pytest.mark.usefixtures("each_file_system")
 def test_repair_keeps_the_working_engine_until_the_new_one_runs(options, lock, tmp_path, content_doctor, monkeypatch):
     make_wheel(tmp_path / "wheels")
     go(options, lock)
@@ -340,6 +342,7 @@ def test_repair_keeps_the_working_engine_until_the_new_one_runs(options, lock, t
     assert not [path for path in options.folder.iterdir() if "old" in path.name or path.name == place.STAGING]
 
 
+@pytest.mark.usefixtures("each_file_system")
 def test_a_repair_begins_with_an_empty_environment(options, lock, tmp_path, content_doctor):
     make_wheel(tmp_path / "wheels")
     go(options, lock)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,10 @@ def preferences() -> Any:
 
 
 def engine_folder() -> Path:
-    return user_folder("engine")
+    """Where the engine is. On Windows in a short place, one for all Blenders: paths end at 260 characters there, of which
+    PyTorch takes 170."""
+    local = os.environ.get("LOCALAPPDATA") if AS_EXTENSION and sys.platform == "win32" else None
+    return Path(local, "Fieldwork", "engine") if local else user_folder("engine")
 
 
 def engine_log() -> Path:

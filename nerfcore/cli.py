@@ -9,7 +9,7 @@ import json
 import logging
 import os
 import sys
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, Literal, TextIO, Union, get_args, get_origin
@@ -175,14 +175,23 @@ def run_command(name: str, values: dict[str, Any], as_json: bool, quiet: bool, s
                 report.table(name, result, stdout)
             stdout.flush()
         except (Cancelled, KeyboardInterrupt):
-            click.echo("Cancelled. Run the same command again to go on.", err=True)
-            return 130
+            return _cancelled(as_json, stdout)
         except Exception as error:  # noqa: BLE001 - the boundary: whatever happened becomes a sentence
             return _failed(error, name, project_of(params), as_json, stdout)
         judged = result.get("verdict", GOOD)
         if judged["level"] != "good":
             click.secho(f"{judged['level']}: {' '.join(judged['reasons'])}", fg=COLORS[judged["level"]], err=True)
         return 3 if strict and (report.warnings or judged["level"] != "good") else 0
+
+
+def _cancelled(as_json: bool, stdout: TextIO) -> int:
+    hint = "Run the same command again to go on."
+    click.echo(f"Cancelled. {hint}", err=True)
+    if as_json:
+        with suppress(NoReader):  # whoever cancels may be gone
+            print_json({"error": {"code": "cancelled", "message": "Cancelled.", "hint": hint}}, stdout)
+            stdout.flush()
+    return 130
 
 
 def _failed(error: Exception, verb: str, project: Path | None, as_json: bool, stdout: TextIO) -> int:

@@ -130,13 +130,21 @@ def _has_gpu() -> bool:
 
 def _check_base(base: Path, run: Runner) -> None:
     """The base must be a Python that the packages exist for."""
-    code = "import sys, struct; print(sys.version_info[0], sys.version_info[1], struct.calcsize('P') * 8)"
+    code = (
+        "import platform, struct, sys; "
+        "print(sys.version_info[0], sys.version_info[1], struct.calcsize('P') * 8, platform.machine())"
+    )
     words = run([base, "-I", "-c", code], f"{base} is not a Python").split()
     version = (int(words[0]), int(words[1]))
     if version < (3, 11) or words[2] != "64":
         raise InstallError(
             f"{base} is Python {version[0]}.{version[1]}, {words[2]} bits; the engine needs 3.11 or newer with 64 bits. "
             "Choose another Base Python."
+        )
+    if sys.platform == "darwin" and words[3:] == ["x86_64"]:
+        raise InstallError(
+            f"{base} is a Python for Macs with Intel processors, which PyTorch no longer has builds for. Reconstruct on "
+            "another computer, or choose a Base Python for Apple silicon if this Mac has it."
         )
 
 

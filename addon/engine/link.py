@@ -107,7 +107,7 @@ class Link:
             options = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP | subprocess.CREATE_NO_WINDOW}
         try:
             with open(self.log, "wb") as log:
-                self.process = subprocess.Popen(
+                process: Any = subprocess.Popen(  # of bytes, which options by name do not tell a type checker
                     self.command,
                     stdin=subprocess.PIPE,
                     stdout=subprocess.PIPE,
@@ -120,8 +120,9 @@ class Link:
             raise EngineError(
                 "missing", f"The engine cannot be started: {error}.", "Repair it in the preferences."
             ) from error
+        self.process = process
         reader = threading.Thread(
-            target=_read, args=(self.process.stdout, self._messages), name="fieldwork-engine", daemon=True
+            target=_read, args=(process.stdout, self._messages), name="fieldwork-engine", daemon=True
         )
         reader.start()
         self.last_used = time.monotonic()

@@ -125,12 +125,12 @@ def find_sources(
     names = unique_names(paths, root)
     stems = companion_stems(paths, root, names)
     pictures, drawn = beside_all(labels, stems, exact=False), beside_all(masks, stems, exact=False)
-    sources = []
+    sources, taken = [], {name.casefold() for name in taken}
     for path, name, own, picture, mask in zip(paths, names, stems, pictures, drawn):
         unique = name
-        while unique in taken:
+        while unique.casefold() in taken:
             unique += "_b"
-        taken.add(unique)
+        taken.add(unique.casefold())
         label = (find_probabilities(labels, own) or picture) if labels else None
         confidence = find_confidence(labels, own, label) if labels else None
         sources.append(Source(unique, path, label, mask, confidence))

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from ..files import is_text
@@ -22,12 +23,12 @@ def unique_names(paths: Sequence[Path], root: Path) -> list[str]:
     with. Long names are cut, with a digest of the whole behind.
     """
     names = [path.stem for path in paths]
-    if len(set(map(_joined, names))) < len(names):
+    if _alike(map(_joined, names)):
         names = ["/".join(_below(path, root).with_suffix("").parts) for path in paths]
     names = [_joined(name) for name in names]
-    if len(set(names)) < len(names):  # a.jpg beside a.png
+    if _alike(names):  # a.jpg beside a.png
         names = [f"{name}_{path.suffix[1:].lower()}" for name, path in zip(names, paths)]
-    if len(set(names)) < len(names):
+    if _alike(names):
         names = [f"{name}_{i}" for i, name in enumerate(names)]
     return names
 
@@ -39,11 +40,17 @@ def frame_names(places: Sequence[str]) -> list[str]:
         place[: -len(Path(place).suffix)] if Path(place).suffix.lower() in IMAGE_SUFFIXES else place for place in places
     ]
     names = [_joined(Path(place).name) for place in bare]
-    if len(set(names)) < len(names):
+    if _alike(names):
         names = [_joined("/".join(part for part in Path(place).parts if part.strip("./"))) for place in bare]
-    if len(set(names)) < len(names):
+    if _alike(names):
         names = [f"{name}_{i}" for i, name in enumerate(names)]
     return names
+
+
+def _alike(names: Iterable[str]) -> bool:
+    """Whether two names would be one file on Windows or macOS, which do not tell capitals apart."""
+    folded = [name.casefold() for name in names]
+    return len(set(folded)) < len(folded)
 
 
 def _joined(name: str) -> str:
@@ -59,11 +66,11 @@ def _below(path: Path, root: Path) -> Path:
 
 def find_image(path: Path) -> Path | None:
     """The image file at `path`, or with a usual image suffix appended when the path has none."""
-    if path.is_file():
+    if os.path.isfile(path):  # False, and no error, for names that are too long
         return path
     for suffix in IMAGE_SUFFIXES:
         for candidate in (path.with_name(path.name + suffix), path.with_name(path.name + suffix.upper())):
-            if candidate.is_file():
+            if os.path.isfile(candidate):
                 return candidate
     return None
 
@@ -130,7 +137,7 @@ def labels_and_masks(
 def beside(folder: Path, stem: str, exact: bool = True) -> Path | None:
     """The image in `folder` for a photo called `stem`: `<stem>.png`, or when not `exact` also `<stem>*.png|jpg`."""
     for suffix in (".png", ".PNG", ".tif", ".tiff", ".exr", ".jpg", ".JPG", ".jpeg"):
-        if (folder / f"{stem}{suffix}").exists():  # a folder of that name is told of by who reads it
+        if os.path.exists(folder / f"{stem}{suffix}"):  # a folder of that name is told of by who reads it
             return folder / f"{stem}{suffix}"
     if exact or not folder.is_dir():
         return None

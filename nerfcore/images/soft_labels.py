@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -19,7 +20,7 @@ PROBABILITY_SUFFIXES = (".npy", ".npz", ".exr")
 def find_probabilities(folder: Path, stems: Sequence[str]) -> Path | None:
     """The probability map of a photo in a labels folder, under one of its stems (`names.companion_stems`)."""
     places = (folder / f"{stem}{suffix}" for stem in stems for suffix in PROBABILITY_SUFFIXES)
-    return next((place for place in places if place.is_file()), None)
+    return next((place for place in places if os.path.isfile(place)), None)
 
 
 def find_confidence(folder: Path, stems: Sequence[str], label: Path | None) -> Path | None:

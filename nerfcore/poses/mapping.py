@@ -31,17 +31,27 @@ def mapper_options(relaxed: bool, count: int, names: list[str]) -> Any:
 
 
 class _Progress:
-    """Tells how many of `count` photos are placed; `registered` of them were before mapping began."""
+    """Tells how many of `count` photos are placed; `registered` of them were before mapping began.
+
+    A mapper that gets no further begins a separate model of the photos that are left: those are no gain for the first.
+    """
 
     def __init__(self, tell: Any, count: int, registered: int) -> None:
-        self.tell, self.count, self.registered = tell, count, registered
+        self.tell, self.count = tell, count
+        self.groups = [registered]  # photos of each model
         self.resumed = registered > 0
 
     def place(self, photos: int = 1) -> None:
-        self.registered = min(self.registered + photos, self.count)  # a second model counts its photos again
-        self.tell.progress(self.registered / self.count, f"{self.registered} of {self.count} photos placed")
+        self.groups[-1] += photos
+        now, before = self.groups[-1], max(self.groups[:-1], default=0)
+        text = f"{max(now, before)} of {self.count} photos placed"
+        if before:
+            text += f", {min(now, before)} in a separate group"
+        self.tell.progress(min(sum(self.groups), self.count) / self.count, text)
 
     def first_pair(self) -> None:
+        if self.groups[-1] and not self.resumed:
+            self.groups.append(0)
         self.place(0 if self.resumed else 2)  # it is called too when a model is taken up again
         self.resumed = False
 

@@ -9,6 +9,9 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
+from fieldwork.tests.nerfcore.support.windows_files import each_file_system
+
+__all__ = ["bpy_script", "each_file_system"]
 
 
 @pytest.fixture(scope="session")

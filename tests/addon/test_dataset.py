@@ -240,3 +240,15 @@ def test_a_scene_in_centimetres_becomes_a_data_set_in_metres(blend, tmp_path, bp
     ids = {name: number for number, name in enumerate(["", *result["classes"]])}
     from_center = np.abs(surfaces(tmp_path / "out")[ids["cube"]] - [0, 0, 0.005])
     np.testing.assert_allclose(from_center.max(-1), 0.005, atol=5e-5)
+
+
+def test_the_scene_s_camera_keeps_its_step_of_frames(bpy_script):
+    names = bpy_script(
+        """
+from fieldwork.addon.photograph.dataset import camera_shots
+scene = bpy.context.scene
+scene.frame_start, scene.frame_end, scene.frame_step = 2, 12, 5
+answer([shot.name for shot in camera_shots(scene, 100, None)])
+"""
+    )
+    assert names == ["0002", "0007", "0012"]

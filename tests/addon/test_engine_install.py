@@ -10,10 +10,11 @@ import time
 import tomllib
 import zipfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from fieldwork.addon.engine import install as module
-from fieldwork.addon.engine import place
+from fieldwork.addon.engine import place, tools
 from fieldwork.addon.engine.install import InstallCancelled, InstallError, Options, install
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -102,6 +103,7 @@ def test_offline_install_makes_an_environment_of_its_own(options, lock, tmp_path
     assert not (options.folder / "venv").exists()
 
 
+@pytest.mark.usefixtures("each_file_system")
 def test_broken_package_says_so_and_the_next_try_goes_on(options, lock, tmp_path, content_doctor):
     broken = make_wheel(tmp_path / "wheels")
     whole = broken.read_bytes()
@@ -157,6 +159,33 @@ def test_unsuitable_base_python_is_refused(options, lock, tmp_path, version, rea
     old.chmod(0o755)
     with pytest.raises(InstallError, match=reason):
         go(Options(**{**vars(options), "base": old}), lock)
+
+
+def test_an_intel_mac_is_told(options, lock, tmp_path, monkeypatch):
+    intel = tmp_path / "python"
+    intel.write_text("#!/bin/sh\necho 3 12 64 x86_64\n")
+    intel.chmod(0o755)
+    monkeypatch.setattr(module.sys, "platform", "darwin")
+    with pytest.raises(InstallError, match="Macs with Intel processors"):
+        go(Options(**{**vars(options), "base": intel}), lock)
+
+
+def test_tools_on_windows_have_no_window_and_end_with_their_children(tmp_path, monkeypatch):
+    started, ended = [], []
+
+    def popen(words, **how):
+        started.append(how)
+        raise OSError("there is no such tool")
+
+    monkeypatch.setattr(tools.sys, "platform", "win32")
+    monkeypatch.setattr(tools.subprocess, "CREATE_NO_WINDOW", 8, raising=False)
+    monkeypatch.setattr(tools.subprocess, "Popen", popen)
+    monkeypatch.setattr(tools.subprocess, "run", lambda words, **how: ended.append((words, how["creationflags"])))
+    with open(tmp_path / "log", "w") as log, pytest.raises(InstallError, match="no such tool"):
+        tools.Runner(log, threading.Event(), lambda *_: None)(["tool"], "It failed")
+    tools._kill_tree(SimpleNamespace(pid=7))
+    assert started[0]["creationflags"] == 8
+    assert ended == [(["taskkill", "/F", "/T", "/PID", "7"], 8)]
 
 
 def test_full_disk_is_told_before_anything_is_loaded(options, lock, monkeypatch):
@@ -285,6 +314,7 @@ def test_state_of_a_half_installed_engine(options):
     assert place.installed(options.folder) is None
 
 
+@pytest.mark.usefixtures("each_file_system")
 def test_repair_keeps_the_working_engine_until_the_new_one_runs(options, lock, tmp_path, content_doctor, monkeypatch):
     make_wheel(tmp_path / "wheels")
     go(options, lock)
@@ -312,6 +342,7 @@ def test_repair_keeps_the_working_engine_until_the_new_one_runs(options, lock, t
     assert not [path for path in options.folder.iterdir() if "old" in path.name or path.name == place.STAGING]
 
 
+@pytest.mark.usefixtures("each_file_system")
 def test_a_repair_begins_with_an_empty_environment(options, lock, tmp_path, content_doctor):
     make_wheel(tmp_path / "wheels")
     go(options, lock)

@@ -6,6 +6,7 @@ import os
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -14,6 +15,7 @@ bpy = pytest.importorskip("bpy")
 from fieldwork.addon import machine  # noqa: E402
 from fieldwork.addon.engine.link import Link  # noqa: E402
 from fieldwork.addon.errors import EngineError  # noqa: E402
+from fieldwork.addon.jobs import gate, timer  # noqa: E402
 from fieldwork.addon.jobs.follow import reattach  # noqa: E402
 from fieldwork.addon.jobs.job import CURVE_POINTS  # noqa: E402
 from fieldwork.addon.jobs.queue import Queue  # noqa: E402
@@ -366,3 +368,50 @@ def test_results_come_into_the_scene_one_after_the_other(queue, project):
     tick_until(queue, lambda: queue.current is None)
     assert order == [job.id for job in jobs for _ in range(3)]
     assert [job.state for job in jobs] == ["done"] * 3
+
+
+def test_what_a_job_needs_of_the_scene_waits_until_it_may_be_read(queue, project, monkeypatch):
+    closed = ["Waits for Object Mode"]
+    monkeypatch.setattr(gate, "closed", lambda: closed[0] if closed else None)
+    done = []
+
+    def steps():
+        done.append("read")
+        yield 0.5, "frame"
+
+    job = queue.make("count", {"project": str(project), "steps": 1}, before=steps())
+    queue.submit(job)
+    for _ in range(3):
+        tick(queue)
+    assert done == []
+    assert (job.state, job.message) == ("queued", "Waits for Object Mode")
+    closed.clear()
+    tick_until(queue, lambda: job.state == "done")
+    assert done == ["read"]
+
+
+def test_the_region_is_followed_only_when_nobody_works_on_the_scene(monkeypatch):
+    closed, followed = ["Waits for Object Mode"], []
+    stub = SimpleNamespace(app=SimpleNamespace(background=False), context=SimpleNamespace(scene="scene"))
+    monkeypatch.setattr(timer, "bpy", stub)
+    monkeypatch.setattr(timer.region, "follow", followed.append)
+    monkeypatch.setattr(gate, "closed", lambda: closed[0] if closed else None)
+    timer._follow_region()
+    assert followed == []
+    closed.clear()
+    timer._follow_region()
+    assert followed == ["scene"]
+
+
+def test_what_fails_after_an_undo_reaches_the_panel(queue, monkeypatch):
+    """Of what handlers raise only a terminal would hear."""
+
+    def broken(settings):
+        raise ZeroDivisionError("the lists are broken")
+
+    scenes = [SimpleNamespace(fieldwork=None)]
+    monkeypatch.setattr(timer, "bpy", SimpleNamespace(data=SimpleNamespace(scenes=scenes)))
+    monkeypatch.setattr(timer, "queue", queue)
+    monkeypatch.setattr(timer.lists, "undone", broken)
+    timer._undone()
+    assert "the lists are broken" in queue.outcome.error.message

@@ -168,3 +168,19 @@ def test_each_process_has_a_log_and_old_ones_go(tmp_path):
     kept = sorted(int(path.stem.split("-")[1]) for path in tmp_path.glob("engine-*.log"))
     assert kept == [*range(4, 12), 99]
     assert (tmp_path / "doctor.log").exists()
+
+
+def test_the_engine_has_no_window_on_windows(tmp_path, monkeypatch):
+    started = {}
+
+    def popen(command, **how):
+        started.update(how)
+        raise OSError("no")
+
+    monkeypatch.setattr(module.sys, "platform", "win32")
+    for name, flag in {"CREATE_NEW_PROCESS_GROUP": 2, "CREATE_NO_WINDOW": 8}.items():
+        monkeypatch.setattr(module.subprocess, name, flag, raising=False)
+    monkeypatch.setattr(module.subprocess, "Popen", popen)
+    with pytest.raises(EngineError, match="cannot be started"):
+        Link(sys.executable, tmp_path / "engine.log", ENGINE).start()
+    assert started["creationflags"] & 8

@@ -183,3 +183,26 @@ answer([items, FIELDWORK_OT_render.parameters(Asked(), bpy.context)["passes"]])
         project=make_project(tmp_path / "capture"),
     )
     assert facts == [list(get_args(Pass))] * 2
+
+
+def test_an_animation_of_every_other_frame_is_shown_without_gaps(bpy_script, tmp_path):
+    facts = bpy_script(
+        SETUP
+        + """
+from fieldwork.addon.render import result
+from fieldwork.addon.roles import Owner
+files = []
+for number in (1, 3, 5):
+    image = bpy.data.images.new("frame", 8, 8)
+    files.append(Path(folder, f"frame_{number:04}.png"))
+    image.filepath_raw, image.file_format = str(files[-1]), "PNG"
+    image.save()
+    bpy.data.images.remove(image)
+for _ in result.show_steps(scene, files, "background", False, Owner("capture")):
+    pass
+(slot,) = scene.camera.data.background_images
+answer([slot.image_user.frame_duration, Path(slot.image.filepath).parent.name])
+""",
+        folder=tmp_path,
+    )
+    assert facts == [6, "every_frame"]

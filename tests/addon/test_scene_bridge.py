@@ -278,8 +278,9 @@ bpy.ops.object.mode_set(mode="OBJECT")
 third = finished()
 for _ in range(400):
     tick(queue)
-    if len(bpy.data.objects) > 4 and third.state == "running" and first.state == second.state == "done":
+    if third.message == "view_002":
         break
+middle = [first.state, second.state, third.state, third.message]
 for item in [o for o in bpy.data.objects if "fieldwork_role" in o]:
     bpy.data.objects.remove(item)
 for _ in range(1000):
@@ -287,7 +288,7 @@ for _ in range(1000):
     if queue.current is None:
         break
     time.sleep(0.005)
-answer({"waiting": waiting, "held": held, "states": [first.state, second.state, third.state],
+answer({"waiting": waiting, "held": held, "middle": middle, "states": [first.state, second.state, third.state],
         "error": str(third.error), "objects": count()})
 """,
         package=package,
@@ -295,6 +296,7 @@ answer({"waiting": waiting, "held": held, "states": [first.state, second.state, 
     )
     assert facts["waiting"] == [3, "done", "Waits for Object Mode", True]
     assert facts["held"] == [0, "Waits for Object Mode"]
+    assert facts["middle"] == ["done", "done", "running", "view_002"]
     assert facts["states"] == ["done", "done", "done"], facts["error"]
     assert facts["objects"] == 3 + 8  # parent, four cameras, the animated one, points, surface
 

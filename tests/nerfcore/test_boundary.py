@@ -17,7 +17,7 @@ import pytest
 from fieldwork.nerfcore import cli
 from fieldwork.nerfcore.engine import protocol as rpc
 from fieldwork.nerfcore.engine.server import Server
-from fieldwork.nerfcore.errors import explained
+from fieldwork.nerfcore.errors import Cancelled, explained
 from fieldwork.nerfcore.files import disk_errors, write_text
 from fieldwork.nerfcore.params import RegionParams
 from fieldwork.nerfcore.poses.align import align
@@ -71,6 +71,20 @@ def test_a_failure_nobody_foresaw(
         assert log.is_relative_to(project / "jobs")
         assert "Traceback" in log.read_text(encoding="utf-8")
         assert str(log) in err
+
+
+def test_a_cancelled_command_prints_one_object_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    def cancelled(*_: object) -> None:
+        raise Cancelled
+
+    project = ball_project(tmp_path / "p")
+    monkeypatch.setattr(cli, "run_verb", cancelled)
+    assert cli.main(["evaluate", str(project), "--json"]) == 130
+    out, err = capfd.readouterr()
+    assert json.loads(out)["error"]["code"] == "cancelled"
+    assert "go on" in err
 
 
 def test_a_failure_without_a_project_is_logged_too(

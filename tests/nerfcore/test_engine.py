@@ -403,6 +403,7 @@ def test_unwritable_project_is_an_error_that_names_it(start, tmp_path):
 def test_cancel_does_not_wait_for_libraries_that_load(start, project):
     client = start()
     request = client.send("slow_to_load", project=project)
+    client.next()  # the job has begun
     time.sleep(0.3)
     asked = time.monotonic()
     client.send("cancel")

@@ -26,19 +26,24 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-WITH_RUN = [verb.params for verb in VERBS.values() if "run" in verb.params.model_fields]
+WITH_RUN = [
+    (verb.params, field)
+    for verb in VERBS.values()
+    for field in verb.params.model_fields
+    if field in ("run", "other_run")
+]
 BAD = [
     "", ".", "..", ".new", "../../b/runs/main", "a/b", "a\\b", "/tmp/x", "C:", "a:b", "con", "NUL", "com1.x", "a.", "a ",
     " a", "x" * 65, "a\0b", "a\nb", "a?b", "\udce9",
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("params", WITH_RUN)
+@pytest.mark.parametrize(("params", "field"), WITH_RUN)
 @pytest.mark.parametrize("name", BAD)
-def test_names_of_runs_that_are_refused(params: type[Params], name: str) -> None:
+def test_names_of_runs_that_are_refused(params: type[Params], field: str, name: str) -> None:
     with pytest.raises(ValidationError) as caught:
-        params.model_validate({"project": "p", "run": name})
-    (wrong,) = [detail for detail in caught.value.errors() if detail["loc"] == ("run",)]
+        params.model_validate({"project": "p", field: name})
+    (wrong,) = [detail for detail in caught.value.errors() if detail["loc"] == (field,)]
     assert wrong["type"] == "value_error"
 
 
@@ -91,6 +96,13 @@ def test_long_names_of_photos_are_cut_and_stay_apart(tmp_path: Path) -> None:
     assert len(set(wide)) == 3
     assert all(len(name.encode()) <= LONGEST for name in wide)
     assert unique_names([tmp_path / "a.jpg"], tmp_path) == ["a"]
+
+
+def test_names_of_photos_differ_by_more_than_capitals(tmp_path: Path) -> None:
+    """They become files, which Windows and macOS do not tell apart by capitals."""
+    assert unique_names([tmp_path / "left" / "A.jpg", tmp_path / "right" / "a.jpg"], tmp_path) == ["left_A", "right_a"]
+    assert unique_names([tmp_path / "A.jpg", tmp_path / "a.jpg"], tmp_path) == ["A_jpg_0", "a_jpg_1"]
+    assert frame_names(["left/A", "right/a"]) == ["left_A", "right_a"]
 
 
 def test_json_of_a_wrong_name(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

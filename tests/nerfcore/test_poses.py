@@ -14,10 +14,13 @@ import pytest
 from fieldwork.nerfcore.data.load import load_scene
 from fieldwork.nerfcore.errors import DiskError, FieldworkError, PosesError
 from fieldwork.nerfcore.geometry.similarity import transform_points
+from fieldwork.nerfcore.params import PosesParams
 from fieldwork.nerfcore.poses import estimate, process
 from fieldwork.nerfcore.poses.estimate import in_groups
+from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.schema import SemanticClass
 from fieldwork.nerfcore.project.store import load_points, load_poses, load_project, load_visibility, save_project
+from fieldwork.tests.nerfcore.support.ball import ball_project
 from fieldwork.tests.nerfcore.support.captures import centre_errors, ingest, poses, rotation_errors, view_errors
 from PIL import Image
 
@@ -388,3 +391,64 @@ def test_a_further_try_says_which_groups_there_are() -> None:
     names = ["x"] * 60
     assert pipeline._placed(one, names) == "49 of 60 photos placed"  # type: ignore[arg-type]
     assert pipeline._placed(two, names).endswith("groups of 49 and 11")  # type: ignore[arg-type]
+
+
+def test_progress_counts_no_two_groups_together() -> None:
+    import zlib  # noqa: F401 - before pycolmap
+
+    from fieldwork.nerfcore.poses import mapping
+
+    said: list[tuple[float, str]] = []
+    tell = SimpleNamespace(progress=lambda fraction, message: said.append((fraction, message)))
+    progress = mapping._Progress(tell, 60, 0)
+    progress.first_pair()
+    for _ in range(47):
+        progress.place()
+    assert said[-1] == (49 / 60, "49 of 60 photos placed")
+    progress.first_pair()
+    for _ in range(9):
+        progress.place()
+    assert said[-1] == (1.0, "49 of 60 photos placed, 11 in a separate group")
+    resumed = mapping._Progress(tell, 60, 30)
+    resumed.first_pair()
+    resumed.place()
+    assert said[-1][1] == "31 of 60 photos placed"
+
+
+def test_the_verb_says_groups_and_judges(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    project = ball_project(tmp_path / "p", views=8, side=24)
+    known = load_poses(project)
+
+    def two_groups(job: dict[str, Any], work: Path, report: Reporter) -> dict[str, Any]:
+        """Five of the photos are placed, the others by themselves."""
+        random = np.random.default_rng(0)
+        none = np.zeros(0, np.int32)
+        colors = np.zeros((30, 3), np.uint8)
+        np.savez(
+            work / "points.npz", xyz=random.normal(size=(30, 3)), rgb=colors, error=np.ones(30), view=none, point=none
+        )
+        images = []
+        for number, (image, posed) in enumerate(zip(job["images"], known.images)):
+            there = {"status": "ok", "reason": "", "camera": 0, "camera_to_world": posed.camera_to_world}
+            away = {"status": "unregistered", "reason": "belongs to a separate group of 3 photos"}
+            images.append({"file": image["file"], **(there if number < 5 else away)})
+        cameras = [camera.model_dump(mode="json") for camera in known.cameras]
+        return {
+            "cameras": cameras,
+            "images": images,
+            "links": [],
+            "groups": [5, 3],
+            "reprojection_px": 0.5,
+            "contradicting_pairs": 0,
+            "level": "fast",
+            "points_file": str(work / "points.npz"),
+        }
+
+    monkeypatch.setattr(estimate, "run_worker", two_groups)
+    report = Reporter()
+    result = estimate.estimate_poses(PosesParams(project=project), report)
+    assert (result["registered"], result["groups"]) == (5, [5, 3])
+    assert result["verdict"]["level"] == "weak"
+    assert "5 of 8" in result["verdict"]["reasons"][0]
+    assert "2 groups of 5 and 3" in report.warnings[0]
+    assert "--group 1" in report.warnings[0]

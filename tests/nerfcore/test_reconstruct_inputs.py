@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 from fieldwork.nerfcore.capture.ingest import new
 from fieldwork.nerfcore.params import NewParams, Params, ReconstructParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.store import load_project
+from fieldwork.nerfcore.verdict import verdict
 from fieldwork.nerfcore.workflows import reconstruct as module
 from fieldwork.tests.nerfcore.support.photos import folder_of
 from PIL import Image
@@ -55,20 +57,43 @@ def test_nothing_is_said_of_photos_alone(tmp_path: Path, monkeypatch: pytest.Mon
     assert values.mask_mode == "empty"
 
 
+def all_stages(
+    monkeypatch: pytest.MonkeyPatch, folder: Path, made: dict[str, Any], **asked: Any
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The parameters of the stages of a reconstruction that do nothing, and its result; `made`: results by verb."""
+    seen = {}
+
+    def do(self: module.Pipeline, verb: str, values: Params) -> None:
+        seen[verb] = values
+        self.results[verb], self.seconds[verb] = made.get(verb, {}), 0.0
+
+    monkeypatch.setattr(module.Pipeline, "do", do)
+    monkeypatch.setattr(module, "held_out", lambda project, run: False)
+    params = ReconstructParams(photos=folder_of(folder / "photos", 3), out=folder / "p", **asked)
+    return seen, module.reconstruct(params, Reporter())
+
+
 @pytest.mark.parametrize(("asked", "made"), [({}, (200_000, 4096)), ({"faces": 0, "texture": 0}, (None, None))])
 def test_the_mesh_is_of_a_size_one_can_use(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, asked: dict[str, int], made: tuple[int | None, int | None]
 ) -> None:
-    photos, seen = folder_of(tmp_path / "photos", 3), {}
-
-    def do(self: module.Pipeline, verb: str, values: Params) -> None:
-        seen[verb] = values
-        self.results[verb], self.seconds[verb] = {}, 0.0
-
-    monkeypatch.setattr(module.Pipeline, "do", do)
-    monkeypatch.setattr(module, "held_out", lambda project, run: False)
-    module.reconstruct(ReconstructParams(photos=photos, out=tmp_path / "p", **asked), Reporter())
+    seen, _ = all_stages(monkeypatch, tmp_path, {}, **asked)
     assert (seen["mesh"].faces, seen["mesh"].texture) == made
+
+
+def test_as_many_views_are_rendered_as_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen, _ = all_stages(monkeypatch, tmp_path, {}, render_count=3)
+    assert seen["render"].orbit == 3
+
+
+def test_the_verdict_is_the_worst_of_the_stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = {
+        "poses": {"verdict": verdict([("weak", "Few photos.")])},
+        "train": {"verdict": verdict([])},
+        "mesh": {"verdict": verdict([("failed", "Scraps.")])},
+    }
+    _, result = all_stages(monkeypatch, tmp_path, made)
+    assert result["verdict"] == {"level": "failed", "reasons": ["mesh: Scraps.", "poses: Few photos."]}
 
 
 def test_the_meaning_of_masks_can_be_changed(tmp_path: Path) -> None:

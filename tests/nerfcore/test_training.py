@@ -23,6 +23,7 @@ from fieldwork.nerfcore.params import EvaluateParams, MeshParams, RenderParams, 
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.schema import ImageRecord, PosedImage, Poses, Project, SemanticClass
 from fieldwork.nerfcore.project.store import load_project, save_poses, save_project
+from fieldwork.nerfcore.render.model import Model
 from fieldwork.nerfcore.render.run import read_checkpoint
 from fieldwork.nerfcore.render.verb import look_at
 from fieldwork.nerfcore.verbs import run_verb
@@ -180,6 +181,23 @@ def test_renders_have_all_passes(trained: Path, tmp_path: Path) -> None:
     pixels = buffer.get_pixels(oiio.FLOAT)
     assert pixels[16, 16, names.index("Depth.Z")] == pytest.approx(1.3, abs=0.25)
     assert pixels[16, 16, names.index("Label.ID")] in (1, 2)
+
+
+def test_a_render_is_cancelled_within_a_picture(trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither a picture nor the finer grid before it is made to its end."""
+    asked = []
+
+    class StopsInThePicture(Reporter):
+        def progress(self, fraction: float, message: str = "") -> None:
+            super().progress(fraction, message)
+            self.cancel()
+
+    monkeypatch.setattr(Model, "refine", lambda model, pixels, check=None: asked.append(check))
+    report = StopsInThePicture()
+    with pytest.raises(Cancelled):
+        run_verb("render", RenderParams(project=trained, out=tmp_path, orbit=1, size=(32, 32)), report)
+    assert asked == [report.check]
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_resumed_training_equals_an_uninterrupted_one(tiny_project: Path) -> None:

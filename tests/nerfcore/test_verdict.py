@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from fieldwork.nerfcore.cli import main
+from fieldwork.nerfcore.evaluate.verb import evaluate
 from fieldwork.nerfcore.geometry.cameras import Camera
+from fieldwork.nerfcore.images.picture import Picture
 from fieldwork.nerfcore.mesh.photos import Photo
 from fieldwork.nerfcore.mesh.shown import shown_share
+from fieldwork.nerfcore.mesh.verb import mesh
 from fieldwork.nerfcore.mesh.visibility import PosedCamera
+from fieldwork.nerfcore.params import EvaluateParams, MeshParams, TrainParams
+from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.render.image import Frame
+from fieldwork.nerfcore.train.verb import train
 from fieldwork.nerfcore.verdict import (
     evaluate_verdict,
     mesh_verdict,
@@ -21,6 +29,7 @@ from fieldwork.nerfcore.verdict import (
     worst,
 )
 from fieldwork.tests.nerfcore.support.ball import SMALL, ball_project
+from fieldwork.tests.nerfcore.support.reconstructed import triangle
 
 
 def curve(*psnr: float) -> list[dict[str, float]]:
@@ -103,3 +112,32 @@ def test_scraps_are_told_at_the_command_line(tmp_path: Path, capfd: pytest.Captu
     answer = json.loads(capfd.readouterr().out)
     assert answer["verdict"]["level"] in ("weak", "failed")
     assert 0 <= answer["opacity"] <= 1
+
+
+def test_a_mesh_of_scraps_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    project = ball_project(tmp_path / "p")
+    train(TrainParams(project=project, preset="draft", steps=2, set=SMALL), Reporter())
+    whole = triangle()
+    scraps = replace(whole, vertices=whole.vertices * np.float32(0.01))
+    monkeypatch.setattr("fieldwork.nerfcore.mesh.verb.build", lambda *_: scraps)
+    result = mesh(MeshParams(project=project), Reporter())
+    assert result["shown"] < 0.02
+    assert result["verdict"]["level"] == "failed"
+    assert "The mesh fills" in result["verdict"]["reasons"][0]
+
+
+def test_what_is_judged_of_renders_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A field that is fog, with depths from 1 to 3 where it is not."""
+    project = ball_project(tmp_path / "p")
+    train(TrainParams(project=project, preset="draft", steps=2, set=SMALL), Reporter())
+
+    def fog(model: object, camera: Camera, *_: object, **__: object) -> Frame:
+        pixels = np.zeros((camera.height, camera.width, 4), np.float32)
+        pixels[: camera.height // 4] = 0.8
+        depth = np.broadcast_to(np.linspace(1, 3, camera.width, dtype=np.float32), pixels.shape[:2])
+        return Frame(Picture(pixels, "srgb", "associated"), 1.0, depth, None, np.zeros((*pixels.shape[:2], 3)))
+
+    monkeypatch.setattr("fieldwork.nerfcore.evaluate.verb.render_view", fog)
+    result = evaluate(EvaluateParams(project=project), Reporter())
+    assert result["opacity"] == pytest.approx(0.2, abs=1e-4)
+    assert result["depth_spread"] == pytest.approx(2.9 / 1.1, rel=0.01)

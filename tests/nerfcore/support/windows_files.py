@@ -6,7 +6,6 @@ Windows syncs only files that are open for writing, and neither replaces, rename
 
 from __future__ import annotations
 
-import fcntl
 import os
 import shutil
 import time
@@ -32,6 +31,8 @@ def each_file_system(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyP
 
 def behave_like_windows(monkeypatch: pytest.MonkeyPatch) -> None:
     """Until the end of the test, os.fsync, replace, rename, remove and rmdir refuse what Windows refuses."""
+    import fcntl  # not on Windows itself
+
     monkeypatch.setattr(files, "WINDOWS", True)
     fsync = os.fsync
 

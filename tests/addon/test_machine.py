@@ -1,0 +1,36 @@
+"""What belongs to the machine, and where it lies."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+
+pytest.importorskip("bpy")
+
+from fieldwork.addon import machine
+
+
+@pytest.fixture
+def user(tmp_path, monkeypatch):
+    monkeypatch.setattr(machine, "user_folder", lambda *parts: tmp_path.joinpath("user", *parts))
+    return tmp_path / "user"
+
+
+@pytest.mark.parametrize(
+    ("system", "place"), [("win32", "Fieldwork/engine"), ("linux", "user/engine"), ("darwin", "user/engine")]
+)
+def test_the_engine_has_a_short_path_on_windows(user, tmp_path, monkeypatch, system, place):
+    monkeypatch.setattr(machine, "AS_EXTENSION", True)
+    monkeypatch.setattr(machine.sys, "platform", system)
+    monkeypatch.setenv("LOCALAPPDATA", str(tmp_path))
+    assert machine.engine_folder() == tmp_path / place
+
+
+def test_each_blender_has_a_log_of_its_engine(user, monkeypatch):
+    mine = machine.engine_log()
+    number = os.getpid()
+    monkeypatch.setattr(machine.os, "getpid", lambda: number + 1)
+    others = machine.engine_log()
+    assert mine.parent == others.parent == user / "logs"
+    assert mine != others

@@ -44,10 +44,10 @@ def preferences() -> Any:
 
 
 def engine_folder() -> Path:
-    """Where the engine is. On Windows in a short place, one for all Blenders: paths end at 260 characters there, of which
-    PyTorch takes 170."""
+    """Where the engine is. On Windows in a short place, one for all Blenders with this version of the extension, patches
+    aside: paths end at 260 characters there, of which PyTorch takes 170."""
     local = os.environ.get("LOCALAPPDATA") if AS_EXTENSION and sys.platform == "win32" else None
-    return Path(local, "Fieldwork", "engine") if local else user_folder("engine")
+    return Path(local, "Fieldwork", f"engine-{place.feature_version()}") if local else user_folder("engine")
 
 
 def engine_log() -> Path:

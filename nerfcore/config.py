@@ -185,6 +185,7 @@ class LossConfig(Stage):
     """What training minimises."""
 
     rgb: Literal["huber", "mse"] = Field(default="huber", description="price of colour errors; mse: squared")
+    rgb_warmup: int = Field(default=64, ge=0, le=MANY, description="first steps in which colour errors count squared")
     rgb_weight: float = Field(default=1.0, ge=0, le=1000, description="of colour errors")
     huber_delta: float = Field(default=0.1, gt=0, le=10, description="colour error from which its price grows linearly")
     semantic_weight: float = Field(default=0.04, ge=0, le=1000, description="λ_sem; 0 trains without semantics")

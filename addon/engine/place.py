@@ -74,6 +74,14 @@ def _name(value: dict[str, Any]) -> str:
     return name if name in ENVIRONMENTS else ENVIRONMENTS[0]
 
 
+def feature_version(manifest: Path = ROOT / "blender_manifest.toml") -> str:
+    """The extension's version without its patch number, such as "0.1"."""
+    import tomllib
+
+    version: str = tomllib.loads(manifest.read_text(encoding="utf-8"))["version"]
+    return ".".join(version.split(".")[:2])
+
+
 def lock_hash(lock: Path = LOCK) -> str:
     """Digest of the versions this extension wants."""
     import hashlib

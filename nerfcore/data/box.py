@@ -37,11 +37,12 @@ def looks_inward(views: list[View]) -> bool:
     return float((cosine > 0.7).mean()) > 0.9
 
 
-def choose_box(scene: Scene, config: SceneConfig, transparent: bool) -> Box:
+def choose_box(scene: Scene, config: SceneConfig, empty_around: bool) -> Box:
     """Fit the cube to a scene in the world frame.
 
     - Bounds given by the capture (or the crop box): the cube around them, nothing outside.
-    - Photos or masks with empty surroundings: the cube holds what the cameras surround, nothing outside.
+    - Photos or masks with empty surroundings (`empty_around`), photos in front of black or white too: the cube holds
+      what the cameras surround, nothing outside.
     - Inward-looking captures with visible surroundings: the cube reaches from the focus to the cameras, or holds the
       sparse points (without points: what fills the photos) where those all lie closer together; space beyond is
       contracted.
@@ -54,7 +55,7 @@ def choose_box(scene: Scene, config: SceneConfig, transparent: bool) -> Box:
     if looks_inward(scene.views):
         focus = focus_point([view.camera_to_world for view in scene.views])
         reach = np.linalg.norm(centers - focus, axis=1)
-        if transparent and config.contraction != "on":
+        if empty_around and config.contraction != "on":
             return _box(focus, _object_radius(scene, focus, reach) * config.margin, False)
         # Cameras just inside the cube: what stands between and behind them is resolved finely too.
         extent = float(np.abs(centers - focus).max())

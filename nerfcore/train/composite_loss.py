@@ -26,6 +26,7 @@ def composite_loss(
     config: LossConfig,
     model: Model,
     share: tuple[float, float | torch.Tensor] = (1.0, 1.0),
+    squared: bool = False,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """The loss of R rays in front of `background` (R, 3), and their mean squared colour error; both scalars.
 
@@ -34,12 +35,13 @@ def composite_loss(
         model: what rendered the rays.
         share: the part of the whole batch's rays and of its labelled rays that these are; both results are scaled so
             that those of all parts sum to the batch's.
+        squared: colour errors count squared, see `color_loss`.
     """
     rays, labels = share
     alpha = batch.alpha[:, None]
     target = batch.rgb * alpha + background * (1 - alpha)
     predicted = rendered.color + background * (1 - rendered.opacity[:, None])
-    total = rays * config.rgb_weight * color_loss(predicted, target, config)
+    total = rays * config.rgb_weight * color_loss(predicted, target, config, squared)
     if rendered.probabilities is not None:
         counted = label_weights(batch)
         opacity = torch.lerp(rendered.opacity.detach(), rendered.opacity, model.label_pull)

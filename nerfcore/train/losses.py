@@ -13,10 +13,20 @@ from ..kernels.composite import sums_in_front
 from ..kernels.packed_info import PackedInfo
 
 
-def color_loss(predicted: torch.Tensor, target: torch.Tensor, config: LossConfig) -> torch.Tensor:
-    """Huber (δ as configured, scaled to its quadratic part's slope 1/δ) or squared error of colours (R, 3)."""
+def color_loss(
+    predicted: torch.Tensor, target: torch.Tensor, config: LossConfig, squared: bool = False
+) -> torch.Tensor:
+    """Huber (δ as configured, scaled to its quadratic part's slope 1/δ) or squared error of colours (R, 3).
+
+    Huber's price is all but that of the absolute error, whose best guess for all pixels alike is their median: where
+    most of a capture is black, the field would turn black and transparent before it can tell pixels apart, and black
+    in front of black has no gradient to come back by. `squared`: the quadratic part holds for all errors, whose best
+    guess is the mean.
+    """
     if config.rgb == "mse":
         return F.mse_loss(predicted, target)
+    if squared:
+        return F.mse_loss(predicted, target) / (2 * config.huber_delta)
     return F.huber_loss(predicted, target, delta=config.huber_delta) / config.huber_delta
 
 

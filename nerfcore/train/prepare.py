@@ -77,12 +77,14 @@ def plan_run(
             "At least two are needed: add photos and run poses.",
         )
     transparent = has_transparency(scene)
-    box = choose_box(scene, config.scene, transparent)
+    background = choose_background(scene, transparent)
+    # In front of one colour all around there is nothing but that colour.
+    box = choose_box(scene, config.scene, transparent or background != "random")
     config = config.model_copy(deep=True)
     if config.scene.image_size is None:
         config.scene.image_size = CPU_IMAGE_SIZE if device.type == "cpu" else GPU_IMAGE_SIZE
     if config.scene.background == "auto":
-        config.scene.background = choose_background(scene, transparent)
+        config.scene.background = background
     if config.field.finest is None:
         across = pixels_across(scene, train, box, config.scene.image_size)
         config.field.finest = min(max(across, 2 * config.field.coarsest), MOST_VERTICES)

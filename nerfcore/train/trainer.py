@@ -219,6 +219,7 @@ class Trainer:
             shard_count = max(2, min(worker_count(), sample_budget(config.train, progress) // SHARD_SAMPLES))
         size = -(-rays // shard_count)
         capacity = self._capacity(progress, shard_count)
+        squared = self.steps < config.loss.rgb_warmup
 
         def shard(begin: int) -> ShardResult:
             part = batch.part(slice(begin, begin + size))
@@ -228,7 +229,8 @@ class Trainer:
                 rendered = self._render(part, *noise, capacity)
                 share = len(part.rgb) / rays, counted[begin : begin + size].sum() / labelled
                 behind = background[begin : begin + size]
-                return *composite_loss(part, rendered, behind, progress, config.loss, self.model, share), rendered
+                terms = composite_loss(part, rendered, behind, progress, config.loss, self.model, share, squared)
+                return *terms, rendered
 
             moved = (part.origins, part.directions) if part.origins.requires_grad else ()
             return self._differentiate(loss, moved)

@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("bpy")
 
 from fieldwork.addon.jobs.job import Job
-from fieldwork.panels.base import duration, progress_text, reuse_text, verdict_of
+from fieldwork.panels.base import draw_verdict, duration, progress_text, reuse_text, verdict_of
 
 
 @pytest.mark.parametrize(
@@ -96,6 +96,21 @@ answer(seen)
         "fieldwork.train",
         None,
     ]
+
+
+@pytest.mark.parametrize(("level", "red", "icon"), [("failed", True, "ERROR"), ("weak", False, "INFO")])
+def test_a_failed_verdict_is_red(level, red, icon):
+    from types import SimpleNamespace
+
+    drawn = []
+    column = SimpleNamespace(label=lambda text, icon: drawn.append((text, icon)))
+    box = SimpleNamespace(alert=None, column=lambda **_: column)
+    context = SimpleNamespace(preferences=SimpleNamespace(system=SimpleNamespace(ui_scale=1.0)), region=None)
+    result = {"verdict": {"level": level, "reasons": ["Only scraps came of it."]}}
+    draw_verdict(SimpleNamespace(box=lambda: box), context, result)
+    assert box.alert == red
+    assert [text for text, _ in drawn] == ["Only scraps came of it."]
+    assert drawn[0][1] == icon
 
 
 def test_quality_and_time_come_from_the_project(tmp_path, monkeypatch):

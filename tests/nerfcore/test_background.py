@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from fieldwork.nerfcore.config import RunConfig
 from fieldwork.nerfcore.data.box import box_poses
 from fieldwork.nerfcore.data.load import load_scene
-from fieldwork.nerfcore.params import TrainParams
+from fieldwork.nerfcore.geometry.similarity import similarity_scale
+from fieldwork.nerfcore.params import ImportParams, TrainParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.store import load_project, save_project
 from fieldwork.nerfcore.render.image import render_view
 from fieldwork.nerfcore.render.run import load_trained
 from fieldwork.nerfcore.train.background import choose_background, edge_shares
+from fieldwork.nerfcore.train.prepare import plan_run
 from fieldwork.nerfcore.verbs import run_verb
-from fieldwork.tests.nerfcore.support.ball import SMALL, ball_project, camera_poses, draw
+from fieldwork.tests.nerfcore.support.ball import RADIUS, SMALL, ball_project, camera_poses, draw
 from PIL import Image
 
 
@@ -56,6 +61,26 @@ def test_only_around_objects_without_alpha_and_masks(tmp_path: Path) -> None:
     outward = [pose @ np.diag([-1.0, 1, -1, 1]) for pose in camera_poses(16)]
     room = on_background(ball_project(tmp_path / "room", given=outward), 0)
     assert choose_background(load_scene(room), transparent=False) == "random"
+
+
+@pytest.mark.parametrize("value", [0, 255, None])
+def test_the_cube_holds_all_there_is_in_front_of_one_colour(tmp_path: Path, value: int | None) -> None:
+    project = on_background(ball_project(tmp_path / "p"), value)
+    info, _ = plan_run(project, "draft", RunConfig(), torch.device("cpu"))
+    assert info.contracted == (value is None)
+    side = 2 * similarity_scale(np.asarray(info.sfm_from_box))
+    assert side > 2 * RADIUS  # the ball fits in
+
+
+def test_photos_that_are_mostly_black_do_not_turn_the_field_black(
+    shared_data: Callable[[str], Path], tmp_path: Path
+) -> None:
+    """With Huber's price from the first step, colours and densities ran to zero in ten steps and stayed there, at the
+    11.6 dB of a black picture."""
+    run_verb("import", ImportParams(dataset=shared_data("temple_ring"), project=tmp_path / "p"), Reporter())
+    settings = {"scene.image_size": "320", "scene.contraction": "on"}
+    result = run_verb("train", TrainParams(project=tmp_path / "p", steps=100, set=settings), Reporter())
+    assert result["psnr_train"] > 18
 
 
 def test_edges_only() -> None:

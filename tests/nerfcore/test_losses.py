@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from fieldwork.nerfcore.config import LossConfig
@@ -18,6 +19,21 @@ def test_color_losses() -> None:
     assert float(losses.color_loss(a, b, LossConfig(rgb="mse"))) == pytest.approx((0.05**2 + 0.4**2) / 3)
     huber = (0.5 * 0.05**2 / 0.1 + (0.4 - 0.05)) / 3
     assert float(losses.color_loss(a, b, LossConfig())) == pytest.approx(huber, rel=1e-5)
+
+
+@pytest.mark.parametrize(("squared", "best"), [(True, 0.24), (False, 0.043)])
+def test_one_guess_for_mostly_black_pixels_is_their_mean_where_errors_are_squared(squared: bool, best: float) -> None:
+    """70 % black, 30 % at 0.8: the mean is 0.24; Huber's price is least where 70·x = 30·δ, near the median."""
+    target = torch.zeros(1000, 3)
+    target[:300] = 0.8
+    guesses = torch.linspace(0, 1, 401)
+    config = LossConfig()
+    prices = [float(losses.color_loss(g.expand(1000, 3), target, config, squared)) for g in guesses]
+    assert float(guesses[int(np.argmin(prices))]) == pytest.approx(best, abs=0.004)
+    # Small errors cost the same in both.
+    small = torch.full((1000, 3), 0.02)
+    zero = torch.zeros(1000, 3)
+    assert float(losses.color_loss(small, zero, config, squared)) == pytest.approx(0.002, rel=1e-4)
 
 
 def test_a_batch_without_labels_costs_nothing_and_is_not_nan() -> None:

@@ -120,6 +120,21 @@ def test_colour_errors_are_squared_or_bounded() -> None:
     assert price(0.4, huber_delta=0.5) < price(0.4, huber_delta=0.1)
 
 
+@pytest.mark.setting("loss.rgb_warmup")
+def test_colour_errors_are_squared_in_the_first_steps(ball: Path) -> None:
+    still = {"train.network_rate": "1e-9", "train.grid_rate": "1e-9", "loss.semantic_weight": "0"}
+    prices = {}
+    for warmup in (2, 0):
+        trainer = trainer_of(ball, **still, **{"loss.rgb_warmup": str(warmup)})
+        prices[warmup] = []
+        for _ in range(3):
+            trainer.step(0.0)
+            prices[warmup].append(float(trainer.take_measured().loss))
+    assert prices[2][0] > 1.2 * prices[0][0]  # large errors cost more squared
+    assert prices[2][1] > 1.2 * prices[0][1]
+    assert prices[2][2] == pytest.approx(prices[0][2], rel=1e-3)
+
+
 @pytest.fixture(scope="module")
 def priced(ball: Path) -> Callable[..., float]:
     """The loss of one rendered batch, with some settings of `loss` changed; without the distortion loss."""

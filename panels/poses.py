@@ -8,7 +8,7 @@ from ..addon.project import region, snapshot
 from ..addon.scene import measured_line
 from ..addon.text import t
 from . import states
-from .base import FieldworkPanel, StepPanel, columns, draw_wrapped, text_width
+from .base import FieldworkPanel, StepPanel, columns, draw_verdict, draw_wrapped, text_width
 from .capture import STATUS_ICONS
 from .states import project_folder
 
@@ -45,6 +45,7 @@ class FIELDWORK_PT_poses(StepPanel):
             row.operator("fieldwork.poses", text=t("Start Over"), icon="FILE_REFRESH").restart = True
         if not (done and folder):
             return
+        draw_verdict(layout, context, snapshot.last_result(folder, "poses"))
         layout.template_list("FIELDWORK_UL_poses", "poses", settings, "images", settings, "pose_index", rows=4)
         if 0 <= settings.pose_index < len(settings.images) and settings.images[settings.pose_index].reason:
             draw_wrapped(layout, settings.images[settings.pose_index].reason, text_width(context), icon="INFO")

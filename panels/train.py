@@ -87,6 +87,7 @@ class FIELDWORK_PT_runs(FieldworkPanel):
             chosen = name == settings.run
             row.operator("fieldwork.use_run", text=name, icon="RADIOBUT_ON" if chosen else "RADIOBUT_OFF").run = name
             row.label(text=runs.quality(folder, name))
+        draw_verdict(layout, context, runs.evaluation(folder, settings.run))
         layout.operator("fieldwork.evaluate", icon="VIEWZOOM")
 
 

@@ -46,12 +46,15 @@ def held_out(folder: Path | None, run: str) -> bool:
     return every > 0 and ("test" in splits or splits.count("auto") >= every)
 
 
+def evaluation(folder: Path | None, run: str) -> dict[str, Any]:
+    """What `evaluate` found on the held-out photos of a run; empty when it was not measured."""
+    metrics = cached_json(folder / "runs" / run / "metrics.json") if folder else None
+    return (metrics.get("test") or {}) if isinstance(metrics, dict) else {}
+
+
 def quality(folder: Path | None, run: str) -> str:
     """Measured quality of a run in a few words; empty when it was not measured."""
-    metrics = cached_json(folder / "runs" / run / "metrics.json") if folder else None
-    if not isinstance(metrics, dict):
-        return ""
-    measured = metrics.get("test") or {}
+    measured = evaluation(folder, run)
     psnr, miou = measured.get("psnr"), measured.get("miou")
     words = [f"{psnr:.1f} dB" if psnr is not None else "", f"mIoU {miou:.2f}" if miou is not None else ""]
     return ", ".join(word for word in words if word)

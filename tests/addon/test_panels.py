@@ -113,6 +113,30 @@ def test_a_failed_verdict_is_red(level, red, icon):
     assert drawn[0][1] == icon
 
 
+def test_poses_and_evaluation_show_what_they_say_against_their_results(tmp_path, monkeypatch):
+    from unittest.mock import MagicMock
+
+    from fieldwork.panels import poses, train
+
+    weak = {"verdict": {"level": "weak", "reasons": ["3 of 20 photos were not placed."]}}
+    poor = {"psnr": 14.2, "verdict": {"level": "failed", "reasons": ["Held-out photos look different."]}}
+    (tmp_path / "runs" / "main").mkdir(parents=True)
+    (tmp_path / "runs" / "main" / "metrics.json").write_text(json.dumps({"train": {}, "test": poor}))
+    provenance = [{"verb": "poses", "settings": {}, "result": weak}]
+    (tmp_path / "project.json").write_text(json.dumps({"format": "fieldwork-project", "provenance": provenance}))
+    shown = []
+    context = MagicMock()
+    context.scene.fieldwork.configure_mock(run="main", pose_index=-1, images=[])
+    for module in (poses, train):
+        monkeypatch.setattr(module, "project_folder", lambda context: tmp_path)
+        monkeypatch.setattr(module, "draw_verdict", lambda layout, context, result: shown.append(result))
+    monkeypatch.setattr(poses.snapshot, "has_poses", lambda folder: True)
+    monkeypatch.setattr(poses.states, "training", lambda context: False)
+    poses.FIELDWORK_PT_poses.draw(MagicMock(), context)
+    train.FIELDWORK_PT_runs.draw(MagicMock(), context)
+    assert shown == [weak, poor]
+
+
 def test_quality_and_time_come_from_the_project(tmp_path, monkeypatch):
     from types import SimpleNamespace
 

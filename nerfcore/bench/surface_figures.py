@@ -198,11 +198,12 @@ def hit_share(mesh: tuple[np.ndarray, np.ndarray], truth: Truth, views: Sequence
 
 def class_figures(found: Distances, surface: Surface, painted: Painted, sight: Sight) -> dict[str, float | None]:
     """mIoU by area of the texture's classes (of the faces', without a texture) where the mesh is close to the truth, and
-    by how much the area of the worst class is off, of classes that have at least a hundredth of what is seen."""
+    by how much the faces' area of the worst class is off, of classes that have at least a hundredth of what is seen; both
+    areas are those of what enough cameras see: two may show a mesh more of one thing, which is no error."""
     near = found.to_truth < CLOSE * sight.size
     points, _ = sample_surface(surface.vertices.astype(np.float64), surface.faces, len(found.face))
     ours, theirs = classes_at(surface, painted, points, found.face)[near], sight.class_near(points[near])
-    area = areas(surface.vertices.astype(np.float64), surface.faces)
+    shown = surface.face_class[found.face[near & found.shown]]
     seen = sight.truth.face_class[found.true_face]
     ious, off = [], []
     for number in np.unique(seen):
@@ -211,7 +212,8 @@ def class_figures(found: Distances, surface: Surface, painted: Painted, sight: S
             ious.append((one & other).sum() / (one | other).sum())
         share = float((seen == number).mean())
         if share >= 0.01:
-            off.append(abs(area[surface.face_class == number].sum() / (share * found.true_area) - 1))
+            area = (shown == number).sum() / len(found.face) * found.area
+            off.append(abs(area / (share * found.true_area) - 1))
     return {
         "surface_miou": float(np.mean(ious)) if ious else None,
         "class_area_error": float(max(off)) if off else None,

@@ -51,14 +51,15 @@ def sample_surface(
 class Distances:
     """What lies between a mesh and the true one, sampled evenly by area.
 
-    face (N,) of the mesh and to_truth (N,) from there to the truth, whose nearest face is truth_face (N,); angle (N,)
-    between their normals, degrees, 0 to 90; true_face (M,) of the visible truth and to_mesh (M,) from there; area and
-    true_area: of the mesh, and of the visible truth.
+    face (N,) of the mesh and to_truth (N,) from there to the truth; of the nearest point there, its face truth_face (N,)
+    and whether it is visible: shown (N,) bool; angle (N,) between the two normals, degrees, 0 to 90; true_face (M,) of the
+    visible truth and to_mesh (M,) from there; area and true_area: of the mesh, and of the visible truth.
     """
 
     face: np.ndarray
     to_truth: np.ndarray
     truth_face: np.ndarray
+    shown: np.ndarray
     angle: np.ndarray
     true_face: np.ndarray
     to_mesh: np.ndarray
@@ -89,19 +90,21 @@ def distances(
     """Distances between two meshes (vertices, faces) of one frame, from `count` points of the mesh and twice as many of
     the truth to the closest triangle of the other.
 
-    `visible`: points and normals (N, 3) of the truth → (N,) bool; distances from the truth are those of visible points.
+    `visible`: points and normals (N, 3) of the truth → (N,) bool; distances from the truth are those of visible points, and so is `Distances.shown`.
     """
     points, face = sample_surface(*mesh, count=count, seed=seed)
     true, true_face = sample_surface(*truth, count=2 * count, seed=seed + 1)
     normals = unit(cross(*truth))
     shown = np.ones(len(true), bool) if visible is None else visible(true, normals[true_face])
-    truth_face, _, to_truth = ClosestPoints(*truth).find(points)
+    truth_face, weights, to_truth = ClosestPoints(*truth).find(points)
+    nearest = np.einsum("nk,nkc->nc", weights, truth[0][truth[1][truth_face]])
     to_mesh = ClosestPoints(*mesh).find(true[shown])[2]
     cosine = np.abs((unit(cross(*mesh))[face] * normals[truth_face]).sum(1))
     return Distances(
         face,
         to_truth,
         truth_face,
+        np.ones(len(points), bool) if visible is None else visible(nearest, normals[truth_face]),
         np.degrees(np.arccos(np.clip(cosine, 0, 1))),
         true_face[shown],
         to_mesh,

@@ -161,6 +161,37 @@ def test_formats_with_distortion(name: str, truth: tuple[list[DatasetView], Matc
         assert np.allclose(dataset.world_from_sfm[:3, :3] @ away / 2.5, [0, 0, 1], atol=1e-4)
 
 
+def test_photos_of_two_folders_keep_their_labels_apart(tmp_path: Path) -> None:
+    """`left/0001` and `right/0001` of a rig."""
+    matrix = " ".join(map(str, np.eye(4).ravel()))
+    size = '<resolution width="8" height="6"/>'
+    cameras = ""
+    for side in ("left", "right"):
+        for kind, value in (("", 90), ("labels", 1 if side == "left" else 2), ("masks", 255)):
+            (tmp_path / kind / side).mkdir(parents=True)
+            Image.new("L" if kind else "RGB", (8, 6), value if kind else (value,) * 3).save(
+                tmp_path / kind / side / "0001.png"
+            )
+        cameras += (
+            f'<camera id="{len(cameras)}" sensor_id="0" label="{side}/0001"><transform>{matrix}</transform></camera>'
+        )
+    export = (
+        f'<document version="1.5.0"><chunk><sensors><sensor id="0" type="frame">{size}<calibration type="frame">{size}'
+        "<f>10</f></calibration></sensor></sensors><cameras>{}</cameras></chunk></document>"
+    )
+    (tmp_path / "cameras.xml").write_text(export.format(cameras))
+    dataset = read_dataset(tmp_path)
+    assert [view.name for view in dataset.views] == ["left_0001", "right_0001"]
+    for view, side in zip(dataset.views, ("left", "right")):
+        assert view.image == tmp_path / side / "0001.png"
+        assert view.label == tmp_path / "labels" / side / "0001.png"
+        assert view.mask == tmp_path / "masks" / side / "0001.png"
+    # Without folders nobody knows whose pose is whose.
+    (tmp_path / "cameras.xml").write_text(export.format(cameras.replace("right/", "left/")))
+    with pytest.raises(InputError, match="two cameras that are called left/0001"):
+        read_dataset(tmp_path)
+
+
 WITHOUT_LENS = {"scannet": write_scannet, "replica": write_replica, "dtu": write_dtu, "llff": write_llff}
 
 

@@ -18,7 +18,7 @@ from ...geometry.cameras import Camera
 from ...geometry.frames import rotation_to_z, upright
 from ...geometry.similarity import make_similarity
 from ...images.decode import image_size
-from ...images.names import beside, find_image, plain_name
+from ...images.names import find_image, labels_and_masks, unique_names
 from ..dataset import Dataset, DatasetView, require
 
 EARTH = 5_000_000.0  # metres from the centre of the earth beyond which coordinates are geocentric: its radius is 6.4 million
@@ -66,22 +66,34 @@ def read(folder: Path) -> Dataset:
             entries.append((camera.get("label", ""), sensors[camera.get("sensor_id")], pose, chunk_transform))
     except (OSError, ElementTree.ParseError, ValueError, KeyError) as error:
         raise InputError(f"{path} is damaged: {error}.", "Export the cameras from Metashape again.") from error
-    views, missing = [], []
+    found: dict[Path, tuple[ElementTree.Element, np.ndarray]] = {}
+    missing = []
     for label, sensor, pose, _ in entries:
         image = next((p for d in (folder, folder / "images") if (p := find_image(d / label))), None)
         if image is None:
             missing.append(label)
-            continue
-        views.append(
-            DatasetView(
-                name=plain_name(image),
-                image=image,
-                camera=_camera(sensor, image_size(image), path),
-                camera_to_world=pose,
-                label=beside(folder / "labels", image.stem),
-                mask=beside(folder / "masks", image.stem, exact=False),
+        elif image in found:
+            raise InputError(
+                f"{path} has two cameras that are called {label}.",
+                "Name them in Metashape by folder and file, for example left/0001, and export again.",
             )
+        else:
+            found[image] = sensor, pose
+    images = list(found)
+    names = unique_names(images, folder)
+    views = [
+        DatasetView(
+            name=name,
+            image=image,
+            camera=_camera(sensor, image_size(image), path),
+            camera_to_world=pose,
+            label=label_map,
+            mask=mask,
         )
+        for name, (image, (sensor, pose)), (label_map, mask) in zip(
+            names, found.items(), labels_and_masks(folder, images, names)
+        )
+    ]
     require(views, path, missing)
     warnings = [f"{len(missing)} photos of the export are missing (first: {missing[0]})."] if missing else []
     georeferenced = entries[0][3]

@@ -17,7 +17,7 @@ from ...errors import InputError
 from ...geometry.cameras import Camera
 from ...geometry.frames import upright
 from ...images.decode import image_size
-from ...images.names import beside, find_image, plain_name
+from ...images.names import find_image, labels_and_masks, unique_names
 from ..dataset import Dataset, DatasetView, require
 
 METRIC = ("absolute",)
@@ -38,12 +38,17 @@ def _files(folder: Path) -> list[Path]:
 
 def read(folder: Path) -> Dataset:
     """Read `folder`. Raises InputError naming the file that is missing or damaged."""
-    views, missing, coordinates = [], [], set()
+    found, missing = [], []
     for file in _files(folder):
         image = next((p for d in (file.parent, folder / "images") if (p := find_image(d / file.stem))), None)
         if image is None:
             missing.append(file.stem)
-            continue
+        else:
+            found.append((file, image))
+    images = [image for _, image in found]
+    names = unique_names(images, folder)
+    views, coordinates = [], set()
+    for name, (file, image), (label, mask) in zip(names, found, labels_and_masks(folder, images, names)):
         text = file.read_text(encoding="utf-8", errors="replace")
         coordinates.add(_text(text, "Coordinates"))
         rotation, position = _numbers(file, text, "Rotation", 9), _numbers(file, text, "Position", 3)
@@ -52,12 +57,12 @@ def read(folder: Path) -> Dataset:
         pose[:3, 3] = position
         views.append(
             DatasetView(
-                name=plain_name(image),
+                name=name,
                 image=image,
                 camera=_camera(file, text, image_size(image)),
                 camera_to_world=pose,
-                label=beside(folder / "labels", image.stem),
-                mask=beside(folder / "masks", image.stem, exact=False),
+                label=label,
+                mask=mask,
             )
         )
     require(views, folder, missing)

@@ -21,8 +21,11 @@ from fieldwork.nerfcore.sampling.known_space import BETWEEN, NEAR, SINGLE, Known
 from fieldwork.nerfcore.sampling.occupancy import OccupancyGrid
 from fieldwork.nerfcore.sampling.space import EMPTY, OCCUPIED, UNKNOWN, cell_states, state_at, unknown_share
 from fieldwork.nerfcore.sampling.visibility import cells_at
+from fieldwork.nerfcore.train.closed_picture import COLORS, write_closed_picture
 from fieldwork.nerfcore.verbs import run_verb
 from fieldwork.tests.nerfcore.support.ball import SMALL, ball_project
+from matplotlib.colors import to_rgb
+from scipy.ndimage import find_objects, label
 
 CAMERA = Camera(model="PINHOLE", width=100, height=80, fx=80.0, fy=80.0, cx=50.0, cy=40.0)
 SIDE, RING, HEIGHT = 64, 0.8, 0.3
@@ -125,6 +128,19 @@ def test_unknown_cells_never_become_occupied_and_are_told_from_empty_ones() -> N
     assert not grid.cells[unknown, 0].any()  # beside occupied ones neither
 
 
+def test_a_cell_that_is_unknown_and_occupied_counts_as_unknown() -> None:
+    unknown, occupied = torch.tensor([True, True, False, False]), torch.tensor([True, False, True, False])
+    assert cell_states(unknown, occupied).tolist() == [UNKNOWN, UNKNOWN, OCCUPIED, EMPTY]
+
+
+def test_a_ray_that_misses_the_grid_is_unknown_as_a_whole() -> None:
+    nowhere = torch.zeros(8**3, dtype=torch.bool)
+    origins, directions = torch.tensor([[-2.0, 2.5, 0.0], [-2.0, 0.0, 0.0]]), torch.tensor([[1.0, 0, 0], [1, 0, 0]])
+    distance = torch.full((2,), torch.nan)
+    found = unknown_share(cell_states(nowhere, nowhere), False, origins, directions, distance)
+    assert found.tolist() == [1.0, 0.0]
+
+
 @pytest.mark.parametrize("contracted", [False, True], ids=["box", "contracted"])
 def test_the_unknown_share_of_a_ray_is_its_way_through_unknown_cells(contracted: bool) -> None:
     n = 32
@@ -187,3 +203,32 @@ def test_training_shows_what_the_rules_closed(one_side: Path) -> None:
     assert picture.spec().width > 400
     colored = np.ptp(picture.get_pixels(oiio.FLOAT)[..., :3], axis=-1) > 0.2
     assert colored.mean() > 0.005
+
+
+def test_the_picture_shows_each_rule_in_its_colour_where_it_closed(tmp_path: Path) -> None:
+    """Each rule closes a quarter of the box along an axis of its own; drawn at 75 % over white."""
+    side, nothing, nowhere = 8, torch.zeros(8**3, dtype=torch.bool), torch.zeros(0, 3)
+    cell = torch.arange(side**3)
+    place = {NEAR: cell % side, SINGLE: cell // side % side, BETWEEN: cell // side**2}  # x, y, z
+    found = {}
+    for color, rule in zip(COLORS, place):
+        closed = {name: place[name] < side // 4 if name == rule else nothing for name in place}
+        known = KnownSpace(side, False, torch.ones(side**3), nothing, closed, 0.0)
+        assert write_closed_picture(tmp_path / "closed.png", known, nowhere, nowhere)
+        pixels = oiio.ImageBuf(str(tmp_path / "closed.png")).get_pixels(oiio.FLOAT)[..., :3]
+        parts, _ = label((np.abs(pixels - (0.75 * np.array(to_rgb(color)) + 0.25)) < 0.02).all(-1))
+        areas = [(p[1].start, p[1].stop, p[0].start, p[0].stop) for p in find_objects(parts)]
+        found[rule] = sorted(area for area in areas if area[1] - area[0] > 50 and area[3] - area[2] > 50)
+        assert len(found[rule]) == 2  # from above, from the side
+    above, beside = found[BETWEEN][0], found[SINGLE][1]  # all of each view
+    for view, name, across in ((above, SINGLE, 0), (beside, BETWEEN, 1)):
+        assert found[name][across] == pytest.approx((*view[:2], (view[2] + 3 * view[3]) / 4, view[3]), abs=3)
+    for view, area in zip((above, beside), found[NEAR]):
+        assert area == pytest.approx((view[0], (3 * view[0] + view[1]) / 4, *view[2:]), abs=3)
+
+
+def test_no_picture_where_no_rule_closed_anything(tmp_path: Path) -> None:
+    nothing, nowhere = torch.zeros(8**3, dtype=torch.bool), torch.zeros(0, 3)
+    known = KnownSpace(8, False, torch.ones(8**3), nothing, dict.fromkeys((NEAR, SINGLE, BETWEEN), nothing), 0.0)
+    assert not write_closed_picture(tmp_path / "closed.png", known, nowhere, nowhere)
+    assert not (tmp_path / "closed.png").exists()

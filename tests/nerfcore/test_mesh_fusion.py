@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from fieldwork.nerfcore.config import SamplingConfig
 from fieldwork.nerfcore.data.pixels import VOID
 from fieldwork.nerfcore.data.scene import View
 from fieldwork.nerfcore.errors import Cancelled, TrainingError
@@ -23,6 +24,8 @@ from fieldwork.nerfcore.mesh.region import choose_region
 from fieldwork.nerfcore.mesh.surface import Surface, is_watertight
 from fieldwork.nerfcore.mesh.turntable import write_turntable
 from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.sampling.occupancy import OccupancyGrid
+from fieldwork.nerfcore.sampling.render_grid import present_grid
 from fieldwork.tests.nerfcore.support.depth_views import CAMERA, Hit, box, look_at, maps_of, orbit, sphere
 from PIL import Image
 
@@ -392,3 +395,39 @@ def test_a_smaller_depth_map_is_enlarged_without_new_depths_at_outlines() -> Non
     wall = (found.depth < FREE) & ~pillar
     assert np.abs(found.depth / true - 1)[wall].max() < 0.003
     assert depth_maps.enlarged(found, flat) is found
+
+
+def test_rays_say_what_they_meet_that_nothing_is_there_or_nothing() -> None:
+    """A slab that is 95 %, 30 % and 5 % opaque: a depth, unknown, free; unknown too where the photo shows nothing."""
+    camera, pose, thick = Camera(width=4, height=1, fx=4.0, fy=4.0, cx=2.0, cy=0.5), np.eye(4), 0.5
+    pose[2, 3] = -1.5
+    slope = (torch.arange(4) - 1.5) / 4
+    depth_of = -torch.log(1 - torch.tensor([0.95, 0.3, 0.05, 0.95]))  # optical
+    density = depth_of / (thick * torch.sqrt(1 + slope**2))
+
+    def slab(points: torch.Tensor) -> torch.Tensor:
+        x, _, z = (2 * points - 1).unbind(1)
+        column = (x / (z + 1.5) * 4 + 1.5).round().long().clamp(0, 3)
+        return torch.where((z > 0) & (z < thick), density[column], 0.0)
+
+    grid = OccupancyGrid(SamplingConfig(resolution=32), False)
+    model = SimpleNamespace(
+        priorities=torch.ones(1),
+        render_grid=lambda: present_grid(grid, 0.0),
+        config=SimpleNamespace(render=SimpleNamespace(samples=256)),
+        field=SimpleNamespace(density=slab),
+    )
+    view = depth_maps.FlatView(camera, pose, 0, np.array([[True, True, True, False]]))
+    found = depth_maps.render_depth(model, view, lambda: None).depth[0]  # type: ignore[arg-type]
+    half = 1.5 + thick * np.log(2) / float(depth_of[0])
+    assert found == pytest.approx(np.array([half, 0, FREE, 0], np.float32), abs=0.03)
+
+
+def test_an_enlarged_depth_map_knows_nothing_where_its_photo_shows_nothing() -> None:
+    camera = Camera(width=4, height=2, fx=4.0, fy=4.0, cx=2.0, cy=1.0)
+    inside = np.ones((4, 8), bool)
+    inside[:, 6:] = False
+    view = depth_maps.FlatView(camera.resized(8, 4), np.eye(4), 0, inside)
+    free = np.full((2, 4), FREE, np.float32)
+    small = depth_maps.DepthMap(free, np.zeros_like(free), np.zeros_like(free))
+    assert (depth_maps.enlarged(small, view).depth == np.where(inside, np.float32(FREE), 0)).all()

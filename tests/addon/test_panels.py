@@ -137,6 +137,44 @@ def test_poses_and_evaluation_show_what_they_say_against_their_results(tmp_path,
     assert shown == [weak, poor]
 
 
+def test_results_of_another_run_are_not_shown(tmp_path, monkeypatch):
+    from unittest.mock import MagicMock
+
+    from fieldwork.panels import main, mesh, states, train
+
+    results = {"first": {"faces": 7000}, "second": {"faces": 9000}}
+    provenance = [
+        {"verb": verb, "settings": {"run": run}, "result": result}
+        for run, result in results.items()
+        for verb in ("train", "mesh")
+    ]
+    (tmp_path / "project.json").write_text(json.dumps({"format": "fieldwork-project", "provenance": provenance}))
+    shown = []
+    for module in (mesh, states, train):
+        monkeypatch.setattr(module, "project_folder", lambda context: tmp_path)
+    for module in (mesh, train):
+        monkeypatch.setattr(module, "draw_verdict", lambda layout, context, result: shown.append(result))
+    monkeypatch.setattr(mesh, "open_folder", lambda layout, folder: None)
+    monkeypatch.setattr(train, "draw_estimate", lambda layout, context: None)
+    monkeypatch.setattr(main.snapshot, "folder_of", lambda settings: tmp_path)
+    monkeypatch.setattr(main.snapshot, "absence", lambda settings: None)
+    monkeypatch.setattr(main.snapshot, "has_poses", lambda folder: True)
+    monkeypatch.setattr(main.runs, "can_resume", lambda folder, run: False)
+    monkeypatch.setattr(main.runs, "has_run", lambda folder, run: True)
+    context, said = MagicMock(), {}
+    for run in ("first", "second", "third"):
+        context.scene.fieldwork.configure_mock(run=run)
+        shown.clear()
+        mesh.FIELDWORK_PT_mesh.draw(MagicMock(), context)
+        train.FIELDWORK_PT_train.draw(MagicMock(), context)
+        said[run] = [*shown], tuple(states.mesh(context)), main.next_step(context).operator
+    assert said == {
+        "first": ([results["first"]] * 2, (True, "7 k faces"), "fieldwork.import_scene"),
+        "second": ([results["second"]] * 2, (True, "9 k faces"), "fieldwork.import_scene"),
+        "third": ([{}], (False, ""), "fieldwork.mesh"),
+    }
+
+
 def test_quality_and_time_come_from_the_project(tmp_path, monkeypatch):
     from types import SimpleNamespace
 

@@ -229,7 +229,9 @@ def test_nothing_visible_gives_numbers(ball: Path, kernels: Kernels) -> None:
         assert bool(torch.isfinite(loss))
         assert bool(torch.isfinite(error))
         gradients = torch.autograd.grad(loss, list(model.parameters()), allow_unused=True)
+        model.observe([rendered])
     assert all(bool(torch.isfinite(g).all()) for g in gradients if g is not None)
+    assert 0 <= float(model.visible_share) <= 1
 
 
 def test_what_becomes_visible_after_a_while_of_nothing_is_seen(ball: Path) -> None:

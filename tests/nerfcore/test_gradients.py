@@ -66,15 +66,30 @@ def parameters(trainer: Trainer) -> torch.Tensor:
 def test_small_gradients_survive_half_precision(ball: Path) -> None:
     """Losses so small that their gradients are below the smallest float16."""
     weights = {"loss.rgb_weight": "1e-6", "loss.semantic_weight": "0", "loss.regularization": "0"}
-    found = {}
+    found, of_grid = {}, {}
     for precision in ("float32", "float16"):
         trainer = trainer_of(ball, **weights, **{"field.precision": precision})
         for step in range(3):
             trainer.step(step / 3)
         trainer._accumulate_gradients(trainer.draw(), 0.5)
         found[precision] = trainer.model.field.color_head.weights[0].grad.abs()
+        of_grid[precision] = float(trainer.model.field.grid.gradient.abs().mean())
     assert int((found["float16"] > 0).sum()) > 0.9 * int((found["float32"] > 0).sum())
     assert float(found["float16"].mean()) == pytest.approx(float(found["float32"].mean()), rel=0.3)
+    assert of_grid["float16"] == pytest.approx(of_grid["float32"], rel=0.3)
+
+
+def test_gradients_of_cameras_are_those_of_the_loss_itself(ball: Path) -> None:
+    sizes = {}
+    for precision in ("float32", "float16"):
+        trainer = trainer_of(ball, **{"field.precision": precision, "train.refine_poses": "true"})
+        for step in range(3):
+            trainer.step(step / 300)
+        assert trainer.poses is not None
+        parts = trainer._accumulate_gradients(trainer.poses.move(trainer.draw()), 0.5)
+        sizes[precision] = [float(torch.cat(rays).abs().mean()) for rays in zip(*(p.rays for p in parts if p.rays))]
+    assert len(sizes["float32"]) == 2  # of origins and directions
+    assert sizes["float16"] == pytest.approx(sizes["float32"], rel=0.3)
 
 
 def test_training_in_half_precision_learns_as_well(ball: Path) -> None:

@@ -161,6 +161,8 @@ def test_tiff_says_which_alpha_it_has(tmp_path: Path, kind: str, unassociated: b
     if unassociated:
         retag(path)
     assert np.abs(np.array(photo_pixel(path)) - wanted).max() <= (2 if kind == "uint8" and not unassociated else 0)
+    if kind == "uint8":  # also as a file of the project
+        assert np.abs(read_picture(path).pixels[40, 40].astype(int) - wanted).max() <= (0 if unassociated else 2)
 
 
 def retag(path: Path) -> None:
@@ -215,6 +217,13 @@ def test_any_photo_may_be_the_transparent_one(tmp_path: Path, which: int) -> Non
     assert scene.train == [0, 1, 2, 3]
     assert has_transparency(scene)
     assert not has_transparency(load_scene(ball_with(tmp_path / "q", cut_out(), [])))
+
+
+@pytest.mark.parametrize(("mode", "transparent"), [("empty", True), ("ignore", False)])
+def test_any_photo_may_be_the_one_with_a_mask(tmp_path: Path, mode: str, transparent: bool) -> None:
+    scene = load_scene(ball_with(tmp_path / "p", cut_out(), []))
+    views = [replace(view, mask=tmp_path / "m.png" if n == 2 else None) for n, view in enumerate(scene.views)]
+    assert has_transparency(replace(scene, views=views, mask_mode=mode)) == transparent
 
 
 def test_a_render_holds_its_colours_without_the_background(tmp_path: Path) -> None:

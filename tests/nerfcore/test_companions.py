@@ -150,6 +150,17 @@ def test_maps_with_a_tag_of_their_own(tmp_path: Path, orientation: int) -> None:
     assert not any("as they are stored" in w for w in warnings)
 
 
+@pytest.mark.parametrize("orientation", [2, 3, 6, 8])
+def test_a_map_with_a_tag_is_turned_beside_an_upright_photo(tmp_path: Path, orientation: int) -> None:
+    folder = turned_capture(tmp_path, {"a": 1, "b": 1, "c": 1}, stored=False)
+    block = Image.Exif()
+    block[0x0112] = orientation
+    drawn = upright(Image.fromarray(labels()), INVERSE.get(orientation, orientation))
+    drawn.save(folder / "photos" / "labels" / "b.png", exif=block)
+    found, _ = ingested(folder)
+    assert all(np.array_equal(values, labels()) for values in found.values())
+
+
 @pytest.mark.parametrize("stored", [True, False])
 def test_sideways_photos_tell_how_the_others_were_labelled(tmp_path: Path, stored: bool) -> None:
     """A tool that shows photos upright does so with all of them."""

@@ -15,6 +15,7 @@ from fieldwork.nerfcore.mesh.files import write_surface
 from fieldwork.nerfcore.mesh.parts import texture_of
 from fieldwork.nerfcore.mesh.surface import Surface
 from PIL import Image
+from pxr import Usd, UsdGeom
 
 # sRGB → linear by IEC 61966-2-1, to six digits.
 LINEAR = {0: 0.0, 10: 0.003035, 128: 0.215861, 188: 0.502886, 200: 0.577580, 255: 1.0}
@@ -90,6 +91,14 @@ def test_vertex_colours_are_linear_in_glb(tmp_path: Path, split: str) -> None:
         for place, color in zip(places, colors):
             vertex = int(np.linalg.norm(square().vertices[:, [0, 2, 1]] * [1, 1, -1] - place, axis=1).argmin())
             assert color == pytest.approx([LINEAR[value] for value in COLORS[vertex].tolist()], abs=2e-5)
+
+
+def test_vertex_colours_are_linear_in_usd(tmp_path: Path) -> None:
+    path, *_ = write_surface(tmp_path / "a.usda", square(), plain(), "none")
+    stage = Usd.Stage.Open(str(path))
+    (mesh,) = (UsdGeom.Mesh(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh))
+    wanted = [[LINEAR[value] for value in color] for color in COLORS.tolist()]
+    assert np.array(mesh.GetDisplayColorAttr().Get()) == pytest.approx(np.array(wanted), abs=1e-6)
 
 
 def test_vertex_colours_are_srgb_in_ply_and_obj(tmp_path: Path) -> None:

@@ -83,6 +83,25 @@ def test_a_lock_that_stays_is_told(folder: Path, monkeypatch: pytest.MonkeyPatch
         record_step(folder, "train", {}, {})
 
 
+@pytest.mark.parametrize(
+    ("verb", "values"),
+    [
+        (ClassesParams, {"classes": [{"id": 3, "name": "Holz"}]}),
+        (RegionParams, {"bounds": [[0, 0, 0], [1, 1, 1]]}),
+        (RegionParams, {"clear": True}),
+    ],
+)
+def test_classes_and_regions_wait_for_the_lock(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, verb: type[Params], values: dict
+) -> None:
+    monkeypatch.setattr(store, "PATIENCE", 0.1)
+    edit = {ClassesParams: classes, RegionParams: region}[verb]
+    before = load_project(folder)
+    with edit_project(folder), pytest.raises(ProjectError, match="locked by another program"):
+        edit(verb.model_validate({"project": folder, **values}), Reporter())
+    assert load_project(folder) == before
+
+
 def test_no_project_no_folder(tmp_path: Path) -> None:
     with pytest.raises(ProjectError, match="folder is not there"):
         classes(ClassesParams(project=tmp_path / "unplugged", classes=[]), Reporter())

@@ -15,8 +15,9 @@ from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project import runs
 from fieldwork.nerfcore.project.edit import region
 from fieldwork.nerfcore.project.runs import TrainingFolder, checkpoint_id, fresh_folder, run_folder, settle, swap_in
-from fieldwork.nerfcore.project.store import load_project
+from fieldwork.nerfcore.project.store import load_project, save_project
 from fieldwork.nerfcore.render.run import load_info, load_trained
+from fieldwork.nerfcore.train.reuse import finished, unfinished
 from fieldwork.nerfcore.train.verb import train
 from fieldwork.tests.nerfcore.support.ball import SMALL, ball_project
 from pydantic import ValidationError
@@ -226,6 +227,18 @@ def test_a_run_of_another_project_does_not_go_on(project: Path, tmp_path: Path) 
     shutil.copytree(project / "runs", other / "runs")
     with pytest.raises(ProjectError, match=r"trained in another project.*without --resume"):
         train(params(other, resume=True), Reporter())
+
+
+def test_a_run_of_another_project_is_neither_used_again_nor_gone_on_with(project: Path) -> None:
+    asked, metrics = params(project), run_folder(project, "main") / runs.METRICS
+    assert finished(asked).result is not None
+    here = load_project(project)
+    save_project(project, here.model_copy(update={"uuid": "0" * 32}))
+    assert finished(asked).reason == "trained in another project"
+    metrics.unlink()  # as a training that was stopped leaves it
+    assert not unfinished(asked)
+    save_project(project, here)
+    assert unfinished(asked)
 
 
 def test_a_checkpoint_of_another_training_does_not_go_on(project: Path) -> None:

@@ -431,3 +431,11 @@ def test_an_enlarged_depth_map_knows_nothing_where_its_photo_shows_nothing() -> 
     free = np.full((2, 4), FREE, np.float32)
     small = depth_maps.DepthMap(free, np.zeros_like(free), np.zeros_like(free))
     assert (depth_maps.enlarged(small, view).depth == np.where(inside, np.float32(FREE), 0)).all()
+
+
+def test_what_is_seen_at_a_grazing_angle_is_unknown_not_free() -> None:
+    camera = Camera(width=4, height=1, fx=4.0, fy=4.0, cx=2.0, cy=0.5)
+    depth, cosine = np.array([[1, 1, FREE, 0]], np.float32), np.array([[0.9, 0.1, 0, 0]], np.float32)
+    view = depth_maps.FlatView(camera, np.eye(4), 0, np.ones((1, 4), bool))
+    arrays = depth_maps.map_arrays([view], [depth_maps.DepthMap(depth, np.zeros_like(depth), cosine)], CPU)
+    assert arrays.depth.tolist() == np.array([1, 0, FREE, 0], np.float32).tolist()

@@ -16,7 +16,7 @@ from fieldwork.nerfcore.geometry.cameras import Camera, pixel_centers, rays
 from fieldwork.nerfcore.kernels.depth_arrays import FREE, MapArrays
 from fieldwork.nerfcore.mesh import clean, depth_maps, metrics, planes
 from fieldwork.nerfcore.mesh.decimate import decimate
-from fieldwork.nerfcore.mesh.extract import extract
+from fieldwork.nerfcore.mesh.extract import extract, weld
 from fieldwork.nerfcore.mesh.fusion import BRICK, Bricks, fuse_maps
 from fieldwork.nerfcore.mesh.parts import texture_of
 from fieldwork.nerfcore.mesh.refine import refined_maps
@@ -439,3 +439,11 @@ def test_what_is_seen_at_a_grazing_angle_is_unknown_not_free() -> None:
     view = depth_maps.FlatView(camera, np.eye(4), 0, np.ones((1, 4), bool))
     arrays = depth_maps.map_arrays([view], [depth_maps.DepthMap(depth, np.zeros_like(depth), cosine)], CPU)
     assert arrays.depth.tolist() == np.array([1, 0, FREE, 0], np.float32).tolist()
+
+
+def test_vertices_of_a_grid_beyond_32_bits_are_told_apart() -> None:
+    """The numbers of the first two edges differ by 2³²: 32 · 4096² · 8."""
+    place = np.array([[0.5, 0, 0], [32.5, 0, 0], [1, 4094, 4094]])
+    joined, faces = weld(np.concatenate([place, place]), np.array([[0, 1, 2], [3, 4, 5]]))
+    assert joined[faces].tolist() == [place.tolist()] * 2
+    assert len(joined) == 3

@@ -78,10 +78,10 @@ def train(context: Context) -> State:
 
 
 def last_done(context: Context, *verbs: str) -> Job | None:
-    """The last job of these verbs that went well for the scene's project in this session."""
-    folder = project_folder(context)
+    """The last job of these verbs that went well for the run of the scene's project in this session."""
+    folder, run = project_folder(context), context.scene.fieldwork.run
     done = (job for job in reversed(queue.finished) if job.verb in verbs and job.state == "done" and job.result)
-    return next((job for job in done if job.project == folder), None)
+    return next((job for job in done if job.project == folder and job.params.get("run", "main") == run), None)
 
 
 def render(context: Context) -> State:

@@ -175,6 +175,29 @@ def test_results_of_another_run_are_not_shown(tmp_path, monkeypatch):
     }
 
 
+def test_what_was_rendered_last_is_that_of_the_chosen_run(tmp_path, monkeypatch):
+    from types import SimpleNamespace
+
+    from fieldwork.addon.jobs.job import Job
+    from fieldwork.panels import states
+
+    def rendered(run, project, file):
+        result = {"frames": [f"{file}.exr", f"{file}.png"]}
+        return Job("render", {"run": run}, id=file, project=project, state="done", result=result)
+
+    monkeypatch.setattr(states, "project_folder", lambda context: tmp_path)
+    finished = [
+        rendered("main", tmp_path, "a"),
+        rendered("other", tmp_path, "b"),
+        rendered("main", tmp_path / "c", "c"),
+    ]
+    monkeypatch.setattr(states.queue, "finished", finished)
+    for run, shown in (("main", ["a.png"]), ("other", ["b.png"]), ("third", [])):
+        context = SimpleNamespace(scene=SimpleNamespace(fieldwork=SimpleNamespace(run=run)))
+        assert [str(path) for path in states.rendered(context)] == shown
+        assert states.render(context).done == bool(shown)
+
+
 def test_quality_and_time_come_from_the_project(tmp_path, monkeypatch):
     from types import SimpleNamespace
 

@@ -90,7 +90,8 @@ def distances(
     """Distances between two meshes (vertices, faces) of one frame, from `count` points of the mesh and twice as many of
     the truth to the closest triangle of the other.
 
-    `visible`: points and normals (N, 3) of the truth → (N,) bool; distances from the truth are those of visible points, and so is `Distances.shown`.
+    `visible`: points and normals (N, 3) of the truth → (N,) bool; distances from the truth are those of visible
+    points, and `Distances.shown` tells which are.
     """
     points, face = sample_surface(*mesh, count=count, seed=seed)
     true, true_face = sample_surface(*truth, count=2 * count, seed=seed + 1)

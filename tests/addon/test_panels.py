@@ -178,7 +178,6 @@ def test_results_of_another_run_are_not_shown(tmp_path, monkeypatch):
 def test_what_was_rendered_last_is_that_of_the_chosen_run(tmp_path, monkeypatch):
     from types import SimpleNamespace
 
-    from fieldwork.addon.jobs.job import Job
     from fieldwork.panels import states
 
     def rendered(run, project, file):

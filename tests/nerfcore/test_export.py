@@ -32,7 +32,9 @@ from pxr import Usd, UsdGeom
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A ball of two classes, trained for a moment, with a textured mesh."""
     folder = ball_project(tmp_path_factory.mktemp("export") / "Kugel ü")
-    run_verb("train", TrainParams(project=folder, preset="draft", steps=500, set=SMALL), Reporter())
+    # With some seeds a floater stays after so few steps.
+    settings = {**SMALL, "train.seed": "0"}
+    run_verb("train", TrainParams(project=folder, preset="draft", steps=500, set=settings), Reporter())
     run_verb("mesh", MeshParams(project=folder, resolution=32, texture=128), Reporter())
     return folder
 
@@ -158,9 +160,7 @@ def test_voxels_hold_the_ball_where_it_is(trained: Path) -> None:
         assert data["class_names"].tolist() == ["top", "bottom"]
         place = np.stack(np.meshgrid(*[np.arange(25.0)] * 3, indexing="ij"), -1) @ matrix[:3, :3].T + matrix[:3, 3]
         radius = np.linalg.norm(place, axis=-1)
-        # One floater may stay after so few steps: it depends on the seed.
-        beside = np.quantile(density[radius > 0.75], 0.999)
-        assert beside < 0.2 * np.median(density[(radius > 0.4) & (radius < 0.5)])
+        assert density[radius > 0.75].max() < 0.2 * np.median(density[(radius > 0.4) & (radius < 0.5)])
         shell = (radius > 0.42) & (radius < 0.52) & (np.abs(place[..., 2]) > 0.15) & (ids > 0)
         assert shell.sum() > 50
         assert (np.where(place[..., 2] > 0, 1, 2)[shell] == ids[shell]).mean() > 0.9

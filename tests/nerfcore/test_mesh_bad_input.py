@@ -24,7 +24,8 @@ from fieldwork.tests.nerfcore.support.depth_views import sphere
 @pytest.fixture(scope="module")
 def untrained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = ball_project(tmp_path_factory.mktemp("untrained") / "ball")
-    run_verb("train", TrainParams(project=folder, preset="draft", steps=2, set=SMALL), Reporter())
+    settings = {**SMALL, "loss.rgb_warmup": "0"}  # two steps turn it transparent
+    run_verb("train", TrainParams(project=folder, preset="draft", steps=2, set=settings), Reporter())
     return folder
 
 
@@ -51,6 +52,15 @@ def learned(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def written(folder: Path) -> list[Path]:
     return [path for path in (folder / "exports").rglob("*") if path.is_file()]
+
+
+def test_an_untrained_field_has_no_surface(untrained: Path) -> None:
+    report = Reporter()
+    with pytest.raises(TrainingError, match="surface") as caught:
+        run_verb("mesh", MeshParams(project=untrained, resolution=32), report)
+    assert "Train longer" in (caught.value.hint or "")
+    assert "2 steps only" in report.warnings[0]
+    assert written(untrained) == []
 
 
 def test_the_scraps_of_an_untrained_field_are_called_a_failure(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from ..images.working import read_picture
 from ..kernels.closest import ClosestPoints
 from ..measure.closing import closed
 from ..mesh.clean import areas, components, cross, unit
-from ..mesh.facelets import Facelets, small_pieces
+from ..mesh.facelets import Facelets, facelets, small_pieces
 from ..mesh.metrics import Distances, distances, sample_surface
 from ..mesh.painted import Painted
 from ..mesh.surface import Surface
@@ -31,6 +31,8 @@ FAR = 2.5  # of the median depth of the photos: what is farther is a background
 MOST_CAPPED = 0.25  # share of a body's area that may stand on something
 HIDDEN = 0.5  # footprints of a pixel that something lies in front of what it hides
 STEEPEST = 0.1  # cosine under which a camera is not said to see a place
+MARGIN = 2.0  # radii of a piece by which it may lie beside a picture that shows some of it
+ACROSS = 50  # pieces across what the photos show, from which points of the truth are taken
 SAMPLES = 100_000
 SAME_SIDE = np.cos(np.radians(60))
 
@@ -59,10 +61,34 @@ class Sight:
         self.far = FAR * float(np.median(np.concatenate(depths)))
         near = [camera.footprint(z[z < self.far]) for camera, z in zip(self.cameras, depths)]
         self.pixel = float(np.median(np.concatenate(near)))
-        points, face = sample_surface(truth.vertices, truth.faces, SAMPLES)
-        seen = points[self.visible(points, unit(cross(truth.vertices, truth.faces))[face])]
-        self.size = float(np.ptp(seen, axis=0).max())
         self.truth = truth
+        self.seen = self._sampled()
+        self.size = float(np.ptp(self.seen[0], axis=0).max())
+
+    def _sampled(self) -> tuple[np.ndarray, np.ndarray, float]:
+        """Points (M, 3) spread evenly over what is visible, their triangles (M,) of the truth, and its area. They are taken
+        from small pieces of what lies before a camera, as a ground may reach far beyond what photos show."""
+        whole = self.pieces
+        some = np.flatnonzero(self._reached(whole))
+        small = facelets(whole.vertices, whole.faces[some], limit=self.far / ACROSS)
+        parent, area = whole.parent[some[small.parent]], small.areas
+        found = np.flatnonzero(self._reached(small))
+        points, face = sample_surface(small.vertices, small.faces[found], 2 * SAMPLES)
+        seen = self.visible(points, small.normals[found][face])
+        return points[seen], parent[found[face[seen]]], float(area[found].sum() * seen.mean())
+
+    def _reached(self, pieces: Facelets) -> np.ndarray:
+        """Whether a camera may see something of pieces: (P,); no more is said of those that it does not."""
+        radius = np.linalg.norm(pieces.vertices[pieces.faces] - pieces.centers[:, None], axis=2).max(1)
+        found = np.zeros(len(pieces), bool)
+        for camera in self.cameras:
+            local = camera.local(pieces.centers)
+            depth, pixel = camera.depth(local), camera.pixels(local)
+            size = camera.camera.width, camera.camera.height
+            beside = np.maximum(-pixel, pixel - size).max(1) * camera.footprint(np.maximum(depth, 0))
+            # NaN, of what lies beside the lens: some of it may not.
+            found |= (depth < self.far + radius) & (depth > -radius) & ~(beside > MARGIN * radius)
+        return found
 
     def outline(self) -> np.ndarray:
         """Ends (E, 2, 3) of the edges that are seen and at which the true class changes."""
@@ -122,7 +148,7 @@ def surface_figures(
     """
     mesh = surface.vertices.astype(np.float64), surface.faces
     sight = Sight(truth, [scene.views[i] for i in scene.train])
-    found = distances(mesh, (truth.vertices, truth.faces), sight.visible, SAMPLES)
+    found = distances(mesh, (truth.vertices, truth.faces), sight.visible, SAMPLES, true=sight.seen)
     coarse, fine = found.scores(CLOSE * sight.size), found.scores(2 * sight.pixel)
     held_out = [scene.views[i] for i in scene.test]
     return {

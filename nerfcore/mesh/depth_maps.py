@@ -32,7 +32,7 @@ MOST_VIEWS = 96
 OPAQUE, EMPTY = 0.5, 0.1  # opacities: something is there, nothing is there
 STEEPEST = np.cos(np.radians(80))
 EDGE, EDGE_PIXELS = 0.03, 5.5  # share, or footprints of a pixel, by which the depth of neighbours differs at an outline
-NEIGHBOURS = 8  # views asked to confirm a depth
+NEIGHBOURS = 48  # views asked to confirm a depth: what lies at a picture's rim is seen by views that share little else
 CONFIRMED = 2  # of them that must
 AGREE, AGREE_PIXELS, ROUND_TRIP = (
     0.01,
@@ -278,11 +278,12 @@ def confirmed_maps(
     device: torch.device,
     report: Reporter,
     around: list[list[int]] | None = None,
+    needed: int = CONFIRMED,
 ) -> MapArrays:
-    """The maps as the kernels read them, without what cannot be trusted: see `map_arrays`, and what two other views (the
-    other one where there are two) do not confirm. `around`: the neighbours of each view where they are known."""
+    """The maps as the kernels read them, without what cannot be trusted: see `map_arrays`, and what `needed` other views
+    (all others where they are fewer) do not confirm. `around`: the neighbours of each view where they are known."""
     arrays = map_arrays(views, maps, device)
-    confirmed, needed = [], min(CONFIRMED, len({view.photo for view in views}) - 1)
+    confirmed, needed = [], min(needed, len({view.photo for view in views}) - 1)
     for index, near in enumerate(around or neighbours(views, maps)):
         report.progress(index / len(views))
         others = torch.tensor(near, dtype=torch.int32, device=arrays.depth.device)

@@ -86,20 +86,24 @@ def distances(
     visible: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
     count: int = SAMPLES,
     seed: int = 0,
+    true: tuple[np.ndarray, np.ndarray, float] | None = None,
 ) -> Distances:
     """Distances between two meshes (vertices, faces) of one frame, from `count` points of the mesh and twice as many of
     the truth to the closest triangle of the other.
 
     `visible`: points and normals (N, 3) of the truth → (N,) bool; distances from the truth are those of visible
-    points, and `Distances.shown` tells which are.
+    points, and `Distances.shown` tells which are. `true`: points (M, 3) spread over the visible truth, their triangles (M,)
+    and its area, where they are known: of a large truth of which little is visible, few of the points would be.
     """
     points, face = sample_surface(*mesh, count=count, seed=seed)
-    true, true_face = sample_surface(*truth, count=2 * count, seed=seed + 1)
     normals = unit(cross(*truth))
-    shown = np.ones(len(true), bool) if visible is None else visible(true, normals[true_face])
+    if true is None:
+        place, true_face = sample_surface(*truth, count=2 * count, seed=seed + 1)
+        shown = np.ones(len(place), bool) if visible is None else visible(place, normals[true_face])
+        true = place[shown], true_face[shown], float(areas(*truth).sum() * shown.mean())
     truth_face, weights, to_truth = ClosestPoints(*truth).find(points)
     nearest = np.einsum("nk,nkc->nc", weights, truth[0][truth[1][truth_face]])
-    to_mesh = ClosestPoints(*mesh).find(true[shown])[2]
+    to_mesh = ClosestPoints(*mesh).find(true[0])[2]
     cosine = np.abs((unit(cross(*mesh))[face] * normals[truth_face]).sum(1))
     return Distances(
         face,
@@ -107,10 +111,10 @@ def distances(
         truth_face,
         np.ones(len(points), bool) if visible is None else visible(nearest, normals[truth_face]),
         np.degrees(np.arccos(np.clip(cosine, 0, 1))),
-        true_face[shown],
+        true[1],
         to_mesh,
         float(areas(*mesh).sum()),
-        float(areas(*truth).sum() * shown.mean()),
+        true[2],
     )
 
 

@@ -20,10 +20,11 @@ from ..kernels.patches import refine
 from ..progress import Reporter
 from .depth_maps import DepthMap, FlatView, confirmed_maps, cosines, map_arrays, neighbours, normals
 from .planes import with_planes
-from .sky import backdrop, labels_tell, nothing
+from .sky import backdrop, farthest, labels_tell, nothing
 
 VIEWS = 5  # neighbours whose photos are compared
 LEAST, GAIN = 0.6, 0.05  # correlation that is believed, and by how much it must exceed that of the field's depth
+FIELD_CONFIRMED = 3  # other views that must confirm a depth of the field where planes and photos found none
 SURE = 2.0  # pixels: the spread of a depth that photos confirm
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 SMOOTH = 5  # pixels over which normals are averaged
@@ -70,7 +71,8 @@ def refined_maps(
 ) -> tuple[MapArrays, float]:
     """Confirmed maps (see `depth_maps.confirmed_maps`) whose depths photos have moved, and the share of their depths that
     views do confirm. Where views do not confirm a moved depth, the field's is asked again, or the plane through what is
-    known around (planes.py). What label maps say is nothing (sky.py) has an unknown depth.
+    known around (planes.py). Where they do not confirm that either, but three of them the field's own depth, it is taken, as
+    far away as photos confirm depths. What label maps say is nothing (sky.py) has an unknown depth.
     """
     arrays = map_arrays(views, maps, device)
     grey = torch.from_numpy(np.concatenate([g.reshape(-1) for g in grey_pictures(views, store, report)]))
@@ -87,18 +89,36 @@ def refined_maps(
     sure = [kept & (new.depth != old.depth) for kept, old, new in zip(hits(believed, maps), maps, moved)]
     left_out = [nameless(view, store) for view in views]
     told = labels_tell(sure, left_out)
-    mixed = []
+    mixed, near_maps = [], []
     for view, old, new, safe, unnamed in zip(views, maps, moved, sure, left_out):
-        depth = np.where(safe, new.depth, old.depth)
+        depth, near = np.where(safe, new.depth, old.depth), old.depth
         if told and unnamed is not None:
             empty = nothing(unnamed, safe)
             depth, safe = np.where(empty & old.hit, 0, depth), safe & ~empty
+            near = np.where(unnamed & old.hit, 0, near)
         depth = np.where(backdrop(depth, safe), 0, depth)
         spread = np.where(safe, np.minimum(old.spread, SURE * depth / view.camera.fx), old.spread)
+        too_far = old.hit & (old.depth > farthest(depth, safe))
+        near_maps.append(replace(old, depth=np.where((depth == 0) | too_far, 0, near)))
         mixed.append(with_planes(view, replace(old, depth=depth, spread=spread.astype(np.float32)), safe))
     final = confirmed_maps(views, mixed, device, report, around)
+    final = with_holes_filled(final, confirmed_maps(views, near_maps, device, report, around, FIELD_CONFIRMED))
     asked = sum(int(map_.hit.sum()) for map_ in mixed)
     return final, sum(int(part.sum()) for part in hits(final, mixed)) / max(asked, 1)
+
+
+def with_holes_filled(maps: MapArrays, others: MapArrays) -> MapArrays:
+    """Maps that show what other maps of the same pictures do where they know nothing themselves."""
+    hole = (maps.depth == 0) & (others.depth > 0) & (others.depth < FREE)
+    depth, cosine, spread = (
+        torch.where(hole, theirs, own)
+        for own, theirs in (
+            (maps.depth, others.depth),
+            (maps.cosine, others.cosine),
+            (maps.spread, others.spread),
+        )
+    )
+    return replace(maps, depth=depth, cosine=cosine, spread=spread)
 
 
 def hits(arrays: MapArrays, maps: list[DepthMap]) -> list[np.ndarray]:

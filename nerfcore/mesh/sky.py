@@ -42,6 +42,12 @@ def nothing(left_out: np.ndarray, sure: np.ndarray) -> np.ndarray:
     return (left_out & ~sure) | rim
 
 
+def farthest(depth: np.ndarray, sure: np.ndarray) -> float:
+    """How far the depths (H, W) reach that photos confirm, `sure` (H, W) bool; inf where there are none."""
+    known = depth[(depth > 0) & (depth < FREE) & sure]
+    return float(np.percentile(known, FARTHEST)) if len(known) else np.inf
+
+
 def backdrop(depth: np.ndarray, sure: np.ndarray) -> np.ndarray:
     """Which pixels (H, W) of a depth map show a backdrop without a depth of its own, label maps or not: farther than what
     photos confirm in this view, and nothing of about the same depth is confirmed around.
@@ -50,9 +56,9 @@ def backdrop(depth: np.ndarray, sure: np.ndarray) -> np.ndarray:
         depth: (H, W), 0 or FREE where there is none; sure: which of them photos confirm.
     """
     hit = (depth > 0) & (depth < FREE)
-    if not (hit & sure).any():
-        return np.zeros(depth.shape, bool)
-    far = hit & ~sure & (depth > FAR * np.percentile(depth[hit & sure], FARTHEST))
+    far = hit & ~sure & (depth > FAR * farthest(depth, sure))
+    if not far.any():
+        return far
     size = int(AROUND * depth.shape[1]) | 1
     step = np.full(depth.shape, -(1 << 20))
     step[hit] = np.floor(np.log(depth[hit]) / SIMILAR)

@@ -17,7 +17,7 @@ from ..images.working import read_picture
 from ..kernels.closest import ClosestPoints
 from ..measure.closing import closed
 from ..mesh.clean import areas, components, cross, unit
-from ..mesh.facelets import Facelets, facelets, small_pieces
+from ..mesh.facelets import PIECES, Facelets, facelets, small_pieces
 from ..mesh.metrics import Distances, distances, sample_surface
 from ..mesh.painted import Painted
 from ..mesh.surface import Surface
@@ -68,14 +68,19 @@ class Sight:
     def _sampled(self) -> tuple[np.ndarray, np.ndarray, float]:
         """Points (M, 3) spread evenly over what is visible, their triangles (M,) of the truth, and its area. They are taken
         from small pieces of what lies before a camera, as a ground may reach far beyond what photos show."""
-        whole = self.pieces
-        some = np.flatnonzero(self._reached(whole))
-        small = facelets(whole.vertices, whole.faces[some], limit=self.far / ACROSS)
-        parent, area = whole.parent[some[small.parent]], small.areas
-        found = np.flatnonzero(self._reached(small))
-        points, face = sample_surface(small.vertices, small.faces[found], 2 * SAMPLES)
-        seen = self.visible(points, small.normals[found][face])
-        return points[seen], parent[found[face[seen]]], float(area[found].sum() * seen.mean())
+        small = self.pieces
+        parent, limit = small.parent, float(np.ptp(small.vertices, axis=0).max()) / PIECES
+        while True:  # what does not reach into a picture is left out before the rest is cut further
+            some = np.flatnonzero(self._reached(small))
+            parent = parent[some]
+            if limit <= self.far / ACROSS or not len(some):
+                break
+            limit /= 2
+            small = facelets(small.vertices, small.faces[some], limit=limit)
+            parent = parent[small.parent]
+        points, face = sample_surface(small.vertices, small.faces[some], 2 * SAMPLES)
+        seen = self.visible(points, small.normals[some][face])
+        return points[seen], parent[face[seen]], float(small.areas[some].sum() * seen.mean())
 
     def _reached(self, pieces: Facelets) -> np.ndarray:
         """Whether a camera may see something of pieces: (P,); no more is said of those that it does not."""
@@ -85,9 +90,11 @@ class Sight:
             local = camera.local(pieces.centers)
             depth, pixel = camera.depth(local), camera.pixels(local)
             size = camera.camera.width, camera.camera.height
+            longest = np.hypot(1, np.hypot(*size) * camera.footprint(np.ones(1)))  # ray of depth 1 in the picture
+            around = np.linalg.norm(local, axis=1) < longest * (self.far + radius)
             beside = np.maximum(-pixel, pixel - size).max(1) * camera.footprint(np.maximum(depth, 0))
             # NaN, of what lies beside the lens: some of it may not.
-            found |= (depth < self.far + radius) & (depth > -radius) & ~(beside > MARGIN * radius)
+            found |= around & (depth < self.far + radius) & (depth > -radius) & ~(beside > MARGIN * radius)
         return found
 
     def outline(self) -> np.ndarray:

@@ -22,7 +22,7 @@ from fieldwork.nerfcore.bench.surface_table import FIGURES, figure_table
 from fieldwork.nerfcore.data.scene import Scene, View
 from fieldwork.nerfcore.errors import InputError
 from fieldwork.nerfcore.geometry.cameras import Camera
-from fieldwork.nerfcore.mesh.clean import unit
+from fieldwork.nerfcore.mesh.clean import cross, unit
 from fieldwork.nerfcore.mesh.painted import Painted
 from fieldwork.nerfcore.mesh.surface import Surface
 from fieldwork.nerfcore.mesh.surface_labels import ClassMaps, SurfaceClasses
@@ -74,6 +74,28 @@ def test_the_truth_itself_has_no_fault() -> None:
     assert found["excess_area"] == 0
     assert found["mesh_psnr"] is found["delta_e"] is found["gradient"] is found["seams"] is None
     assert found["class_area_error"] < 0.02  # though no camera sees the rim of the plate, and little below it
+
+
+def test_the_truth_is_sampled_where_photos_look_however_large_it_is() -> None:
+    """A ball above a ground of a square kilometre, of which the photos show a few metres."""
+    import trimesh
+
+    ball = trimesh.creation.icosphere(3, 0.3)
+    ground = trimesh.Trimesh(
+        [[-500, -500, -0.4], [500, -500, -0.4], [500, 500, -0.4], [-500, 500, -0.4]], [[0, 1, 2], [0, 2, 3]]
+    )
+    whole = trimesh.util.concatenate([ball, ground])
+    kinds = np.repeat([1, 2], [len(ball.faces), 2])
+    scene = scene_around()
+    sight = Sight(Truth(np.asarray(whole.vertices), np.asarray(whole.faces), kinds), scene.views)
+    points, face, area = sight.seen
+    assert len(points) > 5000
+    normals = unit(cross(np.asarray(whole.vertices), np.asarray(whole.faces)))
+    assert sight.visible(points, normals[face]).all()
+    assert (np.abs(points[kinds[face] == 2, 2] + 0.4) < 1e-6).all()
+    np.testing.assert_allclose(np.linalg.norm(points[kinds[face] == 1], axis=1), 0.3, atol=0.01)
+    # All of the ball is seen but for what the ground hides from the photos below it.
+    assert area * (kinds[face] == 1).mean() == pytest.approx(4 * np.pi * 0.09, rel=0.1)
 
 
 def test_areas_of_classes_are_compared_where_enough_cameras_see() -> None:

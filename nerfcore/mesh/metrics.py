@@ -92,8 +92,9 @@ def distances(
     the truth to the closest triangle of the other.
 
     `visible`: points and normals (N, 3) of the truth → (N,) bool; distances from the truth are those of visible
-    points, and `Distances.shown` tells which are. `true`: points (M, 3) spread over the visible truth, their triangles (M,)
-    and its area, where they are known: of a large truth of which little is visible, few of the points would be.
+    points, and `Distances.shown` tells where the mesh lies next to them. `true`: points (M, 3) spread over the visible
+    truth, their triangles (M,) and its area, where they are known: of a large truth of which little is visible, few of
+    the points would be.
     """
     points, face = sample_surface(*mesh, count=count, seed=seed)
     normals = unit(cross(*truth))

@@ -89,36 +89,40 @@ def refined_maps(
     sure = [kept & (new.depth != old.depth) for kept, old, new in zip(hits(believed, maps), maps, moved)]
     left_out = [nameless(view, store) for view in views]
     told = labels_tell(sure, left_out)
-    mixed, near_maps = [], []
+    mixed, fields = [], []
     for view, old, new, safe, unnamed in zip(views, maps, moved, sure, left_out):
-        depth, near = np.where(safe, new.depth, old.depth), old.depth
+        depth = np.where(safe, new.depth, old.depth)
         if told and unnamed is not None:
             empty = nothing(unnamed, safe)
             depth, safe = np.where(empty & old.hit, 0, depth), safe & ~empty
-            near = np.where(unnamed & old.hit, 0, near)
         depth = np.where(backdrop(depth, safe), 0, depth)
         spread = np.where(safe, np.minimum(old.spread, SURE * depth / view.camera.fx), old.spread)
-        too_far = old.hit & (old.depth > farthest(depth, safe))
-        near_maps.append(replace(old, depth=np.where((depth == 0) | too_far, 0, near)))
+        fields.append(trusted_field(old, depth, safe, unnamed if told else None))
         mixed.append(with_planes(view, replace(old, depth=depth, spread=spread.astype(np.float32)), safe))
     final = confirmed_maps(views, mixed, device, report, around)
-    final = with_holes_filled(final, confirmed_maps(views, near_maps, device, report, around, FIELD_CONFIRMED))
+    final = with_holes_filled(final, confirmed_maps(views, fields, device, report, around, FIELD_CONFIRMED))
     asked = sum(int(map_.hit.sum()) for map_ in mixed)
     return final, sum(int(part.sum()) for part in hits(final, mixed)) / max(asked, 1)
+
+
+def trusted_field(field: DepthMap, depth: np.ndarray, sure: np.ndarray, unnamed: np.ndarray | None) -> DepthMap:
+    """The field's own depths that may fill holes: not where `depth` (H, W) is unknown, nor farther away than photos
+    confirm it, `sure` (H, W) bool, nor where label maps leave a place out, `unnamed` (H, W) bool."""
+    doubtful = (depth == 0) | (field.depth > farthest(depth, sure))
+    if unnamed is not None:
+        doubtful |= unnamed
+    return replace(field, depth=np.where(field.hit & doubtful, 0, field.depth))
 
 
 def with_holes_filled(maps: MapArrays, others: MapArrays) -> MapArrays:
     """Maps that show what other maps of the same pictures do where they know nothing themselves."""
     hole = (maps.depth == 0) & (others.depth > 0) & (others.depth < FREE)
-    depth, cosine, spread = (
-        torch.where(hole, theirs, own)
-        for own, theirs in (
-            (maps.depth, others.depth),
-            (maps.cosine, others.cosine),
-            (maps.spread, others.spread),
-        )
+    return replace(
+        maps,
+        depth=torch.where(hole, others.depth, maps.depth),
+        cosine=torch.where(hole, others.cosine, maps.cosine),
+        spread=torch.where(hole, others.spread, maps.spread),
     )
-    return replace(maps, depth=depth, cosine=cosine, spread=spread)
 
 
 def hits(arrays: MapArrays, maps: list[DepthMap]) -> list[np.ndarray]:

@@ -3,29 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-from fieldwork.nerfcore.config import SamplingConfig
-from fieldwork.nerfcore.data.pixels import VOID
 from fieldwork.nerfcore.data.scene import View
 from fieldwork.nerfcore.errors import Cancelled, TrainingError
-from fieldwork.nerfcore.geometry.cameras import Camera, pixel_centers, rays
-from fieldwork.nerfcore.kernels.depth_arrays import FREE, MapArrays
-from fieldwork.nerfcore.mesh import clean, depth_maps, metrics, planes
+from fieldwork.nerfcore.geometry.cameras import Camera
+from fieldwork.nerfcore.kernels.depth_arrays import MapArrays
+from fieldwork.nerfcore.mesh import clean, depth_maps, metrics
 from fieldwork.nerfcore.mesh.decimate import decimate
 from fieldwork.nerfcore.mesh.extract import extract, weld
 from fieldwork.nerfcore.mesh.fusion import BRICK, Bricks, fuse_maps
 from fieldwork.nerfcore.mesh.parts import texture_of
-from fieldwork.nerfcore.mesh.refine import refined_maps
 from fieldwork.nerfcore.mesh.region import choose_region
 from fieldwork.nerfcore.mesh.surface import Surface, is_watertight
 from fieldwork.nerfcore.mesh.turntable import write_turntable
 from fieldwork.nerfcore.progress import Reporter
-from fieldwork.nerfcore.sampling.occupancy import OccupancyGrid
-from fieldwork.nerfcore.sampling.render_grid import present_grid
 from fieldwork.tests.nerfcore.support.depth_views import CAMERA, Hit, box, look_at, maps_of, orbit, sphere
 from PIL import Image
 
@@ -288,157 +282,6 @@ def test_a_turntable_shows_fronts_in_their_colours(tmp_path: Path) -> None:
     front, back = (np.array(Image.open(tmp_path / f"color_{number}.png")).astype(int) for number in (0, 4))
     assert front[320, 320] == pytest.approx([0, 200, 0], abs=2)
     assert back[320, 320] == pytest.approx([200, 0, 0], abs=2)
-
-
-def test_photos_move_soft_depths_onto_the_surface() -> None:
-    """A painted sphere whose field lies 1.5 % too deep here and too near there: the photos say where it is."""
-    poses = orbit(24, 1.8)
-    flats, true = maps_of(sphere(0.5), poses)
-    rgba = []
-    for flat, map_ in zip(flats, true):
-        local, _ = rays(flat.camera, pixel_centers(flat.camera.width, flat.camera.height).reshape(-1, 2))
-        z = np.where(map_.hit, map_.depth, 1).reshape(-1, 1)
-        points = (local / local[:, 2:] * z) @ flat.pose[:3, :3].T + flat.pose[:3, 3]
-        tone = 0.5 + 0.2 * np.sin(31 * points + 5 * np.sin(17 * points[:, [1, 2, 0]])).sum(1) / 1.5
-        grey = np.where(map_.hit.reshape(-1), tone, 0.1).clip(0, 1) * 255
-        rgba.append(np.concatenate([np.repeat(grey[:, None], 3, 1), np.full((len(grey), 1), 255)], 1))
-    pose = np.stack([flat.pose for flat in flats])
-    store = SimpleNamespace(
-        rgba=torch.from_numpy(np.concatenate(rgba).round().astype(np.uint8)),
-        first=torch.arange(len(flats) + 1) * len(rgba[0]),
-        cameras=[flat.camera for flat in flats],
-        rays=SimpleNamespace(rotation=torch.from_numpy(pose[:, :3, :3])),
-        label=torch.zeros(sum(map(len, rgba)), dtype=torch.uint8),
-    )
-    soft = []
-    for number, (flat, map_) in enumerate(zip(flats, true)):
-        wave = 1 + 0.015 * np.sin(number + np.linspace(0, 5, map_.depth.shape[1]))[None, :]
-        depth = np.where(map_.hit, map_.depth * wave, map_.depth).astype(np.float32)
-        cosine = depth_maps.cosines(flat.camera, depth)
-        soft.append(depth_maps.DepthMap(depth, np.where(map_.hit, 0.05, 0).astype(np.float32), cosine))
-    before = depth_maps.confirmed_maps(flats, soft, CPU, Reporter())
-    after, share = refined_maps(flats, soft, store, CPU, Reporter())  # type: ignore[arg-type]
-    assert share > 0.9
-    truth = torch.from_numpy(np.concatenate([m.depth.reshape(-1) for m in true]))
-
-    def error(maps: MapArrays) -> float:
-        hit = (maps.depth > 0) & (maps.depth < FREE) & (truth < FREE)
-        return float((maps.depth - truth)[hit].abs().median())
-
-    assert error(before) > 0.008
-    assert error(after) < 0.6 * error(before)  # 0.4 pixels
-    assert float(((after.depth > 0) & (after.depth < FREE)).float().mean()) > 0.9 * float(
-        ((before.depth > 0) & (before.depth < FREE)).float().mean()
-    )
-    # What label maps leave out is only there where photos say so.
-    row = torch.arange(CAMERA.height * CAMERA.width) // CAMERA.width
-
-    def labelled_below(share: float) -> MapArrays:
-        left_out = row < share * CAMERA.height
-        store.label = torch.where(left_out, VOID, 0).to(torch.uint8).repeat(len(flats))
-        return refined_maps(flats, soft, store, CPU, Reporter())[0]  # type: ignore[arg-type]
-
-    named = labelled_below(0.4)
-    field = torch.from_numpy(np.concatenate([m.depth.reshape(-1) for m in soft]))
-    left_out = (row < 0.4 * CAMERA.height).repeat(len(flats)) & (named.depth > 0) & (named.depth < FREE)
-    assert int(left_out.sum()) > 1000
-    assert bool((named.depth != field)[left_out].all())
-    # Label maps that name little of what photos confirm say nothing of the rest.
-    torch.testing.assert_close(labelled_below(0.7).depth, after.depth)
-
-
-def wall_maps(camera: Camera) -> tuple[depth_maps.FlatView, depth_maps.DepthMap]:
-    """A slanted wall, and a pillar half as far away in the middle of the picture."""
-    view = View("wall", camera, np.eye(4), image=None)  # type: ignore[arg-type]
-    flat = depth_maps.flat_views([view], np.eye(4), camera.width)[0]
-    local, _ = rays(camera, pixel_centers(camera.width, camera.height).reshape(-1, 2))
-    flat_direction = local / local[:, 2:]
-    depth = (2 / (1 + 0.3 * flat_direction[:, 0])).reshape(camera.height, camera.width)
-    depth[:, 50:70] = 1.0
-    depth = depth.astype(np.float32)
-    return flat, depth_maps.DepthMap(depth, np.full_like(depth, 0.2), depth_maps.cosines(camera, depth))
-
-
-def test_noisy_depths_of_plain_walls_fall_on_planes_and_others_stay() -> None:
-    flat, true = wall_maps(CAMERA)
-    random = np.random.default_rng(0)
-    wrong = (true.depth * random.normal(1, 0.02, true.depth.shape)).astype(np.float32)
-    sure = random.random(true.depth.shape) < 0.1
-    noisy = depth_maps.DepthMap(np.where(sure, true.depth, wrong), true.spread, true.cosine)
-    found = planes.with_planes(flat, noisy, sure)
-    assert (found.depth[sure] == true.depth[sure]).all()
-    before, after = (np.abs(m.depth / true.depth - 1) for m in (noisy, found))
-    wall = np.ones(true.depth.shape, bool)
-    wall[:, 44:76] = False  # windows across the pillar's edges are no planes
-    assert np.median(after[wall & ~sure]) < 0.2 * np.median(before[wall & ~sure])
-    assert (found.spread[wall] < true.spread[wall]).mean() > 0.8
-    assert np.quantile(after, 0.99) < 1.2 * np.quantile(before, 0.99)  # nothing is smeared over the edges
-    nothing = depth_maps.DepthMap(np.full_like(wrong, FREE), true.spread, true.cosine)
-    assert (planes.with_planes(flat, nothing, sure).depth == FREE).all()
-
-
-def test_a_smaller_depth_map_is_enlarged_without_new_depths_at_outlines() -> None:
-    wide = CAMERA.model_copy(update={"width": 480, "height": 360, "fx": 440.0, "fy": 448.0, "cx": 232.0, "cy": 184.0})
-    view = View("wall", wide, np.eye(4), image=None)  # type: ignore[arg-type]
-    flat = depth_maps.flat_views([view], np.eye(4), 480)[0]
-    small = depth_maps.reduced(flat)
-    assert (small.camera.width, small.camera.height) == small.inside.shape[::-1] == (240, 180)
-    assert depth_maps.reduced(small).camera.width == 160
-    _, rendered = wall_maps(small.camera)
-    rendered.depth[:20] = FREE
-    found = depth_maps.enlarged(rendered, flat)
-    local, _ = rays(wide, pixel_centers(480, 360).reshape(-1, 2))
-    true = (2 / (1 + 0.3 * (local / local[:, 2:])[:, 0])).reshape(360, 480)
-    pillar = np.abs(found.depth - 1) < 1e-6
-    assert (found.depth[:38] == FREE).all()
-    assert np.flatnonzero(pillar[180]).tolist() == list(range(100, 140))
-    wall = (found.depth < FREE) & ~pillar
-    assert np.abs(found.depth / true - 1)[wall].max() < 0.003
-    assert depth_maps.enlarged(found, flat) is found
-
-
-def test_rays_say_what_they_meet_that_nothing_is_there_or_nothing() -> None:
-    """A slab that is 95 %, 30 % and 5 % opaque: a depth, unknown, free; unknown too where the photo shows nothing."""
-    camera, pose, thick = Camera(width=4, height=1, fx=4.0, fy=4.0, cx=2.0, cy=0.5), np.eye(4), 0.5
-    pose[2, 3] = -1.5
-    slope = (torch.arange(4) - 1.5) / 4
-    depth_of = -torch.log(1 - torch.tensor([0.95, 0.3, 0.05, 0.95]))  # optical
-    density = depth_of / (thick * torch.sqrt(1 + slope**2))
-
-    def slab(points: torch.Tensor) -> torch.Tensor:
-        x, _, z = (2 * points - 1).unbind(1)
-        column = (x / (z + 1.5) * 4 + 1.5).round().long().clamp(0, 3)
-        return torch.where((z > 0) & (z < thick), density[column], 0.0)
-
-    grid = OccupancyGrid(SamplingConfig(resolution=32), False)
-    model = SimpleNamespace(
-        priorities=torch.ones(1),
-        render_grid=lambda: present_grid(grid, 0.0),
-        config=SimpleNamespace(render=SimpleNamespace(samples=256)),
-        field=SimpleNamespace(density=slab),
-    )
-    view = depth_maps.FlatView(camera, pose, 0, np.array([[True, True, True, False]]))
-    found = depth_maps.render_depth(model, view, lambda: None).depth[0]  # type: ignore[arg-type]
-    half = 1.5 + thick * np.log(2) / float(depth_of[0])
-    assert found == pytest.approx(np.array([half, 0, FREE, 0], np.float32), abs=0.03)
-
-
-def test_an_enlarged_depth_map_knows_nothing_where_its_photo_shows_nothing() -> None:
-    camera = Camera(width=4, height=2, fx=4.0, fy=4.0, cx=2.0, cy=1.0)
-    inside = np.ones((4, 8), bool)
-    inside[:, 6:] = False
-    view = depth_maps.FlatView(camera.resized(8, 4), np.eye(4), 0, inside)
-    free = np.full((2, 4), FREE, np.float32)
-    small = depth_maps.DepthMap(free, np.zeros_like(free), np.zeros_like(free))
-    assert (depth_maps.enlarged(small, view).depth == np.where(inside, np.float32(FREE), 0)).all()
-
-
-def test_what_is_seen_at_a_grazing_angle_is_unknown_not_free() -> None:
-    camera = Camera(width=4, height=1, fx=4.0, fy=4.0, cx=2.0, cy=0.5)
-    depth, cosine = np.array([[1, 1, FREE, 0]], np.float32), np.array([[0.9, 0.1, 0, 0]], np.float32)
-    view = depth_maps.FlatView(camera, np.eye(4), 0, np.ones((1, 4), bool))
-    arrays = depth_maps.map_arrays([view], [depth_maps.DepthMap(depth, np.zeros_like(depth), cosine)], CPU)
-    assert arrays.depth.tolist() == np.array([1, 0, FREE, 0], np.float32).tolist()
 
 
 def test_vertices_of_a_grid_beyond_32_bits_are_told_apart() -> None:

@@ -1,0 +1,278 @@
+"""Depth maps of a field: what rays meet, where photos move it, and which of it other views confirm."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from fieldwork.nerfcore.config import SamplingConfig
+from fieldwork.nerfcore.data.pixels import VOID
+from fieldwork.nerfcore.data.scene import View
+from fieldwork.nerfcore.geometry.cameras import Camera, pixel_centers, rays
+from fieldwork.nerfcore.kernels.depth_arrays import FREE, MapArrays
+from fieldwork.nerfcore.mesh import depth_maps, planes, refine
+from fieldwork.nerfcore.mesh.refine import refined_maps
+from fieldwork.nerfcore.mesh.sky import farthest
+from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.sampling.occupancy import OccupancyGrid
+from fieldwork.nerfcore.sampling.render_grid import present_grid
+from fieldwork.tests.nerfcore.support.depth_views import CAMERA, box, look_at, maps_of, orbit, sphere
+
+CPU = torch.device("cpu")
+Room = tuple[list[depth_maps.FlatView], list[depth_maps.DepthMap]]
+
+
+@pytest.fixture(scope="module")
+def room() -> Room:
+    """A room seen from near its middle, all around: each wall by many photos, each part of a photo by other ones."""
+    poses = []
+    for k in range(36):
+        angle, side = 2 * np.pi * k / 36, 0.5 * (-1) ** k
+        place = np.array([0.6 * np.cos(3 * angle), 0.6 * np.sin(3 * angle), 0.1 * side])
+        poses.append(look_at(place, place + [np.cos(angle), np.sin(angle), side]))
+    return maps_of(box(np.array([-2, -1.5, -1.0]), np.array([2, 1.5, 1.0])), poses)
+
+
+def known(maps: MapArrays) -> torch.Tensor:
+    return (maps.depth > 0) & (maps.depth < FREE)
+
+
+def test_the_rim_of_a_picture_is_confirmed_by_views_that_share_little_else() -> None:
+    """A wall: twenty photos of its left part, two of its right part, and one between them."""
+    places = [*np.linspace(0.1, 0.5, 20), 1.4, 3.0, 3.2]
+    poses = [look_at(np.array([x, 0.05 * (k % 3), 0]), np.array([x, 2.0, 0])) for k, x in enumerate(places)]
+    flats, maps = maps_of(box(np.array([-9, 2.0, -9.0]), np.array([9, 3.0, 9.0])), poses)
+    width = flats[20].camera.width
+
+    def right_part(maps_: MapArrays) -> float:
+        begin = int(maps_.first[20])
+        rows = known(maps_)[begin : begin + maps[20].depth.size].reshape(-1, width)
+        return float(rows[:, -width // 10 :].float().mean())
+
+    assert 21 not in depth_maps.neighbours(flats, maps, 8)[20]
+    few = depth_maps.confirmed_maps(flats, maps, CPU, Reporter(), depth_maps.neighbours(flats, maps, 8))
+    assert right_part(few) == 0
+    assert right_part(depth_maps.confirmed_maps(flats, maps, CPU, Reporter())) > 0.9
+
+
+def test_more_views_can_be_asked_to_confirm(room: Room) -> None:
+    flats, maps = room
+    counts = [
+        int(known(depth_maps.confirmed_maps(flats, maps, CPU, Reporter(), needed=needed)).sum())
+        for needed in (2, 3, 12)
+    ]
+    assert counts[0] > counts[1] > counts[2]
+    # Of three views two others are all there are.
+    three = flats[:3], maps[:3]
+    assert torch.equal(
+        depth_maps.confirmed_maps(*three, CPU, Reporter(), needed=2).depth,
+        depth_maps.confirmed_maps(*three, CPU, Reporter(), needed=9).depth,
+    )
+
+
+def test_holes_are_filled_and_nothing_else() -> None:
+    def arrays(*depths: float) -> MapArrays:
+        depth = torch.tensor(depths)
+        nothing = torch.zeros(1)
+        return MapArrays(depth, depth + 1, depth + 2, nothing, nothing, nothing, nothing, nothing)
+
+    filled = refine.with_holes_filled(arrays(0, 0, 0, 1, FREE), arrays(3, 0, FREE, 4, 5))
+    assert filled.depth.tolist() == arrays(3, 0, 0, 1, FREE).depth.tolist()
+    assert filled.cosine[:4].tolist() == [4, 1, 1, 2]
+    assert filled.spread[:4].tolist() == [5, 2, 2, 3]
+
+
+def test_how_far_photos_confirm_depths() -> None:
+    depth = np.concatenate([np.linspace(1, 2, 101), [FREE, 0, 9]])
+    sure = np.ones(len(depth), bool)
+    sure[-1] = False
+    assert farthest(depth, sure) == pytest.approx(1.95)
+    assert farthest(depth, ~sure) == 9
+    assert farthest(depth, np.zeros(len(depth), bool)) == np.inf
+
+
+@pytest.mark.parametrize("reach", [np.inf, 1.6])
+def test_where_planes_contradict_each_other_the_field_is_believed_as_far_as_photos_reach(
+    room: Room, reach: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Plain walls: planes of neighbouring views do not meet, and photos confirm what is nearer than `reach` or nothing."""
+    flats, maps = room
+    size = flats[0].camera.width * flats[0].camera.height
+
+    def moved(grey, facing, arrays, number, near, least, gain):
+        depth = torch.from_numpy(maps[number].depth.reshape(-1))
+        near = (depth < reach) & (depth < FREE) if np.isfinite(reach) else torch.zeros(len(depth), dtype=torch.bool)
+        return torch.where(near, depth * 1.0005, depth), depth
+
+    def apart(view, map_, sure):
+        tilted = 1 + 0.04 * (1 + [id(flat) for flat in flats].index(id(view)))
+        return replace(map_, depth=np.where(map_.hit & ~sure, map_.depth * tilted, map_.depth))
+
+    monkeypatch.setattr(refine, "refine", moved)
+    monkeypatch.setattr(refine, "with_planes", apart)
+    monkeypatch.setattr(refine, "grey_pictures", lambda views, store, report: [np.zeros(size, np.float32)] * len(flats))
+    monkeypatch.setattr(refine, "nameless", lambda view, store: None)
+    field = depth_maps.map_arrays(flats, maps, CPU).depth
+    final, _ = refined_maps(flats, maps, SimpleNamespace(), CPU, Reporter())  # type: ignore[arg-type]
+    theirs = known(final) & (final.depth == field)
+    asked = depth_maps.confirmed_maps(flats, maps, CPU, Reporter(), needed=3)
+    if np.isinf(reach):
+        assert int(theirs.sum()) > 0.95 * int(known(asked).sum())
+        assert torch.equal(theirs & ~known(asked), torch.zeros_like(theirs))
+    else:
+        assert not bool((known(final) & (field > reach)).any())
+        assert int(known(final).sum()) > 1000  # what photos confirm
+
+
+def test_photos_move_soft_depths_onto_the_surface() -> None:
+    """A painted sphere whose field lies 1.5 % too deep here and too near there: the photos say where it is."""
+    poses = orbit(24, 1.8)
+    flats, true = maps_of(sphere(0.5), poses)
+    rgba = []
+    for flat, map_ in zip(flats, true):
+        local, _ = rays(flat.camera, pixel_centers(flat.camera.width, flat.camera.height).reshape(-1, 2))
+        z = np.where(map_.hit, map_.depth, 1).reshape(-1, 1)
+        points = (local / local[:, 2:] * z) @ flat.pose[:3, :3].T + flat.pose[:3, 3]
+        tone = 0.5 + 0.2 * np.sin(31 * points + 5 * np.sin(17 * points[:, [1, 2, 0]])).sum(1) / 1.5
+        grey = np.where(map_.hit.reshape(-1), tone, 0.1).clip(0, 1) * 255
+        rgba.append(np.concatenate([np.repeat(grey[:, None], 3, 1), np.full((len(grey), 1), 255)], 1))
+    pose = np.stack([flat.pose for flat in flats])
+    store = SimpleNamespace(
+        rgba=torch.from_numpy(np.concatenate(rgba).round().astype(np.uint8)),
+        first=torch.arange(len(flats) + 1) * len(rgba[0]),
+        cameras=[flat.camera for flat in flats],
+        rays=SimpleNamespace(rotation=torch.from_numpy(pose[:, :3, :3])),
+        label=torch.zeros(sum(map(len, rgba)), dtype=torch.uint8),
+    )
+    soft = []
+    for number, (flat, map_) in enumerate(zip(flats, true)):
+        wave = 1 + 0.015 * np.sin(number + np.linspace(0, 5, map_.depth.shape[1]))[None, :]
+        depth = np.where(map_.hit, map_.depth * wave, map_.depth).astype(np.float32)
+        cosine = depth_maps.cosines(flat.camera, depth)
+        soft.append(depth_maps.DepthMap(depth, np.where(map_.hit, 0.05, 0).astype(np.float32), cosine))
+    before = depth_maps.confirmed_maps(flats, soft, CPU, Reporter())
+    after, share = refined_maps(flats, soft, store, CPU, Reporter())  # type: ignore[arg-type]
+    assert share > 0.9
+    truth = torch.from_numpy(np.concatenate([m.depth.reshape(-1) for m in true]))
+
+    def error(maps: MapArrays) -> float:
+        hit = (maps.depth > 0) & (maps.depth < FREE) & (truth < FREE)
+        return float((maps.depth - truth)[hit].abs().median())
+
+    assert error(before) > 0.008
+    assert error(after) < 0.6 * error(before)  # 0.4 pixels
+    assert float(((after.depth > 0) & (after.depth < FREE)).float().mean()) > 0.9 * float(
+        ((before.depth > 0) & (before.depth < FREE)).float().mean()
+    )
+    # What label maps leave out is only there where photos say so.
+    row = torch.arange(CAMERA.height * CAMERA.width) // CAMERA.width
+
+    def labelled_below(share: float) -> MapArrays:
+        left_out = row < share * CAMERA.height
+        store.label = torch.where(left_out, VOID, 0).to(torch.uint8).repeat(len(flats))
+        return refined_maps(flats, soft, store, CPU, Reporter())[0]  # type: ignore[arg-type]
+
+    named = labelled_below(0.4)
+    field = torch.from_numpy(np.concatenate([m.depth.reshape(-1) for m in soft]))
+    left_out = (row < 0.4 * CAMERA.height).repeat(len(flats)) & (named.depth > 0) & (named.depth < FREE)
+    assert int(left_out.sum()) > 1000
+    assert bool((named.depth != field)[left_out].all())
+    # Label maps that name little of what photos confirm say nothing of the rest.
+    torch.testing.assert_close(labelled_below(0.7).depth, after.depth)
+
+
+def wall_maps(camera: Camera) -> tuple[depth_maps.FlatView, depth_maps.DepthMap]:
+    """A slanted wall, and a pillar half as far away in the middle of the picture."""
+    view = View("wall", camera, np.eye(4), image=None)  # type: ignore[arg-type]
+    flat = depth_maps.flat_views([view], np.eye(4), camera.width)[0]
+    local, _ = rays(camera, pixel_centers(camera.width, camera.height).reshape(-1, 2))
+    flat_direction = local / local[:, 2:]
+    depth = (2 / (1 + 0.3 * flat_direction[:, 0])).reshape(camera.height, camera.width)
+    depth[:, 50:70] = 1.0
+    depth = depth.astype(np.float32)
+    return flat, depth_maps.DepthMap(depth, np.full_like(depth, 0.2), depth_maps.cosines(camera, depth))
+
+
+def test_noisy_depths_of_plain_walls_fall_on_planes_and_others_stay() -> None:
+    flat, true = wall_maps(CAMERA)
+    random = np.random.default_rng(0)
+    wrong = (true.depth * random.normal(1, 0.02, true.depth.shape)).astype(np.float32)
+    sure = random.random(true.depth.shape) < 0.1
+    noisy = depth_maps.DepthMap(np.where(sure, true.depth, wrong), true.spread, true.cosine)
+    found = planes.with_planes(flat, noisy, sure)
+    assert (found.depth[sure] == true.depth[sure]).all()
+    before, after = (np.abs(m.depth / true.depth - 1) for m in (noisy, found))
+    wall = np.ones(true.depth.shape, bool)
+    wall[:, 44:76] = False  # windows across the pillar's edges are no planes
+    assert np.median(after[wall & ~sure]) < 0.2 * np.median(before[wall & ~sure])
+    assert (found.spread[wall] < true.spread[wall]).mean() > 0.8
+    assert np.quantile(after, 0.99) < 1.2 * np.quantile(before, 0.99)  # nothing is smeared over the edges
+    nothing = depth_maps.DepthMap(np.full_like(wrong, FREE), true.spread, true.cosine)
+    assert (planes.with_planes(flat, nothing, sure).depth == FREE).all()
+
+
+def test_a_smaller_depth_map_is_enlarged_without_new_depths_at_outlines() -> None:
+    wide = CAMERA.model_copy(update={"width": 480, "height": 360, "fx": 440.0, "fy": 448.0, "cx": 232.0, "cy": 184.0})
+    view = View("wall", wide, np.eye(4), image=None)  # type: ignore[arg-type]
+    flat = depth_maps.flat_views([view], np.eye(4), 480)[0]
+    small = depth_maps.reduced(flat)
+    assert (small.camera.width, small.camera.height) == small.inside.shape[::-1] == (240, 180)
+    assert depth_maps.reduced(small).camera.width == 160
+    _, rendered = wall_maps(small.camera)
+    rendered.depth[:20] = FREE
+    found = depth_maps.enlarged(rendered, flat)
+    local, _ = rays(wide, pixel_centers(480, 360).reshape(-1, 2))
+    true = (2 / (1 + 0.3 * (local / local[:, 2:])[:, 0])).reshape(360, 480)
+    pillar = np.abs(found.depth - 1) < 1e-6
+    assert (found.depth[:38] == FREE).all()
+    assert np.flatnonzero(pillar[180]).tolist() == list(range(100, 140))
+    wall = (found.depth < FREE) & ~pillar
+    assert np.abs(found.depth / true - 1)[wall].max() < 0.003
+    assert depth_maps.enlarged(found, flat) is found
+
+
+def test_rays_say_what_they_meet_that_nothing_is_there_or_nothing() -> None:
+    """A slab that is 95 %, 30 % and 5 % opaque: a depth, unknown, free; unknown too where the photo shows nothing."""
+    camera, pose, thick = Camera(width=4, height=1, fx=4.0, fy=4.0, cx=2.0, cy=0.5), np.eye(4), 0.5
+    pose[2, 3] = -1.5
+    slope = (torch.arange(4) - 1.5) / 4
+    depth_of = -torch.log(1 - torch.tensor([0.95, 0.3, 0.05, 0.95]))  # optical
+    density = depth_of / (thick * torch.sqrt(1 + slope**2))
+
+    def slab(points: torch.Tensor) -> torch.Tensor:
+        x, _, z = (2 * points - 1).unbind(1)
+        column = (x / (z + 1.5) * 4 + 1.5).round().long().clamp(0, 3)
+        return torch.where((z > 0) & (z < thick), density[column], 0.0)
+
+    grid = OccupancyGrid(SamplingConfig(resolution=32), False)
+    model = SimpleNamespace(
+        priorities=torch.ones(1),
+        render_grid=lambda: present_grid(grid, 0.0),
+        config=SimpleNamespace(render=SimpleNamespace(samples=256)),
+        field=SimpleNamespace(density=slab),
+    )
+    view = depth_maps.FlatView(camera, pose, 0, np.array([[True, True, True, False]]))
+    found = depth_maps.render_depth(model, view, lambda: None).depth[0]  # type: ignore[arg-type]
+    half = 1.5 + thick * np.log(2) / float(depth_of[0])
+    assert found == pytest.approx(np.array([half, 0, FREE, 0], np.float32), abs=0.03)
+
+
+def test_an_enlarged_depth_map_knows_nothing_where_its_photo_shows_nothing() -> None:
+    camera = Camera(width=4, height=2, fx=4.0, fy=4.0, cx=2.0, cy=1.0)
+    inside = np.ones((4, 8), bool)
+    inside[:, 6:] = False
+    view = depth_maps.FlatView(camera.resized(8, 4), np.eye(4), 0, inside)
+    free = np.full((2, 4), FREE, np.float32)
+    small = depth_maps.DepthMap(free, np.zeros_like(free), np.zeros_like(free))
+    assert (depth_maps.enlarged(small, view).depth == np.where(inside, np.float32(FREE), 0)).all()
+
+
+def test_what_is_seen_at_a_grazing_angle_is_unknown_not_free() -> None:
+    camera = Camera(width=4, height=1, fx=4.0, fy=4.0, cx=2.0, cy=0.5)
+    depth, cosine = np.array([[1, 1, FREE, 0]], np.float32), np.array([[0.9, 0.1, 0, 0]], np.float32)
+    view = depth_maps.FlatView(camera, np.eye(4), 0, np.ones((1, 4), bool))
+    arrays = depth_maps.map_arrays([view], [depth_maps.DepthMap(depth, np.zeros_like(depth), cosine)], CPU)
+    assert arrays.depth.tolist() == np.array([1, 0, FREE, 0], np.float32).tolist()

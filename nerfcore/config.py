@@ -37,9 +37,11 @@ class SceneConfig(Stage):
         le=16384,
         description="longest side of the training images in pixels; null: 1600 on a GPU, 800 on the CPU",
     )
-    background: Literal["auto", "random", "white", "black"] = Field(
+    background: Literal["auto", "environment", "random", "white", "black"] = Field(
         default="auto",
-        description="colour behind the field; auto: black or white where an object is photographed in front of that, else random",
+        description="what is behind the field; environment: sky and whatever is too far away to have a place, learned as "
+        "colours of directions; auto: black or white where an object is photographed in front of that, random where "
+        "photos are transparent, else environment",
     )
     margin: float = Field(default=1.05, gt=0, le=100, description="size of the box relative to what must fit in")
     photo_memory: float | None = Field(
@@ -191,7 +193,7 @@ class LossConfig(Stage):
     semantic_weight: float = Field(default=0.04, ge=0, le=1000, description="λ_sem; 0 trains without semantics")
     detach_weights: bool = Field(default=False, description="labels do not move the geometry")
     regularization: float = Field(
-        default=1.0, ge=0, le=1000, description="λ_reg, factor of sparsity, distortion and entropy"
+        default=1.0, ge=0, le=1000, description="λ_reg, factor of sparsity, distortion, entropy and opacity"
     )
     sparsity: Literal["exponential", "cauchy", "l1"] = Field(
         default="exponential", description="l1: the original, literal form"
@@ -203,6 +205,12 @@ class LossConfig(Stage):
     )
     distortion_start: float = Field(default=0.2, ge=0, le=1, description="share of training before that term")
     opacity_weight: float = Field(default=0.0, ge=0, le=1000, description="entropy of the ray's opacity")
+    environment_weight: float = Field(
+        default=1e-3,
+        ge=0,
+        le=1000,
+        description="of opacity in front of an environment: what it explains alone is not put anywhere else",
+    )
     depth_weight: float = Field(
         default=0.0,
         ge=0,

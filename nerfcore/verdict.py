@@ -15,6 +15,7 @@ UNRECOGNISABLE, POOR = 12.0, 18.0  # dB; a picture of one colour, the photo's me
 STILL_RISING = 1.0  # dB over the second half of the steps
 UNSEEN = 6.0  # dB that photos held out may be worse than those trained on
 THIN, EMPTY = 0.6, 0.2  # mean opacity of renders of opaque photos
+NOTHING = 0.01  # mean opacity of renders before an environment
 FLAT = 1.02  # 95th percentile of depth over the 5th
 MISSED, PARTLY = 0.02, 0.1  # share of the photos' pixels that show the mesh
 FEW_LABELS_RIGHT = 0.3  # mIoU
@@ -72,13 +73,16 @@ def train_verdict(result: Mapping[str, Any], curve: Sequence[Mapping[str, float]
     return verdict(found)
 
 
-def evaluate_verdict(result: Mapping[str, Any], psnr_train: float | None, opaque: bool, labelled: bool) -> Verdict:
+def evaluate_verdict(
+    result: Mapping[str, Any], psnr_train: float | None, opaque: bool, labelled: bool, environment: bool = False
+) -> Verdict:
     """Of `evaluate`: photos held out against those trained on, opacity, depth, labels.
 
     Args:
         result: what `evaluate` returns; "opacity" is the mean of the renders, "depth_spread" the 95th percentile of
             their depths over the 5th.
-        opaque: whether the photos fill their frames, without masks or transparency.
+        opaque: whether the field must fill the frames: no masks, no transparency, no environment behind it.
+        environment: whether there is one, which shows what the field does not.
     """
     found, psnr = [], result["psnr"]
     if psnr < UNRECOGNISABLE:
@@ -95,6 +99,9 @@ def evaluate_verdict(result: Mapping[str, Any], psnr_train: float | None, opaque
     if opaque and opacity is not None and opacity < THIN:
         text = f"The field is fog: renders are {opacity:.0%} opaque. Train longer, or look at the poses."
         found.append(("failed" if opacity < EMPTY else "weak", text))
+    if environment and opacity is not None and opacity < NOTHING:
+        text = f"The field is empty: all that renders show lies at infinity ({opacity:.1%} opaque). Look at the poses."
+        found.append(("failed", text))
     spread = result.get("depth_spread")
     if spread is not None and spread < FLAT:
         found.append(("weak", "The depths of renders hardly differ: the field may be a picture before each camera."))

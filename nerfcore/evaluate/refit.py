@@ -62,6 +62,8 @@ def refit_camera(
             grid.point_gains = level_weights(model.config.field.levels, step / STEPS)
         out = model.render(batch.origins, batch.directions, count, jitter, shift, semantics=False)
         predicted = out.color + background * (1 - out.opacity[:, None])
+        if out.environment is not None:
+            predicted = out.color + out.environment.color * out.environment.weight[:, None]
         loss = torch.nn.functional.huber_loss(predicted, batch.rgb, delta=0.1)
         if loss.requires_grad:
             gradients = torch.autograd.grad(loss, (batch.origins, batch.directions), allow_unused=True)

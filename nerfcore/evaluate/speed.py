@@ -127,10 +127,13 @@ def split_times(model: Model, rays: CameraRays, count: int, report: Reporter) ->
             geometry = model.field.geometry(samples.points)
             weights = render_weights(geometry.density, samples.deltas, samples.packed_info)
             kept = (weights > model.config.render.cull).nonzero()[:, 0]
-            directional = spherical_harmonics(directions)[samples.packed_info.ray_indices[kept].long()]
-            model.field.color(geometry[kept], directional)
+            ray_indices = samples.packed_info.ray_indices.long()
+            model.field.color(geometry[kept], spherical_harmonics(directions)[ray_indices[kept]])
             if model.field.semantic_head is not None:
                 model.field.logits(geometry[kept])
+            if model.environment is not None:
+                opacity = torch.zeros(len(pixel), device=device).index_add_(0, ray_indices, weights)
+                model.environment.visible_rays(model.field, directions, opacity, model.config.render.cull, True)
             evaluated = len(samples)
         synchronize(device)
         sampling += middle - begin

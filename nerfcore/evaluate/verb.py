@@ -125,6 +125,12 @@ class Comparison:
         return round(float(np.mean([score[key] for score in self.scores])), digits)
 
 
+def _name_of(background: float, environment: bool) -> str:
+    if environment:
+        return "environment"
+    return "white" if background == 1 else "black"
+
+
 def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
     """Render the held-out (or training) views of a run and compare them with the photos.
 
@@ -164,6 +170,7 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
         view = scene.views[index]
         report.progress(number / len(indices), view.name)
         compared.add(view, size, report.check)
+    environment = trained.model.environment is not None
     speed: dict[str, Any] = dict.fromkeys(SPEED_KEYS)
     if params.speed:
         speed = measure_speed(trained, scene, indices, box_from_world, report)
@@ -176,13 +183,14 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
         "seconds_per_image": round(compared.seconds / len(indices), 3),
         "params_m": round(trained.model.field.parameter_count() / 1e6, 3),
         "memory_mb": round(peak_memory(trained.device)),
-        "background": "white" if compared.background == 1 else "black",
+        "background": _name_of(compared.background, environment),
         "device": str(trained.device),
         **compared.details(folder),
     }
     psnr_train = (read_metrics(run_folder(folder, params.run)).get("train") or {}).get("psnr_train")
-    opaque = not trained.info.transparent and not (scene.mask_mode == "empty" and any(v.mask for v in scene.views))
-    result["verdict"] = evaluate_verdict(result, psnr_train, opaque, bool(compared.confusion.class_ids))
+    empty_around = trained.info.transparent or (scene.mask_mode == "empty" and any(v.mask for v in scene.views))
+    opaque = not environment and not empty_around
+    result["verdict"] = evaluate_verdict(result, psnr_train, opaque, bool(compared.confusion.class_ids), environment)
     path = run_folder(folder, params.run) / "metrics.json"
     stored = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     write_json(path, {**stored, params.split: result})

@@ -61,6 +61,8 @@ def field_model(field: HybridField, box: Box) -> onnx.ModelProto:
     exponent = g.add("Add", g.slice(out, 0, 1), g.const(field.config.density_shift))
     density = g.add("Exp", g.add("Clip", exponent, g.const(-15.0), g.const(11.0)))
     density = g.add("Div", density, g.const(similarity_scale(box.world_from_box)))
+    if field.thinning:
+        density = g.add("Mul", density, _thinning(g, points))
     g.add("Squeeze", density, g.const([1], np.int64), name="density")
     parts = [out, _harmonics(g, box)]
     if field.config.appearance:
@@ -126,6 +128,15 @@ def _grid_position(g: _Graph, box: Box) -> str:
         shrink = g.add("Div", g.add("Sub", g.const(2.0), g.add("Reciprocal", r)), r)
         scaled = g.add("Mul", g.add("Mul", p, shrink), g.const(0.25))
     return g.add("Clip", g.add("Add", scaled, g.const(0.5)), g.const(0.0), g.const(1.0))
+
+
+def _thinning(g: _Graph, points: str) -> str:
+    """As geometry/contraction.py, (N, 1)."""
+    away = g.add("Abs", g.add("Sub", points, g.const(0.5)))
+    away = g.add("ReduceMax", away, g.const([1], np.int64), keepdims=1)
+    share = g.add("Sub", g.const(2.0), g.add("Mul", away, g.const(4.0)))
+    share = g.add("Clip", share, g.const(0.0), g.const(1.0))
+    return g.add("Mul", share, share)
 
 
 def _corners(g: _Graph, scaled: str, last: int) -> tuple[list[tuple[str, str]], list[tuple[str, str]]]:

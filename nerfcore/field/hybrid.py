@@ -8,6 +8,7 @@ import torch
 from torch import nn
 
 from ..config import MOST_VERTICES, FieldConfig
+from ..geometry.contraction import thinning
 from ..kernels.encode import FEATURES
 from .blend import BlendWeight
 from .encoding import frequency_encoding
@@ -54,11 +55,12 @@ class HybridField(nn.Module):
         config: settings of the field.
         classes: number of class logits; 0 leaves the semantic head out.
         images: number of training images (for appearance codes).
+        thinning: density falls outside of the inner half of the grid, see `contraction.thinning`.
     """
 
-    def __init__(self, config: FieldConfig, classes: int, images: int = 0) -> None:
+    def __init__(self, config: FieldConfig, classes: int, images: int = 0, thinning: bool = False) -> None:
         super().__init__()
-        self.config, self.classes = config, classes
+        self.config, self.classes, self.thinning = config, classes, thinning
         self.features = config.levels * FEATURES
         self.grid = (
             VertexGrid(level_layout(config.levels, config.coarsest, config.finest or MOST_VERTICES, config.table_log2))
@@ -128,6 +130,8 @@ class HybridField(nn.Module):
                 hidden = torch.lerp(implicit.to(explicit.dtype), explicit, w)
         out = self.density_head(hidden, self.dtype)
         density = _TruncatedExp.apply(out[:, 0].float() + self.config.density_shift)
+        if self.thinning:
+            density = density * thinning(points)
         return Geometry(density, out, implicit, explicit)  # type: ignore[arg-type]
 
     def density(self, points: torch.Tensor) -> torch.Tensor:

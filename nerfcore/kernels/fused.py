@@ -41,6 +41,7 @@ class FusedField:
     blend_floor: float
     blend_rate: float
     density_shift: float
+    thinning: bool
     class_count: int
 
 
@@ -136,5 +137,5 @@ def _field_arrays(field: FusedField) -> Any:
     out.evidence, out.evidence_side = array(field.evidence), field.evidence_side
     out.blend_floor, out.blend_rate = field.blend_floor, field.blend_rate
     out.weights, out.code = array(field.weights), array(field.code)
-    out.density_shift, out.class_count = field.density_shift, field.class_count
+    out.density_shift, out.thinning, out.class_count = field.density_shift, int(field.thinning), field.class_count
     return out

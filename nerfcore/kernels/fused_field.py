@@ -39,6 +39,7 @@ class FieldArrays:
     weights: wp.array2d(dtype=wp.float16)
     code: wp.array(dtype=float)
     density_shift: float
+    thinning: int
     class_count: int
 
 
@@ -48,8 +49,8 @@ class FieldFunctions:
 
     grid: point in [0, 1]³ → features of the grid. blended: point, active, features of the grid → input of the density
     head, features of the implicit branch and the number of the block's samples that need them; where that is 0 they
-    were not read; None without an implicit branch. density: its input → features for the other heads, and density per
-    normalised unit length. color: those features and the ray's direction → logits of red, green and blue. classes:
+    were not read; None without an implicit branch. density: its input and the point → features for the other heads, and
+    density per normalised unit length. color: those features and the ray's direction → logits of red, green and blue. classes:
     features for the heads, of the grid and of the implicit branch, whether those were read, and the point → scores;
     None without classes.
     """
@@ -140,16 +141,27 @@ def _blended(shape: FusedShape, lanes: int, smooth_features: Any) -> Any:
     return wp.func(blended_features, name=f"blended_features_{shape_name(shape, lanes)}")
 
 
+@wp.func
+def thinning(p: wp.vec3):
+    """See `geometry.contraction.thinning`."""
+    away = wp.max(wp.abs(p[0] - 0.5), wp.max(wp.abs(p[1] - 0.5), wp.abs(p[2] - 0.5)))
+    share = wp.clamp(2.0 - 4.0 * away, 0.0, 1.0)
+    return share * share
+
+
 def _density(shape: FusedShape, lanes: int) -> Any:
     head_network, row = network(shape.density, lanes), shape.rows()["density"]
     geometry, vector, head_input = shape.geometry, half_vector(shape.geometry), half_vector(shape.density[0])
 
-    def density(x: head_input, field: FieldArrays):
+    def density(x: head_input, p: wp.vec3, field: FieldArrays):
         head = head_network(x, field.weights, row)
         out = vector()
         for k in range(geometry):
             out[k] = wp.float16(head[k])
-        return out, wp.exp(wp.clamp(head[0] + field.density_shift, -15.0, 11.0))
+        sigma = wp.exp(wp.clamp(head[0] + field.density_shift, -15.0, 11.0))
+        if field.thinning == 1:
+            sigma *= thinning(p)
+        return out, sigma
 
     return wp.func(density, name=f"density_{shape_name(shape, lanes)}")
 

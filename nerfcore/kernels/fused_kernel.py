@@ -130,7 +130,7 @@ def fused_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
                     joined, implicit, uncertain_lanes = blended_features(p, active, explicit, field)
                 else:
                     joined = density_input(explicit)
-                head, density = density_at(joined, field)
+                head, density = density_at(joined, p, field)
                 pixel.optical_depth += density * length
                 after = wp.exp(-pixel.optical_depth)
                 weight = pixel.transmittance - after

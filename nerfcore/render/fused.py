@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import dataclass, replace
 from functools import cache
 
 import torch
 
+from ..field.environment import EnvironmentRays
 from ..field.hybrid import HybridField
 from ..field.mlp import MLP
 from ..kernels.device import backend_of
@@ -149,8 +151,16 @@ def pack(field: HybridField, semantics: bool = True, logits: bool = False) -> Fu
         blend_floor=blend.floor if blend is not None else 1.0,
         blend_rate=blend.rate if blend is not None else 0.0,
         density_shift=c.density_shift,
+        thinning=field.thinning,
         class_count=field.classes if semantics else 0,
     )
+
+
+@dataclass(frozen=True)
+class FusedRendered(FusedRays):
+    """The same with what is behind the field, which the kernel does not know of."""
+
+    environment: EnvironmentRays | None
 
 
 class FusedRenderer:
@@ -159,7 +169,8 @@ class FusedRenderer:
     rays = 1 << 20  # rendered at once
 
     def __init__(self, model: Model, semantics: bool = True) -> None:
-        self.config, self.grid = model.config, model.render_grid()
+        self.model, self.config, self.grid = model, model.config, model.render_grid()
+        self.semantics = semantics
         self.field = pack(model.field, semantics, self.config.render.accumulate == "logits")
 
     def coarse(self, origins: torch.Tensor, directions: torch.Tensor) -> CoarseRays:
@@ -167,17 +178,20 @@ class FusedRenderer:
         g = self.grid
         return coarse_march(origins, directions, g.cells, g.skip_distance, g.settings)
 
-    def fine(self, rays: CoarseRays, count: int) -> FusedRays:
+    def fine(self, rays: CoarseRays, count: int) -> FusedRendered:
         """Samples, field and compositing of rays after their coarse march."""
         g = self.grid
         out = render_coarse(self.field, rays, g.cells, g.skip_distance, g.settings, count, self.config.render.cull)
-        if out.probabilities is None or self.config.render.accumulate == "probabilities":
-            return out
-        # Summed logits become probabilities of the ray once it is complete.
-        shares = torch.softmax(out.probabilities, 1) * out.opacity[:, None]
-        return FusedRays(out.color, out.opacity, out.depth, shares, out.evaluated)
+        if out.probabilities is not None and self.config.render.accumulate == "logits":
+            # Summed logits become probabilities of the ray once it is complete.
+            out = replace(out, probabilities=torch.softmax(out.probabilities, 1) * out.opacity[:, None])
+        field, environment, behind = self.model.field, self.model.environment, None
+        if environment is not None:
+            cull = self.config.render.cull
+            behind = environment.visible_rays(field, rays.directions, out.opacity, cull, self.semantics)
+        return FusedRendered(**vars(out), environment=behind)
 
-    def __call__(self, origins: torch.Tensor, directions: torch.Tensor, samples_per_ray: int) -> FusedRays:
+    def __call__(self, origins: torch.Tensor, directions: torch.Tensor, samples_per_ray: int) -> FusedRendered:
         """Render rays (R, 3) of the normalised frame with at most `samples_per_ray` samples where they meet something."""
         return self.fine(self.coarse(origins, directions), samples_per_ray)
 
@@ -196,5 +210,5 @@ class UnfusedRenderer:
 
 def ray_renderer(model: Model, rays: int, semantics: bool = True) -> FusedRenderer | UnfusedRenderer:
     """What renders a picture of `rays` rays: called with (origins, directions, samples_per_ray) it gives color,
-    opacity, depth and probabilities of up to its `rays` rays at once."""
+    opacity, depth, probabilities and environment of up to its `rays` rays at once."""
     return FusedRenderer(model, semantics) if wants_fused(model, rays) else UnfusedRenderer(model, semantics)

@@ -19,21 +19,22 @@ from .model import Model
 from .run import RunInfo
 
 CPU_RAYS = 8192  # at once
+LEAST = 1e-3  # opacity from which something has a depth
 
 
 @dataclass(frozen=True)
 class Frame:
     """One rendered view, numpy, (H, W, …).
 
-    picture: sRGB float32 with associated alpha, nothing behind it; background: the grey that `color` has behind it;
-    opacity; depth: distance along the optical axis in normalised units,
+    picture: sRGB float32 with associated alpha, nothing behind it; background: the grey that `color` has behind it, or the
+    environment (3); opacity; depth: distance along the optical axis in normalised units,
     NaN where nothing is; probabilities (K) or None; position (3) expected surface point in the normalised frame;
     unknown: share of the ray's way, up to what it meets, that no training photo shows, or None where not asked for.
     Where nothing is for a share above 0 the field does not say that there is nothing.
     """
 
     picture: Picture
-    background: float
+    background: float | np.ndarray
     depth: np.ndarray
     probabilities: np.ndarray | None
     position: np.ndarray
@@ -90,6 +91,7 @@ def render_view(
 ) -> Frame:
     """Render what a camera (pose (4, 4) in the normalised frame, OpenCV axes) sees.
 
+    `background`: the grey behind the field where the model has no environment.
     `unknown`: also which share of each ray's way lies where no training photo looked.
     `check` is called before every tile, on the CPU by several threads, and may raise to stop.
     """
@@ -99,7 +101,8 @@ def render_view(
     axis = rays.rotation[0, :, 2]
     pixels = torch.arange(camera.width * camera.height, device=device)
     render = ray_renderer(model, len(pixels), semantics)
-
+    # Haze before the sky has no depth: what is there lies behind it.
+    least = LEAST if model.environment is None else 0.5
     states = model.occupancy.states() if unknown else None
 
     @torch.no_grad()
@@ -111,13 +114,18 @@ def render_view(
         directions = torch.where(valid[:, None], directions, axis.expand_as(directions)).contiguous()
         out = render(origins, directions, count)
         opacity = out.opacity * valid
-        distance = torch.where(opacity > 1e-3, out.depth / out.opacity.clamp(min=1e-3), torch.nan)
+        distance = torch.where(opacity > least, out.depth / out.opacity.clamp(min=least), torch.nan)
         color = torch.cat([out.color * valid[:, None], opacity[:, None]], 1)
         found = [color, distance * (directions @ axis), origins + directions * distance[:, None]]
         if states is not None:
             solid = torch.where(opacity > 0.5, distance, torch.nan)
             found.append(unknown_share(states, model.contracted, origins, directions, solid))
-        return found if out.probabilities is None else [*found, out.probabilities]
+        probabilities, behind = out.probabilities, out.environment
+        if behind is not None:
+            found.append(behind.color * valid[:, None])
+            if probabilities is not None and behind.probabilities is not None:
+                probabilities = probabilities + behind.weight[:, None] * behind.probabilities
+        return found if probabilities is None else [*found, probabilities * valid[:, None]]
 
     # The CPU renders small tiles side by side, each of which fits a core's cache.
     tiles = pixels.split(render.rays if device.type != "cpu" else min(render.rays, CPU_RAYS))
@@ -127,4 +135,5 @@ def render_view(
     color, depth, position, *more = (i.reshape(*shape, *i.shape[1:]).numpy() for i in images)
     picture = Picture(color, "srgb", "associated")
     hidden = more.pop(0) if unknown else None
-    return Frame(picture, background, depth, more[0] if more else None, position, hidden)
+    behind = background if model.environment is None else more.pop(0)
+    return Frame(picture, behind, depth, more[0] if more else None, position, hidden)

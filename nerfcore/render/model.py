@@ -11,6 +11,7 @@ from torch import nn
 
 from ..config import RunConfig
 from ..field.encoding import spherical_harmonics
+from ..field.environment import Environment, EnvironmentRays
 from ..field.hybrid import Geometry, HybridField
 from ..geometry.contraction import grid_position
 from ..kernels.composite import render_weights, weighted_sum
@@ -29,7 +30,8 @@ LEAST_CAPACITY = 1 / 16  # of all samples, or nothing would be visible ever agai
 @dataclass(frozen=True)
 class Rendered:
     """Of R rays: color (R, 3) without background, opacity (R,), depth (R,) expected distance (normalised units, not
-    divided by opacity), probabilities (R, K) or None; of the visible samples: weights (N,), density (N,), packed as
+    divided by opacity), probabilities (R, K) or None; environment: what is behind the field, None where the model has
+    none; of the visible samples: weights (N,), density (N,), packed as
     in `samples`; of all M samples the field was evaluated at: `evaluated_points` (M, 3) in grid coordinates and
     `evaluated_density`, −1 where an entry is unused; visible (): number of samples worth shading, also of the rays that
     were left out for want of capacity.
@@ -39,6 +41,7 @@ class Rendered:
     opacity: torch.Tensor
     depth: torch.Tensor
     probabilities: torch.Tensor | None
+    environment: EnvironmentRays | None
     weights: torch.Tensor
     density: torch.Tensor
     samples: Samples
@@ -81,7 +84,9 @@ class Model(nn.Module):
     ) -> None:
         super().__init__()
         self.config = config
-        self.field = HybridField(config.field, classes, images)
+        self.environment = Environment() if config.scene.background == "environment" else None
+        thinning = self.environment is not None and contracted
+        self.field = HybridField(config.field, classes, images, thinning)
         self.occupancy = OccupancyGrid(config.sampling, contracted, seen, unknown)
         self.register_buffer("priorities", torch.ones(max(classes, 1)) if priorities is None else priorities)
         self.priorities: torch.Tensor
@@ -188,7 +193,8 @@ class Model(nn.Module):
         probabilities = None
         if semantics and self.field.semantic_head is not None:
             probabilities = self._probabilities(self.field.logits(geometry), weights, visible.packed_info)
-        shaded = (summed[:, :3], summed[:, 3], summed[:, 4], probabilities)
+        environment = self._environment(directions, summed[:, 3], samples, codes, semantics)
+        shaded = (summed[:, :3], summed[:, 3], summed[:, 4], probabilities, environment)
         return Rendered(*shaded, weights, density, visible, samples.points, evaluated_density, visible_count)
 
     def _sample(
@@ -257,6 +263,23 @@ class Model(nn.Module):
         color = self.field.color(geometry, harmonics[ray_indices], None if codes is None else codes[ray_indices])
         values = torch.cat([color, torch.ones_like(weights)[:, None], samples.t[:, None]], 1)
         return weighted_sum(values, weights, samples.packed_info)
+
+    def _environment(
+        self,
+        directions: torch.Tensor,
+        opacity: torch.Tensor,
+        samples: Samples,
+        codes: torch.Tensor | None,
+        semantics: bool,
+    ) -> EnvironmentRays | None:
+        """What is behind the field where it has this opacity (R,)."""
+        if self.environment is None:
+            return None
+        if not torch.is_grad_enabled():
+            return self.environment.visible_rays(self.field, directions, opacity, self.config.render.cull, semantics)
+        # Rays that met something and were left out for want of capacity do not show the environment.
+        shown = (samples.packed_info.counts > 0) | (samples.t_first < 0)
+        return self.environment.rays(self.field, directions, (1 - opacity) * shown, codes, semantics)
 
     @torch.no_grad()
     def observe(self, rendered: list[Rendered]) -> None:

@@ -20,7 +20,7 @@ from ..geometry.frames import focus_point
 from ..geometry.similarity import similarity_scale
 from ..images.encode import write_layers, write_picture
 from ..images.names import frame_names
-from ..images.picture import to_linear
+from ..images.picture import Picture, to_linear
 from ..params import RenderParams
 from ..progress import Reporter
 from ..project.fingerprints import (
@@ -233,7 +233,7 @@ def write_frame(
     """Write NAME.png, NAME_depth.png, … and NAME.exr with all asked passes. Returns the paths of these pictures.
 
     The PNG shows the field on its background; the EXR has the field alone, linear and with associated alpha, to be put
-    over anything.
+    over anything, and beside it the environment, if the run has one.
     """
     scale = similarity_scale(box.world_from_box)
     rotation = box.world_from_box[:3, :3] / scale
@@ -269,6 +269,9 @@ def write_frame(
         prefix, channels, value = values[kind]
         for index, channel in enumerate(channels):
             layers[prefix + channel] = value[..., index]
+    if "rgb" in passes and isinstance(frame.background, np.ndarray):
+        environment = to_linear(Picture(frame.background)).pixels
+        layers |= {f"Environment.{channel}": environment[..., index] for index, channel in enumerate("RGB")}
     path = out / f"{name}.exr"
     with atomic_path(path) as temporary:
         write_layers(temporary, layers)

@@ -10,7 +10,7 @@ from ..data.box import looks_inward
 from ..data.scene import Scene
 from ..images.working import read_picture
 
-Background = Literal["random", "white", "black"]
+Background = Literal["environment", "random", "white", "black"]
 LEVEL: dict[str, float] = {"white": 1.0, "black": 0.0}
 
 # Not tuned: the next four.
@@ -26,14 +26,17 @@ def choose_background(scene: Scene, transparent: bool) -> Background:
     - An object in front of black (or white) on nearly all sides: that colour. Nothing has to be there, then, for rays
       past the object; a field that must be opaque everywhere fills the space around it with black clouds instead, at
       any depth, since black looks the same from all sides.
-    - All else: random, so that rays without alpha have to meet something, and transparent ones nothing.
+    - Transparent photos: random, so that rays without alpha have to meet something, and transparent ones nothing.
+    - All else: an environment, which has the sky and whatever is too far away to have a place.
     """
-    if transparent or any(view.mask is not None for view in scene.views) or not looks_inward(scene.views):
+    if transparent or any(view.mask is not None for view in scene.views):
         return "random"
+    if not looks_inward(scene.views):
+        return "environment"
     chosen = np.unique(np.linspace(0, len(scene.train) - 1, MOST_PHOTOS).round().astype(int))
     shares = [edge_shares(read_picture(scene.views[scene.train[i]].image).pixels[..., :3]) for i in chosen]
     black, white = np.median(shares, axis=0)
-    return "black" if black > SHARE else "white" if white > SHARE else "random"
+    return "black" if black > SHARE else "white" if white > SHARE else "environment"
 
 
 def edge_shares(photo: np.ndarray) -> tuple[float, float]:

@@ -28,7 +28,7 @@ def composite_loss(
     share: tuple[float, float | torch.Tensor] = (1.0, 1.0),
     squared: bool = False,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """The loss of R rays in front of `background` (R, 3), and their mean squared colour error; both scalars.
+    """The loss of R rays in front of `background` (R, 3), or of the environment where the model has one, and their mean squared colour error; both scalars.
 
     Args:
         progress: of the schedule, in [0, 1]; some terms begin later.
@@ -38,14 +38,18 @@ def composite_loss(
         squared: colour errors count squared, see `color_loss`.
     """
     rays, labels = share
-    alpha = batch.alpha[:, None]
-    target = batch.rgb * alpha + background * (1 - alpha)
-    predicted = rendered.color + background * (1 - rendered.opacity[:, None])
+    alpha, behind, environment = batch.alpha[:, None], 1 - rendered.opacity, rendered.environment
+    if environment is not None:
+        background, behind = environment.color, environment.weight
+    target = batch.rgb * alpha + background.detach() * (1 - alpha)
+    predicted = rendered.color + background * behind[:, None]
     total = rays * config.rgb_weight * color_loss(predicted, target, config, squared)
     if rendered.probabilities is not None:
         counted = label_weights(batch)
         opacity = torch.lerp(rendered.opacity.detach(), rendered.opacity, model.label_pull)
         probabilities = at_given_opacity(rendered.probabilities, opacity)
+        if environment is not None and environment.probabilities is not None:
+            probabilities = probabilities + environment.probabilities * environment.weight.detach()[:, None]
         price = semantic_loss(probabilities, batch.label, counted, batch.confidence)
         total = total + labels * config.semantic_weight * price
         if config.entropy_ratio > 0 and config.regularization > 0 and progress >= config.entropy_start:
@@ -66,4 +70,6 @@ def _regularizers(rendered: Rendered, progress: float, config: LossConfig, contr
         total = total + config.distortion_weight * distortion
     if config.opacity_weight > 0:
         total = total + config.opacity_weight * opacity_entropy(rendered.opacity)
+    if config.environment_weight > 0 and rendered.environment is not None:
+        total = total + config.environment_weight * rendered.opacity.mean()
     return total

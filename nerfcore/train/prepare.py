@@ -79,7 +79,7 @@ def plan_run(
     transparent = has_transparency(scene)
     background = choose_background(scene, transparent)
     # In front of one colour all around there is nothing but that colour.
-    box = choose_box(scene, config.scene, transparent or background != "random")
+    box = choose_box(scene, config.scene, transparent or background in LEVEL)
     config = config.model_copy(deep=True)
     if config.scene.image_size is None:
         config.scene.image_size = CPU_IMAGE_SIZE if device.type == "cpu" else GPU_IMAGE_SIZE

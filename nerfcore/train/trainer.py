@@ -11,7 +11,7 @@ from functools import partial
 import torch
 
 from ..config import RunConfig
-from ..data.pixels import Batch, PixelStore
+from ..data.pixels import VOID, Batch, PixelStore
 from ..errors import TrainingError
 from ..field.grid import Part
 from ..kernels.device import backend_of
@@ -159,6 +159,11 @@ class Trainer:
             model.field.grid.step(config.train.grid_rate * factor * bias_correction(self.steps, *BETAS), BETAS)
         rendered = [part.rendered for part in shards if part.rendered is not None]
         model.observe(rendered)
+        if model.environment is not None and batch.label.numel():
+            # Rays of known length, which are rendered as well, come after those of the batch.
+            behind = [r.environment.weight for r in rendered if r.environment is not None]
+            weight = torch.cat(behind)[: len(batch.label)]
+            model.environment.observe(weight, batch.label != VOID, model.labelled)
         if model.field.blend is not None and self.steps % config.sampling.update_every == 0:
             model.field.blend.update(
                 torch.cat([r.samples.points for r in rendered]),

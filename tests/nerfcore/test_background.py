@@ -41,7 +41,8 @@ def on_background(project: Path, value: int | None) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("value", "chosen"), [(0, "black"), (255, "white"), (128, "random"), (25, "random"), (None, "random")]
+    ("value", "chosen"),
+    [(0, "black"), (255, "white"), (128, "environment"), (25, "environment"), (None, "environment")],
 )
 def test_black_and_white_surroundings_are_recognised(tmp_path: Path, value: int | None, chosen: str) -> None:
     project = on_background(ball_project(tmp_path / "p"), value)
@@ -60,7 +61,7 @@ def test_only_around_objects_without_alpha_and_masks(tmp_path: Path) -> None:
     assert choose_background(load_scene(project), transparent=False) == "random"
     outward = [pose @ np.diag([-1.0, 1, -1, 1]) for pose in camera_poses(16)]
     room = on_background(ball_project(tmp_path / "room", given=outward), 0)
-    assert choose_background(load_scene(room), transparent=False) == "random"
+    assert choose_background(load_scene(room), transparent=False) == "environment"
 
 
 @pytest.mark.parametrize("value", [0, 255, None])

@@ -202,7 +202,7 @@ def test_the_graph_computes_what_the_field_does(settings: dict, contracted: bool
     """Dense and hashed levels, every branch and fusion, a turned and scaled cube, at any place and direction."""
     torch.manual_seed(0)
     small = {"precision": "float32", "levels": 4, "coarsest": 8, "finest": 200, "table_log2": 12}
-    field = HybridField(FieldConfig(**small, **settings), classes=3, images=5)
+    field = HybridField(FieldConfig(**small, **settings), classes=3, images=5, thinning=contracted)
     if field.grid is not None:
         field.grid.table.normal_(0, 0.5)
     if field.blend is not None:

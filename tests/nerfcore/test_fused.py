@@ -50,6 +50,8 @@ def random_model(
         model.field.blend.evidence.uniform_(0, 0.6)
     if model.field.appearance is not None:
         model.field.appearance.normal_()
+    if model.environment is not None:
+        model.environment.labelled.fill_(1.0)
     occupancy = model.occupancy
     n = occupancy.config.resolution
     cell = torch.arange(n**3)
@@ -81,6 +83,14 @@ def assert_same(fused, unfused) -> None:
             assert float(difference.mean()) < MEAN * scale, name
 
 
+def assert_same_environment(fused, unfused) -> None:
+    """Of rays that the field leaves something of; the rest may fall on either side of the limit."""
+    shown = unfused.weight > 0.01
+    assert bool(shown.any())
+    assert float((fused.color - unfused.color)[shown].abs().max()) < LARGEST
+    assert float((fused.probabilities - unfused.probabilities)[shown].abs().max()) < LARGEST
+
+
 CASES = {
     "standard, 7 classes": (7, False, "standard", {}),
     "contracted, logits, 20 classes": (20, True, "standard", {"render.accumulate": "logits"}),
@@ -90,6 +100,7 @@ CASES = {
         "standard",
         {"field.branch": "explicit", "field.appearance": "4", "field.color_layers": "2"},
     ),
+    "environment": (5, True, "standard", {"scene.background": "environment"}),
     "side by side": (5, False, "standard", {"field.fusion": "concat", "field.levels": "6"}),
     "blended": (5, False, "standard", {"field.fusion": "blend"}),
     "draft, narrow": (3, False, "draft", {"field.width": "32", "sampling.pdf": "uniform"}),
@@ -104,6 +115,8 @@ def test_the_fused_kernel_renders_what_the_separate_kernels_do(case: str, device
     fused = FusedRenderer(model)(origins, directions, COUNT)
     unfused = UnfusedRenderer(model)(origins, directions, COUNT)
     assert_same(fused, unfused)
+    if model.environment is not None:
+        assert_same_environment(fused.environment, unfused.environment)
     missed = unfused.opacity == 0
     assert bool(missed.any()) or model.contracted
     assert bool((fused.color[missed] == 0).all())

@@ -78,6 +78,9 @@ def test_held_out_photos() -> None:
     assert (
         evaluate_verdict({**good, "opacity": 0.1, "miou": None}, 29.0, opaque=False, labelled=False)["level"] == "good"
     )
+    before_sky = [evaluate_verdict({**good, "opacity": o}, 29.0, False, True, True) for o in (0.1, 0.001)]
+    assert [found["level"] for found in before_sky] == ["good", "failed"]
+    assert "empty" in before_sky[1]["reasons"][0]
     assert evaluate_verdict({**good, "split": "train", "psnr": 20.0}, 29.0, True, True)["level"] == "good"
 
 

@@ -1,0 +1,253 @@
+"""What is behind the field as colours of directions: where it is read, what it learns, and how pictures show it."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+import torch
+from fieldwork.nerfcore.config import RunConfig, make_config
+from fieldwork.nerfcore.data.box import box_poses
+from fieldwork.nerfcore.data.load import load_scene
+from fieldwork.nerfcore.field.environment import NAMED, Environment
+from fieldwork.nerfcore.geometry.cameras import Camera, pixel_centers
+from fieldwork.nerfcore.geometry.contraction import grid_position, horizon, thinning
+from fieldwork.nerfcore.images.picture import linear_to_srgb
+from fieldwork.nerfcore.kernels.device import use_device
+from fieldwork.nerfcore.params import EvaluateParams, RenderParams, TrainParams
+from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.project.schema import SemanticClass
+from fieldwork.nerfcore.project.store import load_project, save_project
+from fieldwork.nerfcore.render.image import Frame, render_view
+from fieldwork.nerfcore.render.model import Model
+from fieldwork.nerfcore.render.run import Trained, load_trained
+from fieldwork.nerfcore.render.verb import look_at
+from fieldwork.nerfcore.train.composite_loss import composite_loss
+from fieldwork.nerfcore.train.prepare import make_trainer, plan_run
+from fieldwork.nerfcore.verbs import run_verb
+from fieldwork.tests.nerfcore.support.ball import SMALL, ball_project, camera_poses, draw
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+STEPS, VIEWS = 500, 48
+CLEARED = {"loss.environment_weight": "0.01"}  # so few steps need a higher price
+
+
+def sky(directions: np.ndarray) -> np.ndarray:
+    """Colours (…, 3) of directions (…, 3): a gradient with soft clouds."""
+    height = directions[..., 2:] * [0.25, 0.1, -0.2]
+    clouds = 0.1 * np.sin(directions @ [3.0, 2.0, 1.0])[..., None]
+    return 0.55 + height + clouds
+
+
+def looking(camera: Camera, pose: np.ndarray) -> np.ndarray:
+    """Unit directions (H, W, 3) of a pinhole's pixels in the world."""
+    place = (pixel_centers(camera.width, camera.height) - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    d = np.concatenate([place, np.ones_like(place[..., :1])], -1) @ pose[:3, :3].T
+    return d / np.linalg.norm(d, axis=-1, keepdims=True)
+
+
+def under_the_sky(folder: Path, named: bool = False) -> Path:
+    """The ball's capture with opaque photos, in which the sky is behind it; a class of its own where it is `named`."""
+    project = ball_project(folder, views=VIEWS)
+    camera = load_scene(project).views[0].camera
+    for i, pose in enumerate(camera_poses(VIEWS)):
+        path = project / "images" / f"{i:02d}.png"
+        rgba = np.asarray(Image.open(path))
+        behind = (sky(looking(camera, pose)) * 255 + 0.5).astype(np.uint8)
+        Image.fromarray(np.where(rgba[..., 3:] > 0, rgba[..., :3], behind)).save(path)
+        if named:
+            labels = project / "labels" / path.name
+            label = np.asarray(Image.open(labels))
+            Image.fromarray(np.where(label == 0, 3, label).astype(np.uint8)).save(labels)
+    if named:
+        saved = load_project(project)
+        saved.classes.append(SemanticClass(id=3, name="sky", color=(0.3, 0.5, 0.9)))
+        save_project(project, saved)
+    return project
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A trained run under the sky, and what a camera far from those of the photos sees of it."""
+
+    project: Path
+    trained: Trained
+    frame: Frame
+    ball: np.ndarray
+    sky: np.ndarray
+
+
+def trained_under_the_sky(folder: Path, named: bool = False, **settings: str) -> Seen:
+    project = under_the_sky(folder, named)
+    values = {**SMALL, **CLEARED, **{name.replace("__", "."): value for name, value in settings.items()}}
+    run_verb("train", TrainParams(project=project, preset="draft", steps=STEPS, set=values), Reporter())
+    trained = load_trained(project, "main")
+    scene = load_scene(project)
+    camera, pose = scene.views[0].camera, look_at(np.array([1.3, 1.5, 0.2]), np.zeros(3))
+    moved = trained.info.box(load_project(project)).box_from_world @ pose
+    moved[:3, :3] = pose[:3, :3]
+    frame = render_view(trained.model, camera, moved, 0.0)
+    _, label, _ = draw(camera, pose)
+    return Seen(project, trained, frame, label > 0, sky(looking(camera, pose)))
+
+
+@pytest.fixture(scope="module")
+def seen(tmp_path_factory: pytest.TempPathFactory) -> Seen:
+    return trained_under_the_sky(tmp_path_factory.mktemp("sky") / "p")
+
+
+coordinate = st.floats(-20, 20)
+
+
+@given(st.tuples(coordinate, coordinate, coordinate).filter(lambda p: max(map(abs, p)) > 1e-3))
+def test_thinning_is_how_much_shorter_space_becomes_outwards(place: tuple[float, float, float]) -> None:
+    """Of a step away from the middle: by the difference of grid positions, in the cube 1."""
+    p = torch.tensor([place], dtype=torch.float64)
+    u = grid_position(p, True)
+    step = 1e-6 * p
+    moved = (grid_position(p + step, True) - u).abs().amax() * 4
+    inside = float(p.abs().max()) < 1 - 1e-5
+    outside = float(p.abs().max()) > 1 + 1e-5
+    if inside or outside:
+        assert float(thinning(u)[0]) == pytest.approx(float(moved / step.abs().amax()), rel=1e-4)
+
+
+def test_rays_end_at_the_horizon_wherever_they_begin() -> None:
+    generator = torch.Generator().manual_seed(0)
+    origins = torch.randn(500, 3, generator=generator, dtype=torch.float64)
+    directions = torch.nn.functional.normalize(torch.randn(500, 3, generator=generator, dtype=torch.float64), dim=1)
+    far = grid_position(origins + 1e9 * directions, True)
+    assert torch.allclose(far, horizon(directions), atol=1e-6)
+
+
+def test_captures_with_visible_surroundings_have_an_environment(tmp_path: Path) -> None:
+    project = under_the_sky(tmp_path / "p")
+    info, _ = plan_run(project, "draft", RunConfig(), torch.device("cpu"))
+    assert info.config.scene.background == "environment"
+    assert info.contracted
+
+
+def test_the_sky_is_learned_and_the_field_stays_empty_before_it(seen: Seen) -> None:
+    beside = ~seen.ball
+    assert seen.trained.info.config.scene.background == "environment"
+    assert seen.frame.opacity[beside].mean() < 0.1
+    assert seen.frame.opacity[seen.ball].mean() > 0.9
+    error = seen.frame.color[beside] - seen.sky[beside]
+    assert -10 * math.log10((error**2).mean()) > 27
+    assert np.isnan(seen.frame.depth[beside]).mean() > 0.5
+
+
+def test_without_an_environment_the_sky_is_somewhere(tmp_path: Path) -> None:
+    filled = trained_under_the_sky(tmp_path / "p", scene__background="random")
+    assert filled.frame.opacity[~filled.ball].mean() > 0.9
+
+
+def test_an_environment_without_labels_is_void(seen: Seen) -> None:
+    ids = seen.trained.info.class_ids
+    assert seen.trained.model.environment is not None
+    assert float(seen.trained.model.environment.labelled) < NAMED
+    label = seen.frame.label(ids)
+    assert (label[~seen.ball] == 0).mean() > 0.9
+    assert (label[seen.ball] > 0).mean() > 0.9
+
+
+def test_an_environment_with_labels_has_its_class(tmp_path: Path) -> None:
+    found = trained_under_the_sky(tmp_path / "p", named=True)
+    label = found.frame.label(found.trained.info.class_ids)
+    assert (label[~found.ball] == 3).mean() > 0.9
+    assert (label[found.ball] == 3).mean() < 0.1
+    assert np.abs(found.frame.probabilities.sum(-1) - 1).max() < 0.05
+
+
+def test_pictures_show_the_environment_and_layers_keep_it_apart(seen: Seen, tmp_path: Path) -> None:
+    run_verb("render", RenderParams(project=seen.project, out=tmp_path, test=True), Reporter())
+    name = next(tmp_path.glob("*.exr"))
+    layers = oiio.ImageBuf(str(name))
+    names, pixels = list(layers.spec().channelnames), layers.get_pixels(oiio.FLOAT)
+    alpha = pixels[..., names.index("A")]
+    picture = np.asarray(Image.open(name.with_suffix(".png"))).astype(float) / 255
+    empty = alpha < 0.02
+    assert empty.mean() > 0.2
+    environment = pixels[..., [names.index(f"Environment.{c}") for c in "RGB"]]
+    assert np.abs(linear_to_srgb(environment) - picture)[empty].max() < 0.03
+    camera = load_scene(seen.project).views[int(name.stem)]
+    true = sky(looking(camera.camera, camera.camera_to_world))
+    assert np.abs(picture - true)[empty].mean() < 0.08
+    assert pixels[..., names.index("R")][empty].max() < 0.02
+
+
+def test_the_verdict_knows_that_the_rest_is_sky(seen: Seen) -> None:
+    result = run_verb("evaluate", EvaluateParams(project=seen.project), Reporter())
+    assert result["opacity"] < 0.6
+    assert not any("fog" in reason or "empty" in reason for reason in result["verdict"]["reasons"])
+
+
+def test_only_rays_that_were_rendered_teach_the_environment(tmp_path: Path) -> None:
+    """With too small a capacity rays that meet the ball are left out; they do not show the sky."""
+    project = under_the_sky(tmp_path / "p")
+    config = make_config("draft", SMALL)
+    info, scene = plan_run(project, "draft", config, use_device())
+    trainer = make_trainer(project, info, scene, use_device(), Reporter())
+    model = trainer.model
+    model.fixed_capacity = True
+    batch = trainer.store.batch(torch.arange(256))
+    rendered = model.render(batch.origins, batch.directions, 12, capacity=16)
+    assert rendered.environment is not None
+    dropped = (rendered.samples.t_first >= 0) & (rendered.opacity == 0)
+    assert int(dropped.sum()) > 100
+    assert bool((rendered.environment.weight[dropped] == 0).all())
+    assert float(rendered.environment.weight.detach().max()) > 0
+    rendered.environment.color.retain_grad()
+    loss, _ = composite_loss(batch, rendered, torch.zeros(256, 3), 0.0, config.loss, model)
+    loss.backward()
+    gradient = rendered.environment.color.grad
+    assert gradient is not None
+    assert bool((gradient[dropped] == 0).all())
+    assert float(gradient[~dropped].abs().max()) > 0
+
+
+def test_pictures_read_the_environment_only_where_it_shows() -> None:
+    model = Model(make_config("draft", {**SMALL, "scene.background": "environment"}), 3, 4, True).eval()
+    environment = model.environment
+    assert environment is not None
+    environment.labelled.fill_(1.0)
+    directions = torch.nn.functional.normalize(torch.randn(50, 3, generator=torch.Generator().manual_seed(1)), dim=1)
+    opacity = torch.linspace(0, 1, 50)
+    with torch.no_grad():
+        whole = environment.rays(model.field, directions, 1 - opacity)
+        part = environment.visible_rays(model.field, directions, opacity, 0.5, True)
+    shown = opacity < 0.5
+    assert torch.allclose(part.color[shown], whole.color[shown], atol=1e-5)
+    assert part.probabilities is not None
+    assert whole.probabilities is not None
+    assert torch.allclose(part.probabilities[shown], whole.probabilities[shown], atol=1e-5)
+    assert float(part.color[~shown].abs().max()) == float(part.probabilities[~shown].abs().max()) == 0
+
+
+@pytest.mark.parametrize(("share", "named"), [(0.0, False), (0.2, False), (0.8, True), (1.0, True)])
+def test_the_environment_is_named_as_often_as_other_pixels(share: float, named: bool) -> None:
+    """A tenth of all pixels is labelled; of those behind the field `share` times as many."""
+    environment, generator = Environment(), torch.Generator().manual_seed(0)
+    for _ in range(200):
+        labelled = torch.rand(4000, generator=generator) < 0.1 * share
+        environment.observe(torch.ones(4000), labelled, 0.1)
+        environment.observe(torch.zeros(4000), torch.ones(4000), 0.1)  # nothing of it is seen
+    assert float(environment.labelled) == pytest.approx(share, abs=0.1)
+    assert (float(environment.labelled) > NAMED) == named
+
+
+def test_runs_remember_their_environment(seen: Seen) -> None:
+    config = json.loads((seen.project / "runs" / "main" / "config.json").read_text())
+    assert config["config"]["scene"]["background"] == "environment"
+    again = load_trained(seen.project, "main").model
+    poses = box_poses(load_scene(seen.project).views, seen.trained.info.box(load_project(seen.project)).box_from_world)
+    camera = load_scene(seen.project).views[3].camera
+    first, second = (render_view(model, camera, poses[3], 0.0).color for model in (seen.trained.model, again))
+    assert np.array_equal(first, second)

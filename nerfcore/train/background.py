@@ -9,6 +9,7 @@ import numpy as np
 from ..data.box import looks_inward
 from ..data.scene import Scene
 from ..images.working import read_picture
+from .infinity import share_at_infinity
 
 Background = Literal["environment", "random", "white", "black"]
 LEVEL: dict[str, float] = {"white": 1.0, "black": 0.0}
@@ -18,6 +19,7 @@ MOST_PHOTOS = 12  # that are looked at
 EDGE = 0.04  # of the sides: the strip along the borders that is looked at
 BLACK, WHITE = 8, 248  # of 255: all channels below, all channels above
 SHARE = 0.5  # of the strip
+INFINITE = 0.008  # of all pixels; measured: docs/experiments.md, “Is there a sky?”
 
 
 def choose_background(scene: Scene, transparent: bool) -> Background:
@@ -26,17 +28,25 @@ def choose_background(scene: Scene, transparent: bool) -> Background:
     - An object in front of black (or white) on nearly all sides: that colour. Nothing has to be there, then, for rays
       past the object; a field that must be opaque everywhere fills the space around it with black clouds instead, at
       any depth, since black looks the same from all sides.
-    - Transparent photos: random, so that rays without alpha have to meet something, and transparent ones nothing.
-    - All else: an environment, which has the sky and whatever is too far away to have a place.
+    - Photos that show something infinitely far away, like the sky: an environment. Where there is none, it would take over
+      what few photos show.
+    - All else: random, so that rays without alpha have to meet something, and transparent ones nothing.
     """
     if transparent or any(view.mask is not None for view in scene.views):
         return "random"
-    if not looks_inward(scene.views):
-        return "environment"
+    if looks_inward(scene.views):
+        surroundings = _plain_surroundings(scene)
+        if surroundings is not None:
+            return surroundings
+    return "environment" if share_at_infinity(scene) > INFINITE else "random"
+
+
+def _plain_surroundings(scene: Scene) -> Background | None:
+    """Black or white, where nearly all photos have borders of that."""
     chosen = np.unique(np.linspace(0, len(scene.train) - 1, MOST_PHOTOS).round().astype(int))
     shares = [edge_shares(read_picture(scene.views[scene.train[i]].image).pixels[..., :3]) for i in chosen]
     black, white = np.median(shares, axis=0)
-    return "black" if black > SHARE else "white" if white > SHARE else "environment"
+    return "black" if black > SHARE else "white" if white > SHARE else None
 
 
 def edge_shares(photo: np.ndarray) -> tuple[float, float]:

@@ -1,0 +1,50 @@
+"""Whether photos show something infinitely far away, as the sky: it has the same colour in the same direction from everywhere."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..data.scene import Scene, View
+from ..geometry.cameras import pixel_centers, rays
+from ..images.picture import resized
+from ..images.working import read_picture
+
+# Measured: docs/experiments.md, “Is there a sky?”.
+MOST_PHOTOS, SIDE = 40, 120  # that are looked at, and their longest side in pixels
+ALIKE = 4.0  # standard deviation of colours, of 255
+# Not tuned: the next two.
+CELL = 1.0  # degrees in which directions count as the same
+CAMERAS = 3  # that must look there
+
+
+def share_at_infinity(scene: Scene) -> float:
+    """Share of the training photos' pixels that lie infinitely far away: at least `CAMERAS` cameras look that way, and what
+    all of them see there has one colour. Walls with a texture have several; plain ones have light that changes along them.
+    """
+    chosen = np.unique(np.linspace(0, len(scene.train) - 1, MOST_PHOTOS).round().astype(int))
+    seen = [_colored_directions(scene.views[scene.train[i]]) for i in chosen]
+    directions, colors = (np.concatenate(part) for part in zip(*seen))
+    photo = np.repeat(np.arange(len(seen)), [len(part) for part, _ in seen])
+    usable = np.isfinite(directions).all(1)
+    directions, colors, photo = directions[usable], colors[usable], photo[usable]
+    _, cell = np.unique(np.floor(directions / np.radians(CELL)).astype(int), axis=0, return_inverse=True)
+    pixels = np.bincount(cell)
+    cameras = np.bincount(np.unique(np.stack([cell, photo], 1), axis=0)[:, 0])
+    variance = np.zeros(len(pixels))
+    for channel in colors.T:
+        mean = np.bincount(cell, channel) / pixels
+        variance += np.bincount(cell, (channel - mean[cell]) ** 2) / pixels / 3
+    far = (cameras >= CAMERAS) & (variance < ALIKE**2)
+    return float(far[cell].mean())
+
+
+def _colored_directions(view: View) -> tuple[np.ndarray, np.ndarray]:
+    """Unit directions (N, 3) in the world of a small version of a photo, NaN where the lens does not see, and its colours
+    (N, 3) in [0, 255]."""
+    photo = read_picture(view.image)
+    scale = min(1.0, SIDE / max(photo.size))
+    camera = view.camera.resized(*(max(1, round(n * scale)) for n in photo.size))
+    small = resized(photo, camera.width, camera.height).pixels[..., :3].reshape(-1, 3)
+    directions, _ = rays(camera, pixel_centers(camera.width, camera.height).reshape(-1, 2))
+    directions = directions @ view.camera_to_world[:3, :3].T
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True), small.astype(np.float64)

@@ -19,7 +19,7 @@ MOST_PHOTOS = 12  # that are looked at
 EDGE = 0.04  # of the sides: the strip along the borders that is looked at
 BLACK, WHITE = 8, 248  # of 255: all channels below, all channels above
 SHARE = 0.5  # of the strip
-INFINITE = 0.008  # of all pixels; measured: docs/experiments.md, “Is there a sky?”
+INFINITE = 0.004  # of all pixels; measured: docs/experiments.md, “Is there a sky?”
 
 
 def choose_background(scene: Scene, transparent: bool) -> Background:

@@ -28,7 +28,8 @@ def composite_loss(
     share: tuple[float, float | torch.Tensor] = (1.0, 1.0),
     squared: bool = False,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """The loss of R rays in front of `background` (R, 3), or of the environment where the model has one, and their mean squared colour error; both scalars.
+    """The loss of R rays in front of `background` (R, 3), or of the environment where the model has one, and their mean
+    squared colour error; both scalars.
 
     Args:
         progress: of the schedule, in [0, 1]; some terms begin later.

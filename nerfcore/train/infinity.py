@@ -13,7 +13,7 @@ from ..images.working import read_picture
 MOST_PHOTOS, SIDE = 40, 120  # that are looked at, and their longest side in pixels
 ALIKE = 4.0  # standard deviation of colours, of 255
 # Not tuned: the next two.
-CELL = 1.0  # degrees in which directions count as the same
+CELL, CELL_PIXELS = 1.0, 3.0  # degrees, and pixels at least, in which directions count as the same
 CAMERAS = 3  # that must look there
 
 
@@ -22,12 +22,15 @@ def share_at_infinity(scene: Scene) -> float:
     all of them see there has one colour. Walls with a texture have several; plain ones have light that changes along them.
     """
     chosen = np.unique(np.linspace(0, len(scene.train) - 1, MOST_PHOTOS).round().astype(int))
-    seen = [_colored_directions(scene.views[scene.train[i]]) for i in chosen]
+    views = [scene.views[scene.train[i]] for i in chosen]
+    seen = [_colored_directions(view) for view in views]
+    focal = np.median([v.camera.fx * min(1.0, SIDE / max(v.camera.width, v.camera.height)) for v in views])
     directions, colors = (np.concatenate(part) for part in zip(*seen))
     photo = np.repeat(np.arange(len(seen)), [len(part) for part, _ in seen])
     usable = np.isfinite(directions).all(1)
     directions, colors, photo = directions[usable], colors[usable], photo[usable]
-    _, cell = np.unique(np.floor(directions / np.radians(CELL)).astype(int), axis=0, return_inverse=True)
+    side = max(np.radians(CELL), CELL_PIXELS / focal)
+    _, cell = np.unique(np.floor(directions / side).astype(int), axis=0, return_inverse=True)
     pixels = np.bincount(cell)
     cameras = np.bincount(np.unique(np.stack([cell, photo], 1), axis=0)[:, 0])
     variance = np.zeros(len(pixels))

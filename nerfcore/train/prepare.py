@@ -12,7 +12,7 @@ from ..data.box import Box, box_poses, choose_box, looks_inward
 from ..data.load import load_scene
 from ..data.pixels import PixelStore
 from ..data.scene import Scene
-from ..errors import TrainingError
+from ..errors import SettingError, TrainingError
 from ..field.blend import RESOLUTION
 from ..geometry.frames import focus_point
 from ..geometry.similarity import transform_points
@@ -67,7 +67,7 @@ def plan_run(
     """Decide what a run will be: its views, classes and box, and the settings that follow from the photos.
 
     Raises:
-        TrainingError: fewer than two posed training images.
+        TrainingError: fewer than two posed training images. SettingError: an environment behind transparent photos.
     """
     project, scene = load_project(project_folder), load_scene(project_folder, holdout)
     train = training_views(scene, config)
@@ -77,6 +77,11 @@ def plan_run(
             "At least two are needed: add photos and run poses.",
         )
     transparent = has_transparency(scene)
+    if transparent and config.scene.background == "environment":
+        raise SettingError(
+            "scene.background is “environment”, and photos or masks are transparent: nothing tells what is behind.",
+            "Leave it at “auto”.",
+        )
     background = choose_background(scene, transparent)
     # In front of one colour all around there is nothing but that colour.
     box = choose_box(scene, config.scene, transparent or background in LEVEL)

@@ -42,10 +42,10 @@ def on_background(project: Path, value: int | None) -> Path:
 
 @pytest.mark.parametrize(
     ("value", "chosen"),
-    [(0, "black"), (255, "white"), (128, "environment"), (25, "environment"), (None, "environment")],
+    [(0, "black"), (255, "white"), (128, "environment"), (25, "environment"), (None, "random")],
 )
 def test_black_and_white_surroundings_are_recognised(tmp_path: Path, value: int | None, chosen: str) -> None:
-    project = on_background(ball_project(tmp_path / "p"), value)
+    project = on_background(ball_project(tmp_path / "p", views=48), value)
     assert choose_background(load_scene(project), transparent=False) == chosen
 
 
@@ -59,8 +59,8 @@ def test_only_around_objects_without_alpha_and_masks(tmp_path: Path) -> None:
         record.mask = f"masks/{record.name}.png"
     save_project(project, settings)
     assert choose_background(load_scene(project), transparent=False) == "random"
-    outward = [pose @ np.diag([-1.0, 1, -1, 1]) for pose in camera_poses(16)]
-    room = on_background(ball_project(tmp_path / "room", given=outward), 0)
+    outward = [pose @ np.diag([-1.0, 1, -1, 1]) for pose in camera_poses(48)]
+    room = on_background(ball_project(tmp_path / "room", views=48, given=outward), 0)
     assert choose_background(load_scene(room), transparent=False) == "environment"
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,63 +14,31 @@ import torch
 from fieldwork.nerfcore.config import RunConfig, make_config
 from fieldwork.nerfcore.data.box import box_poses
 from fieldwork.nerfcore.data.load import load_scene
+from fieldwork.nerfcore.errors import SettingError
 from fieldwork.nerfcore.field.environment import NAMED, Environment
-from fieldwork.nerfcore.geometry.cameras import Camera, pixel_centers
 from fieldwork.nerfcore.geometry.contraction import grid_position, horizon, thinning
 from fieldwork.nerfcore.images.picture import linear_to_srgb
 from fieldwork.nerfcore.kernels.device import use_device
 from fieldwork.nerfcore.params import EvaluateParams, RenderParams, TrainParams
 from fieldwork.nerfcore.progress import Reporter
-from fieldwork.nerfcore.project.schema import SemanticClass
-from fieldwork.nerfcore.project.store import load_project, save_project
+from fieldwork.nerfcore.project.store import load_project
 from fieldwork.nerfcore.render.image import Frame, render_view
 from fieldwork.nerfcore.render.model import Model
 from fieldwork.nerfcore.render.run import Trained, load_trained
 from fieldwork.nerfcore.render.verb import look_at
+from fieldwork.nerfcore.train.background import INFINITE
 from fieldwork.nerfcore.train.composite_loss import composite_loss
+from fieldwork.nerfcore.train.infinity import share_at_infinity
 from fieldwork.nerfcore.train.prepare import make_trainer, plan_run
 from fieldwork.nerfcore.verbs import run_verb
-from fieldwork.tests.nerfcore.support.ball import SMALL, ball_project, camera_poses, draw
+from fieldwork.tests.nerfcore.support.ball import SMALL, ball_project, draw
+from fieldwork.tests.nerfcore.support.sky import looking, sky, under_the_sky
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-STEPS, VIEWS = 500, 48
+STEPS = 500
 CLEARED = {"loss.environment_weight": "0.01"}  # so few steps need a higher price
-
-
-def sky(directions: np.ndarray) -> np.ndarray:
-    """Colours (…, 3) of directions (…, 3): a gradient with soft clouds."""
-    height = directions[..., 2:] * [0.25, 0.1, -0.2]
-    clouds = 0.1 * np.sin(directions @ [3.0, 2.0, 1.0])[..., None]
-    return 0.55 + height + clouds
-
-
-def looking(camera: Camera, pose: np.ndarray) -> np.ndarray:
-    """Unit directions (H, W, 3) of a pinhole's pixels in the world."""
-    place = (pixel_centers(camera.width, camera.height) - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
-    d = np.concatenate([place, np.ones_like(place[..., :1])], -1) @ pose[:3, :3].T
-    return d / np.linalg.norm(d, axis=-1, keepdims=True)
-
-
-def under_the_sky(folder: Path, named: bool = False) -> Path:
-    """The ball's capture with opaque photos, in which the sky is behind it; a class of its own where it is `named`."""
-    project = ball_project(folder, views=VIEWS)
-    camera = load_scene(project).views[0].camera
-    for i, pose in enumerate(camera_poses(VIEWS)):
-        path = project / "images" / f"{i:02d}.png"
-        rgba = np.asarray(Image.open(path))
-        behind = (sky(looking(camera, pose)) * 255 + 0.5).astype(np.uint8)
-        Image.fromarray(np.where(rgba[..., 3:] > 0, rgba[..., :3], behind)).save(path)
-        if named:
-            labels = project / "labels" / path.name
-            label = np.asarray(Image.open(labels))
-            Image.fromarray(np.where(label == 0, 3, label).astype(np.uint8)).save(labels)
-    if named:
-        saved = load_project(project)
-        saved.classes.append(SemanticClass(id=3, name="sky", color=(0.3, 0.5, 0.9)))
-        save_project(project, saved)
-    return project
 
 
 @dataclass(frozen=True)
@@ -127,11 +95,32 @@ def test_rays_end_at_the_horizon_wherever_they_begin() -> None:
     assert torch.allclose(far, horizon(directions), atol=1e-6)
 
 
-def test_captures_with_visible_surroundings_have_an_environment(tmp_path: Path) -> None:
+def test_captures_under_the_sky_have_an_environment(tmp_path: Path) -> None:
     project = under_the_sky(tmp_path / "p")
-    info, _ = plan_run(project, "draft", RunConfig(), torch.device("cpu"))
+    info, scene = plan_run(project, "draft", RunConfig(), torch.device("cpu"))
     assert info.config.scene.background == "environment"
     assert info.contracted
+    labels = [np.asarray(Image.open(path)) for path in (project / "labels").iterdir()]
+    beside = float(np.mean([label == 0 for label in labels]))
+    # Few: where one camera sees past the ball, others mostly see it.
+    assert INFINITE < share_at_infinity(scene) <= beside
+
+
+def test_transparent_photos_say_nothing_of_what_is_behind_them(tmp_path: Path) -> None:
+    config = make_config("draft", {"scene.background": "environment"})
+    with pytest.raises(SettingError, match=r"scene\.background"):
+        plan_run(ball_project(tmp_path / "p"), "draft", config, torch.device("cpu"))
+
+
+def test_what_has_a_place_is_not_at_infinity(tmp_path: Path) -> None:
+    """The same colours before each camera, whichever way it looks; and a photo alone, or two."""
+    project = under_the_sky(tmp_path / "p")
+    scene = load_scene(project)
+    assert share_at_infinity(replace(scene, train=scene.train[:2])) == 0
+    first = Image.open(project / "images" / "00.png")
+    for path in (project / "images").iterdir():
+        first.save(path)
+    assert share_at_infinity(load_scene(project)) < INFINITE
 
 
 def test_the_sky_is_learned_and_the_field_stays_empty_before_it(seen: Seen) -> None:
@@ -211,6 +200,26 @@ def test_only_rays_that_were_rendered_teach_the_environment(tmp_path: Path) -> N
     assert gradient is not None
     assert bool((gradient[dropped] == 0).all())
     assert float(gradient[~dropped].abs().max()) > 0
+
+
+@pytest.mark.setting("loss.environment_weight")
+def test_opacity_before_an_environment_has_a_price(tmp_path: Path) -> None:
+    project = under_the_sky(tmp_path / "p")
+    prices = {}
+    for background in ("environment", "random"):
+        config = make_config("draft", {**SMALL, "scene.background": background})
+        info, scene = plan_run(project, "draft", config, use_device())
+        trainer = make_trainer(project, info, scene, use_device(), Reporter())
+        batch = trainer.store.batch(torch.arange(200))
+        rendered = trainer.model.render(batch.origins, batch.directions, 12)
+        for weight in (0.0, 0.5):
+            loss = config.loss.model_copy(update={"environment_weight": weight})
+            total, _ = composite_loss(batch, rendered, torch.zeros(200, 3), 0.0, loss, trainer.model)
+            prices[background, weight] = float(total.detach())
+        opacity = float(rendered.opacity.detach().mean())
+        assert opacity > 0.01
+        price = 0.5 * opacity if background == "environment" else 0.0
+        assert prices[background, 0.5] - prices[background, 0.0] == pytest.approx(price, rel=1e-3, abs=1e-6)
 
 
 def test_pictures_read_the_environment_only_where_it_shows() -> None:

@@ -21,6 +21,7 @@ from fieldwork.nerfcore.train.trainer import Trainer
 from fieldwork.nerfcore.train.verb import train
 from fieldwork.tests.nerfcore.support.ball import SMALL, ball_project
 from fieldwork.tests.nerfcore.support.settings import config_of, trainer_of
+from fieldwork.tests.nerfcore.support.sky import under_the_sky
 from torch.utils._python_dispatch import TorchDispatchMode
 
 UPDATE = 16  # steps between updates of the occupancy grid, which may read back
@@ -142,6 +143,7 @@ def test_a_fixed_capacity_gives_the_same_picture_gradients_and_grid(ball: Path, 
         {"loss.distortion_weight": "0.01", "loss.opacity_weight": "0.01", "field.fusion": "concat"},
         {"field.branch": "implicit", "render.accumulate": "logits", "field.appearance": "4"},
         {"field.branch": "explicit", "sampling.pdf": "uniform", "field.blend_by": "density"},
+        {"scene.background": "environment", "scene.contraction": "on", "train.refine_poses": "true"},
     ],
     ids=lambda s: " ".join(s) or "default",
 )
@@ -149,8 +151,10 @@ def test_an_ordinary_step_asks_the_device_for_nothing(
     ball: Path,
     settings: dict[str, str],
     one_thread: None,
+    tmp_path: Path,
 ) -> None:
-    trainer = trainer_of(ball, **settings)
+    project = under_the_sky(tmp_path / "p") if "scene.background" in settings else ball
+    trainer = trainer_of(project, **settings)
     trainer.model.fixed_capacity = True
     waited: dict[int, list[str]] = {}
     for step in range(2 * UPDATE + 20):

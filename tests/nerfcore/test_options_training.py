@@ -68,13 +68,12 @@ def test_photos_are_reduced_to_the_size_asked_for(ball: Path) -> None:
 @pytest.mark.setting("scene.background")
 def test_the_background_of_training_and_of_pictures(ball: Path) -> None:
     learned, grey = [], []
-    for choice in ("auto", "random", "environment", "white", "black"):
+    for choice in ("auto", "random", "white", "black"):
         settings = {"scene.background": choice}
-        trainer = trainer_of(ball, **settings)
-        learned.append(trainer.background if trainer.model.environment is None else "environment")
+        learned.append(trainer_of(ball, **settings).background)
         grey.append(background_of(planned(ball, **settings)))
-    assert learned == [None, None, "environment", 1.0, 0.0]
-    assert grey == [1.0, 1.0, 1.0, 1.0, 0.0]
+    assert learned == [None, None, 1.0, 0.0]
+    assert grey == [1.0, 1.0, 1.0, 0.0]
 
 
 @pytest.mark.setting("scene.background")

@@ -12,6 +12,7 @@ from fieldwork.nerfcore.render.fused import unsupported
 from fieldwork.nerfcore.train.trainer import Trainer
 from fieldwork.tests.nerfcore.support.ball import ball_project
 from fieldwork.tests.nerfcore.support.settings import trainer_of
+from fieldwork.tests.nerfcore.support.sky import under_the_sky
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
@@ -62,17 +63,20 @@ def test_the_torch_backend_trains_as_well_as_warp(ball: Path) -> None:
         {"loss.distortion_start": "0", "loss.opacity_weight": "0.01", "sampling.outline_rays": "0.3"},
         {"train.refine_poses": "true", "train.pose_start": "0", "scene.contraction": "on"},
         {"field.fusion": "blend", "sampling.importance": "boundary", "sampling.pdf": "literal"},
+        {"scene.background": "environment", "scene.contraction": "on"},
     ],
-    ids=["losses", "poses", "literal"],
+    ids=["losses", "poses", "literal", "environment"],
 )
 def test_the_torch_backend_needs_neither_warp_nor_double_precision(
-    ball: Path, settings: dict[str, str], monkeypatch: pytest.MonkeyPatch
+    ball: Path, settings: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    project = under_the_sky(tmp_path / "p") if "scene.background" in settings else ball
+
     def launched(*args, **kwargs) -> None:
         raise AssertionError("a Warp kernel was launched")
 
     with using_kernels("torch"):
-        trainer = trainer_of(ball, **settings)
+        trainer = trainer_of(project, **settings)
         monkeypatch.setattr(runtime.wp, "launch", launched)
         monkeypatch.setattr(runtime.wp, "from_torch", launched)
         with DoublePrecision() as doubles:

@@ -1,0 +1,49 @@
+"""The ball's capture under a sky drawn from a formula, in opaque photos."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from fieldwork.nerfcore.data.load import load_scene
+from fieldwork.nerfcore.geometry.cameras import Camera, pixel_centers
+from fieldwork.nerfcore.project.schema import SemanticClass
+from fieldwork.nerfcore.project.store import load_project, save_project
+from fieldwork.tests.nerfcore.support.ball import ball_project, camera_poses
+from PIL import Image
+
+VIEWS = 48
+
+
+def sky(directions: np.ndarray) -> np.ndarray:
+    """Colours (…, 3) of directions (…, 3): a gradient with soft clouds."""
+    height = directions[..., 2:] * [0.25, 0.1, -0.2]
+    clouds = 0.1 * np.sin(directions @ [3.0, 2.0, 1.0])[..., None]
+    return 0.55 + height + clouds
+
+
+def looking(camera: Camera, pose: np.ndarray) -> np.ndarray:
+    """Unit directions (H, W, 3) of a pinhole's pixels in the world."""
+    place = (pixel_centers(camera.width, camera.height) - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    d = np.concatenate([place, np.ones_like(place[..., :1])], -1) @ pose[:3, :3].T
+    return d / np.linalg.norm(d, axis=-1, keepdims=True)
+
+
+def under_the_sky(folder: Path, named: bool = False) -> Path:
+    """The ball's capture with opaque photos, in which the sky is behind it; a class of its own where it is `named`."""
+    project = ball_project(folder, views=VIEWS)
+    camera = load_scene(project).views[0].camera
+    for i, pose in enumerate(camera_poses(VIEWS)):
+        path = project / "images" / f"{i:02d}.png"
+        rgba = np.asarray(Image.open(path))
+        behind = (sky(looking(camera, pose)) * 255 + 0.5).astype(np.uint8)
+        Image.fromarray(np.where(rgba[..., 3:] > 0, rgba[..., :3], behind)).save(path)
+        if named:
+            labels = project / "labels" / path.name
+            label = np.asarray(Image.open(labels))
+            Image.fromarray(np.where(label == 0, 3, label).astype(np.uint8)).save(labels)
+    if named:
+        saved = load_project(project)
+        saved.classes.append(SemanticClass(id=3, name="sky", color=(0.3, 0.5, 0.9)))
+        save_project(project, saved)
+    return project

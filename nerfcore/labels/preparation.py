@@ -125,8 +125,10 @@ def prepare(params: LabelPrepareParams, report: Reporter) -> dict[str, Any]:
     }
 
 
-def ensured(folder: Path, run: str, report: Reporter, count: int = COUNT) -> tuple[Preparation, bool]:
+def ensured(folder: Path, run: str, report: Reporter, count: int | None = None) -> tuple[Preparation, bool]:
     """The preparation of a run, made where there is none of its present field; whether it was there already.
+
+    `count`: number of surfels that is wanted; None: what is there, else the usual number.
 
     Raises:
         as `prepare`.
@@ -134,7 +136,7 @@ def ensured(folder: Path, run: str, report: Reporter, count: int = COUNT) -> tup
     ready = current(folder, run, count)
     if ready is not None:
         return ready, True
-    return _made(folder, run, report, count), False
+    return _made(folder, run, report, count or COUNT), False
 
 
 def current(folder: Path, run: str, count: int | None = None) -> Preparation | None:

@@ -17,6 +17,7 @@ from .walker import random_walk
 STRENGTH = 0.003  # γ of the prior, of the median of what edges conduct
 KNOWN_LOOK = 2.75  # distance to the nearest marked surfel, in feature columns, at which prior and void count the same
 SHARPNESS = 4
+CERTAINTY = 3  # exponent that makes confidence the share that is right
 FINE_STEPS = 15  # on surfels, after the coarse solution of all of it
 
 
@@ -39,17 +40,18 @@ def propagated(
     known = seeds.label != VOID
     if not known.any():
         return np.zeros((count, classes), np.float32)
+    start = None if start is None else calibrated(start, 1 / CERTAINTY)
     features = torch.from_numpy(np.array(ready.features))
     # Void is one more class of the classifier where it is marked.
     void_marked = bool((~known).any())
     target = torch.from_numpy(np.where(known, seeds.label, classes)).long()
-    marked = torch.from_numpy(seeds.surfel)
-    look = class_probabilities(features, marked, target, classes + void_marked, check)
-    distance = distance_to_samples(features, marked, target, check)
+    marked, mark = torch.from_numpy(seeds.surfel), torch.from_numpy(seeds.mark)
+    look = class_probabilities(features, marked, target, mark, classes + void_marked, check)
+    distance = distance_to_samples(features, marked, mark, check)
     familiar = 0.5 ** ((distance / KNOWN_LOOK) ** SHARPNESS)
     values = np.zeros((len(seeds.surfel), classes), np.float32)
     values[np.flatnonzero(known), seeds.label[known]] = 1
-    return walked(ready.graph, look[:, :classes], familiar, seeds.surfel, values, start, check)
+    return calibrated(walked(ready.graph, look[:, :classes], familiar, seeds.surfel, values, start, check))
 
 
 def walked(
@@ -85,3 +87,12 @@ def walked(
     coarse = random_walk(graph.coarse, prior, pull, sink, known, mean, begin, check)
     first = coarse[graph.part]
     return random_walk(graph.edges, look, to_classes, to_void, seeds, values, first, check, most_steps=FINE_STEPS)
+
+
+def calibrated(probability: np.ndarray, exponent: float = CERTAINTY) -> np.ndarray:
+    """Probabilities (N, C), in sum at most 1, with their ratios, and that of all classes to void, to the power of the
+    exponent: a walker is far less sure than it is right. What is most probable stays so."""
+    total = probability.sum(1, keepdims=True).clip(0, 1)
+    share = (probability / np.maximum(probability.max(1, keepdims=True), 1e-12)) ** exponent
+    classed = total**exponent / (total**exponent + (1 - total) ** exponent)
+    return (classed * share / np.maximum(share.sum(1, keepdims=True), 1e-12)).astype(np.float32)

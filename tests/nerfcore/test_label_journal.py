@@ -108,9 +108,10 @@ def test_on_a_full_disk_nothing_is_appended(tmp_path: Path, monkeypatch: pytest.
     def full(_: int) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    with monkeypatch.context() as patch, pytest.raises(DiskError, match="No space left"):
+    with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", full)
-        append_mark(tmp_path, LINE)
+        with pytest.raises(DiskError, match="No space left"):
+            append_mark(tmp_path, LINE)
     assert (tmp_path / FOLDER / JOURNAL).read_bytes() == before
     assert append_mark(tmp_path, LINE).revision == 2
 

@@ -7,14 +7,15 @@ import pytest
 import torch
 from fieldwork.nerfcore.errors import Cancelled
 from fieldwork.nerfcore.labels.drawing import covered
+from fieldwork.nerfcore.labels.propagation import calibrated
 from fieldwork.nerfcore.labels.surfels import cell_of, nearest_neighbours, shape_at
-from fieldwork.nerfcore.labels.unary import class_probabilities, distance_to_samples, logistic_regression
+from fieldwork.nerfcore.labels.unary import balanced, class_probabilities, distance_to_samples, logistic_regression
 from fieldwork.nerfcore.labels.walker import edge_matrix, random_walk
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 
-def some_graph(seed: int, count: int, classes: int):  # noqa: ANN201
+def some_graph(seed: int, count: int, classes: int):
     random = np.random.default_rng(seed)
     position = random.random((count, 3))
     neighbours = nearest_neighbours(position, 5)
@@ -27,7 +28,7 @@ def some_graph(seed: int, count: int, classes: int):  # noqa: ANN201
     return edges, prior, strength, sink, seeds, values
 
 
-def dense(edges, prior, strength, sink, seeds, values) -> np.ndarray:  # noqa: ANN001
+def dense(edges, prior, strength, sink, seeds, values) -> np.ndarray:
     """The same linear system, with rows of known nodes replaced, solved directly."""
     weights = edges.toarray().astype(np.float64)
     matrix = np.diag(weights.sum(1) + strength + sink) - weights
@@ -74,7 +75,7 @@ def test_classes_count_the_same_however_often_they_are_marked() -> None:
     """One dimension, 300 marks at 0 and 3 at 1: the border lies in the middle."""
     features = torch.cat([torch.zeros(300, 1), torch.ones(3, 1)])
     target = torch.tensor([0] * 300 + [1] * 3)
-    matrix, bias = logistic_regression(features, target, 2, decay=1e-3)
+    matrix, bias = logistic_regression(features, target, balanced(target, target), 2, decay=1e-3)
     margin = (matrix[:, 1] - matrix[:, 0], bias[1] - bias[0])
     assert float(-margin[1] / margin[0]) == pytest.approx(0.5, abs=0.02)
 
@@ -83,14 +84,33 @@ def test_the_classifier_knows_what_is_marked_and_how_far_all_else_is() -> None:
     random = np.random.default_rng(0)
     middle = np.array([[0, 0, 0, 0], [4, 0, 0, 0], [0, 4, 0, 0]])
     label = random.integers(3, size=900)
-    features = torch.from_numpy((middle[label] + random.normal(size=(900, 4)) * 0.3)).float()
+    features = torch.from_numpy(middle[label] + random.normal(size=(900, 4)) * 0.3).float()
     marked = torch.arange(60)
-    found = class_probabilities(features, marked, torch.from_numpy(label[:60]), 4, lambda: None)
+    target = torch.from_numpy(label[:60])
+    found = class_probabilities(features, marked, target, target, 4, lambda: None)
     assert (found.argmax(1) == label).mean() > 0.99
     assert (found[:, 3] == 0).all()
-    distance = distance_to_samples(features, marked, torch.from_numpy(label[:60]), lambda: None)
+    distance = distance_to_samples(features, marked, target, lambda: None)
     truth = np.linalg.norm(features.numpy()[:, None] - features.numpy()[None, :60], axis=2).min(1)
     np.testing.assert_allclose(distance, truth, atol=1e-2)
+
+
+def test_a_short_mark_counts_as_much_as_a_long_one_of_its_class() -> None:
+    share = balanced(torch.tensor([0] * 10 + [1] * 40 + [1] * 2), torch.tensor([1] * 10 + [2] * 40 + [3] * 2))
+    assert float(share[:10].sum()) == pytest.approx(0.5)
+    assert float(share[10:50].sum()) == pytest.approx(0.25)
+    assert float(share[50:].sum()) == pytest.approx(0.25)
+
+
+@given(st.integers(0, 1000))
+@settings(max_examples=20, deadline=None)
+def test_calibration_keeps_the_winner_and_can_be_taken_back(seed: int) -> None:
+    p = np.random.default_rng(seed).dirichlet(np.ones(4), 50)[:, :3].astype(np.float32)
+    sharp = calibrated(p)
+    np.testing.assert_array_equal(sharp.argmax(1), p.argmax(1))
+    np.testing.assert_array_equal(sharp.sum(1) > 0.5, p.sum(1) > 0.5)
+    assert (sharp.sum(1) <= 1 + 1e-5).all()
+    np.testing.assert_allclose(calibrated(calibrated(p, 2), 0.5), p, atol=1e-3)
 
 
 @pytest.mark.parametrize("width", [1.0, 3.0, 8.0])
@@ -112,7 +132,7 @@ def test_outlines_and_clicks() -> None:
     assert (square != expected).sum() <= 24  # the border itself may fall to either side
     assert square[4:6, 3:7].all()
     clicks = covered("click", np.array([[2.5, 2.5], [9.5, 7.5]]), 3.0, 12, 10)
-    assert clicks[2, 2] and clicks[7, 9] and not clicks[5, 6]
+    assert (clicks[2, 2], clicks[7, 9], clicks[5, 6]) == (True, True, False)
     assert not covered("click", np.array([[-9.0, 2.0]]), 3.0, 12, 10).any()
 
 

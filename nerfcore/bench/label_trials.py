@@ -15,9 +15,9 @@ from ..images.working import nearest, read_label
 from ..labels.journal import Mark
 from ..labels.overlay import photo_labels
 from ..labels.preparation import Preparation
-from ..labels.propagation import propagated
+from ..labels.propagation import appearance, propagated
 from ..labels.revisions import Labelling
-from ..labels.seeds import seeds_of
+from ..labels.seeds import Seeds, seeds_of
 from ..progress import Reporter
 from .annotator import LEAST_PIXELS, WIDTH, Stroke, correction, first_strokes
 
@@ -84,13 +84,23 @@ class Annotator:
         about = {"photo": stroke.photo, "shape": "line", "width": WIDTH, "class_id": stroke.class_id}
         return Mark(revision=revision, parent=revision - 1, points=points, **about)
 
+    def seeds(self) -> tuple[Seeds, list[int]]:
+        """The surfels that are marked so far, and the ids of their classes."""
+        marked = {mark.class_id for mark in self.marks}
+        class_ids = [i for i in self.subject.class_ids if i in marked]
+        sizes = {name: (ids.shape[1], ids.shape[0]) for name, ids in self.subject.truth.items()}
+        return seeds_of(self.subject.ready, self.marks, class_ids, sizes), class_ids
+
+    def by_appearance(self) -> Labelling:
+        """Labels by what surfels look like alone, without the graph and without void."""
+        seeds, class_ids = self.seeds()
+        look, _ = appearance(self.subject.ready, seeds, len(class_ids))
+        return Labelling(len(self.marks), look, np.array(class_ids, np.int32), "")
+
     def look(self, report: Reporter) -> Labelling:
         """Labels by all strokes so far."""
         subject, begin = self.subject, time.perf_counter()
-        marked = {mark.class_id for mark in self.marks}
-        class_ids = [i for i in subject.class_ids if i in marked]
-        sizes = {name: (ids.shape[1], ids.shape[0]) for name, ids in subject.truth.items()}
-        seeds = seeds_of(subject.ready, self.marks, class_ids, sizes)
+        seeds, class_ids = self.seeds()
         probability = propagated(subject.ready, seeds, len(class_ids), check=report.check)
         self.shown = Labelling(len(self.marks), probability, np.array(class_ids, np.int32), "")
         self.times.append(time.perf_counter() - begin)

@@ -18,7 +18,9 @@ from ..project.runs import has_checkpoint, run_folder
 from ..project.store import edit_project, is_project
 from ..train.verb import train
 from .label_trials import CORRECTIONS, Annotator, Subject, all_labels, hidden_void, read_subject, scores
-from .machine import describe
+from .machine import describe, taken
+from .page import figures_folder, write_page
+from .results import ResultSet, write_set
 from .tables import table
 
 FIRST = {"replica_room": ["39", "111"]}  # photos the annotator begins with; others: those that show most classes
@@ -35,14 +37,18 @@ COLUMNS = {
 }
 
 
-def labels_suite(params: BenchParams, projects: dict[str, Path], out: Path, report: Reporter) -> dict[str, Any]:
+def labels_suite(
+    params: BenchParams, projects: dict[str, Path], out: Path, command: str, report: Reporter
+) -> dict[str, Any]:
     """Label each scene with several seeds of the simulated annotator.
 
     Args:
         projects: with label maps, which the field and the annotator's tools do not see, by the scenes' names.
+        command: the command line that measures the same.
     Returns:
         {"suite", "machine", "runs", "failed", "rows", "trials", "notes", "files"}
     """
+    origin = taken()
     rows: list[dict[str, Any]] = []
     trials: list[dict[str, Any]] = []
     notes: list[str] = []
@@ -65,6 +71,19 @@ def labels_suite(params: BenchParams, projects: dict[str, Path], out: Path, repo
         rows += [{"scene": name, **row} for row in summarised(own, scores(subject, all_labels(subject)))]
         notes += [f"{name}: {line}" for line in [*hidden_notes(subject, seeds[0], report), *time_notes(subject, own)]]
     machine = describe()
+    if params.page is not None:
+        result = ResultSet(
+            suite="labels",
+            title=f"{params.steps or STEPS} steps, seeds {', '.join(map(str, seeds))} ({origin.date})",
+            command=command,
+            source="bench",
+            taken=origin,
+            columns=COLUMNS,
+            rows=rows,
+            notes=notes,
+        )
+        write_set(figures_folder(params.page), result)
+        write_page(params.page)
     files = [out / "results.json", out / "table.md"]
     text = f"# Suite labels\n\nMachine: {machine}.\n\n{table(COLUMNS, rows)}\n\n" + "".join(f"- {n}\n" for n in notes)
     write_json(files[0], {"suite": "labels", "machine": machine, "rows": rows, "trials": trials, "notes": notes})
@@ -101,20 +120,26 @@ def scene_trials(subject: Subject, seeds: list[int], report: Reporter) -> list[d
     for seed in seeds:
         report.stage(f"Strokes, seed {seed}")
         annotator = Annotator(subject, seed)
+        alone = scores(subject, annotator.by_appearance())
         steps = [scores(subject, annotator.look(report))]
         first = len(annotator.marks)
         while len(steps) <= CORRECTIONS and annotator.correct():
             report.progress(len(steps) / (CORRECTIONS + 1))
             steps.append(scores(subject, annotator.look(report)))
-        trials.append({"seed": seed, "strokes": first, "steps": steps, "seconds": annotator.times})
+        trials.append({"seed": seed, "strokes": first, "appearance": alone, "steps": steps, "seconds": annotator.times})
     return trials
 
 
 def summarised(trials: list[dict[str, Any]], most: dict[str, Any]) -> list[dict[str, Any]]:
-    """Rows of the table: after the first strokes, after the corrections, and by all label maps."""
+    """Rows of the table: after the first strokes, by the look of surfels alone and with the graph, after the corrections,
+    and by all label maps."""
     rows = []
-    for words, index in (("first", 0), (f"{CORRECTIONS} corrections", -1)):
-        found = [trial["steps"][index] for trial in trials]
+    shown = {
+        "on two photos, look alone": [trial["appearance"] for trial in trials],
+        "on two photos": [trial["steps"][0] for trial in trials],
+        f"{CORRECTIONS} corrections": [trial["steps"][-1] for trial in trials],
+    }
+    for words, found in shown.items():
         miou = [step["miou"] for step in found]
         sure = [step["sure_right"] for step in found if step["sure_right"] is not None]
         rows.append(

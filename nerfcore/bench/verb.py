@@ -46,7 +46,7 @@ def bench(params: BenchParams, report: Reporter) -> dict[str, Any]:
     data = data_folder(params.data)
     projects, notes = _scenes(params, data, root, report)
     if params.suite == "labels":
-        result = labels_suite(params, projects, out, report)
+        result = labels_suite(params, projects, out, command_of(params), report)
         return {**result, "notes": [*notes, *result["notes"]]}
     jobs = plan(params, list(projects))
     more = partial(surface.measure, root=root) if params.suite == "surface" else None

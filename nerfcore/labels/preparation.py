@@ -171,7 +171,10 @@ def _made(folder: Path, run: str, report: Reporter, count: int) -> Preparation:
     scene, box = load_scene(folder, trained.info.holdout), trained.info.box(project)
     refined = refined_poses(folder, run, trained.info)
     given = box_poses(scene.views, box.box_from_world)
-    poses = np.stack([refined.get(view.name, given[i]) for i, view in enumerate(scene.views)])
+    poses = given.copy()
+    for number, view in enumerate(scene.views):
+        if view.name in refined:
+            poses[number] = refined[view.name]
     sizes = map_sizes(scene, trained.device)
     report.stage("Rendering depth")
     pixels = float(sum(width * height for width, height in sizes))

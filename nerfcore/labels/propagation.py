@@ -36,11 +36,22 @@ def propagated(
     Args:
         start: (N, classes) of an earlier revision, to begin with. check: called often, may raise to stop.
     """
-    count = len(ready.surfels)
     known = seeds.label != VOID
     if not known.any():
-        return np.zeros((count, classes), np.float32)
+        return np.zeros((len(ready.surfels), classes), np.float32)
+    look, familiar = appearance(ready, seeds, classes, check)
+    values = np.zeros((len(seeds.surfel), classes), np.float32)
+    values[np.flatnonzero(known), seeds.label[known]] = 1
     start = None if start is None else calibrated(start, 1 / CERTAINTY)
+    return calibrated(walked(ready.graph, look, familiar, seeds.surfel, values, start, check))
+
+
+def appearance(
+    ready: Preparation, seeds: Seeds, classes: int, check: Callable[[], None] = lambda: None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Probability (N, classes) float32 of each class by what surfels look like, and how much (N,) in [0, 1] each looks like
+    any that is marked."""
+    known = seeds.label != VOID
     features = torch.from_numpy(np.array(ready.features))
     # Void is one more class of the classifier where it is marked.
     void_marked = bool((~known).any())
@@ -48,10 +59,7 @@ def propagated(
     marked, mark = torch.from_numpy(seeds.surfel), torch.from_numpy(seeds.mark)
     look = class_probabilities(features, marked, target, mark, classes + void_marked, check)
     distance = distance_to_samples(features, marked, mark, check)
-    familiar = 0.5 ** ((distance / KNOWN_LOOK) ** SHARPNESS)
-    values = np.zeros((len(seeds.surfel), classes), np.float32)
-    values[np.flatnonzero(known), seeds.label[known]] = 1
-    return calibrated(walked(ready.graph, look[:, :classes], familiar, seeds.surfel, values, start, check))
+    return look[:, :classes], 0.5 ** ((distance / KNOWN_LOOK) ** SHARPNESS)
 
 
 def walked(

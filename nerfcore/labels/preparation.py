@@ -51,6 +51,7 @@ CPU_SIDE, GPU_SIDE = 480, 1600  # longest side of a map
 CPU_PIXELS, GPU_PIXELS = 4e6, 1e8  # of all maps together
 CPU_SHARE = 0.5  # of a map's side that rays are rendered for on a CPU
 LEAST_SURFELS = 64
+PIXELS_EACH = 4  # at least, in the mean: what a surfel of one pixel looks like is noise
 VERSION = 1  # of what is made; another one makes it again
 MATRIX = ("data", "indices", "indptr")
 
@@ -238,7 +239,7 @@ def surfel_arrays(
     photo = np.repeat(np.arange(len(seen)), [hits.distance.size for hits, _ in seen])
     clear = np.flatnonzero(solid & ~edge)
     grid = grid_position(torch.from_numpy(places), trained.model.contracted).numpy()
-    number, surfels = cell_of(grid[clear], count)
+    number, surfels = cell_of(grid[clear], max(1, min(count, len(clear) // PIXELS_EACH)))
     if surfels < LEAST_SURFELS:
         raise TrainingError(
             f"The field shows no surface to label: the photos see {surfels} places of it.",

@@ -8,6 +8,7 @@ meshes and later trainings have the classes as well; held-out photos get none, f
 from __future__ import annotations
 
 import os
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -70,9 +71,10 @@ def accept(params: LabelAcceptParams, report: Reporter) -> dict[str, Any]:
     known = [photo.name for photo in ready.photos if photo.name in train - own]
     try:
         write_maps(maps, ready, labelling, project, known, report)
+        del ready  # Windows moves no folder with mapped files in it
         write_run(folder, params.run, info, model, labelling.revision)
     except BaseException:
-        if not any(i.label and i.label.startswith(MAPS.format(labelling.revision)) for i in project.images):
+        if not any(i.label and i.label.startswith(f"{MAPS.format(labelling.revision)}/") for i in project.images):
             shutil.rmtree(maps, ignore_errors=True)
         raise
     names = {c.id: c.name for c in project.classes}
@@ -148,7 +150,7 @@ def agreement(predicted: np.ndarray, labelling: Labelling) -> float | None:
 
 def is_accepted(path: str) -> bool:
     """Whether a label map of the project was written by this verb."""
-    return path.startswith(MAPS.format(""))
+    return re.match(MAPS.format(r"\d+") + "/", path) is not None
 
 
 def write_maps(

@@ -10,7 +10,7 @@ from scipy.sparse import csr_matrix
 from .surfels import Surfels, cell_of
 from .walker import edge_matrix
 
-PARTS = 20_000  # cells of the coarse graph
+PARTS = 20_000  # cells of the coarse graph; not tuned
 # Weights of the columns in units of their deviation; see experiments.md, “Labels from a few strokes”.
 LAB, LAB_AROUND, CONTRAST, TEXTURE, NORMAL, HEIGHT, PLANARITY, FIELD, FIELD_AROUND = 0.5, 1, 0.5, 0.5, 1, 1, 0.3, 1.5, 1
 EDGE_SCALE = 4.0  # b of an edge's weight exp(−Σ d²/(b·median d²))

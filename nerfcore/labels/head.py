@@ -12,6 +12,7 @@ import torch
 from ..field.hybrid import HybridField
 from ..progress import Reporter
 
+# Not tuned:
 BATCH = 4096  # surfels a step
 RATE = 3e-3
 JITTER = 0.001  # deviation of places around a surfel, of the grid's side: rays sample beside the surface too

@@ -14,7 +14,7 @@ from .journal import marks_at, read_marks
 from .preparation import Preparation
 from .revisions import Labelling, computed
 
-BLANK_BONUS = 0.5  # of surfels that no class explains: what is there may be a class without marks
+BLANK_BONUS = 0.5  # of surfels that no class explains: what is there may be a class without marks; not tuned
 
 
 def next_photo(params: LabelNextParams, report: Reporter) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from ..kernels.surface import depth_quantiles
 from ..render.model import Model
 
 RAYS = 8192  # at once
+# Not tuned: the next three.
 OPAQUE = 0.5  # opacity of a ray that hits something
 TWO_PEAKS = 0.2  # share of the distance between transmittance 3/4 and 1/4 beyond which a ray meets two surfaces
 JUMP = 0.06  # share by which the distances of neighbouring pixels differ at an edge

@@ -17,6 +17,7 @@ from fieldwork.nerfcore.params import LabelCheckoutParams, LabelStrokeParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.store import edit_project
 from fieldwork.tests.nerfcore.support.ball import ball_project
+from fieldwork.tests.nerfcore.test_engine import start  # noqa: F401
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
@@ -173,3 +174,21 @@ def test_a_mark_of_a_class_that_is_gone_stays_in_the_journal(ball: Path) -> None
     with edit_project(ball) as project:
         project.classes = project.classes[1:]
     assert [mark.class_id for mark in read_marks(ball)] == [1]
+
+
+def test_the_engine_takes_marks_beside_a_job(start, ball: Path) -> None:  # noqa: F811
+    client = start()
+    job = client.send("count", project=ball, steps=400)
+    client.until_progress()
+    line = {"project": ball, "photo": "00", "points": [[5, 5], [30, 30]]}
+    first = client.send("label stroke", **line, class_id=2)
+    wrong = client.send("label stroke", **line, class_id=9)
+    undone = client.send("label checkout", project=ball, revision=0)
+    assert client.answer(first)["result"] == {"revision": 1, "parent": 0, "marks": 1}
+    assert client.answer(wrong)["error"]["data"]["code"] == "input"
+    assert client.answer(undone)["result"]["marks"] == 0
+    assert all(message.get("id") != job for message in client.seen), "the job is still at work"
+    client.send("cancel")
+    untrained = client.send("label prepare", project=ball)
+    assert "fieldwork train" in client.answer(untrained, 60)["error"]["message"]
+    assert sorted(path.name for path in (ball / "jobs").glob("label-prepare-*")) != []

@@ -239,7 +239,7 @@ def surfel_arrays(
     photo = np.repeat(np.arange(len(seen)), [hits.distance.size for hits, _ in seen])
     clear = np.flatnonzero(solid & ~edge)
     grid = grid_position(torch.from_numpy(places), trained.model.contracted).numpy()
-    number, surfels = cell_of(grid[clear], max(1, min(count, len(clear) // PIXELS_EACH)))
+    number, surfels = cell_of(grid[clear], max(1, min(count, len(clear) // PIXELS_EACH)), report.check)
     if surfels < LEAST_SURFELS:
         raise TrainingError(
             f"The field shows no surface to label: the photos see {surfels} places of it.",
@@ -248,12 +248,16 @@ def surfel_arrays(
     report.progress(0.3)
     position = means(number, surfels, grid[clear])
     normalised = means(number, surfels, places[clear])
+    report.progress(0.35)
     towards = means(number, surfels, centers[photo[clear]]) - normalised
+    report.progress(0.4)
     color = means(number, surfels, lab[clear])
+    report.progress(0.45)
     texture = np.sqrt((means(number, surfels, lab[clear][:, :1] ** 2)[:, 0] - color[:, 0] ** 2).clip(0))
-    neighbours = nearest_neighbours(position)
+    neighbours = nearest_neighbours(position, check=report.check)
     report.progress(0.6)
     normal, planarity = shape_at(normalised, neighbours, towards)
+    report.progress(0.7)
     made = Surfels(
         position=position.astype(np.float32),
         normal=normal,
@@ -266,6 +270,7 @@ def surfel_arrays(
     )
     report.progress(0.8)
     graph = make_graph(made, neighbours)
+    report.progress(0.9)
     pixel_surfel = np.full(len(solid), -1, np.int32)
     pixel_surfel[clear] = number
     pixel_surfel[solid & edge] = nearest_surfel(position, grid[solid & edge])

@@ -6,6 +6,7 @@ and not meshes: what pixel shows which surfel is known without any search.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +18,7 @@ from ..field.hybrid import HybridField
 NEIGHBOURS = 16
 COMPONENTS = 16  # principal components of the field's features
 FINEST = 1 << 20  # cells along a side: keys of three of them fit 63 bits
-POINTS = 8192  # of the field read at once
+POINTS = 8192  # at once
 
 
 @dataclass(frozen=True)
@@ -40,19 +41,23 @@ class Surfels:
         return len(self.position)
 
 
-def cell_of(points: np.ndarray, wanted: int) -> tuple[np.ndarray, int]:
+def cell_of(points: np.ndarray, wanted: int, check: Callable[[], None] = lambda: None) -> tuple[np.ndarray, int]:
     """Number (M,) of the occupied cell of each point (M, 3) in [0, 1]³, and how many there are.
 
-    The cells are nearly the finest of which at most `wanted` are occupied.
+    The cells are nearly the finest of which at most `wanted` are occupied. `check`: called often, may raise to
+    stop.
     """
     low, high = 1, 1
     some = points[:: max(1, len(points) // 1_000_000)]  # enough to choose the size by
     while high < FINEST and _occupied(some, high) <= wanted:
+        check()
         low, high = high, high * 2
     while high - low > max(1, low // 64):
+        check()
         middle = (low + high) // 2
         low, high = (middle, high) if _occupied(some, middle) <= wanted else (low, middle)
     while low > 1 and _occupied(points, low) > wanted:
+        check()
         low -= max(1, low // 64)
     _, number = np.unique(_keys(points, low), return_inverse=True)
     return number.reshape(-1), int(number.max(initial=-1)) + 1
@@ -73,11 +78,16 @@ def means(number: np.ndarray, count: int, values: np.ndarray) -> np.ndarray:
     return np.stack([np.bincount(number, column, count) / amount for column in values.T], 1)
 
 
-def nearest_neighbours(position: np.ndarray, count: int = NEIGHBOURS) -> np.ndarray:
+def nearest_neighbours(
+    position: np.ndarray, count: int = NEIGHBOURS, check: Callable[[], None] = lambda: None
+) -> np.ndarray:
     """Indices (N, K) int32 of the nearest other points of each point (N, 3), K at most `count`."""
     count = min(count, len(position) - 1)
-    found = np.asarray(KDTree(position).query(position, k=count + 1)[1])
-    return found[:, 1:].astype(np.int32)
+    tree, found = KDTree(position), []
+    for first in range(0, len(position), POINTS):
+        check()
+        found.append(np.asarray(tree.query(position[first : first + POINTS], k=count + 1)[1])[:, 1:].astype(np.int32))
+    return np.concatenate(found)
 
 
 def shape_at(position: np.ndarray, neighbours: np.ndarray, towards: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

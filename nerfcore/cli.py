@@ -49,7 +49,10 @@ NAMED = {
     "reconstruct": {"out"},
     "bench": {"out"},
     "export": {"out"},
+    "label overlay": {"out"},
 }
+# What verbs of two words have in common.
+GROUPS = {"label": "Label a scene by a few marks on its photos."}
 ORDER = {"import": ["dataset", "project"], "compare": ["project", "other"]}
 # Parameters that the command line takes from a file only.
 FILES = {"classes": {"classes"}}
@@ -70,6 +73,18 @@ class Size(click.ParamType):
         except ValueError:
             self.fail(f"{value} is not a size like 800x600", param, ctx)
         return width, height
+
+
+class Points(click.ParamType):
+    name = "X,Y X,Y …"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> list[tuple[float, ...]]:
+        if isinstance(value, list):
+            return value
+        try:
+            return [(float(x), float(y)) for x, y in (point.split(",") for point in str(value).split())]
+        except ValueError:
+            self.fail(f"{value} is not a list of points like “10,20 30,40”", param, ctx)
 
 
 class CommaList(click.ParamType):
@@ -108,6 +123,8 @@ def _option(name: str, info: FieldInfo) -> click.Option:
         return click.Option(flags, type=Size(), default=default, show_default=default is not None, **shared)
     if get_origin(kind) is tuple:
         return click.Option(flags, nargs=len(get_args(kind)), type=tuple(get_args(kind)), default=default, **shared)
+    if kind == list[tuple[float, float]]:
+        return click.Option(flags, type=Points(), **shared)
     if get_origin(kind) is list:
         return click.Option(flags, type=CommaList(), default=default, **shared)
     if get_origin(kind) is Literal:
@@ -137,13 +154,21 @@ def _command(name: str) -> click.Command:
     return click.Command(name, callback=callback, params=params, help=verb.summary, short_help=verb.summary)
 
 
+def _group(name: str) -> click.Group:
+    """The verbs of two words that begin with the same one."""
+    verbs = [verb for verb in VERBS if verb.startswith(f"{name} ")]
+    return click.Group(name, {verb.split(" ")[1]: _command(verb) for verb in verbs}, help=GROUPS[name])
+
+
 class _Commands(click.Group):
     def list_commands(self, ctx: click.Context) -> list[str]:
-        return [*VERBS, "serve"]
+        return [*dict.fromkeys(verb.split(" ")[0] for verb in VERBS), "serve"]
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name == "serve":
             return click.Command("serve", callback=_serve, help="Run the engine: JSON-RPC 2.0 on stdio.")
+        if cmd_name in GROUPS:
+            return _group(cmd_name)
         return _command(cmd_name) if cmd_name in VERBS else None
 
 

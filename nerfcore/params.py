@@ -358,6 +358,82 @@ class CompareParams(Params):
     )
 
 
+Revision = Annotated[
+    int | None, Field(ge=0, le=MANY, description="revision of the marks; default: the one that is shown")
+]
+
+
+class LabelPrepareParams(Params):
+    project: Path
+    run: RunName = "main"
+    surfels: int = Field(default=200_000, ge=1000, le=5_000_000, description="most surfels to make")
+
+
+class LabelStrokeParams(Params):
+    project: Path
+    photo: str = Field(description="name of the photo that the mark is drawn on")
+    points: list[tuple[float, float]] = Field(
+        description="pixels x,y of the photo, its top-left corner being 0,0: the corners of a line or an outline, or where "
+        "clicked; on the command line x,y x,y …",
+        min_length=1,
+        max_length=100_000,
+    )
+    shape: Literal["line", "outline", "click"] = Field(
+        default="line", description="what the points are: a brush's line, the outline of an area, clicks"
+    )
+    width: float = Field(default=8.0, gt=0, le=LARGEST_PICTURE, description="width of the brush in pixels")
+    class_id: int | None = Field(default=None, ge=0, le=65535, description="id of the class that is marked")
+    void: bool = Field(default=False, description="what is marked is none of the classes")
+    erase: bool = Field(default=False, description="take away earlier marks here")
+    author: str = Field(default="", max_length=200, description="who made the mark")
+
+    @model_validator(mode="after")
+    def _one_meaning(self) -> Self:
+        if (self.class_id is not None) + self.void + self.erase != 1:
+            raise ValueError("give one of class_id, void and erase")
+        return self
+
+
+class LabelPropagateParams(Params):
+    project: Path
+    run: RunName = "main"
+    revision: Revision = None
+
+
+class LabelCheckoutParams(Params):
+    project: Path
+    revision: int | None = Field(
+        default=None, ge=0, le=MANY, description="revision to show, 0 being the one without marks; default: only tell"
+    )
+
+
+class LabelOverlayParams(Params):
+    project: Path
+    photo: str = Field(description="name of the photo")
+    out: Path | None = Field(
+        default=None, description="PNG to write; default: runs/RUN/overlays/PHOTO_KIND.png of the project"
+    )
+    run: RunName = "main"
+    revision: Revision = None
+    kind: Literal["ids", "colors", "confidence"] = Field(
+        default="colors", description="class ids, their colours over the photo, or how sure they are"
+    )
+
+
+class LabelNextParams(Params):
+    project: Path
+    run: RunName = "main"
+    revision: Revision = None
+    count: int = Field(default=5, ge=1, le=1000, description="number of photos to suggest")
+
+
+class LabelAcceptParams(Params):
+    project: Path
+    run: RunName = "main"
+    revision: Revision = None
+    seconds: float = Field(default=15.0, gt=0, le=3600, description="time for training the classes")
+
+
 class ReportParams(Params):
     project: Path
     run: RunName = "main"
@@ -424,7 +500,7 @@ class BatchParams(Params):
 
 
 class BenchParams(Params):
-    suite: Literal["figures", "speed", "ablation", "robustness", "baselines", "gpu", "surface"] = Field(
+    suite: Literal["figures", "speed", "ablation", "robustness", "baselines", "gpu", "surface", "labels"] = Field(
         description="which table"
     )
     out: Path = Field(default=Path("build/bench"), description="folder for results and scenes; finished runs are kept")

@@ -41,6 +41,17 @@ VERBS = {
     "section": Verb(p.SectionParams, "measure.drawings:section", "Draw a section of the mesh to scale."),
     "compare": Verb(p.CompareParams, "measure.epochs:compare", "Compare the meshes of two epochs of one object."),
     "report": Verb(p.ReportParams, "evaluate.report:report", "Write a report by which others can check and repeat it."),
+    "label prepare": Verb(p.LabelPrepareParams, "labels.preparation:prepare", "Prepare a run for labelling by marks."),
+    "label stroke": Verb(p.LabelStrokeParams, "labels.stroke:stroke", "Mark a place on a photo.", immediate=True),
+    "label propagate": Verb(
+        p.LabelPropagateParams, "labels.propagate:propagate", "Carry the marks over the whole surface."
+    ),
+    "label checkout": Verb(
+        p.LabelCheckoutParams, "labels.stroke:checkout", "Show another revision of the marks.", immediate=True
+    ),
+    "label overlay": Verb(p.LabelOverlayParams, "labels.overlay:overlay", "Draw the labels of a photo."),
+    "label next": Verb(p.LabelNextParams, "labels.next_photo:next_photo", "Find the photo to mark next."),
+    "label accept": Verb(p.LabelAcceptParams, "labels.accept:accept", "Give the run the classes of the marks."),
     "blend": Verb(p.BlendParams, "blender.blend:blend", "Write a .blend with cameras, points, mesh and materials."),
     "package": Verb(p.PackageParams, "blender.package:package", "Prepare cameras, points and mesh for Blender."),
     "export": Verb(p.ExportParams, "export.verb:export", "Write what other programs read."),

@@ -35,6 +35,12 @@ SUITES = {
         "The textured mesh of 200 000 faces beside the true surface of simulated scenes. A pixel is the median footprint "
         "of a photo's pixel on the surface, the size the longest side of what three cameras see.",
     ),
+    "labels": (
+        "Labels from strokes",
+        "A simulated annotator draws one stroke for each class on two photos and then corrects the largest mistakes; the "
+        "field saw no label map. mIoU is of the pixels of held-out photos, those without a class counting as wrong; “all "
+        "label maps” is the most that the same surfels can show. ECE: expected calibration error of the confidence.",
+    ),
 }
 # No suites of `bench`: figures that other verbs reported.
 OTHERS = {

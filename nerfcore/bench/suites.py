@@ -20,6 +20,7 @@ SCENES = {
     "baselines": ["lego_400", "replica_room"],
     "gpu": ["lego_400", "replica_room"],
     "surface": ["museum", "facade", "fence", "vase"],
+    "labels": ["museum", "facade", "replica_room"],
 }
 REFERENCE = {"ablation": "hybrid", "robustness": "clean", "baselines": "ours"}
 SECONDS = {"speed": 120.0, "ablation": 180.0, "robustness": 180.0, "baselines": 600.0, "gpu": 60.0}

@@ -21,6 +21,7 @@ from ..params import BenchParams
 from ..progress import Reporter, shortened
 from . import gpu, machine, surface, tables
 from .jobs import run_all, unknown_origin
+from .labels import labels_suite
 from .page import check_page, figures_folder, write_page
 from .results import Asked, ResultSet, Row, grouped, write_set
 from .scenes import available, data_folder, is_labelled, prepare, scene_name
@@ -44,6 +45,9 @@ def bench(params: BenchParams, report: Reporter) -> dict[str, Any]:
         return _without_gpu(params, out, report)
     data = data_folder(params.data)
     projects, notes = _scenes(params, data, root, report)
+    if params.suite == "labels":
+        result = labels_suite(params, projects, out, command_of(params), report)
+        return {**result, "notes": [*notes, *result["notes"]]}
     jobs = plan(params, list(projects))
     more = partial(surface.measure, root=root) if params.suite == "surface" else None
     results = run_all(jobs, projects, out, report, params.keep, more)
@@ -87,7 +91,7 @@ def _scenes(params: BenchParams, data: Path | None, root: Path, report: Reporter
         project = prepare(scene, data, root, report)
         if params.suite == "surface":
             surface.read_truth(root, scene_name(scene))  # before anything is trained for nothing
-        if not params.scenes and params.suite in ("ablation", "robustness") and not is_labelled(project):
+        if not params.scenes and params.suite in ("ablation", "robustness", "labels") and not is_labelled(project):
             notes.append(f"{scene} is left out: it has no labels.")
             continue
         if scene_name(scene) in projects:

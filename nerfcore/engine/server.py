@@ -119,7 +119,10 @@ class Server:
         params = rpc.parse_params(request.method, values)
         with self._jobs_lock:
             self._count += 1
-            name = name or f"{request.method}-{time.strftime('%Y%m%d-%H%M%S')}-{os.getpid()}-{self._count}"
+            name = (
+                name
+                or f"{request.method.replace(' ', '-')}-{time.strftime('%Y%m%d-%H%M%S')}-{os.getpid()}-{self._count}"
+            )
             if name in self._jobs:
                 raise rpc.RpcError(rpc.INVALID_PARAMS, f"There is a job “{name}” already.")
             job = Job(name, request.method, params, request.id, self.send, detach)

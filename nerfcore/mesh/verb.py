@@ -43,7 +43,8 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
 
     Returns:
         {"vertices", "faces", "watertight", "voxel": in world units, "classes": {name: {"faces", "area"}},
-        "instances": how many, "lods": [{"faces", "deviation": in world units}], "files"};
+        "instances": how many, "lods": [{"faces", "deviation": in world units}],
+        "label_revision": of the marks that the classes are from, or None, "files"};
         "shown": the share of the photos' pixels that show the mesh, "verdict";
         "silhouette" of a capture with masks: see `shown.silhouette`;
         for a preview see `preview.preview`;
@@ -95,6 +96,7 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
         "classes": class_table(surface, names),
         "instances": len(instances),
         "lods": [{"faces": len(level.surface.faces), "deviation": level.deviation} for level in levels],
+        "label_revision": trained.info.label_revision,
         "files": [str(path) for path in files],
     }
     shown = shown_share(photos, built.vertices, built.faces)

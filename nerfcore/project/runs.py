@@ -25,6 +25,7 @@ INSTANCES = "instances.json"  # in exports/<run>: what the numbers of instances 
 MEASURES = "measures.json"  # in exports/<run>: areas and volumes of the mesh beside it
 RENDER_RECORD = "render.json"  # in a folder of renders: what they were made from
 NEW, OLD = ".new", ".old"
+ACCEPTED = "accepted"  # in a checkpoint's state: which revision of the marks its classes are from, and when
 # Every so many photos one is held out, unless a run says otherwise: as usual since NeRF (Mildenhall et al., 2020).
 HOLDOUT = 8
 
@@ -141,11 +142,20 @@ def checkpoint_id(project: Path, run: str) -> str:
     return state_id(checkpoint_state(run_folder(project, run) / CHECKPOINT))
 
 
+def geometry_id(project: Path, run: str) -> str:
+    """Which density and colours a run holds, whatever classes it was given since; empty without a checkpoint."""
+    state = checkpoint_state(run_folder(project, run) / CHECKPOINT)
+    return state_id(None if state is None else {**state, ACCEPTED: None})
+
+
 def state_id(state: dict[str, Any] | None) -> str:
     """The identity of a checkpoint with this state."""
     if state is None:
         return ""
-    return digest([state["training"], state["steps"]] if state.get("training") else state)
+    if not state.get("training"):
+        return digest(state)
+    accepted = [state[ACCEPTED]] if state.get(ACCEPTED) else []
+    return digest([state["training"], state["steps"], *accepted])
 
 
 def holdout_of(project: Path, run: str) -> int:

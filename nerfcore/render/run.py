@@ -41,6 +41,15 @@ class Origin(BaseModel):
     inputs: dict[str, str] = {}  # fingerprint, with the settings as asked for
 
 
+class AcceptedLabels(BaseModel):
+    """Which revision of the project's marks a run has its classes from, and since when."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    revision: int
+    time: str
+
+
 class RunInfo(BaseModel):
     """What a run was trained on and with. `sfm_from_box` (4, 4) carries the cube [−1, 1]³ into the SfM frame."""
 
@@ -57,6 +66,12 @@ class RunInfo(BaseModel):
     transparent: bool
     holdout: int = HOLDOUT  # every so many photos one was held out, where the project does not say which
     origin: Origin = Origin()
+    accepted: AcceptedLabels | None = None  # None: its classes are those of the label maps it was trained on
+
+    @property
+    def label_revision(self) -> int | None:
+        """The revision of the marks that the classes are from, if they are from any."""
+        return None if self.accepted is None else self.accepted.revision
 
     @field_validator("config")
     @classmethod

@@ -52,7 +52,7 @@ def render(params: RenderParams, report: Reporter) -> dict[str, Any]:
     ids, confidence, world-space normals.
 
     Returns:
-        {"frames": [paths], "ms_per_frame"}
+        {"frames": [paths], "ms_per_frame", "label_revision": of the marks that classes are from, or None}
     Raises:
         InputError: no cameras were asked for, or the camera file is unusable. ProjectError, DiskError.
     """
@@ -90,7 +90,9 @@ def render(params: RenderParams, report: Reporter) -> dict[str, Any]:
         )
         seconds += time.perf_counter() - begin
         frames += write_frame(out, name, frame, params.passes, trained.info.class_ids, scene.ignore_id, colors, box)
-    result = {"frames": [str(path) for path in frames], "ms_per_frame": round(seconds / max(len(cameras), 1) * 1e3, 1)}
+    result: dict[str, Any] = {"frames": [str(path) for path in frames]}
+    result["ms_per_frame"] = round(seconds / max(len(cameras), 1) * 1e3, 1)
+    result["label_revision"] = trained.info.label_revision
     made = step("render", params.model_dump(mode="json"), result, inputs, state_id(trained.state))
     write_made(out / RENDER_RECORD, made)
     return result

@@ -40,7 +40,15 @@ def save_checkpoint(path: Path, trainer: Trainer, state: dict[str, Any]) -> None
         DiskError: the disk is full or the folder is not writable; an older checkpoint stays as it was.
     """
     tensors = {name: value.detach().cpu().contiguous() for name, value in trainer_tensors(trainer).items()}
-    state = {**state, "steps": trainer.steps, "rays": trainer.rays}
+    write_checkpoint(path, tensors, {**state, "steps": trainer.steps, "rays": trainer.rays})
+
+
+def write_checkpoint(path: Path, tensors: dict[str, torch.Tensor], state: dict[str, Any]) -> None:
+    """Atomically write tensors of the host and the state that belongs to them.
+
+    Raises:
+        DiskError: the disk is full or the folder is not writable; an older checkpoint stays as it was.
+    """
     with atomic_path(path) as temporary:
         try:
             save_file(tensors, temporary, metadata={"fieldwork": json.dumps(state)})

@@ -156,7 +156,8 @@ def test_every_verb_with_every_setting_is_an_operator(bpy_script):
     from fieldwork.nerfcore.verbs import VERBS
 
     # Edits that take no time are no jobs: the list of classes and the crop box make them.
-    jobs = {verb: entry for verb, entry in VERBS.items() if not entry.immediate}
+    # Labelling has no buttons yet: its verbs are called by scripts and over RPC.
+    jobs = {verb: entry for verb, entry in VERBS.items() if not entry.immediate and not verb.startswith("label ")}
     wanted = {verb: sorted(entry.params.model_fields) for verb, entry in jobs.items()}
     lacking = bpy_script(
         SETUP

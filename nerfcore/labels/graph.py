@@ -1,0 +1,80 @@
+"""What surfels look like as columns of numbers, and how strongly neighbours belong together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csr_matrix
+
+from .surfels import Surfels, cell_of
+from .walker import edge_matrix
+
+PARTS = 20_000  # cells of the coarse graph; not tuned
+# Weights of the columns in units of their deviation; see experiments.md, “Labels from a few strokes”.
+LAB, LAB_AROUND, CONTRAST, TEXTURE, NORMAL, HEIGHT, PLANARITY, FIELD, FIELD_AROUND = 0.5, 1, 0.5, 0.5, 1, 1, 0.3, 1.5, 1
+EDGE_SCALE = 4.0  # b of an edge's weight exp(−Σ d²/(b·median d²))
+
+
+@dataclass(frozen=True)
+class Graph:
+    """Edges of N surfels and of P parts: symmetric weights edges (N, N), coarse (P, P); part (N,) of each surfel."""
+
+    edges: csr_matrix
+    coarse: csr_matrix
+    part: np.ndarray
+
+
+def feature_columns(surfels: Surfels, neighbours: np.ndarray) -> np.ndarray:
+    """Columns (N, F) float32 by which surfels are told apart, mostly means over their neighbours (N, K), for one surfel is
+    noisy. Places are not among them: what looks alike is alike wherever it stands."""
+
+    def around(values: np.ndarray) -> np.ndarray:
+        return values[neighbours].mean(1)
+
+    lab = standardised(surfels.lab)
+    contrast = standardised(np.log(lab[neighbours].std(1) + 0.02))
+    texture = around(standardised(np.log1p(surfels.texture)[:, None]))
+    planarity = around(standardised(surfels.planarity))
+    height = standardised(surfels.height[:, None])
+    field = around(np.asarray(surfels.field))
+    columns = [
+        LAB * lab,
+        LAB_AROUND * around(lab),
+        CONTRAST * contrast,
+        TEXTURE * texture,
+        NORMAL * around(np.asarray(surfels.normal)),
+        HEIGHT * height,
+        PLANARITY * planarity,
+        FIELD * field,
+        FIELD_AROUND * around(field),
+    ]
+    return np.concatenate(columns, 1).astype(np.float32)
+
+
+def standardised(columns: np.ndarray) -> np.ndarray:
+    """Columns (N, F) with mean 0 and deviation 1."""
+    columns = np.asarray(columns, np.float32)
+    return (columns - columns.mean(0)) / np.maximum(columns.std(0), 1e-6)
+
+
+def make_graph(surfels: Surfels, neighbours: np.ndarray) -> Graph:
+    """The graph of surfels with these neighbours (N, K), by colour, normal and features of the field; and that of its
+    parts, the cells of a coarser grid, whose weights are sums."""
+    total = np.zeros(neighbours.shape, np.float32)
+    for values in (surfels.lab, surfels.normal, surfels.field):
+        square = ((values[neighbours] - values[:, None]) ** 2).sum(2)
+        total += square / max(float(np.median(square)), 1e-12)
+    edges = edge_matrix(neighbours, np.exp(-total / EDGE_SCALE))
+    part, count = cell_of(np.asarray(surfels.position, np.float64), min(PARTS, max(1, len(surfels) // 4)))
+    members = membership(part, count)
+    coarse = (members.T @ edges @ members).tocsr()
+    coarse.setdiag(0)
+    coarse.eliminate_zeros()
+    return Graph(edges, coarse, part.astype(np.int32))
+
+
+def membership(part: np.ndarray, count: int) -> csr_matrix:
+    """Matrix (N, P) float32 that says which part each surfel is of (N,)."""
+    rows = np.arange(len(part))
+    return csr_matrix((np.ones(len(part), np.float32), (rows, part)), (len(part), count))

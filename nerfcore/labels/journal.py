@@ -1,0 +1,189 @@
+"""The marks of a project: an append-only file, one JSON object a line, and which revision of it is shown.
+
+marks/journal.jsonl   one mark a line; line n makes revision n of its parent, the revision it was drawn on
+marks/shown.json      {"revision": n}; revision 0 has no marks
+
+Undoing shows an earlier revision and deletes nothing; a mark drawn then has that one as its parent. What is shown at
+revision n are the marks of n, of its parent, and so on.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Literal
+
+from filelock import FileLock, Timeout
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from ..errors import InputError, ProjectError, wrong_value
+from ..files import disk_errors, write_json
+from ..project.schema import ImageName, now
+from ..project.store import PATIENCE
+
+FOLDER = "marks"
+JOURNAL = "journal.jsonl"
+SHOWN = "shown.json"
+LOCK_FILE = "jobs/marks.lock"
+
+Shape = Literal["line", "outline", "click"]
+
+
+class Mark(BaseModel):
+    """One mark on a photo: points in pixels of its working copy, brush width in the same. class_id: None for void and
+    for what erases."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
+
+    revision: int = Field(ge=1)
+    parent: int = Field(ge=0)
+    time: str = Field(default_factory=now)
+    author: str = ""
+    photo: ImageName
+    shape: Shape
+    points: list[tuple[float, float]] = Field(min_length=1)
+    width: float = Field(gt=0)
+    class_id: int | None = None
+    erase: bool = False
+
+    @property
+    def void(self) -> bool:
+        return self.class_id is None and not self.erase
+
+
+def read_marks(project: Path) -> list[Mark]:
+    """All marks, by revision; a last line that a kill cut off is left out.
+
+    Raises:
+        ProjectError: the journal is damaged elsewhere.
+    """
+    path = Path(project) / FOLDER / JOURNAL
+    try:
+        whole = path.read_bytes()
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        raise ProjectError(f"{path} cannot be read: {error.strerror}.", "Check its permissions.") from error
+    marks: list[Mark] = []
+    for number, line in enumerate(whole[: _whole_lines(whole)].splitlines(), 1):
+        try:
+            mark = Mark.model_validate_json(line)
+        except ValidationError as error:
+            what = wrong_value(error.errors()[0])
+            raise ProjectError(
+                f"{path} is damaged in line {number}: {what}.",
+                "Restore it from a backup, or delete that line and after.",
+            ) from error
+        if mark.revision != number or mark.parent >= number:
+            raise ProjectError(
+                f"{path} is damaged in line {number}: it is revision {mark.revision} of {mark.parent}.",
+                "Restore it from a backup.",
+            )
+        marks.append(mark)
+    return marks
+
+
+def _whole_lines(text: bytes) -> int:
+    """Number of bytes of the lines that were written to their end."""
+    return text.rfind(b"\n") + 1
+
+
+def append_mark(project: Path, values: dict[str, object]) -> Mark:
+    """Append a mark to the journal, drawn on the revision that is shown, and show it. On disk when this returns.
+
+    Args:
+        values: of `Mark`, but for revision, parent and time.
+    Raises:
+        ProjectError: the journal is damaged or stays locked. DiskError: nothing was appended.
+    """
+    project = Path(project)
+    path = project / FOLDER / JOURNAL
+    with _locked(project):
+        marks = read_marks(project)
+        mark = Mark.model_validate(
+            {**values, "revision": len(marks) + 1, "parent": shown_revision(project, len(marks))}
+        )
+        line = (mark.model_dump_json() + "\n").encode()
+        with disk_errors(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            _append(path, line)
+        _show(project, mark.revision)
+    return mark
+
+
+def _append(path: Path, line: bytes) -> None:
+    """Append a line behind the whole lines of a file and fsync it; where that fails the file is as it was."""
+    with open(path, "ab+") as file:
+        file.seek(0)
+        end = _whole_lines(file.read())
+        file.truncate(end)
+        try:
+            file.write(line)
+            file.flush()
+            os.fsync(file.fileno())
+        except OSError:
+            os.truncate(path, end)
+            raise
+
+
+def shown_revision(project: Path, newest: int) -> int:
+    """The revision that is shown, of `newest` there are; the newest where none was chosen."""
+    try:
+        value = json.loads((Path(project) / FOLDER / SHOWN).read_text(encoding="utf-8"))["revision"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return newest
+    return value if isinstance(value, int) and 0 <= value <= newest else newest
+
+
+def show(project: Path, revision: int) -> None:
+    """Show a revision from now on.
+
+    Raises:
+        InputError: there is no such revision. ProjectError, DiskError.
+    """
+    with _locked(Path(project)):
+        require_revision(revision, len(read_marks(project)))
+        _show(Path(project), revision)
+
+
+def _show(project: Path, revision: int) -> None:
+    write_json(project / FOLDER / SHOWN, {"revision": revision})
+
+
+def require_revision(revision: int, newest: int) -> None:
+    """Raise InputError where a journal of `newest` revisions has not this one."""
+    if not 0 <= revision <= newest:
+        raise InputError(f"There is no revision {revision} of the marks.", f"The newest is {newest}, 0 has no marks.")
+
+
+def marks_at(marks: list[Mark], revision: int) -> list[Mark]:
+    """The marks of a revision, oldest first. Raises InputError where there is no such revision."""
+    require_revision(revision, len(marks))
+    found = []
+    while revision > 0:
+        mark = marks[revision - 1]
+        found.append(mark)
+        revision = mark.parent
+    return found[::-1]
+
+
+@contextmanager
+def _locked(project: Path) -> Iterator[None]:
+    path = project / LOCK_FILE
+    with disk_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(path, thread_local=False)
+        try:
+            lock.acquire(timeout=PATIENCE)
+        except Timeout as error:
+            raise ProjectError(
+                f"{project / FOLDER / JOURNAL} has been locked by another program for {PATIENCE:.0f} s.",
+                "End that program, then try again.",
+            ) from error
+    try:
+        yield
+    finally:
+        lock.release()

@@ -1,0 +1,83 @@
+"""The verb `label propagate`: from the marks of a revision to the class of every surfel."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..params import LabelPropagateParams
+from ..progress import Reporter
+from ..project.store import load_project
+from .journal import marks_at, read_marks, shown_revision
+from .preparation import Preparation, ensured
+from .propagation import propagated
+from .revisions import Labelling, load, made_of, path_of, save
+from .seeds import seeds_of
+
+
+def propagate(params: LabelPropagateParams, report: Reporter) -> dict[str, Any]:
+    """Carry the marks of a revision over the surface; the run is prepared where it is not.
+
+    Returns:
+        {"revision", "marks", "surfels", "void": share of the surfels that no class explains, "confidence": mean of the
+        others, "classes": [{"id", "name", "surfels", "confidence"}], "conflicts": [{"revision", "other", "surfels"}],
+        "unused": revisions of marks that met no surface or whose class is gone, "seconds", "file"}
+    Raises:
+        ProjectError: there is no trained run, or the journal is damaged. InputError: there is no such revision.
+        TrainingError, DiskError, Cancelled.
+    """
+    folder = Path(params.project)
+    project, marks = load_project(folder), read_marks(folder)
+    revision = shown_revision(folder, len(marks)) if params.revision is None else params.revision
+    at = marks_at(marks, revision)
+    ready, _ = ensured(folder, params.run, report)
+    begin = time.perf_counter()
+    report.stage("Propagating")
+    marked = {mark.class_id for mark in at}
+    class_ids = [c.id for c in project.classes if c.id in marked]
+    sizes = {image.name: (image.width, image.height) for image in project.images}
+    seeds = seeds_of(ready, at, class_ids, sizes)
+    start = warm_start(folder, params.run, ready, class_ids, at[-1].parent if at else None)
+    probability = propagated(ready, seeds, len(class_ids), start, report.check)
+    labelling = Labelling(revision, probability, np.array(class_ids, np.int32), made_of(ready, at, class_ids))
+    file = save(folder, params.run, labelling)
+    label, sure = labelling.label(project.ignore_id), labelling.confidence()
+    names = {c.id: c.name for c in project.classes}
+    return {
+        "revision": revision,
+        "marks": len(at),
+        "surfels": len(label),
+        "void": round(float((label == project.ignore_id).mean()), 4),
+        "confidence": _mean(sure[label != project.ignore_id]),
+        "classes": [
+            {"id": i, "name": names[i], "surfels": int((label == i).sum()), "confidence": _mean(sure[label == i])}
+            for i in class_ids
+        ],
+        "conflicts": seeds.conflicts,
+        "unused": seeds.unused,
+        "seconds": round(time.perf_counter() - begin, 3),
+        "file": str(file),
+    }
+
+
+def warm_start(
+    folder: Path, run: str, ready: Preparation, class_ids: list[int], revision: int | None
+) -> np.ndarray | None:
+    """Probabilities (N, C) of an earlier revision to begin with; None where it was not computed for these surfels."""
+    if revision is None or not path_of(folder, run, revision).is_file():
+        return None
+    earlier = load(folder, run, revision)
+    if earlier is None or len(earlier.probability) != len(ready.surfels):
+        return None
+    start = np.zeros((len(ready.surfels), len(class_ids)), np.float32)
+    for number, class_id in enumerate(earlier.class_ids.tolist()):
+        if class_id in class_ids:
+            start[:, class_ids.index(class_id)] = earlier.probability[:, number]
+    return start
+
+
+def _mean(values: np.ndarray) -> float | None:
+    return round(float(values.mean()), 4) if len(values) else None

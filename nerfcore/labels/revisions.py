@@ -1,0 +1,105 @@
+"""Labels of the surfels at a revision of the marks, as `label propagate` leaves them in runs/RUN/revisions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+
+from ..errors import ProjectError
+from ..files import atomic_path
+from ..project.fingerprints import digest
+from ..project.runs import run_folder
+from .journal import Mark, marks_at, read_marks, shown_revision
+from .preparation import Preparation, current
+
+FOLDER = "revisions"
+KEPT = 32  # results; the oldest go first
+LEAST = 0.5  # probability of all classes together below which a surfel is void
+
+
+@dataclass(frozen=True)
+class Labelling:
+    """What a revision says of N surfels: probability (N, C) of each class, what is missing to 1 being void; class_ids (C,);
+    made: digest of the marks and the preparation it comes from."""
+
+    revision: int
+    probability: np.ndarray
+    class_ids: np.ndarray
+    made: str
+
+    def label(self, void: int) -> np.ndarray:
+        """Class id (N,) int32 of each surfel; `void` where no class explains it."""
+        if not len(self.class_ids):
+            return np.full(len(self.probability), void, np.int32)
+        best = self.class_ids[self.probability.argmax(1)]
+        return np.where(self.probability.sum(1) > LEAST, best, void).astype(np.int32)
+
+    def confidence(self) -> np.ndarray:
+        """Probability (N,) float32 of what `label` says, void included."""
+        total = self.probability.sum(1)
+        best = self.probability.max(1, initial=0)
+        return np.where(total > LEAST, best, 1 - total).clip(0, 1).astype(np.float32)
+
+
+def made_of(ready: Preparation, marks: list[Mark], class_ids: list[int]) -> str:
+    """Digest of what labels are made from."""
+    return digest([ready.inputs, [mark.model_dump(mode="json") for mark in marks], class_ids])
+
+
+def path_of(project: Path, run: str, revision: int) -> Path:
+    return run_folder(project, run) / FOLDER / f"{revision}.npz"
+
+
+def save(project: Path, run: str, labelling: Labelling) -> Path:
+    """Atomically write the labels of a revision, and forget the oldest ones beyond `KEPT`. Raises DiskError."""
+    path = path_of(project, run, labelling.revision)
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        np.savez(
+            file,
+            revision=labelling.revision,
+            probability=labelling.probability.astype(np.float16),
+            class_ids=labelling.class_ids,
+            made=labelling.made,
+        )
+    others = sorted(path.parent.glob("*.npz"), key=lambda p: p.stat().st_mtime)
+    for old in others[:-KEPT]:
+        old.unlink()
+    return path
+
+
+def load(project: Path, run: str, revision: int) -> Labelling | None:
+    """The labels of a revision; None where they were not computed or cannot be read."""
+    try:
+        with np.load(path_of(project, run, revision), allow_pickle=False) as data:
+            probability = data["probability"].astype(np.float32)
+            return Labelling(int(data["revision"]), probability, data["class_ids"], str(data["made"]))
+    except (OSError, ValueError, KeyError, BadZipFile):
+        return None
+
+
+def computed(project: Path, run: str, revision: int | None) -> tuple[Preparation, Labelling]:
+    """The preparation of a run and the labels of a revision (None: the one that is shown), both of its present field.
+
+    Raises:
+        ProjectError: the run was not prepared, or the revision not propagated, since it was trained.
+        InputError: there is no such revision.
+    """
+    ready = current(project, run)
+    if ready is None:
+        raise ProjectError(
+            f"The run “{run}” of {project} is not prepared for labelling since it was trained.",
+            "Run `fieldwork label propagate`, which prepares it too.",
+        )
+    marks = read_marks(project)
+    wanted = shown_revision(project, len(marks)) if revision is None else revision
+    at = marks_at(marks, wanted)
+    found = load(project, run, wanted)
+    if found is None or found.made != made_of(ready, at, found.class_ids.tolist()):
+        raise ProjectError(
+            f"Revision {wanted} of the marks was not propagated over the present field of the run “{run}”.",
+            "Run `fieldwork label propagate`.",
+        )
+    return ready, found

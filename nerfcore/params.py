@@ -228,6 +228,15 @@ class EvaluateParams(Params):
     run: RunName = "main"
     split: Literal["test", "train"] = "test"
     speed: bool = Field(default=False, description="measure frames of 800x800 too; on a CPU this can take minutes")
+    baked: bool = Field(default=False, description="measure the baked field, and what it lost against the field")
+
+
+class BakeParams(Params):
+    project: Path
+    run: RunName = "main"
+    memory: float = Field(
+        default=100, ge=2, le=1500, description="megabytes of graphics memory that the baked field takes at most"
+    )
 
 
 class RenderParams(Params):
@@ -242,6 +251,7 @@ class RenderParams(Params):
         default=None, description="WxH; cut where a camera has other proportions (held-out and all photos: resampled)"
     )
     passes: list[Pass] = ["rgb", "depth", "semantic"]
+    baked: bool = Field(default=False, description="from the baked field, which is faster, instead of the field")
 
 
 class MeshParams(Params):

@@ -34,6 +34,7 @@ VERBS = {
     "region": Verb(p.RegionParams, "project.edit:region", "Show, set or clear the region of interest.", immediate=True),
     "train": Verb(p.TrainParams, "train.verb:train", "Train the field."),
     "evaluate": Verb(p.EvaluateParams, "evaluate.verb:evaluate", "Measure the held-out images."),
+    "bake": Verb(p.BakeParams, "bake.verb:bake", "Bake the field into voxels that render fast."),
     "render": Verb(p.RenderParams, "render.verb:render", "Render images from the field."),
     "mesh": Verb(p.MeshParams, "mesh.verb:mesh", "Extract the labelled surface."),
     "measure": Verb(p.MeasureParams, "measure.verb:measure", "Measure areas, volumes and distances on the mesh."),

@@ -25,6 +25,7 @@ TITLES = {
     "align": "Aligning",
     "train": "Training",
     "evaluate": "Measuring",
+    "bake": "Baking",
     "render": "Rendering",
     "mesh": "Extracting Mesh",
     "measure": "Measuring the Mesh",

@@ -15,7 +15,7 @@ from ..data.box import box_poses
 from ..data.load import class_inputs, load_scene, view_inputs
 from ..data.pixels import training_size
 from ..data.scene import Scene, View
-from ..errors import InputError
+from ..errors import InputError, SettingError
 from ..files import atomic_path, write_json
 from ..geometry.cameras import Camera
 from ..images.encode import write_picture
@@ -24,11 +24,13 @@ from ..images.working import nearest, read_image, read_label, read_picture
 from ..kernels.runtime import compile_seconds
 from ..params import EvaluateParams
 from ..progress import Reporter
-from ..project.fingerprints import Earlier, Fingerprint, compare, digest, read_made, write_made
+from ..project.fingerprints import Earlier, Fingerprint, compare, digest, files_digest, read_made, write_made
 from ..project.runs import checkpoint_id, read_metrics, run_folder, state_id
 from ..project.schema import step
 from ..project.store import load_project
+from ..render.baked import META, BakedField, load_baked, voxels_folder
 from ..render.image import Frame, background_of, render_view
+from ..render.model import Model
 from ..render.pictures import colorize_depth, colorize_labels, side_by_side
 from ..render.run import Trained, load_info, load_trained, refined_poses
 from ..verdict import evaluate_verdict
@@ -42,10 +44,12 @@ class Comparison:
     """Views of a run rendered and held against their photos; `scores`, `pictures`, `confusion`, and the rays and
     seconds of rendering, grow with every view.
 
-    refined: camera-to-box poses (4, 4) by image of a run that refined them. out: folder of the pictures.
+    shown: what is rendered, the model or its baked field. refined: camera-to-box poses (4, 4) by image of a run that
+    refined them. out: folder of the pictures.
     """
 
     trained: Trained
+    shown: Model | BakedField
     scene: Scene
     refined: dict[str, np.ndarray]
     box_from_world: np.ndarray
@@ -64,12 +68,12 @@ class Comparison:
 
     def add(self, view: View, size: tuple[int, int], check: Callable[[], None]) -> None:
         """Compare one view at a size (width, height)."""
-        model, background = self.trained.model, self.background
+        background = self.background
         camera = view.camera.resized(*size)
         photo, keep, label = _truth(view, self.scene, camera.width, camera.height, background)
         pose, given = self._pose(view, camera, photo, keep, check)
         begin, compiled = time.perf_counter(), compile_seconds()
-        frame = render_view(model, camera, pose, background, check=check)
+        frame = render_view(self.shown, camera, pose, background, check=check)
         self.seconds += time.perf_counter() - begin - (compile_seconds() - compiled)
         self.rays += camera.width * camera.height
         image = to_bytes(frame.color)
@@ -139,10 +143,14 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
         "params_m", "memory_mb", "images", "background", …}; what was not measured is None, as "fps", "spr",
         "ms_sampling" and "ms_network" are unless `params.speed` asks for them. Of runs with refined poses
         training views are rendered from those and held-out ones from poses fitted to their photos;
-        "psnr_given_poses" is what the latter score without that.
+        "psnr_given_poses" is what the latter score without that. With `params.baked` the baked field is measured, and
+        "lost" says {"psnr", "miou"} by which it is worse than the field, None where that was not measured before.
     Raises:
-        ProjectError: no such run. InputError: nothing is held out, or a photo cannot be read.
+        ProjectError: no such run, or no baked field of its present training. InputError: nothing is held out, or a
+        photo cannot be read. SettingError: the speed of a baked field was asked for.
     """
+    if params.baked and params.speed:
+        raise SettingError("--speed measures the field itself.", "Leave out --baked, or look at its `rps`.")
     folder = Path(params.project)
     project, trained = load_project(folder), load_trained(folder, params.run)
     scene = load_scene(folder, trained.info.holdout)
@@ -154,15 +162,19 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
         )
     # Views larger than the training images are compared at the training size.
     sizes = [training_size(scene.views[index].camera, trained.info.image_size) for index in indices]
+    shown = load_baked(folder, params.run, trained.info) if params.baked else trained.model
+    refined = refined_poses(folder, params.run, trained.info)
     report.stage("Preparing")
-    trained.model.refine(check=report.check)
+    if not params.baked or refined:  # poses are fitted to the field
+        trained.model.refine(check=report.check)
     box_from_world = trained.info.box(project).box_from_world
     compared = Comparison(
         trained,
+        shown,
         scene,
-        refined_poses(folder, params.run, trained.info),
+        refined,
         box_from_world,
-        run_folder(folder, params.run) / "evaluation",
+        _record(params).parent,
         Confusion(trained.info.class_ids if trained.model.field.classes else []),
     )
     report.stage("Rendering held-out views" if params.split == "test" else "Rendering training views")
@@ -191,16 +203,26 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
     empty_around = trained.info.transparent or (scene.mask_mode == "empty" and any(v.mask for v in scene.views))
     opaque = not environment and not empty_around
     result["verdict"] = evaluate_verdict(result, psnr_train, opaque, bool(compared.confusion.class_ids), environment)
+    if params.baked:
+        result["lost"] = _lost(params, result)
     path = run_folder(folder, params.run) / "metrics.json"
     stored = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-    write_json(path, {**stored, params.split: result})
+    write_json(path, {**stored, f"{params.split}_baked" if params.baked else params.split: result})
     made = step("evaluate", params.model_dump(mode="json"), result, evaluation_inputs(params), state_id(trained.state))
     write_made(_record(params), made)
     return result
 
 
 def _record(params: EvaluateParams) -> Path:
-    return run_folder(Path(params.project), params.run) / "evaluation" / f"{params.split}.json"
+    folder = run_folder(Path(params.project), params.run) / "evaluation"
+    return (folder / "baked" if params.baked else folder) / f"{params.split}.json"
+
+
+def _lost(params: EvaluateParams, baked: dict[str, Any]) -> dict[str, float | None]:
+    """By how much the baked field is worse than the field was in its last evaluation, None where that is not known."""
+    field = evaluated(params.model_copy(update={"baked": False})).result or {}
+    pairs = {key: (field.get(key), baked[key]) for key in ("psnr", "miou")}
+    return {key: None if None in pair else round(pair[0] - pair[1], 4) for key, pair in pairs.items()}
 
 
 def evaluation_inputs(params: EvaluateParams) -> Fingerprint:
@@ -212,6 +234,7 @@ def evaluation_inputs(params: EvaluateParams) -> Fingerprint:
         "trained field": checkpoint_id(folder, params.run),
         "classes": class_inputs(scene),
         "settings": digest([params.split, info.config.model_dump(mode="json")]),
+        **({"baked field": files_digest([("meta", voxels_folder(folder, params.run) / META)])} if params.baked else {}),
         **view_inputs(scene, scene.test if params.split == "test" else scene.train, files=True),
     }
 

@@ -18,7 +18,7 @@ from pathlib import Path
 import warp as wp
 
 from ..files import write_json, write_section, write_text
-from . import cells, closest, composite, encode, encode_points, march, patches, raycast, surface, triangles
+from . import cells, closest, composite, encode, encode_points, march, patches, raycast, surface, triangles, voxel_march
 from .device import default_threads
 from .fused import LANES
 from .fused_kernel import fused_kernel
@@ -27,7 +27,7 @@ from .resources import Resources, disassembler, markdown, read_resources
 from .runtime import CUDA_BLOCK, init
 
 ARCHITECTURES = (75, 86, 89, 90, 120)
-SOURCES = (encode, encode_points, march, composite, cells, surface, patches, raycast, closest, triangles)
+SOURCES = (encode, encode_points, march, composite, cells, surface, patches, raycast, closest, triangles, voxel_march)
 # The standard preset: without classes, with few, with the most; and the branches blended.
 _STANDARD = FusedShape(
     levels=8, octaves=8, concat=True, width=64, geometry=16, color_layers=3, appearance=0, classes=16, logits=False

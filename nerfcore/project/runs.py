@@ -20,6 +20,7 @@ CHECKPOINT = "field.safetensors"
 INFO = "config.json"
 EVENTS = "events.jsonl"
 METRICS = "metrics.json"
+VOXELS = "voxels"  # folder of the baked field
 MESH_RECORD = "mesh.json"  # in exports/<run>: what the mesh beside it was made from
 INSTANCES = "instances.json"  # in exports/<run>: what the numbers of instances on the mesh beside it mean
 MEASURES = "measures.json"  # in exports/<run>: areas and volumes of the mesh beside it

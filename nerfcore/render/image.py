@@ -14,6 +14,7 @@ from ..geometry.cameras import Camera
 from ..images.picture import Picture, over
 from ..kernels.runtime import run_parallel
 from ..sampling.space import unknown_share
+from .baked import BakedField
 from .fused import ray_renderer
 from .model import Model
 from .run import RunInfo
@@ -81,7 +82,7 @@ def background_of(info: RunInfo) -> float:
 
 @torch.no_grad()
 def render_view(
-    model: Model,
+    model: Model | BakedField,
     camera: Camera,
     camera_to_box: np.ndarray,
     background: float,
@@ -92,18 +93,21 @@ def render_view(
     """Render what a camera (pose (4, 4) in the normalised frame, OpenCV axes) sees.
 
     `background`: the grey behind the field where the model has no environment.
-    `unknown`: also which share of each ray's way lies where no training photo looked.
+    `unknown`: also which share of each ray's way lies where no training photo looked, which only a model knows.
     `check` is called before every tile, on the CPU by several threads, and may raise to stop.
     """
-    device = model.priorities.device
+    device = model.device
     rays = CameraRays([camera], camera_to_box[None], device)
-    count = model.config.render.samples or model.config.sampling.samples
     axis = rays.rotation[0, :, 2]
     pixels = torch.arange(camera.width * camera.height, device=device)
-    render = ray_renderer(model, len(pixels), semantics)
     # Haze before the sky has no depth: what is there lies behind it.
     least = LEAST if model.environment is None else 0.5
-    states = model.occupancy.states() if unknown else None
+    if isinstance(model, BakedField):
+        render, count, states, contracted = model, 0, None, False
+    else:
+        render = ray_renderer(model, len(pixels), semantics)
+        count = model.config.render.samples or model.config.sampling.samples
+        states, contracted = model.occupancy.states() if unknown else None, model.contracted
 
     @torch.no_grad()
     def tile(pixel: torch.Tensor) -> list[torch.Tensor]:
@@ -119,7 +123,7 @@ def render_view(
         found = [color, distance * (directions @ axis), origins + directions * distance[:, None]]
         if states is not None:
             solid = torch.where(opacity > 0.5, distance, torch.nan)
-            found.append(unknown_share(states, model.contracted, origins, directions, solid))
+            found.append(unknown_share(states, contracted, origins, directions, solid))
         probabilities, behind = out.probabilities, out.environment
         if behind is not None:
             found.append(behind.color * valid[:, None])
@@ -134,6 +138,6 @@ def render_view(
     images = [torch.cat(column).cpu() for column in zip(*parts)]
     color, depth, position, *more = (i.reshape(*shape, *i.shape[1:]).numpy() for i in images)
     picture = Picture(color, "srgb", "associated")
-    hidden = more.pop(0) if unknown else None
+    hidden = more.pop(0) if states is not None else None
     behind = background if model.environment is None else more.pop(0)
     return Frame(picture, behind, depth, more[0] if more else None, position, hidden)

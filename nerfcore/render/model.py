@@ -109,6 +109,10 @@ class Model(nn.Module):
         self.host_visible_share = float(self.visible_share)
 
     @property
+    def device(self) -> torch.device:
+        return self.priorities.device
+
+    @property
     def contracted(self) -> bool:
         return self.occupancy.contracted
 

@@ -13,7 +13,7 @@ from ..data.box import Box, box_poses
 from ..data.load import class_inputs, load_scene, view_inputs
 from ..data.pixels import training_size
 from ..data.scene import Scene, View
-from ..errors import InputError
+from ..errors import InputError, SettingError
 from ..files import atomic_path, disk_errors, write_json
 from ..geometry.cameras import Camera, flip_camera_axes
 from ..geometry.frames import focus_point
@@ -33,12 +33,14 @@ from ..project.fingerprints import (
     rounded,
     write_made,
 )
-from ..project.runs import RENDER_RECORD, checkpoint_id, state_id
+from ..project.runs import RENDER_RECORD, checkpoint_id
 from ..project.schema import step
 from ..project.store import load_project, world_from_sfm
+from .baked import META, BakedField, load_baked, voxels_folder
 from .image import Frame, background_of, render_view
+from .model import Model
 from .pictures import colorize_depth, colorize_labels, depth_range
-from .run import load_info, load_trained
+from .run import RunInfo, load_info, load_trained
 
 ORBIT_PIXELS = 800  # longest side of orbit frames unless a size is asked for
 # Not tuned:
@@ -54,13 +56,15 @@ def render(params: RenderParams, report: Reporter) -> dict[str, Any]:
     Returns:
         {"frames": [paths], "ms_per_frame", "label_revision": of the marks that classes are from, or None}
     Raises:
-        InputError: no cameras were asked for, or the camera file is unusable. ProjectError, DiskError.
+        InputError: no cameras were asked for, or the camera file is unusable. SettingError: the baked field has not
+        all of the passes. ProjectError, DiskError.
     """
     folder, out = Path(params.project), Path(params.out)
-    project, trained = load_project(folder), load_trained(folder, params.run)
-    scene = load_scene(folder, trained.info.holdout)
+    project, info = load_project(folder), load_info(folder, params.run)
+    scene = load_scene(folder, info.holdout)
+    shown = _shown(params, info)
     inputs = render_inputs(params)
-    box = trained.info.box(project)
+    box = info.box(project)
     cameras = chosen_cameras(params, scene)
     if params.size is not None:
         # Pictures of photos' cameras are laid over the photos; all others keep their pixels square.
@@ -70,7 +74,8 @@ def render(params: RenderParams, report: Reporter) -> dict[str, Any]:
             for name, camera, pose in cameras
         ]
     report.stage("Preparing")
-    trained.model.refine(sum(camera.width * camera.height for _, camera, _ in cameras), report.check)
+    if isinstance(shown, Model):
+        shown.refine(sum(camera.width * camera.height for _, camera, _ in cameras), report.check)
     with disk_errors(out):
         out.mkdir(parents=True, exist_ok=True)
     colors = {c.id: c.color for c in scene.classes}
@@ -81,21 +86,30 @@ def render(params: RenderParams, report: Reporter) -> dict[str, Any]:
         view = View(name, camera, pose, Path())
         begin = time.perf_counter()
         frame = render_view(
-            trained.model,
+            shown,
             camera,
             box_poses([view], box.box_from_world)[0],
-            background_of(trained.info),
+            background_of(info),
             check=report.check,
             unknown="unknown" in params.passes,
         )
         seconds += time.perf_counter() - begin
-        frames += write_frame(out, name, frame, params.passes, trained.info.class_ids, scene.ignore_id, colors, box)
+        frames += write_frame(out, name, frame, params.passes, info.class_ids, scene.ignore_id, colors, box)
     result: dict[str, Any] = {"frames": [str(path) for path in frames]}
     result["ms_per_frame"] = round(seconds / max(len(cameras), 1) * 1e3, 1)
-    result["label_revision"] = trained.info.label_revision
-    made = step("render", params.model_dump(mode="json"), result, inputs, state_id(trained.state))
+    result["label_revision"] = info.label_revision
+    made = step("render", params.model_dump(mode="json"), result, inputs, inputs["trained field"])
     write_made(out / RENDER_RECORD, made)
     return result
+
+
+def _shown(params: RenderParams, info: RunInfo) -> Model | BakedField:
+    """What is rendered. Raises ProjectError, SettingError."""
+    if not params.baked:
+        return load_trained(params.project, params.run).model
+    if "unknown" in params.passes:
+        raise SettingError("A baked field has no pass “unknown”.", "Leave it out of --passes, or leave out --baked.")
+    return load_baked(params.project, params.run, info)
 
 
 def render_inputs(params: RenderParams) -> Fingerprint:
@@ -109,6 +123,7 @@ def render_inputs(params: RenderParams) -> Fingerprint:
         "alignment": digest(rounded(world_from_sfm(load_project(folder)))),
         "classes": class_inputs(scene),
         "settings": digest([chosen, info.config.render.model_dump(mode="json")]),
+        **({"baked field": files_digest([("meta", voxels_folder(folder, params.run) / META)])} if params.baked else {}),
         "camera file": files_digest([("camera", params.camera)]),
         **view_inputs(scene, list(range(len(scene.views))), files=False),
     }

@@ -14,16 +14,19 @@ import torch
 from fieldwork.nerfcore.config import RunConfig, make_config
 from fieldwork.nerfcore.data.box import box_poses
 from fieldwork.nerfcore.data.load import load_scene
-from fieldwork.nerfcore.errors import SettingError
+from fieldwork.nerfcore.errors import ProjectError, SettingError
 from fieldwork.nerfcore.field.environment import NAMED, Environment
 from fieldwork.nerfcore.geometry.contraction import grid_position, horizon, thinning
 from fieldwork.nerfcore.images.picture import linear_to_srgb
 from fieldwork.nerfcore.kernels.device import use_device
-from fieldwork.nerfcore.params import EvaluateParams, RenderParams, TrainParams
+from fieldwork.nerfcore.kernels.voxel_field import VoxelRays
+from fieldwork.nerfcore.params import BakeParams, EvaluateParams, RenderParams, TrainParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.store import load_project
+from fieldwork.nerfcore.render.baked import load_baked
 from fieldwork.nerfcore.render.image import Frame, render_view
 from fieldwork.nerfcore.render.model import Model
+from fieldwork.nerfcore.render.panorama import Panorama, panorama
 from fieldwork.nerfcore.render.run import Trained, load_trained
 from fieldwork.nerfcore.render.verb import look_at
 from fieldwork.nerfcore.train.background import INFINITE
@@ -250,6 +253,49 @@ def test_the_environment_is_named_as_often_as_other_pixels(share: float, named: 
         environment.observe(torch.zeros(4000), torch.ones(4000), 0.1)  # nothing of it is seen
     assert float(environment.labelled) == pytest.approx(share, abs=0.1)
     assert (float(environment.labelled) > NAMED) == named
+
+
+def test_baked_fields_have_the_environment_too(seen: Seen, tmp_path: Path) -> None:
+    run_verb("bake", BakeParams(project=seen.project, memory=20), Reporter())
+    baked = load_baked(seen.project, "main", seen.trained.info)
+    project = load_project(seen.project)
+    scene = load_scene(seen.project)
+    poses = box_poses(scene.views, seen.trained.info.box(project).box_from_world)
+    camera = scene.views[5].camera
+    field, frame = (render_view(shown, camera, poses[5], 0.0) for shown in (seen.trained.model, baked))
+    beside = (frame.opacity < 0.02) & (field.opacity < 0.02)
+    assert beside.mean() > 0.2
+    assert np.abs(frame.color - field.color)[beside].max() < 0.05
+    (seen.project / "runs" / "main" / "voxels" / "environment.npy").unlink()
+    with pytest.raises(ProjectError, match=r"environment\.npy is damaged"):
+        load_baked(seen.project, "main", seen.trained.info)
+
+
+def test_a_panorama_is_read_where_it_was_drawn() -> None:
+    """In all directions, across its border and at the poles; classes and void."""
+    model = Model(make_config("draft", {**SMALL, "scene.background": "environment"}), 3, 4, True).eval()
+    assert model.environment is not None
+    assert model.field.grid is not None
+    model.field.grid.table.normal_(0, 0.3)
+    directions = torch.nn.functional.normalize(torch.randn(500, 3, generator=torch.Generator().manual_seed(2)), dim=1)
+    directions[:4] = torch.tensor([[-1.0, 1e-7, 0], [-1.0, -1e-7, 0], [0, 0, 1.0], [0, 0, -1.0]])
+    nothing = torch.zeros(500)
+    rays = VoxelRays(torch.zeros(500, 3), nothing, nothing, torch.zeros(500, 3))
+    for labelled in (0.0, 1.0):
+        model.environment.labelled.fill_(labelled)
+        with torch.no_grad():
+            true = model.environment.rays(model.field, directions, 1 - nothing)
+        picture = panorama(model, lambda: None, 256)
+        found = Panorama(picture, 3, torch.device("cpu")).behind(directions, rays)
+        assert float((found.color - true.color).abs().mean()) < 0.02
+        assert true.probabilities is not None
+        assert found.probabilities is not None
+        assert bool((found.weight == 1).all())
+        if labelled:
+            same = found.probabilities.argmax(1) == true.probabilities.argmax(1)
+            assert float(same.float().mean()) > 0.9
+        else:
+            assert not found.probabilities.any()
 
 
 def test_runs_remember_their_environment(seen: Seen) -> None:

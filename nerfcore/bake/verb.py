@@ -1,0 +1,147 @@
+"""The verb `bake`: the field as voxels that render fast, on the CPU, on CUDA and by graphics cards' own means."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..data.box import box_poses
+from ..data.camera_rays import CameraRays
+from ..data.load import load_scene
+from ..data.pixels import training_size
+from ..data.scene import Scene
+from ..errors import SettingError
+from ..params import BakeParams
+from ..progress import Reporter
+from ..project.runs import state_id
+from ..project.store import load_project, record_step
+from ..render.baked import Meta, most_blocks, save_baked, texture_bytes, texture_shape, voxels_folder
+from ..render.panorama import panorama
+from ..render.run import Trained, load_trained, refined_poses
+from .blocks import (
+    Blocks,
+    Check,
+    march_settings,
+    read_blocks,
+    seen_by,
+    side_for,
+    visible_grid,
+    weights_and_cameras,
+)
+from .colors import HARMONIC_RANGE, vertex_texels
+
+# Not tuned: the next three.
+FINEST = 64  # blocks along a side of the grid
+MOST_CLASSES = 255  # that a byte tells apart, and void
+MOST_VIEWS = 1000  # training photos whose rays are asked
+# Measured (docs/experiments.md, “How fine must a baked field be?”):
+RAYS = 2_000_000  # through training cameras, that tell what is seen
+LEAST_SEEN = 0.03  # weight that a block has in one of these rays at least
+
+
+def bake(params: BakeParams, report: Reporter) -> dict[str, Any]:
+    """Bake a run into runs/RUN/voxels, in the place of what was baked before.
+
+    Returns:
+        {"run", "folder", "blocks", "cells", "memory_mb", "seconds", "files"}; cells: along a side of the grid
+    Raises:
+        ProjectError: the run has no checkpoint. SettingError: more than 255 classes.
+        DiskError: the files cannot be written; what was baked before is still there.
+    """
+    begin, folder = time.perf_counter(), Path(params.project)
+    project, trained = load_project(folder), load_trained(folder, params.run)
+    classes = trained.info.class_ids if trained.model.field.classes else []
+    if len(classes) > MOST_CLASSES:
+        raise SettingError(
+            f"The run “{params.run}” has {len(classes)} classes; a baked field holds at most {MOST_CLASSES}.",
+            "Render from the field itself, or train with fewer classes.",
+        )
+    scene = load_scene(folder, trained.info.holdout)
+    report.stage("Looking for what the photos show")
+    rays = training_rays(folder, params.run, trained, scene, trained.info.box(project).box_from_world)
+    blocks = visible_blocks(trained, rays, params.memory * 1e6, report.check)
+    if len(blocks) == 0:
+        report.warn("The photos show nothing of the field: what was baked is empty. Train longer.")
+    report.stage("Reading colours")
+    views = seen_by(blocks, rays, march_settings(trained.model, blocks.side, 1.0), True, report.check)
+    texels = vertex_texels(trained.model, blocks, views, rays.center, report.check)
+    report.stage("Writing")
+    settings = march_settings(trained.model, blocks.side, 1.0)
+    names = {c.id: c.name for c in scene.classes}
+    meta = Meta(
+        checkpoint=state_id(trained.state),
+        side=blocks.side,
+        blocks=len(blocks),
+        across=texture_shape(len(blocks)),
+        contracted=settings.contracted,
+        near=settings.near,
+        far=settings.far,
+        empty_distance=settings.empty_distance,
+        harmonic_range=HARMONIC_RANGE,
+        class_ids=classes,
+        class_names=[names.get(number, str(number)) for number in classes],
+        sfm_from_box=trained.info.sfm_from_box,
+        environment=trained.model.environment is not None,
+    )
+    environment = panorama(trained.model, report.check) if meta.environment else None
+    place = voxels_folder(folder, params.run)
+    lut = class_table(scene, classes)
+    files = save_baked(place, meta, blocks.index().cpu().numpy(), texels.cpu().numpy(), lut, environment)
+    result = {
+        "run": params.run,
+        "folder": str(place),
+        "blocks": len(blocks),
+        "cells": settings.resolution,
+        "memory_mb": round(texture_bytes(len(blocks), blocks.side) / 1e6, 1),
+        "seconds": round(time.perf_counter() - begin, 1),
+        "files": [str(path) for path in files],
+    }
+    record_step(folder, "bake", params.model_dump(mode="json"), result)
+    return result
+
+
+def training_rays(folder: Path, run: str, trained: Trained, scene: Scene, box_from_world: np.ndarray) -> CameraRays:
+    """Rays through the training photos, made so small that there are about `RAYS`."""
+    chosen = np.unique(np.linspace(0, len(scene.train) - 1, MOST_VIEWS).round().astype(int))
+    views = [scene.views[scene.train[number]] for number in chosen]
+    sizes = [training_size(view.camera, trained.info.image_size) for view in views]
+    pixels = sum(width * height for width, height in sizes)
+    scale = min(1.0, (RAYS / max(pixels, 1)) ** 0.5)
+    cameras = [
+        view.camera.resized(max(1, round(width * scale)), max(1, round(height * scale)))
+        for view, (width, height) in zip(views, sizes)
+    ]
+    refined = refined_poses(folder, run, trained.info)
+    poses = box_poses(views, box_from_world)
+    for number, view in enumerate(views):
+        poses[number] = refined.get(view.name, poses[number])
+    return CameraRays(cameras, poses, trained.device)
+
+
+def visible_blocks(trained: Trained, rays: CameraRays, memory: float, check: Check) -> Blocks:
+    """The blocks that rays of training cameras see, of the finest grid with which they fit into so many bytes."""
+    model, side, first = trained.model, max(1, FINEST // 2), True
+    model.refine(check=check)
+    grid = visible_grid(model, model.render_grid(), rays, check)
+    while True:
+        found = read_blocks(model, grid, side, check)
+        views = seen_by(found, rays, march_settings(model, side, 1.0), False, check)
+        weights, _ = weights_and_cameras(views.amax(1))
+        blocks = found.kept(weights > LEAST_SEEN)
+        # The first grid only tells how fine the next may be.
+        if not first and len(blocks) <= most_blocks(memory, side):
+            return blocks
+        finest = FINEST if first else side - 1
+        side, first = min(finest, side_for(len(blocks), side, most_blocks(memory, finest))), False
+
+
+def class_table(scene: Scene, class_ids: list[int]) -> np.ndarray:
+    """Colour and opacity (256, 4) uint8 of each class index; all classes are opaque."""
+    colors = {c.id: c.color for c in scene.classes}
+    table = np.full((256, 4), 255, np.uint8)
+    for index, number in enumerate(class_ids):
+        table[index, :3] = np.round(np.array(colors.get(number, (1.0, 1.0, 1.0))) * 255)
+    return table

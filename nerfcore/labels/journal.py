@@ -11,18 +11,15 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
 
-from filelock import FileLock, Timeout
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from ..errors import InputError, ProjectError, wrong_value
 from ..files import disk_errors, write_json
 from ..project.schema import ImageName, now
-from ..project.store import PATIENCE
+from ..project.store import locked
 
 FOLDER = "marks"
 JOURNAL = "journal.jsonl"
@@ -101,7 +98,7 @@ def append_mark(project: Path, values: dict[str, object]) -> Mark:
     """
     project = Path(project)
     path = project / FOLDER / JOURNAL
-    with _locked(project):
+    with locked(path, project / LOCK_FILE):
         marks = read_marks(project)
         mark = Mark.model_validate(
             {**values, "revision": len(marks) + 1, "parent": shown_revision(project, len(marks))}
@@ -144,9 +141,10 @@ def show(project: Path, revision: int) -> None:
     Raises:
         InputError: there is no such revision. ProjectError, DiskError.
     """
-    with _locked(Path(project)):
+    project = Path(project)
+    with locked(project / FOLDER / JOURNAL, project / LOCK_FILE):
         require_revision(revision, len(read_marks(project)))
-        _show(Path(project), revision)
+        _show(project, revision)
 
 
 def _show(project: Path, revision: int) -> None:
@@ -168,22 +166,3 @@ def marks_at(marks: list[Mark], revision: int) -> list[Mark]:
         found.append(mark)
         revision = mark.parent
     return found[::-1]
-
-
-@contextmanager
-def _locked(project: Path) -> Iterator[None]:
-    path = project / LOCK_FILE
-    with disk_errors(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        lock = FileLock(path, thread_local=False)
-        try:
-            lock.acquire(timeout=PATIENCE)
-        except Timeout as error:
-            raise ProjectError(
-                f"{project / FOLDER / JOURNAL} has been locked by another program for {PATIENCE:.0f} s.",
-                "End that program, then try again.",
-            ) from error
-    try:
-        yield
-    finally:
-        lock.release()

@@ -64,6 +64,28 @@ def load_project(folder: Path) -> Project:
 
 
 @contextmanager
+def locked(path: Path, lock_file: Path) -> Iterator[None]:
+    """Keep other programs from changing the file `path` during the block: they wait for the lock beside it, as this does.
+
+    Raises:
+        ProjectError: it stays locked. DiskError: the lock cannot be made.
+    """
+    with disk_errors(lock_file):
+        lock_file.parent.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(lock_file, thread_local=False)
+        try:
+            lock.acquire(timeout=PATIENCE)
+        except Timeout as error:
+            raise ProjectError(
+                f"{path} has been locked by another program for {PATIENCE:.0f} s.", "End that program, then try again."
+            ) from error
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+@contextmanager
 def edit_project(folder: Path, fresh: Project | None = None) -> Iterator[Project]:
     """Read project.json, let the block change it, write it: no other edit comes between. Keep the block short.
 
@@ -75,23 +97,10 @@ def edit_project(folder: Path, fresh: Project | None = None) -> Iterator[Project
     folder = Path(folder)
     if fresh is None or is_project(folder):
         load_project(folder)  # says what is wrong before a lock file is made
-    path = folder / LOCK_FILE
-    with disk_errors(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        lock = FileLock(path, thread_local=False)
-        try:
-            lock.acquire(timeout=PATIENCE)
-        except Timeout as error:
-            raise ProjectError(
-                f"{folder / PROJECT_FILE} has been locked by another program for {PATIENCE:.0f} s.",
-                "End that program, then try again.",
-            ) from error
-    try:
+    with locked(folder / PROJECT_FILE, folder / LOCK_FILE):
         project = load_project(folder) if fresh is None or is_project(folder) else fresh
         yield project
         save_project(folder, project)
-    finally:
-        lock.release()
 
 
 def save_project(folder: Path, project: Project) -> None:

@@ -15,7 +15,7 @@ from ..addon.jobs.job import Done, Job, Steps
 from ..addon.jobs.queue import queue
 from ..addon.project import snapshot
 from ..addon.properties import PASSES
-from ..addon.props import StringProperty
+from ..addon.props import BoolProperty, StringProperty
 from ..addon.roles import Owner
 from ..addon.scene.frame import scene_from_capture
 from ..addon.scene.lens import pinhole
@@ -109,6 +109,11 @@ class FIELDWORK_OT_render(ProjectOperator):
         subtype="FILE_PATH", options={"SKIP_SAVE"},
     )  # fmt: skip
 
+    baked: BoolProperty(
+        name="Baked", description="Render the baked field: faster, but not quite the same", default=False,
+        options={"SKIP_SAVE"},
+    )  # fmt: skip
+
     @classmethod
     def reason(cls, context: Context) -> str | None:
         settings = context.scene.fieldwork
@@ -131,6 +136,7 @@ class FIELDWORK_OT_render(ProjectOperator):
             "out": str(folder),
             "passes": [name for name, *_ in PASSES if name in passes],
             "size": list(size) if all(size) else None,
+            "baked": self.baked,
         }
         if self.camera:
             return {**params, "camera": absolute(self.camera)}

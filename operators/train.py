@@ -9,7 +9,7 @@ from bpy.types import Context, Event, Operator
 
 from ..addon.jobs.job import Done, Job
 from ..addon.project import runs, snapshot
-from ..addon.props import BoolProperty, EnumProperty, StringProperty
+from ..addon.props import BoolProperty, EnumProperty, FloatProperty, StringProperty
 from ..addon.text import t
 from .base import (
     HoldoutProperty,
@@ -112,9 +112,38 @@ class FIELDWORK_OT_evaluate(ProjectOperator):
         options={"SKIP_SAVE"},
     )
 
+    baked: BoolProperty(
+        name="Baked",
+        description="Compare renders of the baked field, and say what baking lost",
+        default=False,
+        options={"SKIP_SAVE"},
+    )
+
     def parameters(self, context: Context) -> dict[str, Any]:
         project, run = self.project_path(context), self.value(context, "run")
-        return {"project": project, "run": run, "split": self.split, "speed": self.speed}
+        return {"project": project, "run": run, "split": self.split, "speed": self.speed, "baked": self.baked}
+
+
+@scene_settings(run="run")
+class FIELDWORK_OT_bake(ProjectOperator):
+    """Bake the run into voxels that render several times as fast"""
+
+    bl_idname = "fieldwork.bake"
+    bl_label = "Bake Field"
+    verb = "bake"
+    needs = (need_run,)
+
+    memory: FloatProperty(
+        name="Memory",
+        description="Graphics memory that the baked field may take, in megabytes",
+        default=100.0,
+        min=2.0,
+        max=1500.0,
+        options={"SKIP_SAVE"},
+    )
+
+    def parameters(self, context: Context) -> dict[str, Any]:
+        return {"project": self.project_path(context), "run": self.value(context, "run"), "memory": self.memory}
 
 
 class FIELDWORK_OT_use_run(Operator):
@@ -151,6 +180,7 @@ class FIELDWORK_OT_train_preset_add(AddPresetBase, Operator):
 CLASSES = [
     FIELDWORK_OT_train,
     FIELDWORK_OT_evaluate,
+    FIELDWORK_OT_bake,
     FIELDWORK_OT_use_run,
     FIELDWORK_OT_train_preset_add,
 ]

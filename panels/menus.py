@@ -24,8 +24,11 @@ class FIELDWORK_MT_steps(Menu):
         layout.operator("fieldwork.align")
         layout.operator("fieldwork.train").resume = False
         layout.operator("fieldwork.train", text=t("Resume Training")).resume = True
-        layout.operator("fieldwork.evaluate")
-        layout.operator("fieldwork.render")
+        layout.operator("fieldwork.evaluate").baked = False
+        layout.operator("fieldwork.render").baked = False
+        layout.operator("fieldwork.bake")
+        layout.operator("fieldwork.evaluate", text=t("Measure Baked Field")).baked = True
+        layout.operator("fieldwork.render", text=t("Render Baked Field")).baked = True
         layout.operator("fieldwork.mesh")
         layout.operator("fieldwork.measure")
         layout.operator("fieldwork.plan")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -60,3 +61,14 @@ def test_an_import_that_climbs_is_found(copy, file, line):
     done = check(copy)
     assert done.returncode != 0
     assert "BROKEN" in done.stdout
+
+
+def test_every_room_is_packaged() -> None:
+    """What the list of packages lacks is missing where Fieldwork is installed, though not in a checkout."""
+    listed = set(tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]["packages"])
+    rooms = {
+        ".".join(["fieldwork", *path.parent.relative_to(ROOT).parts])
+        for top in ("addon", "nerfcore", "operators", "panels")
+        for path in (ROOT / top).rglob("__init__.py")
+    }
+    assert rooms - listed == set()

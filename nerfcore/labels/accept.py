@@ -122,8 +122,8 @@ def with_head_of(model: Model, state: dict[str, torch.Tensor]) -> Model:
 
 
 def is_of_classes(name: str) -> bool:
-    """Whether a tensor of a model depends on which classes there are."""
-    return name.startswith("field.semantic_head.") or name == "priorities"
+    """Whether a tensor of a model depends on which classes there are. Marks are on surfaces: none names an environment."""
+    return name.startswith("field.semantic_head.") or name in ("priorities", "environment.labelled")
 
 
 def soft_targets(ready: Preparation, labelling: Labelling, project: Project, folder: Path) -> np.ndarray:

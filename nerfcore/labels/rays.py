@@ -90,8 +90,7 @@ def ray_distances(
 
 
 def beside_jump(distance: np.ndarray) -> np.ndarray:
-    """Pixels (H, W) that have a neighbour (of four) whose distance (H, W) differs by more than a share of the nearer one,
-    beyond the slope on their other side: a plane seen at a grazing angle has none."""
+    """Pixels (H, W) that have a neighbour (of four) whose distance (H, W) differs by more than a share of the nearer one."""
     found = np.zeros(distance.shape, bool)
     for axis in (0, 1):
         step = np.abs(np.diff(distance, axis=axis))

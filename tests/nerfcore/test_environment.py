@@ -20,6 +20,7 @@ from fieldwork.nerfcore.geometry.contraction import grid_position, horizon, thin
 from fieldwork.nerfcore.images.picture import linear_to_srgb
 from fieldwork.nerfcore.kernels.device import use_device
 from fieldwork.nerfcore.kernels.voxel_field import VoxelRays
+from fieldwork.nerfcore.labels.accept import with_head_of
 from fieldwork.nerfcore.params import BakeParams, EvaluateParams, RenderParams, TrainParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.store import load_project
@@ -273,7 +274,10 @@ def test_baked_fields_have_the_environment_too(seen: Seen, tmp_path: Path) -> No
 
 def test_a_panorama_is_read_where_it_was_drawn() -> None:
     """In all directions, across its border and at the poles; classes and void."""
-    model = Model(make_config("draft", {**SMALL, "scene.background": "environment"}), 3, 4, True).eval()
+    torch.manual_seed(0)
+    # The finest octaves of an untrained field change within a pixel.
+    smooth = {"scene.background": "environment", "field.precision": "float32", "field.octaves": "2"}
+    model = Model(make_config("draft", {**SMALL, **smooth}), 3, 4, True).eval()
     assert model.environment is not None
     assert model.field.grid is not None
     model.field.grid.table.normal_(0, 0.3)
@@ -285,17 +289,29 @@ def test_a_panorama_is_read_where_it_was_drawn() -> None:
         model.environment.labelled.fill_(labelled)
         with torch.no_grad():
             true = model.environment.rays(model.field, directions, 1 - nothing)
-        picture = panorama(model, lambda: None, 256)
+        picture = panorama(model, lambda: None, 512)
         found = Panorama(picture, 3, torch.device("cpu")).behind(directions, rays)
-        assert float((found.color - true.color).abs().mean()) < 0.02
+        assert float((found.color - true.color).abs().max()) < 0.006
         assert true.probabilities is not None
         assert found.probabilities is not None
         assert bool((found.weight == 1).all())
         if labelled:
             same = found.probabilities.argmax(1) == true.probabilities.argmax(1)
-            assert float(same.float().mean()) > 0.9
+            assert float(same.float().mean()) > 0.95
         else:
             assert not found.probabilities.any()
+
+
+def test_new_classes_do_not_name_the_environment() -> None:
+    """Those of marks are on surfaces, whatever label maps the run was trained with."""
+    config = make_config("draft", {**SMALL, "scene.background": "environment"})
+    before, fresh = Model(config, 3, 4, True), Model(config, 2, 4, True)
+    assert before.environment is not None
+    before.environment.labelled.fill_(1.0)
+    made = with_head_of(fresh, before.state_dict())
+    assert made.environment is not None
+    assert float(made.environment.labelled) == 0
+    assert torch.equal(made.field.density_head.weights[0], before.field.density_head.weights[0])
 
 
 def test_runs_remember_their_environment(seen: Seen) -> None:

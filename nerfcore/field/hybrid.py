@@ -14,6 +14,7 @@ from .blend import BlendWeight
 from .encoding import frequency_encoding
 from .grid import VertexGrid, level_layout
 from .mlp import MLP, compute_dtype
+from .slices import read_in_slices
 
 DIRECTION_FEATURES = 16  # spherical harmonics of degrees 0 to 3
 
@@ -112,6 +113,14 @@ class HybridField(nn.Module):
 
         `precomputed` (N, F): explicit features of these points, from a pass without gradients.
         """
+        if torch.is_grad_enabled():
+            return Geometry(*self._geometry(points, precomputed))
+        given = (points,) if precomputed is None else (points, precomputed)
+        return Geometry(*read_in_slices(self._geometry, *given))  # type: ignore[arg-type]
+
+    def _geometry(
+        self, points: torch.Tensor, precomputed: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None, torch.Tensor | None]:
         explicit = self.grid(points, self.gains, precomputed) if self.grid is not None else None
         implicit = None
         if self.implicit is not None:
@@ -132,7 +141,7 @@ class HybridField(nn.Module):
         density = _TruncatedExp.apply(out[:, 0].float() + self.config.density_shift)
         if self.thinning:
             density = density * thinning(points)
-        return Geometry(density, out, implicit, explicit)  # type: ignore[arg-type]
+        return density, out, implicit, explicit
 
     def density(self, points: torch.Tensor) -> torch.Tensor:
         """Density (N,) alone."""

@@ -16,9 +16,9 @@ from torch import nn
 
 from ..kernels.device import native_half
 from ..kernels.runtime import run_parallel
+from .slices import MOST_ROWS, padded, row_slices
 
 Precision = Literal["auto", "float32", "bfloat16", "float16"]
-_MOST_ROWS, _LEAST_ROWS = 8192, 1024  # of a matrix product on the CPU; the most still fits a core's cache
 
 
 def compute_dtype(precision: Precision, device: torch.device) -> torch.dtype:
@@ -27,38 +27,14 @@ def compute_dtype(precision: Precision, device: torch.device) -> torch.dtype:
     return getattr(torch, precision) if precision != "auto" else native_half(device) or torch.float32
 
 
-def _slices(rows: int, device: torch.device) -> list[slice]:
-    """Parts of the rows. The CPU's have few different sizes, powers of two, and the last one may reach beyond the rows:
-    the matrix library compiles a kernel for every new shape, which takes longer than using it."""
-    if device.type != "cpu":
-        return [slice(0, rows)]
-    parts, begin, size = [], 0, _MOST_ROWS
-    while begin < rows:
-        while size > _LEAST_ROWS and size > rows - begin:
-            size //= 2
-        parts.append(slice(begin, begin + size))
-        begin += size
-    return parts
-
-
-def _padded(x: torch.Tensor, rows: int, dtype: torch.dtype) -> torch.Tensor:
-    """`x` with zero rows after its own."""
-    if len(x) == rows:
-        return x.to(dtype)
-    out = torch.empty(rows, x.shape[1], dtype=dtype, device=x.device)
-    out[: len(x)] = x
-    out[len(x) :] = 0
-    return out
-
-
 class _Chain(torch.autograd.Function):
     @staticmethod
     def forward(ctx, x: torch.Tensor, dtype: torch.dtype, *weights: torch.Tensor) -> torch.Tensor:
         ctx.dtype, ctx.input_dtype = dtype, x.dtype
         matrices = [w.to(dtype) for w in weights]
-        parts = _slices(len(x), x.device)
+        parts = row_slices(len(x), x.device)
         rows = parts[-1].stop if parts else 0
-        layers = [_padded(x, rows, dtype), *(torch.empty(rows, len(w), dtype=dtype, device=x.device) for w in matrices)]
+        layers = [padded(x, rows, dtype), *(torch.empty(rows, len(w), dtype=dtype, device=x.device) for w in matrices)]
 
         def run(part: slice) -> None:
             with torch.no_grad():
@@ -75,9 +51,9 @@ class _Chain(torch.autograd.Function):
     def backward(ctx, *grads):
         count = len(ctx.saved_tensors) // 2
         matrices, layers = ctx.saved_tensors[:count], ctx.saved_tensors[count:]
-        grad = _padded(grads[0], len(layers[0]), ctx.dtype)
+        grad = padded(grads[0], len(layers[0]), ctx.dtype)
         grad_input = torch.empty_like(layers[0]) if ctx.needs_input_grad[0] else None
-        parts = _slices(len(grads[0]), grad.device)
+        parts = row_slices(len(grads[0]), grad.device)
         found: list[list[torch.Tensor]] = [[] for _ in parts]
 
         def run(number: int, part: slice) -> None:
@@ -113,4 +89,11 @@ class MLP(nn.Module):
             self.weights.append(nn.Parameter(torch.empty(fan_out, fan_in).uniform_(-bound, bound)))
 
     def forward(self, x: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
-        return _Chain.apply(x, dtype, *self.weights)  # type: ignore[no-any-return]
+        if torch.is_grad_enabled() or x.device.type == "cpu" and len(x) > MOST_ROWS:
+            return _Chain.apply(x, dtype, *self.weights)  # type: ignore[no-any-return]
+        x = x.to(dtype)
+        for index, weight in enumerate(self.weights):
+            x = torch.mm(x, weight.to(dtype).t())
+            if index < len(self.weights) - 1:
+                x.relu_()
+        return x

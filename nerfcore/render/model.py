@@ -13,6 +13,7 @@ from ..config import RunConfig
 from ..field.encoding import spherical_harmonics
 from ..field.environment import Environment, EnvironmentRays
 from ..field.hybrid import Geometry, HybridField
+from ..field.slices import read_in_slices
 from ..geometry.contraction import grid_position
 from ..kernels.composite import render_weights, weighted_sum
 from ..kernels.device import backend_of
@@ -186,17 +187,17 @@ class Model(nn.Module):
         if two_passes:
             explicit = geometry.explicit[indices] if geometry.explicit is not None else None
             geometry, weights = self._weighted(points[indices], visible, explicit)
+            density, chosen = geometry.density, None
         else:
-            geometry, weights = geometry[indices], weights[indices]
-        density = geometry.density
+            density, weights, chosen = geometry.density[indices], weights[indices], indices
         if fixed:  # unused entries count for nothing
             density = _where_used(visible, density, 0.0)
             weights = weights if two_passes else _where_used(visible, weights, 0.0)
             evaluated_density = _where_used(samples, evaluated_density, -1.0)
-        summed = self._composite(geometry, weights, visible, directions, codes)
-        probabilities = None
-        if semantics and self.field.semantic_head is not None:
-            probabilities = self._probabilities(self.field.logits(geometry), weights, visible.packed_info)
+        color, logits = self._shade(geometry, chosen, visible.packed_info, directions, codes, semantics)
+        values = torch.cat([color, torch.ones_like(weights)[:, None], visible.t[:, None]], 1)
+        summed = weighted_sum(values, weights, visible.packed_info)
+        probabilities = None if logits is None else self._probabilities(logits, weights, visible.packed_info)
         environment = self._environment(directions, summed[:, 3], samples, codes, semantics)
         shaded = (summed[:, :3], summed[:, 3], summed[:, 4], probabilities, environment)
         return Rendered(*shaded, weights, density, visible, samples.points, evaluated_density, visible_count)
@@ -252,21 +253,31 @@ class Model(nn.Module):
         visible = Samples(samples.points[indices], t, deltas, packed_info, samples.t_first, samples.t_last)
         return indices, visible, kept.sum()
 
-    def _composite(
+    def _shade(
         self,
         geometry: Geometry,
-        weights: torch.Tensor,
-        samples: Samples,
+        chosen: torch.Tensor | None,
+        packed_info: PackedInfo,
         directions: torch.Tensor,
         codes: torch.Tensor | None,
-    ) -> torch.Tensor:
-        """Colour, opacity and expected distance (R, 5) of rays from their visible samples' weights (M,)."""
-        ray_indices = samples.packed_info.ray_indices.long()
+        semantics: bool,
+    ) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """Colour (N, 3) and class logits (N, K), or None without semantics, of the samples that `packed_info` packs:
+        the rows `chosen` of `geometry`, or all of them."""
         # Per ray first: a ray's samples share direction and code.
         harmonics = spherical_harmonics(directions).to(self.field.dtype)
-        color = self.field.color(geometry, harmonics[ray_indices], None if codes is None else codes[ray_indices])
-        values = torch.cat([color, torch.ones_like(weights)[:, None], samples.t[:, None]], 1)
-        return weighted_sum(values, weights, samples.packed_info)
+        ray_indices = packed_info.ray_indices.long()
+
+        def shade(rays: torch.Tensor, rows: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor | None]:
+            part = geometry if rows is None else geometry[rows]
+            color = self.field.color(part, harmonics[rays], None if codes is None else codes[rays])
+            wanted = semantics and self.field.semantic_head is not None
+            return color, self.field.logits(part) if wanted else None
+
+        if torch.is_grad_enabled():
+            return shade(ray_indices, chosen)
+        rows = torch.arange(len(ray_indices), device=ray_indices.device) if chosen is None else chosen
+        return read_in_slices(shade, ray_indices, rows)  # type: ignore[return-value]
 
     def _environment(
         self,

@@ -9,6 +9,7 @@ from ..config import FieldConfig
 from ..kernels import cells
 
 RESOLUTION = 64  # cells along a side of the grid of evidence; not tuned
+SHOWN = 1e-4  # evidence of cells that photos show
 
 
 class BlendWeight(nn.Module):
@@ -34,6 +35,15 @@ class BlendWeight(nn.Module):
         with torch.no_grad():
             evidence = cells.trilinear(self.evidence, RESOLUTION, points)
             return 1 - (1 - self.floor) * torch.exp(-self.rate * evidence)
+
+    @torch.no_grad()
+    def shown(self, resolution: int) -> torch.Tensor | None:
+        """Cells (resolution³,) bool, x fastest, in which samples of training rays had weight; None where that is not known."""
+        if self.by != "evidence":
+            return None
+        axis = torch.arange(resolution, device=self.evidence.device) * RESOLUTION // resolution
+        seen = (self.evidence > SHOWN).view(RESOLUTION, RESOLUTION, RESOLUTION)
+        return seen[axis][:, axis][:, :, axis].flatten()
 
     @torch.no_grad()
     def update(self, points: torch.Tensor, weights: torch.Tensor, density: torch.Tensor, decay: float = 0.9) -> None:

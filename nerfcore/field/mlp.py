@@ -89,7 +89,7 @@ class MLP(nn.Module):
             self.weights.append(nn.Parameter(torch.empty(fan_out, fan_in).uniform_(-bound, bound)))
 
     def forward(self, x: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
-        if torch.is_grad_enabled() or x.device.type == "cpu" and len(x) > MOST_ROWS:
+        if torch.is_grad_enabled() or (x.device.type == "cpu" and len(x) > MOST_ROWS):
             return _Chain.apply(x, dtype, *self.weights)  # type: ignore[no-any-return]
         x = x.to(dtype)
         for index, weight in enumerate(self.weights):

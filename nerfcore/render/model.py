@@ -20,7 +20,8 @@ from ..kernels.device import backend_of
 from ..kernels.march import Samples, sample
 from ..kernels.packed_info import PackedInfo
 from ..sampling.occupancy import OccupancyGrid, class_importance
-from ..sampling.render_grid import RenderGrid, present_grid, refined_grid
+from ..sampling.render_grid import RenderGrid, present_grid, read_fine, refined_grid
+from .kept_grid import KeptGrid
 
 ONE_PASS_SHARE = 0.67  # of visible samples: 3k + 1 against 3 forward costs, equal at k = 2/3 (see `render`)
 # Not tuned: the next two.
@@ -96,6 +97,7 @@ class Model(nn.Module):
         self.register_buffer("visible_share", torch.ones(()))
         self.visible_share: torch.Tensor
         self._refined: RenderGrid | None = None
+        self.kept_grid: KeptGrid | None = None  # where the finer grid of a finished field is kept
         # What is differentiated has a fixed capacity, so that the host need not wait for the number of samples; None:
         # where the backend wants it.
         self.fixed_capacity: bool | None = None
@@ -134,11 +136,20 @@ class Model(nn.Module):
         return s.beta > 0 and (s.importance == "boundary" or (s.importance == "priority" and not flat))
 
     def refine(self, pixels: float = math.inf, check: Callable[[], None] | None = None) -> None:
-        """Render from now on with a finer grid if it pays for so many pixels. Training leaves it behind: for fields that
-        are finished."""
-        if self._refined is None:
-            c = self.config.render
-            self._refined = refined_grid(self.occupancy, self.field.density, c.refine, c.per_bin, pixels, check)
+        """Render from now on with a finer grid if it pays for so many pixels, or has been kept. Training leaves it behind:
+        for fields that are finished."""
+        c = self.config.render
+        if self._refined is not None or c.refine == 1:
+            return
+        fine = self.kept_grid.load(c.refine, self.device) if self.kept_grid is not None else None
+        if fine is None:
+            shown = self.field.blend.shown(self.config.sampling.resolution) if self.field.blend is not None else None
+            fine = read_fine(self.occupancy, self.field.density, c.refine, pixels, shown, check)
+            if fine is None:
+                return
+            if self.kept_grid is not None:
+                self.kept_grid.save(c.refine, fine)
+        self._refined = refined_grid(self.occupancy, fine, c.per_bin)
 
     @property
     def label_pull(self) -> float:

@@ -19,15 +19,17 @@ from ..errors import ProjectError
 from ..files import write_json
 from ..geometry.similarity import transform_pose
 from ..kernels.device import use_device
-from ..project.runs import CHECKPOINT, HOLDOUT, INFO, run_folder, settle
+from ..project.runs import CHECKPOINT, HOLDOUT, INFO, run_folder, settle, state_id
 from ..project.schema import Poses, Project
 from ..project.store import world_from_sfm
+from .kept_grid import KeptGrid
 from .migration import migrate_info, migrate_tensors
 from .model import Model
 
 CPU_IMAGE_SIZE, GPU_IMAGE_SIZE = 800, 1600  # longest side of the photos in training; see `train.image_size`
 REFINED_POSES = "poses.json"  # of a run with train.refine_poses
 LIMITS = {"greater_than", "greater_than_equal", "less_than", "less_than_equal"}  # as pydantic names what is beyond them
+RENDER_GRID = "render_grid.safetensors"  # the finer grid of a finished field
 PIXEL_FEATURES = "voxel_init.safetensors"  # of a run with field.voxel_init=cnn
 
 
@@ -201,6 +203,7 @@ def load_trained(project: Path, run: str) -> Trained:
             f"{path} holds a field of another shape than {INFO} beside it describes.", "Train the run again."
         ) from error
     model.field.set_progress(state["progress"], info.config.train.fade, state["steps"])
+    model.kept_grid = KeptGrid(path.with_name(RENDER_GRID), state_id(state))
     return Trained(model.eval().requires_grad_(False), info, state, device)
 
 

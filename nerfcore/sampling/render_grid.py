@@ -1,10 +1,12 @@
 """The grid that rays traverse when a trained field is rendered: the occupancy grid's occupied cells, cut finer and read anew.
 
 Fewer of its cells are occupied, and their densities are nearer to what a ray meets, so that a picture needs fewer samples.
+`read_fine` reads the field, which takes seconds; `refined_grid` makes the grid of it.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -18,6 +20,7 @@ from .occupancy import OccupancyGrid
 
 PROBES = 4  # points read in each fine cell; not tuned
 SAVED = 8  # samples that a pixel needs less with it, about; not tuned
+LARGEST_HALF = 65504.0  # of float16
 CHUNK = 1 << 14
 
 
@@ -43,33 +46,39 @@ def largest_factor(resolution: int, factor: int) -> int:
     return factor
 
 
+@dataclass(frozen=True)
+class FineDensity:
+    """What was read of the field in finer cells: `coarse` (C,) int32, the occupied cells that were cut, `density` (C,
+    factor³) float16 per normalised unit length, 0 where a finer cell is empty; x runs slowest within a cell."""
+
+    coarse: torch.Tensor
+    density: torch.Tensor
+
+
 @torch.no_grad()
-def refined_grid(
+def read_fine(
     occupancy: OccupancyGrid,
     density: Callable[[torch.Tensor], torch.Tensor],
     factor: int,
-    per_bin: float,
-    pixels: float,
+    pixels: float = math.inf,
+    shown: torch.Tensor | None = None,
     check: Callable[[], None] | None = None,
-) -> RenderGrid | None:
+) -> FineDensity | None:
     """Every occupied cell cut into factor³, of which those stay occupied where `density` (points (N, 3) in grid coordinates →
     (N,), per normalised unit length) is not negligible at one of a few random points; their mean is the density.
 
-    None where reading the cells takes longer than it saves in rendering so many `pixels`.
-    `check` is called often, on the CPU by several threads, and may raise to stop.
+    None where there is nothing to cut, or where reading takes longer than it saves in rendering so many `pixels`.
+    `shown` (resolution³,) bool: only these cells are cut. `check` is called often, on the CPU by several threads, and may
+    raise to stop.
     """
     factor = largest_factor(occupancy.config.resolution, factor)
-    coarse = (occupancy.cells[:, 0] > 0).nonzero()[:, 0]
+    occupied = occupancy.cells[:, 0] > 0
+    coarse = (occupied if shown is None else occupied & shown).nonzero()[:, 0]
     if factor == 1 or len(coarse) * factor**3 * PROBES > pixels * SAVED:
         return None
-    device, n = coarse.device, occupancy.config.resolution
-    axis = torch.arange(factor, device=device)
-    part = torch.cartesian_prod(axis, axis, axis)
-    corner = torch.stack([coarse % n, coarse // n % n, coarse // (n * n)], 1)
-    fine = (corner[:, None] * factor + part).view(-1, 3)
-    generator = torch.Generator(device).manual_seed(0)  # the same picture every time
-    side = n * factor
-    largest, mean = (torch.zeros(len(fine), device=device) for _ in range(2))
+    fine, side = _parts(coarse, occupancy.config.resolution, factor), occupancy.config.resolution * factor
+    generator = torch.Generator(coarse.device).manual_seed(0)  # the same picture every time
+    largest, mean = (torch.zeros(len(fine), device=coarse.device) for _ in range(2))
 
     @torch.no_grad()
     def read(points: torch.Tensor) -> torch.Tensor:
@@ -78,15 +87,36 @@ def refined_grid(
         return density(points)
 
     for _ in range(PROBES):
-        points = (fine + torch.rand(fine.shape, device=device, generator=generator)) / side
-        fresh = torch.cat(run_parallel([partial(read, some) for some in points.split(CHUNK)], device))
+        points = (fine + torch.rand(fine.shape, device=coarse.device, generator=generator)) / side
+        fresh = torch.cat(run_parallel([partial(read, some) for some in points.split(CHUNK)], coarse.device))
         mean += fresh / PROBES
         torch.maximum(largest, fresh, out=largest)
     step = occupancy.step / factor
-    row = (fine[:, 2] * side + fine[:, 1]) * side + fine[:, 0]
-    occupied = largest * step > occupancy.config.threshold
-    cells = torch.zeros(side**3, 2, device=device)
-    cells[row, 0] = torch.where(occupied, mean.clamp(1e-3, occupancy.config.optical_depth / step), 0.0)
-    cells[row, 1] = occupancy.importance[coarse].repeat_interleave(factor**3)
+    mean = mean.clamp(1e-3, min(occupancy.config.optical_depth / step, LARGEST_HALF))
+    kept = torch.where(largest * step > occupancy.config.threshold, mean, 0.0)
+    return FineDensity(coarse.int(), kept.view(len(coarse), factor**3).half())
+
+
+def _parts(coarse: torch.Tensor, n: int, factor: int) -> torch.Tensor:
+    """Places (C · factor³, 3) of the parts of cells (C,) of an n³ grid in the grid that is `factor` times finer."""
+    axis = torch.arange(factor, device=coarse.device)
+    corner = torch.stack([coarse % n, coarse // n % n, coarse // (n * n)], 1)
+    return (corner[:, None] * factor + torch.cartesian_prod(axis, axis, axis)).view(-1, 3)
+
+
+@torch.no_grad()
+def refined_grid(occupancy: OccupancyGrid, fine: FineDensity, per_bin: float) -> RenderGrid:
+    """The finer grid. Occupied cells that were not read keep their density in all of their parts."""
+    parts, n = fine.density.shape[1], occupancy.config.resolution
+    factor = round(parts ** (1 / 3))
+    side, step = n * factor, occupancy.step / factor
+    coarse = (occupancy.cells[:, 0] > 0).nonzero()[:, 0]
+    density = occupancy.cells[:, 0].index_select(0, coarse)[:, None].repeat(1, parts)
+    density[torch.searchsorted(coarse, fine.coarse.long())] = fine.density.float()
+    place = _parts(coarse, n, factor)
+    row = (place[:, 2] * side + place[:, 1]) * side + place[:, 0]
+    cells = torch.zeros(side**3, 2, device=coarse.device)
+    cells[row, 0] = density.view(-1)
+    cells[row, 1] = occupancy.importance[coarse].repeat_interleave(parts)
     settings = replace(occupancy.march_settings(), per_bin=per_bin, resolution=side, step=step)
     return RenderGrid(cells, skip_distances((cells[:, 0] > 0).view(side, side, side)), settings)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import threading
 
 import pytest
@@ -15,7 +14,15 @@ from fieldwork.nerfcore.kernels.runtime import worker_count
 from fieldwork.nerfcore.kernels.traversal import skip_distances
 from fieldwork.nerfcore.sampling import render_grid
 from fieldwork.nerfcore.sampling.occupancy import OccupancyGrid
-from fieldwork.nerfcore.sampling.render_grid import PROBES, SAVED, largest_factor, present_grid, refined_grid
+from fieldwork.nerfcore.sampling.render_grid import (
+    PROBES,
+    SAVED,
+    RenderGrid,
+    largest_factor,
+    present_grid,
+    read_fine,
+    refined_grid,
+)
 
 N = 32
 THICK = 0.02
@@ -38,6 +45,13 @@ def shell_grid() -> OccupancyGrid:
     return grid
 
 
+def finer(factor: int, shown: torch.Tensor | None = None) -> RenderGrid:
+    coarse = shell_grid()
+    fine = read_fine(coarse, shell, factor, shown=shown)
+    assert fine is not None
+    return refined_grid(coarse, fine, 1.0)
+
+
 def parallel_rays() -> tuple[torch.Tensor, torch.Tensor]:
     side = torch.linspace(-0.6, 0.6, 25)
     x, y = torch.meshgrid(side, side, indexing="ij")
@@ -47,8 +61,7 @@ def parallel_rays() -> tuple[torch.Tensor, torch.Tensor]:
 
 def test_the_refined_grid_closes_what_is_empty_and_keeps_every_surface() -> None:
     coarse = shell_grid()
-    fine = refined_grid(coarse, shell, 2, 1.0, math.inf)
-    assert fine is not None
+    fine = finer(2)
     assert fine.settings.resolution == 2 * N
     assert fine.settings.step == pytest.approx(coarse.step / 2)
     occupied = fine.cells[:, 0] > 0
@@ -72,11 +85,31 @@ def test_cells_are_not_refined_where_it_does_not_pay() -> None:
     coarse = shell_grid()
     cells = int((coarse.cells[:, 0] > 0).sum())
     pays = cells * 2**3 * PROBES / SAVED
-    assert refined_grid(coarse, shell, 2, 1.0, 0.9 * pays) is None
-    finer = refined_grid(coarse, shell, 2, 1.0, 1.1 * pays)
-    assert finer is not None
-    assert finer.settings.resolution == 2 * N
-    assert refined_grid(coarse, shell, 1, 1.0, math.inf) is None
+    assert read_fine(coarse, shell, 2, 0.9 * pays) is None
+    assert read_fine(coarse, shell, 2, 1.1 * pays) is not None
+    assert read_fine(coarse, shell, 1) is None
+
+
+def test_cells_that_no_photo_shows_are_not_read_and_keep_their_density() -> None:
+    coarse = shell_grid()
+    shown = (torch.arange(N**3) % N) < N // 2  # the half of small x
+    half = finer(2, shown)
+    side = 2 * N
+    x = torch.arange(side**3) % side
+    occupied = int((coarse.cells[shown, 0] > 0).sum()) * 2**3
+    assert 0 < int((half.cells[x < N, 0] > 0).sum()) < 0.6 * occupied
+    kept = half.cells[x >= N].view(side, side, N, 2)
+    given = coarse.cells.view(N, N, N, 2)[:, :, N // 2 :]
+    expected = given.repeat_interleave(2, 0).repeat_interleave(2, 1).repeat_interleave(2, 2)
+    assert torch.equal(kept, expected)
+    read: list[int] = []
+
+    def counting(points: torch.Tensor) -> torch.Tensor:
+        read.append(int((points[:, 0] >= 0.5).sum()))
+        return shell(points)
+
+    assert read_fine(coarse, counting, 2, shown=shown) is not None
+    assert sum(read) == 0
 
 
 def test_rays_through_more_open_cells_get_more_samples() -> None:
@@ -121,7 +154,7 @@ def test_reading_the_finer_cells_stops_as_soon_as_asked(monkeypatch: pytest.Monk
             raise Cancelled
 
     with pytest.raises(Cancelled):
-        refined_grid(shell_grid(), density, 2, 1.0, math.inf, check)
+        read_fine(shell_grid(), density, 2, check=check)
     assert len(read) <= worker_count()  # what was under way already
 
 
@@ -137,6 +170,4 @@ def test_grids_are_not_made_finer_than_kernels_can_number_their_cells() -> None:
 
 def test_a_grid_is_refined_as_far_as_its_cells_can_be_numbered(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(render_grid, "MOST_CELLS_A_SIDE", 3 * N)
-    fine = refined_grid(shell_grid(), shell, 4, 1.0, math.inf)
-    assert fine is not None
-    assert fine.settings.resolution == 2 * N
+    assert finer(4).settings.resolution == 2 * N

@@ -1,0 +1,88 @@
+"""The finer grid that is kept with a run: read once, never of another field, never in the way of a picture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from fieldwork.nerfcore.config import RunConfig
+from fieldwork.nerfcore.render.kept_grid import KeptGrid
+from fieldwork.nerfcore.render.model import Model
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture
+def model(monkeypatch: pytest.MonkeyPatch) -> Model:
+    """An untrained model with a small grid, and how often its field was read."""
+    config = RunConfig()
+    config.sampling.resolution = 16
+    config.field.levels, config.field.table_log2, config.field.finest = 4, 12, 64
+    torch.manual_seed(0)
+    found = Model(config, 0, 1, False).eval().requires_grad_(False)
+    reads: list[int] = []
+    density = found.field.density
+
+    def counting(points: torch.Tensor) -> torch.Tensor:
+        reads.append(len(points))
+        return density(points)
+
+    monkeypatch.setattr(found.field, "density", counting)
+    found.reads = reads  # type: ignore[assignment]
+    return found
+
+
+def refined(model: Model, kept: KeptGrid, pixels: float = 1e9) -> tuple[torch.Tensor | None, int]:
+    """Cells of the finer grid and how often the field was read for it."""
+    model.reads.clear()  # type: ignore[operator]
+    model._refined, model.kept_grid = None, kept
+    model.refine(pixels)
+    return (None if model._refined is None else model._refined.cells), len(model.reads)  # type: ignore[arg-type]
+
+
+def test_a_field_is_read_once_for_all_its_pictures(model: Model, tmp_path: Path) -> None:
+    kept = KeptGrid(tmp_path / "grid.safetensors", "one")
+    first, reads = refined(model, kept)
+    assert reads > 0
+    assert first is not None
+    second, reads = refined(model, kept)
+    assert reads == 0
+    assert torch.equal(first, second)
+    assert refined(model, kept, pixels=1.0)[0] is not None  # kept, it pays for any picture
+
+
+def test_another_training_reads_its_own(model: Model, tmp_path: Path) -> None:
+    path = tmp_path / "grid.safetensors"
+    refined(model, KeptGrid(path, "one"))
+    assert KeptGrid(path, "two").load(2, CPU) is None
+    assert KeptGrid(path, "one").load(4, CPU) is None
+    assert refined(model, KeptGrid(path, "two"))[1] > 0
+    assert KeptGrid(path, "one").load(2, CPU) is None
+    assert KeptGrid(path, "two").load(2, CPU) is not None
+
+
+@pytest.mark.parametrize("damage", [b"", b"garbage", None])
+def test_a_damaged_grid_is_read_anew(model: Model, tmp_path: Path, damage: bytes | None) -> None:
+    path = tmp_path / "grid.safetensors"
+    first, _ = refined(model, KeptGrid(path, "one"))
+    path.write_bytes(path.read_bytes()[:-100] if damage is None else damage)
+    again, reads = refined(model, KeptGrid(path, "one"))
+    assert reads > 0
+    assert first is not None
+    assert torch.equal(first, again)
+
+
+def test_pictures_are_rendered_where_nothing_can_be_kept(model: Model, tmp_path: Path) -> None:
+    blocked = tmp_path / "a file"
+    blocked.write_text("")
+    cells, reads = refined(model, KeptGrid(blocked / "grid.safetensors", "one"))
+    assert cells is not None
+    assert reads > 0
+
+
+def test_settings_without_a_finer_grid_have_none(model: Model, tmp_path: Path) -> None:
+    model.config.render.refine = 1
+    cells, reads = refined(model, KeptGrid(tmp_path / "grid.safetensors", "one"))
+    assert cells is None
+    assert reads == 0

@@ -30,7 +30,7 @@ DONE = Callable[[dict[str, Any] | None, EngineError | None], None]
 
 
 def engine_environment(base: dict[str, str] | None = None) -> dict[str, str]:
-    """Environment of the engine: its own modules only, idle threads that sleep, one core left to Blender."""
+    """Environment of the engine: its own modules only, idle threads that sleep."""
     env = dict(os.environ if base is None else base)
     for name in ("PYTHONHOME", "PYTHONSTARTUP", "PYTHONEXECUTABLE", "VIRTUAL_ENV"):
         env.pop(name, None)
@@ -43,13 +43,7 @@ def engine_environment(base: dict[str, str] | None = None) -> dict[str, str]:
     if "bpy" in sys.modules:
         env.setdefault("FIELDWORK_BLENDER", sys.modules["bpy"].app.binary_path or sys.executable)
     env["OMP_WAIT_POLICY"] = "passive"
-    threads = max(1, (os.cpu_count() or 2) - 1)
-    env["OMP_NUM_THREADS"] = str(min(threads, _positive(env.get("OMP_NUM_THREADS")) or threads))
     return env
-
-
-def _positive(text: str | None) -> int | None:
-    return int(text) if text and text.isdecimal() and int(text) > 0 else None
 
 
 def _prune(log: Path) -> None:

@@ -15,7 +15,8 @@ import psutil
 import torch
 
 from ..errors import InputError
-from ..kernels.device import default_threads, use_device
+from ..kernels.device import use_device
+from ..kernels.host import default_threads
 from ..progress import Reporter
 from .results import CPU_FLAGS, Machine, Taken
 

@@ -29,6 +29,7 @@ import psutil
 from .. import __version__
 from ..errors import Cancelled, FieldworkError
 from ..files import name_problem
+from ..kernels.host import give_back_memory, give_way
 from ..progress import Reporter
 from ..project.lock import project_lock
 from ..verbs import VERBS, load_verb, run_verb
@@ -185,6 +186,7 @@ class Server:
     def _work(self) -> None:
         while (job := self._queue.get()) is not None:
             self._run(job)
+            give_back_memory()
 
     def _edit(self) -> None:
         """Verbs that take no time, in the order they came, beside the running job."""
@@ -353,6 +355,7 @@ def claim_stdio() -> tuple[BinaryIO, BinaryIO]:
 def main() -> int:
     """Entry point of `python -m nerfcore serve`."""
     requests, answers = claim_stdio()
+    give_way()
     logging.basicConfig(stream=sys.stderr, level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     server = Server(requests, answers)
     logging.getLogger("fieldwork").addHandler(_Forward(server))

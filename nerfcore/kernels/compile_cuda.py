@@ -19,10 +19,10 @@ import warp as wp
 
 from ..files import write_json, write_section, write_text
 from . import cells, closest, composite, encode, encode_points, march, patches, raycast, surface, triangles, voxel_march
-from .device import default_threads
 from .fused import LANES
 from .fused_kernel import fused_kernel
 from .fused_shape import FusedShape
+from .host import default_threads
 from .resources import Resources, disassembler, markdown, read_resources
 from .runtime import CUDA_BLOCK, init
 

@@ -13,7 +13,6 @@ FIELDWORK_BACKEND (warp, torch) overrides which kernels run on it.
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -24,6 +23,7 @@ import psutil
 import torch
 
 from ..errors import SettingError
+from .host import default_threads, keep_memory
 
 Kernels = Literal["warp", "torch"]
 BackendName = Literal["warp-cuda", "warp-cpu", "torch"]
@@ -120,15 +120,6 @@ def using_kernels(kernels: Kernels | None) -> Iterator[None]:
         _kernels = before
 
 
-def default_threads() -> int:
-    """Threads the engine may use: all cores but one, so that Blender stays responsive.
-
-    FIELDWORK_THREADS overrides it.
-    """
-    available = len(os.sched_getaffinity(0)) if sys.platform == "linux" else (os.cpu_count() or 1)
-    return int(os.environ.get("FIELDWORK_THREADS", 0)) or max(1, available - 1)
-
-
 def choose_device() -> torch.device:
     """The device to compute on: FIELDWORK_DEVICE when set, else the first GPU there is, else the CPU.
 
@@ -160,7 +151,9 @@ def choose_device() -> torch.device:
 
 
 def use_device() -> torch.device:
-    """`choose_device`, with torch set up for it: as many threads as the engine may use, and on the device at hand."""
+    """`choose_device`, with torch set up for it: as many threads as the engine may use, memory that is used again, and
+    on the device at hand."""
+    keep_memory()
     torch.set_num_threads(default_threads())
     device = choose_device()
     if device.index is not None:

@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 
 from ..errors import TrainingError
 from ..files import disk_errors
-from ..kernels.device import default_threads
+from ..kernels.host import default_threads
 from ..progress import Reporter
 
 # xatlas takes longer than in proportion to the faces: 200 000 noisy ones took 74 s in chunks of 25 000, 36 s of 6 000.

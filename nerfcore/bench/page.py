@@ -84,7 +84,13 @@ def _table(result: ResultSet) -> str:
         del columns["variant"]
     for side in tables.frame_sides(rows):
         columns |= {f"{key}_{side}": f"{heading}, {side}×{side}" for key, heading in tables.SPEED.items()}
-    return tables.table(columns, rows)
+    text = tables.table(columns, rows)
+    if any("render_ratio" in row for row in rows):
+        shares = {"scene": "scene", "budget": "budget", **tables.SHARES}
+        text += "\n\nTimes beside the least that the machine needs for the multiplications and the reads alone "
+        text += "(`nerfcore/bench/roofline.py`), a frame of 400×400 and a step in the middle of training:\n\n"
+        text += tables.table(shares, rows)
+    return text
 
 
 def _gpu_text(sets: Sequence[ResultSet]) -> str:

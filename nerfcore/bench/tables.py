@@ -35,6 +35,21 @@ COLUMNS = {
 }
 DIGITS = {"psnr": ".2f", "ssim": ".3f", "miou": ".3f", "psnr_gain": "+.2f", "miou_gain": "+.3f"}
 NAMES = {"psnr": "PSNR (dB)", "miou": "mIoU", "f_size": "F at 1 %", "f_pixel": "F at two pixels"}
+# Of the suite `speed`, see `bench/speed.py`: rates of the machine, and times beside the least that it needs.
+SHARES = {
+    "precision": "precision",
+    "gflops": "matrix products (GFLOP/s)",
+    "reads": "random reads (M/s)",
+    "copy": "copy (GB/s)",
+    "render_least": "frame, at least (s)",
+    "render_taken": "frame, taken (s)",
+    "render_ratio": "times the least",
+    "step_least": "step, at least (ms)",
+    "step_taken": "step, taken (ms)",
+    "step_ratio": "times the least",
+    "step_faults": "page faults a step",
+    "step_system": "system time (%)",
+}
 SPEED = {"fps": "frames/s", "ms_frame": "ms a frame", "ms_sampling": "ms sampling", "ms_network": "ms network"}
 
 
@@ -71,6 +86,7 @@ def make_rows(suite: str, results: Sequence[dict[str, Any]]) -> list[Row]:
             row["spr"], row["fused"] = speed["spr"], speed["fused"]
             values = {**speed, "ms_frame": round(1e3 / speed["fps"], 2)}
             row |= {f"{key}_{side}": values[key] for key in SPEED}
+        row |= {key: result["roofline"][key] for key in SHARES if "roofline" in result}
         row |= {key: result[key] for key in (*FIGURES, "stages") if suite == "surface" and key in result}
         row["error"] = result.get("error")
         rows.append(row)
@@ -186,6 +202,9 @@ def markdown(suite: str, rows: Sequence[Row], machine: str, command: str, notes:
         columns |= {f"{key}_{side}": heading for key, heading in SPEED.items()}
         classes = "colour and, where the scene has labels, classes"
         parts += [f"## Frames of {side}×{side}, {classes}", "", table(columns, rows), ""]
+    if any("render_ratio" in row for row in rows):
+        columns = {"scene": "scene", "budget": "budget", **SHARES}
+        parts += ["## Beside the machine", "", table(columns, rows), ""]
     failed = [f"- {r['scene']} {r['variant']}, {r['budget']}: {r['error']}" for r in rows if r.get("error")]
     if failed:
         parts += ["## Failed runs", "", *failed, ""]
@@ -201,8 +220,11 @@ def plot(path: Path, suite: str, rows: Sequence[Row], results: Sequence[dict[str
     from matplotlib.figure import Figure
 
     if suite in ("speed", "gpu"):
-        figure = Figure(figsize=(7, 4), layout="constrained")
-        axes = figure.subplots()
+        shown = [result for result in results if "roofline" in result]
+        figure = Figure(figsize=(12 if shown else 7, 4), layout="constrained")
+        axes, *more = figure.subplots(1, 2 if shown else 1, squeeze=False)[0]
+        if more:
+            _shares(more[0], shown)
         for result in results:
             curve = result.get("curve") or []
             job = result["job"]
@@ -223,6 +245,22 @@ def plot(path: Path, suite: str, rows: Sequence[Row], results: Sequence[dict[str
                 _bars(axes, found, key, f"{case}: {NAMES[key]}")
     with atomic_path(path) as temporary:
         figure.savefig(temporary, dpi=120)
+
+
+def _shares(axes: Any, results: Sequence[dict[str, Any]]) -> None:
+    """Bars of how many times the least a frame and a training step take."""
+    names = [f"{r['job']['scene']}, {Job(**r['job']).budget}" for r in results]
+    places = range(len(names))
+    for shift, key, color, label in (
+        (-0.2, "render_ratio", "#2a6f97", "frame"),
+        (0.2, "step_ratio", "#89a9bd", "training step"),
+    ):
+        values = [r["roofline"][key] for r in results]
+        axes.barh([place + shift for place in places], values, 0.38, color=color, label=label)
+    axes.axvline(1, color="black", linewidth=1)
+    axes.set_yticks(list(places), names)
+    axes.set_xlabel("time taken, in multiples of the least the machine needs")
+    axes.legend()
 
 
 def _bars(axes: Any, found: dict[str, Row], key: str, title: str) -> None:

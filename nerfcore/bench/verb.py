@@ -19,7 +19,7 @@ from ..files import write_json, write_text
 from ..kernels.device import use_device
 from ..params import BenchParams
 from ..progress import Reporter, shortened
-from . import gpu, machine, surface, tables
+from . import gpu, machine, speed, surface, tables
 from .jobs import run_all, unknown_origin
 from .labels import labels_suite
 from .page import check_page, figures_folder, write_page
@@ -49,7 +49,7 @@ def bench(params: BenchParams, report: Reporter) -> dict[str, Any]:
         result = labels_suite(params, projects, out, command_of(params), report)
         return {**result, "notes": [*notes, *result["notes"]]}
     jobs = plan(params, list(projects))
-    more = partial(surface.measure, root=root) if params.suite == "surface" else None
+    more = {"surface": partial(surface.measure, root=root), "speed": speed.measure}.get(params.suite)
     results = run_all(jobs, projects, out, report, params.keep, more)
     rows = tables.make_rows(params.suite, results)
     described = machine.describe()

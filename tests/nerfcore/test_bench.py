@@ -177,7 +177,11 @@ def test_speed_has_two_limits_and_two_frame_sizes(tiny_project: Path, tmp_path: 
         assert row["rays_per_second"] > 0
         assert row["memory_training_mb"] > 50
         assert row["params_m"] > 0
-    assert "Frames of 800×800" in (tmp_path / "speed" / "table.md").read_text("utf-8")
+        assert row["render_taken"] >= row["render_least"] > 0
+        assert row["step_taken"] >= row["step_least"] > 0
+    table = (tmp_path / "speed" / "table.md").read_text("utf-8")
+    assert "Frames of 800×800" in table
+    assert "times the least" in table
 
 
 def test_robustness_reports_drops_against_the_clean_run(tiny_project: Path, tmp_path: Path) -> None:  # noqa: F811

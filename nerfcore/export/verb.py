@@ -9,7 +9,8 @@ from ..blender.package import stale
 from ..data.load import load_scene
 from ..errors import SettingError
 from ..mesh.features import features_of
-from ..mesh.files import USD, write_surface
+from ..mesh.files import write_surface
+from ..mesh.formats import USD
 from ..mesh.instances import read_instances
 from ..mesh.stored import load_surface, mesh_folder
 from ..params import ExportParams

@@ -26,23 +26,12 @@ from trimesh.visual import ColorVisuals, TextureVisuals
 from trimesh.visual.material import SimpleMaterial
 
 from ..data.scene import View
-from ..errors import SettingError
 from ..files import atomic_path
 from .features import Features
+from .formats import TEXTURED, USD, Y_UP
 from .gltf import write_glb
 from .parts import Part, Texture, make_part
 from .surface import Surface
-
-USD = (".usdc", ".usda", ".usd", ".usdz")
-FORMATS = (".ply", ".obj", ".glb", ".stl", *USD)
-Y_UP = (".glb", ".obj")
-TEXTURED = (".glb", ".obj")  # and USD, which knows the corners' own places on the texture
-
-
-def check_format(path: Path) -> None:
-    """Raise SettingError unless the ending of the file is one of `FORMATS`."""
-    if path.suffix.lower() not in FORMATS:
-        raise SettingError(f"{path}: meshes are written as {', '.join(FORMATS)}.", "Choose one of these endings.")
 
 
 def write_surface(

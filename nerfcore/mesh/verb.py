@@ -25,7 +25,7 @@ from ..verdict import mesh_verdict
 from .build import Built, build
 from .features import features_of
 from .field_values import shade
-from .files import check_format, write_surface
+from .formats import check_format
 from .instances import GAP, Instance, find_instances, write_instances
 from .lods import Level, make_levels, remove_levels, write_level
 from .painted import Painted, paint_surface, training_photos, write_maps
@@ -133,6 +133,8 @@ def _write_meshes(
     report: Reporter,
 ) -> tuple[list[Path], list[Level]]:
     """Write mesh.ply, the file that was asked for, and the levels of detail; the files, and the levels."""
+    from .files import write_surface  # with its libraries, a quarter of a second
+
     files: list[Path] = []
     features = features_of(surface, scene.classes, scene.ignore_id, instances)
     for path in [target / "mesh.ply", *([params.out] if params.out else [])]:

@@ -6,10 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import to_rgba
-from matplotlib.figure import Figure
-from matplotlib.patches import Patch
 
 from ..files import atomic_path
 from ..geometry.contraction import grid_position
@@ -31,6 +27,12 @@ def write_closed_picture(path: Path, space: KnownSpace, centers: torch.Tensor, p
     """
     if not any(bool(cells.any()) for cells in space.closed.values()):
         return False
+    # Loaded where it draws: each training would wait for it.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.colors import to_rgba
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Patch
+
     figure = Figure(figsize=(9, 5.2), dpi=100, layout="constrained")
     FigureCanvasAgg(figure)
     cameras, cloud = (

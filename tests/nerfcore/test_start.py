@@ -1,0 +1,26 @@
+"""What a command loads before it begins: whoever starts one waits for it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+HEAVY = {
+    "cli": ("torch", "warp", "scipy", "matplotlib", "pycolmap", "trimesh"),
+    "engine.server": ("torch", "warp", "scipy", "matplotlib", "pycolmap", "trimesh"),
+    "train.verb": ("matplotlib.figure", "trimesh", "skimage", "pycolmap", "torch._dynamo"),
+    "mesh.verb": ("matplotlib.figure", "trimesh", "networkx", "pycolmap", "torch._dynamo"),
+    "render.verb": ("matplotlib.figure", "trimesh", "skimage", "pycolmap", "torch._dynamo"),
+    "evaluate.verb": ("matplotlib.figure", "trimesh", "pycolmap", "torch._dynamo"),
+}
+
+
+@pytest.mark.parametrize("module", HEAVY)
+def test_a_verb_loads_no_library_before_it_needs_it(module: str) -> None:
+    code = f"import sys, fieldwork.nerfcore.{module}; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = set(done.stdout.split())
+    assert f"fieldwork.nerfcore.{module}" in loaded
+    assert loaded.isdisjoint(HEAVY[module]), loaded & set(HEAVY[module])

@@ -229,6 +229,9 @@ class EvaluateParams(Params):
     split: Literal["test", "train"] = "test"
     speed: bool = Field(default=False, description="measure frames of 800x800 too; on a CPU this can take minutes")
     baked: bool = Field(default=False, description="measure the baked field, and what it lost against the field")
+    time_limit: float | None = Field(
+        default=None, gt=0, le=LONGEST_RUN, description="seconds; as many photos, evenly spread, as fit: at least one"
+    )
 
 
 class BakeParams(Params):
@@ -489,7 +492,12 @@ class ReconstructParams(Params):
     mask_mode: Literal["ignore", "empty"] | None = Field(default=None, description=MASK_MODE)
     classes: Path | None = None
     blend: Path | None = None
-    time_limit: float | None = Field(default=None, gt=0, le=LONGEST_RUN, description="seconds of training")
+    time_limit: float | None = Field(
+        default=None,
+        gt=0,
+        le=LONGEST_RUN,
+        description="seconds of training; all that comes after it gets half as much and a minute",
+    )
     holdout: Holdout = 8
     set: dict[str, str] = Field(default_factory=dict)
     faces: int = Field(default=200_000, ge=0, le=1_000_000_000, description="triangles of the mesh; 0: all there are")

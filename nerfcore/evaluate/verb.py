@@ -178,10 +178,15 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
         Confusion(trained.info.class_ids if trained.model.field.classes else []),
     )
     report.stage("Rendering held-out views" if params.split == "test" else "Rendering training views")
-    for number, (index, size) in enumerate(zip(indices, sizes)):
-        view = scene.views[index]
+    begin, order = time.perf_counter(), range(len(indices)) if params.time_limit is None else spread(len(indices))
+    for number, place in enumerate(order):
+        spent = time.perf_counter() - begin
+        if params.time_limit is not None and number > 0 and spent * (number + 1) / number > params.time_limit:
+            report.note(f"{number} of {len(indices)} photos are compared: the time is used up.")
+            break
+        view = scene.views[indices[place]]
         report.progress(number / len(indices), view.name)
-        compared.add(view, size, report.check)
+        compared.add(view, sizes[place], report.check)
     environment = trained.model.environment is not None
     speed: dict[str, Any] = dict.fromkeys(SPEED_KEYS)
     if params.speed:
@@ -192,7 +197,7 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
         **compared.means(),
         **speed,
         "rps": round(compared.rays / compared.seconds),
-        "seconds_per_image": round(compared.seconds / len(indices), 3),
+        "seconds_per_image": round(compared.seconds / len(compared.scores), 3),
         "params_m": round(trained.model.field.parameter_count() / 1e6, 3),
         "memory_mb": round(peak_memory(trained.device)),
         "background": _name_of(compared.background, environment),
@@ -213,6 +218,14 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
     return result
 
 
+def spread(count: int) -> list[int]:
+    """0 … count − 1 in an order whose first few are always spread over all of them: each halves the widest gap that the
+    ones before it leave (van der Corput's sequence)."""
+    digits = max(count - 1, 1).bit_length()
+    reverse = [int(f"{number:0{digits}b}"[::-1], 2) for number in range(1 << digits)]
+    return [place for place in reverse if place < count]
+
+
 def _record(params: EvaluateParams) -> Path:
     folder = run_folder(Path(params.project), params.run) / "evaluation"
     return (folder / "baked" if params.baked else folder) / f"{params.split}.json"
@@ -230,10 +243,11 @@ def evaluation_inputs(params: EvaluateParams) -> Fingerprint:
     folder = Path(params.project)
     info = load_info(folder, params.run)
     scene = load_scene(folder, info.holdout)
+    limit = [] if params.time_limit is None else ["limited"]  # to however many seconds
     return {
         "trained field": checkpoint_id(folder, params.run),
         "classes": class_inputs(scene),
-        "settings": digest([params.split, info.config.model_dump(mode="json")]),
+        "settings": digest([params.split, info.config.model_dump(mode="json"), *limit]),
         **({"baked field": files_digest([("meta", voxels_folder(folder, params.run) / META)])} if params.baked else {}),
         **view_inputs(scene, scene.test if params.split == "test" else scene.train, files=True),
     }

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 from .. import params as p
 from ..blender.blend import blend, blended
 from ..capture.ingest import ingested, new
+from ..data.load import load_scene
 from ..data.readers import colmap, transforms
 from ..errors import ProjectError
 from ..evaluate.report import check_report, write_report
@@ -19,10 +20,12 @@ from ..mesh.verb import mesh, meshed
 from ..poses.estimate import estimate_poses, posed
 from ..progress import Reporter
 from ..project.fingerprints import Earlier
+from ..project.runs import holdout_of
 from ..project.store import is_project, load_project
-from ..render.verb import render, rendered
+from ..render.verb import orbit_cameras, render, rendered
 from ..train.reuse import finished, held_out, train_or_keep, unfinished
 from ..verdict import worst
+from . import budget
 
 
 class Stage(NamedTuple):
@@ -74,9 +77,13 @@ class Pipeline:
         self.results[verb] = stage.run(values, self.report)
         self.seconds[verb] = round(time.perf_counter() - begin, 1)
 
+    def spent(self, *verbs: str) -> float:
+        """Seconds that these stages took."""
+        return sum(self.seconds.get(verb, 0.0) for verb in verbs)
+
 
 def reconstruct(params: p.ReconstructParams, report: Reporter) -> dict[str, Any]:
-    """Run new, poses, train, evaluate, mesh, render and blend one after the other.
+    """Run new, poses, train, mesh, blend, evaluate and render one after the other.
 
     An existing project at `out` is continued: a stage is done again only where what it depends on has changed.
 
@@ -90,6 +97,8 @@ def reconstruct(params: p.ReconstructParams, report: Reporter) -> dict[str, Any]
         check_report(params.report)
     project, run = Path(params.out), "main"
     pipeline = Pipeline(project, report)
+    if params.time_limit is not None:
+        report.note(budget.estimate(params.time_limit))
     if is_project(project) and load_project(project).last("import") is not None:
         raise ProjectError(f"{project} is an imported data set.", "Use train, mesh and blend on it.")
     _offer_poses(params.photos, report)
@@ -114,22 +123,17 @@ def reconstruct(params: p.ReconstructParams, report: Reporter) -> dict[str, Any]
         holdout=params.holdout,
     )
     pipeline.do("train", training.model_copy(update={"resume": unfinished(training)}))
+    pipeline.do("mesh", _mesh_params(params, project, run))
+    renders = params.renders or project / "exports" / run / "renders"
+    if params.blend is not None:  # what was asked for, before what says how good it is
+        pipeline.do("blend", p.BlendParams(project=project, out=params.blend, run=run))
     if held_out(project, run):
-        pipeline.do("evaluate", p.EvaluateParams(project=project, run=run))
+        seconds = budget.share_of(params.time_limit, budget.EVALUATION, pipeline.spent("mesh", "blend"))
+        limit = None if params.time_limit is None else seconds
+        pipeline.do("evaluate", p.EvaluateParams(project=project, run=run, time_limit=limit))
     else:
         report.stage("evaluate: left out, no photos are held out")
-    pipeline.do(
-        "mesh", p.MeshParams(project=project, run=run, faces=params.faces or None, texture=params.texture or None)
-    )
-    renders = params.renders or project / "exports" / run / "renders"
-    pipeline.do(
-        "render",
-        p.RenderParams(
-            project=project, run=run, out=renders, orbit=params.render_count, passes=["rgb", "depth", "semantic"]
-        ),
-    )
-    if params.blend is not None:
-        pipeline.do("blend", p.BlendParams(project=project, out=params.blend, run=run))
+    pipeline.do("render", _render_params(params, pipeline, run, renders))
     result = {
         "project": str(project),
         "stages": pipeline.seconds,
@@ -142,6 +146,26 @@ def reconstruct(params: p.ReconstructParams, report: Reporter) -> dict[str, Any]
         write_report(params.report, project, run, renders, result)
         result["report"] = str(params.report)
     return result
+
+
+def _mesh_params(params: p.ReconstructParams, project: Path, run: str) -> p.MeshParams:
+    faces, texture = params.faces or None, params.texture or None
+    if budget.seconds_after(params.time_limit) >= budget.WHOLE_MESH:
+        return p.MeshParams(project=project, run=run, faces=faces, texture=texture)
+    texture = None if texture is None else min(texture, 2048)
+    return p.MeshParams(project=project, run=run, faces=faces, texture=texture, resolution=256)
+
+
+def _render_params(params: p.ReconstructParams, pipeline: Pipeline, run: str, renders: Path) -> p.RenderParams:
+    """Pictures of new views, as many and as large as there is time for."""
+    project, size, count = pipeline.project, None, params.render_count
+    if params.time_limit is not None:
+        camera = orbit_cameras(load_scene(project, holdout_of(project, run)), count)[0][1]
+        seconds = budget.share_of(params.time_limit, budget.PICTURES, pipeline.spent("mesh", "blend", "evaluate"))
+        speed = pipeline.results.get("evaluate", {}).get("rps")
+        size, count = budget.fitting_pictures((camera.width, camera.height), count, speed, seconds)
+    passes: list[p.Pass] = ["rgb", "depth", "semantic"]
+    return p.RenderParams(project=project, run=run, out=renders, orbit=count, size=size, passes=passes)
 
 
 def _offer_poses(photos: Path, report: Reporter) -> None:

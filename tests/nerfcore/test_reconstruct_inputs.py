@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 from fieldwork.nerfcore.capture.ingest import new
+from fieldwork.nerfcore.geometry.cameras import Camera
 from fieldwork.nerfcore.params import NewParams, Params, ReconstructParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.store import load_project
@@ -84,6 +85,27 @@ def test_the_mesh_is_of_a_size_one_can_use(
 def test_as_many_views_are_rendered_as_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen, _ = all_stages(monkeypatch, tmp_path, {}, render_count=3)
     assert seen["render"].orbit == 3
+
+
+def test_the_blend_comes_before_what_says_how_good_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen, _ = all_stages(monkeypatch, tmp_path, {}, blend=tmp_path / "scene.blend")
+    assert list(seen) == ["new", "poses", "train", "mesh", "blend", "render"]
+
+
+def test_a_short_training_has_a_quick_mesh(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        module,
+        "orbit_cameras",
+        lambda scene, count: [("a", Camera(width=800, height=600, fx=700, fy=700, cx=400, cy=300), None)],
+    )
+    monkeypatch.setattr(module, "load_scene", lambda folder, holdout: None)
+    monkeypatch.setattr(module, "holdout_of", lambda folder, run: 8)
+    short, _ = all_stages(monkeypatch, tmp_path / "a", {}, time_limit=60)
+    assert (short["mesh"].resolution, short["mesh"].texture) == (256, 2048)
+    assert short["render"].size == (200, 150)  # how fast the field renders is not known
+    evaluated = {"evaluate": {"rps": 1e6}}
+    longer, _ = all_stages(monkeypatch, tmp_path / "b", evaluated, time_limit=240)
+    assert (longer["mesh"].resolution, longer["mesh"].texture) == (512, 4096)
 
 
 def test_the_verdict_is_the_worst_of_the_stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -94,7 +94,7 @@ def test_a_photo_touched(place: Path) -> None:
 def test_a_label_of_training(place: Path) -> None:
     shutil.copyfile(place / "photos" / "labels" / "p03.png", place / "photos" / "labels" / "p05.png")
     result = call(place)
-    assert redone(result) == ["new", "train", "evaluate", "mesh", "render"]
+    assert redone(result) == ["new", "train", "mesh", "evaluate", "render"]
     assert result["redone"]["train"] == "changed: labels"
 
 
@@ -105,7 +105,7 @@ def test_a_label_held_out(place: Path) -> None:
 
 def test_a_label_changed_in_the_project(place: Path) -> None:
     shutil.copyfile(place / "p" / "labels" / "p03.png", place / "p" / "labels" / "p05.png")
-    assert redone(call(place)) == ["train", "evaluate", "mesh", "render"]
+    assert redone(call(place)) == ["train", "mesh", "evaluate", "render"]
 
 
 def test_masks(place: Path) -> None:
@@ -120,11 +120,11 @@ def test_names_and_colours_of_classes_are_not_trained(place: Path) -> None:
     known = classes(ClassesParams(project=place / "p"), Reporter())["classes"]
     known[0]["name"] = "Oben"
     classes(ClassesParams.model_validate({"project": place / "p", "classes": known}), Reporter())
-    assert redone(call(place)) == ["evaluate", "mesh", "render"]
+    assert redone(call(place)) == ["mesh", "evaluate", "render"]
     known[0]["priority"] = 3.0
     classes(ClassesParams.model_validate({"project": place / "p", "classes": known}), Reporter())
     result = call(place)
-    assert redone(result) == ["train", "evaluate", "mesh", "render"]
+    assert redone(result) == ["train", "mesh", "evaluate", "render"]
     assert result["redone"]["train"] == "changed: classes"
 
 
@@ -135,7 +135,7 @@ def test_the_region(place: Path) -> None:
     # In a world of another size it is the same region.
     align(AlignParams(project=place / "p", scale=("p00", "p01", 5.0)), Reporter())
     result = call(place)
-    assert redone(result) == ["evaluate", "mesh", "render"]
+    assert redone(result) == ["mesh", "evaluate", "render"]
     assert "alignment" in result["redone"]["mesh"]
 
 

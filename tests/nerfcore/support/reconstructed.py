@@ -25,7 +25,7 @@ from PIL import Image
 
 SIDE, VIEWS = 72, 10
 CAMERA = Camera(width=SIDE, height=SIDE, fx=1.375 * SIDE, fy=1.375 * SIDE, cx=SIDE / 2, cy=SIDE / 2)
-STAGES = ["new", "poses", "train", "evaluate", "mesh", "render"]
+STAGES = ["new", "poses", "train", "mesh", "evaluate", "render"]
 SETTINGS = {**SMALL, "train.steps": "8"}
 
 

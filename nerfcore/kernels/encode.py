@@ -7,7 +7,7 @@ The torch backend is in `encode_torch.py`.
 
 from __future__ import annotations
 
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
 import torch
@@ -113,17 +113,21 @@ def add(target: wp.array(dtype=feature), touched: wp.array(dtype=wp.uint8), row:
 def encode_backward(
     points: wp.array(dtype=wp.vec3),
     grad_out: wp.array(dtype=feature, ndim=2),
-    level: int,
-    resolution: int,
-    base: int,
-    size: int,
-    gain: float,
+    levels: wp.array(dtype=wp.vec3i),
+    gains: wp.array(dtype=float),
     grad_table: wp.array(dtype=feature),
     touched: wp.array(dtype=wp.uint8),
     offset: int,
 ):
-    i = wp.tid() + offset
-    low, high, f = cell_of(points[i], resolution, base, size)
+    # All points of a level after those of the level before: its threads write near each other.
+    index = wp.tid() + offset
+    level = index / points.shape[0]
+    gain = gains[level]
+    if gain == 0.0:
+        return
+    i = index - level * points.shape[0]
+    layout = levels[level]
+    low, high, f = cell_of(points[i], layout[0], layout[1], layout[2])
     g = grad_out[i, level] * gain
     g0 = g * (1.0 - f[0])
     g1 = g * f[0]
@@ -194,11 +198,19 @@ def forward(
         return encode_torch.forward(table, levels, gains, points)
     init()
     out = torch.empty(len(points), len(levels), FEATURES, device=device)
-    layout = small_tensor(levels, torch.int32, device)
-    factors = small_tensor(gains, torch.float32, device)
+    layout, factors = _on_device(tuple(levels), tuple(gains), device)
     inputs = [array(table, feature), array(points, wp.vec3), array(layout, wp.vec3i), array(factors)]
     launch(encode_forward, len(points), [*inputs, array(out, feature)], device)
     return out.flatten(1)
+
+
+@lru_cache(maxsize=64)
+def _on_device(
+    levels: tuple[tuple[int, int, int], ...], gains: tuple[float, ...], device: torch.device
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Layout (L, 3) int32 and factors (L,) float32 of the levels. Kept: a step reads them many times, and they change
+    only while levels fade in."""
+    return small_tensor(levels, torch.int32, device), small_tensor(gains, torch.float32, device)
 
 
 def scatter(
@@ -214,7 +226,7 @@ def scatter(
         parts: points (N, 3) and the gradient (N, levels · FEATURES) float32 of their features, any number of times.
 
     On the CPU each level is one task, so no two threads write the same row and the sum has a fixed order.
-    On CUDA rows are summed with atomics.
+    On CUDA all levels of a part are one launch, and rows are summed with atomics.
     """
     if not backend_of(grad_table.device).warp:
         return encode_torch.scatter(grad_table, touched, levels, gains, parts)
@@ -227,23 +239,21 @@ def scatter(
     ]
     device = grad_table.device
 
-    def arguments(where: wp.array, grad: wp.array, index: int) -> list:
-        resolution, base, size = levels[index]
-        return [where, grad, index, resolution, base, size, gains[index], rows, flags]
-
-    active = [index for index in range(len(levels)) if gains[index] != 0.0]
+    layout, factors = _on_device(tuple(levels), tuple(gains), device)
+    shared = [array(layout, wp.vec3i), array(factors), rows, flags]
     if not backend_of(device).host_threads:
         for where, grad in arrays:
-            for index in active:
-                launch(encode_backward, where.shape[0], arguments(where, grad, index), device)
+            launch(encode_backward, len(levels) * where.shape[0], [where, grad, *shared], device)
         return
     load(encode_backward, device)
 
     def one_level(index: int) -> None:
         for where, grad in arrays:
-            wp.launch(encode_backward, dim=where.shape[0], inputs=[*arguments(where, grad, index), 0], device="cpu")
+            count = where.shape[0]
+            wp.launch(encode_backward, dim=count, inputs=[where, grad, *shared, index * count], device="cpu")
 
     # Levels share no block (rows are padded to BLOCK), so their flags do not race either.
+    active = [index for index in range(len(levels)) if gains[index] != 0.0]
     run_parallel([partial(one_level, index) for index in reversed(active)], device)
 
 

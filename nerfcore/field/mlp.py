@@ -62,7 +62,8 @@ class _Chain(torch.autograd.Function):
                 for index in range(count - 1, -1, -1):
                     found[number].append(torch.mm(g.t(), layers[index][part]).float())
                     if index > 0:
-                        g = torch.ops.aten.threshold_backward(torch.mm(g, matrices[index]), layers[index][part], 0)
+                        g = torch.mm(g, matrices[index])
+                        torch.ops.aten.threshold_backward.grad_input(g, layers[index][part], 0, grad_input=g)
                     elif grad_input is not None:
                         torch.mm(g, matrices[0], out=grad_input[part])
 

@@ -27,10 +27,13 @@ def row_slices(rows: int, device: torch.device) -> list[slice]:
 
 
 def padded(x: torch.Tensor, rows: int, dtype: torch.dtype) -> torch.Tensor:
-    """`x` with zero rows after its own."""
+    """`x` with zero rows after its own; what lies column by column (encoded positions) stays so."""
     if len(x) == rows:
         return x.to(dtype)
-    out = torch.empty(rows, *x.shape[1:], dtype=dtype, device=x.device)
+    if x.dim() == 2 and x.stride(0) == 1 and x.shape[1] > 1:
+        out = torch.empty(x.shape[1], rows, dtype=dtype, device=x.device).t()
+    else:
+        out = torch.empty(rows, *x.shape[1:], dtype=dtype, device=x.device)
     out[: len(x)] = x
     out[len(x) :] = 0
     return out

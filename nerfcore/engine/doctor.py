@@ -87,6 +87,17 @@ def doctor(params: DoctorParams, report: Reporter) -> dict[str, Any]:
     return result
 
 
+def training_memory() -> dict[str, float] | None:
+    """Gigabytes of a graphics card that training with each preset takes, without the photos, which may stay outside; None
+    where the engine's libraries do not load, which is told elsewhere."""
+    try:
+        from ..config import preset_names
+        from ..train.memory_plan import preset_plans
+    except (ImportError, OSError):
+        return None
+    return {name: round(plan.needed / 1e9, 1) for name, plan in preset_plans(preset_names()).items()}
+
+
 def _library(distribution: str, module: str) -> tuple[str | None, list[str]]:
     try:
         version = metadata.version(distribution)
@@ -120,7 +131,7 @@ class _Device:
 
 def _device() -> _Device:
     """The device that the engine would compute on, measured by using it."""
-    empty = {"device": "none", "device_name": "", "gpu_memory_gb": None}
+    empty = {"device": "none", "device_name": "", "gpu_memory_gb": None, "training_memory_gb": None}
     found = _Device({**empty, "backend": None, "native_dtype": None, "free_memory_gb": None}, [], [])
     try:
         import torch
@@ -151,6 +162,7 @@ def _device() -> _Device:
     elif torch.cuda.is_available() or torch.backends.mps.is_available():
         found.notes.append("FIELDWORK_DEVICE asks for the CPU although there is a GPU that torch can use.")
     found.facts |= {"device": kind, "device_name": name, "gpu_memory_gb": memory, "backend": backend.name}
+    found.facts["training_memory_gb"] = training_memory()
     if not backend.warp:
         found.notes.append(
             f"{name} computes with PyTorch's own operations (backend torch): training is complete but slower than with "

@@ -59,6 +59,8 @@ def test_doctor_names_the_backend_and_what_it_multiplies_in(monkeypatch):
     result = module.doctor(DoctorParams(), Reporter())
     assert result["backend"] == backend_of(choose_device()).name
     assert result["native_dtype"] in ("bfloat16", "float16", "float32")
+    assert set(result["training_memory_gb"]) == {"draft", "standard", "high"}
+    assert all(0.5 < gigabytes < 8 for gigabytes in result["training_memory_gb"].values())
     assert result["free_memory_gb"] > 0
     monkeypatch.setenv("FIELDWORK_BACKEND", "torch")
     result = module.doctor(DoctorParams(), Reporter())

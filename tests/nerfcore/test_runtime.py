@@ -4,6 +4,8 @@ import subprocess
 import sys
 
 import pytest
+import torch
+from fieldwork.nerfcore.kernels import blocks, runtime
 
 FIRST_USE = """
 import threading, torch
@@ -95,3 +97,23 @@ def test_a_machine_without_a_gpu_is_not_told_that_its_driver_is_missing(gpu: boo
     done = subprocess.run([sys.executable, "-c", QUIET.format(gpu=gpu)], capture_output=True, text=True, check=True)
     assert ("CUDA driver" in done.stderr) == gpu
     assert done.stderr.splitlines()[-2:] == ["another line", "afterwards"]
+
+
+def test_kernels_follow_torch_on_its_current_stream(monkeypatch):
+    """Without a GPU: which stream a launch names."""
+    launched = []
+    monkeypatch.setattr(runtime, "load", lambda kernel, device: None)
+    monkeypatch.setattr(runtime.torch.cuda, "current_stream", lambda device: f"current of {device}")
+    monkeypatch.setattr(runtime.wp, "stream_from_torch", lambda stream: f"Warp's view of {stream}")
+    monkeypatch.setattr(runtime.wp, "device_from_torch", lambda name: name)
+    monkeypatch.setattr(runtime.wp, "launch", lambda kernel, **how: launched.append(how))
+    device = torch.device("cuda:1")
+    runtime.launch(None, 1000, ["a"], device)
+    assert launched == [
+        {"dim": 1000, "inputs": ["a", 0], "device": "cuda:1", "stream": "Warp's view of current of cuda:1"}
+    ]
+    launched.clear()
+    monkeypatch.setattr(blocks, "load_blocks", lambda kernel, lanes, device: None)
+    blocks.launch_blocks(None, 3, 64, ["a"], device)
+    assert [how["stream"] for how in launched] == ["Warp's view of current of cuda:1"]
+    assert launched[0]["dim"] == 3 * 64

@@ -391,14 +391,17 @@ class LabelStrokeParams(Params):
         min_length=1,
         max_length=100_000,
     )
-    shape: Literal["line", "outline", "click"] = Field(
-        default="line", description="what the points are: a brush's line, the outline of an area, clicks"
+    shape: Literal["line", "outline", "click", "part"] = Field(
+        default="line",
+        description="what the points are: a brush's line, the outline of an area, clicks, or clicks that each take the whole "
+        "part of the surface that looks alike",
     )
     width: float = Field(default=8.0, gt=0, le=LARGEST_PICTURE, description="width of the brush in pixels")
     class_id: int | None = Field(default=None, ge=0, le=65535, description="id of the class that is marked")
     void: bool = Field(default=False, description="what is marked is none of the classes")
     erase: bool = Field(default=False, description="take away earlier marks here")
     author: str = Field(default="", max_length=200, description="who made the mark")
+    key: str = Field(default="", max_length=64, description="a mark sent again with the same key is not made again")
 
     @model_validator(mode="after")
     def _one_meaning(self) -> Self:

@@ -285,7 +285,11 @@ class FieldworkScene(PropertyGroup):
     label_strokes: BoolProperty(name="Marks", description="Show the marks that were drawn on the photo", default=True)
     label_author: StringProperty(name="Author", description="Who draws the marks: it is noted with each of them")
     label_seconds: FloatProperty(
-        name="Time", description="For how many seconds Accept trains the classes", default=15.0, min=1.0, soft_max=120.0
+        name="Accept Time",
+        description="For how many seconds Accept trains the classes",
+        default=15.0,
+        min=1.0,
+        soft_max=120.0,
     )
     label_revision: IntProperty(
         name="Revision", description="Which revision of the marks undo comes back to", default=-1, options={"HIDDEN"}

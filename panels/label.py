@@ -16,6 +16,7 @@ from .base import StepPanel, columns, draw_job, draw_outcome, draw_wrapped, text
 from .states import project_folder
 
 MOST_CONFLICTS = 3  # in the panel
+LEAST_ROWS, MOST_ROWS = 3, 9  # of the list of classes
 
 
 class FIELDWORK_UL_label_classes(UIList):
@@ -71,13 +72,18 @@ def draw_label(layout: UILayout, context: Context) -> None:
         note.label(text=t("Train the field first"))
         return
     row = layout.row()
-    rows = 3 if len(settings.classes) < 4 else 5
+    rows = min(max(len(settings.classes), LEAST_ROWS), MOST_ROWS)
     row.template_list(
         "FIELDWORK_UL_label_classes", "", settings, "classes", settings, "class_index", rows=rows, sort_lock=True
     )
     side = row.column(align=True)
     side.operator("fieldwork.class_add", text="", icon="ADD")
     side.operator("fieldwork.class_remove", text="", icon="REMOVE")
+    if 0 <= settings.class_index < len(settings.classes):
+        entry = settings.classes[settings.class_index]
+        note = layout.row()
+        note.active = False
+        note.label(text=states.class_line(states.facts(context), entry.name, entry.id), translate=False)
     shown = editor.shown_photo(folder)
     row = layout.row(align=True)
     if shown is None:
@@ -119,7 +125,8 @@ def draw_state_of_marks(layout: UILayout, context: Context, folder: Path, settin
         draw_wrapped(box, error.message, width, icon="ERROR")
         count = len(pending.marks_of(folder))
         if count:
-            draw_wrapped(box, t("{} marks are kept here and sent again.", count), width, icon="INFO")
+            kept = t("{} marks are kept and sent again.", count) if count > 1 else t("The mark is kept and sent again.")
+            draw_wrapped(box, kept, width, icon="INFO")
     if error is not None or (facts.stale and session.job_of(folder) is None):
         box.operator("fieldwork.label_retry", icon="FILE_REFRESH")
     for conflict in facts.told.get("conflicts", [])[:MOST_CONFLICTS]:

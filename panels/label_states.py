@@ -89,13 +89,20 @@ def label(context: Context) -> State:
 
 
 def class_text(known: Facts, class_id: int) -> str:
-    """Number of marks, share of the surface and confidence of a class, as short as can be."""
+    """Number of marks and share of the surface of a class, as short as can be."""
     strokes, share = known.strokes.get(class_id, 0), known.shares.get(class_id)
-    parts = [f"{strokes} ✎" if strokes else ""]
+    return "  ".join([f"{strokes} ✎"] * (strokes > 0) + [f"{share.share:.0%}"] * (share is not None))
+
+
+def class_line(known: Facts, name: str, class_id: int) -> str:
+    """The same in words, and how sure the class is."""
+    strokes, share = known.strokes.get(class_id, 0), known.shares.get(class_id)
+    told = t("{}: {} marks", name, strokes) if strokes != 1 else t("{}: 1 mark", name)
     if share is not None:
-        parts.append(f"{share.share:.0%}")
-        parts.append("" if share.confidence is None else f"±{1 - share.confidence:.0%}")
-    return "  ".join(part for part in parts if part)
+        told += t(", {:.0%} of the surface", share.share)
+    if share is not None and share.confidence is not None:
+        told += t(", {:.0%} sure", share.confidence)
+    return told
 
 
 def lines(known: Facts) -> list[str]:
@@ -113,7 +120,7 @@ def lines(known: Facts) -> list[str]:
         told.append(t("The last propagation took {:.1f} s.", known.told["seconds"]))
     unused = len(known.told.get("unused", []))
     if unused:
-        told.append(t("{} marks met no surface.", unused))
+        told.append(t("{} marks met no surface.", unused) if unused > 1 else t("1 mark met no surface."))
     if known.accepted is not None:
         told.append(t("The field has the classes of revision {}.", known.accepted))
     return told

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -60,11 +61,16 @@ def show(folder: Path, photo: dict[str, Any]) -> bpy.types.Image:
         _halve()
     for window, area in spaces():
         space = area.spaces.active
-        known = photo_of(space.image, folder) is not None
+        before = space.image
         space.image = image
-        if not known:
+        if photo_of(before, folder) is None:
             space.mode = "VIEW"
-            _make_ready(window, area)
+            space.show_region_toolbar = space.show_region_tool_header = True
+            with _within(window, area):
+                bpy.ops.wm.tool_set_by_id(name=TOOL, space_type="IMAGE_EDITOR")
+        if before != image:
+            with _within(window, area):
+                bpy.ops.image.view_all(fit_view=True)
         area.tag_redraw()
     return image
 
@@ -75,23 +81,17 @@ def _halve() -> None:
     views = [area for area in window.screen.areas if area.type == "VIEW_3D"] or list(window.screen.areas)
     area = max(views, key=lambda area: area.width * area.height)
     before = {other.as_pointer() for other in window.screen.areas}
-    region = next(region for region in area.regions if region.type == "WINDOW")
-    with bpy.context.temp_override(window=window, screen=window.screen, area=area, region=region):
+    with _within(window, area):
         bpy.ops.screen.area_split(direction="VERTICAL", factor=0.5)
     new = next((other for other in window.screen.areas if other.as_pointer() not in before), area)
     left = min((new, area), key=lambda part: part.x)
     left.ui_type = "IMAGE_EDITOR"
 
 
-def _make_ready(window: bpy.types.Window, area: bpy.types.Area) -> None:
-    """Toolbar, sidebar and the label tool; the whole photo in view."""
-    space = area.spaces.active
-    space.show_region_toolbar = space.show_region_ui = True
+def _within(window: bpy.types.Window, area: bpy.types.Area) -> AbstractContextManager[Any]:
+    """Let operators work in an editor."""
     region = next(region for region in area.regions if region.type == "WINDOW")
-    with bpy.context.temp_override(window=window, screen=window.screen, area=area, region=region):
-        bpy.ops.wm.tool_set_by_id(name=TOOL, space_type="IMAGE_EDITOR")
-        if bpy.ops.image.view_all.poll():
-            bpy.ops.image.view_all(fit_view=True)
+    return bpy.context.temp_override(window=window, screen=window.screen, area=area, region=region)
 
 
 def pixel_at(region: bpy.types.Region, size: tuple[int, int], x: float, y: float) -> tuple[float, float]:

@@ -7,6 +7,7 @@ runs/RUN/revisions/N.npz                           the labels of the surfels at 
 from __future__ import annotations
 
 import json
+import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ import numpy as np
 
 SURFELS, RECORD = "surfels", "prepared.json"
 REVISIONS = "revisions"
+UNREADABLE = (OSError, EOFError, ValueError, KeyError, TypeError, BadZipFile, zlib.error)  # what damaged files raise
 LEAST = 0.5  # probability of all classes together below which a surfel is void
 
 
@@ -61,7 +63,7 @@ def read_labelling(path: Path) -> Labelling | None:
             probability = data["probability"].astype(np.float32)
             told = json.loads(str(data["told"])) if "told" in data else {}
             return Labelling(int(data["revision"]), probability, data["class_ids"], str(data["made"]), told)
-    except (OSError, ValueError, KeyError, BadZipFile):
+    except UNREADABLE:
         return None
 
 
@@ -76,7 +78,7 @@ def surfel_map(surfels: Path, name: str) -> np.ndarray | None:
         photo = photo_maps(json.loads((surfels / RECORD).read_text(encoding="utf-8")))[name]
         pixels = np.load(surfels / "pixel_surfel.npy", mmap_mode="r", allow_pickle=False)
         return np.array(part_of(pixels, photo))
-    except (OSError, ValueError, KeyError, TypeError):
+    except UNREADABLE:
         return None
 
 

@@ -40,7 +40,7 @@ from ..project.runs import geometry_id, run_folder
 from ..project.store import load_project, world_from_sfm
 from ..render.run import Trained, load_trained, refined_poses
 from .graph import Graph, feature_columns, make_graph
-from .lookup import RECORD, part_of, photo_maps
+from .lookup import RECORD, UNREADABLE, part_of, photo_maps
 from .lookup import SURFELS as FOLDER
 from .rays import Hits, hits_of
 from .surfels import Surfels, cell_of, field_features, means, nearest_neighbours, nearest_surfel, shape_at
@@ -135,7 +135,7 @@ def current(folder: Path, run: str, count: int | None = None) -> Preparation | N
     """
     try:
         ready = Preparation(run_folder(folder, run) / FOLDER)
-    except (OSError, ValueError, KeyError, TypeError):
+    except UNREADABLE:
         return None
     wanted = prepared_inputs(folder, run, ready.inputs.get("surfels") if count is None else count)
     return ready if ready.inputs == wanted else None

@@ -450,6 +450,44 @@ class LabelAcceptParams(Params):
     seconds: float = Field(default=15.0, gt=0, le=3600, description="time for training the classes")
 
 
+class LabelImportParams(Params):
+    project: Path
+    file: Path = Field(description="file or folder that a labelling tool wrote")
+    format: Literal["auto", "coco", "cvat", "label-studio", "labelme", "segments", "supervisely", "png", "masks"] = (
+        Field(
+            default="auto",
+            description="what the file is; masks: black and white pictures, as Metashape writes them; default: by its contents",
+        )
+    )
+    class_name: str = Field(
+        default="object", min_length=1, max_length=200, description="class of what is white in masks"
+    )
+    replace: bool = Field(default=False, description="also for photos that have labels of their own")
+
+
+class LabelExportParams(Params):
+    project: Path
+    out: Path
+    format: Literal[
+        "coco",
+        "coco-panoptic",
+        "cvat",
+        "label-studio",
+        "labelme",
+        "segments",
+        "supervisely",
+        "png",
+        "png-colors",
+        "masks",
+    ] = Field(default="coco", description="coco, cvat and label-studio are one file, the others a folder")
+    source: Literal["maps", "marks"] = Field(
+        default="maps", description="label maps of the photos, or what was propagated from marks over all photos"
+    )
+    run: RunName = "main"
+    revision: Revision = None
+    class_name: str = Field(default="", max_length=200, description="class that is white in masks")
+
+
 class ReportParams(Params):
     project: Path
     run: RunName = "main"

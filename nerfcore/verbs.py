@@ -52,6 +52,12 @@ VERBS = {
     ),
     "label overlay": Verb(p.LabelOverlayParams, "labels.overlay:overlay", "Draw the labels of a photo."),
     "label next": Verb(p.LabelNextParams, "labels.next_photo:next_photo", "Find the photo to mark next."),
+    "label import": Verb(
+        p.LabelImportParams, "labels.exchange:import_labels", "Read labels of another labelling tool."
+    ),
+    "label export": Verb(
+        p.LabelExportParams, "labels.exchange:export_labels", "Write labels for another labelling tool."
+    ),
     "label accept": Verb(p.LabelAcceptParams, "labels.accept:accept", "Give the run the classes of the marks."),
     "blend": Verb(p.BlendParams, "blender.blend:blend", "Write a .blend with cameras, points, mesh and materials."),
     "package": Verb(p.PackageParams, "blender.package:package", "Prepare cameras, points and mesh for Blender."),

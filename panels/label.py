@@ -81,9 +81,7 @@ def draw_label(layout: UILayout, context: Context) -> None:
     side.operator("fieldwork.class_remove", text="", icon="REMOVE")
     if 0 <= settings.class_index < len(settings.classes):
         entry = settings.classes[settings.class_index]
-        note = layout.row()
-        note.active = False
-        note.label(text=states.class_line(states.facts(context), entry.name, entry.id), translate=False)
+        draw_wrapped(layout, states.class_line(states.facts(context), entry.name, entry.id), text_width(context))
     shown = editor.shown_photo(folder)
     row = layout.row(align=True)
     if shown is None:

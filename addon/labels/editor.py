@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 import bpy
 
 from ..project import snapshot
-from ..render.slot import is_of, load_image
+from ..render.slot import load_image
 
 PHOTO = "fieldwork_label_photo"  # on images: the name of the photo in its project
 TOOL = "fieldwork.label"
@@ -27,7 +28,11 @@ def photo_of(image: bpy.types.Image | None, folder: Path | None) -> dict[str, An
     if image is None or folder is None or PHOTO not in image:
         return None
     found = photos(folder).get(str(image[PHOTO]))
-    return found if found is not None and is_of(image, folder / found["file"]) else None
+    if found is None or image.library is not None:
+        return None
+    # A saved file may have the path relative to itself, by another way.
+    same = os.path.realpath(bpy.path.abspath(image.filepath)) == os.path.realpath(folder / found["file"])
+    return found if same else None
 
 
 def spaces() -> Iterator[tuple[bpy.types.Window, bpy.types.Area]]:
@@ -68,9 +73,8 @@ def show(folder: Path, photo: dict[str, Any]) -> bpy.types.Image:
             space.show_region_toolbar = space.show_region_tool_header = True
             with _within(window, area):
                 bpy.ops.wm.tool_set_by_id(name=TOOL, space_type="IMAGE_EDITOR")
-        if before != image:
-            with _within(window, area):
-                bpy.ops.image.view_all(fit_view=True)
+        with _within(window, area):
+            bpy.ops.image.view_all(fit_view=True)
         area.tag_redraw()
     return image
 

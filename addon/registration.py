@@ -36,6 +36,7 @@ MODULES = (
     "operators.picking",
     "operators.region",
     "operators.label",
+    "operators.label_files",
     "operators.label_tool",
     "operators.train",
     "operators.render",

@@ -99,6 +99,9 @@ def draw_label(layout: UILayout, context: Context) -> None:
     column = columns(layout)
     column.prop(settings, "label_author")
     column.prop(settings, "label_seconds")
+    row = layout.row(align=True)
+    row.operator("fieldwork.label_import", text=t("Import…"), icon="IMPORT")
+    row.operator("fieldwork.label_export", text=t("Export…"), icon="EXPORT")
 
 
 def draw_tools(layout: UILayout, settings: Any) -> None:

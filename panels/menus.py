@@ -32,6 +32,8 @@ class FIELDWORK_MT_steps(Menu):
         layout.operator("fieldwork.label_next")
         layout.operator("fieldwork.label_overlay")
         layout.operator("fieldwork.label_accept")
+        layout.operator("fieldwork.label_import", text=t("Import Labels…"))
+        layout.operator("fieldwork.label_export", text=t("Export Labels…"))
         layout.operator("fieldwork.bake")
         layout.operator("fieldwork.evaluate", text=t("Measure Baked Field")).baked = True
         layout.operator("fieldwork.render", text=t("Render Baked Field")).baked = True

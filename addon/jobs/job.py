@@ -37,6 +37,8 @@ TITLES = {
     "label propagate": "Propagating",
     "label overlay": "Drawing Labels",
     "label next": "Finding the Next Photo",
+    "label import": "Importing Labels",
+    "label export": "Exporting Labels",
     "label accept": "Accepting Labels",
     "blend": "Writing .blend",
     "export": "Exporting",

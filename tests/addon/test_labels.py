@@ -357,3 +357,39 @@ answer(seen)
 
     for values in facts[1:]:
         LabelStrokeParams.model_validate({"project": tmp_path, "photo": "a", "points": [(1, 1)], **values})
+
+
+def test_labels_are_imported_and_exported_by_the_engine(bpy_script, tmp_path):
+    """What the operators ask for is what the verbs take."""
+    facts = bpy_script(
+        SETUP
+        + """
+from fieldwork.addon.jobs.queue import queue
+asked = []
+def run(job):
+    asked.append([job.verb, job.params])
+    job.state, job.result = "done", {"photos": 3}
+    if job.on_done:
+        job.on_done(job)
+    return job.result
+queue.run = run
+settings.project = project
+seen = [attempt(lambda: bpy.ops.fieldwork.label_import()), attempt(lambda: bpy.ops.fieldwork.label_export())]
+bpy.ops.fieldwork.label_import(filepath="/data/annotations.xml", format="cvat", replace=True)
+settings.class_index = 1
+bpy.ops.fieldwork.label_export(filepath="/data/labels", format="coco")
+bpy.ops.fieldwork.label_export(filepath="/data/masks", format="masks", source="marks", revision=2)
+answer([seen, asked])
+""",
+        project=make_posed_project(tmp_path / "p"),
+    )
+    (nothing, nowhere), asked = facts
+    assert "Choose a file" in nothing
+    assert "Choose a file" in nowhere
+    from fieldwork.nerfcore.params import LabelExportParams, LabelImportParams
+
+    read = LabelImportParams.model_validate(asked[0][1])
+    assert (read.file, read.format, read.replace) == (Path("/data/annotations.xml"), "cvat", True)
+    files, masks = (LabelExportParams.model_validate(params) for _, params in asked[1:])
+    assert (files.out, files.format, files.source) == (Path("/data/labels.json"), "coco", "maps")
+    assert (masks.out, masks.class_name, masks.revision) == (Path("/data/masks"), "gold", 2)

@@ -145,6 +145,8 @@ RENAMED = {
     ("dataset", "blend"): None,  # the file that is open
     ("dataset", "path"): "path_kind",
     ("dataset", "center"): "around",
+    ("label import", "file"): "filepath",
+    ("label export", "out"): "filepath",
     ("classes", "classes"): None,  # those of the list in the scene
     ("region", "bounds"): None,  # those of the box in the scene
     ("region", "clear"): None,  # crop_remove

@@ -31,6 +31,7 @@ class Live:
 live: Live | None = None
 _handle: Any = None
 _textures: dict[tuple[Any, ...], Any] = {}
+_linear: bool | None = None  # whether this Blender takes the colors of textures as linear; None: not known yet
 KEPT = 4  # textures
 
 
@@ -81,8 +82,33 @@ def _overlay(folder: Path, settings: Any, photo: str, colors: dict[int, tuple[fl
             return None
         while len(_textures) >= KEPT:
             del _textures[next(iter(_textures))]
-        _textures[key] = texture_of(results.overlay(found, surfels, colors, results.void_of(folder), confidence))
+        picture = results.overlay(found, surfels, colors, results.void_of(folder), confidence)
+        if takes_linear():
+            picture[..., :3] = results.linear(picture[..., :3])
+        _textures[key] = texture_of(picture)
     return _textures[key]
+
+
+def takes_linear() -> bool:
+    """Whether the colors of textures are taken as linear here: Blender changed that, while plain colors stayed sRGB. Found
+    out by drawing the same grey both ways into the lower left corner; called while an editor is drawn."""
+    global _linear
+    if _linear is None:
+        import gpu
+        import numpy as np
+
+        corner = [(0, 0), (2, 0), (2, 2), (0, 2)]
+        grey, seen = (0.5, 0.5, 0.5, 1.0), []
+        frame = gpu.state.active_framebuffer_get()
+        left, bottom, *_ = gpu.state.viewport_get()
+        for textured in (False, True):
+            if textured:
+                _textured(texture_of(np.full((2, 2, 4), grey, np.float32)), corner, 1.0)
+            else:
+                _fan(corner, grey)
+            seen.append(frame.read_color(left, bottom, 1, 1, 3, 0, "FLOAT").to_list()[0][0][0])
+        _linear = abs(seen[1] - seen[0]) > 0.1
+    return _linear
 
 
 def texture_of(picture: Any) -> Any:
@@ -96,16 +122,18 @@ def texture_of(picture: Any) -> Any:
 
 
 def _draw_texture(texture: Any, region: bpy.types.Region, opacity: float) -> None:
+    """Draw the texture over the whole photo."""
+    (left, bottom), (right, top) = (region.view2d.view_to_region(u, u, clip=False) for u in (0.0, 1.0))
+    _textured(texture, [(left, bottom), (right, bottom), (right, top), (left, top)], opacity)
+
+
+def _textured(texture: Any, corners: Sequence[Sequence[float]], opacity: float) -> None:
+    """A texture between four corners, from the lower left against the clock."""
     import gpu
     from gpu_extras.batch import batch_for_shader
 
-    (left, bottom), (right, top) = (region.view2d.view_to_region(u, u, clip=False) for u in (0.0, 1.0))
     shader = gpu.shader.from_builtin("IMAGE_COLOR")
-    corners = {
-        "pos": [(left, bottom), (right, bottom), (right, top), (left, top)],
-        "texCoord": [(0, 0), (1, 0), (1, 1), (0, 1)],
-    }
-    batch = batch_for_shader(shader, "TRI_FAN", corners)
+    batch = batch_for_shader(shader, "TRI_FAN", {"pos": corners, "texCoord": [(0, 0), (1, 0), (1, 1), (0, 1)]})
     shader.uniform_sampler("image", texture)
     shader.uniform_float("color", (1.0, 1.0, 1.0, opacity))
     batch.draw(shader)
@@ -158,13 +186,17 @@ def _line(places: Sequence[Sequence[float]], width: float, color: Sequence[float
 def _disc(x: float, y: float, radius: float, color: Sequence[float]) -> None:
     from math import cos, pi, sin
 
+    _fan([(x + radius * cos(2 * pi * i / CIRCLE), y + radius * sin(2 * pi * i / CIRCLE)) for i in range(CIRCLE)], color)
+
+
+def _fan(corners: Sequence[Sequence[float]], color: Sequence[float]) -> None:
+    """A convex area in one color."""
     import gpu
     from gpu_extras.batch import batch_for_shader
 
-    rim = [(x + radius * cos(2 * pi * i / CIRCLE), y + radius * sin(2 * pi * i / CIRCLE)) for i in range(CIRCLE)]
     shader = gpu.shader.from_builtin("UNIFORM_COLOR")
     shader.uniform_float("color", color)
-    batch_for_shader(shader, "TRI_FAN", {"pos": [(px, py, 0.0) for px, py in rim]}).draw(shader)
+    batch_for_shader(shader, "TRI_FAN", {"pos": [(x, y, 0.0) for x, y in corners]}).draw(shader)
 
 
 def register() -> None:

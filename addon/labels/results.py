@@ -129,6 +129,11 @@ def overlay(
     return np.ascontiguousarray(picture[::-1])
 
 
+def linear(srgb: np.ndarray) -> np.ndarray:
+    """Linear light of sRGB values in [0, 1]."""
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
 def void_of(folder: Path) -> int:
     """The id in label maps that stands for no class."""
     return int((snapshot.project(folder) or {}).get("ignore_id", 0))

@@ -488,6 +488,45 @@ class LabelExportParams(Params):
     class_name: str = Field(default="", max_length=200, description="class that is white in masks")
 
 
+class AssistEmbedParams(Params):
+    project: Path
+    encoder: Path = Field(description="ONNX file of the encoder of a SAM, MobileSAM, SAM 2 or EfficientSAM")
+    decoder: Path = Field(description="ONNX file of its decoder")
+    photos: list[str] = Field(default=[], description="names of the photos; default: all")
+
+
+class AssistSegmentParams(Params):
+    project: Path
+    photo: str = Field(description="name of the photo")
+    encoder: Path = Field(description="ONNX file of the encoder of a SAM, MobileSAM, SAM 2 or EfficientSAM")
+    decoder: Path = Field(description="ONNX file of its decoder")
+    points: list[tuple[float, float]] = Field(default=[], max_length=1000, description="pixels x,y inside of the thing")
+    outside: list[tuple[float, float]] = Field(default=[], max_length=1000, description="pixels x,y outside of it")
+    box: tuple[float, float, float, float] | None = Field(
+        default=None, description="left, top, right and bottom of a box around it in pixels"
+    )
+    class_id: int | None = Field(default=None, ge=0, le=65535, description="class of the mark that is made of it")
+    void: bool = Field(default=False, description="make it a mark of what is none of the classes")
+    author: str = Field(default="", max_length=200, description="who made the mark")
+    key: str = Field(default="", max_length=64, description="a mark sent again with the same key is not made again")
+
+    @model_validator(mode="after")
+    def _something(self) -> Self:
+        if not self.points and self.box is None:
+            raise ValueError("give points or a box")
+        if self.class_id is not None and self.void:
+            raise ValueError("give one of class_id and void")
+        return self
+
+
+class AssistSuggestParams(Params):
+    project: Path
+    model: Path = Field(description="ONNX file of a model from pictures to logits of classes, such as SegFormer")
+    mapping: Path = Field(description="JSON file with the project's class of each class of the model: {number: name}")
+    photos: list[str] = Field(default=[], description="names of the photos; default: all")
+    least: float = Field(default=0.5, ge=0, le=1, description="probability from which a pixel gets a class")
+
+
 class ReportParams(Params):
     project: Path
     run: RunName = "main"

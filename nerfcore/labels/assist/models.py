@@ -71,7 +71,7 @@ class Model:
         try:
             self.session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
         except Exception as error:
-            first = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+            first = _first_line(error)
             raise InputError(
                 f"{path} is no ONNX model that can be run: {first}.", "Export the model once more."
             ) from error
@@ -84,11 +84,14 @@ class Model:
     def has_output(self, name: str) -> bool:
         return any(port.name == name for port in self.outputs)
 
-    def bind(self, what: str, wanted: Sequence[Wanted], outputs: bool = False) -> list[Port]:
+    def bind(self, what: str, wanted: Sequence[Wanted], outputs: bool = False, also: Sequence[str] = ()) -> list[Port]:
         """The port of each wanted one: by name, else the only one left that fits by rank and channels.
 
+        Args:
+            also: inputs that there may be.
         Raises:
-            InputError: a port is missing or of another shape. It names what was expected and what was found.
+            InputError: a port is missing or of another shape, or there are inputs more. It names what was expected and
+            what was found.
         """
         ports = self.outputs if outputs else self.inputs
         found: list[Port | None] = [next((p for p in ports if p.name in w.names), None) for w in wanted]
@@ -97,7 +100,8 @@ class Model:
                 left = [p for p in ports if p not in found and want.fits(p)]
                 found[number] = left[0] if len(left) == 1 else None
         bound = [port for port, want in zip(found, wanted) if port is not None and want.fits(port)]
-        if len(bound) < len(wanted):
+        more = [] if outputs else [port for port in ports if port not in bound and port.name not in also]
+        if len(bound) < len(wanted) or more:
             side = "outputs" if outputs else "inputs"
             raise InputError(
                 f"{self.path.name} is not {what}: expected {side} are {'; '.join(str(w) for w in wanted)}; found "
@@ -116,6 +120,10 @@ class Model:
             raise InputError(
                 f"{self.path.name} failed with {given}: {first}.", "Export the model once more."
             ) from error
+
+
+def _first_line(error: Exception) -> str:
+    return next(iter(str(error).strip().splitlines()), type(error).__name__).rstrip(".")
 
 
 def _port(entry: Any) -> Port:

@@ -52,6 +52,7 @@ class Segmenter:
         Wanted(("has_mask_input",), (1,)),
         Wanted(("orig_im_size",), (1,)),
     )
+    also: tuple[str, ...] = ()  # inputs that some decoders have
     encoder_outputs = (Wanted(("image_embeddings", "image_embed", "embeddings"), (4,)),)
     image = Wanted(("image", "input_image", "images", "x", "input"), (3, 4))
     masks = Wanted(("masks", "low_res_masks"), (4,))
@@ -62,7 +63,7 @@ class Segmenter:
         self.encoder, self.decoder = encoder, decoder
         (self.input,) = encoder.bind(f"the encoder of {self.name}", [self.image])
         self.embeddings = encoder.bind(f"the encoder of {self.name}", self.encoder_outputs, outputs=True)
-        self.prompts = decoder.bind(f"the decoder of {self.name}", self.decoder_inputs)
+        self.prompts = decoder.bind(f"the decoder of {self.name}", self.decoder_inputs, also=self.also)
         self.results = decoder.bind(f"the decoder of {self.name}", [self.masks, self.scores], outputs=True)
         self.side = next((size for size in self.input.shape[-2:] if size and size > 3), SIDE)
 
@@ -122,6 +123,7 @@ class Sam2(Segmenter):
         Wanted(("mask_input",), (4,), 1),
         Wanted(("has_mask_input",), (1,)),
     )
+    also = ("orig_im_size",)
     encoder_outputs = (
         Wanted(("image_embed", "image_embeddings"), (4,)),
         Wanted(("high_res_feats_0",), (4,)),

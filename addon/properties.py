@@ -81,7 +81,7 @@ LABEL_TOOLS = [
     (
         "click",
         "Click",
-        "Click a part of the surface that looks alike: all of it belongs to the class",
+        "Click a part of the surface that looks alike, or with a model a thing: all of it belongs to the class",
         "RESTRICT_SELECT_OFF",
         1,
     ),
@@ -290,6 +290,15 @@ class FieldworkScene(PropertyGroup):
         default=15.0,
         min=1.0,
         soft_max=120.0,
+    )
+    label_encoder: StringProperty(
+        name="Encoder",
+        description="ONNX file of the encoder of a SAM, MobileSAM, SAM 2 or EfficientSAM, by which Click cuts things out; "
+        "empty: Click takes a part of the surface",
+        subtype="FILE_PATH",
+    )
+    label_decoder: StringProperty(
+        name="Decoder", description="ONNX file of the decoder of the same model", subtype="FILE_PATH"
     )
     label_revision: IntProperty(
         name="Revision", description="Which revision of the marks undo comes back to", default=-1, options={"HIDDEN"}

@@ -37,6 +37,7 @@ MODULES = (
     "operators.region",
     "operators.label",
     "operators.label_files",
+    "operators.label_models",
     "operators.label_tool",
     "operators.train",
     "operators.render",

@@ -11,6 +11,7 @@ from ..addon.labels import draw, editor, session
 from ..addon.project import snapshot
 from ..addon.text import t
 from .base import engine_reason
+from .label_models import cut_out
 
 LEAST_STEP = 1.0  # pixels of the screen between two points of a stroke
 DIGITS = 2  # of pixels in the journal
@@ -41,7 +42,7 @@ class FIELDWORK_OT_label_mark(Operator):
         draw.live = draw.Live(str(photo["name"]), {**params, "photo": str(photo["name"])})
         self._area, self._region = context.area, context.region
         self._add(event)
-        if params["shape"] == "part":
+        if params["shape"] == "part" and not params.get("box"):
             return self._finish(context)
         context.window_manager.modal_handler_add(self)
         return {"RUNNING_MODAL"}
@@ -63,19 +64,32 @@ class FIELDWORK_OT_label_mark(Operator):
         place = (event.mouse_x - self._region.x, event.mouse_y - self._region.y)
         if max(abs(a - b) for a, b in zip(place, self._last)) >= LEAST_STEP:
             self._last = place
-            x, y = editor.pixel_at(self._region, self._size, *place)
-            draw.live.points.append((round(x, DIGITS), round(y, DIGITS)))
+            x, y = (round(v, DIGITS) for v in editor.pixel_at(self._region, self._size, *place))
+            if draw.live.params.get("box") and draw.live.points:  # its corners, along the way that an outline goes
+                left, top = draw.live.points[0]
+                draw.live.points = [(left, top), (x, top), (x, y), (left, y)]
+            else:
+                draw.live.points.append((x, y))
 
     def _finish(self, context: Context) -> set[str]:
         stroke, draw.live = draw.live, None
         settings = context.scene.fieldwork
-        session.mark(snapshot.folder_of(settings), {**stroke.params, "points": stroke.points})
+        folder = snapshot.folder_of(settings)
         self._area.tag_redraw()
+        if stroke.params.get("box"):
+            try:
+                cut_out(settings, folder, stroke.photo, stroke.points[:: max(1, len(stroke.points) // 2)][:2])
+            except RuntimeError as error:
+                self.report({"ERROR"}, str(error))
+                return {"CANCELLED"}
+        else:
+            session.mark(folder, {**stroke.params, "points": stroke.points})
         return {"FINISHED"}
 
 
 def mark_parameters(settings: Any, erase: bool = False) -> dict[str, Any] | None:
-    """What a mark with the chosen tool says, as parameters of `label stroke`; None where no class is chosen."""
+    """What a mark with the chosen tool says, as parameters of `label stroke`; None where no class is chosen. `box`: a model is
+    to be asked."""
     tool = "erase" if erase else settings.label_tool
     params: dict[str, Any] = {"shape": "line", "width": settings.label_width, "author": settings.label_author}
     if tool == "erase":
@@ -85,6 +99,8 @@ def mark_parameters(settings: Any, erase: bool = False) -> dict[str, Any] | None
     if not 0 <= settings.class_index < len(settings.classes):
         return None
     shape = {"shape": "part", "width": 2.0} if tool == "click" else {}
+    if shape and settings.label_encoder and settings.label_decoder:
+        shape = {"shape": "outline", "width": 2.0, "box": True}  # a model cuts out what is clicked or boxed
     return {**params, **shape, "class_id": settings.classes[settings.class_index].id}
 
 

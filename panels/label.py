@@ -107,7 +107,13 @@ def draw_label(layout: UILayout, context: Context) -> None:
 def draw_tools(layout: UILayout, settings: Any) -> None:
     layout.row(align=True).prop(settings, "label_tool", expand=True)
     column = columns(layout)
-    if settings.label_tool != "click":
+    if settings.label_tool == "click":
+        column.prop(settings, "label_encoder")
+        column.prop(settings, "label_decoder")
+        if settings.label_encoder and settings.label_decoder:
+            layout.operator("fieldwork.assist_embed", icon="IMAGE_DATA")
+        column = columns(layout)
+    else:
         column.prop(settings, "label_width")
     column.prop(settings, "label_view")
     column.prop(settings, "label_opacity", slider=True)

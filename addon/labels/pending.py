@@ -90,6 +90,11 @@ def tell(folder: Path, error: EngineError) -> None:
     _errors[folder] = error
 
 
+def fulfilled(folder: Path, revision: int) -> None:
+    """A mark is in the journal that nobody here sent."""
+    _taken.append(Taken(folder, "label stroke", revision))
+
+
 def take() -> list[Taken]:
     """What was fulfilled since the last call, oldest first."""
     found = list(_taken)

@@ -46,6 +46,13 @@ def mark(folder: Path, params: dict[str, Any]) -> None:
         raise wrong
 
 
+def taken(folder: Path, revision: int) -> None:
+    """A mark that the engine made by itself is in the journal."""
+    _live.add(folder)
+    pending.fulfilled(folder, revision)
+    hurry()
+
+
 def job_of(folder: Path | None) -> Job | None:
     """The job that prepares or propagates for a project, if any."""
     jobs = (*queue.landing.jobs, queue.running, queue.followed, *queue.waiting)

@@ -343,6 +343,8 @@ for tool in ("brush", "click", "erase", "void"):
     seen.append(mark_parameters(settings))
 settings.label_tool = "brush"
 seen.append(mark_parameters(settings, erase=True))
+settings.label_tool, settings.label_encoder, settings.label_decoder = "click", "e.onnx", "d.onnx"
+seen.append(mark_parameters(settings))
 answer(seen)
 """,
         project=make_posed_project(tmp_path / "p"),
@@ -353,9 +355,10 @@ answer(seen)
     assert facts[2] == {**common, "shape": "part", "width": 2.0, "class_id": 2}
     assert facts[3] == facts[5] == {**common, "shape": "line", "erase": True}
     assert facts[4] == {**common, "shape": "line", "void": True}
+    assert facts[6]["box"], "with a model a click asks it"
     from fieldwork.nerfcore.params import LabelStrokeParams
 
-    for values in facts[1:]:
+    for values in facts[1:6]:
         LabelStrokeParams.model_validate({"project": tmp_path, "photo": "a", "points": [(1, 1)], **values})
 
 
@@ -393,3 +396,52 @@ answer([seen, asked])
     files, masks = (LabelExportParams.model_validate(params) for _, params in asked[1:])
     assert (files.out, files.format, files.source) == (Path("/data/labels.json"), "coco", "maps")
     assert (masks.out, masks.class_name, masks.revision) == (Path("/data/masks"), "gold", 2)
+
+
+def test_clicks_and_boxes_go_to_the_model_and_come_back_as_marks(bpy_script, tmp_path):
+    facts = bpy_script(
+        SETUP
+        + """
+from fieldwork.addon.jobs.queue import queue
+from fieldwork.addon.labels import pending
+from fieldwork.operators.label_models import cut_out
+asked = []
+def run(job):
+    asked.append([job.verb, job.params])
+    job.state, job.result = "done", {"revision": 7}
+    if job.on_done:
+        job.on_done(job)
+    return job.result
+queue.run = run
+settings.project = project
+folder = Path(project)
+settings.label_encoder, settings.label_decoder, settings.class_index = "/m/e.onnx", "/m/d.onnx", 1
+cut_out(settings, folder, "a", [(10.5, 20.0), (11.0, 20.0)])
+revision = settings.label_revision
+cut_out(settings, folder, "a", [(30.0, 5.0), (10.0, 25.0)])
+bpy.ops.fieldwork.assist_segment(photo="a", points="1,2 3,4", outside="9,9", void=True)
+bpy.ops.fieldwork.assist_embed(photos="a, b")
+bpy.ops.fieldwork.assist_suggest(model="/m/s.onnx", mapping="/m/c.json", least=0.25)
+wrong = attempt(lambda: bpy.ops.fieldwork.assist_segment(photo="a", points="1;2"))
+answer([asked, revision, wrong])
+""",
+        project=make_posed_project(tmp_path / "p"),
+    )
+    asked, revision, wrong = facts
+    from fieldwork.nerfcore import params as p
+
+    models = [
+        p.AssistSegmentParams,
+        p.AssistSegmentParams,
+        p.AssistSegmentParams,
+        p.AssistEmbedParams,
+        p.AssistSuggestParams,
+    ]
+    click, box, void, ahead, guess = (model.model_validate(values) for model, (_, values) in zip(models, asked))
+    assert (click.points, click.box, click.class_id) == ([(10.5, 20.0)], None, 2)
+    assert (box.points, box.box) == ([], (10.0, 5.0, 30.0, 25.0))
+    assert (void.points, void.outside, void.void, void.class_id) == ([(1, 2), (3, 4)], [(9, 9)], True, None)
+    assert ahead.photos == ["a", "b"]
+    assert (guess.model, guess.least) == (Path("/m/s.onnx"), 0.25)
+    assert revision == 7, "what was cut out is a step of undo"
+    assert "are no places" in wrong

@@ -52,7 +52,10 @@ NAMED = {
     "label overlay": {"out"},
 }
 # What verbs of two words have in common.
-GROUPS = {"label": "Label a scene by a few marks on its photos."}
+GROUPS = {
+    "label": "Label a scene by a few marks on its photos.",
+    "assist": "Let models that you bring help with labelling.",
+}
 ORDER = {"import": ["dataset", "project"], "compare": ["project", "other"]}
 # Parameters that the command line takes from a file only.
 FILES = {"classes": {"classes"}}

@@ -52,7 +52,24 @@ VERBS = {
     ),
     "label overlay": Verb(p.LabelOverlayParams, "labels.overlay:overlay", "Draw the labels of a photo."),
     "label next": Verb(p.LabelNextParams, "labels.next_photo:next_photo", "Find the photo to mark next."),
+    "label import": Verb(
+        p.LabelImportParams, "labels.exchange:import_labels", "Read labels of another labelling tool."
+    ),
+    "label export": Verb(
+        p.LabelExportParams, "labels.exchange:export_labels", "Write labels for another labelling tool."
+    ),
     "label accept": Verb(p.LabelAcceptParams, "labels.accept:accept", "Give the run the classes of the marks."),
+    "assist embed": Verb(
+        p.AssistEmbedParams, "labels.assist.verbs:embed", "Encode photos ahead for clicks, with a model you bring."
+    ),
+    "assist segment": Verb(
+        p.AssistSegmentParams,
+        "labels.assist.verbs:segment",
+        "Cut out a thing by clicks or a box, with a model you bring.",
+    ),
+    "assist suggest": Verb(
+        p.AssistSuggestParams, "labels.assist.verbs:suggest", "Guess the classes of photos, with a model you bring."
+    ),
     "blend": Verb(p.BlendParams, "blender.blend:blend", "Write a .blend with cameras, points, mesh and materials."),
     "package": Verb(p.PackageParams, "blender.package:package", "Prepare cameras, points and mesh for Blender."),
     "export": Verb(p.ExportParams, "export.verb:export", "Write what other programs read."),

@@ -41,7 +41,7 @@ class FIELDWORK_PT_classes(StepPanel):
         if not count:
             note = layout.row()
             note.active = False
-            note.label(text=t("Choose a folder of labels under Capture"))
+            note.label(text=t("Choose a folder of labels under Capture, or add classes under Label"))
             return
         labelled = sum(image.labelled for image in settings.images)
         layout.label(text=t("{} classes on {} photos", count, labelled))

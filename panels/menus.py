@@ -26,6 +26,17 @@ class FIELDWORK_MT_steps(Menu):
         layout.operator("fieldwork.train", text=t("Resume Training")).resume = True
         layout.operator("fieldwork.evaluate").baked = False
         layout.operator("fieldwork.render").baked = False
+        layout.operator("fieldwork.label_photo")
+        layout.operator("fieldwork.label_prepare")
+        layout.operator("fieldwork.label_propagate")
+        layout.operator("fieldwork.label_next")
+        layout.operator("fieldwork.label_overlay")
+        layout.operator("fieldwork.label_accept")
+        layout.operator("fieldwork.assist_embed")
+        layout.operator("fieldwork.assist_segment")
+        layout.operator("fieldwork.assist_suggest", text=t("Guess Classes…"))
+        layout.operator("fieldwork.label_import", text=t("Import Labels…"))
+        layout.operator("fieldwork.label_export", text=t("Export Labels…"))
         layout.operator("fieldwork.bake")
         layout.operator("fieldwork.evaluate", text=t("Measure Baked Field")).baked = True
         layout.operator("fieldwork.render", text=t("Render Baked Field")).baked = True

@@ -99,7 +99,7 @@ class Queue:
         return Job(
             verb,
             params,
-            id=f"{verb}-{time.strftime('%Y%m%d-%H%M%S')}-{self._number}",
+            id=f"{verb.replace(' ', '-')}-{time.strftime('%Y%m%d-%H%M%S')}-{self._number}",
             project=Path(folder) if folder else None,
             on_done=on_done,
             before=before,

@@ -13,10 +13,10 @@ from ..data.load import load_scene
 from ..evaluate.metrics import Confusion
 from ..images.working import nearest, read_label
 from ..labels.journal import Mark
+from ..labels.lookup import Labelling
 from ..labels.overlay import photo_labels
 from ..labels.preparation import Preparation
 from ..labels.propagation import appearance, propagated
-from ..labels.revisions import Labelling
 from ..labels.seeds import Seeds, seeds_of
 from ..progress import Reporter
 from .annotator import LEAST_PIXELS, WIDTH, Stroke, correction, first_strokes

@@ -31,9 +31,10 @@ from ..render.run import AcceptedLabels, RunInfo, load_trained, new_model, read_
 from ..train.checkpoint import write_checkpoint
 from .head import train_head
 from .journal import marks_at, read_marks
+from .lookup import Labelling
 from .overlay import photo_labels
 from .preparation import Preparation
-from .revisions import Labelling, computed
+from .revisions import computed
 from .seeds import VOID, seeds_of
 
 MAPS = "labels/revision_{}"  # of the project, for the label maps of a revision

@@ -26,12 +26,12 @@ JOURNAL = "journal.jsonl"
 SHOWN = "shown.json"
 LOCK_FILE = "jobs/marks.lock"
 
-Shape = Literal["line", "outline", "click"]
+Shape = Literal["line", "outline", "click", "part"]
 
 
 class Mark(BaseModel):
     """One mark on a photo: points in pixels of its working copy, brush width in the same. class_id: None for void and
-    for what erases."""
+    for what erases. key: which mark it is to whoever sent it."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
 
@@ -39,6 +39,7 @@ class Mark(BaseModel):
     parent: int = Field(ge=0)
     time: str = Field(default_factory=now)
     author: str = ""
+    key: str = ""
     photo: ImageName
     shape: Shape
     points: list[tuple[float, float]] = Field(min_length=1)
@@ -91,6 +92,8 @@ def _whole_lines(text: bytes) -> int:
 def append_mark(project: Path, values: dict[str, object]) -> Mark:
     """Append a mark to the journal, drawn on the revision that is shown, and show it. On disk when this returns.
 
+    A mark whose key is there already was sent twice: it is not appended again.
+
     Args:
         values: of `Mark`, but for revision, parent and time.
     Raises:
@@ -100,6 +103,9 @@ def append_mark(project: Path, values: dict[str, object]) -> Mark:
     path = project / FOLDER / JOURNAL
     with locked(path, project / LOCK_FILE):
         marks = read_marks(project)
+        sent = next((m for m in reversed(marks) if m.key and m.key == values.get("key")), None)
+        if sent is not None:
+            return sent
         mark = Mark.model_validate(
             {**values, "revision": len(marks) + 1, "parent": shown_revision(project, len(marks))}
         )

@@ -11,8 +11,9 @@ from ..params import LabelNextParams
 from ..progress import Reporter
 from ..project.store import load_project
 from .journal import marks_at, read_marks
+from .lookup import Labelling
 from .preparation import Preparation
-from .revisions import Labelling, computed
+from .revisions import computed
 
 BLANK_BONUS = 0.5  # of surfels that no class explains: what is there may be a class without marks; not tuned
 

@@ -17,8 +17,9 @@ from ..params import LabelOverlayParams
 from ..progress import Reporter
 from ..project.runs import run_folder
 from ..project.store import load_project
+from .lookup import Labelling
 from .preparation import Preparation
-from .revisions import Labelling, computed
+from .revisions import computed
 from .stroke import require_photo
 
 FOLDER = "overlays"

@@ -14,7 +14,6 @@ from __future__ import annotations
 import json
 import shutil
 import time
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -41,11 +40,11 @@ from ..project.runs import geometry_id, run_folder
 from ..project.store import load_project, world_from_sfm
 from ..render.run import Trained, load_trained, refined_poses
 from .graph import Graph, feature_columns, make_graph
+from .lookup import RECORD, UNREADABLE, part_of, photo_maps
+from .lookup import SURFELS as FOLDER
 from .rays import Hits, hits_of
 from .surfels import Surfels, cell_of, field_features, means, nearest_neighbours, nearest_surfel, shape_at
 
-FOLDER = "surfels"
-RECORD = "prepared.json"
 COUNT = 200_000
 CPU_SIDE, GPU_SIDE = 480, 1600  # longest side of a map
 CPU_PIXELS, GPU_PIXELS = 4e6, 1e8  # of all maps together
@@ -56,16 +55,6 @@ VERSION = 1  # of what is made; another one makes it again
 MATRIX = ("data", "indices", "indptr")
 
 
-@dataclass(frozen=True)
-class PhotoMap:
-    """Where the map of one photo lies: its name, width and height of the map, and its first pixel among those of all."""
-
-    name: str
-    width: int
-    height: int
-    first: int
-
-
 class Preparation:
     """A prepared run, its arrays memory-mapped."""
 
@@ -73,10 +62,11 @@ class Preparation:
         """Raises OSError, ValueError or KeyError where the folder holds no whole preparation."""
         record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
         self.folder, self.inputs = folder, record["inputs"]
-        self.photos = [PhotoMap(**photo) for photo in record["photos"]]
-        self.of_photo = {photo.name: photo for photo in self.photos}
+        self.of_photo = photo_maps(record)
+        self.photos = list(self.of_photo.values())
         self.surfels = Surfels(**{name: self._array(name) for name in Surfels.__dataclass_fields__})
         self.neighbours, self.features = self._array("neighbours"), self._array("features")
+        self.part = self._array("part")
         self.pixel_surfel, self.pixel_edge = self._array("pixel_surfel"), self._array("pixel_edge")
 
     def _array(self, name: str) -> np.ndarray:
@@ -91,14 +81,12 @@ class Preparation:
         photo = self.of_photo.get(name)
         if photo is None:
             raise InputError(f"The photo “{name}” has no pose.", "Choose another photo, or run `fieldwork poses`.")
-        part = slice(photo.first, photo.first + photo.width * photo.height)
-        shape = photo.height, photo.width
-        return self.pixel_surfel[part].reshape(shape), self.pixel_edge[part].reshape(shape)
+        return part_of(self.pixel_surfel, photo), part_of(self.pixel_edge, photo)
 
     @cached_property
     def graph(self) -> Graph:
         """The graph of the surfels."""
-        return Graph(self._matrix("edges"), self._matrix("coarse"), np.array(self._array("part")))
+        return Graph(self._matrix("edges"), self._matrix("coarse"), np.array(self.part))
 
     def _matrix(self, name: str) -> csr_matrix:
         parts = [np.array(self._array(f"{name}_{part}")) for part in MATRIX]
@@ -147,7 +135,7 @@ def current(folder: Path, run: str, count: int | None = None) -> Preparation | N
     """
     try:
         ready = Preparation(run_folder(folder, run) / FOLDER)
-    except (OSError, ValueError, KeyError, TypeError):
+    except UNREADABLE:
         return None
     wanted = prepared_inputs(folder, run, ready.inputs.get("surfels") if count is None else count)
     return ready if ready.inputs == wanted else None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,10 @@ from ..params import LabelPropagateParams
 from ..progress import Reporter
 from ..project.store import load_project
 from .journal import marks_at, read_marks, shown_revision
+from .lookup import Labelling
 from .preparation import Preparation, ensured
 from .propagation import propagated
-from .revisions import Labelling, load, made_of, path_of, save
+from .revisions import load, made_of, path_of, save
 from .seeds import seeds_of
 
 
@@ -43,10 +45,9 @@ def propagate(params: LabelPropagateParams, report: Reporter) -> dict[str, Any]:
     start = warm_start(folder, params.run, ready, class_ids, at[-1].parent if at else None)
     probability = propagated(ready, seeds, len(class_ids), start, report.check)
     labelling = Labelling(revision, probability, np.array(class_ids, np.int32), made_of(ready, at, class_ids))
-    file = save(folder, params.run, labelling)
     label, sure = labelling.label(project.ignore_id), labelling.confidence()
     names = {c.id: c.name for c in project.classes}
-    return {
+    told = {
         "revision": revision,
         "marks": len(at),
         "surfels": len(label),
@@ -59,8 +60,8 @@ def propagate(params: LabelPropagateParams, report: Reporter) -> dict[str, Any]:
         "conflicts": seeds.conflicts,
         "unused": seeds.unused,
         "seconds": round(time.perf_counter() - begin, 3),
-        "file": str(file),
     }
+    return {**told, "file": str(save(folder, params.run, replace(labelling, told=told)))}
 
 
 def warm_start(

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 
@@ -13,35 +12,10 @@ from ..files import atomic_path
 from ..project.fingerprints import digest
 from ..project.runs import run_folder
 from .journal import Mark, marks_at, read_marks, shown_revision
+from .lookup import REVISIONS, Labelling, read_labelling
 from .preparation import Preparation, current
 
-FOLDER = "revisions"
 KEPT = 32  # results; the oldest go first
-LEAST = 0.5  # probability of all classes together below which a surfel is void
-
-
-@dataclass(frozen=True)
-class Labelling:
-    """What a revision says of N surfels: probability (N, C) of each class, what is missing to 1 being void; class_ids (C,);
-    made: digest of the marks and the preparation it comes from."""
-
-    revision: int
-    probability: np.ndarray
-    class_ids: np.ndarray
-    made: str
-
-    def label(self, void: int) -> np.ndarray:
-        """Class id (N,) int32 of each surfel; `void` where no class explains it."""
-        if not len(self.class_ids):
-            return np.full(len(self.probability), void, np.int32)
-        best = self.class_ids[self.probability.argmax(1)]
-        return np.where(self.probability.sum(1) > LEAST, best, void).astype(np.int32)
-
-    def confidence(self) -> np.ndarray:
-        """Probability (N,) float32 of what `label` says, void included."""
-        total = self.probability.sum(1)
-        best = self.probability.max(1, initial=0)
-        return np.where(total > LEAST, best, 1 - total).clip(0, 1).astype(np.float32)
 
 
 def made_of(ready: Preparation, marks: list[Mark], class_ids: list[int]) -> str:
@@ -50,7 +24,7 @@ def made_of(ready: Preparation, marks: list[Mark], class_ids: list[int]) -> str:
 
 
 def path_of(project: Path, run: str, revision: int) -> Path:
-    return run_folder(project, run) / FOLDER / f"{revision}.npz"
+    return run_folder(project, run) / REVISIONS / f"{revision}.npz"
 
 
 def save(project: Path, run: str, labelling: Labelling) -> Path:
@@ -63,6 +37,7 @@ def save(project: Path, run: str, labelling: Labelling) -> Path:
             probability=labelling.probability.astype(np.float16),
             class_ids=labelling.class_ids,
             made=labelling.made,
+            told=json.dumps(labelling.told),
         )
     others = sorted(path.parent.glob("*.npz"), key=lambda p: p.stat().st_mtime)
     for old in others[:-KEPT]:
@@ -72,12 +47,7 @@ def save(project: Path, run: str, labelling: Labelling) -> Path:
 
 def load(project: Path, run: str, revision: int) -> Labelling | None:
     """The labels of a revision; None where they were not computed or cannot be read."""
-    try:
-        with np.load(path_of(project, run, revision), allow_pickle=False) as data:
-            probability = data["probability"].astype(np.float32)
-            return Labelling(int(data["revision"]), probability, data["class_ids"], str(data["made"]))
-    except (OSError, ValueError, KeyError, BadZipFile):
-        return None
+    return read_labelling(path_of(project, run, revision))
 
 
 def computed(project: Path, run: str, revision: int | None) -> tuple[Preparation, Labelling]:

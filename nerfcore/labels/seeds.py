@@ -65,11 +65,13 @@ def seeds_of(
 
 
 def marked_surfels(ready: Preparation, mark: Mark, size: tuple[int, int]) -> np.ndarray:
-    """The surfels (S,) that a mark on a photo of this width and height covers, each once."""
+    """The surfels (S,) that a mark on a photo of this width and height covers, each once; with shape "part" all those of
+    the parts that are covered."""
     surfel, edge = ready.map_of(mark.photo)
     rows, columns = surfel.shape
     scale = columns / size[0]
     points = np.array(mark.points, np.float64) * [scale, rows / size[1]]
     touched = covered(mark.shape, points, mark.width * scale, columns, rows) & (surfel >= 0)
     clear = touched & ~edge
-    return np.unique(surfel[touched if mark.erase else clear])
+    found = np.unique(surfel[touched if mark.erase else clear])
+    return np.flatnonzero(np.isin(ready.part, ready.part[found])) if mark.shape == "part" else found

@@ -37,7 +37,7 @@ def stroke(params: LabelStrokeParams, report: Reporter) -> dict[str, Any]:
             f"The mark lies outside the photo “{params.photo}”, which is {size[0]}×{size[1]}.",
             "Give pixels of the photo, its top-left corner being 0,0.",
         )
-    values = params.model_dump(include={"photo", "shape", "points", "width", "class_id", "erase", "author"})
+    values = params.model_dump(include={"photo", "shape", "points", "width", "class_id", "erase", "author", "key"})
     mark = append_mark(folder, values)
     marks = marks_at(read_marks(folder), mark.revision)
     return {"revision": mark.revision, "parent": mark.parent, "marks": len(marks)}

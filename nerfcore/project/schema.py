@@ -54,6 +54,7 @@ class ImageRecord(Model):
     exif: dict[str, Any] = {}
     sharpness: float | None = None
     label: OwnFile | None = None
+    instances: OwnFile | None = None  # numbers of the labelled things of this photo, 0 for none
     mask: OwnFile | None = None
     confidence: OwnFile | None = None  # how sure the labels are, 8-bit grey
     depth: OwnFile | None = None

@@ -145,6 +145,8 @@ RENAMED = {
     ("dataset", "blend"): None,  # the file that is open
     ("dataset", "path"): "path_kind",
     ("dataset", "center"): "around",
+    ("label import", "file"): "filepath",
+    ("label export", "out"): "filepath",
     ("classes", "classes"): None,  # those of the list in the scene
     ("region", "bounds"): None,  # those of the box in the scene
     ("region", "clear"): None,  # crop_remove
@@ -156,15 +158,14 @@ def test_every_verb_with_every_setting_is_an_operator(bpy_script):
     from fieldwork.nerfcore.verbs import VERBS
 
     # Edits that take no time are no jobs: the list of classes and the crop box make them.
-    # Labelling has no buttons yet: its verbs are called by scripts and over RPC.
-    jobs = {verb: entry for verb, entry in VERBS.items() if not entry.immediate and not verb.startswith("label ")}
+    jobs = {verb: entry for verb, entry in VERBS.items() if not entry.immediate}
     wanted = {verb: sorted(entry.params.model_fields) for verb, entry in jobs.items()}
     lacking = bpy_script(
         SETUP
         + """
 lacking = []
 for verb, names in wanted.items():
-    operator = operators.get(verb, verb)
+    operator = operators.get(verb, verb.replace(" ", "_"))
     if operator not in dir(bpy.ops.fieldwork):
         lacking.append(operator)
         continue

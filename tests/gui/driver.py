@@ -23,7 +23,7 @@ import bpy
 Steps = Iterator[float | None]
 TICK = 0.03
 PATIENCE = float(os.environ.get("FIELDWORK_GUI_PATIENCE", "1"))  # factor of all waiting, for a machine under load
-PANELS = ["capture", "poses", "classes", "train", "render", "mesh", "measure", "export", "engine"]
+PANELS = ["capture", "poses", "classes", "train", "label", "render", "mesh", "measure", "export", "engine"]
 PACKAGE = "bl_ext.user_default.fieldwork"
 BARE = {"life"}  # scenarios that install and enable the extension themselves
 
@@ -133,13 +133,16 @@ class Screen:
         """Distance of two headers of closed panels in pixels."""
         return 26 * bpy.context.preferences.system.ui_scale
 
-    def buttons(self, depth: float = 2000) -> Iterator[float | None]:
-        """Sweep the mouse down the sidebar; returns [(python command, x, y)] of all operator buttons seen."""
+    def buttons(self, depth: float = 2000, shares: tuple[float, ...] = ()) -> Iterator[float | None]:
+        """Sweep the mouse down the sidebar; returns [(python command, x, y)] of all operator buttons seen.
+
+        `shares`: where across its width the mouse goes down, if not at the usual places.
+        """
         found, region = [], self.sidebar
         top = region.y + region.height
         for y in range(top - 8, int(max(region.y + 4, top - depth)), -9):
             # The small button that stops a job stands at the right edge.
-            for share in (0.83,) if self.queue.current else (0.25, 0.72):
+            for share in shares or ((0.83,) if self.queue.current else (0.25, 0.72)):
                 x = region.x + region.width * share
                 self.move(x, y)
                 yield
@@ -154,9 +157,9 @@ class Screen:
                     found.append((command, x, y - 4))
         return found
 
-    def press_button(self, operator: str, depth: float = 260) -> Steps:
+    def press_button(self, operator: str, depth: float = 260, shares: tuple[float, ...] = ()) -> Steps:
         """Click the button of an operator in the sidebar, found as a hand with eyes closed would."""
-        buttons = yield from self.buttons(depth)
+        buttons = yield from self.buttons(depth, shares)
         places = [(x, y) for command, x, y in buttons if command.startswith(f"bpy.ops.{operator}(")]
         assert places, f"there is no button {operator} among {[command for command, _, _ in buttons]}"
         self.clicked = time.monotonic()
@@ -213,7 +216,7 @@ def main() -> None:
     if name not in BARE:
         bpy.ops.preferences.addon_enable(module=PACKAGE)
     sys.path.insert(0, str(Path(__file__).parent))
-    modules = [importlib.import_module(module) for module in ("scenarios", "sessions", "panels")]
+    modules = [importlib.import_module(module) for module in ("scenarios", "sessions", "panels", "labelling")]
     scenario = next(getattr(module, name) for module in modules if hasattr(module, name))
     screen = Screen(Path(folder))
     run(scenario(screen), screen)

@@ -16,6 +16,7 @@ LIMIT = 150_000  # bytes
 
 SIDEBAR = (1288, 84, 1548, None)
 VIEW = (0, 50, 1576, 980)
+PHOTO = (0, 250, 788, 790)
 # name: (screenshot, part of it, width in the guide)
 IMAGES = {
     "reconstruct": ("panels/one-button", SIDEBAR, 260),
@@ -33,6 +34,11 @@ IMAGES = {
     "trained": ("panels/all-train", SIDEBAR, 260),
     "paused": ("interruptions/paused", SIDEBAR, 260),
     "died": ("interruptions/died", SIDEBAR, 260),
+    "label": ("labels-sid/next", SIDEBAR, 260),
+    "label-first": ("labels-sid/propagating", VIEW, 900),
+    "label-next": ("labels-sid/next", PHOTO, 640),
+    "label-confidence": ("labels-sid/confidence", PHOTO, 640),
+    "label-kept": ("labels-sid/kept", SIDEBAR, 260),
     "render": ("panels/all-render", SIDEBAR, 260),
     "mesh": ("panels/all-mesh", SIDEBAR, 260),
     "export": ("panels/all-export", SIDEBAR, 260),

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import os
 import shutil
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 HERE = Path(__file__).parent
@@ -198,6 +200,125 @@ def test_edits_wait_for_the_engine_and_a_moved_project_is_found():
     assert name == "marble"
     assert_never_held_up(facts)
     assert {"unsaved", "gone", "found"} <= shots("edits")
+
+
+def unlabelled(folder: Path) -> Path:
+    """The simulated capture, its photos without labels, trained and prepared."""
+    from fieldwork.nerfcore.project.store import edit_project
+
+    if not (folder / "runs/main/surfels/prepared.json").is_file():
+        shutil.rmtree(folder, ignore_errors=True)
+        run = lambda *words: window.subprocess.run([sys.executable, "-m", "fieldwork.nerfcore", *words], check=True)  # noqa: E731
+        run("import", window.MUSEUM / "ground_truth", folder)
+        with edit_project(folder) as project:
+            project.classes = []
+            for image in project.images:
+                image.label = None
+        run("train", folder, "--preset", "draft", "--steps", "600")
+        run("label", "prepare", folder)
+    return folder
+
+
+def strokes_for(names: list[str], photos: list[str], seed: int) -> list[dict]:
+    """Strokes as a simulated annotator draws them on photos of the simulated capture."""
+    from fieldwork.nerfcore.bench.annotator import first_strokes
+    from fieldwork.nerfcore.images.working import read_label
+    from scipy.ndimage import uniform_filter1d
+
+    found = []
+    for photo in photos:
+        truth = read_label(window.MUSEUM / "labels" / f"{photo}.png")
+        for stroke in first_strokes(photo, truth, list(range(1, len(names) + 1)), seed):
+            points = uniform_filter1d(stroke.points, 5, axis=0, mode="nearest")  # a hand that is calm
+            points = np.clip(points, 4, np.array(truth.shape[::-1]) - 4)
+            found.append({"photo": photo, "class": stroke.class_id, "points": points.tolist()})
+    return found
+
+
+def share_that_is_right(project: Path, revision: int) -> float:
+    """Share of the pixels of all photos with a true class that have the true one at a revision."""
+    from fieldwork.nerfcore.images.working import nearest, read_label
+    from fieldwork.nerfcore.labels.overlay import photo_labels
+    from fieldwork.nerfcore.labels.revisions import computed
+
+    ready, labelling = computed(project, "main", revision)
+    right = total = 0
+    for photo in ready.photos:
+        truth = nearest(read_label(window.MUSEUM / "labels" / f"{photo.name}.png"), photo.width, photo.height)
+        found, _ = photo_labels(ready, labelling, photo.name, 0)
+        right, total = right + ((found == truth) & (truth > 0)).sum(), total + (truth > 0).sum()
+    return float(right / total)
+
+
+def overlay_that_is_seen(shot: Path, opaque: dict, project: Path, revision: int) -> tuple[float, int]:
+    """Of the middles of places with one class, the share that have its colour on the screen, and how many were compared."""
+    from fieldwork.nerfcore.labels.overlay import photo_labels
+    from fieldwork.nerfcore.labels.revisions import computed
+    from PIL import Image
+
+    ready, labelling = computed(project, "main", revision)
+    ids, _ = photo_labels(ready, labelling, opaque["photo"], 0)
+    screen = np.asarray(Image.open(shot).convert("RGB"), np.float64) / 255
+    (left, top), (right, bottom) = opaque["corners"]
+    seen, height, width = [], *ids.shape
+    for y in range(4, height - 4, 7):
+        for x in range(4, width - 4, 7):
+            if ids[y, x] and (ids[y - 3 : y + 4, x - 3 : x + 4] == ids[y, x]).all():
+                column, row = left + (x + 0.5) / width * (right - left), top + (y + 0.5) / height * (bottom - top)
+                difference = screen[int(row), int(column)] - opaque["colors"][str(ids[y, x])]
+                seen.append(np.abs(difference).max() < 0.02)
+    return float(np.mean(seen)), len(seen)
+
+
+@pytest.mark.parametrize("suite", ["sid", "trixie"])
+def test_labels_from_strokes_on_photos(suite):
+    """Scribbles, undo, a click, the next photo, an engine that is killed, accepting, the file loaded again."""
+    root = window.BLENDER_ROOT if suite == "sid" else window.OLDER_ROOT
+    reason = window.missing(root, suite)
+    if reason:
+        pytest.skip(reason)
+    window.simulate()
+    session = WINDOW(f"labels-{suite}", root)
+    project = Path(shutil.copytree(unlabelled(window.BUILD / "unlabelled"), session.folder / "project"))
+    names = ["stone", "gilding", "wood", "textile", "ceramic", "floor", "wall"]
+    strokes = strokes_for(names, ["IMG_0001", "IMG_0013"], 0)
+    plan = session.folder / "plan.json"
+    plan.write_text(json.dumps({"project": str(project), "classes": names, "strokes": strokes}))
+    session.environment["FIELDWORK_LABELLING"] = str(plan)
+    facts = session.play("labels", timeout=900)
+    assert facts["classes"] == names
+    count = len(strokes)
+    assert facts["revisions"] == list(range(1, count + 1)), "each stroke is one mark"
+    marks = [json.loads(line) for line in (project / "marks/journal.jsonl").read_text().splitlines()]
+    for mark, stroke in zip(marks, strokes):
+        assert (mark["photo"], mark["class_id"]) == (stroke["photo"], stroke["class"])
+        for end in (0, -1):
+            assert mark["points"][end] == pytest.approx(stroke["points"][end], abs=1.0), "marked where the mouse was"
+    assert share_that_is_right(project, count) > 0.6
+    share, compared = overlay_that_is_seen(session.folder / "opaque.png", facts["opaque"], project, count)
+    assert compared > 100
+    assert share > 0.97, "the classes have their colours on the photo"
+    newest, seen, stored = facts["undo"]
+    assert seen == [newest - 1, newest - 2, newest - 1, newest]
+    assert stored == newest
+    click, erased, void = facts["tools"]
+    assert (click["shape"], erased["erase"], void["class_id"], void["erase"]) == ("part", True, None, False)
+    assert facts["next"][0] != facts["next"][1]
+    assert "signal 9" in facts["death"]
+    before, after = facts["after death"]
+    assert after > before, "the stroke was in the journal when the engine died"
+    assert facts["kept"] == 1
+    assert "signal 9" in facts["told"]
+    before, after, shown = facts["not lost"]
+    assert (after, shown) == (before + 1, before + 1), "the stroke is neither lost nor there twice"
+    accepted, shown, agreement = facts["accepted"]
+    assert accepted == shown
+    assert agreement > 0.8
+    before, after, remembered, photo = facts["loaded"]
+    assert before == after == remembered
+    assert photo is not None
+    assert facts["undone after loading"] == before
+    assert_never_held_up(facts)
 
 
 def test_engine_is_installed_from_the_preferences():

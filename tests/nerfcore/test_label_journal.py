@@ -192,3 +192,13 @@ def test_the_engine_takes_marks_beside_a_job(start, ball: Path) -> None:  # noqa
     untrained = client.send("label prepare", project=ball)
     assert "fieldwork train" in client.answer(untrained, 60)["error"]["message"]
     assert sorted(path.name for path in (ball / "jobs").glob("label-prepare-*")) != []
+
+
+def test_a_mark_that_is_sent_twice_is_one_mark(tmp_path: Path) -> None:
+    first = append_mark(tmp_path, {**LINE, "key": "a"})
+    other = append_mark(tmp_path, {**LINE, "key": "b"})
+    assert append_mark(tmp_path, {**LINE, "key": "a"}) == first
+    assert read_marks(tmp_path) == [first, other]
+    assert [append_mark(tmp_path, LINE).revision, append_mark(tmp_path, LINE).revision] == [3, 4], (
+        "without a key each is one"
+    )

@@ -1,0 +1,143 @@
+"""Marks and undone revisions on their way to the engine, which alone writes the journal.
+
+A mark stays here until the engine has answered that it is on disk. Where the engine dies meanwhile it is sent again, with
+the same key, so that it is neither lost nor made twice. Kept outside the scene: undo does not take back what is under way.
+"""
+
+from __future__ import annotations
+
+import time
+import uuid
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ..errors import EngineError
+from . import journal
+
+RETRY = 2.0  # seconds until what the engine did not take is sent again
+REFUSED = ("setting", "input", "refused")  # kinds of errors that the same mark would meet again
+
+Answer = Callable[[dict[str, Any] | None, EngineError | None], None]
+Ask = Callable[[str, dict[str, Any], Answer], object]  # verb, parameters, what takes the answer; raises EngineError
+
+
+@dataclass
+class Wish:
+    """What the engine is to do with the marks of a project: `label stroke` or `label checkout`."""
+
+    folder: Path
+    verb: str
+    params: dict[str, Any]
+    key: str = field(default_factory=lambda: uuid.uuid4().hex)
+    sent: bool = False
+    due: float = 0.0  # when to send (again), by the monotonic clock
+
+
+@dataclass(frozen=True)
+class Taken:
+    """A wish that the engine has fulfilled, and the revision that is shown by it."""
+
+    folder: Path
+    verb: str
+    revision: int
+
+
+_wishes: list[Wish] = []
+_taken: list[Taken] = []
+_errors: dict[Path, EngineError] = {}
+
+
+def mark(folder: Path, params: dict[str, Any]) -> Wish:
+    """Let a mark (parameters of `label stroke`, but for the project) wait for `send`."""
+    wish = Wish(folder, "label stroke", params)
+    wish.params = {**params, "key": wish.key}
+    _errors.pop(folder, None)
+    _wishes.append(wish)
+    return wish
+
+
+def check_out(folder: Path, revision: int) -> None:
+    """Let a revision be shown once the marks before it are taken; an earlier such wish that nobody sent is forgotten."""
+    _wishes[:] = [w for w in _wishes if w.sent or w.folder != folder or w.verb != "label checkout"]
+    _wishes.append(Wish(folder, "label checkout", {"revision": revision}))
+
+
+def marks_of(folder: Path) -> list[dict[str, Any]]:
+    """Parameters of the marks that the engine has not taken yet."""
+    return [wish.params for wish in _wishes if wish.folder == folder and wish.verb == "label stroke"]
+
+
+def shown(folder: Path) -> int:
+    """The revision that is to be shown: what undo asked for, else what the project says."""
+    wanted = [w.params["revision"] for w in _wishes if w.folder == folder and w.verb == "label checkout"]
+    return wanted[-1] if wanted else journal.shown(folder)
+
+
+def waiting(folder: Path | None = None) -> bool:
+    """Whether there is something the engine has not taken (of one project)."""
+    return any(folder in (None, wish.folder) for wish in _wishes)
+
+
+def error(folder: Path) -> EngineError | None:
+    """Why the last mark or undo of a project was not taken; None once one is."""
+    return _errors.get(folder)
+
+
+def tell(folder: Path, error: EngineError) -> None:
+    """Let the panel show what else went wrong, until the next mark."""
+    _errors[folder] = error
+
+
+def fulfilled(folder: Path, revision: int) -> None:
+    """A mark is in the journal that nobody here sent."""
+    _taken.append(Taken(folder, "label stroke", revision))
+
+
+def take() -> list[Taken]:
+    """What was fulfilled since the last call, oldest first."""
+    found = list(_taken)
+    _taken.clear()
+    return found
+
+
+def send(ask: Ask, at_once: bool = False) -> None:
+    """Hand the oldest wish of each project to the engine, where that is due; the next follows when it has answered."""
+    now, seen = time.monotonic(), set()
+    for wish in list(_wishes):
+        first = wish.folder not in seen
+        seen.add(wish.folder)
+        if not first or wish.sent or (now < wish.due and not at_once):
+            continue
+        wish.sent = True
+        try:
+            ask(wish.verb, {"project": str(wish.folder), **wish.params}, _taker(wish))
+        except EngineError as error:
+            _answered(wish, None, error)
+
+
+def clear() -> None:
+    """Forget everything."""
+    for found in (_wishes, _taken, _errors):
+        found.clear()
+
+
+def _taker(wish: Wish) -> Answer:
+    return lambda result, error: _answered(wish, result, error)
+
+
+def _answered(wish: Wish, result: dict[str, Any] | None, error: EngineError | None) -> None:
+    if wish not in _wishes:
+        return
+    wish.sent = False
+    if error is None and result is not None:
+        _wishes.remove(wish)
+        _errors.pop(wish.folder, None)
+        _taken.append(Taken(wish.folder, wish.verb, int(result["revision"])))
+        return
+    if error is not None:
+        _errors[wish.folder] = error
+        if error.kind in REFUSED:
+            _wishes.remove(wish)
+    wish.due = time.monotonic() + RETRY

@@ -1,0 +1,139 @@
+"""What was propagated, as the panels and the overlay show it: looked up on disk, without the engine."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...nerfcore.labels.lookup import RECORD, REVISIONS, SURFELS, Labelling, read_labelling, surfel_map
+from ..project import snapshot
+from . import journal
+
+UNSURE = 0.75  # confidence below which a place is hatched; see the calibration in docs/experiments.md
+STRIPE = 6  # pixels of the map from one stripe of the hatching to the next
+VOID_COLOR = (0.12, 0.12, 0.12)
+
+_labellings: dict[Path, tuple[tuple[int, int], Labelling | None]] = {}
+_maps: dict[tuple[Path, str], tuple[tuple[int, int], np.ndarray | None]] = {}
+KEPT = 8  # of each that are remembered
+
+
+@dataclass(frozen=True)
+class ClassShare:
+    """What a class has of the surface: share in [0, 1] of the surfels, mean confidence, None where it has none."""
+
+    share: float
+    confidence: float | None
+
+
+def run_of(folder: Path, run: str) -> Path:
+    return folder / "runs" / run
+
+
+def prepared(folder: Path, run: str) -> bool:
+    """Whether a run was prepared for labelling (perhaps before it was trained anew: the engine knows)."""
+    return (run_of(folder, run) / SURFELS / RECORD).is_file()
+
+
+def computed(folder: Path, run: str, revision: int) -> bool:
+    """Whether the labels of a revision are there, of the present preparation."""
+    return _file(folder, run, revision) is not None
+
+
+def nearest_computed(folder: Path, run: str, revision: int) -> int | None:
+    """The revision, or the youngest it was drawn on, whose labels are there; None where there is none."""
+    found = (number for number in journal.ancestry(folder, revision) if computed(folder, run, number))
+    return next(found, None)
+
+
+def _file(folder: Path, run: str, revision: int) -> tuple[Path, tuple[int, int]] | None:
+    """The file of a revision and what changes with it; None where it is missing or older than the preparation."""
+    path = run_of(folder, run) / REVISIONS / f"{revision}.npz"
+    try:
+        made, ready = path.stat(), (run_of(folder, run) / SURFELS / RECORD).stat()
+    except OSError:
+        return None
+    return (path, (made.st_mtime_ns, made.st_size)) if made.st_mtime_ns >= ready.st_mtime_ns else None
+
+
+def labelling(folder: Path, run: str, revision: int | None) -> Labelling | None:
+    """The labels of a revision; None where they are not there."""
+    found = None if revision is None else _file(folder, run, revision)
+    if found is None:
+        return None
+    path, changed = found
+    if path not in _labellings or _labellings[path][0] != changed:
+        _remember(_labellings, path, (changed, read_labelling(path)))
+    return _labellings[path][1]
+
+
+def photo_map(folder: Path, run: str, photo: str) -> np.ndarray | None:
+    """Surfel (H, W) of each pixel of a photo's map, −1 for none; None where the run was not prepared or has no such photo."""
+    surfels = run_of(folder, run) / SURFELS
+    try:
+        stat = (surfels / RECORD).stat()
+    except OSError:
+        return None
+    changed = (stat.st_mtime_ns, stat.st_size)
+    key = (surfels, photo)
+    if key not in _maps or _maps[key][0] != changed:
+        _remember(_maps, key, (changed, surfel_map(surfels, photo)))
+    return _maps[key][1]
+
+
+def _remember(cache: dict[Any, Any], key: Any, value: Any) -> None:
+    cache.pop(key, None)
+    cache[key] = value
+    while len(cache) > KEPT:
+        del cache[next(iter(cache))]
+
+
+def shares(found: Labelling, void: int) -> tuple[dict[int, ClassShare], float]:
+    """What each class id has of the surface, and what share of it is void."""
+    label, sure = found.label(void), found.confidence()
+    whole = max(1, len(label))
+    told = {}
+    for class_id in found.class_ids.tolist():
+        own = label == class_id
+        count = int(np.count_nonzero(own))
+        told[class_id] = ClassShare(count / whole, float(sure[own].mean()) if count else None)
+    return told, float(np.count_nonzero(label == void) / whole)
+
+
+def overlay(
+    found: Labelling, surfels: np.ndarray, colors: dict[int, tuple[float, float, float]], void: int, confidence: bool
+) -> np.ndarray:
+    """The labels of a photo as RGBA (H, W, 4) float32, sRGB, rows from the bottom as Blender has them.
+
+    Where no surface is it is clear, and so is void. With `confidence` unsure places are hatched, and void is dark.
+
+    Args:
+        surfels: (H, W) of the photo. colors: of the classes by id.
+    """
+    label = np.append(found.label(void), -1)
+    sure = np.append(found.confidence(), 1.0).astype(np.float32)
+    table = np.zeros((max([void, *label.tolist(), *colors]) + 2, 4), np.float32)  # the last row is that of no surface
+    for class_id, color in colors.items():
+        if class_id != void:
+            table[class_id] = (*color, 1.0)
+    if confidence:
+        table[void] = (*VOID_COLOR, 1.0)
+    picture = table[label[surfels]]
+    if confidence:
+        y, x = np.indices(surfels.shape)
+        stripe = ((x + y) % STRIPE < STRIPE // 2) & (sure[surfels] < UNSURE) & (picture[..., 3] > 0)
+        picture[stripe, :3] *= 0.25
+    return np.ascontiguousarray(picture[::-1])
+
+
+def linear(srgb: np.ndarray) -> np.ndarray:
+    """Linear light of sRGB values in [0, 1]."""
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
+def void_of(folder: Path) -> int:
+    """The id in label maps that stands for no class."""
+    return int((snapshot.project(folder) or {}).get("ignore_id", 0))

@@ -1,0 +1,283 @@
+"""The verbs `label import` and `label export`: label maps of the photos from and for other labelling tools."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError, SettingError
+from ..files import atomic_path, disk_errors
+from ..images.encode import write_picture
+from ..images.labels import fit_to_photo
+from ..images.working import nearest, read_label
+from ..params import LabelExportParams, LabelImportParams
+from ..progress import Reporter
+from ..project.classes import class_color
+from ..project.schema import ImageRecord, Project, SemanticClass
+from ..project.store import edit_project, load_project
+from .accept import is_accepted
+from .formats import known
+from .formats.regions import LabelClass, Picture, Region, Source
+from .overlay import photo_labels
+from .revisions import computed
+
+IMPORTED = "labels/imported"  # of the project
+INSTANCES = "instances"  # in that folder
+VOID_NAMES = {"void", "unlabelled", "unlabeled", "unassigned", "ignore"}  # background is a class like any other
+MOST_TOLD = 5  # names in one message
+MOST_INSTANCES = 65535
+
+
+def import_labels(params: LabelImportParams, report: Reporter) -> dict[str, Any]:
+    """Give photos the labels of a file that another tool wrote. Pixels that nobody assigned are unlabelled.
+
+    Returns:
+        {"format", "photos": number that got labels, "kept": names of those that have labels of their own, "unknown":
+        pictures that are no photo of the project, "classes": names that occur, "instances", "skipped": shapes without
+        area by kind}
+    Raises:
+        InputError: the file cannot be read, or none of its pictures is a photo of the project. ProjectError, DiskError,
+        Cancelled: the project is as before.
+    """
+    folder, path = Path(params.project), Path(params.file)
+    project = load_project(folder)
+    kind = known.format_of(path) if params.format == "auto" else params.format
+    source = known.read(path, kind, label_classes(project), project.ignore_id, params.class_name)
+    report.stage("Reading labels")
+    classes = Classes(project, source)
+    photos = {image.name: image for image in project.images if image.status != "rejected"}
+    taken: dict[str, tuple[str, str | None]] = {}
+    kept: list[str] = []
+    unknown: list[str] = []
+    instances = 0
+    for number, picture in enumerate(source.pictures):
+        report.progress(number / (number + 10), picture.name)
+        photo = photos.get(Path(picture.name).stem) or photos.get(picture.name)
+        if photo is None:
+            unknown.append(picture.name)
+        elif photo.label and not is_accepted(photo.label) and not params.replace:
+            kept.append(photo.name)
+        else:
+            ids, things = maps_of(picture, classes, project.ignore_id)
+            try:
+                taken[photo.name] = write_photo(folder, photo, ids, things)
+            except InputError as error:
+                report.warn(f"{error.message}: it keeps the labels it has.")
+                continue
+            instances += int(things.max(initial=0))
+    tell(report, kept, unknown, source)
+    if not taken and not kept:
+        raise InputError(
+            f"No picture in {path} is a photo of {folder}.",
+            "Pictures are matched by their names without suffix: compare the two.",
+        )
+    result = {
+        "format": kind,
+        "photos": len(taken),
+        "kept": kept,
+        "unknown": unknown,
+        "classes": sorted(classes.used),
+        "instances": instances,
+        "skipped": dict(source.skipped),
+    }
+    with edit_project(folder) as edited:
+        classes.add_to(edited)
+        for image in edited.images:
+            if image.name in taken:
+                image.label, image.instances = taken[image.name]
+                image.confidence = None
+        edited.record("label import", params.model_dump(mode="json"), result)
+    return result
+
+
+class Classes:
+    """The ids that classes of a file get: of the project's where the name is there, else free ones."""
+
+    def __init__(self, project: Project, source: Source) -> None:
+        self.ids = {c.name: c.id for c in project.classes}
+        self.new: dict[str, SemanticClass] = {}
+        self.used: set[str] = set()
+        self._void, self._colors = project.ignore_id, source.classes
+
+    def id_of(self, name: str) -> int | None:
+        """The id of a class; None for what stands for no class."""
+        name = name.strip()
+        if not name or name.lower() in VOID_NAMES:
+            return None
+        self.used.add(name)
+        if name not in self.ids:
+            number = next(i for i in range(1, 65536) if i != self._void and i not in self.ids.values())
+            given = self._colors.get(name)
+            color = (given[0] / 255, given[1] / 255, given[2] / 255) if given else class_color(number, self._void)
+            self.ids[name] = number
+            self.new[name] = SemanticClass(id=number, name=name, color=color)
+        return self.ids[name]
+
+    def add_to(self, project: Project) -> None:
+        """Add the new ones to a project, unless somebody did so meanwhile."""
+        names = {c.name for c in project.classes}
+        added = [c for name, c in self.new.items() if name not in names]
+        project.classes = sorted([*project.classes, *added], key=lambda c: c.id)
+
+
+def maps_of(picture: Picture, classes: Classes, void: int) -> tuple[np.ndarray, np.ndarray]:
+    """Class ids (H, W) uint16, `void` where nobody assigned any, and numbers of instances (H, W) uint16, 0 for none.
+
+    Raises:
+        InputError: there are more instances than 16 bits count.
+    """
+    ids = np.full((picture.height, picture.width), void, np.uint16)
+    things = np.zeros(ids.shape, np.uint16)
+    for region in picture.regions:
+        class_id = classes.id_of(region.class_name)
+        if region.instance > MOST_INSTANCES:
+            raise InputError(f"{picture.name} has more than {MOST_INSTANCES} instances.", "Merge some of them.")
+        ids[region.mask] = void if class_id is None else class_id
+        things[region.mask] = 0 if class_id is None else region.instance
+    return ids, things
+
+
+def write_photo(folder: Path, photo: ImageRecord, ids: np.ndarray, things: np.ndarray) -> tuple[str, str | None]:
+    """Write the label map of a photo, and that of instances where there are any; their places in the project.
+
+    Raises:
+        InputError: they have another shape than the photo. DiskError.
+    """
+    size = (photo.width, photo.height)
+    place, other = f"{IMPORTED}/{photo.name}.png", f"{IMPORTED}/{INSTANCES}/{photo.name}.png"
+    _write(folder / place, fit_to_photo(ids, 1, size, size, f"the label map of {photo.name}"))
+    if not things.any():
+        return place, None
+    _write(folder / other, fit_to_photo(things, 1, size, size, f"the instances of {photo.name}"))
+    return place, other
+
+
+def _write(path: Path, values: np.ndarray) -> None:
+    with atomic_path(path) as temporary:
+        write_picture(temporary, values.astype(np.uint8) if int(values.max(initial=0)) < 256 else values)
+
+
+def tell(report: Reporter, kept: list[str], unknown: list[str], source: Source) -> None:
+    """Warn of what was left out."""
+    for names, what in (
+        (kept, "photos have labels of their own and keep them (`replace` takes the new ones)"),
+        (unknown, "pictures are no photos of the project"),
+    ):
+        if names:
+            more = "" if len(names) <= MOST_TOLD else " …"
+            report.warn(f"{len(names)} {what}: {', '.join(names[:MOST_TOLD])}{more}.")
+    for kind, count in source.skipped.items():
+        report.warn(f"{count} annotations of the kind “{kind}” have no area and were left out.")
+
+
+def export_labels(params: LabelExportParams, report: Reporter) -> dict[str, Any]:
+    """Write labels of the photos for another tool, as large as the photos of the project.
+
+    Returns:
+        {"format", "photos", "classes": names, "files", "revision": of the marks, None for label maps}
+    Raises:
+        SettingError: the name of the file does not fit the format, or the class is unknown. InputError: the folder is not
+        empty, or there are no labels. ProjectError: the revision was not propagated. DiskError, Cancelled: nothing is
+        written.
+    """
+    folder, out = Path(params.project), Path(params.out)
+    project = load_project(folder)
+    check_out(params, project, out)
+    revision, pictures, count = pictures_of(params, project, folder)
+    if not count:
+        raise InputError(
+            f"No photo of {folder} has labels.", "Mark some, or export what was propagated: --source marks."
+        )
+    report.stage("Writing labels")
+    written = _written(followed(pictures, count, report), params, label_classes(project), out, project.ignore_id)
+    return {
+        "format": params.format,
+        "photos": count,
+        "classes": [c.name for c in project.classes],
+        "files": [str(path) for path in written],
+        "revision": revision,
+    }
+
+
+def check_out(params: LabelExportParams, project: Project, out: Path) -> None:
+    suffix = known.FILES.get(params.format)
+    if suffix and out.suffix.lower() != suffix:
+        raise SettingError(f"{out} does not end in {suffix}.", f"Labels of this format are one {suffix} file.")
+    if not suffix and out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"{out} is there already.", "Give a new folder, or an empty one.")
+    names = [c.name for c in project.classes]
+    if params.format == "masks" and params.class_name not in names:
+        raise SettingError(
+            f"There is no class “{params.class_name}”.", f"The classes are {', '.join(names) or 'none'}."
+        )
+
+
+def pictures_of(params: LabelExportParams, project: Project, folder: Path) -> tuple[int | None, Iterator[Picture], int]:
+    """The revision, the pictures to write, and how many they are."""
+    names = {c.id: c.name for c in project.classes}
+    if params.source == "maps":
+        images = [image for image in project.images if image.label and image.status != "rejected"]
+        return None, (_picture(image, *_maps(folder, image), names) for image in images), len(images)
+    ready, labelling = computed(folder, params.run, params.revision)
+    images = [image for image in project.images if image.name in ready.of_photo]
+
+    def propagated(image: ImageRecord) -> Picture:
+        ids, _ = photo_labels(ready, labelling, image.name, project.ignore_id)
+        return _picture(image, nearest(ids, image.width, image.height), None, names)
+
+    return labelling.revision, map(propagated, images), len(images)
+
+
+def _maps(folder: Path, image: ImageRecord) -> tuple[np.ndarray, np.ndarray | None]:
+    things = read_label(folder / image.instances) if image.instances else None
+    return read_label(folder / str(image.label)), things
+
+
+def _picture(image: ImageRecord, ids: np.ndarray, things: np.ndarray | None, names: dict[int, str]) -> Picture:
+    """The regions of a photo: one for each instance, and one for the rest of each class."""
+    regions = []
+    pairs = ids.astype(np.int64) * (MOST_INSTANCES + 1) + (0 if things is None else things)
+    for pair in np.unique(pairs).tolist():
+        class_id, thing = divmod(pair, MOST_INSTANCES + 1)
+        if class_id in names:
+            regions.append(Region(names[class_id], pairs == pair, thing))
+    return Picture(Path(image.file).name, ids.shape[1], ids.shape[0], regions)
+
+
+def label_classes(project: Project) -> list[LabelClass]:
+    """The classes of a project with colours of bytes."""
+    return [
+        LabelClass(c.id, c.name, (round(c.color[0] * 255), round(c.color[1] * 255), round(c.color[2] * 255)))
+        for c in project.classes
+    ]
+
+
+def followed(pictures: Iterator[Picture], count: int, report: Reporter) -> Iterator[Picture]:
+    """The pictures, with progress."""
+    for number, picture in enumerate(pictures):
+        report.progress(number / count, picture.name)
+        yield picture
+
+
+def _written(
+    pictures: Iterator[Picture], params: LabelExportParams, classes: list[LabelClass], out: Path, void: int
+) -> list[Path]:
+    """Write a file, or a folder as a whole."""
+    if params.format in known.FILES:
+        return known.write(pictures, params.format, classes, out, void, params.class_name)
+    part = out.with_name(f".{out.name}.part")
+    shutil.rmtree(part, ignore_errors=True)
+    try:
+        files = known.write(pictures, params.format, classes, part, void, params.class_name)
+        with disk_errors(out):
+            if out.is_dir():
+                out.rmdir()
+            os.replace(part, out)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+    return [out / file.relative_to(part) for file in files]

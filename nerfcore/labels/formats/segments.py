@@ -1,0 +1,139 @@
+"""Segments.ai: a release file, and beside it the PNGs of segment ids that it names."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote, urlparse
+
+import numpy as np
+from PIL import Image
+
+from ...errors import InputError
+from ...files import atomic_path, write_json
+from .regions import (
+    LabelClass,
+    Picture,
+    Region,
+    Source,
+    checked_size,
+    id_picture,
+    numbers_of,
+    picture_of,
+    polygon_mask,
+    read_json,
+)
+
+RELEASE, LABELSET = "release.json", "ground-truth"
+
+
+def read(path: Path) -> Source:
+    """The labels of a release file, or of a folder with one. Raises InputError."""
+    files = sorted(path.glob("*.json")) if path.is_dir() else [path]
+    found = next((v for v in map(read_json, files) if isinstance(v, dict) and isinstance(v.get("dataset"), dict)), None)
+    try:
+        if found is None:
+            raise KeyError("dataset")
+        samples = found["dataset"]["samples"]
+        categories = found["dataset"]["task_attributes"]["categories"]
+        names = {c["id"]: str(c["name"]) for c in categories}
+        colors = {str(c["name"]): tuple(c["color"][:3]) if c.get("color") else None for c in categories}
+        things = {c["id"]: c.get("has_instances", True) for c in categories}
+    except (KeyError, TypeError) as error:
+        raise InputError(
+            f"{path} is no release of Segments.ai: {error!r} is missing.", "Download the release file."
+        ) from error
+    source = Source(iter(()), colors)
+    source.pictures = _pictures(path if path.is_dir() else path.parent, samples, names, things, source)
+    return source
+
+
+def _pictures(
+    folder: Path, samples: list[dict[str, Any]], names: dict[Any, str], things: dict[Any, bool], source: Source
+) -> Iterator[Picture]:
+    for sample in samples:
+        try:
+            name, labels = str(sample["name"]), sample.get("labels") or {}
+            label = next((value for value in labels.values() if value), None)
+            if not label:
+                continue
+            attributes = label["attributes"]
+            annotations = attributes.get("annotations") or []
+            if "segmentation_bitmap" in attributes:
+                yield _bitmap(folder, name, attributes, names, things)
+                continue
+            image = attributes.get("image") or sample["attributes"]["image"]
+            width, height = checked_size(image.get("width"), image.get("height"), name)
+            regions = []
+            for entry in annotations:
+                if entry.get("type") == "polygon":
+                    mask = polygon_mask(entry["points"], width, height)
+                    regions.append(Region(names[entry["category_id"]], mask, len(regions) + 1))
+                else:
+                    source.skip(str(entry.get("type")))
+            yield Picture(name, width, height, regions)
+        except (KeyError, TypeError, AttributeError) as error:
+            wrong = f"A sample of the release in {folder} is damaged: {error!r}."
+            raise InputError(wrong, "Download the release file once more.") from error
+
+
+def _bitmap(folder: Path, name: str, attributes: dict[str, Any], names: dict, things: dict) -> Picture:
+    place = bitmap_place(folder, name, str((attributes.get("segmentation_bitmap") or {}).get("url", "")))
+    numbers = numbers_of(picture_of(place, name))
+    regions = [
+        Region(names[entry["category_id"]], numbers == entry["id"], i if things[entry["category_id"]] else 0)
+        for i, entry in enumerate(attributes.get("annotations") or [], 1)
+    ]
+    return Picture(name, numbers.shape[1], numbers.shape[0], regions)
+
+
+def bitmap_place(folder: Path, name: str, address: str) -> Path:
+    """Where the bitmap of a sample lies. Nothing is downloaded. Raises InputError."""
+    stem = Path(name).stem
+    wanted = [unquote(urlparse(address).path).rsplit("/", 1)[-1], f"{stem}_label_{LABELSET}.png", f"{stem}.png"]
+    for file in dict.fromkeys(w for w in wanted if w.lower().endswith(".png")):
+        for place in (folder / file, folder / "labels" / file, *sorted(folder.glob(f"*/{file}"))):
+            if place.is_file():
+                return place
+    raise InputError(
+        f"The label picture of {name} is not beside the release file in {folder}.",
+        f"Download it there as {wanted[1]} (the tool of Segments.ai does so: export_dataset).",
+    )
+
+
+def write(pictures: Iterable[Picture], classes: list[LabelClass], out: Path) -> list[Path]:
+    """Write a folder with a release file and a PNG of segment ids for each picture."""
+    ids, samples, files = {c.name: c.id for c in classes}, [], [out / RELEASE]
+    stuff: set[str] = set()
+    for picture in pictures:
+        numbers, annotations = np.zeros((picture.height, picture.width), np.int64), []
+        for number, region in enumerate(picture.regions, 1):
+            numbers[region.mask] = number
+            annotations.append({"id": number, "category_id": ids[region.class_name]})
+            if region.instance == 0:
+                stuff.add(region.class_name)
+        files.append(out / f"{Path(picture.name).stem}_label_{LABELSET}.png")
+        rgba = np.dstack([id_picture(numbers), np.full(numbers.shape, 255, np.uint8)])
+        with atomic_path(files[-1]) as temporary:
+            Image.fromarray(rgba).save(temporary, "PNG")
+        attributes = {
+            "format_version": "0.1",
+            "annotations": annotations,
+            "segmentation_bitmap": {"url": files[-1].name},
+        }
+        label = {"label_status": "LABELED", "attributes": attributes}
+        image = {"url": picture.name, "width": picture.width, "height": picture.height}
+        samples.append({"name": picture.name, "attributes": {"image": image}, "labels": {LABELSET: label}})
+    categories = [
+        {"id": c.id, "name": c.name, "color": list(c.color), "has_instances": c.name not in stuff} for c in classes
+    ]
+    attributes = {"format_version": "0.1", "categories": categories}
+    dataset = {
+        "name": "fieldwork",
+        "task_type": "segmentation-bitmap",
+        "task_attributes": attributes,
+        "samples": samples,
+    }
+    write_json(files[0], {"name": "fieldwork", "dataset": dataset})
+    return files

@@ -1,0 +1,87 @@
+"""What labelling leaves in a run, looked up with numpy alone: Blender's side reads it too.
+
+runs/RUN/surfels/prepared.json, pixel_surfel.npy   which pixel of which photo shows which surfel
+runs/RUN/revisions/N.npz                           the labels of the surfels at revision N of the marks
+"""
+
+from __future__ import annotations
+
+import json
+import zlib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+
+SURFELS, RECORD = "surfels", "prepared.json"
+REVISIONS = "revisions"
+UNREADABLE = (OSError, EOFError, ValueError, KeyError, TypeError, BadZipFile, zlib.error)  # what damaged files raise
+LEAST = 0.5  # probability of all classes together below which a surfel is void
+
+
+@dataclass(frozen=True)
+class PhotoMap:
+    """Where the map of one photo lies: its name, width and height of the map, and its first pixel among those of all."""
+
+    name: str
+    width: int
+    height: int
+    first: int
+
+
+@dataclass(frozen=True)
+class Labelling:
+    """What a revision says of N surfels: probability (N, C) of each class, what is missing to 1 being void; class_ids (C,);
+    made: digest of the marks and the preparation it comes from; told: what `label propagate` said of it."""
+
+    revision: int
+    probability: np.ndarray
+    class_ids: np.ndarray
+    made: str
+    told: dict[str, Any] = field(default_factory=dict)
+
+    def label(self, void: int) -> np.ndarray:
+        """Class id (N,) int32 of each surfel; `void` where no class explains it."""
+        if not len(self.class_ids):
+            return np.full(len(self.probability), void, np.int32)
+        best = self.class_ids[self.probability.argmax(1)]
+        return np.where(self.probability.sum(1) > LEAST, best, void).astype(np.int32)
+
+    def confidence(self) -> np.ndarray:
+        """Probability (N,) float32 of what `label` says, void included."""
+        total = self.probability.sum(1)
+        best = self.probability.max(1, initial=0)
+        return np.where(total > LEAST, best, 1 - total).clip(0, 1).astype(np.float32)
+
+
+def read_labelling(path: Path) -> Labelling | None:
+    """The labels in a file of runs/RUN/revisions; None where they were not computed or cannot be read."""
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            probability = data["probability"].astype(np.float32)
+            told = json.loads(str(data["told"])) if "told" in data else {}
+            return Labelling(int(data["revision"]), probability, data["class_ids"], str(data["made"]), told)
+    except UNREADABLE:
+        return None
+
+
+def photo_maps(record: dict[str, Any]) -> dict[str, PhotoMap]:
+    """The photos of a preparation, by name. Raises KeyError or TypeError where the record is none of one."""
+    return {photo["name"]: PhotoMap(**photo) for photo in record["photos"]}
+
+
+def surfel_map(surfels: Path, name: str) -> np.ndarray | None:
+    """Surfel (H, W) int32 of each pixel of a photo's map, −1 for none; None where runs/RUN/surfels has none of it."""
+    try:
+        photo = photo_maps(json.loads((surfels / RECORD).read_text(encoding="utf-8")))[name]
+        pixels = np.load(surfels / "pixel_surfel.npy", mmap_mode="r", allow_pickle=False)
+        return np.array(part_of(pixels, photo))
+    except UNREADABLE:
+        return None
+
+
+def part_of(pixels: np.ndarray, photo: PhotoMap) -> np.ndarray:
+    """The map (H, W) of one photo among those of all (P,)."""
+    return pixels[photo.first : photo.first + photo.width * photo.height].reshape(photo.height, photo.width)

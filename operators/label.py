@@ -1,0 +1,393 @@
+"""Label: the verbs that prepare, propagate, suggest and accept; photos and classes of the labelling."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import bpy
+from bpy.types import Context, Operator
+
+from ..addon.errors import EngineError
+from ..addon.jobs.job import Done, Job
+from ..addon.jobs.queue import queue
+from ..addon.labels import editor, pending, session
+from ..addon.project import classes, lists, snapshot
+from ..addon.props import EnumProperty, FloatProperty, IntProperty, StringProperty
+from ..addon.text import t
+from .base import (
+    ProjectOperator,
+    absolute,
+    deliver_edits,
+    need_project,
+    need_run,
+    refresh_scenes,
+    scene_of,
+    scene_settings,
+)
+
+Revision = partial(
+    IntProperty,
+    name="Revision",
+    description="Revision of the marks; -1: the one that is shown",
+    default=-1,
+    min=-1,
+    options={"SKIP_SAVE"},
+)
+
+
+def chosen(revision: int) -> int | None:
+    return None if revision < 0 else revision
+
+
+def need_marks(context: Context) -> str | None:
+    folder = snapshot.folder_of(context.scene.fieldwork)
+    if need_run(context) is None and folder is not None and pending.shown(folder) == 0:
+        return t("Mark something on a photo first")
+    return need_run(context)
+
+
+@scene_settings(run="run")
+class FIELDWORK_OT_label_prepare(ProjectOperator):
+    """Prepare the run for labelling: the first marks do so too"""
+
+    bl_idname = "fieldwork.label_prepare"
+    bl_label = "Prepare"
+    verb = "label prepare"
+    needs = (need_run,)
+
+    surfels: IntProperty(
+        name="Surfels", description="Most places of the surface that get a label each", default=200_000, min=1000,
+        max=5_000_000, options={"SKIP_SAVE"},
+    )  # fmt: skip
+
+    def parameters(self, context: Context) -> dict[str, Any]:
+        surfels = self.surfels if self.properties.is_property_set("surfels") else None
+        return {"project": self.project_path(context), "run": self.value(context, "run"), "surfels": surfels}
+
+
+@scene_settings(run="run")
+class FIELDWORK_OT_label_propagate(ProjectOperator):
+    """Carry the marks over the whole surface; in a window that goes without saying"""
+
+    bl_idname = "fieldwork.label_propagate"
+    bl_label = "Propagate"
+    verb = "label propagate"
+    needs = (need_run,)
+
+    revision: Revision()
+
+    def parameters(self, context: Context) -> dict[str, Any]:
+        return {
+            "project": self.project_path(context),
+            "run": self.value(context, "run"),
+            "revision": chosen(self.revision),
+        }
+
+
+@scene_settings(run="run")
+class FIELDWORK_OT_label_overlay(ProjectOperator):
+    """Write a picture of the labels of the photo that is shown, and open it"""
+
+    bl_idname = "fieldwork.label_overlay"
+    bl_label = "Write Label Picture"
+    verb = "label overlay"
+    needs = (need_marks,)
+
+    photo: StringProperty(
+        name="Photo", description="Name of the photo; empty: the one in the image editor", options={"SKIP_SAVE"}
+    )
+    kind: EnumProperty(
+        name="Kind",
+        description="What the picture shows",
+        items=[
+            ("colors", "Colors", "The colors of the classes over the photo"),
+            ("ids", "Label Map", "The id of the class in each pixel"),
+            ("confidence", "Confidence", "How sure the class is"),
+        ],
+        options={"SKIP_SAVE"},
+    )
+    revision: Revision()
+    out: StringProperty(
+        name="File", description="PNG to write; empty: in the run", subtype="FILE_PATH", options={"SKIP_SAVE"}
+    )
+
+    def parameters(self, context: Context) -> dict[str, Any]:
+        photo = self.photo or editor.shown_photo(snapshot.folder_of(context.scene.fieldwork))
+        if not photo:
+            raise ValueError(t("Show a photo in an image editor first."))
+        return {
+            "project": self.project_path(context),
+            "run": self.value(context, "run"),
+            "photo": photo,
+            "kind": self.kind,
+            "revision": chosen(self.revision),
+            "out": absolute(self.out),
+        }
+
+    def after(self) -> Done:
+        return show_overlay
+
+
+def show_overlay(job: Job) -> None:
+    """Tell where the picture is; the editor in which photos are marked stays as it is."""
+    if job.state == "done" and job.result:
+        job.warnings.append(t("The picture is at {}.", job.result["file"]))
+
+
+@scene_settings(run="run")
+class FIELDWORK_OT_label_next(ProjectOperator):
+    """Show the photo on which a mark helps most"""
+
+    bl_idname = "fieldwork.label_next"
+    bl_label = "Next Photo"
+    verb = "label next"
+    needs = (need_marks,)
+
+    revision: Revision()
+    count: IntProperty(
+        name="Count", description="Number of photos to compare", default=5, min=1, max=1000, options={"SKIP_SAVE"}
+    )
+
+    def parameters(self, context: Context) -> dict[str, Any]:
+        return {
+            "project": self.project_path(context),
+            "run": self.value(context, "run"),
+            "revision": chosen(self.revision),
+            "count": self.count,
+        }
+
+    def after(self) -> Done:
+        return show_next
+
+
+def show_next(job: Job) -> None:
+    """Show the best photo that is not shown already."""
+    if job.state != "done" or not job.result or job.project is None:
+        return
+    names = [photo["name"] for photo in job.result["photos"]]
+    now = editor.shown_photo(job.project)
+    name = next((name for name in names if name != now), None)
+    scene = scene_of(job.project)
+    if name is not None and scene is not None:
+        show_photo(scene, job.project, name)
+        if not bpy.app.background:
+            bpy.ops.ed.undo_push(message="Next Photo")
+
+
+@scene_settings(run="run", seconds="label_seconds")
+class FIELDWORK_OT_label_accept(ProjectOperator):
+    """Train the classes that are shown into the field, and write label maps for the photos that have none of their own"""
+
+    bl_idname = "fieldwork.label_accept"
+    bl_label = "Accept"
+    verb = "label accept"
+    needs = (need_marks,)
+
+    revision: Revision()
+
+    def parameters(self, context: Context) -> dict[str, Any]:
+        return {
+            "project": self.project_path(context),
+            "run": self.value(context, "run"),
+            "revision": chosen(self.revision),
+            "seconds": self.value(context, "seconds"),
+        }
+
+    def after(self) -> Done:
+        return refresh_scenes
+
+
+class FIELDWORK_OT_label_photo(Operator):
+    """Show a photo of the project in an image editor to mark it"""
+
+    bl_idname = "fieldwork.label_photo"
+    bl_label = "Label Photos"
+    bl_options = {"REGISTER", "UNDO"}
+
+    photo: StringProperty(
+        name="Photo", description="Name of the photo; empty: the one that is shown", options={"SKIP_SAVE"}
+    )
+    step: IntProperty(
+        name="Step", description="How many photos further, in the order of the project", options={"SKIP_SAVE"}
+    )
+
+    @classmethod
+    def poll(cls, context: Context) -> bool:
+        reason = need_run(context)
+        if reason:
+            cls.poll_message_set(reason)
+        return reason is None
+
+    def execute(self, context: Context) -> set[str]:
+        folder = snapshot.folder_of(context.scene.fieldwork)
+        names = list(editor.photos(folder))
+        now = self.photo or editor.shown_photo(folder) or (names[0] if names else "")
+        if now not in names:
+            self.report({"ERROR"}, t("{} has no photo “{}”.", folder, now))
+            return {"CANCELLED"}
+        try:
+            show_photo(context.scene, folder, names[(names.index(now) + self.step) % len(names)])
+        except (OSError, RuntimeError) as error:
+            self.report({"ERROR"}, t("The photo “{}” cannot be read: {}", now, str(error)))
+            return {"CANCELLED"}
+        return {"FINISHED"}
+
+
+def show_photo(scene: bpy.types.Scene, folder: Path, name: str) -> None:
+    """Show a photo to be marked, and let the engine load meanwhile."""
+    editor.show(folder, editor.photos(folder)[name])
+    session.begin(scene.fieldwork)
+    if not bpy.app.background and not queue.busy:
+        queue.ask("label checkout", {"project": str(folder)})
+
+
+class ClassEdit(Operator):
+    """What the operators have in common that add and remove classes: at once, by the engine."""
+
+    bl_options = {"REGISTER"}
+
+    @classmethod
+    def poll(cls, context: Context) -> bool:
+        reason = need_project(context)
+        if reason:
+            cls.poll_message_set(reason)
+        return reason is None
+
+    def changed(self, settings: Any, known: list[dict[str, Any]]) -> list[dict[str, Any]] | None:
+        """The classes as they shall be; None where there is nothing to do."""
+        raise NotImplementedError
+
+    def execute(self, context: Context) -> set[str]:
+        settings = context.scene.fieldwork
+        folder = snapshot.folder_of(settings)
+        deliver_edits()
+        fields = ("id", *classes.FIELDS)
+        known = [{name: value[name] for name in fields} for value in classes.shown(folder)]
+        wanted = self.changed(settings, known)
+        if wanted is None:
+            return {"CANCELLED"}
+        chosen_id = next((value["id"] for value in wanted if value not in known), None)
+        refused: list[EngineError] = []
+
+        def answered(result: dict[str, Any] | None, error: EngineError | None) -> None:
+            if error is not None:
+                refused.append(error)
+                pending.tell(folder, error)
+            refresh(folder, chosen_id)
+
+        try:
+            ask = queue.ask_and_wait if bpy.app.background else queue.ask
+            ask("classes", {"project": str(folder), "classes": wanted}, answered)
+            session.hurry()
+        except EngineError as error:
+            refused.append(error)
+        if refused:
+            self.report({"ERROR"}, str(refused[0]))
+            return {"CANCELLED"}
+        return {"FINISHED"}
+
+
+def refresh(folder: Path, class_id: int | None) -> None:
+    """Bring changed classes into the lists of the scenes that show the project, and choose one of them."""
+    for scene in bpy.data.scenes:
+        settings = scene.fieldwork
+        if snapshot.folder_of(settings) == folder:
+            lists.refresh(settings)
+            index = next((i for i, entry in enumerate(settings.classes) if entry.id == class_id), None)
+            if index is not None:
+                settings.class_index = index
+
+
+class FIELDWORK_OT_class_add(ClassEdit):
+    """Add a class"""
+
+    bl_idname = "fieldwork.class_add"
+    bl_label = "Add Class"
+
+    name: StringProperty(name="Name", description="Name of the class; empty: a number", options={"SKIP_SAVE"})
+
+    def changed(self, settings: Any, known: list[dict[str, Any]]) -> list[dict[str, Any]]:
+        void = int((snapshot.project(snapshot.folder_of(settings)) or {}).get("ignore_id", 0))
+        taken = {value["id"] for value in known} | {void}
+        number = next(i for i in range(1, len(taken) + 2) if i not in taken)
+        names = {value["name"] for value in known}
+        name = self.name.strip() or t("Class {}", number)
+        while name in names:
+            name += "'"
+        return [*known, {"id": number, "name": name}]
+
+
+class FIELDWORK_OT_class_remove(ClassEdit):
+    """Remove the chosen class; its marks stay in the journal and say nothing"""
+
+    bl_idname = "fieldwork.class_remove"
+    bl_label = "Remove Class"
+
+    def changed(self, settings: Any, known: list[dict[str, Any]]) -> list[dict[str, Any]] | None:
+        if not 0 <= settings.class_index < len(settings.classes):
+            return None
+        gone = settings.classes[settings.class_index].id
+        return [value for value in known if value["id"] != gone]
+
+
+class FIELDWORK_OT_label_class(Operator):
+    """Choose the class that is marked"""
+
+    bl_idname = "fieldwork.label_class"
+    bl_label = "Choose Class"
+    bl_options = {"INTERNAL"}
+
+    number: IntProperty(name="Number", description="Place of the class in the list", default=1, min=1)
+
+    def execute(self, context: Context) -> set[str]:
+        settings = context.scene.fieldwork
+        if self.number > len(settings.classes):
+            self.report({"WARNING"}, t("There are only {} classes", len(settings.classes)))
+            return {"CANCELLED"}
+        settings.class_index = self.number - 1
+        if settings.label_tool in ("erase", "void"):
+            settings.label_tool = "brush"
+        return {"FINISHED"}
+
+
+class FIELDWORK_OT_label_size(Operator):
+    """Make the brush larger or smaller"""
+
+    bl_idname = "fieldwork.label_size"
+    bl_label = "Brush Size"
+    bl_options = {"INTERNAL"}
+
+    factor: FloatProperty(name="Factor", description="By how much", default=1.25, min=0.1, max=10.0)
+
+    def execute(self, context: Context) -> set[str]:
+        settings = context.scene.fieldwork
+        settings.label_width = min(max(settings.label_width * self.factor, 1.0), 2000.0)
+        return {"FINISHED"}
+
+
+class FIELDWORK_OT_label_retry(Operator):
+    """Send the marks that the engine did not take, and propagate again"""
+
+    bl_idname = "fieldwork.label_retry"
+    bl_label = "Try Again"
+
+    def execute(self, context: Context) -> set[str]:
+        session.retry()
+        return {"FINISHED"}
+
+
+CLASSES = [
+    FIELDWORK_OT_label_prepare,
+    FIELDWORK_OT_label_propagate,
+    FIELDWORK_OT_label_overlay,
+    FIELDWORK_OT_label_next,
+    FIELDWORK_OT_label_accept,
+    FIELDWORK_OT_label_photo,
+    FIELDWORK_OT_class_add,
+    FIELDWORK_OT_class_remove,
+    FIELDWORK_OT_label_class,
+    FIELDWORK_OT_label_size,
+    FIELDWORK_OT_label_retry,
+]

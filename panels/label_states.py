@@ -1,0 +1,135 @@
+"""What the Label panel says, in words and numbers. No layout here."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from bpy.types import Context
+
+from ..addon.labels import journal, pending, session
+from ..addon.project import runs, snapshot
+from ..addon.text import t
+from .states import State, project_folder
+
+
+@dataclass(frozen=True)
+class Facts:
+    """revision: that is shown. computed: whose labels are shown, None for none. strokes: number of marks by class id.
+    shares: by class id. told: what the propagation said. working: what the engine does for it, empty for nothing."""
+
+    revision: int = 0
+    newest: int = 0
+    computed: int | None = None
+    strokes: dict[int | None, int] = field(default_factory=dict)
+    shares: dict[int, Any] = field(default_factory=dict)
+    void: float = 0.0
+    told: dict[str, Any] = field(default_factory=dict)
+    working: str = ""
+    accepted: int | None = None
+
+    @property
+    def stale(self) -> bool:
+        """Whether what is shown was not propagated."""
+        return self.revision != (self.computed or 0)
+
+
+_shares: dict[tuple[Any, ...], tuple[dict[int, Any], float]] = {}
+KEPT = 4
+
+
+def facts(context: Context) -> Facts:
+    """What is known of the labelling of the scene's project."""
+    folder, run = project_folder(context), context.scene.fieldwork.run
+    if folder is None or not runs.has_run(folder, run):
+        return Facts()
+    from ..addon.labels import results  # not at the top: it needs numpy, and enabling the extension must be quick
+
+    revision = pending.shown(folder)
+    marks = [*journal.marks_at(folder, revision), *pending.marks_of(folder)]
+    computed = results.nearest_computed(folder, run, revision)
+    found = results.labelling(folder, run, computed)
+    shares, void = ({}, 0.0) if found is None else _shares_of(folder, found)
+    job = session.job_of(folder)
+    info = snapshot.cached_json(folder / "runs" / run / "config.json")
+    return Facts(
+        revision,
+        len(journal.marks(folder)),
+        None if found is None else computed,
+        dict(Counter(mark.get("class_id") for mark in marks if not mark.get("erase"))),
+        shares,
+        void,
+        {} if found is None else found.told,
+        "" if job is None else job.title,
+        ((info or {}).get("accepted") or {}).get("revision"),
+    )
+
+
+def _shares_of(folder: Path, found: Any) -> tuple[dict[int, Any], float]:
+    from ..addon.labels import results
+
+    key = (folder, found.made, found.revision)
+    if key not in _shares:
+        while len(_shares) >= KEPT:
+            del _shares[next(iter(_shares))]
+        _shares[key] = results.shares(found, results.void_of(folder))
+    return _shares[key]
+
+
+def label(context: Context) -> State:
+    """What the header says: how much of the surface has a class."""
+    known = facts(context)
+    if known.working:
+        return State(False, "…")
+    if known.computed is None:
+        return State(False)
+    return State(True, t("{:.0%} labelled", 1 - known.void))
+
+
+def class_text(known: Facts, class_id: int) -> str:
+    """Number of marks and share of the surface of a class, as short as can be."""
+    strokes, share = known.strokes.get(class_id, 0), known.shares.get(class_id)
+    return "  ".join([f"{strokes} ✎"] * (strokes > 0) + [f"{share.share:.0%}"] * (share is not None))
+
+
+def class_line(known: Facts, name: str, class_id: int) -> str:
+    """The same in words, and how sure the class is."""
+    strokes, share = known.strokes.get(class_id, 0), known.shares.get(class_id)
+    told = t("{}: {} marks", name, strokes) if strokes != 1 else t("{}: 1 mark", name)
+    if share is not None:
+        told += t(", {:.0%} of the surface", share.share)
+    if share is not None and share.confidence is not None:
+        told += t(", {:.0%} sure", share.confidence)
+    return told
+
+
+def lines(known: Facts) -> list[str]:
+    """Which revision is shown, and how it stands with it: a sentence each."""
+    if known.revision == 0 and not known.working:
+        return [t("Choose a class and draw over what belongs to it.")]
+    told = [t("Revision {} of {} is shown.", known.revision, known.newest)]
+    if known.working:
+        told.append(t("{}: it is being computed.", known.working))
+    elif known.stale:
+        told.append(t("It was not propagated yet."))
+    if known.computed is not None:
+        told.append(t("{:.0%} of the surface is void: nothing like it is marked.", known.void))
+    if known.told.get("seconds") is not None:
+        told.append(t("The last propagation took {:.1f} s.", known.told["seconds"]))
+    unused = len(known.told.get("unused", []))
+    if unused:
+        told.append(t("{} marks met no surface.", unused) if unused > 1 else t("1 mark met no surface."))
+    if known.accepted is not None:
+        told.append(t("The field has the classes of revision {}.", known.accepted))
+    return told
+
+
+def conflict_text(conflict: dict[str, int], marks: list[dict[str, Any]]) -> str:
+    """Two marks that contradict each other, with the photos on which they are."""
+    photos = [
+        marks[number - 1]["photo"] if 0 < number <= len(marks) else "?"
+        for number in (conflict["revision"], conflict["other"])
+    ]
+    return t("Mark {} on {} contradicts mark {} on {}.", conflict["revision"], photos[0], conflict["other"], photos[1])

@@ -1,0 +1,447 @@
+"""Labelling on Blender's side: marks on their way to the engine, undo, what panels and overlay show."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fieldwork.addon.errors import EngineError
+from fieldwork.nerfcore.labels.journal import append_mark, show
+from fieldwork.nerfcore.labels.lookup import Labelling, read_labelling, surfel_map
+from fieldwork.nerfcore.labels.revisions import path_of, save
+from fieldwork.tests.addon.support import SETUP, make_posed_project
+
+pytest.importorskip("bpy")
+
+from fieldwork.addon.labels import journal, pending, results
+from fieldwork.panels import label_states
+
+LINE = {"photo": "a", "shape": "line", "points": [(1.0, 2.0), (3.0, 4.0)], "width": 2.0, "class_id": 1}
+DEAD = EngineError("died", "The engine stopped unexpectedly (signal 9).", "Run it again.")
+
+
+@pytest.fixture(autouse=True)
+def forgotten():
+    pending.clear()
+    yield
+    pending.clear()
+
+
+class Engine:
+    """Takes marks as the engine does; `dies`: when it does not answer. `before`: it dies before it writes."""
+
+    def __init__(self, project: Path) -> None:
+        self.project, self.dies, self.before, self.asked = project, False, False, []
+
+    def __call__(self, verb, params, answer):
+        self.asked.append(verb)
+        if self.dies and self.before:
+            return answer(None, DEAD)
+        if verb == "label checkout":
+            show(self.project, params["revision"])
+            result = {"revision": params["revision"]}
+        else:
+            values = {name: value for name, value in params.items() if name not in ("project", "void")}
+            result = {"revision": append_mark(self.project, values).revision}
+        return answer(None, DEAD) if self.dies else answer(result, None)
+
+
+def project_with_labels(folder: Path) -> Path:
+    """A posed project whose run was prepared, with the labels of revision 2: photo "a" shows four surfels."""
+    make_posed_project(folder)
+    run = folder / "runs/main"
+    (run / "surfels").mkdir(parents=True)
+    (run / "field.safetensors").touch()
+    (run / "config.json").write_text(json.dumps({"accepted": {"revision": 1, "time": ""}}))
+    photos = [{"name": "b", "width": 2, "height": 1, "first": 0}, {"name": "a", "width": 3, "height": 2, "first": 2}]
+    np.save(run / "surfels/pixel_surfel.npy", np.array([0, 0, 0, 1, -1, 2, 3, 3], np.int32))
+    (run / "surfels/prepared.json").write_text(json.dumps({"inputs": {}, "photos": photos}))
+    for class_id in (1, 2):
+        append_mark(folder, {**LINE, "class_id": class_id})
+    probability = np.array([[0.9, 0.05], [0.2, 0.6], [0.1, 0.1], [0.55, 0.4]], np.float32)
+    told = {"seconds": 1.5, "conflicts": [{"revision": 2, "other": 1, "surfels": 3}], "unused": [2]}
+    save(folder, "main", Labelling(2, probability, np.array([1, 2], np.int32), "made", told))
+    return folder
+
+
+def test_a_mark_that_the_engine_does_not_answer_is_sent_again_and_written_once(tmp_path):
+    for before in (True, False):
+        project = tmp_path / str(before)
+        engine = Engine(project)
+        engine.dies, engine.before = True, before
+        pending.mark(project, LINE)
+        pending.mark(project, {**LINE, "class_id": 2})
+        pending.send(engine)
+        assert len(pending.marks_of(project)) == 2, "nothing is lost"
+        assert "signal 9" in pending.error(project).message
+        assert pending.take() == []
+        pending.send(engine)
+        assert len(engine.asked) == 1, "it is not asked again at once"
+        engine.dies = False
+        for _ in range(3):
+            pending.send(engine, at_once=True)
+        assert not pending.waiting(project)
+        assert pending.error(project) is None
+        assert [mark["class_id"] for mark in journal.marks(project)] == [1, 2], "in order, and each once"
+        assert [(taken.verb, taken.revision) for taken in pending.take()] == [("label stroke", 1), ("label stroke", 2)]
+
+
+def test_a_mark_that_is_refused_is_dropped_and_the_next_one_goes_on(tmp_path):
+    refused = EngineError("input", "The mark lies outside the photo.")
+    pending.mark(tmp_path, {**LINE, "photo": "nowhere"})
+    pending.send(lambda verb, params, answer: answer(None, refused))
+    assert pending.error(tmp_path) is refused
+    assert not pending.waiting()
+    pending.mark(tmp_path, LINE)
+    assert pending.error(tmp_path) is None, "the message goes with the next mark"
+    pending.send(Engine(tmp_path))
+    assert len(journal.marks(tmp_path)) == 1
+
+
+def test_a_mark_without_an_engine_waits(tmp_path):
+    def missing(verb, params, answer):
+        raise EngineError("missing", "The engine is not installed.")
+
+    pending.mark(tmp_path, LINE)
+    pending.send(missing)
+    assert "not installed" in pending.error(tmp_path).message
+    assert pending.waiting(tmp_path)
+
+
+def test_of_several_undone_steps_the_last_one_is_shown_at_once_and_after_the_marks(tmp_path):
+    engine = Engine(tmp_path)
+    for class_id in (1, 2, 3):
+        pending.mark(tmp_path, {**LINE, "class_id": class_id})
+        pending.send(engine)
+    pending.check_out(tmp_path, 2)
+    pending.check_out(tmp_path, 1)
+    assert pending.shown(tmp_path) == 1
+    assert journal.shown(tmp_path) == 3, "the engine has not been told"
+    pending.send(engine)
+    assert journal.shown(tmp_path) == 1
+    assert engine.asked[3:] == ["label checkout"], "what lies between is not worth asking for"
+    assert [mark["class_id"] for mark in journal.marks_at(tmp_path, 3)] == [1, 2, 3]
+    pending.mark(tmp_path, {**LINE, "class_id": 7})
+    pending.send(engine)
+    assert journal.ancestry(tmp_path, 4) == [4, 1], "a mark grows from what is shown"
+
+
+def test_a_torn_or_foreign_journal_is_read_as_far_as_it_is_whole(tmp_path):
+    assert journal.marks(tmp_path) == []
+    append_mark(tmp_path, LINE)
+    path = tmp_path / journal.JOURNAL
+    whole = path.read_bytes()
+    for more in (b'{"revision": 2, "par', b"no json\n", b'{"revision": 9, "parent": 0}\n'):
+        path.write_bytes(whole + more)
+        assert [mark["revision"] for mark in journal.marks(tmp_path)] == [1]
+    (tmp_path / journal.SHOWN).write_text('{"revision": 12}')
+    assert journal.shown(tmp_path) == 1
+
+
+def test_what_was_propagated_is_looked_up_without_the_engine(tmp_path):
+    folder = project_with_labels(tmp_path / "p")
+    assert results.prepared(folder, "main")
+    assert results.computed(folder, "main", 2)
+    assert results.nearest_computed(folder, "main", 2) == 2
+    append_mark(folder, LINE)
+    assert results.nearest_computed(folder, "main", 3) == 2, "until it is propagated, the one before is shown"
+    assert results.nearest_computed(folder, "main", 1) is None
+    found = results.labelling(folder, "main", 2)
+    assert found is not None
+    shares, void = results.shares(found, 0)
+    assert (shares[1].share, shares[2].share, void) == (0.5, 0.25, 0.25)
+    assert shares[1].confidence == pytest.approx((0.9 + 0.55) / 2, abs=1e-3)
+    record = folder / "runs/main/surfels/prepared.json"
+    record.write_text(record.read_text())  # prepared anew
+    assert not results.computed(folder, "main", 2)
+
+
+def test_the_overlay_has_the_colours_of_the_classes_where_photos_show_them(tmp_path):
+    folder = project_with_labels(tmp_path / "p")
+    found = results.labelling(folder, "main", 2)
+    surfels = results.photo_map(folder, "main", "a")
+    np.testing.assert_array_equal(surfels, [[0, 1, -1], [2, 3, 3]])
+    colors = {1: (1.0, 0.0, 0.0), 2: (0.0, 0.5, 0.0)}
+    seen = results.overlay(found, surfels, colors, 0, confidence=False)
+    red, green, clear = (1, 0, 0, 1), (0, 0.5, 0, 1), (0, 0, 0, 0)
+    # From the bottom row: surfel 2 is void, 3 is of the first class.
+    np.testing.assert_allclose(seen, [[clear, red, red], [red, green, clear]])
+    doubt = results.overlay(found, surfels, colors, 0, confidence=True)
+    assert doubt[0, 0].tolist() == pytest.approx([*results.VOID_COLOR, 1.0])
+    assert doubt[1, 0].tolist() == [1, 0, 0, 1], "sure places are as before"
+    assert doubt[1, 1, 1] < 0.5, "unsure places are hatched"
+    assert doubt[1, 2, 3] == 0
+
+
+def test_what_is_missing_or_damaged_is_no_labelling(tmp_path):
+    folder = project_with_labels(tmp_path / "p")
+    assert surfel_map(folder / "runs/main/surfels", "nobody") is None
+    assert surfel_map(folder / "runs/other/surfels", "a") is None
+    path = path_of(folder, "main", 2)
+    whole = path.read_bytes()
+    for broken in (b"", whole[:100], b"PK" + whole[2:50]):
+        path.write_bytes(broken)
+        assert read_labelling(path) is None
+        assert results.labelling(folder, "main", 2) is None
+
+
+def test_the_panel_says_what_is_shown_and_what_contradicts(bpy_script, tmp_path):
+    facts = bpy_script(
+        SETUP
+        + """
+from fieldwork.panels import label_states as states
+from fieldwork.addon.labels import pending, journal
+settings.project = project
+known = states.facts(bpy.context)
+seen = [states.lines(known), states.class_text(known, 1), states.class_line(known, "stone", 1)]
+seen.append(states.conflict_text(known.told["conflicts"][0], journal.marks(Path(project))))
+seen.append(list(states.label(bpy.context)))
+pending.mark(Path(project), {"photo": "a", "points": [[1, 1]], "width": 2, "class_id": 1})
+seen.append(states.class_text(states.facts(bpy.context), 1))
+settings.run = "other"
+seen.append(states.lines(states.facts(bpy.context)))
+answer(seen)
+""",
+        project=project_with_labels(tmp_path / "p"),
+    )
+    lines, row, line, conflict, state, more, nothing = facts
+    assert lines[0] == "Revision 2 of 2 is shown."
+    assert "25% of the surface is void: nothing like it is marked." in lines
+    assert "The last propagation took 1.5 s." in lines
+    assert "1 mark met no surface." in lines
+    assert "The field has the classes of revision 1." in lines
+    assert row == "1 ✎  50%"
+    assert line.startswith("stone: 1 mark, 50% of the surface, 7")
+    assert conflict == "Mark 2 on a contradicts mark 1 on a."
+    assert state == [True, "75% labelled"]
+    assert more == "2 ✎  50%"
+    assert nothing == ["Choose a class and draw over what belongs to it."]
+    assert label_states.Facts(revision=3, computed=2).stale
+
+
+CLASSES = """
+from fieldwork.addon.jobs.queue import queue
+def engine(verb, params, on_done):
+    path = Path(params["project"]) / "project.json"
+    value = json.loads(path.read_text())
+    known = {entry["id"]: entry for entry in value["classes"]}
+    value["classes"] = [{"color": [0, 0, 1], "priority": 1.0, **known.get(c["id"], {}), **c} for c in params["classes"]]
+    path.with_name("part").write_text(json.dumps(value))
+    os.replace(path.with_name("part"), path)
+    on_done({}, None)
+queue.ask_and_wait = engine
+settings.project = project
+"""
+
+
+def test_classes_are_added_chosen_and_removed(bpy_script, tmp_path):
+    facts = bpy_script(
+        SETUP
+        + CLASSES
+        + """
+rows = lambda: [[entry.id, entry.name] for entry in settings.classes]
+seen = [rows()]
+bpy.ops.fieldwork.class_add(name="wood")
+seen.append([rows(), settings.class_index])
+bpy.ops.fieldwork.class_add()
+bpy.ops.fieldwork.class_add(name="wood")
+seen.append(rows())
+settings.label_tool = "erase"
+bpy.ops.fieldwork.label_class(number=2)
+seen.append([settings.class_index, settings.label_tool])
+bpy.ops.fieldwork.class_remove()
+seen.append(rows())
+seen.append(sorted(bpy.ops.fieldwork.label_class(number=9)))
+answer(seen)
+""",
+        project=make_posed_project(tmp_path / "p"),
+    )
+    first, added, more, chosen, removed, beyond = facts
+    assert first == [[1, "stone"], [2, "gold"]]
+    assert added == [[*first, [3, "wood"]], 2], "the new class is the chosen one"
+    assert more[3:] == [[4, "Class 4"], [5, "wood'"]]
+    assert chosen == [1, "brush"]
+    assert removed == [[1, "stone"], [3, "wood"], [4, "Class 4"], [5, "wood'"]]
+    assert beyond == ["CANCELLED"]
+
+
+def test_a_refused_class_is_told(bpy_script, tmp_path):
+    message = bpy_script(
+        SETUP
+        + """
+from fieldwork.addon.errors import EngineError
+from fieldwork.addon.jobs.queue import queue
+queue.ask_and_wait = lambda verb, params, on_done: on_done(None, EngineError("setting", "300 classes are too many."))
+settings.project = project
+answer(attempt(lambda: bpy.ops.fieldwork.class_add()))
+""",
+        project=make_posed_project(tmp_path / "p"),
+    )
+    assert "too many" in message
+
+
+def test_marks_become_steps_of_undo_and_undo_shows_earlier_revisions(bpy_script, tmp_path):
+    """The revision stands in the scene: undo brings it back, and the project follows."""
+    facts = bpy_script(
+        SETUP
+        + """
+from fieldwork.addon.jobs.queue import queue
+from fieldwork.addon.labels import journal, pending, session
+from fieldwork.nerfcore.labels.journal import append_mark, show
+folder = Path(project)
+def engine(verb, params, on_done):
+    values = {name: value for name, value in params.items() if name not in ("project", "revision")}
+    if verb == "label checkout":
+        show(folder, params["revision"])
+        on_done({"revision": params["revision"]}, None)
+    else:
+        on_done({"revision": append_mark(folder, values).revision}, None)
+queue.ask_and_wait = engine
+look = lambda: [bpy.context.scene.fieldwork.label_revision, journal.shown(folder)]
+settings.project = project
+session.begin(settings)
+bpy.ops.ed.undo_push(message="begin")
+seen = [look()]
+for class_id in (1, 2):
+    session.mark(folder, {"photo": "a", "shape": "line", "points": [[1, 1]], "width": 2.0, "class_id": class_id})
+    bpy.ops.ed.undo_push(message="Label")
+    seen.append(look())
+for step in (bpy.ops.ed.undo, bpy.ops.ed.undo, bpy.ops.ed.redo):
+    step()
+    seen.append(look())
+# A file that was saved before: its revision is old news.
+bpy.ops.wm.save_as_mainfile(filepath=project + "/x.blend")
+append_mark(folder, {"photo": "a", "shape": "line", "points": [[1, 1]], "width": 2.0, "class_id": 1})
+bpy.ops.wm.open_mainfile(filepath=project + "/x.blend")
+seen.append(look())
+answer(seen)
+""",
+        project=project_without_marks(tmp_path / "p"),
+    )
+    assert facts == [[0, 0], [1, 1], [2, 2], [1, 1], [0, 0], [1, 1], [3, 3]]
+
+
+def project_without_marks(folder: Path) -> Path:
+    project_with_labels(folder)
+    for path in (folder / "marks").iterdir():
+        path.unlink()
+    return folder
+
+
+def test_what_a_stroke_says_follows_from_the_tool(bpy_script, tmp_path):
+    facts = bpy_script(
+        SETUP
+        + """
+from fieldwork.operators.label_tool import mark_parameters
+seen = [mark_parameters(settings)]
+settings.project = project
+settings.label_width, settings.label_author, settings.class_index = 7, "Ada", 1
+for tool in ("brush", "click", "erase", "void"):
+    settings.label_tool = tool
+    seen.append(mark_parameters(settings))
+settings.label_tool = "brush"
+seen.append(mark_parameters(settings, erase=True))
+settings.label_tool, settings.label_encoder, settings.label_decoder = "click", "e.onnx", "d.onnx"
+seen.append(mark_parameters(settings))
+answer(seen)
+""",
+        project=make_posed_project(tmp_path / "p"),
+    )
+    common = {"width": 7.0, "author": "Ada"}
+    assert facts[0] is None, "there is no class to mark"
+    assert facts[1] == {**common, "shape": "line", "class_id": 2}
+    assert facts[2] == {**common, "shape": "part", "width": 2.0, "class_id": 2}
+    assert facts[3] == facts[5] == {**common, "shape": "line", "erase": True}
+    assert facts[4] == {**common, "shape": "line", "void": True}
+    assert facts[6]["box"], "with a model a click asks it"
+    from fieldwork.nerfcore.params import LabelStrokeParams
+
+    for values in facts[1:6]:
+        LabelStrokeParams.model_validate({"project": tmp_path, "photo": "a", "points": [(1, 1)], **values})
+
+
+def test_labels_are_imported_and_exported_by_the_engine(bpy_script, tmp_path):
+    """What the operators ask for is what the verbs take."""
+    facts = bpy_script(
+        SETUP
+        + """
+from fieldwork.addon.jobs.queue import queue
+asked = []
+def run(job):
+    asked.append([job.verb, job.params])
+    job.state, job.result = "done", {"photos": 3}
+    if job.on_done:
+        job.on_done(job)
+    return job.result
+queue.run = run
+settings.project = project
+seen = [attempt(lambda: bpy.ops.fieldwork.label_import()), attempt(lambda: bpy.ops.fieldwork.label_export())]
+bpy.ops.fieldwork.label_import(filepath="/data/annotations.xml", format="cvat", replace=True)
+settings.class_index = 1
+bpy.ops.fieldwork.label_export(filepath="/data/labels", format="coco")
+bpy.ops.fieldwork.label_export(filepath="/data/masks", format="masks", source="marks", revision=2)
+answer([seen, asked])
+""",
+        project=make_posed_project(tmp_path / "p"),
+    )
+    (nothing, nowhere), asked = facts
+    assert "Choose a file" in nothing
+    assert "Choose a file" in nowhere
+    from fieldwork.nerfcore.params import LabelExportParams, LabelImportParams
+
+    read = LabelImportParams.model_validate(asked[0][1])
+    assert (read.file, read.format, read.replace) == (Path("/data/annotations.xml"), "cvat", True)
+    files, masks = (LabelExportParams.model_validate(params) for _, params in asked[1:])
+    assert (files.out, files.format, files.source) == (Path("/data/labels.json"), "coco", "maps")
+    assert (masks.out, masks.class_name, masks.revision) == (Path("/data/masks"), "gold", 2)
+
+
+def test_clicks_and_boxes_go_to_the_model_and_come_back_as_marks(bpy_script, tmp_path):
+    facts = bpy_script(
+        SETUP
+        + """
+from fieldwork.addon.jobs.queue import queue
+from fieldwork.addon.labels import pending
+from fieldwork.operators.label_models import cut_out
+asked = []
+def run(job):
+    asked.append([job.verb, job.params])
+    job.state, job.result = "done", {"revision": 7}
+    if job.on_done:
+        job.on_done(job)
+    return job.result
+queue.run = run
+settings.project = project
+folder = Path(project)
+settings.label_encoder, settings.label_decoder, settings.class_index = "/m/e.onnx", "/m/d.onnx", 1
+cut_out(settings, folder, "a", [(10.5, 20.0), (11.0, 20.0)])
+revision = settings.label_revision
+cut_out(settings, folder, "a", [(30.0, 5.0), (10.0, 25.0)])
+bpy.ops.fieldwork.assist_segment(photo="a", points="1,2 3,4", outside="9,9", void=True)
+bpy.ops.fieldwork.assist_embed(photos="a, b")
+bpy.ops.fieldwork.assist_suggest(model="/m/s.onnx", mapping="/m/c.json", least=0.25)
+wrong = attempt(lambda: bpy.ops.fieldwork.assist_segment(photo="a", points="1;2"))
+answer([asked, revision, wrong])
+""",
+        project=make_posed_project(tmp_path / "p"),
+    )
+    asked, revision, wrong = facts
+    from fieldwork.nerfcore import params as p
+
+    models = [
+        p.AssistSegmentParams,
+        p.AssistSegmentParams,
+        p.AssistSegmentParams,
+        p.AssistEmbedParams,
+        p.AssistSuggestParams,
+    ]
+    click, box, void, ahead, guess = (model.model_validate(values) for model, (_, values) in zip(models, asked))
+    assert (click.points, click.box, click.class_id) == ([(10.5, 20.0)], None, 2)
+    assert (box.points, box.box) == ([], (10.0, 5.0, 30.0, 25.0))
+    assert (void.points, void.outside, void.void, void.class_id) == ([(1, 2), (3, 4)], [(9, 9)], True, None)
+    assert ahead.photos == ["a", "b"]
+    assert (guess.model, guess.least) == (Path("/m/s.onnx"), 0.25)
+    assert revision == 7, "what was cut out is a step of undo"
+    assert "are no places" in wrong

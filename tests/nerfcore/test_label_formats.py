@@ -1,0 +1,368 @@
+"""Labels of other tools: files as these tools write them, and everything there and back."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from fieldwork.nerfcore.cli import main
+from fieldwork.nerfcore.errors import DiskError, FieldworkError, InputError, SettingError
+from fieldwork.nerfcore.images.working import read_label
+from fieldwork.nerfcore.labels.exchange import export_labels, import_labels
+from fieldwork.nerfcore.labels.formats import coco, cvat, known, label_studio
+from fieldwork.nerfcore.labels.formats.regions import from_runs, hex_color, runs_of
+from fieldwork.nerfcore.params import LabelExportParams, LabelImportParams
+from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.project.store import edit_project, load_project
+from fieldwork.tests.nerfcore.support.ball import ball_project
+from fieldwork.tests.nerfcore.support.label_files import (
+    BRUSH,
+    COCO,
+    CORNER,
+    CVAT,
+    HEIGHT,
+    RING,
+    WIDTH,
+    WRITTEN,
+    write_coco,
+    write_cvat,
+)
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+MASKS = st.integers(1, 12).flatmap(
+    lambda w: st.integers(1, 12).flatmap(
+        lambda h: st.lists(st.booleans(), min_size=w * h, max_size=w * h).map(lambda v: np.array(v).reshape(h, w))
+    )
+)
+
+
+def project_of(folder: Path, names: list[str], size: tuple[int, int] = (WIDTH, HEIGHT)) -> Path:
+    """A project with photos of these names, without classes and labels."""
+    ball_project(folder, views=len(names), side=8)
+    with edit_project(folder) as project:
+        project.classes = []
+        for image, name in zip(project.images, names):
+            image.name, image.label, (image.width, image.height) = name, None, size
+            image.file = f"images/{name}.jpg"
+    return folder
+
+
+def bring(folder: Path, file: Path, **values: Any) -> tuple[dict[str, Any], Reporter]:
+    report = Reporter()
+    return import_labels(LabelImportParams.model_validate({"project": folder, "file": file, **values}), report), report
+
+
+def named_map(folder: Path, photo: str) -> np.ndarray:
+    """The label map of a photo with the names of the classes, "" for unlabelled."""
+    project = load_project(folder)
+    label = next(image.label for image in project.images if image.name == photo)
+    assert label is not None
+    names = {project.ignore_id: "", **{c.id: c.name for c in project.classes}}
+    return np.vectorize(names.__getitem__)(read_label(folder / label))
+
+
+def expect(**masks: np.ndarray) -> np.ndarray:
+    found = np.full((HEIGHT, WIDTH), "", dtype="<U8")
+    for name, mask in masks.items():
+        found[mask] = name
+    return found
+
+
+@pytest.mark.parametrize("kind", WRITTEN)
+def test_files_as_tools_write_them_are_recognised_and_read(tmp_path: Path, kind: str) -> None:
+    folder = project_of(tmp_path / "p", ["a", "b"])
+    (tmp_path / "given").mkdir()
+    told, _ = bring(folder, WRITTEN[kind](tmp_path / "given"))
+    assert (told["photos"], told["classes"]) == (1, ["stone", "wood"])
+    np.testing.assert_array_equal(named_map(folder, "a"), expect(wood=RING, stone=CORNER))
+    images = {image.name: image for image in load_project(folder).images}
+    assert images["b"].label is None, "what nobody labelled stays unlabelled"
+    if kind == "colors":
+        assert images["a"].instances is None
+    else:
+        assert images["a"].instances is not None
+        things = read_label(folder / images["a"].instances)
+        assert len(np.unique(things[RING])) == 1
+        assert things[RING][0] not in (0, things[CORNER][0])
+        assert not things[~RING & ~CORNER].any()
+        assert (things[CORNER][0] == 0) == (kind == "segments"), "what has no instances is no thing"
+    if kind in ("panoptic", "cvat", "segments", "supervisely", "colors"):
+        colors = {c.name: [round(part * 255) for part in c.color] for c in load_project(folder).classes}
+        assert colors == {"stone": [1, 2, 3], "wood": [255, 0, 51]}
+
+
+def test_what_has_no_area_and_strange_pictures_are_told(tmp_path: Path) -> None:
+    folder = project_of(tmp_path / "p", ["a"])
+    told, report = bring(folder, write_coco(tmp_path))
+    assert told["unknown"] == ["stranger.jpg"]
+    assert told["skipped"] == {"box": 1}
+    assert any("stranger.jpg" in text for text in report.warnings)
+    assert any("“box” have no area" in text for text in report.warnings)
+    told, _ = bring(folder, write_cvat(tmp_path), replace=True)
+    assert told["skipped"] == {"polyline": 1}
+
+
+def test_photos_keep_labels_of_their_own_unless_they_shall_not(tmp_path: Path) -> None:
+    folder = project_of(tmp_path / "p", ["a"])
+    own = folder / "labels/mine.png"
+    Image.fromarray(np.full((HEIGHT, WIDTH), 9, np.uint8)).save(own)
+    with edit_project(folder) as project:
+        project.images[0].label = "labels/mine.png"
+    told, report = bring(folder, write_cvat(tmp_path))
+    assert (told["photos"], told["kept"]) == (0, ["a"])
+    assert any("keep them" in text for text in report.warnings)
+    assert load_project(folder).images[0].label == "labels/mine.png"
+    told, _ = bring(folder, write_cvat(tmp_path), replace=True)
+    assert told["photos"] == 1
+    np.testing.assert_array_equal(named_map(folder, "a"), expect(wood=RING, stone=CORNER))
+    assert own.is_file(), "nothing is deleted"
+
+
+def test_known_classes_keep_their_ids_and_names_for_nothing_are_no_class(tmp_path: Path) -> None:
+    folder = project_of(tmp_path / "p", ["a"])
+    with edit_project(folder) as project:
+        project.ignore_id = 1
+        project.classes = [known_class(5, "wood")]
+    (tmp_path / "annotations.xml").write_text(CVAT.replace("stone", "Unlabeled"))
+    bring(folder, tmp_path / "annotations.xml")
+    project = load_project(folder)
+    assert [(c.id, c.name) for c in project.classes] == [(5, "wood")]
+    label = read_label(folder / str(project.images[0].label))
+    assert (label[RING] == 5).all()
+    assert (label[~RING] == 1).all(), "void has the id that the project says"
+    (tmp_path / "annotations.xml").write_text(CVAT.replace("stone", "background"))
+    bring(folder, tmp_path / "annotations.xml", replace=True)
+    assert [(c.id, c.name) for c in load_project(folder).classes] == [(2, "background"), (5, "wood")]
+
+
+def known_class(number: int, name: str) -> Any:
+    from fieldwork.nerfcore.project.schema import SemanticClass
+
+    return SemanticClass(id=number, name=name, color=(1, 0, 0))
+
+
+def test_labels_of_larger_photos_are_brought_to_their_size_and_others_are_refused(tmp_path: Path) -> None:
+    folder = project_of(tmp_path / "p", ["a"], (14, 10))
+    bring(folder, write_cvat(tmp_path))
+    large = expect(wood=RING, stone=CORNER).repeat(2, 0).repeat(2, 1)
+    np.testing.assert_array_equal(named_map(folder, "a"), large)
+    other = project_of(tmp_path / "q", ["a"], (10, 14))
+    with pytest.raises(InputError, match="No picture"):
+        bring(other, write_cvat(tmp_path))
+    assert load_project(other).images[0].label is None
+
+
+def test_masks_as_metashape_writes_them_are_one_class(tmp_path: Path) -> None:
+    folder = project_of(tmp_path / "p", ["a", "IMG_1.x"])
+    given = tmp_path / "masks"
+    given.mkdir()
+    Image.fromarray(RING.astype(np.uint8) * 255).save(given / "a_mask.png")
+    Image.fromarray(CORNER).save(given / "IMG_1.x_mask.png")  # one bit
+    told, _ = bring(folder, given, format="masks", class_name="vase")
+    assert (told["photos"], told["classes"]) == (2, ["vase"])
+    np.testing.assert_array_equal(named_map(folder, "a"), expect(vase=RING))
+    np.testing.assert_array_equal(named_map(folder, "IMG_1.x"), expect(vase=CORNER))
+    out = tmp_path / "again"
+    export(folder, out, "masks", class_name="vase")
+    np.testing.assert_array_equal(np.asarray(Image.open(out / "a_mask.png")), RING * 255)
+
+
+def export(folder: Path, out: Path, kind: str, **values: Any) -> dict[str, Any]:
+    given = {"project": folder, "out": out, "format": kind, **values}
+    return export_labels(LabelExportParams.model_validate(given), Reporter())
+
+
+@pytest.mark.parametrize(
+    "kind", ["coco", "coco-panoptic", "cvat", "label-studio", "labelme", "segments", "supervisely", "png", "png-colors"]
+)
+def test_labels_and_instances_come_back_as_they_went(tmp_path: Path, kind: str) -> None:
+    random = np.random.default_rng(4)
+    folder = project_of(tmp_path / "p", ["a", "b"], (23, 17))
+    ids, things = {}, {}
+    with edit_project(folder) as project:
+        project.classes = [known_class(2, "stone"), known_class(300, "holz & stein")]
+        project.classes[1].color = (0.0, 0.4, 1.0)
+        (folder / "labels/i").mkdir()
+        for image in project.images:
+            ids[image.name] = random.choice([0, 2, 300], (17, 23)).astype(np.uint16)
+            things[image.name] = np.where(ids[image.name] == 300, random.integers(1, 4, (17, 23)), 0).astype(np.uint16)
+            image.label, image.instances = f"labels/{image.name}.png", f"labels/i/{image.name}.png"
+            Image.fromarray(ids[image.name]).save(folder / image.label)
+            Image.fromarray(things[image.name]).save(folder / image.instances)
+    out = tmp_path / f"out{known.FILES.get(kind, '')}"
+    told = export(folder, out, kind)
+    assert told["photos"] == 2
+    assert all(Path(file).is_file() for file in told["files"])
+    other = project_of(tmp_path / "q", ["a", "b"], (23, 17))
+    path = out / "panoptic.json" if kind == "coco-panoptic" else out
+    told, _ = bring(other, path)
+    assert told["unknown"] == []
+    for name in ("a", "b"):
+        wanted = np.vectorize({0: "", 2: "stone", 300: "holz & stein"}.__getitem__)(ids[name])
+        np.testing.assert_array_equal(named_map(other, name), wanted)
+        if kind not in ("png", "png-colors"):
+            record = next(image for image in load_project(other).images if image.name == name)
+            assert record.instances is not None
+            back = read_label(other / record.instances)
+            pairs = {(int(a), int(b)) for a, b in zip(things[name].flat, back.flat) if a}
+            assert len(pairs) == 3, "each instance is one again"
+            assert len({b for _, b in pairs}) == 3
+
+
+@given(MASKS)
+@settings(max_examples=60, deadline=None)
+def test_run_lengths_come_back(mask: np.ndarray) -> None:
+    runs = runs_of(mask)
+    assert sum(runs) == mask.size
+    assert (from_runs(runs, mask.size) == mask.reshape(-1)).all()
+    assert coco.unpacked(coco.packed(runs)) == runs
+    flat = np.repeat(mask.reshape(-1).astype(np.uint8) * 255, 4)
+    np.testing.assert_array_equal(label_studio.unpacked(label_studio.packed(flat)), flat)
+
+
+def test_run_lengths_are_those_of_the_tools() -> None:
+    assert coco.packed(runs_of(RING.T)) == ";32NO0129"
+    mask = np.zeros((4, 6), np.uint8)
+    mask[1:3, 2:5] = 255
+    np.testing.assert_array_equal(label_studio.unpacked(BRUSH), np.repeat(mask.reshape(-1), 4))
+    many = np.zeros(3_000_000, np.uint8)
+    many[700_000:] = 255
+    np.testing.assert_array_equal(label_studio.unpacked(label_studio.packed(many)), many)
+
+
+def test_names_of_label_studio_s_pictures() -> None:
+    name = lambda address: label_studio.picture_name({"image": address}, 1)  # noqa: E731
+    assert name("/data/upload/3/0a1b2c3d-IMG_1.jpg") == "IMG_1.jpg"
+    assert name("/data/local-files/?d=vase%2FIMG%201.jpg") == "IMG 1.jpg"
+    assert name("s3://bucket/vase/IMG_1.jpg?versionId=4") == "IMG_1.jpg"
+    assert hex_color("#0f8") == (0, 255, 136)
+    assert hex_color("red") is None
+
+
+BROKEN = {
+    "no json.json": b"{",
+    "other.json": b'{"a": 1}',
+    "broken.xml": b"<annotations><image",
+    "video.xml": b"<annotations><track id='0' label='x'/></annotations>",
+    "empty.xml": b"<annotations/>",
+    "size.xml": b"<annotations><image name='a' width='-3' height='5'/></annotations>",
+    "huge.xml": b"<annotations><image name='a' width='30000' height='30000'/></annotations>",
+    "runs.xml": b"<annotations><image name='a' width='7' height='5'><mask label='x' rle='3, 9' left='0' top='0' width='2' height='2'/></image></annotations>",
+    "points.xml": b"<annotations><image name='a' width='7' height='5'><polygon label='x' points='1,2;3'/></image></annotations>",
+    "categories.json": b'{"images": [], "annotations": []}',
+    "runs.json": json.dumps(
+        {**COCO, "annotations": [{**COCO["annotations"][0], "segmentation": {"size": [5, 7], "counts": [3, 4]}}]}
+    ).encode(),
+    "strange category.json": json.dumps(
+        {**COCO, "annotations": [{**COCO["annotations"][1], "category_id": 77}]}
+    ).encode(),
+    "no panoptic.json": json.dumps(
+        {**COCO, "annotations": [{"image_id": 4, "file_name": "x.png", "segments_info": []}]}
+    ).encode(),
+    "brush.json": json.dumps(
+        [
+            {
+                "data": {"image": "a.jpg"},
+                "annotations": [
+                    {
+                        "result": [
+                            {
+                                "type": "brushlabels",
+                                "original_width": 7,
+                                "original_height": 5,
+                                "value": {"rle": [1, 2], "brushlabels": ["x"]},
+                            }
+                        ]
+                    }
+                ],
+            }
+        ]
+    ).encode(),
+    "mask.json": json.dumps(
+        {
+            "shapes": [{"label": "x", "points": [[0, 0], [1, 1]], "shape_type": "mask", "mask": "!"}],
+            "imagePath": "a.jpg",
+            "imageWidth": 7,
+            "imageHeight": 5,
+        }
+    ).encode(),
+    "release.json": b'{"dataset": {"samples": [], "task_attributes": {}}}',
+    "a.png": b"no picture",
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_what_cannot_be_read_is_told_in_a_sentence(tmp_path: Path, name: str) -> None:
+    folder = project_of(tmp_path / "p", ["a"])
+    before = (folder / "project.json").read_bytes()
+    path = tmp_path / name
+    path.write_bytes(BROKEN[name])
+    with pytest.raises(InputError) as error:
+        bring(folder, path)
+    assert error.value.message.endswith(".")
+    assert error.value.hint
+    assert (folder / "project.json").read_bytes() == before
+
+
+def test_folders_and_files_that_are_wrong_are_refused(tmp_path: Path) -> None:
+    folder = project_of(tmp_path / "p", ["a"])
+    (tmp_path / "empty").mkdir()
+    for path in (tmp_path / "nothing", tmp_path / "empty"):
+        with pytest.raises(InputError):
+            bring(folder, path)
+    with pytest.raises(InputError, match="has labels"):
+        export(folder, tmp_path / "x.json", "coco")
+    bring(folder, write_cvat(tmp_path))
+    with pytest.raises(SettingError, match=r"end in \.xml"):
+        export(folder, tmp_path / "x.json", "cvat")
+    with pytest.raises(SettingError, match="no class"):
+        export(folder, tmp_path / "m", "masks", class_name="gold")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full/x").touch()
+    with pytest.raises(InputError, match="there already"):
+        export(folder, tmp_path / "full", "png")
+    (tmp_path / "new").mkdir()
+    assert export(folder, tmp_path / "new", "png")["photos"] == 1, "an empty folder is as good as none"
+
+
+def test_a_full_disk_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = project_of(tmp_path / "p", ["a"])
+    bring(folder, write_cvat(tmp_path))
+
+    def full(*_: Any, **__: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Image.Image, "save", full)
+    with pytest.raises(DiskError):
+        export(folder, tmp_path / "out", "png")
+    assert not (tmp_path / "out").exists()
+    assert not list(tmp_path.glob(".out*"))
+
+
+def test_polygons_of_cvat_turn_as_the_tool_turns_them() -> None:
+    from xml.etree import ElementTree
+
+    box = ElementTree.fromstring("<box xtl='1' ytl='2' xbr='5' ybr='4' rotation='90'/>")
+    mask = cvat._mask(box, 8, 8)
+    assert mask is not None
+    assert [list(map(int, edge)) for edge in (np.flatnonzero(mask.any(0)), np.flatnonzero(mask.any(1)))] == [
+        [2, 3],
+        [1, 2, 3, 4],
+    ]
+
+
+def test_the_command_line_imports_and_exports(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    folder = project_of(tmp_path / "p", ["a"])
+    assert main(["label", "import", str(folder), "--file", str(write_cvat(tmp_path)), "--json"]) == 0
+    assert json.loads(capfd.readouterr().out)["photos"] == 1
+    out = tmp_path / "labels.json"
+    assert main(["label", "export", str(folder), str(out), "--format", "coco", "--json"]) == 0
+    assert json.loads(capfd.readouterr().out)["files"] == [str(out)]
+    assert main(["label", "import", str(folder), "--file", str(tmp_path / "nothing"), "--json"]) == 1
+    assert "does not exist" in json.loads(capfd.readouterr().out)["error"]["message"]
+    assert issubclass(InputError, FieldworkError)

@@ -20,6 +20,8 @@ WITH_CONTEXT = (bpy.types.Operator, bpy.types.Panel, bpy.types.Menu)
 MODULES = (
     "addon.text",
     "addon.properties",
+    "addon.live.settings",
+    "addon.live.engine",
     "addon.preferences",
     "addon.pictures.thumbnails",
     "addon.jobs.timer",

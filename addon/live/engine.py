@@ -6,16 +6,20 @@ only one; the engine (frames.py) does the work in a process of its own, so the p
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import bpy
+from mathutils import Vector
 
 from .. import machine
 from ..errors import EngineError, SceneError
 from ..text import t
-from . import camera, fields, objects, passes
-from .frames import Frame, FrameEngine, Sizes
+from . import camera, fields, passes
+
+if TYPE_CHECKING:
+    from .frames import Frame, FrameEngine
 
 ENGINE = "FIELDWORK"
 IDLE_PERIOD = 10.0  # seconds between two looks at an engine that may have nothing to do
@@ -30,7 +34,28 @@ def _open_link() -> Any:
     return Link(python, machine.engine_log().with_name(f"frames-{machine.engine_log().stem}.log"))
 
 
-frames = FrameEngine(_open_link)
+_frames: FrameEngine | None = None
+_making = threading.Lock()
+
+
+def frames() -> FrameEngine:
+    """The engine of this Blender's frames; it is started by the first of them."""
+    global _frames
+    with _making:
+        if _frames is None:
+            from .frames import FrameEngine  # not at the top: enabling the extension must be quick
+
+            _frames = FrameEngine(_open_link)
+        return _frames
+
+
+def close_frames() -> None:
+    """End the engine of frames, if there is one."""
+    global _frames
+    with _making:
+        if _frames is not None:
+            _frames.close()
+            _frames = None
 
 
 def working_space() -> str:
@@ -73,6 +98,8 @@ class FieldworkRenderEngine(bpy.types.RenderEngine):
         self.update_stats("", t("Reading the scene"))
         shot = self._shot(depsgraph, asked)
         x0, y0, x1, y1 = shot["border"]
+        from .frames import Sizes
+
         sizes = Sizes(x1 - x0, y1 - y0, {each.name: each.channels for each in asked})
         for each in asked[1:]:
             self.add_pass(each.name, each.channels, each.letters, layer=layer.name)
@@ -90,9 +117,7 @@ class FieldworkRenderEngine(bpy.types.RenderEngine):
             self.update_stats("", t(stage) if stage else "")
 
         try:
-            frame = frames.render(
-                shot, sizes, self.test_break, tell, None if bpy.app.background else show
-            )
+            frame = frames().render(shot, sizes, self.test_break, tell, None if bpy.app.background else show)
         finally:
             if "occluders" in shot:
                 Path(shot["occluders"]).unlink(missing_ok=True)
@@ -140,14 +165,16 @@ class FieldworkRenderEngine(bpy.types.RenderEngine):
         shot: dict[str, Any] = {
             "border": border(render, width, height),
             "samples": live.samples,
-            "fields": fields.rendered_items(scene, layer, depsgraph),
+            "fields": fields.rendered_items(depsgraph),
             "passes": [each.name for each in asked],
             "levels": layer.pass_cryptomatte_depth + layer.pass_cryptomatte_depth % 2,
             "world": None if render.film_transparent else world_color(scene.world),
             "sky": not render.film_transparent,
         }
         if live.objects_hide:
-            shot["occluders"] = str(objects.write_triangles(frames.folder() / "objects.npz", depsgraph))
+            from . import objects
+
+            shot["occluders"] = str(objects.write_triangles(frames().folder() / "objects.npz", depsgraph))
         now = scene.frame_current + scene.frame_subframe
         times = camera.shutter_times(render, now)
         lens["poses"] = camera.poses_in_time(eye, times, self.frame_set, now)
@@ -169,8 +196,9 @@ def border(render: bpy.types.RenderSettings, width: int, height: int) -> tuple[i
     """The pixels that are rendered, from the upper left corner: Blender's count from below."""
     if not render.use_border:
         return 0, 0, width, height
-    x0, x1 = int(render.border_min_x * width), int(render.border_max_x * width)
-    y0, y1 = int(render.border_min_y * height), int(render.border_max_y * height)
+    shares = (render.border_min_x, render.border_max_x, render.border_min_y, render.border_max_y)
+    # In single precision, as Blender does: 0.9 of 80 pixels are 72, not 71.
+    x0, x1, y0, y1 = (int((Vector((share, 0)) * side).x) for share, side in zip(shares, (width, width, height, height)))
     return x0, height - y1, x1, height - y0
 
 
@@ -198,8 +226,8 @@ def _hash7(name: str) -> str:
 
 def _end_when_idle() -> float:
     minutes = machine.preferences().idle_minutes
-    if minutes and frames.idle_seconds > 60 * minutes:
-        frames.close()
+    if minutes and _frames is not None and _frames.idle_seconds > 60 * minutes:
+        close_frames()
     return IDLE_PERIOD
 
 
@@ -229,4 +257,4 @@ def unregister() -> None:
     for panel in bpy.types.Panel.__subclasses__():
         if ENGINE in getattr(panel, "COMPAT_ENGINES", ()):
             panel.COMPAT_ENGINES.discard(ENGINE)
-    frames.close()
+    close_frames()

@@ -20,24 +20,24 @@ def field_objects(objects: Iterable[bpy.types.Object]) -> list[bpy.types.Object]
     return [obj for obj in objects if obj.type == "EMPTY" and obj.fieldwork.is_field]
 
 
-def rendered_items(scene: bpy.types.Scene, layer: bpy.types.ViewLayer, depsgraph: Any = None) -> list[dict[str, Any]]:
+def rendered_items(depsgraph: bpy.types.Depsgraph) -> list[dict[str, Any]]:
     """What a render shows, as nerfcore/film/shot.py describes fields.
 
     Raises SceneError: there is no field to show.
     """
+    scene = depsgraph.scene_eval
     baked = scene.fieldwork_live.source == "baked"
-    found = field_objects(obj for obj in layer.objects if not obj.hide_render)
-    if depsgraph is not None:
-        found = [obj.evaluated_get(depsgraph) for obj in found]
+    known = field_objects(depsgraph.view_layer.objects)  # also those that are hidden in renders
+    found = [obj.evaluated_get(depsgraph) for obj in known if not obj.hide_render]
     items = [item_of(obj, baked, depsgraph) for obj in found]
-    if not items and not field_objects(layer.objects):
+    if not known:
         items = [project_item(scene, baked)]
     if not items:
         raise SceneError(t("All fields of the scene are hidden in renders."))
     return items
 
 
-def item_of(obj: bpy.types.Object, baked: bool, depsgraph: Any = None) -> dict[str, Any]:
+def item_of(obj: bpy.types.Object, baked: bool, depsgraph: bpy.types.Depsgraph) -> dict[str, Any]:
     """A field object. Raises SceneError: it has no project."""
     own = obj.fieldwork
     if not own.project:
@@ -55,8 +55,7 @@ def item_of(obj: bpy.types.Object, baked: bool, depsgraph: Any = None) -> dict[s
     }
     crop = own.crop
     if crop is not None:
-        crop = crop if depsgraph is None else crop.evaluated_get(depsgraph)
-        item["crop"] = rows(crop_matrix(crop))
+        item["crop"] = rows(crop_matrix(crop.evaluated_get(depsgraph)))
     return item
 
 

@@ -206,7 +206,7 @@ class _SharedPixels:
     def __enter__(self) -> _SharedPixels:
         count = sum(self._sizes.channels.values()) * self._sizes.width * self._sizes.height
         try:
-            self._file = open(self.path, "w+b")  # noqa: SIM115 - closed in __exit__
+            self._file = open(self.path, "w+b")
             self._file.truncate(HEADER + 4 * count)
             self._map = mmap.mmap(self._file.fileno(), 0, access=mmap.ACCESS_READ)
         except OSError as error:

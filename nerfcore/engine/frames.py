@@ -93,7 +93,7 @@ class Frames:
 
                     store = FieldStore()
                 message = rpc.answer(request.id, _exposed(request.params, reporter, store))
-            except BaseException as error:  # noqa: BLE001 - everything a frame raises is answered
+            except BaseException as error:
                 tail = [line for block in traceback.format_exception(error)[-6:] for line in block.splitlines()]
                 wrong = error if isinstance(error, rpc.RpcError) else rpc.as_rpc_error(error, None, tail)
                 if wrong.code == rpc.INTERNAL_ERROR:

@@ -70,6 +70,4 @@ class Coverage:
         """Pixels (N, 4) of each pair of ranks: id, coverage, id, coverage; the largest first."""
         order = np.argsort(-self.shares, axis=1, kind="stable")
         ids, shares = np.take_along_axis(self.ids, order, 1), np.take_along_axis(self.shares, order, 1)
-        return [
-            np.stack([ids[:, k], shares[:, k], ids[:, k + 1], shares[:, k + 1]], 1) for k in range(0, levels, 2)
-        ]
+        return [np.stack([ids[:, k], shares[:, k], ids[:, k + 1], shares[:, k + 1]], 1) for k in range(0, levels, 2)]

@@ -10,7 +10,6 @@ import torch
 
 from ..data.load import load_scene
 from ..errors import ProjectError
-from ..kernels.device import use_device
 from ..kernels.march import Samples
 from ..kernels.traversal import BEFORE_CUBE, PDF_UNIFORM, MarchSettings
 from ..progress import Reporter

@@ -78,7 +78,9 @@ def scene_rays(
         x, y = on_aperture(aperture, chance[:, 0], chance[:, 1]).unbind(1)
         if lens.panoramic:
             sharp = origins + directions * aperture.focus
-            side = torch.linalg.cross(torch.tensor([[0.0, 0.0, -1.0]], device=x.device).expand_as(directions), directions)
+            side = torch.linalg.cross(
+                torch.tensor([[0.0, 0.0, -1.0]], device=x.device).expand_as(directions), directions
+            )
             side = side / side.norm(dim=1, keepdim=True).clamp(min=1e-9)
             up = torch.linalg.cross(directions, side)
             shift = side * x[:, None] + up * y[:, None]

@@ -86,5 +86,7 @@ class FirstHits:
         o, d = origins.detach().cpu().contiguous(), directions.detach().cpu().contiguous()
         found = torch.full((len(o),), 1.0e9)
         if self._mesh is not None:
-            launch(distance_kernel, len(o), [self._mesh.id, array(o, wp.vec3), array(d, wp.vec3), array(found)], o.device)
+            launch(
+                distance_kernel, len(o), [self._mesh.id, array(o, wp.vec3), array(d, wp.vec3), array(found)], o.device
+            )
         return found

@@ -84,7 +84,12 @@ cases = {
     "orthographic, vertical": dict(kind="ORTHO", fit="VERTICAL", size=(80, 120)),
     "scaled": dict(scale=(2, 3, 0.5)),
 }
-errors = {}
+asked, frame, errors = engine.frames().render, None, {}
+def noted(*args):
+    global frame
+    frame = asked(*args)
+    return frame
+engine.frames().render = noted
 for name, changes in cases.items():
     case = {**plain, **changes}
     data = camera.data
@@ -94,8 +99,9 @@ for name, changes in cases.items():
     render.resolution_x, render.resolution_y = case["size"]
     render.resolution_percentage, camera.scale = case["percent"], case["scale"]
     bpy.context.view_layer.update()
-    found = passes(shoot())
-    points, alpha = stack(found, "Position", "XYZ"), found["Combined.A"]
+    # Blender itself cannot write multilayer files of pixels that are not square.
+    bpy.ops.render.render()
+    points, alpha = frame.passes["Position"][::-1], frame.passes["Combined"][::-1, :, 3]
     height, width = alpha.shape
     rows, columns = np.nonzero(alpha > 0.9)
     worst = 0.0
@@ -373,16 +379,16 @@ for frame, x in ((1, -0.5), (100, 0.5)):
 scene.frame_start, scene.frame_end = 1, 100
 render.resolution_percentage = 25
 begun = time.monotonic()
-loads, asked = [], engine.frames.render
+loads, asked = [], engine.frames().render
 def noted(*args):
     frame = asked(*args)
     loads.append(frame.facts["loaded"])
     return frame
-engine.frames.render = noted
+engine.frames().render = noted
 shoot("frame_", animation=True)
 seconds = time.monotonic() - begun
-left = list(engine.frames.folder().iterdir())
-place = engine.frames.folder()
+left = list(engine.frames().folder().iterdir())
+place = engine.frames().folder()
 fieldwork.unregister()
 answer({"frames": len(loads), "loads": max(loads), "seconds": seconds, "left": [str(p) for p in left],
         "gone": not place.exists(), "files": len(list(Path(folder).glob("frame_*.exr")))})
@@ -405,11 +411,11 @@ import signal, threading
 live.source, live.samples = "field", 4096
 killed = []
 def kill():
-    while engine.frames.process is None:
+    while engine.frames().process is None:
         time.sleep(0.05)
     time.sleep(wait)
     killed.append(time.monotonic())
-    os.kill(engine.frames.process.pid, signal.SIGKILL)
+    os.kill(engine.frames().process.pid, signal.SIGKILL)
 facts = {}
 for name, wait in (("while it starts", 0.3), ("in the middle", 12.0)):
     thread = threading.Thread(target=kill)

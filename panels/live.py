@@ -99,6 +99,7 @@ class FIELDWORK_PT_engine_settings(_RenderProperties):
         column = columns(self.layout)
         column.prop(live, "source")
         column.prop(live, "samples")
+        column.prop(context.scene.render, "filter_size")
         column.prop(live, "objects_hide")
         column.prop(context.scene.render, "film_transparent")
 

@@ -54,6 +54,7 @@ def _share(scene: bpy.types.Scene, made: bpy.types.Scene) -> None:
     for name in SHARED:
         setattr(made.render, name, getattr(scene.render, name))
     made.render.engine = ENGINE
+    made.render.filter_size = filter_width(scene)
     made.render.film_transparent = True
     made.render.use_compositing = False
     for child in scene.collection.children:
@@ -68,6 +69,14 @@ def _share(scene: bpy.types.Scene, made: bpy.types.Scene) -> None:
     live.source, live.samples = scene.fieldwork_live.source, max(scene.fieldwork_live.samples, 16)
     for layer in made.view_layers:
         layer.update_render_passes()
+
+
+def filter_width(scene: bpy.types.Scene) -> float:
+    """Width in pixels of the filter of the scene's engine: edges are composited well only where both have the same."""
+    if scene.render.engine == "CYCLES":
+        cycles = scene.cycles
+        return 0.0 if cycles.pixel_filter_type == "BOX" else cycles.filter_width
+    return scene.render.filter_size
 
 
 def tree_of(scene: bpy.types.Scene) -> tuple[Any, Any]:

@@ -105,12 +105,11 @@ class FieldworkRenderEngine(bpy.types.RenderEngine):
             self.add_pass(each.name, each.channels, each.letters, layer=layer.name)
         space = working_space()
 
+        result = self.begin_result(0, 0, sizes.width, sizes.height, layer=layer.name)
+
         def show(colors: Any) -> None:
-            result = self.begin_result(0, 0, sizes.width, sizes.height, layer=layer.name)
             self._put(result, {"Combined": colors}, space)
             self.update_result(result)
-            # Not the last word on these pixels: the result of the whole frame follows.
-            self.end_result(result, cancel=True)
 
         def tell(stage: str, share: float) -> None:
             self.update_progress(share if stage == "Rendering" else 0.0)
@@ -118,11 +117,13 @@ class FieldworkRenderEngine(bpy.types.RenderEngine):
 
         try:
             frame = frames().render(shot, sizes, self.test_break, tell, None if bpy.app.background else show)
+            self._put(result, frame.passes, space)
+        except EngineError:
+            self.end_result(result, cancel=True)
+            raise
         finally:
             if "occluders" in shot:
                 Path(shot["occluders"]).unlink(missing_ok=True)
-        result = self.begin_result(0, 0, sizes.width, sizes.height, layer=layer.name)
-        self._put(result, frame.passes, space)
         self.end_result(result)
         self._note_names(frame, layer.name)
 
@@ -165,6 +166,7 @@ class FieldworkRenderEngine(bpy.types.RenderEngine):
         shot: dict[str, Any] = {
             "border": border(render, width, height),
             "samples": live.samples,
+            "filter_width": render.filter_size if render.filter_size > 0.01 else 0.0,
             "fields": fields.rendered_items(depsgraph),
             "passes": [each.name for each in asked],
             "levels": layer.pass_cryptomatte_depth + layer.pass_cryptomatte_depth % 2,

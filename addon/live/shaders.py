@@ -243,7 +243,8 @@ def lay_shader() -> Any:
     info.sampler(0, "FLOAT_2D", "picture")
     info.sampler(1, "FLOAT_2D", "depths")
     info.push_constant("VEC2", "size")
-    info.depth_write("ANY")
+    if hasattr(info, "depth_write"):  # Blender before 4.4 knows OpenGL only, which takes any depth
+        info.depth_write("ANY")
     info.fragment_out(0, "VEC4", "out_color")
     return _made(info, LAY)
 

@@ -93,9 +93,20 @@ def _samples(shot: Shot) -> Iterator[tuple[tuple[float, float], int | None, str]
     if blurred:
         yield (0.5, 0.5), None, "geometry"
     for number in range(shot.samples):
-        offset = tuple((0.5 + number * step) % 1 for step in STEPS2)
+        offset = tuple(in_filter((0.5 + number * step) % 1, shot.filter_width) for step in STEPS2)
         first = number == 0 and not blurred
         yield offset, (number if blurred else None), "both" if first else "color"
+
+
+def in_filter(chance: float, width: float) -> float:
+    """Where in a pixel a sample goes, for an even chance in [0, 1): below 0 or above 1 it is in a neighbour."""
+    if width <= 0:
+        return chance
+    # The integral of the Blackman-Harris window (Harris, 1978).
+    x = np.linspace(0, 1, 257)
+    terms = zip((1, 2, 3), (-0.48829, 0.14128, -0.01168))
+    total = 0.35875 * x + sum(weight * np.sin(2 * np.pi * n * x) / (2 * np.pi * n) for n, weight in terms)
+    return 0.5 + (float(np.interp(chance, total / total[-1], x)) - 0.5) * width
 
 
 class _Film:

@@ -103,13 +103,15 @@ class FieldItem(_Part):
 class Shot(_Part):
     """One frame. border: x0, y0, x1, y1 of the pixels that are rendered; world: linear colour behind everything, None
     leaves it transparent; occluders: file of triangles (npz: vertices, faces) that hide the field; file: where the
-    pixels go; levels: Cryptomatte levels."""
+    pixels go; levels: Cryptomatte levels; filter_width: of the Blackman-Harris filter in pixels, as Blender's engines have it,
+    0 for a pixel's own area."""
 
     lens: Lens
     border: tuple[int, int, int, int]
     samples: int = Field(default=1, ge=1, le=4096)
     fields: list[FieldItem] = Field(min_length=1)
     passes: list[str] = Field(min_length=1)
+    filter_width: float = Field(default=0.0, ge=0, le=16)
     levels: int = Field(default=6, ge=2, le=MOST_LEVELS)
     world: tuple[float, float, float] | None = None
     sky: bool = True

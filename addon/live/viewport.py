@@ -214,7 +214,6 @@ class Viewport:
         gpu.state.depth_test_set("NONE")
         gpu.state.depth_mask_set(False)
         with picture.buffer.bind():
-            picture.buffer.viewport_set(0, 0, picture.width, picture.height)
             gpu.state.scissor_test_set(True)
             gpu.state.scissor_set(0, first, picture.width, count)
             shader.bind()

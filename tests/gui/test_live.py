@@ -87,7 +87,9 @@ def test_the_field_is_among_objects_in_every_shading_mode(project, suite):
     assert colour(folder, "tinted", places["top"])[1] < 0.9
     assert colour(folder, "cropped", places["low"]) == pytest.approx(truth["low"], abs=0.15)
     assert np.ptp(colour(folder, "cropped", place_above(places))) < 0.06
-    assert colour(folder, "turned", places["top"]) == pytest.approx([0, 1, 0], abs=0.06), "the lower class, green by now"
+    assert colour(folder, "turned", places["top"]) == pytest.approx([0, 1, 0], abs=0.06), (
+        "the lower class, green by now"
+    )
     assert colour(folder, "undone", places["field"]) == pytest.approx(truth["field"], abs=0.15)
     assert facts["assets"] == 1, "two objects of one field share its textures"
     assert facts["python"] < 0.002, "seconds of Python in a redraw"

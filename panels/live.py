@@ -17,7 +17,7 @@ from .base import StepPanel, columns, draw_wrapped, text_width
 
 
 class FIELDWORK_UL_field_classes(UIList):
-    """Color, name, tint, opacity and visibility of each class of a field."""
+    """Color, name and visibility of each class of a field."""
 
     def draw_item(self, context, layout, data, item, icon, active_data, active_property, index=0, flt_flag=0):
         row = layout.row(align=True)
@@ -25,10 +25,6 @@ class FIELDWORK_UL_field_classes(UIList):
         color.ui_units_x = 1.2
         color.prop(item, "color", text="")
         row.label(text=item.name, translate=False)
-        numbers = row.row(align=True)
-        numbers.ui_units_x = 6
-        numbers.prop(item, "tint", text="", slider=True)
-        numbers.prop(item, "opacity", text="", slider=True)
         row.operator("fieldwork.isolate_class", text="", icon="SOLO_OFF", emboss=False).index = index
         row.prop(item, "visible", text="", icon="HIDE_OFF" if item.visible else "HIDE_ON", emboss=False)
 
@@ -61,6 +57,10 @@ def draw_field(layout: UILayout, context: Context, obj) -> None:
     row.prop(own, "look", text=look_name(own.look), slider=True)
     if own.classes:
         layout.template_list("FIELDWORK_UL_field_classes", "", own, "classes", own, "class_index", rows=4)
+        if 0 <= own.class_index < len(own.classes):
+            column = columns(layout)
+            column.prop(own.classes[own.class_index], "tint")
+            column.prop(own.classes[own.class_index], "opacity")
         layout.operator("fieldwork.refresh_field_classes", icon="FILE_REFRESH")
     row = layout.row(align=True)
     row.prop(own, "crop")

@@ -16,7 +16,8 @@ from mathutils import Matrix
 
 from . import fields, voxels
 
-BUDGET = 0.05  # seconds of marching in a redraw once the view stands still
+BUDGET = 0.05  # seconds of marching in a redraw once the view stands still, or as long as the rest of the redraw takes
+LONGEST = 0.5  # seconds of marching in a redraw at most
 COARSEST = 8  # pixels of the viewport on a side of one of the picture, while the view moves on a weak card
 MOVED = 0.15  # seconds a picture may take while the view moves, before it is made coarser
 SETTLED = 0.15  # seconds without a change, after which pictures become finer
@@ -108,6 +109,8 @@ class Viewport:
         self._lay: Any = None
         self._batches: list[Any] = []
         self.error = ""
+        self._ended = 0.0  # when the last redraw was done here
+        self._rest = 0.0  # seconds that a redraw takes beside what is done here
 
     def draw(self, context: bpy.types.Context) -> None:
         """Draw the fields of a view; what goes wrong is told in the panel, not in each redraw."""
@@ -128,6 +131,7 @@ class Viewport:
         if self._march is None:
             self._prepare()
         now = time.monotonic()
+        self._rest = min(now - self._ended, LONGEST)
         scene_from_clip = view3d.perspective_matrix.inverted_safe()
         quality = int(context.scene.fieldwork_live.quality)
         unfinished, marched = False, 0.0
@@ -164,6 +168,7 @@ class Viewport:
         self.seconds = [*self.seconds[-99:], spent - marched]
         if marched:
             self.frame_seconds = [*self.frame_seconds[-99:], spent]
+        self._ended = time.monotonic()
         if unfinished:
             _redraw_soon()
 
@@ -194,7 +199,7 @@ class Viewport:
             return 0.0
         if view.next is None:
             view.next = _picture(None, size, quality)
-        count = max(1, int(BUDGET / max(view.row_seconds, 1e-6)))
+        count = max(1, int(max(BUDGET, self._rest) / max(view.row_seconds, 1e-6)))
         seconds = self._march_rows(view.next, asset, rows, uniforms, count)
         view.row_seconds = 0.5 * (view.row_seconds + seconds / count)
         if view.next.done:

@@ -13,6 +13,7 @@ from pathlib import Path
 import bpy
 from bpy_extras.view3d_utils import location_3d_to_region_2d
 from mathutils import Quaternion, Vector
+from steps import alias
 
 SIDE = Quaternion((1, 0, 0), math.pi / 2)  # looks along y, z is up
 
@@ -20,7 +21,7 @@ SIDE = Quaternion((1, 0, 0), math.pi / 2)  # looks along y, z is up
 def ball(screen, sidebar=False):
     """A scene with the ball's field, a cube before it and a large one behind it."""
     settings = bpy.context.scene.fieldwork
-    settings.project = os.environ["FIELDWORK_BALL"]
+    settings.project = alias(Path(os.environ["FIELDWORK_BALL"]), "ball")
     for obj in list(bpy.data.objects):
         if obj.type == "MESH":
             bpy.data.objects.remove(obj)

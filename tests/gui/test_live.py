@@ -124,3 +124,55 @@ def test_f12_in_the_window_cancel_death_and_animation(project, suite):
     assert facts["cancel"] < 2
     assert facts["death"] < 2
     assert facts["frames"] == 5
+
+
+def layers(path: Path) -> dict[str, np.ndarray]:
+    """Channels of a file by their names, without that of the view layer."""
+    import OpenImageIO as oiio
+
+    source, found, number = oiio.ImageInput.open(str(path)), {}, 0
+    while source.seek_subimage(number, 0):
+        spec = source.spec()
+        pixels = np.asarray(source.read_image(number, 0, 0, spec.nchannels, "float"))
+        for place, name in enumerate(spec.channelnames):
+            found[name.removeprefix("ViewLayer.")] = pixels[..., place]
+        number += 1
+    return found
+
+
+@pytest.mark.parametrize("suite", ["sid", "trixie"])
+def test_f12_without_a_window(project, suite):
+    """All passes in a multilayer file, and the compositor, by `blender -b` itself."""
+    root = window.BLENDER_ROOT if suite == "sid" else window.OLDER_ROOT
+    reason = window.missing(root, suite)
+    if reason:
+        pytest.skip(reason)
+    session = window.Window(f"background-{suite}", root)
+    command = ["blender", "-b", "--factory-startup", "--python-exit-code", "1", "--python", str(HERE / "background.py")]
+    done = window.enter(
+        [*command, "--", str(project), str(session.folder)], session.environment, 300 * window.PATIENCE, root
+    )
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    found = layers(session.folder / "passes.exr")
+    assert found["Depth.Z"][40, 60] == pytest.approx(1.5, abs=0.08)
+    assert found["Depth.Z"][0, 0] == pytest.approx(1e10)
+    assert found["Position.Y"][40, 60] == pytest.approx(-0.5, abs=0.08)
+    assert found["Normal.Y"][35:45, 55:65].mean() < -0.6
+    assert [found["Class Index.X"][y, 60] for y in (28, 52, 0)] == [1, 2, 0]
+    assert found["Confidence.X"][28, 60] > 0.8
+    from fieldwork.nerfcore.film.cryptomatte import id_of
+
+    assert found["CryptoMaterial00.R" if "CryptoMaterial00.R" in found else "CryptoMaterial00.r"][28, 60] == np.float32(
+        id_of("top")
+    )
+    mixed = layers(session.folder / "composite.exr")
+    red, green, blue, alpha = (mixed[name] for name in "RGBA")
+    # The grey cube in the middle, the field around it.
+    assert np.ptp([red[40, 60], green[40, 60], blue[40, 60]]) < 0.03
+    truth = pattern(np.array([0.2, -0.45, 0.1]) / np.linalg.norm([0.2, -0.45, 0.1]) * 0.5)
+    scale = 50 / 36 * 120
+    x, y = 60 + scale * 0.2 / 1.55, 40 - scale * 0.1 / 1.55
+    light = np.where(truth > 0.04045, ((truth + 0.055) / 1.055) ** 2.4, truth / 12.92)
+    assert [c[int(y), int(x)] for c in (red, green, blue)] == pytest.approx(light, abs=0.15)
+    assert alpha[40, 60] == pytest.approx(1, abs=1e-3)
+    assert alpha[1, 1] < 0.05

@@ -93,9 +93,9 @@ def _samples(shot: Shot) -> Iterator[tuple[tuple[float, float], int | None, str]
     if blurred:
         yield (0.5, 0.5), None, "geometry"
     for number in range(shot.samples):
-        offset = tuple(in_filter((0.5 + number * step) % 1, shot.filter_width) for step in STEPS2)
+        x, y = (in_filter((0.5 + number * step) % 1, shot.filter_width) for step in STEPS2)
         first = number == 0 and not blurred
-        yield offset, (number if blurred else None), "both" if first else "color"
+        yield (x, y), (number if blurred else None), "both" if first else "color"
 
 
 def in_filter(chance: float, width: float) -> float:

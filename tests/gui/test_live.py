@@ -158,7 +158,7 @@ def test_f12_without_a_window(project, suite):
     assert found["Depth.Z"][0, 0] == pytest.approx(1e10)
     assert found["Position.Y"][40, 60] == pytest.approx(-0.5, abs=0.08)
     assert found["Normal.Y"][35:45, 55:65].mean() < -0.6
-    assert [found["Class Index.X"][y, 60] for y in (28, 52, 0)] == [1, 2, 0]
+    assert [found["Class Index.X"][y, x] for y, x in ((28, 60), (52, 60), (0, 0))] == [1, 2, 0]
     assert found["Confidence.X"][28, 60] > 0.8
     from fieldwork.nerfcore.film.cryptomatte import id_of
 

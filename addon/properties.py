@@ -61,6 +61,7 @@ EXPORTS = [
     ("stl", "STL (.stl)", "The bare surface, for 3D printers"),
     ("onnx", "Field (.onnx)", "The trained field as a function of place and direction"),
     ("voxels", "Voxels (.npz)", "Density, color and class on a regular grid"),
+    ("splats", "Gaussian Splats (.ply)", "The baked field as splats with classes; bake it first"),
 ]
 SIDES = [
     ("top", "Plan", "From above"),

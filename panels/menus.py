@@ -40,6 +40,9 @@ class FIELDWORK_MT_steps(Menu):
         layout.operator("fieldwork.bake")
         layout.operator("fieldwork.evaluate", text=t("Measure Baked Field")).baked = True
         layout.operator("fieldwork.render", text=t("Render Baked Field")).baked = True
+        layout.operator("fieldwork.add_field")
+        layout.operator("fieldwork.add_crop_box")
+        layout.operator("fieldwork.setup_compositor")
         layout.operator("fieldwork.mesh")
         layout.operator("fieldwork.measure")
         layout.operator("fieldwork.plan")

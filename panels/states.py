@@ -10,6 +10,7 @@ from bpy.types import Context
 from ..addon import machine
 from ..addon.jobs.job import Job
 from ..addon.jobs.queue import queue
+from ..addon.live import fields
 from ..addon.project import runs, snapshot
 from ..addon.text import t
 
@@ -143,3 +144,8 @@ def in_short(count: int) -> str:
     if count < 1000:
         return str(count)
     return f"{count / 1e3:.0f} k" if count < 999_500 else f"{count / 1e6:.1f} M"
+
+
+def live(context: Context) -> State:
+    count = len(fields.field_objects(context.scene.objects))
+    return State(count > 0, str(count) if count else "")

@@ -17,7 +17,8 @@ from ..params import ExportParams
 from ..progress import Reporter
 from ..project.runs import holdout_of
 from ..project.store import load_project, record_step
-from ..render.run import load_trained
+from ..render.baked import load_baked
+from ..render.run import load_info, load_trained
 
 SUFFIXES = {
     "glb": (".glb",),
@@ -27,13 +28,14 @@ SUFFIXES = {
     "usd": USD,
     "onnx": (".onnx",),
     "voxels": (".npz",),
+    "splats": (".ply",),
 }
 
 
 def export(params: ExportParams, report: Reporter) -> dict[str, Any]:
     """Write one format to `out`, or to exports/<run>/<project>.<suffix>.
 
-    Meshes (glb, usd, obj, ply, stl) are the last one that the verb `mesh` extracted; usd has the cameras as well; onnx is the trained field itself as a function, voxels its values on a regular grid.
+    Meshes (glb, usd, obj, ply, stl) are the last one that the verb `mesh` extracted; usd has the cameras as well; onnx is the trained field itself as a function, voxels its values on a regular grid; splats is the baked field.
 
     Returns:
         {"files": [paths], "to": format}
@@ -44,10 +46,11 @@ def export(params: ExportParams, report: Reporter) -> dict[str, Any]:
     folder = Path(params.project).absolute()
     project = load_project(folder)
     suffixes = SUFFIXES[params.to]
-    out = params.out or folder / "exports" / params.run / f"{folder.name}{suffixes[0]}"
+    name = f"{folder.name}-splats" if params.to == "splats" else folder.name  # the mesh ends in .ply as well
+    out = params.out or folder / "exports" / params.run / f"{name}{suffixes[0]}"
     if out.suffix.lower() not in suffixes:
         raise SettingError(f"{out}: {params.to} files end in {' or '.join(suffixes)}.", "Choose one of these endings.")
-    if params.to not in ("onnx", "voxels"):  # these are read from the field itself
+    if params.to not in ("onnx", "voxels", "splats"):  # these are read from the field itself
         for warning in stale(folder, params.run, pictures=False):
             report.warn(warning)
     if params.to == "onnx":
@@ -60,6 +63,13 @@ def export(params: ExportParams, report: Reporter) -> dict[str, Any]:
         from .voxels import write_voxels
 
         write_voxels(out, load_trained(folder, params.run), project, params.resolution, report)
+        files = [out]
+    elif params.to == "splats":
+        from .splats import write_splats
+
+        info = load_info(folder, params.run)
+        baked = load_baked(folder, params.run, info)
+        write_splats(out, baked, info.box(project), info.class_ids if baked.classes else [], report)
         files = [out]
     else:
         report.stage("Writing")

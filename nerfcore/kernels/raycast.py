@@ -1,4 +1,4 @@
-"""Which triangle of a mesh rays meet first, seen from its front."""
+"""Which triangle of a mesh rays meet first, seen from its front; how far away one is."""
 
 from __future__ import annotations
 
@@ -55,3 +55,38 @@ class FrontFaces:
         inputs = [self._mesh.id, array(o, wp.vec3), array(d, wp.vec3), array(face), array(corner, wp.vec2)]
         launch(cast_kernel, len(o), inputs, o.device)
         return face.numpy(), corner.numpy()
+
+
+@wp.kernel(module="fieldwork_raycast")
+def distance_kernel(
+    mesh: wp.uint64,
+    origins: wp.array(dtype=wp.vec3),
+    directions: wp.array(dtype=wp.vec3),
+    distance: wp.array(dtype=float),
+    offset: int,
+):
+    i = wp.tid() + offset
+    query = wp.mesh_query_ray(mesh, origins[i], directions[i], 1.0e9)
+    distance[i] = 1.0e9
+    if query.result:
+        distance[i] = query.t
+
+
+class FirstHits:
+    """A mesh, vertices (V, 3) and faces (F, 3), and how far away along rays it is, seen from either side; on the host."""
+
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
+        init()
+        self._points = torch.from_numpy(np.ascontiguousarray(vertices, np.float32))
+        self._corners = torch.from_numpy(np.ascontiguousarray(faces, np.int32)).reshape(-1)
+        self._mesh = wp.Mesh(points=array(self._points, wp.vec3), indices=array(self._corners)) if len(faces) else None
+
+    def distances(self, origins: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
+        """Distance (N,) of what rays (N, 3) with unit directions meet first, 1e9 where that is nothing; on the host."""
+        o, d = origins.detach().cpu().contiguous(), directions.detach().cpu().contiguous()
+        found = torch.full((len(o),), 1.0e9)
+        if self._mesh is not None:
+            launch(
+                distance_kernel, len(o), [self._mesh.id, array(o, wp.vec3), array(d, wp.vec3), array(found)], o.device
+            )
+        return found

@@ -164,6 +164,7 @@ def seen_color(field: VoxelArrays, cell: Cell, d: wp.vec3):
 def march_voxels(
     origins: wp.array(dtype=wp.vec3),
     directions: wp.array(dtype=wp.vec3),
+    ends: wp.array(dtype=float),
     field: VoxelArrays,
     m: MarchParams,
     out: wp.array(dtype=float, ndim=2),
@@ -175,6 +176,7 @@ def march_voxels(
     d = directions[r]
     inverse = reciprocal(d)
     lo, hi = ray_interval(o, inverse, m)
+    hi = wp.min(hi, ends[r])
     t = march_start(o, inverse, lo, m)
     transmittance = float(1.0)
     color = wp.vec3(0.0, 0.0, 0.0)
@@ -278,16 +280,23 @@ def view_code(weight: float, camera: int):
     return wp.where(share > 0, share * 65536 + camera, 0)
 
 
-def march(origins: torch.Tensor, directions: torch.Tensor, field: VoxelField, settings: MarchSettings) -> VoxelRays:
+def march(
+    origins: torch.Tensor,
+    directions: torch.Tensor,
+    field: VoxelField,
+    settings: MarchSettings,
+    ends: torch.Tensor | None = None,
+) -> VoxelRays:
     """Render rays (R, 3) of the normalised frame, unit directions; `settings` say how long a step is, where rays begin
-    and end, and whether space is contracted."""
+    and end, and whether space is contracted; `ends` (R,): distances at which single rays end before that."""
     device, rays = origins.device, len(origins)
+    ends = torch.full((rays,), settings.far, device=device) if ends is None else ends
     if not backend_of(device).warp:
-        return voxel_march_torch.march(origins, directions, field, settings)
+        return voxel_march_torch.march(origins, directions, field, settings, ends)
     init()
     out = torch.empty(rays, 5, device=device)
     probabilities = torch.zeros(rays, field.classes, device=device)
-    inputs = [array(origins, wp.vec3), array(directions, wp.vec3), voxel_arrays(field, settings)]
+    inputs = [array(origins, wp.vec3), array(directions, wp.vec3), array(ends), voxel_arrays(field, settings)]
     launch(march_voxels, rays, [*inputs, march_params(settings), array(out), array(probabilities)], device)
     return VoxelRays(out[:, :3], out[:, 3], out[:, 4], probabilities if field.classes else None)
 

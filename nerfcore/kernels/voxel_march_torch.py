@@ -60,10 +60,12 @@ def _steps(
     n: int,
     s: MarchSettings,
     transmittance: torch.Tensor,
+    ends: torch.Tensor | None = None,
 ) -> Iterator[_Step]:
     """The samples of rays (R, 3), one a ray at a time, while the caller lowers their transmittance (R,) in place."""
     inverse = 1 / torch.where(directions.abs() < 1e-9, 1e-9, directions)
     t, high = _bounds(origins, inverse, s)
+    high = high if ends is None else torch.minimum(high, ends)
     for _ in range(int(MAX_BINS)):
         rays = ((t < high) & (transmittance >= float(EARLY_STOP))).nonzero()[:, 0]
         if len(rays) == 0:
@@ -96,7 +98,9 @@ def unpacked(texels: torch.Tensor) -> torch.Tensor:
     return torch.stack([value >> shift & 255 for shift in (0, 8, 16, 24)], -1)
 
 
-def march(origins: torch.Tensor, directions: torch.Tensor, field: VoxelField, s: MarchSettings) -> VoxelRays:
+def march(
+    origins: torch.Tensor, directions: torch.Tensor, field: VoxelField, s: MarchSettings, ends: torch.Tensor
+) -> VoxelRays:
     """As `voxel_march.march`."""
     count, device = len(origins), origins.device
     color, depth = torch.zeros(count, 3, device=device), torch.zeros(count, device=device)
@@ -104,7 +108,7 @@ def march(origins: torch.Tensor, directions: torch.Tensor, field: VoxelField, s:
     transmittance = torch.ones(count, device=device)
     exponent = s.step / cell_length(field.blocks, s.contracted)
     words = field.vertices.view(-1, 4)
-    for step in _steps(origins, directions, field.index, field.blocks, s, transmittance):
+    for step in _steps(origins, directions, field.index, field.blocks, s, transmittance, ends):
         texels = unpacked(words[step.corners]).float()  # (N, 8, 4 texels, 4 bytes)
         parts = step.shares * texels[..., 0, 3] / 255
         root = parts.sum(1)

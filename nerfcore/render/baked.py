@@ -178,9 +178,16 @@ class BakedField:
     def classes(self) -> int:
         return self.field.classes
 
-    def __call__(self, origins: torch.Tensor, directions: torch.Tensor, samples_per_ray: int = 0) -> BakedRays:
-        """Render rays (R, 3); their samples are as many as the cells they meet, whatever `samples_per_ray` says."""
-        rays = march(origins, directions, self.field, self.settings)
+    def __call__(
+        self,
+        origins: torch.Tensor,
+        directions: torch.Tensor,
+        samples_per_ray: int = 0,
+        ends: torch.Tensor | None = None,
+    ) -> BakedRays:
+        """Render rays (R, 3); their samples are as many as the cells they meet, whatever `samples_per_ray` says; `ends`
+        (R,): distances at which they end."""
+        rays = march(origins, directions, self.field, self.settings, ends)
         behind = None if self.environment is None else self.environment.behind(directions, rays)
         return BakedRays(**vars(rays), environment=behind)
 

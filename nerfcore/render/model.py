@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import nn
@@ -23,6 +23,8 @@ from ..sampling.occupancy import OccupancyGrid, class_importance
 from ..sampling.render_grid import RenderGrid, present_grid, read_fine, refined_grid
 from .kept_grid import KeptGrid
 
+# Factor (N,) of the density of samples, from what the field knows of them.
+Thin = Callable[[Geometry, Samples], torch.Tensor]
 ONE_PASS_SHARE = 0.67  # of visible samples: 3k + 1 against 3 forward costs, equal at k = 2/3 (see `render`)
 # Not tuned: the next two.
 CAPACITY_FACTOR = 1.6  # entries for visible samples, as a multiple of how many there were lately
@@ -172,12 +174,13 @@ class Model(nn.Module):
         semantics: bool = True,
         grid: RenderGrid | None = None,
         capacity: int | None = None,
+        thin: Thin | None = None,
     ) -> Rendered:
         """Render rays (R, 3) of the normalised frame; differentiable in the field.
 
         `grid`: what the rays traverse, by default the occupancy grid, as in training; `jitter`, `shift`: see
         kernels.march.sample; `codes` (R, A): appearance code of each ray; `capacity`: the most rays that get samples
-        where the capacity is fixed, all when None.
+        where the capacity is fixed, all when None; `thin`: what of the density is shown, where not all.
         """
         grid = grid or present_grid(self.occupancy, 0.0)
         learning = torch.is_grad_enabled()
@@ -192,12 +195,12 @@ class Model(nn.Module):
             origins, directions, grid, samples_per_ray, jitter, shift, capacity if fixed else None
         )
         with torch.set_grad_enabled(learning and not two_passes):
-            geometry, weights = self._weighted(points, samples)
+            geometry, weights = self._weighted(points, samples, thin=thin)
         evaluated_density = geometry.density.detach()
         indices, visible, visible_count = self._select_visible(samples, weights, fixed)
         if two_passes:
             explicit = geometry.explicit[indices] if geometry.explicit is not None else None
-            geometry, weights = self._weighted(points[indices], visible, explicit)
+            geometry, weights = self._weighted(points[indices], visible, explicit, thin)
             density, chosen = geometry.density, None
         else:
             density, weights, chosen = geometry.density[indices], weights[indices], indices
@@ -242,11 +245,17 @@ class Model(nn.Module):
         return samples, grid_position(positions, self.contracted).clamp(0, 1)
 
     def _weighted(
-        self, points: torch.Tensor, samples: Samples, explicit: torch.Tensor | None = None
+        self,
+        points: torch.Tensor,
+        samples: Samples,
+        explicit: torch.Tensor | None = None,
+        thin: Thin | None = None,
     ) -> tuple[Geometry, torch.Tensor]:
         """Geometry at the points (N, 3) of samples and their rendering weights (N,); `explicit`: features of the grid
         there, where they are known already."""
         geometry = self.field.geometry(points, explicit)
+        if thin is not None:
+            geometry = replace(geometry, density=geometry.density * thin(geometry, samples))
         return geometry, render_weights(geometry.density, samples.deltas, samples.packed_info)
 
     @torch.no_grad()

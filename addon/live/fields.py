@@ -1,0 +1,107 @@
+"""The fields that a scene shows: those of its field objects, or without any that of its project."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import bpy
+from mathutils import Matrix
+
+from ..errors import SceneError
+from ..project import snapshot
+from ..scene.frame import scene_from_capture
+from ..text import t
+
+
+def field_objects(objects: Iterable[bpy.types.Object]) -> list[bpy.types.Object]:
+    """Those of the objects that are fields."""
+    return [obj for obj in objects if obj.type == "EMPTY" and obj.fieldwork.is_field]
+
+
+def rendered_items(depsgraph: bpy.types.Depsgraph) -> list[dict[str, Any]]:
+    """What a render shows, as nerfcore/film/shot.py describes fields.
+
+    Raises SceneError: there is no field to show.
+    """
+    scene = depsgraph.scene_eval
+    baked = scene.fieldwork_live.source == "baked"
+    known = field_objects(depsgraph.view_layer.objects)  # also those that are hidden in renders
+    found = [obj.evaluated_get(depsgraph) for obj in known if not obj.hide_render]
+    items = [item_of(obj, baked, depsgraph) for obj in found]
+    if not known:
+        items = [project_item(scene, baked)]
+    if not items:
+        raise SceneError(t("All fields of the scene are hidden in renders."))
+    return items
+
+
+def item_of(obj: bpy.types.Object, baked: bool, depsgraph: bpy.types.Depsgraph) -> dict[str, Any]:
+    """A field object. Raises SceneError: it has no project."""
+    own = obj.fieldwork
+    if not own.project:
+        raise SceneError(t("The field “{}” has no project folder.", obj.name))
+    item: dict[str, Any] = {
+        "name": obj.name,
+        "project": absolute(own.project),
+        "run": own.run,
+        "baked": baked,
+        "scene_from_capture": rows(obj.matrix_world),
+        "look": own.look,
+        "classes": {
+            entry.id: {"opacity": entry.shown, "tint": entry.tint, "color": tuple(entry.color)} for entry in own.classes
+        },
+    }
+    crop = own.crop
+    if crop is not None:
+        item["crop"] = rows(crop_matrix(crop.evaluated_get(depsgraph)))
+    return item
+
+
+def project_item(scene: bpy.types.Scene, baked: bool) -> dict[str, Any]:
+    """The field of the scene's project, where its capture stands. Raises SceneError: the scene has no project."""
+    settings = scene.fieldwork
+    folder = snapshot.folder_of(settings)
+    if folder is None:
+        raise SceneError(t("The scene has no field: choose a project in the Fieldwork tab, or add a field."))
+    hidden = {entry.id: entry for entry in settings.classes if not entry.visible}
+    return {
+        "name": folder.name,
+        "project": str(folder),
+        "run": settings.run,
+        "baked": baked,
+        "scene_from_capture": rows(scene_from_capture(scene, snapshot.owner(folder))),
+        "classes": {number: {"opacity": 0.0, "color": tuple(entry.color)} for number, entry in hidden.items()},
+    }
+
+
+def crop_matrix(crop: bpy.types.Object) -> Matrix:
+    """From the cube [−1, 1]³ to what an empty shows as a cube."""
+    return crop.matrix_world @ Matrix.Scale(crop.empty_display_size, 4)
+
+
+def absolute(path: str) -> str:
+    """A folder of a field as an absolute path."""
+    return str(Path(bpy.path.abspath(path)).absolute())
+
+
+def rows(matrix: Matrix) -> list[list[float]]:
+    """A matrix as lists."""
+    return [list(row) for row in matrix]
+
+
+def fill_classes(obj: bpy.types.Object) -> None:
+    """Let the classes of a field object be those of its project, with what the user set of them."""
+    own = obj.fieldwork
+    folder = Path(absolute(own.project))
+    values = (snapshot.project(folder) or {}).get("classes", [])
+    if [entry.id for entry in own.classes] == [value["id"] for value in values]:
+        return
+    before = {entry.id: (entry.visible, entry.opacity, entry.tint, tuple(entry.color)) for entry in own.classes}
+    own.classes.clear()
+    for value in values:
+        entry = own.classes.add()
+        entry.id, entry.name, entry.color = value["id"], value["name"], value["color"]
+        if value["id"] in before:
+            entry.visible, entry.opacity, entry.tint, entry.color = before[value["id"]]

@@ -1,0 +1,65 @@
+"""The passes of Fieldwork's render engine, as Blender and the engine call them."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import bpy
+
+
+class RenderPass(NamedTuple):
+    """`name` is also the engine's; `letters` name the channels, `kind` the socket of the compositor."""
+
+    name: str
+    letters: str
+    kind: str
+
+    @property
+    def channels(self) -> int:
+        return len(self.letters)
+
+
+COMBINED = RenderPass("Combined", "RGBA", "COLOR")
+# Names of the passes that are light, in the scene's working space.
+LIGHT = ("Combined", "Class Color", "FieldFront", "FieldBehind")
+CRYPTOMATTES = (("object", "CryptoObject"), ("material", "CryptoMaterial"), ("asset", "CryptoAsset"))
+
+
+def wanted(scene: bpy.types.Scene, layer: bpy.types.ViewLayer) -> list[RenderPass]:
+    """The passes that a view layer asks for."""
+    own = layer.fieldwork
+    found = [COMBINED]
+    for asked, made in (
+        (layer.use_pass_z, RenderPass("Depth", "Z", "VALUE")),
+        (layer.use_pass_position, RenderPass("Position", "XYZ", "VECTOR")),
+        (layer.use_pass_normal, RenderPass("Normal", "XYZ", "VECTOR")),
+        (own.use_class_index, RenderPass("Class Index", "X", "VALUE")),
+        (own.use_class_color, RenderPass("Class Color", "RGBA", "COLOR")),
+        (own.use_confidence, RenderPass("Confidence", "X", "VALUE")),
+        (scene.fieldwork_live.objects_hide, RenderPass("FieldFront", "RGBA", "COLOR")),
+        (scene.fieldwork_live.objects_hide, RenderPass("FieldBehind", "RGBA", "COLOR")),
+    ):
+        if asked:
+            found.append(made)
+    for switch, name in CRYPTOMATTES:
+        if getattr(layer, f"use_pass_cryptomatte_{switch}"):
+            count = (layer.pass_cryptomatte_depth + 1) // 2
+            found += [RenderPass(f"{name}{number:02}", "RGBA", "COLOR") for number in range(count)]
+    return found
+
+
+def working_space(linear: Any, space: str) -> Any:
+    """Light (…, 4) of Rec.709 primaries in another working space of the file; one of Blender before 5 has no other."""
+    import numpy as np
+
+    matrix = _FROM_REC709.get(space)
+    if matrix is None:
+        return linear
+    return np.concatenate([linear[..., :3] @ np.array(matrix, np.float32).T, linear[..., 3:]], -1)
+
+
+# Linear Rec.709 (D65) into others; ITU-R BT.2087, and for ACEScg with the Bradford adaptation to its white (ACES TB-2014-004).
+_FROM_REC709 = {
+    "Linear Rec.2020": [[0.6274, 0.3293, 0.0433], [0.0691, 0.9195, 0.0114], [0.0164, 0.0880, 0.8956]],
+    "ACEScg": [[0.61309740, 0.33952315, 0.04737945], [0.07019372, 0.91635388, 0.01345240], [0.02061559, 0.10956977, 0.86981463]],
+}  # fmt: skip

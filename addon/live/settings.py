@@ -1,0 +1,149 @@
+"""What scenes, objects and view layers remember of fields that Blender shows."""
+
+import bpy
+from bpy.types import Context, PropertyGroup
+
+from ..props import (
+    BoolProperty,
+    CollectionProperty,
+    EnumProperty,
+    FloatProperty,
+    FloatVectorProperty,
+    IntProperty,
+    PointerProperty,
+    StringProperty,
+)
+from ..text import t
+
+SOURCES = [
+    ("field", "Field", "The field itself: exact, but slow without a large graphics card"),
+    ("baked", "Baked Field", "The baked field: nearly the same, and fast; bake it first"),
+]
+
+
+def _changed(self: PropertyGroup, context: Context) -> None:
+    """What the viewport shows has changed."""
+    if not bpy.app.background:
+        for window in context.window_manager.windows:
+            for area in window.screen.areas:
+                if area.type == "VIEW_3D":
+                    area.tag_redraw()
+
+
+class FieldworkFieldClass(PropertyGroup):
+    """How a field in the scene shows one of its classes. `name` is that of the class."""
+
+    id: IntProperty()
+    color: FloatVectorProperty(
+        name="Color", description="Color that the class is tinted with", subtype="COLOR_GAMMA", min=0.0, max=1.0,
+        update=_changed,
+    )  # fmt: skip
+    visible: BoolProperty(
+        name="Visible", description="Show the class; what is behind it appears where it is hidden", default=True,
+        update=_changed,
+    )  # fmt: skip
+    opacity: FloatProperty(
+        name="Opacity", description="How much of the class is seen", default=1.0, min=0.0, max=1.0, subtype="FACTOR",
+        update=_changed,
+    )  # fmt: skip
+    tint: FloatProperty(
+        name="Tint", description="How much of its own color the class gets", default=0.0, min=0.0, max=1.0,
+        subtype="FACTOR", update=_changed,
+    )  # fmt: skip
+
+    @property
+    def shown(self) -> float:
+        """Opacity, 0 where it is hidden."""
+        return self.opacity if self.visible else 0.0
+
+
+def _is_crop_box(self: PropertyGroup, obj: bpy.types.Object) -> bool:
+    return obj.type == "EMPTY"
+
+
+class FieldworkField(PropertyGroup):
+    """A field in the scene: its object, an empty, says where it lies."""
+
+    is_field: BoolProperty()
+    project: StringProperty(
+        name="Project", description="Project folder of the field", subtype="DIR_PATH", update=_changed
+    )
+    run: StringProperty(name="Run", description="Training run that is shown", default="main", update=_changed)
+    look: FloatProperty(
+        name="Look", description="What is shown: 0 the photos' colors, 1 the classes, 2 how certain they are",
+        default=0.0, min=0.0, max=2.0, update=_changed,
+    )  # fmt: skip
+    crop: PointerProperty(
+        name="Crop Box", description="Empty whose cube cuts the field; none: all of it is shown",
+        type=bpy.types.Object, poll=_is_crop_box, update=_changed,
+    )  # fmt: skip
+    classes: CollectionProperty(type=FieldworkFieldClass)
+    class_index: IntProperty(name="Class", description="Selected class")
+
+
+class FieldworkLayer(PropertyGroup):
+    """Passes of a view layer that Blender has no switch for."""
+
+    use_class_index: BoolProperty(name="Class Index", description="The id of the class", update=lambda s, c: _passes(s))
+    use_class_color: BoolProperty(
+        name="Class Color", description="The color of the class", update=lambda s, c: _passes(s)
+    )
+    use_confidence: BoolProperty(
+        name="Confidence", description="How certain the class is", update=lambda s, c: _passes(s)
+    )
+
+
+def _passes(self: PropertyGroup) -> None:
+    """Let the nodes of the compositor know of the passes."""
+    if hasattr(self.id_data, "view_layers"):
+        for layer in self.id_data.view_layers:
+            layer.update_render_passes()
+
+
+class FieldworkLive(PropertyGroup):
+    """How a scene renders and draws fields."""
+
+    source: EnumProperty(name="Render", description="What is rendered", items=SOURCES, default="field")
+    samples: IntProperty(
+        name="Samples", description="Rays through each pixel: smoother edges, softer blur", default=4, min=1,
+        max=4096, soft_max=256,
+    )  # fmt: skip
+    objects_hide: BoolProperty(
+        name="Objects in Front", description="The scene's meshes hide what of the field is behind them, and the passes "
+        "FieldFront and FieldBehind say what to composite over and under them", default=False,
+        update=lambda self, context: _passes(self),
+    )  # fmt: skip
+    viewport: BoolProperty(
+        name="Draw in Viewport", description="Draw the baked fields of the scene in its viewports", default=True,
+        update=_changed,
+    )  # fmt: skip
+    quality: EnumProperty(
+        name="Resolution",
+        description="Resolution of the viewport's picture; while the view moves, it is half of that",
+        items=[
+            ("1", "Full", "Every pixel of the viewport"),
+            ("2", "Half", "Every other pixel"),
+            ("4", "Quarter", "Every fourth pixel: for weak graphics cards"),
+        ],
+        update=_changed,
+    )
+
+
+def look_name(look: float) -> str:
+    """What a look shows, in a word."""
+    return t("Photo") if look < 0.5 else t("Labels") if look < 1.5 else t("Confidence")
+
+
+CLASSES = [FieldworkFieldClass, FieldworkField, FieldworkLayer, FieldworkLive]
+
+
+def register() -> None:
+    bpy.types.Object.fieldwork = PointerProperty(type=FieldworkField)
+    bpy.types.ViewLayer.fieldwork = PointerProperty(type=FieldworkLayer)
+    bpy.types.Scene.fieldwork_live = PointerProperty(type=FieldworkLive)
+
+
+def unregister() -> None:
+    del bpy.types.Object.fieldwork
+    del bpy.types.ViewLayer.fieldwork
+    del bpy.types.Scene.fieldwork_live

@@ -1,0 +1,265 @@
+"""The two shaders of the viewport: one marches through a baked field, one lays its picture over the view with depth.
+
+The march is that of nerfcore/kernels/voxel_march.py, on textures that the graphics card interpolates.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+MOST_STEPS = 2000
+
+MARCH = """
+const int CELLS = 8;
+const int VERTICES = 9;
+
+vec3 grid_position(vec3 p)
+{
+  if (contracted == 0) {
+    return p * 0.5 + 0.5;
+  }
+  float r = max(abs(p.x), max(abs(p.y), abs(p.z)));
+  vec3 q = (r > 1.0) ? p * ((2.0 - 1.0 / r) / r) : p;
+  return q * 0.25 + 0.5;
+}
+
+float exit_distance(vec3 u, vec3 inverse_d, float n, float radius, float border)
+{
+  vec3 cell = floor(u * n);
+  vec3 low = max((cell - radius) / n, vec3(border));
+  vec3 high = min((cell + 1.0 + radius) / n, vec3(1.0 - border));
+  vec3 end = mix(low, high, greaterThan(inverse_d, vec3(0.0)));
+  vec3 away = (end - u) * inverse_d;
+  return max(min(away.x, min(away.y, away.z)), 0.0);
+}
+
+float leap(vec3 u, vec3 inverse_d, vec3 p, float distance_)
+{
+  if (contracted == 0) {
+    return 2.0 * exit_distance(u, inverse_d, float(blocks), distance_ - 1.0, 0.0);
+  }
+  float r = max(abs(p.x), max(abs(p.y), abs(p.z)));
+  if (r <= 1.0) {
+    return 4.0 * exit_distance(u, inverse_d, float(blocks), distance_ - 1.0, 0.25);
+  }
+  vec3 block = floor(u * float(blocks));
+  vec3 below = u - (block - (distance_ - 1.0)) / float(blocks);
+  vec3 above = (block + distance_) / float(blocks) - u;
+  vec3 free = min(below, above);
+  return max(min(free.x, min(free.y, free.z)), 0.0) * max(3.0, 0.5 * r);
+}
+
+void slab(vec3 o, vec3 inverse_d, inout float low, inout float high)
+{
+  vec3 one = (-1.0 - o) * inverse_d;
+  vec3 other = (1.0 - o) * inverse_d;
+  vec3 near_side = min(one, other);
+  vec3 far_side = max(one, other);
+  low = max(low, max(near_side.x, max(near_side.y, near_side.z)));
+  high = min(high, min(far_side.x, min(far_side.y, far_side.z)));
+}
+
+vec3 reciprocal(vec3 d)
+{
+  return 1.0 / mix(d, vec3(1e-9), lessThan(abs(d), vec3(1e-9)));
+}
+
+/* The vertex of a cell that adds most to its opacity. */
+ivec3 strongest(ivec3 first, vec3 place)
+{
+  ivec3 nearest = first + ivec3(greaterThan(place, vec3(0.5)));
+  if (texelFetch(t0, nearest, 0).a > 0.0) {
+    return nearest;
+  }
+  float most = 0.0;
+  for (int corner = 0; corner < 8; corner++) {
+    ivec3 offset = ivec3(corner & 1, (corner >> 1) & 1, corner >> 2);
+    vec3 share = mix(1.0 - place, place, vec3(offset));
+    float part = share.x * share.y * share.z * texelFetch(t0, first + offset, 0).a;
+    if (part > most) {
+      most = part;
+      nearest = first + offset;
+    }
+  }
+  return nearest;
+}
+
+void main()
+{
+  vec2 ndc = gl_FragCoord.xy / size * 2.0 - 1.0;
+  vec4 start = box_from_clip * vec4(ndc, -1.0, 1.0);
+  vec4 stop = box_from_clip * vec4(ndc, 1.0, 1.0);
+  vec3 o = start.xyz / start.w;
+  vec3 way = stop.xyz / stop.w - o;
+  float length_ = length(way);
+  vec3 d = way / length_;
+  vec3 inverse_d = reciprocal(d);
+  float low = 0.0;
+  float high = min(length_, far);
+  if (contracted == 0) {
+    slab(o, inverse_d, low, high);
+  }
+  else if (empty_distance > 0.0) {
+    float entry = -1e9;
+    float leave = 1e9;
+    slab(o, inverse_d, entry, leave);
+    low = max(low, min(empty_distance, 0.8 * entry));
+  }
+  if (cropped == 1) {
+    vec3 co = (crop_from_box * vec4(o, 1.0)).xyz;
+    vec3 cd = (crop_from_box * vec4(d, 0.0)).xyz;
+    slab(co, reciprocal(cd), low, high);
+  }
+  vec3 texels = vec3(textureSize(t0, 0));
+  ivec3 across = textureSize(t0, 0) / VERTICES;
+  float t = low + 0.5 * step_;
+  float left = 1.0;
+  vec3 color = vec3(0.0);
+  float sure = 0.0;
+  float half_way = -1.0;
+  bool classes_matter = classes > 0 && (look > 0.0 || edited == 1);
+  for (int n = 0; n < MOST_STEPS; n++) {
+    if (t >= high || left < 0.004) {
+      break;
+    }
+    vec3 p = o + d * t;
+    float r = max(abs(p.x), max(abs(p.y), abs(p.z)));
+    float bin = (contracted == 1 && r > 1.0) ? step_ * r * sqrt(r) : step_;
+    vec3 u = clamp(grid_position(p), 0.0, 1.0);
+    vec3 x = u * float(blocks);
+    ivec3 block = min(ivec3(x), ivec3(blocks - 1));
+    float entry = texelFetch(index_, block, 0).r;
+    if (entry <= 0.5) {
+      t += leap(u, inverse_d, p, -entry) + 0.5 * bin;
+      continue;
+    }
+    int slot = int(entry + 0.5) - 1;
+    ivec3 corner = ivec3(slot % across.x, (slot / across.x) % across.y, slot / (across.x * across.y)) * VERTICES;
+    vec3 local = (x - vec3(block)) * float(CELLS);
+    vec3 place = (vec3(corner) + local + 0.5) / texels;
+    vec4 base = texture(t0, place);
+    if (base.a > 0.0) {
+      float alpha = 1.0 - pow(max(1.0 - base.a * base.a, 0.0), exponent);
+      ivec3 cell = min(ivec3(local), ivec3(CELLS - 1));
+      ivec3 vertex = ivec3(0);
+      int top = 0;
+      int second = 0;
+      float share = 0.0;
+      if (classes_matter) {
+        vertex = strongest(corner + cell, local - vec3(cell));
+        top = int(texelFetch(t1, vertex, 0).a * 255.0 + 0.5);
+        second = int(texelFetch(t3, vertex, 0).a * 255.0 + 0.5);
+        share = texelFetch(t2, vertex, 0).a;
+        alpha *= share * texelFetch(lut, ivec2(top, 0), 0).a + (1.0 - share) * texelFetch(lut, ivec2(second, 0), 0).a;
+      }
+      if (alpha > 0.0005) {
+        vec3 slope = (texture(t1, place).rgb - 0.5) * d.x + (texture(t2, place).rgb - 0.5) * d.y +
+                     (texture(t3, place).rgb - 0.5) * d.z;
+        vec3 seen = clamp(base.rgb + slope * (2.0 * harmonic_range), 0.0, 1.0);
+        if (classes_matter) {
+          vec3 first_color = texelFetch(lut, ivec2(top, 0), 0).rgb;
+          vec3 second_color = texelFetch(lut, ivec2(second, 0), 0).rgb;
+          float first_tint = texelFetch(lut, ivec2(top, 1), 0).r;
+          float second_tint = texelFetch(lut, ivec2(second, 1), 0).r;
+          seen = share * mix(seen, first_color, first_tint) + (1.0 - share) * mix(seen, second_color, second_tint);
+          vec3 labels = share * first_color + (1.0 - share) * second_color;
+          seen = mix(seen, labels, min(look, 1.0));
+          seen = mix(seen, vec3(max(share, 1.0 - share)), max(look - 1.0, 0.0));
+        }
+        color += left * alpha * seen;
+        float before = left;
+        left *= 1.0 - alpha;
+        if (before >= 0.5 && left < 0.5) {
+          half_way = t;
+        }
+      }
+    }
+    t += bin;
+  }
+  float opacity = 1.0 - left;
+  if (opacity < 0.02) {
+    out_color = vec4(0.0);
+    out_depth = 1.0;
+    return;
+  }
+  /* Where it is thin all along, it stands at the end of it. */
+  vec4 clip = clip_from_box * vec4(o + d * (half_way < 0.0 ? min(t, high) : half_way), 1.0);
+  out_color = vec4(color, opacity);
+  out_depth = clamp(clip.z / clip.w * 0.5 + 0.5, 0.0, 1.0);
+}
+"""
+
+LAY = """
+/* The picture is sRGB, the view's pixels are light where the framebuffer encodes them. */
+vec3 light(vec3 c)
+{
+  vec3 low = c / 12.92;
+  vec3 high = pow((max(c, 0.0) + 0.055) / 1.055, vec3(2.4));
+  return mix(high, low, lessThanEqual(c, vec3(0.04045)));
+}
+
+void main()
+{
+  ivec2 texel = min(ivec2(gl_FragCoord.xy / size * vec2(textureSize(picture, 0))), textureSize(picture, 0) - 1);
+  vec4 seen = texelFetch(picture, texel, 0);
+  if (seen.a < 0.02) {
+    discard;
+  }
+  out_color = vec4(light(clamp(seen.rgb / seen.a, 0.0, 1.0)) * seen.a, seen.a);
+  gl_FragDepth = texelFetch(depths, texel, 0).r;
+}
+"""
+
+VERTEX = "void main() { gl_Position = vec4(corner, 0.0, 1.0); }"
+
+
+def march_shader() -> Any:
+    """Draws a baked field into a picture: colour (sRGB, associated alpha) and depth of the view."""
+    from gpu.types import GPUShaderCreateInfo
+
+    info = GPUShaderCreateInfo()
+    for place, (kind, name) in enumerate(
+        [("FLOAT_3D", "index_"), *(("FLOAT_3D", f"t{n}") for n in range(4)), ("FLOAT_2D", "lut")]
+    ):
+        info.sampler(place, kind, name)
+    for kind, name in (
+        ("MAT4", "box_from_clip"), ("MAT4", "clip_from_box"), ("MAT4", "crop_from_box"), ("VEC2", "size"),
+        ("FLOAT", "step_"), ("FLOAT", "exponent"), ("FLOAT", "far"), ("FLOAT", "empty_distance"),
+        ("FLOAT", "harmonic_range"), ("FLOAT", "look"), ("INT", "blocks"), ("INT", "contracted"), ("INT", "cropped"),
+        ("INT", "classes"), ("INT", "edited"),
+    ):  # fmt: skip
+        info.push_constant(kind, name)
+    info.define("MOST_STEPS", str(MOST_STEPS))
+    info.fragment_out(0, "VEC4", "out_color")
+    info.fragment_out(1, "FLOAT", "out_depth")
+    return _made(info, MARCH)
+
+
+def lay_shader() -> Any:
+    """Lays such a picture over the view."""
+    from gpu.types import GPUShaderCreateInfo
+
+    info = GPUShaderCreateInfo()
+    info.sampler(0, "FLOAT_2D", "picture")
+    info.sampler(1, "FLOAT_2D", "depths")
+    info.push_constant("VEC2", "size")
+    if hasattr(info, "depth_write"):  # Blender before 4.4 knows OpenGL only, which takes any depth
+        info.depth_write("ANY")
+    info.fragment_out(0, "VEC4", "out_color")
+    return _made(info, LAY)
+
+
+def _made(info: Any, fragment: str) -> Any:
+    import gpu
+
+    info.vertex_in(0, "VEC2", "corner")
+    info.vertex_source(VERTEX)
+    info.fragment_source(fragment)
+    return gpu.shader.create_from_info(info)
+
+
+def whole_view(shader: Any) -> Any:
+    """A batch that covers the view."""
+    from gpu_extras.batch import batch_for_shader
+
+    return batch_for_shader(shader, "TRIS", {"corner": ((-1, -1), (3, -1), (-1, 3))})

@@ -1,0 +1,333 @@
+"""Baked fields in the 3D viewport, in any shading mode, with depth: drawn by Blender's own GPU module after the scene.
+
+A field is marched into a picture of its own, coarse while the view moves and then finer, in strips that hold the window up
+only briefly; each redraw lays the picture over the view. Nothing of the GPU module is touched before the first field is
+drawn.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import bpy
+from mathutils import Matrix
+
+from . import fields, voxels
+
+BUDGET = 0.05  # seconds of marching in a redraw once the view stands still, or as long as the rest of the redraw takes
+LONGEST = 0.5  # seconds of marching in a redraw at most
+COARSEST = 8  # pixels of the viewport on a side of one of the picture, while the view moves on a weak card
+MOVED = 0.15  # seconds a picture may take while the view moves, before it is made coarser
+SETTLED = 0.15  # seconds without a change, after which pictures become finer
+UNUSED = 30.0  # seconds after which what no viewport shows is given up
+
+
+class Asset:
+    """The textures of a baked field; they are loaded one in each redraw."""
+
+    def __init__(self, found: voxels.Baked) -> None:
+        self.found, self.used = found, time.monotonic()
+        self.error = ""
+        self.index: Any = None
+        self.texels: list[Any] = []
+        self._table: tuple[Any, Any] = (None, None)
+
+    @property
+    def ready(self) -> bool:
+        return self.index is not None and len(self.texels) == len(voxels.TEXELS)
+
+    def load(self) -> None:
+        """Load the next texture."""
+        try:
+            if self.index is None:
+                self.index = _texture((self.found.meta["side"],) * 3, "R32F", voxels.read_index(self.found))
+            elif not self.ready:
+                name = voxels.TEXELS[len(self.texels)]
+                data = voxels.read_texels(self.found, name)
+                self.texels.append(_texture(voxels.texture_size(self.found.meta), "RGBA8", data))
+        except (OSError, ValueError, RuntimeError, MemoryError) as error:
+            self.error = str(error)
+
+    def table(self, rows: list[float]) -> Any:
+        """The table of the classes as a texture; a new one when it changed."""
+        if self._table[0] != rows:
+            import numpy as np
+
+            self._table = rows, _texture((256, 2), "RGBA16F", np.array(rows, np.float32))
+        return self._table[1]
+
+
+def _texture(size: tuple[int, ...], kind: str, values: Any) -> Any:
+    import gpu
+
+    return gpu.types.GPUTexture(size, format=kind, data=gpu.types.Buffer("FLOAT", len(values), values))
+
+
+class Picture:
+    """Colour and depth of a field at some size."""
+
+    def __init__(self, width: int, height: int) -> None:
+        import gpu
+
+        self.width, self.height = width, height
+        self.color = gpu.types.GPUTexture((width, height), format="RGBA16F")
+        self.depth = gpu.types.GPUTexture((width, height), format="R32F")
+        self.buffer = gpu.types.GPUFrameBuffer(color_slots=[self.color, self.depth])
+        self.rows = 0  # that are drawn, from below
+
+    @property
+    def done(self) -> bool:
+        return self.rows >= self.height
+
+
+class View:
+    """What one region shows of one field: the picture that is laid over it, and a finer one in the making."""
+
+    def __init__(self) -> None:
+        self.state: Any = None  # what the pictures show
+        self.changed = 0.0
+        self.used = 0.0
+        self.coarse = 2
+        self.shown: Picture | None = None
+        self.next: Picture | None = None
+        self.row_seconds = 1e-3  # a row of the finest picture takes
+        self.marched = 0.0  # seconds of the last whole coarse picture
+        self.refined = False
+
+
+class Viewport:
+    """All that is drawn; one for Blender."""
+
+    def __init__(self) -> None:
+        self.assets: dict[tuple[str, int], Asset] = {}
+        self.views: dict[tuple[int, str], View] = {}
+        self.seconds: list[float] = []  # of Python in the last redraws
+        self.frame_seconds: list[float] = []  # of whole redraws in which something was marched
+        self._march: Any = None
+        self._lay: Any = None
+        self._batches: list[Any] = []
+        self.error = ""
+        self._ended = 0.0  # when the last redraw was done here
+        self._rest = 0.0  # seconds that a redraw takes beside what is done here
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw the fields of a view; what goes wrong is told in the panel, not in each redraw."""
+        scene, region, view3d = context.scene, context.region, context.region_data
+        if not scene.fieldwork_live.viewport or view3d is None:
+            return
+        found = fields.field_objects(context.view_layer.objects)
+        shown = [obj for obj in found if obj.visible_get(view_layer=context.view_layer, viewport=context.space_data)]
+        if not shown or self.error:
+            return
+        try:
+            self._draw(context, region, view3d, shown)
+        except Exception as error:  # noqa: BLE001 - a handler that raises in each redraw would fill the terminal
+            self.error = f"{type(error).__name__}: {error}"
+
+    def _draw(self, context: Any, region: Any, view3d: Any, shown: list[bpy.types.Object]) -> None:
+        begin = time.perf_counter()
+        if self._march is None:
+            self._prepare()
+        now = time.monotonic()
+        self._rest = min(now - self._ended, LONGEST)
+        scene_from_clip = view3d.perspective_matrix.inverted_safe()
+        quality = int(context.scene.fieldwork_live.quality)
+        unfinished, marched = False, 0.0
+        # The farthest first: pixels at edges of nearer ones mix with what is behind.
+        for obj in sorted(shown, key=lambda o: (view3d.view_matrix @ o.matrix_world.translation).z):
+            own = obj.fieldwork
+            project = Path(fields.absolute(own.project)) if own.project else None
+            baked = voxels.baked(project, own.run) if project is not None else None
+            if baked is None:
+                continue
+            asset = self.assets.setdefault(baked.key, Asset(baked))
+            asset.used = now
+            if not asset.ready:
+                if not asset.error and not unfinished:
+                    asset.load()
+                unfinished = unfinished or not asset.error
+                continue
+            rows = voxels.class_rows(baked.meta, own.classes)
+            box = obj.matrix_world @ voxels.world_from_box(project, baked.meta)
+            crop = fields.crop_matrix(own.crop) if own.crop is not None else None
+            state = (
+                _numbers(view3d.perspective_matrix), _numbers(box), crop and _numbers(crop), own.look, tuple(rows),
+                baked.key, region.width, region.height, quality,
+            )  # fmt: skip
+            view = self.views.setdefault((region.as_pointer(), obj.name_full), View())
+            view.used = now
+            uniforms = _uniforms(baked.meta, view3d.perspective_matrix, scene_from_clip, box, crop, own.look, rows)
+            marched += self._bring_up(view, state, asset, rows, uniforms, (region.width, region.height), quality, now)
+            unfinished = unfinished or not view.refined
+            if view.shown is not None:
+                self._lay_over(view.shown, region)
+        self._give_up(now)
+        spent = time.perf_counter() - begin
+        self.seconds = [*self.seconds[-99:], spent - marched]
+        if marched:
+            self.frame_seconds = [*self.frame_seconds[-99:], spent]
+        self._ended = time.monotonic()
+        if unfinished:
+            _redraw_soon()
+
+    def _prepare(self) -> None:
+        from . import shaders
+
+        self._march, self._lay = shaders.march_shader(), shaders.lay_shader()
+        self._batches = [shaders.whole_view(self._march), shaders.whole_view(self._lay)]
+
+    def _bring_up(
+        self, view: View, state: Any, asset: Asset, rows: list[float], uniforms: dict[str, Any],
+        size: tuple[int, int], quality: int, now: float,
+    ) -> float:  # fmt: skip
+        """March what is to be marched of a view in this redraw; returns the seconds that took."""
+        if state != view.state:
+            view.state, view.changed, view.refined, view.next = state, now, False, None
+            scale = max(2 * quality, view.coarse)
+            view.shown = _picture(view.shown, size, scale)
+            view.marched = self._march_rows(view.shown, asset, rows, uniforms, view.shown.height)
+            # A weak card gets a coarser picture the next time, a strong one a finer one.
+            if view.marched > MOVED and view.coarse < COARSEST:
+                view.coarse *= 2
+            elif view.marched < MOVED / 8 and view.coarse > 2:
+                view.coarse //= 2
+            view.row_seconds = view.marched / max(view.shown.height, 1) * scale / quality
+            return view.marched
+        if view.refined or now - view.changed < SETTLED:
+            return 0.0
+        if view.next is None:
+            view.next = _picture(None, size, quality)
+        count = max(1, int(max(BUDGET, self._rest) / max(view.row_seconds, 1e-6)))
+        seconds = self._march_rows(view.next, asset, rows, uniforms, count)
+        view.row_seconds = 0.5 * (view.row_seconds + seconds / count)
+        if view.next.done:
+            view.shown, view.next, view.refined = view.next, None, True
+        return seconds
+
+    def _march_rows(
+        self, picture: Picture, asset: Asset, rows: list[float], uniforms: dict[str, Any], count: int
+    ) -> float:
+        """Draw the next rows of a picture; returns how many seconds they took."""
+        import gpu
+
+        begin = time.perf_counter()
+        shader, first = self._march, picture.rows if not picture.done else 0
+        count = min(count, picture.height - first)
+        gpu.state.blend_set("NONE")
+        gpu.state.depth_test_set("NONE")
+        gpu.state.depth_mask_set(False)
+        with picture.buffer.bind():
+            gpu.state.scissor_test_set(True)
+            gpu.state.scissor_set(0, first, picture.width, count)
+            shader.bind()
+            shader.uniform_sampler("index_", asset.index)
+            for number, texture in enumerate(asset.texels):
+                shader.uniform_sampler(f"t{number}", texture)
+            shader.uniform_sampler("lut", asset.table(rows))
+            for name, value in uniforms.items():
+                if isinstance(value, int):
+                    shader.uniform_int(name, value)
+                else:
+                    shader.uniform_float(name, value)
+            shader.uniform_float("size", (picture.width, picture.height))
+            self._batches[0].draw(shader)
+            gpu.state.scissor_test_set(False)
+            # Reading a pixel waits for the card, so that the time is known.
+            picture.buffer.read_color(0, first, 1, 1, 4, 0, "FLOAT")
+        picture.rows = first + count
+        return time.perf_counter() - begin
+
+    def _lay_over(self, picture: Picture, region: Any) -> None:
+        import gpu
+
+        gpu.state.blend_set("ALPHA_PREMULT")
+        gpu.state.depth_test_set("LESS_EQUAL")
+        gpu.state.depth_mask_set(True)
+        self._lay.bind()
+        self._lay.uniform_sampler("picture", picture.color)
+        self._lay.uniform_sampler("depths", picture.depth)
+        self._lay.uniform_float("size", (region.width, region.height))
+        self._batches[1].draw(self._lay)
+        gpu.state.depth_mask_set(False)
+        gpu.state.depth_test_set("NONE")
+        gpu.state.blend_set("NONE")
+
+    def _give_up(self, now: float) -> None:
+        """Let go of textures and pictures that nothing shows any more."""
+        self.assets = {key: asset for key, asset in self.assets.items() if now - asset.used < UNUSED}
+        self.views = {key: view for key, view in self.views.items() if now - view.used < UNUSED}
+
+
+def _picture(old: Picture | None, size: tuple[int, int], scale: int) -> Picture:
+    width, height = max(1, -(-size[0] // scale)), max(1, -(-size[1] // scale))
+    if old is not None and (old.width, old.height) == (width, height):
+        old.rows = 0
+        return old
+    return Picture(width, height)
+
+
+def _numbers(matrix: Matrix) -> tuple[float, ...]:
+    return tuple(value for row in matrix for value in row)
+
+
+def _uniforms(
+    meta: dict[str, Any], clip_from_scene: Matrix, scene_from_clip: Matrix, box: Matrix, crop: Matrix | None,
+    look: float, rows: list[float],
+) -> dict[str, Any]:  # fmt: skip
+    """What the march needs to know."""
+    cell = (4.0 if meta["contracted"] else 2.0) / (meta["side"] * (voxels.VERTICES - 1))
+    edited = any(rows[4 * n + 3] < 1 or rows[1024 + 4 * n] > 0 for n in range(len(meta["class_ids"])))
+    return {
+        "box_from_clip": box.inverted_safe() @ scene_from_clip,
+        "clip_from_box": clip_from_scene @ box,
+        "crop_from_box": crop.inverted_safe() @ box if crop is not None else Matrix.Identity(4),
+        "step_": cell,
+        "exponent": 1.0,
+        "far": float(meta["far"]),
+        "empty_distance": float(meta["empty_distance"]),
+        "harmonic_range": float(meta["harmonic_range"]),
+        "look": float(look),
+        "blocks": int(meta["side"]),
+        "contracted": int(meta["contracted"]),
+        "cropped": int(crop is not None),
+        "classes": len(meta["class_ids"]),
+        "edited": int(edited),
+    }
+
+
+viewport = Viewport()
+_handle: Any = None
+
+
+def _draw() -> None:
+    viewport.draw(bpy.context)
+
+
+def _redraw_soon() -> None:
+    if not bpy.app.timers.is_registered(_redraw):
+        bpy.app.timers.register(_redraw, first_interval=0.01)
+
+
+def _redraw() -> None:
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type == "VIEW_3D":
+                area.tag_redraw()
+
+
+def register() -> None:
+    global _handle
+    if not bpy.app.background:
+        _handle = bpy.types.SpaceView3D.draw_handler_add(_draw, (), "WINDOW", "POST_VIEW")
+
+
+def unregister() -> None:
+    global _handle
+    if _handle is not None:
+        bpy.types.SpaceView3D.draw_handler_remove(_handle, "WINDOW")
+        _handle = None
+    if bpy.app.timers.is_registered(_redraw):
+        bpy.app.timers.unregister(_redraw)
+    viewport.__init__()

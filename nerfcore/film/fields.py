@@ -1,0 +1,252 @@
+"""Fields ready to be seen by Blender's cameras, and rays of the scene through them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ..data.load import load_scene
+from ..errors import ProjectError
+from ..kernels.march import Samples
+from ..kernels.traversal import BEFORE_CUBE, PDF_UNIFORM, MarchSettings
+from ..progress import Reporter
+from ..project.runs import checkpoint_id
+from ..project.store import load_project
+from ..render.baked import META, BakedField, load_baked, voxels_folder
+from ..render.fused import ray_renderer
+from ..render.image import LEAST
+from ..render.model import Geometry, Model, Thin
+from ..render.run import load_info, load_trained
+from .shot import ClassLook, FieldItem
+
+FAR = 1e9  # a distance that nothing reaches
+
+
+@dataclass(frozen=True)
+class FieldRays:
+    """Of R rays: color (R, 3) sRGB with associated alpha, as it is shown; opacity (R,); distance (R,) in the scene of what
+    is met, NaN where nothing is; best (R,) index of the most probable class, −1 for void; share (R,) its probability; sky
+    (R, 3) sRGB behind the field, or None."""
+
+    color: torch.Tensor
+    opacity: torch.Tensor
+    distance: torch.Tensor
+    best: torch.Tensor
+    share: torch.Tensor
+    sky: torch.Tensor | None
+
+
+@dataclass(frozen=True)
+class LoadedField:
+    """A field as it lies in its capture: box_from_world (4, 4), ids, names and colours (K, 3) of its classes."""
+
+    shown: Model | BakedField
+    box_from_world: np.ndarray
+    class_ids: list[int]
+    class_names: list[str]
+    class_colors: np.ndarray
+    void: int
+
+
+def load_field(project: Path, run: str, baked: bool) -> LoadedField:
+    """Raises ProjectError: there is none, or it is damaged."""
+    info = load_info(project, run)
+    scene = load_scene(project, info.holdout)
+    known = {entry.id: entry for entry in scene.classes}
+    shown = load_baked(project, run, info) if baked else load_trained(project, run).model
+    ids = info.class_ids if shown_classes(shown) else []
+    names = [known[i].name if i in known else f"class {i}" for i in ids]
+    colors = np.array([known[i].color if i in known else (0.5, 0.5, 0.5) for i in ids], np.float32).reshape(-1, 3)
+    box = info.box(load_project(project)).box_from_world
+    return LoadedField(shown, box, list(ids), names, colors, scene.ignore_id)
+
+
+def shown_classes(shown: Model | BakedField) -> int:
+    """How many classes it tells apart."""
+    return shown.classes if isinstance(shown, BakedField) else shown.field.classes
+
+
+class FieldStore:
+    """The fields that were asked for last, kept for the next frame."""
+
+    KEPT = 4
+
+    def __init__(self) -> None:
+        self.loaded = 0  # how often a field was read from disk
+        self._fields: dict[tuple, LoadedField] = {}
+
+    def field(self, item: FieldItem, pixels: float, report: Reporter) -> LoadedField:
+        """The field of an item, for so many rays. Raises ProjectError."""
+        folder = item.project
+        state = [checkpoint_id(folder, item.run), (folder / "project.json").stat().st_mtime_ns]
+        if item.baked:
+            meta = voxels_folder(folder, item.run) / META
+            state.append(meta.stat().st_mtime_ns if meta.is_file() else 0)
+        key = (str(folder), item.run, item.baked, *state)
+        found = self._fields.pop(key, None)
+        if found is None:
+            report.stage("Loading the field")
+            # A field of an earlier training is of no use any more.
+            self._fields = {k: v for k, v in self._fields.items() if k[:3] != key[:3]}
+            found = load_field(folder, item.run, item.baked)
+            self.loaded += 1
+            if isinstance(found.shown, Model):
+                found.shown.refine(pixels, report.check)
+        self._fields[key] = found
+        for old in list(self._fields)[: -self.KEPT]:
+            del self._fields[old]
+        return found
+
+
+class PlacedField:
+    """A field in the scene, as one item of a shot shows it.
+
+    Args:
+        pixels: rays of a picture.
+    Raises:
+        ProjectError: the item's matrices cannot be inverted.
+    """
+
+    def __init__(self, field: LoadedField, item: FieldItem, pixels: int) -> None:
+        self.field, self.item, self.device = field, item, field.shown.device
+        try:
+            box_from_scene = field.box_from_world @ np.linalg.inv(np.array(item.scene_from_capture))
+            self.crop = None if item.crop is None else self._tensor(np.linalg.inv(np.array(item.crop)))
+        except np.linalg.LinAlgError as error:
+            raise ProjectError(
+                f"“{item.name}” or its crop box is scaled to nothing.", "Give it a scale other than 0."
+            ) from error
+        self.box_from_scene = self._tensor(box_from_scene)
+        looks = [item.classes.get(i, ClassLook(color=tuple(c))) for i, c in zip(field.class_ids, field.class_colors)]
+        self.opacity = self._tensor([look.opacity for look in looks])
+        self.tint = self._tensor([look.tint for look in looks])
+        self.colors = self._tensor([look.color for look in looks]).reshape(-1, 3)
+        self.hides = bool(looks) and bool((self.opacity < 1).any())
+        self.settings = self._settings()
+        self._plain = None if isinstance(field.shown, BakedField) else ray_renderer(field.shown, pixels, True)
+
+    def _tensor(self, values: object) -> torch.Tensor:
+        return torch.tensor(np.asarray(values, np.float32), device=self.device)
+
+    def _settings(self) -> MarchSettings:
+        shown = self.field.shown
+        return shown.settings if isinstance(shown, BakedField) else shown.render_grid().settings
+
+    def rays(
+        self, origins: torch.Tensor, directions: torch.Tensor, begin: torch.Tensor, end: torch.Tensor
+    ) -> FieldRays:
+        """What rays of the scene (R, 3), unit directions, show of the field between two distances (R,)."""
+        begin, end = self._cropped(origins, directions, begin, end)
+        places = origins @ self.box_from_scene[:3, :3].T + self.box_from_scene[:3, 3]
+        turned = directions @ self.box_from_scene[:3, :3].T
+        stretch = turned.norm(dim=1)
+        turned = turned / stretch[:, None]
+        first = self._first(places, turned)
+        # Rays that begin later than they would do by themselves are moved to where they do.
+        shifted = bool((begin * stretch > first).any())
+        shift = torch.maximum(begin * stretch, first) - self.settings.near if shifted else torch.zeros_like(first)
+        places = places + turned * shift[:, None]
+        color, opacity, depth, probabilities, sky = self._rendered(
+            places.contiguous(), turned.contiguous(), end * stretch - shift, shifted
+        )
+        opacity = opacity.clamp(0, 1)
+        empty = LEAST if sky is None else 0.5  # haze before the sky has no depth
+        met = depth / opacity.clamp(min=LEAST) + shift
+        distance = torch.where(opacity > empty, met / stretch, torch.nan)
+        best = torch.full_like(opacity, -1, dtype=torch.long)
+        share = torch.zeros_like(opacity)
+        if probabilities is not None:
+            share, index = probabilities.max(1)
+            best = torch.where(probabilities.sum(1) > 0.5 * opacity.clamp(min=LEAST), index, -1)
+            color = self._looked(color, opacity, probabilities, share)
+        return FieldRays(color, opacity, distance, best, share, sky)
+
+    def _cropped(
+        self, origins: torch.Tensor, directions: torch.Tensor, begin: torch.Tensor, end: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """The part of the rays that is within the crop box."""
+        if self.crop is None:
+            return begin, end
+        place = origins @ self.crop[:3, :3].T + self.crop[:3, 3]
+        along = directions @ self.crop[:3, :3].T
+        inverse = 1 / torch.where(along.abs() < 1e-12, 1e-12, along)
+        one, other = (-1 - place) * inverse, (1 - place) * inverse
+        begin = torch.maximum(begin, torch.minimum(one, other).amax(1))
+        return begin, torch.minimum(end, torch.maximum(one, other).amin(1))
+
+    def _first(self, places: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
+        """Where rays of the cube's frame begin: what the march would do, were they not shifted."""
+        s = self.settings
+        least = torch.full_like(places[:, 0], s.near)
+        if not (s.contracted and s.empty_distance > 0):
+            return least
+        inverse = 1 / torch.where(directions.abs() < 1e-9, 1e-9, directions)
+        entry = torch.minimum((-1 - places) * inverse, (1 - places) * inverse).amax(1)
+        return torch.maximum(least, (float(BEFORE_CUBE) * entry).clamp(max=s.empty_distance))
+
+    def _leave(self, places: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
+        """Where rays of the cube's frame end by themselves."""
+        if self.settings.contracted:
+            return torch.full_like(places[:, 0], self.settings.far)
+        inverse = 1 / torch.where(directions.abs() < 1e-9, 1e-9, directions)
+        return torch.maximum((-1 - places) * inverse, (1 - places) * inverse).amin(1)
+
+    def _rendered(
+        self, places: torch.Tensor, directions: torch.Tensor, ends: torch.Tensor, shifted: bool
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor | None, torch.Tensor | None]:
+        shown = self.field.shown
+        # Rays that were moved to where they begin take nothing to be empty before them.
+        settings = replace(self.settings, empty_distance=0.0) if shifted else self.settings
+        limited = bool((ends < self._leave(places, directions)).any())
+        if isinstance(shown, BakedField):
+            baked = shown.field
+            if self.hides:
+                opacity = baked.class_opacity.clone()
+                opacity[: len(self.opacity)] *= self.opacity
+                baked = replace(baked, class_opacity=opacity)
+            out = BakedField(baked, settings, shown.environment)(places, directions, ends=ends if limited else None)
+        else:
+            count = shown.config.render.samples or shown.config.sampling.samples
+            if not (limited or self.hides or (shifted and settings.contracted)):
+                assert self._plain is not None
+                out = self._plain(places, directions, count)
+            else:
+                # What hidden classes leave to be seen is not where the field is densest.
+                settings = replace(settings, mode=PDF_UNIFORM) if self.hides else settings
+                grid = replace(shown.render_grid(), settings=settings)
+                thin = self._thin(shown, ends) if limited or self.hides else None
+                out = shown.render(places, directions, count, grid=grid, thin=thin)
+        behind = out.environment
+        sky = None if behind is None else behind.color
+        return out.color, out.opacity, out.depth, out.probabilities, sky
+
+    def _thin(self, model: Model, ends: torch.Tensor) -> Thin:
+        def thin(geometry: Geometry, samples: Samples) -> torch.Tensor:
+            within = (samples.t <= ends[samples.packed_info.ray_indices.long()]).float()
+            if not self.hides:
+                return within
+            opacity = torch.softmax(model.field.logits(geometry), 1) @ self.opacity
+            # A class's opacity is a factor of alpha, as in a baked field.
+            thickness = (geometry.density * samples.deltas).clamp(1e-6, 50)
+            return within * -torch.log1p(opacity * torch.expm1(-thickness)) / thickness
+
+        return thin
+
+    def _looked(
+        self, color: torch.Tensor, opacity: torch.Tensor, probabilities: torch.Tensor, share: torch.Tensor
+    ) -> torch.Tensor:
+        """The colour with tints of classes, towards their colours, and on towards their probability."""
+        if bool((self.tint > 0).any()):
+            tinted = probabilities * self.tint
+            plain = color / opacity.clamp(min=LEAST)[:, None]
+            color = color + tinted @ self.colors - tinted.sum(1)[:, None] * plain
+        look = self.item.look
+        if look > 0:
+            labels = probabilities @ self.colors
+            color = torch.lerp(color, labels, min(look, 1.0))
+        if look > 1:
+            color = torch.lerp(color, share[:, None].expand_as(color), look - 1)
+        return color

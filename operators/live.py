@@ -1,0 +1,152 @@
+"""Fields in the scene: adding one, cropping it, its classes, and the compositor that puts it among objects."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+from bpy.types import Context, Operator
+
+from ..addon.errors import SceneError
+from ..addon.live import compositor, fields
+from ..addon.project import snapshot
+from ..addon.props import IntProperty
+from ..addon.scene.frame import root_of, scene_from_capture
+from ..addon.text import t
+from .base import need_run
+
+
+def active_field(context: Context) -> bpy.types.Object | None:
+    """The active object, if it is a field; else the only field of the scene."""
+    obj = context.object
+    if obj is not None and obj.fieldwork.is_field:
+        return obj
+    found = fields.field_objects(context.scene.objects)
+    return found[0] if len(found) == 1 else None
+
+
+class _OfField(Operator):
+    """An operator for the active field."""
+
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context: Context) -> bool:
+        if active_field(context) is None:
+            cls.poll_message_set(t("Choose a field in the scene"))
+            return False
+        return True
+
+
+class FIELDWORK_OT_add_field(Operator):
+    """Add the trained field of the project to the scene, where the capture stands"""
+
+    bl_idname = "fieldwork.add_field"
+    bl_label = "Add Field"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context: Context) -> bool:
+        reason = None if bpy.app.background else need_run(context)
+        if reason:
+            cls.poll_message_set(reason)
+        return reason is None
+
+    def execute(self, context: Context) -> set[str]:
+        if reason := need_run(context):
+            self.report({"ERROR"}, reason)
+            return {"CANCELLED"}
+        scene, settings = context.scene, context.scene.fieldwork
+        folder = snapshot.folder_of(settings)
+        obj = bpy.data.objects.new(f"{folder.name} · {settings.run}", None)
+        obj.empty_display_type, obj.empty_display_size = "PLAIN_AXES", 0.25
+        context.collection.objects.link(obj)
+        owner = snapshot.owner(folder)
+        root = root_of(scene, owner)
+        if root is not None:
+            obj.parent = root
+        else:
+            obj.matrix_world = scene_from_capture(scene, owner)
+        own = obj.fieldwork
+        own.is_field, own.project, own.run = True, settings.project, settings.run
+        fields.fill_classes(obj)
+        for other in context.selected_objects:
+            other.select_set(False)
+        obj.select_set(True)
+        context.view_layer.objects.active = obj
+        return {"FINISHED"}
+
+
+class FIELDWORK_OT_add_crop_box(_OfField):
+    """Add an empty cube that the field is cut to; move, turn and scale it"""
+
+    bl_idname = "fieldwork.add_crop_box"
+    bl_label = "Add Crop Box"
+
+    def execute(self, context: Context) -> set[str]:
+        obj = active_field(context)
+        box = bpy.data.objects.new(t("Crop of {}", obj.name), None)
+        box.empty_display_type, box.empty_display_size = "CUBE", 1.0
+        for collection in obj.users_collection:
+            collection.objects.link(box)
+        box.parent = obj
+        obj.fieldwork.crop = box
+        return {"FINISHED"}
+
+
+class FIELDWORK_OT_isolate_class(_OfField):
+    """Show only this class of the field; once more, all of them"""
+
+    bl_idname = "fieldwork.isolate_class"
+    bl_label = "Isolate Class"
+
+    index: IntProperty(
+        name="Class", description="Which class of the field's list", min=0, options={"SKIP_SAVE", "HIDDEN"}
+    )
+
+    def execute(self, context: Context) -> set[str]:
+        entries = active_field(context).fieldwork.classes
+        if self.index >= len(entries):
+            self.report({"ERROR"}, t("The field has no such class."))
+            return {"CANCELLED"}
+        alone = all(entry.visible == (number == self.index) for number, entry in enumerate(entries))
+        for number, entry in enumerate(entries):
+            entry.visible = alone or number == self.index
+        return {"FINISHED"}
+
+
+class FIELDWORK_OT_refresh_field_classes(_OfField):
+    """Read the classes of the field from its project anew; what is set for them stays"""
+
+    bl_idname = "fieldwork.refresh_field_classes"
+    bl_label = "Refresh Classes"
+
+    def execute(self, context: Context) -> set[str]:
+        fields.fill_classes(active_field(context))
+        return {"FINISHED"}
+
+
+class FIELDWORK_OT_setup_compositor(Operator):
+    """Render the field in a scene of its own and composite it before and behind the objects of this one"""
+
+    bl_idname = "fieldwork.setup_compositor"
+    bl_label = "Composite with Objects"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self, context: Context) -> set[str]:
+        try:
+            made: Any = compositor.set_up(context.scene)
+        except SceneError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        self.report({"INFO"}, t("The scene “{}” renders the field; F12 here renders both.", made.name))
+        return {"FINISHED"}
+
+
+CLASSES = [
+    FIELDWORK_OT_add_field,
+    FIELDWORK_OT_add_crop_box,
+    FIELDWORK_OT_isolate_class,
+    FIELDWORK_OT_refresh_field_classes,
+    FIELDWORK_OT_setup_compositor,
+]

@@ -1,0 +1,161 @@
+"""A field among Blender's objects: two scenes and the compositor, against the same picture at sixteen times the resolution."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fieldwork.tests.addon.support import SETUP
+from fieldwork.tests.nerfcore.support.live import live_ball
+
+
+@pytest.fixture(scope="module")
+def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return live_ball(tmp_path_factory.mktemp("objects") / "ball")
+
+
+START = (
+    """
+os.environ["FIELDWORK_ENGINE_PYTHON"] = sys.executable
+import math
+import numpy as np
+"""
+    + SETUP
+    + """
+settings.project = project
+render, camera = scene.render, scene.camera
+camera.location, camera.rotation_euler = (0, -2, 0), (math.pi / 2, 0, 0)
+camera.data.clip_end = 50
+scene.fieldwork_live.source = "baked"
+render.engine = "CYCLES"
+scene.cycles.samples, scene.cycles.use_denoising, scene.cycles.pixel_filter_type = 64, False, "BOX"
+scene.view_settings.view_transform = "Raw"
+bpy.data.objects.remove(bpy.data.objects["Cube"])
+def plate(name, color, corners):
+    mesh = bpy.data.meshes.new(name)
+    mesh.from_pydata(corners, [], [(0, 1, 2, 3)])
+    obj = bpy.data.objects.new(name, mesh)
+    scene.collection.objects.link(obj)
+    material = bpy.data.materials.new(name)
+    material.use_nodes = True
+    tree = material.node_tree
+    tree.nodes.clear()
+    glow, out = tree.nodes.new("ShaderNodeEmission"), tree.nodes.new("ShaderNodeOutputMaterial")
+    glow.inputs[0].default_value = (*color, 1)
+    tree.links.new(glow.outputs[0], out.inputs[0])
+    mesh.materials.append(material)
+    return obj
+plate("before", (0.9, 0.2, 0.1), [(-0.35, -1, -0.3), (-0.05, -1, -0.35), (0.0, -1, 0.0), (-0.3, -1, 0.02)])
+plate("through", (0.1, 0.8, 0.9), [(0.1, -0.7, -0.5), (0.5, 0.6, -0.5), (0.45, 0.6, 0.1), (0.1, -0.7, 0.1)])
+plate("behind", (0.2, 0.9, 0.2), [(-0.9, 1, 0.1), (0.9, 1, 0.2), (0.9, 1, 1.2), (-0.9, 1, 1.2)])
+image = render.image_settings
+if hasattr(image, "media_type"):
+    image.media_type = "IMAGE"
+image.file_format, image.color_mode, image.color_depth = "OPEN_EXR", "RGBA", "32"
+def shoot(name, target=None):
+    render.filepath = f"{folder}/{name}.exr"
+    bpy.ops.render.render(write_still=True)
+    import OpenImageIO as oiio
+    source = oiio.ImageInput.open(render.filepath)
+    return np.asarray(source.read_image(0, 0, 0, source.spec().nchannels, "float"))
+"""
+)
+
+
+def test_edges_of_objects_are_exact_in_the_composite(bpy_script, ball, tmp_path):
+    """No pixel here has an edge of one object on another that the field hides: of such a pixel the renderer of the objects
+    tells one colour only (docs/live.md)."""
+    facts = bpy_script(
+        START
+        + """
+render.resolution_x, render.resolution_y = 72, 48
+bpy.ops.fieldwork.setup_compositor()
+made = scene["fieldwork_field_scene"]
+made.fieldwork_live.samples = 256
+scene.cycles.samples = 512
+small = shoot("small")
+render.resolution_percentage = 1600
+scene.cycles.samples = 1
+bpy.ops.fieldwork.setup_compositor()
+made.fieldwork_live.samples = 1
+large = shoot("large")
+np.savez(f"{folder}/both.npz", small=small, large=large)
+answer({"scenes": len(bpy.data.scenes), "nodes": len(made.objects), "engine": made.render.engine})
+""",
+        project=ball,
+        folder=tmp_path,
+    )
+    assert facts["scenes"] == 2, "the button makes one scene, however often it is pressed"
+    assert facts["engine"] == "FIELDWORK"
+    pictures = np.load(tmp_path / "both.npz")
+    small, large = pictures["small"], pictures["large"]
+    truth = large.reshape(48, 16, 72, 16, 4).mean((1, 3))
+    assert truth[..., 3].max() > 0.99
+    spread = large.reshape(48, 16, 72, 16, 4).std((1, 3)).max(-1)
+    edges = spread > 0.15
+    assert edges.sum() > 150
+    error = np.abs(small - truth)[..., :3]
+    print("mean error", 255 * error.mean(), "at edges", 255 * error[edges].mean(), edges.sum())
+    assert error.mean() < 0.2 / 255
+    assert error[edges].mean() < 1.5 / 255
+    # Before, within and behind the field, each is seen.
+    for color, least in (((0.9, 0.2, 0.1), 60), ((0.1, 0.8, 0.9), 15), ((0.2, 0.9, 0.2), 60)):
+        assert (np.abs(small[..., :3] - color).max(-1) < 0.03).sum() > least, color
+
+
+def test_the_button_keeps_what_the_user_composited(bpy_script, ball, tmp_path):
+    facts = bpy_script(
+        START
+        + """
+from fieldwork.addon.live import compositor
+render.resolution_x, render.resolution_y = 24, 16
+tree, out = compositor.tree_of(scene)
+layers = next((n for n in tree.nodes if n.type == "R_LAYERS"), None) or tree.nodes.new("CompositorNodeRLayers")
+blur = tree.nodes.new("CompositorNodeBlur")
+tree.links.new(layers.outputs["Image"], blur.inputs["Image"])
+tree.links.new(blur.outputs["Image"], out.inputs[0])
+for _ in range(2):
+    bpy.ops.fieldwork.setup_compositor()
+facts = {"nodes": sorted(n.type for n in tree.nodes), "into blur": blur.inputs["Image"].links[0].from_node["fieldwork_node"],
+         "out": out.inputs[0].links[0].from_node.type}
+bpy.ops.render.render()
+scene.render.engine = "FIELDWORK"
+facts["itself"] = attempt(bpy.ops.fieldwork.setup_compositor)
+scene.render.engine, scene.camera = "CYCLES", None
+facts["camera"] = attempt(bpy.ops.fieldwork.setup_compositor)
+answer(facts)
+""",
+        project=ball,
+        folder=tmp_path,
+    )
+    assert facts["nodes"].count("R_LAYERS") == 2
+    assert facts["nodes"].count("ALPHAOVER") == 2
+    assert facts["into blur"] == "front"
+    assert facts["out"] == "BLUR"
+    assert "itself" in facts["itself"]
+    assert "camera" in facts["camera"]
+
+
+def test_surfaces_of_the_capture_do_not_hide_its_field(bpy_script, ball, tmp_path):
+    facts = bpy_script(
+        START
+        + """
+from fieldwork.addon.live.objects import triangles
+depsgraph = bpy.context.evaluated_depsgraph_get()
+facts = {"all": [len(a) for a in triangles(depsgraph)]}
+bpy.data.objects["before"]["fieldwork_role"] = "mesh"
+bpy.data.objects["behind"].hide_render = True
+bpy.context.view_layer.update()
+facts["one"] = [len(a) for a in triangles(bpy.context.evaluated_depsgraph_get())]
+bpy.data.objects["through"].location = (1, 2, 3)
+bpy.context.view_layer.update()
+facts["place"] = [float(v) for v in triangles(bpy.context.evaluated_depsgraph_get())[0][0]]
+answer(facts)
+""",
+        project=ball,
+        folder=tmp_path,
+    )
+    assert facts["all"] == [12, 6]
+    assert facts["one"] == [4, 2]
+    assert facts["place"] == pytest.approx([1.1, 1.3, 2.5], abs=1e-5)

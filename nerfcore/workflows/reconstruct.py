@@ -75,6 +75,80 @@ class Pipeline:
         self.seconds[verb] = round(time.perf_counter() - begin, 1)
 
 
+def stages_of(params: p.ReconstructParams) -> list[str]:
+    """The stages of a reconstruction in their order."""
+    return [verb for verb in STAGES if verb != "blend" or params.blend is not None]
+
+
+def stage_params(params: p.ReconstructParams, verb: str) -> p.Params | None:
+    """What a stage of a reconstruction is asked for; None where it has nothing to do.
+
+    The project has to be as the stages before leave it: whether a training goes on, and whether photos are held out,
+    stands there.
+    """
+    project, run = Path(params.out), "main"
+    match verb:
+        case "new":
+            return p.NewParams(
+                project=project,
+                photos=params.photos,
+                labels=params.labels,
+                masks=params.masks,
+                classes=params.classes,
+                mask_mode=params.mask_mode,
+            )
+        case "poses":
+            return p.PosesParams(project=project)
+        case "train":
+            training = p.TrainParams(
+                project=project,
+                preset=params.preset,
+                run=run,
+                time_limit=params.time_limit,
+                set=params.set,
+                holdout=params.holdout,
+            )
+            return training.model_copy(update={"resume": unfinished(training)})
+        case "evaluate":
+            return p.EvaluateParams(project=project, run=run) if held_out(project, run) else None
+        case "mesh":
+            return p.MeshParams(project=project, run=run, faces=params.faces or None, texture=params.texture or None)
+        case "render":
+            return p.RenderParams(
+                project=project,
+                run=run,
+                out=renders_folder(params),
+                orbit=params.render_count,
+                passes=["rgb", "depth", "semantic"],
+            )
+        case _:
+            return p.BlendParams(project=project, out=params.blend, run=run)
+
+
+def renders_folder(params: p.ReconstructParams) -> Path:
+    return params.renders or Path(params.out) / "exports" / "main" / "renders"
+
+
+def run_stages(params: p.ReconstructParams, verbs: list[str], report: Reporter) -> Pipeline:
+    """Do some stages of a reconstruction in turn, going on from what is there.
+
+    Raises:
+        any verb's error; the project is left so that the same call goes on.
+    """
+    pipeline = Pipeline(Path(params.out), report)
+    for verb in verbs:
+        if verb == "new":
+            if is_project(pipeline.project) and load_project(pipeline.project).last("import") is not None:
+                raise ProjectError(f"{pipeline.project} is an imported data set.", "Use train, mesh and blend on it.")
+            _offer_poses(params.photos, report)
+        values = stage_params(params, verb)
+        if values is None:
+            report.stage("evaluate: left out, no photos are held out")
+        else:
+            pipeline.do(verb, values)
+    return pipeline
+
+
 def reconstruct(params: p.ReconstructParams, report: Reporter) -> dict[str, Any]:
     """Run new, poses, train, evaluate, mesh, render and blend one after the other.
 
@@ -88,58 +162,28 @@ def reconstruct(params: p.ReconstructParams, report: Reporter) -> dict[str, Any]
     """
     if params.report is not None:
         check_report(params.report)
-    project, run = Path(params.out), "main"
-    pipeline = Pipeline(project, report)
-    if is_project(project) and load_project(project).last("import") is not None:
-        raise ProjectError(f"{project} is an imported data set.", "Use train, mesh and blend on it.")
-    _offer_poses(params.photos, report)
-    pipeline.do(
-        "new",
-        p.NewParams(
-            project=project,
-            photos=params.photos,
-            labels=params.labels,
-            masks=params.masks,
-            classes=params.classes,
-            mask_mode=params.mask_mode,
-        ),
-    )
-    pipeline.do("poses", p.PosesParams(project=project))
-    training = p.TrainParams(
-        project=project,
-        preset=params.preset,
-        run=run,
-        time_limit=params.time_limit,
-        set=params.set,
-        holdout=params.holdout,
-    )
-    pipeline.do("train", training.model_copy(update={"resume": unfinished(training)}))
-    if held_out(project, run):
-        pipeline.do("evaluate", p.EvaluateParams(project=project, run=run))
-    else:
-        report.stage("evaluate: left out, no photos are held out")
-    pipeline.do(
-        "mesh", p.MeshParams(project=project, run=run, faces=params.faces or None, texture=params.texture or None)
-    )
-    renders = params.renders or project / "exports" / run / "renders"
-    pipeline.do(
-        "render",
-        p.RenderParams(
-            project=project, run=run, out=renders, orbit=params.render_count, passes=["rgb", "depth", "semantic"]
-        ),
-    )
-    if params.blend is not None:
-        pipeline.do("blend", p.BlendParams(project=project, out=params.blend, run=run))
+    made = run_stages(params, stages_of(params), report)
+    return summed_up(params, made.seconds, made.reused, made.redone, made.results)
+
+
+def summed_up(
+    params: p.ReconstructParams,
+    seconds: dict[str, float],
+    reused: list[str],
+    redone: dict[str, str],
+    results: dict[str, Any],
+) -> dict[str, Any]:
+    """What `reconstruct` returns, of stages that were done; writes the report that was asked for."""
     result = {
-        "project": str(project),
-        "stages": pipeline.seconds,
-        "reused": pipeline.reused,
-        "redone": pipeline.redone,
-        "verdict": worst({verb: made.get("verdict") for verb, made in pipeline.results.items()}),
-        **pipeline.results,
+        "project": str(params.out),
+        "stages": seconds,
+        "reused": reused,
+        "redone": redone,
+        "verdict": worst({verb: made.get("verdict") for verb, made in results.items()}),
+        **results,
     }
     if params.report is not None:
-        write_report(params.report, project, run, renders, result)
+        write_report(params.report, Path(params.out), "main", renders_folder(params), result)
         result["report"] = str(params.report)
     return result
 

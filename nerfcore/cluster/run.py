@@ -19,6 +19,7 @@ from .tasks import Need, Task, Tasks
 SILENT = 60.0  # seconds without a sign of life after which a worker is given up
 MOST_LOSSES = 8  # of workers with one task: then it is the task that ends them
 GRACE = 2.5  # seconds in which tasks may end by themselves after a cancel
+PATIENCE = 600.0  # seconds in which no worker could be used, after which the campaign ends
 RESTED = 20.0  # seconds until a worker that was refused or full is asked again
 USER_FAULTS = ("input", "setting")  # other photos or settings are the user's to give
 
@@ -26,12 +27,11 @@ USER_FAULTS = ("input", "setting")  # other photos or settings are the user's to
 @dataclass
 class Options:
     """How a campaign is run. `folder` is all that workers may write in; a worker whose disk has less than
-    `keep_free_gb` gets nothing to do; when none has room for `patience` seconds the campaign ends."""
+    `keep_free_gb` gets nothing to do."""
 
     folder: Path
     retries: int = 1
     keep_free_gb: float = 2.0
-    patience: float = 600.0
 
 
 @dataclass
@@ -93,30 +93,25 @@ class Runner:
     def _allowed(self) -> list[dict[str, Any]]:
         now = time.monotonic()
         self.excluded = {node: entry for node, entry in self.excluded.items() if entry[0] > now}
-        return [node for node in self.nodes if node["id"] not in self.excluded]
+        return [node for node in self.nodes if node["cores"] >= 1 and node["id"] not in self.excluded]
 
     def _submit(self) -> None:
         """Hand out what fits on the cluster now; nothing waits at the workers."""
         allowed = self._allowed()
         if not allowed:
-            self._starve()
+            if not self.tasks.running:
+                self._starve()
             return
-        self.starved = 0.0
         used = [limited(task.need, allowed) for task in self.tasks.running]
         cores = sum(node["cores"] for node in allowed) - sum(need.cores for need in used)
         memory = sum(node["memory_gb"] for node in allowed) - sum(need.memory_gb for need in used)
         gpus = sum(node["gpus"] for node in allowed) - sum(need.gpu for need in used)
         while cores > 0:
-            room = Need(
-                float("inf") if not used else cores, float("inf") if not used else memory, float("inf") if not used else gpus
-            )
-            if not any(node["gpus"] for node in allowed):
-                room = Need(room.cores, room.memory_gb, float("inf"))
-            task = self.tasks.take(time.monotonic(), room)
+            room = Need(cores, memory, gpus)
+            task = self.tasks.take(time.monotonic(), lambda task, room=room: limited(task.need, allowed).fits(room))
             if task is None:
                 return
             need = limited(task.need, allowed)
-            used.append(need)
             cores, memory, gpus = cores - need.cores, memory - need.memory_gb, gpus - need.gpu
             job = {
                 "function": task.function,
@@ -143,9 +138,9 @@ class Runner:
         if not self.starved:
             self.starved = now
             self.report.warn(f"The campaign waits. {' '.join(reasons[:3])}")
-        if now - self.starved > self.options.patience:
+        if now - self.starved > PATIENCE:
             raise DiskError(
-                f"No worker could be used for {self.options.patience:.0f} s. {' '.join(reasons[:3])}",
+                f"No worker could be used for {PATIENCE:.0f} s. {' '.join(reasons[:3])}",
                 "Mend that, then run the same command: finished work is kept.",
             )
 
@@ -175,8 +170,10 @@ class Runner:
 
     def _answered(self, task: Task, answer: dict[str, Any]) -> None:
         for warning in answer.get("warnings", []):
-            self.report.warn(f"{task.group}: {warning}")
+            self.report.warn(f"{Path(task.group).name}: {warning}")
         state = answer["state"]
+        if state in ("done", "failed"):
+            self.starved = 0.0
         if state == "done":
             self.durations.add(task.stage, answer["seconds"])
             self.tasks.finish(task, answer)
@@ -197,7 +194,7 @@ class Runner:
         if error["code"] in USER_FAULTS or task.attempts > self.options.retries:
             self._fail(task, answer)
             return
-        self.report.warn(f"{task.group}: {error['message']} It is tried again.")
+        self.report.warn(f"{Path(task.group).name}: {error['message']} It is tried again.")
         self.tasks.put_back(task)
 
     def _fail(self, task: Task, answer: dict[str, Any]) -> None:
@@ -209,7 +206,7 @@ class Runner:
         self.cut_short.pop(task.id, None)
         task.losses += 1
         if task.losses < MOST_LOSSES:
-            self.report.note(f"{task.group}, {task.stage}: its worker was lost ({reason}); it goes on elsewhere.")
+            self.report.note(f"{Path(task.group).name}, {task.stage}: its worker was lost ({reason}); it goes on elsewhere.")
             self.tasks.put_back(task, time.monotonic() + 0.2 * task.losses)
             return
         message = f"{task.losses} workers were lost one after the other while at “{task.stage}” of it."
@@ -276,10 +273,14 @@ class Runner:
 
 
 def limited(need: Need, nodes: list[dict[str, Any]]) -> Need:
-    """What is asked of a worker: never more than the largest one has, and a GPU only where there is one."""
-    gpus = max(node["gpus"] for node in nodes)
-    return Need(
-        min(need.cores, max(node["cores"] for node in nodes) or need.cores),
-        min(need.memory_gb, max(node["memory_gb"] for node in nodes) * 0.9 or need.memory_gb),
-        min(need.gpu, gpus),
-    )
+    """What is asked of a worker: no more than one of them has, and a GPU only where there is one.
+
+    Args:
+        nodes: those with cores.
+    """
+    gpu = min(need.gpu, max(node["gpus"] for node in nodes))
+    roomy = [node for node in nodes if node["gpus"] >= gpu]
+    if any(node["cores"] >= need.cores and node["memory_gb"] >= need.memory_gb for node in roomy):
+        return Need(need.cores, need.memory_gb, gpu)
+    largest = max(roomy, key=lambda node: (node["memory_gb"], node["cores"]))
+    return Need(min(need.cores, largest["cores"]), min(need.memory_gb, 0.95 * largest["memory_gb"]), gpu)

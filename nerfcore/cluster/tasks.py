@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,6 +17,9 @@ class Need:
     cores: float = 1.0
     memory_gb: float = 1.0
     gpu: float = 0.0
+
+    def fits(self, room: Need) -> bool:
+        return self.cores <= room.cores and self.memory_gb <= room.memory_gb and self.gpu <= room.gpu
 
 
 @dataclass
@@ -72,14 +75,13 @@ class Tasks:
     def _push(self, task: Task) -> None:
         heapq.heappush(self._ready, (-task.priority, self._order[task.id], task.id))
 
-    def take(self, now: float, fits: Need) -> Task | None:
-        """The next task that may begin and takes no more than `fits`; it is running from now on."""
+    def take(self, now: float, fits: Callable[[Task], bool]) -> Task | None:
+        """The next task that may begin, if there is room for it; it is running from now on."""
         held, found = [], None
         while self._ready:
             entry = heapq.heappop(self._ready)
             task = self.all[entry[2]]
-            small = task.need.cores <= fits.cores and task.need.memory_gb <= fits.memory_gb and task.need.gpu <= fits.gpu
-            if task.not_before <= now and small:
+            if task.not_before <= now and fits(task):
                 found = task
                 break
             held.append(entry)

@@ -27,11 +27,12 @@ USER_FAULTS = ("input", "setting")  # other photos or settings are the user's to
 @dataclass
 class Options:
     """How a campaign is run. `folder` is all that workers may write in; a worker whose disk has less than
-    `keep_free_gb` gets nothing to do."""
+    `keep_free_gb` gets nothing to do. `storage` is where files are, if workers do not see the folder."""
 
     folder: Path
     retries: int = 1
     keep_free_gb: float = 2.0
+    storage: str | None = None
 
 
 @dataclass
@@ -118,6 +119,7 @@ class Runner:
                 "values": task.values,
                 "version": __version__,
                 "folder": str(self.options.folder),
+                "storage": self.options.storage,
                 "cores": need.cores,
                 "keep_free_gb": self.options.keep_free_gb,
             }

@@ -18,6 +18,7 @@ from typing import Any
 from .. import __version__
 from ..errors import Cancelled, FieldworkError, explained
 from ..progress import Reporter
+from .storage import work_folder
 
 TELL_EVERY = 1.0  # seconds between two signs of life
 HINT_VERSION = "Install the same version of Fieldwork on all machines, or give --wheel."
@@ -64,7 +65,8 @@ def execute(text: str, tell: Tell) -> str:
     """Run one task.
 
     Args:
-        text: JSON: function, values, version of the caller, folder the worker may write in, cores, keep_free_gb.
+        text: JSON: function, values, version of the caller, folder the worker may write in (or storage, whose folder of
+            this machine it is), cores, keep_free_gb.
         tell: takes {"stage", "fraction", "message"} about once a second.
     Returns:
         JSON: {"state": "done", "result"}, {"state": "cancelled"} or {"state": "failed" | "refused" | "full", "error":
@@ -73,9 +75,13 @@ def execute(text: str, tell: Tell) -> str:
     begin, job, report = time.monotonic(), json.loads(text), WorkerReporter(tell)
     before = os.environ.get("FIELDWORK_THREADS")
     os.environ["FIELDWORK_THREADS"] = str(max(1, int(job["cores"])))
+    folder = Path(job["folder"])
     try:
         check_version(job["version"])
-        check_room(job)
+        if job.get("storage"):
+            folder = work_folder(job["storage"])
+            folder.mkdir(parents=True, exist_ok=True)
+        check_room(folder, job["keep_free_gb"])
         with interruptible(report), report.telling():
             answer: dict[str, Any] = {"state": "done", "result": _function(job["function"])(job["values"], report)}
     except Cancelled:
@@ -89,7 +95,7 @@ def execute(text: str, tell: Tell) -> str:
         if before is not None:
             os.environ["FIELDWORK_THREADS"] = before
     answer |= {"seconds": round(time.monotonic() - begin, 3), "warnings": report.warnings, "host": platform.node()}
-    answer["free_gb"] = free_gb(Path(job["folder"]))
+    answer["free_gb"] = free_gb(folder)
     return json.dumps(answer, ensure_ascii=False, default=str)
 
 
@@ -107,18 +113,17 @@ class Full(FieldworkError):
     code = "full"
 
 
-def check_room(job: dict[str, Any]) -> None:
+def check_room(folder: Path, keep_free_gb: float) -> None:
     """Raise Full where the disk of the campaign has less room than shall stay free, Refusal where the folder is missing."""
-    folder = Path(job["folder"])
     if not folder.is_dir():
         raise Refusal(
             f"The worker {platform.node()} does not have the folder {folder}.",
             "Mount it at the same place on all machines, or give --storage.",
         )
     free = free_gb(folder)
-    if free < job["keep_free_gb"]:
+    if free < keep_free_gb:
         raise Full(
-            f"The worker {platform.node()} has {free:.1f} GB free in {folder}, less than {job['keep_free_gb']:g} GB.",
+            f"The worker {platform.node()} has {free:.1f} GB free in {folder}, less than {keep_free_gb:g} GB.",
             "Free some space; the campaign goes on by itself.",
         )
 

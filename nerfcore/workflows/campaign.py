@@ -11,6 +11,7 @@ from ..cluster import status as st
 from ..cluster.estimate import Durations
 from ..cluster.link import Link
 from ..cluster.run import Options, Progress, Runner
+from ..cluster.storage import Copy, Storage
 from ..cluster.tasks import Need, Task
 from ..config import make_config
 from ..errors import Cancelled, SettingError, explained
@@ -19,7 +20,7 @@ from ..params import BatchParams, ReconstructParams
 from ..progress import Reporter
 from .captures import Capture
 from .reconstruct import stages_of, summed_up
-from .stage_task import WRITTEN
+from .stage_task import READ, WRITTEN, capture_name, tracked_paths
 
 PAGE = st.PAGE
 STAGE_TASK = f"{__package__}.stage_task:run_stage"
@@ -58,10 +59,12 @@ def run(
     link = Link(params.cluster or "auto", params.wheel)
     folder = params.list.absolute().parent
     campaign = Campaign(params, captures, entries, note, report)
-    tasks = plan(todo, folder)
+    tasks = plan(todo, folder, params.storage)
     for task in tasks:
         campaign.stages.setdefault(task.group, []).append(task)
-    options = Options(folder, params.retries, params.keep_free)
+    if params.storage:
+        campaign.share(todo, folder, params.storage)
+    options = Options(folder, params.retries, params.keep_free, params.storage)
     runner = Runner(tasks, link, options, report, campaign.ended, campaign.watch, campaign.durations())
     report.stage(f"Campaign of {len(todo)} captures")
     try:
@@ -72,7 +75,7 @@ def run(
         raise
 
 
-def plan(captures: list[Capture], folder: Path) -> list[Task]:
+def plan(captures: list[Capture], folder: Path, storage: str | None = None) -> list[Task]:
     """The tasks of captures, in the order in which they are begun: a capture that was begun is brought to its end first.
 
     Raises:
@@ -80,12 +83,13 @@ def plan(captures: list[Capture], folder: Path) -> list[Task]:
     """
     root, tasks = folder.resolve(), []
     for params, priority in captures:
-        for name in WRITTEN:
+        for name in (*WRITTEN, *(READ if storage else ())):
             path = getattr(params, name)
             if path is not None and not path.resolve().is_relative_to(root):
                 raise SettingError(
-                    f"{path} (“{name}”) is outside of {folder}, where workers of a campaign may write.",
-                    "Put the list into a folder above all results.",
+                    f"{path} (“{name}”) is outside of {folder}, the only folder that workers of a campaign "
+                    f"{'write to' if name in WRITTEN else 'are sent files of'}.",
+                    "Put the list into a folder above all of its files.",
                 )
         if params.report is not None:
             check_report(params.report)
@@ -98,7 +102,7 @@ def plan(captures: list[Capture], folder: Path) -> list[Task]:
                 group=key,
                 stage=stage,
                 function=STAGE_TASK,
-                values={"capture": values, "stage": stage, "folder": str(folder)},
+                values={"capture": values, "stage": stage, "folder": str(folder), "storage": storage},
                 needs=before,
                 need=need_of(stage, memory),
                 priority=priority,
@@ -154,8 +158,24 @@ class Campaign:
         self.folder, self.started = folder_of(params.list), time.time()
         self.stages: dict[str, list[Task]] = {}
         self.pictures: dict[str, str] = {}
+        self.copies: dict[str, Copy] = {}
         self.progress: Progress | None = None
         self.noted = self.written = self.paged = 0.0
+
+    def share(self, todo: list[Capture], folder: Path, url: str) -> None:
+        """Upload what captures are made of, and what there is of them already; results are fetched when they are done.
+
+        Raises:
+            StorageError, SettingError, Cancelled.
+        """
+        storage = Storage(url)
+        self.report.stage("Uploading files")
+        for number, (params, _) in enumerate(todo):
+            self.report.progress(number / len(todo), params.out.name)
+            copy = Copy(storage, folder, capture_name(params, folder), tracked_paths(params))
+            self.copies[str(params.out)] = copy
+            if copy.changed():
+                copy.upload()
 
     def durations(self) -> Durations:
         """What stages took of captures that are done."""
@@ -172,6 +192,7 @@ class Campaign:
         if task.state == "done" and any(each.state != "done" for each in tasks):
             return
         params = self.captures[task.group]
+        self._fetch(task)
         entry: dict[str, Any] = {"settings": params.model_dump(mode="json")}
         if task.state == "done":
             entry |= self._made(params, tasks)
@@ -186,6 +207,18 @@ class Campaign:
         write = now - self.noted > WRITE_EVERY
         self.noted = now if write else self.noted
         self.note(task.group, entry, write)
+
+    def _fetch(self, task: Task) -> None:
+        """Bring the files of a capture here; a storage that fails makes it a failed one."""
+        copy = self.copies.get(task.group)
+        if copy is None:
+            return
+        try:
+            copy.fetch()
+        except Exception as error:  # noqa: BLE001 - one capture's files must not stop the others
+            known = explained(error)
+            task.state = "failed"
+            task.answer = {"error": {"code": known.code, "message": known.message, "hint": known.hint}}
 
     def _made(self, params: ReconstructParams, tasks: list[Task]) -> dict[str, Any]:
         """The result of all stages together, as `reconstruct` returns it."""

@@ -159,6 +159,8 @@ class FIELDWORK_OT_batch(VerbOperator):
     def parameters(self, context: Context) -> dict[str, Any]:
         if not self.list:
             raise ValueError(t("Choose a list of captures."))
+        if self.cluster:
+            context.scene.fieldwork.campaign = self.list  # which the panel follows
         return {
             "list": absolute(self.list),
             "retries": self.retries,

@@ -29,25 +29,40 @@ class Durations:
 def finish_times(
     tasks: Iterable[Task], cores: float, seconds: Callable[[Task], float], overhead: float = 0.0
 ) -> dict[str, float]:
-    """When each task that is not finished ends, in seconds from now, if each goes to the first cores that are free.
+    """When each task that is not finished ends, in seconds from now, if the first that may begin gets the cores that are free.
 
     Args:
-        tasks: in the order in which they are begun, those that a task needs before it.
+        tasks: in the order in which they are begun.
         cores: of the cluster. seconds: of one task. overhead: seconds that each takes besides.
     """
+    todo = {task.id: task for task in tasks if task.state not in FINISHED}
+    place = {name: number for number, name in enumerate(todo)}
+    open_needs = {name: sum(need in todo for need in task.needs) for name, task in todo.items()}
+    followers: dict[str, list[str]] = {}
+    for name, task in todo.items():
+        for need in task.needs:
+            followers.setdefault(need, []).append(name)
+    ready = [(place[name], name) for name, count in open_needs.items() if count == 0]
+    heapq.heapify(ready)
     ends: dict[str, float] = {}
-    free = max(1, int(cores))
-    heap = [0.0] * free  # when each core is free
-    for task in tasks:
-        if task.state in FINISHED:
-            continue
-        wanted = min(max(1, round(task.need.cores)), free)
-        taken = [heapq.heappop(heap) for _ in range(wanted)]
-        ready = max((ends.get(need, 0.0) for need in task.needs), default=0.0)
-        end = max(taken[-1], ready) + seconds(task) + overhead
-        ends[task.id] = end
-        for _ in range(wanted):
-            heapq.heappush(heap, end)
+    running: list[tuple[float, int, str]] = []  # when it ends, cores, which
+    free, now = max(1, int(cores)), 0.0
+    most = free
+    while ready or running:
+        while ready:
+            wanted = min(max(1, round(todo[ready[0][1]].need.cores)), most)
+            if wanted > free:
+                break
+            _, name = heapq.heappop(ready)
+            ends[name] = now + seconds(todo[name]) + overhead
+            heapq.heappush(running, (ends[name], wanted, name))
+            free -= wanted
+        now, cores_back, name = heapq.heappop(running)
+        free += cores_back
+        for follower in followers.get(name, []):
+            open_needs[follower] -= 1
+            if open_needs[follower] == 0:
+                heapq.heappush(ready, (place[follower], follower))
     return ends
 
 

@@ -31,6 +31,7 @@ PHOTO_GB = {"poses": 0.02, "new": 0.01}  # a photo that is worked on, with its f
 BYTES_A_PIXEL = 5  # colour, alpha and label
 FIELD_FLOATS = 4  # value, gradient, two moments
 SMALLEST_GPU_GB = 8.0  # shares of a GPU are for one of this size
+SHOWN = (("failed", 8), ("running", 20), ("waiting", 4))  # captures in the terminal's table
 WRITE_EVERY, PAGE_EVERY = 2.0, 10.0  # seconds
 
 
@@ -244,7 +245,8 @@ class Campaign:
         value = self._status("running")
         total = len(self.captures)
         done = value["counts"]["done"] + value["counts"]["failed"]
-        self.report.event("campaign", **{**value, "captures": value["captures"][:20]})
+        shown = [row for state, most in SHOWN for row in [r for r in value["captures"] if r["state"] == state][:most]]
+        self.report.event("campaign", **{**value, "captures": shown})
         self.report.progress(done / max(total, 1), f"{done} of {total} captures, {value['workers']} workers")
         if now - self.written > WRITE_EVERY:
             page = now - self.paged > PAGE_EVERY

@@ -70,7 +70,8 @@ class Node:
         found = []
         for process in self.children():
             try:
-                if "run_task" in " ".join(process.cmdline()):
+                name = " ".join(process.cmdline())  # ray::NAME OF THE TASK while it has one
+                if name.startswith("ray::/") and ":" in name:
                     found.append(process)
             except psutil.Error:
                 continue

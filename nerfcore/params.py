@@ -252,6 +252,17 @@ class RenderParams(Params):
     )
     passes: list[Pass] = ["rgb", "depth", "semantic"]
     baked: bool = Field(default=False, description="from the baked field, which is faster, instead of the field")
+    frame_range: tuple[int, int] | None = Field(
+        default=None,
+        description="first and last frame of these, counted from 0, to render only a part: several programs may render "
+        "parts of one render at the same time, and a render of all keeps what they made",
+    )
+
+    @model_validator(mode="after")
+    def _range_goes_up(self) -> Self:
+        if self.frame_range is not None and not 0 <= self.frame_range[0] <= self.frame_range[1]:
+            raise ValueError(f"frame_range: {self.frame_range[0]} to {self.frame_range[1]} is no range of frames")
+        return self
 
 
 class MeshParams(Params):

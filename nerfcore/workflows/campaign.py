@@ -31,6 +31,7 @@ PHOTO_GB = {"poses": 0.02, "new": 0.01}  # a photo that is worked on, with its f
 BYTES_A_PIXEL = 5  # colour, alpha and label
 FIELD_FLOATS = 4  # value, gradient, two moments
 SMALLEST_GPU_GB = 8.0  # shares of a GPU are for one of this size
+PART = 32  # frames of a render that one worker makes
 SHOWN = (("failed", 8), ("running", 20), ("waiting", 4))  # captures in the terminal's table
 WRITE_EVERY, PAGE_EVERY = 2.0, 10.0  # seconds
 
@@ -94,23 +95,38 @@ def plan(captures: list[Capture], folder: Path, storage: str | None = None) -> l
                 )
         if params.report is not None:
             check_report(params.report)
-        key, before = str(params.out), ()
-        values = params.model_dump(mode="json")
-        memory = memory_gb(params)
-        for stage in stages_of(params):
-            task = Task(
-                id=f"{key}:{stage}",
-                group=key,
-                stage=stage,
-                function=STAGE_TASK,
-                values={"capture": values, "stage": stage, "folder": str(folder), "storage": storage},
-                needs=before,
-                need=need_of(stage, memory),
-                priority=priority,
-            )
-            tasks.append(task)
-            before = (task.id,)
+        # Parts of a render would write one list of files at the same time.
+        parts = [] if storage else frame_ranges(params.render_count)
+        tasks += capture_tasks(params, priority, parts, {"folder": str(folder), "storage": storage})
     return tasks
+
+
+def capture_tasks(
+    params: ReconstructParams, priority: int, parts: list[tuple[int, int]], shared: dict[str, Any]
+) -> list[Task]:
+    """The tasks of one capture, one after the other; frames of its render in parts beside each other."""
+    key, before, tasks = str(params.out), (), []
+    values = {"capture": params.model_dump(mode="json"), **shared}
+    memory = memory_gb(params)
+
+    def add(stage: str, needs: tuple[str, ...], **more: Any) -> str:
+        verb = stage.partition(" ")[0]
+        known = {"function": STAGE_TASK, "values": {**values, "stage": verb, **more}, "needs": needs}
+        tasks.append(Task(f"{key}:{stage}", key, stage, need=need_of(verb, memory), priority=priority, **known))
+        return tasks[-1].id
+
+    for stage in stages_of(params):
+        if stage == "render" and parts:
+            before = tuple(add(f"render {first}-{last}", before, frame_range=[first, last]) for first, last in parts)
+        before = (add(stage, before),)
+    return tasks
+
+
+def frame_ranges(count: int) -> list[tuple[int, int]]:
+    """The parts of a render of so many frames; none where it is too short to be worth it."""
+    if count <= PART:
+        return []
+    return [(first, min(first + PART, count) - 1) for first in range(0, count, PART)]
 
 
 def memory_gb(params: ReconstructParams) -> dict[str, float]:
@@ -223,7 +239,7 @@ class Campaign:
 
     def _made(self, params: ReconstructParams, tasks: list[Task]) -> dict[str, Any]:
         """The result of all stages together, as `reconstruct` returns it."""
-        made = {task.stage: task.answer["result"] for task in tasks}
+        made = {task.stage: task.answer["result"] for task in tasks if not task.values.get("frame_range")}
         made = {stage: answer for stage, answer in made.items() if answer["result"] is not None}
         try:
             result = summed_up(

@@ -13,11 +13,11 @@ from ..capture.find import classes_beside, subfolder
 from ..cluster.storage import Copy, Saving, Storage, placed, work_folder
 from ..cluster.worker import require_inside
 from ..errors import ProjectError
-from ..params import ReconstructParams
+from ..params import ReconstructParams, RenderParams
 from ..progress import Reporter
 from ..project.fingerprints import digest
 from ..project.lock import lockable, project_lock
-from .reconstruct import run_stages
+from .reconstruct import STAGES, run_stages, stage_params
 
 READ = ("photos", "labels", "masks", "classes")
 WRITTEN = ("out", "blend", "report", "renders")
@@ -31,7 +31,7 @@ def run_stage(values: dict[str, Any], report: Reporter) -> dict[str, Any]:
     """Do one stage of a capture, unless what is there is still good.
 
     Args:
-        values: "capture": settings of reconstruct; "stage"; "folder": of the campaign, the only one that is written in;
+        values: "capture": settings of reconstruct; "stage"; "frame_range": of a part of the stage render; "folder": of the campaign, the only one that is written in;
             "storage": None, or the URL from which files are fetched into a folder of this machine, and left.
     Returns:
         {"result": what the verb returned, None where it had nothing to do, "seconds", "reused", "redone": why or None}
@@ -59,6 +59,8 @@ def do_stage(values: dict[str, Any], report: Reporter) -> dict[str, Any]:
     for path in written_paths(params):
         require_inside(path, Path(values["folder"]))
     verb = values["stage"]
+    if values.get("frame_range"):
+        return _render_part(params, tuple(values["frame_range"]), report)
     with _project(params, report):
         made = run_stages(params, [verb], report)
     return {
@@ -67,6 +69,19 @@ def do_stage(values: dict[str, Any], report: Reporter) -> dict[str, Any]:
         "reused": verb in made.reused,
         "redone": made.redone.get(verb),
     }
+
+
+def _render_part(params: ReconstructParams, frames: tuple[int, int], report: Reporter) -> dict[str, Any]:
+    """Render some frames of a capture while others render the rest; the project is only read."""
+    begin = time.perf_counter()
+    values = stage_params(params, "render")
+    assert isinstance(values, RenderParams)
+    part = values.model_copy(update={"frame_range": frames})
+    stage = STAGES["render"]
+    earlier = stage.earlier(part)
+    result = stage.run(part, report) if earlier.result is None else earlier.result
+    seconds = round(time.perf_counter() - begin, 1)
+    return {"result": result, "seconds": seconds, "reused": earlier.result is not None, "redone": None}
 
 
 def capture_name(params: ReconstructParams, folder: Path) -> str:

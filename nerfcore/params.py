@@ -530,7 +530,10 @@ class BatchParams(Params):
     )
     wheel: Path | None = Field(default=None, description="with --cluster: wheel of Fieldwork that workers are to use")
     keep_free: float = Field(
-        default=2.0, ge=0, le=1e6, description="with --cluster: a worker with fewer GB free on its disk gets nothing to do"
+        default=2.0,
+        ge=0,
+        le=1e6,
+        description="with --cluster: a worker with fewer GB free on its disk gets nothing to do",
     )
 
 

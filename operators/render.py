@@ -15,7 +15,7 @@ from ..addon.jobs.job import Done, Job, Steps
 from ..addon.jobs.queue import queue
 from ..addon.project import snapshot
 from ..addon.properties import PASSES
-from ..addon.props import BoolProperty, StringProperty
+from ..addon.props import BoolProperty, IntVectorProperty, StringProperty
 from ..addon.roles import Owner
 from ..addon.scene.frame import scene_from_capture
 from ..addon.scene.lens import pinhole

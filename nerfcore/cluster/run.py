@@ -208,7 +208,9 @@ class Runner:
         self.cut_short.pop(task.id, None)
         task.losses += 1
         if task.losses < MOST_LOSSES:
-            self.report.note(f"{Path(task.group).name}, {task.stage}: its worker was lost ({reason}); it goes on elsewhere.")
+            self.report.note(
+                f"{Path(task.group).name}, {task.stage}: its worker was lost ({reason}); it goes on elsewhere."
+            )
             self.tasks.put_back(task, time.monotonic() + 0.2 * task.losses)
             return
         message = f"{task.losses} workers were lost one after the other while at “{task.stage}” of it."

@@ -1,8 +1,8 @@
 """Where a campaign stands: a JSON file that anybody may read, and a page for a browser.
 
-    LIST-campaign/status.json    see `status`; written every two seconds
-    LIST-campaign/index.html     a picture, the verdict and figures of each capture, what failed first
-    LIST-campaign/pictures/      small pictures of finished captures
+LIST-campaign/status.json    see `status`; written every two seconds
+LIST-campaign/index.html     a picture, the verdict and figures of each capture, what failed first
+LIST-campaign/pictures/      small pictures of finished captures
 """
 
 from __future__ import annotations

@@ -51,7 +51,9 @@ class Storage:
             self.fs, self.root = fsspec.core.url_to_fs(url)
         except (ImportError, ValueError) as error:
             raise SettingError(f"--storage {url} cannot be used: {error}.", "Give a URL that fsspec knows.") from error
-        self.whole_puts = "file" not in (self.fs.protocol if isinstance(self.fs.protocol, tuple) else (self.fs.protocol,))
+        self.whole_puts = "file" not in (
+            self.fs.protocol if isinstance(self.fs.protocol, tuple) else (self.fs.protocol,)
+        )
 
     def _told(self, doing: str, work: Callable[[], Any]) -> Any:
         try:
@@ -60,7 +62,8 @@ class Storage:
             raise StorageError(f"{self.url} lacks a file while {doing}: {error}.", "Run the campaign again.") from error
         except OSError as error:
             raise StorageError(
-                f"{self.url} cannot be reached while {doing}: {error}.", "Check the address, the network and the rights."
+                f"{self.url} cannot be reached while {doing}: {error}.",
+                "Check the address, the network and the rights.",
             ) from error
 
     def _put(self, source: Path, target: str) -> None:
@@ -104,7 +107,9 @@ class Storage:
         found = self._told("reading a list of files", work)
         for path in found:
             if leads_outside(path):
-                raise StorageError(f"{self.url} names the file {path}, outside of the campaign's folder.", "Look at it.")
+                raise StorageError(
+                    f"{self.url} names the file {path}, outside of the campaign's folder.", "Look at it."
+                )
         return found
 
     def set_files(self, capture: str, files: Files) -> None:
@@ -274,4 +279,3 @@ def placed(value: Any, old: str, new: str) -> Any:
     if isinstance(value, str) and (value == old or value.startswith((f"{old}/", f"{old}\\"))):
         return new + value[len(old) :]
     return value
-

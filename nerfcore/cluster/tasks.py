@@ -124,4 +124,3 @@ class Tasks:
     @property
     def finished(self) -> bool:
         return all(task.state in FINISHED for task in self.all.values())
-

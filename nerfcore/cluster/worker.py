@@ -140,7 +140,8 @@ def require_inside(path: Path, folder: Path) -> None:
     """Raise Refusal unless `path` lies in `folder`, links resolved: a worker writes nowhere else."""
     if not path.resolve().is_relative_to(folder.resolve()):
         raise Refusal(
-            f"{path} is outside of the campaign's folder {folder}.", "Let all results be written below the list's folder."
+            f"{path} is outside of the campaign's folder {folder}.",
+            "Let all results be written below the list's folder.",
         )
 
 

@@ -121,7 +121,9 @@ def test_two_thousand_captures_are_planned_in_five_seconds(tmp_path):
 
 def test_memory_and_shares_of_a_gpu_follow_the_plan_of_the_run(tmp_path):
     path = tmp_path / "list.csv"
-    path.write_text("photos,preset,set\na,draft,field.table_log2=14\nb,high,field.table_log2=22\nc,high,field.table_log2=24\n")
+    path.write_text(
+        "photos,preset,set\na,draft,field.table_log2=14\nb,high,field.table_log2=22\nc,high,field.table_log2=24\n"
+    )
     needs = [{task.stage: task.need for task in plan([c], tmp_path)} for c in read_list(path)]
     shares = [need["train"].gpu for need in needs]
     assert shares == sorted(shares)
@@ -407,7 +409,9 @@ def test_the_table_in_the_terminal():
     lines = console.export_text().splitlines()
     title = " ".join(line.strip() for line in lines[: next(i for i, line in enumerate(lines) if "┏" in line)])
     assert "1 done, 1 failed, 1 running, 1 waiting, 1 workers, about 1.7 h left" in title
-    assert next(i for i, line in enumerate(lines) if "bad" in line) < next(i for i, line in enumerate(lines) if "run " in line)
+    assert next(i for i, line in enumerate(lines) if "bad" in line) < next(
+        i for i, line in enumerate(lines) if "run " in line
+    )
     assert any("train" in line and "40%" in line and "75 s" in line for line in lines)
 
 

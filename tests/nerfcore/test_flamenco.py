@@ -23,7 +23,9 @@ def compiled(folder: Path, **settings: Any) -> dict[str, Any]:
     path = folder / "settings.json"
     values = {"project": "/mnt/vase", "camera": "/mnt/path.json", "render_output_path": "/mnt/out", **settings}
     path.write_text(json.dumps(values))
-    found = subprocess.run([str(NODE), str(COMPILER), str(SCRIPT), str(path)], capture_output=True, text=True, timeout=60)
+    found = subprocess.run(
+        [str(NODE), str(COMPILER), str(SCRIPT), str(path)], capture_output=True, text=True, timeout=60
+    )
     assert found.returncode == 0, found.stderr
     return json.loads(found.stdout)
 

@@ -78,7 +78,7 @@ class Bridge:
     def run(self, address: str, must_exist: bool, wheel: str) -> None:
         joined = self.connect(address, must_exist, wheel)
         here = ray.get_runtime_context().get_node_id()
-        self.board = Board.options(
+        self.board = Board.options(  # pyright: ignore[reportAttributeAccessIssue] - what ray.remote makes of it
             scheduling_strategy=ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(here, soft=True)
         ).remote()
         ray.get(self.board.take.remote())

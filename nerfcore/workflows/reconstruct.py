@@ -122,6 +122,7 @@ def stage_params(params: p.ReconstructParams, verb: str) -> p.Params | None:
                 passes=["rgb", "depth", "semantic"],
             )
         case _:
+            assert params.blend is not None
             return p.BlendParams(project=project, out=params.blend, run=run)
 
 

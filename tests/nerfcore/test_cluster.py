@@ -419,3 +419,25 @@ def test_without_a_terminal_there_are_no_tables(capfd):
     with ConsoleReporter(quiet=False) as report:
         report.event("campaign", **st.status("list", "running", 0.0, rows(), [], None))
     assert capfd.readouterr().err == ""
+
+
+def test_growth_is_drawn_from_measured_times(tmp_path):
+    from fieldwork.nerfcore.cluster import growth
+
+    report = tmp_path / "list-report.json"
+    entries = {
+        "a": {"state": "done", "stages": {"new": 1.0, "train": 9.0, "render": 0.0}},
+        "b": {"state": "failed", "error": "", "hint": ""},
+    }
+    report.write_text(json.dumps({"captures": entries}))
+    chains = growth.measured(report)
+    assert chains == [{"new": 1.0, "train": 9.0}]
+    assert growth.makespan(chains, 4, 1, 0.0) == 40.0
+    assert growth.makespan(chains, 4, 2, 0.5) == 22.0
+    assert growth.makespan(chains, 4, 64, 0.0) == 10.0
+    growth.main([str(report), str(tmp_path / "growth.png"), "--captures", "4", "8"])
+    with Image.open(tmp_path / "growth.png") as picture:
+        assert len(picture.convert("RGB").getcolors(1 << 20)) > 20
+    report.write_text("{}")
+    with pytest.raises(Exception, match="no report of a batch"):
+        growth.measured(report)

@@ -206,6 +206,11 @@ class FieldworkScene(PropertyGroup):
     project_uuid: StringProperty(
         name="Project UUID", description="Which project was in the folder when it was last there", options={"HIDDEN"}
     )
+    campaign: StringProperty(
+        name="Campaign",
+        description="List of captures, or folder beside it, of a batch on a cluster that the panel follows",
+        subtype="FILE_PATH",
+    )
 
     # Capture
     photos: StringProperty(name="Photos", description="Folder of photos, or a video file", subtype="FILE_PATH")

@@ -62,6 +62,7 @@ MODULES = (
     "panels.mesh",
     "panels.measure",
     "panels.export",
+    "panels.campaign",
     "panels.engine",
     "panels.menus",
 )

@@ -122,7 +122,7 @@ def _option(name: str, info: FieldInfo) -> click.Option:
         return click.Option([switch, name], is_flag=True, default=default, help=info.description or "")
     if get_origin(kind) is dict:
         return click.Option(flags, multiple=True, metavar="KEY=VALUE", **shared)
-    if get_origin(kind) is tuple and get_args(kind) == (int, int):
+    if get_origin(kind) is tuple and get_args(kind) == (int, int) and name == "size":
         return click.Option(flags, type=Size(), default=default, show_default=default is not None, **shared)
     if get_origin(kind) is tuple:
         return click.Option(flags, nargs=len(get_args(kind)), type=tuple(get_args(kind)), default=default, **shared)

@@ -6,6 +6,7 @@ import time
 from typing import Any, TextIO
 
 from rich.console import Console
+from rich.live import Live
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
@@ -24,6 +25,7 @@ class ConsoleReporter(Reporter):
         self.bar: Progress | None = None
         self.task: TaskID | None = None
         self.name, self.begin, self.told = "", time.monotonic(), 0.0
+        self.live: Live | None = None  # the table of a campaign
         self.begun = False  # whether the work has told of anything
 
     def __enter__(self) -> ConsoleReporter:
@@ -44,7 +46,10 @@ class ConsoleReporter(Reporter):
         self.close()
 
     def close(self) -> None:
-        """Take the bar off the screen."""
+        """Take the bar off the screen, and the table of a campaign."""
+        if self.live is not None:
+            self.live.stop()
+            self.live = None
         if self.bar is not None:
             self.bar.stop()
             self.bar = None
@@ -64,11 +69,22 @@ class ConsoleReporter(Reporter):
         super().progress(fraction, message)
         if self.bar is not None and self.task is not None:
             self.bar.update(self.task, completed=min(fraction, 1.0), message=message)
-        elif not self.quiet and time.monotonic() - self.told > PLAIN_EVERY:
+        elif not self.quiet and self.live is None and time.monotonic() - self.told > PLAIN_EVERY:
             self.told = time.monotonic()
             elapsed = self.told - self.begin
             left = f", about {elapsed / fraction - elapsed:.0f} s left" if fraction > 0.02 else ""
             self.console.print(f"{self.name}: {fraction:.0%}{left}  {message}")
+
+    def event(self, kind: str, **data: Any) -> None:
+        if kind != "campaign" or self.quiet or not self.console.is_terminal:
+            return
+        if self.live is None:
+            if self.bar is not None:
+                self.bar.stop()
+                self.bar = None
+            self.live = Live(console=self.console, auto_refresh=False, transient=True)
+            self.live.start()
+        self.live.update(campaign_table(data), refresh=True)
 
     def note(self, message: str) -> None:
         if not self.quiet:
@@ -84,6 +100,30 @@ class ConsoleReporter(Reporter):
         for name, value in flattened(result):
             table.add_row(name, value)
         Console(file=stream, highlight=False, width=None if stream.isatty() else 120).print(table)
+
+
+def campaign_table(status: dict[str, Any]) -> Table:
+    """The captures of a campaign, those that failed first, with what is left of each and of all."""
+    counts = status["counts"]
+    head = ", ".join(f"{counts[state]} {state}" for state in ("done", "failed", "running", "waiting"))
+    left = "" if status["eta_s"] is None else f", about {time_text(status['eta_s'])} left"
+    table = Table(title=f"{status['campaign']}: {head}, {status['workers']} workers{left}", title_justify="left")
+    for name in ("capture", "state", "stage", "done", "left"):
+        table.add_column(name, justify="right" if name in ("done", "left") else "left")
+    for row in status["captures"]:
+        failed = row["state"] == "failed"
+        share = "" if failed or row["state"] == "waiting" else f"{row['fraction']:.0%}"
+        stage = row["error"] if failed else row["stage"]
+        table.add_row(row["name"], row["state"], stage, share, time_text(row["eta_s"]), style="red" if failed else "")
+    return table
+
+
+def time_text(seconds: float | None) -> str:
+    """Seconds as people say them; empty where they are not known."""
+    if seconds is None:
+        return ""
+    minutes = round(seconds / 60)
+    return f"{seconds:.0f} s" if seconds < 90 else f"{minutes} min" if minutes < 90 else f"{minutes / 60:.1f} h"
 
 
 def flattened(value: dict[str, Any], prefix: str = "") -> list[tuple[str, str]]:

@@ -255,6 +255,17 @@ class RenderParams(Params):
     )
     passes: list[Pass] = ["rgb", "depth", "semantic"]
     baked: bool = Field(default=False, description="from the baked field, which is faster, instead of the field")
+    frame_range: tuple[int, int] | None = Field(
+        default=None,
+        description="first and last frame of these, counted from 0, to render only a part: several programs may render "
+        "parts of one render at the same time, and a render of all keeps what they made",
+    )
+
+    @model_validator(mode="after")
+    def _range_goes_up(self) -> Self:
+        if self.frame_range is not None and not 0 <= self.frame_range[0] <= self.frame_range[1]:
+            raise ValueError(f"frame_range: {self.frame_range[0]} to {self.frame_range[1]} is no range of frames")
+        return self
 
 
 class MeshParams(Params):
@@ -595,6 +606,23 @@ class BatchParams(Params):
     list: Path = Field(description=".csv or .json file with one capture a row: the settings of reconstruct by name")
     retries: int = Field(default=1, ge=0, le=1000, description="how often a capture that failed is tried again")
     report: Path | None = Field(default=None, description="JSON report to write; default: LIST-report.json beside it")
+    cluster: str | None = Field(
+        default=None,
+        description="spread the captures over a Ray cluster: HOST:PORT, or auto for one of this machine; default: one "
+        "capture after the other",
+    )
+    storage: str | None = Field(
+        default=None,
+        description="with --cluster: where workers take files from and leave them, s3://BUCKET/FOLDER for instance; "
+        "default: the list's folder, which all of them see at the same place",
+    )
+    wheel: Path | None = Field(default=None, description="with --cluster: wheel of Fieldwork that workers are to use")
+    keep_free: float = Field(
+        default=2.0,
+        ge=0,
+        le=1e6,
+        description="with --cluster: a worker with fewer GB free on its disk gets nothing to do",
+    )
 
 
 class BenchParams(Params):

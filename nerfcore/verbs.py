@@ -75,7 +75,9 @@ VERBS = {
     "export": Verb(p.ExportParams, "export.verb:export", "Write what other programs read."),
     "bench": Verb(p.BenchParams, "bench.verb:bench", "Reproduce a table of figures on this machine."),
     "reconstruct": Verb(p.ReconstructParams, "workflows.reconstruct:reconstruct", "Photos in, a labelled .blend out."),
-    "batch": Verb(p.BatchParams, "workflows.batch:batch", "Reconstruct many captures, one after the other."),
+    "batch": Verb(
+        p.BatchParams, "workflows.batch:batch", "Reconstruct many captures, one after the other or on a cluster."
+    ),
 }
 
 

@@ -117,7 +117,7 @@ def reconstructed(job: Job, scene_name: str) -> None:
 
 
 class FIELDWORK_OT_batch(VerbOperator):
-    """Reconstruct many captures, one after the other; one that fails does not stop the others"""
+    """Reconstruct many captures, one after the other or on a cluster; one that fails does not stop the others"""
 
     bl_idname = "fieldwork.batch"
     bl_label = "Reconstruct Many"
@@ -133,6 +133,25 @@ class FIELDWORK_OT_batch(VerbOperator):
         name="Report", description="JSON report to write; empty: beside the list", subtype="FILE_PATH",
         options={"SKIP_SAVE"},
     )  # fmt: skip
+    cluster: StringProperty(
+        name="Cluster",
+        description="Address HOST:PORT of a Ray cluster, or auto for one on this machine; empty: one capture after the other",
+        options={"SKIP_SAVE"},
+    )
+    storage: StringProperty(
+        name="Storage",
+        description="Where workers of the cluster take files from and leave them, s3://bucket/folder for instance; "
+        "empty: the folder of the list, which all of them see",
+        options={"SKIP_SAVE"},
+    )
+    wheel: StringProperty(
+        name="Wheel", description="Wheel of Fieldwork that workers of the cluster use; empty: what they have",
+        subtype="FILE_PATH", options={"SKIP_SAVE"},
+    )  # fmt: skip
+    keep_free: FloatProperty(
+        name="Keep Free", description="GB: a worker of the cluster with less free on its disk gets nothing to do",
+        default=2.0, min=0.0,
+    )  # fmt: skip
 
     def invoke(self, context: Context, event: bpy.types.Event) -> set[str]:
         return context.window_manager.invoke_props_dialog(self, width=380)
@@ -140,7 +159,17 @@ class FIELDWORK_OT_batch(VerbOperator):
     def parameters(self, context: Context) -> dict[str, Any]:
         if not self.list:
             raise ValueError(t("Choose a list of captures."))
-        return {"list": absolute(self.list), "retries": self.retries, "report": absolute(self.report_file)}
+        if self.cluster:
+            context.scene.fieldwork.campaign = self.list  # which the panel follows
+        return {
+            "list": absolute(self.list),
+            "retries": self.retries,
+            "report": absolute(self.report_file),
+            "cluster": self.cluster or None,
+            "storage": self.storage or None,
+            "wheel": absolute(self.wheel),
+            "keep_free": self.keep_free,
+        }
 
 
 class FIELDWORK_OT_bench(VerbOperator):

@@ -15,7 +15,7 @@ from ..addon.jobs.job import Done, Job, Steps
 from ..addon.jobs.queue import queue
 from ..addon.project import snapshot
 from ..addon.properties import PASSES
-from ..addon.props import BoolProperty, StringProperty
+from ..addon.props import BoolProperty, IntVectorProperty, StringProperty
 from ..addon.roles import Owner
 from ..addon.scene.frame import scene_from_capture
 from ..addon.scene.lens import pinhole
@@ -113,6 +113,10 @@ class FIELDWORK_OT_render(ProjectOperator):
         name="Baked", description="Render the baked field: faster, but not quite the same", default=False,
         options={"SKIP_SAVE"},
     )  # fmt: skip
+    frame_range: IntVectorProperty(
+        name="Frames", description="First and last frame of a part, counted from 0; -1: all", size=2, default=(-1, -1),
+        min=-1, options={"SKIP_SAVE"},
+    )  # fmt: skip
 
     @classmethod
     def reason(cls, context: Context) -> str | None:
@@ -137,6 +141,7 @@ class FIELDWORK_OT_render(ProjectOperator):
             "passes": [name for name, *_ in PASSES if name in passes],
             "size": list(size) if all(size) else None,
             "baked": self.baked,
+            "frame_range": list(self.frame_range) if min(self.frame_range) >= 0 else None,
         }
         if self.camera:
             return {**params, "camera": absolute(self.camera)}

@@ -11,7 +11,7 @@ from typing import Any
 import bpy
 
 from .. import machine
-from ..project import edits, lists, region, snapshot
+from ..project import campaign, edits, lists, region, snapshot
 from . import gate
 from .follow import follow, reattach
 from .queue import Queue, queue
@@ -28,7 +28,7 @@ def tick(queue: Queue) -> float:
     job = queue.current
     doing = f"{job.verb}: {job.stage} {job.message}" if job else ""
     # Edits before jobs: a training that starts now is to know of them.
-    for part in (_follow_region, lambda: edits.send(queue.ask), lambda: follow(queue), queue.work):
+    for part in (_follow_region, lambda: edits.send(queue.ask), lambda: follow(queue), queue.work, _follow_campaign):
         try:
             part()
         except Exception as error:  # noqa: BLE001 - a timer that raises is dropped by Blender, and all jobs with it
@@ -48,6 +48,11 @@ def tick(queue: Queue) -> float:
 def _follow_region() -> None:
     if not bpy.app.background and gate.closed() is None:
         region.follow(bpy.context.scene)
+
+
+def _follow_campaign() -> None:
+    if not bpy.app.background and campaign.changed(bpy.context.scene.fieldwork):
+        queue.redraw()
 
 
 def _tick() -> float:

@@ -14,29 +14,17 @@ from dataclasses import dataclass
 from functools import partial
 
 import torch
-import warp as wp
 
 from ..field.hybrid import HybridField
 from ..field.mlp import MLP
 from ..field.slices import MOST_ROWS
 from ..kernels.device import synchronize
-from ..kernels.encode import BLOCK, feature
-from ..kernels.runtime import array, in_pool, init, launch, run_parallel, worker_count
+from ..kernels.encode import BLOCK, FEATURES
+from ..kernels.random_reads import READS, sum_random_rows
+from ..kernels.runtime import in_pool, run_parallel, worker_count
 
 SECONDS = 0.5  # of each measurement
-READS = 64  # of a thread of `random_reads`
 CORNERS = 8  # of a cell, each read for every level
-
-
-@wp.kernel(module="fieldwork_roofline")
-def random_reads(table: wp.array(dtype=feature), out: wp.array(dtype=feature), offset: int):
-    i = wp.tid() + offset
-    state = wp.uint32(i) * wp.uint32(747796405)
-    total = feature()
-    for _ in range(READS):
-        state = state * wp.uint32(1664525) + wp.uint32(1013904223)
-        total += table[int((state >> wp.uint32(3)) % wp.uint32(table.shape[0]))]
-    out[i] = total
 
 
 @dataclass(frozen=True)
@@ -99,13 +87,11 @@ def _matrix_rate(field: HybridField, device: torch.device) -> float:
 
 
 def _read_rate(field: HybridField, device: torch.device) -> float:
-    init()
-    rows = 1 << 20 if field.grid is None else len(field.grid.table)
-    table, out = (torch.zeros(n, feature._length_, device=device) for n in (rows, 1 << 15))
+    table = torch.zeros(1 << 20 if field.grid is None else len(field.grid.table), FEATURES, device=device)
 
     def run() -> float:
-        launch(random_reads, len(out), [array(table, feature), array(out, feature)], device)
-        return len(out) * READS
+        sum_random_rows(table, 1 << 15)
+        return (1 << 15) * READS
 
     return _rate(run, device)
 

@@ -32,8 +32,10 @@ def lockable(params: Params) -> Path | None:
     """The project folder to lock for a verb.
 
     None when it is no project and the verb would not make it one: that is the verb's to tell, and a folder of
-    something else is left as it is.
+    something else is left as it is. None for a part of a render: it only reads the project, and others render the rest.
     """
+    if getattr(params, "frame_range", None) is not None:
+        return None
     folder = project_of(params)
     makes_it = {"photos", "dataset"} & type(params).model_fields.keys()
     return folder if folder is not None and (makes_it or is_project(folder)) else None

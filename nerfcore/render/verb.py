@@ -33,9 +33,10 @@ from ..project.fingerprints import (
     rounded,
     write_made,
 )
-from ..project.runs import RENDER_RECORD, checkpoint_id
+from ..project.runs import checkpoint_id
 from ..project.schema import step
 from ..project.store import load_project, world_from_sfm
+from . import parts
 from .baked import META, BakedField, load_baked, voxels_folder
 from .image import Frame, background_of, render_view
 from .model import Model
@@ -48,7 +49,7 @@ OPEN_ANGLE = np.pi / 2  # around the subject without a photo: from there on an o
 
 
 def render(params: RenderParams, report: Reporter) -> dict[str, Any]:
-    """Render a run from some cameras; existing frames are overwritten.
+    """Render a run from some cameras; existing frames are overwritten, but for those of parts of the same render.
 
     Depth PNGs are coloured for viewing, and NAME_depth.json says what the colours mean; the EXR holds the values: depth in world units along the optical axis, class
     ids, confidence, world-space normals.
@@ -57,7 +58,7 @@ def render(params: RenderParams, report: Reporter) -> dict[str, Any]:
         {"frames": [paths], "ms_per_frame", "label_revision": of the marks that classes are from, or None}
     Raises:
         InputError: no cameras were asked for, or the camera file is unusable. SettingError: the baked field has not
-        all of the passes. ProjectError, DiskError.
+        all of the passes, or there are no frames of the range. ProjectError, DiskError.
     """
     folder, out = Path(params.project), Path(params.out)
     project, info = load_project(folder), load_info(folder, params.run)
@@ -73,16 +74,22 @@ def render(params: RenderParams, report: Reporter) -> dict[str, Any]:
             (name, (camera.resized if photos else camera.reframed)(*params.size), pose)
             for name, camera, pose in cameras
         ]
+    pixels = sum(camera.width * camera.height for _, camera, _ in cameras)  # of all parts, which are to look alike
+    cameras = _part(cameras, params.frame_range)
+    kept = {} if params.frame_range else parts.rendered_parts(out, inputs, [name for name, _, _ in cameras])
+    if kept:
+        report.note(f"{len(kept)} of {len(cameras)} frames are there already, rendered as parts.")
+    todo = [camera for camera in cameras if camera[0] not in kept]
     report.stage("Preparing")
-    if isinstance(shown, Model):
-        shown.refine(sum(camera.width * camera.height for _, camera, _ in cameras), report.check)
+    if isinstance(shown, Model) and todo:
+        shown.refine(pixels, report.check)
     with disk_errors(out):
         out.mkdir(parents=True, exist_ok=True)
     colors = {c.id: c.color for c in scene.classes}
-    frames, seconds = [], 0.0
+    frames, seconds = [path for made in kept.values() for path in made], 0.0
     report.stage("Rendering")
-    for number, (name, camera, pose) in enumerate(cameras):
-        report.progress(number / len(cameras), name)
+    for number, (name, camera, pose) in enumerate(todo):
+        report.progress(number / len(todo), name)
         view = View(name, camera, pose, Path())
         begin = time.perf_counter()
         frame = render_view(
@@ -95,12 +102,24 @@ def render(params: RenderParams, report: Reporter) -> dict[str, Any]:
         )
         seconds += time.perf_counter() - begin
         frames += write_frame(out, name, frame, params.passes, info.class_ids, scene.ignore_id, colors, box)
-    result: dict[str, Any] = {"frames": [str(path) for path in frames]}
-    result["ms_per_frame"] = round(seconds / max(len(cameras), 1) * 1e3, 1)
+    result: dict[str, Any] = {"frames": [str(path) for path in sorted(frames)] if kept else [str(p) for p in frames]}
+    result["ms_per_frame"] = round(seconds / max(len(todo), 1) * 1e3, 1)
     result["label_revision"] = info.label_revision
     made = step("render", params.model_dump(mode="json"), result, inputs, inputs["trained field"])
-    write_made(out / RENDER_RECORD, made)
+    write_made(out / parts.record_name(params.frame_range), made)
     return result
+
+
+def _part(cameras: list[tuple[str, Camera, np.ndarray]], frames: tuple[int, int] | None) -> list:
+    """The cameras of a range of frames. Raises SettingError where the render has none of them."""
+    if frames is None:
+        return cameras
+    if frames[0] >= len(cameras):
+        raise SettingError(
+            f"--frame-range {frames[0]} {frames[1]}: the render has the frames 0 to {len(cameras) - 1}.",
+            "Give a range of these.",
+        )
+    return cameras[frames[0] : frames[1] + 1]
 
 
 def _shown(params: RenderParams, info: RunInfo) -> Model | BakedField:
@@ -117,7 +136,7 @@ def render_inputs(params: RenderParams) -> Fingerprint:
     folder = Path(params.project)
     info = load_info(folder, params.run)
     scene = load_scene(folder, info.holdout)
-    chosen = params.model_dump(mode="json", exclude={"project", "run", "out"})
+    chosen = params.model_dump(mode="json", exclude={"project", "run", "out", "frame_range"})
     return {
         "trained field": checkpoint_id(folder, params.run),
         "alignment": digest(rounded(world_from_sfm(load_project(folder)))),
@@ -131,7 +150,7 @@ def render_inputs(params: RenderParams) -> Fingerprint:
 
 def rendered(params: RenderParams) -> Earlier:
     """The renders that are there, if they are of the present field and cameras."""
-    made = read_made(params.out / RENDER_RECORD)
+    made = read_made(params.out / parts.record_name(params.frame_range))
     if made is None:
         return Earlier()
     frames = [params.out / Path(frame).name for frame in made.result.get("frames", [])]

@@ -1,26 +1,24 @@
-"""The verb `batch`: many captures, one after the other, each with a project of its own."""
+"""The verb `batch`: many captures, each with a project of its own, one after the other or on a cluster."""
 
 from __future__ import annotations
 
-import csv
 import json
 import logging
 import time
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
-from ..errors import Cancelled, FieldworkError, InputError, SettingError, wrong_value
+from ..errors import Cancelled, FieldworkError, InputError, SettingError
 from ..files import write_json
 from ..params import BatchParams, ReconstructParams
 from ..progress import Reporter
 from ..project.lock import lockable, project_lock
 from ..project.store import is_project
+from . import campaign
+from .captures import read_list
 from .reconstruct import reconstruct
 
 log = logging.getLogger("fieldwork.batch")
-PATHS = ("photos", "out", "labels", "masks", "classes", "blend", "report", "renders")
 
 
 class BatchError(FieldworkError):
@@ -38,37 +36,52 @@ def batch(params: BatchParams, report: Reporter) -> dict[str, Any]:
 
     Returns:
         {"done": [projects], "failed": [{"project", "error", "hint"}], "skipped": how many were done before,
-        "seconds", "report": path}
+        "seconds", "report": path}; with `cluster` also "page": path
     Raises:
         InputError: the list cannot be read. SettingError: a row of it is wrong.
-        BatchError: at the end, when captures failed; its `result` is as above.
+        ClusterError: the cluster cannot be reached. BatchError: at the end, when captures failed; its `result` is as
+            above.
     """
     begin = time.monotonic()
     captures = read_list(params.list)
     path = params.report or params.list.with_name(f"{params.list.stem}-report.json")
     before = _read_report(path)
     entries: dict[str, dict[str, Any]] = {}
-    skipped = 0
-    for number, capture in enumerate(captures, 1):
-        key = str(capture.out)
-        settings = capture.model_dump(mode="json")
+    todo = []
+    for capture in captures:
+        key = str(capture.params.out)
         known = before.get(key, {})
-        if known.get("state") == "done" and known.get("settings") == settings and is_project(capture.out):
+        same = known.get("settings") == capture.params.model_dump(mode="json")
+        if known.get("state") == "done" and same and is_project(capture.params.out):
             entries[key] = known
-            skipped += 1
-            continue
-        inner = _Named(report, f"{capture.out.name} ({number} of {len(captures)})")
-        entries[key] = {"settings": settings, **_attempts(capture, params.retries, inner)}
-        write_json(path, {"captures": {**before, **entries}})
-    done = [key for key, entry in entries.items() if entry["state"] == "done"]
+        else:
+            todo.append(capture)
+    skipped = len(entries)
+
+    def note(key: str, entry: dict[str, Any], write: bool = True) -> None:
+        entries[key] = entry
+        if write:
+            write_json(path, {"captures": {**before, **entries}})
+
+    if params.cluster is not None:
+        campaign.run(params, captures, todo, entries, note, report)
+    else:
+        for number, (capture, _) in enumerate(todo, skipped + 1):
+            inner = _Named(report, f"{capture.out.name} ({number} of {len(captures)})")
+            settings = capture.model_dump(mode="json")
+            note(str(capture.out), {"settings": settings, **_attempts(capture, params.retries, inner)})
+    ordered = {str(capture.params.out): entries[str(capture.params.out)] for capture in captures}
+    done = [key for key, entry in ordered.items() if entry["state"] == "done"]
     failed = [
         {"project": key, "error": entry["error"], "hint": entry["hint"]}
-        for key, entry in entries.items()
+        for key, entry in ordered.items()
         if entry["state"] == "failed"
     ]
-    write_json(path, {"captures": entries})
+    write_json(path, {"captures": ordered})
     seconds = round(time.monotonic() - begin, 1)
     result = {"done": done, "failed": failed, "skipped": skipped, "seconds": seconds, "report": str(path)}
+    if params.cluster is not None:
+        result["page"] = str(campaign.folder_of(params.list) / campaign.PAGE)
     if failed:
         first = f"{Path(failed[0]['project']).name}: {failed[0]['error']}"
         raise BatchError(
@@ -77,69 +90,6 @@ def batch(params: BatchParams, report: Reporter) -> dict[str, Any]:
             result,
         )
     return result
-
-
-def read_list(path: Path) -> list[ReconstructParams]:
-    """The captures of a .csv with a header, or of a .json with an array of objects: settings of reconstruct by name.
-
-    `photos` must be there. Relative paths start at the list's folder; without `out` a project is made beside the list,
-    named after the photos. In a .csv, empty cells are left out and `set` holds name=value words.
-
-    Raises:
-        InputError: it cannot be read, or holds no captures.
-        SettingError: a row names an unknown setting or has a wrong value, or two rows have the same project.
-    """
-    captures = []
-    for number, row in enumerate(_rows(path), 1):
-        values = {key: value for key, value in row.items() if value not in (None, "")}
-        for name in PATHS:
-            if name in values:
-                values[name] = path.absolute().parent / str(values[name])
-        if "photos" in values:
-            values.setdefault("out", path.absolute().parent / _name(values["photos"]))
-        if isinstance(values.get("set"), str):
-            values["set"] = dict(word.partition("=")[::2] for word in values["set"].split())
-        try:
-            captures.append(ReconstructParams.model_validate(values))
-        except ValidationError as error:
-            raise SettingError(
-                f"{path}, capture {number}: {wrong_value(error.errors()[0])}.",
-                "Columns are named like the options of `fieldwork reconstruct`.",
-            ) from error
-    if not captures:
-        raise InputError(f"{path} lists no captures.", "Write one row for each, with its folder under “photos”.")
-    outs = [capture.out for capture in captures]
-    twice = next((out for out in outs if outs.count(out) > 1), None)
-    if twice is not None:
-        raise SettingError(f"{path} has two captures with the project {twice}.", "Give each another “out”.")
-    return captures
-
-
-def _rows(path: Path) -> list[dict[str, Any]]:
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read: {error}.", "Give a .csv or .json file.") from error
-    if path.suffix.lower() == ".csv":
-        rows = list(csv.DictReader(text.splitlines()))
-        if any(None in row for row in rows):
-            raise InputError(f"{path} has a row with more cells than its first line.", "Give each column a name.")
-        return rows
-    if path.suffix.lower() != ".json":
-        raise InputError(f"{path} is neither a .csv nor a .json file.", "Write the list as one of these.")
-    try:
-        value = json.loads(text)
-    except ValueError as error:
-        raise InputError(f"{path} is damaged: {error}.", "Write an array of objects.") from error
-    if not isinstance(value, list) or not all(isinstance(row, dict) for row in value):
-        raise InputError(f"{path} holds no array of objects.", 'Write [{"photos": "folder"}, …].')
-    return value
-
-
-def _name(photos: Path) -> str:
-    """Name of the project of a folder of photos or a video."""
-    whole = photos.parent if photos.name.lower() in ("photos", "images", "rgb") else photos
-    return f"{whole.stem if whole.suffix else whole.name}_fieldwork"
 
 
 def _read_report(path: Path) -> dict[str, dict[str, Any]]:

@@ -7,7 +7,6 @@ import math
 SHARE, EXTRA = 0.5, 60.0  # of the training's seconds, and seconds, for everything after it
 EVALUATION, PICTURES = 0.2, 0.2  # of that; mesh and .blend take the rest
 SMALLEST = 0.25  # of the side of pictures, before there are fewer of them
-WHOLE_MESH = 120.0  # seconds for everything below which the mesh is made coarser
 FLOOR = 1.0  # seconds that a stage gets when those before it took all
 
 

@@ -20,7 +20,7 @@ from ..mesh.verb import mesh, meshed
 from ..poses.estimate import estimate_poses, posed
 from ..progress import Reporter
 from ..project.fingerprints import Earlier
-from ..project.runs import holdout_of
+from ..project.runs import holdout_of, read_metrics, run_folder
 from ..project.store import is_project, load_project
 from ..render.verb import orbit_cameras, render, rendered
 from ..train.reuse import finished, held_out, train_or_keep, unfinished
@@ -35,15 +35,17 @@ class Stage(NamedTuple):
     earlier: Callable[[Any], Earlier]
 
 
+# The mesh and the .blend come before what says how good they are.
 STAGES = {
     "new": Stage(new, ingested),
     "poses": Stage(estimate_poses, posed),
     "train": Stage(train_or_keep, finished),
-    "evaluate": Stage(evaluate, evaluated),
     "mesh": Stage(mesh, meshed),
-    "render": Stage(render, rendered),
     "blend": Stage(blend, blended),
+    "evaluate": Stage(evaluate, evaluated),
+    "render": Stage(render, rendered),
 }
+AFTER_TRAINING = ("mesh", "blend", "evaluate")
 
 
 @dataclass
@@ -82,6 +84,78 @@ class Pipeline:
         return sum(self.seconds.get(verb, 0.0) for verb in verbs)
 
 
+def stages_of(params: p.ReconstructParams) -> list[str]:
+    """The stages of a reconstruction in their order."""
+    return [verb for verb in STAGES if verb != "blend" or params.blend is not None]
+
+
+def stage_params(params: p.ReconstructParams, verb: str, spent: float = 0.0) -> p.Params | None:
+    """What a stage of a reconstruction is asked for; None where it has nothing to do. `spent`: seconds since training.
+
+    The project has to be as the stages before leave it: whether a training goes on, and whether photos are held out,
+    stands there.
+    """
+    project, run = Path(params.out), "main"
+    match verb:
+        case "new":
+            return p.NewParams(
+                project=project,
+                photos=params.photos,
+                labels=params.labels,
+                masks=params.masks,
+                classes=params.classes,
+                mask_mode=params.mask_mode,
+            )
+        case "poses":
+            return p.PosesParams(project=project)
+        case "train":
+            training = p.TrainParams(
+                project=project,
+                preset=params.preset,
+                run=run,
+                time_limit=params.time_limit,
+                set=params.set,
+                holdout=params.holdout,
+            )
+            return training.model_copy(update={"resume": unfinished(training)})
+        case "mesh":
+            return p.MeshParams(project=project, run=run, faces=params.faces or None, texture=params.texture or None)
+        case "evaluate":
+            if not held_out(project, run):
+                return None
+            seconds = budget.share_of(params.time_limit, budget.EVALUATION, spent)
+            return p.EvaluateParams(project=project, run=run, time_limit=None if params.time_limit is None else seconds)
+        case "render":
+            return _render_params(params, project, run, spent)
+        case _:
+            assert params.blend is not None
+            return p.BlendParams(project=project, out=params.blend, run=run)
+
+
+def renders_folder(params: p.ReconstructParams) -> Path:
+    return params.renders or Path(params.out) / "exports" / "main" / "renders"
+
+
+def run_stages(params: p.ReconstructParams, verbs: list[str], report: Reporter) -> Pipeline:
+    """Do some stages of a reconstruction in turn, going on from what is there.
+
+    Raises:
+        any verb's error; the project is left so that the same call goes on.
+    """
+    pipeline = Pipeline(Path(params.out), report)
+    for verb in verbs:
+        if verb == "new":
+            if is_project(pipeline.project) and load_project(pipeline.project).last("import") is not None:
+                raise ProjectError(f"{pipeline.project} is an imported data set.", "Use train, mesh and blend on it.")
+            _offer_poses(params.photos, report)
+        values = stage_params(params, verb, pipeline.spent(*AFTER_TRAINING))
+        if values is None:
+            report.stage("evaluate: left out, no photos are held out")
+        else:
+            pipeline.do(verb, values)
+    return pipeline
+
+
 def reconstruct(params: p.ReconstructParams, report: Reporter) -> dict[str, Any]:
     """Run new, poses, train, mesh, blend, evaluate and render one after the other.
 
@@ -95,77 +169,44 @@ def reconstruct(params: p.ReconstructParams, report: Reporter) -> dict[str, Any]
     """
     if params.report is not None:
         check_report(params.report)
-    project, run = Path(params.out), "main"
-    pipeline = Pipeline(project, report)
     if params.time_limit is not None:
         report.note(budget.estimate(params.time_limit))
-    if is_project(project) and load_project(project).last("import") is not None:
-        raise ProjectError(f"{project} is an imported data set.", "Use train, mesh and blend on it.")
-    _offer_poses(params.photos, report)
-    pipeline.do(
-        "new",
-        p.NewParams(
-            project=project,
-            photos=params.photos,
-            labels=params.labels,
-            masks=params.masks,
-            classes=params.classes,
-            mask_mode=params.mask_mode,
-        ),
-    )
-    pipeline.do("poses", p.PosesParams(project=project))
-    training = p.TrainParams(
-        project=project,
-        preset=params.preset,
-        run=run,
-        time_limit=params.time_limit,
-        set=params.set,
-        holdout=params.holdout,
-    )
-    pipeline.do("train", training.model_copy(update={"resume": unfinished(training)}))
-    pipeline.do("mesh", _mesh_params(params, project, run))
-    renders = params.renders or project / "exports" / run / "renders"
-    if params.blend is not None:  # what was asked for, before what says how good it is
-        pipeline.do("blend", p.BlendParams(project=project, out=params.blend, run=run))
-    if held_out(project, run):
-        seconds = budget.share_of(params.time_limit, budget.EVALUATION, pipeline.spent("mesh", "blend"))
-        limit = None if params.time_limit is None else seconds
-        pipeline.do("evaluate", p.EvaluateParams(project=project, run=run, time_limit=limit))
-    else:
-        report.stage("evaluate: left out, no photos are held out")
-    pipeline.do("render", _render_params(params, pipeline, run, renders))
+    made = run_stages(params, stages_of(params), report)
+    return summed_up(params, made.seconds, made.reused, made.redone, made.results)
+
+
+def summed_up(
+    params: p.ReconstructParams,
+    seconds: dict[str, float],
+    reused: list[str],
+    redone: dict[str, str],
+    results: dict[str, Any],
+) -> dict[str, Any]:
+    """What `reconstruct` returns, of stages that were done; writes the report that was asked for."""
     result = {
-        "project": str(project),
-        "stages": pipeline.seconds,
-        "reused": pipeline.reused,
-        "redone": pipeline.redone,
-        "verdict": worst({verb: made.get("verdict") for verb, made in pipeline.results.items()}),
-        **pipeline.results,
+        "project": str(params.out),
+        "stages": seconds,
+        "reused": reused,
+        "redone": redone,
+        "verdict": worst({verb: made.get("verdict") for verb, made in results.items()}),
+        **results,
     }
     if params.report is not None:
-        write_report(params.report, project, run, renders, result)
+        write_report(params.report, Path(params.out), "main", renders_folder(params), result)
         result["report"] = str(params.report)
     return result
 
 
-def _mesh_params(params: p.ReconstructParams, project: Path, run: str) -> p.MeshParams:
-    faces, texture = params.faces or None, params.texture or None
-    if budget.seconds_after(params.time_limit) >= budget.WHOLE_MESH:
-        return p.MeshParams(project=project, run=run, faces=faces, texture=texture)
-    texture = None if texture is None else min(texture, 2048)
-    return p.MeshParams(project=project, run=run, faces=faces, texture=texture, resolution=256)
-
-
-def _render_params(params: p.ReconstructParams, pipeline: Pipeline, run: str, renders: Path) -> p.RenderParams:
+def _render_params(params: p.ReconstructParams, project: Path, run: str, spent: float) -> p.RenderParams:
     """Pictures of new views, as many and as large as there is time for."""
-    project, size, count = pipeline.project, None, params.render_count
+    size, count = None, params.render_count
     if params.time_limit is not None:
         camera = orbit_cameras(load_scene(project, holdout_of(project, run)), count)[0][1]
-        seconds = budget.share_of(params.time_limit, budget.PICTURES, pipeline.spent("mesh", "blend", "evaluate"))
-        speed = pipeline.results.get("evaluate", {}).get("rps")
+        seconds = budget.share_of(params.time_limit, budget.PICTURES, spent)
+        speed = (read_metrics(run_folder(project, run)).get("test") or {}).get("rps")
         size, count = budget.fitting_pictures((camera.width, camera.height), count, speed, seconds)
     passes: list[p.Pass] = ["rgb", "depth", "semantic"]
-    return p.RenderParams(project=project, run=run, out=renders, orbit=count, size=size, passes=passes)
+    return p.RenderParams(project=project, run=run, out=renders_folder(params), orbit=count, size=size, passes=passes)
 
 
 def _offer_poses(photos: Path, report: Reporter) -> None:

@@ -17,7 +17,19 @@ def faces(obj):
 
 def every_panel(screen, name):
     """Open the sub-panels one by one."""
-    for panel in ("capture", "poses", "classes", "train", "label", "render", "live", "mesh", "measure", "export", "engine"):
+    for panel in (
+        "capture",
+        "poses",
+        "classes",
+        "train",
+        "label",
+        "render",
+        "live",
+        "mesh",
+        "measure",
+        "export",
+        "engine",
+    ):
         yield from screen.toggle(panel)
         yield 0.4
         screen.shot(f"{name}-{panel}")

@@ -117,8 +117,8 @@ def test_lists_of_both_kinds_say_the_same(tmp_path):
             ]
         )
     )
-    first, second = read_list(table)
-    assert [first, second] == read_list(objects)
+    assert read_list(table) == read_list(objects)
+    first, second = (capture.params for capture in read_list(table))
     assert first.out == tmp_path / "a_fieldwork"
     assert first.photos == tmp_path / "a/images"
     assert first.time_limit == 30
@@ -133,6 +133,7 @@ def test_lists_of_both_kinds_say_the_same(tmp_path):
         ("a.csv", "photos\nx,y,z\n", InputError, "more cells"),
         ("a.csv", "photos,out\nx,p\ny,p\n", SettingError, "two captures with the project"),
         ("a.csv", "photos,preset\nx,best\n", SettingError, "preset"),
+        ("a.csv", "photos,priority\nx,soon\n", SettingError, "capture 1: “priority”"),
         ("a.json", "{", InputError, "damaged"),
         ("a.json", '{"photos": "x"}', InputError, "no array"),
         ("a.txt", "x", InputError, "neither"),
@@ -164,6 +165,13 @@ def test_the_list_of_the_documentation_is_one(tmp_path):
     (example,) = re.findall(r"```csv\n(photos.*?)```", text, re.S)
     path = tmp_path / "captures.csv"
     path.write_text(example)
-    vase, walk = read_list(path)
+    vase, walk = (capture.params for capture in read_list(path))
     assert (vase.out, vase.blend, vase.time_limit) == (tmp_path / "vase_fieldwork", tmp_path / "vase.blend", 120)
     assert (walk.out, walk.labels, walk.preset) == (tmp_path / "walk_fieldwork", None, "standard")
+
+
+def test_captures_of_a_higher_priority_come_first(tmp_path, reconstructed):
+    path = tmp_path / "captures.csv"
+    path.write_text("photos,priority\nlast/photos,-1\nmiddle/photos,\nfirst/photos,5\nsecond/photos,0\n")
+    batch(BatchParams(list=path), Reporter())
+    assert reconstructed == [f"{name}_fieldwork" for name in ("first", "middle", "second", "last")]

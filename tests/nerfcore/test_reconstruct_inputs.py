@@ -92,20 +92,18 @@ def test_the_blend_comes_before_what_says_how_good_it_is(tmp_path: Path, monkeyp
     assert list(seen) == ["new", "poses", "train", "mesh", "blend", "render"]
 
 
-def test_a_short_training_has_a_quick_mesh(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        module,
-        "orbit_cameras",
-        lambda scene, count: [("a", Camera(width=800, height=600, fx=700, fy=700, cx=400, cy=300), None)],
-    )
+def test_pictures_after_a_short_training_are_small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    camera = Camera(width=800, height=600, fx=700, fy=700, cx=400, cy=300)
+    monkeypatch.setattr(module, "orbit_cameras", lambda scene, count: [("a", camera, None)])
     monkeypatch.setattr(module, "load_scene", lambda folder, holdout: None)
     monkeypatch.setattr(module, "holdout_of", lambda folder, run: 8)
-    short, _ = all_stages(monkeypatch, tmp_path / "a", {}, time_limit=60)
-    assert (short["mesh"].resolution, short["mesh"].texture) == (256, 2048)
-    assert short["render"].size == (200, 150)  # how fast the field renders is not known
-    evaluated = {"evaluate": {"rps": 1e6}}
-    longer, _ = all_stages(monkeypatch, tmp_path / "b", evaluated, time_limit=240)
-    assert (longer["mesh"].resolution, longer["mesh"].texture) == (512, 4096)
+    unknown, _ = all_stages(monkeypatch, tmp_path / "a", {}, time_limit=60)
+    assert unknown["render"].size == (200, 150)  # how fast the field renders is not known
+    # 8 pictures in a fifth of 90 seconds: 18 s.
+    for speed, size in ((8 * 800 * 600 / 18, (800, 600)), (8 * 400 * 300 / 18, (400, 300))):
+        monkeypatch.setattr(module, "read_metrics", lambda folder, speed=speed: {"test": {"rps": speed}})
+        seen, _ = all_stages(monkeypatch, tmp_path / str(size[0]), {}, time_limit=60)
+        assert (seen["render"].size, seen["render"].orbit) == (size, 8)
 
 
 def test_the_verdict_is_the_worst_of_the_stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,281 @@
+"""Files between machines without a common folder: any place that fsspec reaches, S3 for instance.
+
+    URL/objects/ab/abcd…      the contents of files, named by their SHA-256; never changed, so never half written for a reader
+    URL/captures/NAME.json    which files a capture has: {path below the campaign's folder: [SHA-256, bytes, time]}
+
+A stage fetches what it needs and has not got, and uploads what it changed: first contents, the list of files last.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+import threading
+import uuid
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from ..errors import DiskError, FieldworkError, SettingError
+from ..files import atomic_path, file_hash, leads_outside, write_json
+from ..project.fingerprints import digest
+from .link import INSTALL
+
+Files = dict[str, list[Any]]  # path below the campaign's folder → [SHA-256, bytes, time in ns]
+STATE = ".state"  # folder: what was fetched or uploaded last, so that only what changed since is read again
+PLACE = "fieldwork-campaign:"  # stands for the campaign's folder in files that name places
+NAMES_PLACES = ("project.json", "metrics.json", "render.json", "mesh.json")
+GROWING = (".jsonl", ".db")  # files that are changed in place
+THREADS = 8
+
+
+class StorageError(FieldworkError):
+    """The storage of a campaign cannot be reached, or lacks a file."""
+
+    code = "storage"
+
+
+class Storage:
+    """One place of an fsspec file system."""
+
+    def __init__(self, url: str) -> None:
+        try:
+            import fsspec
+        except ImportError as error:
+            raise SettingError("--storage needs fsspec, which is not installed here.", INSTALL) from error
+        self.url = url
+        try:
+            self.fs, self.root = fsspec.core.url_to_fs(url)
+        except (ImportError, ValueError) as error:
+            raise SettingError(f"--storage {url} cannot be used: {error}.", "Give a URL that fsspec knows.") from error
+        self.whole_puts = "file" not in (
+            self.fs.protocol if isinstance(self.fs.protocol, tuple) else (self.fs.protocol,)
+        )
+
+    def _told(self, doing: str, work: Callable[[], Any]) -> Any:
+        try:
+            return work()
+        except FileNotFoundError as error:
+            raise StorageError(f"{self.url} lacks a file while {doing}: {error}.", "Run the campaign again.") from error
+        except OSError as error:
+            raise StorageError(
+                f"{self.url} cannot be reached while {doing}: {error}.",
+                "Check the address, the network and the rights.",
+            ) from error
+
+    def _put(self, source: Path, target: str) -> None:
+        """Upload so that a reader sees all of the file or none."""
+        if self.whole_puts:
+            self.fs.put_file(str(source), target)
+            return
+        self.fs.makedirs(target.rpartition("/")[0], exist_ok=True)
+        temporary = f"{target}.{uuid.uuid4().hex}"
+        self.fs.put_file(str(source), temporary)
+        self.fs.mv(temporary, target)
+
+    def _object(self, name: str) -> str:
+        return f"{self.root}/objects/{name[:2]}/{name}"
+
+    def put_object(self, path: Path, name: str) -> None:
+        """Upload the contents of a file, unless they are there."""
+        target = self._object(name)
+
+        def work() -> None:
+            if not self.fs.exists(target):
+                self._put(path, target)
+
+        self._told(f"uploading {path}", work)
+
+    def get_object(self, name: str, path: Path) -> None:
+        """Fetch contents into a file, which appears whole or not at all. Raises StorageError, DiskError."""
+        with atomic_path(path) as temporary:
+            self._told(f"fetching {path.name}", lambda: self.fs.get_file(self._object(name), str(temporary)))
+            if file_hash(temporary) != name:
+                raise StorageError(f"{self.url} has damaged contents of {path}.", "Upload it again.")
+
+    def files(self, capture: str) -> Files:
+        """The files of a capture; none where nothing was uploaded of it."""
+        place = f"{self.root}/captures/{capture}.json"
+        self.fs.invalidate_cache()
+
+        def work() -> Files:
+            return json.loads(self.fs.cat_file(place)) if self.fs.exists(place) else {}
+
+        found = self._told("reading a list of files", work)
+        for path in found:
+            if leads_outside(path):
+                raise StorageError(
+                    f"{self.url} names the file {path}, outside of the campaign's folder.", "Look at it."
+                )
+        return found
+
+    def set_files(self, capture: str, files: Files) -> None:
+        """Write the files of a capture, in one go."""
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "files.json"
+            path.write_text(json.dumps(files, sort_keys=True), encoding="utf-8")
+            self._told("writing a list of files", lambda: self._put(path, f"{self.root}/captures/{capture}.json"))
+
+
+def work_folder(url: str) -> Path:
+    """Where a worker keeps its copies of a campaign's files: below FIELDWORK_WORK, else the temporary folder."""
+    base = Path(os.environ.get("FIELDWORK_WORK") or Path(tempfile.gettempdir()) / "fieldwork-campaigns")
+    return base / digest(url)
+
+
+class Copy:
+    """A capture's files in a folder of this machine, beside those in the storage.
+
+    Args:
+        tracked: the files and folders of the capture, below `folder`.
+    """
+
+    def __init__(self, storage: Storage, folder: Path, capture: str, tracked: Iterable[Path]) -> None:
+        self.storage, self.folder, self.capture = storage, folder, capture
+        self.tracked = [path.absolute() for path in tracked]
+        self.state_file = folder / STATE / f"{capture}.json"
+        self.lock = threading.Lock()
+
+    def _state(self) -> dict[str, list[Any]]:
+        """path → [SHA-256 in the storage, bytes and time of the file here] when they were last the same."""
+        try:
+            return json.loads(self.state_file.read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return {}
+
+    def _here(self) -> dict[str, Path]:
+        found = {}
+        for place in self.tracked:
+            inside = [place] if place.is_file() else [path for path in place.rglob("*") if path.is_file()]
+            for path in inside:
+                relative = path.relative_to(self.folder)
+                if "jobs" not in relative.parts and not path.name.startswith("."):
+                    found[relative.as_posix()] = path
+        return found
+
+    def fetch(self, wanted: Callable[[str], bool] = lambda _: True, check: Callable[[], None] = lambda: None) -> int:
+        """Bring files here that are wanted and not the same; those that are gone from the storage go. How many came."""
+        state, files, todo = self._state(), self.storage.files(self.capture), []
+        for name, (sha, _, _) in files.items():
+            same = state.get(name) == [sha, *_stamp(self.folder / name)]
+            if wanted(name) and not same:
+                todo.append(name)
+        with ThreadPoolExecutor(THREADS) as pool:
+            for _ in pool.map(lambda name: self._fetch_one(name, files[name], check), todo):
+                check()
+        for name in todo:
+            state[name] = [files[name][0], *_stamp(self.folder / name)]
+        for name in [name for name in state if name not in files]:
+            (self.folder / name).unlink(missing_ok=True)
+            del state[name]
+        write_json(self.state_file, state)
+        return len(todo)
+
+    def _fetch_one(self, name: str, entry: list[Any], check: Callable[[], None]) -> None:
+        check()
+        path = self.folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self.storage.get_object(entry[0], path)
+        if path.name in NAMES_PLACES:
+            write_json(path, placed(json.loads(path.read_text(encoding="utf-8")), PLACE, str(self.folder)))
+        os.utime(path, ns=(entry[2], entry[2]))
+
+    def changed(self) -> bool:
+        """Whether files here are others than when they were last the same as in the storage."""
+        state, here = self._state(), self._here()
+        came = any(name not in state or state[name][1:] != _stamp(path) for name, path in here.items())
+        return came or any(not (self.folder / name).is_file() for name in state)
+
+    def upload(self, databases: bool = True) -> int:
+        """Upload what changed here; the list of files comes last. How many files went.
+
+        Args:
+            databases: also COLMAP's, which are whole only when nobody writes them.
+        """
+        with self.lock:
+            state, files, here = self._state(), self.storage.files(self.capture), self._here()
+            todo = [name for name, path in here.items() if name not in state or state[name][1:] != _stamp(path)]
+            todo = [name for name in todo if databases or not name.endswith(".db")]
+            with ThreadPoolExecutor(THREADS) as pool:
+                for name, entry in zip(todo, pool.map(lambda name: self._upload_one(here[name]), todo)):
+                    if entry is not None:
+                        files[name], state[name] = entry[:3], [entry[0], *entry[1:]]
+            for name in [name for name in state if not (self.folder / name).is_file()]:
+                files.pop(name, None)
+                del state[name]
+            self.storage.set_files(self.capture, files)
+            write_json(self.state_file, state)
+            return len(todo)
+
+    def _upload_one(self, path: Path) -> list[Any] | None:
+        """[SHA-256, bytes, time] of an uploaded file; None where it went away meanwhile."""
+        try:
+            with tempfile.TemporaryDirectory(dir=self._spare()) as folder:
+                stamp, source = _stamp(path), Path(folder) / "contents"
+                if path.name in NAMES_PLACES:
+                    value = placed(json.loads(path.read_text(encoding="utf-8")), str(self.folder), PLACE)
+                    source.write_text(json.dumps(value, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+                elif path.suffix in GROWING:
+                    shutil.copyfile(path, source)
+                else:
+                    # Such a file is replaced, never changed: a second name keeps its contents while they are read.
+                    os.link(path, source)
+                sha = file_hash(source)
+                self.storage.put_object(source, sha)
+                return [sha, *stamp]
+        except FileNotFoundError:
+            return None
+
+    def _spare(self) -> Path:
+        folder = self.folder / STATE
+        folder.mkdir(parents=True, exist_ok=True)
+        return folder
+
+
+class Saving:
+    """Uploads now and then what a long stage writes, so that another worker can go on from its last checkpoint."""
+
+    def __init__(self, copy: Copy, every: float) -> None:
+        self.copy, self.every, self.over = copy, every, threading.Event()
+        self.thread = threading.Thread(target=self._work, daemon=True)
+        self.trouble: FieldworkError | None = None
+
+    def __enter__(self) -> Saving:
+        self.thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.over.set()
+        self.thread.join()
+        self.copy.upload()
+
+    def _work(self) -> None:
+        while not self.over.wait(self.every):
+            try:
+                if self.copy.changed():
+                    self.copy.upload(databases=False)
+            except (FieldworkError, OSError) as error:  # the end of the stage tries again, and tells
+                self.trouble = error if isinstance(error, FieldworkError) else DiskError(str(error))
+
+
+def _stamp(path: Path) -> list[int]:
+    """Bytes and time of a file; empty where it is not there."""
+    try:
+        stat = path.stat()
+    except FileNotFoundError:
+        return []
+    return [stat.st_size, stat.st_mtime_ns]
+
+
+def placed(value: Any, old: str, new: str) -> Any:
+    """JSON with another folder in the places it names."""
+    if isinstance(value, dict):
+        return {key: placed(item, old, new) for key, item in value.items()}
+    if isinstance(value, list):
+        return [placed(item, old, new) for item in value]
+    if isinstance(value, str) and (value == old or value.startswith((f"{old}/", f"{old}\\"))):
+        return new + value[len(old) :]
+    return value

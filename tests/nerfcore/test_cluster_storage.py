@@ -1,0 +1,210 @@
+"""Files of captures between machines: an S3 server of moto, and a folder."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fieldwork.nerfcore.cluster import storage as module
+from fieldwork.nerfcore.cluster.storage import Copy, Saving, Storage, StorageError, placed
+from fieldwork.nerfcore.cluster.worker import Refusal
+from fieldwork.nerfcore.errors import SettingError
+from fieldwork.nerfcore.params import ReconstructParams
+from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.workflows.campaign import plan
+from fieldwork.nerfcore.workflows.captures import Capture
+from fieldwork.nerfcore.workflows.reconstruct import STAGES, reconstruct, stages_of
+from fieldwork.nerfcore.workflows.stage_task import capture_name, run_stage, tracked_paths
+from fieldwork.tests.nerfcore.support import reconstructed as support
+
+pytest.importorskip("fsspec", reason="the extra “cluster” is not installed")
+
+
+@pytest.fixture(scope="module")
+def s3() -> Iterator[str]:
+    """Address of a bucket on a server of this process."""
+    pytest.importorskip("s3fs", reason="the extra “cluster” is not installed")
+    server = pytest.importorskip("moto.server", reason="moto is not installed").ThreadedMotoServer(port=0)
+    server.start()
+    host, port = server.get_host_and_port()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("AWS_ENDPOINT_URL", f"http://{host}:{port}")
+        patch.setenv("AWS_ACCESS_KEY_ID", "testing")
+        patch.setenv("AWS_SECRET_ACCESS_KEY", "testing")
+        patch.setenv("AWS_DEFAULT_REGION", "us-east-1")
+        import s3fs
+
+        s3fs.S3FileSystem.clear_instance_cache()
+        s3fs.S3FileSystem().mkdir("campaigns")
+        yield "s3://campaigns"
+    server.stop()
+
+
+@pytest.fixture(params=["s3", "folder"])
+def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    if request.param == "folder":
+        return (tmp_path / "store").as_uri()
+    return f"{request.getfixturevalue('s3')}/{tmp_path.name}"
+
+
+def machine(root: Path, url: str) -> Copy:
+    root.mkdir(exist_ok=True)
+    return Copy(Storage(url), root, "vase-1", [root / "vase"])
+
+
+def test_what_one_machine_uploads_the_other_fetches(tmp_path, url):
+    one, two = machine(tmp_path / "one", url), machine(tmp_path / "two", url)
+    inner = tmp_path / "one/vase/runs"
+    inner.mkdir(parents=True)
+    (inner / "field.bin").write_bytes(os.urandom(200_000))
+    (inner / "same.bin").write_bytes((inner / "field.bin").read_bytes())
+    (tmp_path / "one/vase/project.json").write_text(
+        f'{{"photos": "{tmp_path}/one/vase/photos", "of": "{tmp_path}/one"}}'
+    )
+    (tmp_path / "one/vase/jobs").mkdir()
+    (tmp_path / "one/vase/jobs/engine.lock").touch()
+    assert one.changed()
+    assert one.upload() == 3
+    assert not one.changed()
+    assert one.upload() == 0
+    assert two.fetch() == 3
+    assert two.fetch() == 0
+    copied = tmp_path / "two/vase/runs/field.bin"
+    assert copied.read_bytes() == (inner / "field.bin").read_bytes()
+    assert copied.stat().st_mtime_ns == (inner / "field.bin").stat().st_mtime_ns
+    assert not (tmp_path / "two/vase/jobs").exists()
+    assert f"{tmp_path}/two/vase/photos" in (tmp_path / "two/vase/project.json").read_text()
+    storage = Storage(url)
+    assert len(storage.fs.find(f"{storage.root}/objects")) == 2, "equal contents are there once"
+    # Changes, additions and removals go back.
+    assert not two.changed(), "what was only fetched is not uploaded again"
+    copied.write_bytes(b"better")
+    (tmp_path / "two/vase/new.txt").write_text("new")
+    (tmp_path / "two/vase/runs/same.bin").unlink()
+    assert two.upload() == 2
+    one.fetch()
+    assert (inner / "field.bin").read_bytes() == b"better"
+    assert (tmp_path / "one/vase/new.txt").read_text() == "new"
+    assert not (inner / "same.bin").exists()
+
+
+def test_only_what_is_wanted_is_fetched_and_the_rest_stays(tmp_path, url):
+    one, two = machine(tmp_path / "one", url), machine(tmp_path / "two", url)
+    for name in ("a", "b"):
+        (tmp_path / f"one/vase/{name}").mkdir(parents=True)
+        (tmp_path / f"one/vase/{name}/x.bin").write_bytes(name.encode())
+    one.upload()
+    assert two.fetch(lambda name: "/a/" in name) == 1
+    (tmp_path / "two/vase/a/x.bin").write_bytes(b"changed")
+    two.upload()
+    assert set(Storage(url).files("vase-1")) == {"vase/a/x.bin", "vase/b/x.bin"}
+
+
+def test_an_upload_that_breaks_off_leaves_the_old_state(tmp_path, url, monkeypatch):
+    one, two = machine(tmp_path / "one", url), machine(tmp_path / "two", url)
+    (tmp_path / "one/vase").mkdir()
+    for name in ("x", "y"):
+        (tmp_path / "one/vase" / name).write_bytes(b"old")
+    one.upload()
+    for name in ("x", "y"):
+        (tmp_path / "one/vase" / name).write_bytes(b"newer")
+    monkeypatch.setattr(Storage, "set_files", lambda *_: (_ for _ in ()).throw(StorageError("gone.")))
+    with pytest.raises(StorageError):
+        one.upload()
+    monkeypatch.undo()
+    two.fetch()
+    assert {(tmp_path / "two/vase" / name).read_bytes() for name in ("x", "y")} == {b"old"}
+    assert one.upload() == 2
+
+
+def test_damaged_contents_and_paths_that_lead_outside_are_refused(tmp_path, url):
+    one, two = machine(tmp_path / "one", url), machine(tmp_path / "two", url)
+    (tmp_path / "one/vase").mkdir()
+    (tmp_path / "one/vase/x").write_bytes(b"whole")
+    one.upload()
+    storage = Storage(url)
+    (place,) = storage.fs.find(f"{storage.root}/objects")
+    storage.fs.pipe_file(place, b"halved")
+    with pytest.raises(StorageError, match="damaged contents of"):
+        two.fetch()
+    assert not (tmp_path / "two/vase/x").exists()
+    storage.set_files("vase-1", {"../outside": ["0" * 64, 1, 1]})
+    with pytest.raises(StorageError, match="outside of the campaign's folder"):
+        two.fetch()
+
+
+def test_a_storage_that_is_not_there_is_told(tmp_path, s3, monkeypatch):
+    with pytest.raises(SettingError, match="cannot be used"):
+        Storage("nothing-like://x/y")
+    with pytest.raises(StorageError, match=r"cannot be reached|lacks a file"):
+        Storage("s3://no-such-bucket/x").set_files("a", {})
+
+
+def test_checkpoints_are_saved_while_a_stage_runs(tmp_path, url):
+    one, two = machine(tmp_path / "one", url), machine(tmp_path / "two", url)
+    (tmp_path / "one/vase").mkdir()
+    with Saving(one, every=0.1):
+        (tmp_path / "one/vase/field.bin").write_bytes(b"checkpoint")
+        deadline = 200
+        while not two.fetch() and deadline:
+            deadline -= 1
+        assert (tmp_path / "two/vase/field.bin").read_bytes() == b"checkpoint"
+        (tmp_path / "one/vase/field.bin").write_bytes(b"the end")
+    two.fetch()
+    assert (tmp_path / "two/vase/field.bin").read_bytes() == b"the end"
+
+
+def test_places_move_with_the_folder():
+    value = {"a": ["/one/x", "/onelike/x", 3], "b": "/one"}
+    assert placed(value, "/one", "/two") == {"a": ["/two/x", "/onelike/x", 3], "b": "/two"}
+
+
+def test_captures_outside_of_the_list_s_folder_are_refused(tmp_path):
+    inside = {"photos": tmp_path / "photos", "out": tmp_path / "p"}
+    assert len(plan([Capture(ReconstructParams(**inside))], tmp_path)) == 6
+    for change in ({"out": tmp_path.parent / "p"}, {"blend": Path("/elsewhere/a.blend")}):
+        with pytest.raises(SettingError, match="is outside of"):
+            plan([Capture(ReconstructParams(**{**inside, **change}))], tmp_path)
+    far = [Capture(ReconstructParams(**{**inside, "photos": Path("/elsewhere/photos")}))]
+    assert plan(far, tmp_path)
+    with pytest.raises(SettingError, match="are sent files of"):
+        plan(far, tmp_path, "s3://bucket/x")
+
+
+def test_a_worker_writes_nowhere_but_in_its_folder(tmp_path):
+    (tmp_path / "campaign").mkdir()
+    (tmp_path / "campaign/p").symlink_to(tmp_path / "elsewhere")
+    for out in (tmp_path / "elsewhere", tmp_path / "campaign/p"):
+        capture = ReconstructParams(photos=tmp_path / "photos", out=out).model_dump(mode="json")
+        with pytest.raises(Refusal, match="outside of the campaign's folder"):
+            run_stage({"capture": capture, "stage": "new", "folder": str(tmp_path / "campaign")}, Reporter())
+    assert not (tmp_path / "elsewhere").exists()
+
+
+def test_each_stage_on_another_machine_makes_what_one_machine_makes(tmp_path, s3, monkeypatch):
+    """Photos of a ball, each stage with an empty disk; at home nothing is left to do."""
+    home = tmp_path / "home"
+    support.take_photos(home / "photos")
+    support.fake(monkeypatch)
+    params = ReconstructParams(photos=home / "photos", out=home / "p", preset="draft", set=support.SETTINGS)
+    url = f"{s3}/{tmp_path.name}"
+    copy = Copy(Storage(url), home, capture_name(params, home), tracked_paths(params))
+    copy.upload()
+    values: dict[str, Any] = {"capture": params.model_dump(mode="json"), "folder": str(home), "storage": url}
+    for number, stage in enumerate(stages_of(params)):
+        worker = tmp_path / f"worker{number}"
+        monkeypatch.setattr(module, "work_folder", lambda _, worker=worker: worker)
+        monkeypatch.setattr("fieldwork.nerfcore.workflows.stage_task.work_folder", lambda _, worker=worker: worker)
+        made = run_stage({**values, "stage": stage}, Reporter())
+        assert not made["reused"]
+        assert str(worker) not in str(made)
+        shutil.rmtree(worker)
+    copy.fetch()
+    assert (home / "p/runs/main/field.safetensors").is_file()
+    assert str(tmp_path / "worker") not in (home / "p/project.json").read_text()
+    result = reconstruct(params, Reporter())
+    assert result["reused"] == [verb for verb in STAGES if verb != "blend"]

@@ -1,0 +1,110 @@
+"""A render in parts, as several programs make it at the same time."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fieldwork.nerfcore.errors import SettingError
+from fieldwork.nerfcore.params import ReconstructParams, RenderParams
+from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.project.lock import lockable, project_lock
+from fieldwork.nerfcore.render import verb as module
+from fieldwork.nerfcore.render.verb import render, rendered
+from fieldwork.nerfcore.workflows import stage_task
+from fieldwork.nerfcore.workflows.campaign import capture_tasks, frame_ranges
+from fieldwork.tests.nerfcore.support.reconstructed import SETTINGS, place, reconstructed
+from PIL import Image
+from pydantic import ValidationError
+
+__all__ = ["place", "reconstructed"]
+
+
+def asked(place: Path, out: Path, frames: tuple[int, int] | None = None, **more) -> RenderParams:
+    values = {"project": place / "p", "out": out, "orbit": 5, "size": (24, 16), "passes": ["rgb", "depth"], **more}
+    return RenderParams(**values, frame_range=frames)
+
+
+def pictures(folder: Path) -> dict[str, np.ndarray]:
+    return {path.name: np.asarray(Image.open(path)) for path in sorted(folder.glob("*.png"))}
+
+
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The names of the frames that were rendered."""
+    names, write = [], module.write_frame
+    monkeypatch.setattr(module, "write_frame", lambda out, name, *rest: names.append(name) or write(out, name, *rest))
+    return names
+
+
+def test_parts_make_what_one_program_makes(place, tmp_path, drawn):
+    render(asked(place, tmp_path / "whole"), Reporter())
+    drawn.clear()
+    # While another program holds the project.
+    assert lockable(asked(place, tmp_path, (0, 1))) is None
+    with project_lock(place / "p", "train"):
+        for frames in ((0, 1), (2, 9)):
+            render(asked(place, tmp_path / "parts", frames), Reporter())
+    assert drawn == [f"orbit_{i:04d}" for i in range(5)]
+    assert rendered(asked(place, tmp_path / "parts")).result is None, "parts are not the whole"
+    assert rendered(asked(place, tmp_path / "parts", (0, 1))).result is not None
+    drawn.clear()
+    result = render(asked(place, tmp_path / "parts"), Reporter())
+    assert drawn == [], "what parts have made is kept"
+    assert len(result["frames"]) == 15
+    assert rendered(asked(place, tmp_path / "parts")).result is not None
+    whole, parts = pictures(tmp_path / "whole"), pictures(tmp_path / "parts")
+    assert list(whole) == list(parts)
+    assert len(whole) == 10
+    for name in whole:
+        assert np.array_equal(whole[name], parts[name]), name
+
+
+def test_a_picture_that_is_gone_and_other_settings_are_rendered_again(place, tmp_path, drawn):
+    render(asked(place, tmp_path, (0, 3)), Reporter())
+    (tmp_path / "orbit_0001_depth.png").unlink()
+    drawn.clear()
+    render(asked(place, tmp_path), Reporter())
+    assert drawn == ["orbit_0001", "orbit_0004"]
+    drawn.clear()
+    render(asked(place, tmp_path, size=(16, 16)), Reporter())
+    assert len(drawn) == 5
+
+
+def test_wrong_ranges_are_told(place, tmp_path):
+    with pytest.raises(SettingError, match="has the frames 0 to 4"):
+        render(asked(place, tmp_path, (5, 6)), Reporter())
+    for frames in ((3, 2), (-1, 2)):
+        with pytest.raises(ValidationError, match="no range of frames"):
+            asked(place, tmp_path, frames)
+
+
+def test_a_long_render_of_a_campaign_is_spread_over_workers(place, monkeypatch):
+    assert frame_ranges(8) == []
+    assert frame_ranges(70) == [(0, 31), (32, 63), (64, 69)]
+    params = ReconstructParams(photos=place / "photos", out=place / "p", preset="draft", set=SETTINGS, render_count=4)
+    tasks = capture_tasks(params, 0, [(0, 1), (2, 3)], {"folder": str(place), "storage": None})
+    names = [task.stage for task in tasks]
+    assert names == ["new", "poses", "train", "evaluate", "mesh", "render 0-1", "render 2-3", "render"]
+    by_stage = {task.stage: task for task in tasks}
+    assert by_stage["render 2-3"].needs == by_stage["render 0-1"].needs == (by_stage["mesh"].id,)
+    assert set(by_stage["render"].needs) == {by_stage["render 0-1"].id, by_stage["render 2-3"].id}
+    asked_for = []
+    stage = stage_task.STAGES["render"]
+
+    def run(values, report):
+        asked_for.append(values.frame_range)
+        return render(values.model_copy(update={"orbit": 4, "size": (16, 16), "passes": ["rgb"]}), report)
+
+    def earlier(values):
+        return rendered(values.model_copy(update={"orbit": 4, "size": (16, 16), "passes": ["rgb"]}))
+
+    monkeypatch.setitem(stage_task.STAGES, "render", stage._replace(run=run, earlier=earlier))
+    for _ in range(2):
+        made = [stage_task.run_stage(task.values, Reporter()) for task in tasks if task.stage.startswith("render")]
+    assert asked_for == [(0, 1), (2, 3), None], "a second time nothing is rendered"
+    assert [m["reused"] for m in made] == [True] * 3
+    record = json.loads((place / "p/exports/main/renders/render.json").read_text())
+    assert len(record["result"]["frames"]) == 8

@@ -227,7 +227,10 @@ class TrainConfig(Stage):
     steps: int = Field(default=20000, gt=0, le=MANY, description="optimisation steps when there is no time limit")
     batch_start: int = Field(default=1 << 14, ge=256, le=1 << 26, description="field samples of the first steps")
     batch_samples: int = Field(
-        default=1 << 17, ge=256, le=1 << 26, description="field samples of the last steps; grows geometrically"
+        default=1 << 17,
+        ge=256,
+        le=1 << 26,
+        description="field samples of the last steps; grows geometrically, less far where a time limit leaves few steps",
     )
     max_rays: int = Field(default=32768, ge=16, le=1 << 24, description="at most so many rays a step")
     grid_rate: float = Field(default=0.03, gt=0, le=10, description="learning rate of the grid")

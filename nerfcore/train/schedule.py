@@ -6,6 +6,9 @@ import math
 
 from ..config import TrainConfig
 
+ENOUGH_STEPS = 1500
+FIXED_COST = 0.6  # of a first step on a CPU, which does not grow with its samples
+
 
 def rate_factor(progress: float, decay: float) -> float:
     """Learning-rate factor: × `decay` at ½, ¾ and 9/10."""
@@ -17,6 +20,27 @@ def bias_correction(step: int, beta1: float = 0.9, beta2: float = 0.99) -> float
     return math.sqrt(1 - beta2**step) / (1 - beta1**step)
 
 
-def sample_budget(train: TrainConfig, progress: float) -> int:
-    """Field samples of a step: early on many small steps learn faster, later large batches average out the noise."""
-    return round(train.batch_start * (train.batch_samples / train.batch_start) ** progress)
+def sample_budget(train: TrainConfig, progress: float, largest: int | None = None) -> int:
+    """Field samples of a step: early on many small steps learn faster, later large batches average out the noise.
+
+    `largest`: those of the last steps instead of the setting's.
+    """
+    return round(train.batch_start * ((largest or train.batch_samples) / train.batch_start) ** progress)
+
+
+def largest_batch(train: TrainConfig, seconds: float, step_seconds: float) -> int:
+    """Field samples of the last steps of a training of so many seconds, whose first steps take `step_seconds`: as large
+    as the setting has them if that leaves `ENOUGH_STEPS`, else as small as it takes, down to twice those of the first."""
+    least = min(2 * train.batch_start, train.batch_samples)
+    if train.batch_samples <= train.batch_start:
+        return train.batch_samples
+    size = train.batch_samples
+    while size > least and seconds / (step_seconds * _mean_cost(size / train.batch_start)) < ENOUGH_STEPS:
+        size = max(least, size // 2)
+    return size
+
+
+def _mean_cost(growth: float) -> float:
+    """Seconds of a step, on average over a schedule in which its samples grow by this factor, relative to its first."""
+    mean = 1.0 if growth <= 1 else (growth - 1) / math.log(growth)
+    return FIXED_COST + (1 - FIXED_COST) * mean

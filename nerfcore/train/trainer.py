@@ -97,6 +97,7 @@ class Trainer:
         self.guard = GradientGuard(model.field.dtype, self.device)
         self.generator = torch.Generator(self.device).manual_seed(config.train.seed)
         self.steps = 0
+        self.largest_batch: int | None = None  # samples of the last steps, where time is too short for the setting's
         self.rays = max(16, min(config.train.max_rays, config.train.batch_start // config.sampling.samples))
         self.cache = CoarseCache(store)
         self.poses = PoseRefinement(store.rays, config.train) if config.train.refine_poses else None
@@ -221,7 +222,7 @@ class Trainer:
         labelled = counted.sum().clamp(min=1e-6)
         shard_count = 1
         if self.backend.host_threads:
-            shard_count = max(2, min(worker_count(), sample_budget(config.train, progress) // SHARD_SAMPLES))
+            shard_count = max(2, min(worker_count(), self._budget(progress) // SHARD_SAMPLES))
         size = -(-rays // shard_count)
         capacity = self._capacity(progress, shard_count)
         squared = self.steps < config.loss.rgb_warmup
@@ -302,10 +303,14 @@ class Trainer:
             batch.origins, batch.directions, per_ray, jitter, shift, codes, semantics, capacity=capacity
         )
 
+    def _budget(self, progress: float) -> int:
+        """Field samples of a step."""
+        return sample_budget(self.config.train, progress, self.largest_batch)
+
     def _capacity(self, progress: float, shards: int) -> int:
         """Rays of a shard that may get samples where the capacity is fixed: what the budget is enough for, and some."""
         per_ray = self.config.sampling.samples
-        return max(16, math.ceil(HEADROOM * sample_budget(self.config.train, progress) / (per_ray * shards)))
+        return max(16, math.ceil(HEADROOM * self._budget(progress) / (per_ray * shards)))
 
     def _adapt(self, rays: int, rendered: list[Rendered], progress: float) -> None:
         """Keep the number of field samples a step near its budget, which grows with progress."""
@@ -327,7 +332,7 @@ class Trainer:
     def _set_rays(self, rays: int, per_ray: float, progress: float) -> None:
         """Let the next steps have as many rays as the budget is enough for, at most twice and at least half `rays`."""
         train = self.config.train
-        wanted = sample_budget(train, progress) / max(per_ray, 1 / max(rays, 1))
+        wanted = self._budget(progress) / max(per_ray, 1 / max(rays, 1))
         self.rays = int(min(max(wanted, rays * 0.5, 16), rays * 2, train.max_rays))
 
     def _ask_device(self, progress: float) -> None:

@@ -53,12 +53,14 @@ from .closed_picture import write_closed_picture
 from .inputs import data_inputs, training_inputs, training_length
 from .pose_refinement import write_poses
 from .prepare import make_trainer, plan_run
+from .schedule import largest_batch
 from .trainer import Measured, Trainer
 from .voxel_init import save_features
 
 CLOSED_PICTURE = "closed.png"
 # Not tuned: the next two.
 MOST_DROPPED = 0.01  # share of the rays that may be left out without a word
+MEASURED_STEPS = (16, 48)  # the steps between these say how fast the machine is
 PREVIEW_PAUSE = 20  # times what a preview costs, before the next one
 
 
@@ -97,10 +99,11 @@ def train(params: TrainParams, report: Reporter) -> dict[str, Any]:
         half_written.unlink()
     trainer = make_trainer(project_folder, info, scene, device, report)
     _picture_closed(place.folder / CLOSED_PICTURE, trainer, scene, info.box(load_project(project_folder)))
-    state = {"seconds": 0.0, "progress": 0.0, "psnr": None}
+    state = {"seconds": 0.0, "progress": 0.0, "psnr": None, "largest_batch": None}
     if saved is not None:
         restore(trainer, *saved)
-        state.update({key: saved[1][key] for key in state})
+        state.update({key: saved[1].get(key) for key in state})
+        trainer.largest_batch = state["largest_batch"]
         del saved
     limit = training_length(params.steps, params.time_limit, info.config)["steps"]
     report.stage("Training")
@@ -215,6 +218,7 @@ class _Loop:
         self.step_limit, self.time_limit, self.report = steps, seconds, report
         self.clock = _Clock(state["seconds"])
         self.warned: set[str] = set()
+        self.measured_from: float | None = None  # seconds at the first of `MEASURED_STEPS`
 
     def progress(self) -> float:
         """Position in the schedule, in [0, 1]: of the time limit when there is one, else of the steps."""
@@ -231,6 +235,8 @@ class _Loop:
         seen = False
         with disk_errors(self.place.folder):
             while (progress := self.progress()) < 1:
+                if self.trainer.steps in MEASURED_STEPS and self.state["largest_batch"] is None:
+                    self._fit_into_time()
                 self.trainer.step(progress)
                 self.state.update(progress=progress, seconds=self.clock.seconds())
                 now = time.perf_counter()
@@ -250,6 +256,18 @@ class _Loop:
                 self.report.check()
             self.state["progress"] = 1.0
             self._write_event(1.0, max(time.perf_counter() - last_event, 1e-3))
+
+    def _fit_into_time(self) -> None:
+        """Let a short training have enough steps, by how long its first ones take."""
+        first, last = MEASURED_STEPS
+        if self.time_limit is None:
+            return
+        if self.trainer.steps == first:
+            self.measured_from = self.clock.seconds()
+        elif self.measured_from is not None:
+            each = (self.clock.seconds() - self.measured_from) / (last - first)
+            self.trainer.largest_batch = largest_batch(self.info.config.train, self.time_limit, each)
+            self.state["largest_batch"] = self.trainer.largest_batch
 
     def _warn(self, measured: Measured) -> None:
         """Say once what keeps training from using all that it computes."""

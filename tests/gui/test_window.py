@@ -309,9 +309,8 @@ def test_labels_from_strokes_on_photos(suite):
     assert (click["shape"], erased["erase"], void["class_id"], void["erase"]) == ("part", True, None, False)
     for cut, (x, y) in zip(facts["cut out"], facts["cut out at"]):
         assert cut["shape"] == "outline"
-        assert np.mean(cut["points"], axis=0) == pytest.approx([x, y], abs=1.5), (
-            "what the model cuts out is where the mouse was"
-        )
+        middle = (np.min(cut["points"], axis=0) + np.max(cut["points"], axis=0)) / 2
+        assert middle == pytest.approx([x, y], abs=1.5), "what the model cuts out is where the mouse was"
     assert facts["next"][0] != facts["next"][1]
     assert "signal 9" in facts["death"]
     before, after = facts["after death"]

@@ -88,7 +88,7 @@ class FIELDWORK_OT_label_propagate(ProjectOperator):
 
 @scene_settings(run="run")
 class FIELDWORK_OT_label_overlay(ProjectOperator):
-    """Write a picture of the labels of the photo that is shown, and open it"""
+    """Write a picture of the labels of the photo that is shown"""
 
     bl_idname = "fieldwork.label_overlay"
     bl_label = "Write Label Picture"

@@ -17,6 +17,7 @@ from ..errors import EngineError
 from . import journal
 
 RETRY = 2.0  # seconds until what the engine did not take is sent again
+LOST = 10.0  # seconds without an answer after which the same is done: an engine that was stopped answers nothing
 REFUSED = ("setting", "input", "refused")  # kinds of errors that the same mark would meet again
 
 Answer = Callable[[dict[str, Any] | None, EngineError | None], None]
@@ -108,9 +109,9 @@ def send(ask: Ask, at_once: bool = False) -> None:
     for wish in list(_wishes):
         first = wish.folder not in seen
         seen.add(wish.folder)
-        if not first or wish.sent or (now < wish.due and not at_once):
+        if not first or (now < wish.due and (wish.sent or not at_once)):
             continue
-        wish.sent = True
+        wish.sent, wish.due = True, now + LOST
         try:
             ask(wish.verb, {"project": str(wish.folder), **wish.params}, _taker(wish))
         except EngineError as error:

@@ -100,6 +100,26 @@ def test_a_mark_that_is_refused_is_dropped_and_the_next_one_goes_on(tmp_path):
     assert len(journal.marks(tmp_path)) == 1
 
 
+def test_a_mark_that_is_never_answered_is_sent_again(tmp_path, monkeypatch):
+    """An engine that was stopped by its button answers nothing more."""
+    now, engine, answers = [100.0], Engine(tmp_path), []
+    monkeypatch.setattr(pending.time, "monotonic", lambda: now[0])
+    pending.mark(tmp_path, LINE)
+    pending.send(lambda verb, params, answer: engine(verb, params, lambda *given: answers.append((answer, given))))
+    assert len(journal.marks(tmp_path)) == 1
+    for seconds in (1.0, pending.LOST - 2.0):
+        now[0] += seconds
+        pending.send(engine, at_once=True)
+    assert len(engine.asked) == 1
+    now[0] += 2.0
+    pending.send(engine)
+    assert not pending.waiting()
+    assert len(journal.marks(tmp_path)) == 1, "it is there once"
+    ((answer, given),) = answers
+    answer(*given)
+    assert len(pending.take()) == 1, "a late answer is none"
+
+
 def test_a_mark_without_an_engine_waits(tmp_path):
     def missing(verb, params, answer):
         raise EngineError("missing", "The engine is not installed.")

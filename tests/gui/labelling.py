@@ -107,6 +107,7 @@ def labels(screen):
     yield from first_strokes(screen, desk, begin)
     yield from undo(screen, desk)
     yield from other_tools(screen, desk)
+    yield from model(screen, desk)
     yield from next_photo(screen, desk)
     yield from killed(screen, desk)
     yield from accept(screen, desk)
@@ -214,6 +215,27 @@ def other_tools(screen, desk):
     lines = (desk.folder / "marks/journal.jsonl").read_text().splitlines()
     screen.facts["tools"] = [json.loads(line) for line in lines[-3:]]
     desk.settings.label_tool = "brush"
+
+
+def model(screen, desk):
+    """A click, and a box that is dragged, are answered by a model from files; Ctrl-Z takes both back."""
+    desk.settings.label_tool = "click"
+    desk.settings.label_encoder, desk.settings.label_decoder = desk.plan["encoder"], desk.plan["decoder"]
+    before, journal = desk.shown, desk.folder / "marks/journal.jsonl"
+    count = len(journal.read_text().splitlines())
+    for number, points in enumerate(([(180, 120)], [(100, 60), (130, 90), (140, 100)]), 1):
+        yield from desk.stroke(points)
+        wanted = count + number
+        yield from screen.wait(lambda wanted=wanted: desk.shown == wanted, 60, "the model was not asked")
+        yield from desk.settled()
+    screen.facts["cut out"] = [json.loads(line) for line in journal.read_text().splitlines()[-2:]]
+    screen.facts["cut out at"] = [(180, 120), (120, 80)]
+    screen.shot("model")
+    for _ in range(2):
+        yield from desk.key("Z", ctrl=True)
+    yield from screen.wait(lambda: desk.shown == before, 20, "Ctrl-Z did not take back what the model cut out")
+    yield from desk.settled()
+    desk.settings.label_tool, desk.settings.label_encoder = "brush", ""
 
 
 def next_photo(screen, desk):

@@ -273,6 +273,8 @@ def overlay_that_is_seen(shot: Path, opaque: dict, project: Path, revision: int)
 @pytest.mark.parametrize("suite", ["sid", "trixie"])
 def test_labels_from_strokes_on_photos(suite):
     """Scribbles, undo, a click, the next photo, an engine that is killed, accepting, the file loaded again."""
+    from fieldwork.tests.nerfcore.support import onnx_models as tiny_models
+
     root = window.BLENDER_ROOT if suite == "sid" else window.OLDER_ROOT
     reason = window.missing(root, suite)
     if reason:
@@ -283,7 +285,9 @@ def test_labels_from_strokes_on_photos(suite):
     names = ["stone", "gilding", "wood", "textile", "ceramic", "floor", "wall"]
     strokes = strokes_for(names, ["IMG_0001", "IMG_0013"], 0)
     plan = session.folder / "plan.json"
-    plan.write_text(json.dumps({"project": str(project), "classes": names, "strokes": strokes}))
+    models = {"encoder": tiny_models.encoder, "decoder": tiny_models.sam_decoder}
+    files = {name: str(make(session.folder / f"{name}.onnx")) for name, make in models.items()}
+    plan.write_text(json.dumps({"project": str(project), "classes": names, "strokes": strokes, **files}))
     session.environment["FIELDWORK_LABELLING"] = str(plan)
     facts = session.play("labels", timeout=900)
     assert facts["classes"] == names
@@ -303,6 +307,10 @@ def test_labels_from_strokes_on_photos(suite):
     assert stored == newest
     click, erased, void = facts["tools"]
     assert (click["shape"], erased["erase"], void["class_id"], void["erase"]) == ("part", True, None, False)
+    for cut, (x, y) in zip(facts["cut out"], facts["cut out at"]):
+        assert cut["shape"] == "outline"
+        middle = (np.min(cut["points"], axis=0) + np.max(cut["points"], axis=0)) / 2
+        assert middle == pytest.approx([x, y], abs=1.5), "what the model cuts out is where the mouse was"
     assert facts["next"][0] != facts["next"][1]
     assert "signal 9" in facts["death"]
     before, after = facts["after death"]

@@ -23,7 +23,6 @@ from . import worker
 
 NODES_EVERY = 2.0
 NAMESPACE = "fieldwork"
-BEFORE_HEAD_IS_GONE = "10"  # seconds that a head may be silent
 
 
 @ray.remote(num_cpus=0, max_restarts=0)
@@ -91,7 +90,7 @@ class Bridge:
             self._collect()
             if time.monotonic() - looked > NODES_EVERY:
                 looked = time.monotonic()
-                told = ray.get(self.board.take.remote(), timeout=10)
+                told = ray.get(self.board.take.remote(), timeout=30)
                 for task, text in told.items():
                     self.say("told", id=task, **json.loads(text))
                 self.say("nodes", nodes=nodes())

@@ -22,7 +22,7 @@ log = logging.getLogger("fieldwork.cluster")
 INSTALL = 'Install it on this machine and on the workers: pip install "fieldwork[cluster]".'
 START = "Start one (ray start --head), or use --cluster auto."
 BRIDGE_STARTS = 60.0  # seconds at most
-SILENT = 25.0  # seconds after which a bridge that says nothing is given up
+SILENT = 45.0  # seconds after which a bridge that says nothing is given up
 PAUSE = 2.0  # seconds between two attempts to reach a head that is gone
 
 

@@ -25,7 +25,7 @@ WRITTEN = ("out", "blend", "report", "renders")
 # Of a project, what a stage does not fetch: COLMAP's files only where poses are estimated.
 NOT_READ = {"new": ("poses/sfm/", "runs/", "exports/"), "poses": ("runs/", "exports/", "labels/")}
 SAVE_EVERY = 30.0  # seconds, as often as training writes a checkpoint
-LOCK_PATIENCE = 20.0  # seconds: a worker that was given up may hold the project for a moment longer
+LOCK_PATIENCE = 90.0  # seconds: a worker whose head is gone may hold the project until it notices
 
 
 def run_stage(values: dict[str, Any], report: Reporter) -> dict[str, Any]:

@@ -96,8 +96,9 @@ def plan(captures: list[Capture], folder: Path, storage: str | None = None) -> l
                 )
         if params.report is not None:
             check_report(params.report)
-        # Parts of a render would write one list of files at the same time.
-        parts = [] if storage else frame_ranges(params.render_count)
+        # Parts would write one list of files at the same time; with a limit of time nobody knows yet how many frames fit.
+        whole = storage or params.time_limit is not None
+        parts = [] if whole else frame_ranges(params.render_count)
         shares = 0 if storage else matching_shares(photos_in(params.photos))
         tasks += capture_tasks(params, priority, parts, {"folder": str(folder), "storage": storage}, shares)
     return tasks

@@ -11,8 +11,11 @@ import json
 import os
 import queue
 import sys
+import tempfile
 import threading
 import time
+import zipfile
+from pathlib import Path
 from typing import IO, Any
 
 import ray
@@ -23,7 +26,6 @@ from . import worker
 
 NODES_EVERY = 2.0
 NAMESPACE = "fieldwork"
-BEFORE_HEAD_IS_GONE = "10"  # seconds that a head may be silent
 
 
 @ray.remote(num_cpus=0, max_restarts=0)
@@ -53,6 +55,7 @@ def run_task(text: str, task: str, board: Any) -> str:
 class Bridge:
     def __init__(self, out: IO[str]) -> None:
         self.out, self.lock = out, threading.Lock()
+        self.scratch = tempfile.TemporaryDirectory(prefix="fieldwork-wheel-")
         self.refs: dict[Any, str] = {}
         self.commands: queue.Queue[dict[str, Any] | None] = queue.Queue()
 
@@ -63,7 +66,7 @@ class Bridge:
 
     def connect(self, address: str, must_exist: bool, wheel: str) -> bool:
         """Join the cluster; for “auto” one of this machine, or a new one where none runs. Whether it was joined."""
-        environment = {"py_modules": [wheel]} if wheel else {}
+        environment = {"py_modules": unpacked(Path(wheel), Path(self.scratch.name))} if wheel else {}
         shared: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR", "namespace": NAMESPACE}
         shared["runtime_env"] = environment or None
         try:
@@ -91,7 +94,7 @@ class Bridge:
             self._collect()
             if time.monotonic() - looked > NODES_EVERY:
                 looked = time.monotonic()
-                told = ray.get(self.board.take.remote(), timeout=10)
+                told = ray.get(self.board.take.remote(), timeout=30)
                 for task, text in told.items():
                     self.say("told", id=task, **json.loads(text))
                 self.say("nodes", nodes=nodes())
@@ -145,6 +148,13 @@ class Bridge:
                 self.say("lost", id=task, reason=f"{type(error).__name__}: {str(error).splitlines()[0]}")
 
 
+def unpacked(wheel: Path, folder: Path) -> list[str]:
+    """The package folders in a wheel, unpacked: of a wheel itself Ray would install all requirements again on each worker."""
+    with zipfile.ZipFile(wheel) as packed:
+        packed.extractall(folder)
+    return [str(path) for path in sorted(folder.iterdir()) if path.is_dir() and not path.name.endswith(".dist-info")]
+
+
 def unusable(error: Exception) -> dict[str, str]:
     """What it means that a worker cannot even begin."""
     last = str(error).strip().splitlines()[-1]
@@ -180,6 +190,7 @@ def main() -> None:
     except Exception as error:  # noqa: BLE001 - the boundary of the process: the parent tells the user
         bridge.say("fatal", message=f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}")
     ray.shutdown()
+    bridge.scratch.cleanup()
     os._exit(0)
 
 

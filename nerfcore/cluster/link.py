@@ -13,16 +13,17 @@ import subprocess
 import sys
 import threading
 import time
+import zipfile
 from pathlib import Path
 from typing import Any
 
-from ..errors import FieldworkError, SettingError
+from ..errors import FieldworkError, InputError, SettingError
 
 log = logging.getLogger("fieldwork.cluster")
 INSTALL = 'Install it on this machine and on the workers: pip install "fieldwork[cluster]".'
 START = "Start one (ray start --head), or use --cluster auto."
 BRIDGE_STARTS = 60.0  # seconds at most
-SILENT = 25.0  # seconds after which a bridge that says nothing is given up
+SILENT = 45.0  # seconds after which a bridge that says nothing is given up
 PAUSE = 2.0  # seconds between two attempts to reach a head that is gone
 
 
@@ -36,6 +37,12 @@ def require_ray() -> None:
     """Raise SettingError where the optional extra is not installed."""
     if importlib.util.find_spec("ray") is None:
         raise SettingError("--cluster needs Ray, which is not installed here.", INSTALL)
+
+
+def check_wheel(wheel: Path | None) -> None:
+    """Raise InputError unless a wheel that was given is one."""
+    if wheel is not None and not (wheel.suffix == ".whl" and zipfile.is_zipfile(wheel)):
+        raise InputError(f"--wheel {wheel} is no wheel.", "Give the .whl file that `pip wheel` made of Fieldwork.")
 
 
 def check_address(address: str) -> None:
@@ -52,6 +59,7 @@ class Link:
     def __init__(self, address: str, wheel: Path | None = None, reconnect: float = 300.0) -> None:
         require_ray()
         check_address(address)
+        check_wheel(wheel)
         self.address, self.wheel, self.reconnect = address, wheel, reconnect
         self.joined = False
         self.process: subprocess.Popen[bytes] | None = None

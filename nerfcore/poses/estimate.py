@@ -56,20 +56,13 @@ def estimate_poses(params: PosesParams, report: Reporter) -> dict[str, Any]:
             "Add photos with `fieldwork new --add`; twenty to a hundred around the subject work well.",
         )
     inputs = posing_inputs(folder, project, params)
-    work = folder / WORK_FOLDER
-    with disk_errors(work):
-        work.mkdir(parents=True, exist_ok=True)
-        same = _forget_changed(work, records)
-        # Where a photo that has a pose is another one now, the poses around it are worth nothing.
-        anew = params.restart or params.group or not same
-        previous = None if anew else _extendable(folder, records)
-        masks = _prepare_masks(folder, work, records, report)
-    result = run_worker(_job(folder, project, records, masks, params, extend=previous is not None), work, report)
+    job = pose_job(folder, project, params, report)
+    result = run_worker(job, folder / WORK_FOLDER, report)
     # Classes and region may have been edited meanwhile.
     with edit_project(folder) as project:
         records = _usable(project)
         poses, points, visibility = _poses(result, records)
-        _update_project(project, records, poses, points, result, keep_frame=previous is not None)
+        _update_project(project, records, poses, points, result, keep_frame=job["start"] is not None)
         save_poses(folder, poses, points, visibility)
         answer = {
             "registered": len(poses.images),
@@ -94,6 +87,23 @@ def estimate_poses(params: PosesParams, report: Reporter) -> dict[str, Any]:
         where = f"{len(missing)} of {answer['total']} photos have no pose"
         report.warn(f"{shortened(where, missing)} {folder / REPORT_FILE} says why.")
     return answer
+
+
+def pose_job(folder: Path, project: Project, params: PosesParams, report: Reporter) -> dict[str, Any]:
+    """What the pose process is asked for, with masks where it looks for them; features of other photos are thrown away.
+
+    Raises:
+        DiskError, Cancelled.
+    """
+    records, work = _usable(project), folder / WORK_FOLDER
+    with disk_errors(work):
+        work.mkdir(parents=True, exist_ok=True)
+        same = _forget_changed(work, records)
+        # Where a photo that has a pose is another one now, the poses around it are worth nothing.
+        anew = params.restart or params.group or not same
+        previous = None if anew else _extendable(folder, records)
+        masks = _prepare_masks(folder, work, records, report)
+    return _job(folder, project, records, masks, params, extend=previous is not None)
 
 
 def in_groups(groups: list[int], used: int) -> str:

@@ -15,7 +15,7 @@ import pycolmap
 from ..errors import PosesError
 from ..files import write_json
 from ..geometry.colmap_cameras import camera_from_colmap
-from . import chain, features, mapping, merge, second_look
+from . import chain, features, mapping, matching_parts, merge, second_look
 from .adjust import adjust, has_long_lens, has_odd_lens
 from .presets import ENOUGH, EXHAUSTIVE_AT_MOST, EXHAUSTIVE_UP_TO, LADDERS, Level
 from .resume import mapping_folder
@@ -53,7 +53,7 @@ def run(job: dict[str, Any], tell: Any) -> dict[str, Any]:
 
     Job: image_folder, masks (or null), work and sparse (folders), preset, neighbours, video (all are
     frames in order), restart (forget earlier mappings), group (which of several separate models), start (a model to
-    extend, or null), images [{file, group, width, height, focal_px}].
+    extend, or null), images [{file, group, width, height, focal_px}]; only (features or match: just these) and part.
 
     Returns:
         {cameras, images [{file, status, reason, camera, camera_to_world, agreement, points, error_px, mates}], links,
@@ -63,6 +63,10 @@ def run(job: dict[str, Any], tell: Any) -> dict[str, Any]:
     """
     work = Path(job["work"])
     work.mkdir(parents=True, exist_ok=True)
+    if job.get("only") == "features":
+        return matching_parts.find_features(job, tell)
+    if job.get("only") == "match":
+        return matching_parts.match_part(job, tell)
     if job["restart"]:
         shutil.rmtree(work / "mapping", ignore_errors=True)
     names = [image["file"] for image in job["images"]]
@@ -127,7 +131,9 @@ def _attempt(job: dict[str, Any], level: Level, names: list[str], exhaustive: bo
     if exhaustive:
         pairs = features.all_pairs(names)
     else:
-        pairs = features.likely_pairs(path, names, job["neighbours"], tell)
+        chosen = matching_parts.planned_pairs(work, level.database, names)
+        pairs = features.likely_pairs(path, names, job["neighbours"], tell) if chosen is None else chosen
+    matching_parts.gather(work, path)
     features.match(path, pairs, work / "pairs.txt", tell)
     contradicting = _tell_apart(job, path, names, tell)
     start = None

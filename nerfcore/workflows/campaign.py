@@ -31,6 +31,7 @@ PHOTO_GB = {"poses": 0.02, "new": 0.01}  # a photo that is worked on, with its f
 BYTES_A_PIXEL = 5  # colour, alpha and label
 FIELD_FLOATS = 4  # value, gradient, two moments
 SMALLEST_GPU_GB = 8.0  # shares of a GPU are for one of this size
+MANY_PHOTOS, MOST_SHARES = 200, 16  # from so many on pairs are matched in parts, at most so many
 PART = 32  # frames of a render that one worker makes
 SHOWN = (("failed", 8), ("running", 20), ("waiting", 4))  # captures in the terminal's table
 WRITE_EVERY, PAGE_EVERY = 2.0, 10.0  # seconds
@@ -95,16 +96,19 @@ def plan(captures: list[Capture], folder: Path, storage: str | None = None) -> l
                 )
         if params.report is not None:
             check_report(params.report)
-        # Parts of a render would write one list of files at the same time.
-        parts = [] if storage else frame_ranges(params.render_count)
-        tasks += capture_tasks(params, priority, parts, {"folder": str(folder), "storage": storage})
+        # Parts would write one list of files at the same time; with a limit of time nobody knows yet how many frames fit.
+        whole = storage or params.time_limit is not None
+        parts = [] if whole else frame_ranges(params.render_count)
+        shares = 0 if storage else matching_shares(photos_in(params.photos))
+        tasks += capture_tasks(params, priority, parts, {"folder": str(folder), "storage": storage}, shares)
     return tasks
 
 
 def capture_tasks(
-    params: ReconstructParams, priority: int, parts: list[tuple[int, int]], shared: dict[str, Any]
+    params: ReconstructParams, priority: int, parts: list[tuple[int, int]], shared: dict[str, Any], shares: int = 0
 ) -> list[Task]:
-    """The tasks of one capture, one after the other; frames of its render in parts beside each other."""
+    """The tasks of one capture, one after the other; beside each other are `parts` of the frames of its render, and
+    `shares` of the pairs of its photos to match."""
     key, before, tasks = str(params.out), (), []
     values = {"capture": params.model_dump(mode="json"), **shared}
     memory = memory_gb(params)
@@ -116,6 +120,9 @@ def capture_tasks(
         return tasks[-1].id
 
     for stage in stages_of(params):
+        if stage == "poses" and shares:
+            before = (add("poses features", before, matching="features"),)
+            before = tuple(add(f"poses pairs {k + 1}", before, matching=[k, shares]) for k in range(shares))
         if stage == "render" and parts:
             before = tuple(add(f"render {first}-{last}", before, frame_range=[first, last]) for first, last in parts)
         before = (add(stage, before),)
@@ -127,6 +134,11 @@ def frame_ranges(count: int) -> list[tuple[int, int]]:
     if count <= PART:
         return []
     return [(first, min(first + PART, count) - 1) for first in range(0, count, PART)]
+
+
+def matching_shares(photos: int) -> int:
+    """In how many parts the pairs of so many photos are matched; 0 where it is not worth it."""
+    return 0 if photos < MANY_PHOTOS else min(MOST_SHARES, photos // (MANY_PHOTOS // 2))
 
 
 def memory_gb(params: ReconstructParams) -> dict[str, float]:
@@ -239,7 +251,7 @@ class Campaign:
 
     def _made(self, params: ReconstructParams, tasks: list[Task]) -> dict[str, Any]:
         """The result of all stages together, as `reconstruct` returns it."""
-        made = {task.stage: task.answer["result"] for task in tasks if not task.values.get("frame_range")}
+        made = {task.stage: task.answer["result"] for task in tasks if task.stage in stages_of(params)}
         made = {stage: answer for stage, answer in made.items() if answer["result"] is not None}
         try:
             result = summed_up(

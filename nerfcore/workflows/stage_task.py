@@ -13,7 +13,8 @@ from ..capture.find import classes_beside, subfolder
 from ..cluster.storage import Copy, Saving, Storage, placed, work_folder
 from ..cluster.worker import require_inside
 from ..errors import ProjectError
-from ..params import ReconstructParams, RenderParams
+from ..params import PosesParams, ReconstructParams, RenderParams
+from ..poses.spread import find_features, match_part
 from ..progress import Reporter
 from ..project.fingerprints import digest
 from ..project.lock import lockable, project_lock
@@ -24,14 +25,15 @@ WRITTEN = ("out", "blend", "report", "renders")
 # Of a project, what a stage does not fetch: COLMAP's files only where poses are estimated.
 NOT_READ = {"new": ("poses/sfm/", "runs/", "exports/"), "poses": ("runs/", "exports/", "labels/")}
 SAVE_EVERY = 30.0  # seconds, as often as training writes a checkpoint
-LOCK_PATIENCE = 20.0  # seconds: a worker that was given up may hold the project for a moment longer
+LOCK_PATIENCE = 90.0  # seconds: a worker whose head is gone may hold the project until it notices
 
 
 def run_stage(values: dict[str, Any], report: Reporter) -> dict[str, Any]:
     """Do one stage of a capture, unless what is there is still good.
 
     Args:
-        values: "capture": settings of reconstruct; "stage"; "frame_range": of a part of the stage render; "folder": of the campaign, the only one that is written in;
+        values: "capture": settings of reconstruct; "stage"; "frame_range": of a part of the stage render; "matching": of poses only “features”,
+            or one of so many parts of the pairs, as [number, parts]; "folder": of the campaign, the only one that is written in;
             "storage": None, or the URL from which files are fetched into a folder of this machine, and left.
     Returns:
         {"result": what the verb returned, None where it had nothing to do, "seconds", "reused", "redone": why or None}
@@ -61,6 +63,8 @@ def do_stage(values: dict[str, Any], report: Reporter) -> dict[str, Any]:
     verb = values["stage"]
     if values.get("frame_range"):
         return _render_part(params, tuple(values["frame_range"]), report)
+    if values.get("matching"):
+        return _matching(params, values["matching"], report)
     with _project(params, report):
         made = run_stages(params, [verb], report)
     return {
@@ -82,6 +86,17 @@ def _render_part(params: ReconstructParams, frames: tuple[int, int], report: Rep
     result = stage.run(part, report) if earlier.result is None else earlier.result
     seconds = round(time.perf_counter() - begin, 1)
     return {"result": result, "seconds": seconds, "reused": earlier.result is not None, "redone": None}
+
+
+def _matching(params: ReconstructParams, what: str | list[int], report: Reporter) -> dict[str, Any]:
+    """The features of a large capture, or a part of its pairs while others match the rest."""
+    begin, values = time.perf_counter(), PosesParams(project=Path(params.out))
+    if isinstance(what, str):
+        with _project(params, report):
+            result = find_features(values, report)
+    else:
+        result = match_part(values, what[0], what[1], report)
+    return {"result": result, "seconds": round(time.perf_counter() - begin, 1), "reused": False, "redone": None}
 
 
 def capture_name(params: ReconstructParams, folder: Path) -> str:

@@ -18,7 +18,7 @@ from fieldwork.nerfcore.cluster.link import Link
 from fieldwork.nerfcore.cluster.run import Options, Runner, limited
 from fieldwork.nerfcore.cluster.tasks import Need, Task, Tasks
 from fieldwork.nerfcore.console import ConsoleReporter, campaign_table
-from fieldwork.nerfcore.errors import Cancelled, PosesError, SettingError
+from fieldwork.nerfcore.errors import Cancelled, InputError, PosesError, SettingError
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.workflows.campaign import plan
 from fieldwork.nerfcore.workflows.captures import read_list
@@ -361,6 +361,14 @@ def test_only_addresses_are_taken(address, monkeypatch):
         Link(address)
     for fine in ("auto", "head:6379", "10.0.0.1:6379", "ray://head.lan:10001", "[::1]:6379"):
         Link(fine)
+
+
+def test_a_wheel_that_is_none_is_told(tmp_path, monkeypatch):
+    monkeypatch.setattr(link, "require_ray", lambda: None)
+    (tmp_path / "a.whl").write_text("no archive")
+    for wheel in (tmp_path / "a.whl", tmp_path / "none.whl", tmp_path):
+        with pytest.raises(InputError, match="is no wheel"):
+            Link("auto", wheel)
 
 
 def rows() -> list[dict[str, Any]]:

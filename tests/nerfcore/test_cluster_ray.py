@@ -7,6 +7,7 @@ import os
 import random
 import threading
 import time
+import zipfile
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,6 +21,7 @@ from fieldwork.nerfcore.params import BatchParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.workflows import batch as batch_module
 from fieldwork.nerfcore.workflows import campaign
+from fieldwork.nerfcore.workflows import reconstruct as reconstruct_module
 from fieldwork.nerfcore.workflows.batch import BatchError, batch
 from fieldwork.tests.nerfcore.support import cluster_work
 from fieldwork.tests.nerfcore.support.ray_cluster import Cluster, write_list
@@ -128,6 +130,20 @@ def test_another_version_is_refused_with_a_sentence(tmp_path, cluster, monkeypat
         work_on(path, cluster)
     assert "No worker could be used" in str(failure.value)
     assert not (tmp_path / "a_fieldwork").exists()
+
+
+def test_workers_use_the_wheel_that_is_given(tmp_path, cluster):
+    wheel, root = tmp_path / "fieldwork-0.1.0-py3-none-any.whl", Path(cluster_work.__file__).parents[3]
+    folders = [root / "nerfcore", root / "tests" / "nerfcore" / "support"]
+    with zipfile.ZipFile(wheel, "w") as packed:
+        for path in [root / "__init__.py", *(path for folder in folders for path in sorted(folder.rglob("*")))]:
+            if path.is_file() and "__pycache__" not in path.parts:
+                packed.write(path, Path("fieldwork") / path.relative_to(root))
+    path = write_list(tmp_path, ["a"])
+    work_on(path, cluster, wheel=wheel)
+    code = captures(path)[str(tmp_path / "a_fieldwork")]["result"]["new"]["code"]
+    assert Path(code).parts[-4:] == ("tests", "nerfcore", "support", "cluster_work.py")
+    assert not Path(code).is_relative_to(root), "a worker used its own code"
 
 
 def test_a_full_disk_pauses_the_campaign(tmp_path, cluster, monkeypatch):

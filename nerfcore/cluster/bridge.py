@@ -20,6 +20,7 @@ from typing import IO, Any
 
 import ray
 from ray import exceptions as failures
+from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from .. import __version__
 from . import worker
@@ -82,7 +83,7 @@ class Bridge:
         joined = self.connect(address, must_exist, wheel)
         here = ray.get_runtime_context().get_node_id()
         self.board = Board.options(  # pyright: ignore[reportAttributeAccessIssue] - what ray.remote makes of it
-            scheduling_strategy=ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(here, soft=True)
+            scheduling_strategy=NodeAffinitySchedulingStrategy(here, soft=True)
         ).remote()
         ray.get(self.board.take.remote())
         self.say("ready", joined=joined, version=__version__, nodes=nodes())
@@ -94,7 +95,7 @@ class Bridge:
             self._collect()
             if time.monotonic() - looked > NODES_EVERY:
                 looked = time.monotonic()
-                told = ray.get(self.board.take.remote(), timeout=30)
+                told: Any = ray.get(self.board.take.remote(), timeout=30)
                 for task, text in told.items():
                     self.say("told", id=task, **json.loads(text))
                 self.say("nodes", nodes=nodes())

@@ -21,7 +21,6 @@ from fieldwork.nerfcore.params import BatchParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.workflows import batch as batch_module
 from fieldwork.nerfcore.workflows import campaign
-from fieldwork.nerfcore.workflows import reconstruct as reconstruct_module
 from fieldwork.nerfcore.workflows.batch import BatchError, batch
 from fieldwork.tests.nerfcore.support import cluster_work
 from fieldwork.tests.nerfcore.support.ray_cluster import Cluster, write_list

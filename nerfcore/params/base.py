@@ -1,0 +1,70 @@
+"""What parameters have in common: names, sizes, bounds, and what is checked of all of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+
+from ..files import is_text, name_problem, printable
+
+# Bounds that only mistakes go beyond.
+LARGEST_PICTURE = 32768  # pixels on a side
+MANY = 1_000_000  # photos, frames
+LONGEST_RUN = 1_000_000_000  # steps or seconds
+MASK_MODE = (
+    "what black mask pixels mean; default: empty where masks cut an object out of nearly all photos, else ignore"
+)
+Preset = Literal["draft", "standard", "high"]
+Split = Literal["none", "classes", "instances"]
+Pass = Literal["rgb", "depth", "semantic", "confidence", "normal", "unknown"]
+
+
+def _leaves_some(every: int) -> int:
+    if every == 1:
+        raise ValueError("1 would hold out every photo; give 0 for none, or 2 and more")
+    return every
+
+
+Holdout = Annotated[
+    int,
+    Field(
+        ge=0,
+        le=MANY,
+        description="every so many photos, one is held out for `evaluate`; 0: all are trained on, for a final field",
+    ),
+    AfterValidator(_leaves_some),
+]
+
+
+def _checked_name(name: str) -> str:
+    problem = name_problem(name)
+    if problem:
+        raise ValueError(problem)
+    return name
+
+
+RunName = Annotated[str, Field(description="name of the run"), AfterValidator(_checked_name)]
+
+
+def _picture(size: tuple[int, int]) -> tuple[int, int]:
+    if not all(1 <= side <= LARGEST_PICTURE for side in size):
+        raise ValueError(f"{size[0]}x{size[1]} is no size of a picture: sides have 1 to {LARGEST_PICTURE} pixels")
+    return size
+
+
+PictureSize = Annotated[tuple[int, int], AfterValidator(_picture)]
+
+
+class Params(BaseModel):
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+    @model_validator(mode="after")
+    def _paths_are_text(self) -> Self:
+        """project.json and what is printed are UTF-8: a path of other bytes could be read and never written down."""
+        for name in type(self).model_fields:
+            path = getattr(self, name)
+            if isinstance(path, Path) and not is_text(str(path)):
+                raise ValueError(f"the path {printable(str(path))} is not UTF-8: rename it")
+        return self

@@ -1,0 +1,66 @@
+"""What the verbs of a field are asked for: training, measuring, baking, rendering."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal, Self
+
+from pydantic import Field, model_validator
+
+from .base import LONGEST_RUN, MANY, Holdout, Params, Pass, PictureSize, Preset, RunName
+
+
+class TrainParams(Params):
+    project: Path
+    preset: Preset = "standard"
+    run: RunName = "main"
+    holdout: Holdout = 8
+    time_limit: float | None = Field(default=None, gt=0, le=LONGEST_RUN, description="seconds of training")
+    steps: int | None = Field(default=None, gt=0, le=LONGEST_RUN, description="optimisation steps")
+    set: dict[str, str] = Field(default_factory=dict, description="settings by name, e.g. loss.semantic=0.1")
+    resume: bool = False
+
+
+class EvaluateParams(Params):
+    project: Path
+    run: RunName = "main"
+    split: Literal["test", "train"] = "test"
+    speed: bool = Field(default=False, description="measure frames of 800x800 too; on a CPU this can take minutes")
+    baked: bool = Field(default=False, description="measure the baked field, and what it lost against the field")
+    time_limit: float | None = Field(
+        default=None, gt=0, le=LONGEST_RUN, description="seconds; as many photos, evenly spread, as fit: at least one"
+    )
+
+
+class BakeParams(Params):
+    project: Path
+    run: RunName = "main"
+    memory: float = Field(
+        default=100, ge=2, le=1500, description="megabytes of graphics memory that the baked field takes at most"
+    )
+
+
+class RenderParams(Params):
+    project: Path
+    out: Path
+    run: RunName = "main"
+    test: bool = Field(default=False, description="from the held-out photos")
+    all: bool = Field(default=False, description="from every photo, also those of training")
+    camera: Path | None = None
+    orbit: int | None = Field(default=None, gt=0, le=MANY)
+    size: PictureSize | None = Field(
+        default=None, description="WxH; cut where a camera has other proportions (held-out and all photos: resampled)"
+    )
+    passes: list[Pass] = ["rgb", "depth", "semantic"]
+    baked: bool = Field(default=False, description="from the baked field, which is faster, instead of the field")
+    frame_range: tuple[int, int] | None = Field(
+        default=None,
+        description="first and last frame of these, counted from 0, to render only a part: several programs may render "
+        "parts of one render at the same time, and a render of all keeps what they made",
+    )
+
+    @model_validator(mode="after")
+    def _range_goes_up(self) -> Self:
+        if self.frame_range is not None and not 0 <= self.frame_range[0] <= self.frame_range[1]:
+            raise ValueError(f"frame_range: {self.frame_range[0]} to {self.frame_range[1]} is no range of frames")
+        return self

@@ -1,0 +1,90 @@
+"""What the verbs that run others are asked for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field
+
+from .base import LONGEST_RUN, MANY, MASK_MODE, Holdout, Params, Preset
+
+
+class ReconstructParams(Params):
+    photos: Path
+    out: Path
+    preset: Preset = "standard"
+    labels: Path | None = None
+    masks: Path | None = None
+    mask_mode: Literal["ignore", "empty"] | None = Field(default=None, description=MASK_MODE)
+    classes: Path | None = None
+    blend: Path | None = None
+    time_limit: float | None = Field(
+        default=None,
+        gt=0,
+        le=LONGEST_RUN,
+        description="seconds of training; all that comes after it gets half as much and a minute",
+    )
+    holdout: Holdout = 8
+    set: dict[str, str] = Field(default_factory=dict)
+    faces: int = Field(default=200_000, ge=0, le=1_000_000_000, description="triangles of the mesh; 0: all there are")
+    texture: int = Field(
+        default=4096, ge=0, le=16384, description="size of the mesh's texture in pixels; 0: vertex colours only"
+    )
+    report: Path | None = Field(default=None, description="report to write, .html or .pdf")
+    renders: Path | None = Field(default=None, description="folder for renders of new views")
+    render_count: int = Field(
+        default=8, ge=1, le=MANY, description="number of renders of new views, around the subject"
+    )
+
+
+class BatchParams(Params):
+    list: Path = Field(description=".csv or .json file with one capture a row: the settings of reconstruct by name")
+    retries: int = Field(default=1, ge=0, le=1000, description="how often a capture that failed is tried again")
+    report: Path | None = Field(default=None, description="JSON report to write; default: LIST-report.json beside it")
+    cluster: str | None = Field(
+        default=None,
+        description="spread the captures over a Ray cluster: HOST:PORT, or auto for one of this machine; default: one "
+        "capture after the other",
+    )
+    storage: str | None = Field(
+        default=None,
+        description="with --cluster: where workers take files from and leave them, s3://BUCKET/FOLDER for instance; "
+        "default: the list's folder, which all of them see at the same place",
+    )
+    wheel: Path | None = Field(default=None, description="with --cluster: wheel of Fieldwork that workers are to use")
+    keep_free: float = Field(
+        default=2.0,
+        ge=0,
+        le=1e6,
+        description="with --cluster: a worker with fewer GB free on its disk gets nothing to do",
+    )
+
+
+class BenchParams(Params):
+    suite: Literal["figures", "speed", "ablation", "robustness", "baselines", "gpu", "surface", "labels"] = Field(
+        description="which table"
+    )
+    out: Path = Field(default=Path("build/bench"), description="folder for results and scenes; finished runs are kept")
+    data: Path | None = Field(default=None, description="folder of data sets; default: ../shared/data when it is there")
+    scenes: list[str] | None = Field(
+        default=None, description="data sets, simulated scenes (museum, facade, fence, vase), or capture projects"
+    )
+    variants: list[str] | None = Field(default=None, description="only these variants of the suite")
+    seconds: float | None = Field(
+        default=None, gt=0, le=LONGEST_RUN, description="seconds of training a run, instead of the suite's"
+    )
+    steps: int | None = Field(
+        default=None, gt=0, le=LONGEST_RUN, description="steps of training a run, instead of the suite's"
+    )
+    seeds: list[int] | None = Field(default=None, description="a run for each of these seeds, instead of the suite's")
+    preset: Preset = "standard"
+    set: dict[str, str] = Field(
+        default_factory=dict, description="settings changed in every run, but for what a variant changes"
+    )
+    keep: bool = Field(default=False, description="keep the trained fields in OUT/projects")
+    yardstick: Path | None = Field(default=None, description="speed: script of another trainer to run beside ours")
+    page: Path | None = Field(
+        default=None, description="Markdown page written anew from the folder figures beside it, which gets this table"
+    )
+    tests: Path | None = Field(default=None, description="gpu: JUnit file of the kernels' tests")

@@ -118,7 +118,7 @@ class FieldworkRenderEngine(bpy.types.RenderEngine):
         try:
             frame = frames().render(shot, sizes, self.test_break, tell, None if bpy.app.background else show)
             self._put(result, frame.passes, space)
-        except EngineError:
+        except BaseException:
             self.end_result(result, cancel=True)
             raise
         finally:

@@ -21,7 +21,6 @@ from fieldwork.nerfcore.params import BatchParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.workflows import batch as batch_module
 from fieldwork.nerfcore.workflows import campaign
-from fieldwork.nerfcore.workflows import reconstruct as reconstruct_module
 from fieldwork.nerfcore.workflows.batch import BatchError, batch
 from fieldwork.tests.nerfcore.support import cluster_work
 from fieldwork.tests.nerfcore.support.ray_cluster import Cluster, write_list
@@ -242,6 +241,7 @@ def test_a_worker_that_stands_still_is_given_up(tmp_path, cluster, monkeypatch):
     assert sum(entry["losses"] for entry in captures(path).values()) >= 1
 
 
+@pytest.mark.timeout(900)  # on a busy machine
 def test_two_workers_are_faster_than_one(tmp_path, cluster):
     """24 captures of the same work, with one of the workers and with both."""
     seconds = {}

@@ -107,7 +107,8 @@ def campaign_table(status: dict[str, Any]) -> Table:
     counts = status["counts"]
     head = ", ".join(f"{counts[state]} {state}" for state in ("done", "failed", "running", "waiting"))
     left = "" if status["eta_s"] is None else f", about {time_text(status['eta_s'])} left"
-    table = Table(title=f"{status['campaign']}: {head}, {status['workers']} workers{left}", title_justify="left")
+    workers = "1 worker" if status["workers"] == 1 else f"{status['workers']} workers"
+    table = Table(title=f"{status['campaign']}: {head}, {workers}{left}", title_justify="left")
     for name in ("capture", "state", "stage", "done", "left"):
         table.add_column(name, justify="right" if name in ("done", "left") else "left")
     for row in status["captures"]:

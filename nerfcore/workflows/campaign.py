@@ -189,6 +189,7 @@ class Campaign:
         self.pictures: dict[str, str] = {}
         self.copies: dict[str, Copy] = {}
         self.progress: Progress | None = None
+        self.closed = False
         self.noted = self.written = self.paged = 0.0
 
     def share(self, todo: list[Capture], folder: Path, url: str) -> None:
@@ -282,7 +283,8 @@ class Campaign:
             st.write_status(self.folder, value, page)
 
     def close(self, state: str) -> None:
-        """Write what is known, at the end."""
+        """Write what is known, at the end: what was running waits for the next time."""
+        self.closed = True
         st.write_status(self.folder, self._status(state), page=True)
         for key, entry in list(self.entries.items())[-1:]:
             self.note(key, entry, True)
@@ -311,6 +313,6 @@ class Campaign:
             return st.capture_row(key, "waiting", **known)
         eta = ends.get(tasks[-1].id)
         known |= {"stage": task.stage, "eta_s": None if eta is None else round(eta, 1)}
-        begun = task.state == "running" or bool(results)
+        begun = not self.closed and (task.state == "running" or bool(results))
         fraction = (len(results) + task.fraction) / len(tasks)
         return st.capture_row(key, "running" if begun else "waiting", fraction=round(fraction, 3), **known)

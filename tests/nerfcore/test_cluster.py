@@ -416,7 +416,7 @@ def test_the_table_in_the_terminal():
     console.print(campaign_table(value))
     lines = console.export_text().splitlines()
     title = " ".join(line.strip() for line in lines[: next(i for i, line in enumerate(lines) if "┏" in line)])
-    assert "1 done, 1 failed, 1 running, 1 waiting, 1 workers, about 1.7 h left" in title
+    assert "1 done, 1 failed, 1 running, 1 waiting, 1 worker, about 1.7 h left" in title
     assert next(i for i, line in enumerate(lines) if "bad" in line) < next(
         i for i, line in enumerate(lines) if "run " in line
     )

@@ -109,7 +109,8 @@ def test_cancelling_takes_less_than_five_seconds_and_the_campaign_goes_on_later(
     with pytest.raises(Cancelled):
         work_on(path, cluster, report)
     assert time.monotonic() - report.cancelled_at < 5.0
-    assert json.loads((tmp_path / "captures-campaign/status.json").read_text())["state"] == "cancelled"
+    status = json.loads((tmp_path / "captures-campaign/status.json").read_text())
+    assert (status["state"], status["counts"]["running"]) == ("cancelled", 0)
     before = {log.parent.name: sum(steps_of(log.parent).values()) for log in tmp_path.glob("*/steps.log")}
     assert before
     time.sleep(1.5)
@@ -241,6 +242,7 @@ def test_a_worker_that_stands_still_is_given_up(tmp_path, cluster, monkeypatch):
     assert sum(entry["losses"] for entry in captures(path).values()) >= 1
 
 
+@pytest.mark.timeout(900)  # on a busy machine
 def test_two_workers_are_faster_than_one(tmp_path, cluster):
     """24 captures of the same work, with one of the workers and with both."""
     seconds = {}

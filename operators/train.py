@@ -119,9 +119,23 @@ class FIELDWORK_OT_evaluate(ProjectOperator):
         options={"SKIP_SAVE"},
     )
 
+    time_limit: FloatProperty(
+        name="Time Limit",
+        description="As many photos are compared as fit into so many seconds; 0: all",
+        default=0.0,
+        min=0.0,
+        options={"SKIP_SAVE"},
+    )
+
     def parameters(self, context: Context) -> dict[str, Any]:
-        project, run = self.project_path(context), self.value(context, "run")
-        return {"project": project, "run": run, "split": self.split, "speed": self.speed, "baked": self.baked}
+        return {
+            "project": self.project_path(context),
+            "run": self.value(context, "run"),
+            "split": self.split,
+            "speed": self.speed,
+            "baked": self.baked,
+            "time_limit": self.time_limit or None,
+        }
 
 
 @scene_settings(run="run")

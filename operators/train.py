@@ -126,14 +126,6 @@ class FIELDWORK_OT_evaluate(ProjectOperator):
         options={"SKIP_SAVE"},
     )
 
-    time_limit: FloatProperty(
-        name="Time Limit",
-        description="As many photos are compared as fit into so many seconds; 0: all",
-        default=0.0,
-        min=0.0,
-        options={"SKIP_SAVE"},
-    )
-
     def parameters(self, context: Context) -> dict[str, Any]:
         return {
             "project": self.project_path(context),

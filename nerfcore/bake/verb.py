@@ -124,7 +124,7 @@ def training_rays(folder: Path, run: str, trained: Trained, scene: Scene, box_fr
 def visible_blocks(trained: Trained, rays: CameraRays, memory: float, check: Check) -> Blocks:
     """The blocks that rays of training cameras see, of the finest grid with which they fit into so many bytes."""
     model, side, first = trained.model, max(1, FINEST // 2), True
-    model.refine(check=check)
+    model.refine(check=check, everywhere=True)
     grid = visible_grid(model, model.render_grid(), rays, check)
     while True:
         found = read_blocks(model, grid, side, check)

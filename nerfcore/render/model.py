@@ -137,20 +137,26 @@ class Model(nn.Module):
         flat = bool((self.priorities == self.priorities[0]).all())
         return s.beta > 0 and (s.importance == "boundary" or (s.importance == "priority" and not flat))
 
-    def refine(self, pixels: float = math.inf, check: Callable[[], None] | None = None) -> None:
+    def refine(
+        self, pixels: float = math.inf, check: Callable[[], None] | None = None, everywhere: bool = False
+    ) -> None:
         """Render from now on with a finer grid if it pays for so many pixels, or has been kept. Training leaves it behind:
-        for fields that are finished."""
-        c = self.config.render
+        for fields that are finished.
+
+        `everywhere`: also where no training ray had weight, for those who ask which cells hide others; never kept.
+        """
+        c, kept = self.config.render, None if everywhere else self.kept_grid
         if self._refined is not None or c.refine == 1:
             return
-        fine = self.kept_grid.load(c.refine, self.device) if self.kept_grid is not None else None
+        fine = kept.load(c.refine, self.device) if kept is not None else None
         if fine is None:
-            shown = self.field.blend.shown(self.config.sampling.resolution) if self.field.blend is not None else None
+            blend = None if everywhere else self.field.blend
+            shown = None if blend is None else blend.shown(self.config.sampling.resolution)
             fine = read_fine(self.occupancy, self.field.density, c.refine, pixels, shown, check)
             if fine is None:
                 return
-            if self.kept_grid is not None:
-                self.kept_grid.save(c.refine, fine)
+            if kept is not None:
+                kept.save(c.refine, fine)
         self._refined = refined_grid(self.occupancy, fine, c.per_bin)
 
     @property

@@ -52,6 +52,21 @@ def test_a_field_is_read_once_for_all_its_pictures(model: Model, tmp_path: Path)
     assert refined(model, kept, pixels=1.0)[0] is not None  # kept, it pays for any picture
 
 
+def test_whoever_asks_what_hides_what_reads_it_everywhere(model: Model, tmp_path: Path) -> None:
+    path = tmp_path / "grid.safetensors"
+    _, few = refined(model, KeptGrid(path, "one"))
+    points = sum(model.reads)  # type: ignore[arg-type]
+    model._refined = None
+    model.reads.clear()  # type: ignore[operator]
+    model.refine(everywhere=True)
+    assert few > 0
+    # An untrained field has evidence nowhere.
+    assert sum(model.reads) > 100 * points  # type: ignore[arg-type]
+    fine = KeptGrid(path, "one").load(2, CPU)
+    assert fine is not None
+    assert fine.density.numel() * 4 == points
+
+
 def test_another_training_reads_its_own(model: Model, tmp_path: Path) -> None:
     path = tmp_path / "grid.safetensors"
     refined(model, KeptGrid(path, "one"))

@@ -33,7 +33,7 @@ def test_what_training_depends_on(place: Path, values: dict[str, Any], reason: s
     """Before, the old run was kept silently and the new settings went into the provenance."""
     before = checkpoint_id(place / "p", "main")
     result = call(place, **values)
-    assert redone(result) == ["train", "evaluate", "mesh", "render"]
+    assert redone(result) == ["train", "mesh", "evaluate", "render"]
     assert reason.startswith(result["redone"]["train"])
     assert "trained field" in result["redone"]["mesh"]
     assert checkpoint_id(place / "p", "main") != before
@@ -46,7 +46,7 @@ def test_what_training_depends_on(place: Path, values: dict[str, Any], reason: s
 @pytest.mark.parametrize("setting", ["render.accumulate=logits", "render.cull=0.001"])
 def test_settings_of_rendering_that_training_reads(place: Path, setting: str) -> None:
     result = call(place, set={**SETTINGS, **dict([setting.split("=")])})
-    assert redone(result) == ["train", "evaluate", "mesh", "render"]
+    assert redone(result) == ["train", "mesh", "evaluate", "render"]
     assert result["redone"]["train"] == "changed: settings"
 
 
@@ -64,7 +64,7 @@ def test_settings_that_only_pictures_depend_on(place: Path, monkeypatch: pytest.
     field = checkpoint_id(place / "p", "main")
     asked = {"render.samples": "5", "render.per_bin": "0", "render.refine": "1", "render.fused": "off"}
     result = call(place, set={**SETTINGS, **asked})
-    assert redone(result) == ["train", "evaluate", "mesh", "render"]
+    assert redone(result) == ["train", "mesh", "evaluate", "render"]
     assert result["redone"]["train"] == "changed: settings of rendering; the trained field is kept"
     assert checkpoint_id(place / "p", "main") == field
     assert result["train"]["steps"] == 8
@@ -75,7 +75,7 @@ def test_settings_that_only_pictures_depend_on(place: Path, monkeypatch: pytest.
     assert step is not None
     assert step.settings["config"]["render"]["samples"] == 5
     assert call(place, set={**SETTINGS, **asked})["reused"] == STAGES
-    assert redone(call(place)) == ["train", "evaluate", "mesh", "render"]
+    assert redone(call(place)) == ["train", "mesh", "evaluate", "render"]
     assert checkpoint_id(place / "p", "main") == field
 
 

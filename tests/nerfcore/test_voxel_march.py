@@ -71,8 +71,10 @@ def test_backends_agree(device: torch.device, contracted: bool, step: float) -> 
     _, field = random_field()
     origins, directions = random_rays()
     here = settings(contracted, step)
-    expected = voxel_march_torch.march(origins, directions, field, here)
-    found = march(origins.to(device), directions.to(device), moved(field, device), here)
+    ends = torch.full((len(origins),), here.far)
+    ends[::3] = torch.linspace(1.0, 4.0, len(ends[::3]))
+    expected = voxel_march_torch.march(origins, directions, field, here, ends)
+    found = march(origins.to(device), directions.to(device), moved(field, device), here, ends.to(device))
     assert float(expected.opacity.mean()) > 0.03
     assert largest_difference(found, expected) < 1e-4
     assert torch.allclose(found.depth.cpu(), expected.depth, rtol=1e-3, atol=1e-4)

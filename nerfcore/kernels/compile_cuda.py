@@ -18,7 +18,20 @@ from pathlib import Path
 import warp as wp
 
 from ..files import write_json, write_section, write_text
-from . import cells, closest, composite, encode, encode_points, march, patches, raycast, surface, triangles, voxel_march
+from . import (
+    cells,
+    closest,
+    composite,
+    encode,
+    encode_points,
+    march,
+    patches,
+    random_reads,
+    raycast,
+    surface,
+    triangles,
+    voxel_march,
+)
 from .fused import LANES
 from .fused_kernel import fused_kernel
 from .fused_shape import FusedShape
@@ -27,7 +40,20 @@ from .resources import Resources, disassembler, markdown, read_resources
 from .runtime import CUDA_BLOCK, init
 
 ARCHITECTURES = (75, 86, 89, 90, 120)
-SOURCES = (encode, encode_points, march, composite, cells, surface, patches, raycast, closest, triangles, voxel_march)
+SOURCES = (
+    encode,
+    encode_points,
+    march,
+    composite,
+    cells,
+    surface,
+    patches,
+    raycast,
+    closest,
+    triangles,
+    voxel_march,
+    random_reads,
+)
 # The standard preset: without classes, with few, with the most; and the branches blended.
 _STANDARD = FusedShape(
     levels=8, octaves=8, concat=True, width=64, geometry=16, color_layers=3, appearance=0, classes=16, logits=False

@@ -9,10 +9,12 @@ import re
 import sys
 import tempfile
 import time
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 from .errors import InputError, disk_refusal
 
@@ -21,6 +23,7 @@ READERS_TAKE = 5.0  # seconds at most that a file which is to be replaced may st
 LONGEST_NAME = 64  # characters of a name that the user gives, of a run for instance
 # Windows keeps these for devices, whatever comes behind a dot.
 _DEVICES = {"con", "prn", "aux", "nul", *(f"{kind}{i}" for kind in ("com", "lpt") for i in "0123456789¹²³")}
+UNREADABLE_ARRAYS = (OSError, EOFError, ValueError, BadZipFile, zlib.error)  # what damaged .npy and .npz raise
 
 
 def name_problem(name: str) -> str | None:

@@ -40,6 +40,8 @@ class Asset:
 
     def load(self) -> None:
         """Load the next texture."""
+        from ...nerfcore.files import UNREADABLE_ARRAYS  # not at the top: enabling the extension must be quick
+
         try:
             if self.index is None:
                 self.index = _texture((self.found.meta["side"],) * 3, "R32F", voxels.read_index(self.found))
@@ -47,7 +49,7 @@ class Asset:
                 name = voxels.TEXELS[len(self.texels)]
                 data = voxels.read_texels(self.found, name)
                 self.texels.append(_texture(voxels.texture_size(self.found.meta), "RGBA8", data))
-        except (OSError, ValueError, RuntimeError, MemoryError) as error:
+        except (*UNREADABLE_ARRAYS, RuntimeError, MemoryError) as error:
             self.error = str(error)
 
     def table(self, rows: list[float]) -> Any:

@@ -46,7 +46,7 @@ def texture_size(meta: dict[str, Any]) -> tuple[int, int, int]:
 
 
 def read_texels(found: Baked, name: str) -> Any:
-    """The bytes of a texture as numbers in [0, 1]: flat float32, x fastest. Raises OSError, ValueError: it is damaged."""
+    """The bytes of a texture as numbers in [0, 1]: flat float32, x fastest. Raises one of UNREADABLE_ARRAYS: it is damaged."""
     import numpy as np
 
     array = np.load(found.folder / f"{name}.npy", mmap_mode="r")
@@ -57,7 +57,7 @@ def read_texels(found: Baked, name: str) -> Any:
 
 
 def read_index(found: Baked) -> Any:
-    """The index of the blocks: flat float32, x fastest. Raises OSError, ValueError: it is damaged."""
+    """The index of the blocks: flat float32, x fastest. Raises one of UNREADABLE_ARRAYS: it is damaged."""
     import numpy as np
 
     side = found.meta["side"]

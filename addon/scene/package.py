@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -132,8 +131,10 @@ def sketch_package(path: Path, owner: Owner, project: dict[str, Any]) -> Package
 
 
 def _arrays(path: Path) -> dict[str, np.ndarray]:
+    from ...nerfcore.files import UNREADABLE_ARRAYS  # not at the top: enabling the extension must be quick
+
     try:
         with np.load(path, allow_pickle=False) as data:
             return {name: data[name] for name in data.files}
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
+    except UNREADABLE_ARRAYS as error:
         raise PackageError(f"{path} cannot be read: {error}.") from error

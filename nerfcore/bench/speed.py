@@ -18,8 +18,7 @@ from ..kernels.device import synchronize
 from ..progress import Reporter
 from ..project.store import load_project
 from ..render.image import CPU_RAYS, render_view
-from ..render.model import Model
-from ..render.run import load_trained
+from ..render.run import Trained, load_trained
 from ..train.prepare import make_trainer, plan_run
 from ..train.trainer import Trainer
 from .jobs import Job
@@ -59,7 +58,7 @@ def measure(job: Job, project: Path, report: Reporter) -> dict[str, Any]:
     model = trained.model
     report.stage("Measuring the machine")
     before = measure_rates(model.field, trained.device)
-    found = {**_frame(model, project, job, report), **_steps(job, project, report)}
+    found = {**_frame(trained, project, report), **_steps(job, project, report)}
     after = measure_rates(model.field, trained.device)
     # What was there while both were measured: other programs come and go.
     rates = Rates(*(max(a, b) for a, b in zip(asdict(before).values(), asdict(after).values())))
@@ -86,9 +85,9 @@ def measure(job: Job, project: Path, report: Reporter) -> dict[str, Any]:
 
 
 @torch.no_grad()
-def _frame(model: Model, project: Path, job: Job, report: Reporter) -> dict[str, Any]:
+def _frame(trained: Trained, project: Path, report: Reporter) -> dict[str, Any]:
     """Seconds of a picture with classes, the best of three, and its samples."""
-    info = load_trained(project, job.name).info
+    model, info = trained.model, trained.info
     scene = load_scene(project, info.holdout)
     view = scene.views[(scene.test or scene.train)[0]]
     box = info.box(load_project(project))

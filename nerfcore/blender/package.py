@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import zipfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,7 +25,7 @@ from PIL import Image
 from ..data.load import load_scene
 from ..data.scene import Scene, View
 from ..errors import InputError, ProjectError
-from ..files import atomic_path, disk_errors, write_json
+from ..files import UNREADABLE_ARRAYS, atomic_path, disk_errors, write_json
 from ..geometry.cameras import Camera, flip_camera_axes, pixel_centers, project, rays
 from ..images.encode import write_picture
 from ..images.picture import Picture, as_float, associated, to_srgb8
@@ -271,7 +270,7 @@ def _copy_mesh(source: Path, target: Path) -> bool:
     try:
         with np.load(source, allow_pickle=False) as data:
             missing = [name for name in MESH_ARRAYS if name not in data]
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
+    except UNREADABLE_ARRAYS as error:
         raise ProjectError(f"{source} is damaged: {error}.", "Run `fieldwork mesh` again.") from error
     if missing:
         raise ProjectError(f"{source} lacks {', '.join(missing)}.", "Run `fieldwork mesh` again.")

@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 from pathlib import Path
 from typing import IO
-from zipfile import BadZipFile, ZipFile
+from zipfile import ZipFile
 
 import numpy as np
 from numpy.lib import format as npy
 
 from ..errors import InputError
+from ..files import UNREADABLE_ARRAYS
 
 
 def read_array(path: Path) -> np.ndarray:
@@ -31,7 +32,7 @@ def read_array(path: Path) -> np.ndarray:
             first = archive.infolist()[0]
             with archive.open(first) as file:
                 return _read(file, first.file_size, path.name)
-    except (OSError, ValueError, BadZipFile, NotImplementedError) as error:
+    except (*UNREADABLE_ARRAYS, NotImplementedError) as error:
         raise InputError(f"{path.name} cannot be read: {error}") from error
     except MemoryError as error:
         raise InputError(f"{path.name} is larger than the memory") from error

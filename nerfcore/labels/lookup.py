@@ -7,17 +7,17 @@ runs/RUN/revisions/N.npz                           the labels of the surfels at 
 from __future__ import annotations
 
 import json
-import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 
+from ..files import UNREADABLE_ARRAYS
+
 SURFELS, RECORD = "surfels", "prepared.json"
 REVISIONS = "revisions"
-UNREADABLE = (OSError, EOFError, ValueError, KeyError, TypeError, BadZipFile, zlib.error)  # what damaged files raise
+UNREADABLE = (*UNREADABLE_ARRAYS, KeyError, TypeError)  # what damaged files raise
 LEAST = 0.5  # probability of all classes together below which a surfel is void
 
 

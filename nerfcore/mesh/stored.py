@@ -7,12 +7,12 @@ from contextlib import contextmanager
 from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 from PIL import Image
 
 from ..errors import ProjectError
+from ..files import UNREADABLE_ARRAYS
 from ..project.fingerprints import digest, read_made, rounded
 from ..project.runs import MESH_RECORD
 from ..project.schema import ProvenanceStep
@@ -66,7 +66,7 @@ def _reading(path: Path, missing: str) -> Iterator[Any]:
             yield data
     except FileNotFoundError as error:
         raise ProjectError(missing, "Run `fieldwork mesh`.") from error
-    except (OSError, ValueError, KeyError, BadZipFile) as error:
+    except (*UNREADABLE_ARRAYS, KeyError) as error:
         raise ProjectError(f"{path} is damaged: {error}.", "Run `fieldwork mesh` again.") from error
 
 

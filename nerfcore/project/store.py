@@ -18,14 +18,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
-from zipfile import BadZipFile
 
 import numpy as np
 from filelock import FileLock, Timeout
 from pydantic import BaseModel, ValidationError
 
 from ..errors import ProjectError, wrong_value
-from ..files import atomic_path, disk_errors, write_json
+from ..files import UNREADABLE_ARRAYS, atomic_path, disk_errors, write_json
 from ..geometry.points import Points
 from .migrate import migrated
 from .schema import FORMAT, VERSION, Poses, Project
@@ -156,7 +155,7 @@ def load_points(folder: Path) -> Points:
     try:
         with np.load(path, allow_pickle=False) as data:
             return Points(data["xyz"], data["rgb"], data["error"])
-    except (ValueError, OSError, KeyError, BadZipFile) as error:
+    except (*UNREADABLE_ARRAYS, KeyError) as error:
         raise ProjectError(f"{path} is damaged: {error}.", "Run `fieldwork poses` again.") from error
 
 
@@ -170,7 +169,7 @@ def load_visibility(folder: Path) -> dict[str, np.ndarray]:
             if "view" not in data:
                 return {}
             view, point = data["view"], data["point"]
-    except (ValueError, OSError, KeyError, BadZipFile) as error:
+    except (*UNREADABLE_ARRAYS, KeyError) as error:
         raise ProjectError(f"{path} is damaged: {error}.", "Run `fieldwork poses` again.") from error
     return {image.name: point[view == i] for i, image in enumerate(load_poses(folder).images)}
 

@@ -26,7 +26,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from ..errors import ProjectError
 from ..field.environment import EnvironmentRays
-from ..files import disk_errors, write_json
+from ..files import UNREADABLE_ARRAYS, disk_errors, write_json
 from ..kernels.device import use_device
 from ..kernels.traversal import MarchSettings
 from ..kernels.voxel_field import CELLS, VERTICES, VoxelField, VoxelRays, cell_length
@@ -260,7 +260,7 @@ def _read(path: Path, shape: tuple[int, ...], dtype: type) -> np.ndarray:
     """A file's array, mapped into memory. Raises ProjectError when it is missing, truncated or of another shape."""
     try:
         array = np.load(path, mmap_mode="r")
-    except (OSError, ValueError, EOFError) as error:
+    except UNREADABLE_ARRAYS as error:
         raise _damaged(path, "it cannot be read to its end") from error
     if array.shape != shape or array.dtype != dtype:
         raise _damaged(path, f"it holds {array.dtype} {array.shape}, not {np.dtype(dtype)} {shape}")

@@ -302,8 +302,8 @@ class Model(nn.Module):
 
         if torch.is_grad_enabled():
             return shade(ray_indices, chosen)
-        rows = torch.arange(len(ray_indices), device=ray_indices.device) if chosen is None else chosen
-        return read_in_slices(shade, ray_indices, rows)  # type: ignore[return-value]
+        assert chosen is not None  # two passes are made for gradients only
+        return read_in_slices(shade, ray_indices, chosen)  # type: ignore[return-value]
 
     def _environment(
         self,

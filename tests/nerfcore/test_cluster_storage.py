@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from fieldwork.nerfcore.cluster import storage as module
 from fieldwork.nerfcore.cluster.storage import Copy, Saving, Storage, StorageError, placed
 from fieldwork.nerfcore.cluster.worker import Refusal
 from fieldwork.nerfcore.errors import SettingError
+from fieldwork.nerfcore.files import atomic_path
 from fieldwork.nerfcore.params import ReconstructParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.workflows.campaign import plan
@@ -149,11 +151,12 @@ def test_checkpoints_are_saved_while_a_stage_runs(tmp_path, url):
     (tmp_path / "one/vase").mkdir()
     with Saving(one, every=0.1):
         (tmp_path / "one/vase/field.bin").write_bytes(b"checkpoint")
-        deadline = 200
-        while not two.fetch() and deadline:
-            deadline -= 1
+        deadline = time.monotonic() + 60
+        while not two.fetch() and time.monotonic() < deadline:
+            time.sleep(0.05)
         assert (tmp_path / "two/vase/field.bin").read_bytes() == b"checkpoint"
-        (tmp_path / "one/vase/field.bin").write_bytes(b"the end")
+        with atomic_path(tmp_path / "one/vase/field.bin") as temporary:
+            temporary.write_bytes(b"the end")
     two.fetch()
     assert (tmp_path / "two/vase/field.bin").read_bytes() == b"the end"
 

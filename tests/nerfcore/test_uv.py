@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 
 import numpy as np
@@ -66,22 +65,29 @@ def test_faces_without_area_get_a_place() -> None:
     assert made.corners.max() <= 1
 
 
+class Impatient(Reporter):
+    """Cancels two seconds after the first progress."""
+
+    cancelled_at: float | None = None
+    began: float | None = None
+
+    def progress(self, fraction: float, message: str = "") -> None:
+        self.began = self.began or time.monotonic()
+        if self.cancelled_at is None and time.monotonic() > self.began + 2:
+            self.cancelled_at = time.monotonic()
+            self.cancel()
+        super().progress(fraction, message)
+
+
 def test_cancelled_unwrapping_ends_its_processes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(uv, "CHUNK_FACES", 100_000)
-    rough = trimesh.creation.icosphere(7)  # 327 680 faces in four chunks: much longer than the patience below
+    monkeypatch.setattr(uv, "CHUNK_FACES", 25_000)
+    rough = trimesh.creation.icosphere(6)  # 81 920 faces in four chunks: much longer than the patience
     vertices = rough.vertices * (1 + 0.05 * np.random.default_rng(0).normal(size=(len(rough.vertices), 1)))
-    report = Reporter()
-    cancelled_at: list[float] = []
-
-    def cancel() -> None:
-        cancelled_at.append(time.monotonic())
-        report.cancel()
-
-    timer = threading.Timer(3.0, cancel)
-    timer.start()
+    report = Impatient()
     with pytest.raises(Cancelled):
         uv.unwrap(vertices, rough.faces, 4096, report)
-    assert time.monotonic() - cancelled_at[0] < 2
+    assert report.cancelled_at is not None
+    assert time.monotonic() - report.cancelled_at < 2
     mine = psutil.Process().children(recursive=True)
     assert not [child for child in mine if "uv_worker" in " ".join(child.cmdline())]
 

@@ -6,13 +6,12 @@ that of `world_mat`; the sphere becomes the region of interest.
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from pathlib import Path
 
 import numpy as np
 
 from ...errors import InputError
+from ...files import UNREADABLE_ARRAYS
 from ...geometry.frames import upright
 from ...geometry.similarity import transform_points
 from ...images.decode import image_size
@@ -35,7 +34,7 @@ def read(folder: Path) -> Dataset:
     try:
         with np.load(path, allow_pickle=False) as data:
             matrices = {name: np.asarray(data[name], np.float64) for name in data.files}
-    except (OSError, ValueError, zipfile.BadZipFile, zlib.error) as error:
+    except UNREADABLE_ARRAYS as error:
         raise InputError(f"{path} cannot be read: {error}.", "Download the data set again.") from error
     images = next((found for name in ("image", "images", "rgb") if (found := list_images(folder / name))), [])
     masks = next((found for name in ("mask", "masks") if (found := list_images(folder / name))), [])

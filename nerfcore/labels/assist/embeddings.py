@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 
@@ -12,6 +11,7 @@ from ...images.picture import over
 from ...images.working import read_picture
 from ...project.fingerprints import digest
 from ...project.schema import ImageRecord
+from ..lookup import UNREADABLE
 from .segmenter import Segmenter
 
 FOLDER = "jobs/embeddings"
@@ -43,5 +43,5 @@ def _read(path: Path, count: int) -> list[np.ndarray] | None:
     try:
         with np.load(path, allow_pickle=False) as data:
             return [data[f"arr_{number}"].astype(np.float32) for number in range(count)]
-    except (OSError, EOFError, ValueError, KeyError, BadZipFile):
+    except UNREADABLE:
         return None

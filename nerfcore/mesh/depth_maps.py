@@ -9,7 +9,7 @@ from functools import partial
 
 import numpy as np
 import torch
-from scipy.ndimage import map_coordinates, maximum_filter, minimum_filter
+from scipy.ndimage import map_coordinates, maximum_filter, minimum_filter, uniform_filter
 
 from ..data.box import box_poses
 from ..data.camera_rays import CameraRays
@@ -208,7 +208,7 @@ def render_depth(model: Model, view: FlatView, check: Callable[[], None]) -> Dep
 def cosines(camera: Camera, depth: np.ndarray) -> np.ndarray:
     """Cosine (H, W) of the angle between each pixel's ray and the surface normal there; 0 where there is no surface or an
     outline."""
-    directions = _directions(camera)
+    directions = pixel_directions(camera)
     length = np.linalg.norm(directions, axis=-1)
     return (np.abs((normals(camera, depth) * directions).sum(-1)) / length).astype(np.float32)
 
@@ -217,7 +217,7 @@ def normals(camera: Camera, depth: np.ndarray) -> np.ndarray:
     """Unit normals (H, W, 3) in camera axes, towards the camera, from depth differences over one or two pixels; 0 where
     there is no surface or an outline."""
     solid = (depth > 0) & (depth < FREE)
-    points = _directions(camera) * np.where(solid, depth, 1)[..., None]
+    points = pixel_directions(camera) * np.where(solid, depth, 1)[..., None]
     edge = max(EDGE, EDGE_PIXELS / camera.fx)
     normal = np.cross(_slope(points, solid, 1, edge), _slope(points, solid, 0, edge))
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
@@ -225,7 +225,15 @@ def normals(camera: Camera, depth: np.ndarray) -> np.ndarray:
     return -normal * np.sign((normal * points).sum(-1, keepdims=True))
 
 
-def _directions(camera: Camera) -> np.ndarray:
+def smooth_normals(camera: Camera, depth: np.ndarray, size: int) -> np.ndarray:
+    """Normals (H, W, 3) as `normals` gives them, averaged over windows of `size` pixels; 0 where there is none."""
+    found = normals(camera, depth)
+    mean = np.stack([uniform_filter(found[..., k], size) for k in range(3)], -1)
+    length = np.linalg.norm(mean, axis=-1, keepdims=True)
+    return np.where(length > 0.1, mean / np.maximum(length, 1e-9), 0).astype(np.float32)
+
+
+def pixel_directions(camera: Camera) -> np.ndarray:
     """Where the pixels (H, W, 3) of a pinhole look, in camera axes, with z = 1."""
     place = pixel_centers(camera.width, camera.height)
     flat = (place - [camera.cx, camera.cy]) / [camera.fx, camera.fy]

@@ -18,16 +18,17 @@ from ..geometry.cameras import pixel_centers, project, rays
 from ..kernels.depth_arrays import FREE, MapArrays
 from ..kernels.patches import refine
 from ..progress import Reporter
-from .depth_maps import DepthMap, FlatView, confirmed_maps, cosines, map_arrays, neighbours, normals
+from .depth_maps import DepthMap, FlatView, confirmed_maps, cosines, map_arrays, neighbours, smooth_normals
 from .planes import with_planes
+from .scene_planes import known_points, on_scene_planes, scene_planes
 from .sky import backdrop, farthest, labels_tell, nothing
 
 VIEWS = 5  # neighbours whose photos are compared
 LEAST, GAIN = 0.6, 0.05  # correlation that is believed, and by how much it must exceed that of the field's depth
 FIELD_CONFIRMED = 3  # other views that must confirm a depth of the field where planes and photos found none
+SMOOTH = 5  # pixels over which normals are averaged
 SURE = 2.0  # pixels: the spread of a depth that photos confirm
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
-SMOOTH = 5  # pixels over which normals are averaged
 
 
 def grey_pictures(views: list[FlatView], store: PixelStore, report: Reporter) -> list[np.ndarray]:
@@ -70,8 +71,8 @@ def refined_maps(
     views: list[FlatView], maps: list[DepthMap], store: PixelStore, device: torch.device, report: Reporter
 ) -> tuple[MapArrays, float]:
     """Confirmed maps (see `depth_maps.confirmed_maps`) whose depths photos have moved, and the share of their depths that
-    views do confirm. Where views do not confirm a moved depth, the field's is asked again, or the plane through what is
-    known around (planes.py). Where they do not confirm that either, but three of them the field's own depth, it is taken, as
+    views do confirm. Where views do not confirm a moved depth, the field's is asked again, the plane through what is
+    known around (planes.py), or that of a wall or floor that goes on from elsewhere (scene_planes.py). Where they do not confirm that either, but three of them the field's own depth, it is taken, as
     far away as photos confirm depths. What label maps say is nothing (sky.py) has an unknown depth.
     """
     arrays = map_arrays(views, maps, device)
@@ -81,24 +82,32 @@ def refined_maps(
     moved = []
     for number, (view, map_) in enumerate(zip(views, maps)):
         report.progress(number / len(views))
-        facing = torch.from_numpy(smooth_normals(view, map_).reshape(-1, 3)).to(grey.device)
+        facing = torch.from_numpy(smooth_normals(view.camera, map_.depth, SMOOTH).reshape(-1, 3)).to(grey.device)
         near = torch.tensor(around[number][:VIEWS], dtype=torch.int32, device=grey.device)
         depth, _ = refine(grey, facing, arrays, number, near, LEAST, GAIN)
         moved.append(_with_depth(view, map_, depth.cpu().numpy().reshape(map_.depth.shape)))
     believed = confirmed_maps(views, moved, device, report, around)
-    sure = [kept & (new.depth != old.depth) for kept, old, new in zip(hits(believed, maps), maps, moved)]
+    kept = hits(believed, maps)
+    sure = [there & (new.depth != old.depth) for there, old, new in zip(kept, maps, moved)]
     left_out = [nameless(view, store) for view in views]
     told = labels_tell(sure, left_out)
-    mixed, fields = [], []
-    for view, old, new, safe, unnamed in zip(views, maps, moved, sure, left_out):
+    known, fields = [], []
+    for number, (view, old, new, unnamed) in enumerate(zip(views, maps, moved, left_out)):
+        safe = sure[number]
         depth = np.where(safe, new.depth, old.depth)
         if told and unnamed is not None:
             empty = nothing(unnamed, safe)
             depth, safe = np.where(empty & old.hit, 0, depth), safe & ~empty
+            sure[number] = safe
         depth = np.where(backdrop(depth, safe), 0, depth)
         spread = np.where(safe, np.minimum(old.spread, SURE * depth / view.camera.fx), old.spread)
         fields.append(trusted_field(old, depth, safe, unnamed if told else None))
-        mixed.append(with_planes(view, replace(old, depth=depth, spread=spread.astype(np.float32)), safe))
+        known.append(replace(old, depth=depth, spread=spread.astype(np.float32)))
+    planes = scene_planes(known_points(views, known, kept), report)
+    mixed = []
+    for view, map_, safe in zip(views, known, sure):
+        report.check()
+        mixed.append(on_scene_planes(view, map_, safe, with_planes(view, map_, safe), planes))
     final = confirmed_maps(views, mixed, device, report, around)
     final = with_holes_filled(final, confirmed_maps(views, fields, device, report, around, FIELD_CONFIRMED))
     asked = sum(int(map_.hit.sum()) for map_ in mixed)
@@ -134,11 +143,3 @@ def hits(arrays: MapArrays, maps: list[DepthMap]) -> list[np.ndarray]:
 
 def _with_depth(view: FlatView, map_: DepthMap, depth: np.ndarray) -> DepthMap:
     return replace(map_, depth=depth, cosine=cosines(view.camera, depth))
-
-
-def smooth_normals(view: FlatView, map_: DepthMap) -> np.ndarray:
-    """Normals (H, W, 3) in camera axes, towards the camera, averaged over a few pixels; 0 where there is none."""
-    found = normals(view.camera, map_.depth)
-    mean = np.stack([ndimage.uniform_filter(found[..., k], SMOOTH) for k in range(3)], -1)
-    length = np.linalg.norm(mean, axis=-1, keepdims=True)
-    return np.where(length > 0.1, mean / np.maximum(length, 1e-9), 0).astype(np.float32)

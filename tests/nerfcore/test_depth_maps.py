@@ -113,6 +113,7 @@ def test_where_planes_contradict_each_other_the_field_is_believed_as_far_as_phot
 
     monkeypatch.setattr(refine, "refine", moved)
     monkeypatch.setattr(refine, "with_planes", apart)
+    monkeypatch.setattr(refine, "scene_planes", lambda known, report: [])
     monkeypatch.setattr(refine, "grey_pictures", lambda views, store, report: [np.zeros(size, np.float32)] * len(flats))
     monkeypatch.setattr(refine, "nameless", lambda view, store: None)
     field = depth_maps.map_arrays(flats, maps, CPU).depth

@@ -1,0 +1,184 @@
+"""Planes of a scene: walls, floors and grounds, found where views confirm depths and continued to where photos do not.
+
+A white wall shows nothing that photos could be compared by, and a field that few cameras saw is off there by more than a
+pixel. But where a wall is known at one end, it mostly goes on: a depth that photos do not confirm is moved onto a plane
+of the scene, provided that the plane is known close by and the field's depth agrees with it as far as the field is sure.
+
+Source: planes by random samples, Schnabel, Wahl and Klein, "Efficient RANSAC for point-cloud shape detection", 2007.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt
+
+from ..progress import Reporter
+from .depth_maps import DepthMap, FlatView, cosines, pixel_directions, smooth_normals
+
+POINTS = 40_000  # that are looked at
+MOST = 12  # planes
+SHARE = 0.01  # of the area known that a plane must hold
+SOFT = 0.5  # share of its spread by which a depth may be wrong, but at least a footprint of a pixel
+TRIES, KEPT = 100, 12  # points whose tangent plane is tried, and the best of them that are fitted
+WIDTHS = (3.0, 2.0, 1.5, 1.5)  # errors around a plane in which points are its own, from fit to fit
+BESIDE = 4.0  # errors from a plane that was found, within which no other plane takes points
+TILTED = np.cos(np.radians(25))  # between the normal of a point and that of its plane
+SMOOTH = 13  # pixels over which normals are averaged: a plain wall's depths are noisy
+FEWEST = 20  # points of a plane
+CELL, REACH = 8.0, 12.0  # footprints along a cell of a plane, and cells by which a plane goes on beyond its points
+MOST_CELLS = 1024  # along a side
+AGREES, SPREADS, OFF = (
+    0.01,
+    1.5,
+    0.1,
+)  # share by which depths may be off a plane: at least, spreads of the field, at most
+STEEPEST = 0.05  # cosine under which a plane is not looked at
+FITTED_PIXELS = 3.0  # spread of a depth on a plane, in footprints
+
+
+@dataclass(frozen=True)
+class Known:
+    """Points (N, 3) that views confirm, their unit normals (N, 3) towards the camera, the footprint (N,) of a pixel there, and
+    by how much their depth may be wrong (N,)."""
+
+    points: np.ndarray
+    normals: np.ndarray
+    footprint: np.ndarray
+    error: np.ndarray
+
+
+@dataclass(frozen=True)
+class ScenePlane:
+    """Part of a plane: a point of it (3,), its unit normal (3,) towards the cameras, two axes (2, 3) in it, and which cells
+    (X, Y) bool it reaches into, of size `cell` from `low` (2,) on along the axes."""
+
+    point: np.ndarray
+    normal: np.ndarray
+    axes: np.ndarray
+    low: np.ndarray
+    cell: float
+    reached: np.ndarray
+
+    def holds(self, points: np.ndarray) -> np.ndarray:
+        """Whether points (N, 3) of the plane lie in what is reached."""
+        place = np.floor(((points - self.point) @ self.axes.T - self.low) / self.cell)
+        inside = ((place >= 0) & (place < self.reached.shape)).all(1)
+        found = np.zeros(len(points), bool)
+        found[inside] = self.reached[tuple(place[inside].astype(int).T)]
+        return found
+
+
+def known_points(views: Sequence[FlatView], maps: Sequence[DepthMap], confirmed: Sequence[np.ndarray]) -> Known:
+    """What views confirm, `confirmed` (H, W) bool of each map, thinned evenly."""
+    step = max(1, -(-sum(int(there.sum()) for there in confirmed) // POINTS))
+    parts = []
+    for view, map_, there in zip(views, maps, confirmed):
+        rows, columns = (part[::step] for part in np.nonzero(there & map_.hit))
+        normal = smooth_normals(view.camera, map_.depth, SMOOTH)[rows, columns]
+        facing = (normal != 0).any(1)
+        rows, columns, normal = rows[facing], columns[facing], normal[facing]
+        depth = map_.depth[rows, columns]
+        local = pixel_directions(view.camera)[rows, columns] * depth[:, None]
+        points = local @ view.pose[:3, :3].T + view.pose[:3, 3]
+        footprint = depth / view.camera.fx
+        error = np.maximum(SOFT * map_.spread[rows, columns], footprint)
+        parts.append((points, normal @ view.pose[:3, :3].T, footprint, error))
+    return Known(*(np.concatenate(part) for part in zip(*parts)))
+
+
+def scene_planes(known: Known, report: Reporter) -> list[ScenePlane]:
+    """The largest planes among known points, by area."""
+    area, rng = known.footprint**2, np.random.default_rng(0)
+    left, found = np.ones(len(area), bool), []
+    for _ in range(MOST):
+        report.check()
+        if area[left].sum() < SHARE * area.sum() or not left.any():
+            break
+        best = _largest(known, area, left, rng)
+        if best is None or area[best].sum() < SHARE * area.sum():
+            break
+        point, normal = _fit(known, area, best)
+        found.append(_reaching(known, best, point, normal))
+        left &= ~_near(known, point, normal, BESIDE)
+    return found
+
+
+def _largest(known: Known, area: np.ndarray, left: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
+    """The points, of those that are left, on the largest plane that was met; None where there is none."""
+    rows, best = np.flatnonzero(left), None
+    tried = []
+    for start in rng.choice(rows, min(TRIES, len(rows)), replace=False, p=area[rows] / area[rows].sum()):
+        on = left & _near(known, known.points[start], known.normals[start], WIDTHS[0])
+        tried.append((area[on].sum(), start))
+    for _, start in sorted(tried, reverse=True)[:KEPT]:
+        point, normal = known.points[start], known.normals[start]
+        for width in WIDTHS:
+            on = np.flatnonzero(left & _near(known, point, normal, width))
+            if len(on) < FEWEST:
+                break
+            point, normal = _fit(known, area, on)
+        if len(on) >= FEWEST and (best is None or area[on].sum() > area[best].sum()):
+            best = on
+    return best
+
+
+def _near(known: Known, point: np.ndarray, normal: np.ndarray, width: float) -> np.ndarray:
+    """Which points lie within `width` times their error of a plane and face as it does."""
+    off = np.abs((known.points - point) @ normal)
+    return (off < width * known.error) & (known.normals @ normal > TILTED)
+
+
+def _fit(known: Known, area: np.ndarray, on: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A point and the normal of the plane through points, by least squares weighted with their area over their error."""
+    weight = area[on] / known.error[on] ** 2
+    middle = np.average(known.points[on], axis=0, weights=weight)
+    around = (known.points[on] - middle) * np.sqrt(weight)[:, None]
+    normal = np.linalg.svd(around, full_matrices=False)[2][2]
+    return middle, normal * np.sign(normal @ known.normals[on].mean(0) or 1.0)
+
+
+def _reaching(known: Known, on: np.ndarray, point: np.ndarray, normal: np.ndarray) -> ScenePlane:
+    """The plane through points, as far as it reaches."""
+    first = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
+    first /= np.linalg.norm(first)
+    axes = np.stack([first, np.cross(normal, first)])
+    place = (known.points[on] - point) @ axes.T
+    cell = max(CELL * float(np.median(known.footprint[on])), float(np.ptp(place, axis=0).max()) / MOST_CELLS)
+    rim = int(REACH) + 1
+    low = place.min(0) - rim * cell
+    index = ((place - low) / cell).astype(int)
+    there = np.zeros(index.max(0) + rim + 1, bool)
+    there[tuple(index.T)] = True
+    return ScenePlane(point, normal, axes, low, cell, np.asarray(distance_transform_edt(~there)) <= REACH)
+
+
+def on_scene_planes(
+    view: FlatView, field: DepthMap, sure: np.ndarray, map_: DepthMap, planes: list[ScenePlane]
+) -> DepthMap:
+    """A depth map whose depths that are not `sure` (H, W) bool lie on a plane of the scene, where the field's own depth
+    agrees with one: the one closest to it.
+
+    Args:
+        field: the field's depths and spreads where it is not sure; map_: what becomes of them without such a plane.
+    """
+    rows, columns = np.nonzero(field.hit & ~sure)
+    ray = pixel_directions(view.camera)[rows, columns] @ view.pose[:3, :3].T
+    eye, depth = view.pose[:3, 3], field.depth[rows, columns]
+    allowed = np.clip(SPREADS * field.spread[rows, columns] / depth, AGREES, OFF)
+    moved = np.zeros(len(rows), np.float32)
+    for plane in planes:
+        towards = np.negative(ray @ plane.normal)
+        facing = towards > STEEPEST
+        reached = np.where(facing, ((eye - plane.point) @ plane.normal) / np.where(facing, towards, 1), 0)
+        off = np.abs(reached - depth) / depth
+        close = np.flatnonzero(off < allowed)
+        close = close[plane.holds(eye + ray[close] * reached[close, None])]
+        moved[close], allowed[close] = reached[close], off[close]
+    new, spread = map_.depth.copy(), map_.spread.copy()
+    found = moved > 0
+    new[rows[found], columns[found]] = moved[found]
+    spread[rows[found], columns[found]] = FITTED_PIXELS / view.camera.fx * moved[found]
+    return replace(map_, depth=new, spread=spread, cosine=cosines(view.camera, new))

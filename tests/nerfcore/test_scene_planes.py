@@ -1,0 +1,93 @@
+"""Planes of a scene: a wall that is known at one end goes on where photos say nothing, and only there."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from fieldwork.nerfcore.errors import Cancelled
+from fieldwork.nerfcore.geometry.cameras import Camera
+from fieldwork.nerfcore.mesh.depth_maps import DepthMap, FlatView, cosines, pixel_directions
+from fieldwork.nerfcore.mesh.scene_planes import known_points, on_scene_planes, scene_planes
+from fieldwork.nerfcore.progress import Reporter
+
+LENS = Camera(width=120, height=90, fx=100.0, fy=100.0, cx=60.0, cy=45.0)
+
+
+def looking(x: float, turn: float) -> FlatView:
+    """A view from (x, 0, 0) along z, turned around y."""
+    pose = np.eye(4)
+    pose[:3, :3] = [[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]]
+    pose[0, 3] = x
+    return FlatView(LENS, pose, 0, np.ones((90, 120), bool))
+
+
+def wall_depth(view: FlatView, z: float = 3.0) -> np.ndarray:
+    """Depths (H, W) of the wall at `z`."""
+    return ((z - view.pose[2, 3]) / (pixel_directions(LENS) @ view.pose[:3, :3].T)[..., 2]).astype(np.float32)
+
+
+def as_map(depth: np.ndarray, spread: float) -> DepthMap:
+    depth = depth.astype(np.float32)
+    return DepthMap(depth, np.full_like(depth, spread), cosines(LENS, depth))
+
+
+@pytest.fixture(scope="module")
+def walls() -> tuple[list[FlatView], list[np.ndarray], list[np.ndarray]]:
+    """Views of one wall, its depths, and where they are sure: on the left two thirds of the pictures."""
+    views = [looking(-0.3, 0.1), looking(0.0, 0.0), looking(0.3, -0.1)]
+    sure = np.zeros((90, 120), bool)
+    sure[:, :80] = True
+    return views, [wall_depth(view) for view in views], [sure] * 3
+
+
+def test_one_plane_is_found_where_it_is(walls) -> None:
+    views, depths, sure = walls
+    rng = np.random.default_rng(0)
+    maps = [as_map(d * (1 + 0.002 * rng.standard_normal(d.shape)), 0.01) for d in depths]
+    (plane,) = scene_planes(known_points(views, maps, sure), Reporter())
+    assert plane.normal == pytest.approx([0, 0, -1], abs=0.01)  # towards the cameras
+    assert plane.point[2] == pytest.approx(3.0, abs=0.005)
+    assert plane.holds(np.array([[0.0, 0, 3]])).all()
+    assert not plane.holds(np.array([[9.0, 0, 3], [0, -7, 3]])).any()
+
+
+def test_unsure_depths_that_agree_lie_on_the_plane(walls) -> None:
+    views, depths, sure = walls
+    maps = [as_map(d, 0.01) for d in depths]
+    planes = scene_planes(known_points(views, maps, sure), Reporter())
+    off = np.where(sure[1], 1, 1.04)  # the field is 4 % too far where photos say nothing
+    blurred = as_map(depths[1] * off, 0.2)
+    found = on_scene_planes(views[1], blurred, sure[1], blurred, planes)
+    near = slice(80, 100)
+    assert found.depth[:, near] == pytest.approx(depths[1][:, near], rel=1e-3)
+    assert (found.spread[:, near] < 0.1).all()
+    assert (found.depth[sure[1]] == blurred.depth[sure[1]]).all()
+    # A field that is sure of another depth is believed: a picture that hangs before the wall.
+    sharp = as_map(depths[1] * np.where(sure[1], 1, 0.95), 0.01)
+    assert (on_scene_planes(views[1], sharp, sure[1], sharp, planes).depth == sharp.depth).all()
+
+
+def test_a_plane_ends_and_has_one_side(walls) -> None:
+    views, depths, sure = walls
+    planes = scene_planes(known_points(views, [as_map(d, 0.01) for d in depths], sure), Reporter())
+    aside = looking(6.0, 0.0)  # the same wall, far from what is known of it
+    blurred = as_map(wall_depth(aside) * 1.04, 0.2)
+    nothing = np.zeros((90, 120), bool)
+    assert (on_scene_planes(aside, blurred, nothing, blurred, planes).depth == blurred.depth).all()
+    behind = looking(0.0, np.pi)
+    behind.pose[2, 3] = 6.0
+    seen = as_map(np.full((90, 120), 3.1), 0.2)
+    assert (on_scene_planes(behind, seen, nothing, seen, planes).depth == seen.depth).all()
+
+
+def test_nothing_known_is_no_plane_and_cancelling_is_heard(walls) -> None:
+    views, depths, sure = walls
+    maps = [as_map(d, 0.01) for d in depths]
+    assert scene_planes(known_points(views, maps, [np.zeros_like(s) for s in sure]), Reporter()) == []
+    rng = np.random.default_rng(1)
+    rough = [as_map(rng.uniform(1, 5, d.shape), 0.01) for d in depths]
+    assert scene_planes(known_points(views, rough, sure), Reporter()) == []
+    report = Reporter()
+    report.cancel()
+    with pytest.raises(Cancelled):
+        scene_planes(known_points(views, maps, sure), report)

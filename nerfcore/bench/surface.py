@@ -15,9 +15,9 @@ import numpy as np
 from ..data.load import load_scene
 from ..errors import InputError
 from ..mesh.build import build
-from ..mesh.metrics import on_border
 from ..mesh.painted import training_photos
 from ..mesh.parts import texture_of
+from ..mesh.region import on_sides
 from ..mesh.surface import Surface, to_world
 from ..mesh.turntable import write_turntable
 from ..mesh.verb import paint
@@ -117,7 +117,7 @@ def measure(job: Job, project: Path, report: Reporter, root: Path) -> dict[str, 
     texture = texture_of(built.faces, painted.uv.corners, painted.image)
     write_turntable(pictures, surface, texture, {c.id: c.color for c in scene.classes}, report)
     figures |= {
-        "border_faces": on_border(built.vertices, built.faces, region.low, region.high, region.voxel / 2),
+        "border_faces": int(on_sides(built.vertices, built.faces, region, region.voxel / 2).sum()),
         "faces": len(built.faces),
         "mesh_seconds": duration,
         "mesh_processor": sum(clock.seconds.values()),

@@ -82,7 +82,6 @@ class FusionParams:
     truncation: float
     free_at: float
     gap: float
-    apart: float
 
 
 @wp.struct
@@ -95,18 +94,14 @@ class Fused:
     outer_weight: float
     seen: int  # views
     free: int  # views that look through
-    direction: wp.vec3  # from the first view
-    wide: int  # 1 where another view looks from far enough beside it
 
 
 @wp.func
 def view_distance(maps: Maps, view: int, p: wp.vec3, f: FusionParams):
-    """Whether a view says something of a point of the frame (1 or 0), its distance, its weight, and the ray from the
-    camera."""
+    """Whether a view says something of a point of the frame (1 or 0), its distance, and its weight."""
     known = int(0)
     distance = float(0.0)
     weight = float(0.0)
-    ray = wp.vec3(0.0, 0.0, 0.0)
     q, pixel, inside = seen_at(maps, view, p)
     if inside:
         depth, place = read_depth(maps, view, pixel, f.gap)
@@ -122,12 +117,11 @@ def view_distance(maps: Maps, view: int, p: wp.vec3, f: FusionParams):
                     behind = 1.0 + distance / f.truncation
                     weight *= behind * behind
                 distance = wp.min(distance, f.truncation)
-                ray = wp.transpose(maps.rotation[view]) * q / far
-    return known, distance, weight, ray
+    return known, distance, weight
 
 
 @wp.func
-def with_view(fused: Fused, distance: float, weight: float, ray: wp.vec3, f: FusionParams):
+def with_view(fused: Fused, distance: float, weight: float, f: FusionParams):
     """What is known of a point after one more view."""
     w = float(weight)
     fused.seen += 1
@@ -139,10 +133,6 @@ def with_view(fused: Fused, distance: float, weight: float, ray: wp.vec3, f: Fus
     if distance >= 0.0:
         fused.outer += w * distance
         fused.outer_weight += w
-    if fused.seen == 1:
-        fused.direction = ray
-    elif wp.dot(fused.direction, ray) < f.apart:
-        fused.wide = 1
     return fused
 
 
@@ -153,16 +143,15 @@ def fuse_kernel(
     f: FusionParams,
     distance: wp.array(dtype=float),
     weight: wp.array(dtype=float),
-    known: wp.array(dtype=wp.uint8),
     offset: int,
 ):
     i = wp.tid() + offset
     p = points[i]
     fused = Fused()
     for v in range(maps.first.shape[0]):
-        seen, d, w, ray = view_distance(maps, v, p, f)
+        seen, d, w = view_distance(maps, v, p, f)
         if seen == 1:
-            fused = with_view(fused, d, w, ray, f)
+            fused = with_view(fused, d, w, f)
     total = fused.distance
     total_weight = fused.weight
     # A thin sheet: enough views look through this place, so what others see behind it is another side.
@@ -175,14 +164,13 @@ def fuse_kernel(
         mean = total / total_weight
     distance[i] = mean
     weight[i] = total_weight
-    known[i] = wp.uint8(fused.wide)
 
 
 def fuse(
-    points: torch.Tensor, maps: MapArrays, voxel: float, truncation: float, free_at: float, gap: float, apart: float
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Signed distance (N,) of points (N, 3) from the surface that depth maps show, positive in front of it, its weight
-    (N,), and whether (N,) uint8 two views whose directions differ by more than arccos(`apart`) see the point.
+    points: torch.Tensor, maps: MapArrays, voxel: float, truncation: float, free_at: float, gap: float
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Signed distance (N,) of points (N, 3) from the surface that depth maps show, positive in front of it, and its weight
+    (N,), 0 where no view says anything.
 
     A view's distance is (D − z) · ‖q‖/z · cos θ, from the point q in camera axes along the ray to the surface and from
     there to its plane; beyond `truncation` behind the surface the view says nothing. Weights: cos θ (f/z)² ·
@@ -194,12 +182,11 @@ def fuse(
     init()
     device, count = points.device, len(points)
     distance, weight = torch.empty(count, device=device), torch.empty(count, device=device)
-    known = torch.empty(count, dtype=torch.uint8, device=device)
     f = FusionParams()
-    f.voxel, f.truncation, f.free_at, f.gap, f.apart = voxel, truncation, free_at, gap, apart
-    inputs = [array(points.contiguous(), wp.vec3), map_struct(maps), f, array(distance), array(weight), array(known)]
+    f.voxel, f.truncation, f.free_at, f.gap = voxel, truncation, free_at, gap
+    inputs = [array(points.contiguous(), wp.vec3), map_struct(maps), f, array(distance), array(weight)]
     launch(fuse_kernel, count, inputs, device)
-    return distance, weight, known
+    return distance, weight
 
 
 @wp.func

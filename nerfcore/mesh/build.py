@@ -27,7 +27,7 @@ from .extract import extract
 from .field_values import shade
 from .fusion import TRUNCATION, coarser, fuse_maps
 from .refine import refined_maps
-from .region import Region, choose_region
+from .region import Region, choose_region, on_sides
 from .surface import vertex_normals
 
 FEW_STEPS = 300  # of training, below which a field is a sketch
@@ -90,6 +90,8 @@ def build(trained: Trained, project: Project, scene: Scene, params: MeshParams, 
         report.stage("Simplifying")
         fewer = decimate_closed if params.watertight else decimate
         vertices, faces = compact(*fewer(vertices, faces, params.faces, report))
+    if not params.watertight:
+        vertices, faces = compact(vertices, faces[~on_sides(vertices, faces, region, region.voxel / 2)])
     check_parts(vertices, faces, report)
     report.stage("Reading colours")
     vertices, faces = vertices.astype(np.float32), faces.astype(np.int32)

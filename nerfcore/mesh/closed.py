@@ -12,7 +12,7 @@ from ..progress import Reporter
 from .clean import FEWEST_VIEWS, compact, cross, seen_by, unit
 from .decimate import decimate
 from .extract import BLOCK, assemble, off_corners, weld
-from .fusion import APART, BRICK, FREE_AT, TRUNCATION, Bricks, depth_gap
+from .fusion import BRICK, FREE_AT, TRUNCATION, Bricks, depth_gap
 from .surface import is_watertight
 
 CHUNK = 1 << 16  # bricks asked about at once
@@ -54,7 +54,7 @@ def _free(bricks: Bricks, maps: MapArrays, report: Reporter) -> np.ndarray:
         report.progress(begin / len(empty))
         some = empty[begin : begin + CHUNK]
         middle = torch.from_numpy(bricks.origin + h * (some * BRICK + (BRICK - 1) / 2)).float().to(device)
-        distance, weight, _ = fuse(middle, maps, h, TRUNCATION * h, FREE_AT * h, depth_gap(maps), APART)
+        distance, weight = fuse(middle, maps, h, TRUNCATION * h, FREE_AT * h, depth_gap(maps))
         free[tuple(some.T)] = ((weight > 0) & (distance > 0)).cpu().numpy()
     return free
 

@@ -42,7 +42,7 @@ def _block(bricks: Bricks, corner: np.ndarray) -> tuple[np.ndarray, np.ndarray] 
     if not (index[:BLOCK, :BLOCK, :BLOCK] >= 0).any():
         return None
     distance = assemble(index, bricks.distance) / np.float32(bricks.voxel)
-    whole = assemble(index, bricks.known)
+    whole = assemble(index, bricks.weight) > 0
     side = tuple(min(n, BLOCK * BRICK + 1) for n in distance.shape)
     distance, whole = distance[: side[0], : side[1], : side[2]], whole[: side[0], : side[1], : side[2]]
     # scikit-image looks at the cell before a corner where the mask of that corner is set.

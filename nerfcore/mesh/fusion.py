@@ -25,14 +25,13 @@ GAP, GAP_PIXELS = (
     0.03,
     5.5,
 )  # share, or footprints of a pixel, by which depths of one surface differ from pixel to pixel
-APART = float(np.cos(np.radians(3)))
 CHUNK = 256  # bricks
 
 
 @dataclass(frozen=True)
 class Bricks:
     """Distances on a sparse grid. index (X, Y, Z) int32: place of each brick, −1 where there is none; distance
-    (B, 8, 8, 8) float32 in normalised units, negative inside, weight, and known (B, 8, 8, 8) bool, of the corners
+    (B, 8, 8, 8) float32 in normalised units, negative inside, and weight, 0 where no view says anything, of the corners
     origin + voxel · (8 · brick + (i, j, k))."""
 
     origin: np.ndarray
@@ -40,7 +39,6 @@ class Bricks:
     index: np.ndarray
     distance: np.ndarray
     weight: np.ndarray
-    known: np.ndarray
 
     def __len__(self) -> int:
         return len(self.distance)
@@ -57,15 +55,15 @@ def fuse_maps(maps: MapArrays, region: Region, report: Reporter) -> Bricks:
     axis = torch.arange(BRICK, device=device)
     inner = torch.cartesian_prod(axis, axis, axis)
     start = torch.from_numpy(origin).float().to(device)
-    distance, weight, known = [], [], []
+    distance, weight = [], []
     for begin in range(0, len(bricks), CHUNK):
         report.progress(begin / len(bricks))
         some = torch.from_numpy(bricks[begin : begin + CHUNK]).to(device)
         points = (some[:, None] * BRICK + inner).reshape(-1, 3) * h + start
-        d, w, k = fuse(points.float(), maps, h, TRUNCATION * h, FREE_AT * h, depth_gap(maps), APART)
-        for parts, values in ((distance, d), (weight, w), (known, k > 0)):
+        d, w = fuse(points.float(), maps, h, TRUNCATION * h, FREE_AT * h, depth_gap(maps))
+        for parts, values in ((distance, d), (weight, w)):
             parts.append(values.view(-1, BRICK, BRICK, BRICK).cpu().numpy())
-    return Bricks(origin, h, index, np.concatenate(distance), np.concatenate(weight), np.concatenate(known))
+    return Bricks(origin, h, index, np.concatenate(distance), np.concatenate(weight))
 
 
 def depth_gap(maps: MapArrays) -> float:
@@ -84,16 +82,13 @@ def coarser(bricks: Bricks) -> Bricks:
     found = (children >= 0).any(-1)
     index = np.full(found.shape, -1, np.int32)
     index[found] = np.arange(int(found.sum()), dtype=np.int32)
-    made = [
-        np.zeros((int(found.sum()), BRICK, BRICK, BRICK), a.dtype)
-        for a in (bricks.distance, bricks.weight, bricks.known)
-    ]
+    made = [np.zeros((int(found.sum()), BRICK, BRICK, BRICK), a.dtype) for a in (bricks.distance, bricks.weight)]
     half = BRICK // 2
     for number, child in enumerate(children[found].T):
         corner = np.array(np.unravel_index(number, (2, 2, 2))) * half
         block = tuple(slice(c, c + half) for c in corner)
         there = child >= 0
-        for new, old in zip(made, (bricks.distance, bricks.weight, bricks.known)):
+        for new, old in zip(made, (bricks.distance, bricks.weight)):
             new[(there, *block)] = old[child[there]][:, ::2, ::2, ::2]
     return Bricks(bricks.origin, 2 * bricks.voxel, index, *made)
 

@@ -127,11 +127,3 @@ def compare(
 ) -> SurfaceScores:
     """Scores of a mesh beside the true one; see `distances`."""
     return distances(mesh, truth, visible).scores(threshold)
-
-
-def on_border(vertices: np.ndarray, faces: np.ndarray, low: np.ndarray, high: np.ndarray, within: float) -> int:
-    """Number of triangles that lie in one of the sides of a box, to `within`."""
-    corners = vertices[faces]
-    near_low = (np.abs(corners - low) < within).all(1)
-    near_high = (np.abs(corners - high) < within).all(1)
-    return int((near_low | near_high).any(1).sum())

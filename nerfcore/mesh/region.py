@@ -82,3 +82,10 @@ def footprint(maps: MapArrays) -> float:
         depth = maps.depth[begin : begin + int(maps.size[view].prod())][::7]
         sizes.append(depth[(depth > 0) & (depth < FREE)] / maps.lens[view, 0])
     return float(torch.cat(sizes).median())
+
+
+def on_sides(vertices: np.ndarray, faces: np.ndarray, region: Region, within: float) -> np.ndarray:
+    """Which triangles (F,) lie in one of the sides of a region, to `within`: there it was cut, nothing was seen."""
+    corners = vertices[faces]
+    low, high = ((np.abs(corners - side) < within).all(1) for side in (region.low, region.high))
+    return (low | high).any(1)

@@ -59,7 +59,7 @@ def test_noise_over_several_blocks_of_bricks_is_closed_too() -> None:
     shape = (int(there.sum()), BRICK, BRICK, BRICK)
     distance = random.normal(size=shape).astype(np.float32) * 0.01
     weight = (random.random(shape) < 0.9).astype(np.float32)
-    bricks = Bricks(np.array([-0.7, -0.1, -0.1]), 0.01, index, distance, weight, weight > 0)
+    bricks = Bricks(np.array([-0.7, -0.1, -0.1]), 0.01, index, distance, weight)
     vertices, faces = extract_closed(bricks, maps, Reporter())
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     assert mesh.is_watertight

@@ -16,7 +16,7 @@ from fieldwork.nerfcore.mesh.decimate import decimate
 from fieldwork.nerfcore.mesh.extract import extract, weld
 from fieldwork.nerfcore.mesh.fusion import BRICK, Bricks, fuse_maps
 from fieldwork.nerfcore.mesh.parts import texture_of
-from fieldwork.nerfcore.mesh.region import choose_region
+from fieldwork.nerfcore.mesh.region import Region, choose_region, on_sides
 from fieldwork.nerfcore.mesh.surface import Surface, is_watertight
 from fieldwork.nerfcore.mesh.turntable import write_turntable
 from fieldwork.nerfcore.progress import Reporter
@@ -110,7 +110,7 @@ def test_the_surface_ends_where_the_grid_knows_nothing() -> None:
     x, y, z = np.meshgrid(axis, axis, axis, indexing="ij")
     distance = (np.sqrt(x * x + y * y + z * z) - 2.5).astype(np.float32)[None]
     one = np.zeros((1, 1, 1), np.int32)
-    bricks = Bricks(np.full(3, -3.5), 1.0, one, distance, np.ones_like(distance), (x > 0)[None])
+    bricks = Bricks(np.full(3, -3.5), 1.0, one, distance, (x > 0).astype(np.float32)[None])
     vertices, faces = extract(bricks, Reporter())
     assert len(faces) > 20
     assert vertices.min(0) == pytest.approx([0.5, -2.5, -2.5], abs=0.15)
@@ -245,10 +245,11 @@ def test_small_triangles_among_large_ones_are_what_is_closest() -> None:
     assert found.to_truth.max() < 1e-6
 
 
-def test_faces_on_the_border_of_a_box_are_counted() -> None:
+def test_faces_on_the_sides_of_a_region_are_told() -> None:
     vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 0.5], [0.5, 0.5, 0.5]])
     faces = np.array([[0, 1, 2], [0, 1, 4], [1, 2, 3]])
-    assert metrics.on_border(vertices, faces, np.zeros(3), np.ones(3), 1e-3) == 1
+    box = Region(np.zeros(3), np.ones(3), 0.1)
+    assert on_sides(vertices, faces, box, 1e-3).tolist() == [True, False, False]
 
 
 def test_a_turntable_shows_fronts_in_their_colours(tmp_path: Path) -> None:

@@ -84,9 +84,6 @@ def test_nothing_known_is_no_plane_and_cancelling_is_heard(walls) -> None:
     views, depths, sure = walls
     maps = [as_map(d, 0.01) for d in depths]
     assert scene_planes(known_points(views, maps, [np.zeros_like(s) for s in sure]), Reporter()) == []
-    rng = np.random.default_rng(1)
-    rough = [as_map(rng.uniform(1, 5, d.shape), 0.01) for d in depths]
-    assert scene_planes(known_points(views, rough, sure), Reporter()) == []
     report = Reporter()
     report.cancel()
     with pytest.raises(Cancelled):

@@ -85,8 +85,8 @@ def view_distances(
 
 
 def fuse(
-    points: torch.Tensor, maps: MapArrays, voxel: float, truncation: float, free_at: float, gap: float, apart: float
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    points: torch.Tensor, maps: MapArrays, voxel: float, truncation: float, free_at: float, gap: float
+) -> tuple[torch.Tensor, torch.Tensor]:
     """As `surface.fuse`."""
     pairs = [view_distances(points, maps, v, voxel, truncation, gap) for v in range(len(maps))]
     distance, weight = torch.stack([d for d, _ in pairs]), torch.stack([w for _, w in pairs])
@@ -100,12 +100,7 @@ def fuse(
     used = torch.where(thin, outer, weight)
     total = used.sum(0)
     fused = torch.where(total > 0, (used * value).sum(0) / total.clamp(min=1e-30), 0.0)
-    centers = torch.stack([-maps.translation[v] @ maps.rotation[v] for v in range(len(maps))])
-    ray = torch.nn.functional.normalize(points - centers[:, None], dim=2)
-    first = seen.float().argmax(0)
-    toward = ray[first, torch.arange(len(points))]
-    known = (seen & ((ray * toward).sum(2) < apart)).any(0)
-    return fused, total, known.to(torch.uint8)
+    return fused, total
 
 
 def agreement(maps: MapArrays, view: int, neighbours: list[int], share: float, pixels: float) -> torch.Tensor:

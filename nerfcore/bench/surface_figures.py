@@ -33,7 +33,7 @@ HIDDEN = 0.5  # footprints of a pixel that something lies in front of what it hi
 STEEPEST = 0.1  # cosine under which a camera is not said to see a place
 MARGIN = 2.0  # radii of a piece by which it may lie beside a picture that shows some of it
 ACROSS = 50  # pieces across what the photos show, from which points of the truth are taken
-SAMPLES = 100_000
+SAMPLES = 400_000  # a class of a fiftieth of the area is then known to 1.2 %
 SAME_SIDE = np.cos(np.radians(60))
 
 

@@ -3,6 +3,7 @@
 import bpy
 from bpy.types import Context, PropertyGroup
 
+from .label_settings import LabelSettings
 from .props import (
     BoolProperty,
     CollectionProperty,
@@ -77,23 +78,6 @@ SPLITS = [
     ("instances", "One per Instance", "One object for each connected thing of a class"),
 ]
 SOME_FACES = 200_000  # where the user wants fewer than all, at first
-LABEL_TOOLS = [
-    ("brush", "Brush", "Draw over what belongs to the class", "BRUSH_DATA", 0),
-    (
-        "click",
-        "Click",
-        "Click a part of the surface that looks alike, or with a model a thing: all of it belongs to the class",
-        "RESTRICT_SELECT_OFF",
-        1,
-    ),
-    ("erase", "Erase", "Draw over marks to take them away; also with Ctrl held", "X", 2),
-    ("void", "Void", "Draw over what belongs to none of the classes", "GHOST_DISABLED", 3),
-]
-LABEL_VIEWS = [
-    ("labels", "Labels", "The colors of the classes over the photo"),
-    ("confidence", "Confidence", "Hatched where the class is unsure, dark where there is none"),
-    ("photo", "Photo", "The photo alone"),
-]
 PASSES = [
     ("rgb", "Color", "The photographed colors"),
     ("depth", "Depth", "Distance along the ray in meters"),
@@ -196,7 +180,7 @@ class FieldworkClass(PropertyGroup):
     area: FloatProperty(name="Area", description="Area of the class on the mesh", unit="AREA")
 
 
-class FieldworkScene(PropertyGroup):
+class FieldworkScene(LabelSettings, PropertyGroup):
     project: StringProperty(
         name="Project",
         description="Folder that holds everything known about the capture",
@@ -268,47 +252,6 @@ class FieldworkScene(PropertyGroup):
     # Classes
     classes: CollectionProperty(type=FieldworkClass)
     class_index: IntProperty(name="Class", description="Selected class")
-
-    # Labels
-    label_tool: EnumProperty(name="Tool", description="What a stroke on a photo does", items=LABEL_TOOLS)
-    label_width: FloatProperty(
-        name="Size",
-        description="Diameter of the brush in pixels of the photo",
-        default=12.0,
-        min=1.0,
-        soft_max=200.0,
-        subtype="PIXEL",
-    )
-    label_view: EnumProperty(name="Show", description="What lies over the photo", items=LABEL_VIEWS)
-    label_opacity: FloatProperty(
-        name="Opacity",
-        description="How much of the photo the colors of the classes cover",
-        default=0.5,
-        min=0.0,
-        max=1.0,
-        subtype="FACTOR",
-    )
-    label_strokes: BoolProperty(name="Marks", description="Show the marks that were drawn on the photo", default=True)
-    label_author: StringProperty(name="Author", description="Who draws the marks: it is noted with each of them")
-    label_seconds: FloatProperty(
-        name="Accept Time",
-        description="For how many seconds Accept trains the classes",
-        default=15.0,
-        min=1.0,
-        soft_max=120.0,
-    )
-    label_encoder: StringProperty(
-        name="Encoder",
-        description="ONNX file of the encoder of a SAM, MobileSAM, SAM 2 or EfficientSAM, by which Click cuts things out; "
-        "empty: Click takes a part of the surface",
-        subtype="FILE_PATH",
-    )
-    label_decoder: StringProperty(
-        name="Decoder", description="ONNX file of the decoder of the same model", subtype="FILE_PATH"
-    )
-    label_revision: IntProperty(
-        name="Revision", description="Which revision of the marks undo comes back to", default=-1, options={"HIDDEN"}
-    )
 
     # Training
     preset: EnumProperty(name="Preset", description="Trade quality for time", items=PRESETS, default="standard")
@@ -546,6 +489,8 @@ class FieldworkScene(PropertyGroup):
     )
 
 
+# By name, those that a scene has from its parts too: a class knows only its own.
+SETTINGS = LabelSettings.__annotations__ | FieldworkScene.__annotations__
 CLASSES = [FieldworkImage, FieldworkClass, FieldworkScene]
 
 

@@ -38,6 +38,10 @@ VERBS = {
     "render": Verb(p.RenderParams, "render.verb:render", "Render images from the field."),
     "mesh": Verb(p.MeshParams, "mesh.verb:mesh", "Extract the labelled surface."),
     "measure": Verb(p.MeasureParams, "measure.verb:measure", "Measure areas, volumes and distances on the mesh."),
+    "instances": Verb(
+        p.InstancesParams, "things.edit:instances", "List, rename, join or split the things of the mesh."
+    ),
+    "relations": Verb(p.RelationsParams, "things.graph:relate", "Tell how the things of the mesh stand to each other."),
     "plan": Verb(p.PlanParams, "measure.drawings:plan", "Draw plans and elevations to scale."),
     "section": Verb(p.SectionParams, "measure.drawings:section", "Draw a section of the mesh to scale."),
     "compare": Verb(p.CompareParams, "measure.epochs:compare", "Compare the meshes of two epochs of one object."),

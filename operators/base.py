@@ -16,7 +16,7 @@ from ..addon.errors import EngineError
 from ..addon.jobs.job import Done, Job, Steps
 from ..addon.jobs.queue import queue
 from ..addon.project import edits, lists, recent, runs, snapshot
-from ..addon.properties import FieldworkScene
+from ..addon.properties import SETTINGS
 from ..addon.props import IntProperty, StringProperty
 from ..addon.text import t
 
@@ -31,7 +31,7 @@ def scene_settings(**names: str) -> Callable[[type], type]:
 
     def decorate(cls: type) -> type:
         own = dict(cls.__dict__.get("__annotations__", {}))
-        cls.__annotations__ = own | {name: FieldworkScene.__annotations__[scene] for name, scene in names.items()}
+        cls.__annotations__ = own | {name: SETTINGS[scene] for name, scene in names.items()}
         cls.scene_names = names
         return cls
 

@@ -45,6 +45,8 @@ class FIELDWORK_MT_steps(Menu):
         layout.operator("fieldwork.setup_compositor")
         layout.operator("fieldwork.mesh")
         layout.operator("fieldwork.measure")
+        layout.operator("fieldwork.relations")
+        layout.operator("fieldwork.instances")
         layout.operator("fieldwork.plan")
         layout.operator("fieldwork.section")
         layout.operator("fieldwork.compare")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,8 @@ class Package:
     """One capture: `name` of its folder and `uuid` (may be empty) of its project. Points: `xyz` (N, 3), `rgb` (N, 3) uint8. `mesh` holds the arrays of mesh.npz, or None.
 
     `texture` is a picture for the mesh's "uv" (F, 3, 2), v upwards; None where colours are the vertices'. `instances` are
-    the entries {"id", "name", "class_id"} for the mesh's "face_instance", `measures` the areas and volumes of measures.json.
+    the entries {"id", "name", "class_id"} for the mesh's "face_instance", `measures` the areas and volumes of measures.json,
+    `relations` how the instances stand to each other: {"subject", "relation", "object"} with their ids.
     """
 
     folder: Path
@@ -40,6 +41,7 @@ class Package:
     texture: Path | None
     instances: list[dict[str, Any]]
     measures: dict[str, Any]
+    relations: list[dict[str, Any]] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -105,6 +107,7 @@ def read_package(folder: Path | str) -> Package:
         texture=folder / value["texture"] if value.get("texture") else None,
         instances=value.get("instances") or [],
         measures=value.get("measures") or {},
+        relations=value.get("relations") or [],
     )
 
 

@@ -12,6 +12,7 @@ from typing import Any
 import bpy
 import numpy as np
 
+from ..roles import ROLE
 from .edited import WRITTEN, Steps, mesh_fingerprint
 from .look import (
     CLASS_COLOR_ATTRIBUTE,
@@ -28,6 +29,7 @@ from .slices import Held
 
 CLASS_ATTRIBUTE, VERTEX_CLASS_ATTRIBUTE = "class_id", "vertex_class_id"
 INSTANCE_ATTRIBUTE = "instance_id"
+RELATIONS = "relations"  # custom property of the objects of instances
 INSTANCE_NAMES = "instances"  # custom property of the objects: names by the numbers of the attribute
 UV_MAP = "UVMap"
 # Custom properties, in `unit`² and `unit`³: the value and the ends of its 95 % interval.
@@ -51,7 +53,22 @@ def surface(owned: Owned, package: Package, part: Part, groups: Callable[[], tup
     add_viewport_colors(item, groups()[1])
     item[INSTANCE_NAMES] = {str(entry["id"]): entry["name"] for entry in package.instances}
     describe(item, part.measured, package.measures)
+    relate(item, {entry["id"]: entry["name"] for entry in package.instances}, package.relations)
     return item
+
+
+def relate(item: bpy.types.Object, names: dict[int, str], relations: list[dict[str, Any]]) -> None:
+    """Note how an instance stands to others as a custom property of its object: {"on": "table.001", …}."""
+    role = str(item.get(ROLE, ""))
+    own = int(role.partition(":")[2]) if role.startswith("instance:") else None
+    told: dict[str, list[str]] = {}
+    for entry in relations:
+        if entry["subject"] == own:
+            told.setdefault(entry["relation"], []).append(names.get(entry["object"], str(entry["object"])))
+    if told:
+        item[RELATIONS] = {kind: ", ".join(others) for kind, others in told.items()}
+    elif RELATIONS in item:
+        del item[RELATIONS]
 
 
 def describe(item: Any, measured: dict[str, Any], measures: dict[str, Any]) -> None:

@@ -1,7 +1,7 @@
 """The package: what Blender needs of a capture, readable with numpy and JSON alone.
 
 package.json        name and UUID of the project, classes, cameras (camera-to-world in the world frame, OpenGL axes);
-                    instances and measures of the mesh, empty where there are none
+                    instances, their relations and measures of the mesh, empty where there are none
 renders/            rendered photos, without lens distortion too, where there are any
 images/             the photos without lens distortion, in the size of their camera
 points.npz          xyz (N, 3) float32 world, rgb (N, 3) uint8 sRGB
@@ -39,6 +39,7 @@ from ..project.runs import (
     MEASURES,
     MESH_RECORD,
     RENDER_RECORD,
+    SCENE_GRAPH,
     checkpoint_id,
     checkpoint_state,
     holdout_of,
@@ -100,6 +101,7 @@ def write_package(
             "mesh": has_mesh,
             "texture": "texture.png" if has_texture else None,
             "instances": _beside(source / INSTANCES, []) if has_mesh else [],
+            "relations": _relations(source) if has_mesh else [],
             "measures": _beside(source / MEASURES, {}) if has_mesh else {},
             "checkpoint": checkpoint_id(project, run),
             "mesh_checkpoint": made.checkpoint if has_mesh and made else "",
@@ -287,6 +289,14 @@ def _beside(path: Path, missing: Any) -> Any:
         return json.loads(path.read_text("utf-8"))
     except (OSError, ValueError) as error:
         raise ProjectError(f"{path} is damaged: {error}.", "Run `fieldwork mesh` again.") from error
+
+
+def _relations(source: Path) -> list[dict[str, Any]]:
+    """How the instances of a mesh stand to each other; none where nobody looked since they were found or renamed."""
+    graph, known = _beside(source / SCENE_GRAPH, {}), _beside(source / INSTANCES, [])
+    names = {entry["id"]: entry["name"] for entry in known}
+    same = all(names.get(thing["id"]) == thing["name"] for thing in graph.get("things", []))
+    return graph.get("relations", []) if same else []
 
 
 def _copy_texture(source: Path, folder: Path) -> bool:

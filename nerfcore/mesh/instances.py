@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ from .clean import areas, border_edges, components
 
 GAP = 3.0  # voxels that a thing may be torn apart by: a crack of the reconstruction is one or two wide
 LEAST_SHARE = 0.01  # of the area of its class, below which a part is no instance
+ALIKE = 2.0  # by how much the areas of what may be the same thing in two meshes differ
 SAME_SIZE = 0.05  # areas within one such step are told apart by where the things stand, not by their noise
 
 
@@ -69,6 +70,34 @@ def find_instances(
             found.append(Instance(len(found) + 1, name, class_id, float(size[p]), (x, y, z)))
             face_instance[own[part == p]] = len(found)
     return face_instance, found
+
+
+def with_earlier_names(instances: list[Instance], earlier: list[Instance]) -> list[Instance]:
+    """The instances of a mesh that was made again, each with the name of the earlier one of its class that stood where it
+    does and was about as large; names that are new take free numbers."""
+    pairs = []
+    for number, one in enumerate(instances):
+        for index, old in enumerate(earlier):
+            apart = float(np.linalg.norm(np.subtract(one.center, old.center)))
+            alike = max(one.area, old.area) <= ALIKE * min(one.area, old.area)
+            if old.class_id == one.class_id and alike and apart <= 0.5 * min(one.area, old.area) ** 0.5:
+                pairs.append((apart, number, index))
+    names: dict[int, str] = {}
+    used: set[int] = set()
+    for _, number, index in sorted(pairs):
+        if number not in names and index not in used:
+            names[number] = earlier[index].name
+            used.add(index)
+    taken, found = set(names.values()), []
+    for number, one in enumerate(instances):
+        name = names.get(number)
+        if name is None:
+            stem = one.name.rpartition(".")[0]
+            free = (f"{stem}.{n:03d}" for n in range(1, len(instances) + len(earlier) + 2))
+            name = one.name if one.name not in taken else next(n for n in free if n not in taken)
+            taken.add(name)
+        found.append(replace(one, name=name))
+    return found
 
 
 def _joined(vertices: np.ndarray, faces: np.ndarray, gap: float) -> np.ndarray:

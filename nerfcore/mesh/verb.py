@@ -11,6 +11,7 @@ import numpy as np
 from ..data.box import Box
 from ..data.load import class_inputs, load_scene, view_inputs
 from ..data.scene import Scene
+from ..errors import ProjectError
 from ..files import atomic_path
 from ..geometry.similarity import similarity_scale, transform_points
 from ..images.picture import to_bytes
@@ -26,7 +27,7 @@ from .build import Built, build
 from .features import features_of
 from .field_values import shade
 from .formats import check_format
-from .instances import GAP, Instance, find_instances, write_instances
+from .instances import GAP, Instance, find_instances, read_instances, with_earlier_names, write_instances
 from .lods import Level, make_levels, remove_levels, write_level
 from .painted import Painted, paint_surface, training_photos, write_maps
 from .parts import Texture, texture_of
@@ -76,6 +77,7 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
     face_instance, instances = find_instances(
         surface.vertices, surface.faces, surface.face_class, names, scene.ignore_id, GAP * voxel
     )
+    instances = with_earlier_names(instances, earlier_instances(target, inputs))
     surface = replace(surface, face_instance=face_instance)
     report.stage("Writing")
     for record in (MESH_RECORD, MEASURES):  # what they say is no longer true from here on
@@ -110,6 +112,17 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
     write_made(target / MESH_RECORD, step("mesh", settings, result, inputs, state_id(trained.state)))
     record_step(folder, "mesh", settings, result, inputs)
     return result
+
+
+def earlier_instances(target: Path, inputs: dict[str, str]) -> list[Instance]:
+    """The instances of the mesh that is there, where it lies as the new one will; none where they cannot be read."""
+    made = read_made(target / MESH_RECORD)
+    if made is None or made.inputs.get("alignment") != inputs.get("alignment"):
+        return []
+    try:
+        return read_instances(target)
+    except ProjectError:  # it is written anew
+        return []
 
 
 def _write_arrays(target: Path, surface: Surface, painted: Painted, built: Built, box: Box) -> None:

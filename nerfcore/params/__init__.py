@@ -46,6 +46,7 @@ from .labels import (
 )
 from .results import BlendParams, ExportParams, PackageParams, ReportParams
 from .surfaces import CompareParams, MeasureParams, MeshParams, PaperScale, PlanParams, SectionParams, Side, Turn
+from .things import InstancesParams, RelationsParams
 from .workflows import BatchParams, BenchParams, ReconstructParams
 
 __all__ = [
@@ -70,6 +71,7 @@ __all__ = [
     "ExportParams",
     "Holdout",
     "ImportParams",
+    "InstancesParams",
     "LabelAcceptParams",
     "LabelCheckoutParams",
     "LabelExportParams",
@@ -92,6 +94,7 @@ __all__ = [
     "Preset",
     "ReconstructParams",
     "RegionParams",
+    "RelationsParams",
     "RenderParams",
     "ReportParams",
     "Revision",

@@ -23,6 +23,7 @@ METRICS = "metrics.json"
 VOXELS = "voxels"  # folder of the baked field
 MESH_RECORD = "mesh.json"  # in exports/<run>: what the mesh beside it was made from
 INSTANCES = "instances.json"  # in exports/<run>: what the numbers of instances on the mesh beside it mean
+SCENE_GRAPH = "scene_graph.json"  # in exports/<run>: how the instances of the mesh beside it stand to each other
 MEASURES = "measures.json"  # in exports/<run>: areas and volumes of the mesh beside it
 RENDER_RECORD = "render.json"  # in a folder of renders: what they were made from
 NEW, OLD = ".new", ".old"

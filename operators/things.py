@@ -1,0 +1,158 @@
+"""Things: the instances on the mesh, how they stand to each other, and selecting them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+from bpy.types import Context, Operator
+
+from ..addon.jobs.job import Done, Job
+from ..addon.project import snapshot, things
+from ..addon.props import BoolProperty, IntProperty, StringProperty
+from ..addon.text import t
+from .base import ProjectOperator, refresh_scenes, scene_settings
+from .measure import need_mesh
+
+
+@scene_settings(run="run", query="thing_query")
+class FIELDWORK_OT_relations(ProjectOperator):
+    """Find how the things on the mesh stand to each other, and select those that the question means"""
+
+    bl_idname = "fieldwork.relations"
+    bl_label = "Find Relations"
+    verb = "relations"
+    needs = (need_mesh,)
+
+    def parameters(self, context: Context) -> dict[str, Any]:
+        return {
+            "project": self.project_path(context),
+            "run": self.value(context, "run"),
+            "query": self.value(context, "query"),
+        }
+
+    def after(self) -> Done:
+        return show_relations
+
+
+def show_relations(job: Job) -> None:
+    """Note the relations with the objects of the scene, and select what was asked for."""
+    refresh_scenes(job)
+    if job.state != "done" or not job.result or job.project is None:
+        return
+    from ..addon.scene import things as objects  # not at the top: enabling the extension must be quick
+
+    known = things.graph(job.project, str(job.params.get("run", "main")))
+    if known is None:
+        return
+    owner, asked = snapshot.owner(job.project), str(job.params.get("query", "")).strip()
+    objects.describe(owner, known)
+    if asked:
+        ids = [thing["id"] for thing in known["things"] if thing["name"] in job.result["found"]]
+        told = ", ".join(job.result["found"])
+        job.warnings.append(t("{}: {}", asked, told) if ids else t("{}: nothing", asked))
+        if ids and not objects.select(owner, ids):
+            job.warnings.append(t("They are not in the scene: press Update Scene."))
+    if not bpy.app.background:
+        bpy.ops.ed.undo_push(message="Select Things")
+
+
+@scene_settings(run="run")
+class FIELDWORK_OT_instances(ProjectOperator):
+    """Rename the chosen thing, join the chosen ones into one, or split one into its pieces"""
+
+    bl_idname = "fieldwork.instances"
+    bl_label = "Change Things…"
+    verb = "instances"
+    needs = (need_mesh,)
+
+    things: StringProperty(
+        name="Things", description="Names of the things, separated by commas; empty: those of the selected objects",
+        options={"SKIP_SAVE"},
+    )  # fmt: skip
+    rename: StringProperty(name="New Name", description="Name for the thing", options={"SKIP_SAVE"})
+    merge: BoolProperty(name="Join", description="The things are one", options={"SKIP_SAVE"})
+    split: BoolProperty(
+        name="Split", description="The unconnected pieces are things of their own", options={"SKIP_SAVE"}
+    )
+
+    def invoke(self, context: Context, event: bpy.types.Event) -> set[str]:
+        if self.rename or self.merge or self.split:
+            return self.execute(context)
+        return context.window_manager.invoke_props_dialog(self)
+
+    def parameters(self, context: Context) -> dict[str, Any]:
+        project = self.project_path(context)
+        params: dict[str, Any] = {"project": project, "run": self.value(context, "run")}
+        names = [name.strip() for name in self.things.split(",") if name.strip()] or selected_names(context)
+        if not (self.rename or self.merge or self.split):
+            return params
+        if not names:
+            raise ValueError(t("Select the object of a thing first."))
+        if self.merge:
+            return {**params, "merge": names}
+        return {**params, "split": names[0]} if self.split else {**params, "rename": [names[0], self.rename]}
+
+    def after(self) -> Done:
+        return show_instances
+
+
+def selected_names(context: Context) -> list[str]:
+    """The names of the things whose objects are selected, the active one first."""
+    from ..addon.scene import things as objects  # not at the top: enabling the extension must be quick
+
+    settings = context.scene.fieldwork
+    folder = snapshot.folder_of(settings)
+    known = snapshot.cached_json(folder / "exports" / settings.run / "instances.json") if folder else None
+    names = {entry["id"]: entry["name"] for entry in known or []}
+    own = objects.objects(snapshot.owner(folder)) if folder else {}
+    chosen = [number for number, item in own.items() if item.select_get() and number in names]
+    active = context.view_layer.objects.active
+    return [names[number] for number in sorted(chosen, key=lambda number: own[number] != active)]
+
+
+def show_instances(job: Job) -> None:
+    """Give objects the names of their things; where things were joined or split, tell how to see that."""
+    refresh_scenes(job)
+    if job.state != "done" or not job.result or job.project is None:
+        return
+    from ..addon.scene import things as objects  # not at the top: enabling the extension must be quick
+
+    own = objects.objects(snapshot.owner(job.project))
+    for entry in job.result["instances"]:
+        if entry["id"] in own and entry["name"] in job.result["changed"]:
+            own[entry["id"]].name = entry["name"]
+    if own and (job.params.get("merge") or job.params.get("split")):
+        job.warnings.append(t("Press Update Scene to see the things as they are now."))
+
+
+class FIELDWORK_OT_select_thing(Operator):
+    """Select the object of the thing, and what is on it with Shift; where the surface is one object, its faces"""
+
+    bl_idname = "fieldwork.select_thing"
+    bl_label = "Select Thing"
+    bl_options = {"REGISTER", "UNDO"}
+
+    number: IntProperty(name="Number", description="Number of the thing", options={"SKIP_SAVE"})
+    below: BoolProperty(name="All of It", description="Also what it holds", options={"SKIP_SAVE"})
+
+    def invoke(self, context: Context, event: bpy.types.Event) -> set[str]:
+        self.below = self.below or event.shift
+        return self.execute(context)
+
+    def execute(self, context: Context) -> set[str]:
+        from ..addon.scene import things as objects  # not at the top: enabling the extension must be quick
+
+        settings = context.scene.fieldwork
+        folder = snapshot.folder_of(settings)
+        known = things.graph(folder, settings.run)
+        chosen = [self.number]
+        if self.below and known is not None:
+            chosen += things.held(things.outline(known), self.number)
+        if folder is None or not objects.select(snapshot.owner(folder), chosen):
+            self.report({"WARNING"}, t("It is not in the scene: press Update Scene."))
+            return {"CANCELLED"}
+        return {"FINISHED"}
+
+
+CLASSES = [FIELDWORK_OT_relations, FIELDWORK_OT_instances, FIELDWORK_OT_select_thing]

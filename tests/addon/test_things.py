@@ -1,0 +1,160 @@
+"""Things in the scene: relations as custom properties, the list of the panel, questions that select objects."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from fieldwork.tests.addon.support import SETUP, make_posed_project
+from fieldwork.tests.addon.test_surface_look import package  # noqa: F401
+
+pytest.importorskip("bpy")
+
+from fieldwork.addon.project.things import graph, held, outline
+
+NAMES = {1: "floor.001", 2: "table.001", 3: "vase.001", 4: "lamp.001"}
+GRAPH = {
+    "made": "",
+    "things": [{"id": number, "name": name, "class": name[:-4]} for number, name in NAMES.items()],
+    "relations": [
+        {"subject": 2, "relation": "on", "object": 1, "gap": 0.0},
+        {"subject": 3, "relation": "on", "object": 2, "gap": 0.0},
+        {"subject": 3, "relation": "next to", "object": 4, "gap": 0.1},
+        {"subject": 4, "relation": "on", "object": 2, "gap": 0.0},
+    ],
+}
+
+
+def with_graph(folder, value=GRAPH, names=NAMES):
+    exports = folder / "exports/main"
+    exports.mkdir(parents=True, exist_ok=True)
+    (exports / "scene_graph.json").write_text(json.dumps(value))
+    (exports / "instances.json").write_text(json.dumps([{"id": i, "name": n, "class_id": 1} for i, n in names.items()]))
+    return folder
+
+
+def test_the_list_stands_each_thing_below_what_holds_it():
+    lines = outline(GRAPH)
+    assert [(line.depth, line.name, line.relation) for line in lines] == [
+        (0, "floor.001", ""),
+        (1, "table.001", "on"),
+        (2, "vase.001", "on"),
+        (2, "lamp.001", "on"),
+    ]
+    assert [line.beside for line in lines] == [(), (), ("lamp.001",), ("vase.001",)]
+    assert held(lines, 2) == [3, 4]
+    assert held(lines, 4) == []
+    # What holds itself over others is still listed, once.
+    circle = [{"subject": a, "relation": "on", "object": b, "gap": 0} for a, b in ((1, 2), (2, 3), (3, 1))]
+    assert sorted(line.id for line in outline({**GRAPH, "relations": circle})) == [1, 2, 3, 4]
+
+
+def test_a_graph_of_other_instances_is_none(tmp_path):
+    folder = with_graph(tmp_path)
+    assert graph(folder, "main") == GRAPH
+    with_graph(folder, names={**NAMES, 3: "Ming vase"})
+    assert graph(folder, "main") is None
+    (folder / "exports/main/scene_graph.json").write_text("[1]")
+    assert graph(folder, "main") is None
+    assert graph(None, "main") is None
+
+
+def test_questions_select_objects_and_relations_are_properties(bpy_script, tmp_path, package):  # noqa: F811
+    project = with_graph(make_posed_project(tmp_path / "capture"))
+    value = json.loads((package / "package.json").read_text())
+    facts = bpy_script(
+        SETUP
+        + """
+import numpy as np
+from fieldwork.addon.project import snapshot
+from fieldwork.addon.scene import things
+from fieldwork.addon.roles import ROLE
+settings.project = folder
+owner = snapshot.owner(Path(folder))
+for number, name in names.items():
+    item = bpy.data.objects.new(name, bpy.data.meshes.new(name))
+    owner.mark(item, f"instance:{number}")
+    scene.collection.objects.link(item)
+value = json.loads((Path(folder) / "exports/main/scene_graph.json").read_text())
+things.describe(owner, value)
+seen = {item.name: dict(item["relations"]) for item in scene.objects if "relations" in item}
+things.describe(owner, {**value, "relations": []})
+gone = any("relations" in item for item in scene.objects)
+chosen = lambda: sorted(item.name for item in scene.objects if item.select_get())
+bpy.ops.fieldwork.select_thing(number=3)
+picked = [chosen()]
+bpy.ops.fieldwork.select_thing(number=2, below=True)
+picked.append(chosen())
+from fieldwork.addon.jobs.queue import queue
+from fieldwork.operators import things as operators
+asked = []
+def run(job):
+    asked.append(job.params)
+    job.state, job.project, job.result = "done", Path(folder), {"found": ["lamp.001", "vase.001"]}
+    operators.show_relations(job)
+queue.run = run
+(Path(folder) / "exports/main/mesh.npz").touch()
+settings.thing_query = "everything on the table"
+bpy.ops.fieldwork.relations()
+picked.append(chosen())
+def changed(job):
+    asked.append(job.params)
+    instances = [{"id": 3, "name": "Ming", "class_id": 1, "class": "", "area": 1.0}]
+    job.state, job.project, job.result = "done", Path(folder), {"instances": instances, "changed": ["Ming"]}
+    operators.show_instances(job)
+queue.run = changed
+bpy.ops.fieldwork.select_thing(number=3)
+bpy.ops.fieldwork.instances(rename="Ming")
+things.select(owner, [3, 4])
+bpy.context.view_layer.objects.active = bpy.data.objects["Ming"]
+bpy.ops.fieldwork.instances(merge=True)
+nothing = attempt(lambda: (things.select(owner, []), bpy.ops.fieldwork.instances(split=True))[1])
+answer({"seen": seen, "gone": gone, "picked": picked, "asked": asked, "named": sorted(i.name for i in scene.objects), "nothing": nothing})
+""",
+        folder=project,
+        names={str(number): name for number, name in NAMES.items()},
+    )
+    assert facts["seen"]["vase.001"] == {"on": "table.001", "next to": "lamp.001"}
+    assert facts["seen"]["table.001"] == {"on": "floor.001"}
+    assert "floor.001" not in facts["seen"]
+    assert not facts["gone"]
+    everything = ["lamp.001", "table.001", "vase.001"]
+    assert facts["picked"] == [["vase.001"], everything, ["lamp.001", "vase.001"]]
+    assert facts["asked"][0]["query"] == "everything on the table"
+    assert facts["asked"][1]["rename"] == ["vase.001", "Ming"]
+    assert facts["asked"][2]["merge"] == ["vase.001", "lamp.001"]
+    assert "Ming" in facts["named"]
+    assert "vase.001" not in facts["named"]
+    assert "Select the object" in facts["nothing"]
+    # As the package brings them into the scene.
+    value["instances"] = [{"id": 1, "name": "gold.001", "class_id": 2}, {"id": 2, "name": "base", "class_id": 1}]
+    value["relations"] = [{"subject": 1, "relation": "on", "object": 2, "gap": 0.0}]
+    (package / "package.json").write_text(json.dumps(value))
+    facts = bpy_script(
+        """
+from fieldwork.addon.scene.package import read_package
+from fieldwork.addon.scene.build import import_package
+from fieldwork.addon.scene import things
+from fieldwork.addon.roles import Owner, ROLE
+import numpy as np
+bpy.ops.wm.read_factory_settings(use_empty=True)
+loaded = read_package(package)
+import_package(bpy.context.scene, loaded, split="instances")
+told = {item[ROLE]: dict(item["relations"]) for item in bpy.data.objects if "relations" in item}
+bpy.ops.wm.read_factory_settings(use_empty=True)
+import_package(bpy.context.scene, loaded, split="none")
+owner = Owner(loaded.name, loaded.uuid)
+count = things.select(owner, [1])
+mesh = next(item for item in bpy.data.objects if item.get(ROLE) == "mesh").data
+chosen = np.empty(len(mesh.polygons), bool)
+mesh.polygons.foreach_get("select", chosen)
+own = np.empty(len(mesh.polygons), np.int32)
+mesh.attributes["instance_id"].data.foreach_get("value", own)
+answer({"told": told, "count": count, "same": bool(((own == 1) == chosen).all()), "some": int(chosen.sum())})
+""",
+        package=package,
+    )
+    assert facts["told"] == {"instance:1": {"on": "base"}}
+    assert facts["count"] == 1
+    assert facts["same"]
+    assert facts["some"] > 0

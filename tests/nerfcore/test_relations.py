@@ -1,0 +1,206 @@
+"""Things and how they stand to each other, in rooms built from boxes: every relation, questions, names that stay."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from fieldwork.nerfcore.cli import main
+from fieldwork.nerfcore.errors import InputError, ProjectError
+from fieldwork.nerfcore.mesh.instances import Instance, read_instances, with_earlier_names
+from fieldwork.nerfcore.mesh.stored import MESH, mesh_folder
+from fieldwork.nerfcore.params import InstancesParams, RelationsParams
+from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.project.runs import SCENE_GRAPH
+from fieldwork.nerfcore.project.schema import Project, SemanticClass
+from fieldwork.nerfcore.project.store import save_project
+from fieldwork.nerfcore.things.edit import instances
+from fieldwork.nerfcore.things.graph import relate
+from fieldwork.tests.nerfcore.support.meshed import store_mesh
+
+NAMES = ["floor", "wall", "table", "vase", "book", "bowl", "apple", "painting", "chair", "chair/leg", "rug"]
+IDS = {name: number for number, name in enumerate(NAMES, 1)}
+
+
+def box(low: list[float], high: list[float]) -> trimesh.Trimesh:
+    return trimesh.creation.box(bounds=[low, high])
+
+
+def open_shell(mesh: trimesh.Trimesh, gone: int, above: bool) -> trimesh.Trimesh:
+    """The mesh without its faces that look up (or down): as a capture has it, or as a bowl is."""
+    keep = mesh.face_normals[:, gone] < 0.9 if above else mesh.face_normals[:, gone] > -0.9
+    return trimesh.Trimesh(mesh.vertices, mesh.faces[keep], process=False)
+
+
+def table(x: float, y: float) -> trimesh.Trimesh:
+    legs = [box([x + i, y + j, 0.002], [x + i + 0.06, y + j + 0.06, 0.7]) for i in (0, 1.14) for j in (0, 0.74)]
+    plate = open_shell(box([x, y, 0.7], [x + 1.2, y + 0.8, 0.75]), 2, False)
+    return trimesh.util.concatenate([*(open_shell(leg, 2, True) for leg in legs), plate])
+
+
+def bowl(x: float, y: float, z: float) -> trimesh.Trimesh:
+    outer, inner = (
+        box([x, y, z], [x + 0.4, y + 0.4, z + 0.2]),
+        box([x + 0.01, y + 0.01, z + 0.02], [x + 0.39, y + 0.39, z + 0.2]),
+    )
+    inner = open_shell(inner, 2, True)
+    inner.invert()
+    return trimesh.util.concatenate([open_shell(outer, 2, True), inner])
+
+
+def room() -> list[tuple[str, trimesh.Trimesh]]:
+    """A table with a vase, a book on which a bowl with an apple stands; a second book under it on the floor; a chair with a
+    leg of its own class, a painting on the wall, a rug."""
+    return [
+        ("floor", box([0, 0, -0.1], [5, 4, 0])),
+        ("wall", box([0, 4, 0], [5, 4.1, 2.8])),
+        ("table", table(1, 1)),
+        ("vase", open_shell(box([1.1, 1.1, 0.755], [1.25, 1.25, 1.1]), 2, False)),
+        ("book", box([1.5, 1.2, 0.755], [2.0, 1.7, 0.82])),
+        ("bowl", bowl(1.55, 1.25, 0.825)),
+        ("apple", box([1.7, 1.4, 0.85], [1.78, 1.48, 0.93])),
+        ("book", box([1.4, 1.3, 0.002], [1.7, 1.5, 0.06])),
+        ("painting", box([2, 3.96, 1.4], [3, 3.995, 2.1])),
+        ("chair", box([3.2, 1.2, 0.4], [3.7, 1.7, 0.9])),
+        ("chair/leg", box([3.4, 1.4, 0.002], [3.5, 1.5, 0.398])),
+        ("rug", box([3.0, 2.5, 0.001], [4.4, 3.4, 0.02])),
+    ]
+
+
+@pytest.fixture
+def project(tmp_path: Path) -> Path:
+    folder = tmp_path / "p"
+    color = (0.5, 0.5, 0.5)
+    save_project(folder, Project(classes=[SemanticClass(id=i, name=n, color=color) for n, i in IDS.items()]))
+    parts = [(name, part.subdivide_to_size(0.25)) for name, part in room()]
+    mesh = trimesh.util.concatenate([part for _, part in parts])
+    labels = np.repeat([IDS[name] for name, _ in parts], [len(part.faces) for _, part in parts])
+    store_mesh(folder, mesh, labels, mesh, 0.005)
+    return folder
+
+
+def asked(folder: Path, query: str = "") -> dict[str, Any]:
+    return relate(RelationsParams(project=folder, query=query), Reporter())
+
+
+def changed(folder: Path, **values: Any) -> dict[str, Any]:
+    return instances(InstancesParams(project=folder, **values), Reporter())
+
+
+def told(result: dict[str, Any]) -> set[str]:
+    return {f"{r['subject']} {r['relation']} {r['object']}" for r in result["relations"]}
+
+
+def test_every_relation_of_a_room_is_found_and_no_other(project: Path) -> None:
+    found = told(asked(project))
+    expected = {
+        "wall.001 on floor.001",
+        "table.001 on floor.001",
+        "vase.001 on table.001",
+        "book.001 on table.001",
+        "bowl.001 on book.001",
+        "apple.001 in bowl.001",
+        "book.002 on floor.001",
+        "painting.001 hangs on wall.001",
+        "chair/leg.001 part of chair.001",
+        "chair/leg.001 on floor.001",
+        "rug.001 on floor.001",
+    }
+    assert {line for line in found if "next to" not in line} == expected
+    graph = json.loads((mesh_folder(project, "main") / SCENE_GRAPH).read_text())
+    apple = next(thing for thing in graph["things"] if thing["name"] == "apple.001")
+    np.testing.assert_allclose([apple["low"], apple["high"]], [[1.7, 1.4, 0.85], [1.78, 1.48, 0.93]], atol=0.01)
+    assert apple["class"] == "apple"
+
+
+def test_questions_mean_the_things_that_stand_so(project: Path) -> None:
+    def ask(question: str) -> set[str]:
+        return set(asked(project, question)["found"])
+
+    assert ask("everything on the table") == {"vase.001", "book.001", "bowl.001", "apple.001"}
+    assert ask("Books on the table?") == {"book.001"}
+    assert ask("everything in bowl.001") == {"apple.001"}
+    assert ask("what hangs on the wall") == {"painting.001"}
+    assert ask("everything under the vase") == {"table.001"}
+    assert ask("what is part of the chair") == {"chair/leg.001"}
+    assert ask("book") == {"book.001", "book.002"}
+    assert ask("legs") == {"chair/leg.001"}
+    with pytest.raises(InputError, match="no thing and no class “lamp”") as told_:
+        ask("everything on the lamp")
+    assert "table" in told_.value.hint
+
+
+def test_next_to_is_for_neighbours_of_one_height_and_goes_either_way(project: Path) -> None:
+    beside = {line for line in told(asked(project)) if "next to" in line}
+    assert not any("painting" in line or "wall" in line for line in beside)
+    for one, other in (line.split(" next to ") for line in beside):
+        assert other in asked(project, f"everything next to {one}")["found"]
+        assert one in asked(project, f"everything next to {other}")["found"]
+
+
+def test_a_graph_is_kept_until_the_things_change(project: Path) -> None:
+    assert not asked(project)["reused"]
+    assert asked(project)["reused"]
+    assert changed(project, rename=["vase.001", "Ming"])["changed"] == ["Ming"]
+    again = asked(project, "everything on the table")
+    assert not again["reused"]
+    assert "Ming" in again["found"]
+    (mesh_folder(project, "main") / SCENE_GRAPH).write_text("{")
+    assert not asked(project)["reused"], "a damaged graph is made anew"
+
+
+def test_instances_are_joined_and_split(project: Path) -> None:
+    before = {i.name: i.area for i in read_instances(mesh_folder(project, "main"))}
+    assert changed(project, merge=["book.001", "book.002"])["changed"] == ["book.001"]
+    now = {i.name: i for i in read_instances(mesh_folder(project, "main"))}
+    assert "book.002" not in now
+    assert now["book.001"].area == pytest.approx(before["book.001"] + before["book.002"])
+    with np.load(mesh_folder(project, "main") / MESH) as data:
+        own = data["face_instance"] == now["book.001"].id
+        assert set(data["face_class"][own].tolist()) == {IDS["book"]}
+        assert np.isin(data["face_instance"], [i.id for i in now.values()]).all()
+    made = changed(project, split="book.001")["changed"]
+    assert made == ["book.001.2"]
+    apart = {i.name: i.area for i in read_instances(mesh_folder(project, "main"))}
+    assert apart["book.001"] == pytest.approx(before["book.001"])
+    assert apart["book.001.2"] == pytest.approx(before["book.002"])
+    assert "bowl.001" in asked(project, "everything on the table")["found"]
+
+
+def test_what_cannot_be_done_with_instances_is_a_sentence(project: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    for words, values in {
+        "no instance “lamp”": {"rename": ["lamp", "light"]},
+        "an instance “table.001” already": {"rename": ["vase.001", "table.001"]},
+        "several classes": {"merge": ["vase.001", "table.001"]},
+        "Only one": {"merge": ["vase.001"]},
+        "one connected piece": {"split": "rug.001"},
+    }.items():
+        with pytest.raises(InputError, match=words):
+            changed(project, **values)
+    with pytest.raises(ProjectError, match="no mesh"):
+        relate(RelationsParams(project=project, run="other"), Reporter())
+    assert main(["relations", str(project), "--query", "everything on the table", "--json"]) == 0
+    assert "vase.001" in json.loads(capfd.readouterr().out)["found"]
+
+
+def test_a_mesh_that_is_made_again_keeps_the_names_of_its_things() -> None:
+    before = [
+        Instance(1, "Ming", 4, 0.50, (0.0, 0.0, 1.0)),
+        Instance(2, "vase.002", 4, 0.48, (2.0, 0.0, 1.0)),
+        Instance(3, "book.001", 5, 0.30, (0.0, 0.0, 1.0)),
+    ]
+    # The second vase came out larger, so that it is the first now; a third one stands where none was.
+    after = [
+        Instance(1, "vase.001", 4, 0.51, (2.01, 0.0, 1.0)),
+        Instance(2, "vase.002", 4, 0.49, (0.02, 0.0, 1.0)),
+        Instance(3, "vase.003", 4, 0.20, (0.0, 5.0, 1.0)),
+        Instance(4, "book.001", 5, 0.10, (9.0, 0.0, 0.0)),
+    ]
+    named = with_earlier_names(after, before)
+    assert [i.name for i in named] == ["vase.002", "Ming", "vase.003", "book.001"]
+    assert [i.id for i in named] == [1, 2, 3, 4]
+    assert [i.name for i in with_earlier_names(after, [])] == [i.name for i in after]

@@ -39,6 +39,7 @@ MODULES = (
     "operators.picking",
     "operators.region",
     "operators.label",
+    "operators.label_classes",
     "operators.label_files",
     "operators.label_models",
     "operators.label_tool",

@@ -62,6 +62,7 @@ VERBS = {
     "label export": Verb(
         p.LabelExportParams, "labels.exchange:export_labels", "Write labels for another labelling tool."
     ),
+    "label carry": Verb(p.LabelCarryParams, "labels.carry:carry", "Take over the labels of an earlier epoch."),
     "label accept": Verb(p.LabelAcceptParams, "labels.accept:accept", "Give the run the classes of the marks."),
     "assist embed": Verb(
         p.AssistEmbedParams, "labels.assist.verbs:embed", "Encode photos ahead for clicks, with a model you bring."

@@ -1,4 +1,4 @@
-"""Label: the verbs that prepare, propagate, suggest and accept; photos and classes of the labelling."""
+"""Label: the verbs that prepare, propagate, carry and accept; photos that are marked."""
 
 from __future__ import annotations
 
@@ -9,18 +9,15 @@ from typing import Any
 import bpy
 from bpy.types import Context, Operator
 
-from ..addon.errors import EngineError
 from ..addon.jobs.job import Done, Job
 from ..addon.jobs.queue import queue
 from ..addon.labels import editor, pending, session
-from ..addon.project import classes, lists, snapshot
-from ..addon.props import EnumProperty, FloatProperty, IntProperty, StringProperty
+from ..addon.project import snapshot
+from ..addon.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
 from ..addon.text import t
 from .base import (
     ProjectOperator,
     absolute,
-    deliver_edits,
-    need_project,
     need_run,
     refresh_scenes,
     scene_of,
@@ -48,8 +45,17 @@ def need_marks(context: Context) -> str | None:
     return need_run(context)
 
 
+class RunOperator(ProjectOperator):
+    """A verb of labelling that works on a run, at a revision of the marks where it has one."""
+
+    def of_run(self, context: Context, **more: Any) -> dict[str, Any]:
+        """Project, run, and revision where the verb takes one, with more parameters."""
+        own = {"revision": chosen(self.revision)} if "revision" in self.properties.bl_rna.properties else {}
+        return {"project": self.project_path(context), "run": self.value(context, "run"), **own, **more}
+
+
 @scene_settings(run="run")
-class FIELDWORK_OT_label_prepare(ProjectOperator):
+class FIELDWORK_OT_label_prepare(RunOperator):
     """Prepare the run for labelling: the first marks do so too"""
 
     bl_idname = "fieldwork.label_prepare"
@@ -63,12 +69,11 @@ class FIELDWORK_OT_label_prepare(ProjectOperator):
     )  # fmt: skip
 
     def parameters(self, context: Context) -> dict[str, Any]:
-        surfels = self.surfels if self.properties.is_property_set("surfels") else None
-        return {"project": self.project_path(context), "run": self.value(context, "run"), "surfels": surfels}
+        return self.of_run(context, surfels=self.surfels if self.properties.is_property_set("surfels") else None)
 
 
 @scene_settings(run="run")
-class FIELDWORK_OT_label_propagate(ProjectOperator):
+class FIELDWORK_OT_label_propagate(RunOperator):
     """Carry the marks over the whole surface; in a window that goes without saying"""
 
     bl_idname = "fieldwork.label_propagate"
@@ -79,15 +84,11 @@ class FIELDWORK_OT_label_propagate(ProjectOperator):
     revision: Revision()
 
     def parameters(self, context: Context) -> dict[str, Any]:
-        return {
-            "project": self.project_path(context),
-            "run": self.value(context, "run"),
-            "revision": chosen(self.revision),
-        }
+        return self.of_run(context)
 
 
 @scene_settings(run="run")
-class FIELDWORK_OT_label_overlay(ProjectOperator):
+class FIELDWORK_OT_label_overlay(RunOperator):
     """Write a picture of the labels of the photo that is shown"""
 
     bl_idname = "fieldwork.label_overlay"
@@ -117,14 +118,7 @@ class FIELDWORK_OT_label_overlay(ProjectOperator):
         photo = self.photo or editor.shown_photo(snapshot.folder_of(context.scene.fieldwork))
         if not photo:
             raise ValueError(t("Show a photo in an image editor first."))
-        return {
-            "project": self.project_path(context),
-            "run": self.value(context, "run"),
-            "photo": photo,
-            "kind": self.kind,
-            "revision": chosen(self.revision),
-            "out": absolute(self.out),
-        }
+        return self.of_run(context, photo=photo, kind=self.kind, out=absolute(self.out))
 
     def after(self) -> Done:
         return show_overlay
@@ -137,7 +131,7 @@ def show_overlay(job: Job) -> None:
 
 
 @scene_settings(run="run")
-class FIELDWORK_OT_label_next(ProjectOperator):
+class FIELDWORK_OT_label_next(RunOperator):
     """Show the photo on which a mark helps most"""
 
     bl_idname = "fieldwork.label_next"
@@ -151,12 +145,7 @@ class FIELDWORK_OT_label_next(ProjectOperator):
     )
 
     def parameters(self, context: Context) -> dict[str, Any]:
-        return {
-            "project": self.project_path(context),
-            "run": self.value(context, "run"),
-            "revision": chosen(self.revision),
-            "count": self.count,
-        }
+        return self.of_run(context, count=self.count)
 
     def after(self) -> Done:
         return show_next
@@ -177,7 +166,7 @@ def show_next(job: Job) -> None:
 
 
 @scene_settings(run="run", seconds="label_seconds")
-class FIELDWORK_OT_label_accept(ProjectOperator):
+class FIELDWORK_OT_label_accept(RunOperator):
     """Train the classes that are shown into the field, and write label maps for the photos that have none of their own"""
 
     bl_idname = "fieldwork.label_accept"
@@ -188,15 +177,55 @@ class FIELDWORK_OT_label_accept(ProjectOperator):
     revision: Revision()
 
     def parameters(self, context: Context) -> dict[str, Any]:
-        return {
-            "project": self.project_path(context),
-            "run": self.value(context, "run"),
-            "revision": chosen(self.revision),
-            "seconds": self.value(context, "seconds"),
-        }
+        return self.of_run(context, seconds=self.value(context, "seconds"))
 
     def after(self) -> Done:
         return refresh_scenes
+
+
+@scene_settings(run="run", other="other_project", other_run="other_run", points="common_points", author="label_author")
+class FIELDWORK_OT_label_carry(RunOperator):
+    """Take over the labels of an earlier epoch of the same object, or say that those taken over are right"""
+
+    bl_idname = "fieldwork.label_carry"
+    bl_label = "Carry Labels"
+    verb = "label carry"
+    needs = (need_run,)
+
+    confirm: BoolProperty(
+        name="Confirm", description="What was carried before is right, instead of carrying", options={"SKIP_SAVE"}
+    )
+
+    def parameters(self, context: Context) -> dict[str, Any]:
+        params = self.of_run(context, author=self.value(context, "author"))
+        if self.confirm:
+            return {**params, "confirm": True}
+        other = self.path(context, "other")
+        if other is None:
+            raise ValueError(t("Choose the project of the earlier epoch."))
+        more = {"other_run": self.value(context, "other_run"), "points": self.path(context, "points")}
+        return {**params, "other": other, **more}
+
+    def after(self) -> Done:
+        return carried
+
+
+def carried(job: Job) -> None:
+    """What was carried or confirmed is a step of undo like a mark, and is propagated."""
+    refresh_scenes(job)
+    if job.state != "done" or not job.result or job.project is None:
+        return
+    if job.result["rms"] is not None:
+        share, none, other = job.result["carried"], job.result["unmatched"], job.result["changed"]
+        job.warnings.append(
+            t(
+                "{:.0%} of the surface got labels; {:.0%} has no counterpart, {:.0%} looks different.",
+                share,
+                none,
+                other,
+            )
+        )
+    session.taken(job.project, job.result["revision"])
 
 
 class FIELDWORK_OT_label_photo(Operator):
@@ -241,95 +270,6 @@ def show_photo(scene: bpy.types.Scene, folder: Path, name: str) -> None:
     session.begin(scene.fieldwork)
     if not bpy.app.background and not queue.busy:
         queue.ask("label checkout", {"project": str(folder)})
-
-
-class ClassEdit(Operator):
-    """What the operators have in common that add and remove classes: at once, by the engine."""
-
-    bl_options = {"REGISTER"}
-
-    @classmethod
-    def poll(cls, context: Context) -> bool:
-        reason = need_project(context)
-        if reason:
-            cls.poll_message_set(reason)
-        return reason is None
-
-    def changed(self, settings: Any, known: list[dict[str, Any]]) -> list[dict[str, Any]] | None:
-        """The classes as they shall be; None where there is nothing to do."""
-        raise NotImplementedError
-
-    def execute(self, context: Context) -> set[str]:
-        settings = context.scene.fieldwork
-        folder = snapshot.folder_of(settings)
-        deliver_edits()
-        fields = ("id", *classes.FIELDS)
-        known = [{name: value[name] for name in fields} for value in classes.shown(folder)]
-        wanted = self.changed(settings, known)
-        if wanted is None:
-            return {"CANCELLED"}
-        chosen_id = next((value["id"] for value in wanted if value not in known), None)
-        refused: list[EngineError] = []
-
-        def answered(result: dict[str, Any] | None, error: EngineError | None) -> None:
-            if error is not None:
-                refused.append(error)
-                pending.tell(folder, error)
-            refresh(folder, chosen_id)
-
-        try:
-            ask = queue.ask_and_wait if bpy.app.background else queue.ask
-            ask("classes", {"project": str(folder), "classes": wanted}, answered)
-            session.hurry()
-        except EngineError as error:
-            refused.append(error)
-        if refused:
-            self.report({"ERROR"}, str(refused[0]))
-            return {"CANCELLED"}
-        return {"FINISHED"}
-
-
-def refresh(folder: Path, class_id: int | None) -> None:
-    """Bring changed classes into the lists of the scenes that show the project, and choose one of them."""
-    for scene in bpy.data.scenes:
-        settings = scene.fieldwork
-        if snapshot.folder_of(settings) == folder:
-            lists.refresh(settings)
-            index = next((i for i, entry in enumerate(settings.classes) if entry.id == class_id), None)
-            if index is not None:
-                settings.class_index = index
-
-
-class FIELDWORK_OT_class_add(ClassEdit):
-    """Add a class"""
-
-    bl_idname = "fieldwork.class_add"
-    bl_label = "Add Class"
-
-    name: StringProperty(name="Name", description="Name of the class; empty: a number", options={"SKIP_SAVE"})
-
-    def changed(self, settings: Any, known: list[dict[str, Any]]) -> list[dict[str, Any]]:
-        void = int((snapshot.project(snapshot.folder_of(settings)) or {}).get("ignore_id", 0))
-        taken = {value["id"] for value in known} | {void}
-        number = next(i for i in range(1, len(taken) + 2) if i not in taken)
-        names = {value["name"] for value in known}
-        name = self.name.strip() or t("Class {}", number)
-        while name in names:
-            name += "'"
-        return [*known, {"id": number, "name": name}]
-
-
-class FIELDWORK_OT_class_remove(ClassEdit):
-    """Remove the chosen class; its marks stay in the journal and say nothing"""
-
-    bl_idname = "fieldwork.class_remove"
-    bl_label = "Remove Class"
-
-    def changed(self, settings: Any, known: list[dict[str, Any]]) -> list[dict[str, Any]] | None:
-        if not 0 <= settings.class_index < len(settings.classes):
-            return None
-        gone = settings.classes[settings.class_index].id
-        return [value for value in known if value["id"] != gone]
 
 
 class FIELDWORK_OT_label_class(Operator):
@@ -384,9 +324,8 @@ CLASSES = [
     FIELDWORK_OT_label_overlay,
     FIELDWORK_OT_label_next,
     FIELDWORK_OT_label_accept,
+    FIELDWORK_OT_label_carry,
     FIELDWORK_OT_label_photo,
-    FIELDWORK_OT_class_add,
-    FIELDWORK_OT_class_remove,
     FIELDWORK_OT_label_class,
     FIELDWORK_OT_label_size,
     FIELDWORK_OT_label_retry,

@@ -97,6 +97,12 @@ def draw_label(layout: UILayout, context: Context) -> None:
     row.operator("fieldwork.label_next", icon="FORWARD")
     row.operator("fieldwork.label_accept", icon="CHECKMARK")
     column = columns(layout)
+    column.prop(settings, "other_project")
+    if settings.other_project:
+        column.prop(settings, "other_run")
+        column.prop(settings, "common_points")
+        layout.operator("fieldwork.label_carry", icon="TRACKING_FORWARDS").confirm = False
+    column = columns(layout)
     column.prop(settings, "label_author")
     column.prop(settings, "label_seconds")
     row = layout.row(align=True)
@@ -136,6 +142,8 @@ def draw_state_of_marks(layout: UILayout, context: Context, folder: Path, settin
             draw_wrapped(box, kept, width, icon="INFO")
     if error is not None or (facts.stale and session.job_of(folder) is None):
         box.operator("fieldwork.label_retry", icon="FILE_REFRESH")
+    if facts.told.get("carried"):
+        box.operator("fieldwork.label_carry", text=t("They Are Right"), icon="CHECKMARK").confirm = True
     for conflict in facts.told.get("conflicts", [])[:MOST_CONFLICTS]:
         draw_wrapped(box, states.conflict_text(conflict, journal.marks(folder)), width, icon="ERROR")
 

@@ -38,6 +38,7 @@ class Facts:
 
 _shares: dict[tuple[Any, ...], tuple[dict[int, Any], float]] = {}
 KEPT = 4
+NO_MARKS = ("carried", "confirmed")  # shapes in the journal of what nobody drew
 
 
 def facts(context: Context) -> Facts:
@@ -58,7 +59,11 @@ def facts(context: Context) -> Facts:
         revision,
         len(journal.marks(folder)),
         None if found is None else computed,
-        dict(Counter(mark.get("class_id") for mark in marks if not mark.get("erase"))),
+        dict(
+            Counter(
+                mark.get("class_id") for mark in marks if not mark.get("erase") and mark.get("shape") not in NO_MARKS
+            )
+        ),
         shares,
         void,
         {} if found is None else found.told,
@@ -116,6 +121,8 @@ def lines(known: Facts) -> list[str]:
         told.append(t("It was not propagated yet."))
     if known.computed is not None:
         told.append(t("{:.0%} of the surface is void: nothing like it is marked.", known.void))
+    if known.told.get("carried"):
+        told.append(t("{:.0%} is carried from the earlier epoch: look at it, then confirm.", known.told["carried"]))
     if known.told.get("seconds") is not None:
         told.append(t("The last propagation took {:.1f} s.", known.told["seconds"]))
     unused = len(known.told.get("unused", []))
@@ -129,7 +136,7 @@ def lines(known: Facts) -> list[str]:
 def conflict_text(conflict: dict[str, int], marks: list[dict[str, Any]]) -> str:
     """Two marks that contradict each other, with the photos on which they are."""
     photos = [
-        marks[number - 1]["photo"] if 0 < number <= len(marks) else "?"
+        marks[number - 1]["photo"] or t("the surface") if 0 < number <= len(marks) else "?"
         for number in (conflict["revision"], conflict["other"])
     ]
     return t("Mark {} on {} contradicts mark {} on {}.", conflict["revision"], photos[0], conflict["other"], photos[1])

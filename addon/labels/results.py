@@ -13,6 +13,7 @@ from ..project import snapshot
 from . import journal
 
 UNSURE = 0.75  # confidence below which a place is hatched; see the calibration in docs/experiments.md
+DOTS = 6  # pixels of the map from one white dot to the next, where labels are carried and not confirmed
 STRIPE = 6  # pixels of the map from one stripe of the hatching to the next
 VOID_COLOR = (0.12, 0.12, 0.12)
 
@@ -108,7 +109,8 @@ def overlay(
 ) -> np.ndarray:
     """The labels of a photo as RGBA (H, W, 4) float32, sRGB, rows from the bottom as Blender has them.
 
-    Where no surface is it is clear, and so is void. With `confidence` unsure places are hatched, and void is dark.
+    Where no surface is it is clear, and so is void. What an earlier epoch gave and nobody confirmed is dotted. With `confidence` unsure places are hatched, and void
+    is dark.
 
     Args:
         surfels: (H, W) of the photo. colors: of the classes by id.
@@ -122,6 +124,10 @@ def overlay(
     if confidence:
         table[void] = (*VOID_COLOR, 1.0)
     picture = table[label[surfels]]
+    if found.carried is not None:
+        y, x = np.indices(surfels.shape)
+        dots = (x % DOTS < DOTS // 2) & (y % DOTS < DOTS // 2) & np.append(found.carried, False)[surfels]
+        picture[dots & (picture[..., 3] > 0), :3] = 1.0
     if confidence:
         y, x = np.indices(surfels.shape)
         stripe = ((x + y) % STRIPE < STRIPE // 2) & (sure[surfels] < UNSURE) & (picture[..., 3] > 0)

@@ -12,13 +12,13 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from ..errors import InputError, ProjectError, wrong_value
 from ..files import disk_errors, write_json
-from ..project.schema import ImageName, now
+from ..project.schema import ImageName, OwnFile, now
 from ..project.store import locked
 
 FOLDER = "marks"
@@ -26,12 +26,18 @@ JOURNAL = "journal.jsonl"
 SHOWN = "shown.json"
 LOCK_FILE = "jobs/marks.lock"
 
-Shape = Literal["line", "outline", "click", "part"]
+Shape = Literal["line", "outline", "click", "part", "carried", "confirmed"]
+DRAWN = ("line", "outline", "click", "part")
 
 
 class Mark(BaseModel):
-    """One mark on a photo: points in pixels of its working copy, brush width in the same. class_id: None for void and
-    for what erases. key: which mark it is to whoever sent it."""
+    """One mark: on a photo points in pixels of its working copy, and the brush's width in the same; on the surface places
+    in the frame of the poses (which no alignment changes), and the width in its units. class_id: None for void and for what
+    erases. key: which mark it is to whoever sent it.
+
+    With shape "carried" the labels of an earlier epoch in `file` (see carry.py), with "confirmed" the word of the author
+    that what was carried before is right.
+    """
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
 
@@ -40,16 +46,33 @@ class Mark(BaseModel):
     time: str = Field(default_factory=now)
     author: str = ""
     key: str = ""
-    photo: ImageName
+    photo: ImageName = ""
     shape: Shape
-    points: list[tuple[float, float]] = Field(min_length=1)
-    width: float = Field(gt=0)
+    points: list[tuple[float, float]] = []
+    places: list[tuple[float, float, float]] = []
+    file: OwnFile = ""
+    width: float = Field(default=1.0, gt=0)
     class_id: int | None = None
     erase: bool = False
 
     @property
     def void(self) -> bool:
-        return self.class_id is None and not self.erase
+        return self.class_id is None and not self.erase and self.drawn
+
+    @property
+    def drawn(self) -> bool:
+        """Whether somebody drew it, on a photo or on the surface."""
+        return self.shape in DRAWN
+
+    @model_validator(mode="after")
+    def _whole(self) -> Self:
+        if self.drawn and bool(self.photo) + bool(self.places) != 1:
+            raise ValueError("a mark is on a photo or on the surface")
+        if self.drawn and not (self.points or self.places):
+            raise ValueError("a mark has at least one point")
+        if (self.shape == "carried") != bool(self.file):
+            raise ValueError("labels that were carried stand in a file")
+        return self
 
 
 def read_marks(project: Path) -> list[Mark]:

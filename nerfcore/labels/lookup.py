@@ -34,13 +34,15 @@ class PhotoMap:
 @dataclass(frozen=True)
 class Labelling:
     """What a revision says of N surfels: probability (N, C) of each class, what is missing to 1 being void; class_ids (C,);
-    made: digest of the marks and the preparation it comes from; told: what `label propagate` said of it."""
+    made: digest of the marks and the preparation it comes from; told: what `label propagate` said of it;
+    carried: (N,) which are labelled as an earlier epoch was, and nobody confirmed it, None for none."""
 
     revision: int
     probability: np.ndarray
     class_ids: np.ndarray
     made: str
     told: dict[str, Any] = field(default_factory=dict)
+    carried: np.ndarray | None = None
 
     def label(self, void: int) -> np.ndarray:
         """Class id (N,) int32 of each surfel; `void` where no class explains it."""
@@ -62,7 +64,8 @@ def read_labelling(path: Path) -> Labelling | None:
         with np.load(path, allow_pickle=False) as data:
             probability = data["probability"].astype(np.float32)
             told = json.loads(str(data["told"])) if "told" in data else {}
-            return Labelling(int(data["revision"]), probability, data["class_ids"], str(data["made"]), told)
+            carried = data.get("carried", None)
+            return Labelling(int(data["revision"]), probability, data["class_ids"], str(data["made"]), told, carried)
     except UNREADABLE:
         return None
 

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import torch
 from scipy.sparse import csr_matrix
+from scipy.spatial import KDTree
 from skimage.color import rgb2lab
 
 from ..data.box import Box, box_poses
@@ -29,8 +30,8 @@ from ..data.pixels import training_size
 from ..data.scene import Scene, View
 from ..errors import InputError, TrainingError
 from ..files import disk_errors, write_json
-from ..geometry.contraction import grid_position
-from ..geometry.similarity import transform_points
+from ..geometry.contraction import grid_position, uncontract
+from ..geometry.similarity import similarity_scale, transform_points
 from ..images.picture import over, resized
 from ..images.working import nearest, read_image, read_picture
 from ..params import LabelPrepareParams
@@ -38,7 +39,7 @@ from ..progress import Reporter
 from ..project.fingerprints import digest, rounded
 from ..project.runs import geometry_id, run_folder
 from ..project.store import load_project, world_from_sfm
-from ..render.run import Trained, load_trained, refined_poses
+from ..render.run import Trained, load_info, load_trained, refined_poses
 from .graph import Graph, feature_columns, make_graph
 from .lookup import RECORD, UNREADABLE, part_of, photo_maps
 from .lookup import SURFELS as FOLDER
@@ -82,6 +83,21 @@ class Preparation:
         if photo is None:
             raise InputError(f"The photo “{name}” has no pose.", "Choose another photo, or run `fieldwork poses`.")
         return part_of(self.pixel_surfel, photo), part_of(self.pixel_edge, photo)
+
+    @cached_property
+    def world(self) -> tuple[np.ndarray, np.ndarray]:
+        """Places (N, 3) and unit normals (N, 3) of the surfels in the world."""
+        project, run = self.folder.parents[2], self.folder.parent.name
+        box = load_info(project, run).box(load_project(project))
+        position = torch.from_numpy(np.array(self.surfels.position, np.float64))
+        inside = uncontract(position) if box.contracted else position * 2 - 1
+        rotation = box.world_from_box[:3, :3] / similarity_scale(box.world_from_box)
+        return transform_points(box.world_from_box, inside.numpy()), np.asarray(self.surfels.normal) @ rotation.T
+
+    @cached_property
+    def tree(self) -> KDTree:
+        """The places of the surfels in the world, to be searched."""
+        return KDTree(self.world[0])
 
     @cached_property
     def graph(self) -> Graph:

@@ -12,20 +12,21 @@ import numpy as np
 from ..params import LabelPropagateParams
 from ..progress import Reporter
 from ..project.store import load_project
+from .carry import carried_classes
 from .journal import marks_at, read_marks, shown_revision
 from .lookup import Labelling
 from .preparation import Preparation, ensured
 from .propagation import propagated
 from .revisions import load, made_of, path_of, save
-from .seeds import seeds_of
+from .seeds import UNMARKED, Seeds, seeds_of
 
 
 def propagate(params: LabelPropagateParams, report: Reporter) -> dict[str, Any]:
     """Carry the marks of a revision over the surface; the run is prepared where it is not.
 
     Returns:
-        {"revision", "marks", "surfels", "void": share of the surfels that no class explains, "confidence": mean of the
-        others, "classes": [{"id", "name", "surfels", "confidence"}], "conflicts": [{"revision", "other", "surfels"}],
+        {"revision", "marks", "surfels", "void": share of the surfels that no class explains, "carried": share that an earlier
+        epoch says and nobody confirmed, "confidence": mean of the labelled ones, "classes": [{"id", "name", "surfels", "confidence"}], "conflicts": [{"revision", "other", "surfels"}],
         "unused": revisions of marks that met no surface or whose class is gone, "seconds", "file"}
     Raises:
         ProjectError: there is no trained run, or the journal is damaged. InputError: there is no such revision.
@@ -38,13 +39,14 @@ def propagate(params: LabelPropagateParams, report: Reporter) -> dict[str, Any]:
     ready, _ = ensured(folder, params.run, report)
     begin = time.perf_counter()
     report.stage("Propagating")
-    marked = {mark.class_id for mark in at}
+    marked = {mark.class_id for mark in at} | carried_classes(folder, at)
     class_ids = [c.id for c in project.classes if c.id in marked]
     sizes = {image.name: (image.width, image.height) for image in project.images}
     seeds = seeds_of(ready, at, class_ids, sizes)
     start = warm_start(folder, params.run, ready, class_ids, at[-1].parent if at else None)
     probability = propagated(ready, seeds, len(class_ids), start, report.check)
     labelling = Labelling(revision, probability, np.array(class_ids, np.int32), made_of(ready, at, class_ids))
+    labelling = replace(labelling, carried=unconfirmed(labelling, seeds))
     label, sure = labelling.label(project.ignore_id), labelling.confidence()
     names = {c.id: c.name for c in project.classes}
     told = {
@@ -59,9 +61,22 @@ def propagate(params: LabelPropagateParams, report: Reporter) -> dict[str, Any]:
         ],
         "conflicts": seeds.conflicts,
         "unused": seeds.unused,
+        "carried": 0.0 if labelling.carried is None else round(float(labelling.carried.mean()), 4),
         "seconds": round(time.perf_counter() - begin, 3),
     }
     return {**told, "file": str(save(folder, params.run, replace(labelling, told=told)))}
+
+
+def unconfirmed(labelling: Labelling, seeds: Seeds) -> np.ndarray | None:
+    """Which surfels (N,) have the class that an earlier epoch gave them, without anybody having said so; None where nothing
+    was carried."""
+    if seeds.carried is None or not len(labelling.class_ids):
+        return None
+    told = seeds.carried.label
+    wanted = np.append(labelling.class_ids, UNMARKED)[np.where(told >= 0, told, -1)]
+    found = (told >= 0) & (labelling.label(UNMARKED) == wanted) & ~seeds.carried.confirmed
+    found[seeds.surfel] = False
+    return found
 
 
 def warm_start(

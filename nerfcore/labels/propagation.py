@@ -9,7 +9,7 @@ import torch
 
 from .graph import Graph, membership
 from .preparation import Preparation
-from .seeds import VOID, Seeds
+from .seeds import VOID, Carried, Seeds
 from .unary import class_probabilities, distance_to_samples
 from .walker import random_walk
 
@@ -17,6 +17,7 @@ from .walker import random_walk
 STRENGTH = 0.003  # γ of the prior, of the median of what edges conduct
 KNOWN_LOOK = 2.75  # distance to the nearest marked surfel, in feature columns, at which prior and void count the same
 SHARPNESS = 4
+CARRIED = 30.0  # by how much firmer the labels of an earlier epoch are than what surfels look like; not tuned
 CERTAINTY = 3  # exponent that makes confidence the share that is right
 FINE_STEPS = 15  # on surfels, after the coarse solution of all of it
 
@@ -36,14 +37,20 @@ def propagated(
     Args:
         start: (N, classes) of an earlier revision, to begin with. check: called often, may raise to stop.
     """
-    known = seeds.label != VOID
-    if not known.any():
+    known, carried = seeds.label != VOID, seeds.carried
+    if not known.any() and carried is None:
         return np.zeros((len(ready.surfels), classes), np.float32)
-    look, familiar = appearance(ready, seeds, classes, check)
+    count = len(ready.surfels)
+    look, familiar = np.zeros((count, classes), np.float32), np.zeros(count, np.float32)
+    if known.any():
+        look, familiar = appearance(ready, seeds, classes, check)
+    firm = np.ones(count, np.float32)
+    if carried is not None:
+        look, familiar, firm = with_carried(look, familiar, carried)
     values = np.zeros((len(seeds.surfel), classes), np.float32)
     values[np.flatnonzero(known), seeds.label[known]] = 1
     start = None if start is None else calibrated(start, 1 / CERTAINTY)
-    return calibrated(walked(ready.graph, look, familiar, seeds.surfel, values, start, check))
+    return calibrated(walked(ready.graph, look, familiar, seeds.surfel, values, start, check, firm))
 
 
 def appearance(
@@ -62,6 +69,19 @@ def appearance(
     return look[:, :classes], 0.5 ** ((distance / KNOWN_LOOK) ** SHARPNESS)
 
 
+def with_carried(look: np.ndarray, familiar: np.ndarray, carried: Carried) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Prior (N, C), its share of the strength (N,) and factors (N,) of the strength, where an earlier epoch has a say: as
+    sure as it was, and firmer than what surfels look like."""
+    told = carried.label >= 0
+    mixed, known = look.copy(), familiar.copy()
+    one = np.zeros((int(told.sum()), look.shape[1]), np.float32)
+    one[np.arange(len(one)), carried.label[told]] = 1
+    sure = carried.sure[told, None]
+    mixed[told] = sure * one + (1 - sure) * look[told]
+    known[told] = np.maximum(familiar[told], carried.sure[told])
+    return mixed, known, np.where(told, CARRIED, 1).astype(np.float32)
+
+
 def walked(
     graph: Graph,
     look: np.ndarray,
@@ -70,17 +90,18 @@ def walked(
     values: np.ndarray,
     start: np.ndarray | None,
     check: Callable[[], None],
+    firm: np.ndarray | float = 1.0,
 ) -> np.ndarray:
     """Probability (N, C) of the classes by the random walker, first on parts, then on surfels.
 
     Args:
         look: (N, C) prior of each surfel, in sum at most 1. familiar: (N,) in [0, 1], share of its strength that the prior
             has; the rest conducts to void. seeds: (S,) known surfels; values: (S, C) their probabilities. start: (N, C) or
-            None, as in `propagated`.
+            None, as in `propagated`. firm: (N,) factors of the strength.
     """
     count = int(graph.part.max(initial=-1)) + 1
     members = membership(graph.part, count)
-    strength = STRENGTH * float(np.median(np.asarray(graph.edges.sum(1))))
+    strength = STRENGTH * float(np.median(np.asarray(graph.edges.sum(1)))) * firm
     to_classes = strength * familiar
     to_void = strength * (1 - familiar)
     pull = np.asarray(members.T @ to_classes)

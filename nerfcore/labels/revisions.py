@@ -30,6 +30,7 @@ def path_of(project: Path, run: str, revision: int) -> Path:
 def save(project: Path, run: str, labelling: Labelling) -> Path:
     """Atomically write the labels of a revision, and forget the oldest ones beyond `KEPT`. Raises DiskError."""
     path = path_of(project, run, labelling.revision)
+    more = {} if labelling.carried is None else {"carried": labelling.carried}
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         np.savez(
             file,
@@ -38,6 +39,7 @@ def save(project: Path, run: str, labelling: Labelling) -> Path:
             class_ids=labelling.class_ids,
             made=labelling.made,
             told=json.dumps(labelling.told),
+            **more,
         )
     others = sorted(path.parent.glob("*.npz"), key=lambda p: p.stat().st_mtime)
     for old in others[:-KEPT]:

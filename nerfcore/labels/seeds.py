@@ -4,15 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
+from scipy.spatial import KDTree
 
+from ..errors import ProjectError
+from ..files import UNREADABLE_ARRAYS
+from ..geometry.similarity import similarity_scale, transform_points
+from ..project.store import load_project, world_from_sfm
 from .drawing import covered
 from .journal import Mark
 from .preparation import Preparation
 
 VOID = -1  # class index of surfels that are marked as none of the classes
 UNMARKED = -2
+SAME_SIDE = 0.3  # cosine between normals of one side of a surface
+MOST_STEPS = 10_000  # of a brush between two places
 
 
 @dataclass(frozen=True)
@@ -26,6 +35,17 @@ class Seeds:
     mark: np.ndarray
     conflicts: list[dict[str, int]]
     unused: list[int]
+    carried: Carried | None = None
+
+
+@dataclass(frozen=True)
+class Carried:
+    """What an earlier epoch says of N surfels: label (N,) class index, VOID or UNMARKED where it says nothing; sure (N,) in
+    [0, 1]; confirmed: whether somebody said that it is right."""
+
+    label: np.ndarray
+    sure: np.ndarray
+    confirmed: np.ndarray
 
 
 def seeds_of(
@@ -44,15 +64,25 @@ def seeds_of(
     source = np.zeros(len(ready.surfels), np.int32)
     overlaps: dict[tuple[int, int], int] = {}
     unused = []
+    carried: Carried | None = None
     for mark in marks:
+        if mark.shape == "carried":
+            carried = carried_labels(ready, ready.folder.parents[2] / mark.file, class_ids)
+            continue
+        if mark.shape == "confirmed":
+            if carried is not None:
+                carried.confirmed[:] = True
+            continue
         if mark.class_id is not None and mark.class_id not in index:
             unused.append(mark.revision)
             continue
-        surfels = marked_surfels(ready, mark, sizes[mark.photo])
+        surfels = placed_surfels(ready, mark) if mark.places else marked_surfels(ready, mark, sizes[mark.photo])
         if not len(surfels):
             unused.append(mark.revision)
         elif mark.erase:
             label[surfels] = UNMARKED
+            if carried is not None:
+                carried.label[surfels] = UNMARKED
         else:
             new = VOID if mark.class_id is None else index[mark.class_id]
             other = surfels[(label[surfels] != UNMARKED) & (label[surfels] != new)]
@@ -61,7 +91,7 @@ def seeds_of(
             label[surfels], source[surfels] = new, mark.revision
     surfel = np.flatnonzero(label != UNMARKED)
     conflicts = [{"revision": a, "other": b, "surfels": count} for (a, b), count in sorted(overlaps.items())]
-    return Seeds(surfel, label[surfel], source[surfel], conflicts, unused)
+    return Seeds(surfel, label[surfel], source[surfel], conflicts, unused, carried)
 
 
 def marked_surfels(ready: Preparation, mark: Mark, size: tuple[int, int]) -> np.ndarray:
@@ -75,3 +105,47 @@ def marked_surfels(ready: Preparation, mark: Mark, size: tuple[int, int]) -> np.
     clear = touched & ~edge
     found = np.unique(surfel[touched if mark.erase else clear])
     return np.flatnonzero(np.isin(ready.part, ready.part[found])) if mark.shape == "part" else found
+
+
+def placed_surfels(ready: Preparation, mark: Mark) -> np.ndarray:
+    """The surfels (S,) that a mark on the surface covers, each once: those no farther from it than half of its width that
+    face as the nearest one does, so that a brush on one side of a sheet leaves the other side alone."""
+    world_from_sfm_ = world_from_sfm(load_project(ready.folder.parents[2]))
+    places = transform_points(world_from_sfm_, np.array(mark.places, np.float64))
+    radius = mark.width / 2 * similarity_scale(world_from_sfm_)
+    tree, normal = ready.tree, ready.world[1]
+    corners = [places[:1]]
+    for begin, end in pairwise(places) if mark.shape == "line" else ():
+        steps = int(np.ceil(float(np.linalg.norm(end - begin)) / max(radius / 2, 1e-9)))
+        corners.append(begin + (end - begin) * (np.arange(1, min(steps, MOST_STEPS) + 1) / max(steps, 1))[:, None])
+    along = np.concatenate(corners) if mark.shape == "line" else places
+    nearest = np.asarray(tree.query(along)[1])
+    if mark.shape == "part":
+        return np.flatnonzero(np.isin(ready.part, ready.part[np.unique(nearest)]))
+    found = [nearest]
+    for number, near in zip(nearest, tree.query_ball_point(along, radius)):
+        near = np.array(near, np.int64)
+        found.append(near[normal[near] @ normal[number] > SAME_SIDE])
+    return np.unique(np.concatenate(found))
+
+
+def carried_labels(ready: Preparation, path: Path, class_ids: Sequence[int]) -> Carried:
+    """What a file of carried labels (see carry.py) says of the present surfels.
+
+    Raises:
+        ProjectError: it is missing or damaged.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            places, told, sure, reach = data["places"], data["class_id"], data["sure"], float(data["reach"])
+    except (*UNREADABLE_ARRAYS, KeyError) as error:
+        raise ProjectError(
+            f"The labels that were carried are not readable: {path} ({error}).",
+            "Show the revision before them (`fieldwork label checkout`), and carry them again.",
+        ) from error
+    sfm_from_world = np.linalg.inv(world_from_sfm(load_project(ready.folder.parents[2])))
+    distance, nearest = KDTree(places).query(transform_points(sfm_from_world, ready.world[0]))
+    index = np.full(max([*class_ids, int(told.max(initial=0))]) + 1, UNMARKED, np.int32)
+    index[list(class_ids)] = np.arange(len(class_ids))
+    label = np.where(np.asarray(distance) <= reach, index[told[nearest]], UNMARKED).astype(np.int32)
+    return Carried(label, sure[nearest].astype(np.float32), np.zeros(len(label), bool))

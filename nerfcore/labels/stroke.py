@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
+from ..geometry.similarity import similarity_scale, transform_points
 from ..params import LabelCheckoutParams, LabelStrokeParams
 from ..progress import Reporter
 from ..project.schema import Project
-from ..project.store import load_poses, load_project
+from ..project.store import load_poses, load_project, world_from_sfm
 from .drawing import covered
 from .journal import append_mark, marks_at, read_marks, show, shown_revision
 
@@ -27,9 +28,12 @@ def stroke(params: LabelStrokeParams, report: Reporter) -> dict[str, Any]:
     """
     folder = Path(params.project)
     project = load_project(folder)
-    require_photo(project, folder, params.photo)
     if params.class_id is not None:
         require_class(project, params.class_id)
+    values = params.model_dump(include={"photo", "shape", "points", "width", "class_id", "erase", "author", "key"})
+    if params.places:
+        return _appended(folder, {**values, **on_surface(params, world_from_sfm(project))})
+    require_photo(project, folder, params.photo)
     size = next((i.width, i.height) for i in project.images if i.name == params.photo)
     points = np.array(params.points, np.float64)
     if not np.isfinite(points).all() or not covered(params.shape, points, params.width, *size).any():
@@ -37,7 +41,20 @@ def stroke(params: LabelStrokeParams, report: Reporter) -> dict[str, Any]:
             f"The mark lies outside the photo “{params.photo}”, which is {size[0]}×{size[1]}.",
             "Give pixels of the photo, its top-left corner being 0,0.",
         )
-    values = params.model_dump(include={"photo", "shape", "points", "width", "class_id", "erase", "author", "key"})
+    return _appended(folder, values)
+
+
+def on_surface(params: LabelStrokeParams, world_from_sfm: np.ndarray) -> dict[str, Any]:
+    """Places and width of a mark on the surface in the frame of the poses."""
+    places = np.array(params.places, np.float64)
+    sfm_from_world = np.linalg.inv(world_from_sfm)
+    return {
+        "places": transform_points(sfm_from_world, places).tolist(),
+        "width": params.width * similarity_scale(sfm_from_world),
+    }
+
+
+def _appended(folder: Path, values: dict[str, Any]) -> dict[str, Any]:
     mark = append_mark(folder, values)
     marks = marks_at(read_marks(folder), mark.revision)
     return {"revision": mark.revision, "parent": mark.parent, "marks": len(marks)}

@@ -13,6 +13,7 @@ from trimesh.exchange.ply import export_ply
 
 from ..errors import ProjectError
 from ..files import atomic_path, write_json
+from ..geometry.registration import Registered, by_points, by_surfaces
 from ..geometry.similarity import similarity_scale
 from ..kernels.closest import ClosestPoints
 from ..mesh.clean import areas, cross, unit
@@ -24,7 +25,6 @@ from ..progress import Reporter
 from ..project.store import record_step
 from .amounts import K
 from .drawings import Subject, axis_names, framed, load_subject
-from .registration import Registered, by_points, by_surfaces
 from .sheet import Entry, Sheet, write_sheet
 from .views import picture, projection
 

@@ -22,11 +22,16 @@ class LabelPrepareParams(Params):
 
 class LabelStrokeParams(Params):
     project: Path
-    photo: str = Field(description="name of the photo that the mark is drawn on")
+    photo: str = Field(default="", description="name of the photo that the mark is drawn on")
     points: list[tuple[float, float]] = Field(
+        default=[],
         description="pixels x,y of the photo, its top-left corner being 0,0: the corners of a line or an outline, or where "
         "clicked; on the command line x,y x,y …",
-        min_length=1,
+        max_length=100_000,
+    )
+    places: list[tuple[float, float, float]] = Field(
+        default=[],
+        description="instead of a photo: places x,y,z on the surface in the aligned world",
         max_length=100_000,
     )
     shape: Literal["line", "outline", "click", "part"] = Field(
@@ -34,7 +39,12 @@ class LabelStrokeParams(Params):
         description="what the points are: a brush's line, the outline of an area, clicks, or clicks that each take the whole "
         "part of the surface that looks alike",
     )
-    width: float = Field(default=8.0, gt=0, le=LARGEST_PICTURE, description="width of the brush in pixels")
+    width: float = Field(
+        default=8.0,
+        gt=0,
+        le=LARGEST_PICTURE,
+        description="width of the brush: pixels of the photo, or units of the world on the surface",
+    )
     class_id: int | None = Field(default=None, ge=0, le=65535, description="id of the class that is marked")
     void: bool = Field(default=False, description="what is marked is none of the classes")
     erase: bool = Field(default=False, description="take away earlier marks here")
@@ -45,6 +55,35 @@ class LabelStrokeParams(Params):
     def _one_meaning(self) -> Self:
         if (self.class_id is not None) + self.void + self.erase != 1:
             raise ValueError("give one of class_id, void and erase")
+        if bool(self.photo) + bool(self.places) != 1:
+            raise ValueError("give a photo with points, or places on the surface")
+        if self.photo and not self.points:
+            raise ValueError("give at least one point of the photo")
+        if self.places and self.shape == "outline":
+            raise ValueError("an outline is drawn on a photo")
+        return self
+
+
+class LabelCarryParams(Params):
+    project: Path
+    other: Path | None = Field(
+        default=None, description="project of an earlier epoch of the same object, which is labelled"
+    )
+    run: RunName = "main"
+    other_run: RunName = "main"
+    points: Path | None = Field(
+        default=None,
+        description="table (.csv: name,x,y,z,other_x,other_y,other_z) of points in both worlds; default: by the surfaces",
+    )
+    confirm: bool = Field(
+        default=False, description="say that the labels carried before are right, instead of carrying"
+    )
+    author: str = Field(default="", max_length=200, description="who carries or confirms them")
+
+    @model_validator(mode="after")
+    def _one_thing(self) -> Self:
+        if (self.other is not None) + self.confirm != 1:
+            raise ValueError("give the project of the earlier epoch, or confirm")
         return self
 
 

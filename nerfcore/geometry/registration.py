@@ -16,8 +16,8 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
-from ..geometry.similarity import fit_similarity, make_similarity, transform_points
 from ..progress import Reporter
+from .similarity import fit_similarity, make_similarity, transform_points
 
 KEPT = 0.7  # of the pairs that a step goes by
 TURNS = 12  # about z that are tried where nothing says how the epochs lie to each other

@@ -15,6 +15,16 @@ from .label_models import cut_out
 
 LEAST_STEP = 1.0  # pixels of the screen between two points of a stroke
 DIGITS = 2  # of pixels in the journal
+NUMBERS = ("ONE", "TWO", "THREE", "FOUR", "FIVE", "SIX", "SEVEN", "EIGHT", "NINE")
+KEYS = (
+    ("fieldwork.label_size", {"type": "LEFT_BRACKET", "value": "PRESS"}, {"properties": [("factor", 0.8)]}),
+    ("fieldwork.label_size", {"type": "RIGHT_BRACKET", "value": "PRESS"}, {"properties": [("factor", 1.25)]}),
+    ("fieldwork.label_next", {"type": "N", "value": "PRESS", "shift": True}, None),
+    *(
+        ("fieldwork.label_class", {"type": key, "value": "PRESS"}, {"properties": [("number", number)]})
+        for number, key in enumerate(NUMBERS, 1)
+    ),
+)
 
 
 class FIELDWORK_OT_label_mark(Operator):
@@ -115,13 +125,7 @@ class FIELDWORK_TOOL_label(WorkSpaceTool):
     bl_keymap = (
         ("fieldwork.label_mark", {"type": "LEFTMOUSE", "value": "PRESS"}, None),
         ("fieldwork.label_mark", {"type": "LEFTMOUSE", "value": "PRESS", "ctrl": True}, None),
-        ("fieldwork.label_size", {"type": "LEFT_BRACKET", "value": "PRESS"}, {"properties": [("factor", 0.8)]}),
-        ("fieldwork.label_size", {"type": "RIGHT_BRACKET", "value": "PRESS"}, {"properties": [("factor", 1.25)]}),
-        ("fieldwork.label_next", {"type": "N", "value": "PRESS", "shift": True}, None),
-        *(
-            ("fieldwork.label_class", {"type": key, "value": "PRESS"}, {"properties": [("number", number)]})
-            for number, key in enumerate(("ONE", "TWO", "THREE", "FOUR", "FIVE", "SIX", "SEVEN", "EIGHT", "NINE"), 1)
-        ),
+        *KEYS,
     )
 
     @staticmethod

@@ -92,6 +92,9 @@ def draw_label(layout: UILayout, context: Context) -> None:
         row.label(text=f"  {shown}", translate=False)
         row.operator("fieldwork.label_photo", text="", icon="TRIA_RIGHT").step = 1
         draw_tools(layout, settings)
+    if context.area is not None and context.area.type == "VIEW_3D":
+        tool = layout.operator("wm.tool_set_by_id", text=t("Mark the Surface"), icon="MESH_DATA")
+        tool.name = "fieldwork.label_surface"
     draw_state_of_marks(layout, context, folder, settings)
     row = layout.row(align=True)
     row.operator("fieldwork.label_next", icon="FORWARD")

@@ -28,9 +28,10 @@ WRITE = [
     ("coco-panoptic", "COCO Panoptic", "A folder with panoptic.json and pictures of segment ids"),
     *TOOLS[1:],
     ("png-colors", "Colored Label Maps", "A folder of PNG files in the colors of the classes"),
+    ("history", "History", "A table of who marked what when (.csv)"),
     MASKS,
 ]
-SUFFIXES = {"coco": ".json", "cvat": ".xml", "label-studio": ".json"}  # formats of one file
+SUFFIXES = {"history": ".csv", "coco": ".json", "cvat": ".xml", "label-studio": ".json"}  # formats of one file
 
 
 class FIELDWORK_OT_label_import(ProjectOperator):

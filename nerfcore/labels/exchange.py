@@ -23,6 +23,8 @@ from ..project.store import edit_project, load_project
 from .accept import is_accepted
 from .formats import known
 from .formats.regions import LabelClass, Picture, Region, Source
+from .history import write_history
+from .journal import read_marks, shown_revision
 from .overlay import photo_labels
 from .revisions import computed
 
@@ -187,6 +189,8 @@ def export_labels(params: LabelExportParams, report: Reporter) -> dict[str, Any]
     """
     folder, out = Path(params.project), Path(params.out)
     project = load_project(folder)
+    if params.format == "history":
+        return export_history(params, project, folder, out)
     check_out(params, project, out)
     revision, pictures, count = pictures_of(params, project, folder)
     if not count:
@@ -202,6 +206,20 @@ def export_labels(params: LabelExportParams, report: Reporter) -> dict[str, Any]
         "files": [str(path) for path in written],
         "revision": revision,
     }
+
+
+def export_history(params: LabelExportParams, project: Project, folder: Path, out: Path) -> dict[str, Any]:
+    """Write the table of all marks; returns as `export_labels`. Raises InputError, SettingError, ProjectError, DiskError."""
+    if out.suffix.lower() != ".csv":
+        raise SettingError(f"{out} does not end in .csv.", "The history of marks is one .csv file.")
+    marks = read_marks(folder)
+    if not marks:
+        raise InputError(f"{folder} has no marks.", "Mark something with `fieldwork label stroke`.")
+    revision = shown_revision(folder, len(marks)) if params.revision is None else params.revision
+    written = write_history(out, project, marks, revision)
+    photos = len({mark.photo for mark in marks if mark.photo})
+    names = [c.name for c in project.classes]
+    return {"format": "history", "photos": photos, "classes": names, "files": [str(written)], "revision": revision}
 
 
 def check_out(params: LabelExportParams, project: Project, out: Path) -> None:

@@ -156,7 +156,12 @@ class LabelExportParams(Params):
         "png",
         "png-colors",
         "masks",
-    ] = Field(default="coco", description="coco, cvat and label-studio are one file, the others a folder")
+        "history",
+    ] = Field(
+        default="coco",
+        description="coco, cvat, label-studio and history are one file, the others a folder; history: a table of who marked "
+        "what when",
+    )
     source: Literal["maps", "marks"] = Field(
         default="maps", description="label maps of the photos, or what was propagated from marks over all photos"
     )

@@ -16,7 +16,6 @@ from fieldwork.tests.addon.support import SETUP, make_posed_project
 pytest.importorskip("bpy")
 
 from fieldwork.addon.labels import journal, pending, results
-from fieldwork.panels import label_states
 
 LINE = {"photo": "a", "shape": "line", "points": [(1.0, 2.0), (3.0, 4.0)], "width": 2.0, "class_id": 1}
 DEAD = EngineError("died", "The engine stopped unexpectedly (signal 9).", "Run it again.")
@@ -205,101 +204,6 @@ def test_what_is_missing_or_damaged_is_no_labelling(tmp_path):
         path.write_bytes(broken)
         assert read_labelling(path) is None
         assert results.labelling(folder, "main", 2) is None
-
-
-def test_the_panel_says_what_is_shown_and_what_contradicts(bpy_script, tmp_path):
-    facts = bpy_script(
-        SETUP
-        + """
-from fieldwork.panels import label_states as states
-from fieldwork.addon.labels import pending, journal
-settings.project = project
-known = states.facts(bpy.context)
-seen = [states.lines(known), states.class_text(known, 1), states.class_line(known, "stone", 1)]
-seen.append(states.conflict_text(known.told["conflicts"][0], journal.marks(Path(project))))
-seen.append(list(states.label(bpy.context)))
-pending.mark(Path(project), {"photo": "a", "points": [[1, 1]], "width": 2, "class_id": 1})
-seen.append(states.class_text(states.facts(bpy.context), 1))
-settings.run = "other"
-seen.append(states.lines(states.facts(bpy.context)))
-answer(seen)
-""",
-        project=project_with_labels(tmp_path / "p"),
-    )
-    lines, row, line, conflict, state, more, nothing = facts
-    assert lines[0] == "Revision 2 of 2 is shown."
-    assert "25% of the surface is void: nothing like it is marked." in lines
-    assert "The last propagation took 1.5 s." in lines
-    assert "1 mark met no surface." in lines
-    assert "The field has the classes of revision 1." in lines
-    assert row == "1 ✎  50%"
-    assert line.startswith("stone: 1 mark, 50% of the surface, 7")
-    assert conflict == "Mark 2 on a contradicts mark 1 on a."
-    assert state == [True, "75% labelled"]
-    assert more == "2 ✎  50%"
-    assert nothing == ["Choose a class and draw over what belongs to it."]
-    assert label_states.Facts(revision=3, computed=2).stale
-
-
-CLASSES = """
-from fieldwork.addon.jobs.queue import queue
-def engine(verb, params, on_done):
-    path = Path(params["project"]) / "project.json"
-    value = json.loads(path.read_text())
-    known = {entry["id"]: entry for entry in value["classes"]}
-    value["classes"] = [{"color": [0, 0, 1], "priority": 1.0, **known.get(c["id"], {}), **c} for c in params["classes"]]
-    path.with_name("part").write_text(json.dumps(value))
-    os.replace(path.with_name("part"), path)
-    on_done({}, None)
-queue.ask_and_wait = engine
-settings.project = project
-"""
-
-
-def test_classes_are_added_chosen_and_removed(bpy_script, tmp_path):
-    facts = bpy_script(
-        SETUP
-        + CLASSES
-        + """
-rows = lambda: [[entry.id, entry.name] for entry in settings.classes]
-seen = [rows()]
-bpy.ops.fieldwork.class_add(name="wood")
-seen.append([rows(), settings.class_index])
-bpy.ops.fieldwork.class_add()
-bpy.ops.fieldwork.class_add(name="wood")
-seen.append(rows())
-settings.label_tool = "erase"
-bpy.ops.fieldwork.label_class(number=2)
-seen.append([settings.class_index, settings.label_tool])
-bpy.ops.fieldwork.class_remove()
-seen.append(rows())
-seen.append(sorted(bpy.ops.fieldwork.label_class(number=9)))
-answer(seen)
-""",
-        project=make_posed_project(tmp_path / "p"),
-    )
-    first, added, more, chosen, removed, beyond = facts
-    assert first == [[1, "stone"], [2, "gold"]]
-    assert added == [[*first, [3, "wood"]], 2], "the new class is the chosen one"
-    assert more[3:] == [[4, "Class 4"], [5, "wood'"]]
-    assert chosen == [1, "brush"]
-    assert removed == [[1, "stone"], [3, "wood"], [4, "Class 4"], [5, "wood'"]]
-    assert beyond == ["CANCELLED"]
-
-
-def test_a_refused_class_is_told(bpy_script, tmp_path):
-    message = bpy_script(
-        SETUP
-        + """
-from fieldwork.addon.errors import EngineError
-from fieldwork.addon.jobs.queue import queue
-queue.ask_and_wait = lambda verb, params, on_done: on_done(None, EngineError("setting", "300 classes are too many."))
-settings.project = project
-answer(attempt(lambda: bpy.ops.fieldwork.class_add()))
-""",
-        project=make_posed_project(tmp_path / "p"),
-    )
-    assert "too many" in message
 
 
 def test_marks_become_steps_of_undo_and_undo_shows_earlier_revisions(bpy_script, tmp_path):

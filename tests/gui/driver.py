@@ -23,7 +23,20 @@ import bpy
 Steps = Iterator[float | None]
 TICK = 0.03
 PATIENCE = float(os.environ.get("FIELDWORK_GUI_PATIENCE", "1"))  # factor of all waiting, for a machine under load
-PANELS = ["capture", "poses", "classes", "train", "label", "render", "live", "mesh", "measure", "export", "engine"]
+PANELS = [
+    "capture",
+    "poses",
+    "classes",
+    "train",
+    "label",
+    "render",
+    "live",
+    "mesh",
+    "measure",
+    "things",
+    "export",
+    "engine",
+]
 PACKAGE = "bl_ext.user_default.fieldwork"
 BARE = {"life"}  # scenarios that install and enable the extension themselves
 
@@ -216,7 +229,10 @@ def main() -> None:
     if name not in BARE:
         bpy.ops.preferences.addon_enable(module=PACKAGE)
     sys.path.insert(0, str(Path(__file__).parent))
-    modules = [importlib.import_module(module) for module in ("scenarios", "sessions", "panels", "labelling", "live")]
+    modules = [
+        importlib.import_module(module)
+        for module in ("scenarios", "sessions", "panels", "labelling", "surface_labels", "live")
+    ]
     scenario = next(getattr(module, name) for module in modules if hasattr(module, name))
     screen = Screen(Path(folder))
     run(scenario(screen), screen)

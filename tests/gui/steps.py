@@ -27,6 +27,7 @@ def every_panel(screen, name):
         "live",
         "mesh",
         "measure",
+        "things",
         "export",
         "engine",
     ):

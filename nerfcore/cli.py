@@ -79,15 +79,24 @@ class Size(click.ParamType):
 
 
 class Points(click.ParamType):
-    name = "X,Y X,Y …"
+    """Points of as many numbers each."""
+
+    def __init__(self, numbers: int) -> None:
+        self.numbers = numbers
+        each = ",".join("XYZ"[:numbers])
+        self.name = f"{each} {each} …"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> list[tuple[float, ...]]:
         if isinstance(value, list):
             return value
         try:
-            return [(float(x), float(y)) for x, y in (point.split(",") for point in str(value).split())]
+            points = [tuple(map(float, point.split(","))) for point in str(value).split()]
         except ValueError:
-            self.fail(f"{value} is not a list of points like “10,20 30,40”", param, ctx)
+            points = []
+        if not points or any(len(point) != self.numbers for point in points):
+            example = "10,20 30,40" if self.numbers == 2 else "1,2,3 4,5,6"
+            self.fail(f"{value} is not a list of points like “{example}”", param, ctx)
+        return points
 
 
 class CommaList(click.ParamType):
@@ -126,8 +135,8 @@ def _option(name: str, info: FieldInfo) -> click.Option:
         return click.Option(flags, type=Size(), default=default, show_default=default is not None, **shared)
     if get_origin(kind) is tuple:
         return click.Option(flags, nargs=len(get_args(kind)), type=tuple(get_args(kind)), default=default, **shared)
-    if kind == list[tuple[float, float]]:
-        return click.Option(flags, type=Points(), **shared)
+    if kind in (list[tuple[float, float]], list[tuple[float, float, float]]):
+        return click.Option(flags, type=Points(len(get_args(get_args(kind)[0]))), **shared)
     if get_origin(kind) is list:
         return click.Option(flags, type=CommaList(), default=default, **shared)
     if get_origin(kind) is Literal:

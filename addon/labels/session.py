@@ -14,7 +14,7 @@ from ..jobs import gate, redraw
 from ..jobs.job import Job
 from ..jobs.queue import queue
 from ..project import snapshot
-from . import journal, pending, results
+from . import journal, pending
 
 BUSY_PERIOD = 0.05  # seconds between two looks while the engine has something of ours
 IDLE_PERIOD = 0.5
@@ -94,6 +94,8 @@ def _propagate(scene: bpy.types.Scene) -> None:
     folder, run = snapshot.folder_of(scene.fieldwork), scene.fieldwork.run
     if folder not in _live or pending.waiting(folder) or job_of(folder) is not None:
         return
+    from . import results  # not at the top: it needs numpy, and enabling the extension must be quick
+
     revision = journal.shown(folder)
     if revision == 0 or _tried.get((folder, run)) == revision or results.computed(folder, run, revision):
         return

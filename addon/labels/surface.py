@@ -7,13 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import bpy
-from bpy_extras import view3d_utils
 from mathutils import Matrix, Vector
 
 from ..project import snapshot
 from ..roles import Owner
 from ..scene.frame import scene_from_capture
-from ..scene.visibility import is_surface
 from . import draw, journal, pending
 
 PASSES = 32  # things in front of the surface that a ray goes through
@@ -27,6 +25,10 @@ def under(
     scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph, owner: Owner, origin: Vector, direction: Vector
 ) -> Vector | None:
     """The first place of the project's surface along a ray in the scene; other things do not hide it."""
+    from ..scene.visibility import (
+        is_surface,
+    )  # not at the top: it needs numpy, and enabling the extension must be quick
+
     for _ in range(PASSES):
         hit, place, _normal, _index, item, _matrix = scene.ray_cast(depsgraph, origin, direction)
         if not hit:
@@ -40,6 +42,8 @@ def under(
 
 def under_mouse(context: bpy.types.Context, owner: Owner, x: float, y: float) -> Vector | None:
     """The place of the surface at x, y of the region; None beside it."""
+    from bpy_extras import view3d_utils
+
     region, view = context.region, context.region_data
     origin = view3d_utils.region_2d_to_origin_3d(region, view, (x, y))
     direction = view3d_utils.region_2d_to_vector_3d(region, view, (x, y))
@@ -48,6 +52,8 @@ def under_mouse(context: bpy.types.Context, owner: Owner, x: float, y: float) ->
 
 def width_at(context: bpy.types.Context, place: Vector, pixels: float) -> float:
     """How wide so many pixels of the screen are at a place of the scene."""
+    from bpy_extras import view3d_utils
+
     region, view = context.region, context.region_data
     middle = view3d_utils.location_3d_to_region_2d(region, view, place)
     if middle is None:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fieldwork.nerfcore.cli import main
 from fieldwork.nerfcore.errors import InputError, ProjectError
 from fieldwork.nerfcore.geometry.similarity import transform_points
 from fieldwork.nerfcore.labels.accept import accept
@@ -88,6 +89,16 @@ def test_a_stroke_on_the_surface_marks_what_lies_under_it(ball: Path) -> None:  
 def prepared_anew(folder: Path) -> Preparation:
     """The same surfels where the world lies otherwise."""
     return Preparation(folder / "runs/main/surfels")
+
+
+def test_a_mark_on_the_surface_is_made_on_the_command_line(ball: Path) -> None:  # noqa: F811
+    words = ["label", "stroke", str(ball), "--class-id", "1", "--width", "0.05"]
+    assert main([*words, "--places", "0,0,0.5 0.1,0,0.49"]) == 0
+    (mark,) = read_marks(ball)
+    assert mark.points == []
+    np.testing.assert_allclose(np.shape(mark.places), (2, 3))
+    assert main([*words, "--places", "0,0 0.1,0"]) != 0
+    assert len(read_marks(ball)) == 1
 
 
 def test_what_is_wrong_with_a_mark_on_the_surface_is_told(ball: Path) -> None:  # noqa: F811

@@ -185,6 +185,8 @@ def test_what_cannot_be_done_with_instances_is_a_sentence(project: Path, capfd: 
         relate(RelationsParams(project=project, run="other"), Reporter())
     assert main(["relations", str(project), "--query", "everything on the table", "--json"]) == 0
     assert "vase.001" in json.loads(capfd.readouterr().out)["found"]
+    assert main(["instances", str(project), "--rename", "vase.001,Ming"]) == 0
+    assert "Ming" in {i.name for i in read_instances(mesh_folder(project, "main"))}
 
 
 def test_a_mesh_that_is_made_again_keeps_the_names_of_its_things() -> None:

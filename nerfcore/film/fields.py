@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from ..data.load import load_scene
+from ..data.scene import Scene
 from ..errors import ProjectError
 from ..kernels.march import Samples
 from ..kernels.traversal import BEFORE_CUBE, PDF_UNIFORM, MarchSettings
@@ -19,7 +20,7 @@ from ..render.baked import META, BakedField, load_baked, voxels_folder
 from ..render.fused import ray_renderer
 from ..render.image import LEAST
 from ..render.model import Geometry, Model, Thin
-from ..render.run import load_info, load_trained
+from ..render.run import RunInfo, load_info, load_trained
 from .shot import ClassLook, FieldItem
 
 FAR = 1e9  # a distance that nothing reaches
@@ -54,9 +55,13 @@ class LoadedField:
 def load_field(project: Path, run: str, baked: bool) -> LoadedField:
     """Raises ProjectError: there is none, or it is damaged."""
     info = load_info(project, run)
-    scene = load_scene(project, info.holdout)
-    known = {entry.id: entry for entry in scene.classes}
     shown = load_baked(project, run, info) if baked else load_trained(project, run).model
+    return described(shown, project, info, load_scene(project, info.holdout))
+
+
+def described(shown: Model | BakedField, project: Path, info: RunInfo, scene: Scene) -> LoadedField:
+    """A model with what its run and its capture say of it. Raises ProjectError: the project is damaged."""
+    known = {entry.id: entry for entry in scene.classes}
     ids = info.class_ids if shown_classes(shown) else []
     names = [known[i].name if i in known else f"class {i}" for i in ids]
     colors = np.array([known[i].color if i in known else (0.5, 0.5, 0.5) for i in ids], np.float32).reshape(-1, 3)

@@ -53,8 +53,8 @@ def train(project: Path, act: Callable[[int], None], steps: int, run: str = "mai
 
 @pytest.fixture
 def eager(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pictures take as long as they like."""
-    monkeypatch.setattr(training_view, "SHARE", 0.4)
+    """Pictures come with every step, whatever they take."""
+    monkeypatch.setattr(training_view, "SHARE", 1.0)
     monkeypatch.setattr(training_view, "MOVING_SHARE", 1.0)
     monkeypatch.setattr(training_view, "FIRST", 0.0)
     monkeypatch.setattr(training_view, "LONGEST", 1e9)
@@ -67,7 +67,7 @@ def project(tmp_path: Path) -> Path:
 
 @pytest.mark.usefixtures("eager")
 def test_pictures_become_finer_and_converge_to_the_photos(project, tmp_path):
-    viewer, found, running = Viewer(project, tmp_path, side=48), [], []
+    viewer, found, running = Viewer(project, tmp_path, side=32), [], []
 
     def act(step: int) -> None:
         running.append(live.training_run(project))
@@ -76,7 +76,7 @@ def test_pictures_become_finer_and_converge_to_the_photos(project, tmp_path):
         if (picture := viewer.look()) is not None:
             found.append((step, *picture))
 
-    train(project, act, 160)
+    train(project, act, 130)
     assert set(running) == {"main"}
     assert live.training_run(project) is None, "it is over"
     sizes = [color.shape[0] for _, _, color, _ in found]
@@ -85,7 +85,7 @@ def test_pictures_become_finer_and_converge_to_the_photos(project, tmp_path):
     assert sizes[-1] == viewer.side
     assert found[0][0] == 2, "it comes with the next step"
     errors = []
-    place = (np.arange(48) + 0.5) / 24 - 1
+    place = (np.arange(32) + 0.5) / 16 - 1
     x, z = np.meshgrid(place, place)
     # Rays from (0, −1.2, 0) through (x, 1, z) meet the ball of radius 0.5.
     a, b, c = x**2 + z**2 + 1, -2 * 1.2, 1.2**2 - 0.25
@@ -96,9 +96,9 @@ def test_pictures_become_finer_and_converge_to_the_photos(project, tmp_path):
     truth = pattern(point)
     for _, number, color, _ in found:
         assert number == 1
-        if len(color) == 48:
+        if len(color) == 32:
             errors.append(np.abs(color[inside][:, :3] - truth[inside]).mean())
-    assert errors[-1] < 0.6 * errors[0], "one sees it converge"
+    assert errors[-1] < 0.75 * errors[0], "one sees it converge"
     _, _, color, depth = found[-1]
     beside = np.hypot(x, z) > 0.6
     assert (color[beside][:, 3] < 0.05).mean() > 0.9
@@ -112,22 +112,22 @@ def test_a_view_that_moves_begins_anew_and_follows_the_class_panel(project, tmp_
     viewer, found = Viewer(project, tmp_path, side=32), {}
 
     def act(step: int) -> None:
-        if step == 120:
+        if step == 100:
             viewer.ask(FRONT)
-        if step == 130:
+        if step == 104:
             viewer.ask(FRONT, classes={1: {"opacity": 0.0}, 2: {"tint": 1.0, "color": (0, 1, 0)}})
-        if step == 140:
+        if step == 108:
             viewer.ask(perspective((0, 1.2, 0)))  # looks away from it
         if (picture := viewer.look()) is not None:
             found.setdefault(picture[0], []).append(picture[1])
 
-    train(project, act, 150)
+    train(project, act, 112)
     assert sorted(found) == [1, 2, 3]
     for pictures in found.values():
         assert len(pictures[0]) == 16
         assert len(pictures[-1]) == 32
     plain, edited, away = (found[number][-1] for number in (1, 2, 3))
-    above, below = (slice(20, 24), slice(13, 19)), (slice(8, 12), slice(13, 19))
+    above, below = (slice(18, 21), slice(13, 19)), (slice(11, 14), slice(13, 19))
     assert plain[above][..., 3].mean() > 0.9
     assert edited[below][..., :3].mean((0, 1)) == pytest.approx([0, 1, 0], abs=0.25), "the lower class is tinted"
     assert edited[above][..., 0].mean() < 0.5 * plain[above][..., 0].mean(), "the upper class is hidden"

@@ -22,6 +22,8 @@ MODULES = (
     "addon.properties",
     "addon.live.settings",
     "addon.live.engine",
+    "addon.live.training",
+    "addon.live.hint",
     "addon.live.viewport",
     "addon.preferences",
     "addon.pictures.thumbnails",

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from typing import Any, TextIO
 
 from rich.console import Console
@@ -85,6 +87,11 @@ class ConsoleReporter(Reporter):
             self.live = Live(console=self.console, auto_refresh=False, transient=True)
             self.live.start()
         self.live.update(campaign_table(data), refresh=True)
+
+    def watching(self, training: Any) -> AbstractContextManager[Callable[[], None]]:
+        from .film.training_view import watched  # loads torch, as the training has done
+
+        return watched(training, self.check)
 
     def note(self, message: str) -> None:
         if not self.quiet:

@@ -7,7 +7,6 @@ import json
 import os
 import re
 import sys
-import tempfile
 import time
 import zlib
 from collections.abc import Iterator
@@ -88,6 +87,8 @@ def atomic_path(path: Path) -> Iterator[Path]:
     Raises:
         DiskError: the disk is full or the folder is not writable.
     """
+    import tempfile  # not at the top: Blender reads this module when it enables the extension
+
     path = Path(path)
     with disk_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 import threading
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 from .errors import Cancelled
@@ -31,6 +33,11 @@ class Reporter:
 
     def event(self, kind: str, **data: Any) -> None:
         """A measured value or artefact: kind "train" (step, loss, psnr), "preview" (path), …"""
+
+    def watching(self, training: Any) -> AbstractContextManager[Callable[[], None]]:
+        """A training (`render.unfinished.Unfinished`) begins and lasts as long as the context; what comes with it is called
+        after every step, between which the model does not change, and may raise `Cancelled`."""
+        return nullcontext(lambda: None)
 
     def note(self, message: str) -> None:
         """A line for whoever watches: a plan, what is reused. Nothing needs to be done about it."""

@@ -9,6 +9,7 @@ from bpy.types import Context, Operator
 
 from ..addon.errors import SceneError
 from ..addon.live import compositor, fields
+from ..addon.live.training import trainings
 from ..addon.project import snapshot
 from ..addon.props import IntProperty
 from ..addon.scene.frame import root_of, scene_from_capture
@@ -25,6 +26,15 @@ def active_field(context: Context) -> bpy.types.Object | None:
     return found[0] if len(found) == 1 else None
 
 
+def need_field(context: Context) -> str | None:
+    """Why there is no field to add; one in training is one."""
+    settings = context.scene.fieldwork
+    folder = snapshot.folder_of(settings)
+    if folder is not None and trainings.run_of(folder) == settings.run:
+        return None
+    return need_run(context)
+
+
 class _OfField(Operator):
     """An operator for the active field."""
 
@@ -39,7 +49,7 @@ class _OfField(Operator):
 
 
 class FIELDWORK_OT_add_field(Operator):
-    """Add the trained field of the project to the scene, where the capture stands"""
+    """Add the field of the project to the scene, where the capture stands; one in training is shown as it converges"""
 
     bl_idname = "fieldwork.add_field"
     bl_label = "Add Field"
@@ -47,13 +57,13 @@ class FIELDWORK_OT_add_field(Operator):
 
     @classmethod
     def poll(cls, context: Context) -> bool:
-        reason = None if bpy.app.background else need_run(context)
+        reason = None if bpy.app.background else need_field(context)
         if reason:
             cls.poll_message_set(reason)
         return reason is None
 
     def execute(self, context: Context) -> set[str]:
-        if reason := need_run(context):
+        if reason := need_field(context):
             self.report({"ERROR"}, reason)
             return {"CANCELLED"}
         scene, settings = context.scene, context.scene.fieldwork

@@ -6,9 +6,10 @@ from pathlib import Path
 
 from bpy.types import Context, Panel, UILayout, UIList
 
-from ..addon.live import fields, voxels
+from ..addon.live import fields, hint, voxels
 from ..addon.live.engine import ENGINE
 from ..addon.live.settings import look_name
+from ..addon.live.training import trainings
 from ..addon.live.viewport import viewport
 from ..addon.text import t
 from ..operators.live import active_field
@@ -70,6 +71,10 @@ def draw_field(layout: UILayout, context: Context, obj) -> None:
 def why_not_drawn(context: Context, own) -> list[str]:
     """Sentences that say why the viewport does not show the field."""
     reasons = []
+    if hint.lacks_overlays(context.space_data):
+        return [t("Show overlays to see the field: this version of Blender needs them.")]
+    if own.project and trainings.run_of(Path(fields.absolute(own.project))) == own.run:
+        return [t("In training: shown as it converges, coarse where the view moves.")]
     baked = voxels.baked(Path(fields.absolute(own.project)), own.run) if own.project else None
     if baked is None:
         reasons.append(t("Bake the field to see it here: the viewport draws baked fields."))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import bpy
 from mathutils import Matrix
@@ -13,7 +13,8 @@ from ..errors import SceneError
 from ..scene.lens import pinhole
 from ..text import t
 
-BLUR_POSES = 9  # poses of the camera while the shutter is open
+Value = TypeVar("Value")
+BLUR_POSES = 9  # poses while the shutter is open
 PANORAMAS = {
     "EQUIRECTANGULAR": "equirectangular",
     "FISHEYE_EQUIDISTANT": "equidistant",
@@ -106,7 +107,7 @@ def pose(camera: bpy.types.Object) -> list[list[float]]:
 
 
 def shutter_times(render: Any, frame: float) -> list[float]:
-    """Frames, with fractions, at which the camera is looked at while the shutter is open; one without motion blur."""
+    """Frames, with fractions, at which the scene is looked at while the shutter is open; one without motion blur."""
     if not render.use_motion_blur or render.motion_blur_shutter <= 0:
         return [frame]
     length = render.motion_blur_shutter
@@ -114,17 +115,22 @@ def shutter_times(render: Any, frame: float) -> list[float]:
     return [first + length * number / (BLUR_POSES - 1) for number in range(BLUR_POSES)]
 
 
-def poses_in_time(
-    camera: Callable[[], bpy.types.Object], times: Sequence[float], go_to: Callable[[int, float], None], now: float
-) -> list[list[list[float]]]:
-    """Poses of the camera at these times, and back to now; a camera that stays gives one."""
+def in_time(
+    read: Callable[[], Value], times: Sequence[float], go_to: Callable[[int, float], None], now: float
+) -> list[Value]:
+    """What is read of the scene at these times, and back to now."""
     if len(times) == 1:
-        return [pose(camera())]
+        return [read()]
     found = []
     try:
         for time in times:
             go_to(math.floor(time), time - math.floor(time))
-            found.append(pose(camera()))
+            found.append(read())
     finally:
         go_to(math.floor(now), now - math.floor(now))
-    return found if any(other != found[0] for other in found[1:]) else found[:1]
+    return found
+
+
+def moving(poses: list[Value]) -> list[Value]:
+    """Poses in time of what moves; of what stays, one."""
+    return poses if any(other != poses[0] for other in poses[1:]) else poses[:1]

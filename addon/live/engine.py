@@ -179,7 +179,20 @@ class FieldworkRenderEngine(bpy.types.RenderEngine):
             shot["occluders"] = str(objects.write_triangles(frames().folder() / "objects.npz", depsgraph))
         now = scene.frame_current + scene.frame_subframe
         times = camera.shutter_times(render, now)
-        lens["poses"] = camera.poses_in_time(eye, times, self.frame_set, now)
+
+        known = fields.rendered_objects(depsgraph)
+
+        def poses() -> tuple[Any, ...]:
+            placed = [fields.poses_of(obj.evaluated_get(depsgraph), depsgraph) for obj in known]
+            return camera.pose(eye()), placed
+
+        seen, placed = zip(*camera.in_time(poses, times, self.frame_set, now))
+        lens["poses"] = camera.moving(list(seen))
+        for number, item in enumerate(shot["fields"] if known else ()):
+            for name, key in (("scene_from_capture", "motion"), ("crop", "crop_motion")):
+                found = camera.moving([one[number].get(name) for one in placed])
+                if len(found) > 1:
+                    item[key] = found
         return {**shot, "lens": lens}
 
     # The viewport: the field is drawn in all shading modes (viewport.py), here is nothing else.

@@ -20,6 +20,11 @@ def field_objects(objects: Iterable[bpy.types.Object]) -> list[bpy.types.Object]
     return [obj for obj in objects if obj.type == "EMPTY" and obj.fieldwork.is_field]
 
 
+def rendered_objects(depsgraph: bpy.types.Depsgraph) -> list[bpy.types.Object]:
+    """Those that a render shows."""
+    return [obj for obj in field_objects(depsgraph.view_layer.objects) if not obj.hide_render]
+
+
 def rendered_items(depsgraph: bpy.types.Depsgraph) -> list[dict[str, Any]]:
     """What a render shows, as nerfcore/film/shot.py describes fields.
 
@@ -27,18 +32,16 @@ def rendered_items(depsgraph: bpy.types.Depsgraph) -> list[dict[str, Any]]:
     """
     scene = depsgraph.scene_eval
     baked = scene.fieldwork_live.source == "baked"
-    known = field_objects(depsgraph.view_layer.objects)  # also those that are hidden in renders
-    found = [obj.evaluated_get(depsgraph) for obj in known if not obj.hide_render]
-    items = [item_of(obj, baked, depsgraph) for obj in found]
-    if not known:
+    items = [item_of(obj.evaluated_get(depsgraph), baked, depsgraph) for obj in rendered_objects(depsgraph)]
+    if not field_objects(depsgraph.view_layer.objects):
         items = [project_item(scene, baked)]
     if not items:
         raise SceneError(t("All fields of the scene are hidden in renders."))
     return items
 
 
-def item_of(obj: bpy.types.Object, baked: bool, depsgraph: bpy.types.Depsgraph) -> dict[str, Any]:
-    """A field object. Raises SceneError: it has no project."""
+def item_of(obj: bpy.types.Object, baked: bool, depsgraph: bpy.types.Depsgraph | None = None) -> dict[str, Any]:
+    """A field object as it is, or in a depsgraph. Raises SceneError: it has no project."""
     own = obj.fieldwork
     if not own.project:
         raise SceneError(t("The field “{}” has no project folder.", obj.name))
@@ -47,16 +50,21 @@ def item_of(obj: bpy.types.Object, baked: bool, depsgraph: bpy.types.Depsgraph) 
         "project": absolute(own.project),
         "run": own.run,
         "baked": baked,
-        "scene_from_capture": rows(obj.matrix_world),
+        **poses_of(obj, depsgraph),
         "look": own.look,
         "classes": {
             entry.id: {"opacity": entry.shown, "tint": entry.tint, "color": tuple(entry.color)} for entry in own.classes
         },
     }
-    crop = own.crop
-    if crop is not None:
-        item["crop"] = rows(crop_matrix(crop.evaluated_get(depsgraph)))
     return item
+
+
+def poses_of(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None) -> dict[str, Any]:
+    """Where a field object is, and its crop box if it has one."""
+    found, crop = {"scene_from_capture": rows(obj.matrix_world)}, obj.fieldwork.crop
+    if crop is not None:
+        found["crop"] = rows(crop_matrix(crop.evaluated_get(depsgraph) if depsgraph is not None else crop))
+    return found
 
 
 def project_item(scene: bpy.types.Scene, baked: bool) -> dict[str, Any]:

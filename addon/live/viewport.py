@@ -1,4 +1,6 @@
-"""Baked fields in the 3D viewport, in any shading mode, with depth: drawn by Blender's own GPU module after the scene.
+"""Fields in the 3D viewport, in any shading mode, with depth: drawn by Blender's own GPU module after the scene.
+
+Of a field in training the pictures of the training are shown (training.py), else the baked field.
 
 A field is marched into a picture of its own, coarse while the view moves and then finer, in strips that hold the window up
 only briefly; each redraw lays the picture over the view. Nothing of the GPU module is touched before the first field is
@@ -14,7 +16,8 @@ from typing import Any
 import bpy
 from mathutils import Matrix
 
-from . import fields, voxels
+from . import fields, hint, voxels
+from .training import Textures, trainings
 
 BUDGET = 0.05  # seconds of marching in a redraw once the view stands still, or as long as the rest of the redraw takes
 LONGEST = 0.5  # seconds of marching in a redraw at most
@@ -121,7 +124,7 @@ class Viewport:
             return
         found = fields.field_objects(context.view_layer.objects)
         shown = [obj for obj in found if obj.visible_get(view_layer=context.view_layer, viewport=context.space_data)]
-        if not shown or self.error:
+        if not shown or self.error or hint.lacks_overlays(context.space_data):
             return
         try:
             self._draw(context, region, view3d, shown)
@@ -141,6 +144,12 @@ class Viewport:
         for obj in sorted(shown, key=lambda o: (view3d.view_matrix @ o.matrix_world.translation).z):
             own = obj.fieldwork
             project = Path(fields.absolute(own.project)) if own.project else None
+            key = (region.as_pointer(), obj.name_full)
+            size = max(1, region.width // quality), max(1, region.height // quality)
+            trained = trainings.textures(key, obj, project, size, scene_from_clip) if project is not None else None
+            if trained is not None:
+                self._lay_over(trained, region)
+                continue
             baked = voxels.baked(project, own.run) if project is not None else None
             if baked is None:
                 continue
@@ -158,7 +167,7 @@ class Viewport:
                 _numbers(view3d.perspective_matrix), _numbers(box), crop and _numbers(crop), own.look, tuple(rows),
                 baked.key, region.width, region.height, quality,
             )  # fmt: skip
-            view = self.views.setdefault((region.as_pointer(), obj.name_full), View())
+            view = self.views.setdefault(key, View())
             view.used = now
             uniforms = _uniforms(baked.meta, view3d.perspective_matrix, scene_from_clip, box, crop, own.look, rows)
             marched += self._bring_up(view, state, asset, rows, uniforms, (region.width, region.height), quality, now)
@@ -241,7 +250,7 @@ class Viewport:
         picture.rows = first + count
         return time.perf_counter() - begin
 
-    def _lay_over(self, picture: Picture, region: Any) -> None:
+    def _lay_over(self, picture: Picture | Textures, region: Any) -> None:
         import gpu
 
         gpu.state.blend_set("ALPHA_PREMULT")

@@ -8,7 +8,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -107,6 +107,11 @@ class Job(Reporter):
                     file.write(line)
             except OSError as error:
                 log.warning("The events of the job cannot be written to %s: %s", path, error)
+
+    def watching(self, training: Any) -> AbstractContextManager[Callable[[], None]]:
+        from ..film.training_view import watched  # loads torch, as the training has done
+
+        return watched(training, self.check)
 
     def warn(self, message: str) -> None:
         super().warn(message)

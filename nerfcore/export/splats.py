@@ -17,6 +17,7 @@ from ..kernels.voxel_field import CELLS, VERTICES
 from ..kernels.voxel_march_torch import unpacked
 from ..progress import Reporter
 from ..render.baked import BakedField
+from .gltf_splats import write_gltf_splats
 
 # Spherical harmonics of degree 0 and 1.
 C0, C1 = 0.28209479177387814, 0.4886025119029199
@@ -26,8 +27,8 @@ SPREAD = 0.6  # standard deviation in cells: neighbours overlap to a closed surf
 MOST = 0.99  # opacity of a splat, whose logit is finite
 
 
-def write_splats(path: Path, baked: BakedField, box: Box, class_ids: list[int], report: Reporter) -> int:
-    """Write a splat for each vertex at the surface of a baked field; returns how many.
+def write_splats(path: Path, baked: BakedField, box: Box, class_ids: list[int], report: Reporter) -> list[Path]:
+    """Write a splat for each vertex at the surface of a baked field, and beside it the same as glTF; returns both files.
 
     A splat is round, in the world, z up: x, y, z; nx, ny, nz (0); f_dc_* and f_rest_* (degree 1, by channel); opacity
     (logit); scale_* (logarithm); rot_* (w first); class_id and class_probability, −1 and 0 without classes.
@@ -83,7 +84,9 @@ def write_splats(path: Path, baked: BakedField, box: Box, class_ids: list[int], 
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.write(_header(splats))
         file.write(splats.tobytes())
-    return len(splats)
+    beside = path.with_suffix(".glb")
+    write_gltf_splats(beside, splats)
+    return [path, beside]
 
 
 def _surface(index: np.ndarray, blocks: int, opacity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -35,7 +35,7 @@ SUFFIXES = {
 def export(params: ExportParams, report: Reporter) -> dict[str, Any]:
     """Write one format to `out`, or to exports/<run>/<project>.<suffix>.
 
-    Meshes (glb, usd, obj, ply, stl) are the last one that the verb `mesh` extracted; usd has the cameras as well; onnx is the trained field itself as a function, voxels its values on a regular grid; splats is the baked field.
+    Meshes (glb, usd, obj, ply, stl) are the last one that the verb `mesh` extracted; usd has the cameras as well; onnx is the trained field itself as a function, voxels its values on a regular grid; splats is the baked field, as .ply and beside it as .glb.
 
     Returns:
         {"files": [paths], "to": format}
@@ -69,8 +69,7 @@ def export(params: ExportParams, report: Reporter) -> dict[str, Any]:
 
         info = load_info(folder, params.run)
         baked = load_baked(folder, params.run, info)
-        write_splats(out, baked, info.box(project), info.class_ids if baked.classes else [], report)
-        files = [out]
+        files = write_splats(out, baked, info.box(project), info.class_ids if baked.classes else [], report)
     else:
         report.stage("Writing")
         surface, texture = load_surface(folder, params.run)

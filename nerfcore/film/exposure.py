@@ -40,7 +40,7 @@ class Seen:
     """What one sample of N pixels shows, numpy: color (N, 4) linear with associated alpha (with what is behind, where that
     is shown); opacity, distance (N,) of the fields alone; origins, directions (N, 3); item (N,) number of the field in the
     shot, −1 for none; best (N,) its class index, −1 for void; share (N,) the probability; hit (N,) bool: an object is
-    met; behind (N, 4): what is behind that object."""
+    met; behind (N, 4): what is behind that object; times (N,) while the shutter is open."""
 
     def __init__(self, parts: list[dict[str, torch.Tensor]]) -> None:
         for name in parts[0]:
@@ -56,6 +56,7 @@ class Seen:
     share: np.ndarray
     hit: np.ndarray
     behind: np.ndarray
+    times: np.ndarray
 
 
 def expose(
@@ -89,7 +90,7 @@ def _samples(shot: Shot) -> Iterator[tuple[tuple[float, float], int | None, str]
 
     Geometry is that of the middle of the pixel and of the lens, as Cycles' is of one sample.
     """
-    blurred = shot.lens.aperture is not None or len(shot.lens.poses) > 1
+    blurred = shot.blurred
     if blurred:
         yield (0.5, 0.5), None, "geometry"
     for number in range(shot.samples):
@@ -180,16 +181,19 @@ class _Film:
             met = torch.where((met > begin) & (met < end), met, FAR)
             far = torch.minimum(end, met)
         hit = met < FAR
-        color, facts = self._merged(origins, directions, begin, far, ~hit)
+        times = None if chances is None else chances[:, 2]
+        color, facts = self._merged(origins, directions, begin, far, ~hit, times)
         behind = torch.zeros_like(color)
         if "FieldBehind" in shot.passes and bool(hit.any()):
             rows = hit.nonzero()[:, 0]
-            hidden, _ = self._merged(origins[rows], directions[rows], met[rows], end[rows], hit[rows])
+            then = None if times is None else times[rows]
+            hidden, _ = self._merged(origins[rows], directions[rows], met[rows], end[rows], hit[rows], then)
             behind = behind.index_copy(0, rows, hidden)
         found = {"color": color, "behind": behind, "hit": hit & valid, **facts}
         found = {name: value * valid.view(-1, *[1] * (value.ndim - 1)) for name, value in found.items()}
         found["item"] = torch.where(valid, facts["item"], -1)
-        return {**found, "origins": origins, "directions": directions}
+        moments = torch.full_like(begin, 0.5) if times is None else times
+        return {**found, "origins": origins, "directions": directions, "times": moments}
 
     def _merged(
         self,
@@ -198,10 +202,11 @@ class _Film:
         begin: torch.Tensor,
         end: torch.Tensor,
         open_: torch.Tensor,
+        times: torch.Tensor | None,
     ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Linear colour (N, 4) of all fields, the nearest over the others, on what is behind them where rays are open
         (N,); and the facts of the field that shows most."""
-        seen = [field.rays(origins, directions, begin, end) for field in self.fields]
+        seen = [field.rays(origins, directions, begin, end, times) for field in self.fields]
         near = torch.stack([rays.distance.nan_to_num(FAR) for rays in seen]).argsort(0)
         color, opacity = torch.stack([rays.color for rays in seen]), torch.stack([rays.opacity for rays in seen])
         total, left = torch.zeros_like(origins), torch.ones_like(begin)
@@ -268,7 +273,10 @@ class _Film:
                 names = self.instances[number]
                 assert names is not None
                 points = seen.origins[mine] + seen.directions[mine] * seen.distance[mine, None]
-                ids[mine] = names.ids(points, seen.best[mine])
+                still = field.still(
+                    *(torch.from_numpy(values).to(field.device) for values in (points, seen.times[mine]))
+                )
+                ids[mine] = names.ids(still.cpu().numpy(), seen.best[mine])
         return ids
 
     # Passes

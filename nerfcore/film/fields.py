@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from ..data.load import load_scene
+from ..data.scene import Scene
 from ..errors import ProjectError
 from ..kernels.march import Samples
 from ..kernels.traversal import BEFORE_CUBE, PDF_UNIFORM, MarchSettings
@@ -19,8 +20,9 @@ from ..render.baked import META, BakedField, load_baked, voxels_folder
 from ..render.fused import ray_renderer
 from ..render.image import LEAST
 from ..render.model import Geometry, Model, Thin
-from ..render.run import load_info, load_trained
-from .shot import ClassLook, FieldItem
+from ..render.run import RunInfo, load_info, load_trained
+from .lens_rays import poses_at
+from .shot import ClassLook, FieldItem, Matrix
 
 FAR = 1e9  # a distance that nothing reaches
 
@@ -54,9 +56,13 @@ class LoadedField:
 def load_field(project: Path, run: str, baked: bool) -> LoadedField:
     """Raises ProjectError: there is none, or it is damaged."""
     info = load_info(project, run)
-    scene = load_scene(project, info.holdout)
-    known = {entry.id: entry for entry in scene.classes}
     shown = load_baked(project, run, info) if baked else load_trained(project, run).model
+    return described(shown, project, info, load_scene(project, info.holdout))
+
+
+def described(shown: Model | BakedField, project: Path, info: RunInfo, scene: Scene) -> LoadedField:
+    """A model with what its run and its capture say of it. Raises ProjectError: the project is damaged."""
+    known = {entry.id: entry for entry in scene.classes}
     ids = info.class_ids if shown_classes(shown) else []
     names = [known[i].name if i in known else f"class {i}" for i in ids]
     colors = np.array([known[i].color if i in known else (0.5, 0.5, 0.5) for i in ids], np.float32).reshape(-1, 3)
@@ -67,6 +73,18 @@ def load_field(project: Path, run: str, baked: bool) -> LoadedField:
 def shown_classes(shown: Model | BakedField) -> int:
     """How many classes it tells apart."""
     return shown.classes if isinstance(shown, BakedField) else shown.field.classes
+
+
+def _moved(
+    matrices: torch.Tensor, origins: torch.Tensor, directions: torch.Tensor, times: torch.Tensor | None
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Rays (R, 3) carried by a matrix, or by those (P, 4, 4) at even times, between which it is interpolated."""
+    if len(matrices) == 1:
+        turn, shift = matrices[0, :3, :3], matrices[0, :3, 3]
+        return origins @ turn.T + shift, directions @ turn.T
+    matrix = poses_at(matrices, torch.full_like(origins[:, 0], 0.5) if times is None else times)
+    places = torch.einsum("nij,nj->ni", matrix[:, :3, :3], origins) + matrix[:, :3, 3]
+    return places, torch.einsum("nij,nj->ni", matrix[:, :3, :3], directions)
 
 
 class FieldStore:
@@ -113,13 +131,13 @@ class PlacedField:
     def __init__(self, field: LoadedField, item: FieldItem, pixels: int) -> None:
         self.field, self.item, self.device = field, item, field.shown.device
         try:
-            box_from_scene = field.box_from_world @ np.linalg.inv(np.array(item.scene_from_capture))
-            self.crop = None if item.crop is None else self._tensor(np.linalg.inv(np.array(item.crop)))
+            self.box_from_scene = self._matrices(field.box_from_world, item.scene_from_capture, item.motion)
+            self.crop = None if item.crop is None else self._matrices(np.eye(4), item.crop, item.crop_motion)
         except np.linalg.LinAlgError as error:
             raise ProjectError(
                 f"“{item.name}” or its crop box is scaled to nothing.", "Give it a scale other than 0."
             ) from error
-        self.box_from_scene = self._tensor(box_from_scene)
+        self.now_from_box = self._tensor(np.array(item.scene_from_capture) @ np.linalg.inv(field.box_from_world))
         looks = [item.classes.get(i, ClassLook(color=tuple(c))) for i, c in zip(field.class_ids, field.class_colors)]
         self.opacity = self._tensor([look.opacity for look in looks])
         self.tint = self._tensor([look.tint for look in looks])
@@ -131,17 +149,34 @@ class PlacedField:
     def _tensor(self, values: object) -> torch.Tensor:
         return torch.tensor(np.asarray(values, np.float32), device=self.device)
 
+    def _matrices(self, after: np.ndarray, still: Matrix, motion: list[Matrix]) -> torch.Tensor:
+        """`after` times the inverses of poses (P, 4, 4), one where it stands still."""
+        poses = np.array(motion if len(motion) > 1 else [still])
+        return self._tensor(after @ np.linalg.inv(poses))
+
     def _settings(self) -> MarchSettings:
         shown = self.field.shown
         return shown.settings if isinstance(shown, BakedField) else shown.render_grid().settings
 
+    def still(self, points: torch.Tensor, times: torch.Tensor | None) -> torch.Tensor:
+        """Where points (R, 3) of the field, which are in the scene at `times`, would be if it stood where it does now."""
+        if len(self.box_from_scene) == 1:
+            return points
+        place, _ = _moved(self.box_from_scene, points, points, times)
+        return place @ self.now_from_box[:3, :3].T + self.now_from_box[:3, 3]
+
     def rays(
-        self, origins: torch.Tensor, directions: torch.Tensor, begin: torch.Tensor, end: torch.Tensor
+        self,
+        origins: torch.Tensor,
+        directions: torch.Tensor,
+        begin: torch.Tensor,
+        end: torch.Tensor,
+        times: torch.Tensor | None = None,
     ) -> FieldRays:
-        """What rays of the scene (R, 3), unit directions, show of the field between two distances (R,)."""
-        begin, end = self._cropped(origins, directions, begin, end)
-        places = origins @ self.box_from_scene[:3, :3].T + self.box_from_scene[:3, 3]
-        turned = directions @ self.box_from_scene[:3, :3].T
+        """What rays of the scene (R, 3), unit directions, show of the field between two distances (R,); `times` (R,) in
+        [0, 1] while the shutter is open, None: when it is half over."""
+        begin, end = self._cropped(origins, directions, begin, end, times)
+        places, turned = _moved(self.box_from_scene, origins, directions, times)
         stretch = turned.norm(dim=1)
         turned = turned / stretch[:, None]
         first = self._first(places, turned)
@@ -165,13 +200,17 @@ class PlacedField:
         return FieldRays(color, opacity, distance, best, share, sky)
 
     def _cropped(
-        self, origins: torch.Tensor, directions: torch.Tensor, begin: torch.Tensor, end: torch.Tensor
+        self,
+        origins: torch.Tensor,
+        directions: torch.Tensor,
+        begin: torch.Tensor,
+        end: torch.Tensor,
+        times: torch.Tensor | None,
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """The part of the rays that is within the crop box."""
         if self.crop is None:
             return begin, end
-        place = origins @ self.crop[:3, :3].T + self.crop[:3, 3]
-        along = directions @ self.crop[:3, :3].T
+        place, along = _moved(self.crop, origins, directions, times)
         inverse = 1 / torch.where(along.abs() < 1e-12, 1e-12, along)
         one, other = (-1 - place) * inverse, (1 - place) * inverse
         begin = torch.maximum(begin, torch.minimum(one, other).amax(1))

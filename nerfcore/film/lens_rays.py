@@ -64,6 +64,15 @@ def on_aperture(aperture: Aperture, u: torch.Tensor, v: torch.Tensor) -> torch.T
     return point * torch.tensor([aperture.radius / aperture.ratio, aperture.radius], device=u.device)
 
 
+def poses_at(poses: torch.Tensor, time: torch.Tensor) -> torch.Tensor:
+    """Matrices (N, 4, 4) at times (N,) in [0, 1], between those (P, 4, 4) at even times."""
+    if len(poses) == 1:
+        return poses[0].expand(len(time), 4, 4)
+    place = time * (len(poses) - 1)
+    first = place.floor().long().clamp(max=len(poses) - 2)
+    return torch.lerp(poses[first], poses[first + 1], (place - first)[:, None, None])
+
+
 def scene_rays(
     lens: Lens, pixels: torch.Tensor, chance: torch.Tensor | None = None
 ) -> tuple[torch.Tensor, torch.Tensor]:
@@ -92,11 +101,7 @@ def scene_rays(
         directions = directions / directions.norm(dim=1, keepdim=True)
     poses = torch.tensor(lens.poses, dtype=torch.float32, device=pixels.device)
     time = torch.full_like(pixels[:, 0], 0.5) if chance is None else chance[:, 2]
-    place = time * (len(poses) - 1)
-    first = place.floor().long().clamp(max=max(len(poses) - 2, 0))
-    second = (first + 1).clamp(max=len(poses) - 1)
-    share = (place - first)[:, None, None]
-    pose = poses[first] * (1 - share) + poses[second] * share if len(poses) > 1 else poses[0].expand(len(pixels), 4, 4)
+    pose = poses_at(poses, time)
     turned = torch.einsum("nij,nj->ni", pose[:, :3, :3], directions)
     start = torch.einsum("nij,nj->ni", pose[:, :3, :3], origins) + pose[:, :3, 3]
     return start, turned / turned.norm(dim=1, keepdim=True)

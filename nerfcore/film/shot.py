@@ -88,7 +88,8 @@ class ClassLook(_Part):
 
 class FieldItem(_Part):
     """A field in the scene: `name` is that of its object; scene_from_capture (4, 4); crop: (4, 4) scene from the cube
-    [−1, 1]³ to which it is cut; look: 0 photo … 1 labels … 2 confidence; classes by id."""
+    [−1, 1]³ to which it is cut; motion, crop_motion: the same at even times while the shutter is open, empty where it stands
+    still; look: 0 photo … 1 labels … 2 confidence; classes by id."""
 
     name: str
     project: Path
@@ -96,6 +97,8 @@ class FieldItem(_Part):
     baked: bool = False
     scene_from_capture: Matrix
     crop: Matrix | None = None
+    motion: list[Matrix] = []
+    crop_motion: list[Matrix] = []
     look: float = Field(default=0.0, ge=0, le=2)
     classes: dict[int, ClassLook] = {}
 
@@ -127,6 +130,12 @@ class Shot(_Part):
         if unknown:
             raise ValueError(f"there is no pass {unknown[0]}")
         return self
+
+    @property
+    def blurred(self) -> bool:
+        """Whether rays of a pixel differ by chance: in their place on the aperture or in their time."""
+        moving = any(len(field.motion) > 1 or len(field.crop_motion) > 1 for field in self.fields)
+        return self.lens.aperture is not None or len(self.lens.poses) > 1 or moving
 
     @property
     def size(self) -> tuple[int, int]:

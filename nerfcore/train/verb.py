@@ -47,6 +47,7 @@ from ..render.run import (
     save_info,
     settled_as,
 )
+from ..render.unfinished import Unfinished
 from ..verdict import train_verdict
 from .checkpoint import restore, save_checkpoint
 from .closed_picture import write_closed_picture
@@ -108,8 +109,10 @@ def train(params: TrainParams, report: Reporter) -> dict[str, Any]:
     limit = training_length(params.steps, params.time_limit, info.config)["steps"]
     report.stage("Training")
     loop = _Loop(trainer, info, place, state, limit, params.time_limit, report)
+    shown = Unfinished(project_folder, params.run, info, scene, trainer.model)
     try:
-        loop.run(_preview(project_folder, place, info, scene, trainer.model))
+        with report.watching(shown) as show:
+            loop.run(_preview(project_folder, place, info, scene, trainer.model), show)
     except Cancelled:
         loop.checkpoint()
         raise
@@ -228,7 +231,7 @@ class _Loop:
         assert self.step_limit is not None
         return self.trainer.steps / self.step_limit
 
-    def run(self, preview: Callable[[], Path]) -> None:
+    def run(self, preview: Callable[[], Path], show: Callable[[], None]) -> None:
         train = self.info.config.train
         last_event = last_checkpoint = last_preview = time.perf_counter()
         cost = 0.0  # seconds of the last preview
@@ -238,6 +241,7 @@ class _Loop:
                 if self.trainer.steps in MEASURED_STEPS and self.state["largest_batch"] is None:
                     self._fit_into_time()
                 self.trainer.step(progress)
+                show()
                 self.state.update(progress=progress, seconds=self.clock.seconds())
                 now = time.perf_counter()
                 if now - last_event >= 0.5:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import logging
 import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -139,6 +141,9 @@ class _Named(Reporter):
 
     def event(self, kind: str, **data: Any) -> None:
         self.outer.event(kind, **data)
+
+    def watching(self, training: Any) -> AbstractContextManager[Callable[[], None]]:
+        return self.outer.watching(training)
 
     def warn(self, message: str) -> None:
         self.warnings.append(message)

@@ -231,7 +231,7 @@ def main() -> None:
     sys.path.insert(0, str(Path(__file__).parent))
     modules = [
         importlib.import_module(module)
-        for module in ("scenarios", "sessions", "panels", "labelling", "surface_labels", "live")
+        for module in ("scenarios", "sessions", "panels", "labelling", "surface_labels", "live", "live_training")
     ]
     scenario = next(getattr(module, name) for module in modules if hasattr(module, name))
     screen = Screen(Path(folder))

@@ -3,14 +3,12 @@ over a `Screen` (see driver.py)."""
 
 from __future__ import annotations
 
-import os
 import statistics
 import time
 from pathlib import Path
 
 import bpy
 from live import ball, look, place, settled
-from steps import alias
 
 POINTS = {
     "field": (0.2, -0.45, 0.1), "low": (0.1, -0.46, -0.2), "front": (-0.2, -1.02, 0.15), "back": (0.6, 0.9, 0.55),
@@ -147,20 +145,3 @@ def endurance(screen):
     screen.facts["places"] = {name: place(screen, point) for name, point in POINTS.items()}
     screen.facts["points"] = POINTS
     screen.shot("after")
-
-
-def reconstruction(screen):
-    """A field of a real capture among objects, for the pictures of the guide."""
-    settings, live = bpy.context.scene.fieldwork, screen.module("addon.live.viewport")
-    settings.project = alias(Path(os.environ["FIELDWORK_RECONSTRUCTION"]), "reconstruction")
-    settings.run = os.environ["FIELDWORK_RECONSTRUCTION_RUN"]
-    for obj in list(bpy.data.objects):
-        if obj.type == "MESH":
-            bpy.data.objects.remove(obj)
-    exec(os.environ.get("FIELDWORK_RECONSTRUCTION_SCENE", ""), {"bpy": bpy, "screen": screen, "live": live})
-    bpy.ops.fieldwork.add_field()
-    yield from screen.show_sidebar()
-    yield from settled(screen, 300)
-    yield from screen.toggle("live")
-    yield 1.0
-    screen.shot("field")

@@ -73,8 +73,9 @@ def still_life(seed: int) -> StillLife:
         body.apply_translation(random.uniform(0.3, 0.36) * np.array([np.cos(angle), np.sin(angle), 0]))
         parts.append(body)
     face_class = np.repeat(np.arange(len(parts)) + 1, [len(part.faces) for part in parts])
-    whole = trimesh.util.concatenate(parts)
-    vertices, faces = np.array(whole.vertices), np.array(whole.faces)
+    first = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    vertices = np.concatenate([part.vertices for part in parts])
+    faces = np.concatenate([part.faces + begin for part, begin in zip(parts, first)])
     hidden = (np.abs(vertices[faces][..., 2]) < 1e-9).all(1) & (face_class > 1)
     volumes = {number: float(part.volume) for number, part in enumerate(parts, 1) if number > 1}
     return StillLife(vertices, faces, face_class, hidden, volumes)
@@ -110,7 +111,7 @@ def photographed(truth: StillLife, folder: Path, seed: int, photos: int = PHOTOS
         images.append(
             ImageRecord(name=name, file=f"images/{name}.png", label=f"labels/{name}.png", width=width, height=height)
         )
-        claimed = _moved(pose, random, POSE_PIXELS / camera.fx, np.linalg.norm(away))
+        claimed = _moved(pose, random, POSE_PIXELS / camera.fx, float(np.linalg.norm(away)))
         claimed[:3, 3] *= factor
         posed.append(PosedImage(name=name, camera=0, camera_to_world=claimed.tolist()))
     shades = np.clip(COLORS, 0, 1).tolist()

@@ -88,7 +88,7 @@ def measure(params: MeasureParams, report: Reporter) -> dict[str, Any]:
     if known and not len(votes.piece):
         report.warn("No photo has a label map: how sure the borders of classes are is not known and not counted.")
     report.stage("Measuring")
-    views, longest = [photo.view for photo in photos], info.config.scene.image_size
+    views, longest = [photo.view for photo in photos], info.image_size
     sized = Sized(voxel, partial(u_places, views, pieces.centers, longest=longest))
     measured = amounts(surface, pieces, coarse, sized, list(known), instances, votes, scale.u, params.caps, report)
     result: dict[str, Any] = {

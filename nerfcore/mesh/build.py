@@ -22,7 +22,7 @@ from ..verdict import LITTLE_IN_ONE
 from . import depth_maps as dm
 from .appearance import Photos
 from .clean import areas, clean, compact, components, drop_scraps
-from .closed import decimate_closed, extract_closed, unseen_faces
+from .closed import decimate_closed, drop_unseen, extract_closed, unseen_faces
 from .decimate import decimate
 from .extract import extract
 from .field_values import shade
@@ -82,6 +82,7 @@ def build(trained: Trained, project: Project, scene: Scene, params: MeshParams, 
     report.stage("Cleaning the surface")
     tolerance = TRUNCATION * region.voxel
     if params.watertight:
+        faces = drop_unseen(vertices, faces, maps, tolerance, report)
         vertices, faces = compact(vertices, drop_scraps(vertices, faces))
     elif len(faces):
         vertices, faces, _ = clean(vertices, faces, maps, tolerance, report)

@@ -130,7 +130,7 @@ def mesh_verdict(hit: float, solid: float | None = None, holes: float = 0.0, lar
         found.append(("failed" if hit < MISSED else "weak", text))
     elif solid is not None and solid < SOLID:
         text = (
-            f"Of what the photos show near, {1 - solid:.0%} is missing in the mesh: train longer, add photos of what is "
+            f"Of what the photos show near, {1 - solid:.0%} is missing in the mesh. Train longer, add photos of what is "
             "missing, or enlarge the region."
         )
         found.append(("failed" if solid < HALF_GONE else "weak", text))

@@ -9,12 +9,11 @@ from skimage.measure import marching_cubes
 from ..kernels.depth_arrays import MapArrays
 from ..kernels.surface import fuse
 from ..progress import Reporter
-from .clean import FEWEST_VIEWS, areas, compact, components, cross, fill_holes, seen_by, unit
+from .clean import FEWEST_VIEWS, areas, compact, components, cross, seen_by, unit
 from .decimate import decimate
 from .extract import BLOCK, assemble, off_corners, weld
 from .fusion import BRICK, FREE_AT, TRUNCATION, Bricks, depth_gap
 from .surface import is_watertight
-from .unfold import unfolded
 
 CHUNK = 1 << 16  # bricks asked about at once
 SEEN = 0.1  # share of a part's area
@@ -102,13 +101,8 @@ def unseen_faces(
 def decimate_closed(
     vertices: np.ndarray, faces: np.ndarray, target: int, report: Reporter
 ) -> tuple[np.ndarray, np.ndarray]:
-    """About `target` triangles of a closed mesh; the mesh as it is, and a warning, where it would not stay closed.
-
-    Where collapses have let it touch itself it is cut apart, and small holes they have left are filled.
-    """
+    """About `target` triangles of a closed mesh; the mesh as it is, and a warning, where it would not stay closed."""
     fewer = compact(*decimate(vertices, faces, target, report))
-    if not is_watertight(fewer[1]):
-        fewer = compact(*fill_holes(*unfolded(*fewer))[:2])
     if is_watertight(fewer[1]):
         return fewer
     report.warn(f"The surface keeps its {len(faces)} triangles: with {target} it would not stay closed.")

@@ -18,6 +18,9 @@ THIN, EMPTY = 0.6, 0.2  # mean opacity of renders of opaque photos
 NOTHING = 0.01  # mean opacity of renders before an environment
 FLAT = 1.02  # 95th percentile of depth over the 5th
 MISSED, PARTLY = 0.02, 0.1  # share of the photos' pixels that show the mesh
+SOLID, HALF_GONE = 0.9, 0.5  # share of the pixels that show something near with detail which hit the mesh
+HOLES = 0.02  # share of what the mesh fills in pictures that is holes
+LITTLE_IN_ONE = 0.5  # share of the area that the largest part has
 FEW_LABELS_RIGHT = 0.3  # mIoU
 PLACED, HALF = 0.9, 0.5  # share of the photos with a pose
 
@@ -111,15 +114,34 @@ def evaluate_verdict(
     return verdict(found)
 
 
-def mesh_verdict(hit: float) -> Verdict:
-    """Of `mesh`: the share of the photos' pixels that show it."""
-    if hit >= PARTLY:
-        return verdict([])
-    text = (
-        f"The mesh fills {hit:.1%} of the photos: the rest of what they show is missing. Train longer, or enlarge the "
-        "region (“photos” takes in all they show)."
-    )
-    return verdict([("failed" if hit < MISSED else "weak", text)])
+def mesh_verdict(hit: float, solid: float | None = None, holes: float = 0.0, largest: float = 1.0) -> Verdict:
+    """Of `mesh`.
+
+    Args:
+        hit: share of the photos' pixels that show it. solid, holes: shares as `mesh.coverage.Coverage` has them.
+        largest: share of the area that its largest connected part has.
+    """
+    found = []
+    if hit < MISSED or (solid is None and hit < PARTLY):
+        text = (
+            f"The mesh fills {hit:.1%} of the photos: the rest of what they show is missing. Train longer, or enlarge the "
+            "region (“photos” takes in all they show)."
+        )
+        found.append(("failed" if hit < MISSED else "weak", text))
+    elif solid is not None and solid < SOLID:
+        text = (
+            f"Of what the photos show near, {1 - solid:.0%} is missing in the mesh. Train longer, add photos of what is "
+            "missing, or enlarge the region."
+        )
+        found.append(("failed" if solid < HALF_GONE else "weak", text))
+    if holes > HOLES:
+        found.append(("weak", f"The mesh has holes: {holes:.0%} of it in the photos. Train longer, or add photos."))
+    if largest < LITTLE_IN_ONE:
+        text = (
+            f"The mesh is in pieces, the largest with {largest:.0%} of the area: more photos or training may join them."
+        )
+        found.append(("weak", text))
+    return verdict(found)
 
 
 def worst(verdicts: Mapping[str, Verdict | None]) -> Verdict:

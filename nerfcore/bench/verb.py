@@ -22,6 +22,7 @@ from ..progress import Reporter, shortened
 from . import gpu, machine, speed, surface, tables
 from .jobs import run_all, unknown_origin
 from .labels import labels_suite
+from .measures import measures_suite
 from .page import check_page, figures_folder, write_page
 from .results import Asked, ResultSet, Row, grouped, write_set
 from .scenes import available, data_folder, is_labelled, prepare, scene_name
@@ -43,6 +44,8 @@ def bench(params: BenchParams, report: Reporter) -> dict[str, Any]:
         check_page(params.page)
     if params.suite == "gpu" and use_device().type != "cuda":
         return _without_gpu(params, out, report)
+    if params.suite == "measures":
+        return measures_suite(params, out, command_of(params), report)
     data = data_folder(params.data)
     projects, notes = _scenes(params, data, root, report)
     if params.suite == "labels":

@@ -1,11 +1,12 @@
 """Areas and volumes of classes and instances, each with the interval that holds the truth in 95 of 100 cases.
 
-    u² = (n · A · u_s / s)² + u_boot² + u_geom² (+ u_caps² for volumes)
+    u² = (n · A · u_s / s)² + u_boot² + u_geom² + u_place² (+ u_caps² for volumes)
 
 n is 2 for areas and 3 for volumes, u_s / s the relative uncertainty of the scale, u_boot the spread over photos drawn
 anew (see resampling.py), u_geom the difference between the surface at cells of h and of 2h: of noise, which adds area,
-and of the cells' size, which takes some, half of the cells shows at least as much as what is left to the truth. The
-interval is the value ± 1.96 u.
+and of the cells' size, which takes some, half of the cells shows at least as much as what is left to the truth. u_place
+is what the surface and its borders being off by a part of a pixel costs (see placing.py). The interval is the value
+± 1.96 u.
 """
 
 from __future__ import annotations
@@ -33,10 +34,11 @@ class Amount:
     u_scale: float
     u_photos: float
     u_geometry: float
+    u_place: float
 
     @property
     def u(self) -> float:
-        return float(np.sqrt(self.u_scale**2 + self.u_photos**2 + self.u_geometry**2))
+        return float(np.sqrt(self.u_scale**2 + self.u_photos**2 + self.u_geometry**2 + self.u_place**2))
 
     @property
     def interval(self) -> tuple[float, float]:
@@ -75,28 +77,35 @@ def transferred(
     return [Labelled(pieces.vertices, pieces.faces[near], label[nearest[near]]) for label in labels]
 
 
-def area_amounts(fine: np.ndarray, coarse: np.ndarray, u_boot: np.ndarray, scale: float) -> list[Amount]:
+def area_amounts(
+    fine: np.ndarray, coarse: np.ndarray, u_boot: np.ndarray, u_place: np.ndarray, scale: float
+) -> list[Amount]:
     """Amounts of areas (N,) at cells of h and of 2h; scale: relative uncertainty of lengths."""
     return [
-        Amount(float(a), 2 * float(a) * scale, float(b), abs(float(a) - float(c)))
-        for a, b, c in zip(fine, u_boot, coarse)
+        Amount(float(a), 2 * float(a) * scale, float(b), abs(float(a) - float(c)), float(p))
+        for a, b, c, p in zip(fine, u_boot, coarse, u_place)
     ]
 
 
-def volume_amount(fine: Closed | None, coarse: Closed | None, area: float, voxel: float, scale: float) -> Amount | None:
-    """The volume of a closed part; None where it is open.
+def volume_amount(
+    fine: Closed | None, coarse: Closed | None, area: float, voxel: float, u_place: float, scale: float
+) -> Amount | None:
+    """The volume of a closed part of an area; None where it is open. u_place: of its surface, along the normals.
 
-    Where the coarse surface is not closed, the surface may be off by half a cell everywhere.
+    Where the coarse surface is not closed, the surface may be off by half a cell everywhere. Its rims are off in their own
+    way, and with them the caps.
     """
     if fine is None:
         return None
     geometry = abs(fine.volume - coarse.volume) if coarse is not None else area * voxel / 2
-    return Amount(fine.volume, 3 * fine.volume * scale, 0.0, float(np.hypot(geometry, fine.uneven)))
+    caps = area * fine.capped / (1 - fine.capped)
+    moved = float(np.hypot(area, caps)) * u_place
+    return Amount(fine.volume, 3 * fine.volume * scale, 0.0, float(np.hypot(geometry, fine.uneven)), moved)
 
 
 def summed(volumes: list[Amount | None]) -> Amount | None:
-    """The volume of several parts together; None where one of them is open, or there is none. They share the scale, and
-    the photos; their surfaces are off each in its own way."""
+    """The volume of several parts together; None where one of them is open, or there is none. They share the scale and
+    the photos, which also say where surfaces lie; noise and cells are each one's own."""
     parts = [volume for volume in volumes if volume is not None]
     if not parts or len(parts) < len(volumes):
         return None
@@ -105,4 +114,5 @@ def summed(volumes: list[Amount | None]) -> Amount | None:
         sum(p.u_scale for p in parts),
         sum(p.u_photos for p in parts),
         float(np.sqrt(sum(p.u_geometry**2 for p in parts))),
+        sum(p.u_place for p in parts),
     )

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +28,18 @@ from ..project.runs import MEASURES
 from ..project.store import load_poses, load_project, record_step, world_from_sfm
 from ..render.run import load_info, refined_poses
 from .amounts import Amount, K, Labelled, area_amounts, summed, transferred, volume_amount
+from .placing import area_deviations_of_place, u_places
 from .resampling import Pieces, Votes, area_deviations
 from .scale import Distance, Scale, read_distances, scale_of, u_measured
+
+
+@dataclass(frozen=True)
+class Sized:
+    """How fine a surface is: side of its cells, and (labels (P,) of its pieces, how many labels) → standard uncertainty
+    of the place of each label's surface, as `u_places` says it."""
+
+    voxel: float
+    u_places: Callable[[np.ndarray, int], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -76,7 +88,9 @@ def measure(params: MeasureParams, report: Reporter) -> dict[str, Any]:
     if known and not len(votes.piece):
         report.warn("No photo has a label map: how sure the borders of classes are is not known and not counted.")
     report.stage("Measuring")
-    measured = amounts(surface, pieces, coarse, voxel, list(known), instances, votes, scale.u, params.caps, report)
+    views, longest = [photo.view for photo in photos], info.image_size
+    sized = Sized(voxel, partial(u_places, views, pieces.centers, longest=longest))
+    measured = amounts(surface, pieces, coarse, sized, list(known), instances, votes, scale.u, params.caps, report)
     result: dict[str, Any] = {
         "unit": scale.unit,
         "scale": {"u_percent": round(100 * scale.u, 4), "source": scale.source, "factor": round(scale.factor, 6)},
@@ -108,7 +122,7 @@ def amounts(
     surface: Surface,
     pieces: Facelets,
     coarse: tuple[np.ndarray, np.ndarray],
-    voxel: float,
+    sized: Sized,
     class_ids: list[int],
     instances: list[Instance],
     votes: Votes,
@@ -119,8 +133,7 @@ def amounts(
     """Areas and volumes of the classes and instances of a surface.
 
     Args:
-        pieces: of the surface; coarse: the surface (vertices, faces) at cells of twice the size; voxel: side of the
-            fine ones. votes: for `class_ids`. u_scale: relative uncertainty of lengths. most_capped: share of a closed
+        pieces: of the surface; coarse: the surface (vertices, faces) at cells of twice the size. votes: for `class_ids`. u_scale: relative uncertainty of lengths. most_capped: share of a closed
             part's area that caps may have.
     """
     of_class = index_of(class_ids)[np.minimum(surface.face_class, max(class_ids, default=0) + 1)]
@@ -131,16 +144,21 @@ def amounts(
     u_class, u_instance = area_deviations(labels, votes, len(instances))
     vertices = surface.vertices.astype(np.float64)
     fine = [Labelled(vertices, surface.faces, label) for label in (of_class + 1, of_instance)]
-    rough = transferred(coarse, pieces.centers, [labels.label + 1, labels.instance], voxel)
+    rough = transferred(coarse, pieces.centers, [labels.label + 1, labels.instance], sized.voxel)
+    counts = len(class_ids) + 1, len(instances) + 1
+    places = [sized.u_places(label, n) for label, n in zip((labels.label + 1, labels.instance), counts)]
+    moved = [area_deviations_of_place(f.vertices, f.faces, f.label, place) for f, place in zip(fine, places)]
     by_class, by_instance = (
-        area_amounts(f.areas(n)[1:], r.areas(n)[1:], u, u_scale)
-        for f, r, n, u in zip(fine, rough, (len(class_ids) + 1, len(instances) + 1), (u_class, u_instance))
+        area_amounts(f.areas(n)[1:], r.areas(n)[1:], u, place[1:], u_scale)
+        for f, r, n, u, place in zip(fine, rough, counts, (u_class, u_instance), moved)
     )
     volumes = []
     for number, instance in enumerate(instances):
         report.progress(number / len(instances), instance.name)
         one, other = (part[1].closed(instance.id, most_capped) for part in (fine, rough))
-        volumes.append(volume_amount(one, other, by_instance[number].value, voxel, u_scale))
+        volumes.append(
+            volume_amount(one, other, by_instance[number].value, sized.voxel, places[1][instance.id], u_scale)
+        )
     together = [
         summed([volume for volume, i in zip(volumes, instances) if i.class_id == class_id]) for class_id in class_ids
     ]
@@ -169,7 +187,8 @@ def entries(area: Amount, volume: Amount | None) -> dict[str, Any]:
     for name, amount in (("area", area), ("volume", volume)):
         low, high = (None, None) if amount is None else amount.interval
         row |= {name: None if amount is None else amount.value, f"{name}_low": low, f"{name}_high": high}
-    row["area_u"] = {"scale": area.u_scale, "photos": area.u_photos, "geometry": area.u_geometry}
+    parts = {"scale": area.u_scale, "photos": area.u_photos, "geometry": area.u_geometry, "place": area.u_place}
+    row["area_u"] = parts
     return row
 
 

@@ -18,10 +18,11 @@ from ..progress import Reporter
 from ..project.schema import Project
 from ..render.model import Model
 from ..render.run import Trained
+from ..verdict import LITTLE_IN_ONE
 from . import depth_maps as dm
 from .appearance import Photos
 from .clean import areas, clean, compact, components, drop_scraps
-from .closed import decimate_closed, extract_closed, unseen_faces
+from .closed import decimate_closed, drop_unseen, extract_closed, unseen_faces
 from .decimate import decimate
 from .extract import extract
 from .field_values import shade
@@ -31,7 +32,7 @@ from .region import Region, choose_region, on_sides
 from .surface import vertex_normals
 
 FEW_STEPS = 300  # of training, below which a field is a sketch
-LITTLE_AGREEMENT, LITTLE_IN_ONE = 0.3, 0.5  # shares below which the user is told
+LITTLE_AGREEMENT = 0.3  # share below which the user is told
 
 
 @dataclass(frozen=True)
@@ -81,6 +82,7 @@ def build(trained: Trained, project: Project, scene: Scene, params: MeshParams, 
     report.stage("Cleaning the surface")
     tolerance = TRUNCATION * region.voxel
     if params.watertight:
+        faces = drop_unseen(vertices, faces, maps, tolerance, report)
         vertices, faces = compact(vertices, drop_scraps(vertices, faces))
     elif len(faces):
         vertices, faces, _ = clean(vertices, faces, maps, tolerance, report)
@@ -155,13 +157,18 @@ def check_agreement(share: float, report: Reporter) -> None:
 
 def check_parts(vertices: np.ndarray, faces: np.ndarray, report: Reporter) -> None:
     """Warn where the surface is in scraps."""
-    part = components(faces, len(vertices))
-    area = np.bincount(part, areas(vertices, faces))
-    if area.max() < LITTLE_IN_ONE * area.sum():
+    largest, parts = largest_share(vertices, faces)
+    if largest < LITTLE_IN_ONE:
         report.warn(
-            f"The surface is in {len(area)} parts, the largest with {100 * area.max() / area.sum():.0f} % of the area. "
+            f"The surface is in {parts} parts, the largest with {100 * largest:.0f} % of the area. "
             "More photos or longer training may join them."
         )
+
+
+def largest_share(vertices: np.ndarray, faces: np.ndarray) -> tuple[float, int]:
+    """Share of the area that the largest connected part of triangles (F, 3) has, and how many parts there are."""
+    area = np.bincount(components(faces, len(vertices)), areas(vertices, faces))
+    return float(area.max() / max(area.sum(), 1e-30)), len(area)
 
 
 def read_photos(trained: Trained, scene: Scene, views: list[View], box: Box, report: Reporter) -> PixelStore:

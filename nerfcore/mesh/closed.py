@@ -9,13 +9,14 @@ from skimage.measure import marching_cubes
 from ..kernels.depth_arrays import MapArrays
 from ..kernels.surface import fuse
 from ..progress import Reporter
-from .clean import FEWEST_VIEWS, compact, cross, seen_by, unit
+from .clean import FEWEST_VIEWS, areas, compact, components, cross, seen_by, unit
 from .decimate import decimate
 from .extract import BLOCK, assemble, off_corners, weld
 from .fusion import BRICK, FREE_AT, TRUNCATION, Bricks, depth_gap
 from .surface import is_watertight
 
 CHUNK = 1 << 16  # bricks asked about at once
+SEEN = 0.1  # share of a part's area
 
 
 def extract_closed(bricks: Bricks, maps: MapArrays, report: Reporter) -> tuple[np.ndarray, np.ndarray]:
@@ -77,6 +78,16 @@ def _distances(bricks: Bricks, free: np.ndarray, corner: np.ndarray) -> np.ndarr
     offset = low * BRICK - 1
     window = tuple(slice(a, b) for a, b in zip(begin - offset, end - offset))
     return off_corners(distance[window])
+
+
+def drop_unseen(
+    vertices: np.ndarray, faces: np.ndarray, maps: MapArrays, tolerance: float, report: Reporter
+) -> np.ndarray:
+    """The triangles (F, 3) of connected parts of whose area views see at least `SEEN`: what hangs in space that no view
+    shows, between rays of some that do, is nothing."""
+    unseen, area = unseen_faces(vertices, faces, maps, tolerance, report), areas(vertices, faces)
+    part = components(faces, len(vertices))
+    return faces[(np.bincount(part, area * ~unseen) >= SEEN * np.bincount(part, area))[part]]
 
 
 def unseen_faces(

@@ -23,7 +23,8 @@ from ..project.schema import step
 from ..project.store import load_project, record_step, world_from_sfm
 from ..render.run import Trained, load_info, load_trained, refined_poses
 from ..verdict import mesh_verdict
-from .build import Built, build
+from .build import Built, build, largest_share, wanted_bounds
+from .coverage import coverage
 from .features import features_of
 from .field_values import shade
 from .formats import check_format
@@ -46,7 +47,8 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
         {"vertices", "faces", "watertight", "voxel": in world units, "classes": {name: {"faces", "area"}},
         "instances": how many, "lods": [{"faces", "deviation": in world units}],
         "label_revision": of the marks that the classes are from, or None, "files"};
-        "shown": the share of the photos' pixels that show the mesh, "verdict";
+        "shown": the share of the photos' pixels that show the mesh; "solid_shown" and "holes": see
+        `coverage.Coverage`; "verdict";
         "silhouette" of a capture with masks: see `shown.silhouette`;
         for a preview see `preview.preview`;
         with a texture of photos "painted_by_photos", the share of its texels that a photo shows
@@ -102,7 +104,19 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
         "files": [str(path) for path in files],
     }
     shown = shown_share(photos, built.vertices, built.faces)
-    result |= {"shown": round(shown, 4), "verdict": mesh_verdict(shown)}
+    found = coverage(
+        trained.model,
+        scene,
+        box.box_from_world,
+        built.vertices,
+        built.faces,
+        wanted_bounds(params, scene, box),
+        report.check,
+    )
+    solid = None if found.solid is None else round(found.solid, 4)
+    largest, _ = largest_share(built.vertices, built.faces)
+    result |= {"shown": round(shown, 4), "solid_shown": solid, "holes": round(found.holes, 4)}
+    result["verdict"] = mesh_verdict(shown, found.solid, found.holes, largest)
     outlines = silhouette(scene, surface.vertices, surface.faces, report.check)
     if outlines is not None:
         result["silhouette"] = round(outlines, 4)

@@ -62,9 +62,9 @@ class BatchParams(Params):
 
 
 class BenchParams(Params):
-    suite: Literal["figures", "speed", "ablation", "robustness", "baselines", "gpu", "surface", "labels"] = Field(
-        description="which table"
-    )
+    suite: Literal[
+        "figures", "speed", "ablation", "robustness", "baselines", "gpu", "surface", "labels", "measures"
+    ] = Field(description="which table")
     out: Path = Field(default=Path("build/bench"), description="folder for results and scenes; finished runs are kept")
     data: Path | None = Field(default=None, description="folder of data sets; default: ../shared/data when it is there")
     scenes: list[str] | None = Field(

@@ -8,7 +8,7 @@ import torch
 import trimesh
 from fieldwork.nerfcore.errors import Cancelled
 from fieldwork.nerfcore.mesh import clean, depth_maps
-from fieldwork.nerfcore.mesh.closed import decimate_closed, extract_closed, unseen_faces
+from fieldwork.nerfcore.mesh.closed import decimate_closed, drop_unseen, extract_closed, unseen_faces
 from fieldwork.nerfcore.mesh.fusion import BRICK, Bricks, fuse_maps
 from fieldwork.nerfcore.mesh.region import choose_region
 from fieldwork.nerfcore.progress import Reporter
@@ -75,10 +75,21 @@ def test_fewer_triangles_only_where_they_stay_closed() -> None:
     assert len(faces) <= 1100
     assert trimesh.Trimesh(vertices, faces, process=False).is_watertight
     assert report.warnings == []
-    opened = np.array(mesh.faces)[1:]
+    opened = np.array(mesh.faces)[mesh.triangles_center[:, 2] > -0.2]
     _, faces = decimate_closed(np.array(mesh.vertices), opened, 1000, report)
     assert len(faces) == len(opened)
     assert "would not stay closed" in report.warnings[0]
+
+
+def test_what_hangs_in_unseen_space_goes() -> None:
+    """A ball that views see, and one behind it that none does."""
+    flats, rendered = maps_of(sphere(0.5), orbit(24, 1.8))
+    maps = depth_maps.confirmed_maps(flats, rendered, torch.device("cpu"), Reporter())
+    balls = [trimesh.creation.icosphere(3, 0.5), trimesh.creation.icosphere(3, 0.1)]
+    both = trimesh.util.concatenate(balls)
+    vertices, faces = np.array(both.vertices), np.array(both.faces)
+    kept = drop_unseen(vertices, faces, maps, 0.05, Reporter())
+    np.testing.assert_array_equal(kept, faces[: len(balls[0].faces)])
 
 
 def test_closing_stops_when_asked() -> None:

@@ -10,14 +10,17 @@ import numpy as np
 import pytest
 import trimesh
 from fieldwork.nerfcore.errors import InputError, ProjectError
+from fieldwork.nerfcore.geometry.cameras import Camera
 from fieldwork.nerfcore.measure.closing import border_loops, closed
+from fieldwork.nerfcore.measure.placing import area_rates, border_lengths, u_places
 from fieldwork.nerfcore.measure.resampling import Votes
 from fieldwork.nerfcore.measure.scale import read_distances, scale_of
-from fieldwork.nerfcore.measure.verb import Measured, amounts, measure
+from fieldwork.nerfcore.measure.verb import Measured, Sized, amounts, measure
 from fieldwork.nerfcore.mesh.facelets import facelets
 from fieldwork.nerfcore.mesh.instances import find_instances
 from fieldwork.nerfcore.mesh.stored import COARSE, mesh_folder
 from fieldwork.nerfcore.mesh.surface import Surface
+from fieldwork.nerfcore.mesh.visibility import PosedCamera
 from fieldwork.nerfcore.params import MeasureParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.runs import MEASURES, MESH_RECORD
@@ -30,14 +33,18 @@ from skimage.measure import marching_cubes
 
 SIDE, ROUND = 33, 11.0  # corners of the grid, radius of the ball in its cells
 U_SCALE = 0.005
+BALL = trimesh.creation.icosphere(4)
 RIM = 0.3  # height, in radii, of the border between the two classes
 
 
-def noisy_ball(random: np.random.Generator) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    """A ball of radius 1 as it comes out of noisy distances, at cells of h and of 2h: vertices and faces of each."""
+def noisy_ball(
+    random: np.random.Generator, pixel: float
+) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    """A ball of radius 1 as it comes out of noisy distances that are all off by up to a pixel's footprint, at cells of h
+    and of 2h: vertices and faces of each."""
     axis = np.arange(SIDE) - SIDE // 2 + random.uniform(-0.5, 0.5, (3, 1))
     distance = np.sqrt(sum(g**2 for g in np.meshgrid(*axis, indexing="ij"))) - ROUND
-    distance += random.normal(scale=0.1, size=distance.shape)
+    distance += random.normal(scale=0.1, size=distance.shape) + ROUND * random.uniform(-pixel, pixel)
     made = []
     for every in (1, 2):
         vertices, faces, *_ = marching_cubes(distance[::every, ::every, ::every], 0.0, gradient_direction="descent")
@@ -58,10 +65,10 @@ def voted(centers: np.ndarray, random: np.random.Generator, photos: int = 12) ->
     return Votes(photos, *(np.concatenate(part) for part in zip(*found)))
 
 
-def simulated(seed: int) -> Measured:
+def simulated(seed: int, pixel: float) -> Measured:
     """One capture of the ball, whose scale is off as well: what is measured of its two classes."""
     random = np.random.default_rng(seed)
-    (vertices, faces), coarse = noisy_ball(random)
+    (vertices, faces), coarse = noisy_ball(random, pixel)
     factor = 1 + random.normal(scale=U_SCALE)
     vertices, coarse = vertices * factor, (coarse[0] * factor, coarse[1])
     pieces = facelets(vertices, faces)
@@ -71,26 +78,44 @@ def simulated(seed: int) -> Measured:
     face_class = np.where(mass.any(1), mass.argmax(1) + 1, np.where(pieces.centers[:, 2] > 0, 1, 2))
     face_instance, instances = find_instances(vertices, faces, face_class, {}, 0, 0.2)
     surface = Surface(vertices, faces, vertices, vertices, face_class[:0], face_class, face_instance)
-    return amounts(surface, pieces, coarse, 1 / ROUND, [1, 2], instances, votes, U_SCALE, 0.9, Reporter())
+    sized = Sized(1 / ROUND, lambda _, count: np.full(count, pixel / np.sqrt(3)))
+    return amounts(surface, pieces, coarse, sized, [1, 2], instances, votes, U_SCALE, 0.9, Reporter())
 
 
-def test_true_sizes_lie_in_the_intervals() -> None:
+@pytest.mark.parametrize(("pixel", "widest"), [(0.0, 0.25), (0.06, 0.4)])
+def test_true_sizes_lie_in_the_intervals(pixel: float, widest: float) -> None:
     """In at least 18 of 20 runs, and intervals are not so wide that they say nothing."""
     truth = np.array([2 * np.pi * (1 - RIM), 2 * np.pi * (1 + RIM)])
     cap = np.pi * (1 - RIM) ** 2 * (2 + RIM) / 3
     solids = np.array([cap, 4 / 3 * np.pi - cap])
-    runs = [simulated(seed) for seed in range(20)]
+    runs = [simulated(seed, pixel) for seed in range(20)]
     for number in range(2):
         intervals = np.array([run.areas[number].interval for run in runs])
         inside = (intervals[:, 0] <= truth[number]) & (truth[number] <= intervals[:, 1])
         assert inside.sum() >= 18
-        assert np.ptp(intervals, axis=1).mean() < 0.25 * truth[number]
+        assert np.ptp(intervals, axis=1).mean() < widest * truth[number]
         bodies = [run.instance_volumes[number] for run in runs]
         assert all(body is not None for body in bodies)
         held = [body is not None and body.interval[0] <= solids[number] <= body.interval[1] for body in bodies]
         assert sum(held) >= 18
     # Photos matter: without them the border would be thought certain.
     assert min(run.areas[0].u_photos for run in runs) > 0.003
+
+
+def test_what_a_moved_surface_costs() -> None:
+    """Of a cube with a red top: its area grows by four times its edges' length as it grows, the top by its rim."""
+    vertices, faces = box_mesh(0.5)
+    top = (vertices[faces][..., 2] > 0).all(1).astype(int)
+    assert border_lengths(vertices, faces, top, 2) == pytest.approx([4, 4])
+    assert area_rates(
+        np.asarray(BALL.vertices), np.asarray(BALL.faces), np.zeros(len(BALL.faces), int), 1
+    ) == pytest.approx([8 * np.pi], rel=0.01)
+    view = PosedCamera(Camera(width=100, height=80, fx=50, fy=50, cx=50, cy=40), np.eye(4))
+    centers = np.array([[0, 0, 2.0], [0, 0, 4], [0, 0, -3]])
+    # A pixel is 4 and 8 cm there; photos of half the size have pixels twice as large; what no photo shows has the mean.
+    found = u_places([view], centers, np.arange(3), 3, 50) * np.sqrt(3)
+    assert found == pytest.approx([0.08, 0.16, 0.12])
+    assert (u_places([view], centers[2:], np.zeros(1, int), 1, 50) == 0).all()
 
 
 def test_the_volume_of_an_open_box_is_that_of_the_box_with_a_lid() -> None:

@@ -1,0 +1,116 @@
+"""How much of what photos show a mesh has: photos, above all held-out ones, against the mesh and the field's own depths.
+
+What must be there is what a photo shows with some detail, where the field says that something is near: a dark room behind
+an object, a sky or a white background have no detail, and hills are far. What is plain is not asked for in this way; where
+it is missing in the middle of the mesh it is a hole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import binary_fill_holes, minimum_filter, uniform_filter
+
+from ..data.box import box_poses
+from ..data.scene import Scene, View
+from ..geometry.cameras import Camera, pixel_centers, project, rays
+from ..images.picture import resized
+from ..images.working import nearest, read_picture
+from ..kernels.depth_arrays import FREE
+from ..kernels.raycast import FrontFaces
+from ..render.model import Model
+from .depth_maps import FlatView, flat_views, render_depth
+from .shown import cut_out
+
+MOST_PHOTOS, ACROSS = 12, 96  # photos that are asked, evenly spread, and pixels along their longest side
+DETAIL, WINDOW = 3.0, 5  # standard deviation, of 255, that is more than noise, within so many pixels
+FAR = 2.5  # of the median depth of the mesh: what is farther is a background
+FEWEST = 100  # pixels below which nothing is said
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Shares: `solid`, of the pixels that show something near with detail, how many hit the mesh, None where there are too few such
+    pixels; `holes`, of what the mesh fills in the pictures, holes included, how much is holes through which
+    the field sees something near."""
+
+    solid: float | None
+    holes: float
+
+
+def coverage(
+    model: Model,
+    scene: Scene,
+    box_from_world: np.ndarray,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    bounds: tuple[np.ndarray, np.ndarray] | None,
+    check: Callable[[], None],
+) -> Coverage:
+    """How much of the held-out photos (of all where none is held out) a mesh in the normalised frame fills.
+
+    Args:
+        bounds: corners (3,) of the region that was asked for: what lies beside it need not be there.
+    """
+    chosen = [scene.views[i] for i in scene.test or scene.train]
+    chosen = [chosen[i] for i in np.unique(np.linspace(0, len(chosen) - 1, MOST_PHOTOS).round().astype(int))]
+    flats = flat_views(chosen, box_from_world, ACROSS)
+    poses, mesh, seen = box_poses(chosen, box_from_world), FrontFaces(vertices, faces), []
+    for flat in flats:
+        check()
+        directions = pixel_rays(flat) @ flat.pose[:3, :3].T
+        face, _ = mesh.cast(np.broadcast_to(flat.pose[:3, 3], directions.shape), directions)
+        hit = (face >= 0).reshape(flat.inside.shape)
+        shown = detailed(chosen[flat.photo], scene.mask_mode, flat, poses[flat.photo])
+        seen.append((hit, render_depth(model, flat, check).depth, shown))
+    there = [depth[hit & (depth > 0) & (depth < FREE)] for hit, depth, _ in seen]
+    middle = float(np.median(np.concatenate(there))) if sum(map(len, there)) else np.inf
+    asked = found = filled = missing = 0
+    for flat, (hit, depth, shown) in zip(flats, seen):
+        near = flat.inside & (depth > 0) & (depth < min(FAR * middle, FREE)) & within_bounds(flat, depth, bounds)
+        solid = near & shown
+        asked, found = asked + int(solid.sum()), found + int((solid & hit).sum())
+        whole = np.asarray(binary_fill_holes(hit))
+        # A pixel beside the mesh may show its outline.
+        holes = minimum_filter(whole & ~hit, 3) & near
+        filled, missing = filled + int(whole.sum()), missing + int(holes.sum())
+    return Coverage(found / asked if asked >= FEWEST else None, missing / max(filled, 1))
+
+
+def within_bounds(flat: FlatView, depth: np.ndarray, bounds: tuple[np.ndarray, np.ndarray] | None) -> np.ndarray:
+    """Which pixels (H, W) bool of a flat view with depths (H, W) show what lies between two corners."""
+    if bounds is None:
+        return np.ones(depth.shape, bool)
+    local = pixel_rays(flat)
+    points = local / local[:, 2:] * depth.reshape(-1, 1) @ flat.pose[:3, :3].T + flat.pose[:3, 3]
+    return ((points >= bounds[0]) & (points <= bounds[1])).all(1).reshape(depth.shape)
+
+
+def pixel_rays(flat: FlatView) -> np.ndarray:
+    """Directions (N, 3) of the pixels of a flat view, row by row, in its camera's axes."""
+    return rays(flat.camera, pixel_centers(flat.camera.width, flat.camera.height).reshape(-1, 2))[0]
+
+
+def detailed(view: View, mask_mode: str, flat: FlatView, pose: np.ndarray) -> np.ndarray:
+    """Which pixels (H, W) bool of a flat view its photo, with the pose (4, 4) of its camera, shows with detail and does not
+    cut away."""
+    small = view.camera.resized(*looked_at(view.camera))
+    photo = resized(read_picture(view.image), small.width, small.height).pixels[..., :3].astype(np.float32).mean(2)
+    detail = uniform_filter(photo**2, WINDOW) - uniform_filter(photo, WINDOW) ** 2 > DETAIL**2
+    # An outline alone is none on either side.
+    detail = minimum_filter(detail, WINDOW, mode="nearest")
+    cut = cut_out(view, mask_mode)
+    pixel = project(small, pixel_rays(flat) @ flat.pose[:3, :3].T @ pose[:3, :3])
+    x, y = (np.clip(np.nan_to_num(p), 0, n - 1).astype(int) for p, n in zip(pixel.T, (small.width, small.height)))
+    shown = np.asarray(detail[y, x], bool)
+    if cut is not None:
+        shown = shown & (nearest(cut.astype(np.uint8), small.width, small.height)[y, x] > 0)
+    return shown.reshape(flat.inside.shape)
+
+
+def looked_at(camera: Camera) -> tuple[int, int]:
+    """Width and height of a photo at which detail is looked for: four pixels for each that is asked."""
+    share = min(1.0, 2 * ACROSS / max(camera.width, camera.height))
+    return max(1, round(share * camera.width)), max(1, round(share * camera.height))

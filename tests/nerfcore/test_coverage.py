@@ -1,0 +1,108 @@
+"""What a mesh has of what photos show: a ball before a dark room, with and without parts missing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from fieldwork.nerfcore.data.load import load_scene
+from fieldwork.nerfcore.data.scene import Scene
+from fieldwork.nerfcore.geometry.cameras import pixel_centers, rays
+from fieldwork.nerfcore.mesh import coverage as module
+from fieldwork.nerfcore.mesh.coverage import Coverage, coverage
+from fieldwork.nerfcore.mesh.depth_maps import DepthMap, FlatView
+from fieldwork.nerfcore.verdict import mesh_verdict
+from fieldwork.tests.nerfcore.support.ball import RADIUS, ball_project
+from PIL import Image
+
+ROOM = 2.4  # distance of the room's walls from every camera, at a depth that is near: 2.5 times the ball's is 3.3
+
+
+def ball_depth(_model: object, flat: FlatView, _check: object) -> DepthMap:
+    """What the field says: a ball of half the size of the world's unit, with the room's walls behind it."""
+    local = rays(flat.camera, pixel_centers(flat.camera.width, flat.camera.height).reshape(-1, 2))[0]
+    d, o = local @ flat.pose[:3, :3].T, flat.pose[:3, 3]
+    b = d @ o
+    root = b * b - (o @ o - RADIUS**2)
+    away = np.where(root > 0, -b - np.sqrt(np.maximum(root, 0)), ROOM)
+    depth = (away * local[:, 2]).reshape(flat.inside.shape).astype(np.float32)
+    return DepthMap(depth, depth, depth)
+
+
+@pytest.fixture
+def room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Scene]:
+    """Photos of the ball before black, with the noise of a sensor."""
+    folder, random = ball_project(tmp_path / "ball", views=6, side=96), np.random.default_rng(0)
+    for path in (folder / "images").iterdir():
+        with Image.open(path) as image:
+            rgba = np.array(image).astype(int)
+        rgb = rgba[..., :3] * (rgba[..., 3:] > 0) + random.normal(scale=1.5, size=rgba[..., :3].shape)
+        Image.fromarray(rgb.clip(0, 255).astype(np.uint8)).save(path)
+    monkeypatch.setattr(module, "render_depth", ball_depth)
+    return folder, load_scene(folder, 0)
+
+
+def found(
+    scene: Scene, keep: np.ndarray | None = None, bounds: tuple[np.ndarray, np.ndarray] | None = None
+) -> Coverage:
+    ball = trimesh.creation.icosphere(5, RADIUS)
+    faces = np.asarray(ball.faces) if keep is None else np.asarray(ball.faces)[keep]
+    return coverage(None, scene, np.eye(4), np.asarray(ball.vertices), faces, bounds, lambda: None)  # pyright: ignore
+
+
+def middles() -> np.ndarray:
+    return np.asarray(trimesh.creation.icosphere(5, RADIUS).triangles_center)
+
+
+def level(shares: Coverage) -> str:
+    return mesh_verdict(0.3, shares.solid, shares.holes)["level"]
+
+
+def test_an_object_before_a_dark_room_is_all_there(room: tuple[Path, Scene]) -> None:
+    whole = found(room[1])
+    assert whole.solid is not None
+    assert whole.solid > 0.95
+    assert whole.holes == 0
+    assert level(whole) == "good"
+
+
+def test_half_an_object_and_one_with_holes_are_told(room: tuple[Path, Scene]) -> None:
+    half = found(room[1], middles()[:, 2] > 0)
+    assert half.solid is not None
+    assert 0.2 < half.solid < 0.8
+    assert level(half) != "good"
+    towards = np.array([1.0, 0.2, 0.1]) / np.linalg.norm([1.0, 0.2, 0.1])
+    with_hole = found(room[1], middles() @ towards < 0.8 * RADIUS)
+    assert with_hole.holes > 0.02
+    assert level(with_hole) == "weak"
+    assert "holes" in mesh_verdict(0.3, 1.0, with_hole.holes)["reasons"][0]
+    # What was not asked for is not missing.
+    region = np.array([-1.0, -1, 0]), np.ones(3)
+    asked = found(room[1], middles()[:, 2] > 0, region)
+    assert asked.solid is not None
+    assert asked.solid > 0.95
+
+
+def test_a_room_that_can_be_seen_is_missing(room: tuple[Path, Scene]) -> None:
+    folder, _ = room
+    stripes = (128 + 60 * np.sin(np.arange(96) * 0.8)).astype(int)
+    for path in (folder / "images").iterdir():
+        with Image.open(path) as image:
+            rgb = np.array(image).astype(int)
+        beside = rgb.max(2, keepdims=True) < 12
+        rgb = np.where(beside, np.broadcast_to(stripes[None, :, None], rgb.shape), rgb)
+        Image.fromarray(rgb.astype(np.uint8)).save(path)
+    seen = found(load_scene(folder, 0))
+    assert seen.solid is not None
+    assert seen.solid < 0.7
+    assert level(seen) != "good"
+
+
+def test_scraps_are_told_whatever_they_cover() -> None:
+    assert mesh_verdict(0.5, 0.97, 0.0, 0.3)["level"] == "weak"
+    assert "pieces" in mesh_verdict(0.5, 0.97, 0.0, 0.3)["reasons"][0]
+    assert mesh_verdict(0.05, 0.97)["level"] == "good"  # a small thing in large photos
+    assert mesh_verdict(0.05, None)["level"] == "weak"
+    assert mesh_verdict(0.45, 0.45)["level"] == "failed"

@@ -46,7 +46,7 @@ from .labels import (
 )
 from .results import BlendParams, ExportParams, PackageParams, ReportParams
 from .surfaces import CompareParams, MeasureParams, MeshParams, PaperScale, PlanParams, SectionParams, Side, Turn
-from .workflows import BatchParams, BenchParams, ReconstructParams
+from .workflows import BatchParams, BenchParams, BlocksParams, ReconstructParams
 
 __all__ = [
     "LARGEST_PICTURE",
@@ -61,6 +61,7 @@ __all__ = [
     "BatchParams",
     "BenchParams",
     "BlendParams",
+    "BlocksParams",
     "ClassValues",
     "ClassesParams",
     "CompareParams",

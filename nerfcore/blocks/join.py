@@ -40,7 +40,8 @@ def joined(parts: Sequence[Part]) -> Surface:
 
 
 def open_at_seams(surface: Surface, parts: Sequence[Part]) -> int:
-    """Number of edges in the planes between blocks that have a triangle on one side only: a gap where there are any."""
+    """Number of edges in the planes between blocks that have a triangle on one side only: as many as a mesh in one piece
+    has there, whose holes end at such planes now and then; more would be a gap."""
     border = border_edges(surface.faces)
     slack = ON_SEAM * parts[0].voxel
     found = np.zeros(len(border), bool)

@@ -41,9 +41,6 @@ def write_whole(folder: Path, plan: Plan, out: Path | None, turntable: Path | No
     report.stage("Joining the blocks")
     parts = [load_part(folder, block) for block in plan.blocks]
     common = joined(parts)
-    gaps = open_at_seams(common, parts)
-    if gaps:
-        report.warn(f"The mesh has {gaps} open edges where blocks meet.")
     scene, voxel = load_scene(folder, 0), parts[0].voxel * similarity_scale(plan.world_from_common)
     surface = to_world(common, plan.world_from_common)
     names = {scene.ignore_id: "void"} | {c.id: c.name for c in scene.classes}
@@ -66,7 +63,7 @@ def write_whole(folder: Path, plan: Plan, out: Path | None, turntable: Path | No
         "blocks": [_row(folder, plan, number, len(part.surface.faces)) for number, part in enumerate(parts)],
         "vertices": len(surface.vertices),
         "faces": len(surface.faces),
-        "open_at_seams": gaps,
+        "open_at_seams": open_at_seams(common, parts),
         "voxel": voxel,
         "classes": class_table(surface, names),
         "instances": len(instances),

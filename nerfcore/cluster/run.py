@@ -190,9 +190,13 @@ class Runner:
 
     def _failed(self, task: Task, answer: dict[str, Any]) -> None:
         error = answer["error"]
+        if error["code"] == "disk" and answer.get("node") and task.disks < MOST_LOSSES:
+            # It is the worker's fault, not the capture's: others may have room.
+            task.disks += 1
+            self._exclude(answer["node"], error)
+            self.tasks.put_back(task)
+            return
         task.attempts += 1
-        if error["code"] == "disk":
-            self._exclude(answer.get("node", ""), error)
         if error["code"] in USER_FAULTS or task.attempts > self.options.retries:
             self._fail(task, answer)
             return

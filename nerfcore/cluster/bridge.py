@@ -22,7 +22,6 @@ import ray
 from ray import exceptions as failures
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from .. import __version__
 from . import worker
 
 NODES_EVERY = 2.0
@@ -86,7 +85,7 @@ class Bridge:
             scheduling_strategy=NodeAffinitySchedulingStrategy(here, soft=True)
         ).remote()
         ray.get(self.board.take.remote())
-        self.say("ready", joined=joined, version=__version__, nodes=nodes())
+        self.say("ready", joined=joined, address=ray.get_runtime_context().gcs_address, nodes=nodes())
         threading.Thread(target=self._read, daemon=True).start()
         looked = time.monotonic()
         while True:

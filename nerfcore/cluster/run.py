@@ -76,7 +76,9 @@ class Runner:
         Raises:
             Cancelled: the workers have stopped. ClusterError: the cluster is gone. DiskError: no worker has room.
         """
-        self.nodes = self.link.open(self.report.check)["nodes"]
+        ready = self.link.open(self.report.check)
+        self.nodes = ready["nodes"]
+        self.report.note(welcome(ready))
         try:
             while not self.tasks.finished:
                 self.report.check()
@@ -278,6 +280,15 @@ class Runner:
         """What runs, then what waits in its order."""
         tasks = list(self.tasks.all.values())
         return sorted(tasks, key=lambda task: (task.state != "running", -task.priority))
+
+
+def welcome(ready: dict[str, Any]) -> str:
+    """Which cluster it is: “auto” takes the one that runs on this machine, which may be somebody else's."""
+    cores = sum(node["cores"] for node in ready["nodes"])
+    there = f"{sum(node['cores'] > 0 for node in ready['nodes'])} workers, {cores:g} cores"
+    if not ready["joined"]:
+        return f"No cluster runs here: one of this machine was started for the time of the campaign ({there})."
+    return f"Joined the cluster at {ready['address']} ({there})."
 
 
 def limited(need: Need, nodes: list[dict[str, Any]]) -> Need:

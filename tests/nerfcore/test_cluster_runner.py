@@ -33,6 +33,14 @@ def test_failures_are_tried_again_but_not_those_of_the_user(tmp_path):
     assert runner.tasks.all["a0"].answer["error"]["code"] == "poses"
 
 
+def test_it_is_said_which_cluster_was_joined(tmp_path, caplog):
+    caplog.set_level("INFO")
+    run_with(chain("a", 1), FakeLink(good, nodes=2), tmp_path)
+    assert "Joined the cluster at 10.0.0.1:6379 (2 workers, 2 cores)." in caplog.text
+    own = run.welcome({"joined": False, "address": "127.0.0.1:1", "nodes": []})
+    assert "started for the time of the campaign" in own
+
+
 def test_a_task_that_ends_its_workers_is_given_up(tmp_path, monkeypatch):
     monkeypatch.setattr(run, "MOST_LOSSES", 3)
     line = FakeLink(lambda command: None if command["id"] == "a0" else good(command))

@@ -45,7 +45,7 @@ class FakeLink:
         self.sent: list[dict[str, Any]] = []
 
     def open(self, check: Any) -> dict[str, Any]:
-        return {"nodes": self.nodes}
+        return {"nodes": self.nodes, "joined": True, "address": "10.0.0.1:6379"}
 
     open_again = open
 

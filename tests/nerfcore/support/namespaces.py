@@ -37,7 +37,8 @@ class NamespacedCluster(Cluster):
     def __init__(self, workers: int = 2) -> None:
         super().__init__(workers)
         self.name = f"fw{os.getpid() % 10000}"
-        self.ends: list[str] = []  # of cables, on our side
+        self.ends: list[str] = []  # of cables, on our side; each namespace has the name of its cable
+        self.cables: dict[int, str] = {}  # by the worker's process
 
     @property
     def host(self) -> str:
@@ -67,11 +68,10 @@ class NamespacedCluster(Cluster):
             ip("-n", end, *words)
         ip("-n", end, "link", "set", "eth0", "up")
         arguments = [*self.worker_arguments(), f"--node-ip-address={address}"]
-        return Node(arguments, ("ip", "netns", "exec", end), **self.access, **more)
+        node = Node(arguments, ("ip", "netns", "exec", end), **self.access, **more)
+        self.cables[node.process.pid] = end
+        return node
 
-    def pull(self, number: int) -> None:
-        """Unplug the cable of a worker, counted from 0 in the order in which they were added."""
-        ip("link", "set", self.ends[number], "down")
-
-    def plug(self, number: int) -> None:
-        ip("link", "set", self.ends[number], "up")
+    def pull(self, node: Node) -> None:
+        """Unplug the cable of a worker."""
+        ip("link", "set", self.cables[node.process.pid], "down")

@@ -17,6 +17,7 @@ from .link import Link
 from .tasks import Need, Task, Tasks
 
 SILENT = 60.0  # seconds without a sign of life after which a worker is given up
+DEAF = 30.0  # seconds in which a silent worker may obey; then it is taken to be out of reach
 MOST_LOSSES = 8  # of workers with one task: then it is the task that ends them
 GRACE = 2.5  # seconds in which tasks may end by themselves after a cancel
 PATIENCE = 600.0  # seconds in which no worker could be used, after which the campaign ends
@@ -244,6 +245,9 @@ class Runner:
             if task.node and now - task.heard > SILENT and task.id not in self.cut_short:
                 self.cut_short[task.id] = now
                 self.link.send(do="cancel", id=task.id, force=True)
+            elif now - self.cut_short.get(task.id, now) > DEAF:
+                self.link.send(do="drop", id=task.id)
+                self._lost(task, "it cannot be reached")
 
     def _cancel(self) -> None:
         """Let running tasks write what they have, then end those that have not."""

@@ -216,7 +216,10 @@ def main() -> None:
     if name not in BARE:
         bpy.ops.preferences.addon_enable(module=PACKAGE)
     sys.path.insert(0, str(Path(__file__).parent))
-    modules = [importlib.import_module(module) for module in ("scenarios", "sessions", "panels", "labelling", "live")]
+    modules = [
+        importlib.import_module(module)
+        for module in ("scenarios", "sessions", "panels", "labelling", "live", "campaigns")
+    ]
     scenario = next(getattr(module, name) for module in modules if hasattr(module, name))
     screen = Screen(Path(folder))
     run(scenario(screen), screen)

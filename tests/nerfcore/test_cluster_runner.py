@@ -116,6 +116,26 @@ def test_a_silent_worker_is_cut_off(tmp_path, monkeypatch):
     assert runner.tasks.all["a0"].losses == 1
 
 
+def test_a_worker_out_of_reach_is_not_waited_for(tmp_path, monkeypatch):
+    """It neither works nor obeys: as if its network cable was pulled."""
+    monkeypatch.setattr(run, "SILENT", 0.2)
+    monkeypatch.setattr(run, "DEAF", 0.3)
+    line, first = FakeLink(good), []
+
+    def send(**command: Any) -> None:
+        line.sent.append(command)
+        if command["do"] == "submit" and not first:
+            first.append(command)
+            line.waiting.append({"kind": "told", "id": command["id"], "node": "n0"})
+        elif command["do"] == "submit":
+            line.waiting.append({"kind": "answer", "id": command["id"], "answer": good(command)})
+
+    line.send = send
+    runner = run_with(chain("a", 1), line, tmp_path)
+    assert [command["do"] for command in line.sent] == ["submit", "cancel", "drop", "submit"]
+    assert (runner.tasks.all["a0"].state, runner.tasks.all["a0"].losses) == ("done", 1)
+
+
 def test_a_cancel_reaches_the_workers(tmp_path):
     report, line = Reporter(), FakeLink(good)
 

@@ -1,9 +1,10 @@
-"""Campaigns on workers that have networks of their own: namespaces of this machine, a cable that is pulled, a head that
-is restarted."""
+"""Campaigns on workers that have networks and disks of their own: namespaces of this machine, cables that are pulled,
+a disk that is really full, a worker that is slow."""
 
 from __future__ import annotations
 
 import json
+import subprocess
 import threading
 import time
 from collections import Counter
@@ -11,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 from fieldwork.nerfcore.cluster import run as runner
 from fieldwork.nerfcore.params import BatchParams
@@ -49,6 +51,12 @@ def work_on(path: Path, cluster: Cluster, report: Reporter | None = None, **valu
 
 def entries(path: Path) -> list[dict[str, Any]]:
     return list(json.loads(path.with_name("captures-report.json").read_text())["captures"].values())
+
+
+def by_worker(path: Path) -> Counter[str]:
+    """How many stages each worker did."""
+    made = [stage for entry in entries(path) for stage in entry["result"].values() if isinstance(stage, dict)]
+    return Counter(stage["worker"] for stage in made if "worker" in stage)
 
 
 def repeated(folder: Path) -> int:
@@ -109,3 +117,65 @@ def test_the_head_is_restarted_in_another_namespace_than_its_workers(
     assert any("head is gone" in warning for warning in report.warnings)
     print(f"head restarted: {repeated(tmp_path)} steps done again")
     assert repeated(tmp_path) <= 2
+
+
+def test_a_slow_worker_does_less_and_nothing_is_lost(tmp_path: Path) -> None:
+    """One of two workers is stopped for three quarters of the time."""
+    path, over = write_list(tmp_path, [f"c{i}" for i in range(8)], seconds=0.5), threading.Event()
+    with Cluster(0) as cluster:
+        slow = cluster.add(FIELDWORK_TEST_WORKER="slow")
+        cluster.nodes = [slow, cluster.add(FIELDWORK_TEST_WORKER="quick")]
+
+        def hold() -> None:
+            while not over.is_set():
+                working = slow.workers()
+                for action, seconds in (("suspend", 0.6), ("resume", 0.2)):
+                    for process in working:
+                        try:
+                            getattr(process, action)()
+                        except psutil.NoSuchProcess:
+                            continue
+                    time.sleep(seconds)
+
+        thread = threading.Thread(target=hold, daemon=True)
+        thread.start()
+        result = work_on(path, cluster)
+        over.set()
+        thread.join()
+    assert len(result["done"]) == 8
+    assert sum(entry["losses"] for entry in entries(path)) == 0
+    assert repeated(tmp_path) == 0
+    done = by_worker(path)
+    print(f"slow worker: stages of each {dict(done)}")
+    assert sum(done.values()) == 8 * STAGES
+    assert 0 < done["slow"] < done["quick"]
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A disk of 400 kB."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    made = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=400k", "none", str(place)], capture_output=True, text=True
+    )
+    if made.returncode:
+        pytest.skip(f"mounting a disk is not permitted: {made.stderr.strip()}")
+    yield place
+    subprocess.run(["umount", str(place)], check=True)
+
+
+def test_the_disk_of_one_worker_is_really_full(tmp_path: Path, small_disk: Path) -> None:
+    """It says so in the middle of writing; its stages are done by the other worker, and no capture fails."""
+    path = write_list(tmp_path, [f"c{i}" for i in range(4)], seconds=0.3)
+    report = Reporter()
+    with Cluster(0) as cluster:
+        full = {"FIELDWORK_TEST_WORKER": "full", "FIELDWORK_TEST_DISK": str(small_disk)}
+        cluster.nodes = [cluster.add(**full), cluster.add(FIELDWORK_TEST_WORKER="roomy")]
+        result = work_on(path, cluster, report, keep_free=0.0)
+    assert len(result["done"]) == 4
+    assert any("No space left" in warning and str(small_disk) in warning for warning in report.warnings)
+    done = by_worker(path)
+    print(f"full disk: stages of each worker {dict(done)}")
+    assert set(done) == {"roomy"}
+    assert all(entry["state"] == "done" for entry in entries(path))

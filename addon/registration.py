@@ -56,6 +56,7 @@ MODULES = (
     "operators.scene",
     "operators.export",
     "operators.reconstruct",
+    "operators.many",
     "panels.main",
     "panels.capture",
     "panels.dataset",

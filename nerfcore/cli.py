@@ -47,6 +47,7 @@ NAMED = {
     "compare": {"out"},
     "report": {"out"},
     "reconstruct": {"out"},
+    "blocks": {"out"},
     "bench": {"out"},
     "export": {"out"},
     "label overlay": {"out"},

@@ -80,6 +80,9 @@ VERBS = {
     "export": Verb(p.ExportParams, "export.verb:export", "Write what other programs read."),
     "bench": Verb(p.BenchParams, "bench.verb:bench", "Reproduce a table of figures on this machine."),
     "reconstruct": Verb(p.ReconstructParams, "workflows.reconstruct:reconstruct", "Photos in, a labelled .blend out."),
+    "blocks": Verb(
+        p.BlocksParams, "workflows.blocks:blocks", "Train and mesh a large capture in parts that meet without a seam."
+    ),
     "batch": Verb(
         p.BatchParams, "workflows.batch:batch", "Reconstruct many captures, one after the other or on a cluster."
     ),

@@ -1,4 +1,4 @@
-"""Whole jobs in one step, made for scripts: photos to a .blend, many captures, simulated photos, benchmarks."""
+"""Whole jobs in one step, made for scripts: photos to a .blend, simulated photos, benchmarks."""
 
 from __future__ import annotations
 
@@ -116,62 +116,6 @@ def reconstructed(job: Job, scene_name: str) -> None:
     queue.follow_up(queue.make("package", params, lambda done: import_result(done, "both", scene_name)))
 
 
-class FIELDWORK_OT_batch(VerbOperator):
-    """Reconstruct many captures, one after the other or on a cluster; one that fails does not stop the others"""
-
-    bl_idname = "fieldwork.batch"
-    bl_label = "Reconstruct Many"
-    verb = "batch"
-
-    list: StringProperty(
-        name="List", description=".csv or .json file with one capture a row", subtype="FILE_PATH", options={"SKIP_SAVE"}
-    )
-    retries: IntProperty(
-        name="Retries", description="How often a capture that failed is tried again", default=1, min=0, soft_max=5
-    )
-    report_file: StringProperty(
-        name="Report", description="JSON report to write; empty: beside the list", subtype="FILE_PATH",
-        options={"SKIP_SAVE"},
-    )  # fmt: skip
-    cluster: StringProperty(
-        name="Cluster",
-        description="Address HOST:PORT of a Ray cluster, or auto for one on this machine; empty: one capture after the other",
-        options={"SKIP_SAVE"},
-    )
-    storage: StringProperty(
-        name="Storage",
-        description="Where workers of the cluster take files from and leave them, s3://bucket/folder for instance; "
-        "empty: the folder of the list, which all of them see",
-        options={"SKIP_SAVE"},
-    )
-    wheel: StringProperty(
-        name="Wheel", description="Wheel of Fieldwork that workers of the cluster use; empty: what they have",
-        subtype="FILE_PATH", options={"SKIP_SAVE"},
-    )  # fmt: skip
-    keep_free: FloatProperty(
-        name="Keep Free", description="GB: a worker of the cluster with less free on its disk gets nothing to do",
-        default=2.0, min=0.0,
-    )  # fmt: skip
-
-    def invoke(self, context: Context, event: bpy.types.Event) -> set[str]:
-        return context.window_manager.invoke_props_dialog(self, width=380)
-
-    def parameters(self, context: Context) -> dict[str, Any]:
-        if not self.list:
-            raise ValueError(t("Choose a list of captures."))
-        if self.cluster:
-            context.scene.fieldwork.campaign = self.list  # which the panel follows
-        return {
-            "list": absolute(self.list),
-            "retries": self.retries,
-            "report": absolute(self.report_file),
-            "cluster": self.cluster or None,
-            "storage": self.storage or None,
-            "wheel": absolute(self.wheel),
-            "keep_free": self.keep_free,
-        }
-
-
 class FIELDWORK_OT_bench(VerbOperator):
     """Reproduce a table of figures on this machine; takes from minutes to hours"""
 
@@ -281,4 +225,4 @@ class FIELDWORK_OT_simulate(VerbOperator):
         }
 
 
-CLASSES = [FIELDWORK_OT_reconstruct, FIELDWORK_OT_batch, FIELDWORK_OT_simulate, FIELDWORK_OT_bench]
+CLASSES = [FIELDWORK_OT_reconstruct, FIELDWORK_OT_simulate, FIELDWORK_OT_bench]

@@ -60,6 +60,7 @@ class FIELDWORK_MT_steps(Menu):
         layout.separator()
         layout.operator("fieldwork.dataset", text=t("Dataset from Scene…"))
         layout.operator("fieldwork.batch", text=t("Reconstruct Many…"))
+        layout.operator("fieldwork.blocks", text=t("Reconstruct in Blocks…"))
         layout.operator("fieldwork.simulate", text=t("Simulate Capture…"))
         layout.separator()
         layout.operator("fieldwork.cancel")

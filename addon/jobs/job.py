@@ -46,6 +46,7 @@ TITLES = {
     "blend": "Writing .blend",
     "export": "Exporting",
     "batch": "Reconstructing Many",
+    "blocks": "Reconstructing in Blocks",
     "bench": "Benchmarking",
     "simulate": "Simulating a Capture",
     "reconstruct": "Reconstructing",

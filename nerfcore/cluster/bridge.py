@@ -2,7 +2,7 @@
 
 A process of its own, because Ray ends the process that uses it when its head is gone: the campaign goes on and starts
 another one. Commands: {"do": "submit", "id", "text", "cores", "memory", "gpu", "avoid": [nodes]}, {"do": "cancel", "id",
-"force"}, {"do": "end"}. Answers have a "kind": ready, nodes, told, answer (of a task), lost (its worker), fatal.
+"force"}, {"do": "drop", "id"} (what comes of it is not wanted any more), {"do": "end"}. Answers have a "kind": ready, nodes, told, answer (of a task), lost (its worker), fatal.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ import ray
 from ray import exceptions as failures
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from .. import __version__
 from . import worker
 
 NODES_EVERY = 2.0
@@ -86,7 +85,7 @@ class Bridge:
             scheduling_strategy=NodeAffinitySchedulingStrategy(here, soft=True)
         ).remote()
         ray.get(self.board.take.remote())
-        self.say("ready", joined=joined, version=__version__, nodes=nodes())
+        self.say("ready", joined=joined, address=ray.get_runtime_context().gcs_address, nodes=nodes())
         threading.Thread(target=self._read, daemon=True).start()
         looked = time.monotonic()
         while True:
@@ -116,6 +115,8 @@ class Bridge:
                 return False
             if command["do"] == "submit":
                 self._submit(command)
+            elif command["do"] == "drop":
+                self.refs = {ref: task for ref, task in self.refs.items() if task != command["id"]}
             elif command["do"] == "cancel":
                 for ref in [ref for ref, task in self.refs.items() if task == command["id"]]:
                     ray.cancel(ref, force=command["force"])

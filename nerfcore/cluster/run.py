@@ -17,6 +17,7 @@ from .link import Link
 from .tasks import Need, Task, Tasks
 
 SILENT = 60.0  # seconds without a sign of life after which a worker is given up
+DEAF = 30.0  # seconds in which a silent worker may obey; then it is taken to be out of reach
 MOST_LOSSES = 8  # of workers with one task: then it is the task that ends them
 GRACE = 2.5  # seconds in which tasks may end by themselves after a cancel
 PATIENCE = 600.0  # seconds in which no worker could be used, after which the campaign ends
@@ -76,7 +77,9 @@ class Runner:
         Raises:
             Cancelled: the workers have stopped. ClusterError: the cluster is gone. DiskError: no worker has room.
         """
-        self.nodes = self.link.open(self.report.check)["nodes"]
+        ready = self.link.open(self.report.check)
+        self.nodes = ready["nodes"]
+        self.report.note(welcome(ready))
         try:
             while not self.tasks.finished:
                 self.report.check()
@@ -190,9 +193,13 @@ class Runner:
 
     def _failed(self, task: Task, answer: dict[str, Any]) -> None:
         error = answer["error"]
+        if error["code"] == "disk" and answer.get("node") and task.disks < MOST_LOSSES:
+            # It is the worker's fault, not the capture's: others may have room.
+            task.disks += 1
+            self._exclude(answer["node"], error)
+            self.tasks.put_back(task)
+            return
         task.attempts += 1
-        if error["code"] == "disk":
-            self._exclude(answer.get("node", ""), error)
         if error["code"] in USER_FAULTS or task.attempts > self.options.retries:
             self._fail(task, answer)
             return
@@ -238,6 +245,9 @@ class Runner:
             if task.node and now - task.heard > SILENT and task.id not in self.cut_short:
                 self.cut_short[task.id] = now
                 self.link.send(do="cancel", id=task.id, force=True)
+            elif now - self.cut_short.get(task.id, now) > DEAF:
+                self.link.send(do="drop", id=task.id)
+                self._lost(task, "it cannot be reached")
 
     def _cancel(self) -> None:
         """Let running tasks write what they have, then end those that have not."""
@@ -274,6 +284,15 @@ class Runner:
         """What runs, then what waits in its order."""
         tasks = list(self.tasks.all.values())
         return sorted(tasks, key=lambda task: (task.state != "running", -task.priority))
+
+
+def welcome(ready: dict[str, Any]) -> str:
+    """Which cluster it is: “auto” takes the one that runs on this machine, which may be somebody else's."""
+    cores = sum(node["cores"] for node in ready["nodes"])
+    there = f"{sum(node['cores'] > 0 for node in ready['nodes'])} workers, {cores:g} cores"
+    if not ready["joined"]:
+        return f"No cluster runs here: one of this machine was started for the time of the campaign ({there})."
+    return f"Joined the cluster at {ready['address']} ({there})."
 
 
 def limited(need: Need, nodes: list[dict[str, Any]]) -> Need:

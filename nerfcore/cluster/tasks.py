@@ -42,6 +42,7 @@ class Task:
     state: str = "waiting"  # waiting, running, done, failed, left out
     attempts: int = 0  # that failed
     losses: int = 0  # workers that were lost
+    disks: int = 0  # workers whose disk was full
     not_before: float = 0.0  # monotonic time
     begun: float = 0.0
     heard: float = 0.0

@@ -13,6 +13,7 @@ from ..data.scene import Scene, View
 from ..errors import SettingError, TrainingError
 from ..geometry.similarity import similarity_scale, transform_points
 from ..images.picture import to_bytes
+from ..kernels.depth_arrays import MapArrays
 from ..params import MeshParams
 from ..progress import Reporter
 from ..project.schema import Project
@@ -59,19 +60,7 @@ def build(trained: Trained, project: Project, scene: Scene, params: MeshParams, 
         SettingError: an impossible region, or `detail` without a known scale.
     """
     box = trained.info.box(project)
-    chosen = [scene.views[i] for i in scene.train]
-    if len(chosen) < 2:
-        raise TrainingError("A surface needs at least two posed photos.", "Add photos and run `fieldwork poses`.")
-    if trained.state["steps"] < FEW_STEPS:
-        report.warn(f"The field was trained for {trained.state['steps']} steps only: expect a sketch of the surface.")
-    views = dm.spread_views(chosen, dm.MOST_VIEWS)
-    flats = dm.flat_views(views, box.box_from_world, dm.map_size(views, trained.device))
-    report.stage("Rendering depth maps")
-    rendered = dm.depth_maps(trained.model, flats, report)
-    report.stage("Comparing photos")
-    store = read_photos(trained, scene, views, box, report)
-    maps, agreed = refined_maps(flats, rendered, store, trained.device, report)
-    check_agreement(agreed, report)
+    flats, store, maps = agreed_maps(trained, scene, box, report)
     bounds, voxel = wanted_bounds(params, scene, box), wanted_voxel(params, project, box)
     region = choose_region(maps, bounds, params.resolution, voxel)
     report.stage("Fusing")
@@ -102,6 +91,31 @@ def build(trained: Trained, project: Project, scene: Scene, params: MeshParams, 
     colors = vertex_colors(trained.model, region, photos, vertices, normals, report)
     unseen = unseen_faces(vertices, faces, maps, tolerance, report) if params.watertight else None
     return Built(vertices, faces, normals, colors, region, coarse, unseen)
+
+
+def agreed_maps(
+    trained: Trained, scene: Scene, box: Box, report: Reporter
+) -> tuple[list[dm.FlatView], PixelStore, MapArrays]:
+    """Depth maps of the training photos, corrected by these, without what other views do not confirm: the pictures that
+    they are of, the pixels of the photos, and the maps in the normalised frame.
+
+    Raises:
+        TrainingError: fewer than two photos.
+    """
+    chosen = [scene.views[i] for i in scene.train]
+    if len(chosen) < 2:
+        raise TrainingError("A surface needs at least two posed photos.", "Add photos and run `fieldwork poses`.")
+    if trained.state["steps"] < FEW_STEPS:
+        report.warn(f"The field was trained for {trained.state['steps']} steps only: expect a sketch of the surface.")
+    views = dm.spread_views(chosen, dm.MOST_VIEWS)
+    flats = dm.flat_views(views, box.box_from_world, dm.map_size(views, trained.device))
+    report.stage("Rendering depth maps")
+    rendered = dm.depth_maps(trained.model, flats, report)
+    report.stage("Comparing photos")
+    store = read_photos(trained, scene, views, box, report)
+    maps, agreed = refined_maps(flats, rendered, store, trained.device, report)
+    check_agreement(agreed, report)
+    return flats, store, maps
 
 
 def wanted_bounds(params: MeshParams, scene: Scene, box: Box) -> tuple[np.ndarray, np.ndarray] | None:

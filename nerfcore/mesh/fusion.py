@@ -44,12 +44,20 @@ class Bricks:
         return len(self.distance)
 
 
-def fuse_maps(maps: MapArrays, region: Region, report: Reporter) -> Bricks:
-    """Fuse depth maps within a region."""
+def fuse_maps(
+    maps: MapArrays, region: Region, report: Reporter, part: tuple[np.ndarray, np.ndarray] | None = None
+) -> Bricks:
+    """Fuse depth maps within a region.
+
+    Args:
+        part: first bricks (3,) and those after the last (3,), where only a part of the region's grid is wanted: what is
+            there is the same, to the bit, as on the whole grid.
+    """
     h = region.voxel
-    cells = np.maximum(np.ceil((region.high - region.low) / h).astype(int), 1)
-    origin = (region.low + region.high) / 2 - cells * h / 2
-    index = _mark(maps, origin, h, -(-(cells + 1) // BRICK), report)
+    origin, counts = grid_of(region)
+    index = _mark(maps, origin, h, counts, report)
+    if part is not None:
+        index = _only(index, *part)
     bricks = np.stack(np.nonzero(index >= 0), 1)
     device = maps.depth.device
     axis = torch.arange(BRICK, device=device)
@@ -63,7 +71,26 @@ def fuse_maps(maps: MapArrays, region: Region, report: Reporter) -> Bricks:
         d, w = fuse(points.float(), maps, h, TRUNCATION * h, FREE_AT * h, depth_gap(maps))
         for parts, values in ((distance, d), (weight, w)):
             parts.append(values.view(-1, BRICK, BRICK, BRICK).cpu().numpy())
+    if not distance:
+        empty = np.zeros((0, BRICK, BRICK, BRICK), np.float32)
+        return Bricks(origin, h, index, empty, empty)
     return Bricks(origin, h, index, np.concatenate(distance), np.concatenate(weight))
+
+
+def grid_of(region: Region) -> tuple[np.ndarray, np.ndarray]:
+    """The first corner (3,) of a region's grid, and how many bricks (3,) it has."""
+    cells = np.maximum(np.ceil((region.high - region.low) / region.voxel).astype(int), 1)
+    return (region.low + region.high) / 2 - cells * region.voxel / 2, -(-(cells + 1) // BRICK)
+
+
+def _only(index: np.ndarray, first: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """The index with the bricks from `first` to before `end` alone, numbered anew."""
+    inside = np.zeros(index.shape, bool)
+    inside[tuple(slice(max(a, 0), max(b, 0)) for a, b in zip(first, end))] = True
+    kept = np.full(index.shape, -1, np.int32)
+    found = inside & (index >= 0)
+    kept[found] = np.arange(int(found.sum()), dtype=np.int32)
+    return kept
 
 
 def depth_gap(maps: MapArrays) -> float:

@@ -48,7 +48,7 @@ from .labels import (
 from .results import BlendParams, ExportParams, PackageParams, ReportParams
 from .surfaces import CompareParams, MeasureParams, MeshParams, PaperScale, PlanParams, SectionParams, Side, Turn
 from .things import InstancesParams, RelationsParams
-from .workflows import BatchParams, BenchParams, ReconstructParams
+from .workflows import BatchParams, BenchParams, BlocksParams, ReconstructParams
 
 __all__ = [
     "LARGEST_PICTURE",
@@ -63,6 +63,7 @@ __all__ = [
     "BatchParams",
     "BenchParams",
     "BlendParams",
+    "BlocksParams",
     "ClassValues",
     "ClassesParams",
     "CompareParams",

@@ -61,6 +61,37 @@ class BatchParams(Params):
     )
 
 
+class BlocksParams(Params):
+    project: Path
+    count: int = Field(default=2, ge=2, le=1000, description="number of blocks")
+    preset: Preset = "standard"
+    steps: int | None = Field(default=None, gt=0, le=LONGEST_RUN, description="optimisation steps of each block")
+    time_limit: float | None = Field(
+        default=None, gt=0, le=LONGEST_RUN, description="seconds of training of each block"
+    )
+    set: dict[str, str] = Field(default_factory=dict)
+    holdout: Holdout = 8
+    faces: int = Field(default=200_000, ge=0, le=1_000_000_000, description="triangles of each block; 0: all there are")
+    resolution: int = Field(default=512, ge=16, le=2048, description="cells along the longest side of a block")
+    out: Path | None = Field(default=None, description="file for the whole mesh: .ply, .obj, .glb, .stl, .usdc")
+    turntable: Path | None = Field(
+        default=None, description="folder for pictures of the whole mesh from eight sides: its colours and its classes"
+    )
+    cluster: str | None = Field(
+        default=None,
+        description="spread the blocks over a Ray cluster: HOST:PORT, or auto for one of this machine; default: one block "
+        "after the other",
+    )
+    retries: int = Field(default=1, ge=0, le=1000, description="with --cluster: how often a task is tried again")
+    wheel: Path | None = Field(default=None, description="with --cluster: wheel of Fieldwork that workers are to use")
+    keep_free: float = Field(
+        default=2.0,
+        ge=0,
+        le=1e6,
+        description="with --cluster: a worker with fewer GB free on its disk gets nothing to do",
+    )
+
+
 class BenchParams(Params):
     suite: Literal[
         "figures", "speed", "ablation", "robustness", "baselines", "gpu", "surface", "labels", "measures"

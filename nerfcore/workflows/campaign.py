@@ -143,8 +143,12 @@ def matching_shares(photos: int) -> int:
 
 def memory_gb(params: ReconstructParams) -> dict[str, float]:
     """GB that the stages of a capture take at most, by the plan of its run; “field” is what its training holds."""
-    config = make_config(params.preset, params.set)
-    count = photos_in(params.photos)
+    return held_gb(params.preset, params.set, photos_in(params.photos))
+
+
+def held_gb(preset: str, settings: dict[str, str], count: int) -> dict[str, float]:
+    """`memory_gb` of a run with these settings on so many photos."""
+    config = make_config(preset, settings)
     side = config.scene.image_size or 1600
     field = config.field.levels * 2**config.field.table_log2 * 4 * 4 * FIELD_FLOATS / 1e9
     photos = config.scene.photo_memory or count * side * side * 0.75 * BYTES_A_PIXEL / 1e9

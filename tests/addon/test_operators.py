@@ -139,6 +139,7 @@ RENAMED = {
     ("render", "test"): "source",
     ("render", "all"): "source",
     ("reconstruct", "set"): "settings",
+    ("blocks", "set"): "settings",
     ("reconstruct", "report"): "report_file",
     ("batch", "report"): "report_file",
     ("bench", "set"): "settings",

@@ -231,7 +231,16 @@ def main() -> None:
     sys.path.insert(0, str(Path(__file__).parent))
     modules = [
         importlib.import_module(module)
-        for module in ("scenarios", "sessions", "panels", "labelling", "surface_labels", "live", "live_training")
+        for module in (
+            "scenarios",
+            "sessions",
+            "panels",
+            "labelling",
+            "surface_labels",
+            "live",
+            "live_training",
+            "campaigns",
+        )
     ]
     scenario = next(getattr(module, name) for module in modules if hasattr(module, name))
     screen = Screen(Path(folder))

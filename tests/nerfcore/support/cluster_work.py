@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from fieldwork.nerfcore.errors import DiskError, InputError, PosesError
-from fieldwork.nerfcore.files import write_json
+from fieldwork.nerfcore.files import atomic_path, write_json
 from fieldwork.nerfcore.params import ReconstructParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.lock import lockable, project_lock
@@ -45,15 +45,24 @@ def run_stage(values: dict[str, Any], report: Reporter) -> dict[str, Any]:
             for step in range(done, STEPS):
                 report.progress(step / STEPS)
                 work((params.time_limit or 0.1) / STEPS)
+                _use_disk()
                 log.write(f"{stage} {step}\n")
                 log.flush()
                 write_json(place, {"done": step + 1})
     return {
-        "result": {"images": 7, "psnr": 20.0, "code": __file__},
+        "result": {"images": 7, "psnr": 20.0, "code": __file__, "worker": os.environ.get("FIELDWORK_TEST_WORKER", "")},
         "seconds": params.time_limit or 0.1,
         "reused": False,
         "redone": None,
     }
+
+
+def _use_disk() -> None:
+    """Write to the disk that a worker was given, if it was: 100 kB that stay."""
+    place = os.environ.get("FIELDWORK_TEST_DISK")
+    if place:
+        with atomic_path(Path(place) / f"{os.getpid()}-{time.monotonic_ns()}.bin") as temporary:
+            temporary.write_bytes(b"." * 100_000)
 
 
 def work(seconds: float) -> None:

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,8 +39,8 @@ def environment(**more: str) -> dict[str, str]:
 class Node:
     """One `ray start --block`, in a session of its own."""
 
-    def __init__(self, arguments: list[str], **more: str) -> None:
-        command = [sys.executable, "-m", "ray.scripts.scripts", "start", "--block", "--disable-usage-stats"]
+    def __init__(self, arguments: list[str], prefix: Sequence[str] = (), **more: str) -> None:
+        command = [*prefix, sys.executable, "-m", "ray.scripts.scripts", "start", "--block", "--disable-usage-stats"]
         self.log = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the node
         self.process = subprocess.Popen(
             [*command, "--object-store-memory", "80000000", *arguments],
@@ -101,8 +102,12 @@ class Cluster:
         self.head: Node | None = None
 
     @property
+    def host(self) -> str:
+        return "127.0.0.1"
+
+    @property
     def address(self) -> str:
-        return f"127.0.0.1:{self.port}"
+        return f"{self.host}:{self.port}"
 
     def __enter__(self) -> Cluster:
         self.start()
@@ -114,7 +119,8 @@ class Cluster:
 
     def start(self) -> None:
         head = ["--head", f"--port={self.port}", "--num-cpus=0", "--include-dashboard=false"]
-        self.head = Node([*head, f"--temp-dir={self.folder}"], **self.access)
+        place = [] if self.host == "127.0.0.1" else [f"--node-ip-address={self.host}"]
+        self.head = Node([*head, *place, f"--temp-dir={self.folder}"], **self.access)
         self.head.wait()
         self.nodes = [self.add() for _ in range(self.count)]
 
@@ -126,8 +132,11 @@ class Cluster:
                 return node
         raise AssertionError("a worker does not start")
 
+    def worker_arguments(self) -> list[str]:
+        return [f"--address={self.address}", "--num-cpus=1", "--memory=4000000000"]
+
     def _worker(self, **more: str) -> Node:
-        return Node([f"--address={self.address}", "--num-cpus=1", "--memory=4000000000"], **self.access, **more)
+        return Node(self.worker_arguments(), **self.access, **more)
 
     def stop(self) -> None:
         for node in [*self.nodes, *([self.head] if self.head else [])]:

@@ -1,0 +1,221 @@
+"""The surface of one block: the depth maps of all blocks fused on one grid, and of it what lies in the block's core.
+
+Near a seam both neighbours fuse the same maps on the same grid, so that they get the same triangles there, to the bit: cut
+between the cells of the grid, their meshes meet vertex by vertex.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from ..data.load import load_scene
+from ..data.scene import Scene
+from ..errors import ProjectError, TrainingError
+from ..files import UNREADABLE_ARRAYS, atomic_path
+from ..geometry.similarity import similarity_scale, transform_points
+from ..kernels.depth_arrays import MapArrays
+from ..kernels.device import use_device
+from ..mesh.appearance import Photos
+from ..mesh.build import Built, agreed_maps, read_photos, vertex_colors
+from ..mesh.clean import FEWEST_VIEWS, compact, cross, seen_by, unit
+from ..mesh.decimate import decimate_patches
+from ..mesh.depth_maps import MOST_VIEWS, flat_views, map_size, spread_views
+from ..mesh.extract import extract
+from ..mesh.fusion import BRICK, TRUNCATION, fuse_maps, grid_of
+from ..mesh.painted import training_photos
+from ..mesh.region import Region, choose_region
+from ..mesh.surface import Surface, to_world, vertex_normals
+from ..mesh.verb import paint
+from ..params import MeshParams
+from ..progress import Reporter
+from ..project.runs import run_folder
+from ..project.store import load_project
+from ..render.run import Trained, load_trained, refined_poses
+from .maps import cut_maps, joined_maps, load_maps, moved, save_maps
+from .plan import BlockPlan, Plan, block_folder
+
+RUN = "main"  # of a block's project
+MAPS, PART = "depth_maps.npz", "part.npz"  # in the run's folder
+
+
+@dataclass(frozen=True)
+class Part:
+    """A block's surface in the frame that all blocks share; `seams` (S, 2) axis and place of the planes it was cut at;
+    `voxel` of the grid."""
+
+    surface: Surface
+    seams: np.ndarray
+    voxel: float
+
+
+def make_maps(folder: Path, plan: Plan, block: BlockPlan, report: Reporter) -> int:
+    """Render the depth maps of a trained block, correct them by its photos, and keep them in the shared frame: how many.
+
+    Raises:
+        ProjectError, TrainingError, DiskError.
+    """
+    own = block_folder(folder, block)
+    trained, project = load_trained(own, RUN), load_project(own)
+    box = trained.info.box(project)
+    _, _, maps = agreed_maps(trained, load_scene(own, trained.info.holdout), box, report)
+    common_from_world = np.linalg.inv(plan.world_from_common)
+    maps = moved(maps, common_from_world @ box.world_from_box)
+    reach = _corners(common_from_world, plan.reach(block))
+    save_maps(run_folder(own, RUN) / MAPS, cut_maps(maps, reach, _corners(common_from_world, plan.whole)))
+    return len(maps)
+
+
+def make_part(
+    folder: Path, plan: Plan, block: BlockPlan, resolution: int, faces: int | None, report: Reporter
+) -> dict[str, int]:
+    """Mesh a block's core, with the classes and colours of its photos.
+
+    Args:
+        resolution: cells along the longest side of a block. faces: triangles at most, where the seams allow.
+    Returns:
+        {"vertices", "faces"}
+    Raises:
+        ProjectError, TrainingError, DiskError.
+    """
+    own = block_folder(folder, block)
+    trained, project = load_trained(own, RUN), load_project(own)
+    scene = load_scene(own, trained.info.holdout)
+    report.stage("Fusing")
+    device = use_device()
+    each = [load_maps(run_folder(block_folder(folder, b), RUN) / MAPS, device) for b in plan.blocks]
+    maps = joined_maps(each)
+    region = shared_region(load_project(folder).frame.bounds, plan, maps, resolution)
+    vertices, triangles, inside, seams = core_surface(maps, region, plan, block, report)
+    if not inside.any():
+        raise TrainingError(f"Block {block.name} has no surface.", "Train longer, or cut into fewer blocks.")
+    if faces is not None and inside.sum() > faces:
+        report.stage("Simplifying")
+        target = round(faces * len(triangles) / inside.sum())
+        vertices, triangles, inside = decimate_patches(vertices, triangles, inside.astype(np.int64), target, report)
+        inside = inside.astype(bool)
+    box = trained.info.box(project)
+    box_from_common = box.box_from_world @ plan.world_from_common
+    own_maps = moved(each[plan.blocks.index(block)], box_from_common)
+    made = _painted(trained, own, scene, own_maps, vertices, triangles, region, box_from_common, report)
+    part = Part(_inner(to_world(made, np.linalg.inv(box_from_common)), vertices, inside), seams, region.voxel)
+    save_part(run_folder(own, RUN) / PART, part)
+    return {"vertices": len(part.surface.vertices), "faces": len(part.surface.faces)}
+
+
+def shared_region(bounds: list[list[float]] | None, plan: Plan, maps: MapArrays, resolution: int) -> Region:
+    """Where surfaces are looked for in the shared frame, the same for each block: `bounds` (corners in the world), else
+    what all maps show."""
+    common_from_world = np.linalg.inv(plan.world_from_common)
+    inner = None if bounds is None else _corners(common_from_world, (np.array(bounds[0]), np.array(bounds[1])))
+    whole = np.array(plan.high) - np.array(plan.low)
+    widest = max(float((np.array(block.high) - np.array(block.low)).max()) for block in plan.blocks)
+    return choose_region(maps, inner, max(1, round(resolution * float(whole.max()) / widest)))
+
+
+def core_surface(
+    maps: MapArrays, region: Region, plan: Plan, block: BlockPlan, report: Reporter
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The surface of a block and of its overlap with others, in the shared frame: vertices (V, 3), triangles (F, 3), which
+    of them (F,) bool are in the core, and the planes (S, 2) between it and its neighbours: axis, place."""
+    origin, counts = grid_of(region)
+    common_from_world, brick = np.linalg.inv(plan.world_from_common), BRICK * region.voxel
+    low, high = _bricks(_corners(common_from_world, plan.core(block)), origin, brick, counts)
+    first, end = _bricks(_corners(common_from_world, plan.reach(block)), origin, brick, counts)
+    # A cell at the far side of a brick needs corners of the next one.
+    bricks = fuse_maps(maps, region, report, (first, end + 1))
+    report.stage("Extracting the surface")
+    vertices, faces = extract(bricks, report)
+    if len(faces):
+        tolerance = TRUNCATION * region.voxel
+        views = seen_by(vertices[faces].mean(1), unit(cross(vertices, faces)), maps, tolerance, report)
+        vertices, faces = compact(vertices, faces[views >= FEWEST_VIEWS])
+    place = (vertices[faces].mean(1) - origin) / brick
+    shared = np.stack([low > 0, high < counts], 1)
+    inside = ((place >= np.where(shared[:, 0], low, -np.inf)) & (place < np.where(shared[:, 1], high, np.inf))).all(1)
+    planes = [
+        (axis, origin[axis] + brick * at[axis])
+        for axis in range(3)
+        for at, cut in zip((low, high), shared[axis])
+        if cut
+    ]
+    return vertices, faces, inside, np.array(planes, np.float64).reshape(-1, 2)
+
+
+def save_part(path: Path, part: Part) -> None:
+    """Atomically write a block's surface. Raises DiskError."""
+    arrays = {name: value for name, value in vars(part.surface).items() if value is not None}
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        np.savez(file, **arrays, seams=part.seams, voxel=np.float64(part.voxel))
+
+
+def load_part(folder: Path, block: BlockPlan) -> Part:
+    """The surface of a block. Raises ProjectError: there is none, or its file is damaged."""
+    path = run_folder(block_folder(folder, block), RUN) / PART
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            surface = Surface(**{f.name: data[f.name] for f in fields(Surface) if f.name in data})
+            return Part(surface, data["seams"], float(data["voxel"]))
+    except FileNotFoundError as error:
+        raise ProjectError(f"{path} is missing.", "Run `fieldwork blocks` again.") from error
+    except (*UNREADABLE_ARRAYS, KeyError, TypeError) as error:
+        raise ProjectError(f"{path} is damaged: {error}.", "Remove it and run `fieldwork blocks` again.") from error
+
+
+def _painted(
+    trained: Trained,
+    folder: Path,
+    scene: Scene,
+    maps: MapArrays,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    region: Region,
+    box_from_common: np.ndarray,
+    report: Reporter,
+) -> Surface:
+    """A surface of the shared frame in a block's box, with the colours and classes that the block's photos show."""
+    box = trained.info.box(load_project(folder))
+    report.stage("Reading colours")
+    scale = similarity_scale(box_from_common)
+    own = Region(*_corners(box_from_common, (region.low, region.high)), region.voxel * scale)
+    points, faces = transform_points(box_from_common, vertices).astype(np.float32), faces.astype(np.int32)
+    normals = vertex_normals(points, faces)
+    views = spread_views([scene.views[i] for i in scene.train], MOST_VIEWS)
+    flats = flat_views(views, box.box_from_world, map_size(views, trained.device))
+    store = read_photos(trained, scene, views, box, report)
+    photos = Photos(store, maps, np.array([flat.photo for flat in flats]), TRUNCATION * own.voxel)
+    colors = vertex_colors(trained.model, own, photos, points, normals, report)
+    built = Built(points, faces, normals, colors, own, (points[:0], faces[:0]))
+    posed = training_photos(scene, box.box_from_world, refined_poses(folder, RUN, trained.info))
+    params = MeshParams(project=folder, run=RUN)
+    classes = paint(trained, built, posed, params, scene.ignore_id, report).classes
+    return Surface(points, faces, normals, colors, classes.class_id, classes.face_class)
+
+
+def _inner(surface: Surface, vertices: np.ndarray, inside: np.ndarray) -> Surface:
+    """The triangles (F,) `inside` of a surface, its vertices (V, 3) at their exact place."""
+    used, index = np.unique(surface.faces[inside], return_inverse=True)
+    return Surface(
+        vertices[used].astype(np.float32),
+        index.reshape(-1, 3).astype(np.int32),
+        surface.normals[used],
+        surface.colors[used],
+        surface.class_id[used],
+        surface.face_class[inside],
+    )
+
+
+def _corners(matrix: np.ndarray, box: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """The corners (3,) of a box moved by a similarity without a turn; what is infinite stays so."""
+    scale, shift = np.diag(matrix)[:3], matrix[:3, 3]
+    return np.asarray(box[0]) * scale + shift, np.asarray(box[1]) * scale + shift
+
+
+def _bricks(
+    box: tuple[np.ndarray, np.ndarray], origin: np.ndarray, brick: float, counts: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The bricks (3,) nearest to the corners of a box."""
+    low, high = ((np.clip((corner - origin) / brick, 0, counts)).round().astype(int) for corner in box)
+    return low, high

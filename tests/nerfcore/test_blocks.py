@@ -1,0 +1,246 @@
+"""Large captures in blocks: which photos a block gets, and that the meshes of two blocks meet as if they were one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from fieldwork.nerfcore.blocks.join import joined, open_at_seams
+from fieldwork.nerfcore.blocks.maps import cut_maps, joined_maps, load_maps, moved, save_maps
+from fieldwork.nerfcore.blocks.plan import Plan, cut, load_plan, save_plan
+from fieldwork.nerfcore.blocks.projects import write_block
+from fieldwork.nerfcore.blocks.surface import Part, core_surface, load_part, save_part, shared_region
+from fieldwork.nerfcore.data.load import load_scene
+from fieldwork.nerfcore.data.scene import Scene, View
+from fieldwork.nerfcore.errors import ProjectError, SettingError
+from fieldwork.nerfcore.geometry.cameras import Camera
+from fieldwork.nerfcore.geometry.points import Points
+from fieldwork.nerfcore.geometry.similarity import make_similarity
+from fieldwork.nerfcore.kernels.depth_arrays import FREE, MapArrays
+from fieldwork.nerfcore.mesh import clean, depth_maps
+from fieldwork.nerfcore.mesh.extract import extract
+from fieldwork.nerfcore.mesh.fusion import fuse_maps
+from fieldwork.nerfcore.mesh.instances import GAP, find_instances
+from fieldwork.nerfcore.mesh.region import all_hits
+from fieldwork.nerfcore.mesh.surface import Surface, is_watertight, vertex_normals
+from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.project.schema import Frame, ImageRecord, PosedImage, Poses, Project, SemanticClass
+from fieldwork.nerfcore.project.store import load_points, load_project, load_visibility, save_poses, save_project
+from fieldwork.tests.nerfcore.support.depth_views import Hit, box, look_at, maps_of, orbit, sphere
+
+CPU = torch.device("cpu")
+NAMES = {0: "void", 1: "upper", 2: "lower"}
+CELLS = 48
+
+
+def two_blocks(half: float = 1.0, at: float = 0.1) -> Plan:
+    """The cube of half side `half`, cut across x."""
+    whole = {"low": (-half,) * 3, "high": (half,) * 3}
+    left = {"name": "1", "low": (-half,) * 3, "high": (at, half, half), "images": []}
+    right = {"name": "2", "low": (at, -half, -half), "high": (half,) * 3, "images": []}
+    return Plan.model_validate({**whole, "blocks": [left, right]})
+
+
+def known_maps(hit: Hit, plan: Plan, poses: list[np.ndarray]) -> list[MapArrays]:
+    """What two perfect fields show of an analytic shape, each cut to what is its own."""
+    maps = depth_maps.confirmed_maps(*maps_of(hit, poses), CPU, Reporter())
+    common = np.linalg.inv(plan.world_from_common)
+    maps = moved(maps, common)
+
+    def corners(pair: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        low, high = (corner * common[0, 0] + common[:3, 3] for corner in pair)
+        return low, high
+
+    return [cut_maps(maps, corners(plan.reach(block)), corners(plan.whole)) for block in plan.blocks]
+
+
+def classed(vertices: np.ndarray, faces: np.ndarray) -> Surface:
+    """A surface with the class of its height and a colour of its place."""
+    face_class = np.where(vertices[faces].mean(1)[:, 2] > 0.05, 1, 2).astype(np.int32)
+    class_id = np.where(vertices[:, 2] > 0.05, 1, 2).astype(np.int32)
+    colors = ((vertices + 1) * 100).clip(0, 255).astype(np.uint8)
+    normals = vertex_normals(vertices, faces).astype(np.float32)
+    return Surface(vertices.astype(np.float32), faces.astype(np.int32), normals, colors, class_id, face_class)
+
+
+def in_blocks(maps: MapArrays, plan: Plan) -> list[Part]:
+    region, parts = shared_region(None, plan, maps, CELLS), []
+    for block in plan.blocks:
+        vertices, faces, inside, seams = core_surface(maps, region, plan, block, Reporter())
+        used, index = np.unique(faces[inside], return_inverse=True)
+        parts.append(Part(classed(vertices[used], index.reshape(-1, 3)), seams, region.voxel))
+    return parts
+
+
+def in_one(maps: MapArrays, plan: Plan) -> Surface:
+    region = shared_region(None, plan, maps, CELLS)
+    vertices, faces = extract(fuse_maps(maps, region, Reporter()), Reporter())
+    views = clean.seen_by(
+        vertices[faces].mean(1), clean.unit(clean.cross(vertices, faces)), maps, 4 * region.voxel, Reporter()
+    )
+    vertices, faces = clean.compact(vertices, faces[views >= clean.FEWEST_VIEWS])
+    return joined([Part(classed(vertices, faces), np.zeros((0, 2)), region.voxel)])
+
+
+SHAPES: dict[str, Callable[[], Hit]] = {
+    "sphere": lambda: sphere(0.5),
+    "box": lambda: box(np.array([-0.45, -0.3, -0.25]), np.array([0.5, 0.3, 0.35])),
+}
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_two_blocks_make_the_mesh_of_one(shape: str) -> None:
+    plan = two_blocks()
+    maps = joined_maps(known_maps(SHAPES[shape](), plan, orbit(24, 1.8)))
+    parts, one = in_blocks(maps, plan), in_one(maps, plan)
+    assert all(len(part.surface.faces) > 0.2 * len(one.faces) for part in parts)
+    assert open_at_seams(parts[0].surface, parts) > 20, "a block alone is open at its seam"
+    both = joined(parts)
+    assert open_at_seams(both, parts) == 0
+    assert is_watertight(both.faces)
+    assert is_watertight(one.faces)
+    # No double layer: there is as much surface as in one piece, and every triangle of it.
+    assert len(both.faces) == len(one.faces)
+    area = [clean.areas(s.vertices.astype(float), s.faces).sum() for s in (both, one)]
+    assert area[0] == pytest.approx(area[1], rel=1e-5)
+    # Labels agree: so do the areas of each class, and things that the seam cuts through are one.
+    for kind in (1, 2):
+        shares = [clean.areas(s.vertices.astype(float), s.faces)[s.face_class == kind].sum() for s in (both, one)]
+        assert shares[0] == pytest.approx(shares[1], rel=1e-5)
+    found = [find_instances(s.vertices, s.faces, s.face_class, NAMES, 0, GAP * parts[0].voxel)[1] for s in (both, one)]
+    assert [i.name for i in found[0]] == [i.name for i in found[1]] == ["upper.001", "lower.001"]
+    alone = [find_instances(p.surface.vertices, p.surface.faces, p.surface.face_class, NAMES, 0, 0.0)[1] for p in parts]
+    assert sum(len(instances) for instances in alone) == 4, "each block has a part of both"
+
+
+def test_a_block_s_maps_tell_only_of_its_surroundings() -> None:
+    plan = two_blocks()
+    left, right = known_maps(sphere(0.5), plan, orbit(12, 1.8))
+    (_, far), (near, _) = plan.reach(plan.blocks[0]), plan.reach(plan.blocks[1])
+    assert all_hits(left)[:, 0].max() <= far[0] + 1e-5
+    assert all_hits(right)[:, 0].min() >= near[0] - 1e-5
+    assert all_hits(left)[:, 0].max() > 0.1 > all_hits(right)[:, 0].min(), "they overlap"
+    # A ray that meets nothing says nothing of the other block's part.
+    whole = depth_maps.confirmed_maps(*maps_of(sphere(0.5), orbit(12, 1.8)), CPU, Reporter())
+    assert 0 < int((left.depth >= FREE).sum()) < int((whole.depth >= FREE).sum())
+
+
+def test_maps_in_another_frame_show_the_same_places(tmp_path: Path) -> None:
+    maps = depth_maps.confirmed_maps(*maps_of(sphere(0.5), orbit(6, 1.8)), CPU, Reporter())
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    similarity = make_similarity(2.5, turn, np.array([3.0, -1, 0.5]))
+    other = moved(maps, similarity)
+    expected = all_hits(maps).numpy() @ similarity[:3, :3].T + similarity[:3, 3]
+    np.testing.assert_allclose(all_hits(other).numpy(), expected, atol=1e-5)
+    save_maps(tmp_path / "maps.npz", other)
+    stored = load_maps(tmp_path / "maps.npz", CPU)
+    assert all(torch.equal(getattr(stored, name), value) for name, value in vars(other).items())
+    (tmp_path / "maps.npz").write_bytes(b"PK\x03\x04 broken")
+    with pytest.raises(ProjectError, match="damaged"):
+        load_maps(tmp_path / "maps.npz", CPU)
+
+
+CAMERA = Camera(width=60, height=40, fx=50, fy=50, cx=30, cy=20)
+
+
+def walk(photos: int = 12, points: bool = True) -> Scene:
+    """Photos along a wall of 12 m, each of 2.4 m of it."""
+    x = np.linspace(-5, 5, photos)
+    poses = [look_at(np.array([place, -2.0, 1.0]), np.array([place, 0, 1.0])) for place in x]
+    views = [View(f"p{k:02d}", CAMERA, pose, image=Path("none")) for k, pose in enumerate(poses)]
+    wall = np.stack(np.meshgrid(np.linspace(-6, 6, 60), [0.0], np.linspace(0, 2, 10), indexing="ij"), -1).reshape(-1, 3)
+    seen = Points(wall, np.zeros((len(wall), 3), np.uint8), np.ones(len(wall))) if points else Points.empty()
+    bounds = None if points else np.array([[-6.0, -0.5, 0], [6, 0.5, 2]])
+    return Scene(views, list(range(photos)), [], points=seen, bounds=bounds)
+
+
+@pytest.mark.parametrize("points", [True, False])
+def test_blocks_are_cut_by_where_the_photos_were_taken(points: bool) -> None:
+    plan = cut(walk(points=points), 2)
+    first, second = plan.blocks
+    assert first.high[0] == second.low[0] == pytest.approx(0, abs=0.6)
+    assert first.low[0] == plan.low[0] < first.high[0] < second.high[0] == plan.high[0]
+    assert (first.low[1:], first.high[1:]) == (second.low[1:], second.high[1:])
+    # Those beside the seam see both blocks, the others one.
+    assert set(first.images) | set(second.images) == {f"p{k:02d}" for k in range(12)}
+    both = set(first.images) & set(second.images)
+    assert "p05" in both
+    assert "p06" in both
+    assert not {"p00", "p11"} & both
+    assert plan.region(first)[1][0] > first.high[0]
+    assert np.isinf(plan.core(first)[0]).all(), "nothing lies beyond but what it sees"
+
+
+def test_four_blocks_divide_where_most_photos_are() -> None:
+    plan = cut(walk(24), 4)
+    assert [block.name for block in plan.blocks] == ["1", "2", "3", "4"]
+    cuts = [block.high[0] for block in plan.blocks[:-1]]
+    assert cuts == sorted(cuts) == [block.low[0] for block in plan.blocks[1:]]
+    volume = sum(np.prod(np.subtract(block.high, block.low)) for block in plan.blocks)
+    assert volume == pytest.approx(np.prod(np.subtract(plan.high, plan.low)))
+
+
+def test_too_many_blocks_for_the_photos_are_told() -> None:
+    with pytest.raises(SettingError, match="fewer blocks"):
+        cut(walk(4), 8)
+
+
+def test_a_block_is_a_project_of_its_own(tmp_path: Path) -> None:
+    scene = walk()
+    project = Project(
+        images=[ImageRecord(name=v.name, file=f"images/{v.name}.jpg", width=60, height=40) for v in scene.views],
+        classes=[SemanticClass(id=1, name="wall", color=(1, 0, 0))],
+        frame=Frame(scale_known=True),
+    )
+    (tmp_path / "images").mkdir()
+    for view in scene.views:
+        (tmp_path / "images" / f"{view.name}.jpg").write_bytes(view.name.encode())
+    save_project(tmp_path, project)
+    images = [PosedImage(name=v.name, camera=0, camera_to_world=v.camera_to_world.tolist()) for v in scene.views]
+    # Each photo saw the points in front of it.
+    place = scene.points.xyz[:, 0]
+    view, point = np.nonzero(np.abs(np.linspace(-5, 5, 12)[:, None] - place[None]) < 1.2)
+    save_poses(tmp_path, Poses(cameras=[CAMERA], images=images), scene.points, (view, point))
+    plan = cut(load_scene(tmp_path, 4), 2)
+    save_plan(tmp_path, plan)
+    assert load_plan(tmp_path) == plan
+    folder = write_block(tmp_path, plan, plan.blocks[0], 4)
+    own = load_scene(folder)
+    assert [v.name for v in own.views] == plan.blocks[0].images
+    assert all(v.image.read_bytes() == v.name.encode() for v in own.views)
+    held_out = {load_scene(tmp_path, 4).views[i].name for i in load_scene(tmp_path, 4).test}
+    assert {own.views[i].name for i in own.test} == held_out & set(plan.blocks[0].images)
+    assert own.bounds is not None
+    np.testing.assert_allclose(own.bounds, plan.region(plan.blocks[0]))
+    assert 0 < len(load_points(folder)) < len(scene.points)
+    for name, seen in load_visibility(folder).items():
+        np.testing.assert_allclose(
+            np.sort(load_points(folder).xyz[seen], axis=0),
+            np.sort(scene.points.xyz[load_visibility(tmp_path)[name]], axis=0),
+        )
+    # Written again it is the same project, with what was done to it.
+    before = load_project(folder).uuid
+    write_block(tmp_path, plan, plan.blocks[0], 4)
+    assert load_project(folder).uuid == before
+    (tmp_path / "blocks/plan.json").write_text("{}")
+    with pytest.raises(ProjectError, match="damaged"):
+        load_plan(tmp_path)
+
+
+def test_a_part_that_is_missing_or_damaged_is_told(tmp_path: Path) -> None:
+    block = two_blocks().blocks[0]
+    with pytest.raises(ProjectError, match="missing"):
+        load_part(tmp_path, block)
+    vertices, faces = np.eye(3), np.array([[0, 1, 2]])
+    part = Part(classed(vertices, faces), np.array([[0, 0.1]]), 0.02)
+    path = tmp_path / "blocks/1/runs/main/part.npz"
+    save_part(path, part)
+    stored = load_part(tmp_path, block)
+    assert (stored.voxel, stored.seams.tolist()) == (0.02, [[0, 0.1]])
+    np.testing.assert_array_equal(stored.surface.vertices, part.surface.vertices)
+    path.write_bytes(path.read_bytes()[:100])
+    with pytest.raises(ProjectError, match="damaged"):
+        load_part(tmp_path, block)

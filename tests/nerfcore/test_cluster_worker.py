@@ -1,0 +1,77 @@
+"""What a worker does with a task: answers, refusals, interrupts."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fieldwork.nerfcore import __version__
+from fieldwork.nerfcore.cluster import worker
+from fieldwork.nerfcore.errors import PosesError
+from fieldwork.nerfcore.progress import Reporter
+
+
+def said(values: dict[str, Any], report: Reporter) -> dict[str, Any]:
+    report.stage("Speaking")
+    report.warn("A word.")
+    if values.get("fails"):
+        raise PosesError("No poses.", "Take more photos.")
+    if values.get("odd"):
+        raise KeyError("odd")
+    while values.get("long"):
+        report.check()
+        time.sleep(0.01)
+    return {"said": values["what"]}
+
+
+def ask(place: Path, /, **changes: Any) -> dict[str, Any]:
+    job = {
+        "function": f"{__name__}:said",
+        "values": {"what": "ä"},
+        "version": __version__,
+        "folder": str(place),
+        "cores": 1,
+        "keep_free_gb": 0.0,
+        **changes,
+    }
+    return json.loads(worker.execute(json.dumps(job), lambda _: None))
+
+
+def test_a_worker_answers_in_json(tmp_path):
+    answer = ask(tmp_path)
+    assert (answer["state"], answer["result"], answer["warnings"]) == ("done", {"said": "ä"}, ["A word."])
+    assert answer["free_gb"] > 0
+    failed = ask(tmp_path, values={"fails": True})
+    assert (failed["state"], failed["error"]) == (
+        "failed",
+        {"code": "poses", "message": "No poses.", "hint": "Take more photos."},
+    )
+    assert ask(tmp_path, values={"odd": True})["error"]["code"] == "internal"
+
+
+@pytest.mark.parametrize(
+    ("changes", "state", "words"),
+    [
+        ({"version": "9.9"}, "refused", f"has Fieldwork {__version__}, this campaign 9.9"),
+        ({"folder": "/not/here"}, "refused", "does not have the folder /not/here"),
+        ({"keep_free_gb": 1e9}, "full", "GB free"),
+    ],
+)
+def test_a_worker_refuses_what_it_cannot_do(tmp_path, changes, state, words):
+    answer = ask(tmp_path, **changes)
+    assert answer["state"] == state
+    assert words in answer["error"]["message"]
+    assert answer["error"]["hint"]
+
+
+def test_an_interrupt_ends_the_work_of_a_worker(tmp_path):
+    import _thread
+    import threading
+
+    threading.Timer(0.5, _thread.interrupt_main).start()
+    begin = time.monotonic()
+    assert ask(tmp_path, values={"long": True})["state"] == "cancelled"
+    assert time.monotonic() - begin < 3.0

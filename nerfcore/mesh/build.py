@@ -22,12 +22,12 @@ from ..render.run import Trained
 from ..verdict import LITTLE_IN_ONE
 from . import depth_maps as dm
 from .appearance import Photos
-from .clean import areas, clean, compact, components, drop_scraps
-from .closed import decimate_closed, drop_unseen, extract_closed, unseen_faces
+from .clean import areas, clean, compact, components
+from .closed import closed_surface, unseen_faces
 from .decimate import decimate
 from .extract import extract
 from .field_values import shade
-from .fusion import TRUNCATION, coarser, fuse_maps
+from .fusion import TRUNCATION, Bricks, coarser, fuse_maps
 from .refine import refined_maps
 from .region import Region, choose_region, on_sides
 from .surface import vertex_normals
@@ -66,23 +66,13 @@ def build(trained: Trained, project: Project, scene: Scene, params: MeshParams, 
     report.stage("Fusing")
     bricks = fuse_maps(maps, region, report)
     report.stage("Extracting the surface")
-    vertices, faces = extract_closed(bricks, maps, report) if params.watertight else extract(bricks, report)
-    coarse = extract(coarser(bricks), report)
-    report.stage("Cleaning the surface")
-    tolerance = TRUNCATION * region.voxel
+    coarse, tolerance = extract(coarser(bricks), report), TRUNCATION * region.voxel
     if params.watertight:
-        faces = drop_unseen(vertices, faces, maps, tolerance, report)
-        vertices, faces = compact(vertices, drop_scraps(vertices, faces))
-    elif len(faces):
-        vertices, faces, _ = clean(vertices, faces, maps, tolerance, report)
+        vertices, faces = closed_surface(bricks, maps, tolerance, params.faces, report)
+    else:
+        vertices, faces = open_surface(bricks, maps, tolerance, region, params.faces, report)
     if not len(faces):
         raise TrainingError("The field has no surface in the region of interest.", "Train longer, or check the box.")
-    if params.faces is not None and len(faces) > params.faces:
-        report.stage("Simplifying")
-        fewer = decimate_closed if params.watertight else decimate
-        vertices, faces = compact(*fewer(vertices, faces, params.faces, report))
-    if not params.watertight:
-        vertices, faces = compact(vertices, faces[~on_sides(vertices, faces, region, region.voxel / 2)])
     check_parts(vertices, faces, report)
     report.stage("Reading colours")
     vertices, faces = vertices.astype(np.float32), faces.astype(np.int32)
@@ -116,6 +106,22 @@ def agreed_maps(
     maps, agreed = refined_maps(flats, rendered, store, trained.device, report)
     check_agreement(agreed, report)
     return flats, store, maps
+
+
+def open_surface(
+    bricks: Bricks, maps: MapArrays, tolerance: float, region: Region, most: int | None, report: Reporter
+) -> tuple[np.ndarray, np.ndarray]:
+    """What two views see of the fused surface, in about `most` triangles where a number is given; open where nothing is
+    known, and where the region cuts it."""
+    vertices, faces = extract(bricks, report)
+    if not len(faces):
+        return vertices, faces
+    report.stage("Cleaning the surface")
+    vertices, faces, _ = clean(vertices, faces, maps, tolerance, report)
+    if most is not None and len(faces) > most:
+        report.stage("Simplifying")
+        vertices, faces = decimate(vertices, faces, most, report)
+    return compact(vertices, faces[~on_sides(vertices, faces, region, region.voxel / 2)])
 
 
 def wanted_bounds(params: MeshParams, scene: Scene, box: Box) -> tuple[np.ndarray, np.ndarray] | None:

@@ -9,14 +9,34 @@ from skimage.measure import marching_cubes
 from ..kernels.depth_arrays import MapArrays
 from ..kernels.surface import fuse
 from ..progress import Reporter
-from .clean import FEWEST_VIEWS, areas, compact, components, cross, seen_by, unit
+from .clean import FEWEST_VIEWS, areas, compact, components, cross, drop_scraps, seen_by, unit
 from .decimate import decimate
 from .extract import BLOCK, assemble, off_corners, weld
-from .fusion import BRICK, FREE_AT, TRUNCATION, Bricks, depth_gap
+from .fusion import BRICK, FREE_AT, TRUNCATION, Bricks, coarser, depth_gap
 from .surface import is_watertight
 
 CHUNK = 1 << 16  # bricks asked about at once
 SEEN = 0.1  # share of a part's area
+MOST_SIMPLIFIED = 10  # times the triangles wanted: what has more is taken from larger voxels
+
+
+def closed_surface(
+    bricks: Bricks, maps: MapArrays, tolerance: float, most: int | None, report: Reporter
+) -> tuple[np.ndarray, np.ndarray]:
+    """The closed surface of `extract_closed` without what hangs in unseen space, in about `most` triangles where a number is
+    given: simplified, provided that it stays closed, else from voxels of twice the size."""
+    while True:
+        vertices, faces = extract_closed(bricks, maps, report)
+        faces = drop_unseen(vertices, faces, maps, tolerance, report)
+        vertices, faces = compact(vertices, drop_scraps(vertices, faces))
+        if most is None or len(faces) <= most:
+            return vertices, faces
+        if len(faces) <= MOST_SIMPLIFIED * most:
+            fewer = compact(*decimate(vertices, faces, most, report))
+            if is_watertight(fewer[1]):
+                return fewer
+        report.note(f"{len(faces)} triangles are too many or would not stay closed with {most}: voxels twice as large.")
+        bricks = coarser(bricks)
 
 
 def extract_closed(bricks: Bricks, maps: MapArrays, report: Reporter) -> tuple[np.ndarray, np.ndarray]:
@@ -96,14 +116,3 @@ def unseen_faces(
     """Which triangles (F,) bool fewer than two views see."""
     normals = unit(cross(vertices, faces))
     return seen_by(vertices[faces].mean(1), normals, maps, tolerance, report) < FEWEST_VIEWS
-
-
-def decimate_closed(
-    vertices: np.ndarray, faces: np.ndarray, target: int, report: Reporter
-) -> tuple[np.ndarray, np.ndarray]:
-    """About `target` triangles of a closed mesh; the mesh as it is, and a warning, where it would not stay closed."""
-    fewer = compact(*decimate(vertices, faces, target, report))
-    if is_watertight(fewer[1]):
-        return fewer
-    report.warn(f"The surface keeps its {len(faces)} triangles: with {target} it would not stay closed.")
-    return vertices, faces

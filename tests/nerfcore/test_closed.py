@@ -7,8 +7,8 @@ import pytest
 import torch
 import trimesh
 from fieldwork.nerfcore.errors import Cancelled
-from fieldwork.nerfcore.mesh import clean, depth_maps
-from fieldwork.nerfcore.mesh.closed import decimate_closed, drop_unseen, extract_closed, unseen_faces
+from fieldwork.nerfcore.mesh import clean, closed, depth_maps
+from fieldwork.nerfcore.mesh.closed import closed_surface, drop_unseen, extract_closed, unseen_faces
 from fieldwork.nerfcore.mesh.fusion import BRICK, Bricks, fuse_maps
 from fieldwork.nerfcore.mesh.region import choose_region
 from fieldwork.nerfcore.progress import Reporter
@@ -68,17 +68,24 @@ def test_noise_over_several_blocks_of_bricks_is_closed_too() -> None:
     np.testing.assert_array_less(np.array([-0.71, -0.11, -0.11]) - 1e-9, mesh.bounds[0])
 
 
-def test_fewer_triangles_only_where_they_stay_closed() -> None:
-    mesh = trimesh.creation.icosphere(4)
-    report = Reporter()
-    vertices, faces = decimate_closed(np.array(mesh.vertices), np.array(mesh.faces), 1000, report)
-    assert len(faces) <= 1100
-    assert trimesh.Trimesh(vertices, faces, process=False).is_watertight
-    assert report.warnings == []
-    opened = np.array(mesh.faces)[mesh.triangles_center[:, 2] > -0.2]
-    _, faces = decimate_closed(np.array(mesh.vertices), opened, 1000, report)
-    assert len(faces) == len(opened)
-    assert "would not stay closed" in report.warnings[0]
+def test_fewer_triangles_stay_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    maps = depth_maps.confirmed_maps(*maps_of(sphere(0.5), orbit(30, 1.8)), torch.device("cpu"), Reporter())
+    region = choose_region(maps, None, 64)
+    bricks, tolerance = fuse_maps(maps, region, Reporter()), 4 * region.voxel
+    _, whole = closed_surface(bricks, maps, tolerance, None, Reporter())
+
+    def ball(most: int) -> trimesh.Trimesh:
+        mesh = trimesh.Trimesh(*closed_surface(bricks, maps, tolerance, most, Reporter()), process=False)
+        assert mesh.is_watertight
+        assert mesh.volume == pytest.approx(np.pi / 6, rel=0.02)
+        return mesh
+
+    simplified = ball(len(whole) // 3)
+    assert len(simplified.faces) <= 1.1 * len(whole) / 3
+    # Where simplifying opens it, larger voxels do.
+    monkeypatch.setattr(closed, "decimate", lambda vertices, faces, target, report: (vertices, faces[:target]))
+    larger = ball(len(whole) // 3)
+    assert len(larger.faces) <= len(whole) // 3
 
 
 def test_what_hangs_in_unseen_space_goes() -> None:

@@ -10,33 +10,32 @@ from ..kernels.depth_arrays import MapArrays
 from ..kernels.surface import fuse
 from ..progress import Reporter
 from .clean import FEWEST_VIEWS, areas, compact, components, cross, drop_scraps, seen_by, unit
-from .decimate import decimate
+from .decimate import decimate_closed
 from .extract import BLOCK, assemble, off_corners, weld
-from .fusion import BRICK, FREE_AT, TRUNCATION, Bricks, coarser, depth_gap
-from .surface import is_watertight
+from .fusion import BRICK, FREE_AT, TRUNCATION, Bricks, depth_gap
 
 CHUNK = 1 << 16  # bricks asked about at once
 SEEN = 0.1  # share of a part's area
-MOST_SIMPLIFIED = 10  # times the triangles wanted: what has more is taken from larger voxels
+MUCH_MORE = 1.1  # times the triangles wanted, of which the user is told
 
 
 def closed_surface(
     bricks: Bricks, maps: MapArrays, tolerance: float, most: int | None, report: Reporter
 ) -> tuple[np.ndarray, np.ndarray]:
     """The closed surface of `extract_closed` without what hangs in unseen space, in about `most` triangles where a number is
-    given: simplified, provided that it stays closed, else from voxels of twice the size."""
-    while True:
-        vertices, faces = extract_closed(bricks, maps, report)
-        faces = drop_unseen(vertices, faces, maps, tolerance, report)
-        vertices, faces = compact(vertices, drop_scraps(vertices, faces))
-        if most is None or len(faces) <= most:
-            return vertices, faces
-        if len(faces) <= MOST_SIMPLIFIED * most:
-            fewer = compact(*decimate(vertices, faces, most, report))
-            if is_watertight(fewer[1]):
-                return fewer
-        report.note(f"{len(faces)} triangles are too many or would not stay closed with {most}: voxels twice as large.")
-        bricks = coarser(bricks)
+    given and it can stay closed."""
+    vertices, faces = extract_closed(bricks, maps, report)
+    if not len(faces):
+        return vertices, faces
+    report.stage("Cleaning the surface")
+    faces = drop_unseen(vertices, faces, maps, tolerance, report)
+    vertices, faces = compact(vertices, drop_scraps(vertices, faces))
+    if most is not None and len(faces) > most:
+        report.stage("Simplifying")
+        vertices, faces = decimate_closed(vertices, faces, most, report)
+        if len(faces) > MUCH_MORE * most:
+            report.warn(f"The surface keeps {len(faces)} triangles: with {most} it would not stay closed.")
+    return vertices, faces
 
 
 def extract_closed(bricks: Bricks, maps: MapArrays, report: Reporter) -> tuple[np.ndarray, np.ndarray]:

@@ -10,6 +10,7 @@ from ..progress import Reporter
 from .clean import compact
 
 CHUNK = 60_000  # faces simplified at once: a fraction of a second
+SMALL_CHUNK = 1000  # of a closed mesh: a chunk that simplifying would fold is left as it is
 PASSES = 12
 AT_ONCE = 0.25  # share of a chunk's faces that at least remain in one pass: its border is kept as it is until the next
 
@@ -21,7 +22,15 @@ def decimate(vertices: np.ndarray, faces: np.ndarray, target: int, report: Repor
     Each pass cuts elsewhere, so that what was the border of a chunk is inside the next time.
     """
     patch = np.zeros(len(faces), np.int64)
-    vertices, faces, _ = _passes(vertices, faces, patch, target, True, report)
+    vertices, faces, _ = _passes(vertices, faces, patch, target, True, CHUNK, report)
+    return vertices, faces
+
+
+def decimate_closed(
+    vertices: np.ndarray, faces: np.ndarray, target: int, report: Reporter
+) -> tuple[np.ndarray, np.ndarray]:
+    """As `decimate`, with a closed mesh staying closed, so that more triangles than `target` may remain."""
+    vertices, faces, _ = _passes(vertices, faces, np.zeros(len(faces), np.int64), target, False, SMALL_CHUNK, report)
     return vertices, faces
 
 
@@ -31,11 +40,17 @@ def decimate_patches(
     """As `decimate`, with triangles of different patches (F,) never merged: the vertices of all borders between patches,
     and of open ones, stay where they are, and what was manifold remains so, so that more triangles than `target` may
     remain. Returns the patch of each triangle too."""
-    return _passes(vertices, faces, patch, target, False, report)
+    return _passes(vertices, faces, patch, target, False, CHUNK, report)
 
 
 def _passes(
-    vertices: np.ndarray, faces: np.ndarray, patch: np.ndarray, target: int, move_borders: bool, report: Reporter
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    patch: np.ndarray,
+    target: int,
+    move_borders: bool,
+    size: int,
+    report: Reporter,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     total = max(len(faces) - target, 1)
     for number in range(PASSES):
@@ -45,12 +60,12 @@ def _passes(
         before = len(faces)
         ratio = max(target / len(faces), AT_ONCE)
         keep = not move_borders or number < PASSES - 2
-        vertices, faces, patch = _one_pass(vertices, faces, patch, ratio, number, keep, not move_borders, report)
+        vertices, faces, patch = _one_pass(vertices, faces, patch, ratio, number, size, keep, not move_borders, report)
         if len(faces) > 0.98 * before:  # nothing but borders is left
             if not move_borders:
                 break
             if keep:
-                vertices, faces, patch = _one_pass(vertices, faces, patch, ratio, number, False, False, report)
+                vertices, faces, patch = _one_pass(vertices, faces, patch, ratio, number, size, False, False, report)
     return vertices, faces, patch
 
 
@@ -60,6 +75,7 @@ def _one_pass(
     patch: np.ndarray,
     ratio: float,
     number: int,
+    size: int,
     keep_border: bool,
     keep_manifold: bool,
     report: Reporter,
@@ -68,7 +84,7 @@ def _one_pass(
     chunks = [
         own[part]
         for own in (np.flatnonzero(patch == p) for p in np.unique(patch))
-        for part in _chunks(centers[own], number)
+        for part in _chunks(centers[own], number, size)
     ]
     whole = [compact(vertices, faces[chunk]) for chunk in chunks]
     made = []
@@ -110,14 +126,14 @@ def _folded(faces: np.ndarray) -> np.ndarray:
     return (count[index.reshape(-1)] > 2).reshape(-1, 3).any(1)
 
 
-def _chunks(centers: np.ndarray, number: int) -> list[np.ndarray]:
-    """Places of triangles (N,) by their centres (N, 3) in chunks of at most `CHUNK`: halves of halves, cut across the
+def _chunks(centers: np.ndarray, number: int, size: int) -> list[np.ndarray]:
+    """Places of triangles (N,) by their centres (N, 3) in chunks of at most `size`: halves of halves, cut across the
     longest side, at another share in each pass."""
     share = (0.5, 0.37, 0.61, 0.44, 0.56)[number % 5]
     waiting, done = [np.arange(len(centers))], []
     while waiting:
         part = waiting.pop()
-        if len(part) <= CHUNK:
+        if len(part) <= size:
             done.append(part)
             continue
         axis = int(np.argmax(np.ptp(centers[part], axis=0)))

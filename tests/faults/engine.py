@@ -20,7 +20,7 @@ from .outcome import Reply
 
 ROOT = Path(__file__).resolve().parents[2]
 COMMAND = [sys.executable, "-m", "fieldwork.nerfcore"]
-PATIENCE = 120.0  # seconds after which a request counts as never answered
+PATIENCE = 300.0  # seconds after which a request counts as never answered
 MOST_ADDRESSES = 16 * 2**30  # bytes, so that a setting that asks for more does not take the whole machine
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT.parent)}
 

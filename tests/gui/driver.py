@@ -23,20 +23,6 @@ import bpy
 Steps = Iterator[float | None]
 TICK = 0.03
 PATIENCE = float(os.environ.get("FIELDWORK_GUI_PATIENCE", "1"))  # factor of all waiting, for a machine under load
-PANELS = [
-    "capture",
-    "poses",
-    "classes",
-    "train",
-    "label",
-    "render",
-    "live",
-    "mesh",
-    "measure",
-    "things",
-    "export",
-    "engine",
-]
 PACKAGE = "bl_ext.user_default.fieldwork"
 BARE = {"life"}  # scenarios that install and enable the extension themselves
 
@@ -123,6 +109,8 @@ class Screen:
 
     def toggle(self, panel: str) -> Steps:
         """Click the header of a sub-panel while those above it are closed and no job runs."""
+        from steps import PANELS  # beside this file, which Blender runs by its path
+
         if self.queue.outcome is not None:  # a message above the headers would move them
             bpy.ops.fieldwork.dismiss()
             self.sidebar.tag_redraw()

@@ -10,6 +10,21 @@ import bpy
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 PHOTOS = DATA / "banana" / "images"
 
+PANELS = [
+    "capture",
+    "poses",
+    "classes",
+    "train",
+    "label",
+    "render",
+    "live",
+    "mesh",
+    "measure",
+    "things",
+    "export",
+    "engine",
+]
+
 
 def faces(obj):
     return len(obj.evaluated_get(bpy.context.evaluated_depsgraph_get()).data.polygons)
@@ -17,20 +32,7 @@ def faces(obj):
 
 def every_panel(screen, name):
     """Open the sub-panels one by one."""
-    for panel in (
-        "capture",
-        "poses",
-        "classes",
-        "train",
-        "label",
-        "render",
-        "live",
-        "mesh",
-        "measure",
-        "things",
-        "export",
-        "engine",
-    ):
+    for panel in PANELS:
         yield from screen.toggle(panel)
         yield 0.4
         screen.shot(f"{name}-{panel}")

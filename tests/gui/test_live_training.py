@@ -2,29 +2,19 @@
 
 from __future__ import annotations
 
-import importlib.util
 import shutil
 import statistics
 from pathlib import Path
 
 import numpy as np
 import pytest
+from fieldwork.tests.gui import test_live as support
 from fieldwork.tests.nerfcore.support.ball import pattern
 from PIL import Image
 
 HERE = Path(__file__).parent
 
 
-def _module(name: str):
-    spec = importlib.util.spec_from_file_location(name, HERE / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-support = _module("test_live")
 colour, played, window, project = support.colour, support.played, support.window, support.project
 pytestmark = support.pytestmark
 

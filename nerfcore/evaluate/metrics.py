@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from skimage.metrics import structural_similarity
 
 
 def psnr(image: np.ndarray, photo: np.ndarray, keep: np.ndarray | None = None) -> float:
@@ -19,6 +18,8 @@ def psnr(image: np.ndarray, photo: np.ndarray, keep: np.ndarray | None = None) -
 
 def ssim(image: np.ndarray, photo: np.ndarray) -> float:
     """Structural similarity, 11×11 Gaussian window with σ 1.5 (Wang et al., 2004), of (H, W, 3) uint8 images."""
+    from skimage.metrics import structural_similarity  # takes a quarter of a second
+
     value: Any = structural_similarity(
         image, photo, data_range=255, channel_axis=2, gaussian_weights=True, sigma=1.5, use_sample_covariance=False
     )

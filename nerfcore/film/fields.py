@@ -267,7 +267,7 @@ class PlacedField:
             within = (samples.t <= ends[samples.packed_info.ray_indices.long()]).float()
             if not self.hides:
                 return within
-            opacity = torch.softmax(model.field.logits(geometry), 1) @ self.opacity
+            opacity = model.field.class_probabilities(geometry) @ self.opacity
             # A class's opacity is a factor of alpha, as in a baked field.
             thickness = (geometry.density * samples.deltas).clamp(1e-6, 50)
             return within * -torch.log1p(opacity * torch.expm1(-thickness)) / thickness

@@ -77,6 +77,7 @@ def _along(
     camera_to_box: torch.Tensor, free: dict[tuple[int, int], float], resolution: int, contracted: bool
 ) -> torch.Tensor:
     """Cells (resolution³,) around the lines between pairs of cameras, as far as these are `free`."""
+
     device = camera_to_box.device
     tree = KDTree(grid_centers(resolution, contracted, device).cpu().numpy())
     close = torch.zeros(resolution**3, dtype=torch.bool, device=device)

@@ -142,15 +142,18 @@ def painted() -> tuple[MapArrays, np.ndarray, np.ndarray]:
     return arrays, np.concatenate(grey), normals(flats[0].camera, maps[0].depth).reshape(-1, 3).astype(np.float32)
 
 
+@pytest.mark.parametrize("host", [False, True])
 @pytest.mark.parametrize("device", WARP_DEVICES)
 def test_photos_move_depths_as_their_reference_says(
-    device: str, painted: tuple[MapArrays, np.ndarray, np.ndarray]
+    device: str, host: bool, painted: tuple[MapArrays, np.ndarray, np.ndarray]
 ) -> None:
+    if host and device != "cpu":
+        pytest.skip("this code is for CPUs")
     maps, grey, normal = painted
     others, least, gain = [3, 8, 5, 16, 21], 0.6, 0.05
     near = torch.tensor(others, dtype=torch.int32, device=device)
     facing = torch.from_numpy(normal).to(device)
-    depth, score = refine(torch.from_numpy(grey).to(device), facing, on(device, maps), 0, near, least, gain)
+    depth, score = refine(torch.from_numpy(grey).to(device), facing, on(device, maps), 0, near, least, gain, host)
     views = patches_reference.Views(maps, grey)
     pixels = [(row, column) for row in range(0, SMALL.height, 3) for column in range(0, SMALL.width, 4)]
     expected = np.array(

@@ -296,7 +296,7 @@ def confirmed_maps(
         report.progress(index / len(views))
         others = torch.tensor(near, dtype=torch.int32, device=arrays.depth.device)
         share = max(AGREE, AGREE_PIXELS / views[index].camera.fx)
-        confirmed.append(agreement(arrays, index, others, share, ROUND_TRIP) >= needed)
+        confirmed.append(agreement(arrays, index, others, share, ROUND_TRIP, needed) >= needed)
     keep = torch.cat(confirmed) | (arrays.depth >= FREE)
     return replace(arrays, depth=torch.where(keep, arrays.depth, 0.0))
 

@@ -107,6 +107,7 @@ def test_as_many_views_agree_as_their_reference_says(device: str, rough: MapArra
     near = torch.tensor(others, dtype=torch.int32, device=device)
     ours = surface.agreement(on(device, rough), 0, near, 0.02, 1.5).cpu()
     expected = surface_reference.agreement(rough, 0, others, 0.02, 1.5)
+    assert torch.equal(surface.agreement(on(device, rough), 0, near, 0.02, 1.5, 2).cpu(), ours.clamp(max=2))
     assert len(expected.unique()) >= 4
     assert ours.shape == expected.shape
     assert float((ours == expected)[expected > 0].float().mean()) > 0.99

@@ -16,7 +16,12 @@ from fieldwork.nerfcore.kernels.raycast import FrontFaces
 from fieldwork.nerfcore.kernels.triangles import nearest_triangle
 from fieldwork.nerfcore.mesh.depth_maps import DepthMap, FlatView, confirmed_maps, map_arrays, normals
 from fieldwork.nerfcore.progress import Reporter
-from fieldwork.tests.nerfcore.support import patches_reference, surface_reference, triangles_reference
+from fieldwork.tests.nerfcore.support import (
+    normals_reference,
+    patches_reference,
+    surface_reference,
+    triangles_reference,
+)
 from fieldwork.tests.nerfcore.support.backends import WARP_DEVICES
 from fieldwork.tests.nerfcore.support.depth_views import maps_of, orbit, sphere
 
@@ -99,6 +104,16 @@ def test_unsure_and_thin_places_are_fused_as_their_reference_says(device: str, r
     same = (ours[0] - expected[0]).abs() < 1e-4
     assert float(same.float().mean()) > 0.99
     assert float(((ours[1] - expected[1]).abs() < 1e-3 * expected[1] + 1e-2).float().mean()) > 0.99
+
+
+def test_normals_of_depths_equal_their_reference() -> None:
+    flats, maps = maps_of(sphere(0.5), orbit(3, 1.8), SMALL)
+    depth = np.where(np.random.default_rng(3).random(maps[0].depth.shape) < 0.02, 0, maps[0].depth)
+    expected = normals_reference.normals(flats[0].camera, depth)
+    ours = normals(flats[0].camera, depth)
+    assert (depth >= FREE).mean() > 0.2
+    assert 0.1 < (expected != 0).any(-1).mean() < 0.8
+    assert np.abs(ours - expected).max() < 1e-5
 
 
 @pytest.mark.parametrize("device", WARP_DEVICES)

@@ -110,7 +110,7 @@ class FIELDWORK_TOOL_label_surface(WorkSpaceTool):
     def draw_settings(context: Context, layout: UILayout, tool: Any) -> None:
         settings = context.scene.fieldwork
         layout.prop(settings, "label_tool", text="")
-        layout.prop(settings, "label_width")
+        layout.prop(settings, "label_level" if settings.label_tool == "part" else "label_width")
 
 
 CLASSES = [FIELDWORK_OT_label_surface]

@@ -108,8 +108,10 @@ def mark_parameters(settings: Any, erase: bool = False) -> dict[str, Any] | None
         return {**params, "void": True}
     if not 0 <= settings.class_index < len(settings.classes):
         return None
-    shape = {"shape": "part", "width": 2.0} if tool == "click" else {}
-    if shape and settings.label_encoder and settings.label_decoder:
+    shape = {"shape": "part", "width": 2.0} if tool in ("click", "part") else {}
+    if tool == "part":
+        shape["level"] = settings.label_level
+    elif shape and settings.label_encoder and settings.label_decoder:
         shape = {"shape": "outline", "width": 2.0, "box": True}  # a model cuts out what is clicked or boxed
     return {**params, **shape, "class_id": settings.classes[settings.class_index].id}
 
@@ -132,7 +134,7 @@ class FIELDWORK_TOOL_label(WorkSpaceTool):
     def draw_settings(context: Context, layout: UILayout, tool: Any) -> None:
         settings = context.scene.fieldwork
         layout.prop(settings, "label_tool", text="")
-        layout.prop(settings, "label_width")
+        layout.prop(settings, "label_level" if settings.label_tool == "part" else "label_width")
         layout.prop(settings, "label_view", text="")
         layout.prop(settings, "label_opacity")
 
@@ -142,7 +144,7 @@ class FIELDWORK_TOOL_label(WorkSpaceTool):
         space = context.space_data
         photo = editor.photo_of(getattr(space, "image", None), snapshot.folder_of(context.scene.fieldwork))
         settings = context.scene.fieldwork
-        if photo is None or context.region is None or settings.label_tool == "click":
+        if photo is None or context.region is None or settings.label_tool in ("click", "part"):
             return
         from gpu_extras.presets import draw_circle_2d
 

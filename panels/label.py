@@ -122,6 +122,8 @@ def draw_tools(layout: UILayout, settings: Any) -> None:
         if settings.label_encoder and settings.label_decoder:
             layout.operator("fieldwork.assist_embed", icon="IMAGE_DATA")
         column = columns(layout)
+    elif settings.label_tool == "part":
+        column.prop(settings, "label_level")
     else:
         column.prop(settings, "label_width")
     column.prop(settings, "label_view")

@@ -4,7 +4,8 @@ runs/RUN/surfels/   prepared.json (what it was made from), and arrays as .npy fi
     position, normal, lab, texture, planarity, field, height, pixels   see Surfels
     neighbours (N, K) int32     nearest surfels
     features (N, F)             columns by which surfels are told apart, see graph.py
-    part, edges_…, coarse_…     see Graph; of a matrix its data, indices and indptr
+    cell, edges_…, coarse_…     see Graph; of a matrix its data, indices and indptr
+    parts (N, 2) int32          see parts.py
     pixel_surfel (P,) int32     surfel that each pixel of each photo's map shows, −1 for none; maps one after the other
     pixel_edge (P,) bool        pixels at depth edges, whose marks are dropped
 """
@@ -43,6 +44,7 @@ from ..render.run import Trained, load_info, load_trained, refined_poses
 from .graph import Graph, feature_columns, make_graph
 from .lookup import RECORD, UNREADABLE, part_of, photo_maps
 from .lookup import SURFELS as FOLDER
+from .parts import surface_parts
 from .rays import Hits, hits_of
 from .surfels import Surfels, cell_of, field_features, means, nearest_neighbours, nearest_surfel, shape_at
 
@@ -52,7 +54,7 @@ CPU_PIXELS, GPU_PIXELS = 4e6, 1e8  # of all maps together
 CPU_SHARE = 0.5  # of a map's side that rays are rendered for on a CPU
 LEAST_SURFELS = 64
 PIXELS_EACH = 4  # at least, in the mean: what a surfel of one pixel looks like is noise
-VERSION = 1  # of what is made; another one makes it again
+VERSION = 2  # of what is made; another one makes it again
 MATRIX = ("data", "indices", "indptr")
 
 
@@ -67,7 +69,7 @@ class Preparation:
         self.photos = list(self.of_photo.values())
         self.surfels = Surfels(**{name: self._array(name) for name in Surfels.__dataclass_fields__})
         self.neighbours, self.features = self._array("neighbours"), self._array("features")
-        self.part = self._array("part")
+        self.cell, self.parts = self._array("cell"), self._array("parts")
         self.pixel_surfel, self.pixel_edge = self._array("pixel_surfel"), self._array("pixel_edge")
 
     def _array(self, name: str) -> np.ndarray:
@@ -102,7 +104,7 @@ class Preparation:
     @cached_property
     def graph(self) -> Graph:
         """The graph of the surfels."""
-        return Graph(self._matrix("edges"), self._matrix("coarse"), np.array(self.part))
+        return Graph(self._matrix("edges"), self._matrix("coarse"), np.array(self.cell))
 
     def _matrix(self, name: str) -> csr_matrix:
         parts = [np.array(self._array(f"{name}_{part}")) for part in MATRIX]
@@ -283,7 +285,8 @@ def surfel_arrays(
         **vars(made),
         "neighbours": neighbours,
         "features": feature_columns(made, neighbours),
-        "part": graph.part,
+        "cell": graph.cell,
+        "parts": surface_parts(made, neighbours, report.check),
         **{f"{name}_{part}": getattr(matrix, part) for name, matrix in matrices.items() for part in MATRIX},
         "pixel_surfel": pixel_surfel,
         "pixel_edge": edge,

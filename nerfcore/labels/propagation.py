@@ -92,29 +92,29 @@ def walked(
     check: Callable[[], None],
     firm: np.ndarray | float = 1.0,
 ) -> np.ndarray:
-    """Probability (N, C) of the classes by the random walker, first on parts, then on surfels.
+    """Probability (N, C) of the classes by the random walker, first on the cells of a coarser grid, then on surfels.
 
     Args:
         look: (N, C) prior of each surfel, in sum at most 1. familiar: (N,) in [0, 1], share of its strength that the prior
             has; the rest conducts to void. seeds: (S,) known surfels; values: (S, C) their probabilities. start: (N, C) or
             None, as in `propagated`. firm: (N,) factors of the strength.
     """
-    count = int(graph.part.max(initial=-1)) + 1
-    members = membership(graph.part, count)
+    count = int(graph.cell.max(initial=-1)) + 1
+    members = membership(graph.cell, count)
     strength = STRENGTH * float(np.median(np.asarray(graph.edges.sum(1)))) * firm
     to_classes = strength * familiar
     to_void = strength * (1 - familiar)
     pull = np.asarray(members.T @ to_classes)
     prior = (members.T @ (to_classes[:, None] * look)) / np.maximum(pull, 1e-12)[:, None]
-    amount = np.bincount(graph.part[seeds], minlength=count)
+    amount = np.bincount(graph.cell[seeds], minlength=count)
     known = np.flatnonzero(amount)
-    mean = np.stack([np.bincount(graph.part[seeds], column, count) for column in values.T], 1)
+    mean = np.stack([np.bincount(graph.cell[seeds], column, count) for column in values.T], 1)
     mean = mean[known] / amount[known, None]
     sink = np.asarray(members.T @ to_void)
-    size = np.maximum(np.bincount(graph.part, minlength=count), 1)[:, None]
+    size = np.maximum(np.bincount(graph.cell, minlength=count), 1)[:, None]
     begin = None if start is None else (members.T @ start) / size
     coarse = random_walk(graph.coarse, prior, pull, sink, known, mean, begin, check)
-    first = coarse[graph.part]
+    first = coarse[graph.cell]
     return random_walk(graph.edges, look, to_classes, to_void, seeds, values, first, check, most_steps=FINE_STEPS)
 
 

@@ -67,6 +67,11 @@ class LabelSettings:
     label_decoder: StringProperty(
         name="Decoder", description="ONNX file of the decoder of the same model", subtype="FILE_PATH"
     )
+    label_features: StringProperty(
+        name="Features",
+        description="ONNX file of a model such as DINOv2, whose features help to tell apart what looks alike; empty: none",
+        subtype="FILE_PATH",
+    )
     label_revision: IntProperty(
         name="Revision", description="Which revision of the marks undo comes back to", default=-1, options={"HIDDEN"}
     )

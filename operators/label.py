@@ -70,7 +70,7 @@ class RunOperator(ProjectOperator):
         return {"project": self.project_path(context), "run": self.value(context, "run"), **own, **more}
 
 
-@scene_settings(run="run")
+@scene_settings(run="run", features="label_features")
 class FIELDWORK_OT_label_prepare(RunOperator):
     """Prepare the run for labelling: the first marks do so too"""
 
@@ -85,7 +85,8 @@ class FIELDWORK_OT_label_prepare(RunOperator):
     )  # fmt: skip
 
     def parameters(self, context: Context) -> dict[str, Any]:
-        return self.of_run(context, surfels=self.surfels if self.properties.is_property_set("surfels") else None)
+        surfels = self.surfels if self.properties.is_property_set("surfels") else None
+        return self.of_run(context, surfels=surfels, features=self.path(context, "features"))
 
 
 @scene_settings(run="run")

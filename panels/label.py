@@ -106,6 +106,10 @@ def draw_label(layout: UILayout, context: Context) -> None:
         column.prop(settings, "common_points")
         layout.operator("fieldwork.label_carry", icon="TRACKING_FORWARDS").confirm = False
     column = columns(layout)
+    column.prop(settings, "label_features")
+    if settings.label_features:
+        layout.operator("fieldwork.label_prepare", icon="IMAGE_DATA")
+        column = columns(layout)
     column.prop(settings, "label_author")
     column.prop(settings, "label_seconds")
     row = layout.row(align=True)

@@ -13,6 +13,7 @@ from .walker import edge_matrix
 CELLS = 20_000  # of the coarse graph; not tuned
 # Weights of the columns in units of their deviation; see experiments.md, “Labels from a few strokes”.
 LAB, LAB_AROUND, CONTRAST, TEXTURE, NORMAL, HEIGHT, PLANARITY, FIELD, FIELD_AROUND = 0.5, 1, 0.5, 0.5, 1, 1, 0.3, 1.5, 1
+FILTERS, TOKENS = 1.5, 1.5
 EDGE_SCALE = 4.0  # b of an edge's weight exp(−Σ d²/(b·median d²))
 
 

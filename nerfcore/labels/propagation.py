@@ -60,11 +60,13 @@ def appearance(
     any that is marked."""
     known = seeds.label != VOID
     features = torch.from_numpy(np.array(ready.features))
+    columns = torch.cat([features, torch.from_numpy(np.array(ready.photo_features))], 1)
     # Void is one more class of the classifier where it is marked.
     void_marked = bool((~known).any())
     target = torch.from_numpy(np.where(known, seeds.label, classes)).long()
     marked, mark = torch.from_numpy(seeds.surfel), torch.from_numpy(seeds.mark)
-    look = class_probabilities(features, marked, target, mark, classes + void_marked, check)
+    look = class_probabilities(columns, marked, target, mark, classes + void_marked, check)
+    # What photos show is too fine to say what is known: every place has another texture.
     distance = distance_to_samples(features, marked, mark, check)
     return look[:, :classes], 0.5 ** ((distance / KNOWN_LOOK) ** SHARPNESS)
 

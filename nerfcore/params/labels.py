@@ -21,6 +21,10 @@ class LabelPrepareParams(Params):
     project: Path
     run: RunName = "main"
     surfels: int = Field(default=200_000, ge=1000, le=5_000_000, description="most surfels to make")
+    features: Path | None = Field(
+        default=None,
+        description="ONNX file of a model such as DINOv2, whose features tell surfels apart too; default: the one used before",
+    )
 
 
 class LabelStrokeParams(Params):

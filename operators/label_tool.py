@@ -116,25 +116,37 @@ def mark_parameters(settings: Any, erase: bool = False) -> dict[str, Any] | None
     return {**params, **shape, "class_id": settings.classes[settings.class_index].id}
 
 
-class FIELDWORK_TOOL_label(WorkSpaceTool):
-    bl_space_type = "IMAGE_EDITOR"
-    bl_context_mode = "VIEW"
-    bl_idname = editor.TOOL
+class LabelTool:
+    """What the tools of all editors share."""
+
     bl_label = "Label"
-    bl_description = "Mark what belongs to a class on the photos of a capture"
     bl_icon = "brush.generic"
     bl_cursor = "CROSSHAIR"
-    bl_keymap = (
-        ("fieldwork.label_mark", {"type": "LEFTMOUSE", "value": "PRESS"}, None),
-        ("fieldwork.label_mark", {"type": "LEFTMOUSE", "value": "PRESS", "ctrl": True}, None),
-        *KEYS,
-    )
 
     @staticmethod
     def draw_settings(context: Context, layout: UILayout, tool: Any) -> None:
         settings = context.scene.fieldwork
         layout.prop(settings, "label_tool", text="")
         layout.prop(settings, "label_level" if settings.label_tool == "part" else "label_width")
+
+
+def keymap(operator: str) -> tuple[Any, ...]:
+    """The keys of a tool whose strokes an operator takes: with Ctrl they erase."""
+    press = {"type": "LEFTMOUSE", "value": "PRESS"}
+    return ((operator, press, None), (operator, {**press, "ctrl": True}, None), *KEYS)
+
+
+class FIELDWORK_TOOL_label(LabelTool, WorkSpaceTool):
+    bl_space_type = "IMAGE_EDITOR"
+    bl_context_mode = "VIEW"
+    bl_idname = editor.TOOL
+    bl_description = "Mark what belongs to a class on the photos of a capture"
+    bl_keymap = keymap("fieldwork.label_mark")
+
+    @staticmethod
+    def draw_settings(context: Context, layout: UILayout, tool: Any) -> None:
+        LabelTool.draw_settings(context, layout, tool)
+        settings = context.scene.fieldwork
         layout.prop(settings, "label_view", text="")
         layout.prop(settings, "label_opacity")
 

@@ -51,6 +51,7 @@ NAMED = {
     "bench": {"out"},
     "export": {"out"},
     "label overlay": {"out"},
+    "label parts": {"out"},
 }
 # What verbs of two words have in common.
 GROUPS = {

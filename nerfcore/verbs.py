@@ -55,6 +55,7 @@ VERBS = {
         p.LabelCheckoutParams, "labels.stroke:checkout", "Show another revision of the marks.", immediate=True
     ),
     "label overlay": Verb(p.LabelOverlayParams, "labels.overlay:overlay", "Draw the labels of a photo."),
+    "label parts": Verb(p.LabelPartsParams, "labels.part_picture:parts", "Tell the parts of the surface in a photo."),
     "label next": Verb(p.LabelNextParams, "labels.next_photo:next_photo", "Find the photo to mark next."),
     "label import": Verb(
         p.LabelImportParams, "labels.exchange:import_labels", "Read labels of another labelling tool."

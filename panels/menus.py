@@ -31,6 +31,7 @@ class FIELDWORK_MT_steps(Menu):
         layout.operator("fieldwork.label_propagate")
         layout.operator("fieldwork.label_next")
         layout.operator("fieldwork.label_overlay")
+        layout.operator("fieldwork.label_parts")
         layout.operator("fieldwork.label_carry").confirm = False
         layout.operator("fieldwork.label_carry", text=t("Confirm Carried Labels")).confirm = True
         layout.operator("fieldwork.label_accept")

@@ -35,7 +35,7 @@ VERBS = {
     "train": Verb(p.TrainParams, "train.verb:train", "Train the field."),
     "evaluate": Verb(p.EvaluateParams, "evaluate.verb:evaluate", "Measure the held-out images."),
     "bake": Verb(p.BakeParams, "bake.verb:bake", "Bake the field into voxels that render fast."),
-    "render": Verb(p.RenderParams, "render.verb:render", "Render images from the field."),
+    "render": Verb(p.RenderParams, "film.edits:render", "Render images from the field."),
     "mesh": Verb(p.MeshParams, "mesh.verb:mesh", "Extract the labelled surface."),
     "measure": Verb(p.MeasureParams, "measure.verb:measure", "Measure areas, volumes and distances on the mesh."),
     "instances": Verb(

@@ -46,7 +46,17 @@ from .labels import (
     Revision,
 )
 from .results import BlendParams, ExportParams, PackageParams, ReportParams
-from .surfaces import CompareParams, MeasureParams, MeshParams, PaperScale, PlanParams, SectionParams, Side, Turn
+from .surfaces import (
+    CompareParams,
+    MeasureParams,
+    MeshParams,
+    PaperScale,
+    PlanParams,
+    SectionParams,
+    Side,
+    Turn,
+    TurntableParams,
+)
 from .things import InstancesParams, RelationsParams
 from .workflows import BatchParams, BenchParams, BlocksParams, ReconstructParams
 
@@ -108,4 +118,5 @@ __all__ = [
     "Split",
     "TrainParams",
     "Turn",
+    "TurntableParams",
 ]

@@ -42,6 +42,7 @@ NAMED = {
     "new": {"photos"},
     "render": {"out"},
     "mesh": {"out"},
+    "turntable": {"out"},
     "plan": {"out"},
     "section": {"out"},
     "compare": {"out"},

@@ -37,6 +37,7 @@ VERBS = {
     "bake": Verb(p.BakeParams, "bake.verb:bake", "Bake the field into voxels that render fast."),
     "render": Verb(p.RenderParams, "film.edits:render", "Render images from the field."),
     "mesh": Verb(p.MeshParams, "mesh.verb:mesh", "Extract the labelled surface."),
+    "turntable": Verb(p.TurntableParams, "mesh.turntable:turntable", "Picture the mesh from all around."),
     "measure": Verb(p.MeasureParams, "measure.verb:measure", "Measure areas, volumes and distances on the mesh."),
     "instances": Verb(
         p.InstancesParams, "things.edit:instances", "List, rename, join or split the things of the mesh."

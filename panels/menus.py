@@ -47,6 +47,7 @@ class FIELDWORK_MT_steps(Menu):
         layout.operator("fieldwork.add_crop_box")
         layout.operator("fieldwork.setup_compositor")
         layout.operator("fieldwork.mesh")
+        layout.operator("fieldwork.turntable")
         layout.operator("fieldwork.measure")
         layout.operator("fieldwork.relations")
         layout.operator("fieldwork.instances")

@@ -47,7 +47,17 @@ from .labels import (
     Revision,
 )
 from .results import BlendParams, ExportParams, PackageParams, ReportParams
-from .surfaces import CompareParams, MeasureParams, MeshParams, PaperScale, PlanParams, SectionParams, Side, Turn
+from .surfaces import (
+    CompareParams,
+    MeasureParams,
+    MeshParams,
+    PaperScale,
+    PlanParams,
+    SectionParams,
+    Side,
+    Turn,
+    TurntableParams,
+)
 from .things import InstancesParams, RelationsParams
 from .workflows import BatchParams, BenchParams, BlocksParams, ReconstructParams
 
@@ -110,4 +120,5 @@ __all__ = [
     "Split",
     "TrainParams",
     "Turn",
+    "TurntableParams",
 ]

@@ -75,7 +75,8 @@ def calibration_error(sure: np.ndarray, right: np.ndarray) -> float:
 def boundary(mask: np.ndarray) -> np.ndarray:
     """The pixels (H, W) bool of a mask that lie near its outline; what the picture cuts off is no outline."""
     width = max(1, round(BOUNDARY * math.hypot(*mask.shape)))
-    return mask & ~binary_erosion(mask, np.ones((3, 3), bool), iterations=width, border_value=1)
+    inner = np.asarray(binary_erosion(mask, np.ones((3, 3), bool), iterations=width, border_value=1), bool)
+    return mask & ~inner
 
 
 @dataclass

@@ -136,9 +136,7 @@ def trials_of(
     plan = known.profiles[profile]
     for name in variants or []:
         if name not in known.variants:
-            raise SettingError(
-                f"The suite evidence has no variant “{name}”.", f"It has: {', '.join(known.variants)}."
-            )
+            raise SettingError(f"The suite evidence has no variant “{name}”.", f"It has: {', '.join(known.variants)}.")
     found = []
     for table in plan.tables:
         chosen = [name for name in table.variants if variants is None or name in variants]
@@ -177,5 +175,10 @@ def planned(trials: Sequence[Trial], profile: str, there: Sequence[bool]) -> lis
     lines = [f"{'there' if known else 'to do'}: {trial.title}" for trial, known in zip(trials, there)]
     left = sum(expected_seconds(trial, profile) for trial, known in zip(trials, there) if not known) / 60
     duration = f"{left:.0f} minutes" if left < 120 else f"{left / 60:.1f} hours"
-    clock = " of a processor, more where other programs run" if protocol().profiles[profile].clock == "processor" else ""
-    return [*lines, f"{len(trials) - sum(there)} of {len(trials)} trials to do, one after the other: about {duration}{clock}."]
+    clock = (
+        " of a processor, more where other programs run" if protocol().profiles[profile].clock == "processor" else ""
+    )
+    return [
+        *lines,
+        f"{len(trials) - sum(there)} of {len(trials)} trials to do, one after the other: about {duration}{clock}.",
+    ]

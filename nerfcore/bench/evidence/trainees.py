@@ -5,6 +5,7 @@ All get the same photos, labels, noise, cube and held-out cameras; only what hap
 
 from __future__ import annotations
 
+import shutil
 import time
 import uuid
 from abc import ABC, abstractmethod
@@ -45,6 +46,7 @@ class Trainee(ABC):
     info: RunInfo
     scene: Scene
     box_from_world: np.ndarray
+    device: torch.device
 
     @abstractmethod
     def step(self, progress: float) -> tuple[int, float]:
@@ -107,8 +109,9 @@ class OurTrainee(Trainee):
         save_checkpoint(place.folder / CHECKPOINT, self.trainer, state)
         place.keep()
         bake(BakeParams(project=self.project, run=self.trial.name), report)
-        (place.folder / CHECKPOINT).unlink()
-        return load_baked(self.project, self.trial.name, self.info, check=False)
+        baked = load_baked(self.project, self.trial.name, self.info)
+        shutil.rmtree(place.folder)
+        return baked
 
     def frame(self, camera: Camera, pose: np.ndarray, semantics: bool, check: Callable[[], None]) -> Frame:
         shown = self.trainer.model if self.baked is None else self.baked
@@ -175,7 +178,11 @@ class BaselineTrainee(Trainee):
                 rays = Rays(rays.origins, directions.contiguous(), rays.radii.nan_to_num(0.0))
             out = self.method.render(rays, semantics)
             distance = torch.where(out.opacity > LEAST, out.depth / out.opacity.clamp(min=LEAST), torch.nan)
-            columns = [out.color, out.opacity[:, None], (distance * (rays.directions @ cameras.rotation[0, :, 2]))[:, None]]
+            columns = [
+                out.color,
+                out.opacity[:, None],
+                (distance * (rays.directions @ cameras.rotation[0, :, 2]))[:, None],
+            ]
             columns.append(rays.origins + rays.directions * distance[:, None])
             if out.probabilities is not None:
                 columns.append(out.probabilities)

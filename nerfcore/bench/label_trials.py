@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..data.load import load_scene
-from ..evaluate.metrics import Confusion
+from ..evaluate.metrics import Confusion, calibration_error
 from ..images.working import nearest, read_label
 from ..labels.journal import Mark
 from ..labels.lookup import Labelling
@@ -24,7 +24,6 @@ from .annotator import LEAST_PIXELS, WIDTH, Stroke, correction, first_strokes
 LEAST_SHARE = 0.005  # of the labelled pixels, for a class to be asked for
 CORRECTIONS = 5
 SURE = 0.9
-BINS = 10  # of the expected calibration error
 
 
 @dataclass(frozen=True)
@@ -149,13 +148,6 @@ def scores(subject: Subject, labelling: Labelling) -> dict[str, Any]:
         "sure_right": round(float(correct[above].mean()), 4) if above.any() else None,
         "void": round(missing / max(pixels, 1), 4),
     }
-
-
-def calibration_error(sure: np.ndarray, right: np.ndarray) -> float:
-    """Expected calibration error of confidences (N,) in [0, 1] of answers that are right (N,) or not."""
-    number = np.minimum((sure * BINS).astype(int), BINS - 1)
-    gap = np.bincount(number, sure - right, BINS)
-    return float(np.abs(gap).sum() / max(len(sure), 1))
 
 
 def hidden_void(subject: Subject, labelling: Labelling, hidden: int) -> float | None:

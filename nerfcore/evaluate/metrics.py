@@ -8,6 +8,9 @@ from typing import Any
 
 import numpy as np
 
+BINS = 10  # of the expected calibration error
+BOUNDARY = 0.02  # of the image's diagonal, as wide as what counts as a class's boundary
+
 
 def psnr(image: np.ndarray, photo: np.ndarray, keep: np.ndarray | None = None) -> float:
     """Peak signal-to-noise ratio in dB of two (H, W, 3) uint8 images, over pixels where `keep` (H, W) is true."""
@@ -57,3 +60,47 @@ class Confusion:
         """Mean IoU over the classes in the truth; None without labels."""
         values = list(self.iou().values())
         return float(np.mean(values)) if values else None
+
+
+def calibration_error(sure: np.ndarray, right: np.ndarray) -> float:
+    """Expected calibration error of confidences (N,) in [0, 1] of answers that are right (N,) or not.
+
+    Source: Naeini et al., “Obtaining well calibrated probabilities using Bayesian binning”, 2015.
+    """
+    number = np.minimum((sure * BINS).astype(int), BINS - 1)
+    gap = np.bincount(number, sure - right, BINS)
+    return float(np.abs(gap).sum() / max(len(sure), 1))
+
+
+def boundary(mask: np.ndarray) -> np.ndarray:
+    """The pixels (H, W) bool of a mask that lie near its outline; what the picture cuts off is no outline."""
+    from scipy.ndimage import binary_erosion
+
+    width = max(1, round(BOUNDARY * math.hypot(*mask.shape)))
+    inner = np.asarray(binary_erosion(mask, np.ones((3, 3), bool), iterations=width, border_value=1), bool)
+    return mask & ~inner
+
+
+@dataclass
+class BoundaryOverlap:
+    """Boundary IoU of each class over the whole data set; pixels whose truth is not in the list are left out.
+
+    Source: Cheng et al., “Boundary IoU: Improving Object-Centric Image Segmentation Evaluation”, 2021.
+    """
+
+    class_ids: list[int]
+    both: dict[int, int] = field(default_factory=dict)
+    either: dict[int, int] = field(default_factory=dict)
+
+    def add(self, truth: np.ndarray, predicted: np.ndarray) -> None:
+        """Count two label images (H, W) of class ids."""
+        known = np.isin(truth, self.class_ids)
+        for number in np.unique(truth[known]).tolist():
+            there, told = (boundary(labels == number) & known for labels in (truth, predicted))
+            self.both[number] = self.both.get(number, 0) + int((there & told).sum())
+            self.either[number] = self.either.get(number, 0) + int((there | told).sum())
+
+    def mean(self) -> float | None:
+        """Mean over the classes in the truth that have a boundary; None without labels."""
+        found = [self.both[number] / union for number, union in self.either.items() if union]
+        return float(np.mean(found)) if found else None

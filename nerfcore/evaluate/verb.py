@@ -70,7 +70,7 @@ class Comparison:
         """Compare one view at a size (width, height)."""
         background = self.background
         camera = view.camera.resized(*size)
-        photo, keep, label = _truth(view, self.scene, camera.width, camera.height, background)
+        photo, keep, label = compared_with(view, self.scene, camera.width, camera.height, background)
         pose, given = self._pose(view, camera, photo, keep, check)
         begin, compiled = time.perf_counter(), compile_seconds()
         frame = render_view(self.shown, camera, pose, background, check=check)
@@ -260,10 +260,11 @@ def evaluated(params: EvaluateParams) -> Earlier:
     return compare(made, evaluation_inputs(params), pictures)
 
 
-def _truth(
+def compared_with(
     view: View, scene: Scene, width: int, height: int, background: float
 ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
-    """Photo (H, W, 3) uint8 on the background, mask of pixels that count (or None), label ids (or None)."""
+    """What a render of a view is compared with: photo (H, W, 3) uint8 on the background, mask of pixels that count (or
+    None), label ids (or None)."""
     picture = resized(read_picture(view.image), width, height)
     keep = None
     if view.mask is not None:

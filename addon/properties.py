@@ -430,6 +430,11 @@ class FieldworkScene(LabelSettings, PropertyGroup):
         options={"ENUM_FLAG"},
         default={"top", "front", "right", "back", "left"},
     )
+    conditions: StringProperty(
+        name="Conditions",
+        description="Classes to map as conditions, such as damages, with commas between them: hatched over the drawings, "
+        "numbered, listed with their areas; or all",
+    )
     turn: FloatProperty(
         name="Turn",
         description="Degrees about Z from the world to the front that is drawn, for slanted fronts",

@@ -67,7 +67,7 @@ class FIELDWORK_OT_turntable(ProjectOperator):
         return show_drawing
 
 
-@scene_settings(run="run", views="sides", turn="turn", scale="paper_scale", out="drawings")
+@scene_settings(run="run", views="sides", conditions="conditions", turn="turn", scale="paper_scale", out="drawings")
 class FIELDWORK_OT_plan(ProjectOperator):
     """Draw plans and elevations of the mesh to scale, in its colors and as maps of its classes"""
 
@@ -84,6 +84,7 @@ class FIELDWORK_OT_plan(ProjectOperator):
             "project": self.project_path(context),
             "run": self.value(context, "run"),
             "views": ordered(views),
+            "conditions": [name.strip() for name in self.value(context, "conditions").split(",") if name.strip()],
             "turn": self.value(context, "turn"),
             "scale": self.value(context, "scale") or None,
             "out": self.path(context, "out"),

@@ -29,7 +29,7 @@ class FIELDWORK_PT_measure(StepPanel):
             column.prop(settings, name)
         layout.operator("fieldwork.measure", icon="DRIVER_DISTANCE")
         column = columns(layout)
-        for name in ("sides", "turn", "paper_scale", "drawings"):
+        for name in ("sides", "conditions", "turn", "paper_scale", "drawings"):
             column.prop(settings, name)
         layout.operator("fieldwork.plan", icon="IMAGE_REFERENCE")
         columns(layout).prop(settings, "section_plane")

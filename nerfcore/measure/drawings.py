@@ -10,6 +10,7 @@ import numpy as np
 
 from ..errors import SettingError
 from ..mesh.clean import areas
+from ..mesh.instances import Instance, read_instances
 from ..mesh.parts import Texture
 from ..mesh.stored import load_surface, mesh_folder, mesh_record
 from ..mesh.surface import Surface
@@ -17,6 +18,7 @@ from ..params import PlanParams, SectionParams
 from ..progress import Reporter
 from ..project.schema import Project
 from ..project.store import load_project, record_step
+from .conditions import chosen_classes, condition_sheet, find_places, write_places
 from .sections import profile, write_profile
 from .sheet import DPI, MM, Color, Entry, Sheet, chosen_scale, write_sheet
 from .stored import read_measures
@@ -40,6 +42,8 @@ class Subject:
     metric: bool
     measures: dict[int, dict[str, Any]]
     void: int
+    instances: list[Instance]
+    instance_measures: dict[int, dict[str, Any]]
 
     def class_ids(self) -> list[int]:
         """The classes that occur; void is none."""
@@ -72,21 +76,26 @@ def load_subject(folder: Path, run: str) -> Subject:
         project.frame.scale_known,
         {row["id"]: row for row in measures.get("classes", [])},
         project.ignore_id,
+        read_instances(mesh_folder(folder, run)),
+        {row["id"]: row for row in measures.get("instances", [])},
     )
 
 
 def plan(params: PlanParams, report: Reporter) -> dict[str, Any]:
-    """Draw plans and elevations of the mesh, in its colours and as maps of its classes, to scale.
+    """Draw plans and elevations of the mesh, in its colours, as maps of its classes and of conditions, to scale.
 
     Returns:
         {"scales": {view: N of 1:N, None while the scale is not known}, "files"}
     Raises:
-        ProjectError: there is no mesh. SettingError: a scale that no paper is large enough for.
+        ProjectError: there is no mesh. SettingError: a scale that no paper is large enough for, or an unknown class.
     """
     folder = Path(params.project)
     subject = load_subject(folder, params.run)
     target = params.out or mesh_folder(folder, params.run) / "drawings"
     scales, files = {}, []
+    mapped = chosen_classes(params.conditions, subject.names, subject.void)
+    places = find_places(subject.surface, mapped, subject.instances, subject.instance_measures)
+    legend = {c: (f"{subject.names[c]}  {subject.size_text(c)}", line_color(subject, c)) for c in mapped}
     for name in params.views:
         report.stage(f"Drawing: {name}")
         view = projection(name, params.turn)
@@ -100,6 +109,11 @@ def plan(params: PlanParams, report: Reporter) -> dict[str, Any]:
         files += write_sheet(target / name, sheet)
         if subject.class_ids():
             files += write_sheet(target / f"{name}_classes", class_sheet(sheet, subject, seen))
+        if mapped:
+            conditions = condition_sheet(sheet, subject.surface, seen, places, legend)
+            files += write_sheet(target / f"{name}_conditions", conditions)
+    if mapped:
+        files.append(write_places(target / "conditions.csv", places, subject.names))
     result = {"scales": scales, "files": [str(path) for path in files]}
     record_step(folder, "plan", params.model_dump(mode="json"), result)
     return result

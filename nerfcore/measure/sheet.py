@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from matplotlib import rc_context
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
@@ -31,12 +33,31 @@ class Entry:
 
     text: str
     color: Color
+    hatch: str = ""
+
+
+@dataclass(frozen=True)
+class Zone:
+    """A part of the drawing that is hatched and outlined: mask (H, W) bool over all of the image."""
+
+    mask: np.ndarray
+    color: Color
+    hatch: str
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A number at a place of the drawing, in world units."""
+
+    x: float
+    y: float
+    text: str
 
 
 @dataclass(frozen=True)
 class Sheet:
     """What is drawn: the window low, high (2,) of the drawing in world units; image (H, W, 3) uint8 over all of it;
-    lines (S, 2, 2) with a colour (S, 3) each. scale: 1 : scale on paper; metric: whether a unit is a metre."""
+    lines (S, 2, 2) with a colour (S, 3) each; zones of the image, and marks. scale: 1 : scale on paper; metric: whether a unit is a metre."""
 
     title: str
     low: np.ndarray
@@ -49,6 +70,8 @@ class Sheet:
     heading: str = ""
     lines: np.ndarray | None = None
     line_colors: np.ndarray | None = None
+    zones: list[Zone] = field(default_factory=list)
+    marks: list[Mark] = field(default_factory=list)
 
 
 def chosen_scale(size: np.ndarray, asked: float | None) -> float:
@@ -98,6 +121,11 @@ def _figure(sheet: Sheet) -> Figure:
     axes.imshow(sheet.image, extent=box, interpolation="none", aspect="auto")
     if sheet.lines is not None and len(sheet.lines):
         axes.add_collection(LineCollection(list(sheet.lines), colors=sheet.line_colors, linewidths=1.2))
+    for zone in sheet.zones:
+        _hatched(axes, zone, sheet)
+    for mark in sheet.marks:
+        edge = {"boxstyle": "circle,pad=0.15", "facecolor": "white", "edgecolor": "black", "linewidth": 0.4}
+        axes.text(mark.x, mark.y, mark.text, fontsize=5.5, ha="center", va="center", bbox=edge)
     axes.set(xlim=box[:2], ylim=box[2:])
     step = nice_step(float(extent.max()), 10)
     for axis, low, high in ((axes.xaxis, box[0], box[1]), (axes.yaxis, box[2], box[3])):
@@ -115,6 +143,21 @@ def _figure(sheet: Sheet) -> Figure:
     _scale_bar(figure, sheet, float(width), float(height))
     _legend(figure, sheet, float(width), float(height))
     return figure
+
+
+def _hatched(axes: Axes, zone: Zone, sheet: Sheet) -> None:
+    """A zone as outlines and hatching, which stay lines in SVG and PDF."""
+    height, width = zone.mask.shape
+    step = (sheet.high - sheet.low) / [width, height]
+    # With a border around it, so that what reaches the side is closed too.
+    x = sheet.low[0] + (np.arange(width + 2) - 0.5) * step[0]
+    y = sheet.high[1] - (np.arange(height + 2) - 0.5) * step[1]
+    inside = np.pad(zone.mask, 1).astype(float)
+    with rc_context({"hatch.linewidth": 0.5}):
+        filled = axes.contourf(x, y, inside, levels=[0.5, 1.5], colors="none", hatches=[zone.hatch])
+    filled.set_edgecolor(zone.color)
+    filled.set_linewidth(0)
+    axes.contour(x, y, inside, levels=[0.5], colors=[zone.color], linewidths=0.8)
 
 
 def _scale_bar(figure: Figure, sheet: Sheet, width: float, height: float) -> None:
@@ -146,7 +189,8 @@ def _legend(figure: Figure, sheet: Sheet, width: float, height: float) -> None:
         y = top - 3 - 6.0 * number
         figure.patches.append(
             Rectangle(
-                (left, y / height), 4 / width, 3 / height, facecolor=entry.color, edgecolor="black", linewidth=0.3,
+                (left, y / height), 4 / width, 3 / height, linewidth=0.3, hatch=2 * entry.hatch,
+                facecolor="white" if entry.hatch else entry.color, edgecolor=entry.color if entry.hatch else "black",
                 transform=figure.transFigure, figure=figure,
             )
         )  # fmt: skip

@@ -19,7 +19,7 @@ from scipy.ndimage import binary_dilation
 
 from ..errors import SettingError
 from ..images.picture import linear_to_srgb, to_bytes
-from ..progress import Reporter
+from ..progress import Reporter, go_on
 from .facelets import Facelets, facelets
 from .painting import Jobs, Texels, crossings, paint, texels_of
 from .photos import Photo
@@ -30,6 +30,7 @@ TILE = 4096  # texels a side that are worked on at once
 PIECE_TEXELS = 40  # longest edge of a piece for which one photo is chosen
 SECOND_BEST = 3  # further photos that are tried where the chosen one is hidden
 MARGIN = 4  # texels around charts that repeat their border
+BAND = 1 << 22  # texels that are spread at once: a fraction of a second
 BYTES_PER_TEXEL, BYTES_PER_TILE_TEXEL = 8, 70
 
 Fill = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -155,7 +156,7 @@ def _texture(
         block = np.s_[top : top + tile[3], left : left + tile[2]]
         image[block], source[block] = _tile(prepared, texels, tile, rounds, careful, fill, part)
     report.stage("Spreading borders")
-    spread(image, source > (GAP if fill else UNSEEN))
+    spread(image, source > (GAP if fill else UNSEEN), report.check)
     return image, source
 
 
@@ -263,32 +264,45 @@ def _tile(
     return image.reshape(height, width, 3), source.reshape(height, width)
 
 
-def spread(image: np.ndarray, known: np.ndarray) -> None:
+def spread(image: np.ndarray, known: np.ndarray, check: Callable[[], None] = go_on) -> None:
     """Fill what is not `known` (S, S) of an image (S, S, C) in place: a margin from the texels beside it, so that
     filtering at a chart's border finds its colours; the rest from means over growing squares."""
     known = known.copy()
     height, width = known.shape
+    bands = [(top, min(top + max(1, BAND // width), height)) for top in range(0, height, max(1, BAND // width))]
     for _ in range(MARGIN):
-        grown = np.asarray(binary_dilation(known, np.ones((3, 3), bool)))
-        rows, columns = np.nonzero(np.logical_and(grown, ~known))
-        total, number = np.zeros((len(rows), image.shape[2]), np.float32), np.zeros(len(rows), np.float32)
-        for dy in (-1, 0, 1):
-            for dx in (-1, 0, 1):
-                y, x = np.clip(rows + dy, 0, height - 1), np.clip(columns + dx, 0, width - 1)
-                good = known[y, x]
-                total += image[y, x] * good[:, None]
-                number += good
-        image[rows, columns] = (total / np.maximum(number, 1)[:, None] + 0.5).astype(np.uint8)
-        known[rows, columns] = True
+        reached = []
+        for top, end in bands:
+            check()
+            above = max(top - 1, 0)
+            grown = np.asarray(binary_dilation(known[above : end + 1], np.ones((3, 3), bool)))[top - above :][
+                : end - top
+            ]
+            rows, columns = np.nonzero(np.logical_and(grown, ~known[top:end]))
+            rows += top
+            total, number = np.zeros((len(rows), image.shape[2]), np.float32), np.zeros(len(rows), np.float32)
+            for dy in (-1, 0, 1):
+                for dx in (-1, 0, 1):
+                    y, x = np.clip(rows + dy, 0, height - 1), np.clip(columns + dx, 0, width - 1)
+                    good = known[y, x]
+                    total += image[y, x] * good[:, None]
+                    number += good
+            image[rows, columns] = (total / np.maximum(number, 1)[:, None] + 0.5).astype(np.uint8)
+            reached.append((rows, columns))
+        for place in reached:
+            known[place] = True
     if known.all() or not known.any():
         return
     step = 4
     small = torch.from_numpy(image[::step, ::step].astype(np.float32)).permute(2, 0, 1)
     weight = torch.from_numpy(known[::step, ::step].astype(np.float32))[None]
     filled = _pushed(small * weight, weight)
-    gaps = np.nonzero(~known)
-    values = filled[:, torch.from_numpy(gaps[0] // step), torch.from_numpy(gaps[1] // step)]
-    image[gaps] = values.T.clamp(0, 255).to(torch.uint8).numpy()
+    for top, end in bands:
+        check()
+        rows, columns = np.nonzero(~known[top:end])
+        rows += top
+        values = filled[:, torch.from_numpy(rows // step), torch.from_numpy(columns // step)]
+        image[rows, columns] = values.T.clamp(0, 255).to(torch.uint8).numpy()
 
 
 def _pushed(values: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:

@@ -92,6 +92,11 @@ class PlanParams(Params):
     project: Path
     run: RunName = "main"
     views: list[Side] = ["top", "front", "right", "back", "left"]
+    conditions: list[str] = Field(
+        default=[],
+        description="classes to map as conditions, such as damages: hatched over the drawing, numbered, listed with their "
+        "areas; or all",
+    )
     turn: Turn = 0.0
     scale: PaperScale = None
     out: Path | None = Field(

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fieldwork.nerfcore.errors import ProjectError, SettingError
+from fieldwork.nerfcore.measure.conditions import widest, without_specks
 from fieldwork.nerfcore.measure.drawings import axis_names, framed, load_subject, plan, section
 from fieldwork.nerfcore.measure.sections import profile
 from fieldwork.nerfcore.measure.sheet import DPI, chosen_scale, nice_step
@@ -104,6 +105,41 @@ def test_plans_are_written_as_large_as_they_say(project: Path, tmp_path: Path) -
         colors = {tuple(c) for c in np.array(image.convert("RGB")).reshape(-1, 3)[::7].tolist()}
     assert (87, 181, 232) in colors  # the plinth's colour in the legend
     assert (tmp_path / "top.pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_conditions_are_hatched_numbered_and_listed(project: Path, tmp_path: Path) -> None:
+    wanted = PlanParams(project=project, views=["top"], conditions=["plinth"], scale=50, out=tmp_path)
+    files = [Path(path).name for path in plan(wanted, Reporter())["files"]]
+    assert files[-4:] == [*(f"top_conditions.{kind}" for kind in ("png", "svg", "pdf")), "conditions.csv"]
+    with open(tmp_path / "conditions.csv", newline="") as file:
+        first, second = csv.DictReader(file)
+    assert (first["number"], first["class"], first["instance"]) == ("1", "plinth", "plinth.001")
+    assert float(first["area"]) == pytest.approx(2 + 4 * 0.999)
+    assert float(second["area"]) == pytest.approx(2 * 0.25 + 4 * 0.5 * 1.499)
+    assert [float(second[axis]) for axis in "xy"] == pytest.approx([3, 1.25])
+    svg = (tmp_path / "top_conditions.svg").read_text()
+    assert "<pattern" in svg  # hatching is lines, not dots
+    with Image.open(tmp_path / "top_conditions.png") as image:
+        line = np.abs(np.diff(np.array(image.convert("RGB")).astype(int), axis=1)).max(2) > 25
+    # The frame begins at 18 mm and, from below, at 26 mm; 2 % of 4 m lie around the drawing. Plinths alone are hatched.
+    height, dot = line.shape[0], DPI / 25.4
+    x = (18 + (np.array([0.5, 1.5, 2.0, 2.7]) + 0.08) * 20) * dot
+    y = height - (26 + (np.array([0.5, 1.5]) + 0.08) * 20) * dot
+    rows = slice(int(y[1]) + 8, int(y[0]) - 8)
+    assert line[rows, int(x[0]) + 8 : int(x[1]) - 8].mean() > 0.1
+    assert line[rows, int(x[1]) + 8 : int(x[3])].mean() < 0.05
+    with pytest.raises(SettingError, match=r"no class “crack”.*floor, wall, plinth"):
+        plan(PlanParams(project=project, conditions=["crack"], out=tmp_path), Reporter())
+
+
+def test_specks_are_left_out_and_numbers_stand_inside() -> None:
+    mask = np.zeros((20, 30), bool)
+    mask[2:12, 3:23] = mask[17, 28] = True
+    assert without_specks(mask, 2).sum() == 200
+    assert not without_specks(mask, 500).any()
+    row, column = widest(mask)
+    assert 6 <= row <= 7
+    assert 7 <= column <= 18
 
 
 def test_a_section_is_drawn_and_listed(project: Path, tmp_path: Path) -> None:

@@ -41,6 +41,11 @@ SUITES = {
         "field saw no label map. mIoU is of the pixels of held-out photos, those without a class counting as wrong; “all "
         "label maps” is the most that the same surfels can show. ECE: expected calibration error of the confidence.",
     ),
+    "live": (
+        "Baked fields",
+        "What the baked field of a run costs, what it loses on the held-out photos, and how fast `render --baked` makes pictures "
+        "with classes; beside it the field itself.",
+    ),
     "measures": (
         "Measures",
         "Things of known size on a table, about 25 pixels across in 24 small photos whose poses, exposure, label maps and "

@@ -21,12 +21,13 @@ SCENES = {
     "gpu": ["lego_400", "replica_room"],
     "surface": ["museum", "facade", "fence", "vase"],
     "labels": ["museum", "facade", "replica_room"],
+    "live": ["lego_400", "museum", "replica_room"],
 }
 REFERENCE = {"ablation": "hybrid", "robustness": "clean", "baselines": "ours"}
 SECONDS = {"speed": 120.0, "ablation": 180.0, "robustness": 180.0, "baselines": 600.0, "gpu": 60.0}
-SIDES = {"speed": (400, 800), "gpu": (800,), "baselines": (800,), "surface": ()}
+SIDES = {"speed": (400, 800), "gpu": (800,), "baselines": (800,), "surface": (), "live": (400,)}
 LONGER = 5.0  # the speed suite's second run
-STEPS = {"figures": 600, "ablation": 4000, "surface": 600}
+STEPS = {"figures": 600, "ablation": 4000, "surface": 600, "live": 2000}
 SEEDS = {"figures": [0, 1]}
 # Published drops of PSNR (dB) and of mIoU (points) under input noise.
 PUBLISHED_DROPS = {"noise 0.01": (1.6, 2.5), "noise 0.03": (3.7, 4.7), "noise 0.05": (5.4, 8.1)}

@@ -11,6 +11,7 @@ import matplotlib
 
 from ..files import atomic_path
 from .jobs import COUNTING_SIDE, Job
+from .live import live_table
 from .results import Row
 from .suites import PUBLISHED_DROPS, REFERENCE
 from .surface_table import FIGURES, figure_table
@@ -50,6 +51,7 @@ SHARES = {
     "step_faults": "page faults a step",
     "step_system": "system time (%)",
 }
+OWN = {"surface": figure_table, "live": live_table}  # suites with tables of their own
 SPEED = {"fps": "frames/s", "ms_frame": "ms a frame", "ms_sampling": "ms sampling", "ms_network": "ms network"}
 
 
@@ -88,6 +90,9 @@ def make_rows(suite: str, results: Sequence[dict[str, Any]]) -> list[Row]:
             row |= {f"{key}_{side}": values[key] for key in SPEED}
         row |= {key: result["roofline"][key] for key in SHARES if "roofline" in result}
         row |= {key: result[key] for key in (*FIGURES, "stages") if suite == "surface" and key in result}
+        if suite == "live":
+            row |= result.get("live", {})
+            row["field_400"] = row.pop("fps_400", None)
         row["error"] = result.get("error")
         rows.append(row)
     reference = {_case(r): r for r in rows if r["variant"] == REFERENCE.get(suite)}
@@ -195,8 +200,8 @@ def markdown(suite: str, rows: Sequence[Row], machine: str, command: str, notes:
     present = [key for key in COLUMNS if any(row.get(key) is not None for row in rows) or key in ("psnr", "miou")]
     parts = [f"# Suite {suite}", "", f"Machine: {machine}. Command: `{command}`", ""]
     parts += [table({key: COLUMNS[key] for key in present}, rows), ""]
-    if suite == "surface":
-        parts += [table(*figure_table(rows)), ""]
+    if suite in OWN:
+        parts += [table(*OWN[suite](rows)), ""]
     for side in frame_sides(rows):
         columns = {"scene": "scene", "variant": "variant", "budget": "budget"}
         columns |= {f"{key}_{side}": heading for key, heading in SPEED.items()}

@@ -19,7 +19,7 @@ from ..files import write_json, write_text
 from ..kernels.device import use_device
 from ..params import BenchParams
 from ..progress import Reporter, shortened
-from . import gpu, machine, speed, surface, tables
+from . import gpu, live, machine, speed, surface, tables
 from .jobs import run_all, unknown_origin
 from .labels import labels_suite
 from .measures import measures_suite
@@ -27,7 +27,6 @@ from .page import check_page, figures_folder, write_page
 from .results import Asked, ResultSet, Row, grouped, write_set
 from .scenes import available, data_folder, is_labelled, prepare, scene_name
 from .suites import MISSING_BASELINES, PUBLISHED_DROPS, SCENES, SECONDS, plan
-from .surface_table import figure_table
 
 
 def bench(params: BenchParams, report: Reporter) -> dict[str, Any]:
@@ -52,7 +51,9 @@ def bench(params: BenchParams, report: Reporter) -> dict[str, Any]:
         result = labels_suite(params, projects, out, command_of(params), report)
         return {**result, "notes": [*notes, *result["notes"]]}
     jobs = plan(params, list(projects))
-    more = {"surface": partial(surface.measure, root=root), "speed": speed.measure}.get(params.suite)
+    more = {"surface": partial(surface.measure, root=root), "speed": speed.measure, "live": live.measure}.get(
+        params.suite
+    )
     results = run_all(jobs, projects, out, report, params.keep, more)
     rows = tables.make_rows(params.suite, results)
     described = machine.describe()
@@ -150,7 +151,7 @@ def _write_page(
     """Add the result sets of this command to the page's, one for each machine and commit, and write the page anew."""
     files = []
     for taken, own in grouped(results, rows):
-        columns, shown = figure_table(own) if params.suite == "surface" else (None, own)
+        columns, shown = tables.OWN[params.suite](own) if params.suite in tables.OWN else (None, own)
         result = ResultSet(
             suite=params.suite,
             title=f"{', '.join(dict.fromkeys(row['budget'] for row in own))} ({taken.date})",

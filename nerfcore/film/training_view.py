@@ -229,8 +229,9 @@ class TrainingView:
         end = time.perf_counter()
         view.pixels, view.step = width * height, self._steps
         self._ray_seconds = (end - begin) / view.pixels
+        # A view that moves must not wait for a fine picture's share of the time.
         self._free = {
-            True: end + (end - begin) * (1 / MOVING_SHARE - 1),
+            True: end + min(end - begin, FIRST) * (1 / MOVING_SHARE - 1),
             False: end + (end - begin) * (1 / SHARE - 1),
         }
 

@@ -94,7 +94,7 @@ class BlocksParams(Params):
 
 class BenchParams(Params):
     suite: Literal[
-        "figures", "speed", "ablation", "robustness", "baselines", "gpu", "surface", "labels", "measures"
+        "figures", "speed", "ablation", "robustness", "baselines", "gpu", "surface", "labels", "measures", "live"
     ] = Field(description="which table")
     out: Path = Field(default=Path("build/bench"), description="folder for results and scenes; finished runs are kept")
     data: Path | None = Field(default=None, description="folder of data sets; default: ../shared/data when it is there")

@@ -103,6 +103,7 @@ def overlays(screen):
 
 def endurance(screen):
     """200 sizes of the viewport and 50 undos: what is kept, and what memory it takes."""
+    bpy.context.preferences.edit.undo_steps = 64  # Blender keeps 32 otherwise, and fifty are taken back
     yield from ball(screen)
     space = screen.area.spaces.active
     drawn = yield from settled(screen)

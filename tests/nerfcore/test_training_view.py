@@ -202,6 +202,38 @@ def test_pictures_take_a_small_part_of_the_time(project, tmp_path, monkeypatch):
 
 
 @pytest.mark.usefixtures("eager")
+def test_a_view_that_moves_does_not_wait_for_the_fine_picture_before(project, tmp_path, monkeypatch):
+    """A picture that took three seconds keeps finer ones away for long, but not the first one of another view."""
+    viewer, makings, clock = Viewer(project, tmp_path), [], [0.0]
+    make = training_view.view_picture
+
+    def slow(field, request, width, height, check):
+        begin, made = clock[0], make(field, request, width, height, check)
+        clock[0] += 0.01 if request.number == 1 and not makings else 3.0
+        makings.append((request.number, begin, clock[0]))
+        return made
+
+    class Clock:
+        time = staticmethod(time.time)
+        perf_counter = staticmethod(lambda: clock[0])
+
+    monkeypatch.setattr(training_view, "view_picture", slow)
+    monkeypatch.setattr(training_view, "time", Clock)
+
+    def act(step: int) -> None:
+        clock[0] += 0.05
+        if step == 1:
+            viewer.ask(FRONT)
+        if len(makings) == 2 and viewer.number == 1:
+            viewer.ask(perspective((0.05, -1.2, 0)))
+
+    train(project, act, 60)
+    numbers = [number for number, _, _ in makings]
+    assert numbers[:3] == [1, 1, 2]
+    wait = makings[2][1] - makings[1][2]
+    assert wait <= training_view.FIRST * (1 / training_view.MOVING_SHARE - 1) + 0.11
+
+
 def test_cancelling_in_a_picture_leaves_a_checkpoint(project, tmp_path, monkeypatch):
     viewer, report = Viewer(project, tmp_path), None
     plain = training_view.view_picture

@@ -164,6 +164,6 @@ def _crops(record: dict[str, Any], pictures: Path) -> Any:
                 with Image.open(pictures / name) as image:
                     axis.imshow(np.asarray(image.convert("RGB")), interpolation="nearest")
             else:
-                axis.text(0.5, 0.5, "not measured", ha="center", va="center", fontsize=7, transform=axis.transAxes)
+                axis.text(0.5, 0.5, "no labels", ha="center", va="center", fontsize=7, transform=axis.transAxes)
         line[0].set_ylabel(scene, fontsize=8)
     return figure

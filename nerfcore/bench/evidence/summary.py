@@ -50,8 +50,10 @@ def title_of(variant: str) -> str:
 
 
 def distinct(rows: Sequence[Row], key: str) -> list[Any]:
-    """Values of a trial's field, in the order in which they occur."""
-    return list(dict.fromkeys(row["trial"][key] for row in rows))
+    """Values of a trial's field: variants in the protocol's order, others in that in which they occur."""
+    values = list(dict.fromkeys(row["trial"][key] for row in rows))
+    order = list(protocol().variants)
+    return sorted(values, key=lambda v: order.index(v) if v in order else len(order)) if key == "variant" else values
 
 
 def over_seeds(rows: Sequence[Row], key: str, **fields: Any) -> Spread | None:

@@ -7,17 +7,23 @@ LABEL_TOOLS = [
     (
         "click",
         "Click",
-        "Click a part of the surface that looks alike, or with a model a thing: all of it belongs to the class",
+        "Click a small part of the surface that looks alike, or with a model a thing: all of it belongs to the class",
         "RESTRICT_SELECT_OFF",
         1,
     ),
+    ("part", "Part", "Click a whole part of the surface: all of it belongs to the class", "OUTLINER_OB_SURFACE", 4),
     ("erase", "Erase", "Draw over marks to take them away; also with Ctrl held", "X", 2),
     ("void", "Void", "Draw over what belongs to none of the classes", "GHOST_DISABLED", 3),
 ]
 LABEL_VIEWS = [
     ("labels", "Labels", "The colors of the classes over the photo"),
     ("confidence", "Confidence", "Hatched where the class is unsure, dark where there is none"),
+    ("parts", "Parts", "The outlines of the parts that the tool Part takes"),
     ("photo", "Photo", "The photo alone"),
+]
+PART_LEVELS = [
+    ("coarse", "Large", "Parts that end where color, direction or what the field learned change much"),
+    ("fine", "Small", "Parts that end at small changes, too"),
 ]
 
 
@@ -33,6 +39,7 @@ class LabelSettings:
         soft_max=200.0,
         subtype="PIXEL",
     )
+    label_level: EnumProperty(name="Parts", description="How large the parts are that are clicked", items=PART_LEVELS)
     label_view: EnumProperty(name="Show", description="What lies over the photo", items=LABEL_VIEWS)
     label_opacity: FloatProperty(
         name="Opacity",
@@ -54,11 +61,16 @@ class LabelSettings:
     label_encoder: StringProperty(
         name="Encoder",
         description="ONNX file of the encoder of a SAM, MobileSAM, SAM 2 or EfficientSAM, by which Click cuts things out; "
-        "empty: Click takes a part of the surface",
+        "empty: Click takes a small part of the surface",
         subtype="FILE_PATH",
     )
     label_decoder: StringProperty(
         name="Decoder", description="ONNX file of the decoder of the same model", subtype="FILE_PATH"
+    )
+    label_features: StringProperty(
+        name="Features",
+        description="ONNX file of a model such as DINOv2, whose features help to tell apart what looks alike; empty: none",
+        subtype="FILE_PATH",
     )
     label_revision: IntProperty(
         name="Revision", description="Which revision of the marks undo comes back to", default=-1, options={"HIDDEN"}

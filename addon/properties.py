@@ -63,6 +63,11 @@ EXPORTS = [
     ("onnx", "Field (.onnx)", "The trained field as a function of place and direction"),
     ("voxels", "Voxels (.npz)", "Density, color and class on a regular grid"),
     ("splats", "Gaussian Splats (.ply)", "The baked field as splats with classes; bake it first"),
+    (
+        "vdb",
+        "OpenVDB (.vdb)",
+        "The baked field as a volume with density, color and a grid for each class; bake it first",
+    ),
 ]
 SIDES = [
     ("top", "Plan", "From above"),

@@ -42,6 +42,7 @@ NAMED = {
     "new": {"photos"},
     "render": {"out"},
     "mesh": {"out"},
+    "turntable": {"out"},
     "plan": {"out"},
     "section": {"out"},
     "compare": {"out"},
@@ -51,6 +52,7 @@ NAMED = {
     "bench": {"out"},
     "export": {"out"},
     "label overlay": {"out"},
+    "label parts": {"out"},
 }
 # What verbs of two words have in common.
 GROUPS = {

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
 
-from .errors import InputError, disk_refusal
+from .errors import DiskError, InputError, disk_refusal
 
 WINDOWS = sys.platform == "win32"
 READERS_TAKE = 5.0  # seconds at most that a file which is to be replaced may stay open in another program
@@ -104,6 +104,34 @@ def atomic_path(path: Path) -> Iterator[Path]:
             replace(temporary, path)
         finally:
             temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def staged(folder: Path) -> Iterator[Path]:
+    """Yield an empty folder inside `folder`; when the block succeeds, the files that were written into it are moved to
+    `folder`, in the place of those of their names.
+
+    On any failure they are removed, and what stood in `folder` before is untouched.
+
+    Raises:
+        DiskError: the disk is full or the folder is not writable.
+    """
+    import shutil
+    import tempfile
+
+    folder = Path(folder)
+    with disk_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        place = Path(tempfile.mkdtemp(prefix=".new-", dir=folder))
+        try:
+            yield place
+            for path in sorted(place.iterdir()):
+                replace(path, folder / path.name)
+        except DiskError as error:  # the folder of a moment is of no use to the user
+            error.message = error.message.replace(str(place), str(folder))
+            raise
+        finally:
+            shutil.rmtree(place, ignore_errors=True)
 
 
 def replace(source: Path, target: Path) -> None:

@@ -26,6 +26,7 @@ class Reporter:
 
     def stage(self, name: str) -> None:
         """A named part of the work begins ("Matching features"); progress restarts at 0."""
+        self.check()
 
     def progress(self, fraction: float, message: str = "") -> None:
         """`fraction` in [0, 1] of the current stage is done."""
@@ -58,6 +59,10 @@ class Reporter:
     def check(self) -> None:
         if self._cancelled.is_set():
             raise Cancelled
+
+
+def go_on() -> None:
+    """For `check` of whatever asks between its steps whether to go on, where nothing says no."""
 
 
 def shortened(what: str, items: list[str], most: int = 6) -> str:

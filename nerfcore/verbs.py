@@ -35,8 +35,9 @@ VERBS = {
     "train": Verb(p.TrainParams, "train.verb:train", "Train the field."),
     "evaluate": Verb(p.EvaluateParams, "evaluate.verb:evaluate", "Measure the held-out images."),
     "bake": Verb(p.BakeParams, "bake.verb:bake", "Bake the field into voxels that render fast."),
-    "render": Verb(p.RenderParams, "render.verb:render", "Render images from the field."),
+    "render": Verb(p.RenderParams, "film.edits:render", "Render images from the field."),
     "mesh": Verb(p.MeshParams, "mesh.verb:mesh", "Extract the labelled surface."),
+    "turntable": Verb(p.TurntableParams, "mesh.turntable:turntable", "Picture the mesh from all around."),
     "measure": Verb(p.MeasureParams, "measure.verb:measure", "Measure areas, volumes and distances on the mesh."),
     "instances": Verb(
         p.InstancesParams, "things.edit:instances", "List, rename, join or split the things of the mesh."
@@ -55,6 +56,7 @@ VERBS = {
         p.LabelCheckoutParams, "labels.stroke:checkout", "Show another revision of the marks.", immediate=True
     ),
     "label overlay": Verb(p.LabelOverlayParams, "labels.overlay:overlay", "Draw the labels of a photo."),
+    "label parts": Verb(p.LabelPartsParams, "labels.part_picture:parts", "Tell the parts of the surface in a photo."),
     "label next": Verb(p.LabelNextParams, "labels.next_photo:next_photo", "Find the photo to mark next."),
     "label import": Verb(
         p.LabelImportParams, "labels.exchange:import_labels", "Read labels of another labelling tool."

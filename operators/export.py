@@ -5,12 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import bpy
 from bpy.types import Context
 
+from ..addon.jobs.job import Done, Job
 from ..addon.project import snapshot
 from ..addon.props import StringProperty
 from ..addon.text import t
-from .base import ProjectOperator, absolute, need_run, scene_settings
+from .base import ProjectOperator, absolute, need_run, refresh_scenes, scene_of, scene_settings
 
 OF_THE_MESH = {"glb", "obj", "ply", "stl", "usd"}
 
@@ -74,6 +76,25 @@ class FIELDWORK_OT_export(ProjectOperator):
             "split": self.value(context, "split"),
             "resolution": self.value(context, "resolution"),
         }
+
+    def after(self) -> Done:
+        name = bpy.context.scene.name
+        return lambda job: show_volume(job, name)
+
+
+def show_volume(job: Job, scene_name: str) -> None:
+    """Bring a volume that was written into the scene."""
+    refresh_scenes(job)
+    if job.state != "done" or not job.result or job.result.get("to") != "vdb" or job.project is None:
+        return
+    scene = scene_of(job.project, scene_name)
+    if scene is None:
+        return
+    from ..addon.scene import volume  # not at the top: enabling the extension must be quick
+
+    volume.show(scene, snapshot.owner(job.project), Path(job.result["files"][0]))
+    if not bpy.app.background:
+        bpy.ops.ed.undo_push(message="Add Volume")
 
 
 CLASSES = [FIELDWORK_OT_blend, FIELDWORK_OT_export]

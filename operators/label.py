@@ -45,6 +45,22 @@ def need_marks(context: Context) -> str | None:
     return need_run(context)
 
 
+def shown_photo(given: str, context: Context) -> str:
+    """The photo that was named, else the one in the image editor. Raises ValueError where there is none."""
+    photo = given or editor.shown_photo(snapshot.folder_of(context.scene.fieldwork))
+    if not photo:
+        raise ValueError(t("Show a photo in an image editor first."))
+    return photo
+
+
+def pairs(text: str) -> list[list[float]]:
+    """Places as numbers. Raises ValueError with a sentence for the user."""
+    try:
+        return [[float(x), float(y)] for x, y in (pair.split(",") for pair in text.split())]
+    except ValueError as error:
+        raise ValueError(t("“{}” are no places: write them as x,y x,y …", text)) from error
+
+
 class RunOperator(ProjectOperator):
     """A verb of labelling that works on a run, at a revision of the marks where it has one."""
 
@@ -54,7 +70,7 @@ class RunOperator(ProjectOperator):
         return {"project": self.project_path(context), "run": self.value(context, "run"), **own, **more}
 
 
-@scene_settings(run="run")
+@scene_settings(run="run", features="label_features")
 class FIELDWORK_OT_label_prepare(RunOperator):
     """Prepare the run for labelling: the first marks do so too"""
 
@@ -69,7 +85,8 @@ class FIELDWORK_OT_label_prepare(RunOperator):
     )  # fmt: skip
 
     def parameters(self, context: Context) -> dict[str, Any]:
-        return self.of_run(context, surfels=self.surfels if self.properties.is_property_set("surfels") else None)
+        surfels = self.surfels if self.properties.is_property_set("surfels") else None
+        return self.of_run(context, surfels=surfels, features=self.path(context, "features"))
 
 
 @scene_settings(run="run")
@@ -115,10 +132,7 @@ class FIELDWORK_OT_label_overlay(RunOperator):
     )
 
     def parameters(self, context: Context) -> dict[str, Any]:
-        photo = self.photo or editor.shown_photo(snapshot.folder_of(context.scene.fieldwork))
-        if not photo:
-            raise ValueError(t("Show a photo in an image editor first."))
-        return self.of_run(context, photo=photo, kind=self.kind, out=absolute(self.out))
+        return self.of_run(context, photo=shown_photo(self.photo, context), kind=self.kind, out=absolute(self.out))
 
     def after(self) -> Done:
         return show_overlay
@@ -128,6 +142,34 @@ def show_overlay(job: Job) -> None:
     """Tell where the picture is; the editor in which photos are marked stays as it is."""
     if job.state == "done" and job.result:
         job.warnings.append(t("The picture is at {}.", job.result["file"]))
+
+
+@scene_settings(run="run", level="label_level")
+class FIELDWORK_OT_label_parts(RunOperator):
+    """Write a picture of the parts of the surface in the photo that is shown"""
+
+    bl_idname = "fieldwork.label_parts"
+    bl_label = "Write Picture of Parts"
+    verb = "label parts"
+    needs = (need_run,)
+
+    photo: StringProperty(
+        name="Photo", description="Name of the photo; empty: the one in the image editor", options={"SKIP_SAVE"}
+    )
+    points: StringProperty(name="Places", description="Pixels whose parts are told: x,y x,y …", options={"SKIP_SAVE"})
+    out: StringProperty(
+        name="File", description="PNG to write; empty: in the run", subtype="FILE_PATH", options={"SKIP_SAVE"}
+    )
+
+    def parameters(self, context: Context) -> dict[str, Any]:
+        photo = shown_photo(self.photo, context)
+        folder, run = self.project_path(context), self.value(context, "run")
+        out = absolute(self.out) or str(Path(folder) / "runs" / run / "overlays" / f"{photo}_parts.png")
+        more = {"points": pairs(self.points), "level": self.value(context, "level")}
+        return self.of_run(context, photo=photo, out=out, **more)
+
+    def after(self) -> Done:
+        return show_overlay
 
 
 @scene_settings(run="run")
@@ -322,6 +364,7 @@ CLASSES = [
     FIELDWORK_OT_label_prepare,
     FIELDWORK_OT_label_propagate,
     FIELDWORK_OT_label_overlay,
+    FIELDWORK_OT_label_parts,
     FIELDWORK_OT_label_next,
     FIELDWORK_OT_label_accept,
     FIELDWORK_OT_label_carry,

@@ -9,11 +9,11 @@ import bpy
 from bpy.types import Context, Event
 
 from ..addon.jobs.job import Done, Job
-from ..addon.labels import editor, session
-from ..addon.project import snapshot
+from ..addon.labels import session
 from ..addon.props import BoolProperty, FloatProperty, FloatVectorProperty, IntProperty, StringProperty
 from ..addon.text import t
 from .base import ProjectOperator, absolute, need_poses, refresh_scenes, scene_settings
+from .label import pairs, shown_photo
 
 
 def need_models(context: Context) -> str | None:
@@ -69,9 +69,7 @@ class FIELDWORK_OT_assist_segment(ProjectOperator):
 
     def parameters(self, context: Context) -> dict[str, Any]:
         settings = context.scene.fieldwork
-        photo = self.photo or editor.shown_photo(snapshot.folder_of(settings))
-        if not photo:
-            raise ValueError(t("Show a photo in an image editor first."))
+        photo = shown_photo(self.photo, context)
         class_id = None if self.void else self.class_id
         if class_id == -1:
             if not 0 <= settings.class_index < len(settings.classes):
@@ -93,14 +91,6 @@ class FIELDWORK_OT_assist_segment(ProjectOperator):
 
     def after(self) -> Done:
         return marked
-
-
-def pairs(text: str) -> list[list[float]]:
-    """Places as numbers. Raises ValueError with a sentence for the user."""
-    try:
-        return [[float(x), float(y)] for x, y in (pair.split(",") for pair in text.split())]
-    except ValueError as error:
-        raise ValueError(t("“{}” are no places: write them as x,y x,y …", text)) from error
 
 
 def marked(job: Job) -> None:

@@ -5,14 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 import bpy
-from bpy.types import Context, Event, Operator, UILayout, WorkSpaceTool
+from bpy.types import Context, Event, Operator, WorkSpaceTool
 from mathutils import Vector
 
 from ..addon.labels import draw, session, surface
 from ..addon.project import snapshot
 from ..addon.text import t
 from .base import engine_reason, need_run
-from .label_tool import KEYS, mark_parameters
+from .label_tool import LabelTool, keymap, mark_parameters
 
 LEAST_STEP = 3.0  # pixels of the screen between two places of a stroke
 
@@ -92,25 +92,12 @@ def deliver(scene: bpy.types.Scene, params: dict[str, Any], places: list[Vector]
     session.mark(folder, {**params, **surface.parameters(scene, snapshot.owner(folder), places, max(width, 1e-6))})
 
 
-class FIELDWORK_TOOL_label_surface(WorkSpaceTool):
+class FIELDWORK_TOOL_label_surface(LabelTool, WorkSpaceTool):
     bl_space_type = "VIEW_3D"
     bl_context_mode = "OBJECT"
     bl_idname = "fieldwork.label_surface"
-    bl_label = "Label"
     bl_description = "Mark what belongs to a class on the surface of a capture"
-    bl_icon = "brush.generic"
-    bl_cursor = "CROSSHAIR"
-    bl_keymap = (
-        ("fieldwork.label_surface", {"type": "LEFTMOUSE", "value": "PRESS"}, None),
-        ("fieldwork.label_surface", {"type": "LEFTMOUSE", "value": "PRESS", "ctrl": True}, None),
-        *KEYS,
-    )
-
-    @staticmethod
-    def draw_settings(context: Context, layout: UILayout, tool: Any) -> None:
-        settings = context.scene.fieldwork
-        layout.prop(settings, "label_tool", text="")
-        layout.prop(settings, "label_width")
+    bl_keymap = keymap("fieldwork.label_surface")
 
 
 CLASSES = [FIELDWORK_OT_label_surface]

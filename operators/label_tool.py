@@ -108,31 +108,45 @@ def mark_parameters(settings: Any, erase: bool = False) -> dict[str, Any] | None
         return {**params, "void": True}
     if not 0 <= settings.class_index < len(settings.classes):
         return None
-    shape = {"shape": "part", "width": 2.0} if tool == "click" else {}
-    if shape and settings.label_encoder and settings.label_decoder:
+    shape = {"shape": "part", "width": 2.0} if tool in ("click", "part") else {}
+    if tool == "part":
+        shape["level"] = settings.label_level
+    elif shape and settings.label_encoder and settings.label_decoder:
         shape = {"shape": "outline", "width": 2.0, "box": True}  # a model cuts out what is clicked or boxed
     return {**params, **shape, "class_id": settings.classes[settings.class_index].id}
 
 
-class FIELDWORK_TOOL_label(WorkSpaceTool):
-    bl_space_type = "IMAGE_EDITOR"
-    bl_context_mode = "VIEW"
-    bl_idname = editor.TOOL
+class LabelTool:
+    """What the tools of all editors share."""
+
     bl_label = "Label"
-    bl_description = "Mark what belongs to a class on the photos of a capture"
     bl_icon = "brush.generic"
     bl_cursor = "CROSSHAIR"
-    bl_keymap = (
-        ("fieldwork.label_mark", {"type": "LEFTMOUSE", "value": "PRESS"}, None),
-        ("fieldwork.label_mark", {"type": "LEFTMOUSE", "value": "PRESS", "ctrl": True}, None),
-        *KEYS,
-    )
 
     @staticmethod
     def draw_settings(context: Context, layout: UILayout, tool: Any) -> None:
         settings = context.scene.fieldwork
         layout.prop(settings, "label_tool", text="")
-        layout.prop(settings, "label_width")
+        layout.prop(settings, "label_level" if settings.label_tool == "part" else "label_width")
+
+
+def keymap(operator: str) -> tuple[Any, ...]:
+    """The keys of a tool whose strokes an operator takes: with Ctrl they erase."""
+    press = {"type": "LEFTMOUSE", "value": "PRESS"}
+    return ((operator, press, None), (operator, {**press, "ctrl": True}, None), *KEYS)
+
+
+class FIELDWORK_TOOL_label(LabelTool, WorkSpaceTool):
+    bl_space_type = "IMAGE_EDITOR"
+    bl_context_mode = "VIEW"
+    bl_idname = editor.TOOL
+    bl_description = "Mark what belongs to a class on the photos of a capture"
+    bl_keymap = keymap("fieldwork.label_mark")
+
+    @staticmethod
+    def draw_settings(context: Context, layout: UILayout, tool: Any) -> None:
+        LabelTool.draw_settings(context, layout, tool)
+        settings = context.scene.fieldwork
         layout.prop(settings, "label_view", text="")
         layout.prop(settings, "label_opacity")
 
@@ -142,7 +156,7 @@ class FIELDWORK_TOOL_label(WorkSpaceTool):
         space = context.space_data
         photo = editor.photo_of(getattr(space, "image", None), snapshot.folder_of(context.scene.fieldwork))
         settings = context.scene.fieldwork
-        if photo is None or context.region is None or settings.label_tool == "click":
+        if photo is None or context.region is None or settings.label_tool in ("click", "part"):
             return
         from gpu_extras.presets import draw_circle_2d
 

@@ -1,17 +1,18 @@
-"""Fields in the scene: adding one, cropping it, its classes, and the compositor that puts it among objects."""
+"""Fields in the scene: adding one, cropping it, its classes and things, and the compositor that puts it among objects."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import bpy
 from bpy.types import Context, Operator
 
 from ..addon.errors import SceneError
-from ..addon.live import compositor, fields
+from ..addon.live import compositor, fields, things
 from ..addon.live.training import trainings
 from ..addon.project import snapshot
-from ..addon.props import IntProperty
+from ..addon.props import BoolProperty, IntProperty, StringProperty
 from ..addon.scene.frame import root_of, scene_from_capture
 from ..addon.text import t
 from .base import need_run
@@ -79,7 +80,7 @@ class FIELDWORK_OT_add_field(Operator):
             obj.matrix_world = scene_from_capture(scene, owner)
         own = obj.fieldwork
         own.is_field, own.project, own.run = True, settings.project, settings.run
-        fields.fill_classes(obj)
+        fields.refresh(obj)
         for other in context.selected_objects:
             other.select_set(False)
         obj.select_set(True)
@@ -126,13 +127,71 @@ class FIELDWORK_OT_isolate_class(_OfField):
 
 
 class FIELDWORK_OT_refresh_field_classes(_OfField):
-    """Read the classes of the field from its project anew; what is set for them stays"""
+    """Read the classes and things of the field from its project anew; what is set for them stays"""
 
     bl_idname = "fieldwork.refresh_field_classes"
-    bl_label = "Refresh Classes"
+    bl_label = "Refresh Classes and Things"
 
     def execute(self, context: Context) -> set[str]:
-        fields.fill_classes(active_field(context))
+        fields.refresh(active_field(context))
+        return {"FINISHED"}
+
+
+class FIELDWORK_OT_place_thing(_OfField):
+    """Add an object where the thing stands: renders show the thing where this object is moved, turned and scaled to"""
+
+    bl_idname = "fieldwork.place_thing"
+    bl_label = "Move Thing"
+
+    thing: StringProperty(
+        name="Thing", description="Name of the thing; empty: the one chosen in the list", options={"SKIP_SAVE"}
+    )
+    copy: BoolProperty(
+        name="Copy", description="The thing also stays where it stands", default=False, options={"SKIP_SAVE"}
+    )
+
+    def execute(self, context: Context) -> set[str]:
+        obj = active_field(context)
+        own = obj.fieldwork
+        entry = own.things.get(self.thing) if self.thing else None
+        if not self.thing and 0 <= own.thing_index < len(own.things):
+            entry = own.things[own.thing_index]
+        if entry is None:
+            self.report({"ERROR"}, t("The field has no such thing: extract the mesh, then refresh the list."))
+            return {"CANCELLED"}
+        placed = things.add_copy(obj, entry, t("Copy of {}", entry.name) if self.copy else entry.name)
+        entry.visible = entry.visible and self.copy
+        for other in context.selected_objects:
+            other.select_set(False)
+        placed.select_set(True)
+        return {"FINISHED"}
+
+
+class FIELDWORK_OT_save_field_edits(_OfField):
+    """Write what is edited about the field into a file, for renders on the command line"""
+
+    bl_idname = "fieldwork.save_field_edits"
+    bl_label = "Save Field Edits…"
+    bl_options = {"REGISTER"}
+
+    filepath: StringProperty(name="File", description="File to write", subtype="FILE_PATH", options={"SKIP_SAVE"})
+    filter_glob: StringProperty(default="*.json", options={"HIDDEN"})
+
+    def invoke(self, context: Context, event: bpy.types.Event) -> set[str]:
+        self.filepath = self.filepath or "edits.json"
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def execute(self, context: Context) -> set[str]:
+        from ..nerfcore.errors import FieldworkError  # not at the top: enabling the extension must be quick
+        from ..nerfcore.files import write_json
+
+        found = things.edits(active_field(context), context.view_layer.objects)
+        try:
+            write_json(Path(bpy.path.abspath(self.filepath)), {"version": 1, "edits": found})
+        except FieldworkError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
         return {"FINISHED"}
 
 
@@ -158,5 +217,7 @@ CLASSES = [
     FIELDWORK_OT_add_crop_box,
     FIELDWORK_OT_isolate_class,
     FIELDWORK_OT_refresh_field_classes,
+    FIELDWORK_OT_place_thing,
+    FIELDWORK_OT_save_field_edits,
     FIELDWORK_OT_setup_compositor,
 ]

@@ -47,6 +47,26 @@ class FIELDWORK_OT_measure(ProjectOperator):
         }
 
 
+@scene_settings(run="run", out="turntable")
+class FIELDWORK_OT_turntable(ProjectOperator):
+    """Picture the mesh from eight sides, in its colors and in those of its classes"""
+
+    bl_idname = "fieldwork.turntable"
+    bl_label = "Look from All Sides"
+    verb = "turntable"
+    needs = (need_mesh,)
+
+    def parameters(self, context: Context) -> dict[str, Any]:
+        return {
+            "project": self.project_path(context),
+            "run": self.value(context, "run"),
+            "out": self.path(context, "out"),
+        }
+
+    def after(self) -> Done:
+        return show_drawing
+
+
 @scene_settings(run="run", views="sides", turn="turn", scale="paper_scale", out="drawings")
 class FIELDWORK_OT_plan(ProjectOperator):
     """Draw plans and elevations of the mesh to scale, in its colors and as maps of its classes"""
@@ -160,4 +180,11 @@ def show_drawing(job: Job) -> None:
         show_image(first)
 
 
-CLASSES = [FIELDWORK_OT_measure, FIELDWORK_OT_plan, FIELDWORK_OT_section, FIELDWORK_OT_compare, FIELDWORK_OT_report]
+CLASSES = [
+    FIELDWORK_OT_turntable,
+    FIELDWORK_OT_measure,
+    FIELDWORK_OT_plan,
+    FIELDWORK_OT_section,
+    FIELDWORK_OT_compare,
+    FIELDWORK_OT_report,
+]

@@ -113,6 +113,10 @@ class FIELDWORK_OT_render(ProjectOperator):
         name="Baked", description="Render the baked field: faster, but not quite the same", default=False,
         options={"SKIP_SAVE"},
     )  # fmt: skip
+    edits: StringProperty(
+        name="Edits", description="File of classes and things that are edited, with Baked; empty: none",
+        subtype="FILE_PATH", options={"SKIP_SAVE"},
+    )  # fmt: skip
     frame_range: IntVectorProperty(
         name="Frames", description="First and last frame of a part, counted from 0; -1: all", size=2, default=(-1, -1),
         min=-1, options={"SKIP_SAVE"},
@@ -141,6 +145,7 @@ class FIELDWORK_OT_render(ProjectOperator):
             "passes": [name for name, *_ in PASSES if name in passes],
             "size": list(size) if all(size) else None,
             "baked": self.baked,
+            "edits": absolute(self.edits) if self.edits else None,
             "frame_range": list(self.frame_range) if min(self.frame_range) >= 0 else None,
         }
         if self.camera:

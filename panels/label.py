@@ -106,6 +106,10 @@ def draw_label(layout: UILayout, context: Context) -> None:
         column.prop(settings, "common_points")
         layout.operator("fieldwork.label_carry", icon="TRACKING_FORWARDS").confirm = False
     column = columns(layout)
+    column.prop(settings, "label_features")
+    if settings.label_features:
+        layout.operator("fieldwork.label_prepare", icon="IMAGE_DATA")
+        column = columns(layout)
     column.prop(settings, "label_author")
     column.prop(settings, "label_seconds")
     row = layout.row(align=True)
@@ -122,6 +126,8 @@ def draw_tools(layout: UILayout, settings: Any) -> None:
         if settings.label_encoder and settings.label_decoder:
             layout.operator("fieldwork.assist_embed", icon="IMAGE_DATA")
         column = columns(layout)
+    elif settings.label_tool == "part":
+        column.prop(settings, "label_level")
     else:
         column.prop(settings, "label_width")
     column.prop(settings, "label_view")

@@ -30,6 +30,19 @@ class FIELDWORK_UL_field_classes(UIList):
         row.prop(item, "visible", text="", icon="HIDE_OFF" if item.visible else "HIDE_ON", emboss=False)
 
 
+class FIELDWORK_UL_field_things(UIList):
+    """Name and visibility of each thing of a field."""
+
+    def draw_item(self, context, layout, data, item, icon, active_data, active_property, index=0, flt_flag=0):
+        row = layout.row(align=True)
+        if item.tint > 0:
+            color = row.row()
+            color.ui_units_x = 1.2
+            color.prop(item, "color", text="")
+        row.label(text=item.name, translate=False)
+        row.prop(item, "visible", text="", icon="HIDE_OFF" if item.visible else "HIDE_ON", emboss=False)
+
+
 class FIELDWORK_PT_live(StepPanel):
     bl_label = "Live View"
     state = staticmethod(states.live)
@@ -62,10 +75,30 @@ def draw_field(layout: UILayout, context: Context, obj) -> None:
             column = columns(layout)
             column.prop(own.classes[own.class_index], "tint")
             column.prop(own.classes[own.class_index], "opacity")
+    if own.things:
+        draw_things(layout, own)
+    if own.classes:
         layout.operator("fieldwork.refresh_field_classes", icon="FILE_REFRESH")
     row = layout.row(align=True)
     row.prop(own, "crop")
     row.operator("fieldwork.add_crop_box", text="", icon="ADD")
+
+
+def draw_things(layout: UILayout, own) -> None:
+    """The things of a field, and how renders show the chosen one."""
+    box = layout.box()
+    box.label(text=t("Things, in Renders of the Baked Field"))
+    box.template_list("FIELDWORK_UL_field_things", "", own, "things", own, "thing_index", rows=3)
+    if 0 <= own.thing_index < len(own.things):
+        entry = own.things[own.thing_index]
+        column = columns(box)
+        column.prop(entry, "tint")
+        column.prop(entry, "color")
+        column.prop(entry, "opacity")
+        row = box.row(align=True)
+        row.operator("fieldwork.place_thing", icon="EMPTY_ARROWS")
+        row.operator("fieldwork.place_thing", text=t("Copy Thing"), icon="DUPLICATE").copy = True
+    box.operator("fieldwork.save_field_edits", icon="EXPORT")
 
 
 def why_not_drawn(context: Context, own) -> list[str]:
@@ -145,6 +178,7 @@ class FIELDWORK_PT_engine_passes(_RenderProperties):
 
 CLASSES = [
     FIELDWORK_UL_field_classes,
+    FIELDWORK_UL_field_things,
     FIELDWORK_PT_live,
     FIELDWORK_PT_engine_settings,
     FIELDWORK_PT_engine_motion_blur,

@@ -31,6 +31,7 @@ class FIELDWORK_MT_steps(Menu):
         layout.operator("fieldwork.label_propagate")
         layout.operator("fieldwork.label_next")
         layout.operator("fieldwork.label_overlay")
+        layout.operator("fieldwork.label_parts")
         layout.operator("fieldwork.label_carry").confirm = False
         layout.operator("fieldwork.label_carry", text=t("Confirm Carried Labels")).confirm = True
         layout.operator("fieldwork.label_accept")
@@ -46,6 +47,7 @@ class FIELDWORK_MT_steps(Menu):
         layout.operator("fieldwork.add_crop_box")
         layout.operator("fieldwork.setup_compositor")
         layout.operator("fieldwork.mesh")
+        layout.operator("fieldwork.turntable")
         layout.operator("fieldwork.measure")
         layout.operator("fieldwork.relations")
         layout.operator("fieldwork.instances")

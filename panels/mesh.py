@@ -40,6 +40,8 @@ class FIELDWORK_PT_mesh(StepPanel):
             column.prop(settings, "split")
         column.prop(settings, "turntable")
         layout.operator("fieldwork.mesh", icon="MESH_DATA")
+        if result:
+            layout.operator("fieldwork.turntable", icon="RENDERLAYERS")
         row = layout.row(align=True)
         row.operator("fieldwork.import_scene", icon="SCENE_DATA")
         row.operator("fieldwork.pick_surface", icon="EYEDROPPER")

@@ -28,6 +28,7 @@ TITLES = {
     "bake": "Baking",
     "render": "Rendering",
     "mesh": "Extracting Mesh",
+    "turntable": "Looking at the Mesh",
     "measure": "Measuring the Mesh",
     "plan": "Drawing",
     "section": "Drawing a Section",

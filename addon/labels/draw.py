@@ -57,6 +57,10 @@ def _draw() -> None:
         texture = _overlay(folder, settings, str(photo["name"]), colors)
         if texture is not None:
             _draw_texture(texture, region, settings.label_opacity)
+    if settings.label_view == "parts":
+        texture = _outlines(folder, settings, str(photo["name"]))
+        if texture is not None:
+            _draw_texture(texture, region, 1.0)
     if settings.label_strokes:
         marks = [*journal.marks_at(folder, pending.shown(folder)), *pending.marks_of(folder)]
         for mark in marks:
@@ -82,13 +86,30 @@ def _overlay(folder: Path, settings: Any, photo: str, colors: dict[int, tuple[fl
         # A preparation that was made anew meanwhile has other surfels.
         if surfels is None or surfels.max(initial=-1) >= len(found.probability):
             return None
-        while len(_textures) >= KEPT:
-            del _textures[next(iter(_textures))]
         picture = results.overlay(found, surfels, colors, results.void_of(folder), confidence)
         if takes_linear():
             picture[..., :3] = results.linear(picture[..., :3])
-        _textures[key] = texture_of(picture)
+        _keep(key, texture_of(picture))
     return _textures[key]
+
+
+def _outlines(folder: Path, settings: Any, photo: str) -> Any:
+    """The texture of the outlines of the parts that a photo shows; None where the run was not prepared."""
+    from . import results
+
+    key = (folder, settings.run, photo, settings.label_level, results.prepared_at(folder, settings.run))
+    if key not in _textures:
+        picture = results.part_outlines(folder, settings.run, photo, settings.label_level)
+        if picture is None:
+            return None
+        _keep(key, texture_of(picture))
+    return _textures[key]
+
+
+def _keep(key: tuple[Any, ...], texture: Any) -> None:
+    while len(_textures) >= KEPT:
+        del _textures[next(iter(_textures))]
+    _textures[key] = texture
 
 
 def takes_linear() -> bool:

@@ -8,7 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from ...nerfcore.labels.lookup import RECORD, REVISIONS, SURFELS, Labelling, read_labelling, surfel_map
+from ...nerfcore.labels.lookup import (
+    RECORD,
+    REVISIONS,
+    SURFELS,
+    Labelling,
+    outlines,
+    part_map,
+    read_labelling,
+    surfel_map,
+)
 from ..project import snapshot
 from . import journal
 
@@ -73,16 +82,32 @@ def labelling(folder: Path, run: str, revision: int | None) -> Labelling | None:
 
 def photo_map(folder: Path, run: str, photo: str) -> np.ndarray | None:
     """Surfel (H, W) of each pixel of a photo's map, −1 for none; None where the run was not prepared or has no such photo."""
-    surfels = run_of(folder, run) / SURFELS
-    try:
-        stat = (surfels / RECORD).stat()
-    except OSError:
+    surfels, changed = run_of(folder, run) / SURFELS, prepared_at(folder, run)
+    if changed is None:
         return None
-    changed = (stat.st_mtime_ns, stat.st_size)
     key = (surfels, photo)
     if key not in _maps or _maps[key][0] != changed:
         _remember(_maps, key, (changed, surfel_map(surfels, photo)))
     return _maps[key][1]
+
+
+def prepared_at(folder: Path, run: str) -> tuple[int, int] | None:
+    """What changes whenever a run is prepared anew; None where it was not."""
+    try:
+        stat = (run_of(folder, run) / SURFELS / RECORD).stat()
+    except OSError:
+        return None
+    return stat.st_mtime_ns, stat.st_size
+
+
+def part_outlines(folder: Path, run: str, photo: str, level: str) -> np.ndarray | None:
+    """White outlines of the parts that a photo shows as RGBA (H, W, 4) float32, rows from the bottom; clear elsewhere. None
+    where the run was not prepared."""
+    surfels = photo_map(folder, run, photo)
+    parts = None if surfels is None else part_map(run_of(folder, run) / SURFELS, surfels, level)
+    if parts is None:
+        return None
+    return np.ascontiguousarray(np.repeat(outlines(parts)[::-1, :, None], 4, 2).astype(np.float32))
 
 
 def _remember(cache: dict[Any, Any], key: Any, value: Any) -> None:

@@ -14,7 +14,7 @@ from ..jobs import gate, redraw
 from ..jobs.job import Job
 from ..jobs.queue import queue
 from ..project import snapshot
-from . import journal, pending
+from . import ahead, journal, pending
 
 BUSY_PERIOD = 0.05  # seconds between two looks while the engine has something of ours
 IDLE_PERIOD = 0.5
@@ -67,6 +67,7 @@ def work() -> None:
     _land()
     if not bpy.app.background:
         _propagate(bpy.context.scene)
+        ahead.encode(bpy.context.scene)
 
 
 def retry() -> None:
@@ -158,5 +159,6 @@ def unregister() -> None:
     # What the engine has been told before its input ends it does.
     pending.send(queue.ask, at_once=True)
     pending.clear()
+    ahead.clear()
     _live.clear()
     _tried.clear()

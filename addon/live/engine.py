@@ -180,10 +180,10 @@ class FieldworkRenderEngine(bpy.types.RenderEngine):
         now = scene.frame_current + scene.frame_subframe
         times = camera.shutter_times(render, now)
 
-        known = fields.rendered_objects(depsgraph)
+        known = fields.rendered_parts(depsgraph)
 
         def poses() -> tuple[Any, ...]:
-            placed = [fields.poses_of(obj.evaluated_get(depsgraph), depsgraph) for obj in known]
+            placed = [fields.poses_of(part.field.evaluated_get(depsgraph), depsgraph, part.copy) for part in known]
             return camera.pose(eye()), placed
 
         seen, placed = zip(*camera.in_time(poses, times, self.frame_set, now))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import bpy
 from mathutils import Matrix
@@ -13,6 +13,7 @@ from ..errors import SceneError
 from ..project import snapshot
 from ..scene.frame import scene_from_capture
 from ..text import t
+from . import things
 
 
 def field_objects(objects: Iterable[bpy.types.Object]) -> list[bpy.types.Object]:
@@ -20,19 +21,31 @@ def field_objects(objects: Iterable[bpy.types.Object]) -> list[bpy.types.Object]
     return [obj for obj in objects if obj.type == "EMPTY" and obj.fieldwork.is_field]
 
 
-def rendered_objects(depsgraph: bpy.types.Depsgraph) -> list[bpy.types.Object]:
-    """Those that a render shows."""
-    return [obj for obj in field_objects(depsgraph.view_layer.objects) if not obj.hide_render]
+class Part(NamedTuple):
+    """What a render shows: a field, or a copy of a thing of it."""
+
+    field: bpy.types.Object
+    copy: bpy.types.Object | None
+
+
+def rendered_parts(depsgraph: bpy.types.Depsgraph) -> list[Part]:
+    """The fields that a render shows, each with the copies of its things; copies of a field that is hidden are shown."""
+    found, objects = [], list(depsgraph.view_layer.objects)
+    for field in field_objects(objects):
+        placed = [None] if not field.hide_render else []
+        placed += [copy for copy in things.copies(field, objects) if not copy.hide_render]
+        found += [Part(field, copy) for copy in placed]
+    return found
 
 
 def rendered_items(depsgraph: bpy.types.Depsgraph) -> list[dict[str, Any]]:
     """What a render shows, as nerfcore/film/shot.py describes fields.
 
-    Raises SceneError: there is no field to show.
+    Raises SceneError: there is no field to show, or things are edited of one that is not baked.
     """
     scene = depsgraph.scene_eval
     baked = scene.fieldwork_live.source == "baked"
-    items = [item_of(obj.evaluated_get(depsgraph), baked, depsgraph) for obj in rendered_objects(depsgraph)]
+    items = [_rendered_item(part, baked, depsgraph) for part in rendered_parts(depsgraph)]
     if not field_objects(depsgraph.view_layer.objects):
         items = [project_item(scene, baked)]
     if not items:
@@ -40,12 +53,27 @@ def rendered_items(depsgraph: bpy.types.Depsgraph) -> list[dict[str, Any]]:
     return items
 
 
+def _rendered_item(part: Part, baked: bool, depsgraph: bpy.types.Depsgraph) -> dict[str, Any]:
+    field = part.field.evaluated_get(depsgraph)
+    thing = part.copy.fieldwork_copy.thing if part.copy is not None else ""
+    looks = things.look_of_copies(field, thing) if thing else things.looks(field)
+    if (thing or looks) and not baked:
+        raise SceneError(
+            t("Things of “{}” are edited, which only the baked field can show: choose Baked Field.", field.name)
+        )
+    item = {**item_of(field, baked, depsgraph), "instances": looks, "only": thing}
+    if part.copy is not None:
+        item.pop("crop", None)
+        item |= poses_of(field, depsgraph, part.copy)
+    return item
+
+
 def item_of(obj: bpy.types.Object, baked: bool, depsgraph: bpy.types.Depsgraph | None = None) -> dict[str, Any]:
-    """A field object as it is, or in a depsgraph. Raises SceneError: it has no project."""
+    """A field object as it is, or in a depsgraph, with all its things as they are. Raises SceneError: it has no project."""
     own = obj.fieldwork
     if not own.project:
         raise SceneError(t("The field “{}” has no project folder.", obj.name))
-    item: dict[str, Any] = {
+    return {
         "name": obj.name,
         "project": absolute(own.project),
         "run": own.run,
@@ -56,11 +84,15 @@ def item_of(obj: bpy.types.Object, baked: bool, depsgraph: bpy.types.Depsgraph |
             entry.id: {"opacity": entry.shown, "tint": entry.tint, "color": tuple(entry.color)} for entry in own.classes
         },
     }
-    return item
 
 
-def poses_of(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None) -> dict[str, Any]:
-    """Where a field object is, and its crop box if it has one."""
+def poses_of(
+    obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph | None, copy: bpy.types.Object | None = None
+) -> dict[str, Any]:
+    """Where a field object is, and its crop box if it has one; where a copy of a thing of it is, which is not cropped."""
+    if copy is not None:
+        placed = copy.evaluated_get(depsgraph) if depsgraph is not None else copy
+        return {"scene_from_capture": rows(things.scene_from_capture(placed))}
     found, crop = {"scene_from_capture": rows(obj.matrix_world)}, obj.fieldwork.crop
     if crop is not None:
         found["crop"] = rows(crop_matrix(crop.evaluated_get(depsgraph) if depsgraph is not None else crop))
@@ -97,6 +129,12 @@ def absolute(path: str) -> str:
 def rows(matrix: Matrix) -> list[list[float]]:
     """A matrix as lists."""
     return [list(row) for row in matrix]
+
+
+def refresh(obj: bpy.types.Object) -> None:
+    """Read classes and things of a field object anew; what the user set for them stays."""
+    fill_classes(obj)
+    things.fill(obj, Path(absolute(obj.fieldwork.project)))
 
 
 def fill_classes(obj: bpy.types.Object) -> None:

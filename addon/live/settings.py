@@ -57,6 +57,48 @@ class FieldworkFieldClass(PropertyGroup):
         return self.opacity if self.visible else 0.0
 
 
+class FieldworkFieldThing(PropertyGroup):
+    """How renders show one thing of a field. `name` is that of the instance of the mesh."""
+
+    center: FloatVectorProperty(subtype="XYZ")  # in the capture's own frame
+    color: FloatVectorProperty(
+        name="Color", description="Color that the thing is tinted with", subtype="COLOR_GAMMA", min=0.0, max=1.0,
+        default=(1.0, 1.0, 1.0),
+    )  # fmt: skip
+    visible: BoolProperty(
+        name="Visible",
+        description="Render the thing where it stands; its copies are objects of their own",
+        default=True,
+    )
+    opacity: FloatProperty(
+        name="Opacity", description="How much of the thing and of its copies is seen in renders", default=1.0, min=0.0,
+        max=1.0, subtype="FACTOR",
+    )  # fmt: skip
+    tint: FloatProperty(
+        name="Tint", description="How much of its color the thing and its copies get in renders", default=0.0, min=0.0,
+        max=1.0, subtype="FACTOR",
+    )  # fmt: skip
+
+    @property
+    def look(self) -> dict[str, object]:
+        """How it and its copies look, as nerfcore/film/shot.py has it."""
+        return {"opacity": self.opacity, "tint": self.tint, "color": tuple(self.color)}
+
+    @property
+    def edited(self) -> bool:
+        """Whether it is shown other than it is."""
+        return not self.visible or self.opacity < 1 or self.tint > 0
+
+
+class FieldworkThingCopy(PropertyGroup):
+    """What an object says of a thing that renders show where it stands: the field, the thing's name, and the place of the
+    thing in the capture's own frame that lies on the object's origin."""
+
+    field: PointerProperty(type=bpy.types.Object)
+    thing: StringProperty()
+    center: FloatVectorProperty(subtype="XYZ")
+
+
 def _is_crop_box(self: PropertyGroup, obj: bpy.types.Object) -> bool:
     return obj.type == "EMPTY"
 
@@ -79,6 +121,8 @@ class FieldworkField(PropertyGroup):
     )  # fmt: skip
     classes: CollectionProperty(type=FieldworkFieldClass)
     class_index: IntProperty(name="Class", description="Selected class")
+    things: CollectionProperty(type=FieldworkFieldThing)
+    thing_index: IntProperty(name="Thing", description="Selected thing")
 
 
 class FieldworkLayer(PropertyGroup):
@@ -134,16 +178,18 @@ def look_name(look: float) -> str:
     return t("Photo") if look < 0.5 else t("Labels") if look < 1.5 else t("Confidence")
 
 
-CLASSES = [FieldworkFieldClass, FieldworkField, FieldworkLayer, FieldworkLive]
+CLASSES = [FieldworkFieldClass, FieldworkFieldThing, FieldworkThingCopy, FieldworkField, FieldworkLayer, FieldworkLive]
 
 
 def register() -> None:
     bpy.types.Object.fieldwork = PointerProperty(type=FieldworkField)
+    bpy.types.Object.fieldwork_copy = PointerProperty(type=FieldworkThingCopy)
     bpy.types.ViewLayer.fieldwork = PointerProperty(type=FieldworkLayer)
     bpy.types.Scene.fieldwork_live = PointerProperty(type=FieldworkLive)
 
 
 def unregister() -> None:
     del bpy.types.Object.fieldwork
+    del bpy.types.Object.fieldwork_copy
     del bpy.types.ViewLayer.fieldwork
     del bpy.types.Scene.fieldwork_live

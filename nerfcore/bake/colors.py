@@ -47,7 +47,7 @@ def vertex_texels(
         geometry = model.field.geometry(there)
         texels[rows, :, :3] = _colors(model, geometry, there, codes, centers)
         if model.field.classes:
-            texels[rows, 1:, 3] = _classes(torch.softmax(model.field.logits(geometry), 1))
+            texels[rows, 1:, 3] = _classes(model.field.class_probabilities(geometry))
 
     run_parallel([partial(read, rows) for rows in used.split(CHUNK)], device)
     return texels

@@ -14,6 +14,7 @@ import numpy as np
 
 from ..data.load import load_scene
 from ..errors import InputError
+from ..geometry.similarity import transform_points
 from ..mesh.build import build
 from ..mesh.painted import training_photos
 from ..mesh.parts import texture_of
@@ -27,6 +28,7 @@ from ..project.store import load_project
 from ..render.run import load_trained, refined_poses
 from .jobs import Job
 from .machine import peak_memory
+from .surface_exposure import exposure_cost
 from .surface_figures import Truth, surface_figures
 
 FACES, TEXTURE = 200_000, 4096
@@ -114,6 +116,14 @@ def measure(job: Job, project: Path, report: Reporter, root: Path) -> dict[str, 
     pictures = root / "surface" / "pictures" / job.name
     assert painted.uv is not None
     assert painted.image is not None
+    figures["exposure_cost"] = exposure_cost(
+        built.vertices,
+        built.faces,
+        photos,
+        painted,
+        (lambda points: transform_points(box.world_from_box, points), [scene.views[i] for i in scene.test]),
+        report,
+    )
     texture = texture_of(built.faces, painted.uv.corners, painted.image)
     write_turntable(pictures, surface, texture, {c.id: c.color for c in scene.classes}, report)
     figures |= {

@@ -22,6 +22,7 @@ FIGURES = {
     "psnr": ("field, held-out photos (dB)", "", 2),
     "mesh_psnr": ("textured mesh, held-out photos (dB)", "≥ the field's − 2", 2),
     "delta_e": ("textured mesh, held-out photos (CIEDE2000, median)", "≤ 5", 1),
+    "exposure_cost": ("loss where photos were exposed ±0.3 stops (dB)", "≤ 0.5", 2),
     "gradient": ("gradient energy over the photos'", "≥ 0.9", 2),
     "seams": ("seams, ΔE over that of other edges", "≤ 1.5", 2),
     "surface_miou": ("mIoU on the surface", "≥ 0.95", 3),

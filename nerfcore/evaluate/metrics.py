@@ -7,8 +7,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import binary_erosion
-from skimage.metrics import structural_similarity
 
 BINS = 10  # of the expected calibration error
 BOUNDARY = 0.02  # of the image's diagonal, as wide as what counts as a class's boundary
@@ -23,6 +21,8 @@ def psnr(image: np.ndarray, photo: np.ndarray, keep: np.ndarray | None = None) -
 
 def ssim(image: np.ndarray, photo: np.ndarray) -> float:
     """Structural similarity, 11×11 Gaussian window with σ 1.5 (Wang et al., 2004), of (H, W, 3) uint8 images."""
+    from skimage.metrics import structural_similarity  # takes a quarter of a second
+
     value: Any = structural_similarity(
         image, photo, data_range=255, channel_axis=2, gaussian_weights=True, sigma=1.5, use_sample_covariance=False
     )
@@ -74,6 +74,8 @@ def calibration_error(sure: np.ndarray, right: np.ndarray) -> float:
 
 def boundary(mask: np.ndarray) -> np.ndarray:
     """The pixels (H, W) bool of a mask that lie near its outline; what the picture cuts off is no outline."""
+    from scipy.ndimage import binary_erosion
+
     width = max(1, round(BOUNDARY * math.hypot(*mask.shape)))
     inner = np.asarray(binary_erosion(mask, np.ones((3, 3), bool), iterations=width, border_value=1), bool)
     return mask & ~inner

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
-import matplotlib
 
 from ..errors import SettingError
 from ..files import write_text
@@ -19,7 +18,6 @@ from ..project.runs import read_events, read_metrics
 from ..project.store import load_project
 from ..render.run import run_folder
 from .documentation import JUDGEMENT, Section, results_of, sections
-from .report_pdf import write_pdf
 
 FORMATS = (".html", ".pdf")
 HEAD = ("Result", "Time")  # tables that stand beside each other at the top
@@ -36,6 +34,8 @@ def training_curve(run: Path) -> str | None:
     rows = read_events(run)
     if len(rows) < 2:
         return None
+    import matplotlib  # only where a report is made: it takes long
+
     matplotlib.use("Agg")
     from matplotlib.figure import Figure
 
@@ -96,6 +96,8 @@ def write_report(path: Path, folder: Path, run: str, renders: Path, result: dict
     if path.suffix.lower() == ".pdf":
         captions = (("Drawing", drawn), ("Held-out photo and render", compared), ("Render", rendered))
         pictures = [(f"{what}: {file.stem}", file) for what, files in captions for file in files]
+        from .report_pdf import write_pdf  # loads matplotlib
+
         write_pdf(path, name, tables, pictures)
         return [table.title for table in tables]
     scores = {Path(s["name"]).stem: s for s in evaluation.get("per_image", [])}

@@ -29,16 +29,18 @@ SUFFIXES = {
     "onnx": (".onnx",),
     "voxels": (".npz",),
     "splats": (".ply",),
+    "vdb": (".vdb",),
 }
+OF_THE_FIELD = ("onnx", "voxels", "splats", "vdb")
 
 
 def export(params: ExportParams, report: Reporter) -> dict[str, Any]:
     """Write one format to `out`, or to exports/<run>/<project>.<suffix>.
 
-    Meshes (glb, usd, obj, ply, stl) are the last one that the verb `mesh` extracted; usd has the cameras as well; onnx is the trained field itself as a function, voxels its values on a regular grid; splats is the baked field, as .ply and beside it as .glb.
+    Meshes (glb, usd, obj, ply, stl) are the last one that the verb `mesh` extracted; usd has the cameras as well; onnx is the trained field itself as a function, voxels its values on a regular grid; splats is the baked field, as .ply and beside it as .glb; vdb is the baked field as a volume.
 
     Returns:
-        {"files": [paths], "to": format}
+        {"files": [paths], "to": format, "grids": names, of vdb}
     Raises:
         SettingError: the file has another ending. ProjectError: there is no mesh or no trained run.
         DiskError: a file cannot be written.
@@ -50,9 +52,10 @@ def export(params: ExportParams, report: Reporter) -> dict[str, Any]:
     out = params.out or folder / "exports" / params.run / f"{name}{suffixes[0]}"
     if out.suffix.lower() not in suffixes:
         raise SettingError(f"{out}: {params.to} files end in {' or '.join(suffixes)}.", "Choose one of these endings.")
-    if params.to not in ("onnx", "voxels", "splats"):  # these are read from the field itself
+    if params.to not in OF_THE_FIELD:
         for warning in stale(folder, params.run, pictures=False):
             report.warn(warning)
+    result: dict[str, Any] = {"to": params.to}
     if params.to == "onnx":
         from .field_graph import write_onnx  # the library takes its time to load
 
@@ -70,6 +73,15 @@ def export(params: ExportParams, report: Reporter) -> dict[str, Any]:
         info = load_info(folder, params.run)
         baked = load_baked(folder, params.run, info)
         files = write_splats(out, baked, info.box(project), info.class_ids if baked.classes else [], report)
+    elif params.to == "vdb":
+        from .volume import write_volume
+
+        info = load_info(folder, params.run)
+        names = {entry.id: entry.name for entry in project.classes}
+        baked = load_baked(folder, params.run, info)
+        classes = [names.get(number, f"class {number}") for number in info.class_ids] if baked.classes else []
+        result["grids"] = write_volume(out, baked, info.box(project), classes, report)
+        files = [out]
     else:
         report.stage("Writing")
         surface, texture = load_surface(folder, params.run)
@@ -77,6 +89,6 @@ def export(params: ExportParams, report: Reporter) -> dict[str, Any]:
         features = features_of(surface, project.classes, project.ignore_id, instances)
         views = load_scene(folder, holdout_of(folder, params.run)).views if params.to == "usd" else []
         files = write_surface(out, surface, features, params.split, texture, views)
-    result = {"to": params.to, "files": [str(path) for path in files]}
+    result["files"] = [str(path) for path in files]
     record_step(folder, "export", params.model_dump(mode="json"), result)
     return result

@@ -54,7 +54,7 @@ class Environment(nn.Module):
         color = field.color(far, spherical_harmonics(directions).to(field.dtype), codes)
         probabilities = None
         if semantics and field.semantic_head is not None:
-            probabilities = torch.softmax(field.logits(far), 1)
+            probabilities = field.class_probabilities(far)
             if not torch.is_grad_enabled():
                 probabilities = probabilities * (self.labelled > NAMED)
         return EnvironmentRays(color, probabilities, weight)

@@ -17,6 +17,7 @@ from .mlp import MLP, compute_dtype
 from .slices import read_in_slices
 
 DIRECTION_FEATURES = 16  # spherical harmonics of degrees 0 to 3
+SHORT_ROW = 8  # numbers below which torch's softmax of a row is ten times as slow as one across rows, on the CPU
 
 
 class _TruncatedExp(torch.autograd.Function):
@@ -43,10 +44,11 @@ class Geometry:
     implicit: torch.Tensor | None
     explicit: torch.Tensor | None
 
-    def __getitem__(self, kept: torch.Tensor) -> Geometry:
-        implicit = None if self.implicit is None else self.implicit[kept]
-        explicit = None if self.explicit is None else self.explicit[kept]
-        return Geometry(self.density[kept], self.features[kept], implicit, explicit)
+    def __getitem__(self, rows: torch.Tensor) -> Geometry:
+        """The points with these indices (M,)."""
+        # Half the time of indexing with brackets, forward and backward.
+        parts = (self.density, self.features, self.implicit, self.explicit)
+        return Geometry(*(None if x is None else x.index_select(0, rows) for x in parts))  # type: ignore[arg-type]
 
 
 class HybridField(nn.Module):
@@ -167,3 +169,10 @@ class HybridField(nn.Module):
         assert self.semantic_head is not None
         branches = [part.to(self.dtype) for part in (geometry.implicit, geometry.explicit) if part is not None]
         return self.semantic_head(torch.cat([geometry.features, *branches], 1), self.dtype).float()
+
+    def class_probabilities(self, geometry: Geometry) -> torch.Tensor:
+        """Probability of each class (N, K), from the logits."""
+        logits = self.logits(geometry)
+        if self.classes >= SHORT_ROW or logits.device.type != "cpu":
+            return torch.softmax(logits, 1)
+        return torch.softmax(logits.t().contiguous(), 0).t().contiguous()

@@ -30,48 +30,53 @@ def compute_dtype(precision: Precision, device: torch.device) -> torch.dtype:
 class _Chain(torch.autograd.Function):
     @staticmethod
     def forward(ctx, x: torch.Tensor, dtype: torch.dtype, *weights: torch.Tensor) -> torch.Tensor:
-        ctx.dtype, ctx.input_dtype = dtype, x.dtype
         matrices = [w.to(dtype) for w in weights]
         parts = row_slices(len(x), x.device)
         rows = parts[-1].stop if parts else 0
-        layers = [padded(x, rows, dtype), *(torch.empty(rows, len(w), dtype=dtype, device=x.device) for w in matrices)]
+        # Slice by slice: only the last one is copied to reach beyond the rows.
+        inputs = [padded(x[part], part.stop - part.start, dtype) for part in parts]
+        layers = [torch.empty(rows, len(w), dtype=dtype, device=x.device) for w in matrices]
 
-        def run(part: slice) -> None:
+        def run(part: slice, given: torch.Tensor) -> None:
             with torch.no_grad():
                 for index, matrix in enumerate(matrices):
-                    torch.mm(layers[index][part], matrix.t(), out=layers[index + 1][part])
+                    given = torch.mm(given, matrix.t(), out=layers[index][part])
                     if index < len(matrices) - 1:
-                        layers[index + 1][part].relu_()
+                        given.relu_()
 
-        run_parallel([partial(run, part) for part in parts], x.device)
-        ctx.save_for_backward(*matrices, *layers[:-1])
+        run_parallel([partial(run, part, given) for part, given in zip(parts, inputs)], x.device)
+        ctx.parts, ctx.dtype, ctx.input = parts, dtype, (x.dtype, x.device, x.shape)
+        ctx.save_for_backward(*matrices, *layers[:-1], *inputs)
         return layers[-1][: len(x)]
 
     @staticmethod
     def backward(ctx, *grads):
-        count = len(ctx.saved_tensors) // 2
-        matrices, layers = ctx.saved_tensors[:count], ctx.saved_tensors[count:]
-        grad = padded(grads[0], len(layers[0]), ctx.dtype)
-        grad_input = torch.empty_like(layers[0]) if ctx.needs_input_grad[0] else None
-        parts = row_slices(len(grads[0]), grad.device)
+        parts: list[slice] = ctx.parts
+        count = (len(ctx.saved_tensors) - len(parts) + 1) // 2
+        matrices, layers = ctx.saved_tensors[:count], ctx.saved_tensors[count : 2 * count - 1]
+        inputs = ctx.saved_tensors[2 * count - 1 :]
+        dtype, device, shape = ctx.input
+        rows = parts[-1].stop if parts else 0
+        grad_input = torch.empty(rows, shape[1], dtype=ctx.dtype, device=device) if ctx.needs_input_grad[0] else None
         found: list[list[torch.Tensor]] = [[] for _ in parts]
 
         def run(number: int, part: slice) -> None:
             with torch.no_grad():
-                g = grad[part]
+                g = padded(grads[0][part], part.stop - part.start, ctx.dtype)
                 for index in range(count - 1, -1, -1):
-                    found[number].append(torch.mm(g.t(), layers[index][part]).float())
+                    given = layers[index - 1][part] if index > 0 else inputs[number]
+                    found[number].append(torch.mm(g.t(), given).float())
                     if index > 0:
                         g = torch.mm(g, matrices[index])
-                        torch.ops.aten.threshold_backward.grad_input(g, layers[index][part], 0, grad_input=g)
+                        torch.ops.aten.threshold_backward.grad_input(g, given, 0, grad_input=g)
                     elif grad_input is not None:
                         torch.mm(g, matrices[0], out=grad_input[part])
 
-        run_parallel([partial(run, number, part) for number, part in enumerate(parts)], grad.device)
+        run_parallel([partial(run, number, part) for number, part in enumerate(parts)], device)
         # Summed in the order of the slices, whatever order they ran in.
         sums = [torch.stack(column).sum(0) for column in zip(*found)]
         grad_weights = sums[::-1] if sums else [torch.zeros_like(m, dtype=torch.float32) for m in matrices]
-        return None if grad_input is None else grad_input[: len(grads[0])].to(ctx.input_dtype), None, *grad_weights
+        return None if grad_input is None else grad_input[: shape[0]].to(dtype), None, *grad_weights
 
 
 class MLP(nn.Module):

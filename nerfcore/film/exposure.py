@@ -13,7 +13,7 @@ from ..kernels.raycast import FirstHits
 from ..kernels.runtime import run_parallel
 from ..progress import Reporter
 from .cryptomatte import Coverage, id_of, manifest
-from .fields import FAR, FieldStore, PlacedField
+from .fields import FAR, FieldStore, PlacedField, light_left
 from .instances import InstanceNames
 from .lens_rays import axis_cosine, scene_rays
 from .shot import CRYPTOMATTES, Shot
@@ -207,16 +207,10 @@ class _Film:
         """Linear colour (N, 4) of all fields, the nearest over the others, on what is behind them where rays are open
         (N,); and the facts of the field that shows most."""
         seen = [field.rays(origins, directions, begin, end, times) for field in self.fields]
-        near = torch.stack([rays.distance.nan_to_num(FAR) for rays in seen]).argsort(0)
-        color, opacity = torch.stack([rays.color for rays in seen]), torch.stack([rays.opacity for rays in seen])
-        total, left = torch.zeros_like(origins), torch.ones_like(begin)
-        shares = torch.zeros_like(opacity)
-        for order in near:
-            row = order[None]
-            mine = opacity.gather(0, row)[0]
-            total = total + left[:, None] * color.gather(0, row[..., None].expand(1, -1, 3))[0]
-            shares.scatter_(0, row, (left * mine)[None])
-            left = left * (1 - mine)
+        before = light_left(seen)
+        shares = before * torch.stack([rays.opacity for rays in seen])
+        total = (before[..., None] * torch.stack([rays.color for rays in seen])).sum(0)
+        left = (1 - torch.stack([rays.opacity for rays in seen])).prod(0)
         strongest = shares.argmax(0)[None]
         pick = lambda name: torch.stack([getattr(rays, name) for rays in seen]).gather(0, strongest)[0]  # noqa: E731
         alpha = 1 - left

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -10,17 +11,19 @@ import torch
 
 from ..data.load import load_scene
 from ..data.scene import Scene
-from ..errors import ProjectError
+from ..errors import ProjectError, SettingError
 from ..kernels.march import Samples
 from ..kernels.traversal import BEFORE_CUBE, PDF_UNIFORM, MarchSettings
+from ..mesh.stored import MESH, mesh_folder
 from ..progress import Reporter
-from ..project.runs import checkpoint_id
+from ..project.runs import INSTANCES, checkpoint_id
 from ..project.store import load_project
 from ..render.baked import META, BakedField, load_baked, voxels_folder
 from ..render.fused import ray_renderer
 from ..render.image import LEAST
 from ..render.model import Geometry, Model, Thin
 from ..render.run import RunInfo, load_info, load_trained
+from .instance_cells import InstanceCells
 from .lens_rays import poses_at
 from .shot import ClassLook, FieldItem, Matrix
 
@@ -30,20 +33,31 @@ FAR = 1e9  # a distance that nothing reaches
 @dataclass(frozen=True)
 class FieldRays:
     """Of R rays: color (R, 3) sRGB with associated alpha, as it is shown; opacity (R,); distance (R,) in the scene of what
-    is met, NaN where nothing is; best (R,) index of the most probable class, −1 for void; share (R,) its probability; sky
-    (R, 3) sRGB behind the field, or None."""
+    is met, NaN where nothing is; best (R,) index of the most probable class, −1 for void; share (R,) its probability;
+    probabilities (R, K) of the classes, or None; sky (R, 3) sRGB behind the field, or None."""
 
     color: torch.Tensor
     opacity: torch.Tensor
     distance: torch.Tensor
     best: torch.Tensor
     share: torch.Tensor
+    probabilities: torch.Tensor | None
     sky: torch.Tensor | None
+
+
+def light_left(rays: list[FieldRays]) -> torch.Tensor:
+    """What is left (F, R) of each of R rays where it comes to each of F fields, the nearest first."""
+    opacity = torch.stack([one.opacity for one in rays])
+    order = torch.stack([one.distance.nan_to_num(FAR) for one in rays]).argsort(0)
+    passed = (1 - opacity.gather(0, order)).cumprod(0)
+    before = torch.cat([torch.ones_like(passed[:1]), passed[:-1]])
+    return torch.zeros_like(opacity).scatter(0, order, before)
 
 
 @dataclass(frozen=True)
 class LoadedField:
-    """A field as it lies in its capture: box_from_world (4, 4), ids, names and colours (K, 3) of its classes."""
+    """A field as it lies in its capture: box_from_world (4, 4), ids, names and colours (K, 3) of its classes; the project
+    and the run that it is of."""
 
     shown: Model | BakedField
     box_from_world: np.ndarray
@@ -51,23 +65,34 @@ class LoadedField:
     class_names: list[str]
     class_colors: np.ndarray
     void: int
+    project: Path
+    run: str
+
+    @cached_property
+    def instances(self) -> InstanceCells:
+        """Its things. Raises ProjectError: there is no mesh that tells them apart; SettingError: it is not baked."""
+        if not isinstance(self.shown, BakedField):
+            raise SettingError(
+                "Single things are hidden, recoloured and moved in the baked field only.", "Choose the baked field."
+            )
+        return InstanceCells(self.shown, np.linalg.inv(self.box_from_world), self.class_ids, self.project, self.run)
 
 
 def load_field(project: Path, run: str, baked: bool) -> LoadedField:
     """Raises ProjectError: there is none, or it is damaged."""
     info = load_info(project, run)
     shown = load_baked(project, run, info) if baked else load_trained(project, run).model
-    return described(shown, project, info, load_scene(project, info.holdout))
+    return described(shown, project, run, info, load_scene(project, info.holdout))
 
 
-def described(shown: Model | BakedField, project: Path, info: RunInfo, scene: Scene) -> LoadedField:
+def described(shown: Model | BakedField, project: Path, run: str, info: RunInfo, scene: Scene) -> LoadedField:
     """A model with what its run and its capture say of it. Raises ProjectError: the project is damaged."""
     known = {entry.id: entry for entry in scene.classes}
     ids = info.class_ids if shown_classes(shown) else []
     names = [known[i].name if i in known else f"class {i}" for i in ids]
     colors = np.array([known[i].color if i in known else (0.5, 0.5, 0.5) for i in ids], np.float32).reshape(-1, 3)
     box = info.box(load_project(project)).box_from_world
-    return LoadedField(shown, box, list(ids), names, colors, scene.ignore_id)
+    return LoadedField(shown, box, list(ids), names, colors, scene.ignore_id, project, run)
 
 
 def shown_classes(shown: Model | BakedField) -> int:
@@ -102,7 +127,8 @@ class FieldStore:
         state = [checkpoint_id(folder, item.run), (folder / "project.json").stat().st_mtime_ns]
         if item.baked:
             meta = voxels_folder(folder, item.run) / META
-            state.append(meta.stat().st_mtime_ns if meta.is_file() else 0)
+            beside = [mesh_folder(folder, item.run) / name for name in (MESH, INSTANCES)]
+            state += [path.stat().st_mtime_ns if path.is_file() else 0 for path in (meta, *beside)]
         key = (str(folder), item.run, item.baked, *state)
         found = self._fields.pop(key, None)
         if found is None:
@@ -125,26 +151,52 @@ class PlacedField:
     Args:
         pixels: rays of a picture.
     Raises:
-        ProjectError: the item's matrices cannot be inverted.
+        ProjectError: the item's matrices cannot be inverted, or no mesh tells the instances apart that it names.
+        InputError: there is no such instance. SettingError: it names some, and the field is not baked.
     """
 
     def __init__(self, field: LoadedField, item: FieldItem, pixels: int) -> None:
         self.field, self.item, self.device = field, item, field.shown.device
+        self.shown, instances, of_class = field.shown, [], []
+        if item.told_apart:
+            told, instances, of_class = field.instances.told_apart(item.told_apart)
+            assert isinstance(field.shown, BakedField)
+            self.shown = BakedField(told, field.shown.settings, None if item.only else field.shown.environment)
         try:
             self.box_from_scene = self._matrices(field.box_from_world, item.scene_from_capture, item.motion)
-            self.crop = None if item.crop is None else self._matrices(np.eye(4), item.crop, item.crop_motion)
+            self.crops = [] if item.crop is None else [self._matrices(np.eye(4), item.crop, item.crop_motion)]
+            if item.only:  # where it is not, nothing need be looked for
+                cube_from_world = np.linalg.inv(field.instances.world_from_cube(item.only))
+                self.crops.append(self._matrices(cube_from_world, item.scene_from_capture, item.motion))
         except np.linalg.LinAlgError as error:
             raise ProjectError(
                 f"“{item.name}” or its crop box is scaled to nothing.", "Give it a scale other than 0."
             ) from error
         self.now_from_box = self._tensor(np.array(item.scene_from_capture) @ np.linalg.inv(field.box_from_world))
-        looks = [item.classes.get(i, ClassLook(color=tuple(c))) for i, c in zip(field.class_ids, field.class_colors)]
+        looks = self._looks(instances, of_class)
+        self.colors = self._tensor([look.color for look in looks[: len(field.class_ids)]]).reshape(-1, 3)
+        self.of_class = torch.tensor(of_class, dtype=torch.long, device=self.device)
         self.opacity = self._tensor([look.opacity for look in looks])
         self.tint = self._tensor([look.tint for look in looks])
-        self.colors = self._tensor([look.color for look in looks]).reshape(-1, 3)
+        self.tint_colors = self._tensor([look.color for look in looks]).reshape(-1, 3)
         self.hides = bool(looks) and bool((self.opacity < 1).any())
         self.settings = self._settings()
-        self._plain = None if isinstance(field.shown, BakedField) else ray_renderer(field.shown, pixels, True)
+        self._plain = None if isinstance(self.shown, BakedField) else ray_renderer(self.shown, pixels, True)
+
+    def _looks(self, instances: list[str], of_class: list[int]) -> list[ClassLook]:
+        """How the classes are shown, and after them the instances that are told apart."""
+        item, field = self.item, self.field
+        looks = [item.classes.get(i, ClassLook(color=tuple(c))) for i, c in zip(field.class_ids, field.class_colors)]
+        for name, index in zip(instances, of_class):
+            own, look = item.instances.get(name), looks[index]
+            if own is not None:
+                tinted = own if own.tint > 0 else look
+                look = ClassLook(opacity=own.opacity * look.opacity, tint=tinted.tint, color=tinted.color)
+            looks.append(look)
+        if item.only:
+            shown = len(field.class_ids) + instances.index(item.only)
+            looks = [look if n == shown else ClassLook(opacity=0, color=look.color) for n, look in enumerate(looks)]
+        return looks
 
     def _tensor(self, values: object) -> torch.Tensor:
         return torch.tensor(np.asarray(values, np.float32), device=self.device)
@@ -155,7 +207,7 @@ class PlacedField:
         return self._tensor(after @ np.linalg.inv(poses))
 
     def _settings(self) -> MarchSettings:
-        shown = self.field.shown
+        shown = self.shown
         return shown.settings if isinstance(shown, BakedField) else shown.render_grid().settings
 
     def still(self, points: torch.Tensor, times: torch.Tensor | None) -> torch.Tensor:
@@ -194,10 +246,12 @@ class PlacedField:
         best = torch.full_like(opacity, -1, dtype=torch.long)
         share = torch.zeros_like(opacity)
         if probabilities is not None:
+            color = self._tinted(color, opacity, probabilities)
+            probabilities = self._of_classes(probabilities)
             share, index = probabilities.max(1)
             best = torch.where(probabilities.sum(1) > 0.5 * opacity.clamp(min=LEAST), index, -1)
-            color = self._looked(color, opacity, probabilities, share)
-        return FieldRays(color, opacity, distance, best, share, sky)
+            color = self._looked(color, probabilities, share)
+        return FieldRays(color, opacity, distance, best, share, probabilities, sky)
 
     def _cropped(
         self,
@@ -207,14 +261,14 @@ class PlacedField:
         end: torch.Tensor,
         times: torch.Tensor | None,
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """The part of the rays that is within the crop box."""
-        if self.crop is None:
-            return begin, end
-        place, along = _moved(self.crop, origins, directions, times)
-        inverse = 1 / torch.where(along.abs() < 1e-12, 1e-12, along)
-        one, other = (-1 - place) * inverse, (1 - place) * inverse
-        begin = torch.maximum(begin, torch.minimum(one, other).amax(1))
-        return begin, torch.minimum(end, torch.maximum(one, other).amin(1))
+        """The part of the rays that is within the crop boxes."""
+        for crop in self.crops:
+            place, along = _moved(crop, origins, directions, times)
+            inverse = 1 / torch.where(along.abs() < 1e-12, 1e-12, along)
+            one, other = (-1 - place) * inverse, (1 - place) * inverse
+            begin = torch.maximum(begin, torch.minimum(one, other).amax(1))
+            end = torch.minimum(end, torch.maximum(one, other).amin(1))
+        return begin, end
 
     def _first(self, places: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
         """Where rays of the cube's frame begin: what the march would do, were they not shifted."""
@@ -236,7 +290,7 @@ class PlacedField:
     def _rendered(
         self, places: torch.Tensor, directions: torch.Tensor, ends: torch.Tensor, shifted: bool
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor | None, torch.Tensor | None]:
-        shown = self.field.shown
+        shown = self.shown
         # Rays that were moved to where they begin take nothing to be empty before them.
         settings = replace(self.settings, empty_distance=0.0) if shifted else self.settings
         limited = bool((ends < self._leave(places, directions)).any())
@@ -267,21 +321,30 @@ class PlacedField:
             within = (samples.t <= ends[samples.packed_info.ray_indices.long()]).float()
             if not self.hides:
                 return within
-            opacity = torch.softmax(model.field.logits(geometry), 1) @ self.opacity
+            opacity = model.field.class_probabilities(geometry) @ self.opacity
             # A class's opacity is a factor of alpha, as in a baked field.
             thickness = (geometry.density * samples.deltas).clamp(1e-6, 50)
             return within * -torch.log1p(opacity * torch.expm1(-thickness)) / thickness
 
         return thin
 
-    def _looked(
-        self, color: torch.Tensor, opacity: torch.Tensor, probabilities: torch.Tensor, share: torch.Tensor
-    ) -> torch.Tensor:
-        """The colour with tints of classes, towards their colours, and on towards their probability."""
-        if bool((self.tint > 0).any()):
-            tinted = probabilities * self.tint
-            plain = color / opacity.clamp(min=LEAST)[:, None]
-            color = color + tinted @ self.colors - tinted.sum(1)[:, None] * plain
+    def _tinted(self, color: torch.Tensor, opacity: torch.Tensor, probabilities: torch.Tensor) -> torch.Tensor:
+        """The colour with tints of classes and instances."""
+        if not bool((self.tint > 0).any()):
+            return color
+        tinted = probabilities * self.tint
+        plain = color / opacity.clamp(min=LEAST)[:, None]
+        return color + tinted @ self.tint_colors - tinted.sum(1)[:, None] * plain
+
+    def _of_classes(self, probabilities: torch.Tensor) -> torch.Tensor:
+        """The probabilities with those of instances that are told apart added to their classes'."""
+        if not len(self.of_class):
+            return probabilities
+        classes = len(self.field.class_ids)
+        return probabilities[:, :classes].index_add(1, self.of_class, probabilities[:, classes:])
+
+    def _looked(self, color: torch.Tensor, probabilities: torch.Tensor, share: torch.Tensor) -> torch.Tensor:
+        """The colour, towards those of the classes, and on towards their probability."""
         look = self.item.look
         if look > 0:
             labels = probabilities @ self.colors

@@ -89,7 +89,8 @@ class ClassLook(_Part):
 class FieldItem(_Part):
     """A field in the scene: `name` is that of its object; scene_from_capture (4, 4); crop: (4, 4) scene from the cube
     [−1, 1]³ to which it is cut; motion, crop_motion: the same at even times while the shutter is open, empty where it stands
-    still; look: 0 photo … 1 labels … 2 confidence; classes by id."""
+    still; look: 0 photo … 1 labels … 2 confidence; classes by id, instances of the mesh by name, whose opacity is a factor
+    beside that of their class, and whose tint comes in place of it; only: the instance that alone is shown."""
 
     name: str
     project: Path
@@ -101,6 +102,13 @@ class FieldItem(_Part):
     crop_motion: list[Matrix] = []
     look: float = Field(default=0.0, ge=0, le=2)
     classes: dict[int, ClassLook] = {}
+    instances: dict[str, ClassLook] = {}
+    only: str = ""
+
+    @property
+    def told_apart(self) -> list[str]:
+        """The instances that look other than their class."""
+        return list(dict.fromkeys([*self.instances, *filter(None, [self.only])]))
 
 
 class Shot(_Part):

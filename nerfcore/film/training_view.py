@@ -128,7 +128,7 @@ class TrainingView:
     """
 
     def __init__(self, training: Unfinished, check: Callable[[], None]) -> None:
-        self._field = described(training.model, training.project, training.info, training.scene)
+        self._field = described(training.model, training.project, training.run, training.info, training.scene)
         self._run, self._check = training.run, check
         self._training, self._requests = live.training_file(training.project), live.views_file(training.project)
         self._views: dict[Path, _View] = {}

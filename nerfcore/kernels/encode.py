@@ -2,7 +2,7 @@
 
 One table holds all levels, `FEATURES` float32 a vertex. A level is *dense* when its (resolution)³ vertices fit its
 share of the table, else *hashed* (Müller et al., "Instant Neural Graphics Primitives", 2022, eq. 4).
-The torch backend is in `encode_torch.py`.
+The torch backend is in `encode_torch.py`; the kernels that the CPU runs instead of those below, in `encode_host.py`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 import torch
 import warp as wp
 
-from . import encode_torch
+from . import encode_host, encode_torch
 from .device import backend_of
 from .encode_torch import BLOCK, FEATURES
 from .runtime import array, init, launch, load, run_parallel, small_tensor
@@ -183,6 +183,11 @@ def adam_touched(
             grad[row] = feature()
 
 
+def on_host(device: torch.device) -> bool:
+    """Whether a device is served by the kernels of `encode_host.py`."""
+    return device.type == "cpu"
+
+
 def forward(
     table: torch.Tensor, levels: list[tuple[int, int, int]], gains: list[float], points: torch.Tensor
 ) -> torch.Tensor:
@@ -200,7 +205,8 @@ def forward(
     out = torch.empty(len(points), len(levels), FEATURES, device=device)
     layout, factors = _on_device(tuple(levels), tuple(gains), device)
     inputs = [array(table, feature), array(points, wp.vec3), array(layout, wp.vec3i), array(factors)]
-    launch(encode_forward, len(points), [*inputs, array(out, feature)], device)
+    kernel = encode_host.encode_forward if on_host(device) else encode_forward
+    launch(kernel, len(points), [*inputs, array(out, feature)], device)
     return out.flatten(1)
 
 
@@ -245,12 +251,13 @@ def scatter(
         for where, grad in arrays:
             launch(encode_backward, len(levels) * where.shape[0], [where, grad, *shared], device)
         return
-    load(encode_backward, device)
+    kernel = encode_host.encode_backward if on_host(device) else encode_backward
+    load(kernel, device)
 
     def one_level(index: int) -> None:
         for where, grad in arrays:
             count = where.shape[0]
-            wp.launch(encode_backward, dim=count, inputs=[where, grad, *shared, index * count], device="cpu")
+            wp.launch(kernel, dim=count, inputs=[where, grad, *shared, index * count], device="cpu")
 
     # Levels share no block (rows are padded to BLOCK), so their flags do not race either.
     active = [index for index in range(len(levels)) if gains[index] != 0.0]
@@ -277,7 +284,7 @@ def adam(
         return encode_torch.adam(table, grad, mean, square, touched, lost, rate, betas, epsilon)
     init()
     launch(
-        adam_touched,
+        encode_host.adam_touched if on_host(table.device) else adam_touched,
         len(touched),
         [array(table, feature), array(grad, feature), array(mean, feature), array(square, feature), array(touched)]
         + [rate, betas[0], betas[1], epsilon, array(lost)],

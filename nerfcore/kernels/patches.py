@@ -11,6 +11,7 @@ import torch
 import warp as wp
 
 from .depth_arrays import MapArrays
+from .patch_sums import Patch, Window, patch_sums, patch_sums_host
 from .projection import FARTHEST, NEAREST, Maps, map_struct, pixel_ray, project
 from .runtime import array, init, launch
 
@@ -21,27 +22,18 @@ WIDEST = wp.constant(24.0)  # pixels a patch may reach in another view
 MIDDLE = wp.constant(6)  # of 13 depths, every second of which is tried, and both beside the best of these
 UNSEEN = wp.constant(-2.0)  # correlation with a view that does not show the patch
 
-_patch = wp.types.vector(length=25, dtype=float)
 _tries = wp.types.vector(length=13, dtype=float)
 
 
 @wp.struct
 class RefineParams:
-    """See `refine`."""
+    """See `refine`; host: 1 where the CPU's compiler sums up patches."""
 
     view: int
     neighbours: wp.array(dtype=int)
     least: float
     gain: float
-
-
-@wp.struct
-class Patch:
-    """Grey values around a pixel, row by row."""
-
-    values: _patch
-    mean: float
-    variance: float
+    host: int
 
 
 @wp.struct
@@ -122,20 +114,7 @@ def pixels_per_depth(maps: Maps, params: RefineParams, pixel: Pixel, z: float):
 
 
 @wp.func
-def bilinear(grey: wp.array(dtype=float), first: int, width: int, x: float, y: float):
-    """Grey value at x, y counted from the middle of a photo's first pixel."""
-    column = int(x)
-    row = int(y)
-    fx = x - float(column)
-    fy = y - float(row)
-    place = first + row * width + column
-    upper = grey[place] + fx * (grey[place + 1] - grey[place])
-    lower = grey[place + width] + fx * (grey[place + width + 1] - grey[place + width])
-    return upper + fy * (lower - upper)
-
-
-@wp.func
-def correlation(grey: wp.array(dtype=float), maps: Maps, patch: Patch, pixel: Pixel, other: Other, z: float):
+def correlation(grey: wp.array(dtype=float), maps: Maps, patch: Patch, pixel: Pixel, other: Other, z: float, host: int):
     """Normalised cross-correlation of a patch with another view, were the pixel's depth z; `UNSEEN` where the patch
     leaves the picture or is stretched too far."""
     middle = flow(pixel, other, 0.0, 0.0, z)
@@ -153,21 +132,23 @@ def correlation(grey: wp.array(dtype=float), maps: Maps, patch: Patch, pixel: Pi
     inside = inside and middle[0] < float(width) - reach_x and middle[1] < float(height) - reach_y
     result = float(UNSEEN)
     if inside and reach_x < WIDEST and reach_y < WIDEST:
-        mean = float(0.0)
-        square = float(0.0)
-        product = float(0.0)
-        for k in range(25):
-            i = float(k % 5 - 2)
-            j = float(k / 5 - 2)
-            x = middle[0] + i * ax + j * bx - 0.5
-            y = middle[1] + i * ay + j * by - 0.5
-            g = bilinear(grey, maps.first[other.view], width, x, y)
-            mean += g
-            square += g * g
-            product += g * patch.values[k]
-        mean /= 25.0
-        variance = square / 25.0 - mean * mean
-        result = (product / 25.0 - mean * patch.mean) / wp.sqrt(wp.max(variance * patch.variance, 1e-14))
+        w = Window()
+        w.first = maps.first[other.view]
+        w.width = width
+        w.x = middle[0] - 0.5
+        w.y = middle[1] - 0.5
+        w.ax = ax
+        w.ay = ay
+        w.bx = bx
+        w.by = by
+        sums = wp.vec3()
+        if host == 1:
+            sums = patch_sums_host(grey, w, patch)
+        else:
+            sums = patch_sums(grey, w, patch)
+        mean = sums[0] / 25.0
+        variance = sums[1] / 25.0 - mean * mean
+        result = (sums[2] / 25.0 - mean * patch.mean) / wp.sqrt(wp.max(variance * patch.variance, 1e-14))
     return result
 
 
@@ -182,7 +163,7 @@ def photo_agreement(
     if z > NEAREST:
         for m in range(params.neighbours.shape[0]):
             other = other_view(maps, params.view, params.neighbours[m])
-            c = correlation(grey, maps, patch, pixel, other, z)
+            c = correlation(grey, maps, patch, pixel, other, z, params.host)
             if c > first:
                 third = second
                 second = first
@@ -271,7 +252,7 @@ def refine_kernel(
 
 def refine(
     grey: torch.Tensor, normals: torch.Tensor, maps: MapArrays, view: int, neighbours: torch.Tensor,
-    least: float, gain: float,
+    least: float, gain: float, host: bool | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor]:  # fmt: skip
     """Depths (H·W,) of one map moved to where its photo agrees best with those of the maps `neighbours` (K,) int32, and
     how well (H·W,) they agree there, −1 where that is not known.
@@ -279,13 +260,14 @@ def refine(
     grey (P,) in [0, 1]: the photos as the maps see them; normals (H·W, 3) in camera axes, towards the camera. Of thirteen
     depths around each pixel's, about half its spread apart but 0.4 to 1.2 pixels, every second and both beside the best of
     these are rated by the mean correlation of the three best views. The best one counts if it reaches `least`, exceeds the present one's by `gain` and is not the
-    outermost; a parabola places it between its neighbours.
+    outermost; a parabola places it between its neighbours. `host`: by the code for CPUs; None: where the maps are on one.
     """
     init()
     count = int(maps.size[view].prod())
     out, score = torch.empty(count, device=grey.device), torch.empty(count, device=grey.device)
     params = RefineParams()
     params.view, params.neighbours, params.least, params.gain = view, array(neighbours), least, gain
+    params.host = int(grey.device.type == "cpu") if host is None else int(host)
     inputs = [array(grey), array(normals.contiguous(), wp.vec3), map_struct(maps), params, array(out), array(score)]
     launch(refine_kernel, count, inputs, grey.device)
     return out, score

@@ -213,6 +213,7 @@ def agree_kernel(
     neighbours: wp.array(dtype=int),
     share: float,
     pixels: float,
+    enough: int,
     out: wp.array(dtype=int),
     offset: int,
 ):
@@ -227,6 +228,8 @@ def agree_kernel(
     p = wp.transpose(maps.rotation[view]) * (q - maps.translation[view])
     found = int(0)
     for n in range(neighbours.shape[0]):
+        if found >= enough:
+            break
         v = neighbours[n]
         o, place, inside = seen_at(maps, v, p)
         if inside:
@@ -237,13 +240,16 @@ def agree_kernel(
     out[i] = found
 
 
-def agreement(maps: MapArrays, view: int, neighbours: torch.Tensor, share: float, pixels: float) -> torch.Tensor:
+def agreement(
+    maps: MapArrays, view: int, neighbours: torch.Tensor, share: float, pixels: float, enough: int = 1 << 30
+) -> torch.Tensor:
     """How many of the maps `neighbours` (K,) int32 confirm each pixel (H·W,) int32 of one map: their depth there
-    differs by less than `share`, and its point returns to within `pixels` of the pixel."""
+    differs by less than `share`, and its point returns to within `pixels` of the pixel. Counted no farther than to
+    `enough`."""
     init()
     count = int(maps.size[view].prod())
     out = torch.empty(count, dtype=torch.int32, device=maps.depth.device)
-    inputs = [map_struct(maps), view, array(neighbours), share, pixels, array(out)]
+    inputs = [map_struct(maps), view, array(neighbours), share, pixels, enough, array(out)]
     launch(agree_kernel, count, inputs, maps.depth.device)
     return out
 

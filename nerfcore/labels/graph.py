@@ -10,19 +10,21 @@ from scipy.sparse import csr_matrix
 from .surfels import Surfels, cell_of
 from .walker import edge_matrix
 
-PARTS = 20_000  # cells of the coarse graph; not tuned
+CELLS = 20_000  # of the coarse graph; not tuned
 # Weights of the columns in units of their deviation; see experiments.md, “Labels from a few strokes”.
 LAB, LAB_AROUND, CONTRAST, TEXTURE, NORMAL, HEIGHT, PLANARITY, FIELD, FIELD_AROUND = 0.5, 1, 0.5, 0.5, 1, 1, 0.3, 1.5, 1
+FILTERS, TOKENS = 1.5, 1.5
 EDGE_SCALE = 4.0  # b of an edge's weight exp(−Σ d²/(b·median d²))
 
 
 @dataclass(frozen=True)
 class Graph:
-    """Edges of N surfels and of P parts: symmetric weights edges (N, N), coarse (P, P); part (N,) of each surfel."""
+    """Edges of N surfels and of C cells of a coarser grid: symmetric weights edges (N, N), coarse (C, C); cell (N,) of each
+    surfel."""
 
     edges: csr_matrix
     coarse: csr_matrix
-    part: np.ndarray
+    cell: np.ndarray
 
 
 def feature_columns(surfels: Surfels, neighbours: np.ndarray) -> np.ndarray:
@@ -59,22 +61,22 @@ def standardised(columns: np.ndarray) -> np.ndarray:
 
 
 def make_graph(surfels: Surfels, neighbours: np.ndarray) -> Graph:
-    """The graph of surfels with these neighbours (N, K), by colour, normal and features of the field; and that of its
-    parts, the cells of a coarser grid, whose weights are sums."""
+    """The graph of surfels with these neighbours (N, K), by colour, normal and features of the field; and that of
+    the cells of a coarser grid, whose weights are sums."""
     total = np.zeros(neighbours.shape, np.float32)
     for values in (surfels.lab, surfels.normal, surfels.field):
         square = ((values[neighbours] - values[:, None]) ** 2).sum(2)
         total += square / max(float(np.median(square)), 1e-12)
     edges = edge_matrix(neighbours, np.exp(-total / EDGE_SCALE))
-    part, count = cell_of(np.asarray(surfels.position, np.float64), min(PARTS, max(1, len(surfels) // 4)))
-    members = membership(part, count)
+    cell, count = cell_of(np.asarray(surfels.position, np.float64), min(CELLS, max(1, len(surfels) // 4)))
+    members = membership(cell, count)
     coarse = (members.T @ edges @ members).tocsr()
     coarse.setdiag(0)
     coarse.eliminate_zeros()
-    return Graph(edges, coarse, part.astype(np.int32))
+    return Graph(edges, coarse, cell.astype(np.int32))
 
 
-def membership(part: np.ndarray, count: int) -> csr_matrix:
-    """Matrix (N, P) float32 that says which part each surfel is of (N,)."""
-    rows = np.arange(len(part))
-    return csr_matrix((np.ones(len(part), np.float32), (rows, part)), (len(part), count))
+def membership(cell: np.ndarray, count: int) -> csr_matrix:
+    """Matrix (N, C) float32 that says which cell each surfel is in (N,)."""
+    rows = np.arange(len(cell))
+    return csr_matrix((np.ones(len(cell), np.float32), (rows, cell)), (len(cell), count))

@@ -33,7 +33,8 @@ DRAWN = ("line", "outline", "click", "part")
 class Mark(BaseModel):
     """One mark: on a photo points in pixels of its working copy, and the brush's width in the same; on the surface places
     in the frame of the poses (which no alignment changes), and the width in its units. class_id: None for void and for what
-    erases. key: which mark it is to whoever sent it.
+    erases. level: how large the parts are that
+    a mark of shape "part" takes. key: which mark it is to whoever sent it.
 
     With shape "carried" the labels of an earlier epoch in `file` (see carry.py), with "confirmed" the word of the author
     that what was carried before is right.
@@ -52,6 +53,7 @@ class Mark(BaseModel):
     places: list[tuple[float, float, float]] = []
     file: OwnFile = ""
     width: float = Field(default=1.0, gt=0)
+    level: Literal["fine", "coarse"] = "fine"
     class_id: int | None = None
     erase: bool = False
 

@@ -1,6 +1,7 @@
 """What labelling leaves in a run, looked up with numpy alone: Blender's side reads it too.
 
 runs/RUN/surfels/prepared.json, pixel_surfel.npy   which pixel of which photo shows which surfel
+runs/RUN/surfels/parts.npy                         the parts of the surface that surfels belong to, at two levels
 runs/RUN/revisions/N.npz                           the labels of the surfels at revision N of the marks
 """
 
@@ -18,6 +19,7 @@ from ..files import UNREADABLE_ARRAYS
 SURFELS, RECORD = "surfels", "prepared.json"
 REVISIONS = "revisions"
 UNREADABLE = (*UNREADABLE_ARRAYS, KeyError, TypeError)  # what damaged files raise
+LEVELS = ("fine", "coarse")  # of the parts of the surface
 LEAST = 0.5  # probability of all classes together below which a surfel is void
 
 
@@ -88,3 +90,20 @@ def surfel_map(surfels: Path, name: str) -> np.ndarray | None:
 def part_of(pixels: np.ndarray, photo: PhotoMap) -> np.ndarray:
     """The map (H, W) of one photo among those of all (P,)."""
     return pixels[photo.first : photo.first + photo.width * photo.height].reshape(photo.height, photo.width)
+
+
+def part_map(surfels: Path, shown: np.ndarray, level: str) -> np.ndarray | None:
+    """Part (H, W) of each pixel of a map (H, W) of surfels, −1 for none; None where runs/RUN/surfels has none of it."""
+    try:
+        parts = np.load(surfels / "parts.npy", mmap_mode="r", allow_pickle=False)[:, LEVELS.index(level)]
+        return np.append(parts, -1)[shown]
+    except (*UNREADABLE, IndexError):
+        return None
+
+
+def outlines(part: np.ndarray) -> np.ndarray:
+    """Pixels (H, W) bool of a map of parts (H, W) at whose right or lower side another part begins."""
+    found = np.zeros(part.shape, bool)
+    found[:, :-1] |= part[:, :-1] != part[:, 1:]
+    found[:-1] |= part[:-1] != part[1:]
+    return found

@@ -4,7 +4,9 @@ runs/RUN/surfels/   prepared.json (what it was made from), and arrays as .npy fi
     position, normal, lab, texture, planarity, field, height, pixels   see Surfels
     neighbours (N, K) int32     nearest surfels
     features (N, F)             columns by which surfels are told apart, see graph.py
-    part, edges_…, coarse_…     see Graph; of a matrix its data, indices and indptr
+    photo_features (N, G)       more of them, of the photos: see photo_features.py
+    cell, edges_…, coarse_…     see Graph; of a matrix its data, indices and indptr
+    parts (N, 2) int32          see parts.py
     pixel_surfel (P,) int32     surfel that each pixel of each photo's map shows, −1 for none; maps one after the other
     pixel_edge (P,) bool        pixels at depth edges, whose marks are dropped
 """
@@ -43,8 +45,12 @@ from ..render.run import Trained, load_info, load_trained, refined_poses
 from .graph import Graph, feature_columns, make_graph
 from .lookup import RECORD, UNREADABLE, part_of, photo_maps
 from .lookup import SURFELS as FOLDER
+from .models import load
+from .parts import surface_parts
+from .photo_features import identity, photo_features
 from .rays import Hits, hits_of
 from .surfels import Surfels, cell_of, field_features, means, nearest_neighbours, nearest_surfel, shape_at
+from .tokens import TokenModel
 
 COUNT = 200_000
 CPU_SIDE, GPU_SIDE = 480, 1600  # longest side of a map
@@ -52,7 +58,7 @@ CPU_PIXELS, GPU_PIXELS = 4e6, 1e8  # of all maps together
 CPU_SHARE = 0.5  # of a map's side that rays are rendered for on a CPU
 LEAST_SURFELS = 64
 PIXELS_EACH = 4  # at least, in the mean: what a surfel of one pixel looks like is noise
-VERSION = 1  # of what is made; another one makes it again
+VERSION = 3  # of what is made; another one makes it again
 MATRIX = ("data", "indices", "indptr")
 
 
@@ -67,7 +73,8 @@ class Preparation:
         self.photos = list(self.of_photo.values())
         self.surfels = Surfels(**{name: self._array(name) for name in Surfels.__dataclass_fields__})
         self.neighbours, self.features = self._array("neighbours"), self._array("features")
-        self.part = self._array("part")
+        self.photo_features = self._array("photo_features")
+        self.cell, self.parts = self._array("cell"), self._array("parts")
         self.pixel_surfel, self.pixel_edge = self._array("pixel_surfel"), self._array("pixel_edge")
 
     def _array(self, name: str) -> np.ndarray:
@@ -102,7 +109,7 @@ class Preparation:
     @cached_property
     def graph(self) -> Graph:
         """The graph of the surfels."""
-        return Graph(self._matrix("edges"), self._matrix("coarse"), np.array(self.part))
+        return Graph(self._matrix("edges"), self._matrix("coarse"), np.array(self.cell))
 
     def _matrix(self, name: str) -> csr_matrix:
         parts = [np.array(self._array(f"{name}_{part}")) for part in MATRIX]
@@ -116,10 +123,11 @@ def prepare(params: LabelPrepareParams, report: Reporter) -> dict[str, Any]:
     Returns:
         {"surfels", "photos", "pixels", "seconds", "reused", "folder"}
     Raises:
-        ProjectError: there is no trained run. TrainingError: the field shows no surface. DiskError, Cancelled.
+        ProjectError: there is no trained run. TrainingError: the field shows no surface. InputError: the model of features
+        does not fit. DiskError, Cancelled.
     """
     folder, begin = Path(params.project), time.perf_counter()
-    ready, reused = ensured(folder, params.run, report, params.surfels)
+    ready, reused = ensured(folder, params.run, report, params.surfels, params.features)
     return {
         "surfels": len(ready.surfels),
         "photos": len(ready.photos),
@@ -130,35 +138,50 @@ def prepare(params: LabelPrepareParams, report: Reporter) -> dict[str, Any]:
     }
 
 
-def ensured(folder: Path, run: str, report: Reporter, count: int | None = None) -> tuple[Preparation, bool]:
+def ensured(
+    folder: Path, run: str, report: Reporter, count: int | None = None, features: Path | None = None
+) -> tuple[Preparation, bool]:
     """The preparation of a run, made where there is none of its present field; whether it was there already.
 
-    `count`: number of surfels that is wanted; None: what is there, else the usual number.
-
+    Args:
+        count: number of surfels that is wanted; None: what is there, else the usual number. features: file of a model of
+            features; None: the one that the preparation before was made with, if it is still there.
     Raises:
         as `prepare`.
     """
-    ready = current(folder, run, count)
+    ready = current(folder, run, count, features)
     if ready is not None:
         return ready, True
-    return _made(folder, run, report, count or COUNT), False
+    if features is None:
+        before = _stored(folder, run)
+        used = None if before is None else before.inputs.get("features")
+        features = Path(used[0]) if used and Path(used[0]).is_file() else None
+    return _made(folder, run, report, count or COUNT, features), False
 
 
-def current(folder: Path, run: str, count: int | None = None) -> Preparation | None:
+def current(folder: Path, run: str, count: int | None = None, features: Path | None = None) -> Preparation | None:
     """The preparation of a run's present field; None where there is none, or only one that is stale or damaged.
 
-    `count`: number of surfels that is wanted; None: any.
+    `count`: number of surfels that is wanted; None: any. `features`: file of a model of features; None: any or none.
     """
-    try:
-        ready = Preparation(run_folder(folder, run) / FOLDER)
-    except UNREADABLE:
+    ready = _stored(folder, run)
+    if ready is None:
         return None
-    wanted = prepared_inputs(folder, run, ready.inputs.get("surfels") if count is None else count)
+    wanted = prepared_inputs(folder, run, ready.inputs.get("surfels") if count is None else count, features)
+    if features is None:
+        wanted["features"] = ready.inputs.get("features")
     return ready if ready.inputs == wanted else None
 
 
-def prepared_inputs(folder: Path, run: str, count: int | None) -> dict[str, Any]:
-    """What a preparation is made from: the field but for its classes, the cameras, and how the world lies."""
+def _stored(folder: Path, run: str) -> Preparation | None:
+    try:
+        return Preparation(run_folder(folder, run) / FOLDER)
+    except UNREADABLE:
+        return None
+
+
+def prepared_inputs(folder: Path, run: str, count: int | None, features: Path | None) -> dict[str, Any]:
+    """What a preparation is made from: the field but for its classes, the cameras, how the world lies, and a model."""
     project = load_project(folder)
     scene = load_scene(folder)
     cameras = [[v.name, v.camera.model_dump(mode="json"), rounded(v.camera_to_world)] for v in scene.views]
@@ -167,12 +190,14 @@ def prepared_inputs(folder: Path, run: str, count: int | None) -> dict[str, Any]
         "trained field": geometry_id(folder, run),
         "cameras": digest([rounded(world_from_sfm(project)), cameras]),
         "surfels": count,
+        "features": None if features is None else list(identity(features)),
     }
 
 
-def _made(folder: Path, run: str, report: Reporter, count: int) -> Preparation:
+def _made(folder: Path, run: str, report: Reporter, count: int, features: Path | None) -> Preparation:
+    tokens = None if features is None else TokenModel(load(features))  # before the long work: it may not fit
     trained, project = load_trained(folder, run), load_project(folder)
-    inputs = prepared_inputs(folder, run, count)
+    inputs = prepared_inputs(folder, run, count, features)
     scene, box = load_scene(folder, trained.info.holdout), trained.info.box(project)
     refined = refined_poses(folder, run, trained.info)
     given = box_poses(scene.views, box.box_from_world)
@@ -190,6 +215,8 @@ def _made(folder: Path, run: str, report: Reporter, count: int) -> Preparation:
         seen.append(_look(view, pose, size, trained, report))
     report.stage("Making surfels")
     arrays = surfel_arrays(seen, poses[:, :3, 3], trained, box, count, report)
+    pictures = list(zip(scene.views, maps_of(arrays, sizes), (lab for _, lab in seen)))
+    arrays["photo_features"] = photo_features(len(arrays["position"]), pictures, tokens, report)
     place = run_folder(folder, run) / FOLDER
     firsts = np.cumsum([0, *(width * height for width, height in sizes)])
     photos = [
@@ -198,6 +225,13 @@ def _made(folder: Path, run: str, report: Reporter, count: int) -> Preparation:
     ]
     _write(place, arrays, {"inputs": inputs, "photos": photos})
     return Preparation(place)
+
+
+def maps_of(arrays: dict[str, np.ndarray], sizes: list[tuple[int, int]]) -> list[np.ndarray]:
+    """Of each photo the surfel (H, W) of each pixel that is not at a depth edge, −1 for none."""
+    clear = np.where(arrays["pixel_edge"], -1, arrays["pixel_surfel"])
+    ends = np.cumsum([width * height for width, height in sizes])[:-1]
+    return [own.reshape(height, width) for own, (width, height) in zip(np.split(clear, ends), sizes)]
 
 
 def map_sizes(scene: Scene, device: torch.device) -> list[tuple[int, int]]:
@@ -283,7 +317,8 @@ def surfel_arrays(
         **vars(made),
         "neighbours": neighbours,
         "features": feature_columns(made, neighbours),
-        "part": graph.part,
+        "cell": graph.cell,
+        "parts": surface_parts(made, neighbours, report.check),
         **{f"{name}_{part}": getattr(matrix, part) for name, matrix in matrices.items() for part in MATRIX},
         "pixel_surfel": pixel_surfel,
         "pixel_edge": edge,

@@ -60,11 +60,13 @@ def appearance(
     any that is marked."""
     known = seeds.label != VOID
     features = torch.from_numpy(np.array(ready.features))
+    columns = torch.cat([features, torch.from_numpy(np.array(ready.photo_features))], 1)
     # Void is one more class of the classifier where it is marked.
     void_marked = bool((~known).any())
     target = torch.from_numpy(np.where(known, seeds.label, classes)).long()
     marked, mark = torch.from_numpy(seeds.surfel), torch.from_numpy(seeds.mark)
-    look = class_probabilities(features, marked, target, mark, classes + void_marked, check)
+    look = class_probabilities(columns, marked, target, mark, classes + void_marked, check)
+    # What photos show is too fine to say what is known: every place has another texture.
     distance = distance_to_samples(features, marked, mark, check)
     return look[:, :classes], 0.5 ** ((distance / KNOWN_LOOK) ** SHARPNESS)
 
@@ -92,29 +94,29 @@ def walked(
     check: Callable[[], None],
     firm: np.ndarray | float = 1.0,
 ) -> np.ndarray:
-    """Probability (N, C) of the classes by the random walker, first on parts, then on surfels.
+    """Probability (N, C) of the classes by the random walker, first on the cells of a coarser grid, then on surfels.
 
     Args:
         look: (N, C) prior of each surfel, in sum at most 1. familiar: (N,) in [0, 1], share of its strength that the prior
             has; the rest conducts to void. seeds: (S,) known surfels; values: (S, C) their probabilities. start: (N, C) or
             None, as in `propagated`. firm: (N,) factors of the strength.
     """
-    count = int(graph.part.max(initial=-1)) + 1
-    members = membership(graph.part, count)
+    count = int(graph.cell.max(initial=-1)) + 1
+    members = membership(graph.cell, count)
     strength = STRENGTH * float(np.median(np.asarray(graph.edges.sum(1)))) * firm
     to_classes = strength * familiar
     to_void = strength * (1 - familiar)
     pull = np.asarray(members.T @ to_classes)
     prior = (members.T @ (to_classes[:, None] * look)) / np.maximum(pull, 1e-12)[:, None]
-    amount = np.bincount(graph.part[seeds], minlength=count)
+    amount = np.bincount(graph.cell[seeds], minlength=count)
     known = np.flatnonzero(amount)
-    mean = np.stack([np.bincount(graph.part[seeds], column, count) for column in values.T], 1)
+    mean = np.stack([np.bincount(graph.cell[seeds], column, count) for column in values.T], 1)
     mean = mean[known] / amount[known, None]
     sink = np.asarray(members.T @ to_void)
-    size = np.maximum(np.bincount(graph.part, minlength=count), 1)[:, None]
+    size = np.maximum(np.bincount(graph.cell, minlength=count), 1)[:, None]
     begin = None if start is None else (members.T @ start) / size
     coarse = random_walk(graph.coarse, prior, pull, sink, known, mean, begin, check)
-    first = coarse[graph.part]
+    first = coarse[graph.cell]
     return random_walk(graph.edges, look, to_classes, to_void, seeds, values, first, check, most_steps=FINE_STEPS)
 
 

@@ -16,6 +16,7 @@ from ..geometry.similarity import similarity_scale, transform_points
 from ..project.store import load_project, world_from_sfm
 from .drawing import covered
 from .journal import Mark
+from .lookup import LEVELS
 from .preparation import Preparation
 
 VOID = -1  # class index of surfels that are marked as none of the classes
@@ -96,7 +97,7 @@ def seeds_of(
 
 def marked_surfels(ready: Preparation, mark: Mark, size: tuple[int, int]) -> np.ndarray:
     """The surfels (S,) that a mark on a photo of this width and height covers, each once; with shape "part" all those of
-    the parts that are covered."""
+    the parts that are covered (see parts.py)."""
     surfel, edge = ready.map_of(mark.photo)
     rows, columns = surfel.shape
     scale = columns / size[0]
@@ -104,7 +105,7 @@ def marked_surfels(ready: Preparation, mark: Mark, size: tuple[int, int]) -> np.
     touched = covered(mark.shape, points, mark.width * scale, columns, rows) & (surfel >= 0)
     clear = touched & ~edge
     found = np.unique(surfel[touched if mark.erase else clear])
-    return np.flatnonzero(np.isin(ready.part, ready.part[found])) if mark.shape == "part" else found
+    return whole_parts(ready, mark, found) if mark.shape == "part" else found
 
 
 def placed_surfels(ready: Preparation, mark: Mark) -> np.ndarray:
@@ -121,12 +122,18 @@ def placed_surfels(ready: Preparation, mark: Mark) -> np.ndarray:
     along = np.concatenate(corners) if mark.shape == "line" else places
     nearest = np.asarray(tree.query(along)[1])
     if mark.shape == "part":
-        return np.flatnonzero(np.isin(ready.part, ready.part[np.unique(nearest)]))
+        return whole_parts(ready, mark, np.unique(nearest))
     found = [nearest]
     for number, near in zip(nearest, tree.query_ball_point(along, radius)):
         near = np.array(near, np.int64)
         found.append(near[normal[near] @ normal[number] > SAME_SIDE])
     return np.unique(np.concatenate(found))
+
+
+def whole_parts(ready: Preparation, mark: Mark, surfels: np.ndarray) -> np.ndarray:
+    """All surfels of the parts, at the mark's level, that some surfels (S,) are of."""
+    part = np.asarray(ready.parts[:, LEVELS.index(mark.level)])
+    return np.flatnonzero(np.isin(part, part[surfels]))
 
 
 def carried_labels(ready: Preparation, path: Path, class_ids: Sequence[int]) -> Carried:

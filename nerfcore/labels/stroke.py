@@ -30,7 +30,9 @@ def stroke(params: LabelStrokeParams, report: Reporter) -> dict[str, Any]:
     project = load_project(folder)
     if params.class_id is not None:
         require_class(project, params.class_id)
-    values = params.model_dump(include={"photo", "shape", "points", "width", "class_id", "erase", "author", "key"})
+    values = params.model_dump(
+        include={"photo", "shape", "points", "width", "level", "class_id", "erase", "author", "key"}
+    )
     if params.places:
         return _appended(folder, {**values, **on_surface(params, world_from_sfm(project))})
     require_photo(project, folder, params.photo)

@@ -17,6 +17,7 @@ from ..data.pixels import training_size
 from ..data.scene import View
 from ..geometry.cameras import Camera, pixel_centers, project, rays
 from ..kernels.depth_arrays import FREE, MapArrays
+from ..kernels.depth_normals import depth_normals
 from ..kernels.device import backend_of
 from ..kernels.march import sample
 from ..kernels.runtime import run_parallel
@@ -216,13 +217,9 @@ def cosines(camera: Camera, depth: np.ndarray) -> np.ndarray:
 def normals(camera: Camera, depth: np.ndarray) -> np.ndarray:
     """Unit normals (H, W, 3) in camera axes, towards the camera, from depth differences over one or two pixels; 0 where
     there is no surface or an outline."""
-    solid = (depth > 0) & (depth < FREE)
-    points = pixel_directions(camera) * np.where(solid, depth, 1)[..., None]
-    edge = max(EDGE, EDGE_PIXELS / camera.fx)
-    normal = np.cross(_slope(points, solid, 1, edge), _slope(points, solid, 0, edge))
-    length = np.linalg.norm(normal, axis=-1, keepdims=True)
-    normal = np.where(solid[..., None] & (length > 0), normal / np.maximum(length, 1e-30), 0)
-    return -normal * np.sign((normal * points).sum(-1, keepdims=True))
+    lens = camera.fx, camera.fy, camera.cx, camera.cy
+    depth = np.ascontiguousarray(depth, np.float32)
+    return depth_normals(torch.from_numpy(depth), lens, max(EDGE, EDGE_PIXELS / camera.fx)).numpy()
 
 
 def smooth_normals(camera: Camera, depth: np.ndarray, size: int) -> np.ndarray:
@@ -238,24 +235,6 @@ def pixel_directions(camera: Camera) -> np.ndarray:
     place = pixel_centers(camera.width, camera.height)
     flat = (place - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
     return np.concatenate([flat, np.ones_like(flat[..., :1])], -1).astype(np.float32)
-
-
-def _slope(points: np.ndarray, solid: np.ndarray, axis: int, jump: float) -> np.ndarray:
-    """Difference of points (H, W, 3) to a neighbour along an axis: of the two sides, the one whose depth is nearer; 0
-    where neither is solid or continues the surface: depths differ by less than the share `jump`."""
-    out, best = np.zeros_like(points), np.full(solid.shape, np.inf, np.float32)
-    z = points[..., 2]
-    for step in (2, 1):
-        for sign in (-1, 1):
-            moved = np.roll(points, sign * step, axis)
-            change = np.abs(moved[..., 2] - z) / step
-            usable = solid & np.roll(solid, sign * step, axis) & (change < jump * z) & (change < 0.999 * best)
-            edge = [slice(None)] * 2
-            edge[axis] = slice(0, step) if sign > 0 else slice(-step, None)
-            usable[tuple(edge)] = False
-            out[usable] = (moved - points)[usable] * -sign / step
-            best[usable] = change[usable]
-    return out
 
 
 def map_arrays(views: list[FlatView], maps: list[DepthMap], device: torch.device) -> MapArrays:
@@ -296,7 +275,7 @@ def confirmed_maps(
         report.progress(index / len(views))
         others = torch.tensor(near, dtype=torch.int32, device=arrays.depth.device)
         share = max(AGREE, AGREE_PIXELS / views[index].camera.fx)
-        confirmed.append(agreement(arrays, index, others, share, ROUND_TRIP) >= needed)
+        confirmed.append(agreement(arrays, index, others, share, ROUND_TRIP, needed) >= needed)
     keep = torch.cat(confirmed) | (arrays.depth >= FREE)
     return replace(arrays, depth=torch.where(keep, arrays.depth, 0.0))
 

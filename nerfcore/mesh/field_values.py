@@ -90,7 +90,7 @@ def shade(
         color = model.field.color(geometry, facing).view(len(p), -1, 3)
         colors.append((color * weight).sum(1).cpu())
         if semantics:
-            probabilities = torch.softmax(model.field.logits(geometry), 1).view(len(p), len(offsets), -1)
+            probabilities = model.field.class_probabilities(geometry).view(len(p), len(offsets), -1)
             classes.append((probabilities * weight).sum(1).cpu())
     rgb = torch.cat(colors).clamp(0, 1).numpy() if colors else np.zeros((0, 3), np.float32)
     return rgb, torch.cat(classes).numpy() if classes else None

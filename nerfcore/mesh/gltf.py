@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -40,16 +41,23 @@ PROPERTIES = {
 }
 
 
-def write_glb(path: Path, parts: dict[str, Part], rows: list[Feature]) -> None:
-    """Write parts, y up, as one GLB of a named mesh each; `rows`: the features that `Part.feature` counts.
+def write_glb(
+    path: Path, parts: dict[str, Part], rows: list[Feature], png: bytes | None, check: Callable[[], None]
+) -> None:
+    """Write parts, y up, as one GLB of a named mesh each; `rows`: the features that `Part.feature` counts; `png`: the
+    file of the texture, if they have one.
 
     Raises:
-        DiskError: the file cannot be written.
+        DiskError: the file cannot be written. What `check` raises, between steps.
     """
     arrays = _columns(rows)
     first: list[int] = []  # number of the first buffer view of the table, known once those of the meshes are
 
     def add_table(items: Any, tree: dict[str, Any]) -> None:
+        check()
+        for image in tree["images"]:
+            assert png is not None
+            items[list(items)[image["bufferView"]]] = png + b"\0" * (-len(png) % 4)
         # The table's views start at multiples of eight bytes.
         last = list(items)[-1]
         items[last] += b"\0" * (-sum(map(len, items.values())) % 8)
@@ -68,6 +76,7 @@ def write_glb(path: Path, parts: dict[str, Part], rows: list[Feature]) -> None:
         tree["extensionsUsed"] = ["EXT_mesh_features", "EXT_structural_metadata"]
 
     scene = trimesh.Scene({name: _mesh(part) for name, part in parts.items()})
+    check()
     content = export_glb(scene, include_normals=True, buffer_postprocessor=add_table, tree_postprocessor=finish)
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
@@ -80,8 +89,9 @@ def _mesh(part: Part) -> trimesh.Trimesh:
     attributes: dict[str, Any] = {
         FEATURE_ID: part.feature.astype(np.uint16 if part.feature.max(initial=0) < 65536 else np.float32)
     }
-    if part.image is not None:
-        look = TextureVisuals(uv=part.uv, material=PBRMaterial(baseColorTexture=Image.fromarray(part.image), **matt))
+    if part.uv is not None:
+        stands_in = Image.new("RGB", (1, 1))  # for the texture, whose file takes its place
+        look = TextureVisuals(uv=part.uv, material=PBRMaterial(baseColorTexture=stands_in, **matt))
     else:
         color = srgb_to_linear(part.colors / 255)
         attributes[LINEAR_COLOR] = (np.pad(color, ((0, 0), (0, 1)), constant_values=1) * 65535 + 0.5).astype(np.uint16)

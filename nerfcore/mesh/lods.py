@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -63,7 +64,7 @@ def make_levels(surface: Surface, texture: Texture | None, count: int, report: R
     return levels
 
 
-def write_level(folder: Path, number: int, level: Level) -> list[Path]:
+def write_level(folder: Path, number: int, level: Level, check: Callable[[], None]) -> list[Path]:
     """Write mesh_lod<number>.npz, as mesh.npz is, and texture_lod<number>.png if it has one. Raises DiskError."""
     arrays: dict[str, Any] = {name: value for name, value in vars(level.surface).items() if value is not None}
     if level.uv is not None:
@@ -74,14 +75,13 @@ def write_level(folder: Path, number: int, level: Level) -> list[Path]:
     if level.texture is not None:
         written.append(folder / f"texture_lod{number}.png")
         with atomic_path(written[1]) as temporary:
-            write_picture(temporary, level.texture.image)
+            write_picture(temporary, level.texture.image, check)
     return written
 
 
-def remove_levels(folder: Path) -> None:
-    """Delete the levels of an earlier mesh."""
-    for path in [*folder.glob("mesh_lod*"), *folder.glob("texture_lod*.png")]:
-        path.unlink()
+def level_files(folder: Path) -> list[Path]:
+    """The files of the levels of the mesh in a folder."""
+    return [*folder.glob("mesh_lod*"), *folder.glob("texture_lod*.png")]
 
 
 def _instances(surface: Surface) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -109,8 +110,10 @@ def paint_surface(
     return Painted(classes, uv, texture.image, texture.unseen, texture.seen, maps)
 
 
-def write_maps(folder: Path, painted: Painted, colors: dict[int, tuple[float, float, float]]) -> list[Path]:
-    """Write texture.png and the maps that belong to it, and remove those of an earlier texture that have no successor.
+def write_maps(
+    folder: Path, painted: Painted, colors: dict[int, tuple[float, float, float]], check: Callable[[], None]
+) -> list[Path]:
+    """Write texture.png and the maps that belong to it.
 
     texture_unseen.png: 255 where no photo painted; class_id.png: grey, the ids themselves; class_confidence.png: 255 for
     certain; class_color.png: the classes in their colours (sRGB in [0, 1] by id).
@@ -128,9 +131,8 @@ def write_maps(folder: Path, painted: Painted, colors: dict[int, tuple[float, fl
     for name in ("texture.png", *MAPS):
         picture = pictures.get(name)
         if picture is None:
-            (folder / name).unlink(missing_ok=True)
             continue
         with atomic_path(folder / name) as temporary:
-            write_picture(temporary, picture if picture.ndim == 3 else picture[..., None])
+            write_picture(temporary, picture if picture.ndim == 3 else picture[..., None], check)
         written.append(folder / name)
     return written

@@ -33,8 +33,8 @@ class Part:
     """Some faces of a surface with the vertices they use.
 
     vertices, normals (V, 3) float32; faces (F, 3); colors (V, 3) uint8 sRGB; class_id (V,); feature (V,), and
-    face_feature (F,), rows of a `Features`; uv (V, 2), v upwards, and image (S, S, 3) uint8 sRGB, or both None. Where
-    `make_part` did not split vertices between features, `feature` is that of some face of theirs.
+    face_feature (F,), rows of a `Features`; uv (V, 2), v upwards, None without a texture. Where `make_part` did not
+    split vertices between features, `feature` is that of some face of theirs.
     """
 
     vertices: np.ndarray
@@ -45,16 +45,20 @@ class Part:
     feature: np.ndarray
     face_feature: np.ndarray
     uv: np.ndarray | None = None
-    image: np.ndarray | None = None
 
 
 def texture_of(faces: np.ndarray, corner_uv: np.ndarray, image: np.ndarray) -> Texture:
     """The texture of a mesh by the UV (F, 3, 2) of its faces' (F, 3) corners: corners that agree share a vertex."""
-    key = np.empty(faces.size, [("vertex", np.int64), ("u", np.float32), ("v", np.float32)])
-    key["vertex"], key["u"], key["v"] = faces.reshape(-1), corner_uv[..., 0].reshape(-1), corner_uv[..., 1].reshape(-1)
-    made, index = np.unique(key, return_inverse=True)
-    uv = np.stack([made["u"], made["v"]], 1)
-    return Texture(image, Unwrapped(made["vertex"], index.reshape(-1, 3).astype(np.int32), uv))
+    vertex = faces.reshape(-1).astype(np.int64)
+    uv = np.ascontiguousarray(corner_uv.reshape(-1, 2), np.float32) + 0.0  # -0 becomes 0
+    place = uv.view(np.uint64)[:, 0]  # both numbers at once, as they are only compared
+    order = np.lexsort((place, vertex))
+    new = np.ones(len(order), bool)
+    new[1:] = (np.diff(vertex[order]) != 0) | (place[order][1:] != place[order][:-1])
+    index = np.empty(len(order), np.int32)
+    index[order] = np.cumsum(new) - 1
+    first = order[new]
+    return Texture(image, Unwrapped(vertex[first], index.reshape(-1, 3), uv[first]))
 
 
 def make_part(
@@ -81,5 +85,4 @@ def make_part(
         feature,
         face_feature,
         None if texture is None else texture.unwrapped.uv[vertex],
-        None if texture is None else texture.image,
     )

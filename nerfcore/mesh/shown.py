@@ -11,6 +11,7 @@ from ..geometry.cameras import rays
 from ..images.picture import resized
 from ..images.working import nearest, read_image, read_picture
 from ..kernels.raycast import FrontFaces
+from ..progress import go_on
 from .facelets import small_pieces
 from .photos import Photo
 from .visibility import PosedCamera, depth_buffer
@@ -46,13 +47,16 @@ def silhouette(scene: Scene, vertices: np.ndarray, faces: np.ndarray, check: Cal
     return both / either if either else None
 
 
-def shown_share(photos: list[Photo], vertices: np.ndarray, faces: np.ndarray) -> float:
+def shown_share(
+    photos: list[Photo], vertices: np.ndarray, faces: np.ndarray, check: Callable[[], None] = go_on
+) -> float:
     """Share of the photos' pixels that show the front of a mesh, vertices (V, 3) and faces (F, 3) in the photos' frame."""
     if len(faces) == 0 or not photos:
         return 0.0
     mesh = FrontFaces(vertices, faces)
     hits = asked = 0
     for index in np.unique(np.linspace(0, len(photos) - 1, min(len(photos), MOST_PHOTOS)).round().astype(int)):
+        check()
         camera, pose = photos[index].view.camera, photos[index].view.pose
         x = (np.arange(ACROSS) + 0.5) / ACROSS
         places = np.stack(np.meshgrid(x * camera.width, x * camera.height), -1).reshape(-1, 2)

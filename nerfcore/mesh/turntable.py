@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from ..files import atomic_path
+from ..files import atomic_path, staged
 from ..geometry.cameras import Camera, pixel_centers, rays
 from ..images.encode import write_picture
 from ..images.picture import linear_to_srgb, to_bytes
 from ..kernels.raycast import FrontFaces
+from ..params import TurntableParams
 from ..progress import Reporter
+from ..project.store import load_project, record_step
 from .parts import Texture
+from .stored import load_surface, mesh_folder
 from .surface import Surface
 from .surface_picture import TexturedMesh
 
@@ -43,6 +47,26 @@ def turntable_poses(vertices: np.ndarray, count: int) -> list[np.ndarray]:
     return list(poses)
 
 
+def turntable(params: TurntableParams, report: Reporter) -> dict[str, Any]:
+    """Look at the mesh of a run from all around, as `mesh` left it.
+
+    Returns:
+        {"files"}
+    Raises:
+        ProjectError: there is no mesh. DiskError.
+    """
+    folder = Path(params.project)
+    project = load_project(folder)
+    report.stage("Reading the mesh")
+    surface, texture = load_surface(folder, params.run)
+    target = params.out or mesh_folder(folder, params.run) / "turntable"
+    report.stage("Looking at it")
+    files = write_turntable(target, surface, texture, {c.id: c.color for c in project.classes}, report)
+    result = {"files": [str(path) for path in files]}
+    record_step(folder, "turntable", params.model_dump(mode="json"), result)
+    return result
+
+
 def write_turntable(
     folder: Path,
     surface: Surface,
@@ -50,14 +74,32 @@ def write_turntable(
     colors: dict[int, tuple[float, float, float]],
     report: Reporter,
 ) -> list[Path]:
-    """Write color_0.png … and class_0.png …: eight views of a surface in the world, triangles seen from their front only,
-    as one looks into a room without its near walls.
+    """Write the pictures of `look_around` as color_0.png … and class_0.png …; all of them, or none where it is stopped.
+
+    Returns:
+        the files written.
+    """
+    pictures = look_around(surface, texture, colors, report)
+    with staged(folder) as place:
+        for name, picture in pictures.items():
+            report.check()
+            with atomic_path(place / name) as temporary:
+                write_picture(temporary, picture)
+    return [folder / name for name in pictures]
+
+
+def look_around(
+    surface: Surface,
+    texture: Texture | None,
+    colors: dict[int, tuple[float, float, float]],
+    report: Reporter,
+) -> dict[str, np.ndarray]:
+    """Eight views (SIDE, SIDE, 3) uint8 of a surface in the world by the names of their files, in its colours and in those
+    of its classes, triangles seen from their front only, as one looks into a room without its near walls.
 
     Args:
         texture: of the surface; without one its vertices' colours are shown. colors: sRGB in [0, 1] of each class id;
             others are dark.
-    Returns:
-        the files written.
     """
     mesh = FrontFaces(surface.vertices, surface.faces)
     textured = None
@@ -68,7 +110,7 @@ def write_turntable(
     local, _ = rays(camera, pixel_centers(SIDE, SIDE).reshape(-1, 2))
     ids = np.unique(surface.face_class)
     shades = np.array([colors.get(int(c), (0.15, 0.15, 0.15)) for c in ids]) * 255
-    paths = []
+    pictures: dict[str, np.ndarray] = {}
     for number, pose in enumerate(turntable_poses(surface.vertices, VIEWS)):
         report.progress(number / VIEWS)
         face, corner = mesh.cast(np.broadcast_to(pose[:3, 3], local.shape), local @ pose[:3, :3].T)
@@ -84,11 +126,8 @@ def write_turntable(
         light = 0.55 + 0.45 * (_mixed(surface.normals[corners], weights) @ LIGHT)[:, None]
         label[hit] = (shades[np.searchsorted(ids, surface.face_class[face[hit]])] * light).clip(0, 255)
         for name, picture in (("color", color), ("class", label)):
-            path = folder / f"{name}_{number}.png"
-            with atomic_path(path) as temporary:
-                write_picture(temporary, picture.reshape(SIDE, SIDE, 3))
-            paths.append(path)
-    return paths
+            pictures[f"{name}_{number}.png"] = picture.reshape(SIDE, SIDE, 3)
+    return pictures
 
 
 def _mixed(values: np.ndarray, weights: np.ndarray) -> np.ndarray:

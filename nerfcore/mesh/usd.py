@@ -7,11 +7,10 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom, UsdSemantics, UsdShade, UsdUtils, Vt
 
 from ..data.scene import View
@@ -31,8 +30,10 @@ def write_usd(
     surface: Surface,
     features: Features,
     split: str,
-    texture: Texture | None = None,
-    views: Sequence[View] = (),
+    texture: Texture | None,
+    png: bytes | None,
+    views: Sequence[View],
+    check: Callable[[], None],
 ) -> list[Path]:
     """Write a surface in the world as .usdc, .usda, .usd or .usdz.
 
@@ -41,7 +42,7 @@ def write_usd(
     beside the file (in a .usdz inside it), or without one `displayColor`, which is linear.
 
     Args:
-        split: see `write_surface`; several meshes then lie beside each other.
+        png: the file of the texture, if there is one. split: see `write_surface`; several meshes then lie beside each other.
         views: become cameras without lens distortion; panoramas, for which USD has no camera, are left out.
     Returns:
         the files written.
@@ -52,14 +53,14 @@ def write_usd(
     if path.suffix.lower() == ".usdz":
         with tempfile.TemporaryDirectory(prefix="fieldwork-usd-") as folder, atomic_path(path) as temporary:
             inside = Path(folder) / f"{_identifier(path.stem)}.usdc"
-            _write_stage(inside, path.stem, surface, features, split, texture, picture, views)
+            _write_stage(inside, path.stem, surface, features, split, texture, png, picture, views, check)
             if not UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(inside)), str(inside.with_suffix(".usdz"))):
                 raise DiskError(f"{path} cannot be written.", "Check the disk and the folder's permissions.")
             shutil.copyfile(inside.with_suffix(".usdz"), temporary)
         return [path]
     with tempfile.TemporaryDirectory(prefix="fieldwork-usd-") as folder, atomic_path(path) as temporary:
         made = Path(folder) / path.name
-        _write_stage(made, path.stem, surface, features, split, texture, picture, views)
+        _write_stage(made, path.stem, surface, features, split, texture, png, picture, views, check)
         shutil.copyfile(made, temporary)
         if texture is None:
             return [path]
@@ -75,8 +76,10 @@ def _write_stage(
     features: Features,
     split: str,
     texture: Texture | None,
+    png: bytes | None,
     picture: str,
     views: Sequence[View],
+    check: Callable[[], None],
 ) -> None:
     stage = Usd.Stage.CreateNew(str(file))
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
@@ -86,10 +89,12 @@ def _write_stage(
     Usd.ModelAPI(root).SetKind(Kind.Tokens.component)
     stage.SetDefaultPrim(root.GetPrim())
     if texture is not None:
-        Image.fromarray(texture.image).save(file.with_name(picture))
+        assert png is not None
+        file.with_name(picture).write_bytes(png)
     materials = _materials(stage, root.GetPath(), features.rows, picture if texture is not None else None)
     names = _Names()
     for label, chosen in features.groups(split).items():
+        check()
         prim = names.under(root.GetPath(), "Surface" if split == "none" else label)
         mesh = _mesh(stage, prim, surface, features, texture, chosen)
         mesh.GetPrim().SetDisplayName(label if split != "none" else "Surface")

@@ -19,8 +19,8 @@ from ..files import disk_errors
 from ..kernels.host import default_threads
 from ..progress import Reporter
 
-# xatlas takes longer than in proportion to the faces: 200 000 noisy ones took 74 s in chunks of 25 000, 36 s of 6 000.
-CHUNK_FACES = 8_000
+# xatlas takes longer than in proportion to the faces, docs/experiments.md, “Vector types of the CPU's compiler”.
+CHUNK_FACES = 1_000
 PACK_SIZE = 2048  # packing takes time in proportion to the area; charts then stand at steps of size / PACK_SIZE texels
 PADDING = 4  # texels between charts, as far as the packing's steps allow
 

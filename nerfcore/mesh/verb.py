@@ -12,32 +12,30 @@ from ..data.box import Box
 from ..data.load import class_inputs, load_scene, view_inputs
 from ..data.scene import Scene
 from ..errors import ProjectError
-from ..files import atomic_path
-from ..geometry.similarity import similarity_scale, transform_points
+from ..geometry.similarity import similarity_scale
 from ..images.picture import to_bytes
 from ..params import MeshParams
 from ..progress import Reporter
 from ..project.fingerprints import Earlier, Fingerprint, compare, digest, read_made, rounded, write_made
-from ..project.runs import MEASURES, MESH_RECORD, checkpoint_id, state_id
+from ..project.runs import MESH_RECORD, checkpoint_id, state_id
 from ..project.schema import step
 from ..project.store import load_project, record_step, world_from_sfm
 from ..render.run import Trained, load_info, load_trained, refined_poses
 from ..verdict import mesh_verdict
 from .build import Built, build, largest_share, wanted_bounds
 from .coverage import coverage
-from .features import features_of
 from .field_values import shade
 from .formats import check_format
-from .instances import GAP, Instance, find_instances, read_instances, with_earlier_names, write_instances
-from .lods import Level, make_levels, remove_levels, write_level
-from .painted import Painted, paint_surface, training_photos, write_maps
-from .parts import Texture, texture_of
+from .instances import GAP, Instance, find_instances, read_instances, with_earlier_names
+from .lods import make_levels
+from .outputs import Made, write_outputs
+from .painted import Painted, paint_surface, training_photos
+from .parts import texture_of
 from .photos import Photo
 from .preview import preview
 from .shown import shown_share, silhouette
-from .stored import COARSE
 from .surface import Surface, class_table, is_watertight, to_world
-from .turntable import write_turntable
+from .turntable import look_around
 
 
 def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
@@ -72,8 +70,8 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
     if painted.uv is not None and painted.image is not None:
         texture = texture_of(built.faces, painted.uv.corners, painted.image)
     classes = painted.classes
-    made = Surface(built.vertices, built.faces, built.normals, built.colors, classes.class_id, classes.face_class)
-    surface = to_world(made, box.world_from_box)
+    plain = Surface(built.vertices, built.faces, built.normals, built.colors, classes.class_id, classes.face_class)
+    surface = to_world(plain, box.world_from_box)
     names = {scene.ignore_id: "void"} | {c.id: c.name for c in scene.classes}
     voxel = built.region.voxel * similarity_scale(box.world_from_box)
     face_instance, instances = find_instances(
@@ -81,17 +79,16 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
     )
     instances = with_earlier_names(instances, earlier_instances(target, inputs))
     surface = replace(surface, face_instance=face_instance)
-    report.stage("Writing")
-    for record in (MESH_RECORD, MEASURES):  # what they say is no longer true from here on
-        (target / record).unlink(missing_ok=True)
-    _write_arrays(target, surface, painted, built, box)
-    files = [target / "mesh.npz", target / COARSE, write_instances(target, instances)]
-    files += write_maps(target, painted, {c.id: c.color for c in scene.classes})
-    written, levels = _write_meshes(target, surface, texture, scene, instances, params, report)
-    files += written
+    levels = make_levels(surface, texture, params.lods, report)
+    judged = judge(trained, scene, box, built, surface, photos, params, report)
+    colors = {c.id: c.color for c in scene.classes}
+    pictures: dict[str, np.ndarray] = {}
     if params.turntable is not None:
         report.stage("Looking at it")
-        files += write_turntable(params.turntable, surface, texture, {c.id: c.color for c in scene.classes}, report)
+        pictures = look_around(surface, texture, colors, report)
+    made = Made(surface, texture, painted, built, box, instances, levels, pictures)
+    report.stage("Writing")
+    files = write_outputs(target, made, scene, params, report)
     result = {
         "vertices": len(surface.vertices),
         "faces": len(surface.faces),
@@ -102,24 +99,8 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
         "lods": [{"faces": len(level.surface.faces), "deviation": level.deviation} for level in levels],
         "label_revision": trained.info.label_revision,
         "files": [str(path) for path in files],
+        **judged,
     }
-    shown = shown_share(photos, built.vertices, built.faces)
-    found = coverage(
-        trained.model,
-        scene,
-        box.box_from_world,
-        built.vertices,
-        built.faces,
-        wanted_bounds(params, scene, box),
-        report.check,
-    )
-    solid = None if found.solid is None else round(found.solid, 4)
-    largest, _ = largest_share(built.vertices, built.faces)
-    result |= {"shown": round(shown, 4), "solid_shown": solid, "holes": round(found.holes, 4)}
-    result["verdict"] = mesh_verdict(shown, found.solid, found.holes, largest)
-    outlines = silhouette(scene, surface.vertices, surface.faces, report.check)
-    if outlines is not None:
-        result["silhouette"] = round(outlines, 4)
     if painted.seen is not None:
         result["painted_by_photos"] = round(painted.seen, 4)
     settings = params.model_dump(mode="json")
@@ -139,42 +120,27 @@ def earlier_instances(target: Path, inputs: dict[str, str]) -> list[Instance]:
         return []
 
 
-def _write_arrays(target: Path, surface: Surface, painted: Painted, built: Built, box: Box) -> None:
-    """Write mesh.npz, and the coarse surface that `measure` compares it with."""
-    with atomic_path(target / "mesh.npz") as temporary, open(temporary, "wb") as file:
-        sure = {"confidence": painted.classes.confidence, "face_confidence": painted.classes.face_confidence}
-        uv = {} if painted.uv is None else {"uv": painted.uv.corners}
-        unseen = {} if built.unseen is None else {"unseen": built.unseen}
-        np.savez(file, **vars(surface), **sure, **uv, **unseen)
-    with atomic_path(target / COARSE) as temporary, open(temporary, "wb") as file:
-        np.savez(file, vertices=transform_points(box.world_from_box, built.coarse[0]), faces=built.coarse[1])
-
-
-def _write_meshes(
-    target: Path,
-    surface: Surface,
-    texture: Texture | None,
+def judge(
+    trained: Trained,
     scene: Scene,
-    instances: list[Instance],
+    box: Box,
+    built: Built,
+    surface: Surface,
+    photos: list[Photo],
     params: MeshParams,
     report: Reporter,
-) -> tuple[list[Path], list[Level]]:
-    """Write mesh.ply, the file that was asked for, and the levels of detail; the files, and the levels."""
-    from .files import write_surface  # with its libraries, a quarter of a second
-
-    files: list[Path] = []
-    features = features_of(surface, scene.classes, scene.ignore_id, instances)
-    for path in [target / "mesh.ply", *([params.out] if params.out else [])]:
-        files += write_surface(path, surface, features, params.split if path == params.out else "none", texture)
-    remove_levels(target)
-    levels = make_levels(surface, texture, params.lods, report)
-    base = params.out or target / "mesh.glb"
-    for number, level in enumerate(levels, 1):
-        files += write_level(target, number, level)
-        features = features_of(level.surface, scene.classes, scene.ignore_id, instances)
-        path = base.with_name(f"{base.stem}_lod{number}{base.suffix}")
-        files += write_surface(path, level.surface, features, params.split, level.texture)
-    return files, levels
+) -> dict[str, Any]:
+    """What photos say of a surface: "shown", "solid_shown", "holes", "verdict" and "silhouette" of `mesh`."""
+    report.stage("Comparing it with the photos")
+    shown = shown_share(photos, built.vertices, built.faces, report.check)
+    bounds = wanted_bounds(params, scene, box)
+    found = coverage(trained.model, scene, box.box_from_world, built.vertices, built.faces, bounds, report.check)
+    solid = None if found.solid is None else round(found.solid, 4)
+    largest, _ = largest_share(built.vertices, built.faces)
+    result: dict[str, Any] = {"shown": round(shown, 4), "solid_shown": solid, "holes": round(found.holes, 4)}
+    result["verdict"] = mesh_verdict(shown, found.solid, found.holes, largest)
+    outlines = silhouette(scene, surface.vertices, surface.faces, report.check)
+    return result if outlines is None else {**result, "silhouette": round(outlines, 4)}
 
 
 def mesh_inputs(params: MeshParams) -> Fingerprint:

@@ -40,13 +40,24 @@ from .labels import (
     LabelImportParams,
     LabelNextParams,
     LabelOverlayParams,
+    LabelPartsParams,
     LabelPrepareParams,
     LabelPropagateParams,
     LabelStrokeParams,
     Revision,
 )
 from .results import BlendParams, ExportParams, PackageParams, ReportParams
-from .surfaces import CompareParams, MeasureParams, MeshParams, PaperScale, PlanParams, SectionParams, Side, Turn
+from .surfaces import (
+    CompareParams,
+    MeasureParams,
+    MeshParams,
+    PaperScale,
+    PlanParams,
+    SectionParams,
+    Side,
+    Turn,
+    TurntableParams,
+)
 from .things import InstancesParams, RelationsParams
 from .workflows import BatchParams, BenchParams, BlocksParams, ReconstructParams
 
@@ -81,6 +92,7 @@ __all__ = [
     "LabelImportParams",
     "LabelNextParams",
     "LabelOverlayParams",
+    "LabelPartsParams",
     "LabelPrepareParams",
     "LabelPropagateParams",
     "LabelStrokeParams",
@@ -108,4 +120,5 @@ __all__ = [
     "Split",
     "TrainParams",
     "Turn",
+    "TurntableParams",
 ]

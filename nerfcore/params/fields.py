@@ -56,6 +56,10 @@ class RenderParams(Params):
     )
     passes: list[Pass] = ["rgb", "depth", "semantic"]
     baked: bool = Field(default=False, description="from the baked field, which is faster, instead of the field")
+    edits: Path | None = Field(
+        default=None,
+        description="JSON file of the classes and things that are hidden, dimmed, recoloured, moved or copied; with `--baked`",
+    )
     frame_range: tuple[int, int] | None = Field(
         default=None,
         description="first and last frame of these, counted from 0, to render only a part: several programs may render "
@@ -66,4 +70,10 @@ class RenderParams(Params):
     def _range_goes_up(self) -> Self:
         if self.frame_range is not None and not 0 <= self.frame_range[0] <= self.frame_range[1]:
             raise ValueError(f"frame_range: {self.frame_range[0]} to {self.frame_range[1]} is no range of frames")
+        return self
+
+    @model_validator(mode="after")
+    def _edits_are_of_the_baked_field(self) -> Self:
+        if self.edits is not None and not self.baked:
+            raise ValueError("edits: only a baked field is edited; say `--baked` as well")
         return self

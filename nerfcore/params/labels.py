@@ -14,10 +14,17 @@ Revision = Annotated[
 ]
 
 
+Level = Literal["fine", "coarse"]
+
+
 class LabelPrepareParams(Params):
     project: Path
     run: RunName = "main"
     surfels: int = Field(default=200_000, ge=1000, le=5_000_000, description="most surfels to make")
+    features: Path | None = Field(
+        default=None,
+        description="ONNX file of a model such as DINOv2, whose features tell surfels apart too; default: the one used before",
+    )
 
 
 class LabelStrokeParams(Params):
@@ -45,6 +52,7 @@ class LabelStrokeParams(Params):
         le=LARGEST_PICTURE,
         description="width of the brush: pixels of the photo, or units of the world on the surface",
     )
+    level: Level = Field(default="fine", description="how large the parts are that shape part takes")
     class_id: int | None = Field(default=None, ge=0, le=65535, description="id of the class that is marked")
     void: bool = Field(default=False, description="what is marked is none of the classes")
     erase: bool = Field(default=False, description="take away earlier marks here")
@@ -111,6 +119,17 @@ class LabelOverlayParams(Params):
     kind: Literal["ids", "colors", "confidence"] = Field(
         default="colors", description="class ids, their colours over the photo, or how sure they are"
     )
+
+
+class LabelPartsParams(Params):
+    project: Path
+    photo: str = Field(description="name of the photo")
+    points: list[tuple[float, float]] = Field(
+        default=[], max_length=1000, description="pixels x,y of the photo whose parts are told"
+    )
+    level: Level = Field(default="fine", description="how large the parts are")
+    out: Path | None = Field(default=None, description="PNG to write: the photo with the outlines of its parts")
+    run: RunName = "main"
 
 
 class LabelNextParams(Params):

@@ -31,7 +31,7 @@ class BlendParams(Params):
 
 class ExportParams(Params):
     project: Path
-    to: Literal["glb", "obj", "ply", "stl", "usd", "onnx", "voxels", "splats"] = Field(description="format")
+    to: Literal["glb", "obj", "ply", "stl", "usd", "onnx", "voxels", "splats", "vdb"] = Field(description="format")
     run: RunName = "main"
     out: Path | None = Field(default=None, description="file to write; default: exports/RUN/PROJECT of the project")
     split: Split = Field(default="none", description="classes, instances: one object for each of them")

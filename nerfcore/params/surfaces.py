@@ -49,6 +49,14 @@ class MeshParams(Params):
     )
 
 
+class TurntableParams(Params):
+    project: Path
+    run: RunName = "main"
+    out: Path | None = Field(
+        default=None, description="folder to write to; default: exports/RUN/turntable of the project"
+    )
+
+
 class MeasureParams(Params):
     project: Path
     run: RunName = "main"

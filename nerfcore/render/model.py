@@ -124,8 +124,8 @@ class Model(nn.Module):
     def importance(self, points: torch.Tensor) -> torch.Tensor:
         """Importance (N,) of points (N, 3) for the sampling PDF."""
         kind = "literal" if self.config.sampling.pdf == "literal" else self.config.sampling.importance
-        logits = self.field.logits(self.field.geometry(points))
-        return class_importance(torch.softmax(logits, 1), kind, self.priorities)
+        probabilities = self.field.class_probabilities(self.field.geometry(points))
+        return class_importance(probabilities, kind, self.priorities)
 
     def wants_importance(self) -> bool:
         """Whether reading classes would change where samples go."""
@@ -205,19 +205,20 @@ class Model(nn.Module):
         evaluated_density = geometry.density.detach()
         indices, visible, visible_count = self._select_visible(samples, weights, fixed)
         if two_passes:
-            explicit = geometry.explicit[indices] if geometry.explicit is not None else None
-            geometry, weights = self._weighted(points[indices], visible, explicit, thin)
+            explicit = geometry.explicit.index_select(0, indices) if geometry.explicit is not None else None
+            geometry, weights = self._weighted(points.index_select(0, indices), visible, explicit, thin)
             density, chosen = geometry.density, None
         else:
-            density, weights, chosen = geometry.density[indices], weights[indices], indices
+            density, weights = geometry.density.index_select(0, indices), weights.index_select(0, indices)
+            chosen = indices
         if fixed:  # unused entries count for nothing
             density = _where_used(visible, density, 0.0)
             weights = weights if two_passes else _where_used(visible, weights, 0.0)
             evaluated_density = _where_used(samples, evaluated_density, -1.0)
-        color, logits = self._shade(geometry, chosen, visible.packed_info, directions, codes, semantics)
+        color, classes = self._shade(geometry, chosen, visible.packed_info, directions, codes, semantics)
         values = torch.cat([color, torch.ones_like(weights)[:, None], visible.t[:, None]], 1)
         summed = weighted_sum(values, weights, visible.packed_info)
-        probabilities = None if logits is None else self._probabilities(logits, weights, visible.packed_info)
+        probabilities = None if classes is None else self._probabilities(classes, weights, visible.packed_info)
         environment = self._environment(directions, summed[:, 3], samples, codes, semantics)
         shaded = (summed[:, :3], summed[:, 3], summed[:, 4], probabilities, environment)
         return Rendered(*shaded, weights, density, visible, samples.points, evaluated_density, visible_count)
@@ -275,8 +276,10 @@ class Model(nn.Module):
             share = min(1.0, max(LEAST_CAPACITY, CAPACITY_FACTOR * self.host_visible_share))
             capacity = math.ceil(len(samples) * share)
         indices, packed_info = samples.packed_info.subset(kept, capacity)
-        t, deltas = samples.t[indices], samples.deltas[indices]
-        visible = Samples(samples.points[indices], t, deltas, packed_info, samples.t_first, samples.t_last)
+        t, deltas = samples.t.index_select(0, indices), samples.deltas.index_select(0, indices)
+        visible = Samples(
+            samples.points.index_select(0, indices), t, deltas, packed_info, samples.t_first, samples.t_last
+        )
         return indices, visible, kept.sum()
 
     def _shade(
@@ -288,8 +291,8 @@ class Model(nn.Module):
         codes: torch.Tensor | None,
         semantics: bool,
     ) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """Colour (N, 3) and class logits (N, K), or None without semantics, of the samples that `packed_info` packs:
-        the rows `chosen` of `geometry`, or all of them."""
+        """Colour (N, 3) and what is accumulated of classes (N, K), or None without semantics, of the samples that
+        `packed_info` packs: the rows `chosen` of `geometry`, or all of them."""
         # Per ray first: a ray's samples share direction and code.
         harmonics = spherical_harmonics(directions).to(self.field.dtype)
         ray_indices = packed_info.ray_indices.long()
@@ -297,8 +300,10 @@ class Model(nn.Module):
         def shade(rays: torch.Tensor, rows: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor | None]:
             part = geometry if rows is None else geometry[rows]
             color = self.field.color(part, harmonics[rays], None if codes is None else codes[rays])
-            wanted = semantics and self.field.semantic_head is not None
-            return color, self.field.logits(part) if wanted else None
+            if not semantics or self.field.semantic_head is None:
+                return color, None
+            summed = self.config.render.accumulate == "probabilities"
+            return color, self.field.class_probabilities(part) if summed else self.field.logits(part)
 
         if torch.is_grad_enabled():
             return shade(ray_indices, chosen)
@@ -331,10 +336,10 @@ class Model(nn.Module):
         visible = torch.stack([r.visible for r in rendered]).sum()
         self.visible_share += 0.05 * (visible / (density >= 0).sum().clamp(min=1) - self.visible_share)
 
-    def _probabilities(self, logits: torch.Tensor, weight: torch.Tensor, packed_info: PackedInfo) -> torch.Tensor:
+    def _probabilities(self, classes: torch.Tensor, weight: torch.Tensor, packed_info: PackedInfo) -> torch.Tensor:
         pull = self.label_pull
         weight = torch.lerp(weight.detach(), weight, pull) if pull > 0 else weight.detach()
         if self.config.render.accumulate == "probabilities":
-            return weighted_sum(torch.softmax(logits, 1), weight, packed_info)
-        total = weighted_sum(torch.cat([logits, torch.ones_like(weight)[:, None]], 1), weight, packed_info)
+            return weighted_sum(classes, weight, packed_info)
+        total = weighted_sum(torch.cat([classes, torch.ones_like(weight)[:, None]], 1), weight, packed_info)
         return torch.softmax(total[:, :-1], 1) * total[:, -1:]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from matplotlib import colormaps
 
 VOID_COLOR = (0.0, 0.0, 0.0)
 
@@ -15,6 +14,8 @@ def colorize_depth(depth: np.ndarray, opacity: np.ndarray) -> np.ndarray:
         return np.zeros((*depth.shape, 3), np.uint8)
     solid, (near, far) = _solid(depth, opacity), drawn
     value = 1 - (np.nan_to_num(depth, nan=far) - near) / max(far - near, 1e-9)
+    from matplotlib import colormaps  # only where depth is shown: it takes long
+
     picture = colormaps["turbo"](value.clip(0, 1))[..., :3]
     return (np.where(solid[..., None], picture, 0) * 255 + 0.5).astype(np.uint8)
 

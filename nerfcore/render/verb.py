@@ -33,7 +33,7 @@ from ..project.fingerprints import (
     rounded,
     write_made,
 )
-from ..project.runs import checkpoint_id
+from ..project.runs import INSTANCES, MESH_RECORD, checkpoint_id
 from ..project.schema import step
 from ..project.store import load_project, world_from_sfm
 from . import parts
@@ -48,8 +48,10 @@ ORBIT_PIXELS = 800  # longest side of orbit frames unless a size is asked for
 OPEN_ANGLE = np.pi / 2  # around the subject without a photo: from there on an orbit is an arc
 
 
-def render(params: RenderParams, report: Reporter) -> dict[str, Any]:
+def render(params: RenderParams, report: Reporter, shown: Model | BakedField | None = None) -> dict[str, Any]:
     """Render a run from some cameras; existing frames are overwritten, but for those of parts of the same render.
+
+    `shown` is rendered in the place of the run's field.
 
     Depth PNGs are coloured for viewing, and NAME_depth.json says what the colours mean; the EXR holds the values: depth in world units along the optical axis, class
     ids, confidence, world-space normals.
@@ -63,7 +65,9 @@ def render(params: RenderParams, report: Reporter) -> dict[str, Any]:
     folder, out = Path(params.project), Path(params.out)
     project, info = load_project(folder), load_info(folder, params.run)
     scene = load_scene(folder, info.holdout)
-    shown = _shown(params, info)
+    if params.baked and "unknown" in params.passes:
+        raise SettingError("A baked field has no pass “unknown”.", "Leave it out of --passes, or leave out --baked.")
+    shown = shown or _shown(params, info)
     inputs = render_inputs(params)
     box = info.box(project)
     cameras = chosen_cameras(params, scene)
@@ -123,11 +127,9 @@ def _part(cameras: list[tuple[str, Camera, np.ndarray]], frames: tuple[int, int]
 
 
 def _shown(params: RenderParams, info: RunInfo) -> Model | BakedField:
-    """What is rendered. Raises ProjectError, SettingError."""
+    """What is rendered. Raises ProjectError."""
     if not params.baked:
         return load_trained(params.project, params.run).model
-    if "unknown" in params.passes:
-        raise SettingError("A baked field has no pass “unknown”.", "Leave it out of --passes, or leave out --baked.")
     return load_baked(params.project, params.run, info)
 
 
@@ -144,8 +146,15 @@ def render_inputs(params: RenderParams) -> Fingerprint:
         "settings": digest([chosen, info.config.render.model_dump(mode="json")]),
         **({"baked field": files_digest([("meta", voxels_folder(folder, params.run) / META)])} if params.baked else {}),
         "camera file": files_digest([("camera", params.camera)]),
+        **({"edits": _edit_inputs(params)} if params.edits else {}),
         **view_inputs(scene, list(range(len(scene.views))), files=False),
     }
+
+
+def _edit_inputs(params: RenderParams) -> str:
+    """A digest of the edits and of the mesh whose things they name."""
+    exports = Path(params.project) / "exports" / params.run
+    return files_digest([("edits", params.edits), *((name, exports / name) for name in (MESH_RECORD, INSTANCES))])
 
 
 def rendered(params: RenderParams) -> Earlier:

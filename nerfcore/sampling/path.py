@@ -11,7 +11,6 @@ import math
 
 import numpy as np
 import torch
-from scipy.spatial import KDTree
 
 from ..geometry.cameras import Camera
 from .visibility import FEWEST_POINTS, cells_at, depth_ranges, grid_centers, in_front
@@ -77,6 +76,9 @@ def _along(
     camera_to_box: torch.Tensor, free: dict[tuple[int, int], float], resolution: int, contracted: bool
 ) -> torch.Tensor:
     """Cells (resolution³,) around the lines between pairs of cameras, as far as these are `free`."""
+
+    from scipy.spatial import KDTree  # takes a tenth of a second, and few trainings come here
+
     device = camera_to_box.device
     tree = KDTree(grid_centers(resolution, contracted, device).cpu().numpy())
     close = torch.zeros(resolution**3, dtype=torch.bool, device=device)

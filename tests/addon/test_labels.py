@@ -269,6 +269,8 @@ settings.label_tool = "brush"
 seen.append(mark_parameters(settings, erase=True))
 settings.label_tool, settings.label_encoder, settings.label_decoder = "click", "e.onnx", "d.onnx"
 seen.append(mark_parameters(settings))
+settings.label_tool = "part"
+seen.append(mark_parameters(settings))
 answer(seen)
 """,
         project=make_posed_project(tmp_path / "p"),
@@ -282,7 +284,9 @@ answer(seen)
     assert facts[6]["box"], "with a model a click asks it"
     from fieldwork.nerfcore.params import LabelStrokeParams
 
-    for values in facts[1:6]:
+    part = {**common, "shape": "part", "width": 2.0, "class_id": 2}
+    assert facts[7] == {**part, "level": "coarse"}, "parts are those of the surface, with a model too"
+    for values in (*facts[1:6], facts[7]):
         LabelStrokeParams.model_validate({"project": tmp_path, "photo": "a", "points": [(1, 1)], **values})
 
 

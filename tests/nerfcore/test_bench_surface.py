@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fieldwork.nerfcore.bench import surface as suite
+from fieldwork.nerfcore.bench.surface_exposure import exposed
 from fieldwork.nerfcore.bench.surface_figures import (
     Sight,
     Truth,
@@ -24,9 +25,11 @@ from fieldwork.nerfcore.errors import InputError
 from fieldwork.nerfcore.geometry.cameras import Camera
 from fieldwork.nerfcore.mesh.clean import cross, unit
 from fieldwork.nerfcore.mesh.painted import Painted
+from fieldwork.nerfcore.mesh.photos import Photo
 from fieldwork.nerfcore.mesh.surface import Surface
 from fieldwork.nerfcore.mesh.surface_labels import ClassMaps, SurfaceClasses
 from fieldwork.nerfcore.mesh.uv import UvMap
+from fieldwork.nerfcore.mesh.visibility import PosedCamera
 from fieldwork.nerfcore.params import BenchParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.verbs import run_verb
@@ -74,6 +77,18 @@ def test_the_truth_itself_has_no_fault() -> None:
     assert found["excess_area"] == 0
     assert found["mesh_psnr"] is found["delta_e"] is found["gradient"] is found["seams"] is None
     assert found["class_area_error"] < 0.02  # though no camera sees the rim of the plate, and little below it
+
+
+def test_a_photo_with_more_light_is_brighter_and_no_more_than_white() -> None:
+    levels = np.arange(256, dtype=np.uint8).reshape(16, 16)
+    rgba = np.stack([levels, levels, levels, 255 - levels], -1)
+    view = scene_around().views[0]
+    photo = Photo(PosedCamera(view.camera, np.eye(4)), lambda: rgba)
+    more = exposed(photo, 1.0).read()
+    assert more[12, 8].tolist() == [255, 255, 255, 55]  # 200 is 58 % of the light
+    assert more[8, 0].tolist() == [176, 176, 176, 127]  # 21.6 % become 43.2 %, IEC 61966-2-1
+    assert (exposed(photo, -1.0).read()[8, 0, :3] == 92).all()
+    assert rgba[8, 0, 0] == 128
 
 
 def test_the_truth_is_sampled_where_photos_look_however_large_it_is() -> None:

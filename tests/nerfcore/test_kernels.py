@@ -5,14 +5,13 @@ from __future__ import annotations
 
 import pytest
 import torch
-from fieldwork.nerfcore.kernels import cells, composite, encode, encode_points, march, traversal
+from fieldwork.nerfcore.kernels import cells, composite, march, traversal
 from fieldwork.nerfcore.kernels.device import Kernels, backend_of, using_kernels
 from fieldwork.nerfcore.kernels.packed_info import PackedInfo
 from fieldwork.nerfcore.kernels.traversal import PDF_DEFAULT, PDF_LITERAL, PDF_UNIFORM, MarchSettings
 from fieldwork.tests.nerfcore.support import (
     cells_reference,
     composite_reference,
-    encode_reference,
     march_reference,
 )
 from hypothesis import given, settings
@@ -33,106 +32,6 @@ def random_packed_info(rays: int, generator: torch.Generator, device: torch.devi
     start = torch.cumsum(count, 0, dtype=torch.int32) - count
     ray = torch.repeat_interleave(torch.arange(rays, dtype=torch.int32), count.long())
     return PackedInfo(start.to(device), count.to(device), ray.to(device))
-
-
-def test_encode_equals_its_reference_and_so_does_its_gradient(device: torch.device) -> None:
-    generator = torch.Generator().manual_seed(1)
-    table = torch.randn(ROWS, encode.FEATURES, generator=generator).to(device)
-    points = torch.rand(3000, 3, generator=generator).to(device)
-    points[:8] = torch.tensor([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)], device=device)
-    expected_table = table.clone().requires_grad_()
-    expected = encode_reference.forward(expected_table, LEVELS, GAINS, points)
-    assert relative(encode.forward(table, LEVELS, GAINS, points), expected) <= 1e-5
-    upstream = torch.randn(expected.shape, generator=generator).to(device)
-    expected.backward(upstream)
-    gradient, touched = torch.zeros_like(table), torch.zeros(ROWS // encode.BLOCK, dtype=torch.uint8, device=device)
-    encode.scatter(gradient, touched, LEVELS, GAINS, [(points, upstream)])
-    assert expected_table.grad is not None
-    assert relative(gradient, expected_table.grad) <= 1e-4
-    blocks = (expected_table.grad.abs().sum(1) > 0).view(-1, encode.BLOCK).any(1)
-    assert torch.equal(touched.bool() & blocks, blocks)
-
-
-def test_a_level_of_more_vertices_than_32_bits_number_is_hashed(device: torch.device) -> None:
-    generator = torch.Generator().manual_seed(13)
-    levels = [(1300, 0, 1 << 21)]  # 1300³ is beyond 2³¹
-    table = torch.randn(1 << 21, encode.FEATURES, generator=generator).to(device)
-    points = (torch.rand(200, 3, generator=generator) / 1300).to(device)
-    expected = encode_reference.forward(table, levels, [1.0], points)
-    assert relative(encode.forward(table, levels, [1.0], points), expected) <= 1e-5
-
-
-def test_the_gradient_of_encoded_points_equals_its_reference(device: torch.device) -> None:
-    generator = torch.Generator().manual_seed(11)
-    table = torch.randn(ROWS, encode.FEATURES, generator=generator).to(device)
-    points = torch.rand(3000, 3, generator=generator).to(device).requires_grad_()
-    expected = encode_reference.forward(table, LEVELS, GAINS, points)
-    upstream = torch.randn(expected.shape, generator=generator).to(device)
-    expected.backward(upstream)
-    assert points.grad is not None
-    ours = encode_points.backward_points(table, LEVELS, GAINS, points.detach(), upstream)
-    assert relative(ours, points.grad) <= 1e-4
-    coarse = encode_points.backward_points(table, LEVELS, [1.0, 0.0, 0.0], points.detach(), upstream)
-    assert relative(coarse, ours) > 0.5
-
-
-def test_the_gradient_of_encoded_points_agrees_with_finite_differences(device: torch.device) -> None:
-    generator = torch.Generator().manual_seed(12)
-    table = torch.randn(ROWS, encode.FEATURES, generator=generator).to(device)
-    # In the middle of the finest level's cells, so that the steps stay inside one cell of every level.
-    cells_ = torch.randint(0, 63, (64, 3), generator=generator)
-    points = (cells_ + 0.5) / 63
-    step = 2e-4
-    for resolution in (5, 17):
-        f = points * (resolution - 1)
-        points = points[((f - f.round()).abs() > 0.02).all(1)]
-    assert len(points) > 20
-    points = points.to(device)
-    upstream = torch.randn(len(points), len(LEVELS) * encode.FEATURES, generator=generator).to(device)
-    ours = encode_points.backward_points(table, LEVELS, GAINS, points, upstream)
-    for axis in range(3):
-        shift = torch.zeros(3, device=device)
-        shift[axis] = step
-        ahead = encode.forward(table, LEVELS, GAINS, points + shift)
-        behind = encode.forward(table, LEVELS, GAINS, points - shift)
-        difference = ((ahead - behind) * upstream).sum(1) / (2 * step)
-        assert relative(ours[:, axis], difference) < 5e-3
-
-
-@pytest.mark.parametrize("kernels", ["warp", "torch"])
-def test_the_gradient_scatter_gives_the_same_bits_every_time(kernels: Kernels) -> None:
-    generator = torch.Generator().manual_seed(2)
-    points = torch.rand(20000, 3, generator=generator)
-    upstream = torch.randn(20000, len(LEVELS) * encode.FEATURES, generator=generator)
-
-    def gradient() -> torch.Tensor:
-        total = torch.zeros(ROWS, encode.FEATURES)
-        touched = torch.zeros(ROWS // encode.BLOCK, dtype=torch.uint8)
-        with using_kernels(kernels):
-            encode.scatter(total, touched, LEVELS, GAINS, [(points, upstream)])
-        return total
-
-    first = gradient()
-    assert all(torch.equal(first, gradient()) for _ in range(3))
-
-
-def test_adam_moves_touched_rows_only(device: torch.device) -> None:
-    generator = torch.Generator().manual_seed(3)
-    values = [torch.randn(ROWS, encode.FEATURES, generator=generator).to(device) for _ in range(3)]
-    table, mean, square = values[0], values[1], values[2].abs()
-    gradient = torch.randn(ROWS, encode.FEATURES, generator=generator).to(device)
-    gradient[::3] = 0
-    expected = [x.clone() for x in (table, gradient, mean, square)]
-    encode_reference.adam(*expected, rate=0.01)
-    before = table.clone()
-    touched = torch.ones(ROWS // encode.BLOCK, dtype=torch.uint8, device=device)
-    lost = torch.zeros(1, dtype=torch.int32, device=device)
-    encode.adam(table, gradient, mean, square, touched, lost, 0.01)
-    assert int(lost) == 0
-    for ours, theirs in zip((table, gradient, mean, square), expected):
-        assert torch.allclose(ours, theirs, rtol=1e-5, atol=1e-7)
-    assert torch.equal(table[::3], before[::3])
-    assert not touched.any()
 
 
 def test_weights_and_sums_equal_their_references_and_so_do_their_gradients(device: torch.device) -> None:
@@ -343,25 +242,6 @@ def test_sums_without_64_bit_integers_come_close() -> None:
     with using_kernels("torch"):
         cells.average(close, scratch, 4, points, values, 0.1)
     assert torch.allclose(exact, close, rtol=1e-5)
-
-
-def test_a_row_whose_gradient_is_not_finite_is_skipped_counted_and_moves_again(device: torch.device) -> None:
-    table, gradient, mean, square = (torch.zeros(2 * encode.BLOCK, encode.FEATURES, device=device) for _ in range(4))
-    touched, lost = (torch.zeros(n, dtype=d, device=device) for n, d in ((2, torch.uint8), (1, torch.int32)))
-    for bad in (float("nan"), float("inf"), 1e30):  # the last one's square is not finite
-        gradient[3, 1] = bad
-        gradient[4] = 1.0
-        touched[:] = 1
-        encode.adam(table, gradient, mean, square, touched, lost, 0.01)
-        assert not gradient.any()
-    assert int(lost) == 3
-    assert not table[3].any()
-    assert bool((table[4] < 0).all())
-    gradient[3] = 1.0
-    touched[:] = 1
-    encode.adam(table, gradient, mean, square, touched, lost, 0.01)
-    assert bool((table[3] < 0).all())
-    assert all(bool(torch.isfinite(x).all()) for x in (table, mean, square))
 
 
 def test_observing_samples_equals_its_reference(device: torch.device) -> None:

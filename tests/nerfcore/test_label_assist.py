@@ -12,7 +12,7 @@ import pytest
 from fieldwork.nerfcore.cli import main
 from fieldwork.nerfcore.errors import InputError
 from fieldwork.nerfcore.images.working import read_label
-from fieldwork.nerfcore.labels.assist import models as loaded
+from fieldwork.nerfcore.labels import models as loaded
 from fieldwork.nerfcore.labels.assist.embeddings import FOLDER
 from fieldwork.nerfcore.labels.assist.outline import outline_of
 from fieldwork.nerfcore.labels.assist.segmenter import EfficientSam, HuggingSam2, Prompt, Sam2, Segmenter, segmenter

@@ -17,13 +17,11 @@ from fieldwork.nerfcore.data.load import load_scene
 from fieldwork.nerfcore.errors import Cancelled, DiskError, InputError, ProjectError
 from fieldwork.nerfcore.images.working import nearest, read_label
 from fieldwork.nerfcore.labels.accept import MAPS, accept
-from fieldwork.nerfcore.labels.journal import read_marks
 from fieldwork.nerfcore.labels.next_photo import next_photo
 from fieldwork.nerfcore.labels.overlay import overlay, photo_labels
 from fieldwork.nerfcore.labels.preparation import FOLDER, Preparation, current, prepare
 from fieldwork.nerfcore.labels.propagate import propagate
 from fieldwork.nerfcore.labels.revisions import computed, load
-from fieldwork.nerfcore.labels.seeds import marked_surfels
 from fieldwork.nerfcore.labels.stroke import checkout, stroke
 from fieldwork.nerfcore.mesh.verb import mesh
 from fieldwork.nerfcore.params import (
@@ -348,21 +346,6 @@ def test_a_cancel_takes_two_seconds_at_most(ball: Path) -> None:
         with pytest.raises(Cancelled):
             work(stopped)
     assert files_of(ball) == before
-
-
-def test_a_click_on_a_part_takes_all_of_it(ball: Path) -> None:
-    ids = truth(ball)["01"]
-    rows, columns = np.nonzero(ids == TOP)
-    middle = (float(np.median(columns)) + 0.5, float(np.median(rows)) + 0.5)
-    mark(ball, points=[middle], class_id=TOP, shape="click", width=1)
-    mark(ball, points=[middle], class_id=TOP, shape="part", width=1)
-    ready = Preparation(run_folder(ball, "main") / FOLDER)
-    place, part = (marked_surfels(ready, one, (SIDE, SIDE)) for one in read_marks(ball))
-    assert 0 < len(place) < len(part)
-    assert set(place) <= set(part)
-    taken = np.unique(ready.part[part])
-    assert set(taken) == set(np.unique(ready.part[place]))
-    assert np.count_nonzero(np.isin(ready.part, taken)) == len(part), "the whole part, nothing else"
 
 
 def test_what_was_propagated_tells_of_itself_later(ball: Path) -> None:

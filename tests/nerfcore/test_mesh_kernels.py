@@ -16,7 +16,12 @@ from fieldwork.nerfcore.kernels.raycast import FrontFaces
 from fieldwork.nerfcore.kernels.triangles import nearest_triangle
 from fieldwork.nerfcore.mesh.depth_maps import DepthMap, FlatView, confirmed_maps, map_arrays, normals
 from fieldwork.nerfcore.progress import Reporter
-from fieldwork.tests.nerfcore.support import patches_reference, surface_reference, triangles_reference
+from fieldwork.tests.nerfcore.support import (
+    normals_reference,
+    patches_reference,
+    surface_reference,
+    triangles_reference,
+)
 from fieldwork.tests.nerfcore.support.backends import WARP_DEVICES
 from fieldwork.tests.nerfcore.support.depth_views import maps_of, orbit, sphere
 
@@ -101,12 +106,23 @@ def test_unsure_and_thin_places_are_fused_as_their_reference_says(device: str, r
     assert float(((ours[1] - expected[1]).abs() < 1e-3 * expected[1] + 1e-2).float().mean()) > 0.99
 
 
+def test_normals_of_depths_equal_their_reference() -> None:
+    flats, maps = maps_of(sphere(0.5), orbit(3, 1.8), SMALL)
+    depth = np.where(np.random.default_rng(3).random(maps[0].depth.shape) < 0.02, 0, maps[0].depth)
+    expected = normals_reference.normals(flats[0].camera, depth)
+    ours = normals(flats[0].camera, depth)
+    assert (depth >= FREE).mean() > 0.2
+    assert 0.1 < (expected != 0).any(-1).mean() < 0.8
+    assert np.abs(ours - expected).max() < 1e-5
+
+
 @pytest.mark.parametrize("device", WARP_DEVICES)
 def test_as_many_views_agree_as_their_reference_says(device: str, rough: MapArrays) -> None:
     others = [1, 2, 3, 4, 5, 6, 7, 8]
     near = torch.tensor(others, dtype=torch.int32, device=device)
     ours = surface.agreement(on(device, rough), 0, near, 0.02, 1.5).cpu()
     expected = surface_reference.agreement(rough, 0, others, 0.02, 1.5)
+    assert torch.equal(surface.agreement(on(device, rough), 0, near, 0.02, 1.5, 2).cpu(), ours.clamp(max=2))
     assert len(expected.unique()) >= 4
     assert ours.shape == expected.shape
     assert float((ours == expected)[expected > 0].float().mean()) > 0.99
@@ -142,15 +158,18 @@ def painted() -> tuple[MapArrays, np.ndarray, np.ndarray]:
     return arrays, np.concatenate(grey), normals(flats[0].camera, maps[0].depth).reshape(-1, 3).astype(np.float32)
 
 
+@pytest.mark.parametrize("host", [False, True])
 @pytest.mark.parametrize("device", WARP_DEVICES)
 def test_photos_move_depths_as_their_reference_says(
-    device: str, painted: tuple[MapArrays, np.ndarray, np.ndarray]
+    device: str, host: bool, painted: tuple[MapArrays, np.ndarray, np.ndarray]
 ) -> None:
+    if host and device != "cpu":
+        pytest.skip("this code is for CPUs")
     maps, grey, normal = painted
     others, least, gain = [3, 8, 5, 16, 21], 0.6, 0.05
     near = torch.tensor(others, dtype=torch.int32, device=device)
     facing = torch.from_numpy(normal).to(device)
-    depth, score = refine(torch.from_numpy(grey).to(device), facing, on(device, maps), 0, near, least, gain)
+    depth, score = refine(torch.from_numpy(grey).to(device), facing, on(device, maps), 0, near, least, gain, host)
     views = patches_reference.Views(maps, grey)
     pixels = [(row, column) for row in range(0, SMALL.height, 3) for column in range(0, SMALL.width, 4)]
     expected = np.array(

@@ -42,6 +42,9 @@ class BallField(torch.nn.Module):
     def logits(self, geometry: Geometry) -> torch.Tensor:
         return torch.tensor([0.0, 20.0]).expand(len(geometry.density), 2)
 
+    def class_probabilities(self, geometry: Geometry) -> torch.Tensor:
+        return torch.softmax(self.logits(geometry), 1)
+
 
 def ball_model(samples: int, pdf: str = "default", resolution: int = 64) -> Model:
     config = RunConfig.model_validate(

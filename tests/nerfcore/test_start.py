@@ -10,10 +10,10 @@ import pytest
 HEAVY = {
     "cli": ("torch", "warp", "scipy", "matplotlib", "pycolmap", "trimesh"),
     "engine.server": ("torch", "warp", "scipy", "matplotlib", "pycolmap", "trimesh"),
-    "train.verb": ("matplotlib.figure", "trimesh", "skimage", "pycolmap", "torch._dynamo"),
+    "train.verb": ("matplotlib", "scipy", "trimesh", "skimage", "pycolmap", "torch._dynamo"),
     "mesh.verb": ("matplotlib.figure", "trimesh", "networkx", "pycolmap", "torch._dynamo"),
-    "render.verb": ("matplotlib.figure", "trimesh", "skimage", "pycolmap", "torch._dynamo"),
-    "evaluate.verb": ("matplotlib.figure", "trimesh", "pycolmap", "torch._dynamo"),
+    "render.verb": ("matplotlib", "scipy", "trimesh", "skimage", "pycolmap", "torch._dynamo"),
+    "evaluate.verb": ("matplotlib", "scipy", "trimesh", "pycolmap", "torch._dynamo"),
 }
 
 

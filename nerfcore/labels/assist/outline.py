@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from skimage.measure import approximate_polygon, find_contours
 
 from ...errors import InputError
 
@@ -18,6 +17,8 @@ def outline_of(mask: np.ndarray) -> list[tuple[float, float]]:
     Raises:
         InputError: the mask is empty.
     """
+    from skimage.measure import approximate_polygon, find_contours  # half a second
+
     padded = np.pad(mask.astype(np.float32), 1)
     loops = [approximate_polygon(loop, TOLERANCE) for loop in find_contours(padded, 0.5)]
     loops = [loop for loop in loops if len(loop) > LEAST]  # the last corner is the first one again

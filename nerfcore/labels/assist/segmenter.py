@@ -11,9 +11,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from .models import Model, Wanted, load
+from ..models import Model, Wanted, load, normalised
 
-MEAN, DEVIATION = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])  # ImageNet's, of sRGB in [0, 1]
 SIDE = 1024  # pixels of the encoders' frame where the model does not say
 LOW = 256  # side of the masks that decoders take
 OUTSIDE, INSIDE, UPPER_LEFT, LOWER_RIGHT, PAD = 0, 1, 2, 3, -1  # what points mean
@@ -206,8 +205,3 @@ def segmenter(encoder: Path, decoder: Path) -> Segmenter:
 def resized(picture: np.ndarray, width: int, height: int) -> np.ndarray:
     """A picture (H, W, 3) uint8, or values (H, W) float32, at another size, between the pixels."""
     return np.asarray(Image.fromarray(picture).resize((width, height), Image.Resampling.BILINEAR))
-
-
-def normalised(photo: np.ndarray) -> np.ndarray:
-    """A photo (H, W, 3) uint8 as networks take it: (3, H, W), of mean 0 and deviation 1."""
-    return ((photo / 255 - MEAN) / DEVIATION).transpose(2, 0, 1)

@@ -10,8 +10,8 @@ from PIL import Image
 from scipy.special import softmax
 
 from ...errors import InputError
-from .models import Model, Wanted
-from .segmenter import normalised, resized
+from ..models import Model, Wanted, normalised
+from .segmenter import resized
 
 SIDE, STEP = 512, 32  # shorter side of the pictures where the model does not say, and what sides are a multiple of
 IMAGE = Wanted(("pixel_values", "input", "image", "images", "x"), (4,), 3)

@@ -17,9 +17,9 @@ from ...project.schema import ImageRecord, Project
 from ...project.store import edit_project, load_project
 from ..accept import is_accepted
 from ..journal import append_mark
+from ..models import load
 from ..stroke import require_class, require_photo
 from .embeddings import embedded, photo_pixels
-from .models import load
 from .outline import outline_of
 from .segmenter import Prompt, segmenter
 from .semantic import Semantic, guessed, read_mapping

@@ -180,3 +180,22 @@ def segformer(path: Path, side: int | None = None) -> Path:
     g.add("Mul", small, g.constant(5.0), out="logits")
     size = [side, side] if side else ["h", "w"]
     return g.save(path, {"pixel_values": (FLOAT, [1, 3, *size])}, {"logits": (FLOAT, [1, 3, "a", "b"])})
+
+
+def dino(path: Path, patch: int = 14, others: int = 5, side: int | None = None) -> Path:
+    """From pictures to tokens of 8: class and register tokens of 1000, then red, green, blue of each patch, and zeros."""
+    g = Graph()
+    small = g.add("AveragePool", "pixel_values", kernel_shape=[patch, patch], strides=[patch, patch])
+    wide = g.add("Conv", small, g.constant(np.eye(8, 3)[:, :, None, None]))
+    rows = g.add("Transpose", g.add("Reshape", wide, g.constant([1, 8, -1], np.int64)), perm=[0, 2, 1])
+    g.add("Concat", g.constant(np.full((1, others, 8), 1000.0)), rows, axis=1, out="last_hidden_state")
+    size = [side, side] if side else ["h", "w"]
+    return g.save(path, {"pixel_values": (FLOAT, [1, 3, *size])}, {"last_hidden_state": (FLOAT, [1, "t", 8])})
+
+
+def feature_map(path: Path, patch: int = 16) -> Path:
+    """From pictures to a map (1, 8, h / patch, w / patch) of their colors."""
+    g = Graph()
+    small = g.add("AveragePool", "image", kernel_shape=[patch, patch], strides=[patch, patch])
+    g.add("Conv", small, g.constant(np.eye(8, 3)[:, :, None, None]), out="feature_map")
+    return g.save(path, {"image": (FLOAT, [1, 3, "h", "w"])}, {"feature_map": (FLOAT, [1, 8, "a", "b"])})

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import onnxruntime
 
-from ...errors import InputError
+from ..errors import InputError
 
 KINDS = {
     "tensor(float)": np.float32,
@@ -22,6 +22,7 @@ KINDS = {
     "tensor(bool)": np.bool_,
     "tensor(uint8)": np.uint8,
 }
+MEAN, DEVIATION = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])  # ImageNet's, of sRGB in [0, 1]
 KEPT = 3  # models in memory
 
 
@@ -144,3 +145,8 @@ def load(path: Path) -> Model:
 @lru_cache(KEPT)
 def _loaded(path: Path, changed: int, size: int) -> Model:
     return Model(path)
+
+
+def normalised(photo: np.ndarray) -> np.ndarray:
+    """A photo (H, W, 3) uint8 as networks take it: (3, H, W), of mean 0 and deviation 1."""
+    return ((photo / 255 - MEAN) / DEVIATION).transpose(2, 0, 1)

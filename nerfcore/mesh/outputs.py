@@ -1,0 +1,108 @@
+"""What `mesh` leaves on disk: all of it, or, where it is stopped, what was there before."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..data.box import Box
+from ..data.scene import Scene
+from ..files import atomic_path, staged
+from ..geometry.similarity import transform_points
+from ..images.encode import write_picture
+from ..params import MeshParams
+from ..progress import Reporter
+from ..project.runs import MEASURES, MESH_RECORD
+from .build import Built
+from .features import features_of
+from .instances import Instance, write_instances
+from .lods import Level, level_files, write_level
+from .painted import MAPS, Painted, write_maps
+from .parts import Texture
+from .stored import COARSE, MESH, TEXTURE
+from .surface import Surface
+
+
+@dataclass(frozen=True)
+class Made:
+    """A finished mesh in the world: `built`, in the frame of `box`, is what it was made of; pictures: by file name, of
+    the turntable."""
+
+    surface: Surface
+    texture: Texture | None
+    painted: Painted
+    built: Built
+    box: Box
+    instances: list[Instance]
+    levels: list[Level]
+    pictures: dict[str, np.ndarray]
+
+
+def write_outputs(target: Path, made: Made, scene: Scene, params: MeshParams, report: Reporter) -> list[Path]:
+    """Write a mesh to its folder, to the file that was asked for, and its turntable. Nothing that was there is changed
+    before everything is written.
+
+    Returns:
+        the files written.
+    Raises:
+        DiskError: one cannot be written. Cancelled.
+    """
+    from .files import write_surface  # with its libraries, a quarter of a second
+
+    with ExitStack() as stack:
+        places: dict[Path, Path] = {}  # where files are written first → the folder that they are for
+
+        def place(folder: Path) -> Path:
+            found = stack.enter_context(staged(folder))
+            places[found] = folder
+            return found
+
+        here = place(target)
+        there = place(params.out.parent) if params.out is not None else here
+        files = _write_arrays(here, made) + [write_instances(here, made.instances)]
+        files += write_maps(here, made.painted, {c.id: c.color for c in scene.classes}, report.check)
+        surface = made.surface
+        features = features_of(surface, scene.classes, scene.ignore_id, made.instances)
+        files += write_surface(here / "mesh.ply", surface, features, "none", check=report.check)
+        if params.out is not None:
+            out = there / params.out.name
+            files += write_surface(out, surface, features, params.split, made.texture, check=report.check)
+        for number, level in enumerate(made.levels, 1):
+            report.progress(number / (len(made.levels) + 1))
+            files += write_level(here, number, level, report.check)
+            features = features_of(level.surface, scene.classes, scene.ignore_id, made.instances)
+            base = Path("mesh.glb") if params.out is None else params.out
+            path = there / f"{base.stem}_lod{number}{base.suffix}"
+            files += write_surface(path, level.surface, features, params.split, level.texture, check=report.check)
+        if params.turntable is not None:
+            aside = place(params.turntable)
+            for name, picture in made.pictures.items():
+                report.check()
+                with atomic_path(aside / name) as temporary:
+                    write_picture(temporary, picture)
+                files.append(aside / name)
+        report.check()
+        # From here on nothing stops it. What these say is no longer true, and what has no successor goes.
+        written = {path.name for path in files if path.parent == here}
+        for path in [target / MESH_RECORD, target / MEASURES, *level_files(target)]:
+            path.unlink(missing_ok=True)
+        for name in {TEXTURE, *MAPS} - written:
+            (target / name).unlink(missing_ok=True)
+    return [places[path.parent] / path.name for path in files]
+
+
+def _write_arrays(folder: Path, made: Made) -> list[Path]:
+    """Write mesh.npz, and the coarse surface that `measure` compares it with."""
+    painted, built = made.painted, made.built
+    sure = {"confidence": painted.classes.confidence, "face_confidence": painted.classes.face_confidence}
+    uv = {} if painted.uv is None else {"uv": painted.uv.corners}
+    unseen = {} if built.unseen is None else {"unseen": built.unseen}
+    with atomic_path(folder / MESH) as temporary, open(temporary, "wb") as file:
+        np.savez(file, **vars(made.surface), **sure, **uv, **unseen)
+    with atomic_path(folder / COARSE) as temporary, open(temporary, "wb") as file:
+        vertices, faces = built.coarse
+        np.savez(file, vertices=transform_points(made.box.world_from_box, vertices), faces=faces)
+    return [folder / MESH, folder / COARSE]

@@ -203,7 +203,13 @@ def test_the_baked_field_is_measured_like_the_others(tmp_path: Path) -> None:
     project = ball_project(tmp_path / "ball", side=24)
     small = {**SMALL, "sampling.samples": "4"}
     trial = next(t for _, t in trials_of("cpu", [str(project)], ["baked"], [0], 2.0, small))
-    figures = run_trial(trial.model_copy(update={"image_size": 32}), project, tmp_path / "out", None, Reporter())
+    figures = run_trial(
+        trial.model_copy(update={"image_size": 32, "seconds": None, "rays": 60_000}),
+        project,
+        tmp_path / "out",
+        None,
+        Reporter(),
+    )
     assert figures["psnr"] > 10
     assert figures["ms_network"] == figures["ms_frame"]
     assert not list((project / "runs").glob("*/*.safetensors"))

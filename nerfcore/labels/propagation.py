@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
+from .calibration import calibrated, certainty
 from .graph import Graph, membership
 from .preparation import Preparation
 from .seeds import VOID, Carried, Seeds
@@ -18,7 +19,6 @@ STRENGTH = 0.003  # γ of the prior, of the median of what edges conduct
 KNOWN_LOOK = 2.75  # distance to the nearest marked surfel, in feature columns, at which prior and void count the same
 SHARPNESS = 4
 CARRIED = 30.0  # by how much firmer the labels of an earlier epoch are than what surfels look like; not tuned
-CERTAINTY = 3  # exponent that makes confidence the share that is right
 FINE_STEPS = 15  # on surfels, after the coarse solution of all of it
 
 
@@ -49,8 +49,14 @@ def propagated(
         look, familiar, firm = with_carried(look, familiar, carried)
     values = np.zeros((len(seeds.surfel), classes), np.float32)
     values[np.flatnonzero(known), seeds.label[known]] = 1
-    start = None if start is None else calibrated(start, 1 / CERTAINTY)
-    return calibrated(walked(ready.graph, look, familiar, seeds.surfel, values, start, check, firm))
+    exponent = certainty(appearance_columns(ready, seeds.surfel), seeds, classes, check)
+    start = None if start is None else calibrated(start, 1 / exponent)
+    return calibrated(walked(ready.graph, look, familiar, seeds.surfel, values, start, check, firm), exponent)
+
+
+def appearance_columns(ready: Preparation, surfels: np.ndarray | slice) -> torch.Tensor:
+    """What some surfels look like as columns (S, F + G): those of the surface and those of the photos."""
+    return torch.from_numpy(np.concatenate([ready.features[surfels], ready.photo_features[surfels]], 1))
 
 
 def appearance(
@@ -60,7 +66,7 @@ def appearance(
     any that is marked."""
     known = seeds.label != VOID
     features = torch.from_numpy(np.array(ready.features))
-    columns = torch.cat([features, torch.from_numpy(np.array(ready.photo_features))], 1)
+    columns = appearance_columns(ready, slice(None))
     # Void is one more class of the classifier where it is marked.
     void_marked = bool((~known).any())
     target = torch.from_numpy(np.where(known, seeds.label, classes)).long()
@@ -118,12 +124,3 @@ def walked(
     coarse = random_walk(graph.coarse, prior, pull, sink, known, mean, begin, check)
     first = coarse[graph.cell]
     return random_walk(graph.edges, look, to_classes, to_void, seeds, values, first, check, most_steps=FINE_STEPS)
-
-
-def calibrated(probability: np.ndarray, exponent: float = CERTAINTY) -> np.ndarray:
-    """Probabilities (N, C), in sum at most 1, with their ratios, and that of all classes to void, to the power of the
-    exponent: a walker is far less sure than it is right. What is most probable stays so."""
-    total = probability.sum(1, keepdims=True).clip(0, 1)
-    share = (probability / np.maximum(probability.max(1, keepdims=True), 1e-12)) ** exponent
-    classed = total**exponent / (total**exponent + (1 - total) ** exponent)
-    return (classed * share / np.maximum(share.sum(1, keepdims=True), 1e-12)).astype(np.float32)

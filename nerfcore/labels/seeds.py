@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 
@@ -29,7 +29,8 @@ MOST_STEPS = 10_000  # of a brush between two places
 class Seeds:
     """Known surfels, ascending: surfel (S,), label (S,) class index or VOID, mark (S,) revision of the mark each is from;
     conflicts: [{"revision", "other", "surfels"}] of marks that say different things of the same place; unused: revisions
-    of marks that met no surface."""
+    of marks that met no surface; photo (S,): number of the photo that each mark is on, all on the surface having one more.
+    """
 
     surfel: np.ndarray
     label: np.ndarray
@@ -37,6 +38,7 @@ class Seeds:
     conflicts: list[dict[str, int]]
     unused: list[int]
     carried: Carried | None = None
+    photo: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int32))
 
 
 @dataclass(frozen=True)
@@ -92,7 +94,10 @@ def seeds_of(
             label[surfels], source[surfels] = new, mark.revision
     surfel = np.flatnonzero(label != UNMARKED)
     conflicts = [{"revision": a, "other": b, "surfels": count} for (a, b), count in sorted(overlaps.items())]
-    return Seeds(surfel, label[surfel], source[surfel], conflicts, unused, carried)
+    names = sorted({mark.photo for mark in marks})
+    number = {mark.revision: names.index(mark.photo) for mark in marks}
+    photo = np.array([number[revision] for revision in source[surfel].tolist()], np.int32)
+    return Seeds(surfel, label[surfel], source[surfel], conflicts, unused, carried, photo)
 
 
 def marked_surfels(ready: Preparation, mark: Mark, size: tuple[int, int]) -> np.ndarray:

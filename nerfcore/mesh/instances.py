@@ -6,6 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -23,16 +24,21 @@ ALIKE = 2.0  # by how much the areas of what may be the same thing in two meshes
 SAME_SIZE = 0.05  # areas within one such step are told apart by where the things stand, not by their noise
 
 
+Piece = tuple[float, tuple[float, float, float]]  # area and mean place
+
+
 @dataclass(frozen=True)
 class Instance:
     """A connected thing of one class: `id` as in the mesh's `face_instance`, its name (`plinth.001`) and class; area
-    (world units²) and the mean place of its surface."""
+    (world units²) and the mean place of its surface; parts: area and place of each piece that it was joined from by hand, so
+    that a mesh that is made again joins them again."""
 
     id: int
     name: str
     class_id: int
     area: float
     center: tuple[float, float, float]
+    parts: tuple[Piece, ...] = ()
 
 
 def find_instances(
@@ -78,9 +84,8 @@ def with_earlier_names(instances: list[Instance], earlier: list[Instance]) -> li
     pairs = []
     for number, one in enumerate(instances):
         for index, old in enumerate(earlier):
-            apart = float(np.linalg.norm(np.subtract(one.center, old.center)))
-            alike = max(one.area, old.area) <= ALIKE * min(one.area, old.area)
-            if old.class_id == one.class_id and alike and apart <= 0.5 * min(one.area, old.area) ** 0.5:
+            apart = distance_if_alike((one.area, one.center), (old.area, old.center))
+            if old.class_id == one.class_id and apart is not None:
                 pairs.append((apart, number, index))
     names: dict[int, str] = {}
     used: set[int] = set()
@@ -98,6 +103,50 @@ def with_earlier_names(instances: list[Instance], earlier: list[Instance]) -> li
             taken.add(name)
         found.append(replace(one, name=name))
     return found
+
+
+def with_earlier_joins(
+    face_instance: np.ndarray, instances: list[Instance], earlier: list[Instance]
+) -> tuple[np.ndarray, list[Instance]]:
+    """Instance (F,) of each face and the instances of a mesh that was made again, where what stands at the places of pieces
+    that were joined by hand is one again. Numbers of the others stay."""
+    face_instance, found = face_instance.copy(), list(instances)
+    for old in (one for one in earlier if one.parts):
+        alike = [i for i in found if i.class_id == old.class_id]
+        stand = [_nearest(alike, piece) for piece in old.parts]
+        same = list(dict.fromkeys(i for i in stand if i is not None))
+        if len(same) > 1:
+            whole = joined(same)
+        else:  # perhaps they are one by themselves now: it is still remembered what they were
+            one = _nearest(alike, (old.area, old.center))
+            same = [] if one is None else [one]
+            whole = None if one is None else replace(one, parts=old.parts)
+        if whole is not None:
+            face_instance[np.isin(face_instance, [i.id for i in same])] = whole.id
+            found = [whole if i.id == whole.id else i for i in found if i.id == whole.id or i not in same]
+    return face_instance, found
+
+
+def _nearest(instances: list[Instance], piece: Piece) -> Instance | None:
+    """The nearest of some instances to a place that is of about this size."""
+    apart = [(distance_if_alike((one.area, one.center), piece), one) for one in instances]
+    return min(((d, one) for d, one in apart if d is not None), key=lambda pair: pair[0], default=(0.0, None))[1]
+
+
+def joined(parts: list[Instance]) -> Instance:
+    """One instance of several of a class, with number and name of the first, and what it is made of."""
+    area = np.array([part.area for part in parts])
+    x, y, z = np.average([part.center for part in parts], axis=0, weights=np.maximum(area, 1e-30)).tolist()
+    pieces = tuple(piece for part in parts for piece in part.parts or ((part.area, part.center),))
+    return replace(parts[0], area=float(area.sum()), center=(x, y, z), parts=pieces)
+
+
+def distance_if_alike(one: Piece, other: Piece) -> float | None:
+    """How far apart what may be the same thing in two meshes is; None where it is not: too far away or of another size."""
+    (area, place), (other_area, other_place) = one, other
+    apart = float(np.linalg.norm(np.subtract(place, other_place)))
+    alike = max(area, other_area) <= ALIKE * min(area, other_area)
+    return apart if alike and apart <= 0.5 * min(area, other_area) ** 0.5 else None
 
 
 def _joined(vertices: np.ndarray, faces: np.ndarray, gap: float) -> np.ndarray:
@@ -129,8 +178,17 @@ def read_instances(folder: Path) -> list[Instance]:
     """
     path = folder / INSTANCES
     try:
-        return [Instance(**value) for value in json.loads(path.read_text(encoding="utf-8"))]
+        return [_read(value) for value in json.loads(path.read_text(encoding="utf-8"))]
     except FileNotFoundError:
         return []
-    except (OSError, ValueError, TypeError) as error:
+    except (OSError, ValueError, TypeError, KeyError) as error:
         raise ProjectError(f"{path} is damaged: {error}.", "Run `fieldwork mesh` again.") from error
+
+
+def _read(value: dict[str, Any]) -> Instance:
+    def place(given: Any) -> tuple[float, float, float]:
+        x, y, z = (float(part) for part in given)
+        return x, y, z
+
+    pieces = tuple((float(area), place(given)) for area, given in value.get("parts", ()))
+    return Instance(**{**value, "center": place(value["center"]), "parts": pieces})

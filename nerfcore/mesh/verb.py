@@ -26,7 +26,7 @@ from .build import Built, build, largest_share, wanted_bounds
 from .coverage import coverage
 from .field_values import shade
 from .formats import check_format
-from .instances import GAP, Instance, find_instances, read_instances, with_earlier_names
+from .instances import GAP, Instance, find_instances, read_instances, with_earlier_joins, with_earlier_names
 from .lods import make_levels
 from .outputs import Made, write_outputs
 from .painted import Painted, paint_surface, training_photos
@@ -77,7 +77,9 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
     face_instance, instances = find_instances(
         surface.vertices, surface.faces, surface.face_class, names, scene.ignore_id, GAP * voxel
     )
-    instances = with_earlier_names(instances, earlier_instances(target, inputs))
+    earlier = earlier_instances(target, inputs)
+    face_instance, instances = with_earlier_joins(face_instance, instances, earlier)
+    instances = with_earlier_names(instances, earlier)
     surface = replace(surface, face_instance=face_instance)
     levels = make_levels(surface, texture, params.lods, report)
     judged = judge(trained, scene, box, built, surface, photos, params, report)

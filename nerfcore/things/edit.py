@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 from ..errors import InputError, ProjectError
 from ..files import UNREADABLE_ARRAYS, atomic_path
 from ..mesh.clean import areas, components
-from ..mesh.instances import Instance, read_instances, write_instances
+from ..mesh.instances import Instance, joined, read_instances, write_instances
 from ..mesh.stored import MESH, mesh_folder, mesh_record
 from ..params import InstancesParams
 from ..progress import Reporter
@@ -87,8 +87,7 @@ def merged(
     first, ids = parts[0], [part.id for part in parts]
     face_instance = arrays["face_instance"].copy()
     face_instance[np.isin(face_instance, ids)] = first.id
-    size, center = _measured(arrays, face_instance == first.id)
-    whole = replace(first, area=size, center=center)
+    whole = joined(parts)
     return face_instance, [whole if i.id == first.id else i for i in known if i.id not in ids[1:]], [first.name]
 
 
@@ -119,7 +118,7 @@ def split(
         area, center = _measured(arrays, face_instance == number)
         made.append(Instance(number, free, one.class_id, area, center))
     area, center = _measured(arrays, face_instance == one.id)
-    rest = [replace(i, area=area, center=center) if i.id == one.id else i for i in known]
+    rest = [replace(i, area=area, center=center, parts=()) if i.id == one.id else i for i in known]
     return face_instance, [*rest, *made], [instance.name for instance in made]
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 from fieldwork.nerfcore.errors import Cancelled
+from fieldwork.nerfcore.labels.calibration import CERTAINTY, calibrated
 from fieldwork.nerfcore.labels.drawing import covered
-from fieldwork.nerfcore.labels.propagation import calibrated
 from fieldwork.nerfcore.labels.surfels import cell_of, nearest_neighbours, shape_at
 from fieldwork.nerfcore.labels.unary import balanced, class_probabilities, distance_to_samples, logistic_regression
 from fieldwork.nerfcore.labels.walker import edge_matrix, random_walk
@@ -106,7 +106,7 @@ def test_a_short_mark_counts_as_much_as_a_long_one_of_its_class() -> None:
 @settings(max_examples=20, deadline=None)
 def test_calibration_keeps_the_winner_and_can_be_taken_back(seed: int) -> None:
     p = np.random.default_rng(seed).dirichlet(np.ones(4), 50)[:, :3].astype(np.float32)
-    sharp = calibrated(p)
+    sharp = calibrated(p, CERTAINTY)
     np.testing.assert_array_equal(sharp.argmax(1), p.argmax(1))
     np.testing.assert_array_equal(sharp.sum(1) > 0.5, p.sum(1) > 0.5)
     assert (sharp.sum(1) <= 1 + 1e-5).all()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,14 @@ import pytest
 import trimesh
 from fieldwork.nerfcore.cli import main
 from fieldwork.nerfcore.errors import InputError, ProjectError
-from fieldwork.nerfcore.mesh.instances import Instance, read_instances, with_earlier_names
+from fieldwork.nerfcore.mesh.instances import (
+    Instance,
+    joined,
+    read_instances,
+    with_earlier_joins,
+    with_earlier_names,
+    write_instances,
+)
 from fieldwork.nerfcore.mesh.stored import MESH, mesh_folder
 from fieldwork.nerfcore.params import InstancesParams, RelationsParams
 from fieldwork.nerfcore.progress import Reporter
@@ -206,3 +214,31 @@ def test_a_mesh_that_is_made_again_keeps_the_names_of_its_things() -> None:
     assert [i.name for i in named] == ["vase.002", "Ming", "vase.003", "book.001"]
     assert [i.id for i in named] == [1, 2, 3, 4]
     assert [i.name for i in with_earlier_names(after, [])] == [i.name for i in after]
+
+
+def test_a_mesh_that_is_made_again_joins_what_was_joined_by_hand(tmp_path: Path) -> None:
+    top, foot = Instance(1, "lamp.001", 4, 0.50, (0.0, 0.0, 2.0)), Instance(2, "lamp.002", 4, 0.25, (0.0, 0.0, 0.5))
+    other = Instance(3, "lamp.003", 4, 0.25, (5.0, 0.0, 0.5))
+    whole = replace(joined([top, foot]), name="reading lamp")
+    assert (whole.area, whole.center) == (0.75, (0.0, 0.0, 1.5))
+    write_instances(tmp_path, [whole, other])
+    before = read_instances(tmp_path)
+    assert before == [whole, other], "what a thing was joined from is on disk"
+    # Made again the pieces are a little different, and come in another order.
+    after = [
+        Instance(1, "lamp.001", 4, 0.26, (5.02, 0.0, 0.5)),
+        Instance(2, "lamp.002", 4, 0.48, (0.01, 0.0, 2.0)),
+        Instance(3, "lamp.003", 4, 0.24, (0.0, 0.02, 0.5)),
+    ]
+    faces, found = with_earlier_joins(np.array([1, 2, 3, 3, 0]), after, before)
+    assert faces.tolist() == [1, 2, 2, 2, 0]
+    named = with_earlier_names(found, before)
+    assert [(i.id, i.name) for i in named] == [(1, "lamp.003"), (2, "reading lamp")]
+    assert named[1].area == pytest.approx(0.72)
+    # A third mesh, whose pieces hang together by themselves, and a fourth one, where they do not.
+    faces, third = with_earlier_joins(np.array([1]), [Instance(1, "lamp.001", 4, 0.73, (0.0, 0.0, 1.5))], named)
+    assert faces.tolist() == [1]
+    faces, _ = with_earlier_joins(np.array([1, 2, 3]), after, with_earlier_names(third, named))
+    assert faces.tolist() == [1, 2, 2]
+    faces, found = with_earlier_joins(np.array([1, 2, 3]), after, [top, foot, other])
+    assert (faces.tolist(), found) == ([1, 2, 3], after), "nobody joined these"

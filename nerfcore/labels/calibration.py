@@ -1,0 +1,68 @@
+"""How sure labels are: the walker's probabilities, made as right as marks on one photo prove for those on others."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from .seeds import VOID, Seeds
+from .unary import class_probabilities
+
+# See experiments.md, “Labels from a few strokes”.
+CERTAINTY = 3.0  # exponent that makes confidence the share that is right, where marks cannot tell
+SCALE, POWER = 4.7, 4 / 3  # exponent by what is found for the classifier: SCALE · τ^POWER
+TAUS = np.linspace(0.05, 1.5, 30)
+LEAST, MOST = 0.3, 4.0  # exponents
+
+
+def certainty(features: torch.Tensor, seeds: Seeds, classes: int, check: Callable[[], None]) -> float:
+    """The exponent for `calibrated`, by how a classifier taught by the marks on all photos but one does on that one.
+
+    The power τ of its probabilities by which the marks left out are most likely (temperature scaling: Guo et al., "On
+    calibration of modern neural networks", 2017) tells how far looks carry from photo to photo in this scene. Classes that
+    are marked on one photo alone say nothing.
+
+    Args:
+        features: (S, F) of the marked surfels.
+    """
+    found, right, share = [], [], []
+    photos = np.unique(seeds.photo) if len(seeds.photo) else []
+    for photo in photos if len(photos) > 1 else []:
+        check()
+        others = np.flatnonzero((seeds.photo != photo) & (seeds.label != VOID))
+        own = np.flatnonzero((seeds.photo == photo) & np.isin(seeds.label, seeds.label[others]) & (seeds.label != VOID))
+        if not len(own) or len(np.unique(seeds.label[others])) < 2:
+            continue
+        target, mark = (torch.from_numpy(part[others]).long() for part in (seeds.label, seeds.mark))
+        taught = class_probabilities(features, torch.from_numpy(others), target, mark, classes, check)
+        _, number, amount = np.unique(seeds.mark[own], return_inverse=True, return_counts=True)
+        found.append(taught[own])
+        right.append(seeds.label[own])
+        share.append(1 / amount[number])
+    if not found:
+        return CERTAINTY
+    probability, label = np.concatenate(found).clip(1e-6, 1), np.concatenate(right)
+    tau = likeliest_power(probability, label, np.concatenate(share))
+    return float(np.clip(SCALE * tau**POWER, LEAST, MOST))
+
+
+def likeliest_power(probability: np.ndarray, label: np.ndarray, share: np.ndarray) -> float:
+    """The power τ of probabilities (N, C), in sum 1 again, by which the labels (N,) are most likely; each counts `share`."""
+
+    def surprise(tau: float) -> float:
+        scaled = probability**tau
+        own = scaled[np.arange(len(label)), label] / scaled.sum(1)
+        return float(-(share * np.log(np.maximum(own, 1e-12))).sum())
+
+    return float(min(TAUS, key=surprise))
+
+
+def calibrated(probability: np.ndarray, exponent: float) -> np.ndarray:
+    """Probabilities (N, C), in sum at most 1, with their ratios, and that of all classes to void, to the power of the
+    exponent. What is most probable stays so."""
+    total = probability.sum(1, keepdims=True).clip(0, 1)
+    share = (probability / np.maximum(probability.max(1, keepdims=True), 1e-12)) ** exponent
+    classed = total**exponent / (total**exponent + (1 - total) ** exponent)
+    return (classed * share / np.maximum(share.sum(1, keepdims=True), 1e-12)).astype(np.float32)

@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 SHELL := /bin/bash
 export OMP_WAIT_POLICY := passive
 
-.PHONY: venv demo test test-all faults lint matrix gui gpu-compile gpu-check bench benchmarks-page repository clean
+.PHONY: venv demo test test-all faults lint matrix gui gpu-compile gpu-check bench benchmarks-page evidence evidence-page repository clean
 
 venv: $(VENV)/.ready
 
@@ -82,6 +82,16 @@ bench: venv
 # docs/benchmarks.md anew from docs/figures, without measuring anything.
 benchmarks-page: venv
 	$(BIN)/python -m fieldwork.nerfcore.bench.page docs/benchmarks.md
+
+# The published tables beside real baselines (docs/evidence.md): about 22 hours on four quiet cores, QUICK=1: a quarter of an hour,
+# PROFILE=gpu: a GPU's. It can be stopped at any time and goes on with the trials that are missing.
+PROFILE ?= $(if $(QUICK),quick,cpu)
+evidence: venv
+	$(BIN)/fieldwork bench --suite evidence --profile $(PROFILE) --page docs/evidence.md $(EVIDENCE)
+
+# docs/evidence.md anew from docs/evidence, without measuring anything.
+evidence-page: venv
+	$(BIN)/python -m fieldwork.nerfcore.bench.evidence.page docs/evidence.md
 
 repository: venv
 	$(BIN)/python tests/addon/make_repository.py dist/repository

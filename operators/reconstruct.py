@@ -131,7 +131,7 @@ class FIELDWORK_OT_bench(VerbOperator):
             ("figures", "Figures", "Quality on each scene with two seeds"),
             ("ablation", "Ablation", "The parts of the method, one left out at a time"),
             ("robustness", "Robustness", "Noise, missing views, missing and wrong labels"),
-            ("baselines", "Baselines", "Other methods as boundary cases of the field"),
+            ("evidence", "Evidence", "The published tables beside other methods, by a protocol"),
             ("gpu", "GPU", "What is asked of a graphics card"),
             ("surface", "Surfaces", "Textured meshes of simulated scenes beside their true surfaces"),
         ],
@@ -159,6 +159,18 @@ class FIELDWORK_OT_bench(VerbOperator):
         subtype="FILE_PATH",
     )
     tests: StringProperty(name="Tests", description="GPU: JUnit file of the kernels' tests", subtype="FILE_PATH")
+    profile: EnumProperty(
+        name="Profile",
+        description="Evidence: which budget",
+        items=[
+            ("quick", "Quick", "A quarter of an hour: shows that everything works"),
+            ("cpu", "CPU", "A day on a quiet CPU"),
+            ("gpu", "Graphics Card", "Hours on a graphics card"),
+        ],
+    )
+    lpips: StringProperty(
+        name="LPIPS", description="Evidence: torchvision's weights of VGG-16; empty: not measured", subtype="FILE_PATH"
+    )
 
     def invoke(self, context: Context, event: bpy.types.Event) -> set[str]:
         return context.window_manager.invoke_props_dialog(self, width=380)
@@ -176,7 +188,8 @@ class FIELDWORK_OT_bench(VerbOperator):
             "preset": self.preset,
             "set": parse_settings(self.settings),
             "keep": self.keep,
-            **{name: absolute(getattr(self, name)) for name in ("out", "data", "yardstick", "page", "tests")},
+            "profile": self.profile,
+            **{name: absolute(getattr(self, name)) for name in ("out", "data", "yardstick", "page", "tests", "lpips")},
         }
 
 

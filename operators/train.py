@@ -14,6 +14,7 @@ from ..addon.text import t
 from .base import (
     HoldoutProperty,
     ProjectOperator,
+    absolute,
     hold_out,
     need_held_out,
     need_poses,
@@ -125,6 +126,12 @@ class FIELDWORK_OT_evaluate(ProjectOperator):
         min=0.0,
         options={"SKIP_SAVE"},
     )
+    report_file: StringProperty(
+        name="Report",
+        description=".html or .pdf to write: whether the capture is good, and what to photograph next; empty: none",
+        subtype="FILE_PATH",
+        options={"SKIP_SAVE"},
+    )
 
     def parameters(self, context: Context) -> dict[str, Any]:
         return {
@@ -134,6 +141,7 @@ class FIELDWORK_OT_evaluate(ProjectOperator):
             "speed": self.speed,
             "baked": self.baked,
             "time_limit": self.time_limit or None,
+            "report": absolute(self.report_file),
         }
 
 

@@ -20,7 +20,7 @@ HEAD = f"""# Benchmarks
 {MARK}
 Each table stands under the command that measured it, with machine and commit. PSNR, SSIM and mIoU are of held-out
 photos ([what exactly](cli.md)), the suites are described in [the command line](cli.md#benchmarks), what was tried and
-rejected stands in [experiments](experiments.md).
+rejected stands in [experiments](experiments.md). Other methods beside ours: [evidence](evidence.md).
 """
 # Suite: heading, and what its tables show.
 SUITES = {
@@ -28,7 +28,6 @@ SUITES = {
     "speed": ("Speed", "Quality after a given time, and the time of a frame with sampling and networks apart."),
     "ablation": ("Ablation", "The same field with one part changed; pictures take the same samples on every ray."),
     "robustness": ("Robustness", "Training on damaged photos or labels, measured on the undamaged held-out photos."),
-    "baselines": ("Baselines", "Other methods as settings of the same field, from the same loader and rays."),
     "gpu": ("GPU", "What is asked of a GPU."),
     "surface": (
         "Surfaces",

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from itertools import product
-from pathlib import Path
 
 from ..errors import SettingError
 from ..params import BenchParams
@@ -17,24 +15,19 @@ SCENES = {
     "speed": ["lego_400"],
     "ablation": ["replica_room", "museum", "facade"],
     "robustness": ["museum", "replica_room"],
-    "baselines": ["lego_400", "replica_room"],
     "gpu": ["lego_400", "replica_room"],
     "surface": ["museum", "facade", "fence", "vase"],
     "labels": ["museum", "facade", "replica_room"],
     "live": ["lego_400", "museum", "replica_room"],
 }
-REFERENCE = {"ablation": "hybrid", "robustness": "clean", "baselines": "ours"}
-SECONDS = {"speed": 120.0, "ablation": 180.0, "robustness": 180.0, "baselines": 600.0, "gpu": 60.0}
-SIDES = {"speed": (400, 800), "gpu": (800,), "baselines": (800,), "surface": (), "live": (400,)}
+REFERENCE = {"ablation": "hybrid", "robustness": "clean"}
+SECONDS = {"speed": 120.0, "ablation": 180.0, "robustness": 180.0, "gpu": 60.0}
+SIDES = {"speed": (400, 800), "gpu": (800,), "surface": (), "live": (400,)}
 LONGER = 5.0  # the speed suite's second run
 STEPS = {"figures": 600, "ablation": 4000, "surface": 600, "live": 2000}
 SEEDS = {"figures": [0, 1]}
 # Published drops of PSNR (dB) and of mIoU (points) under input noise.
 PUBLISHED_DROPS = {"noise 0.01": (1.6, 2.5), "noise 0.03": (3.7, 4.7), "noise 0.05": (5.4, 8.1)}
-BASELINES = Path(__file__).parent / "baselines.json"
-MISSING_BASELINES = {
-    "mip-nerf": "needs cones instead of rays (integrated positional encoding), which the field does not have"
-}
 
 ABLATION = {
     "hybrid": {},
@@ -66,18 +59,13 @@ ROBUSTNESS = {
 }
 
 
-def baselines() -> dict[str, dict[str, str]]:
-    """Settings of each baseline that is a boundary case of the field."""
-    return {name: entry["settings"] for name, entry in json.loads(BASELINES.read_text(encoding="utf-8")).items()}
-
-
 def variants(suite: str) -> dict[str, dict[str, str]]:
     """Name and settings of everything a suite compares."""
     if suite == "ablation":
         return ABLATION
     if suite == "robustness":
         return ROBUSTNESS
-    return baselines() if suite == "baselines" else {"standard": {}}
+    return {"standard": {}}
 
 
 def plan(params: BenchParams, scenes: list[str]) -> list[Job]:

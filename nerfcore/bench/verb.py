@@ -20,13 +20,14 @@ from ..kernels.device import use_device
 from ..params import BenchParams
 from ..progress import Reporter, shortened
 from . import gpu, live, machine, speed, surface, tables
+from .evidence.suite import evidence_suite
 from .jobs import run_all, unknown_origin
 from .labels import labels_suite
 from .measures import measures_suite
 from .page import check_page, figures_folder, write_page
 from .results import Asked, ResultSet, Row, grouped, write_set
 from .scenes import available, data_folder, is_labelled, prepare, scene_name
-from .suites import MISSING_BASELINES, PUBLISHED_DROPS, SCENES, SECONDS, plan
+from .suites import PUBLISHED_DROPS, SCENES, SECONDS, plan
 
 
 def bench(params: BenchParams, report: Reporter) -> dict[str, Any]:
@@ -39,6 +40,8 @@ def bench(params: BenchParams, report: Reporter) -> dict[str, Any]:
     """
     root = Path(params.out)
     out = root / params.suite
+    if params.suite == "evidence":
+        return evidence_suite(params, out, root, command_of(params), report)
     if params.page is not None:
         check_page(params.page)
     if params.suite == "gpu" and use_device().type != "cuda":
@@ -60,8 +63,6 @@ def bench(params: BenchParams, report: Reporter) -> dict[str, Any]:
     if params.yardstick is not None and params.suite == "speed":
         seconds = min((job.seconds for job in jobs if job.seconds), default=SECONDS["speed"])
         notes.append(f"Yardstick {params.yardstick.name}: {machine.run_yardstick(params.yardstick, seconds, report)}")
-    if params.suite == "baselines":
-        notes += [f"{name} is not there: it {why}." for name, why in MISSING_BASELINES.items()]
     asked = None
     if params.suite == "gpu":
         synchronisations, waits = gpu.step_synchronisations(next(iter(projects.values())), report)
@@ -109,7 +110,7 @@ def _scenes(params: BenchParams, data: Path | None, root: Path, report: Reporter
 def command_of(params: BenchParams) -> str:
     """The command line that measures the same."""
     command = f"fieldwork bench --suite {params.suite}"
-    for name in ("scenes", "variants", "seconds", "steps", "seeds", "preset"):
+    for name in ("profile", "scenes", "variants", "seconds", "steps", "seeds", "preset"):
         value = getattr(params, name)
         if value != type(params).model_fields[name].default:
             text = (

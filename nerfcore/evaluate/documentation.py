@@ -19,9 +19,11 @@ from ..measure.stored import read_measures
 from ..project.runs import INFO, holdout_of, read_metrics, run_folder
 from ..project.schema import Poses, Project
 from ..project.store import load_poses, load_project
+from ..verdict import worst
 
 LIBRARIES = ("torch", "numpy", "warp-lang", "pycolmap", "OpenImageIO", "scikit-image", "scipy", "trimesh", "xatlas")
 POSES_REPORT = "poses/report.json"
+JUDGEMENT = "Is the capture good?"
 
 
 @dataclass(frozen=True)
@@ -56,6 +58,7 @@ def sections(folder: Path, run: str, results: dict[str, Any]) -> list[Section]:
     evaluation = read_metrics(run_folder(folder, run)).get("test") or {}
     measures = read_measures(folder, run) or {}
     made = [
+        _judgement(results, evaluation),
         _summary(project, poses, results, evaluation),
         _measured(measures.get("classes", []), measures, "Classes: areas and volumes"),
         _measured(measures.get("instances", []), measures, "Instances: areas and volumes"),
@@ -70,6 +73,27 @@ def sections(folder: Path, run: str, results: dict[str, Any]) -> list[Section]:
         _versions(),
     ]
     return [section for section in made if section.rows]
+
+
+def _judgement(results: dict[str, Any], evaluation: dict[str, Any]) -> Section:
+    """Whether the capture is good, why not, and what to photograph next."""
+    stages = {
+        "poses": results.get("poses"),
+        "train": results.get("train"),
+        "evaluate": evaluation,
+        "mesh": results.get("mesh"),
+    }
+    judged = {verb: (result or {}).get("verdict") for verb, result in stages.items()}
+    if not any(judged.values()):
+        return Section(JUDGEMENT, [], [])
+    whole = worst(judged)
+    level = {"good": "Yes.", "weak": "In part.", "failed": "No."}[whole["level"]]
+    rows = [["in short", level], *(["because", reason] for reason in whole["reasons"])]
+    told = evaluation.get("advice") or []
+    rows += [["next", text] for text in told]
+    if not told and evaluation:
+        rows.append(["next", "Nothing: more photos would change little."])
+    return Section(JUDGEMENT, [], rows, "By poses, training, held-out photos and mesh, as far as these were made.")
 
 
 def _poses_details(folder: Path) -> dict[str, dict[str, Any]]:

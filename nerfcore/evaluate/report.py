@@ -17,7 +17,7 @@ from ..progress import Reporter
 from ..project.runs import read_events, read_metrics
 from ..project.store import load_project
 from ..render.run import run_folder
-from .documentation import Section, results_of, sections
+from .documentation import JUDGEMENT, Section, results_of, sections
 
 FORMATS = (".html", ".pdf")
 HEAD = ("Result", "Time")  # tables that stand beside each other at the top
@@ -87,7 +87,8 @@ def write_report(path: Path, folder: Path, run: str, renders: Path, result: dict
     stages = result.get("stages") or {}
     if stages:
         seconds = [[stage, f"{value} s"] for stage, value in stages.items()]
-        tables.insert(1, Section("Time", [], [*seconds, ["all", f"{sum(stages.values()):.1f} s"]]))
+        place = next((i + 1 for i, table in enumerate(tables) if table.title == "Result"), 0)
+        tables.insert(place, Section("Time", [], [*seconds, ["all", f"{sum(stages.values()):.1f} s"]]))
     evaluation = result.get("evaluate") or {}
     compared = [folder / name for name in evaluation.get("pictures", []) if (folder / name).is_file()]
     drawn, rendered = sorted((mesh_folder(folder, run) / "drawings").glob("*.png")), sorted(renders.glob("*.png"))
@@ -106,7 +107,8 @@ def write_report(path: Path, folder: Path, run: str, renders: Path, result: dict
         .render(
             name=name,
             head=[table for table in tables if table.title in HEAD],
-            tables=[table for table in tables if table.title not in HEAD],
+            judgement=next((table for table in tables if table.title == JUDGEMENT), None),
+            tables=[table for table in tables if table.title not in (*HEAD, JUDGEMENT)],
             areas=(result.get("mesh") or {}).get("classes") or {},
             evaluation=evaluation,
             pictures=pictures_of(compared),

@@ -34,8 +34,11 @@ from ..render.model import Model
 from ..render.pictures import colorize_depth, colorize_labels, side_by_side
 from ..render.run import Trained, load_info, load_trained, refined_poses
 from ..verdict import evaluate_verdict
+from .advice import advice
+from .documentation import results_of
 from .metrics import Confusion, psnr, ssim
 from .refit import refit_camera
+from .report import check_report, write_report
 from .speed import SPEED_KEYS, measure_speed, peak_memory
 
 
@@ -73,14 +76,18 @@ class Comparison:
         photo, keep, label = compared_with(view, self.scene, camera.width, camera.height, background)
         pose, given = self._pose(view, camera, photo, keep, check)
         begin, compiled = time.perf_counter(), compile_seconds()
-        frame = render_view(self.shown, camera, pose, background, check=check)
+        # Only the field itself knows what no photo showed.
+        frame = render_view(self.shown, camera, pose, background, check=check, unknown=isinstance(self.shown, Model))
         self.seconds += time.perf_counter() - begin - (compile_seconds() - compiled)
         self.rays += camera.width * camera.height
         image = to_bytes(frame.color)
         self.opacity.append(float(frame.opacity.mean()))
         solid = frame.depth[np.isfinite(frame.depth) & (frame.opacity > 0.5)]
         self.spread.append(float(np.divide(*np.percentile(solid, [95, 5]))) if solid.size else 1.0)
-        self.scores.append({"name": view.name, "psnr": psnr(image, photo, keep), "ssim": ssim(image, photo), **given})
+        scores: dict[str, Any] = {"name": view.name, "psnr": psnr(image, photo, keep), "ssim": ssim(image, photo)}
+        if frame.unknown is not None:
+            scores["unknown"] = float(frame.unknown.mean())
+        self.scores.append({**scores, **given})
         if label is not None and self.confusion.class_ids:
             self.confusion.add(label, frame.label(self.confusion.class_ids, self.scene.ignore_id))
         self.pictures.append(_write_pictures(self.out, view.name, photo, frame, label, self.trained, self.scene))
@@ -144,13 +151,16 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
         "ms_sampling" and "ms_network" are unless `params.speed` asks for them. Of runs with refined poses
         training views are rendered from those and held-out ones from poses fitted to their photos;
         "psnr_given_poses" is what the latter score without that. With `params.baked` the baked field is measured, and
-        "lost" says {"psnr", "miou"} by which it is worse than the field, None where that was not measured before.
+        "advice" are sentences on what to photograph
+        next; "lost" says {"psnr", "miou"} by which it is worse than the field, None where that was not measured before.
     Raises:
         ProjectError: no such run, or no baked field of its present training. InputError: nothing is held out, or a
         photo cannot be read. SettingError: the speed of a baked field was asked for.
     """
     if params.baked and params.speed:
         raise SettingError("--speed measures the field itself.", "Leave out --baked, or look at its `rps`.")
+    if params.report is not None:
+        check_report(params.report)
     folder = Path(params.project)
     project, trained = load_project(folder), load_trained(folder, params.run)
     scene = load_scene(folder, trained.info.holdout)
@@ -210,11 +220,18 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
     result["verdict"] = evaluate_verdict(result, psnr_train, opaque, bool(compared.confusion.class_ids), environment)
     if params.baked:
         result["lost"] = _lost(params, result)
+    rejected = sum(image.status == "rejected" for image in project.images)
+    held_out = result["per_image"] if params.split == "test" else []
+    result["advice"] = advice(scene, held_out, result["per_class_iou"], rejected)
     path = run_folder(folder, params.run) / "metrics.json"
     stored = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     write_json(path, {**stored, f"{params.split}_baked" if params.baked else params.split: result})
     made = step("evaluate", params.model_dump(mode="json"), result, evaluation_inputs(params), state_id(trained.state))
     write_made(_record(params), made)
+    if params.report is not None:
+        report.stage("Writing the report")
+        found = {**results_of(load_project(folder), params.run), "evaluate": result}
+        write_report(params.report, folder, params.run, folder / "exports" / params.run / "renders", found)
     return result
 
 

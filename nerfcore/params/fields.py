@@ -30,6 +30,9 @@ class EvaluateParams(Params):
     time_limit: float | None = Field(
         default=None, gt=0, le=LONGEST_RUN, description="seconds; as many photos, evenly spread, as fit: at least one"
     )
+    report: Path | None = Field(
+        default=None, description=".html or .pdf to write: whether the capture is good, and what to photograph next"
+    )
 
 
 class BakeParams(Params):

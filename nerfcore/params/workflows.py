@@ -94,7 +94,7 @@ class BlocksParams(Params):
 
 class BenchParams(Params):
     suite: Literal[
-        "figures", "speed", "ablation", "robustness", "baselines", "gpu", "surface", "labels", "measures", "live"
+        "figures", "speed", "ablation", "robustness", "evidence", "gpu", "surface", "labels", "measures", "live"
     ] = Field(description="which table")
     out: Path = Field(default=Path("build/bench"), description="folder for results and scenes; finished runs are kept")
     data: Path | None = Field(default=None, description="folder of data sets; default: ../shared/data when it is there")
@@ -119,3 +119,9 @@ class BenchParams(Params):
         default=None, description="Markdown page written anew from the folder figures beside it, which gets this table"
     )
     tests: Path | None = Field(default=None, description="gpu: JUnit file of the kernels' tests")
+    profile: Literal["quick", "cpu", "gpu"] = Field(
+        default="quick", description="evidence: which budget, a quarter of an hour, a day on a CPU, or a GPU's"
+    )
+    lpips: Path | None = Field(
+        default=None, description="evidence: torchvision's weights of VGG-16 for LPIPS; default: not measured"
+    )

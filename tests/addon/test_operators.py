@@ -142,6 +142,7 @@ RENAMED = {
     ("blocks", "set"): "settings",
     ("reconstruct", "report"): "report_file",
     ("batch", "report"): "report_file",
+    ("evaluate", "report"): "report_file",
     ("bench", "set"): "settings",
     ("dataset", "blend"): None,  # the file that is open
     ("dataset", "path"): "path_kind",

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from fieldwork.nerfcore.bench import tables
 from fieldwork.nerfcore.bench.scenes import available
-from fieldwork.nerfcore.bench.suites import ABLATION, ROBUSTNESS, TIMED, baselines, plan
+from fieldwork.nerfcore.bench.suites import ABLATION, ROBUSTNESS, TIMED, plan
 from fieldwork.nerfcore.config import make_config
 from fieldwork.nerfcore.params import BenchParams
 
@@ -19,7 +19,7 @@ def test_a_variant_is_what_its_name_says() -> None:
 
 
 def test_every_variant_is_made_of_settings_that_exist() -> None:
-    for settings in (*ABLATION.values(), *ROBUSTNESS.values(), *baselines().values()):
+    for settings in (*ABLATION.values(), *ROBUSTNESS.values()):
         make_config("standard", settings)
 
 

@@ -56,7 +56,8 @@ class Profile(Part):
     """`clock`: “processor” counts the time of the processors, which other programs on the machine do not change.
 
     image_size: longest side of all pictures; held_out: how many held-out photos are compared, spread over all of them;
-    rays: of a training step of a baseline; settings: of ours, in all its variants.
+    rays: of a training step of a baseline, where step_rays does not say another number (grids count samples, 16 a ray);
+    settings: of ours, in all its variants.
     """
 
     about: str
@@ -66,6 +67,7 @@ class Profile(Part):
     seeds: list[int] = Field(min_length=2)
     rays: int
     settings: dict[str, str] = {}
+    step_rays: dict[str, int] = {}
     tables: list[Table]
     evaluation_seconds: dict[str, float] = {}
 
@@ -157,7 +159,7 @@ def trials_of(
                 clock=plan.clock,
                 image_size=plan.image_size,
                 held_out=plan.held_out,
-                step_rays=plan.rays,
+                step_rays=plan.step_rays.get(name, plan.rays),
             )
             found.append((table.name, trial))
     return found

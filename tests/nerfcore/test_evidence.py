@@ -1,0 +1,248 @@
+"""The suite `evidence`: its protocol, a trial of each kind on a tiny capture, and the page made of records."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from fieldwork.nerfcore.bench.baselines import instant_ngp
+from fieldwork.nerfcore.bench.baselines.hash_grid import hash_levels
+from fieldwork.nerfcore.bench.evidence import suite
+from fieldwork.nerfcore.bench.evidence.page import MARK, folder_of, page_text, read_records, write_page
+from fieldwork.nerfcore.bench.evidence.perceptual import Perceptual
+from fieldwork.nerfcore.bench.evidence.protocol import (
+    Profile,
+    Protocol,
+    SceneEntry,
+    Table,
+    expected_seconds,
+    protocol,
+    trials_of,
+)
+from fieldwork.nerfcore.bench.evidence.summary import over_seeds, published
+from fieldwork.nerfcore.bench.evidence.trial import run_trial
+from fieldwork.nerfcore.config import make_config
+from fieldwork.nerfcore.errors import InputError, SettingError
+from fieldwork.nerfcore.evaluate.metrics import BoundaryOverlap, boundary, calibration_error
+from fieldwork.nerfcore.kernels.device import use_device
+from fieldwork.nerfcore.params import BenchParams
+from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.verbs import run_verb
+from fieldwork.tests.nerfcore.support.ball import SMALL, ball_project
+from PIL import Image
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+
+
+def test_the_protocol_names_what_there_is_and_has_two_seeds() -> None:
+    known = protocol()
+    for name, profile in known.profiles.items():
+        assert len(profile.seeds) >= 2
+        assert {table.name for table in profile.tables} == {"time", "rays", "noise", "ablation", "extras"}
+        for table in profile.tables:
+            assert (table.seconds is None) != (table.rays is None)
+            assert set(table.scenes) <= known.scenes.keys()
+            assert set(table.variants) <= known.variants.keys()
+        for _, trial in trials_of(name):
+            if trial.method == "ours":
+                make_config("standard", trial.settings)
+    assert set(published()["main"]) <= known.variants.keys()
+
+
+def test_a_quick_run_takes_a_quarter_of_an_hour() -> None:
+    trials = {trial.name: trial for _, trial in trials_of("quick")}
+    assert sum(expected_seconds(trial, "quick") for trial in trials.values()) <= 15 * 60
+
+
+def test_tables_share_trials_and_other_settings_are_other_trials() -> None:
+    by_table = {name: {t.name for table, t in trials_of("quick") if table == name} for name in ("time", "noise")}
+    assert len(by_table["time"] & by_table["noise"]) == 2  # ours without noise, two seeds
+    (first,), (second,) = (
+        {t.name for _, t in trials_of("quick", ["room"], ["ours"], [0], seconds)} & {t.name for t in chosen}
+        for seconds in (3.0, 4.0)
+        for chosen in [[t for table, t in trials_of("quick", ["room"], ["ours"], [0], seconds) if table == "time"]]
+    )
+    assert first != second
+    with pytest.raises(SettingError, match="no variant “vqrf”"):
+        trials_of("quick", variants=["vqrf"])
+
+
+def test_a_boundary_is_the_rim_of_a_mask() -> None:
+    mask = np.zeros((100, 100), bool)
+    mask[20:80, 20:80] = True
+    rim = boundary(mask)  # 2 % of the diagonal: three pixels
+    assert rim.sum() == 60**2 - 54**2
+    full = np.ones((100, 100), bool)
+    assert not boundary(full).any()  # the picture's border is no outline
+
+
+def test_boundary_iou_sees_what_iou_hides() -> None:
+    truth = np.zeros((100, 100), int)
+    truth[20:80, 20:80] = 1
+    shifted = np.roll(truth, 3, 0)
+    overlap = BoundaryOverlap([1])
+    overlap.add(truth, truth)
+    assert overlap.mean() == 1
+    overlap = BoundaryOverlap([1])
+    overlap.add(truth, shifted)
+    there, told = boundary(truth == 1), boundary(shifted == 1) & (truth == 1)
+    assert overlap.mean() == pytest.approx((there & told).sum() / (there | told).sum())
+    assert overlap.mean() < 0.6 < (truth & shifted).sum() / (truth | shifted).sum()
+    assert BoundaryOverlap([1]).mean() is None
+
+
+def test_calibration_error_is_the_gap_between_sure_and_right() -> None:
+    sure = np.array([0.95] * 10 + [0.55] * 10)
+    right = np.array([True] * 9 + [False] + [True] * 3 + [False] * 7)
+    assert calibration_error(sure, right) == pytest.approx((10 * 0.05 + 10 * 0.25) / 20)
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any], Path, list[str]]:
+    """The suite with a tiny protocol on the ball, with true depth; the second call repeats nothing."""
+    folder = tmp_path_factory.mktemp("evidence")
+    project = ball_project(folder / "ball", side=24, depth=True)
+    small = {**SMALL, "sampling.samples": "4", "render.samples": "4"}
+    variants = ["ours", "instant-ngp", "s-nerf-pp"]
+    tiny = Profile(
+        about="tiny",
+        clock="processor",
+        image_size=32,
+        held_out=1,
+        seeds=[0, 1],
+        rays=16,
+        settings={k: v for k, v in small.items() if k != "train.seed"},
+        tables=[
+            Table(name="time", scenes=["ball"], variants=variants[:2], seconds=0.3),
+            Table(name="rays", scenes=["ball"], variants=variants[2:], rays=64),
+            Table(name="noise", scenes=["ball"], variants=["ours"], noise=[0.0, 0.05], seconds=0.3),
+            Table(name="ablation", scenes=["ball"], variants=["ours", "explicit"], seconds=0.3),
+            Table(name="extras", scenes=["ball"], variants=["no-semantics"], seconds=0.3),
+        ],
+    )
+    scene = SceneEntry(held_out="every 8th photo", source="a formula")
+    known = protocol()
+    small_protocol = Protocol(
+        scenes={"ball": scene}, variants=known.variants, profiles={**known.profiles, "quick": tiny}
+    )
+    notes: list[str] = []
+
+    class Recorder(Reporter):
+        def note(self, message: str) -> None:
+            notes.append(message)
+
+    page = folder / "docs" / "evidence.md"
+    with pytest.MonkeyPatch.context() as patch:
+        for module in ("protocol", "suite", "summary", "page"):
+            patch.setattr(f"fieldwork.nerfcore.bench.evidence.{module}.protocol", lambda: small_protocol)
+        patch.setattr(instant_ngp, "hash_levels", lambda: hash_levels(16, 16, 256, 12))
+        patch.setattr(instant_ngp, "CELLS", 32)
+        patch.setattr(instant_ngp, "STEP", 0.02)
+        params = BenchParams(suite="evidence", out=folder / "out", scenes=[str(project)], page=page)
+        result = run_verb("bench", params, Recorder())
+        before = {p: p.stat().st_mtime_ns for p in (folder / "out" / "evidence" / "trials").glob("*.json")}
+        run_verb("bench", params, Recorder())
+        assert before == {p: p.stat().st_mtime_ns for p in before}
+    return folder, result, page, notes
+
+
+def test_a_profile_is_measured_once_and_told(measured: tuple[Path, dict[str, Any], Path, list[str]]) -> None:
+    folder, result, _, notes = measured
+    assert result["failed"] == 0, [row["error"] for row in result["rows"]]
+    assert result["runs"] == 2 * (2 + 1 + 1 + 1 + 1)
+    assert any("12 of 12 trials to do, one after the other: about" in note for note in notes)
+    assert any("0 of 12 trials to do" in note for note in notes)
+    record = json.loads((folder / "out" / "evidence" / "quick.json").read_text("utf-8"))
+    by = {row["trial"]["variant"]: row for row in record["rows"]}
+    for name, row in by.items():
+        assert 3 < row["psnr"] < 60, name
+        assert row["lpips"] is None
+        assert row["ms_frame"] == pytest.approx(row["ms_sampling"] + row["ms_network"], rel=0.01)
+        assert row["curve"][-1][1] == row["rays"] > 0
+        assert row["taken"]["machine"]["cpu"]
+    assert by["s-nerf-pp"]["rays"] >= 64
+    assert by["instant-ngp"]["miou"] is None
+    assert by["no-semantics"]["miou"] is None
+    for name in ("s-nerf-pp", "ours"):
+        assert 0 <= by[name]["miou"] <= 1
+        assert 0 <= by[name]["ece"] <= 1
+        assert 0 <= by[name]["boundary_iou"] <= 1
+    assert 0 < by["ours"]["depth_error"] < 1
+    assert over_seeds(record["rows"], "psnr", variant="ours", noise=0.05).count == 2  # type: ignore[union-attr]
+
+
+def test_the_page_has_a_table_for_each_published_one(measured: tuple[Path, dict[str, Any], Path, list[str]]) -> None:
+    _, result, page, _ = measured
+    text = page.read_text("utf-8")
+    for heading in (
+        "Quality at equal time",
+        "Quality at equal rays",
+        "Cost",
+        "Noise",
+        "Ablation",
+        "Not in the publication",
+    ):
+        assert f"### {heading}: profile quick" in text
+    assert "| ball | Instant-NGP | 32.5 dB | 0.3 s of a processor |" in text
+    assert "| ball | ours | 0.05 | 27.4 dB, 66.2 points |" in text
+    assert "18 times the" in text
+    assert "not measured" in text
+    for plot in ("time", "parameters", "noise", "ablation", "crops"):
+        file = folder_of(page) / f"quick-{plot}.png"
+        assert str(file) in result["files"]
+        assert f"(evidence/quick-{plot}.png)" in text
+        with Image.open(file) as image:
+            assert len(np.unique(np.asarray(image.convert("L")))) > 20, plot  # something is drawn
+
+
+@pytest.mark.slow
+def test_the_baked_field_is_measured_like_the_others(tmp_path: Path) -> None:
+    project = ball_project(tmp_path / "ball", side=24)
+    small = {**SMALL, "sampling.samples": "4"}
+    trial = next(t for _, t in trials_of("cpu", [str(project)], ["baked"], [0], 2.0, small))
+    figures = run_trial(
+        trial.model_copy(update={"image_size": 32, "seconds": None, "rays": 60_000}),
+        project,
+        tmp_path / "out",
+        None,
+        Reporter(),
+    )
+    assert figures["psnr"] > 10
+    assert figures["ms_network"] == figures["ms_frame"]
+    assert not list((project / "runs").glob("*/*.safetensors"))
+
+
+def test_a_page_that_somebody_wrote_is_left_alone(tmp_path: Path) -> None:
+    page = tmp_path / "evidence.md"
+    page.write_text("# Mine\n", encoding="utf-8")
+    with pytest.raises(InputError, match="was not made by this command"):
+        write_page(page)
+    folder_of(tmp_path / "other.md").mkdir()
+    (folder_of(tmp_path / "other.md") / "quick.json").write_text("{", encoding="utf-8")
+    with pytest.raises(InputError, match=r"quick\.json is not a record"):
+        read_records(folder_of(tmp_path / "other.md"))
+
+
+def test_the_page_of_this_repository_is_what_its_records_say() -> None:
+    text = (DOCS / "evidence.md").read_text("utf-8")
+    assert MARK in text
+    assert text == page_text(DOCS / "evidence")
+
+
+def test_two_runs_beside_each_other_and_steps_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    project = ball_project(tmp_path / "ball", side=16)
+    out = tmp_path / "out"
+    with pytest.raises(SettingError, match="not by steps"):
+        run_verb("bench", BenchParams(suite="evidence", out=out, scenes=[str(project)], steps=3), Reporter())
+    (out / "evidence").mkdir(parents=True)
+    with suite.FileLock(out / "evidence" / ".lock"), pytest.raises(InputError, match="Another benchmark is at work"):
+        run_verb("bench", BenchParams(suite="evidence", out=out, scenes=[str(project)]), Reporter())
+
+
+def test_lpips_without_its_package_says_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "lpips", None)
+    with pytest.raises(InputError, match="needs the package lpips"):
+        Perceptual(tmp_path / "vgg16.pth", use_device())

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
+import psutil
 import torch
 
 from ...errors import FieldworkError, TrainingError
@@ -64,7 +64,7 @@ def run_trial(
     result = {
         "trial": trial.model_dump(mode="json"),
         "taken": taken().model_dump(mode="json"),
-        "load": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
+        "load": round(psutil.getloadavg()[0], 2),
         **spent,
         **figures,
         "params_m": round(trainee.parameter_count() / 1e6, 3),

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from torch import nn
 
 from ..config import SamplingConfig
 from ..kernels.cells import MeanScratch, average, observe
+from ..kernels.runtime import run_parallel
 from ..kernels.traversal import PDF_DEFAULT, PDF_LITERAL, PDF_UNIFORM, MarchSettings, skip_distances
 from .space import cell_states
 
@@ -152,8 +154,10 @@ class OccupancyGrid(nn.Module):
         Points with a negative density were not read."""
         # A cell is observed at up to every step: its decay is spread over them.
         decay = 0.9 if warming_up else self.config.decay ** (1 / self.config.update_every)
-        average(self.mean, self._mean_scratch(), self.config.resolution, points, density, self.config.mean_rate)
-        observe(self.density, self.scratch, self.config.resolution, points, density, decay)
+        n = self.config.resolution
+        mean = partial(average, self.mean, self._mean_scratch(), n, points, density, self.config.mean_rate)
+        largest = partial(observe, self.density, self.scratch, n, points, density, decay)
+        run_parallel([mean, largest], points.device)
 
     @torch.no_grad()
     def update(

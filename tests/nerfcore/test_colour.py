@@ -15,7 +15,7 @@ from fieldwork.nerfcore.blender.package import write_package
 from fieldwork.nerfcore.data.box import Box
 from fieldwork.nerfcore.data.load import load_scene
 from fieldwork.nerfcore.data.pixels import PixelStore
-from fieldwork.nerfcore.evaluate.verb import _truth
+from fieldwork.nerfcore.evaluate.verb import compared_with
 from fieldwork.nerfcore.images.decode import read_photo
 from fieldwork.nerfcore.images.encode import write_picture
 from fieldwork.nerfcore.images.picture import (
@@ -89,11 +89,11 @@ def test_training_targets_keep_the_colour_of_edges(tmp_path: Path, longest: int)
 
 def test_evaluation_compares_with_the_colour_of_edges(tmp_path: Path) -> None:
     scene = load_scene(ball_with(tmp_path / "p", cut_out()))
-    photo, keep, _ = _truth(scene.views[0], scene, 27, 27, 1.0)
+    photo, keep, _ = compared_with(scene.views[0], scene, 27, 27, 1.0)
     assert keep is None
     assert photo.min() == 248
     assert photo.max() == 255
-    black, _, _ = _truth(scene.views[0], scene, 27, 27, 0.0)
+    black, _, _ = compared_with(scene.views[0], scene, 27, 27, 0.0)
     assert black.max() == 248
     assert black.min() == 0
 

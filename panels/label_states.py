@@ -96,7 +96,10 @@ def label(context: Context) -> State:
 def class_text(known: Facts, class_id: int) -> str:
     """Number of marks and share of the surface of a class, as short as can be."""
     strokes, share = known.strokes.get(class_id, 0), known.shares.get(class_id)
-    return "  ".join([f"{strokes} ✎"] * (strokes > 0) + [f"{share.share:.0%}"] * (share is not None))
+    told = [f"{strokes} ✎"] if strokes > 0 else []
+    if share is not None:
+        told.append(f"{share.share:.0%}")
+    return "  ".join(told)
 
 
 def class_line(known: Facts, name: str, class_id: int) -> str:

@@ -43,6 +43,7 @@ answer(seen)
     assert more == "2 ✎  50%"
     assert nothing == ["Choose a class and draw over what belongs to it."]
     assert label_states.Facts(revision=3, computed=2).stale
+    assert label_states.class_text(label_states.Facts(), 1) == "", "nothing is known of a class before labels are"
 
 
 CLASSES = """

@@ -113,4 +113,6 @@ class Window:
             assert result.is_file(), f"{scenario} did not end (status {done.returncode}): {output[-3000:]}"
             facts = json.loads(result.read_text())
             assert not facts["error"], f"{facts['error']}\nscreenshots: {self.folder}"
+        # Panels that fail while they are drawn say so nowhere else.
+        assert "Traceback" not in output, output[output.index("Traceback") :][:3000]
         return facts

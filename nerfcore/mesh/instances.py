@@ -9,9 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import KDTree
 
 from ..errors import ProjectError
 from ..files import write_json
@@ -151,6 +148,11 @@ def distance_if_alike(one: Piece, other: Piece) -> float | None:
 
 def _joined(vertices: np.ndarray, faces: np.ndarray, gap: float) -> np.ndarray:
     """Number (F,) of the part of each face (F, 3), where parts with borders nearer than `gap` to each other are one."""
+    # Most of those who ask about instances join none.
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import KDTree
+
     part = components(faces, len(vertices))
     count = int(part.max(initial=-1)) + 1
     at_border = np.unique(border_edges(faces))

@@ -56,7 +56,7 @@ def project(tmp_path):
     return folder
 
 
-def tick_until(queue, condition, timeout=20.0):
+def tick_until(queue, condition, timeout=120.0):
     end = time.monotonic() + timeout
     while not condition():
         assert time.monotonic() < end, "nothing happened"

@@ -175,7 +175,7 @@ items = [item.identifier for item in settings.bl_rna.properties["passes"].enum_i
 settings.project, settings.render_from = project, "orbit"
 settings.passes = set(items)
 class Asked:
-    out, camera, baked, frame_range = "", "", False, (-1, -1)
+    out, camera, baked, edits, frame_range = "", "", False, "", (-1, -1)
     value = lambda self, context, name: {"run": "main", "source": "orbit"}.get(name) or getattr(settings, name)
     project_path = lambda self, context: project
 answer([items, FIELDWORK_OT_render.parameters(Asked(), bpy.context)["passes"]])

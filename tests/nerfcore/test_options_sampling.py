@@ -263,8 +263,8 @@ def two_samples() -> tuple[torch.Tensor, torch.Tensor, PackedInfo]:
 def test_a_faint_sample_outvotes_a_surface_only_where_logits_are_summed() -> None:
     logits, weights, packed_info = two_samples()
     kept, summed = (
-        model(**{"render.accumulate": how})._probabilities(logits, weights, packed_info)[0]
-        for how in ("probabilities", "logits")
+        model(**{"render.accumulate": how})._probabilities(values, weights, packed_info)[0]
+        for how, values in (("probabilities", torch.softmax(logits, 1)), ("logits", logits))
     )
     assert kept.argmax() == 1
     assert summed.argmax() == 0

@@ -96,7 +96,9 @@ def over(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return a + (1 - a[..., 3:]) * b
 
 
-@pytest.mark.parametrize("y", [-1.0, -0.1, 1.0])
+@pytest.mark.parametrize(
+    "y", [pytest.param(-1.0, marks=pytest.mark.slow), -0.1, pytest.param(1.0, marks=pytest.mark.slow)]
+)
 def test_composited_objects_are_exact_at_edges(ball: Path, store: FieldStore, tmp_path: Path, y: float) -> None:
     """Before, within and behind the field: against the mean over samples of what each shows, with 64 of them."""
     file, paint = plate(tmp_path, y, 0.05), np.array([0.9, 0.3, 0.1, 1.0])

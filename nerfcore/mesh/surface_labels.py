@@ -32,6 +32,7 @@ CERTAIN = 0.98  # share of its evidence a facelet needs for one class, to have n
 PRIOR = 0.1  # what a facelet's evidence counts at its texels beside that of one view
 TILE = 2048  # texels a side that are worked on at once
 MARGIN = 4  # texels around charts that repeat their border
+BAND = 1 << 21  # texels between two questions whether to go on
 
 ClassField = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
@@ -260,7 +261,7 @@ def class_maps(
         covered = np.zeros(tile[2] * tile[3], bool)
         covered[texels.place] = True
         known[block] = covered.reshape(tile[3], tile[2])
-    _widened(ids, sure, known)
+    _widened(ids, sure, known, report)
     return ClassMaps(ids, sure)
 
 
@@ -307,16 +308,25 @@ def _ask(
     return texel, votes / total[:, None]
 
 
-def _widened(ids: np.ndarray, sure: np.ndarray, known: np.ndarray) -> None:
+def _widened(ids: np.ndarray, sure: np.ndarray, known: np.ndarray, report: Reporter) -> None:
     """Repeat the border of the charts in the gaps between them, in place."""
+    size = len(ids)
+    bands = [slice(begin, begin + max(1, BAND // size)) for begin in range(0, size, max(1, BAND // size))]
+    pair = np.zeros((size + 2, size), np.uint32)
     for _ in range(MARGIN):
-        # One number for both, so that a texel takes its class and its confidence from the same neighbour.
-        pair = np.where(known, (sure.astype(np.uint32) << 16 | ids) + 1, 0).astype(np.uint32)
-        near = np.asarray(maximum_filter(pair, 3, mode="nearest"), np.uint32)
-        rim = ~known & (near > 0)
-        ids[rim] = np.bitwise_and(near[rim] - 1, 0xFFFF).astype(ids.dtype)
-        sure[rim] = np.right_shift(near[rim] - 1, 16)
-        known |= rim
+        # One number for both, so that a texel takes its class and its confidence from the same neighbour; 0: unknown.
+        for band in bands:
+            report.check()
+            both = (sure[band].astype(np.uint32) << 16 | ids[band]) + 1
+            pair[1:-1][band] = np.where(known[band], both, 0)
+        for band in bands:
+            report.check()
+            around = pair[band.start : band.stop + 2]
+            near = np.asarray(maximum_filter(around, 3, mode="nearest"), np.uint32)[1:-1]
+            rim = ~known[band] & (near > 0)
+            ids[band][rim] = np.bitwise_and(near[rim] - 1, 0xFFFF).astype(ids.dtype)
+            sure[band][rim] = np.right_shift(near[rim] - 1, 16)
+            known[band] |= rim
 
 
 def class_picture(ids: np.ndarray, colors: dict[int, tuple[float, float, float]]) -> np.ndarray:

@@ -47,16 +47,18 @@ class Stops(Reporter):
 
 
 class Listens(Reporter):
-    """Adds up for each stage the longest time of a processor between two questions whether to go on."""
+    """Adds up for each stage the longest time of a processor between two questions whether to go on, of one thread."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.name, self.last, self.longest = "Preparing", time.thread_time(), dict[str, float]()
+        self.name, self.longest = "Preparing", dict[str, float]()
+        self.last = {threading.get_ident(): time.thread_time()}
 
     def check(self) -> None:
-        now = time.thread_time()
-        self.longest[self.name] = max(self.longest.get(self.name, 0.0), now - self.last)
-        self.last = now
+        now, thread = time.thread_time(), threading.get_ident()
+        asked = self.last.get(thread, now)
+        self.longest[self.name] = max(self.longest.get(self.name, 0.0), now - asked)
+        self.last[thread] = now
         super().check()
 
     def stage(self, name: str) -> None:

@@ -118,7 +118,13 @@ def draw_label(layout: UILayout, context: Context) -> None:
 
 
 def draw_tools(layout: UILayout, settings: Any) -> None:
-    layout.row(align=True).prop(settings, "label_tool", expand=True)
+    # In two rows: the names of five would be cut off in one.
+    column = layout.column(align=True)
+    tools = [item.identifier for item in settings.bl_rna.properties["label_tool"].enum_items]
+    for names in (tools[:3], tools[3:]):
+        row = column.row(align=True)
+        for name in names:
+            row.prop_enum(settings, "label_tool", name)
     column = columns(layout)
     if settings.label_tool == "click":
         column.prop(settings, "label_encoder")

@@ -41,6 +41,8 @@ from .refit import refit_camera
 from .report import check_report, write_report
 from .speed import SPEED_KEYS, measure_speed, peak_memory
 
+UNKNOWN_SIDE = 96  # pixels, see `Comparison._unknown`
+
 
 @dataclass
 class Comparison:
@@ -76,8 +78,7 @@ class Comparison:
         photo, keep, label = compared_with(view, self.scene, camera.width, camera.height, background)
         pose, given = self._pose(view, camera, photo, keep, check)
         begin, compiled = time.perf_counter(), compile_seconds()
-        # Only the field itself knows what no photo showed.
-        frame = render_view(self.shown, camera, pose, background, check=check, unknown=isinstance(self.shown, Model))
+        frame = render_view(self.shown, camera, pose, background, check=check)
         self.seconds += time.perf_counter() - begin - (compile_seconds() - compiled)
         self.rays += camera.width * camera.height
         image = to_bytes(frame.color)
@@ -85,12 +86,21 @@ class Comparison:
         solid = frame.depth[np.isfinite(frame.depth) & (frame.opacity > 0.5)]
         self.spread.append(float(np.divide(*np.percentile(solid, [95, 5]))) if solid.size else 1.0)
         scores: dict[str, Any] = {"name": view.name, "psnr": psnr(image, photo, keep), "ssim": ssim(image, photo)}
-        if frame.unknown is not None:
-            scores["unknown"] = float(frame.unknown.mean())
+        if isinstance(self.shown, Model):  # a baked field does not know what no photo showed
+            scores["unknown"] = self._unknown(self.shown, camera, pose, check)
         self.scores.append({**scores, **given})
         if label is not None and self.confusion.class_ids:
             self.confusion.add(label, frame.label(self.confusion.class_ids, self.scene.ignore_id))
         self.pictures.append(_write_pictures(self.out, view.name, photo, frame, label, self.trained, self.scene))
+
+    def _unknown(self, model: Model, camera: Camera, pose: np.ndarray, check: Callable[[], None]) -> float:
+        """Share of the way of a view's rays that no training photo shows, of a small picture: it takes as long as
+        rendering."""
+        share = min(1.0, UNKNOWN_SIDE / max(camera.width, camera.height))
+        small = camera.resized(max(1, round(share * camera.width)), max(1, round(share * camera.height)))
+        frame = render_view(model, small, pose, self.background, semantics=False, check=check, unknown=True)
+        assert frame.unknown is not None
+        return float(frame.unknown.mean())
 
     def _pose(
         self, view: View, camera: Camera, photo: np.ndarray, keep: np.ndarray | None, check: Callable[[], None]
@@ -151,8 +161,7 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
         "ms_sampling" and "ms_network" are unless `params.speed` asks for them. Of runs with refined poses
         training views are rendered from those and held-out ones from poses fitted to their photos;
         "psnr_given_poses" is what the latter score without that. With `params.baked` the baked field is measured, and
-        "advice" are sentences on what to photograph
-        next; "lost" says {"psnr", "miou"} by which it is worse than the field, None where that was not measured before.
+        "advice" are sentences on what to photograph next; "lost" says {"psnr", "miou"} by which it is worse than the field, None where that was not measured before.
     Raises:
         ProjectError: no such run, or no baked field of its present training. InputError: nothing is held out, or a
         photo cannot be read. SettingError: the speed of a baked field was asked for.

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 from PIL import Image
 
@@ -20,6 +19,8 @@ def write_plots(record: dict[str, Any], pictures: Path, folder: Path) -> list[Pa
 
     `pictures`: where the trials' renders are.
     """
+    import matplotlib  # only where a record is drawn
+
     matplotlib.use("Agg")
     made = []
     for name, draw in (("time", _time), ("parameters", _parameters), ("noise", _noise), ("ablation", _ablation)):

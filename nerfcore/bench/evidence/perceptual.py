@@ -6,6 +6,7 @@ Source: Zhang et al., “The Unreasonable Effectiveness of Deep Features as a Pe
 from __future__ import annotations
 
 import importlib
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +40,7 @@ class Perceptual:
             given = torch.load(weights, map_location=device, weights_only=True)  # tensors only, no code
             own = {name: given[f"features.{name.split('.', 1)[1]}"] for name in own}
             self.model.net.load_state_dict(own)
-        except (OSError, KeyError, RuntimeError, TypeError, ValueError) as error:
+        except (OSError, EOFError, KeyError, RuntimeError, TypeError, ValueError, pickle.UnpicklingError) as error:
             raise InputError(
                 f"{weights} does not hold the weights of torchvision's VGG-16: {error}.",
                 "Give the file vgg16-397923af.pth of torchvision.",

@@ -137,8 +137,11 @@ def test_what_is_judged_of_renders_is_measured(tmp_path: Path, monkeypatch: pyte
     def fog(model: object, camera: Camera, *_: object, **__: object) -> Frame:
         pixels = np.zeros((camera.height, camera.width, 4), np.float32)
         pixels[: camera.height // 4] = 0.8
-        depth = np.broadcast_to(np.linspace(1, 3, camera.width, dtype=np.float32), pixels.shape[:2])
-        return Frame(Picture(pixels, "srgb", "associated"), 1.0, depth, None, np.zeros((*pixels.shape[:2], 3)))
+        shape = pixels.shape[:2]
+        depth = np.broadcast_to(np.linspace(1, 3, camera.width, dtype=np.float32), shape)
+        return Frame(
+            Picture(pixels, "srgb", "associated"), 1.0, depth, None, np.zeros((*shape, 3)), unknown=np.zeros(shape)
+        )
 
     monkeypatch.setattr("fieldwork.nerfcore.evaluate.verb.render_view", fog)
     result = evaluate(EvaluateParams(project=project), Reporter())

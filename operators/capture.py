@@ -8,8 +8,8 @@ from typing import Any
 import bpy
 from bpy.types import Context, FileHandler, Operator, OperatorFileListElement
 
+from ..addon.choices import MASK_MODES
 from ..addon.project import snapshot
-from ..addon.properties import MASK_MODES
 from ..addon.props import BoolProperty, CollectionProperty, EnumProperty, StringProperty
 from ..addon.text import t
 from .base import ProjectOperator, mask_mode, need_photos, need_project_folder, scene_settings, set_if_empty

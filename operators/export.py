@@ -12,9 +12,10 @@ from ..addon.jobs.job import Done, Job
 from ..addon.project import snapshot
 from ..addon.props import StringProperty
 from ..addon.text import t
-from .base import ProjectOperator, absolute, need_run, refresh_scenes, scene_of, scene_settings
+from .base import ProjectOperator, absolute, need_poses, need_run, refresh_scenes, scene_of, scene_settings
 
-OF_THE_MESH = {"glb", "obj", "ply", "stl", "usd"}
+OF_THE_MESH = {"glb", "obj", "ply", "stl", "usd", "masks"}
+OF_THE_CAMERAS = {"transforms", "colmap"}
 
 
 @scene_settings(run="run", out="export_path", split="export_split")
@@ -49,7 +50,7 @@ class FIELDWORK_OT_export(ProjectOperator):
     bl_idname = "fieldwork.export"
     bl_label = "Export"
     verb = "export"
-    needs = (need_run,)
+    needs = (need_poses,)
 
     @classmethod
     def reason(cls, context: Context) -> str | None:
@@ -60,9 +61,13 @@ class FIELDWORK_OT_export(ProjectOperator):
         settings = context.scene.fieldwork
         if settings.export_to == "blend":
             return t("Choose a format for other programs in the Export panel")
+        if settings.export_to in OF_THE_CAMERAS:
+            return None
         folder = snapshot.folder_of(settings)
         mesh = folder is not None and (folder / "exports" / settings.run / "mesh.npz").is_file()
-        return t("Extract the mesh first") if settings.export_to in OF_THE_MESH and not mesh else None
+        if settings.export_to in OF_THE_MESH and not mesh:
+            return t("Extract the mesh first")
+        return need_run(context)
 
     def parameters(self, context: Context) -> dict[str, Any]:
         to = self.value(context, "to")

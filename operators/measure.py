@@ -8,9 +8,9 @@ from typing import Any
 import bpy
 from bpy.types import Context
 
+from ..addon.choices import SIDES
 from ..addon.jobs.job import Done, Job
 from ..addon.project import snapshot
-from ..addon.properties import SIDES
 from ..addon.text import t
 from .base import ProjectOperator, need_poses, need_project, refresh_scenes, scene_settings
 from .scene import show_image

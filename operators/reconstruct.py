@@ -8,10 +8,10 @@ from typing import Any
 import bpy
 from bpy.types import Context
 
+from ..addon.choices import PRESETS
 from ..addon.jobs.job import Done, Job
 from ..addon.jobs.queue import queue
 from ..addon.project import snapshot
-from ..addon.properties import PRESETS
 from ..addon.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, IntVectorProperty, StringProperty
 from ..addon.text import t
 from .base import (

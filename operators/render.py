@@ -10,11 +10,11 @@ from typing import Any
 import bpy
 from bpy.types import Context
 
+from ..addon.choices import PASSES
 from ..addon.errors import SceneError
 from ..addon.jobs.job import Done, Job, Steps
 from ..addon.jobs.queue import queue
 from ..addon.project import snapshot
-from ..addon.properties import PASSES
 from ..addon.props import BoolProperty, IntVectorProperty, StringProperty
 from ..addon.roles import Owner
 from ..addon.scene.frame import scene_from_capture

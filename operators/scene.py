@@ -8,10 +8,10 @@ from typing import Any
 import bpy
 from bpy.types import Context, Operator
 
+from ..addon.choices import SPLITS
 from ..addon.jobs.job import Done, Job, Steps
 from ..addon.jobs.queue import queue
 from ..addon.project import classes, snapshot
-from ..addon.properties import SPLITS
 from ..addon.props import EnumProperty, StringProperty
 from ..addon.roles import ROLE
 from ..addon.scene import viewing

@@ -7,6 +7,8 @@ from bpy.types import Context
 from . import states
 from .base import StepPanel, columns, open_folder
 
+SPLIT = {"blend", "glb", "usd", "obj", "ply", "stl"}  # formats that hold objects
+
 
 class FIELDWORK_PT_export(StepPanel):
     bl_label = "Export"
@@ -20,7 +22,7 @@ class FIELDWORK_PT_export(StepPanel):
         column.prop(settings, "export_path")
         if settings.export_to == "voxels":
             column.prop(settings, "voxels")
-        elif settings.export_to != "onnx":
+        elif settings.export_to in SPLIT:
             column.prop(settings, "export_split")
         if settings.export_to == "blend":
             layout.operator("fieldwork.blend", icon="FILE_BLEND")

@@ -12,83 +12,107 @@ from ..mesh.features import features_of
 from ..mesh.files import write_surface
 from ..mesh.formats import USD
 from ..mesh.instances import read_instances
-from ..mesh.stored import load_surface, mesh_folder
+from ..mesh.stored import load_class_map, load_surface, mesh_folder
 from ..params import ExportParams
 from ..progress import Reporter
 from ..project.runs import holdout_of
+from ..project.schema import Project
 from ..project.store import load_project, record_step
 from ..render.baked import load_baked
 from ..render.run import load_info, load_trained
 
-SUFFIXES = {
-    "glb": (".glb",),
-    "obj": (".obj",),
-    "ply": (".ply",),
-    "stl": (".stl",),
-    "usd": USD,
-    "onnx": (".onnx",),
-    "voxels": (".npz",),
-    "splats": (".ply",),
-    "vdb": (".vdb",),
-}
-OF_THE_FIELD = ("onnx", "voxels", "splats", "vdb")
+# Formats by what they are made of, with the endings of their files; those without an ending are folders.
+OF_THE_MESH = {"glb": (".glb",), "obj": (".obj",), "ply": (".ply",), "stl": (".stl",), "usd": USD, "masks": ()}
+OF_THE_CAMERAS = {"transforms": (".json",), "colmap": ()}
+OF_THE_FIELD = {"onnx": (".onnx",), "voxels": (".npz",), "splats": (".ply",), "vdb": (".vdb",)}
+SUFFIXES = OF_THE_MESH | OF_THE_CAMERAS | OF_THE_FIELD
+# What is not called after the project: cameras are known by these names, and the mesh is a .ply as well.
+NAMES = {"transforms": "transforms.json", "colmap": "colmap", "masks": "masks"}
 
 
 def export(params: ExportParams, report: Reporter) -> dict[str, Any]:
     """Write one format to `out`, or to exports/<run>/<project>.<suffix>.
 
-    Meshes (glb, usd, obj, ply, stl) are the last one that the verb `mesh` extracted; usd has the cameras as well; onnx is the trained field itself as a function, voxels its values on a regular grid; splats is the baked field, as .ply and beside it as .glb; vdb is the baked field as a volume.
+    Meshes (glb, usd, obj, ply, stl) are the last one that the verb `mesh` extracted, masks show its classes; usd has the
+    cameras as well, transforms and colmap nothing else; onnx is the trained field itself as a function, voxels its values
+    on a regular grid; splats is the baked field, as .ply and beside it as .glb; vdb is the baked field as a volume.
 
     Returns:
         {"files": [paths], "to": format, "grids": names, of vdb}
     Raises:
-        SettingError: the file has another ending. ProjectError: there is no mesh or no trained run.
-        DiskError: a file cannot be written.
+        SettingError: the file has another ending, or the format has no words for a lens. ProjectError: there is no mesh, no
+        trained run or no pose. DiskError: a file cannot be written.
     """
     folder = Path(params.project).absolute()
     project = load_project(folder)
+    out = (params.out or folder / "exports" / params.run / _default_name(folder, params.to)).absolute()
     suffixes = SUFFIXES[params.to]
-    name = f"{folder.name}-splats" if params.to == "splats" else folder.name  # the mesh ends in .ply as well
-    out = params.out or folder / "exports" / params.run / f"{name}{suffixes[0]}"
-    if out.suffix.lower() not in suffixes:
+    if suffixes and out.suffix.lower() not in suffixes:
         raise SettingError(f"{out}: {params.to} files end in {' or '.join(suffixes)}.", "Choose one of these endings.")
-    if params.to not in OF_THE_FIELD:
+    result: dict[str, Any] = {"to": params.to}
+    if params.to in OF_THE_MESH:
         for warning in stale(folder, params.run, pictures=False):
             report.warn(warning)
-    result: dict[str, Any] = {"to": params.to}
+        files = _write_mesh(folder, project, params, out, report)
+    elif params.to in OF_THE_CAMERAS:
+        from .cameras import write_colmap, write_transforms
+
+        report.stage("Writing")
+        scene = load_scene(folder, holdout_of(folder, params.run))
+        metres = project.frame.scale_known
+        files = write_colmap(out, scene) if params.to == "colmap" else write_transforms(out, scene, metres)
+    else:
+        files, more = _write_field(folder, project, params, out, report)
+        result |= more
+    result["files"] = [str(path) for path in files]
+    record_step(folder, "export", params.model_dump(mode="json"), result)
+    return result
+
+
+def _default_name(folder: Path, to: str) -> str:
+    if to in NAMES:
+        return NAMES[to]
+    return f"{folder.name}{'-splats' if to == 'splats' else ''}{SUFFIXES[to][0]}"
+
+
+def _write_mesh(folder: Path, project: Project, params: ExportParams, out: Path, report: Reporter) -> list[Path]:
+    report.stage("Writing")
+    surface, texture = load_surface(folder, params.run)
+    scene = load_scene(folder, holdout_of(folder, params.run)) if params.to in ("usd", "masks") else None
+    if scene is not None and params.to == "masks":
+        from .class_masks import write_masks
+
+        ids = load_class_map(folder, params.run) if texture is not None else None
+        return write_masks(out, surface, ids, scene.views, scene.classes, report)
+    instances = read_instances(mesh_folder(folder, params.run))
+    features = features_of(surface, project.classes, project.ignore_id, instances)
+    views = scene.views if scene is not None else []
+    return write_surface(out, surface, features, params.split, texture, views, report.check)
+
+
+def _write_field(
+    folder: Path, project: Project, params: ExportParams, out: Path, report: Reporter
+) -> tuple[list[Path], dict[str, Any]]:
+    """The files written, and what else the result says."""
     if params.to == "onnx":
         from .field_graph import write_onnx  # the library takes its time to load
 
         report.stage("Writing the field")
         write_onnx(out, load_trained(folder, params.run), project)
-        files = [out]
-    elif params.to == "voxels":
+        return [out], {}
+    if params.to == "voxels":
         from .voxels import write_voxels
 
         write_voxels(out, load_trained(folder, params.run), project, params.resolution, report)
-        files = [out]
-    elif params.to == "splats":
+        return [out], {}
+    info = load_info(folder, params.run)
+    baked = load_baked(folder, params.run, info)
+    if params.to == "splats":
         from .splats import write_splats
 
-        info = load_info(folder, params.run)
-        baked = load_baked(folder, params.run, info)
-        files = write_splats(out, baked, info.box(project), info.class_ids if baked.classes else [], report)
-    elif params.to == "vdb":
-        from .volume import write_volume
+        return write_splats(out, baked, info.box(project), info.class_ids if baked.classes else [], report), {}
+    from .volume import write_volume
 
-        info = load_info(folder, params.run)
-        names = {entry.id: entry.name for entry in project.classes}
-        baked = load_baked(folder, params.run, info)
-        classes = [names.get(number, f"class {number}") for number in info.class_ids] if baked.classes else []
-        result["grids"] = write_volume(out, baked, info.box(project), classes, report)
-        files = [out]
-    else:
-        report.stage("Writing")
-        surface, texture = load_surface(folder, params.run)
-        instances = read_instances(mesh_folder(folder, params.run))
-        features = features_of(surface, project.classes, project.ignore_id, instances)
-        views = load_scene(folder, holdout_of(folder, params.run)).views if params.to == "usd" else []
-        files = write_surface(out, surface, features, params.split, texture, views)
-    result["files"] = [str(path) for path in files]
-    record_step(folder, "export", params.model_dump(mode="json"), result)
-    return result
+    names = {entry.id: entry.name for entry in project.classes}
+    classes = [names.get(number, f"class {number}") for number in info.class_ids] if baked.classes else []
+    return [out], {"grids": write_volume(out, baked, info.box(project), classes, report)}

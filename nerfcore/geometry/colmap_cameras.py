@@ -44,3 +44,24 @@ def camera_from_colmap(model: str, width: int, height: int, params: Sequence[flo
     if ours == "OPENCV" and not any(distortion):
         ours, distortion = "PINHOLE", ()
     return Camera(model=ours, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, distortion=distortion)
+
+
+def camera_to_colmap(camera: Camera) -> tuple[str, list[float]]:
+    """COLMAP's model of a camera and its parameters, in its order.
+
+    Raises:
+        InputError: it has none, for panoramas.
+    """
+    lens = [camera.fx, camera.fy, camera.cx, camera.cy]
+    match camera.model:
+        case "PINHOLE":
+            return "PINHOLE", lens
+        case "OPENCV_FISHEYE":
+            return "OPENCV_FISHEYE", [*lens, *camera.distortion]
+        case "OPENCV":
+            model, count = ("OPENCV", 4) if len(camera.distortion) == 4 else ("FULL_OPENCV", 8)
+            return model, [*lens, *camera.distortion, *[0.0] * (count - len(camera.distortion))]
+        case _:
+            raise InputError(
+                "COLMAP has no model for panoramas.", "Use a format that knows them, such as transforms.json."
+            )

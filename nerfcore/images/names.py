@@ -47,6 +47,12 @@ def frame_names(places: Sequence[str]) -> list[str]:
     return names
 
 
+def file_names(names: Sequence[str]) -> list[str]:
+    """A file name, without ending, for each of some names of classes or things, which may hold what file names may not."""
+    plain = [re.sub(r"[^\w.-]+", "_", name).strip(".") or "_" for name in names]
+    return [f"{name}_{i}" for i, name in enumerate(plain)] if _alike(plain) else plain
+
+
 def _alike(names: Iterable[str]) -> bool:
     """Whether two names would be one file on Windows or macOS, which do not tell capitals apart."""
     folded = [name.casefold() for name in names]

@@ -9,7 +9,6 @@ PLY and OBJ, where readers show the numbers as they are.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -24,6 +23,7 @@ from trimesh.visual import ColorVisuals
 from ..data.scene import View
 from ..files import atomic_path
 from ..images.encode import png_bytes
+from ..images.names import file_names
 from ..progress import go_on
 from .features import Features
 from .formats import TEXTURED, USD, Y_UP
@@ -72,8 +72,7 @@ def write_surface(
     if split == "none":
         return _write_one(path, parts["mesh"], features, png, check)
     written = []
-    for name, part in parts.items():
-        plain = re.sub(r"[^\w.-]+", "_", name)  # class names may hold what file names may not
+    for plain, part in zip(file_names(list(parts)), parts.values()):
         written += _write_one(path.with_name(f"{path.stem}_{plain}{path.suffix}"), part, features, png, check)
     return written
 

@@ -23,6 +23,7 @@ from .surface import Surface
 MESH = "mesh.npz"
 COARSE = "mesh_coarse.npz"  # the same surface at cells of twice the size
 TEXTURE = "texture.png"
+CLASS_MAP = "class_id.png"
 
 
 def mesh_folder(project: Path, run: str) -> Path:
@@ -43,8 +44,17 @@ def load_surface(project: Path, run: str) -> tuple[Surface, Texture | None]:
     picture = path.with_name(TEXTURE)
     if uv is None or not picture.is_file():
         return surface, None
-    with Image.open(picture) as image:
-        return surface, texture_of(surface.faces, uv, np.array(image.convert("RGB")))
+    return surface, texture_of(surface.faces, uv, _picture(picture, "RGB"))
+
+
+def load_class_map(project: Path, run: str) -> np.ndarray | None:
+    """The class (S, S) of each texel of the texture of a run's mesh; None where `mesh` made none.
+
+    Raises:
+        ProjectError: the file is damaged.
+    """
+    path = mesh_folder(project, run) / CLASS_MAP
+    return _picture(path) if path.is_file() else None
 
 
 def load_coarse(project: Path, run: str) -> tuple[np.ndarray, np.ndarray]:
@@ -56,6 +66,14 @@ def load_coarse(project: Path, run: str) -> tuple[np.ndarray, np.ndarray]:
     path = mesh_folder(project, run) / COARSE
     with _reading(path, f"{path} is missing.") as data:
         return data["vertices"].astype(np.float64), data["faces"]
+
+
+def _picture(path: Path, mode: str | None = None) -> np.ndarray:
+    try:
+        with Image.open(path) as image:
+            return np.array(image.convert(mode) if mode else image)
+    except OSError as error:
+        raise ProjectError(f"{path} is damaged: {error}.", "Run `fieldwork mesh` again.") from error
 
 
 @contextmanager

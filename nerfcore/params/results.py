@@ -31,9 +31,14 @@ class BlendParams(Params):
 
 class ExportParams(Params):
     project: Path
-    to: Literal["glb", "obj", "ply", "stl", "usd", "onnx", "voxels", "splats", "vdb"] = Field(description="format")
+    to: Literal[
+        "glb", "obj", "ply", "stl", "usd", "masks", "transforms", "colmap", "onnx", "voxels", "splats", "vdb"
+    ] = Field(description="format")
     run: RunName = "main"
-    out: Path | None = Field(default=None, description="file to write; default: exports/RUN/PROJECT of the project")
+    out: Path | None = Field(
+        default=None,
+        description="file to write, for masks and colmap the folder; default: exports/RUN/PROJECT of the project",
+    )
     split: Split = Field(default="none", description="classes, instances: one object for each of them")
     resolution: int = Field(default=128, ge=8, le=512, description="voxels: cells along each side of the field's cube")
 

@@ -83,7 +83,7 @@ settings.project = project
 reasons["no engine"] = operators["poses"].reason(bpy.context)
 need = bpy.types.FIELDWORK_OT_export.need_format
 needs = [need(bpy.context)]
-for settings.export_to in ("glb", "onnx"):
+for settings.export_to in ("glb", "onnx", "colmap"):
     needs.append(need(bpy.context))
 reasons["export"] = needs
 answer(reasons)
@@ -93,6 +93,7 @@ answer(reasons)
     assert facts.pop("export") == [
         "Choose a format for other programs in the Export panel",
         "Extract the mesh first",
+        "Estimate the camera poses first",
         None,
     ]
     assert facts.pop("new") == "Choose a folder of photos, or a video, first"

@@ -1,0 +1,140 @@
+"""The photos' cameras for other programs: transforms.json and COLMAP's text files, in the world (z up, metres when scaled)."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from scipy.spatial.transform import Rotation
+from trimesh.exchange.ply import export_ply
+
+from ..data.scene import Scene, View
+from ..errors import SettingError
+from ..files import atomic_path, staged, write_json, write_text
+from ..geometry.cameras import Camera, flip_camera_axes
+from ..geometry.colmap_cameras import camera_to_colmap
+from ..geometry.points import Points
+
+RADIAL = ("k1", "k2", "p1", "p2", "k3")  # in the order of Camera.distortion
+FISHEYE = ("k1", "k2", "k3", "k4")
+
+
+def write_transforms(out: Path, scene: Scene, metres: bool) -> list[Path]:
+    """A transforms.json as nerfstudio and Instant-NGP read it: camera-to-world with OpenGL axes, intrinsics of each frame
+    in pixels, which photos are held out; and the sparse points beside it.
+
+    Returns:
+        the files written.
+    Raises:
+        SettingError: there are no keys for such a lens. DiskError: a file cannot be written.
+    """
+    # Their k4 is a fourth polynomial term, ours the first of a denominator.
+    rational = next((v.name for v in scene.views if any(v.camera.distortion[len(RADIAL) :])), None)
+    if rational is not None:
+        raise SettingError(
+            f"transforms.json has no keys for the lens of {rational}, whose distortion has a denominator.",
+            "Export colmap, which has them.",
+        )
+    frames = [_frame(view, out.parent) for view in scene.views]
+    head: dict[str, Any] = {"camera_convention": "OpenGL axes, z up" + (", metres" if metres else "")}
+    head |= {
+        f"{split}_filenames": [frames[i]["file_path"] for i in indices]
+        for split, indices in (("train", scene.train), ("test", scene.test))
+    }
+    files = [out]
+    if len(scene.points.xyz):
+        cloud = out.with_name(f"{out.stem}_points.ply")
+        with atomic_path(cloud) as temporary:
+            points = trimesh.PointCloud(scene.points.xyz, scene.points.rgb)
+            temporary.write_bytes(export_ply(points))
+        head["ply_file_path"] = cloud.name
+        files.append(cloud)
+    write_json(out, {**head, "frames": frames})
+    return files
+
+
+def _frame(view: View, folder: Path) -> dict[str, Any]:
+    camera = view.camera
+    frame: dict[str, Any] = {
+        "file_path": _relative(view.image, folder),
+        "transform_matrix": flip_camera_axes(view.camera_to_world).tolist(),
+        "camera_model": camera.model,
+        "w": camera.width,
+        "h": camera.height,
+    }
+    if view.mask is not None:
+        frame["mask_path"] = _relative(view.mask, folder)
+    if view.label is not None:
+        frame["semantic_path"] = _relative(view.label, folder)
+    if camera.model != "EQUIRECTANGULAR":
+        frame |= {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
+    return frame | dict(zip(FISHEYE if camera.model == "OPENCV_FISHEYE" else RADIAL, camera.distortion))
+
+
+def _relative(path: Path, folder: Path) -> str:
+    try:
+        return Path(os.path.relpath(path, folder)).as_posix()
+    except ValueError:  # another drive of Windows
+        return path.as_posix()
+
+
+def write_colmap(out: Path, scene: Scene) -> list[Path]:
+    """A COLMAP model in text files, OUT/sparse/0. Photos are named below the folder that holds them all.
+
+    Returns:
+        the files written.
+    Raises:
+        InputError: COLMAP has no such lens. DiskError: a file cannot be written.
+    """
+    cameras = list(dict.fromkeys(view.camera for view in scene.views))
+    root = photo_folder(scene.views)
+    model = out / "sparse" / "0"
+    texts = {
+        "cameras.txt": _camera_rows(cameras),
+        "images.txt": _image_rows(scene.views, cameras, root),
+        "points3D.txt": _point_rows(scene.points),
+    }
+    with staged(model) as place:
+        for name, rows in texts.items():
+            write_text(place / name, "\n".join(rows) + "\n")
+    return [model / name for name in texts]
+
+
+def photo_folder(views: Sequence[View]) -> Path:
+    """The folder below which all photos lie."""
+    return Path(os.path.commonpath([view.image.parent for view in views]))
+
+
+def _camera_rows(cameras: Sequence[Camera]) -> list[str]:
+    rows = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
+    for number, camera in enumerate(cameras, 1):
+        model, parameters = camera_to_colmap(camera)
+        rows.append(f"{number} {model} {camera.width} {camera.height} {_numbers(parameters)}")
+    return rows
+
+
+def _image_rows(views: Sequence[View], cameras: Sequence[Camera], root: Path) -> list[str]:
+    rows = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "# POINTS2D[] as (X, Y, POINT3D_ID)"]
+    for number, view in enumerate(views, 1):
+        camera_from_world = np.linalg.inv(view.camera_to_world)
+        x, y, z, w = Rotation.from_matrix(camera_from_world[:3, :3]).as_quat()
+        pose = _numbers([w, x, y, z, *camera_from_world[:3, 3]])
+        name = view.image.relative_to(root).as_posix()
+        # The second line lists the image's points: which photo shows which is not told.
+        rows += [f"{number} {pose} {cameras.index(view.camera) + 1} {name}", ""]
+    return rows
+
+
+def _point_rows(points: Points) -> list[str]:
+    rows = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)"]
+    for number, (place, color, error) in enumerate(zip(points.xyz, points.rgb.tolist(), points.error), 1):
+        rows.append(f"{number} {_numbers(place)} {' '.join(map(str, color))} {_numbers([error])}")
+    return rows
+
+
+def _numbers(values: Sequence[float] | np.ndarray) -> str:
+    return " ".join(repr(float(value)) for value in values)

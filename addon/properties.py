@@ -252,9 +252,10 @@ class FieldworkScene(LabelSettings, PropertyGroup):
     # Mesh
     resolution: IntProperty(
         name="Resolution",
-        description="Cells along the longest side of what the photos show; memory grows with the square",
-        default=512,
-        min=16,
+        description="Cells along the longest side of what the photos show; memory grows with the square. 0: 512, or up "
+        "to 1024 where the photos are finer",
+        default=0,
+        min=0,
         max=2048,
     )
     detail: FloatProperty(

@@ -59,7 +59,7 @@ class FIELDWORK_OT_mesh(ProjectOperator):
         return {
             "project": self.project_path(context),
             "run": self.value(context, "run"),
-            "resolution": self.value(context, "resolution"),
+            "resolution": self.value(context, "resolution") or None,
             "detail": self.value(context, "detail") or None,
             "region": self.value(context, "region"),
             "turntable": self.path(context, "turntable"),

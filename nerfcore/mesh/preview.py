@@ -45,7 +45,7 @@ def preview(params: MeshParams, report: Reporter) -> dict[str, Any]:
     flats = dm.flat_views(views, box.box_from_world, SIDE)
     maps = dm.confirmed_maps(flats, dm.depth_maps(trained.model, flats, report), trained.device, report)
     report.stage("A first look: surface")
-    region = choose_region(maps, wanted_bounds(params, scene, box), min(CELLS, params.resolution))
+    region = choose_region(maps, wanted_bounds(params, scene, box), min(CELLS, params.resolution or CELLS))
     vertices, faces = extract(fuse_maps(maps, region, report), report)
     vertices, faces = compact(vertices, drop_scraps(vertices, faces)) if len(faces) else (vertices, faces)
     if not len(faces):

@@ -14,6 +14,8 @@ from .depth_maps import hit_points
 MARGIN = 0.02  # of the longest side
 INNER, REACH = (1.0, 99.0), 0.25  # percentiles of all hits; how far beyond them, as a share of their extent
 FEWEST_HITS = 200
+CELLS = (512, 1024)  # along the longest side, where nobody asks for a number: the fewest and the most
+ENOUGH = 1.5  # median footprints of a pixel that a voxel may have before there are more cells than the fewest
 
 
 @dataclass(frozen=True)
@@ -36,13 +38,13 @@ def all_hits(maps: MapArrays, most: int = 1 << 20) -> torch.Tensor:
 
 
 def choose_region(
-    maps: MapArrays, bounds: tuple[np.ndarray, np.ndarray] | None, cells: int, voxel: float | None = None
+    maps: MapArrays, bounds: tuple[np.ndarray, np.ndarray] | None, cells: int | None, voxel: float | None = None
 ) -> Region:
     """The box to look in: `bounds` (corners (3,)) cut to what is seen, or what the maps show without far outliers.
 
     Args:
-        cells: voxels along the longest side; fewer where the pictures are coarser than that: a voxel is at least half
-            the median footprint of a pixel.
+        cells: voxels along the longest side; None: 512, or up to 1024 where the pictures are finer. Fewer where they are
+            coarser: a voxel is at least half the median footprint of a pixel.
         voxel: side of a voxel, instead of that.
     Raises:
         TrainingError: the maps show (almost) nothing, or nothing within the bounds.
@@ -70,7 +72,9 @@ def choose_region(
     if bounds is not None:
         low, high = np.maximum(low, bounds[0]), np.minimum(high, bounds[1])
     if voxel is None:
-        voxel = max(float((high - low).max()) / cells, 0.5 * footprint(maps))
+        size, pixel = float((high - low).max()), footprint(maps)
+        fewest, most = (cells, cells) if cells else CELLS
+        voxel = max(min(size / fewest, ENOUGH * pixel), size / most, 0.5 * pixel)
     return Region(low, high, voxel)
 
 

@@ -15,7 +15,12 @@ class MeshParams(Params):
     run: RunName = "main"
     out: Path | None = None
     faces: int | None = Field(default=None, gt=0, le=1_000_000_000, description="target number of triangles")
-    resolution: int = Field(default=512, ge=16, le=2048, description="cells along the longest side of the region")
+    resolution: int | None = Field(
+        default=None,
+        ge=16,
+        le=2048,
+        description="cells along the longest side of the region; default: 512, or up to 1024 where photos are finer",
+    )
     detail: float | None = Field(
         default=None,
         gt=0,

@@ -133,6 +133,18 @@ def test_the_region_follows_what_is_seen_and_leaves_out_what_is_far() -> None:
         choose_region(maps, (np.full(3, 2.0), np.full(3, 3.0)), 64)
 
 
+@pytest.mark.parametrize(("pixel", "cells"), [(0.1, 20), (0.003, 512), (0.001, 2 / 3 * 1000), (0.0001, 1024)])
+def test_cells_are_as_fine_as_pixels_between_512_and_1024(pixel: float, cells: float) -> None:
+    """`pixel`: its footprint over the region's size."""
+    maps = depth_maps.confirmed_maps(*maps_of(sphere(0.5), orbit(6, 1.8)), CPU, Reporter())
+    size = choose_region(maps, None, 64).size
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(f"{choose_region.__module__}.footprint", lambda _: pixel * size)
+        assert size / choose_region(maps, None, None).voxel == pytest.approx(cells)
+        assert size / choose_region(maps, None, 64).voxel == pytest.approx(min(64, 2 / pixel))
+        assert choose_region(maps, None, None, 0.123).voxel == 0.123
+
+
 def test_views_that_agree_on_nothing_are_an_error() -> None:
     flats, maps = maps_of(sphere(0.5), orbit(6, 1.8))
     random = np.random.default_rng(0)

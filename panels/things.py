@@ -6,6 +6,7 @@ from bpy.types import Context, UILayout
 
 from ..addon.project import things
 from ..addon.text import t
+from ..operators.measure import need_mesh
 from .base import StepPanel
 from .states import State, project_folder
 
@@ -16,6 +17,13 @@ ICONS = {"part of": "LINKED", "in": "PACKAGE", "on": "TRIA_DOWN_BAR", "hangs on"
 def state(context: Context) -> State:
     known = things.graph(project_folder(context), context.scene.fieldwork.run)
     return State(known is not None, t("{} things", len(known["things"])) if known is not None else "")
+
+
+def what_is_next(context: Context) -> str:
+    """What is to be done before there is a list of things."""
+    if need_mesh(context) is None:
+        return t("The things on the mesh are listed once their relations are found")
+    return t("Extract the mesh, then find its relations")
 
 
 class FIELDWORK_PT_things(StepPanel):
@@ -31,7 +39,7 @@ class FIELDWORK_PT_things(StepPanel):
         if known is None:
             note = layout.row()
             note.active = False
-            note.label(text=t("Extract the mesh, then find its relations"))
+            note.label(text=what_is_next(context))
             return
         draw_outline(layout, things.outline(known))
         row = layout.row(align=True)

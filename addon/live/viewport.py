@@ -23,6 +23,7 @@ BUDGET = 0.05  # seconds of marching in a redraw once the view stands still, or 
 LONGEST = 0.5  # seconds of marching in a redraw at most
 COARSEST = 8  # pixels of the viewport on a side of one of the picture, while the view moves on a weak card
 MOVED = 0.15  # seconds a picture may take while the view moves, before it is made coarser
+STRIPS = 64  # redraws at most, in which a picture becomes fine: how long a few rows take says little
 SETTLED = 0.15  # seconds without a change, after which pictures become finer
 UNUSED = 30.0  # seconds after which what no viewport shows is given up
 
@@ -116,6 +117,7 @@ class Viewport:
         self.error = ""
         self._ended = 0.0  # when the last redraw was done here
         self._rest = 0.0  # seconds that a redraw takes beside what is done here
+        self._waited = 0.0  # seconds of this redraw in which the card did what was asked of it before
 
     def draw(self, context: bpy.types.Context) -> None:
         """Draw the fields of a view; what goes wrong is told in the panel, not in each redraw."""
@@ -136,7 +138,7 @@ class Viewport:
         if self._march is None:
             self._prepare()
         now = time.monotonic()
-        self._rest = min(now - self._ended, LONGEST)
+        self._rest, self._waited = min(now - self._ended, LONGEST), 0.0
         scene_from_clip = view3d.perspective_matrix.inverted_safe()
         quality = int(context.scene.fieldwork_live.quality)
         unfinished, marched = False, 0.0
@@ -176,7 +178,7 @@ class Viewport:
                 self._lay_over(view.shown, region)
         self._give_up(now)
         spent = time.perf_counter() - begin
-        self.seconds = [*self.seconds[-99:], spent - marched]
+        self.seconds = [*self.seconds[-99:], spent - marched - self._waited]
         if marched:
             self.frame_seconds = [*self.frame_seconds[-99:], spent]
         self._ended = time.monotonic()
@@ -210,7 +212,8 @@ class Viewport:
             return 0.0
         if view.next is None:
             view.next = _picture(None, size, quality)
-        count = max(1, int(max(BUDGET, self._rest) / max(view.row_seconds, 1e-6)))
+        least = -(-view.next.height // STRIPS)
+        count = max(least, int(max(BUDGET, self._rest) / max(view.row_seconds, 1e-6)))
         seconds = self._march_rows(view.next, asset, rows, uniforms, count)
         view.row_seconds = 0.5 * (view.row_seconds + seconds / count)
         if view.next.done:
@@ -223,13 +226,17 @@ class Viewport:
         """Draw the next rows of a picture; returns how many seconds they took."""
         import gpu
 
-        begin = time.perf_counter()
         shader, first = self._march, picture.rows if not picture.done else 0
         count = min(count, picture.height - first)
         gpu.state.blend_set("NONE")
         gpu.state.depth_test_set("NONE")
         gpu.state.depth_mask_set(False)
         with picture.buffer.bind():
+            # Reading a pixel waits for the card: first for all that was drawn before, so that only the march is timed.
+            waiting = time.perf_counter()
+            picture.buffer.read_color(0, first, 1, 1, 4, 0, "FLOAT")
+            begin = time.perf_counter()
+            self._waited += begin - waiting
             gpu.state.scissor_test_set(True)
             gpu.state.scissor_set(0, first, picture.width, count)
             shader.bind()
@@ -245,10 +252,10 @@ class Viewport:
             shader.uniform_float("size", (picture.width, picture.height))
             self._batches[0].draw(shader)
             gpu.state.scissor_test_set(False)
-            # Reading a pixel waits for the card, so that the time is known.
             picture.buffer.read_color(0, first, 1, 1, 4, 0, "FLOAT")
+            spent = time.perf_counter() - begin
         picture.rows = first + count
-        return time.perf_counter() - begin
+        return spent
 
     def _lay_over(self, picture: Picture | Textures, region: Any) -> None:
         import gpu

@@ -10,7 +10,7 @@ from fieldwork.tests.nerfcore.support.live import live_ball
 
 START = (
     """
-os.environ["FIELDWORK_ENGINE_PYTHON"] = sys.executable
+os.environ["FIELDWORK_ENGINE_PYTHON"] = ENGINE_PYTHON
 import math, time
 import numpy as np
 """

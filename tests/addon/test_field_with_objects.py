@@ -17,7 +17,7 @@ def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 START = (
     """
-os.environ["FIELDWORK_ENGINE_PYTHON"] = sys.executable
+os.environ["FIELDWORK_ENGINE_PYTHON"] = ENGINE_PYTHON
 import math
 import numpy as np
 """

@@ -59,6 +59,36 @@ def test_a_graph_of_other_instances_is_none(tmp_path):
     assert graph(None, "main") is None
 
 
+def test_the_panel_asks_for_a_mesh_only_where_there_is_none(bpy_script, tmp_path):
+    """Also after an extraction that made the relations found before those of another mesh."""
+    project = with_graph(
+        make_posed_project(tmp_path / "capture"), value={**GRAPH, "made": "before"}, names={1: "wall.001"}
+    )
+    said = bpy_script(
+        SETUP
+        + """
+from fieldwork.panels import things
+labels = []
+class Layout:
+    def __getattr__(self, name):
+        return lambda *args, **values: (labels.append(values["text"]) if name == "label" else None) or self
+def look():
+    labels.clear()
+    things.FIELDWORK_PT_things.draw(type("Panel", (), {"layout": Layout()})(), bpy.context)
+    return list(labels)
+settings.project = folder
+before = look()
+(Path(folder) / "exports/main/mesh.npz").touch()
+answer([before, look()])
+""",
+        folder=project,
+    )
+    assert [len(texts) for texts in said] == [1, 1]
+    assert "Extract the mesh" in said[0][0]
+    assert "Extract" not in said[1][0]
+    assert "relations" in said[1][0]
+
+
 def test_questions_select_objects_and_relations_are_properties(bpy_script, tmp_path, package):  # noqa: F811
     project = with_graph(make_posed_project(tmp_path / "capture"))
     value = json.loads((package / "package.json").read_text())

@@ -104,6 +104,7 @@ def overlays(screen):
 def endurance(screen):
     """200 sizes of the viewport and 50 undos: what is kept, and what memory it takes."""
     bpy.context.preferences.edit.undo_steps = 64  # Blender keeps 32 otherwise, and fifty are taken back
+    bpy.context.preferences.system.use_region_overlap = False  # else the view stays as large below the sidebar
     yield from ball(screen)
     space = screen.area.spaces.active
     drawn = yield from settled(screen)
@@ -113,12 +114,15 @@ def endurance(screen):
         line = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmRSS"))
         return int(line.split()[1]) / 1024
 
+    widths = []
+
     def resize(times):
         for number in range(times):
             space.show_region_ui = not space.show_region_ui
             space.show_region_toolbar = number % 3 == 0
-            bpy.ops.wm.redraw_timer(type="DRAW_WIN", iterations=1)
             yield 0.0
+            bpy.ops.wm.redraw_timer(type="DRAW_WIN", iterations=1)
+            widths.append(screen.view.width)
 
     def undo(times):
         for _ in range(times):
@@ -141,6 +145,9 @@ def endurance(screen):
     yield 0.5
     yield from settled(screen)
     screen.facts["memory"] = [begin, resized, memory()]
+    screen.facts["changes"] = sum(one != other for one, other in zip(widths, widths[1:]))
+    screen.facts["widths"] = sorted(set(widths))
+    screen.facts["moved"] = next(o for o in bpy.data.objects if o.fieldwork.is_field).location.x
     screen.facts["kept"] = [len(drawn.views), len(drawn.assets)]
     screen.facts["viewport error"] = drawn.error
     screen.facts["places"] = {name: place(screen, point) for name, point in POINTS.items()}

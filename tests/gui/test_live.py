@@ -33,14 +33,16 @@ def project() -> Path:
     return folder
 
 
-def played(project: Path, scenario: str, suite: str = "sid", timeout: float = 500) -> tuple[dict, Path]:
+def played(
+    project: Path, scenario: str, suite: str = "sid", timeout: float = 500, size: tuple[int, int] = (1920, 1080)
+) -> tuple[dict, Path]:
     root = window.BLENDER_ROOT if suite == "sid" else window.OLDER_ROOT
     reason = window.missing(root, suite)
     if reason:
         pytest.skip(reason)
     session = window.Window(f"{scenario}-{suite}", root)
     session.environment["FIELDWORK_BALL"] = str(project)
-    return session.play(scenario, timeout=timeout), session.folder
+    return session.play(scenario, timeout=timeout, size=size), session.folder
 
 
 def colour(folder: Path, shot: str, place: list[int]) -> np.ndarray:

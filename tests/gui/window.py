@@ -85,21 +85,15 @@ class Window:
             done = enter(["blender", "--command", "extension", *arguments], self.environment, 120, root)
             assert done.returncode == 0, done.stdout + done.stderr
 
-    def play(self, *scenarios: str, timeout: float = 300) -> dict:
-        """Drive scenarios one after the other, each in a Blender of its own; returns the facts of the last.
+    def play(self, *scenarios: str, timeout: float = 300, size: tuple[int, int] = (1920, 1080)) -> dict:
+        """Drive scenarios one after the other, each in a Blender of its own whose window lies at the lower left corner of the
+        screen; returns the facts of the last.
 
         Fails with the traceback of the scenario and Blender's output.
         """
         blender = ["blender", "--factory-startup", "-noaudio", "--gpu-backend", "opengl", "--enable-event-simulate"]
-        blender += [
-            "--window-geometry",
-            "0",
-            "0",
-            "1920",
-            "1080",
-            "--python",
-            str(Path(__file__).with_name("driver.py")),
-        ]
+        blender += ["--window-geometry", "0", "0", *map(str, size)]
+        blender += ["--python", str(Path(__file__).with_name("driver.py"))]
         runs = [shlex.join([*blender, "--", scenario, str(self.folder)]) for scenario in scenarios]
         for scenario in scenarios:
             (self.folder / f"{scenario}.json").unlink(missing_ok=True)

@@ -1,0 +1,119 @@
+"""Pictures through files in memory, by a process that writes without pause and one that reads: none is torn."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fieldwork.addon.live.frames import Sizes, _SharedPixels
+from fieldwork.nerfcore.film.shared_file import SharedFile
+
+FRAMES = 10_000
+SIZE = 160, 100  # large enough that a reader often meets a picture in the making
+
+# Every value of a picture is its number: one that is torn holds two. Ends with its standard input.
+WRITER = """
+import sys, threading
+from pathlib import Path
+import numpy as np
+from fieldwork.nerfcore.film.shared_file import PictureFile, SharedFile
+kind, path, width, height = sys.argv[1], Path(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4])
+over = threading.Event()
+threading.Thread(target=lambda: (sys.stdin.read(), over.set()), daemon=True).start()
+file = PictureFile(path) if kind == "picture" else SharedFile(path, {"Combined": (height, width, 4)})
+number = 0
+while not over.is_set():
+    number += 1
+    color = np.full((height, width, 4), number % 1_000_000, np.float32)
+    if kind == "picture":
+        file.write(number, color, color[..., 0])
+    else:
+        file.write({"Combined": color})
+print(number)
+"""
+
+
+def start(kind: str, path: Path) -> subprocess.Popen:
+    command = [sys.executable, "-c", WRITER, kind, str(path), *map(str, SIZE)]
+    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+
+def torn(pixels: np.ndarray) -> bool:
+    return bool(pixels.min() != pixels.max())
+
+
+@pytest.mark.slow
+def test_ten_thousand_colours_of_renders_are_whole(tmp_path: Path) -> None:
+    seen, busy, wrong, careless = 0, 0, 0, 0
+    with _SharedPixels(tmp_path / "frame", Sizes(*SIZE, {"Combined": 4})) as pixels:
+        writer = start("frame", pixels.path)
+        try:
+            while seen < FRAMES or careless == 0:
+                assert writer.poll() is None, "the writer died"
+                found = pixels.whole("Combined")
+                if found is None:
+                    busy += 1
+                elif pixels._counter():
+                    seen += 1
+                    wrong += torn(found)
+                careless += torn(pixels.copy("Combined"))  # without a look at the counter
+        finally:
+            written = int(writer.communicate()[0])
+    print(f"{written} written, {seen} read, {busy} times in the making, {careless} torn without the counter")
+    assert wrong == 0
+    assert busy > 0
+
+
+@pytest.mark.slow
+def test_ten_thousand_pictures_for_viewports_are_whole(bpy_script, tmp_path: Path) -> None:
+    """As the viewport reads them, with their numbers, sizes and depths."""
+    facts = bpy_script(
+        """
+import subprocess
+import numpy as np
+import fieldwork
+from fieldwork.addon.live.training import PixelFile
+file = PixelFile(Path(path), size[0] * size[1])
+command = [engine, "-c", writer, "picture", path, *map(str, size)]
+process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+seen = busy = wrong = last = 0
+try:
+    while seen < frames or busy == 0:
+        assert process.poll() is None, "the writer died"
+        found = file.read()
+        if found is None:
+            busy += file._counter() != 0
+            continue
+        seen += 1
+        value = found.number % 1_000_000
+        same = all(bool((part == value).all()) for part in (found.color, found.depth))
+        wrong += not same or (found.width, found.height) != tuple(size) or found.number < last
+        last = found.number
+finally:
+    written = int(process.communicate()[0])
+answer({"seen": seen, "busy": busy, "wrong": wrong, "written": written, "last": last})
+""",
+        path=tmp_path / "view.pixels",
+        size=SIZE,
+        frames=FRAMES,
+        writer=WRITER,
+        engine=sys.executable,
+    )
+    assert facts["wrong"] == 0
+    assert facts["seen"] >= FRAMES
+    assert 0 < facts["last"] <= facts["written"]
+
+
+def test_what_is_being_written_is_not_shown(tmp_path: Path) -> None:
+    with _SharedPixels(tmp_path / "frame", Sizes(4, 2, {"Depth": 1, "Combined": 4})) as pixels:
+        file = SharedFile(pixels.path, {"Depth": (2, 4, 1), "Combined": (2, 4, 4)})
+        file.write({"Combined": np.ones((2, 4, 4), np.float32)})
+        found = pixels.whole("Combined")
+        assert found is not None
+        assert found.min() == 1
+        file._counter[0] += 1
+        assert pixels.whole("Combined") is None
+        assert pixels.whole("Normal") is None, "a pass that was not asked for"

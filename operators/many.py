@@ -7,7 +7,7 @@ from typing import Any
 import bpy
 from bpy.types import Context
 
-from ..addon.props import FloatProperty, IntProperty, StringProperty
+from ..addon.props import BoolProperty, FloatProperty, IntProperty, StringProperty
 from ..addon.text import t
 from .base import HoldoutProperty, ProjectOperator, VerbOperator, absolute, hold_out, need_poses, scene_settings
 from .train import parse_settings
@@ -49,6 +49,10 @@ class FIELDWORK_OT_batch(VerbOperator):
         name="Keep Free", description="GB: a worker of the cluster with less free on its disk gets nothing to do",
         default=2.0, min=0.0,
     )  # fmt: skip
+    dry_run: BoolProperty(
+        name="Dry Run", description="Do nothing: say what there is to do, what is missing, and how long it may take",
+        options={"SKIP_SAVE"},
+    )  # fmt: skip
 
     def invoke(self, context: Context, event: bpy.types.Event) -> set[str]:
         return context.window_manager.invoke_props_dialog(self, width=380)
@@ -56,7 +60,7 @@ class FIELDWORK_OT_batch(VerbOperator):
     def parameters(self, context: Context) -> dict[str, Any]:
         if not self.list:
             raise ValueError(t("Choose a list of captures."))
-        if self.cluster:
+        if self.cluster and not self.dry_run:
             context.scene.fieldwork.campaign = self.list  # which the panel follows
         return {
             "list": absolute(self.list),
@@ -66,6 +70,7 @@ class FIELDWORK_OT_batch(VerbOperator):
             "storage": self.storage or None,
             "wheel": absolute(self.wheel),
             "keep_free": self.keep_free,
+            "dry_run": self.dry_run,
         }
 
 

@@ -18,10 +18,10 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import FieldworkError, InputError, SettingError
+from .refusals import START, why
 
 log = logging.getLogger("fieldwork.cluster")
 INSTALL = 'Install it on this machine and on the workers: pip install "fieldwork[cluster]".'
-START = "Start one (ray start --head), or use --cluster auto."
 BRIDGE_STARTS = 60.0  # seconds at most
 SILENT = 45.0  # seconds after which a bridge that says nothing is given up
 PAUSE = 2.0  # seconds between two attempts to reach a head that is gone
@@ -71,6 +71,7 @@ class Link:
         """Start the bridge: its first message, with the nodes. Raises ClusterError; Cancelled through `check`."""
         self.close()
         self.messages = queue.Queue()
+        self.tail.clear()
         path = os.pathsep.join(entry for entry in sys.path if entry)
         environment = {
             **os.environ,
@@ -89,8 +90,12 @@ class Link:
             env=environment,
             start_new_session=True,  # Ctrl-C reaches us first
         )
-        for target, stream in ((self._read, self.process.stdout), (self._log, self.process.stderr)):
-            threading.Thread(target=target, args=(stream, self.messages), daemon=True).start()
+        readers = [
+            threading.Thread(target=target, args=(stream, self.messages), daemon=True)
+            for target, stream in ((self._read, self.process.stdout), (self._log, self.process.stderr))
+        ]
+        for reader in readers:
+            reader.start()
         deadline = time.monotonic() + BRIDGE_STARTS
         while time.monotonic() < deadline:
             check()
@@ -101,9 +106,11 @@ class Link:
             if message is not None and message["kind"] == "ready":
                 self.joined, self.heard = self.joined or message["joined"], time.monotonic()
                 return message
-            reason = message["message"] if message else (self.tail[-1] if self.tail else "it ended")
             self.close()
-            raise ClusterError(f"The cluster {self.address} cannot be reached: {reason}.", START)
+            for reader in readers:
+                reader.join(timeout=2.0)
+            reason, hint = why(self.address, message["message"] if message else "", list(self.tail))
+            raise ClusterError(f"The cluster {self.address} cannot be reached: {reason}.", hint)
         self.close()
         raise ClusterError(f"The cluster {self.address} has not answered for {BRIDGE_STARTS:.0f} s.", START)
 

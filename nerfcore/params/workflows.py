@@ -59,6 +59,9 @@ class BatchParams(Params):
         le=1e6,
         description="with --cluster: a worker with fewer GB free on its disk gets nothing to do",
     )
+    dry_run: bool = Field(
+        default=False, description="do nothing: say what there is to do, what is missing, and how long it may take"
+    )
 
 
 class BlocksParams(Params):

@@ -18,6 +18,7 @@ from ..project.lock import lockable, project_lock
 from ..project.store import is_project
 from . import campaign
 from .captures import read_list
+from .forecast import forecast
 from .reconstruct import reconstruct
 
 log = logging.getLogger("fieldwork.batch")
@@ -38,7 +39,7 @@ def batch(params: BatchParams, report: Reporter) -> dict[str, Any]:
 
     Returns:
         {"done": [projects], "failed": [{"project", "error", "hint"}], "skipped": how many were done before,
-        "seconds", "report": path}; with `cluster` also "page": path
+        "seconds", "report": path}; with `cluster` also "page": path; with `dry_run` what `forecast` returns, and "skipped"
     Raises:
         InputError: the list cannot be read. SettingError: a row of it is wrong.
         ClusterError: the cluster cannot be reached. BatchError: at the end, when captures failed; its `result` is as
@@ -59,6 +60,10 @@ def batch(params: BatchParams, report: Reporter) -> dict[str, Any]:
         else:
             todo.append(capture)
     skipped = len(entries)
+    if params.dry_run:
+        if params.cluster is not None:
+            campaign.Link(params.cluster, params.wheel)  # says what is wrong with them
+        return {**forecast(params, todo, entries, report), "skipped": skipped}
 
     def note(key: str, entry: dict[str, Any], write: bool = True) -> None:
         entries[key] = entry

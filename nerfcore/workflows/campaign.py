@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -68,7 +69,7 @@ def run(
     if params.storage:
         campaign.share(todo, folder, params.storage)
     options = Options(folder, params.retries, params.keep_free, params.storage)
-    runner = Runner(tasks, link, options, report, campaign.ended, campaign.watch, campaign.durations())
+    runner = Runner(tasks, link, options, report, campaign.ended, campaign.watch, known_durations(entries))
     report.stage(f"Campaign of {len(todo)} captures")
     try:
         runner.run()
@@ -148,13 +149,19 @@ def memory_gb(params: ReconstructParams) -> dict[str, float]:
 
 def held_gb(preset: str, settings: dict[str, str], count: int) -> dict[str, float]:
     """`memory_gb` of a run with these settings on so many photos."""
-    config = make_config(preset, settings)
-    side = config.scene.image_size or 1600
-    field = config.field.levels * 2**config.field.table_log2 * 4 * 4 * FIELD_FLOATS / 1e9
-    photos = config.scene.photo_memory or count * side * side * 0.75 * BYTES_A_PIXEL / 1e9
+    field, side, kept = _sizes(preset, tuple(sorted(settings.items())))
+    photos = kept or count * side * side * 0.75 * BYTES_A_PIXEL / 1e9
     held = PYTHON_GB + field + photos
     working = {stage: PYTHON_GB + each * min(count, 200) for stage, each in PHOTO_GB.items()}
     return {**working, "field": round(held, 2)}
+
+
+@lru_cache(maxsize=64)
+def _sizes(preset: str, settings: tuple[tuple[str, str], ...]) -> tuple[float, int, float | None]:
+    """GB of a field with its optimiser, pixels of a photo's longer side, GB that photos may take where that is set."""
+    config = make_config(preset, dict(settings))
+    field = config.field.levels * 2**config.field.table_log2 * 4 * 4 * FIELD_FLOATS / 1e9
+    return field, config.scene.image_size or 1600, config.scene.photo_memory
 
 
 def photos_in(photos: Path) -> int:
@@ -172,6 +179,16 @@ def need_of(stage: str, memory: dict[str, float]) -> Need:
     if stage in ON_GPU:
         share = min(1.0, max(1, round(4 * memory["field"] / SMALLEST_GPU_GB + 0.499)) / 4)
     return Need(CORES.get(stage, 1.0), round(held, 2), share)
+
+
+def known_durations(entries: Mapping[str, dict[str, Any]]) -> Durations:
+    """What stages took of captures that are done, as a report has them."""
+    known: dict[str, list[float]] = {}
+    for entry in entries.values():
+        for stage, seconds in entry.get("stages", {}).items():
+            if seconds:
+                known.setdefault(stage, []).append(seconds)
+    return Durations(known)
 
 
 class Campaign:
@@ -210,15 +227,6 @@ class Campaign:
             self.copies[str(params.out)] = copy
             if copy.changed():
                 copy.upload()
-
-    def durations(self) -> Durations:
-        """What stages took of captures that are done."""
-        known: dict[str, list[float]] = {}
-        for entry in self.entries.values():
-            for stage, seconds in entry.get("stages", {}).items():
-                if seconds:
-                    known.setdefault(stage, []).append(seconds)
-        return Durations(known)
 
     def ended(self, task: Task) -> None:
         """A task is done or failed: with the last one of a capture its entry is noted."""

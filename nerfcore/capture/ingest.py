@@ -12,6 +12,7 @@ from ..errors import InputError, ProjectError
 from ..files import file_hash
 from ..images.decode import float_exposure, is_linear
 from ..images.labels import Colors, drawn_as_stored
+from ..images.names import VIDEO_SUFFIXES
 from ..params import NewParams
 from ..progress import Reporter, shortened
 from ..project.classes import make_classes, read_classes, unnamed_values
@@ -21,7 +22,6 @@ from ..project.store import PROJECT_FILE, create_folder, edit_project, load_proj
 from .find import Source, classes_beside, find_sources, list_photos, subfolder
 from .mask_mode import MaskMode, chosen_mask_mode
 from .select import reject_blurred, reject_duplicates
-from .video import VIDEO_SUFFIXES, extract_frames
 from .working_copies import Settings, make_working_copies
 
 FRAMES_FOLDER = "frames"
@@ -134,6 +134,8 @@ def _photos(params: NewParams, report: Reporter) -> tuple[list[Path], list[dict[
     if photos.is_file() and photos.suffix.lower() in VIDEO_SUFFIXES:
         report.stage("Choosing frames of the video")
         root = Path(params.project) / FRAMES_FOLDER
+        from .video import extract_frames  # the library takes its time to load
+
         return extract_frames(photos, root, params.frames, report), [], root
     return list_photos(photos, exclude=[params.labels, params.masks])
 

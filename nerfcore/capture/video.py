@@ -16,7 +16,6 @@ from ..errors import InputError
 from ..files import atomic_path, write_json
 from ..progress import Reporter
 
-VIDEO_SUFFIXES = {".mp4", ".mov", ".m4v", ".webm", ".mkv", ".avi", ".mts", ".m2ts", ".3gp", ".mpg", ".mpeg"}
 INDEX_FILE = "frames.json"
 GREY_WIDTH = 640  # pixels, at which the sharpness of frames is compared; not tuned
 

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import trimesh
-from trimesh.intersections import mesh_plane
 
 from ..files import atomic_path
 from ..mesh.surface import Surface
@@ -30,6 +28,9 @@ class Profile:
 
 def profile(surface: Surface, view: Projection, at: float) -> Profile:
     """The section of a surface by the plane across the third axis of a view, `at` along it."""
+    import trimesh  # the library takes its time to load
+    from trimesh.intersections import mesh_plane
+
     mesh = trimesh.Trimesh(surface.vertices.astype(np.float64), surface.faces, process=False)
     segments, face = mesh_plane(mesh, view.axes[2], view.axes[2] * at, return_faces=True)
     return Profile(np.asarray(segments).reshape(-1, 2, 3), surface.face_class[face])

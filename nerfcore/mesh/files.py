@@ -15,10 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
-from trimesh.exchange.ply import export_ply
-from trimesh.exchange.stl import export_stl
-from trimesh.visual import ColorVisuals
 
 from ..data.scene import View
 from ..files import atomic_path
@@ -27,7 +23,6 @@ from ..images.names import file_names
 from ..progress import go_on
 from .features import Features
 from .formats import TEXTURED, USD, Y_UP
-from .gltf import write_glb
 from .obj import write_obj
 from .parts import Part, Texture, make_part
 from .surface import Surface
@@ -67,6 +62,8 @@ def write_surface(
         check()
         parts[name] = make_part(surface, features, shown, chosen, kind == ".glb")
     if kind == ".glb":
+        from .gltf import write_glb
+
         write_glb(path, parts, features.rows, png, check)
         return [path]
     if split == "none":
@@ -91,6 +88,11 @@ def _write_one(path: Path, part: Part, features: Features, png: bytes | None, ch
     kind = path.suffix.lower()
     if kind == ".obj":
         return write_obj(path, part, features, png, check)
+    import trimesh
+    from trimesh.exchange.ply import export_ply
+    from trimesh.exchange.stl import export_stl
+    from trimesh.visual import ColorVisuals
+
     mesh = trimesh.Trimesh(part.vertices, part.faces, vertex_normals=part.normals, process=False)
     if kind == ".stl":
         return _write(path, export_stl(mesh))

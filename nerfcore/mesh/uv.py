@@ -11,8 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from ..errors import TrainingError
 from ..files import disk_errors
@@ -113,6 +111,9 @@ def spatial_chunks(centers: np.ndarray, most: int) -> list[np.ndarray]:
 
 def _pieces(faces: np.ndarray, vertices: int) -> np.ndarray:
     """Number (F,) of the connected piece that each face belongs to."""
+    from scipy.sparse import coo_array  # the library takes its time to load
+    from scipy.sparse.csgraph import connected_components
+
     ends = faces[:, [0, 1, 1, 2]].reshape(-1, 2).T
     _, label = connected_components(coo_array((np.ones(ends.shape[1], bool), (ends[0], ends[1])), (vertices,) * 2))
     return np.unique(label[faces[:, 0]], return_inverse=True)[1].astype(np.int32)

@@ -11,8 +11,10 @@ HEAVY = {
     "cli": ("torch", "warp", "scipy", "matplotlib", "pycolmap", "trimesh"),
     "engine.server": ("torch", "warp", "scipy", "matplotlib", "pycolmap", "trimesh"),
     "train.verb": ("matplotlib", "scipy", "trimesh", "skimage", "pycolmap", "torch._dynamo"),
-    "mesh.verb": ("matplotlib.figure", "trimesh", "networkx", "pycolmap", "torch._dynamo"),
+    "mesh.verb": ("matplotlib.figure", "scipy.sparse.csgraph", "trimesh", "networkx", "pycolmap", "torch._dynamo"),
     "render.verb": ("matplotlib", "scipy", "trimesh", "skimage", "pycolmap", "torch._dynamo"),
+    "export.verb": ("matplotlib", "trimesh", "onnx", "pxr", "pycolmap", "torch._dynamo"),
+    "workflows.reconstruct": ("matplotlib.figure", "scipy.spatial", "trimesh", "av", "pycolmap", "torch._dynamo"),
     "evaluate.verb": ("matplotlib", "scipy", "trimesh", "pycolmap", "torch._dynamo"),
 }
 

@@ -11,13 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ...capture.video import VIDEO_SUFFIXES, every_nth, save_every_nth
 from ...errors import InputError
 from ...geometry.cameras import Camera
 from ...geometry.frames import upright
 from ...images.arrays import read_array
 from ...images.decode import image_size
-from ...images.names import labels_and_masks, list_images, unique_names
+from ...images.names import VIDEO_SUFFIXES, labels_and_masks, list_images, unique_names
 from ..dataset import Dataset, DatasetView, require
 
 FILE = "poses_bounds.npy"
@@ -45,6 +44,8 @@ def read(folder: Path) -> Dataset:
     resources, warnings = (), []
     videos = [path for path in folder.iterdir() if path.suffix.lower() in VIDEO_SUFFIXES]
     if not images and len(videos) == 1:
+        from ...capture.video import every_nth, save_every_nth  # the library takes its time to load
+
         step = every_nth(videos[0], len(rows))
         if step is None:
             raise InputError(

@@ -75,8 +75,7 @@ def _overlay(folder: Path, settings: Any, photo: str, colors: dict[int, tuple[fl
     """The texture of a photo's labels, of the revision that is shown or the youngest that was propagated before it."""
     from . import results  # not at the top: it needs numpy, and enabling the extension must be quick
 
-    revision = results.nearest_computed(folder, settings.run, pending.shown(folder))
-    found = results.labelling(folder, settings.run, revision)
+    found = results.to_show(folder, settings.run, pending.shown(folder))
     if found is None:
         return None
     confidence = settings.label_view == "confidence"

@@ -9,12 +9,14 @@ from typing import Any
 import numpy as np
 
 from ...nerfcore.labels.lookup import (
+    FIRST,
     RECORD,
     REVISIONS,
     SURFELS,
     Labelling,
     outlines,
     part_map,
+    read_first,
     read_labelling,
     surfel_map,
 )
@@ -26,7 +28,7 @@ DOTS = 6  # pixels of the map from one white dot to the next, where labels are c
 STRIPE = 6  # pixels of the map from one stripe of the hatching to the next
 VOID_COLOR = (0.12, 0.12, 0.12)
 
-_labellings: dict[Path, tuple[tuple[int, int], Labelling | None]] = {}
+_labellings: dict[Path, tuple[tuple[int, ...], Labelling | None]] = {}
 _maps: dict[tuple[Path, str], tuple[tuple[int, int], np.ndarray | None]] = {}
 KEPT = 8  # of each that are remembered
 
@@ -59,14 +61,41 @@ def nearest_computed(folder: Path, run: str, revision: int) -> int | None:
     return next(found, None)
 
 
+def to_show(folder: Path, run: str, revision: int) -> Labelling | None:
+    """The labels of a revision; while they are computed those of whole parts, and before these the ones of the youngest
+    revision it was drawn on. None where there are none."""
+    if not computed(folder, run, revision):
+        begun = _first(folder, run, revision)
+        if begun is not None:
+            return begun
+    return labelling(folder, run, nearest_computed(folder, run, revision))
+
+
+def _first(folder: Path, run: str, revision: int) -> Labelling | None:
+    """The labels of a revision by whole parts; None where they are not there."""
+    place, changed = run_of(folder, run), _changed(folder, run, FIRST)
+    if changed is None:
+        return None
+    path, key = place / REVISIONS / FIRST, (*changed, revision)
+    if path not in _labellings or _labellings[path][0] != key:
+        _remember(_labellings, path, (key, read_first(place / REVISIONS, place / SURFELS, revision)))
+    return _labellings[path][1]
+
+
 def _file(folder: Path, run: str, revision: int) -> tuple[Path, tuple[int, int]] | None:
     """The file of a revision and what changes with it; None where it is missing or older than the preparation."""
-    path = run_of(folder, run) / REVISIONS / f"{revision}.npz"
+    changed = _changed(folder, run, f"{revision}.npz")
+    return None if changed is None else (run_of(folder, run) / REVISIONS / f"{revision}.npz", changed)
+
+
+def _changed(folder: Path, run: str, name: str) -> tuple[int, int] | None:
+    """What changes with a file of labels; None where it is missing or older than the preparation."""
+    path = run_of(folder, run) / REVISIONS / name
     try:
         made, ready = path.stat(), (run_of(folder, run) / SURFELS / RECORD).stat()
     except OSError:
         return None
-    return (path, (made.st_mtime_ns, made.st_size)) if made.st_mtime_ns >= ready.st_mtime_ns else None
+    return (made.st_mtime_ns, made.st_size) if made.st_mtime_ns >= ready.st_mtime_ns else None
 
 
 def labelling(folder: Path, run: str, revision: int | None) -> Labelling | None:

@@ -85,13 +85,19 @@ def correction(maps: dict[str, tuple[np.ndarray, np.ndarray]], class_ids: list[i
     Args:
         maps: true and shown class ids (H, W) of photos by name.
     """
-    best: tuple[int, str, int, np.ndarray] | None = None
+    amounts = {}
     for photo, (truth, shown) in maps.items():
-        for class_id in class_ids:
-            wrong = largest_component((truth == class_id) & (shown != class_id))
-            size = int(np.count_nonzero(wrong))
-            if size and (best is None or size > best[0]):
-                best = size, photo, class_id, wrong
+        count = np.bincount(truth[truth != shown], minlength=max(class_ids) + 1)
+        amounts.update({(photo, class_id): int(count[class_id]) for class_id in class_ids if count[class_id]})
+    best: tuple[int, str, int, np.ndarray] | None = None
+    for (photo, class_id), amount in sorted(amounts.items(), key=lambda item: -item[1]):
+        if best is not None and amount <= best[0]:
+            break  # no part is larger than the whole
+        truth, shown = maps[photo]
+        wrong = largest_component((truth == class_id) & (shown != class_id))
+        size = int(np.count_nonzero(wrong))
+        if best is None or size > best[0]:
+            best = size, photo, class_id, wrong
     if best is None:
         return None
     _, photo, class_id, wrong = best

@@ -40,15 +40,17 @@ class Subject:
     void: int
 
 
-def read_subject(ready: Preparation, labelled: Path, first: list[str] | None) -> Subject:
+def read_subject(
+    ready: Preparation, project: Path, first: list[str] | None, least_share: float = LEAST_SHARE
+) -> Subject:
     """What is needed of a project with label maps. `first`: photos the annotator begins with; None: the two training photos
-    that show most classes."""
-    scene = load_scene(labelled)
+    that show most classes. `least_share`: of the labelled pixels, for a class to be asked for."""
+    scene = load_scene(project)
     maps = {view.name: read_label(view.label) for view in scene.views if view.label is not None}
     largest = max(int(ids.max()) for ids in maps.values()) + 1
     count = np.sum([np.bincount(ids.reshape(-1), minlength=largest) for ids in maps.values()], 0)
     count[scene.ignore_id] = 0
-    asked = [i for i in range(largest) if count[i] >= LEAST_SHARE * count.sum()]
+    asked = [i for i in range(largest) if count[i] and count[i] >= least_share * count.sum()]
     truth = {name: np.where(np.isin(ids, asked), ids, scene.ignore_id) for name, ids in maps.items()}
     train = [scene.views[i].name for i in scene.train if scene.views[i].name in truth]
     test = [scene.views[i].name for i in scene.test if scene.views[i].name in truth]
@@ -83,6 +85,10 @@ class Annotator:
         about = {"photo": stroke.photo, "shape": "line", "width": WIDTH, "class_id": stroke.class_id}
         return Mark(revision=revision, parent=revision - 1, points=points, **about)
 
+    def add(self, strokes: list[Stroke]) -> None:
+        """Draw more strokes."""
+        self.marks += [self._mark(stroke, number) for number, stroke in enumerate(strokes, len(self.marks) + 1)]
+
     def seeds(self) -> tuple[Seeds, list[int]]:
         """The surfels that are marked so far, and the ids of their classes."""
         marked = {mark.class_id for mark in self.marks}
@@ -94,14 +100,14 @@ class Annotator:
         """Labels by what surfels look like alone, without the graph and without void."""
         seeds, class_ids = self.seeds()
         look, _ = appearance(self.subject.ready, seeds, len(class_ids))
-        return Labelling(len(self.marks), look, np.array(class_ids, np.int32), "")
+        return labelled(look, class_ids)
 
     def look(self, report: Reporter) -> Labelling:
         """Labels by all strokes so far."""
         subject, begin = self.subject, time.perf_counter()
         seeds, class_ids = self.seeds()
         probability = propagated(subject.ready, seeds, len(class_ids), check=report.check)
-        self.shown = Labelling(len(self.marks), probability, np.array(class_ids, np.int32), "")
+        self.shown = labelled(probability, class_ids)
         self.times.append(time.perf_counter() - begin)
         return self.shown
 
@@ -119,8 +125,13 @@ class Annotator:
         rows, columns = self.subject.truth[stroke.photo].shape
         small = maps[stroke.photo][0].shape
         points = stroke.points * [columns / small[1], rows / small[0]]
-        self.marks.append(self._mark(Stroke(stroke.photo, points, stroke.class_id), len(self.marks) + 1))
+        self.add([Stroke(stroke.photo, points, stroke.class_id)])
         return True
+
+
+def labelled(probability: np.ndarray, class_ids: list[int]) -> Labelling:
+    """Labels that no journal knows, by the probability (N, C) of classes."""
+    return Labelling(0, probability, np.array(class_ids, np.int32), "")
 
 
 def scores(subject: Subject, labelling: Labelling) -> dict[str, Any]:
@@ -175,4 +186,4 @@ def all_labels(subject: Subject) -> Labelling:
         told = (surfel >= 0) & ~edge & (label >= 0)
         np.add.at(votes, (surfel[told], label[told]), 1)
     share = votes / np.maximum(votes.sum(1, keepdims=True), 1)
-    return Labelling(0, share, np.array(subject.class_ids, np.int32), "")
+    return labelled(share, subject.class_ids)

@@ -69,11 +69,16 @@ def make_graph(surfels: Surfels, neighbours: np.ndarray) -> Graph:
         total += square / max(float(np.median(square)), 1e-12)
     edges = edge_matrix(neighbours, np.exp(-total / EDGE_SCALE))
     cell, count = cell_of(np.asarray(surfels.position, np.float64), min(CELLS, max(1, len(surfels) // 4)))
-    members = membership(cell, count)
-    coarse = (members.T @ edges @ members).tocsr()
-    coarse.setdiag(0)
-    coarse.eliminate_zeros()
-    return Graph(edges, coarse, cell.astype(np.int32))
+    return Graph(edges, joined(edges, cell, count), cell.astype(np.int32))
+
+
+def joined(edges: csr_matrix, group: np.ndarray, count: int | None = None) -> csr_matrix:
+    """Weights (C, C) between groups of nodes, (N,) the group of each: sums of those between nodes (N, N)."""
+    members = membership(group, int(group.max()) + 1 if count is None else count)
+    found = (members.T @ edges @ members).tocsr()
+    found.setdiag(0)
+    found.eliminate_zeros()
+    return found
 
 
 def membership(cell: np.ndarray, count: int) -> csr_matrix:

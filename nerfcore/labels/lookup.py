@@ -3,12 +3,14 @@
 runs/RUN/surfels/prepared.json, pixel_surfel.npy   which pixel of which photo shows which surfel
 runs/RUN/surfels/parts.npy                         the parts of the surface that surfels belong to, at two levels
 runs/RUN/revisions/N.npz                           the labels of the surfels at revision N of the marks
+runs/RUN/revisions/parts.npz                       those of the parts alone, of the revision that was last begun
 """
 
 from __future__ import annotations
 
 import json
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,7 @@ import numpy as np
 from ..files import UNREADABLE_ARRAYS
 
 SURFELS, RECORD = "surfels", "prepared.json"
-REVISIONS = "revisions"
+REVISIONS, FIRST = "revisions", "parts.npz"
 UNREADABLE = (*UNREADABLE_ARRAYS, KeyError, TypeError)  # what damaged files raise
 LEVELS = ("fine", "coarse")  # of the parts of the surface
 LEAST = 0.5  # probability of all classes together below which a surfel is void
@@ -48,16 +50,27 @@ class Labelling:
 
     def label(self, void: int) -> np.ndarray:
         """Class id (N,) int32 of each surfel; `void` where no class explains it."""
-        if not len(self.class_ids):
-            return np.full(len(self.probability), void, np.int32)
-        best = self.class_ids[self.probability.argmax(1)]
-        return np.where(self.probability.sum(1) > LEAST, best, void).astype(np.int32)
+        return np.append(self.class_ids, void).astype(np.int32)[self._best]
 
     def confidence(self) -> np.ndarray:
         """Probability (N,) float32 of what `label` says, void included."""
-        total = self.probability.sum(1)
+        return self._sure
+
+    @cached_property
+    def _total(self) -> np.ndarray:
+        return self.probability @ np.ones(self.probability.shape[1], np.float32)
+
+    @cached_property
+    def _best(self) -> np.ndarray:
+        """Class index (N,) of each surfel, that behind the last one where it is void."""
+        if not len(self.class_ids):
+            return np.zeros(len(self.probability), np.intp)
+        return np.where(self._total > LEAST, self.probability.argmax(1), len(self.class_ids))
+
+    @cached_property
+    def _sure(self) -> np.ndarray:
         best = self.probability.max(1, initial=0)
-        return np.where(total > LEAST, best, 1 - total).clip(0, 1).astype(np.float32)
+        return np.where(self._total > LEAST, best, 1 - self._total).clip(0, 1).astype(np.float32)
 
 
 def read_labelling(path: Path) -> Labelling | None:
@@ -69,6 +82,19 @@ def read_labelling(path: Path) -> Labelling | None:
             carried = data.get("carried", None)
             return Labelling(int(data["revision"]), probability, data["class_ids"], str(data["made"]), told, carried)
     except UNREADABLE:
+        return None
+
+
+def read_first(revisions: Path, surfels: Path, revision: int) -> Labelling | None:
+    """The labels of a revision by whole parts, which are there before those of the surfels; None where the folder
+    runs/RUN/revisions holds none, or those of another revision."""
+    found = read_labelling(revisions / FIRST)
+    if found is None or found.revision != revision:
+        return None
+    try:
+        part = np.load(surfels / "parts.npy", mmap_mode="r", allow_pickle=False)[:, 0]
+        return Labelling(revision, found.probability[part], found.class_ids, f"{found.made} by parts", found.told)
+    except (*UNREADABLE, IndexError):
         return None
 
 

@@ -7,6 +7,7 @@ runs/RUN/surfels/   prepared.json (what it was made from), and arrays as .npy fi
     photo_features (N, G)       more of them, of the photos: see photo_features.py
     cell, edges_…, coarse_…     see Graph; of a matrix its data, indices and indptr
     parts (N, 2) int32          see parts.py
+    part_features (P, F + G)    mean columns of the fine parts, and part_edges_…, the weights between them
     pixel_surfel (P,) int32     surfel that each pixel of each photo's map shows, −1 for none; maps one after the other
     pixel_edge (P,) bool        pixels at depth edges, whose marks are dropped
 """
@@ -42,7 +43,7 @@ from ..project.fingerprints import digest, rounded
 from ..project.runs import geometry_id, run_folder
 from ..project.store import load_project, world_from_sfm
 from ..render.run import Trained, load_info, load_trained, refined_poses
-from .graph import Graph, feature_columns, make_graph
+from .graph import Graph, feature_columns, joined, make_graph
 from .lookup import RECORD, UNREADABLE, part_of, photo_maps
 from .lookup import SURFELS as FOLDER
 from .models import load
@@ -58,23 +59,24 @@ CPU_PIXELS, GPU_PIXELS = 4e6, 1e8  # of all maps together
 CPU_SHARE = 0.5  # of a map's side that rays are rendered for on a CPU
 LEAST_SURFELS = 64
 PIXELS_EACH = 4  # at least, in the mean: what a surfel of one pixel looks like is noise
-VERSION = 3  # of what is made; another one makes it again
+VERSION = 4  # of what is made; another one makes it again
 MATRIX = ("data", "indices", "indptr")
 
 
 class Preparation:
-    """A prepared run, its arrays memory-mapped."""
+    """A prepared run, its arrays memory-mapped; `seconds`: how long it was made."""
 
     def __init__(self, folder: Path) -> None:
         """Raises OSError, ValueError or KeyError where the folder holds no whole preparation."""
         record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
-        self.folder, self.inputs = folder, record["inputs"]
+        self.folder, self.inputs, self.seconds = folder, record["inputs"], float(record["seconds"])
         self.of_photo = photo_maps(record)
         self.photos = list(self.of_photo.values())
         self.surfels = Surfels(**{name: self._array(name) for name in Surfels.__dataclass_fields__})
         self.neighbours, self.features = self._array("neighbours"), self._array("features")
         self.photo_features = self._array("photo_features")
         self.cell, self.parts = self._array("cell"), self._array("parts")
+        self.part_features = self._array("part_features")
         self.pixel_surfel, self.pixel_edge = self._array("pixel_surfel"), self._array("pixel_edge")
 
     def _array(self, name: str) -> np.ndarray:
@@ -110,6 +112,16 @@ class Preparation:
     def graph(self) -> Graph:
         """The graph of the surfels."""
         return Graph(self._matrix("edges"), self._matrix("coarse"), np.array(self.cell))
+
+    @property
+    def conductance(self) -> float:
+        """What the edges of a surfel conduct together, in the mean."""
+        return float(self._array("edges_data").sum(dtype=np.float64)) / max(1, len(self.surfels))
+
+    @cached_property
+    def part_edges(self) -> csr_matrix:
+        """Weights (P, P) between the fine parts."""
+        return self._matrix("part_edges")
 
     def _matrix(self, name: str) -> csr_matrix:
         parts = [np.array(self._array(f"{name}_{part}")) for part in MATRIX]
@@ -195,6 +207,7 @@ def prepared_inputs(folder: Path, run: str, count: int | None, features: Path | 
 
 
 def _made(folder: Path, run: str, report: Reporter, count: int, features: Path | None) -> Preparation:
+    begin = time.perf_counter()
     tokens = None if features is None else TokenModel(load(features))  # before the long work: it may not fit
     trained, project = load_trained(folder, run), load_project(folder)
     inputs = prepared_inputs(folder, run, count, features)
@@ -217,13 +230,17 @@ def _made(folder: Path, run: str, report: Reporter, count: int, features: Path |
     arrays = surfel_arrays(seen, poses[:, :3, 3], trained, box, count, report)
     pictures = list(zip(scene.views, maps_of(arrays, sizes), (lab for _, lab in seen)))
     arrays["photo_features"] = photo_features(len(arrays["position"]), pictures, tokens, report)
+    columns = np.concatenate([arrays["features"], arrays["photo_features"]], 1)
+    arrays["part_features"] = means(arrays["parts"][:, 0], int(arrays["parts"][:, 0].max()) + 1, columns).astype(
+        np.float32
+    )
     place = run_folder(folder, run) / FOLDER
     firsts = np.cumsum([0, *(width * height for width, height in sizes)])
     photos = [
         {"name": view.name, "width": width, "height": height, "first": int(first)}
         for view, (width, height), first in zip(scene.views, sizes, firsts)
     ]
-    _write(place, arrays, {"inputs": inputs, "photos": photos})
+    _write(place, arrays, {"inputs": inputs, "photos": photos, "seconds": round(time.perf_counter() - begin, 2)})
     return Preparation(place)
 
 
@@ -312,13 +329,14 @@ def surfel_arrays(
     pixel_surfel = np.full(len(solid), -1, np.int32)
     pixel_surfel[clear] = number
     pixel_surfel[solid & edge] = nearest_surfel(position, grid[solid & edge])
-    matrices = {"edges": graph.edges, "coarse": graph.coarse}
+    parts = surface_parts(made, neighbours, report.check)
+    matrices = {"edges": graph.edges, "coarse": graph.coarse, "part_edges": joined(graph.edges, parts[:, 0])}
     return {
         **vars(made),
         "neighbours": neighbours,
         "features": feature_columns(made, neighbours),
         "cell": graph.cell,
-        "parts": surface_parts(made, neighbours, report.check),
+        "parts": parts,
         **{f"{name}_{part}": getattr(matrix, part) for name, matrix in matrices.items() for part in MATRIX},
         "pixel_surfel": pixel_surfel,
         "pixel_edge": edge,

@@ -16,8 +16,8 @@ from .carry import carried_classes
 from .journal import marks_at, read_marks, shown_revision
 from .lookup import Labelling
 from .preparation import Preparation, ensured
-from .propagation import propagated
-from .revisions import load, made_of, path_of, save
+from .propagation import by_parts, propagated
+from .revisions import load, made_of, path_of, save, save_first
 from .seeds import UNMARKED, Seeds, seeds_of
 
 
@@ -27,7 +27,8 @@ def propagate(params: LabelPropagateParams, report: Reporter) -> dict[str, Any]:
     Returns:
         {"revision", "marks", "surfels", "void": share of the surfels that no class explains, "carried": share that an earlier
         epoch says and nobody confirmed, "confidence": mean of the labelled ones, "classes": [{"id", "name", "surfels", "confidence"}], "conflicts": [{"revision", "other", "surfels"}],
-        "unused": revisions of marks that met no surface or whose class is gone, "seconds", "file"}
+        "unused": revisions of marks that met no surface or whose class is gone, "parts_seconds": until the labels of whole
+        parts were on disk, "seconds", "file"}
     Raises:
         ProjectError: there is no trained run, or the journal is damaged. InputError: there is no such revision.
         TrainingError, DiskError, Cancelled.
@@ -43,9 +44,13 @@ def propagate(params: LabelPropagateParams, report: Reporter) -> dict[str, Any]:
     class_ids = [c.id for c in project.classes if c.id in marked]
     sizes = {image.name: (image.width, image.height) for image in project.images}
     seeds = seeds_of(ready, at, class_ids, sizes)
+    made, ids = made_of(ready, at, class_ids), np.array(class_ids, np.int32)
+    save_first(folder, params.run, Labelling(revision, by_parts(ready, seeds, len(class_ids), report.check), ids, made))
+    parts_seconds = time.perf_counter() - begin
+    report.progress(0.2)  # who follows the job looks at the parts now
     start = warm_start(folder, params.run, ready, class_ids, at[-1].parent if at else None)
     probability = propagated(ready, seeds, len(class_ids), start, report.check)
-    labelling = Labelling(revision, probability, np.array(class_ids, np.int32), made_of(ready, at, class_ids))
+    labelling = Labelling(revision, probability, ids, made)
     labelling = replace(labelling, carried=unconfirmed(labelling, seeds))
     label, sure = labelling.label(project.ignore_id), labelling.confidence()
     names = {c.id: c.name for c in project.classes}
@@ -62,6 +67,7 @@ def propagate(params: LabelPropagateParams, report: Reporter) -> dict[str, Any]:
         "conflicts": seeds.conflicts,
         "unused": seeds.unused,
         "carried": 0.0 if labelling.carried is None else round(float(labelling.carried.mean()), 4),
+        "parts_seconds": round(parts_seconds, 3),
         "seconds": round(time.perf_counter() - begin, 3),
     }
     return {**told, "file": str(save(folder, params.run, replace(labelling, told=told)))}

@@ -12,7 +12,7 @@ from ..files import atomic_path
 from ..project.fingerprints import digest
 from ..project.runs import run_folder
 from .journal import Mark, marks_at, read_marks, shown_revision
-from .lookup import REVISIONS, Labelling, read_labelling
+from .lookup import FIRST, REVISIONS, Labelling, read_labelling
 from .preparation import Preparation, current
 
 KEPT = 32  # results; the oldest go first
@@ -29,7 +29,20 @@ def path_of(project: Path, run: str, revision: int) -> Path:
 
 def save(project: Path, run: str, labelling: Labelling) -> Path:
     """Atomically write the labels of a revision, and forget the oldest ones beyond `KEPT`. Raises DiskError."""
-    path = path_of(project, run, labelling.revision)
+    path = _written(path_of(project, run, labelling.revision), labelling)
+    others = sorted((p for p in path.parent.glob("*.npz") if p.name != FIRST), key=lambda p: p.stat().st_mtime)
+    for old in others[:-KEPT]:
+        old.unlink()
+    return path
+
+
+def save_first(project: Path, run: str, labelling: Labelling) -> Path:
+    """Atomically write the labels of parts, probability (P, C), in the place of those of an earlier revision. Raises
+    DiskError."""
+    return _written(path_of(project, run, labelling.revision).with_name(FIRST), labelling)
+
+
+def _written(path: Path, labelling: Labelling) -> Path:
     more = {} if labelling.carried is None else {"carried": labelling.carried}
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         np.savez(
@@ -41,9 +54,6 @@ def save(project: Path, run: str, labelling: Labelling) -> Path:
             told=json.dumps(labelling.told),
             **more,
         )
-    others = sorted(path.parent.glob("*.npz"), key=lambda p: p.stat().st_mtime)
-    for old in others[:-KEPT]:
-        old.unlink()
     return path
 
 

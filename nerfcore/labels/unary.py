@@ -52,7 +52,7 @@ class Waves:
 
     def __call__(self, features: torch.Tensor) -> torch.Tensor:
         """(N, F) → (N, WAVES)."""
-        return torch.cos(features @ self.frequency + self.phase) * math.sqrt(2 / WAVES)
+        return torch.addmm(self.phase, features, self.frequency).cos_().mul_(math.sqrt(2 / WAVES))
 
 
 def balanced(target: torch.Tensor, mark: torch.Tensor) -> torch.Tensor:
@@ -92,14 +92,19 @@ def distance_to_samples(
     features: torch.Tensor, marked: torch.Tensor, mark: torch.Tensor, check: Callable[[], None]
 ) -> np.ndarray:
     """Distance (N,) of features (N, F) to the nearest of some marked surfels of each mark (S,)."""
-    generator = torch.Generator().manual_seed(0)
-    chosen = []
-    for number in mark.unique():
-        own = marked[mark == number]
-        chosen.append(own[torch.randperm(len(own), generator=generator)[:SAMPLES]])
-    samples = features[torch.cat(chosen)]
+    samples = features[marked[sampled(mark)]]
     found = []
     for rows in features.split(ROWS):
         check()
         found.append(torch.cdist(rows, samples).amin(1))
     return torch.cat(found).numpy()
+
+
+def sampled(mark: torch.Tensor) -> torch.Tensor:
+    """Indices of at most `SAMPLES` of the marked surfels (S,) of each mark, drawn at random, the same in every call."""
+    generator = torch.Generator().manual_seed(0)
+    chosen = []
+    for number in mark.unique():
+        own = torch.nonzero(mark == number).reshape(-1)
+        chosen.append(own[torch.randperm(len(own), generator=generator)[:SAMPLES]])
+    return torch.cat(chosen)

@@ -37,6 +37,7 @@ IMAGES = {
     "label": ("labels-sid/next", SIDEBAR, 260),
     "label-first": ("labels-sid/propagating", VIEW, 900),
     "label-next": ("labels-sid/next", PHOTO, 640),
+    "label-parts": ("labels-sid/parts", PHOTO, 640),
     "label-confidence": ("labels-sid/confidence", PHOTO, 640),
     "label-kept": ("labels-sid/kept", SIDEBAR, 260),
     "render": ("panels/all-render", SIDEBAR, 260),

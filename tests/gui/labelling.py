@@ -107,6 +107,7 @@ def labels(screen):
     yield from first_strokes(screen, desk, begin)
     yield from undo(screen, desk)
     yield from other_tools(screen, desk)
+    yield from part(screen, desk)
     yield from model(screen, desk)
     yield from next_photo(screen, desk)
     yield from killed(screen, desk)
@@ -217,10 +218,35 @@ def other_tools(screen, desk):
     desk.settings.label_tool = "brush"
 
 
+def part(screen, desk):
+    """The outlines of the parts are shown, and a click takes a whole one; Ctrl-Z takes it back."""
+    before, stroke = desk.shown, desk.plan["strokes"][-1]
+    yield from desk.show(stroke["photo"])
+    desk.settings.class_index = stroke["class"] - 1
+    desk.settings.label_tool, desk.settings.label_level, desk.settings.label_view = "part", "coarse", "parts"
+    yield 0.5
+    screen.shot("parts")
+    yield from desk.stroke(stroke["points"][:1])
+    yield from screen.wait(lambda: desk.shown == before + 4, 60, "the part is not marked")  # three were undone
+    yield from desk.settled()
+    screen.shot("part")
+    mark = json.loads((desk.folder / "marks/journal.jsonl").read_text().splitlines()[-1])
+    screen.facts["part"] = {"mark": mark, "revision": desk.shown}
+    yield from desk.key("Z", ctrl=True)
+    yield from screen.wait(lambda: desk.shown == before, 20, "Ctrl-Z did not take the part back")
+    yield from desk.settled()
+    desk.settings.label_tool, desk.settings.label_view = "brush", "labels"
+
+
 def model(screen, desk):
-    """A click, and a box that is dragged, are answered by a model from files; Ctrl-Z takes both back."""
+    """Photos are encoded ahead; a click, and a box that is dragged, are answered by a model from files; Ctrl-Z takes both
+    back."""
     desk.settings.label_tool = "click"
     desk.settings.label_encoder, desk.settings.label_decoder = desk.plan["encoder"], desk.plan["decoder"]
+    encoded = desk.folder / "jobs/embeddings"
+    yield from screen.wait(lambda: len(list(encoded.glob("*.npz"))) >= 4, 120, "no photos are encoded ahead")
+    yield from screen.wait(lambda: screen.queue.current is None, 60, "the job does not end")
+    files = sorted(path.name for path in encoded.glob("*.npz"))
     before, journal = desk.shown, desk.folder / "marks/journal.jsonl"
     count = len(journal.read_text().splitlines())
     for number, points in enumerate(([(180, 120)], [(100, 60), (130, 90), (140, 100)]), 1):
@@ -229,6 +255,7 @@ def model(screen, desk):
         yield from screen.wait(lambda wanted=wanted: desk.shown == wanted, 60, "the model was not asked")
         yield from desk.settled()
     screen.facts["cut out"] = [json.loads(line) for line in journal.read_text().splitlines()[-2:]]
+    screen.facts["encoded"] = [files, sorted(path.name for path in encoded.glob("*.npz"))]
     screen.facts["cut out at"] = [(180, 120), (120, 80)]
     screen.shot("model")
     for _ in range(2):

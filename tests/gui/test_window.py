@@ -240,6 +240,20 @@ def share_that_is_right(project: Path, revision: int) -> float:
     return float(right / total)
 
 
+def share_of_the_part(project: Path, mark: dict, revision: int) -> float:
+    """Share of the part under a click that has the class of the mark at a revision."""
+    from fieldwork.nerfcore.labels.revisions import computed
+
+    ready, labelling = computed(project, "main", revision)
+    surfels, _ = ready.map_of(mark["photo"])
+    image = next(i for i in json.loads((project / "project.json").read_text())["images"] if i["name"] == mark["photo"])
+    (x, y), (rows, columns) = mark["points"][0], surfels.shape
+    parts = np.asarray(ready.parts[:, 1])
+    clicked = surfels[int(y * rows / image["height"]), int(x * columns / image["width"])]
+    assert clicked >= 0, "the click met the surface"
+    return float((labelling.label(0)[parts == parts[clicked]] == mark["class_id"]).mean())
+
+
 def overlay_that_is_seen(shot: Path, opaque: dict, project: Path, revision: int) -> tuple[float, int]:
     """Of the middles of places with one class, the share that have its colour on the screen, and how many were compared."""
     from fieldwork.nerfcore.labels.overlay import photo_labels
@@ -297,6 +311,12 @@ def test_labels_from_strokes_on_photos(suite):
     assert stored == newest
     click, erased, void = facts["tools"]
     assert (click["shape"], erased["erase"], void["class_id"], void["erase"]) == ("part", True, None, False)
+    mark, revision = facts["part"]["mark"], facts["part"]["revision"]
+    assert (mark["shape"], mark["level"], mark["class_id"]) == ("part", "coarse", strokes[-1]["class"])
+    assert share_of_the_part(project, mark, revision) > 0.95, "the whole part that was clicked has the class"
+    before, after = facts["encoded"]
+    assert len(before) == 4, "the photo that is shown and the next three"
+    assert after == before, "what was encoded ahead is not encoded again"
     for cut, (x, y) in zip(facts["cut out"], facts["cut out at"]):
         assert cut["shape"] == "outline"
         middle = (np.min(cut["points"], axis=0) + np.max(cut["points"], axis=0)) / 2

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
+from fieldwork.nerfcore.bench import label_times
 from fieldwork.nerfcore.bench.annotator import LONGEST, correction, first_strokes, largest_component, medial_stroke
+from fieldwork.nerfcore.bench.label_studies import photos_needed, photos_that_show
 from fieldwork.nerfcore.bench.label_trials import best_pair, calibration_error
-from fieldwork.nerfcore.params import BenchParams
+from fieldwork.nerfcore.bench.labels import row
+from fieldwork.nerfcore.params import BenchParams, LabelAcceptParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.store import load_project
 from fieldwork.nerfcore.verbs import run_verb
@@ -76,7 +80,33 @@ def test_the_first_photos_show_most_classes() -> None:
     assert sorted(best_pair(truth, ["a", "b", "c"], [1, 2])) in (["a", "c"], ["b", "c"])
 
 
-def test_the_suite_measures_and_writes_its_page(tmp_path: Path) -> None:
+def test_photos_that_are_needed_are_counted_between_photos() -> None:
+    curve = {"next": [0.2, 0.6, 0.8], "random": [0.2, 0.3, 0.4]}
+    assert photos_needed([curve]) == pytest.approx(1.5 / 3)
+    assert photos_needed([{"next": [0.2, 0.2], "random": [0.2, 0.3]}]) is None
+    assert photos_needed([{"next": [0.5, 0.6], "random": [0.2, 0.3]}]) == pytest.approx(1 / 2)
+
+
+def test_each_further_photo_shows_classes_that_were_missing() -> None:
+    sizes = {
+        "a": np.array([900, 0, 0]),
+        "b": np.array([500, 500, 0]),
+        "c": np.array([0, 0, 300]),
+        "d": np.array([9, 9, 9]),
+    }
+    assert photos_that_show(sizes)[:2] == ["b", "c"]
+
+
+def test_rows_say_whether_what_is_asked_is_reached() -> None:
+    found = row("a", [0.9, 0.8, None], 0.8)
+    assert (found["asked"], found["worst"], found["mean"], found["reached"]) == ("≥ 0.8", 0.8, 0.85, "yes")
+    assert row("a", [1.0, 3.0], most=2.0)["reached"] == "no"
+    assert row("a", [0.5])["asked"] == "–"
+    assert row("a", [None], 0.5)["reached"] is None
+
+
+def test_the_suite_measures_and_writes_its_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(label_times, "LabelAcceptParams", partial(LabelAcceptParams, seconds=2))
     ball = ball_project(tmp_path / "ball", views=12)
     page = tmp_path / "page.md"
     params = BenchParams(
@@ -90,19 +120,27 @@ def test_the_suite_measures_and_writes_its_page(tmp_path: Path) -> None:
         page=page,
     )
     result = run_verb("bench", params, Reporter())
-    assert [row["strokes"] for row in result["rows"]] == [
-        "on two photos, look alone",
-        "on two photos",
-        "5 corrections",
-        "all label maps",
-    ]
-    by_strokes = {row["strokes"]: row["miou"] for row in result["rows"]}
-    assert by_strokes["all label maps"] > 0.7
-    assert by_strokes["all label maps"] >= by_strokes["5 corrections"] - 0.05
-    assert all(0 <= miou <= 1 for miou in by_strokes.values())
+    rows = {row["figure"]: row for row in result["rows"]}
+    assert len(rows) == len(result["rows"]), "no figure is there twice"
+    most = rows["mIoU, all label maps: the most that surfels can show"]["worst"]
+    assert most > 0.7
+    for words in ("two photos", "5 corrections", "two photos, head only", "two photos, + graph", "two photos, + parts"):
+        assert 0 <= rows[f"mIoU, {words}"]["worst"] <= 1
+    assert most >= rows["mIoU, 5 corrections"]["worst"] - 0.05
     (trial,) = result["trials"]
     assert len(trial["seconds"]) == len(trial["steps"]) <= 6
-    assert any("without strokes" in note for note in result["notes"])
+    assert 0 <= rows["void share of a class without strokes"]["worst"] <= 1
+    assert (
+        rows["from a stroke to whole parts (s), 95 %"]["worst"]
+        <= rows["from a stroke to all surfels (s), 95 %"]["worst"]
+    )
+    for words in ("undo (s), 95 %", "labels of another photo (s), 95 %", "prepare (s)", "accept (s)"):
+        assert rows[words]["worst"] >= 0
+        assert rows[words]["reached"] in ("yes", "no")
+    assert rows["click, photo encoded, without the model (s), 95 %"]["worst"] < 5
+    assert rows["accept: PSNR changed by (dB)"]["reached"] == "yes", "accepting changes no colour"
+    assert rows["accept: mIoU lost against what was shown"]["worst"] < 0.3
+    assert not (tmp_path / "out" / "labels" / "accepted" / "ball").exists()
     assert json.loads(Path(result["files"][0]).read_text())["rows"] == result["rows"]
     assert "## Labels from strokes" in page.read_text()
     assert "5 corrections" in page.read_text()

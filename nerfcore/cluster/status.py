@@ -32,6 +32,8 @@ FIGURES = (
     ("mesh", "faces", "triangles", "{:.0f}"),
 )
 ORDER = ("failed", "running", "waiting", "done")
+LEVELS = ("failed", "weak", "good")  # of the verdict on a result
+STATES = {"running": "running", "done": "done", "failed": "done, with failures", "cancelled": "cancelled"}
 
 
 def figures(results: dict[str, Any]) -> dict[str, str]:
@@ -55,7 +57,7 @@ def status(
     name: str, state: str, started: float, rows: list[dict[str, Any]], nodes: list[dict[str, Any]], eta_s: float | None
 ) -> dict[str, Any]:
     """Where the campaign stands: {"campaign", "state": running, done, failed or cancelled, "started", "updated", "eta_s",
-    "workers", "cores", "counts": {state: captures}, "captures": [rows, failed ones first]}."""
+    "workers", "cores", "counts": {state: captures}, "captures": [rows, failed ones first, of those done the worst first]}."""
     counts = dict.fromkeys(ORDER, 0)
     for row in rows:
         counts[row["state"]] += 1
@@ -68,8 +70,14 @@ def status(
         "workers": len(nodes),
         "cores": sum(node["cores"] for node in nodes),
         "counts": counts,
-        "captures": sorted(rows, key=lambda row: ORDER.index(row["state"])),
+        "captures": sorted(rows, key=_rank),
     }
+
+
+def _rank(row: dict[str, Any]) -> tuple[int, int]:
+    """What somebody has to look at comes first."""
+    level = (row["verdict"] or {}).get("level", "good")
+    return ORDER.index(row["state"]), LEVELS.index(level) if level in LEVELS else len(LEVELS)
 
 
 def write_status(folder: Path, value: dict[str, Any], page: bool) -> None:
@@ -78,8 +86,9 @@ def write_status(folder: Path, value: dict[str, Any], page: bool) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         write_json(folder / STATUS_FILE, value)
         if page:
+            when = time.strftime("%Y-%m-%d %H:%M:%S")
             template = jinja2.Template(TEMPLATE.read_text(encoding="utf-8"), autoescape=True)
-            write_text(folder / PAGE, template.render(**value, link=_link, when=time.strftime("%Y-%m-%d %H:%M:%S")))
+            write_text(folder / PAGE, template.render(**value, told=STATES, link=_link, when=when))
     except Exception as error:
         if not isinstance(error, OSError) or disk_refusal(error, folder) is None:
             raise
@@ -91,10 +100,11 @@ def _link(path: str) -> str:
 
 
 def add_picture(folder: Path, project: Path, number: int) -> str:
-    """Make a small picture of a finished capture; its path relative to `folder`, empty where there is nothing to show."""
+    """Make a small picture of a capture that has ended: a render, else one of its photos; its path relative to `folder`, empty
+    where there is nothing to show."""
     renders = sorted((project / "exports" / "main" / "renders").glob("*.png"))
     candidates = [path for path in renders if not path.stem.endswith(("_depth", "_labels"))]
-    candidates += [project / "runs" / "main" / "preview.png"]
+    candidates += [project / "runs" / "main" / "preview.png", *sorted((project / "images").glob("*"))[:1]]
     source = next((path for path in candidates if path.is_file()), None)
     if source is None:
         return ""

@@ -85,6 +85,33 @@ def test_the_page_tells_of_failures_first_and_shows_pictures(tmp_path):
     assert st.add_picture(folder, tmp_path / "nothing", 4) == ""
 
 
+def test_what_somebody_has_to_look_at_comes_first(tmp_path):
+    """A capture that went through may still have failed: its verdict says so, on the page with all reasons."""
+    levels = {"fine": "good", "torn": "failed", "old": None, "thin": "weak"}
+    rows = [
+        st.capture_row(f"/c/{name}", "done", verdict=level and {"level": level, "reasons": [f"{name} <1>.", "More."]})
+        for name, level in levels.items()
+    ]
+    rows.append(st.capture_row("/c/bad", "failed", error="No poses."))
+    value = st.status("list", "failed", 0.0, rows, [], None)
+    assert [row["name"] for row in value["captures"]] == ["bad", "torn", "thin", "fine", "old"]
+    st.write_status(tmp_path, value, page=True)
+    page = (tmp_path / st.PAGE).read_text()
+    assert "done, with failures ·" in page
+    assert re.findall(r'class="(capture [a-z ]+)"', page) == [
+        "capture failed", "capture done bad", "capture done weak", "capture done", "capture done",
+    ]  # fmt: skip
+    assert "<li>torn &lt;1&gt;.</li><li>More.</li>" in page
+    assert "<li>fine" not in page
+
+
+def test_a_capture_that_failed_shows_a_photo(tmp_path):
+    (tmp_path / "vase/images").mkdir(parents=True)
+    Image.new("RGB", (64, 48), (20, 30, 200)).save(tmp_path / "vase/images/a.png")
+    with Image.open(tmp_path / "c" / st.add_picture(tmp_path / "c", tmp_path / "vase", 1)) as picture:
+        assert abs(picture.getpixel((9, 9))[2] - 200) < 8
+
+
 def test_the_table_in_the_terminal():
     value = st.status("list", "running", 0.0, rows(), [{"cores": 4.0}], 6000.0)
     console = Console(width=110, record=True, file=open("/dev/null", "w"))  # noqa: SIM115

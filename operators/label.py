@@ -179,7 +179,7 @@ class FIELDWORK_OT_label_next(RunOperator):
     bl_idname = "fieldwork.label_next"
     bl_label = "Next Photo"
     verb = "label next"
-    needs = (need_marks,)
+    needs = (need_run,)
 
     revision: Revision()
     count: IntProperty(

@@ -128,6 +128,8 @@ def lines(known: Facts) -> list[str]:
         told.append(t("{:.0%} is carried from the earlier epoch: look at it, then confirm.", known.told["carried"]))
     if known.told.get("seconds") is not None:
         told.append(t("The last propagation took {:.1f} s.", known.told["seconds"]))
+    if known.told.get("self_check") is not None:
+        told.append(t("Self-check: from the other photos {:.0%} of the marks are guessed.", known.told["self_check"]))
     unused = len(known.told.get("unused", []))
     if unused:
         told.append(t("{} marks met no surface.", unused) if unused > 1 else t("1 mark met no surface."))

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..files import write_json, write_text
+from ..labels.next_photo import first_photos
 from ..labels.preparation import ensured
 from ..params import BenchParams, TrainParams
 from ..progress import Reporter
@@ -34,7 +36,7 @@ from .page import figures_folder, write_page
 from .results import ResultSet, write_set
 from .tables import table
 
-FIRST = {"replica_room": ["39", "111"]}  # photos the annotator begins with; others: those that show most classes
+TOOL_CHOOSES = ("replica_room",)  # the photos the annotator begins with; of other scenes those that show most classes
 STEPS = 800
 SEEDS = [0, 1, 2, 3, 4]
 # What is asked: mIoU from two photos and after the corrections, as it is or as a share of that with all label maps.
@@ -82,7 +84,9 @@ def labels_suite(
             limits = {"steps": params.steps or STEPS, "time_limit": params.seconds}
             train(TrainParams(project=bare, preset=params.preset, set=params.set, **limits), report)
         ready, _ = ensured(bare, "main", report)
-        subject = read_subject(ready, labelled, FIRST.get(name))
+        subject = read_subject(ready, labelled, None)
+        if name in TOOL_CHOOSES:
+            subject = replace(subject, first=[photo for photo, _ in first_photos(ready, subject.train, 2)])
         steps = read_metrics(run_folder(bare, "main")).get("train", {}).get("steps", "an unknown number of")
         notes.append(
             f"{name}: field of {steps} steps, {len(ready.surfels):,} surfels; {len(subject.class_ids)} classes; strokes on "

@@ -38,7 +38,9 @@ SUITES = {
         "Labels from strokes",
         "A simulated annotator draws one stroke for each class on two photos and then corrects the largest mistakes; the "
         "field saw no label map. mIoU is of the pixels of held-out photos, those without a class counting as wrong; “all "
-        "label maps” is the most that the same surfels can show. ECE: expected calibration error of the confidence.",
+        "label maps” is the most that the same surfels can show. Worst: of the seeds, or the 95th percentile of times, "
+        "beside whose median “mean” shows. “+ parts”: strokes take whole parts; each of the four rows of the method stands "
+        "on those before it.",
     ),
     "live": (
         "Baked fields",

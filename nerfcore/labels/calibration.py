@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -17,8 +18,17 @@ TAUS = np.linspace(0.05, 1.5, 30)
 LEAST, MOST = 0.3, 4.0  # exponents
 
 
-def certainty(features: torch.Tensor, seeds: Seeds, classes: int, check: Callable[[], None]) -> float:
-    """The exponent for `calibrated`, by how a classifier taught by the marks on all photos but one does on that one.
+@dataclass(frozen=True)
+class Certainty:
+    """How far marks can be trusted on other photos: exponent for `calibrated`; right: share of the marks of each photo,
+    each mark counting the same, that the marks on the others guess; None where no class is marked on two photos."""
+
+    exponent: float
+    right: float | None
+
+
+def certainty(features: torch.Tensor, seeds: Seeds, classes: int, check: Callable[[], None]) -> Certainty:
+    """How a classifier taught by the marks on all photos but one does on that one.
 
     The power τ of its probabilities by which the marks left out are most likely (temperature scaling: Guo et al., "On
     calibration of modern neural networks", 2017) tells how far looks carry from photo to photo in this scene. Classes that
@@ -42,10 +52,12 @@ def certainty(features: torch.Tensor, seeds: Seeds, classes: int, check: Callabl
         right.append(seeds.label[own])
         share.append(1 / amount[number])
     if not found:
-        return CERTAINTY
+        return Certainty(CERTAINTY, None)
     probability, label = np.concatenate(found).clip(1e-6, 1), np.concatenate(right)
-    tau = likeliest_power(probability, label, np.concatenate(share))
-    return float(np.clip(SCALE * tau**POWER, LEAST, MOST))
+    weight = np.concatenate(share)
+    tau = likeliest_power(probability, label, weight)
+    correct = float((weight * (probability.argmax(1) == label)).sum() / weight.sum())
+    return Certainty(float(np.clip(SCALE * tau**POWER, LEAST, MOST)), correct)
 
 
 def likeliest_power(probability: np.ndarray, label: np.ndarray, share: np.ndarray) -> float:

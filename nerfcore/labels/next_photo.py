@@ -1,4 +1,4 @@
-"""The verb `label next`: which photo shows most of what is not known yet."""
+"""The verb `label next`: which photo shows most of what is not known yet; before any mark, what is most like all the rest."""
 
 from __future__ import annotations
 
@@ -6,42 +6,54 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from ..params import LabelNextParams
 from ..progress import Reporter
 from ..project.store import load_project
-from .journal import marks_at, read_marks
+from .journal import marks_at, read_marks, shown_revision
 from .lookup import Labelling
-from .preparation import Preparation
+from .preparation import Preparation, ensured
+from .propagation import appearance_columns
 from .revisions import computed
 
 BLANK_BONUS = 0.5  # of surfels that no class explains: what is there may be a class without marks; not tuned
+SAMPLES, SHOWN = 4000, 200  # surfels of the scene that are compared, and of each photo
 
 
 def next_photo(params: LabelNextParams, report: Reporter) -> dict[str, Any]:
-    """The photos that are most useful to mark next, best first.
+    """The photos that are most useful to mark next, best first. Without any mark the run is prepared where it is not.
 
     Returns:
-        {"photos": [{"name", "score": share of the doubt in the scene that the photo shows, "void": share of its surface
-        that is void, "marks"}], "revision"}
+        {"photos": [{"name", "score": share of the doubt in the scene that the photo shows; before any mark see
+        `first_photos`, "void": share of its surface that is void, "marks"}], "revision"}
     Raises:
-        ProjectError: the run was not prepared or the revision not propagated. InputError: no such revision.
+        ProjectError: there is no trained run, or the revision was not propagated. InputError: no such revision.
+        TrainingError, DiskError, Cancelled.
     """
     folder = Path(params.project)
     load_project(folder)
-    ready, labelling = computed(folder, params.run, params.revision)
-    marks = marks_at(read_marks(folder), labelling.revision)
+    known = read_marks(folder)
+    revision = shown_revision(folder, len(known)) if params.revision is None else params.revision
+    marks = marks_at(known, revision)
     marked = [mark.photo for mark in marks]
-    scores = usefulness(ready, labelling)
-    void = 1 - labelling.probability.sum(1)
+    if marks:
+        ready, labelling = computed(folder, params.run, revision)
+        scores = usefulness(ready, labelling)
+        order = np.argsort(-scores, kind="stable")[: params.count].tolist()
+        best = [(ready.photos[index].name, float(scores[index])) for index in order]
+        void = 1 - labelling.probability.sum(1)
+    else:
+        ready, _ = ensured(folder, params.run, report)
+        best = first_photos(ready, [photo.name for photo in ready.photos], params.count)
+        void = np.ones(len(ready.surfels))
     listed = []
-    for index in np.argsort(-scores, kind="stable")[: params.count].tolist():
-        name = ready.photos[index].name
+    for name, score in best:
         seen = shown_by(ready, name)
         blank = float(void[seen].mean()) if len(seen) else 1.0
-        entry = {"name": name, "score": float(scores[index]), "void": blank, "marks": marked.count(name)}
-        listed.append({key: round(v, 4) if isinstance(v, float) else v for key, v in entry.items()})
-    return {"photos": listed, "revision": labelling.revision}
+        entry = {"name": name, "score": round(score, 4), "void": round(blank, 4), "marks": marked.count(name)}
+        listed.append(entry)
+    return {"photos": listed, "revision": revision}
 
 
 def usefulness(ready: Preparation, labelling: Labelling) -> np.ndarray:
@@ -52,6 +64,31 @@ def usefulness(ready: Preparation, labelling: Labelling) -> np.ndarray:
     doubt = entropy + BLANK_BONUS * p[:, -1]
     total = max(float(doubt.sum()), 1e-9)
     return np.array([doubt[shown_by(ready, photo.name)].sum() / total for photo in ready.photos])
+
+
+def first_photos(ready: Preparation, names: list[str], count: int) -> list[tuple[str, float]]:
+    """The photos, of these names, to begin with: one after the other those by which most of the scene comes to look like
+    something that a chosen photo shows. Of each the share by which it lessens the distance of surfels' columns to the nearest
+    ones that are shown; before any photo that is the distance to the photo least like it."""
+    random = np.random.default_rng(0)
+    total = len(ready.surfels)
+    some = appearance_columns(ready, np.sort(random.choice(total, min(SAMPLES, total), replace=False)))
+    distance = {}
+    for name in names:
+        seen = shown_by(ready, name)
+        if len(seen):
+            own = appearance_columns(ready, np.sort(random.choice(seen, min(SHOWN, len(seen)), replace=False)))
+            distance[name] = torch.cdist(some, own).amin(1).numpy()
+    if not distance:
+        return []
+    nearest = np.max(list(distance.values()), 0)
+    whole, chosen = max(float(nearest.sum()), 1e-9), []
+    while distance and len(chosen) < count:
+        best = min(distance, key=lambda name: float(np.minimum(nearest, distance[name]).sum()))
+        nearer = np.minimum(nearest, distance.pop(best))
+        chosen.append((best, float((nearest - nearer).sum()) / whole))
+        nearest = nearer
+    return chosen
 
 
 def shown_by(ready: Preparation, photo: str) -> np.ndarray:

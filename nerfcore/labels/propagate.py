@@ -16,7 +16,7 @@ from .carry import carried_classes
 from .journal import marks_at, read_marks, shown_revision
 from .lookup import Labelling
 from .preparation import Preparation, ensured
-from .propagation import by_parts, propagated
+from .propagation import by_parts, propagated, trusted
 from .revisions import load, made_of, path_of, save, save_first
 from .seeds import UNMARKED, Seeds, seeds_of
 
@@ -27,7 +27,8 @@ def propagate(params: LabelPropagateParams, report: Reporter) -> dict[str, Any]:
     Returns:
         {"revision", "marks", "surfels", "void": share of the surfels that no class explains, "carried": share that an earlier
         epoch says and nobody confirmed, "confidence": mean of the labelled ones, "classes": [{"id", "name", "surfels", "confidence"}], "conflicts": [{"revision", "other", "surfels"}],
-        "unused": revisions of marks that met no surface or whose class is gone, "parts_seconds": until the labels of whole
+        "unused": revisions of marks that met no surface or whose class is gone, "self_check": share of the marks of each
+        photo that those on the others guess, "parts_seconds": until the labels of whole
         parts were on disk, "seconds", "file"}
     Raises:
         ProjectError: there is no trained run, or the journal is damaged. InputError: there is no such revision.
@@ -49,7 +50,8 @@ def propagate(params: LabelPropagateParams, report: Reporter) -> dict[str, Any]:
     parts_seconds = time.perf_counter() - begin
     report.progress(0.2)  # who follows the job looks at the parts now
     start = warm_start(folder, params.run, ready, class_ids, at[-1].parent if at else None)
-    probability = propagated(ready, seeds, len(class_ids), start, report.check)
+    trust = trusted(ready, seeds, len(class_ids), report.check)
+    probability = propagated(ready, seeds, len(class_ids), start, report.check, trust)
     labelling = Labelling(revision, probability, ids, made)
     labelling = replace(labelling, carried=unconfirmed(labelling, seeds))
     label, sure = labelling.label(project.ignore_id), labelling.confidence()
@@ -67,6 +69,7 @@ def propagate(params: LabelPropagateParams, report: Reporter) -> dict[str, Any]:
         "conflicts": seeds.conflicts,
         "unused": seeds.unused,
         "carried": 0.0 if labelling.carried is None else round(float(labelling.carried.mean()), 4),
+        "self_check": None if trust.right is None else round(trust.right, 4),
         "parts_seconds": round(parts_seconds, 3),
         "seconds": round(time.perf_counter() - begin, 3),
     }

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from .calibration import CERTAINTY, calibrated, certainty
+from .calibration import CERTAINTY, Certainty, calibrated, certainty
 from .graph import Graph, membership
 from .preparation import Preparation
 from .seeds import VOID, Carried, Seeds
@@ -28,6 +28,7 @@ def propagated(
     classes: int,
     start: np.ndarray | None = None,
     check: Callable[[], None] = lambda: None,
+    trust: Certainty | None = None,
 ) -> np.ndarray:
     """Probability (N, classes) float32 of each class at all surfels; what is missing to 1 is void.
 
@@ -35,7 +36,8 @@ def propagated(
     marked; the rest of its strength conducts to void. The random walker then evens this out along the surface.
 
     Args:
-        start: (N, classes) of an earlier revision, to begin with. check: called often, may raise to stop.
+        start: (N, classes) of an earlier revision, to begin with. check: called often, may raise to stop. trust: what
+            `trusted` says; None: it is asked.
     """
     known, carried = seeds.label != VOID, seeds.carried
     if not known.any() and carried is None:
@@ -48,9 +50,14 @@ def propagated(
     if carried is not None:
         look, familiar, firm = with_carried(look, familiar, carried)
     values = one_hot(seeds.label, classes)
-    exponent = certainty(appearance_columns(ready, seeds.surfel), seeds, classes, check)
+    exponent = (trust or trusted(ready, seeds, classes, check)).exponent
     start = None if start is None else calibrated(start, 1 / exponent)
     return calibrated(walked(ready.graph, look, familiar, seeds.surfel, values, start, check, firm), exponent)
+
+
+def trusted(ready: Preparation, seeds: Seeds, classes: int, check: Callable[[], None] = lambda: None) -> Certainty:
+    """How far the marks of a scene can be trusted on other photos."""
+    return certainty(appearance_columns(ready, seeds.surfel), seeds, classes, check)
 
 
 def by_parts(ready: Preparation, seeds: Seeds, classes: int, check: Callable[[], None] = lambda: None) -> np.ndarray:

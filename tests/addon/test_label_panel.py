@@ -34,6 +34,7 @@ answer(seen)
     assert lines[0] == "Revision 2 of 2 is shown."
     assert "25% of the surface is void: nothing like it is marked." in lines
     assert "The last propagation took 1.5 s." in lines
+    assert "Self-check: from the other photos 75% of the marks are guessed." in lines
     assert "1 mark met no surface." in lines
     assert "The field has the classes of revision 1." in lines
     assert row == "1 ✎  50%"

@@ -28,7 +28,7 @@ def scene(shift: float, photos: int = 2, each: int = 40) -> tuple[torch.Tensor, 
 
 
 def found(features: torch.Tensor, seeds: Seeds) -> float:
-    return certainty(features, seeds, 2, lambda: None)
+    return certainty(features, seeds, 2, lambda: None).exponent
 
 
 def test_labels_are_less_sure_where_marks_mislead_on_other_photos() -> None:
@@ -37,11 +37,20 @@ def test_labels_are_less_sure_where_marks_mislead_on_other_photos() -> None:
     assert other < 1
 
 
+def test_the_self_check_is_the_share_that_other_photos_guess() -> None:
+    alike, misled = (certainty(*scene(shift), 2, lambda: None).right for shift in (0.0, 6.0))
+    assert alike is not None
+    assert alike > 0.95
+    assert misled is not None
+    assert misled < 0.6, "on the other photo one class is taken for the other"
+    assert certainty(*scene(0.0, photos=1), 2, lambda: None).right is None
+
+
 def test_where_marks_cannot_tell_the_usual_holds() -> None:
     assert found(*scene(0.0, photos=1)) == CERTAINTY
     features, seeds = scene(0.0)
     alone = Seeds(seeds.surfel, (seeds.mark - 1).astype(np.int32), seeds.mark, [], [], None, seeds.photo)
-    assert certainty(features, alone, 4, lambda: None) == CERTAINTY, "no class is on two photos"
+    assert certainty(features, alone, 4, lambda: None).exponent == CERTAINTY, "no class is on two photos"
     void = Seeds(seeds.surfel, np.full_like(seeds.label, VOID), seeds.mark, [], [], None, seeds.photo)
     assert found(features, void) == CERTAINTY
     nothing = Seeds(*(np.zeros(0, np.int32) for _ in range(3)), [], [])

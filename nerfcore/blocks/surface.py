@@ -1,13 +1,16 @@
-"""The surface of one block: the depth maps of all blocks fused on one grid, and of it what lies in the block's core.
+"""The surface of one block: the depth maps that see it fused on the grid of all, and of it what lies in the block's core.
 
 Near a seam both neighbours fuse the same maps on the same grid, so that they get the same triangles there, to the bit: cut
-between the cells of the grid, their meshes meet vertex by vertex.
+between the cells of the grid, their meshes meet vertex by vertex. Maps that say nothing of a block (`sights`) change nothing in
+it, and are not read.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -24,9 +27,9 @@ from ..mesh.clean import FEWEST_VIEWS, compact, cross, seen_by, unit
 from ..mesh.decimate import decimate_patches
 from ..mesh.depth_maps import MOST_VIEWS, flat_views, map_size, spread_views
 from ..mesh.extract import extract
-from ..mesh.fusion import BRICK, TRUNCATION, fuse_maps, grid_of
+from ..mesh.fusion import BRICK, NEAR, TRUNCATION, fuse_maps, grid_of
 from ..mesh.painted import training_photos
-from ..mesh.region import Region, choose_region
+from ..mesh.region import Region, region_around
 from ..mesh.surface import Surface, to_world, vertex_normals
 from ..mesh.verb import paint
 from ..params import MeshParams
@@ -36,9 +39,11 @@ from ..project.store import load_project
 from ..render.run import Trained, load_trained, refined_poses
 from .maps import cut_maps, joined_maps, load_maps, moved, save_maps
 from .plan import BlockPlan, Plan, block_folder
+from .sights import Sights, chosen, load_sights, save_sights, sights_of
 
 RUN = "main"  # of a block's project
-MAPS, PART = "depth_maps.npz", "part.npz"  # in the run's folder
+MAPS, SIGHTS, PART = "depth_maps.npz", "sights.npz", "part.npz"  # in the run's folder
+BEYOND = 0.5  # how far beyond the blocks surfaces are looked for at most, in the shared frame, which is 2 wide
 
 
 @dataclass(frozen=True)
@@ -64,19 +69,22 @@ def make_maps(folder: Path, plan: Plan, block: BlockPlan, report: Reporter) -> i
     common_from_world = np.linalg.inv(plan.world_from_common)
     maps = moved(maps, common_from_world @ box.world_from_box)
     reach = _corners(common_from_world, plan.reach(block))
-    save_maps(run_folder(own, RUN) / MAPS, cut_maps(maps, reach, _corners(common_from_world, plan.whole)))
+    maps = cut_maps(maps, reach, _corners(common_from_world, plan.whole))
+    save_sights(run_folder(own, RUN) / SIGHTS, sights_of(maps, limit_of(plan)))
+    save_maps(run_folder(own, RUN) / MAPS, maps)
     return len(maps)
 
 
 def make_part(
     folder: Path, plan: Plan, block: BlockPlan, resolution: int, faces: int | None, report: Reporter
-) -> dict[str, int]:
+) -> dict[str, Any]:
     """Mesh a block's core, with the classes and colours of its photos.
 
     Args:
         resolution: cells along the longest side of a block. faces: triangles at most, where the seams allow.
     Returns:
-        {"vertices", "faces"}
+        {"vertices", "faces", "maps": how many were fused, "of": how many all blocks have, "read": names of the blocks whose maps
+        were read}
     Raises:
         ProjectError, TrainingError, DiskError.
     """
@@ -85,10 +93,14 @@ def make_part(
     scene = load_scene(own, trained.info.holdout)
     report.stage("Fusing")
     device = use_device()
-    each = [load_maps(run_folder(block_folder(folder, b), RUN) / MAPS, device) for b in plan.blocks]
-    maps = joined_maps(each)
-    region = shared_region(load_project(folder).frame.bounds, plan, maps, resolution)
-    vertices, triangles, inside, seams = core_surface(maps, region, plan, block, report)
+    sights = [load_sights(run_folder(block_folder(folder, b), RUN) / SIGHTS) for b in plan.blocks]
+    region = shared_region(load_project(folder).frame.bounds, plan, sights, resolution)
+    heard = [seen.speak_of(*part_box(region, plan, block)) for seen in sights]
+    read = {b.name: load_maps(run_folder(block_folder(folder, b), RUN) / MAPS, device)
+            for b, keep in zip(plan.blocks, heard) if keep.any() or b is block}  # fmt: skip
+    maps = joined_maps([chosen(read[b.name], keep) for b, keep in zip(plan.blocks, heard) if keep.any()])
+    focal = min(float(seen.focal) for seen in sights)
+    vertices, triangles, inside, seams = core_surface(maps, region, plan, block, report, focal)
     if not inside.any():
         raise TrainingError(f"Block {block.name} has no surface.", "Train longer, or cut into fewer blocks.")
     if faces is not None and inside.sum() > faces:
@@ -98,34 +110,60 @@ def make_part(
         inside = inside.astype(bool)
     box = trained.info.box(project)
     box_from_common = box.box_from_world @ plan.world_from_common
-    own_maps = moved(each[plan.blocks.index(block)], box_from_common)
+    own_maps = moved(read[block.name], box_from_common)
     made = _painted(trained, own, scene, own_maps, vertices, triangles, region, box_from_common, report)
     part = Part(_inner(to_world(made, np.linalg.inv(box_from_common)), vertices, inside), seams, region.voxel)
     save_part(run_folder(own, RUN) / PART, part)
-    return {"vertices": len(part.surface.vertices), "faces": len(part.surface.faces)}
+    counts = {"vertices": len(part.surface.vertices), "faces": len(part.surface.faces)}
+    return {**counts, "maps": len(maps), "of": sum(map(len, heard)), "read": list(read)}
 
 
-def shared_region(bounds: list[list[float]] | None, plan: Plan, maps: MapArrays, resolution: int) -> Region:
+def limit_of(plan: Plan) -> tuple[np.ndarray, np.ndarray]:
+    """Corners (3,) of the space in which surfaces are looked for at most, in the shared frame."""
+    low, high = _corners(np.linalg.inv(plan.world_from_common), plan.whole)
+    return low - BEYOND, high + BEYOND
+
+
+def shared_region(bounds: list[list[float]] | None, plan: Plan, sights: Sequence[Sights], resolution: int) -> Region:
     """Where surfaces are looked for in the shared frame, the same for each block: `bounds` (corners in the world), else
-    what all maps show."""
+    what the maps of all blocks show."""
     common_from_world = np.linalg.inv(plan.world_from_common)
     inner = None if bounds is None else _corners(common_from_world, (np.array(bounds[0]), np.array(bounds[1])))
     whole = np.array(plan.high) - np.array(plan.low)
     widest = max(float((np.array(block.high) - np.array(block.low)).max()) for block in plan.blocks)
-    return choose_region(maps, inner, max(1, round(resolution * float(whole.max()) / widest)))
+    limit, hits = limit_of(plan), np.concatenate([seen.hits for seen in sights])
+    hits = hits[((hits >= limit[0]) & (hits <= limit[1])).all(1)]
+    sizes = np.concatenate([seen.sizes for seen in sights])
+    found = region_around(
+        hits, lambda: float(np.median(sizes)), inner, max(1, round(resolution * float(whole.max()) / widest))
+    )
+    return replace(found, low=np.maximum(found.low, limit[0]), high=np.minimum(found.high, limit[1]))
+
+
+def part_box(region: Region, plan: Plan, block: BlockPlan) -> tuple[np.ndarray, np.ndarray, float, float]:
+    """What `Sights.speak_of` is asked for a block: corners (3,) of the part of the grid that it computes, how far behind a
+    surface maps are heard, and room for what they mark and what is looked up in them."""
+    origin, counts = grid_of(region)
+    brick, truncation = BRICK * region.voxel, TRUNCATION * region.voxel
+    first, end = _bricks(_corners(np.linalg.inv(plan.world_from_common), plan.reach(block)), origin, brick, counts)
+    return origin + brick * first, origin + brick * (end + 1), truncation, 1.5 * truncation + NEAR * region.voxel
 
 
 def core_surface(
-    maps: MapArrays, region: Region, plan: Plan, block: BlockPlan, report: Reporter
+    maps: MapArrays, region: Region, plan: Plan, block: BlockPlan, report: Reporter, focal: float | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """The surface of a block and of its overlap with others, in the shared frame: vertices (V, 3), triangles (F, 3), which
-    of them (F,) bool are in the core, and the planes (S, 2) between it and its neighbours: axis, place."""
+    of them (F,) bool are in the core, and the planes (S, 2) between it and its neighbours: axis, place.
+
+    Args:
+        maps: those of all blocks that speak of this one, in the order of the blocks. focal: see `fuse_maps`.
+    """
     origin, counts = grid_of(region)
     common_from_world, brick = np.linalg.inv(plan.world_from_common), BRICK * region.voxel
     low, high = _bricks(_corners(common_from_world, plan.core(block)), origin, brick, counts)
     first, end = _bricks(_corners(common_from_world, plan.reach(block)), origin, brick, counts)
     # A cell at the far side of a brick needs corners of the next one.
-    bricks = fuse_maps(maps, region, report, (first, end + 1))
+    bricks = fuse_maps(maps, region, report, (first, end + 1), focal)
     report.stage("Extracting the surface")
     vertices, faces = extract(bricks, report)
     if len(faces):

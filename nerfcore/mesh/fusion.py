@@ -45,11 +45,16 @@ class Bricks:
 
 
 def fuse_maps(
-    maps: MapArrays, region: Region, report: Reporter, part: tuple[np.ndarray, np.ndarray] | None = None
+    maps: MapArrays,
+    region: Region,
+    report: Reporter,
+    part: tuple[np.ndarray, np.ndarray] | None = None,
+    focal: float | None = None,
 ) -> Bricks:
     """Fuse depth maps within a region.
 
     Args:
+        focal: the smallest focal length in pixels of all maps, where these are not all there are.
         part: first bricks (3,) and those after the last (3,), where only a part of the region's grid is wanted: what is
             there is the same, to the bit, as on the whole grid.
     """
@@ -68,7 +73,7 @@ def fuse_maps(
         report.progress(begin / len(bricks))
         some = torch.from_numpy(bricks[begin : begin + CHUNK]).to(device)
         points = (some[:, None] * BRICK + inner).reshape(-1, 3) * h + start
-        d, w = fuse(points.float(), maps, h, TRUNCATION * h, FREE_AT * h, depth_gap(maps))
+        d, w = fuse(points.float(), maps, h, TRUNCATION * h, FREE_AT * h, depth_gap(maps, focal))
         for parts, values in ((distance, d), (weight, w)):
             parts.append(values.view(-1, BRICK, BRICK, BRICK).cpu().numpy())
     if not distance:
@@ -93,9 +98,9 @@ def _only(index: np.ndarray, first: np.ndarray, end: np.ndarray) -> np.ndarray:
     return kept
 
 
-def depth_gap(maps: MapArrays) -> float:
+def depth_gap(maps: MapArrays, focal: float | None = None) -> float:
     """Share by which depths of neighbouring pixels of one surface may differ."""
-    return max(GAP, GAP_PIXELS / float(maps.lens[:, 0].min()))
+    return max(GAP, GAP_PIXELS / (float(maps.lens[:, 0].min()) if focal is None else focal))
 
 
 def coarser(bricks: Bricks) -> Bricks:

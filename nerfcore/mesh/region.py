@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,7 +50,17 @@ def choose_region(
     Raises:
         TrainingError: the maps show (almost) nothing, or nothing within the bounds.
     """
-    points = all_hits(maps).cpu().numpy()
+    return region_around(all_hits(maps).cpu().numpy(), lambda: footprint(maps), bounds, cells, voxel)
+
+
+def region_around(
+    points: np.ndarray,
+    pixel: Callable[[], float],
+    bounds: tuple[np.ndarray, np.ndarray] | None,
+    cells: int | None,
+    voxel: float | None = None,
+) -> Region:
+    """`choose_region` from the points (N, 3) that maps show, and the median footprint of a pixel there."""
     if len(points) < FEWEST_HITS:
         raise TrainingError(
             "The field shows no surface that several views agree on.",
@@ -57,7 +68,7 @@ def choose_region(
         )
     if bounds is not None:
         inside = ((points >= bounds[0]) & (points <= bounds[1])).all(1)
-        if inside.sum() < FEWEST_HITS * len(points) / len(all_hits(maps)):
+        if inside.sum() < FEWEST_HITS:
             raise TrainingError(
                 "The field has no surface in the region of interest.", "Train longer, or check the box."
             )
@@ -72,9 +83,9 @@ def choose_region(
     if bounds is not None:
         low, high = np.maximum(low, bounds[0]), np.minimum(high, bounds[1])
     if voxel is None:
-        size, pixel = float((high - low).max()), footprint(maps)
+        size, fine = float((high - low).max()), pixel()
         fewest, most = (cells, cells) if cells else CELLS
-        voxel = max(min(size / fewest, ENOUGH * pixel), size / most, 0.5 * pixel)
+        voxel = max(min(size / fewest, ENOUGH * fine), size / most, 0.5 * fine)
     return Region(low, high, voxel)
 
 

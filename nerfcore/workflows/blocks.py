@@ -10,7 +10,7 @@ from typing import Any
 from .. import params as p
 from ..blocks.plan import BlockPlan, Plan, block_folder, cut, load_plan, save_plan
 from ..blocks.projects import write_block
-from ..blocks.surface import MAPS, PART, RUN, make_maps, make_part
+from ..blocks.surface import MAPS, PART, RUN, SIGHTS, make_maps, make_part
 from ..blocks.whole import write_whole
 from ..cluster.estimate import Durations
 from ..cluster.link import Link
@@ -173,7 +173,9 @@ def _train(params: p.BlocksParams, plan: Plan, block: BlockPlan, report: Reporte
 def _maps(params: p.BlocksParams, plan: Plan, block: BlockPlan, report: Reporter) -> tuple[dict[str, Any], bool]:
     folder, own = Path(params.project), block_folder(Path(params.project), block)
     inputs = {"field": checkpoint_id(own, RUN), "plan": digest(plan.model_dump(mode="json"))}
-    return _kept(run_folder(own, RUN) / MAPS, inputs, lambda: {"maps": make_maps(folder, plan, block, report)})
+    run = run_folder(own, RUN)
+    make = lambda: {"maps": make_maps(folder, plan, block, report)}  # noqa: E731
+    return _kept([run / MAPS, run / SIGHTS], inputs, make)
 
 
 def _part(params: p.BlocksParams, plan: Plan, block: BlockPlan, report: Reporter) -> tuple[dict[str, Any], bool]:
@@ -189,16 +191,17 @@ def _part(params: p.BlocksParams, plan: Plan, block: BlockPlan, report: Reporter
     }
     faces = params.faces or None
     make = lambda: make_part(folder, plan, block, params.resolution, faces, report)  # noqa: E731
-    return _kept(run_folder(own, RUN) / PART, inputs, make)
+    return _kept([run_folder(own, RUN) / PART], inputs, make)
 
 
 _STAGES = {"train": _train, "maps": _maps, "part": _part}
 
 
-def _kept(path: Path, inputs: Fingerprint, make: Callable[[], dict[str, Any]]) -> tuple[dict[str, Any], bool]:
-    """What `make` returns, unless the file that it writes was made of the same inputs; a record of them is kept beside."""
-    record = path.with_suffix(".json")
-    earlier = compare(read_made(record), inputs, [path])
+def _kept(paths: list[Path], inputs: Fingerprint, make: Callable[[], dict[str, Any]]) -> tuple[dict[str, Any], bool]:
+    """What `make` returns, unless the files that it writes were made of the same inputs; a record of them is kept beside the
+    first."""
+    record = paths[0].with_suffix(".json")
+    earlier = compare(read_made(record), inputs, paths)
     if earlier.result is not None:
         return earlier.result, True
     record.unlink(missing_ok=True)

@@ -12,7 +12,16 @@ from fieldwork.nerfcore.blocks.join import joined, open_at_seams
 from fieldwork.nerfcore.blocks.maps import cut_maps, joined_maps, load_maps, moved, save_maps
 from fieldwork.nerfcore.blocks.plan import Plan, cut, load_plan, save_plan
 from fieldwork.nerfcore.blocks.projects import write_block
-from fieldwork.nerfcore.blocks.surface import Part, core_surface, load_part, save_part, shared_region
+from fieldwork.nerfcore.blocks.sights import Sights, chosen, load_sights, save_sights, sights_of
+from fieldwork.nerfcore.blocks.surface import (
+    Part,
+    core_surface,
+    limit_of,
+    load_part,
+    part_box,
+    save_part,
+    shared_region,
+)
 from fieldwork.nerfcore.data.load import load_scene
 from fieldwork.nerfcore.data.scene import Scene, View
 from fieldwork.nerfcore.errors import ProjectError, SettingError
@@ -66,17 +75,27 @@ def classed(vertices: np.ndarray, faces: np.ndarray) -> Surface:
     return Surface(vertices.astype(np.float32), faces.astype(np.int32), normals, colors, class_id, face_class)
 
 
-def in_blocks(maps: MapArrays, plan: Plan) -> list[Part]:
-    region, parts = shared_region(None, plan, maps, CELLS), []
+def sights_in(each: list[MapArrays], plan: Plan) -> list[Sights]:
+    return [sights_of(maps, limit_of(plan)) for maps in each]
+
+
+def in_blocks(each: list[MapArrays], plan: Plan, cells: int = CELLS) -> tuple[list[Part], list[list[int]]]:
+    """The part of each block from the maps that see it, and how many of each block's maps these are."""
+    sights, parts, counts = sights_in(each, plan), [], []
+    region = shared_region(None, plan, sights, cells)
     for block in plan.blocks:
-        vertices, faces, inside, seams = core_surface(maps, region, plan, block, Reporter())
+        heard = [seen.speak_of(*part_box(region, plan, block)) for seen in sights]
+        counts.append([int(keep.sum()) for keep in heard])
+        maps = joined_maps([chosen(own, keep) for own, keep in zip(each, heard) if keep.any()])
+        focal = min(float(seen.focal) for seen in sights)
+        vertices, faces, inside, seams = core_surface(maps, region, plan, block, Reporter(), focal)
         used, index = np.unique(faces[inside], return_inverse=True)
         parts.append(Part(classed(vertices[used], index.reshape(-1, 3)), seams, region.voxel))
-    return parts
+    return parts, counts
 
 
-def in_one(maps: MapArrays, plan: Plan) -> Surface:
-    region = shared_region(None, plan, maps, CELLS)
+def in_one(each: list[MapArrays], plan: Plan, cells: int = CELLS) -> Surface:
+    region, maps = shared_region(None, plan, sights_in(each, plan), cells), joined_maps(each)
     vertices, faces = extract(fuse_maps(maps, region, Reporter()), Reporter())
     views = clean.seen_by(
         vertices[faces].mean(1), clean.unit(clean.cross(vertices, faces)), maps, 4 * region.voxel, Reporter()
@@ -94,8 +113,8 @@ SHAPES: dict[str, Callable[[], Hit]] = {
 @pytest.mark.parametrize("shape", SHAPES)
 def test_two_blocks_make_the_mesh_of_one(shape: str) -> None:
     plan = two_blocks()
-    maps = joined_maps(known_maps(SHAPES[shape](), plan, orbit(24, 1.8)))
-    parts, one = in_blocks(maps, plan), in_one(maps, plan)
+    maps = known_maps(SHAPES[shape](), plan, orbit(24, 1.8))
+    (parts, _), one = in_blocks(maps, plan), in_one(maps, plan)
     assert all(len(part.surface.faces) > 0.2 * len(one.faces) for part in parts)
     assert open_at_seams(parts[0].surface, parts) > 20, "a block alone is open at its seam"
     both = joined(parts)
@@ -114,6 +133,59 @@ def test_two_blocks_make_the_mesh_of_one(shape: str) -> None:
     assert [i.name for i in found[0]] == [i.name for i in found[1]] == ["upper.001", "lower.001"]
     alone = [find_instances(p.surface.vertices, p.surface.faces, p.surface.face_class, NAMES, 0, 0.0)[1] for p in parts]
     assert sum(len(instances) for instances in alone) == 4, "each block has a part of both"
+
+
+def row_of_blocks(count: int) -> Plan:
+    """A bar of 2 along x, cut into equal blocks."""
+    at = np.linspace(-1, 1, count + 1)
+    blocks = [
+        {"name": f"{k + 1}", "low": (at[k], -0.4, -0.4), "high": (at[k + 1], 0.4, 0.4), "images": []}
+        for k in range(count)
+    ]
+    return Plan.model_validate({"low": (-1, -0.4, -0.4), "high": (1, 0.4, 0.4), "blocks": blocks})
+
+
+def test_a_part_needs_only_the_maps_that_see_it() -> None:
+    """A bar of five blocks: a part from the maps of its neighbours is the same as from all."""
+    plan = row_of_blocks(5)
+    bar = box(np.array([-0.95, -0.3, -0.3]), np.array([0.95, 0.3, 0.3]))
+    sides = [np.array([0, y, z]) for y, z in ((0.6, 0.01), (-0.6, 0.01), (0.01, 0.6), (0.01, -0.6))]
+    each = []
+    for number, block in enumerate(plan.blocks):
+        (low, _, _), (high, _, _) = plan.region(block)
+        along = [np.array([x, 0.0, 0.0]) for x in np.linspace(-0.9, 0.9, 19) if low <= x <= high]
+        poses = [look_at(place + side, place) for place in along for side in sides]
+        each.append(known_maps(bar, plan, poses)[number])
+    parts, counts = in_blocks(each, plan, 40)
+    one = in_one(each, plan, 40)
+    both = joined(parts)
+    assert len(both.faces) == len(one.faces) > 1000
+    assert open_at_seams(both, parts) == open_at_seams(one, parts), "holes are those of one piece"
+    assert np.array_equal(np.sort(both.vertices, 0), np.sort(one.vertices, 0)), "to the bit"
+    # Blocks that are farther away are not even read.
+    read = [[other for other, count in enumerate(row) if count] for row in counts]
+    assert read[0] == [0, 1, 2]
+    assert read[4] == [2, 3, 4]
+    assert sum(map(sum, counts)) < 0.7 * 5 * sum(len(maps) for maps in each)
+
+
+def test_what_maps_speak_of_holds_all_that_they_show(tmp_path: Path) -> None:
+    plan = two_blocks()
+    for maps in known_maps(sphere(0.5), plan, orbit(6, 1.8)):
+        seen = sights_of(maps, limit_of(plan))
+        points = [depth_maps.hit_points(maps, view).numpy() for view in range(len(maps))]
+        for view, hits in enumerate(points):
+            asked = [seen.speak_of(point, point, 0.0, 0.0)[view] for point in hits[::97]]
+            assert all(asked)
+        assert not seen.speak_of(np.full(3, 9.0), np.full(3, 9.5), 0.0, 0.0).any()
+        save_sights(tmp_path / "sights.npz", seen)
+        again = load_sights(tmp_path / "sights.npz")
+        assert all(np.array_equal(getattr(again, name), value) for name, value in vars(seen).items())
+    (tmp_path / "sights.npz").write_bytes(b"PK\x03\x04 broken")
+    with pytest.raises(ProjectError, match="damaged"):
+        load_sights(tmp_path / "sights.npz")
+    with pytest.raises(ProjectError, match="missing"):
+        load_sights(tmp_path / "none.npz")
 
 
 def test_a_block_s_maps_tell_only_of_its_surroundings() -> None:

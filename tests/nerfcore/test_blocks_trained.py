@@ -13,7 +13,8 @@ import torch
 from fieldwork.nerfcore.blocks.join import joined, open_at_seams
 from fieldwork.nerfcore.blocks.maps import joined_maps, load_maps
 from fieldwork.nerfcore.blocks.plan import Plan, block_folder, cut
-from fieldwork.nerfcore.blocks.surface import MAPS, Part, load_part, shared_region
+from fieldwork.nerfcore.blocks.sights import load_sights
+from fieldwork.nerfcore.blocks.surface import MAPS, SIGHTS, Part, load_part, shared_region
 from fieldwork.nerfcore.data.load import load_scene
 from fieldwork.nerfcore.errors import SettingError
 from fieldwork.nerfcore.mesh.clean import FEWEST_VIEWS, border_edges, compact, cross, seen_by, unit
@@ -51,7 +52,8 @@ def asked(project: Path, **more: Any) -> BlocksParams:
 def in_one_piece(project: Path, plan: Plan) -> Surface:
     """The surface of the depth maps of all blocks, fused and extracted at once."""
     maps = joined_maps([load_maps(run_folder(block_folder(project, b), "main") / MAPS, CPU) for b in plan.blocks])
-    region = shared_region(BOUNDS, plan, maps, 48)
+    sights = [load_sights(run_folder(block_folder(project, b), "main") / SIGHTS) for b in plan.blocks]
+    region = shared_region(BOUNDS, plan, sights, 48)
     vertices, faces = extract(fuse_maps(maps, region, Reporter()), Reporter())
     views = seen_by(vertices[faces].mean(1), unit(cross(vertices, faces)), maps, 4 * region.voxel, Reporter())
     vertices, faces = compact(vertices, faces[views >= FEWEST_VIEWS])

@@ -175,7 +175,7 @@ class RenderConfig(Stage):
     )
     fused: Literal["auto", "on", "off"] = Field(
         default="auto",
-        description="march, networks and compositing in one kernel; auto: on CUDA; on: on the CPU too, slowly (tests)",
+        description="march, networks and compositing in fused kernels; auto: on CUDA; on: on the CPU too, slowly (tests)",
     )
 
 

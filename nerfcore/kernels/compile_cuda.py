@@ -1,8 +1,10 @@
 """Compile every kernel for NVIDIA GPUs without one, and report what each takes of a multiprocessor.
 
-    python -m fieldwork.nerfcore.kernels.compile_cuda OUT [--architectures 75,86,89,90,120] [--jobs N] [--page FILE]
+    python -m fieldwork.nerfcore.kernels.compile_cuda OUT [--architectures 75,86,89,90,120] [--jobs N]
+        [--page FILE | --only NAME]
 
-Writes OUT/sm_NN/MODULE/*.cubin, OUT/resources.json and OUT/resources.md, and the section "Resources" of a page.
+Writes OUT/sm_NN/MODULE/*.cubin, OUT/resources.json and OUT/resources.md, and the section "Resources" of a page; `--only`:
+the modules whose name holds NAME.
 """
 
 from __future__ import annotations
@@ -34,7 +36,7 @@ from . import (
     voxel_march,
 )
 from .fused import LANES
-from .fused_kernel import fused_kernel
+from .fused_kernel import class_kernel, color_kernel, density_kernel
 from .fused_shape import FusedShape
 from .host import default_threads
 from .resources import Resources, disassembler, markdown, read_resources
@@ -56,23 +58,29 @@ SOURCES = (
     voxel_march,
     random_reads,
 )
-# The standard preset: without classes, with few, with the most; and the branches blended.
+# The standard preset: with few classes and with the most, and the branches blended.
 _STANDARD = FusedShape(
     levels=8, octaves=8, concat=True, width=64, geometry=16, color_layers=3, appearance=0, classes=16, logits=False
 )
-FUSED = {f"fused, {classes} classes": dataclasses.replace(_STANDARD, classes=classes) for classes in (0, 16, 64)}
-FUSED["fused, blend"] = dataclasses.replace(_STANDARD, concat=False)
+_BLENDED, _MANY = dataclasses.replace(_STANDARD, concat=False), dataclasses.replace(_STANDARD, classes=64)
+FUSED = {
+    "fused, side by side": (density_kernel, _STANDARD),
+    "fused, blended": (density_kernel, _BLENDED),
+    "fused, colour": (color_kernel, _STANDARD),
+    "fused, 16 classes": (class_kernel, _STANDARD),
+    "fused, 64 classes": (class_kernel, _MANY),
+}
 
 
 def modules() -> dict[str, tuple[wp.Module, int]]:
     """Every kernel module by name, with the threads a block it is launched with."""
     kernels = [kernel for source in SOURCES for kernel in vars(source).values() if isinstance(kernel, wp.Kernel)]
     found = {kernel.module.name: (kernel.module, CUDA_BLOCK) for kernel in kernels}
-    return found | {name: (fused_kernel(shape, LANES).module, LANES) for name, shape in FUSED.items()}
+    return found | {name: (kernel(shape, LANES).module, LANES) for name, (kernel, shape) in FUSED.items()}
 
 
-def compile_architecture(folder: Path, architecture: int) -> list[tuple[str, float, list[Resources]]]:
-    """Compile all modules for one architecture; (module, seconds, resources of its kernels).
+def compile_architecture(folder: Path, architecture: int, only: str = "") -> list[tuple[str, float, list[Resources]]]:
+    """Compile the modules whose name holds `only` for one architecture; (module, seconds, resources of its kernels).
 
     Raises:
         RuntimeError: a kernel does not compile.
@@ -80,6 +88,8 @@ def compile_architecture(folder: Path, architecture: int) -> list[tuple[str, flo
     init()
     rows = []
     for name, (module, block) in modules().items():
+        if only not in name:
+            continue
         target = folder / f"sm_{architecture}" / name.replace(", ", "_").replace(" ", "_")
         shutil.rmtree(target, ignore_errors=True)
         target.mkdir(parents=True)
@@ -93,11 +103,13 @@ def compile_architecture(folder: Path, architecture: int) -> list[tuple[str, flo
     return rows
 
 
-def compile_all(folder: Path, architectures: list[int], jobs: int) -> list[tuple[str, Resources]]:
+def compile_all(folder: Path, architectures: list[int], jobs: int, only: str = "") -> list[tuple[str, Resources]]:
     """Compile for several architectures, one process each, and write the report; (module, resources) of each kernel."""
     rows: list[tuple[str, Resources]] = []
     with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
-        results = pool.map(compile_architecture, [folder] * len(architectures), architectures)
+        results = pool.map(
+            compile_architecture, [folder] * len(architectures), architectures, [only] * len(architectures)
+        )
         for architecture, compiled in zip(architectures, results):
             for name, seconds, kernels in compiled:
                 print(f"sm_{architecture:<4} {name:22} {seconds:6.1f} s", flush=True)
@@ -116,10 +128,13 @@ def main() -> None:
     parser.add_argument("--architectures", default=",".join(map(str, ARCHITECTURES)))
     parser.add_argument("--jobs", type=int, default=default_threads())
     parser.add_argument("--page", type=Path, help="Markdown page whose section “Resources” is rewritten")
+    parser.add_argument("--only", default="", help="compile only modules whose name holds this")
     options = parser.parse_args()
+    if options.only and options.page is not None:
+        parser.error("--page takes all modules: leave --only out")
     if disassembler() is None:
         print("nvdisasm is not installed: local memory accesses are not measured.")
-    rows = compile_all(options.out, [int(a) for a in options.architectures.split(",")], options.jobs)
+    rows = compile_all(options.out, [int(a) for a in options.architectures.split(",")], options.jobs, options.only)
     if options.page is not None:
         write_section(options.page, "Resources", markdown(rows))
     print(f"Written: {options.out / 'resources.md'}")

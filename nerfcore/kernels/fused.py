@@ -1,4 +1,4 @@
-"""Launching the fused renderer: the coarse march of rays, and the fused kernel on those that meet something."""
+"""Launching the fused renderer: the coarse march of rays, and the fused kernels on those that meet something."""
 
 from __future__ import annotations
 
@@ -11,22 +11,30 @@ from . import march
 from .blocks import launch_blocks
 from .device import backend_of
 from .fused_field import FieldArrays
-from .fused_kernel import RayQueue, RenderedArrays, fused_kernel
+from .fused_kernel import (
+    BLOCKS_PER_MULTIPROCESSOR,
+    RayQueue,
+    RenderedArrays,
+    VisibleSamples,
+    class_kernel,
+    color_kernel,
+    density_kernel,
+)
 from .fused_network import half_feature
 from .fused_shape import FusedShape
 from .runtime import array, init
 from .traversal import MarchSettings, grid_arrays, march_params
 
 LANES = 64  # samples a block works on, on CUDA; two to eight blocks fit a multiprocessor of sm_75 and later
-BLOCKS_PER_MULTIPROCESSOR = 8
 MOST_CLASSES = 64
+CAPACITY = 1 << 22  # visible samples between two kernels; 44 bytes each with 16 features for the heads
 
 
 @dataclass(frozen=True)
 class FusedField:
     """A field as the fused kernel reads it; `render.fused.pack` makes it.
 
-    table (rows, 4) and weights (rows, columns) float16; layout (L, 3) int32: resolution, first row, rows of each
+    table (rows, 4) and weights (W,) float16; layout (L, 3) int32: resolution, first row, rows of each
     level; gains (L,) and code (A,) float32; evidence (E³,) float32 or a single 0 where w is 1 everywhere.
     """
 
@@ -101,34 +109,58 @@ def render_coarse(
     count: int,
     cull: float,
     lanes: int | None = None,
+    capacity: int = CAPACITY,
 ) -> FusedRays:
     """Colour, opacity, depth and class probabilities of rays after their coarse march, at most `count` samples a ray.
 
-    `lanes`: samples a block, by default `LANES` on CUDA and 1 on the CPU, where more need Warp's `enable_cpu_blocks`.
+    `lanes`: samples a block, by default `LANES` on CUDA and 1 on the CPU, where more need Warp's `enable_cpu_blocks`;
+    `capacity`: visible samples there is room for: so many rays are rendered at a time that it is enough for any.
     """
     init()
     device, number = rays.origins.device, len(rays.origins)
     cuda = backend_of(device).fused
     lanes = lanes or (LANES if cuda else 1)
-    kernel = fused_kernel(field.shape, lanes)
     resident = 2 if lanes > 1 else 1  # blocks at a time; more than one on the CPU only to test that they share
     if cuda:
         resident = torch.cuda.get_device_properties(device).multi_processor_count * BLOCKS_PER_MULTIPROCESSOR
     counts = march.sample_counts(rays.bin_counts, count, settings.per_bin)
-    groups = max(1, min(-(-number // lanes), resident))
+    at_once = max(1, min(number, capacity // count))
+    groups = max(1, min(-(-at_once // lanes), resident))
     pixels = torch.zeros(number, 5, device=device)
     classes = field.class_count
     probabilities = torch.zeros(number, max(classes, 1), device=device)
-    next_ray = torch.zeros(1, dtype=torch.int32, device=device)
     evaluated = torch.zeros(groups * lanes, dtype=torch.int32, device=device)
-    queue, out = RayQueue(), RenderedArrays()
-    queue.indices, queue.next_ray, queue.ray_count = array(rays.queue), array(next_ray), array(rays.ray_count)
+    out = RenderedArrays()
     out.pixels, out.probabilities, out.evaluated = array(pixels), array(probabilities), array(evaluated)
     marched = march.marched_rays(rays.origins, rays.directions, rays.total_weight, rays.t_first, counts)
-    grid, params = grid_arrays(cells, skip_distance), march_params(settings)
-    inputs = [marched, queue, grid, params, _field_arrays(field), cull, out]
-    launch_blocks(kernel, groups, lanes, inputs, device)
+    grid, params, arrays = grid_arrays(cells, skip_distance), march_params(settings), _field_arrays(field)
+    visible, places = _visible_samples(at_once * count, field.shape.geometry, device)
+    heads = max(1, min(-(-at_once * count // lanes), resident))
+    stride = heads * lanes
+    for begin in range(0, number, at_once):
+        queue, next_ray = RayQueue(), torch.full((1,), begin, dtype=torch.int32, device=device)
+        queue.indices, queue.next_ray, queue.ray_count = array(rays.queue), array(next_ray), array(rays.ray_count)
+        queue.end = begin + at_once
+        places.zero_()
+        inputs = [marched, queue, grid, params, arrays, cull, visible, out]
+        launch_blocks(density_kernel(field.shape, lanes), groups, lanes, inputs, device)
+        inputs = [marched, visible, stride, arrays, out]
+        launch_blocks(color_kernel(field.shape, lanes), heads, lanes, inputs, device)
+        if classes:
+            inputs = [marched, visible, stride, params, arrays, out]
+            launch_blocks(class_kernel(field.shape, lanes), heads, lanes, inputs, device)
     return FusedRays(pixels[:, :3], pixels[:, 3], pixels[:, 4], probabilities if classes else None, evaluated.sum())
+
+
+def _visible_samples(capacity: int, features: int, device: torch.device) -> tuple[Any, torch.Tensor]:
+    """Room for visible samples, and their number (1,) int32."""
+    count = torch.zeros(1, dtype=torch.int32, device=device)
+    out = VisibleSamples()
+    out.rays = array(torch.empty(capacity, dtype=torch.int32, device=device))
+    out.t, out.weights = (array(torch.empty(capacity, device=device)) for _ in range(2))
+    out.features = array(torch.empty(capacity, features, dtype=torch.float16, device=device))
+    out.count = array(count)
+    return out, count
 
 
 def _field_arrays(field: FusedField) -> Any:

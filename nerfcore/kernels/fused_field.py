@@ -4,20 +4,23 @@ They are made for a `FusedShape` and a number of lanes. Every thread of a block 
 a sample, because layers are shared (`fused_network`).
 """
 
-from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
 import warp as wp
 
 from .cells import trilinear_at
+from .encode import FEATURES
 from .fused_network import (
     frequency_encoding,
     grid_encoding,
     half_feature,
     half_vector,
-    network,
+    hidden_layers,
+    last_layer,
+    layer,
     padded,
+    put,
     spherical_harmonics,
 )
 from .fused_shape import HARMONICS, FusedShape
@@ -36,30 +39,11 @@ class FieldArrays:
     evidence_side: int
     blend_floor: float
     blend_rate: float
-    weights: wp.array2d(dtype=wp.float16)
+    weights: wp.array(dtype=wp.float16)
     code: wp.array(dtype=float)
     density_shift: float
     thinning: int
     class_count: int
-
-
-@dataclass(frozen=True)
-class FieldFunctions:
-    """Device functions of one shape; each takes the field's arrays last.
-
-    grid: point in [0, 1]³ → features of the grid. blended: point, active, features of the grid → input of the density
-    head, features of the implicit branch and the number of the block's samples that need them; where that is 0 they
-    were not read; None without an implicit branch. density: its input and the point → features for the other heads, and
-    density per normalised unit length. color: those features and the ray's direction → logits of red, green and blue. classes:
-    features for the heads, of the grid and of the implicit branch, whether those were read, and the point → scores;
-    None without classes.
-    """
-
-    grid: Any
-    blended: Any
-    density: Any
-    color: Any
-    classes: Any
 
 
 def shape_name(shape: FusedShape, lanes: int) -> str:
@@ -72,37 +56,38 @@ def shape_name(shape: FusedShape, lanes: int) -> str:
     )
 
 
+def input_rows(*networks: tuple[int, ...]) -> int:
+    """Rows of the tile from which networks of these sizes take their input, see `hidden_layers`."""
+    return max(rows for sizes in networks for rows in (sizes[0], *sizes[2:-1]))
+
+
 @cache
-def field_functions(shape: FusedShape, lanes: int) -> FieldFunctions:
-    """The functions for fields of a shape; `lanes` samples a block (1 on the CPU)."""
-    smooth = _smooth(shape, lanes) if shape.octaves else None
-    blended = _blended(shape, lanes, smooth) if shape.octaves else None
-    return FieldFunctions(
-        _grid(shape, lanes),
-        blended,
-        _density(shape, lanes),
-        _color(shape, lanes),
-        _classes(shape, lanes, smooth) if shape.classes else None,
-    )
+def _explicit(shape: FusedShape) -> Any:
+    """A device function: point in [0, 1]³ → features of the grid, see `grid_encoding`; rows beyond them are zeroed."""
+    encoding, used, features = grid_encoding(shape.levels), shape.levels * FEATURES, shape.features
+
+    def explicit_features(p: wp.vec3, field: FieldArrays, into: Any, place: int, share: float, added: int):
+        encoding(p, field.table, field.layout, field.gains, into, place, share, added)
+        for k in range(used, features):
+            put(into, place + k, wp.float16(0.0))
+
+    return wp.func(explicit_features, name=f"explicit_features_{shape.levels}")
 
 
-def _grid(shape: FusedShape, lanes: int) -> Any:
-    encoding = grid_encoding(shape.levels, shape.features)
+@cache
+def _implicit(shape: FusedShape, lanes: int) -> Any:
+    """A device function: point in [0, 1]³ → features of the implicit branch, times `share`, in rows of the tile `x`
+    from `place` on; overwrites all of `x`, and `inner`."""
+    sizes, first = shape.implicit, shape.places()["implicit"]
+    frequencies, hidden = frequency_encoding(shape.octaves, sizes[0]), hidden_layers(sizes, lanes)
+    last, later = layer(sizes[1], sizes[2], lanes, False), first + sizes[0] * sizes[1]
 
-    def grid_features(p: wp.vec3, field: FieldArrays):
-        return encoding(p, field.table, field.layout, field.gains)
+    def implicit_features(p: wp.vec3, field: FieldArrays, x: Any, inner: Any, place: int, share: float):
+        frequencies(p, x)
+        hidden(x, field.weights, first, inner)
+        last(inner, field.weights, later, x, place, share)
 
-    return wp.func(grid_features, name=f"grid_features_{shape_name(shape, lanes)}")
-
-
-def _smooth(shape: FusedShape, lanes: int) -> Any:
-    frequencies = frequency_encoding(shape.octaves, shape.implicit[0])
-    implicit_network, row = network(shape.implicit, lanes), shape.rows()["implicit"]
-
-    def smooth_features(p: wp.vec3, field: FieldArrays):
-        return implicit_network(frequencies(p), field.weights, row)
-
-    return wp.func(smooth_features, name=f"smooth_features_{shape_name(shape, lanes)}")
+    return wp.func(implicit_features, name=f"implicit_features_{shape_name(shape, lanes)}")
 
 
 @wp.func
@@ -115,30 +100,33 @@ def grid_share(p: wp.vec3, active: int, field: FieldArrays):
     return share
 
 
-def _blended(shape: FusedShape, lanes: int, smooth_features: Any) -> Any:
-    features, concat = shape.features, shape.concat
-    density_input, branch = half_vector(shape.density[0]), half_vector(features)
+@cache
+def _joined(shape: FusedShape, lanes: int) -> Any:
+    """A device function: point, active → the input of the density head in the first rows of the tile `x`: blended
+    features; or those of the grid and of the implicit branch, each weighed by its share, one after the other."""
+    features, concat, branches = shape.features, shape.concat, bool(shape.octaves)
+    explicit_features = _explicit(shape)
+    implicit_features = _implicit(shape, lanes) if shape.octaves else None
+    place = features if concat else 0
 
-    def blended_features(p: wp.vec3, active: int, explicit: branch, field: FieldArrays):
-        implicit = branch()
-        joined = density_input()
-        for k in range(features):
-            joined[k] = explicit[k]
-        w = grid_share(p, active, field)
-        # Where the whole block is certain of its grid the implicit branch is read only for classes.
-        uncertain_lanes = wp.tile_sum(wp.tile(wp.where(w < CERTAIN, 1, 0)))[0]
-        if uncertain_lanes > 0:
-            smooth = smooth_features(p, field)
-            for k in range(features):
-                implicit[k] = wp.float16(smooth[k])
+    def joined_features(p: wp.vec3, active: int, field: FieldArrays, x: Any, inner: Any):
+        if wp.static(branches):
+            w = grid_share(p, active, field)
+            added = int(0)
+            # Where the whole block is certain of its grid the implicit branch is not read.
+            if wp.tile_sum(wp.tile(wp.where(w < CERTAIN, 1, 0)))[0] > 0:
+                implicit_features(p, field, x, inner, place, 1.0 - w)
+                added = wp.static(0 if concat else 1)
+            else:
+                w = 1.0
                 if wp.static(concat):
-                    joined[k] = wp.float16(w * float(explicit[k]))
-                    joined[features + k] = wp.float16((1.0 - w) * smooth[k])
-                else:
-                    joined[k] = wp.float16(w * float(explicit[k]) + (1.0 - w) * smooth[k])
-        return joined, implicit, uncertain_lanes
+                    for k in range(features):
+                        put(x, features + k, wp.float16(0.0))
+            explicit_features(p, field, x, 0, w, added)
+        else:
+            explicit_features(p, field, x, 0, 1.0, 0)
 
-    return wp.func(blended_features, name=f"blended_features_{shape_name(shape, lanes)}")
+    return wp.func(joined_features, name=f"joined_features_{shape_name(shape, lanes)}")
 
 
 @wp.func
@@ -149,12 +137,22 @@ def thinning(p: wp.vec3):
     return share * share
 
 
-def _density(shape: FusedShape, lanes: int) -> Any:
-    head_network, row = network(shape.density, lanes), shape.rows()["density"]
-    geometry, vector, head_input = shape.geometry, half_vector(shape.geometry), half_vector(shape.density[0])
+@cache
+def density_function(shape: FusedShape, lanes: int) -> Any:
+    """A device function: point, active → features for the other heads (geometry,) half, and density per normalised
+    unit length."""
+    sizes, first, geometry = shape.density, shape.places()["density"], shape.geometry
+    networks = (shape.implicit, sizes) if shape.octaves else (sizes,)
+    rows, width, vector = input_rows(*networks), sizes[1], half_vector(geometry)
+    features, hidden = _joined(shape, lanes), hidden_layers(sizes, lanes)
+    last, later = last_layer(sizes[1], sizes[2], lanes), first + sizes[0] * sizes[1]
 
-    def density(x: head_input, p: wp.vec3, field: FieldArrays):
-        head = head_network(x, field.weights, row)
+    def density(p: wp.vec3, active: int, field: FieldArrays):
+        x = wp.tile_empty(shape=(rows, lanes), dtype=wp.float16, storage="shared")
+        inner = wp.tile_empty(shape=(width, lanes), dtype=wp.float16, storage="shared")
+        features(p, active, field, x, inner)
+        hidden(x, field.weights, first, inner)
+        head = last(inner, field.weights, later)
         out = vector()
         for k in range(geometry):
             out[k] = wp.float16(head[k])
@@ -166,49 +164,60 @@ def _density(shape: FusedShape, lanes: int) -> Any:
     return wp.func(density, name=f"density_{shape_name(shape, lanes)}")
 
 
-def _color(shape: FusedShape, lanes: int) -> Any:
-    head_network, row, vector = network(shape.color, lanes), shape.rows()["color"], half_vector(shape.color[0])
+@cache
+def color_function(shape: FusedShape, lanes: int) -> Any:
+    """A device function: features for the heads and the ray's direction → logits of red, green and blue."""
+    sizes, first = shape.color, shape.places()["color"]
     geometry, appearance, code = shape.geometry, shape.appearance, shape.geometry + HARMONICS
-    geometry_vector = half_vector(geometry)
+    hidden, last = hidden_layers(sizes, lanes), last_layer(sizes[-2], sizes[-1], lanes)
+    later, vector = first + sum(a * b for a, b in zip(sizes[:-2], sizes[1:-1])), half_vector(geometry)
+    rows, width, used, inputs = input_rows(sizes), sizes[1], code + appearance, sizes[0]
 
-    def color(features: geometry_vector, direction: wp.vec3, field: FieldArrays):
-        x = vector()
+    def color(features: vector, direction: wp.vec3, field: FieldArrays):
+        x = wp.tile_empty(shape=(rows, lanes), dtype=wp.float16, storage="shared")
+        inner = wp.tile_empty(shape=(width, lanes), dtype=wp.float16, storage="shared")
         for k in range(geometry):
-            x[k] = features[k]
+            put(x, k, features[k])
         sh = spherical_harmonics(direction)
         for k in range(HARMONICS):
-            x[geometry + k] = wp.float16(sh[k])
+            put(x, geometry + k, wp.float16(sh[k]))
         for k in range(appearance):
-            x[code + k] = wp.float16(field.code[k])
-        out = head_network(x, field.weights, row)
+            put(x, code + k, wp.float16(field.code[k]))
+        for k in range(used, inputs):
+            put(x, k, wp.float16(0.0))
+        hidden(x, field.weights, first, inner)
+        out = last(inner, field.weights, later)
         return wp.vec3(out[0], out[1], out[2])
 
     return wp.func(color, name=f"color_{shape_name(shape, lanes)}")
 
 
-def _classes(shape: FusedShape, lanes: int, smooth_features: Any) -> Any:
-    head_network, row, vector = network(shape.semantic, lanes), shape.rows()["semantic"], half_vector(shape.semantic[0])
+@cache
+def class_function(shape: FusedShape, lanes: int) -> Any:
+    """A device function: features for the heads and the point → scores (classes,) float, probabilities or logits."""
+    sizes, first = shape.semantic, shape.places()["semantic"]
+    hidden, last = hidden_layers(sizes, lanes), last_layer(sizes[1], sizes[2], lanes)
+    later, branches = first + sizes[0] * sizes[1], bool(shape.octaves)
     geometry, features, logits, classes = shape.geometry, shape.features, shape.logits, shape.classes
-    implicit_row, branches = padded(geometry), bool(shape.octaves)
+    implicit_row = padded(geometry)
     explicit_row = implicit_row + (features if branches else 0)
-    geometry_vector, branch = half_vector(geometry), half_vector(features)
+    rows = input_rows(shape.implicit, sizes) if branches else input_rows(sizes)
+    explicit_features = _explicit(shape)
+    implicit_features = _implicit(shape, lanes) if shape.octaves else None
+    width, vector = sizes[1], half_vector(geometry)
 
-    def class_scores(
-        head: geometry_vector, explicit: branch, implicit: branch, was_read: int, p: wp.vec3, field: FieldArrays
-    ):
-        x = vector()
-        for k in range(geometry):
-            x[k] = head[k]
-        for k in range(features):
-            x[explicit_row + k] = explicit[k]
+    def class_scores(head: vector, p: wp.vec3, field: FieldArrays):
+        x = wp.tile_empty(shape=(rows, lanes), dtype=wp.float16, storage="shared")
+        inner = wp.tile_empty(shape=(width, lanes), dtype=wp.float16, storage="shared")
         if wp.static(branches):
-            for k in range(features):
-                x[implicit_row + k] = implicit[k]
-            if was_read == 0:
-                smooth = smooth_features(p, field)
-                for k in range(features):
-                    x[implicit_row + k] = wp.float16(smooth[k])
-        scores = head_network(x, field.weights, row)
+            implicit_features(p, field, x, inner, implicit_row, 1.0)
+        for k in range(geometry):
+            put(x, k, head[k])
+        for k in range(geometry, implicit_row):
+            put(x, k, wp.float16(0.0))
+        explicit_features(p, field, x, explicit_row, 1.0, 0)
+        hidden(x, field.weights, first, inner)
+        scores = last(inner, field.weights, later)
         if wp.static(not logits):
             largest = float(-1.0e30)
             for k in range(classes):

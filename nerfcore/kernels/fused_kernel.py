@@ -1,38 +1,54 @@
-"""The kernel of the fused renderer: second march, encodings, networks and compositing of whole rays.
+"""The kernels of the fused renderer: second march, encodings, networks and compositing of whole rays.
 
-The coarse march (`march_weight`) says which rays meet occupied cells and how much weight their bins have; this kernel
+The coarse march (`march_weight`) says which rays meet occupied cells and how much weight their bins have. `density_kernel`
 takes those rays from a queue. Every thread of a block follows one ray: it advances to the ray's next sample
-(`pdf_sampling`), the block evaluates its samples together on the matrix units (`fused_field`), and the thread
-composites its own. A ray that is used up, or opaque, makes room for the next one, so blocks stay full. Samples are
-those of `march.sample` with all shifts ½; the unfused path in `render/model.py` is the oracle (equal within half
-precision). `fused.py` launches it.
+(`pdf_sampling`), the block reads the density of its samples together on the matrix units (`fused_field`), and the thread
+composites its own. A ray that is used up, or opaque, makes room for the next one, so blocks stay full. Samples whose
+weight is worth shading are written one after the other, and `color_kernel` and `class_kernel` read colour and classes of
+those, full blocks of them again, and add them to their pixels. Samples are those of `march.sample` with all shifts ½;
+the unfused path in `render/model.py` is the oracle (equal within half precision). `fused.py` launches them.
 
 The same source runs on the CPU for tests, on one thread and slowly.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import warp as wp
 
-from .fused_field import FieldArrays, field_functions, shape_name
+from .fused_field import FieldArrays, class_function, color_function, density_function, shape_name
 from .fused_network import half_vector
 from .fused_shape import FusedShape
-from .pdf_sampling import MarchedRays, Ray, advanced, started
+from .pdf_sampling import MarchedRays, Walk, advanced, ray_of, started
 from .traversal import EARLY_STOP, GridArrays, MarchParams, grid_position, inside
 
 MOST_UNROLLED = 64
+BLOCKS_PER_MULTIPROCESSOR = 8
 
 
 @wp.struct
 class RayQueue:
     """The rays that meet something: their indices, their number `ray_count` (1,), and `next_ray` (1,), the place of the
-    next one."""
+    next one; those from place `end` on wait for another launch."""
 
     indices: wp.array(dtype=int)
     next_ray: wp.array(dtype=int)
     ray_count: wp.array(dtype=int)
+    end: int
+
+
+@wp.struct
+class VisibleSamples:
+    """Samples worth shading: their rays, distances and weights (N,), features for the heads (N, G), and their number
+    `count` (1,). They stand in any order, those of a ray front to back."""
+
+    rays: wp.array(dtype=int)
+    t: wp.array(dtype=float)
+    weights: wp.array(dtype=float)
+    features: wp.array2d(dtype=wp.float16)
+    count: wp.array(dtype=int)
 
 
 @wp.struct
@@ -45,118 +61,143 @@ class RenderedArrays:
     evaluated: wp.array(dtype=int)
 
 
-@wp.struct
-class Pixel:
-    """What has come together along a ray so far."""
-
-    optical_depth: float
-    transmittance: float
-    color: wp.vec3
-    opacity: float
-    depth: float
-
-
-@wp.func
-def empty_pixel():
-    pixel = Pixel()
-    pixel.transmittance = 1.0
-    return pixel
+def _named(function: object, kind: str, shape: FusedShape, lanes: int) -> wp.Kernel:
+    module = f"fieldwork_fused_{kind}_{shape_name(shape, lanes)}"
+    # So many blocks a multiprocessor leave a thread 65536 / (8 · 64) = 128 registers.
+    bounds = (lanes, BLOCKS_PER_MULTIPROCESSOR)
+    kernel = wp.kernel(function, name=f"fused_{kind}", module=module, launch_bounds=bounds, grid_stride=False)
+    # Vectors indexed in loops that are not unrolled would live in local memory.
+    kernel.module.options["max_unroll"] = MOST_UNROLLED
+    return kernel
 
 
-@wp.func
-def with_color(pixel: Pixel, weight: float, logits: wp.vec3, t: float):
-    """The pixel after a visible sample at distance t."""
-    red = weight / (1.0 + wp.exp(-logits[0]))
-    green = weight / (1.0 + wp.exp(-logits[1]))
-    blue = weight / (1.0 + wp.exp(-logits[2]))
-    pixel.color += wp.vec3(red, green, blue)
-    pixel.opacity += weight
-    pixel.depth += weight * t
-    return pixel
-
-
-@wp.func
-def write_pixel(out: RenderedArrays, index: int, pixel: Pixel):
-    for k in range(3):
-        out.pixels[index, k] = pixel.color[k]
-    out.pixels[index, 3] = pixel.opacity
-    out.pixels[index, 4] = pixel.depth
+def density_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
+    """The kernel that follows rays and finds their visible samples; `lanes` samples a block (1 on the CPU)."""
+    # What only the heads know of does not make another kernel.
+    return _density_kernel(replace(shape, color_layers=2, appearance=0, classes=0, logits=False), lanes)
 
 
 @cache
-def fused_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
-    """The kernel for fields of a shape; `lanes` samples a block (1 on the CPU)."""
-    read = field_functions(shape, lanes)
-    grid_features, blended_features = read.grid, read.blended
-    density_at, color_at, class_scores = read.density, read.color, read.classes
-    octaves, classes = shape.octaves, shape.classes
-    branch, density_input = half_vector(shape.features), half_vector(shape.density[0])
+def _density_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
+    density_at, geometry = density_function(shape, lanes), shape.geometry
 
-    def fused_render(
+    def fused_density(
         rays: MarchedRays,
         queue: RayQueue,
         grid: GridArrays,
         m: MarchParams,
         field: FieldArrays,
         cull: float,
+        visible: VisibleSamples,
         out: RenderedArrays,
     ):
         lane = wp.tid()
-        ray = Ray()
-        ray.index = -1
-        pixel = empty_pixel()
-        samples = int(0)
+        index = int(-1)
+        walk = Walk()
+        optical_depth = float(0.0)
         active_lanes = int(1)
+        last_place = wp.min(queue.ray_count[0], queue.end)
         while active_lanes > 0:
-            if ray.index < 0:
+            if index < 0:
                 place = wp.atomic_add(queue.next_ray, 0, 1)
-                if place < queue.ray_count[0]:
-                    ray = started(rays, queue.indices[place], m)
-                    pixel = empty_pixel()
-            active = wp.where(ray.index >= 0, 1, 0)
+                if place < last_place:
+                    index = queue.indices[place]
+                    walk = started(rays, index)
+                    optical_depth = 0.0
+            active = wp.where(index >= 0, 1, 0)
             active_lanes = wp.tile_sum(wp.tile(active))[0]
             if active_lanes > 0:
                 t = float(0.0)
                 length = float(0.0)
                 p = wp.vec3(0.5, 0.5, 0.5)
+                done = int(0)
                 if active == 1:
-                    ray, t, length = advanced(ray, 0.5, grid, m)
+                    # Read again for each sample: kept, it would take registers that the products need.
+                    ray = ray_of(rays, index, m)
+                    walk, t, length = advanced(ray, walk, 0.5, grid, m)
                     p = inside(grid_position(ray.origin + ray.direction * t, m.contracted))
-                    samples += 1
-                explicit = grid_features(p, field)
-                implicit = branch()
-                uncertain_lanes = int(0)
-                if wp.static(octaves > 0):
-                    joined, implicit, uncertain_lanes = blended_features(p, active, explicit, field)
-                else:
-                    joined = density_input(explicit)
-                head, density = density_at(joined, p, field)
-                pixel.optical_depth += density * length
-                after = wp.exp(-pixel.optical_depth)
-                weight = pixel.transmittance - after
-                pixel.transmittance = after
-                visible = wp.where(active == 1 and weight > cull, 1, 0)
-                visible_lanes = wp.tile_sum(wp.tile(visible))[0]
-                if visible_lanes > 0:
-                    logits = color_at(head, ray.direction, field)
-                    if visible == 1:
-                        pixel = with_color(pixel, weight, logits, t)
-                    if wp.static(classes > 0):
-                        scores = class_scores(head, explicit, implicit, uncertain_lanes, p, field)
-                        if visible == 1:
-                            for k in range(classes):
-                                if k < field.class_count:
-                                    # Not +=, which is atomic: a ray belongs to one thread.
-                                    before = out.probabilities[ray.index, k]
-                                    out.probabilities[ray.index, k] = before + weight * scores[k]
-                done = ray.ended == 1 or ray.sample >= ray.count or pixel.transmittance < EARLY_STOP
-                if active == 1 and done:
-                    write_pixel(out, ray.index, pixel)
-                    ray.index = -1
-        out.evaluated[lane] = samples
+                    done = wp.where(walk.ended == 1 or walk.sample >= rays.counts[index], 1, 0)
+                    out.evaluated[lane] = out.evaluated[lane] + 1
+                head, density = density_at(p, active, field)
+                before = wp.exp(-optical_depth)
+                optical_depth += density * length
+                after = wp.exp(-optical_depth)
+                weight = before - after
+                if active == 1 and weight > cull:
+                    # Not +=, which is atomic: a ray belongs to one thread.
+                    out.pixels[index, 3] = out.pixels[index, 3] + weight
+                    out.pixels[index, 4] = out.pixels[index, 4] + weight * t
+                    place = wp.atomic_add(visible.count, 0, 1)
+                    visible.rays[place] = index
+                    visible.t[place] = t
+                    visible.weights[place] = weight
+                    for k in range(geometry):
+                        visible.features[place, k] = head[k]
+                if active == 1 and (done == 1 or after < EARLY_STOP):
+                    index = -1
 
-    name = f"fieldwork_fused_{shape_name(shape, lanes)}"
-    kernel = wp.kernel(fused_render, name="fused_render", module=name, launch_bounds=lanes, grid_stride=False)
-    # Vectors indexed in loops that are not unrolled would live in local memory.
-    kernel.module.options["max_unroll"] = MOST_UNROLLED
-    return kernel
+    return _named(fused_density, "density", shape, lanes)
+
+
+def color_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
+    """The kernel that adds the colours of visible samples to their pixels."""
+    return _color_kernel(replace(shape, classes=0, logits=False), lanes)
+
+
+@cache
+def _color_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
+    color_at, geometry, vector = color_function(shape, lanes), shape.geometry, half_vector(shape.geometry)
+
+    def fused_color(rays: MarchedRays, visible: VisibleSamples, stride: int, field: FieldArrays, out: RenderedArrays):
+        lane = wp.tid() % lanes
+        count = visible.count[0]
+        for begin in range(wp.tid() - lane, count, stride):
+            index = wp.min(begin + lane, count - 1)
+            head = vector()
+            for k in range(geometry):
+                head[k] = visible.features[index, k]
+            ray = visible.rays[index]
+            logits = color_at(head, rays.directions[ray], field)
+            if begin + lane < count:
+                weight = visible.weights[index]
+                for k in range(3):
+                    wp.atomic_add(out.pixels, ray, k, weight / (1.0 + wp.exp(-logits[k])))
+
+    return _named(fused_color, "color", shape, lanes)
+
+
+def class_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
+    """The kernel that adds the class scores of visible samples to their pixels."""
+    return _class_kernel(shape, lanes)
+
+
+@cache
+def _class_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
+    scores_at, geometry, vector = class_function(shape, lanes), shape.geometry, half_vector(shape.geometry)
+    classes = shape.classes
+
+    def fused_classes(
+        rays: MarchedRays,
+        visible: VisibleSamples,
+        stride: int,
+        m: MarchParams,
+        field: FieldArrays,
+        out: RenderedArrays,
+    ):
+        lane = wp.tid() % lanes
+        count = visible.count[0]
+        for begin in range(wp.tid() - lane, count, stride):
+            index = wp.min(begin + lane, count - 1)
+            head = vector()
+            for k in range(geometry):
+                head[k] = visible.features[index, k]
+            ray = visible.rays[index]
+            point = rays.origins[ray] + rays.directions[ray] * visible.t[index]
+            scores = scores_at(head, inside(grid_position(point, m.contracted)), field)
+            if begin + lane < count:
+                weight = visible.weights[index]
+                for k in range(classes):
+                    if k < field.class_count:
+                        wp.atomic_add(out.probabilities, ray, k, weight * scores[k])
+
+    return _named(fused_classes, "classes", shape, lanes)

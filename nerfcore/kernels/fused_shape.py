@@ -58,14 +58,10 @@ class FusedShape:
         parts |= {"density": self.density, "color": self.color}
         return parts | ({"semantic": self.semantic} if self.classes else {})
 
-    def rows(self) -> dict[str, int]:
-        """First row of each network in the packed weights, and their number as "all"."""
-        row, first = 0, {}
+    def places(self) -> dict[str, int]:
+        """First of each network's packed weights, and their number as "all"."""
+        place, first = 0, {}
         for name, sizes in self.networks().items():
-            first[name] = row
-            row += sum(sizes[1:])
-        return {**first, "all": row}
-
-    @property
-    def columns(self) -> int:
-        return max(max(sizes[:-1]) for sizes in self.networks().values())
+            first[name] = place
+            place += sum(inputs * outputs for inputs, outputs in zip(sizes, sizes[1:]))
+        return {**first, "all": place}

@@ -14,7 +14,7 @@ import warp as wp
 from . import march_torch
 from .device import backend_of
 from .packed_info import PackedInfo
-from .pdf_sampling import MarchedRays, advanced, started
+from .pdf_sampling import MarchedRays, advanced, ray_of, started
 from .runtime import array, init, launch
 from .traversal import (
     _DEFAULT,
@@ -124,10 +124,11 @@ def march_sample(
     count = rays.counts[r]
     if count == 0:
         return
-    ray = started(rays, r, m)
+    ray = ray_of(rays, r, m)
+    walk = started(rays, r)
     begin = out.starts[r]
     for i in range(begin, begin + count):
-        ray, t, length = advanced(ray, shift[i], grid, m)
+        walk, t, length = advanced(ray, walk, shift[i], grid, m)
         out.points[i] = inside(grid_position(ray.origin + ray.direction * t, m.contracted))
         out.t[i] = t
         out.deltas[i] = length

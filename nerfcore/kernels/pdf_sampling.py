@@ -40,14 +40,19 @@ class MarchedRays:
 
 @wp.struct
 class Ray:
-    """One ray on its way, from bin to bin and from sample to sample."""
+    """One ray, as it stays: its samples share its weight evenly."""
 
-    index: int
     origin: wp.vec3
     direction: wp.vec3
     inverse: wp.vec3
     high: float  # distance at which the march ends
     share: float  # weight of an interval
+
+
+@wp.struct
+class Walk:
+    """How far along a ray is, from bin to bin and from sample to sample."""
+
     t: float
     t_last: float  # distance of the last occupied bin
     transmittance: float
@@ -58,78 +63,82 @@ class Ray:
     used: float  # part of the present bin given to intervals already
     gathered: float  # occupied length of the next sample's interval so far
     sample: int
-    count: int
     ended: int
 
 
 @wp.func
-def started(rays: MarchedRays, index: int, m: MarchParams):
-    """A ray before its first sample."""
+def ray_of(rays: MarchedRays, index: int, m: MarchParams):
+    """A ray by its index."""
     ray = Ray()
-    ray.index = index
     ray.origin = rays.origins[index]
     ray.direction = rays.directions[index]
     ray.inverse = reciprocal(ray.direction)
     _, high = ray_interval(ray.origin, ray.inverse, m)
     ray.high = high
-    ray.count = rays.counts[index]
-    ray.share = rays.total_weight[index] / float(ray.count)
-    ray.t = rays.t_first[index]
-    ray.t_last = ray.t
-    ray.transmittance = 1.0
+    ray.share = rays.total_weight[index] / float(rays.counts[index])
     return ray
 
 
 @wp.func
-def advanced(ray: Ray, shift: float, grid: GridArrays, m: MarchParams):
-    """The ray after its next sample, with the sample's distance and length; `shift` in [0, 1): where in its interval's
-    weight the sample lies."""
-    target = (float(ray.sample) + shift) * ray.share
-    edge = float(ray.sample + 1) * ray.share
+def started(rays: MarchedRays, index: int):
+    """The walk before a ray's first sample."""
+    walk = Walk()
+    walk.t = rays.t_first[index]
+    walk.t_last = walk.t
+    walk.transmittance = 1.0
+    return walk
+
+
+@wp.func
+def advanced(ray: Ray, walk: Walk, shift: float, grid: GridArrays, m: MarchParams):
+    """The walk after the ray's next sample, with the sample's distance and length; `shift` in [0, 1): where in its
+    interval's weight the sample lies."""
+    target = (float(walk.sample) + shift) * ray.share
+    edge = float(walk.sample + 1) * ray.share
     t = float(NOT_FOUND)
     length = float(0.0)
     complete = int(0)
     for _ in range(MAX_BINS):
-        if complete == 1 or ray.t >= ray.high:
+        if complete == 1 or walk.t >= ray.high:
             break
-        if ray.width == 0.0:
-            p = ray.origin + ray.direction * ray.t
+        if walk.width == 0.0:
+            p = ray.origin + ray.direction * walk.t
             width = bin_length(p, m)
             u = grid_position(p, m.contracted)
             cell = grid.cells[cell_index(u, m.n)]
             if cell[0] > 0.0:
-                ray.width = width
-                ray.bin_transmittance = wp.exp(-cell[0] * width)
-                ray.weight = bin_weight(cell, ray.transmittance, ray.bin_transmittance, m)
-                ray.t_last = ray.t
+                walk.width = width
+                walk.bin_transmittance = wp.exp(-cell[0] * width)
+                walk.weight = bin_weight(cell, walk.transmittance, walk.bin_transmittance, m)
+                walk.t_last = walk.t
             else:
-                ray.t += skip_length(u, ray.direction, ray.inverse, width, m, grid.skip_distance)
-        if ray.width > 0.0:
-            above = ray.below + ray.weight
+                walk.t += skip_length(u, ray.direction, ray.inverse, width, m, grid.skip_distance)
+        if walk.width > 0.0:
+            above = walk.below + walk.weight
             if t == NOT_FOUND and target <= above:
-                t = ray.t + ((target - ray.below) / ray.weight - 0.5) * ray.width
+                t = walk.t + ((target - walk.below) / walk.weight - 0.5) * walk.width
             if edge <= above:
-                fraction = (edge - ray.below) / ray.weight
-                length = ray.gathered + (fraction - ray.used) * ray.width
-                ray.gathered = 0.0
-                ray.used = fraction
+                fraction = (edge - walk.below) / walk.weight
+                length = walk.gathered + (fraction - walk.used) * walk.width
+                walk.gathered = 0.0
+                walk.used = fraction
                 complete = 1
             else:
-                ray.gathered += (1.0 - ray.used) * ray.width
-                ray.used = 0.0
-                ray.below = above
-                ray.t += ray.width
-                ray.width = 0.0
+                walk.gathered += (1.0 - walk.used) * walk.width
+                walk.used = 0.0
+                walk.below = above
+                walk.t += walk.width
+                walk.width = 0.0
                 if m.mode == _DEFAULT:
-                    ray.transmittance *= ray.bin_transmittance
-                    if ray.transmittance < EARLY_STOP:
-                        ray.t = ray.high
+                    walk.transmittance *= walk.bin_transmittance
+                    if walk.transmittance < EARLY_STOP:
+                        walk.t = ray.high
     if complete == 0:
         # Rounding left this interval just short of the total; nothing is behind it.
-        length = ray.gathered
-        ray.gathered = 0.0
-        ray.ended = 1
+        length = walk.gathered
+        walk.gathered = 0.0
+        walk.ended = 1
         if t == NOT_FOUND:
-            t = ray.t_last
-    ray.sample += 1
-    return ray, t, length
+            t = walk.t_last
+    walk.sample += 1
+    return walk, t, length

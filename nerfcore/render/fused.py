@@ -98,14 +98,14 @@ def _spread(matrix: torch.Tensor, parts: list[tuple[int, int]], columns: int) ->
     return torch.nn.functional.pad(joined, (0, columns - joined.shape[1]))
 
 
-def _rows(network: MLP, first: list[tuple[int, int]], sizes: tuple[int, ...], columns: int) -> list[torch.Tensor]:
-    """The layers of a network, padded to `sizes`, `columns` wide, float16."""
-    rows = []
+def _flat(network: MLP, first: list[tuple[int, int]], sizes: tuple[int, ...]) -> list[torch.Tensor]:
+    """The weights of a network's layers, padded to `sizes`, row by row, float16."""
+    layers = []
     for index, weight in enumerate(network.weights):
         value = weight.detach().float()
-        value = _spread(value, first if index == 0 else [(value.shape[1], value.shape[1])], columns)
-        rows.append(torch.nn.functional.pad(value, (0, 0, 0, sizes[index + 1] - len(value))).half())
-    return rows
+        value = _spread(value, first if index == 0 else [(value.shape[1], value.shape[1])], sizes[index])
+        layers.append(torch.nn.functional.pad(value, (0, 0, 0, sizes[index + 1] - len(value))).half().flatten())
+    return layers
 
 
 @torch.no_grad()
@@ -115,7 +115,7 @@ def pack(field: HybridField, semantics: bool = True, logits: bool = False) -> Fu
     c, device = field.config, field.grid.table.device
     semantics = semantics and field.semantic_head is not None
     shape = shape_of(field, semantics, logits)
-    geometry, columns = shape.geometry, shape.columns
+    geometry = shape.geometry
     explicit = [(field.features, shape.features)]
     firsts = {
         "implicit": [(3 + 6 * c.octaves, shape.implicit[0])],
@@ -129,11 +129,11 @@ def pack(field: HybridField, semantics: bool = True, logits: bool = False) -> Fu
         "color": field.color_head,
         "semantic": field.semantic_head,
     }
-    rows: list[torch.Tensor] = []
+    weights: list[torch.Tensor] = []
     for name, sizes in shape.networks().items():
         network = networks[name]
         assert network is not None
-        rows += _rows(network, firsts[name], sizes, columns)
+        weights += _flat(network, firsts[name], sizes)
     code = torch.zeros(max(c.appearance, 1), device=device)
     if field.appearance is not None:
         code = field.appearance.detach().mean(0).float().contiguous()
@@ -144,7 +144,7 @@ def pack(field: HybridField, semantics: bool = True, logits: bool = False) -> Fu
         table=field.grid.table.half(),
         layout=small_tensor(field.grid.levels, torch.int32, device),
         gains=small_tensor(field.gains, torch.float32, device),
-        weights=torch.cat(rows).contiguous(),
+        weights=torch.cat(weights),
         code=code,
         evidence=evidence,
         evidence_side=round(len(evidence) ** (1 / 3)) if blend is not None else 0,

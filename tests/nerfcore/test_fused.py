@@ -159,6 +159,20 @@ def test_threads_of_a_block_share_their_work(monkeypatch: pytest.MonkeyPatch) ->
     assert_same(out, UnfusedRenderer(model)(origins, directions, COUNT))
 
 
+def test_rays_come_in_parts_where_there_is_little_room() -> None:
+    model = random_model(7)
+    origins, directions = rays(100, "cpu")
+    renderer, grid = FusedRenderer(model), model.render_grid()
+    coarse, cull = renderer.coarse(origins, directions), model.config.render.cull
+    march = (grid.cells, grid.skip_distance, grid.settings, COUNT, cull)
+    whole = render_coarse(renderer.field, coarse, *march)
+    parts = render_coarse(renderer.field, coarse, *march, capacity=30 * COUNT)
+    assert int(parts.evaluated) == int(whole.evaluated) > 0
+    assert whole.probabilities is not None
+    for name in ("color", "opacity", "depth", "probabilities"):
+        assert torch.allclose(getattr(parts, name), getattr(whole, name), atol=1e-6), name
+
+
 def test_a_block_that_is_certain_of_its_grid_gets_the_same_picture() -> None:
     """With w near 1 everywhere the implicit branch is skipped for density and colour, but read for classes."""
     model = random_model(4)

@@ -17,6 +17,8 @@ from ..data.load import load_scene
 from ..evaluate.metrics import Confusion, psnr
 from ..images.picture import over, resized, to_bytes
 from ..images.working import nearest, read_picture
+from ..labels.accept import accept
+from ..labels.assist.verbs import segment
 from ..labels.overlay import photo_labels
 from ..labels.propagate import propagate
 from ..labels.revisions import computed
@@ -32,7 +34,6 @@ from ..progress import Reporter
 from ..project.store import load_project
 from ..render.image import background_of, render_view
 from ..render.run import load_trained
-from ..verbs import run_verb
 from .label_stand_in import decoder, encoder
 from .label_trials import Annotator, Subject, scores
 
@@ -103,7 +104,7 @@ def click_times(project: Path, photo: str, report: Reporter) -> list[float]:
         point = (float(random.uniform(0, record.width)), float(random.uniform(0, record.height)))
         begin = time.perf_counter()
         asked = AssistSegmentParams(project=project, photo=photo, points=[point], encoder=eyes, decoder=mouth)
-        run_verb("assist segment", asked, report)
+        segment(asked, report)
         if number:  # the first one encodes
             found.append(time.perf_counter() - begin)
     return found
@@ -117,7 +118,7 @@ def accepted(project: Path, subject: Subject, report: Reporter) -> dict[str, flo
     _, shown = computed(project, "main", None)
     before, _ = rendered(project, some, report)
     begin = time.perf_counter()
-    run_verb("label accept", LabelAcceptParams(project=project), report)
+    accept(LabelAcceptParams(project=project), report)
     seconds = time.perf_counter() - begin
     after, miou = rendered(project, some, report)
     return {

@@ -82,7 +82,7 @@ def photo_curves(subject: Subject, seed: int, report: Reporter) -> dict[str, lis
             if way == "random":
                 photo = str(random.choice(left))
             else:
-                worth = usefulness(subject.ready, shown)
+                worth = usefulness(subject.ready, shown, set(taken))
                 order = [subject.ready.photos[number].name for number in np.argsort(-worth, kind="stable")]
                 photo = next(name for name in order if name in left)
             taken.append(photo)

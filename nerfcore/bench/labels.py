@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,9 +13,10 @@ import numpy as np
 
 from ..files import write_json, write_text
 from ..labels.next_photo import first_photos
-from ..labels.preparation import ensured
+from ..labels.preparation import Preparation, ensured
 from ..params import BenchParams, TrainParams
 from ..progress import Reporter
+from ..project.fingerprints import digest
 from ..project.runs import has_checkpoint, read_metrics, run_folder
 from ..project.store import edit_project, is_project
 from ..train.verb import train
@@ -84,21 +86,14 @@ def labels_suite(
             limits = {"steps": params.steps or STEPS, "time_limit": params.seconds}
             train(TrainParams(project=bare, preset=params.preset, set=params.set, **limits), report)
         ready, _ = ensured(bare, "main", report)
-        subject = read_subject(ready, labelled, None)
-        if name in TOOL_CHOOSES:
-            subject = replace(subject, first=[photo for photo, _ in first_photos(ready, subject.train, 2)])
-        steps = read_metrics(run_folder(bare, "main")).get("train", {}).get("steps", "an unknown number of")
-        notes.append(
-            f"{name}: field of {steps} steps, {len(ready.surfels):,} surfels; {len(subject.class_ids)} classes; strokes on "
-            f"{' and '.join(subject.first)}."
-        )
-        own = scene_trials(subject, seeds, report)
-        trials += [{"scene": name, **trial} for trial in own]
-        most = scores(subject, all_labels(subject))
-        found, told = studied(name, subject, labelled, seeds, own, report)
-        times = timed(bare, out / "accepted" / name, subject, seeds[0], report)
-        rows += [{"scene": name, **row} for row in [*accuracy(name, own, most), *found, *times]]
-        notes += [f"{name}: {line}" for line in told]
+        file, made = out / "runs" / f"{name}.json", digest([ready.inputs, seeds, origin.commit, origin.modified])
+        known = read_run(file, made)
+        if known is None:
+            known = {"made": made, **scene_figures(name, bare, labelled, ready, out, seeds, report)}
+            write_json(file, known)
+        rows += known["rows"]
+        trials += known["trials"]
+        notes += known["notes"]
     machine = describe()
     if params.page is not None:
         result = ResultSet(
@@ -126,6 +121,38 @@ def labels_suite(
         "trials": trials,
         "notes": notes,
         "files": [str(path) for path in files],
+    }
+
+
+def read_run(file: Path, made: str) -> dict[str, Any] | None:
+    """What was measured of a scene before, by the same code with the same seeds on the same surfels; None where it was not."""
+    try:
+        value = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return value if isinstance(value, dict) and value.get("made") == made else None
+
+
+def scene_figures(
+    name: str, bare: Path, labelled: Path, ready: Preparation, out: Path, seeds: list[int], report: Reporter
+) -> dict[str, Any]:
+    """{"rows", "trials", "notes"} of one scene: `bare` its project without label maps, `labelled` the one with them."""
+    subject = read_subject(ready, labelled, None)
+    if name in TOOL_CHOOSES:
+        subject = replace(subject, first=[photo for photo, _ in first_photos(ready, subject.train, 2)])
+    steps = read_metrics(run_folder(bare, "main")).get("train", {}).get("steps", "an unknown number of")
+    about = (
+        f"{name}: field of {steps} steps, {len(ready.surfels):,} surfels; {len(subject.class_ids)} classes; strokes on "
+        f"{' and '.join(subject.first)}."
+    )
+    own = scene_trials(subject, seeds, report)
+    most = scores(subject, all_labels(subject))
+    found, told = studied(name, subject, labelled, seeds, own, report)
+    times = timed(bare, out / "accepted" / name, subject, seeds[0], report)
+    return {
+        "rows": [{"scene": name, **row} for row in [*accuracy(name, own, most), *found, *times]],
+        "trials": [{"scene": name, **trial} for trial in own],
+        "notes": [about, *(f"{name}: {line}" for line in told)],
     }
 
 

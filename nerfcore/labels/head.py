@@ -16,7 +16,7 @@ from ..progress import Reporter
 BATCH = 4096  # surfels a step
 RATE = 3e-3
 JITTER = 0.001  # deviation of places around a surfel, of the grid's side: rays sample beside the surface too
-MOST_STEPS = 3000
+LEAST_STEPS, MOST_STEPS = 300, 3000  # the least also where a busy machine has no time for them
 
 
 @dataclass(frozen=True)
@@ -31,8 +31,8 @@ class Learned:
 def train_head(
     field: HybridField, position: np.ndarray, target: np.ndarray, seconds: float, report: Reporter
 ) -> Learned:
-    """Train the semantic head of a field on points (N, 3) of the grid with soft labels (N, K), for some seconds; nothing
-    else of the field changes. The loss is the cross-entropy.
+    """Train the semantic head of a field on points (N, 3) of the grid with soft labels (N, K), for some seconds, but no less
+    than `LEAST_STEPS`; nothing else of the field changes. The loss is the cross-entropy.
 
     Raises:
         Cancelled.
@@ -43,7 +43,7 @@ def train_head(
     generator = torch.Generator().manual_seed(0)
     optimizer = torch.optim.Adam(field.semantic_head.parameters(), RATE)
     begin, steps = time.perf_counter(), 0
-    while (done := max((time.perf_counter() - begin) / seconds, steps / MOST_STEPS)) < 1:
+    while (done := share_done((time.perf_counter() - begin) / seconds, steps)) < 1:
         report.progress(done, f"step {steps}")
         for group in optimizer.param_groups:
             group["lr"] = RATE * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * done)))
@@ -62,3 +62,8 @@ def train_head(
             report.check()
             found.append(field.logits(field.geometry(part)).argmax(1).cpu())
     return Learned(steps, time.perf_counter() - begin, torch.cat(found).numpy())
+
+
+def share_done(time_share: float, steps: int) -> float:
+    """How far a training is, 1 at its end, by the share of its time that went by and its steps."""
+    return min(max(time_share, steps / MOST_STEPS), steps / LEAST_STEPS)

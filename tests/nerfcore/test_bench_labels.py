@@ -142,6 +142,8 @@ def test_the_suite_measures_and_writes_its_page(tmp_path: Path, monkeypatch: pyt
     assert rows["accept: mIoU lost against what was shown"]["worst"] < 0.3
     assert not (tmp_path / "out" / "labels" / "accepted" / "ball").exists()
     assert json.loads(Path(result["files"][0]).read_text())["rows"] == result["rows"]
+    monkeypatch.setattr("fieldwork.nerfcore.bench.labels.scene_trials", None)  # nothing is measured twice
+    assert run_verb("bench", params, Reporter())["rows"] == result["rows"]
     assert "## Labels from strokes" in page.read_text()
     assert "5 corrections" in page.read_text()
     bare = load_project(tmp_path / "out" / "labels" / "projects" / "ball")

@@ -8,7 +8,8 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from fieldwork.nerfcore.labels.next_photo import first_photos, next_photo
+from fieldwork.nerfcore.bench.label_trials import labelled
+from fieldwork.nerfcore.labels.next_photo import first_photos, next_photo, usefulness
 from fieldwork.nerfcore.labels.preparation import current
 from fieldwork.nerfcore.labels.stroke import stroke
 from fieldwork.nerfcore.params import LabelNextParams, LabelStrokeParams
@@ -38,7 +39,19 @@ def test_photos_that_look_like_all_of_the_scene_come_first() -> None:
     scores = [score for _, score in found]
     assert scores == sorted(scores, reverse=True)
     assert 0.9 < sum(scores) <= 1
-    assert first_photos(scene({"empty": []}), ["empty"], 2) == []
+
+
+def test_a_photo_of_what_is_in_doubt_and_looks_new_is_next() -> None:
+    shows = {"floor": [0], "again": [0], "wall": [1], "corner": [2]}
+    ready, sure = scene(shows), np.zeros((100, 2), np.float32)
+    sure[:60, 0] = 1
+    sure[60:90] = 0.5
+    sure[90:, 1] = 1
+    worth = usefulness(ready, labelled(sure, [1, 2]), {"floor"})
+    assert np.argmax(worth) == 2, "the wall is in doubt and looks unlike the floor"
+    assert worth[1] < 0.01, "it shows nothing that was not marked"
+    assert (worth >= 0).all()
+    assert usefulness(ready, labelled(sure, [1, 2]), set()).max() > 0, "marks may be on the surface alone"
 
 
 def test_before_any_mark_photos_are_suggested_and_the_run_is_prepared(ball: Path) -> None:  # noqa: F811

@@ -92,6 +92,16 @@ class FIELDWORK_OT_blocks(ProjectOperator):
         name="File", description="File for the whole mesh: .ply, .obj, .glb, .stl, .usdc; empty: in the project alone",
         subtype="FILE_PATH", options={"SKIP_SAVE"},
     )  # fmt: skip
+    texture: IntProperty(
+        name="Texture",
+        description="Size of the whole mesh's texture in pixels; 0: colours at its vertices only",
+        min=0,
+        max=16384,
+    )
+    lods: IntProperty(
+        name="Levels of Detail", description="Levels of detail to write as well, each with a quarter of the triangles",
+        min=0, max=6,
+    )  # fmt: skip
     turntable: StringProperty(
         name="Turntable", description="Folder for pictures of the whole mesh from eight sides; empty: none",
         subtype="DIR_PATH", options={"SKIP_SAVE"},
@@ -129,6 +139,8 @@ class FIELDWORK_OT_blocks(ProjectOperator):
             "faces": self.value(context, "faces"),
             "resolution": self.resolution,
             "out": absolute(self.out),
+            "texture": self.texture or None,
+            "lods": self.lods,
             "turntable": absolute(self.turntable),
             "cluster": self.cluster or None,
             "retries": self.retries,

@@ -2,64 +2,92 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..data.load import load_scene
-from ..files import atomic_path
+from ..data.scene import Scene
+from ..files import atomic_path, staged
 from ..geometry.similarity import similarity_scale
+from ..images.encode import write_picture
+from ..kernels.closest import ClosestPoints
 from ..mesh.features import features_of
 from ..mesh.instances import GAP, find_instances, write_instances
-from ..mesh.stored import MESH
-from ..mesh.surface import class_table, to_world
+from ..mesh.lods import level_files, make_levels, write_level
+from ..mesh.painted import training_photos
+from ..mesh.parts import texture_of
+from ..mesh.photo_texture import check_memory, photo_texture, prepare
+from ..mesh.stored import MESH, TEXTURE
+from ..mesh.surface import Surface, class_table, to_world
 from ..mesh.turntable import write_turntable
+from ..mesh.uv import unwrap
+from ..params import BlocksParams
 from ..progress import Reporter
-from ..project.runs import read_metrics, run_folder
+from ..project.fingerprints import digest, rounded, write_made
+from ..project.runs import MESH_RECORD, read_metrics, run_folder
+from ..project.schema import step
+from ..project.store import load_project, world_from_sfm
 from .join import joined, open_at_seams
 from .plan import Plan, block_folder
 from .surface import RUN, load_part
 
+UNSEEN = "texture_unseen.png"
 NAME = "blocks"  # folder in exports
 
 
-def write_whole(folder: Path, plan: Plan, out: Path | None, turntable: Path | None, report: Reporter) -> dict[str, Any]:
-    """Join the surfaces of all blocks, number the instances over all of them, and write the mesh.
+def write_whole(folder: Path, plan: Plan, params: BlocksParams, report: Reporter) -> dict[str, Any]:
+    """Join the surfaces of all blocks, number the instances over all of them, paint it from the photos if asked for, and write
+    the mesh, which other verbs know as that of the run “blocks”. Nothing that was there is changed before all is made.
 
-    Args:
-        out: mesh file to write besides. turntable: folder for pictures.
     Returns:
         {"blocks": [{"name", "photos", "psnr_train", "faces"}], "vertices", "faces", "open_at_seams": edges, "voxel",
-        "classes", "instances", "files"}
+        "classes", "instances", "lods": [{"faces", "deviation"}], "files"}; with a texture "painted_by_photos"
     Raises:
-        ProjectError, SettingError, DiskError.
+        ProjectError, SettingError, TrainingError, DiskError, Cancelled.
     """
     from ..mesh.files import write_surface  # with its libraries, a quarter of a second
 
     report.stage("Joining the blocks")
     parts = [load_part(folder, block) for block in plan.blocks]
     common = joined(parts)
-    scene, voxel = load_scene(folder, 0), parts[0].voxel * similarity_scale(plan.world_from_common)
+    scene, voxel = load_scene(folder, params.holdout), parts[0].voxel * similarity_scale(plan.world_from_common)
     surface = to_world(common, plan.world_from_common)
     names = {scene.ignore_id: "void"} | {c.id: c.name for c in scene.classes}
     numbers, instances = find_instances(
         surface.vertices, surface.faces, surface.face_class, names, scene.ignore_id, GAP * voxel
     )
     surface = replace(surface, face_instance=numbers)
+    painted = None if params.texture is None else paint(common, plan, scene, params.texture, report)
+    texture = None if painted is None else texture_of(surface.faces, painted.uv, painted.image)
+    levels = make_levels(surface, texture, params.lods, report)
     report.stage("Writing")
-    target = folder / "exports" / NAME
-    with atomic_path(target / MESH) as temporary, open(temporary, "wb") as file:
-        np.savez(file, **vars(surface))
-    files = [target / MESH, write_instances(target, instances)]
+    target, out = folder / "exports" / NAME, params.out
     features = features_of(surface, scene.classes, scene.ignore_id, instances)
-    for path in [target / "mesh.ply", *([out] if out is not None else [])]:
-        files += write_surface(path, surface, features, "none")
-    if turntable is not None:
+    with staged(target) as here:
+        written = _write_arrays(here, surface, painted) + [write_instances(here, instances)]
+        written += write_surface(here / "mesh.ply", surface, features, "none", check=report.check)
+        for number, level in enumerate(levels, 1):
+            written += write_level(here, number, level, report.check)
+        report.check()
+        kept = {path.name for path in written}
+        (target / MESH_RECORD).unlink(missing_ok=True)
+        for path in [*level_files(target), *(target / name for name in (TEXTURE, UNSEEN))]:
+            if path.name not in kept:
+                path.unlink(missing_ok=True)
+    files = [target / path.name for path in written]
+    if out is not None:
+        files += write_surface(out, surface, features, "none", texture, check=report.check)
+        for number, level in enumerate(levels, 1):
+            features = features_of(level.surface, scene.classes, scene.ignore_id, instances)
+            path = out.with_name(f"{out.stem}_lod{number}{out.suffix}")
+            files += write_surface(path, level.surface, features, "none", level.texture, check=report.check)
+    if params.turntable is not None:
         report.stage("Looking at it")
-        files += write_turntable(turntable, surface, None, {c.id: c.color for c in scene.classes}, report)
-    return {
+        files += write_turntable(params.turntable, surface, texture, {c.id: c.color for c in scene.classes}, report)
+    result = {
         "blocks": [_row(folder, plan, number, len(part.surface.faces)) for number, part in enumerate(parts)],
         "vertices": len(surface.vertices),
         "faces": len(surface.faces),
@@ -67,8 +95,63 @@ def write_whole(folder: Path, plan: Plan, out: Path | None, turntable: Path | No
         "voxel": voxel,
         "classes": class_table(surface, names),
         "instances": len(instances),
+        "lods": [{"faces": len(level.surface.faces), "deviation": level.deviation} for level in levels],
         "files": [str(path) for path in files],
     }
+    if painted is not None:
+        result["painted_by_photos"] = round(painted.seen, 4)
+    inputs = {"alignment": digest(rounded(world_from_sfm(load_project(folder))))}
+    write_made(target / MESH_RECORD, step("blocks", params.model_dump(mode="json"), result, inputs))
+    return result
+
+
+@dataclass(frozen=True)
+class Paint:
+    """uv (F, 3, 2) of the faces' corners; image (S, S, 3) uint8 sRGB; unseen (S, S) uint8, 255 where no photo painted; seen:
+    the share of the surface that one did."""
+
+    uv: np.ndarray
+    image: np.ndarray
+    unseen: np.ndarray
+    seen: float
+
+
+def paint(surface: Surface, plan: Plan, scene: Scene, size: int, report: Reporter) -> Paint:
+    """A texture of the photos for the whole surface, in the frame that blocks share; what no photo shows has the colours of the
+    vertices.
+
+    Raises:
+        SettingError: no memory for the texture. TrainingError: the mesh cannot be unwrapped.
+    """
+    check_memory(size)
+    report.stage("Unwrapping")
+    uv = unwrap(surface.vertices, surface.faces, size, report).corners
+    photos = training_photos(scene, np.linalg.inv(plan.world_from_common), {})
+    prepared = prepare(surface.vertices, surface.faces, uv, photos, size, report)
+    closest = ClosestPoints(surface.vertices, surface.faces)
+
+    def color(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        report.check()
+        face, weights, _ = closest.find(points)
+        mixed = (surface.colors[surface.faces[face]] * weights[..., None]).sum(1)
+        return (mixed + 0.5).clip(0, 255).astype(np.uint8)
+
+    made = photo_texture(prepared, color, report)
+    return Paint(uv, made.image, made.unseen, made.seen)
+
+
+def _write_arrays(folder: Path, surface: Surface, painted: Paint | None) -> list[Path]:
+    """mesh.npz, and the texture if there is one."""
+    arrays = vars(surface) if painted is None else {**vars(surface), "uv": painted.uv}
+    with atomic_path(folder / MESH) as temporary, open(temporary, "wb") as file:
+        np.savez(file, **arrays)
+    written = [folder / MESH]
+    if painted is not None:
+        for name, picture in ((TEXTURE, painted.image), (UNSEEN, painted.unseen[..., None])):
+            with atomic_path(folder / name) as temporary:
+                write_picture(temporary, picture)
+            written.append(folder / name)
+    return written
 
 
 def _row(folder: Path, plan: Plan, number: int, faces: int) -> dict[str, Any]:

@@ -77,6 +77,15 @@ class BlocksParams(Params):
     faces: int = Field(default=200_000, ge=0, le=1_000_000_000, description="triangles of each block; 0: all there are")
     resolution: int = Field(default=512, ge=16, le=2048, description="cells along the longest side of a block")
     out: Path | None = Field(default=None, description="file for the whole mesh: .ply, .obj, .glb, .stl, .usdc")
+    texture: int | None = Field(
+        default=None,
+        ge=64,
+        le=16384,
+        description="size of the whole mesh's texture in pixels; none: vertex colours only",
+    )
+    lods: int = Field(
+        default=0, ge=0, le=6, description="levels of detail to write as well, each with a quarter of the triangles"
+    )
     turntable: Path | None = Field(
         default=None, description="folder for pictures of the whole mesh from eight sides: its colours and its classes"
     )

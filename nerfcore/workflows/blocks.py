@@ -64,7 +64,7 @@ def blocks(params: p.BlocksParams, report: Reporter) -> dict[str, Any]:
         report.check()
         write_block(folder, plan, block, params.holdout)
     made = _here(params, plan, report) if link is None else _on_cluster(params, plan, link, report)
-    result = write_whole(folder, plan, params.out, params.turntable, report)
+    result = write_whole(folder, plan, params, report)
     result["stages"] = {name: answer["seconds"] for name, answer in made.items()}
     result["reused"] = [name for name, answer in made.items() if answer["reused"]]
     record_step(folder, "blocks", params.model_dump(mode="json"), result)

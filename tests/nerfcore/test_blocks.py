@@ -164,8 +164,9 @@ def test_a_part_needs_only_the_maps_that_see_it() -> None:
     assert np.array_equal(np.sort(both.vertices, 0), np.sort(one.vertices, 0)), "to the bit"
     # Blocks that are farther away are not even read.
     read = [[other for other, count in enumerate(row) if count] for row in counts]
-    assert {0, 1} <= set(read[0]) <= {0, 1, 2}
-    assert {3, 4} <= set(read[4]) <= {2, 3, 4}
+    assert 0 in read[0]
+    assert 4 in read[4]
+    assert max(read[0]) <= 2 <= min(read[4])
     assert sum(map(sum, counts)) < 0.7 * 5 * sum(len(maps) for maps in each)
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from fieldwork.nerfcore.blender.blend import blend
 from fieldwork.nerfcore.blocks.join import joined, open_at_seams
 from fieldwork.nerfcore.blocks.maps import joined_maps, load_maps
 from fieldwork.nerfcore.blocks.plan import Plan, block_folder, cut
@@ -21,11 +22,13 @@ from fieldwork.nerfcore.mesh.clean import FEWEST_VIEWS, border_edges, compact, c
 from fieldwork.nerfcore.mesh.extract import extract
 from fieldwork.nerfcore.mesh.fusion import fuse_maps
 from fieldwork.nerfcore.mesh.instances import read_instances
+from fieldwork.nerfcore.mesh.stored import load_surface
 from fieldwork.nerfcore.mesh.surface import Surface, vertex_normals
-from fieldwork.nerfcore.params import BlocksParams
+from fieldwork.nerfcore.params import BlendParams, BlocksParams, InstancesParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.runs import run_folder
 from fieldwork.nerfcore.project.store import edit_project
+from fieldwork.nerfcore.things.edit import instances
 from fieldwork.nerfcore.workflows import blocks as workflow
 from fieldwork.nerfcore.workflows.blocks import blocks, tasks_of
 from fieldwork.tests.nerfcore.support.ball import SMALL, ball_project
@@ -105,6 +108,37 @@ def test_a_second_call_does_nothing_again_and_other_classes_only_the_parts(
     renamed = blocks(asked(project), Reporter())
     assert [task.split()[0] for task in renamed["reused"]] == ["train", "train", "maps", "maps"]
     assert set(renamed["classes"]) - {"void"} == {"lid", "bottom"}
+
+
+@pytest.mark.slow
+def test_the_whole_has_a_texture_levels_of_detail_and_opens_in_blender(
+    made: tuple[Path, dict[str, Any]], tmp_path: Path
+) -> None:
+    project = Path(shutil.copytree(made[0], tmp_path / "ball"))
+    found = blocks(asked(project, texture=256, lods=1, out=project / "whole.glb"), Reporter())
+    assert len(found["reused"]) == 6
+    assert found["painted_by_photos"] > 0.9
+    assert found["lods"][0]["faces"] < 0.5 * found["faces"]
+    surface, texture = load_surface(project, "blocks")
+    assert texture is not None
+    assert texture.image.shape == (256, 256, 3)
+    # The texture shows in the middle of each triangle about what its vertices have: the same photos.
+    corners = texture.unwrapped.uv[texture.unwrapped.faces].mean(1)
+    x, y = (corners * [256, -256] + [0, 256]).clip(0, 255).astype(int).T
+    painted, plain = texture.image[y, x].astype(float), surface.colors[surface.faces].mean(1)
+    apart = np.abs(painted - plain).mean(1)
+    assert np.median(apart) < 25
+    assert plain.std(0).max() > 25, "it has more than one colour"
+    assert {p.name for p in project.glob("whole*.glb")} == {"whole.glb", "whole_lod1.glb"}
+    # Without them the next call leaves none that is not true any more.
+    blocks(asked(project), Reporter())
+    assert load_surface(project, "blocks")[1] is None
+    assert not list((project / "exports/blocks").glob("*lod*"))
+    listed = instances(InstancesParams(project=project, run="blocks"), Reporter())["instances"]
+    assert {each["class"] for each in listed} <= {"top", "bottom"}
+    pytest.importorskip("bpy", reason="there is no Blender to open it in")
+    file = blend(BlendParams(project=project, out=project / "whole.blend", run="blocks"), Reporter())
+    assert (file["mesh"], file["cameras"]) == (found["faces"], 14)
 
 
 @pytest.mark.slow

@@ -134,6 +134,17 @@ def staged(folder: Path) -> Iterator[Path]:
             shutil.rmtree(place, ignore_errors=True)
 
 
+def linked(source: str, target: str) -> str:
+    """A file at two places, as one where the file system can; for `copy_function` of `shutil.copytree`."""
+    import shutil
+
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copy2(source, target)
+    return target
+
+
 def replace(source: Path, target: Path) -> None:
     """Move a file into the place of another.
 

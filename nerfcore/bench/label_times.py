@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import time
 from dataclasses import replace
@@ -15,6 +14,7 @@ import torch
 from ..data.box import box_poses
 from ..data.load import load_scene
 from ..evaluate.metrics import Confusion, psnr
+from ..files import linked
 from ..images.picture import over, resized, to_bytes
 from ..images.working import nearest, read_picture
 from ..labels.accept import accept
@@ -153,15 +153,7 @@ def rendered(project: Path, subject: Subject, report: Reporter) -> tuple[float, 
 def without_marks(project: Path, target: Path) -> Path:
     """A copy of a project, with the same files where the file system can, that has no marks and no revisions."""
     shutil.rmtree(target, ignore_errors=True)
-
-    def same(source: str, place: str) -> str:
-        try:
-            os.link(source, place)
-        except OSError:
-            shutil.copy2(source, place)
-        return place
-
-    shutil.copytree(project, target, copy_function=same, ignore=shutil.ignore_patterns("marks", "revisions", "jobs"))
+    shutil.copytree(project, target, copy_function=linked, ignore=shutil.ignore_patterns("marks", "revisions", "jobs"))
     (target / "jobs").mkdir(exist_ok=True)
     return target
 

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from pathlib import Path
 
 import numpy as np
 
 from ..data.load import load_scene
-from ..files import atomic_path
+from ..files import atomic_path, linked
 from ..geometry.points import Points
 from ..project.schema import Frame, ImageRecord, Project
 from ..project.store import (
@@ -68,10 +66,7 @@ def _place(source: Path, target: Path) -> None:
             return
     with atomic_path(target) as temporary:
         temporary.unlink(missing_ok=True)
-        try:
-            os.link(source, temporary)
-        except OSError:  # another disk, or one without second names
-            shutil.copy2(source, temporary)
+        linked(str(source), str(temporary))
 
 
 def _write_poses(folder: Path, target: Path, names: set[str]) -> None:

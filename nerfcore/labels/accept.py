@@ -7,7 +7,6 @@ meshes and later trainings have the classes as well; held-out photos get none, f
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
 from pathlib import Path
@@ -18,7 +17,7 @@ import torch
 
 from ..data.load import load_scene
 from ..errors import InputError
-from ..files import atomic_path, disk_errors
+from ..files import atomic_path, disk_errors, linked
 from ..images.encode import write_picture
 from ..images.working import nearest
 from ..params import LabelAcceptParams
@@ -185,18 +184,9 @@ def write_run(folder: Path, run: str, info: RunInfo, model: Model, revision: int
     with disk_errors(fresh):
         shutil.rmtree(fresh, ignore_errors=True)
         try:
-            shutil.copytree(place, fresh, copy_function=_linked, ignore=shutil.ignore_patterns(CHECKPOINT, ".*"))
+            shutil.copytree(place, fresh, copy_function=linked, ignore=shutil.ignore_patterns(CHECKPOINT, ".*"))
             save_info(fresh, info)
             write_checkpoint(fresh / CHECKPOINT, kept, state)
             swap_in(folder, run)
         finally:
             shutil.rmtree(fresh, ignore_errors=True)
-
-
-def _linked(source: str, target: str) -> str:
-    """A file at two places, as one where the file system can."""
-    try:
-        os.link(source, target)
-    except OSError:
-        shutil.copy2(source, target)
-    return target

@@ -239,6 +239,10 @@ def _settings(folder: Path, run: str) -> Section:
         return Section("Settings of the run", [], [])
     stages: dict[str, Any] = value.get("config") or {}
     rows = [["preset", str(value.get("preset")), ""]]
+    accepted = value.get("accepted")
+    if isinstance(accepted, dict):
+        told = f"revision {accepted.get('revision')} of the marks, accepted {accepted.get('time')}"
+        rows.append(["labels", told, ""])
     for stage, settings in stages.items():
         if isinstance(settings, dict):
             rows += [

@@ -213,6 +213,7 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
     result: dict[str, Any] = {
         "run": params.run,
         "split": params.split,
+        "label_revision": trained.info.label_revision,
         **compared.means(),
         **speed,
         "rps": round(compared.rays / compared.seconds),

@@ -5,9 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from fieldwork.nerfcore.evaluate.documentation import sections
+from fieldwork.nerfcore.evaluate.verb import evaluate
 from fieldwork.nerfcore.labels.accept import accept
 from fieldwork.nerfcore.labels.head import LEAST_STEPS, MOST_STEPS, share_done
-from fieldwork.nerfcore.params import LabelAcceptParams
+from fieldwork.nerfcore.params import EvaluateParams, LabelAcceptParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.tests.nerfcore.test_labels import ball, spread, trained, two_strokes  # noqa: F401
 
@@ -25,3 +27,8 @@ def test_without_time_the_field_learns_all_the_same(ball: Path) -> None:  # noqa
     told = accept(LabelAcceptParams(project=ball, seconds=0.01), Reporter())
     assert told["steps"] == LEAST_STEPS
     assert told["agreement"] > 0.75
+    (settings,) = (section for section in sections(ball, "main", {}) if section.title == "Settings of the run")
+    (row,) = (row for row in settings.rows if row[0] == "labels")
+    assert row[1].startswith("revision 2 of the marks, accepted 20"), "the report names the revision of its labels"
+    found = evaluate(EvaluateParams(project=ball), Reporter())
+    assert found["label_revision"] == 2

@@ -19,6 +19,7 @@ from ..images.picture import over, resized, to_bytes
 from ..images.working import nearest, read_picture
 from ..labels.accept import accept
 from ..labels.assist.verbs import segment
+from ..labels.journal import Mark
 from ..labels.overlay import photo_labels
 from ..labels.propagate import propagate
 from ..labels.revisions import computed
@@ -65,13 +66,13 @@ def waiting_times(project: Path, subject: Subject, seed: int, report: Reporter) 
     whole parts and of all surfels are on disk; "undo", until the labels of the revision before are those of a photo;
     "overlay", the labels of another photo; "click", an answer of a model but for the model's own time."""
     watch = Watch(report)
-    marks = Annotator(subject, seed).marks[: STROKES + 1]
+    everything = Annotator(subject, seed).marks
+    marks = everything[: STROKES + 1]
     found: dict[str, list[float]] = {"parts": [], "full": [], "undo": [], "overlay": [], "click": []}
     for number, mark in enumerate(marks):
         watch.begin()
         begin = time.perf_counter()
-        values = mark.model_dump(include={"photo", "shape", "points", "width", "class_id"})
-        stroke(LabelStrokeParams.model_validate({"project": project, **values}), report)
+        draw(project, mark, report)
         propagate(LabelPropagateParams(project=project), watch)
         if number:  # the first one warms up
             found["parts"].append(watch.first)
@@ -83,6 +84,9 @@ def waiting_times(project: Path, subject: Subject, seed: int, report: Reporter) 
         photo_labels(*computed(project, "main", None), photo, subject.void)
         found["undo"].append(time.perf_counter() - begin)
     checkout(LabelCheckoutParams(project=project, revision=len(marks)), report)
+    for mark in everything[len(marks) :]:  # what is accepted later has all classes
+        draw(project, mark, report)
+    propagate(LabelPropagateParams(project=project), report)
     ready, shown = computed(project, "main", None)
     photo_labels(ready, shown, photo, subject.void)
     for other in ready.photos[:LOOKS]:
@@ -91,6 +95,12 @@ def waiting_times(project: Path, subject: Subject, seed: int, report: Reporter) 
         found["overlay"].append(time.perf_counter() - begin)
     found["click"] = click_times(project, photo, report)
     return found
+
+
+def draw(project: Path, mark: Mark, report: Reporter) -> None:
+    """Take a simulated mark into the project's journal."""
+    values = mark.model_dump(include={"photo", "shape", "points", "width", "class_id"})
+    stroke(LabelStrokeParams.model_validate({"project": project, **values}), report)
 
 
 def click_times(project: Path, photo: str, report: Reporter) -> list[float]:

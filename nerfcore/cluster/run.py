@@ -289,7 +289,8 @@ class Runner:
 def welcome(ready: dict[str, Any]) -> str:
     """Which cluster it is: “auto” takes the one that runs on this machine, which may be somebody else's."""
     cores = sum(node["cores"] for node in ready["nodes"])
-    there = f"{sum(node['cores'] > 0 for node in ready['nodes'])} workers, {cores:g} cores"
+    workers = sum(node["cores"] > 0 for node in ready["nodes"])
+    there = f"{workers} worker{'' if workers == 1 else 's'}, {cores:g} core{'' if cores == 1 else 's'}"
     if not ready["joined"]:
         return f"No cluster runs here: one of this machine was started for the time of the campaign ({there})."
     return f"Joined the cluster at {ready['address']} ({there})."

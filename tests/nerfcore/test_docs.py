@@ -77,7 +77,7 @@ def test_files_and_functions_that_a_page_names_exist(page: Path) -> None:
 @NAMED
 def test_options_that_a_page_names_exist(page: Path) -> None:
     known = {"--help", "--addons", "--python"}  # the last two are Blender's
-    known |= {"--head", "--port", "--address"}  # of `ray start`
+    known |= {"--head", "--port", "--address", "--generate"}  # of `ray start` and `ray get-auth-token`
     for verb in VERBS:
         known.update(option for param in _command(verb).params for option in (*param.opts, *param.secondary_opts))
     named = re.findall(r"(?<![\w-])--[a-z][a-z-]+", page.read_text("utf-8"))

@@ -39,6 +39,7 @@ RENDERS = (
     "test_render_passes.py",
     "test_render_engine.py",
     "test_field_with_objects.py",
+    "test_field_shadows.py",
     "test_edited_things.py",
 )
 WHEELS = {"4.2.0": "3.11", "4.5.15": "3.11", "5.0.1": "3.11", "5.2.3": "3.13"}

@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import Any
 
 MOST_STEPS = 2000
+LEAST_LEFT = 0.01  # of the light, at which a ray ends
 
 MARCH = """
 const int CELLS = 8;
@@ -118,8 +119,14 @@ void main()
   float sure = 0.0;
   float half_way = -1.0;
   bool classes_matter = classes > 0 && (look > 0.0 || edited == 1);
+  ivec3 block_before = ivec3(-1);
+  float entry = 0.0;
+  /* Changes with the direction are read once, where most of the light comes from: they vary little on a surface. */
+  vec3 surface = vec3(0.0);
+  float most_weight = 0.0;
+  float photographed = 0.0;
   for (int n = 0; n < MOST_STEPS; n++) {
-    if (t >= high || left < 0.004) {
+    if (t >= high || left < LEAST_LEFT) {
       break;
     }
     vec3 p = o + d * t;
@@ -128,7 +135,10 @@ void main()
     vec3 u = clamp(grid_position(p), 0.0, 1.0);
     vec3 x = u * float(blocks);
     ivec3 block = min(ivec3(x), ivec3(blocks - 1));
-    float entry = texelFetch(index_, block, 0).r;
+    if (any(notEqual(block, block_before))) {
+      entry = texelFetch(index_, block, 0).r;
+      block_before = block;
+    }
     if (entry <= 0.5) {
       t += leap(u, inverse_d, p, -entry) + 0.5 * bin;
       continue;
@@ -153,9 +163,8 @@ void main()
         alpha *= share * texelFetch(lut, ivec2(top, 0), 0).a + (1.0 - share) * texelFetch(lut, ivec2(second, 0), 0).a;
       }
       if (alpha > 0.0005) {
-        vec3 slope = (texture(t1, place).rgb - 0.5) * d.x + (texture(t2, place).rgb - 0.5) * d.y +
-                     (texture(t3, place).rgb - 0.5) * d.z;
-        vec3 seen = clamp(base.rgb + slope * (2.0 * harmonic_range), 0.0, 1.0);
+        vec3 seen = base.rgb;
+        float plain = 1.0;
         if (classes_matter) {
           vec3 first_color = texelFetch(lut, ivec2(top, 0), 0).rgb;
           vec3 second_color = texelFetch(lut, ivec2(second, 0), 0).rgb;
@@ -165,8 +174,14 @@ void main()
           vec3 labels = share * first_color + (1.0 - share) * second_color;
           seen = mix(seen, labels, min(look, 1.0));
           seen = mix(seen, vec3(max(share, 1.0 - share)), max(look - 1.0, 0.0));
+          plain = (1.0 - share * first_tint - (1.0 - share) * second_tint) * (1.0 - min(look, 1.0));
         }
         color += left * alpha * seen;
+        photographed += left * alpha * plain;
+        if (left * alpha > most_weight) {
+          most_weight = left * alpha;
+          surface = place;
+        }
         float before = left;
         left *= 1.0 - alpha;
         if (before >= 0.5 && left < 0.5) {
@@ -181,6 +196,11 @@ void main()
     out_color = vec4(0.0);
     out_depth = 1.0;
     return;
+  }
+  if (photographed > 0.01) {
+    vec3 slope = (texture(t1, surface).rgb - 0.5) * d.x + (texture(t2, surface).rgb - 0.5) * d.y +
+                 (texture(t3, surface).rgb - 0.5) * d.z;
+    color = clamp(color + photographed * slope * (2.0 * harmonic_range), 0.0, opacity);
   }
   /* Where it is thin all along, it stands at the end of it. */
   vec4 clip = clip_from_box * vec4(o + d * (half_way < 0.0 ? min(t, high) : half_way), 1.0);
@@ -230,6 +250,7 @@ def march_shader() -> Any:
     ):  # fmt: skip
         info.push_constant(kind, name)
     info.define("MOST_STEPS", str(MOST_STEPS))
+    info.define("LEAST_LEFT", str(LEAST_LEFT))
     info.fragment_out(0, "VEC4", "out_color")
     info.fragment_out(1, "FLOAT", "out_depth")
     return _made(info, MARCH)

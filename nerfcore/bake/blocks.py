@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import partial, reduce
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from scipy.ndimage import distance_transform_cdt
 
 from ..data.camera_rays import CameraRays
 from ..geometry.contraction import uncontract
-from ..kernels.runtime import run_parallel
+from ..kernels.runtime import run_parallel, worker_count
 from ..kernels.traversal import MarchSettings
 from ..kernels.voxel_field import CELLS, VERTICES, VIEWS, cell_length
 from ..kernels.voxel_march import add_views
@@ -24,6 +24,7 @@ Check = Callable[[], None]
 CHUNK = 1 << 14  # points read at once
 CHUNK_BLOCKS = 64  # blocks whose vertices are made at once
 CHUNK_RAYS = 1 << 15
+MOST_PARTS = 4  # of the cameras that threads ask side by side: each needs 12 kB a block
 # Measured (docs/experiments.md, “How fine must a baked field be?”):
 LEAST_OPACITY = 0.03  # of a cell; what is thinner is haze
 GROWTH = 2.3  # power of the side with which the number of occupied blocks grows: surfaces, but thick ones
@@ -159,17 +160,26 @@ def read_blocks(model: Model, grid: RenderGrid, side: int, check: Check) -> Bloc
 def seen_by(blocks: Blocks, rays: CameraRays, settings: MarchSettings, by_vertex: bool, check: Check) -> torch.Tensor:
     """Which cameras see the blocks (S, VIEWS), or their vertices (S · 9³, VIEWS): codes of `voxel_march.add_views`."""
     device = blocks.roots.device
-    views = torch.zeros(len(blocks.roots) if by_vertex else len(blocks), VIEWS, dtype=torch.int32, device=device)
     index = blocks.index()
-    for number, camera in enumerate(rays.cameras):
-        for pixels in torch.arange(camera.width * camera.height, device=device).split(CHUNK_RAYS):
-            check()
-            image = torch.full_like(pixels, number)
-            origins, directions = rays(image, pixels)
-            valid = ~directions[:, 0].isnan()
-            some = image[valid].to(torch.int32)
-            add_views(views, origins[valid], directions[valid], some, index, blocks.roots, settings)
-    return views
+
+    def noted(cameras: range) -> torch.Tensor:
+        rows = len(blocks.roots) if by_vertex else len(blocks)
+        views = torch.zeros(rows, VIEWS, dtype=torch.int32, device=device)
+        for number in cameras:
+            camera = rays.cameras[number]
+            for pixels in torch.arange(camera.width * camera.height, device=device).split(CHUNK_RAYS):
+                check()
+                image = torch.full_like(pixels, number)
+                origins, directions = rays(image, pixels)
+                valid = ~directions[:, 0].isnan()
+                some = image[valid].to(torch.int32)
+                add_views(views, origins[valid], directions[valid], some, index, blocks.roots, settings)
+        return views
+
+    # Threads of the CPU have no atomic operations: each notes what its own cameras see.
+    parts = min(worker_count(), MOST_PARTS) if device.type == "cpu" else 1
+    noting = [partial(noted, range(part, len(rays.cameras), parts)) for part in range(parts)]
+    return reduce(torch.maximum, run_parallel(noting, device))
 
 
 def weights_and_cameras(views: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from pathlib import Path
 from typing import Any
@@ -11,8 +12,8 @@ import numpy as np
 from ..data.box import box_poses
 from ..data.camera_rays import CameraRays
 from ..data.load import load_scene
-from ..data.pixels import training_size
-from ..data.scene import Scene
+from ..data.pixels import PixelStore, training_size
+from ..data.scene import Scene, View
 from ..errors import SettingError
 from ..params import BakeParams
 from ..progress import Reporter
@@ -32,6 +33,7 @@ from .blocks import (
     weights_and_cameras,
 )
 from .colors import HARMONIC_RANGE, vertex_texels
+from .fit import fitted
 
 # Not tuned: the next three.
 FINEST = 64  # blocks along a side of the grid
@@ -39,6 +41,7 @@ MOST_CLASSES = 255  # that a byte tells apart, and void
 MOST_VIEWS = 1000  # training photos whose rays are asked
 # Measured (docs/experiments.md, “How fine must a baked field be?”):
 RAYS = 2_000_000  # through training cameras, that tell what is seen
+PIXELS = 16_000_000  # of the photos that the baked field is fitted to; not tuned
 LEAST_SEEN = 0.03  # weight that a block has in one of these rays at least
 
 
@@ -68,6 +71,11 @@ def bake(params: BakeParams, report: Reporter) -> dict[str, Any]:
     report.stage("Reading colours")
     views = seen_by(blocks, rays, march_settings(trained.model, blocks.side, 1.0), True, report.check)
     texels = vertex_texels(trained.model, blocks, views, rays.center, report.check)
+    report.stage("Fitting to the photos")
+    photos = training_photos(folder, params.run, trained, scene, trained.info.box(project).box_from_world, report)
+    texels = fitted(
+        trained.model, blocks, texels, photos, march_settings(trained.model, blocks.side, 1.0), report.check
+    )
     report.stage("Writing")
     settings = march_settings(trained.model, blocks.side, 1.0)
     names = {c.id: c.name for c in scene.classes}
@@ -114,11 +122,31 @@ def training_rays(folder: Path, run: str, trained: Trained, scene: Scene, box_fr
         view.camera.resized(max(1, round(width * scale)), max(1, round(height * scale)))
         for view, (width, height) in zip(views, sizes)
     ]
+    return CameraRays(cameras, trained_poses(folder, run, trained, views, box_from_world), trained.device)
+
+
+def trained_poses(
+    folder: Path, run: str, trained: Trained, views: list[View], box_from_world: np.ndarray
+) -> np.ndarray:
+    """Camera-to-box poses (V, 4, 4) of training views as the field knows them."""
     refined = refined_poses(folder, run, trained.info)
     poses = box_poses(views, box_from_world)
     for number, view in enumerate(views):
         poses[number] = refined.get(view.name, poses[number])
-    return CameraRays(cameras, poses, trained.device)
+    return poses
+
+
+def training_photos(
+    folder: Path, run: str, trained: Trained, scene: Scene, box_from_world: np.ndarray, report: Reporter
+) -> PixelStore:
+    """Training photos as large as in training, so many of them that there are about `PIXELS`."""
+    size = sum(math.prod(training_size(scene.views[n].camera, trained.info.image_size)) for n in scene.train)
+    count = max(1, min(len(scene.train), int(len(scene.train) * PIXELS / max(size, 1))))
+    chosen = [scene.train[n] for n in np.unique(np.linspace(0, len(scene.train) - 1, count).round().astype(int))]
+    photos = PixelStore(scene, chosen, [], box_from_world, trained.info.image_size, trained.device, report)
+    poses = trained_poses(folder, run, trained, photos.views, box_from_world)
+    photos.rays = CameraRays(photos.cameras, poses, trained.device)
+    return photos
 
 
 def visible_blocks(trained: Trained, rays: CameraRays, memory: float, check: Check) -> Blocks:

@@ -12,8 +12,10 @@ import torch
 
 from ..bake.verb import bake
 from ..data.box import box_poses
+from ..data.camera_rays import CameraRays
 from ..data.load import load_scene
 from ..evaluate.verb import evaluate
+from ..kernels.voxel_march_torch import texture_reads
 from ..params import BakeParams, EvaluateParams
 from ..progress import Reporter
 from ..project.store import load_project
@@ -24,6 +26,7 @@ from .jobs import Job
 from .results import Row
 
 SIZES = {"400": (400, 400), "800": (800, 800), "1080": (1920, 1080)}
+READ_SIDE = 96  # pixels of the pictures whose reads are counted
 VIEWS = 3  # pictures of each size, of different photos
 COLUMNS = {
     "scene": "scene",
@@ -36,6 +39,7 @@ COLUMNS = {
     "cells": "cells along a side",
     "graphics_mb": "graphics memory (MB)",
     "disk_mb": "files (MB)",
+    "reads": "texture reads a pixel",
     "field_400": "field, 400×400 (frames/s)",
     "baked_400": "baked, 400×400 (frames/s)",
     "baked_800": "baked, 800×800 (frames/s)",
@@ -54,6 +58,7 @@ def measure(job: Job, project: Path, report: Reporter) -> dict[str, Any]:
             "bake_seconds": baked["seconds"],
             "cells": baked["cells"],
             "graphics_mb": baked["memory_mb"],
+            "reads": texture_reads_of_views(job, project),
             "disk_mb": round(sum(Path(file).stat().st_size for file in baked["files"]) / 1e6, 1),
             **{f"baked_{name}": rate for name, rate in frame_rates(job, project, report).items()},
         }
@@ -80,6 +85,20 @@ def frame_rates(job: Job, project: Path, report: Reporter) -> dict[str, float]:
             times.append(time.perf_counter() - begin)
         rates[name] = round(1 / median(times[1:]), 2)  # the first one warms up
     return rates
+
+
+@torch.no_grad()
+def texture_reads_of_views(job: Job, project: Path) -> float:
+    """How often Blender's viewport reads a texture for a pixel, the mean over small pictures of some photos' views."""
+    info = load_info(project, job.name)
+    scene, box = load_scene(project, info.holdout), info.box(load_project(project))
+    shown, found = load_baked(project, job.name, info), []
+    for number in (scene.test or scene.train)[:VIEWS]:
+        camera = scene.views[number].camera.undistorted().reframed(READ_SIDE, READ_SIDE)
+        rays = CameraRays([camera], box_poses([scene.views[number]], box.box_from_world), shown.device)
+        pixels = torch.arange(READ_SIDE**2, device=shown.device)
+        found.append(texture_reads(*rays(torch.zeros_like(pixels), pixels), shown.field, shown.settings).mean())
+    return round(float(torch.stack(found).mean()), 1)
 
 
 def live_table(rows: Sequence[Row]) -> tuple[dict[str, str], list[Row]]:

@@ -1,8 +1,8 @@
 """Rays through a baked field: leap over empty blocks, step through the others, composite front to back.
 
 A step stands for as much of the ray as it is long; outside the cube cells and steps grow alike, so that a step always
-is the same share of a cell. Opacity and colour are interpolated as they are coded; the class is that of the corner that
-adds most to the opacity. The torch version is in `voxel_march_torch.py`.
+is the same share of a cell. Opacity and colour are interpolated as they are coded; each corner's classes have as much of the
+opacity as the corner. The torch version is in `voxel_march_torch.py`.
 """
 
 from __future__ import annotations
@@ -194,25 +194,27 @@ def march_voxels(
         else:
             cell = cell_of(x, entry, field.blocks)
             root = float(0.0)
-            strongest = float(0.0)
-            nearest = cell.first
             for corner in range(8):
-                vertex = corner_vertex(cell, corner)
-                part = corner_weight(cell, corner) * channel(field.vertices[4 * vertex], 3) / 255.0
-                root += part
-                if part > strongest:
-                    strongest = part
-                    nearest = vertex
+                root += (
+                    corner_weight(cell, corner) * channel(field.vertices[4 * corner_vertex(cell, corner)], 3) / 255.0
+                )
             if root > 0.0:
                 alpha = 1.0 - wp.pow(wp.max(1.0 - root * root, 0.0), field.exponent)
                 if field.classes > 0:
-                    top = int(channel(field.vertices[4 * nearest + 1], 3))
-                    second = int(channel(field.vertices[4 * nearest + 3], 3))
-                    share = channel(field.vertices[4 * nearest + 2], 3) / 255.0
-                    alpha *= share * field.class_opacity[top] + (1.0 - share) * field.class_opacity[second]
-                    weight = transmittance * alpha
-                    probabilities[r, top] = probabilities[r, top] + weight * share
-                    probabilities[r, second] = probabilities[r, second] + weight * (1.0 - share)
+                    full = alpha
+                    alpha = float(0.0)
+                    for corner in range(8):
+                        vertex = 4 * corner_vertex(cell, corner)
+                        part = full * corner_weight(cell, corner) * channel(field.vertices[vertex], 3) / (255.0 * root)
+                        if part > 0.0:
+                            top = int(channel(field.vertices[vertex + 1], 3))
+                            second = int(channel(field.vertices[vertex + 3], 3))
+                            share = channel(field.vertices[vertex + 2], 3) / 255.0
+                            first = part * share * field.class_opacity[top]
+                            rest = part * (1.0 - share) * field.class_opacity[second]
+                            alpha += first + rest
+                            probabilities[r, top] = probabilities[r, top] + transmittance * first
+                            probabilities[r, second] = probabilities[r, second] + transmittance * rest
                 weight = transmittance * alpha
                 color += weight * seen_color(field, cell, d)
                 depth += weight * t

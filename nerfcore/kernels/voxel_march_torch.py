@@ -11,6 +11,11 @@ from ..geometry.contraction import grid_position
 from .traversal import BEFORE_CUBE, EARLY_STOP, MAX_BINS, MarchSettings
 from .voxel_field import CELLS, VERTICES, VIEWS, VoxelField, VoxelRays, cell_length
 
+LEAST_WEIGHT = 1e-3  # of a sample that is asked to change
+SHADER_STOP, SHADER_LEAST = (
+    0.004,
+    0.0005,
+)  # transmittance at which the shader stops, opacity from which it asks for colours
 _CORNERS = [(corner & 1, corner >> 1 & 1, corner >> 2) for corner in range(8)]
 
 
@@ -61,8 +66,10 @@ def _steps(
     s: MarchSettings,
     transmittance: torch.Tensor,
     ends: torch.Tensor | None = None,
+    looks: torch.Tensor | None = None,
 ) -> Iterator[_Step]:
-    """The samples of rays (R, 3), one a ray at a time, while the caller lowers their transmittance (R,) in place."""
+    """The samples of rays (R, 3), one a ray at a time, while the caller lowers their transmittance (R,) in place; `looks`
+    (R,): how often each ray looked into the index, counted in place."""
     inverse = 1 / torch.where(directions.abs() < 1e-9, 1e-9, directions)
     t, high = _bounds(origins, inverse, s)
     high = high if ends is None else torch.minimum(high, ends)
@@ -70,6 +77,8 @@ def _steps(
         rays = ((t < high) & (transmittance >= float(EARLY_STOP))).nonzero()[:, 0]
         if len(rays) == 0:
             return
+        if looks is not None:
+            looks[rays] += 1
         now, d = t[rays], directions[rays]
         p = origins[rays] + d * now[:, None]
         r = p.abs().amax(1)
@@ -114,21 +123,38 @@ def march(
         root = parts.sum(1)
         alpha = 1 - (1 - root * root).clamp(min=0) ** exponent
         if field.classes:
-            # The first of equal corners, as in the kernel.
-            nearest = texels[torch.arange(len(root), device=device), parts.argmax(1)]
-            top, second, share = nearest[:, 1, 3].long(), nearest[:, 3, 3].long(), nearest[:, 2, 3] / 255
-            alpha = alpha * (share * field.class_opacity[top] + (1 - share) * field.class_opacity[second])
-            weight = transmittance[step.rays] * alpha
-            probabilities.index_put_((step.rays, top), weight * share, accumulate=True)
-            probabilities.index_put_((step.rays, second), weight * (1 - share), accumulate=True)
+            part = parts / root.clamp(min=1e-9)[:, None] * alpha[:, None]  # (N, 8)
+            top, second, share = texels[..., 1, 3].long(), texels[..., 3, 3].long(), texels[..., 2, 3] / 255
+            first = part * share * field.class_opacity[top]
+            rest = part * (1 - share) * field.class_opacity[second]
+            alpha = (first + rest).sum(1)
+            before, rays = transmittance[step.rays][:, None], step.rays[:, None].expand_as(top)
+            probabilities.index_put_((rays, top), before * first, accumulate=True)
+            probabilities.index_put_((rays, second), before * rest, accumulate=True)
         weight = transmittance[step.rays] * alpha
-        mixed = (step.shares[..., None, None] * texels[..., :3]).sum(1)  # (N, 4, 3)
-        slope = ((mixed[:, 1:] - 127.5) * directions[step.rays][..., None]).sum(1)
-        seen = (mixed[:, 0] / 255 + slope * (field.harmonic_range / 127.5)).clamp(0, 1)
+        seen = _seen(texels, step.shares, directions[step.rays], field.harmonic_range)
         color[step.rays] += weight[:, None] * seen
         depth[step.rays] += weight * step.t
         transmittance[step.rays] *= 1 - alpha
     return VoxelRays(color, 1 - transmittance, depth, probabilities if field.classes else None)
+
+
+def texture_reads(origins: torch.Tensor, directions: torch.Tensor, field: VoxelField, s: MarchSettings) -> torch.Tensor:
+    """How often (R,) the viewport's shader (addon/live/shaders.py) reads a texture for each ray, all classes as they are:
+    the index once in each block it meets, the colour and opacity at each sample, and three more times for the changes
+    with the direction where something is."""
+    transmittance, looks = torch.ones(len(origins), device=origins.device), torch.zeros_like(origins[:, 0])
+    reads, before = torch.zeros_like(looks), torch.full_like(looks, -1, dtype=torch.long)
+    words = field.vertices.view(-1, 4)
+    for step in _steps(origins, directions, field.index, field.blocks, s, transmittance, looks=looks):
+        block = step.corners[:, 0] // VERTICES**3
+        looks[step.rays] -= (block == before[step.rays]).float()
+        before[step.rays] = block
+        root = (step.shares * (words[step.corners][..., 0] >> 24 & 255) / 255).sum(1)
+        reads[step.rays] += 1
+        left = transmittance[step.rays] * (1 - (root * root).clamp(max=1))
+        transmittance[step.rays] = torch.where(left < SHADER_STOP, 0.0, left)
+    return looks + reads + 3 * (transmittance < 1)
 
 
 def add_views(
@@ -155,3 +181,45 @@ def add_views(
         slot = places * VIEWS + camera % VIEWS
         flat.scatter_reduce_(0, slot.reshape(-1), code.reshape(-1), "amax")
         transmittance[step.rays] *= 1 - alpha
+
+
+def add_errors(
+    sums: torch.Tensor,
+    origins: torch.Tensor,
+    directions: torch.Tensor,
+    wanted: torch.Tensor,
+    behind: torch.Tensor,
+    field: VoxelField,
+    s: MarchSettings,
+) -> torch.Tensor:
+    """As `voxel_fit.add_errors`."""
+    words, total, error = field.vertices.view(-1, 4), behind, behind
+    for last in (False, True):
+        transmittance, color = torch.ones(len(origins), device=origins.device), torch.zeros_like(behind)
+        for step in _steps(origins, directions, field.index, field.blocks, s, transmittance):
+            texels = unpacked(words[step.corners]).float()
+            root = (step.shares * texels[..., 0, 3] / 255).sum(1)
+            alpha, before = (root * root).clamp(max=1), transmittance[step.rays]
+            seen = _seen(texels, step.shares, directions[step.rays], field.harmonic_range)
+            color[step.rays] += (before * alpha)[:, None] * seen
+            if last:
+                rest = (total[step.rays] - color[step.rays]) / (before * (1 - alpha)).clamp(min=1e-4)[:, None]
+                change = (seen - rest.clamp(0, 1)) * (2 * before * root)[:, None]
+                here = error[step.rays]
+                weight = (before * alpha)[:, None]
+                slope, square = (change * here).sum(1, keepdim=True), (change * change).sum(1, keepdim=True)
+                told = torch.cat([weight * here, weight, slope, square], 1) * (before * root > LEAST_WEIGHT)[:, None]
+                shared = step.shares[..., None] * told[:, None]
+                sums.index_add_(0, step.corners.reshape(-1), shared.reshape(-1, 6))
+            transmittance[step.rays] *= 1 - alpha
+        if not last:
+            total = color + behind * transmittance[:, None]
+            error = wanted - total
+    return error.square().mean(1)
+
+
+def _seen(texels: torch.Tensor, shares: torch.Tensor, directions: torch.Tensor, harmonic_range: float) -> torch.Tensor:
+    """Colours (N, 3) of samples along directions (N, 3), of the texels (N, 8, 4, 4) of their corners, shares (N, 8)."""
+    mixed = (shares[..., None, None] * texels[..., :3]).sum(1)  # (N, 4, 3)
+    slope = ((mixed[:, 1:] - 127.5) * directions[..., None]).sum(1)
+    return (mixed[:, 0] / 255 + slope * (harmonic_range / 127.5)).clamp(0, 1)

@@ -1,9 +1,11 @@
 """The extension in every supported Blender: build the zip, then install, use, disable and uninstall it in each.
 
-    .venv/bin/python tests/addon/matrix.py [--only 5.0.1 …] [--no-window]
+    .venv/bin/python tests/addon/matrix.py [--only 5.0.1 …] [--no-window] [--renders]
 
 The bpy wheels go into venvs/bpy-<version> (made when missing; each needs 1 GB). Windowed Blenders are used where
-../shared/blender-gui can build them (root, Debian). Prints a table; the exit status is the number of failures.
+../shared/blender-gui can build them (root, Debian). With --renders, the tests of the render engine (cameras, passes,
+Cryptomattes, objects, dead engines) run in each wheel as well, minutes a version. Prints a table; the exit status is the
+number of failures.
 """
 
 from __future__ import annotations
@@ -32,6 +34,14 @@ from rich.table import Table
 
 ROOT = Path(__file__).resolve().parents[2]
 WORKER = Path(__file__).with_name("matrix_worker.py")
+RENDERS = (
+    "test_render_lenses.py",
+    "test_render_passes.py",
+    "test_render_engine.py",
+    "test_field_with_objects.py",
+    "test_field_shadows.py",
+    "test_edited_things.py",
+)
 WHEELS = {"4.2.0": "3.11", "4.5.15": "3.11", "5.0.1": "3.11", "5.2.3": "3.13"}
 WINDOWED = {"sid": "/var/tmp/blender-sid", "trixie": "/var/tmp/blender-trixie"}
 GUI = ROOT.parent / "shared" / "blender-gui"
@@ -71,6 +81,17 @@ def extension_tool(python: Path) -> Path:
     code = "import importlib.util as u; print(*u.find_spec('bpy').submodule_search_locations)"
     place = subprocess.run([python, "-c", code], capture_output=True, text=True, check=True).stdout.strip()
     return next(Path(place).glob("*/scripts/addons_core/bl_pkg/cli/blender_ext.py"))
+
+
+def renders(python: Path) -> dict[str, Any]:
+    """The tests of the render engine in a wheel, which reads its files with OpenImageIO; the engine is this Python's."""
+    subprocess.run([python, "-m", "pip", "install", "-q", "OpenImageIO"], check=True, capture_output=True)
+    environment = {**os.environ, "FIELDWORK_BPY_PYTHON": str(python)}
+    command = [sys.executable, "-m", "pytest", "-q", "-s", *(str(ROOT / "tests/addon" / name) for name in RENDERS)]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=ROOT)
+    if done.returncode != 0:
+        return {"ok": False, "error": "a test of the render engine failed", "log": done.stdout + done.stderr}
+    return {"renders": done.stdout.strip().splitlines()[-1].split(" in ")[0]}
 
 
 def build_zip(python: Path, out: Path) -> Path:
@@ -194,6 +215,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--only", nargs="*", help="versions, or sid and trixie")
     parser.add_argument("--no-window", action="store_true", help="leave the windowed Blenders out")
+    parser.add_argument("--renders", action="store_true", help="also run the tests of the render engine in each wheel")
     options = parser.parse_args()
     chosen = lambda name: not options.only or name in options.only  # noqa: E731
     rows: list[tuple[str, dict[str, Any]]] = []
@@ -216,7 +238,10 @@ def main() -> int:
                 # Each version builds its own zip, so that each version's rules for manifests are kept.
                 request["zip"] = str(build_zip(python, work / f"dist-{version}"))
                 (work / version).mkdir()
-                rows.append((f"bpy {version}", run_wheel(python, request, work / version)))
+                row = run_wheel(python, request, work / version)
+                rows.append((f"bpy {version}", row))
+                if options.renders and row["ok"]:
+                    row |= renders(python)
                 (ROOT / "dist").mkdir(exist_ok=True)
                 shutil.copy(request["zip"], ROOT / "dist")
             except subprocess.SubprocessError as error:
@@ -250,17 +275,29 @@ def report(rows: list[tuple[str, dict[str, Any]]]) -> int:
         "faces",
         "denoiser",
         "-c",
+        "renders",
         "result",
     )
     failures = 0
     for name, row in rows:
         if "skipped" in row:
-            table.add_row(name, *[""] * 9, f"skipped: {row['skipped']}")
+            table.add_row(name, *[""] * 10, f"skipped: {row['skipped']}")
             continue
         failures += not row["ok"]
         facts = [
             str(row.get(key, ""))
-            for key in ("blender", "python", "operators", "enable_ms", "photo_s", "mesh_s", "faces", "oidn", "command")
+            for key in (
+                "blender",
+                "python",
+                "operators",
+                "enable_ms",
+                "photo_s",
+                "mesh_s",
+                "faces",
+                "oidn",
+                "command",
+                "renders",
+            )
         ]
         table.add_row(name, *facts, "ok" if row["ok"] else f"FAILED: {row['error']}")
         if not row["ok"]:

@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
+from fieldwork.tests.addon.rendered import ball
 from fieldwork.tests.addon.support import SETUP
-from fieldwork.tests.nerfcore.support.live import live_ball
 
-
-@pytest.fixture(scope="module")
-def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return live_ball(tmp_path_factory.mktemp("objects") / "ball")
-
+__all__ = ["ball"]
 
 START = (
     """

@@ -156,6 +156,7 @@ def coarse() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("fieldwork.nerfcore.bake.verb.FINEST", 16)
         patch.setattr("fieldwork.nerfcore.bake.verb.RAYS", 50_000)
+        patch.setattr("fieldwork.nerfcore.bake.fit.ROUNDS", 2)
         yield
 
 
@@ -176,7 +177,7 @@ def copied(trained: Path, tmp_path: Path) -> Path:
 def test_a_baked_field_measures_like_the_field(trained: Path) -> None:
     result = run_verb("evaluate", EvaluateParams(project=trained, baked=True), Reporter())
     assert result["psnr"] > 20
-    assert abs(result["lost"]["psnr"]) < 1
+    assert -5 < result["lost"]["psnr"] < 1, "fitted to the photos, it may be better than a field of few steps"
     assert abs(result["lost"]["miou"]) < 0.02
     stored = json.loads((trained / "runs" / "main" / "metrics.json").read_text())
     assert stored["test"]["psnr"] == pytest.approx(result["psnr"] + result["lost"]["psnr"], abs=2e-3)
@@ -236,7 +237,7 @@ def test_a_contracted_field_without_classes(tmp_path: Path, monkeypatch: pytest.
     assert field.classes == 0
     assert field.settings.contracted
     result = run_verb("evaluate", EvaluateParams(project=project, baked=True), Reporter())
-    assert abs(result["lost"]["psnr"]) < 1.5
+    assert -5 < result["lost"]["psnr"] < 1.5
     assert result["lost"]["miou"] is None
     asked = RenderParams(project=project, out=tmp_path / "r", orbit=1, size=(16, 16), baked=True)
     assert len(run_verb("render", asked, Reporter())["frames"]) == 4

@@ -21,6 +21,7 @@ def test_a_baked_field_is_measured_and_stands_on_the_page(
 ) -> None:
     monkeypatch.setattr("fieldwork.nerfcore.bake.verb.FINEST", 8)
     monkeypatch.setattr("fieldwork.nerfcore.bake.verb.RAYS", 5_000)
+    monkeypatch.setattr("fieldwork.nerfcore.bake.fit.ROUNDS", 1)
     monkeypatch.setattr(live, "SIZES", {"400": (40, 40), "800": (60, 60), "1080": (96, 54)})
     monkeypatch.setitem(suites.SIDES, "live", (400,))
     monkeypatch.setattr(tables, "COUNTING_SIDE", 40)
@@ -35,6 +36,7 @@ def test_a_baked_field_is_measured_and_stands_on_the_page(
     assert row["field_400"] > 0
     assert row["baked_400"] > 0
     assert row["bake_seconds"] > 0
+    assert 1 <= row["reads"] < 200
     (run,) = (tmp_path / "projects").glob("*/runs/*")
     folder = voxels_folder(run.parents[1], run.name)
     assert row["disk_mb"] == pytest.approx(sum(p.stat().st_size for p in folder.iterdir()) / 1e6, abs=0.06)

@@ -188,3 +188,20 @@ def test_the_index_tells_distances() -> None:
     assert index[0, 0, 3] == -3
     assert index[2, 1, 0] == -2
     assert np.unique(index.numpy()).tolist() == [-3, -2, -1, 1]
+
+
+def test_reads_of_textures_are_counted() -> None:
+    """Rays beside the cube read nothing; in a wholly opaque one the index, a sample, and three times its changes; where there
+    is hardly anything, a sample for each cell, and the index once a block."""
+    along = torch.tensor([[1.0, 0.0, 0.0]])
+    here, full = settings(False), torch.ones(SIDE, SIDE, SIDE).nonzero()
+    meeting, beside = torch.tensor([[-3.0, 0.01, 0.01]]), torch.tensor([[-3.0, 5.0, 0.01]])
+    reads = voxel_march_torch.texture_reads
+    assert float(reads(beside, along, even_field(255, full), here)[0]) == 0
+    assert float(reads(meeting, along, even_field(255, full), here)[0]) == 1 + 1 + 3
+    thin = float(reads(meeting, along, even_field(1, full), here)[0])
+    assert thin == pytest.approx(SIDE * 8 + SIDE + 3, abs=2)
+    one = torch.tensor([[0, SIDE // 2, SIDE // 2]])
+    assert float(reads(meeting, along, even_field(255, one), here)[0]) == 1 + 1 + 3
+    behind = torch.tensor([[SIDE - 1, SIDE // 2, SIDE // 2]])
+    assert 6 <= float(reads(meeting, along, even_field(255, behind), here)[0]) <= 12, "empty blocks are leapt over"

@@ -19,5 +19,6 @@ def live_ball(folder: Path) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("fieldwork.nerfcore.bake.verb.FINEST", 16)
         patch.setattr("fieldwork.nerfcore.bake.verb.RAYS", 50_000)
+        patch.setattr("fieldwork.nerfcore.bake.fit.ROUNDS", 2)
         run_verb("bake", BakeParams(project=project, memory=20), Reporter())
     return project

@@ -1,0 +1,155 @@
+"""How a baked field must change to look as rays say: what each of its vertices has to do with the error of each ray.
+
+A ray is marched twice: for its colour, and then to hand its error to the vertices it met. The torch version is in
+`voxel_march_torch.py`.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import torch
+import warp as wp
+
+from . import voxel_march_torch
+from .device import backend_of
+from .runtime import array, init, launch, run_parallel, worker_count
+from .traversal import (
+    EARLY_STOP,
+    MAX_BINS,
+    MarchParams,
+    MarchSettings,
+    bin_length,
+    grid_position,
+    inside,
+    march_params,
+    ray_interval,
+    reciprocal,
+)
+from .voxel_field import VoxelField
+from .voxel_march import (
+    VoxelArrays,
+    block_of,
+    cell_of,
+    channel,
+    corner_vertex,
+    corner_weight,
+    leap,
+    march_start,
+    seen_color,
+    voxel_arrays,
+)
+
+_LEAST_WEIGHT = wp.constant(voxel_march_torch.LEAST_WEIGHT)
+
+
+@wp.kernel(module="fieldwork_voxel_fit")
+def add_errors_kernel(
+    origins: wp.array(dtype=wp.vec3),
+    directions: wp.array(dtype=wp.vec3),
+    wanted: wp.array(dtype=wp.vec3),
+    behind: wp.array(dtype=wp.vec3),
+    field: VoxelArrays,
+    m: MarchParams,
+    sums: wp.array(dtype=float, ndim=2),
+    errors: wp.array(dtype=float),
+    offset: int,
+):
+    r = wp.tid() + offset
+    o = origins[r]
+    d = directions[r]
+    inverse = reciprocal(d)
+    lo, hi = ray_interval(o, inverse, m)
+    total = wp.vec3(0.0, 0.0, 0.0)
+    error = wp.vec3(0.0, 0.0, 0.0)
+    for turn in range(2):
+        t = march_start(o, inverse, lo, m)
+        transmittance = float(1.0)
+        color = wp.vec3(0.0, 0.0, 0.0)
+        for _ in range(MAX_BINS):
+            if t >= hi or transmittance < EARLY_STOP:
+                break
+            p = o + d * t
+            length = bin_length(p, m)
+            u = inside(grid_position(p, m.contracted))
+            x = u * float(field.blocks)
+            entry = field.index[block_of(x, field.blocks)]
+            if entry <= 0:
+                t += leap(u, inverse, p, -entry, field.blocks, m.contracted) + 0.5 * length
+            else:
+                cell = cell_of(x, entry, field.blocks)
+                root = float(0.0)
+                for corner in range(8):
+                    vertex = corner_vertex(cell, corner)
+                    root += corner_weight(cell, corner) * channel(field.vertices[4 * vertex], 3) / 255.0
+                if root > 0.0:
+                    alpha = wp.min(root * root, 1.0)
+                    weight = transmittance * alpha
+                    seen = seen_color(field, cell, d)
+                    color += weight * seen
+                    if turn == 1 and transmittance * root > _LEAST_WEIGHT:
+                        # What lies behind the sample, were it alone to be seen.
+                        rest = (total - color) / wp.max(transmittance * (1.0 - alpha), 1.0e-4)
+                        rest = wp.vec3(
+                            wp.clamp(rest[0], 0.0, 1.0), wp.clamp(rest[1], 0.0, 1.0), wp.clamp(rest[2], 0.0, 1.0)
+                        )
+                        change = (seen - rest) * (transmittance * 2.0 * root)
+                        slope = wp.dot(change, error)
+                        square = wp.dot(change, change)
+                        for corner in range(8):
+                            vertex = corner_vertex(cell, corner)
+                            share = corner_weight(cell, corner)
+                            w = share * weight
+                            wp.atomic_add(sums, vertex, 0, w * error[0])
+                            wp.atomic_add(sums, vertex, 1, w * error[1])
+                            wp.atomic_add(sums, vertex, 2, w * error[2])
+                            wp.atomic_add(sums, vertex, 3, w)
+                            wp.atomic_add(sums, vertex, 4, share * slope)
+                            wp.atomic_add(sums, vertex, 5, share * square)
+                    transmittance *= 1.0 - alpha
+                t += length
+        if turn == 0:
+            total = color + behind[r] * transmittance
+            error = wanted[r] - total
+            errors[r] = wp.dot(error, error) / 3.0
+
+
+def add_errors(
+    sums: torch.Tensor,
+    origins: torch.Tensor,
+    directions: torch.Tensor,
+    wanted: torch.Tensor,
+    behind: torch.Tensor,
+    field: VoxelField,
+    settings: MarchSettings,
+) -> torch.Tensor:
+    """Add what rays (R, 3) say about the vertices of a baked field, all of whose classes are opaque; returns the mean
+    squared error (R,) of each ray's colour.
+
+    Args:
+        sums: (S · 9³, 6) float32, changed in place: for each vertex the errors of colour (3) by its weights, the weights,
+            the errors by how much its root changes them, and the squares of that.
+        wanted, behind: (R, 3) the colour that a ray shall have, and what is behind the field, both sRGB.
+        settings: the step is as long as a cell.
+    """
+    device, rays = origins.device, [origins, directions, wanted, behind]
+    if not backend_of(device).warp:
+        return voxel_march_torch.add_errors(sums, *rays, field, settings)
+    init()
+    errors = torch.empty(len(origins), device=device)
+
+    def add(part: slice, own: torch.Tensor) -> torch.Tensor:
+        inputs = [array(value[part], wp.vec3) for value in rays]
+        inputs += [voxel_arrays(field, settings), march_params(settings), array(own), array(errors[part])]
+        launch(add_errors_kernel, len(errors[part]), inputs, device, serial=True)
+        return own
+
+    if device.type == "cuda":
+        add(slice(None), sums)
+        return errors
+    # Threads of the CPU have no atomic additions: each has sums of its own.
+    size = max(1, -(-len(errors) // worker_count()))
+    parts = [slice(begin, begin + size) for begin in range(0, len(errors), size)]
+    for own in run_parallel([partial(add, part, torch.zeros_like(sums)) for part in parts], device):
+        sums += own
+    return errors

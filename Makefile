@@ -69,10 +69,7 @@ gpu-compile: venv
 
 # Kernels against their twins, then training, rendering and memory; adds the figures to docs/figures and writes docs/benchmarks.md.
 gpu-check: venv
-	@mkdir -p build/bench/gpu
-	@rm -f build/bench/gpu/tests.xml
-	@$(BIN)/python -m pytest -m gpu tests/nerfcore --junitxml build/bench/gpu/tests.xml $(PYTEST); checks=$$?; \
-	$(BIN)/fieldwork bench --suite gpu --page docs/benchmarks.md --tests build/bench/gpu/tests.xml $(BENCH) && exit $$checks
+	@$(BIN)/python -m fieldwork.nerfcore.bench.gpu_check $(BENCH)
 
 # make bench SUITE=ablation BENCH="--seconds 60 --scenes museum"
 SUITE ?= speed

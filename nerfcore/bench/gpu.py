@@ -17,12 +17,13 @@ from ..progress import Reporter
 from ..train.prepare import make_trainer, plan_run
 
 ASKED = {
-    "lego_400: PSNR after 60 s (dB)": ("≥", 33.0),
+    "lego_400: PSNR after 30 s (dB)": ("≥", 33.0),
     "800×800 colour (frames/s)": ("≥", 60.0),
-    "800×800 colour and classes (frames/s)": ("≥", 60.0),
+    "800×800 colour and classes (frames/s)": ("≥", 120.0),
     "peak memory, training (MiB)": ("≤", 1.2e9 / 2**20),
     "peak memory, rendering (MiB)": ("≤", 1.2e9 / 2**20),
     "host synchronisations in an ordinary step": ("≤", 0.0),
+    "share of the steps that were recorded": ("≥", 0.5),
 }
 WARM_STEPS, COUNTED_STEPS = 300, 32  # past the warm-up of the grid; two updates of it
 
@@ -53,15 +54,18 @@ def count_synchronisations(step: Callable[[int], None], first: int, steps: int, 
     return counted, places
 
 
-def step_synchronisations(project: Path, report: Reporter) -> tuple[float, dict[str, int]]:
-    """Host synchronisations a training step, outside of updates of the occupancy grid, and where. Needs a GPU."""
+def step_synchronisations(project: Path, report: Reporter) -> tuple[float, dict[str, int], float]:
+    """Host synchronisations a training step, outside of updates of the occupancy grid, and where; the share of the steps
+    that replayed a recording. Needs a GPU."""
     device = use_device()
-    info, scene = plan_run(project, "standard", make_config("standard", {}), device)
+    # All levels from the start: while they fade in nothing is recorded.
+    info, scene = plan_run(project, "standard", make_config("standard", {"train.fade": "0"}), device)
     trainer = make_trainer(project, info, scene, device, report)
     report.stage("Looking for host synchronisation")
     for index in range(WARM_STEPS):
         trainer.step(index / 20000)
         report.check()
+    replayed = trainer.replay.replayed
     torch.cuda.set_sync_debug_mode("warn")
     try:
         counted, places = count_synchronisations(
@@ -69,7 +73,7 @@ def step_synchronisations(project: Path, report: Reporter) -> tuple[float, dict[
         )
     finally:
         torch.cuda.set_sync_debug_mode("default")
-    return sum(places.values()) / counted, dict(places)
+    return sum(places.values()) / counted, dict(places), (trainer.replay.replayed - replayed) / COUNTED_STEPS
 
 
 def kernel_checks(report_file: Path | None) -> str | None:
@@ -85,7 +89,9 @@ def kernel_checks(report_file: Path | None) -> str | None:
     return f"{ran - bad} of {ran} agree with their twins" if ran else None
 
 
-def figures(rows: Sequence[dict[str, Any]], synchronisations: float | None) -> dict[str, float | None]:
+def figures(
+    rows: Sequence[dict[str, Any]], synchronisations: float | None, recorded: float | None
+) -> dict[str, float | None]:
     """The asked figures from the suite's rows; None where one was not measured."""
 
     def row(scene: str) -> dict[str, Any]:
@@ -96,12 +102,13 @@ def figures(rows: Sequence[dict[str, Any]], synchronisations: float | None) -> d
 
     plain, labelled = row("lego_400"), next((r for r in rows if r.get("miou") is not None), {})
     return {
-        "lego_400: PSNR after 60 s (dB)": plain.get("psnr") if plain.get("budget") == "60 s" else None,
+        "lego_400: PSNR after 30 s (dB)": plain.get("psnr") if plain.get("budget") == "30 s" else None,
         "800×800 colour (frames/s)": plain.get("fps_800"),
         "800×800 colour and classes (frames/s)": labelled.get("fps_800"),
         "peak memory, training (MiB)": largest("memory_training_mb"),
         "peak memory, rendering (MiB)": largest("memory_rendering_mb"),
         "host synchronisations in an ordinary step": synchronisations,
+        "share of the steps that were recorded": recorded,
     }
 
 

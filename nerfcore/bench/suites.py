@@ -21,7 +21,7 @@ SCENES = {
     "live": ["lego_400", "museum", "replica_room"],
 }
 REFERENCE = {"ablation": "hybrid", "robustness": "clean"}
-SECONDS = {"speed": 120.0, "ablation": 180.0, "robustness": 180.0, "gpu": 60.0}
+SECONDS = {"speed": 120.0, "ablation": 180.0, "robustness": 180.0, "gpu": 30.0}
 SIDES = {"speed": (400, 800), "gpu": (800,), "surface": (), "live": (400,)}
 LONGER = 5.0  # the speed suite's second run
 STEPS = {"figures": 600, "ablation": 4000, "surface": 600, "live": 2000}

@@ -65,8 +65,8 @@ def bench(params: BenchParams, report: Reporter) -> dict[str, Any]:
         notes.append(f"Yardstick {params.yardstick.name}: {machine.run_yardstick(params.yardstick, seconds, report)}")
     asked = None
     if params.suite == "gpu":
-        synchronisations, waits = gpu.step_synchronisations(next(iter(projects.values())), report)
-        checks, values = gpu.kernel_checks(params.tests), gpu.figures(rows, synchronisations)
+        synchronisations, waits, recorded = gpu.step_synchronisations(next(iter(projects.values())), report)
+        checks, values = gpu.kernel_checks(params.tests), gpu.figures(rows, synchronisations, recorded)
         asked = Asked(figures=values, checks=checks, waits=waits)
     files = _write(params, out, rows, results, described, notes)
     if params.page is not None:

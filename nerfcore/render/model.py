@@ -109,6 +109,13 @@ class Model(nn.Module):
         """Whether `render` reads nothing back from the device where it keeps gradients."""
         return backend_of(self.priorities.device).fixed_capacity if self.fixed_capacity is None else self.fixed_capacity
 
+    def fixed_shares(self) -> tuple[bool, float]:
+        """Whether gradients take two passes, and which share of the samples has room for the visible ones: in sixteenths,
+        so that it stays the same for many steps."""
+        share = CAPACITY_FACTOR * self.host_visible_share
+        padded = math.ceil(share / LEAST_CAPACITY) * LEAST_CAPACITY
+        return self.host_visible_share < ONE_PASS_SHARE, min(1.0, max(LEAST_CAPACITY, padded))
+
     def refresh(self) -> None:
         """Read back how many of the samples are visible."""
         self.host_visible_share = float(self.visible_share)
@@ -195,7 +202,7 @@ class Model(nn.Module):
             self.refresh()
         # Where many samples turn out invisible, a first pass without gradients finds the others, and only those are
         # differentiated; where nearly all are visible, one pass is cheaper (3k + 1 against 3 forward costs at share k).
-        two_passes = learning and self.host_visible_share < ONE_PASS_SHARE
+        two_passes = learning and self.fixed_shares()[0]
         capacity = min(len(origins), capacity or len(origins))
         samples, points = self._sample(
             origins, directions, grid, samples_per_ray, jitter, shift, capacity if fixed else None
@@ -273,8 +280,7 @@ class Model(nn.Module):
         be there if the capacity were unlimited ()."""
         capacity, kept = None, weights > self.config.render.cull
         if fixed:
-            share = min(1.0, max(LEAST_CAPACITY, CAPACITY_FACTOR * self.host_visible_share))
-            capacity = math.ceil(len(samples) * share)
+            capacity = math.ceil(len(samples) * self.fixed_shares()[1])
         indices, packed_info = samples.packed_info.subset(kept, capacity)
         t, deltas = samples.t.index_select(0, indices), samples.deltas.index_select(0, indices)
         visible = Samples(

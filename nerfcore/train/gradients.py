@@ -42,10 +42,9 @@ class GradientGuard:
         return gradient / self.scale if self.scaling else gradient
 
     @torch.no_grad()
-    def inspect(self, gradients: Sequence[torch.Tensor]) -> None:
-        """Note whether all of a step's gradients are finite."""
-        if gradients:
-            self.finite = torch.isfinite(torch.nn.utils.get_total_norm(gradients))
+    def inspected(self, gradients: Sequence[torch.Tensor]) -> torch.Tensor:
+        """Whether all of a step's gradients are finite (): what belongs into `finite` before `step`."""
+        return torch.isfinite(torch.nn.utils.get_total_norm(gradients)) if gradients else self.finite
 
     @torch.no_grad()
     def step(self, optimizer: torch.optim.Optimizer) -> None:
@@ -63,11 +62,12 @@ class GradientGuard:
         self.skipped += ~self.finite
         if not self.scaling:
             return
-        self.good_steps = torch.where(self.finite, self.good_steps + 1, 0.0)
+        # In place: recorded steps read the scale where it was.
+        self.good_steps.copy_(torch.where(self.finite, self.good_steps + 1, 0.0))
         grow = self.good_steps >= GROWTH_STEPS
         factor = torch.where(self.finite, torch.where(grow, 2.0, 1.0), 0.5)
-        self.scale = (self.scale * factor).clamp(1.0, LARGEST_SCALE)
-        self.good_steps = torch.where(grow, 0.0, self.good_steps)
+        self.scale.copy_((self.scale * factor).clamp(1.0, LARGEST_SCALE))
+        self.good_steps.copy_(torch.where(grow, 0.0, self.good_steps))
 
 
 def only_finite(gradient: torch.Tensor) -> torch.Tensor:

@@ -28,6 +28,13 @@ def sample_budget(train: TrainConfig, progress: float, largest: int | None = Non
     return round(train.batch_start * ((largest or train.batch_samples) / train.batch_start) ** progress)
 
 
+def padded_capacity(wanted: float, most: float) -> float:
+    """A capacity of at least `wanted` that is one of four an octave, so that it stays the same for many steps; no more than
+    `most`, if that is enough."""
+    padded = 2.0 ** (math.ceil(4 * math.log2(max(wanted, 1.0))) / 4)
+    return max(wanted, min(padded, most))
+
+
 def largest_batch(train: TrainConfig, seconds: float, step_seconds: float) -> int:
     """Field samples of the last steps of a training of so many seconds, whose first steps take `step_seconds`: as large
     as the setting has them if that leaves `ENOUGH_STEPS`, else as small as it takes, down to twice those of the first."""

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import torch
@@ -13,7 +13,6 @@ import torch
 from ..config import RunConfig
 from ..data.pixels import VOID, Batch, PixelStore
 from ..errors import TrainingError
-from ..field.grid import Part
 from ..kernels.device import backend_of
 from ..kernels.runtime import run_parallel, worker_count
 from ..render.model import Model, Rendered
@@ -23,51 +22,18 @@ from ..sampling.outlines import Outlines
 from .composite_loss import composite_loss
 from .depth import DepthRays, depth_loss
 from .gradients import GradientGuard, only_finite
-from .losses import label_weights, psnr, sparsity_loss
+from .losses import label_weights, sparsity_loss
 from .pose_refinement import PoseRefinement, level_weights
-from .schedule import bias_correction, rate_factor, sample_budget
+from .replay import CudaRecording, Replay, asked_mode
+from .results import Learned, Measured, ShardResult
+from .schedule import bias_correction, padded_capacity, rate_factor, sample_budget
 from .voxel_init import PixelFeatures, initialise
 
 BETAS = (0.9, 0.99)
 HEADROOM = 1.25  # capacity for samples, as a multiple of a step's budget of them; not tuned
 NOT_FINITE_READINGS = 8  # in a row, of gradients that are not finite, until training is given up
+STEADY = 0.1  # change of the number of rays that is not worth another recording of steps; not tuned
 SHARD_SAMPLES = 12288  # measured: docs/experiments.md, “How many shards does a CPU step need?”
-
-
-@dataclass(frozen=True)
-class ShardResult:
-    """What comes of one shard of a batch: gradients of the model's parameters, in their order, and of encoded points;
-    its parts of the loss and of the squared error (scalars); what was rendered, if anything; gradients of the rays'
-    origins and directions where cameras move."""
-
-    gradients: Sequence[torch.Tensor | None]
-    encoded: list[Part]
-    loss: torch.Tensor
-    squared_error: torch.Tensor
-    rendered: Rendered | None
-    rays: Sequence[torch.Tensor] = ()
-
-
-@dataclass
-class Measured:
-    """Sums over the steps since the last reading; `loss` and `mse` stay on the device until they are read.
-
-    With a fixed capacity, `dropped`: rays that were left out for want of it, as far as the device was asked; `skipped`:
-    steps without finite gradients, and `lost_rows`: rows of the grid that were left out for the same reason.
-    """
-
-    loss: float | torch.Tensor = 0.0
-    mse: float | torch.Tensor = 0.0
-    steps: int = 0
-    rays: int = 0
-    samples: int = 0
-    dropped: int = 0
-    skipped: int = 0
-    lost_rows: int = 0
-
-    @property
-    def psnr(self) -> float:
-        return psnr(float(self.mse) / max(self.steps, 1))
 
 
 class Trainer:
@@ -112,12 +78,18 @@ class Trainer:
         self._counted = torch.zeros(2, device=self.device)
         self._drawn = 0
         self._not_finite = 0  # readings in a row that told of gradients that are not finite
+        recorded = self.backend.name == "warp-cuda"
+        recorder = partial(CudaRecording, device=self.device, generator=self.generator) if recorded else None
+        self.replay: Replay[Learned] = Replay(recorder, asked_mode())
+
+    def _refresh_cache(self) -> None:
+        s = self.config.sampling
+        if s.coarse_cache and self.steps >= s.warmup and (self.steps - s.warmup) % s.cache_every == 0:
+            self.cache.rebuild(self.model)
 
     def draw(self) -> Batch:
         """Rays of this step: from image tiles that met the field, and some from everywhere."""
         s = self.config.sampling
-        if s.coarse_cache and self.steps >= s.warmup and (self.steps - s.warmup) % s.cache_every == 0:
-            self.cache.rebuild(self.model)
         count = round(self.rays * self.outlines.share) if self.outlines is not None else 0
         pixel_indices = self.cache.draw(self.rays - count, s.empty_rays, self.generator)
         if self.outlines is not None and count > 0:
@@ -141,13 +113,15 @@ class Trainer:
             importance = model.importance if model.wants_importance() and self.steps >= config.sampling.warmup else None
             model.occupancy.update(self.steps, model.field.density, importance, self.generator)
             self._ask_device(progress)
-        batch, start = self.draw(), config.train.pose_start
+        self._refresh_cache()
+        start = config.train.pose_start
         moving = self.poses if progress >= start else None
-        if moving is not None:
-            batch = moving.move(batch)
-            if model.field.grid is not None:
-                model.field.grid.point_gains = level_weights(config.field.levels, progress)
-        shards = self._accumulate_gradients(batch, progress)
+        if moving is not None and model.field.grid is not None:
+            model.field.grid.point_gains = level_weights(config.field.levels, progress)
+        key = self._key(progress) if moving is None else None
+        learned = self.replay.run(key, partial(self._learn, progress, moving))
+        self._take(learned)
+        batch, shards = learned.batch, learned.shards
         if moving is not None:
             moving.step([part.rays for part in shards if part.rays], (progress - start) / (1 - start))
         self.steps += 1
@@ -178,32 +152,55 @@ class Trainer:
         measured, self.measured = self.measured, Measured()
 
         def learn() -> None:
-            self._accumulate_gradients(self.draw(), progress)
+            self._refresh_cache()
+            self._take(self._learn(progress))
 
         self.pixel_features = initialise(self.model, self.store, learn, self.check)
         self.measured = measured
 
-    def _accumulate_gradients(self, batch: Batch, progress: float) -> list[ShardResult]:
-        """Leave the gradient of the composite loss in the parameters and in the grid; gradients are summed in the order
-        of the shards."""
+    def _key(self, progress: float) -> Hashable:
+        """All that the host tells `_learn`; None where that reads back from the device or from the host's memory."""
+        model, c, store = self.model, self.config, self.store
+        if not self.replay.active or not model.has_fixed_capacity() or store.home != self.device:
+            return None
+        blend, hit = model.field.blend, self.cache.hit
+        return (
+            (self.rays, self._capacity(progress, 1), *model.fixed_shares()),
+            (tuple(model.field.gains), None if blend is None else blend.warming_up),
+            (self.steps < c.loss.rgb_warmup, progress >= c.loss.entropy_start, progress >= c.loss.distortion_start),
+            (None if hit is None else (hit.data_ptr(), len(hit)), model.occupancy.march_settings()),
+            0 if self.depths is None else len(self.depths),
+        )
+
+    def _learn(self, progress: float, moving: PoseRefinement | None = None) -> Learned:
+        """Gradients of the composite loss of rays drawn here, summed in the order of the shards; only the grid's, and the
+        random numbers, are changed: with a fixed capacity it can be recorded and replayed."""
+        batch = self.draw() if moving is None else moving.move(self.draw())
         tasks = self._shard_tasks(batch, progress)
         if self.config.loss.regularization * self.config.loss.sparsity_weight > 0:
             tasks.append(self._sparsity_task())
         if self.depths is not None and len(self.depths):
             tasks.append(self._depth_task(self.depths))
         shards = run_parallel(tasks, self.device)
-        for parameter, *gradients in zip(self.model.parameters(), *(part.gradients for part in shards)):
-            present = [g for g in gradients if g is not None]
-            parameter.grad = self.guard.unscaled(torch.stack(present).sum(0)) if present else None
-        self.guard.inspect([p.grad for p in self.model.parameters() if p.grad is not None])
+        gradients: list[torch.Tensor | None] = []
+        for parts in zip(*(part.gradients for part in shards)):
+            present = [g for g in parts if g is not None]
+            gradients.append(self.guard.unscaled(torch.stack(present).sum(0)) if present else None)
+        finite = self.guard.inspected([g for g in gradients if g is not None])
         grid = self.model.field.grid
         if grid is not None:
             encoded = [(points, self.guard.unscaled(g)) for part in shards for points, g in part.encoded]
             grid.scatter(encoded, self.model.field.gains)
-        for part in shards:
-            self.measured.loss += part.loss
-            self.measured.mse += part.squared_error
-        return shards
+        loss, error = (torch.stack(list(values)).sum() for values in zip(*((p.loss, p.squared_error) for p in shards)))
+        return Learned(batch, shards, gradients, finite, loss, error)
+
+    def _take(self, learned: Learned) -> None:
+        """Leave gradients in the parameters, where the optimiser finds them."""
+        for parameter, gradient in zip(self.model.parameters(), learned.gradients):
+            parameter.grad = gradient
+        self.guard.finite = learned.finite
+        self.measured.loss += learned.loss
+        self.measured.mse += learned.squared_error
 
     def _shard_tasks(self, batch: Batch, progress: float) -> list[Callable[[], ShardResult]]:
         """Tasks that learn from the rays of a batch.
@@ -310,7 +307,8 @@ class Trainer:
     def _capacity(self, progress: float, shards: int) -> int:
         """Rays of a shard that may get samples where the capacity is fixed: what the budget is enough for, and some."""
         per_ray = self.config.sampling.samples
-        return max(16, math.ceil(HEADROOM * self._budget(progress) / (per_ray * shards)))
+        samples = padded_capacity(HEADROOM * self._budget(progress), HEADROOM * self._budget(1.0))
+        return max(16, math.ceil(samples / (per_ray * shards)))
 
     def _adapt(self, rays: int, rendered: list[Rendered], progress: float) -> None:
         """Keep the number of field samples a step near its budget, which grows with progress."""
@@ -352,7 +350,10 @@ class Trainer:
             m.skipped += int(skipped)
             m.lost_rows += int(lost_rows)
         if self._drawn > 0:
-            self._set_rays(self.rays, evaluated / self._drawn, progress)
+            before = self.rays
+            self._set_rays(before, evaluated / self._drawn, progress)
+            if self.replay.active and abs(self.rays - before) < STEADY * before:
+                self.rays = before
         self._counted.zero_()
         self.guard.skipped.zero_()
         self._drawn = 0

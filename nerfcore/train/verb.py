@@ -54,8 +54,9 @@ from .closed_picture import write_closed_picture
 from .inputs import data_inputs, training_inputs, training_length
 from .pose_refinement import write_poses
 from .prepare import make_trainer, plan_run
+from .results import Measured
 from .schedule import largest_batch
-from .trainer import Measured, Trainer
+from .trainer import Trainer
 from .voxel_init import save_features
 
 CLOSED_PICTURE = "closed.png"

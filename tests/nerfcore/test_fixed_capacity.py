@@ -291,7 +291,8 @@ def test_rays_are_shuffled_where_some_may_be_dropped(ball: Path) -> None:
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no NVIDIA GPU")
-def test_ordinary_steps_on_a_gpu_never_make_the_host_wait(ball: Path) -> None:
+def test_ordinary_steps_on_a_gpu_never_make_the_host_wait(ball: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FIELDWORK_GRAPHS", "off")  # recording a step waits before it begins
     device = torch.device("cuda")
     info, scene = plan_run(ball, "draft", config_of(), device)
     trainer = make_trainer(ball, info, scene, device, Reporter())

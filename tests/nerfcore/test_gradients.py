@@ -25,16 +25,16 @@ def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_scale_halves_after_an_overflow_and_grows_again() -> None:
     guard = GradientGuard(torch.float16, CPU)
     for _ in range(3):
-        guard.inspect([torch.ones(3), torch.tensor([1.0, math.inf])])
+        guard.finite = guard.inspected([torch.ones(3), torch.tensor([1.0, math.inf])])
         guard.update()
     assert float(guard.scale) == FIRST_SCALE / 8
     assert int(guard.skipped) == 3
     for _ in range(GROWTH_STEPS):
-        guard.inspect([torch.ones(3)])
+        guard.finite = guard.inspected([torch.ones(3)])
         guard.update()
     assert float(guard.scale) == FIRST_SCALE / 4
     other = GradientGuard(torch.bfloat16, CPU)
-    other.inspect([torch.tensor([math.nan])])
+    other.finite = other.inspected([torch.tensor([math.nan])])
     other.update()
     assert float(other.scale) == 1.0
 
@@ -48,7 +48,7 @@ def test_a_step_without_finite_gradients_changes_nothing(kernels: Kernels) -> No
     for value, moved in ((1.0, True), (math.nan, False), (math.inf, False), (1.0, True)):
         before = parameter.detach().clone()
         parameter.grad = torch.full((4,), value)
-        guard.inspect([parameter.grad])
+        guard.finite = guard.inspected([parameter.grad])
         guard.step(optimizer)
         assert bool((parameter != before).all()) == moved
         assert bool(torch.isfinite(parameter).all())
@@ -71,7 +71,7 @@ def test_small_gradients_survive_half_precision(ball: Path) -> None:
         trainer = trainer_of(ball, **weights, **{"field.precision": precision})
         for step in range(3):
             trainer.step(step / 3)
-        trainer._accumulate_gradients(trainer.draw(), 0.5)
+        trainer._take(trainer._learn(0.5))
         found[precision] = trainer.model.field.color_head.weights[0].grad.abs()
         of_grid[precision] = float(trainer.model.field.grid.gradient.abs().mean())
     assert int((found["float16"] > 0).sum()) > 0.9 * int((found["float32"] > 0).sum())
@@ -86,7 +86,7 @@ def test_gradients_of_cameras_are_those_of_the_loss_itself(ball: Path) -> None:
         for step in range(3):
             trainer.step(step / 300)
         assert trainer.poses is not None
-        parts = trainer._accumulate_gradients(trainer.poses.move(trainer.draw()), 0.5)
+        parts = trainer._learn(0.5, trainer.poses).shards
         sizes[precision] = [float(torch.cat(rays).abs().mean()) for rays in zip(*(p.rays for p in parts if p.rays))]
     assert len(sizes["float32"]) == 2  # of origins and directions
     assert sizes["float16"] == pytest.approx(sizes["float32"], rel=0.3)
@@ -109,29 +109,30 @@ def test_training_survives_a_gradient_that_is_not_finite_and_gives_up_when_they_
     trainer = trainer_of(ball)
     grid = trainer.model.field.grid
     assert grid is not None
-    real = trainer._accumulate_gradients
+    real = trainer._take
 
-    def broken(batch, progress):
-        shards = real(batch, progress)
+    def broken(learned):
+        real(learned)
         next(trainer.model.parameters()).grad[0, 0] = math.nan
-        trainer.guard.inspect([p.grad for p in trainer.model.parameters() if p.grad is not None])
+        trainer.guard.finite = trainer.guard.inspected(
+            [p.grad for p in trainer.model.parameters() if p.grad is not None]
+        )
         grid.gradient[:5, 1] = math.nan
         grid.touched[0] = 1
-        return shards
 
     trainer.step(0.1)
-    trainer._accumulate_gradients = broken
+    trainer._take = broken
     before = parameters(trainer)
     trainer.step(0.1)
     assert torch.equal(parameters(trainer), before)
     assert int(grid.lost) == 5
-    trainer._accumulate_gradients = real
+    trainer._take = real
     for _ in range(20):
         trainer.step(0.2)
     measured = trainer.take_measured()
     assert (measured.skipped, measured.lost_rows) == (1, 5)
     assert bool(torch.isfinite(parameters(trainer)).all())
     assert bool(torch.isfinite(grid.table).all())
-    trainer._accumulate_gradients = broken
+    trainer._take = broken
     with pytest.raises(TrainingError, match="not been finite"):
         many_steps(trainer)

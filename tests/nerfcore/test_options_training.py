@@ -91,7 +91,8 @@ def test_white_photos_are_learned_on_white(ball: Path, monkeypatch: pytest.Monke
             return composite_loss(part, rendered, background, *rest)
 
         monkeypatch.setattr(trainer_module, "composite_loss", spy)
-        trainer._accumulate_gradients(batch, 0.0)
+        trainer.draw = lambda _batch=batch: _batch
+        trainer._take(trainer._learn(0.0))
         prices[choice] = float(torch.cat(seen).mean())
     assert prices == {"white": 1.0, "black": 0.0}
 
@@ -205,7 +206,7 @@ def test_without_semantics_there_are_no_classes(ball: Path) -> None:
 def test_density_at_random_points_has_a_price(ball: Path) -> None:
     def price(**settings: str) -> float:
         trainer = trainer_of(ball, **{f"loss.{name}": value for name, value in settings.items()})
-        trainer._accumulate_gradients(trainer.draw(), 0.0)
+        trainer._take(trainer._learn(0.0))
         return float(trainer.measured.loss)
 
     free = price(sparsity_weight="0")

@@ -84,7 +84,7 @@ def test_only_seen_vertices_of_dense_levels_are_written(ball: Path, kind: str) -
     before = grid.table.clone()
 
     def learn() -> None:
-        trainer._accumulate_gradients(trainer.draw(), 0.1)
+        trainer._take(trainer._learn(0.1))
 
     network = initialise(trainer.model, trainer.store, learn, lambda: None)
     assert (network is None) == (kind == "rgb_stats")
@@ -107,7 +107,7 @@ def test_a_network_learns_features_that_lower_the_loss(ball: Path) -> None:
         trainer.step(0.1)
 
     def learn() -> None:
-        trainer._accumulate_gradients(trainer.draw(), 0.1)
+        trainer._take(trainer._learn(0.1))
 
     def loss() -> float:
         trainer.generator.manual_seed(5)
@@ -135,9 +135,7 @@ def test_a_stopped_initialisation_leaves_the_grid_as_it_was(ball: Path) -> None:
             raise Cancelled
 
     with pytest.raises(Cancelled):
-        initialise(
-            trainer.model, trainer.store, lambda: trainer._accumulate_gradients(trainer.draw(), 0.1) and None, check
-        )
+        initialise(trainer.model, trainer.store, lambda: trainer._take(trainer._learn(0.1)), check)
     assert torch.equal(grid.table, before)
 
 

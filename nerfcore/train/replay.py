@@ -4,8 +4,8 @@ What is recorded keeps the numbers that the host gave it and the memory that it 
 all of these stay the same: they make up its key. With another key steps run as usual until the key has come twice in a
 row, and then a recording is made.
 
-FIELDWORK_GRAPHS (auto, on, off): auto records where it can and goes on without where that fails; on: a failure is an
-error; off: every step runs as usual.
+FIELDWORK_GRAPHS (off, auto, on): off, unless something else is asked for: every step runs as usual; auto records where it
+can and goes on without where that fails; on: a failure is an error.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from ..errors import SettingError
 log = logging.getLogger("fieldwork")
 Result = TypeVar("Result")
 Result_co = TypeVar("Result_co", covariant=True)
-MODES = ("auto", "on", "off")
+MODES = ("off", "auto", "on")  # the first one where nothing is asked for: no GPU has compared the others yet
 
 
 class Recording(Protocol[Result_co]):
@@ -75,9 +75,9 @@ def asked_mode() -> str:
     Raises:
         SettingError: it is none of the modes.
     """
-    mode = os.environ.get("FIELDWORK_GRAPHS", "") or "auto"
+    mode = os.environ.get("FIELDWORK_GRAPHS", "") or MODES[0]
     if mode not in MODES:
-        raise SettingError(f"FIELDWORK_GRAPHS is “{mode}”.", "Set it to auto, on or off, or leave it out.")
+        raise SettingError(f"FIELDWORK_GRAPHS is “{mode}”.", "Set it to off, auto or on, or leave it out.")
     return mode
 
 

@@ -25,6 +25,7 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 from . import worker
 
 NODES_EVERY = 2.0
+BOARDS = 3  # attempts to make a board
 NAMESPACE = "fieldwork"
 
 
@@ -80,11 +81,7 @@ class Bridge:
 
     def run(self, address: str, must_exist: bool, wheel: str) -> None:
         joined = self.connect(address, must_exist, wheel)
-        here = ray.get_runtime_context().get_node_id()
-        self.board = Board.options(  # pyright: ignore[reportAttributeAccessIssue] - what ray.remote makes of it
-            scheduling_strategy=NodeAffinitySchedulingStrategy(here, soft=True)
-        ).remote()
-        ray.get(self.board.take.remote())
+        self.board = made_board(ray.get_runtime_context().get_node_id())
         self.say("ready", joined=joined, address=ray.get_runtime_context().gcs_address, nodes=nodes())
         threading.Thread(target=self._read, daemon=True).start()
         looked = time.monotonic()
@@ -148,6 +145,21 @@ class Bridge:
                     self.say("answer", id=task, answer={"state": "refused", "error": unusable(error)})
             except failures.RayError as error:
                 self.say("lost", id=task, reason=f"{type(error).__name__}: {str(error).splitlines()[0]}")
+
+
+def made_board(node: str) -> Any:
+    """A board on a node. Just after another campaign has ended, Ray may give it a process that ends with that one."""
+    for left in reversed(range(BOARDS)):
+        board = Board.options(  # pyright: ignore[reportAttributeAccessIssue] - what ray.remote makes of it
+            scheduling_strategy=NodeAffinitySchedulingStrategy(node, soft=True)
+        ).remote()
+        try:
+            ray.get(board.take.remote())
+            return board
+        except failures.RayActorError:
+            if not left:
+                raise
+    raise AssertionError
 
 
 def unpacked(wheel: Path, folder: Path) -> list[str]:

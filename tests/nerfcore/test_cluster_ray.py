@@ -249,7 +249,7 @@ def test_two_workers_are_faster_than_one(tmp_path, cluster):
     for workers in (2, 1):
         folder = tmp_path / str(workers)
         folder.mkdir()
-        path = write_list(folder, [f"c{i:02d}" for i in range(24)], seconds=0.4)
+        path = write_list(folder, [f"c{i:02d}" for i in range(24)], seconds=0.8)
         if workers == 1:
             cluster.nodes.pop().kill()
             wait_for_workers(cluster, 1)

@@ -14,7 +14,7 @@ def look_at(position: np.ndarray, target: np.ndarray) -> np.ndarray:
     back = np.asarray(position, float) - target
     back /= np.linalg.norm(back)
     right = np.cross([0.0, 0.0, 1.0], back)
-    if np.linalg.norm(right) < 1e-6:  # straight up or down: any level axis will do
+    if np.linalg.norm(right) < 1e-12:  # straight up or down: any level axis will do
         right = np.array([1.0, 0.0, 0.0])
     right /= np.linalg.norm(right)
     matrix = np.eye(4)

@@ -22,7 +22,7 @@ from fieldwork.nerfcore.project.fingerprints import write_made
 from fieldwork.nerfcore.project.runs import RENDER_RECORD
 from fieldwork.nerfcore.project.schema import Project, step
 from fieldwork.nerfcore.project.store import load_project, save_project
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
@@ -184,6 +184,8 @@ def test_index_png_keeps_every_value(tmp_path):
 
 
 @given(position=st.tuples(*[st.floats(-5, 5)] * 3), target=st.tuples(*[st.floats(-1, 1)] * 3))
+@example(position=(0.0, 0.0, 0.0), target=(1.192092896e-07, 0.0, 1.0))  # nearly straight up
+@example(position=(0.0, 0.0, 3.0), target=(0.0, 0.0, 0.0))
 def test_look_at_is_a_level_rotation_towards_the_target(position, target):
     position, target = np.array(position), np.array(target)
     if np.linalg.norm(position - target) < 1e-3:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from bpy.types import Context
 
+from ..operators.export import OF_THE_MESH
 from . import states
 from .base import StepPanel, columns, open_folder
 
-SPLIT = {"blend", "glb", "usd", "obj", "ply", "stl"}  # formats that hold objects
+SPLIT = {"blend", *OF_THE_MESH} - {"masks"}  # formats that hold objects
 
 
 class FIELDWORK_PT_export(StepPanel):

@@ -147,19 +147,18 @@ class Bridge:
                 self.say("lost", id=task, reason=f"{type(error).__name__}: {str(error).splitlines()[0]}")
 
 
-def made_board(node: str) -> Any:
+def made_board(node: str, attempts: int = BOARDS) -> Any:
     """A board on a node. Just after another campaign has ended, Ray may give it a process that ends with that one."""
-    for left in reversed(range(BOARDS)):
-        board = Board.options(  # pyright: ignore[reportAttributeAccessIssue] - what ray.remote makes of it
-            scheduling_strategy=NodeAffinitySchedulingStrategy(node, soft=True)
-        ).remote()
-        try:
-            ray.get(board.take.remote())
-            return board
-        except failures.RayActorError:
-            if not left:
-                raise
-    raise AssertionError
+    board = Board.options(  # pyright: ignore[reportAttributeAccessIssue] - what ray.remote makes of it
+        scheduling_strategy=NodeAffinitySchedulingStrategy(node, soft=True)
+    ).remote()
+    try:
+        ray.get(board.take.remote())
+    except failures.RayActorError:
+        if attempts <= 1:
+            raise
+        return made_board(node, attempts - 1)
+    return board
 
 
 def unpacked(wheel: Path, folder: Path) -> list[str]:

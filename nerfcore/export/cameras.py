@@ -91,7 +91,7 @@ def write_colmap(out: Path, scene: Scene) -> list[Path]:
         InputError: COLMAP has no such lens. DiskError: a file cannot be written.
     """
     cameras = list(dict.fromkeys(view.camera for view in scene.views))
-    root = photo_folder(scene.views)
+    root = _photo_folder(scene.views)
     model = out / "sparse" / "0"
     texts = {
         "cameras.txt": _camera_rows(cameras),
@@ -104,7 +104,7 @@ def write_colmap(out: Path, scene: Scene) -> list[Path]:
     return [model / name for name in texts]
 
 
-def photo_folder(views: Sequence[View]) -> Path:
+def _photo_folder(views: Sequence[View]) -> Path:
     """The folder below which all photos lie."""
     return Path(os.path.commonpath([view.image.parent for view in views]))
 

@@ -7,6 +7,8 @@ from torch import nn
 
 from ..config import FieldConfig
 from ..kernels import cells
+from ..kernels.device import on_host
+from ..kernels.inputs_host import blend_weights
 
 RESOLUTION = 64  # cells along a side of the grid of evidence; not tuned
 SHOWN = 1e-4  # evidence of cells that photos show
@@ -33,6 +35,8 @@ class BlendWeight(nn.Module):
         if self.warming_up:
             return torch.ones(len(points), device=points.device)
         with torch.no_grad():
+            if on_host(points.device):
+                return blend_weights(self.evidence, RESOLUTION, points, self.floor, self.rate)
             evidence = cells.trilinear(self.evidence, RESOLUTION, points)
             return 1 - (1 - self.floor) * torch.exp(-self.rate * evidence)
 

@@ -4,6 +4,16 @@ from __future__ import annotations
 
 import torch
 
+from ..kernels.device import on_host
+from ..kernels.inputs_host import encode_frequencies
+
+
+def encoded_positions(points: torch.Tensor, octaves: int, dtype: torch.dtype) -> torch.Tensor:
+    """`frequency_encoding` in another dtype."""
+    if on_host(points.device) and dtype in (torch.float32, torch.bfloat16) and not points.requires_grad:
+        return encode_frequencies(points, octaves, dtype)
+    return frequency_encoding(points, octaves).to(dtype)
+
 
 def frequency_encoding(points: torch.Tensor, octaves: int) -> torch.Tensor:
     """Positions (N, 3) in [0, 1]³ → (N, 3 + 6 · octaves): x, then sin and cos of 2^k π x.

@@ -9,9 +9,12 @@ from torch import nn
 
 from ..config import MOST_VERTICES, FieldConfig
 from ..geometry.contraction import thinning
+from ..kernels import network_host
+from ..kernels.device import on_host
 from ..kernels.encode import FEATURES
+from ..kernels.field_host import HostField
 from .blend import BlendWeight
-from .encoding import frequency_encoding
+from .encoding import encoded_positions
 from .grid import VertexGrid, level_layout
 from .mlp import MLP, compute_dtype
 from .slices import read_in_slices
@@ -117,6 +120,8 @@ class HybridField(nn.Module):
         """
         if torch.is_grad_enabled():
             return Geometry(*self._geometry(points, precomputed))
+        if precomputed is None and self._on_host(points.device):
+            return self._read_on_host(points)
         given = (points,) if precomputed is None else (points, precomputed)
         return Geometry(*read_in_slices(self._geometry, *given))  # type: ignore[arg-type]
 
@@ -126,7 +131,7 @@ class HybridField(nn.Module):
         explicit = self.grid(points, self.gains, precomputed) if self.grid is not None else None
         implicit = None
         if self.implicit is not None:
-            implicit = self.implicit(frequency_encoding(points, self.config.octaves).to(self.dtype), self.dtype)
+            implicit = self.implicit(encoded_positions(points, self.config.octaves, self.dtype), self.dtype)
         if explicit is None:
             hidden = implicit
         elif implicit is None:
@@ -140,10 +145,35 @@ class HybridField(nn.Module):
             else:
                 hidden = torch.lerp(implicit.to(explicit.dtype), explicit, w)
         out = self.density_head(hidden, self.dtype)
+        return self._density_of(out, points), out, implicit, explicit
+
+    def _density_of(self, out: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
+        """Density (N,) from what the density head says (N, G) of points (N, 3)."""
         density = _TruncatedExp.apply(out[:, 0].float() + self.config.density_shift)
-        if self.thinning:
-            density = density * thinning(points)
-        return density, out, implicit, explicit
+        return density * thinning(points) if self.thinning else density
+
+    def _on_host(self, device: torch.device) -> bool:
+        """Whether the CPU's own kernel can read this field."""
+        networks = [part for part in (self.implicit, self.density_head) if part is not None]
+        narrow = all(network_host.supported(tuple(part.weights)) for part in networks)
+        return on_host(device) and self.dtype == torch.float32 and narrow
+
+    def _read_on_host(self, points: torch.Tensor) -> Geometry:
+        blend = None if self.blend is None or self.blend.warming_up else self.blend
+        field = HostField.of(
+            None if self.grid is None else self.grid.table,
+            [] if self.grid is None else self.grid.levels,
+            self.gains,
+            None if blend is None else blend.evidence,
+            1.0 if blend is None else blend.floor,
+            0.0 if blend is None else blend.rate,
+            () if self.implicit is None else tuple(self.implicit.weights),
+            self.config.octaves,
+            self.concat,
+            tuple(self.density_head.weights),
+        )
+        out, explicit, implicit = field.read(points, True, self.semantic_head is not None)
+        return Geometry(self._density_of(out, points), out, implicit, explicit)
 
     def density(self, points: torch.Tensor) -> torch.Tensor:
         """Density (N,) alone."""

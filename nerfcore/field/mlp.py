@@ -14,7 +14,8 @@ from typing import Literal
 import torch
 from torch import nn
 
-from ..kernels.device import native_half
+from ..kernels import network_host
+from ..kernels.device import native_half, on_host
 from ..kernels.runtime import run_parallel
 from .slices import MOST_ROWS, padded, row_slices
 
@@ -23,8 +24,11 @@ Precision = Literal["auto", "float32", "bfloat16", "float16"]
 
 def compute_dtype(precision: Precision, device: torch.device) -> torch.dtype:
     """The dtype of matrix products: "auto" takes what the device multiplies natively, bfloat16 before float16 (whose
-    losses are scaled in training, see `train.loss_scale`) before float32."""
-    return getattr(torch, precision) if precision != "auto" else native_half(device) or torch.float32
+    losses are scaled in training, see `train.loss_scale`) before float32; and float32 where the CPU's own kernels serve,
+    which are as fast in it as the matrix library is in bfloat16."""
+    if precision != "auto":
+        return getattr(torch, precision)
+    return torch.float32 if on_host(device) else native_half(device) or torch.float32
 
 
 class _Chain(torch.autograd.Function):
@@ -79,6 +83,25 @@ class _Chain(torch.autograd.Function):
         return None if grad_input is None else grad_input[: shape[0]].to(dtype), None, *grad_weights
 
 
+class _HostChain(torch.autograd.Function):
+    """The same in float32 by the CPU's own kernels."""
+
+    @staticmethod
+    def forward(ctx, x: torch.Tensor, *weights: torch.Tensor) -> torch.Tensor:
+        out, kept = network_host.forward(x, weights, keep=True)
+        ctx.save_for_backward(x, *([] if kept is None else [kept]), *weights)
+        ctx.layers = len(weights)
+        return out
+
+    @staticmethod
+    def backward(ctx, *grads):
+        x, *rest = ctx.saved_tensors
+        weights = rest[-ctx.layers :]
+        kept = rest[0] if len(rest) > ctx.layers else None
+        found = network_host.backward(grads[0].float(), x, kept, weights, ctx.needs_input_grad[0])
+        return found[0], *found[1]
+
+
 class MLP(nn.Module):
     """ReLU network without biases: (N, inputs) → (N, outputs) in the compute dtype.
 
@@ -95,6 +118,10 @@ class MLP(nn.Module):
             self.weights.append(nn.Parameter(torch.empty(fan_out, fan_in).uniform_(-bound, bound)))
 
     def forward(self, x: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
+        if dtype == torch.float32 and on_host(x.device) and network_host.supported(tuple(self.weights)):
+            if torch.is_grad_enabled():
+                return _HostChain.apply(x.float(), *self.weights)  # type: ignore[no-any-return]
+            return network_host.forward(x.float(), tuple(self.weights))[0]
         if torch.is_grad_enabled() or (x.device.type == "cpu" and len(x) > MOST_ROWS):
             return _Chain.apply(x, dtype, *self.weights)  # type: ignore[no-any-return]
         x = x.to(dtype)

@@ -27,10 +27,12 @@ def row_slices(rows: int, device: torch.device) -> list[slice]:
 
 
 def padded(x: torch.Tensor, rows: int, dtype: torch.dtype) -> torch.Tensor:
-    """`x` with zero rows after its own; what lies column by column (encoded positions) stays so."""
-    if len(x) == rows:
+    """`x` with zero rows after its own; what lies column by column (encoded positions) stays so, `rows` from column to
+    column: the matrix library compiles a kernel for every new distance as well."""
+    by_columns = x.dim() == 2 and x.stride(0) == 1 and x.shape[1] > 1
+    if len(x) == rows and (not by_columns or x.stride(1) == rows or x.device.type != "cpu"):
         return x.to(dtype)
-    if x.dim() == 2 and x.stride(0) == 1 and x.shape[1] > 1:
+    if by_columns:
         out = torch.empty(x.shape[1], rows, dtype=dtype, device=x.device).t()
     else:
         out = torch.empty(rows, *x.shape[1:], dtype=dtype, device=x.device)

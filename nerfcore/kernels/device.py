@@ -150,6 +150,11 @@ def choose_device() -> torch.device:
     return torch.device("cuda", int(number)) if number else torch.device("cuda")
 
 
+def on_host(device: torch.device) -> bool:
+    """Whether kernels written for CPUs serve a device (`*_host.py`), instead of those for every device."""
+    return device.type == "cpu" and backend_of(device).warp
+
+
 def use_device() -> torch.device:
     """`choose_device`, with torch set up for it: as many threads as the engine may use, memory that is used again, and
     on the device at hand."""

@@ -14,7 +14,7 @@ import torch
 import warp as wp
 
 from . import encode_host, encode_torch
-from .device import backend_of
+from .device import backend_of, on_host
 from .encode_torch import BLOCK, FEATURES
 from .runtime import array, init, launch, load, run_parallel, small_tensor
 
@@ -181,11 +181,6 @@ def adam_touched(
             square[row] = v
             table[row] = value
             grad[row] = feature()
-
-
-def on_host(device: torch.device) -> bool:
-    """Whether a device is served by the kernels of `encode_host.py`."""
-    return device.type == "cpu"
 
 
 def forward(

@@ -13,7 +13,7 @@ from .encode_torch import BLOCK, FEATURES
 
 feature = wp.types.vector(length=FEATURES, dtype=wp.float32)
 
-_TYPES = """
+FEATURE = """
     typedef float Feature __attribute__((vector_size(16), aligned(4)));
 """
 
@@ -46,11 +46,11 @@ _CELL = """
 """
 
 
-@wp.func_native(
-    _TYPES
+# The features of a point, level by level.
+ENCODE = (
+    FEATURE
     + """
-    const float* point = (const float*)points.data + 3 * (size_t)i;
-    Feature* encoded = (Feature*)out.data + (size_t)i * count;
+    auto encode_point = [&](const float* point, Feature* encoded) {
     for (int level = 0; level < count; ++level) {
         const float gain = ((const float*)gains.data)[level];
         if (gain == 0.0f) {
@@ -68,7 +68,13 @@ _CELL = """
         const Feature v01 = rows[a01] * gx + rows[b01] * fx, v11 = rows[a11] * gx + rows[b11] * fx;
         encoded[level] = (v00 * gy + v10 * fy) * ((1.0f - fz) * gain) + (v01 * gy + v11 * fy) * (fz * gain);
     }
+    };
 """
+)
+
+
+@wp.func_native(
+    ENCODE + "encode_point((const float*)points.data + 3 * (size_t)i, (Feature*)out.data + (size_t)i * count);"
 )
 def _encode(
     table: wp.array(dtype=feature),
@@ -82,7 +88,7 @@ def _encode(
 
 
 @wp.func_native(
-    _TYPES
+    FEATURE
     + """
     const float gain = ((const float*)gains.data)[level];
     if (gain == 0.0f) return;
@@ -120,7 +126,7 @@ def _add_gradient(
 
 
 @wp.func_native(
-    _TYPES
+    FEATURE
     + """
     Feature* values = (Feature*)table.data, *grads = (Feature*)grad.data;
     Feature* means = (Feature*)mean.data, *squares = (Feature*)square.data;

@@ -11,14 +11,16 @@ from dataclasses import dataclass
 import torch
 import warp as wp
 
-from . import march_torch
-from .device import backend_of
+from . import march_host, march_torch
+from .device import backend_of, on_host
+from .march_host import LANES, CoarseArrays
 from .packed_info import PackedInfo
 from .pdf_sampling import MarchedRays, advanced, ray_of, started
 from .runtime import array, init, launch
 from .traversal import (
     _DEFAULT,
     BEFORE_CUBE,
+    BLOCK,
     EARLY_STOP,
     MAX_BINS,
     GridArrays,
@@ -38,16 +40,6 @@ from .traversal import (
 )
 
 FEWEST_SAMPLES = 4  # samples on a ray whose number of samples follows that of its occupied bins; not tuned
-
-
-@wp.struct
-class CoarseArrays:
-    """Where the results of the coarse march are written, see `coarse_march`."""
-
-    total_weight: wp.array(dtype=float)
-    t_first: wp.array(dtype=float)
-    t_last: wp.array(dtype=float)
-    bin_counts: wp.array(dtype=int)
 
 
 @wp.kernel(module="fieldwork_march")
@@ -79,7 +71,10 @@ def march_weight(
         p = o + d * t
         length = bin_length(p, m)
         u = grid_position(p, m.contracted)
-        cell = grid.cells[cell_index(u, m.n)]
+        skip = int(grid.skip_distance[cell_index(u, m.n / BLOCK)])
+        cell = wp.vec2()
+        if skip == 0:  # the grid's cells are in no cache, their blocks are
+            cell = grid.cells[cell_index(u, m.n)]
         if cell[0] > 0.0:
             bin_transmittance = wp.exp(-cell[0] * length)
             weight += bin_weight(cell, transmittance, bin_transmittance, m)
@@ -93,7 +88,7 @@ def march_weight(
                     break
             t += length
         else:
-            t += skip_length(u, d, inverse, length, m, grid.skip_distance)
+            t += skip_length(u, d, inverse, length, m, skip)
     out.total_weight[r] = weight
     out.t_first[r] = front
     out.t_last[r] = back
@@ -176,7 +171,10 @@ def coarse_march(
     out.total_weight, out.bin_counts = array(total_weight), array(bin_counts)
     out.t_first, out.t_last = array(t_first), array(t_last)
     inputs = [array(origins, wp.vec3), array(directions, wp.vec3), array(jitter), grid_arrays(cells, skip_distance)]
-    launch(march_weight, rays, [*inputs, march_params(settings), out], device)
+    if on_host(device):
+        launch(march_host.march_weight, -(-rays // LANES), [*inputs, march_params(settings), out, rays], device)
+    else:
+        launch(march_weight, rays, [*inputs, march_params(settings), out], device)
     return total_weight, t_first, t_last, bin_counts
 
 

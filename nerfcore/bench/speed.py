@@ -104,7 +104,8 @@ def _frame(trained: Trained, project: Path, report: Reporter) -> dict[str, Any]:
     evaluated = visible = 0
     for pixel in torch.arange(SIDE * SIDE, device=model.device).split(CPU_RAYS):
         rendered = model.render(*rays(torch.zeros_like(pixel), pixel), count, grid=model.render_grid())
-        evaluated, visible = evaluated + rendered.evaluated, visible + int(rendered.visible)
+        evaluated += int((rendered.evaluated_density >= 0).sum())
+        visible += int(rendered.visible)
     return {"seconds": min(times[1:]), "evaluated": evaluated, "visible": visible}
 
 

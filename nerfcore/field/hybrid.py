@@ -13,6 +13,7 @@ from ..kernels import network_host
 from ..kernels.device import on_host
 from ..kernels.encode import FEATURES
 from ..kernels.field_host import HostField
+from ..kernels.packed_info import PackedInfo
 from .blend import BlendWeight
 from .encoding import encoded_positions
 from .grid import VertexGrid, level_layout
@@ -120,7 +121,7 @@ class HybridField(nn.Module):
         """
         if torch.is_grad_enabled():
             return Geometry(*self._geometry(points, precomputed))
-        if precomputed is None and self._on_host(points.device):
+        if precomputed is None and self.on_host(points.device):
             return self._read_on_host(points)
         given = (points,) if precomputed is None else (points, precomputed)
         return Geometry(*read_in_slices(self._geometry, *given))  # type: ignore[arg-type]
@@ -152,15 +153,28 @@ class HybridField(nn.Module):
         density = _TruncatedExp.apply(out[:, 0].float() + self.config.density_shift)
         return density * thinning(points) if self.thinning else density
 
-    def _on_host(self, device: torch.device) -> bool:
+    def on_host(self, device: torch.device) -> bool:
         """Whether the CPU's own kernel can read this field."""
         networks = [part for part in (self.implicit, self.density_head) if part is not None]
         narrow = all(network_host.supported(tuple(part.weights)) for part in networks)
         return on_host(device) and self.dtype == torch.float32 and narrow
 
     def _read_on_host(self, points: torch.Tensor) -> Geometry:
+        out, explicit, implicit = self._host_field().read(points, True, self.semantic_head is not None)
+        return Geometry(self._density_of(out, points), out, implicit, explicit)
+
+    def weighted_on_host(
+        self, points: torch.Tensor, deltas: torch.Tensor, packed_info: PackedInfo, cull: float
+    ) -> tuple[Geometry, torch.Tensor]:
+        """Geometry and rendering weights (N,) of packed samples at points (N, 3) on the CPU, without gradients: features only
+        where the weight is above `cull`, nothing behind where a ray is opaque (density −1, weight 0)."""
+        read = self._host_field().render(points, deltas, packed_info, cull, self.semantic_head is not None)
+        density, weights, out, explicit, implicit = read
+        return Geometry(density, out, implicit, explicit), weights
+
+    def _host_field(self) -> HostField:
         blend = None if self.blend is None or self.blend.warming_up else self.blend
-        field = HostField.of(
+        return HostField.of(
             None if self.grid is None else self.grid.table,
             [] if self.grid is None else self.grid.levels,
             self.gains,
@@ -171,9 +185,9 @@ class HybridField(nn.Module):
             self.config.octaves,
             self.concat,
             tuple(self.density_head.weights),
+            self.config.density_shift,
+            self.thinning,
         )
-        out, explicit, implicit = field.read(points, True, self.semantic_head is not None)
-        return Geometry(self._density_of(out, points), out, implicit, explicit)
 
     def density(self, points: torch.Tensor) -> torch.Tensor:
         """Density (N,) alone."""

@@ -207,8 +207,12 @@ class Model(nn.Module):
         samples, points = self._sample(
             origins, directions, grid, samples_per_ray, jitter, shift, capacity if fixed else None
         )
-        with torch.set_grad_enabled(learning and not two_passes):
-            geometry, weights = self._weighted(points, samples, thin=thin)
+        if not learning and thin is None and isinstance(self.field, HybridField) and self.field.on_host(points.device):
+            cull = self.config.render.cull
+            geometry, weights = self.field.weighted_on_host(points, samples.deltas, samples.packed_info, cull)
+        else:
+            with torch.set_grad_enabled(learning and not two_passes):
+                geometry, weights = self._weighted(points, samples, thin=thin)
         evaluated_density = geometry.density.detach()
         indices, visible, visible_count = self._select_visible(samples, weights, fixed)
         if two_passes:

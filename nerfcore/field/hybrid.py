@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import nn
@@ -155,7 +156,8 @@ class HybridField(nn.Module):
 
     def on_host(self, device: torch.device) -> bool:
         """Whether the CPU's own kernel can read this field."""
-        networks = [part for part in (self.implicit, self.density_head) if part is not None]
+        heads = (self.implicit, self.density_head, self.color_head, self.semantic_head)
+        networks = [part for part in heads if part is not None]
         narrow = all(network_host.supported(tuple(part.weights)) for part in networks)
         return on_host(device) and self.dtype == torch.float32 and narrow
 
@@ -198,14 +200,15 @@ class HybridField(nn.Module):
         parts = [geometry.features, directions.to(self.dtype)]
         if self.config.appearance:
             if codes is None:
-                mean = (
-                    self.appearance.mean(0)
-                    if self.appearance is not None
-                    else self._device.new_zeros(self.config.appearance)
-                )
-                codes = mean.expand(len(directions), -1)
+                codes = self._mean_code().expand(len(directions), -1)
             parts.append(codes.to(self.dtype))
         return torch.sigmoid(self.color_head(torch.cat(parts, 1), self.dtype).float())
+
+    def _mean_code(self) -> torch.Tensor:
+        """The appearance code (A,) of pictures."""
+        if self.appearance is None:
+            return self._device.new_zeros(self.config.appearance)
+        return self.appearance.mean(0)
 
     def logits(self, geometry: Geometry) -> torch.Tensor:
         """Class logits (N, K). The viewing direction has no say; both branches are read as they are as well, for what
@@ -216,7 +219,32 @@ class HybridField(nn.Module):
 
     def class_probabilities(self, geometry: Geometry) -> torch.Tensor:
         """Probability of each class (N, K), from the logits."""
-        logits = self.logits(geometry)
+        return self._softmax(self.logits(geometry))
+
+    def shaded_on_host(
+        self,
+        geometry: Geometry,
+        chosen: torch.Tensor,
+        directions: torch.Tensor,
+        rays: torch.Tensor,
+        codes: torch.Tensor | None,
+        classes: Literal["probabilities", "logits"] | None,
+    ) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """Colour (M, 3) and classes (M, K) of the points `chosen` (M,), whose rays are `rays` (M,), on the CPU without
+        gradients; `directions` (R, 16) spherical harmonics and `codes` (R, A) of rays."""
+        parts = [(geometry.features, chosen), (directions, rays)]
+        if self.config.appearance:
+            shared = codes is None
+            parts.append((self._mean_code()[None], torch.zeros_like(rays)) if shared else (codes, rays))  # type: ignore[arg-type]
+        color = torch.sigmoid(network_host.forward_of_parts(parts, tuple(self.color_head.weights)))
+        if classes is None or self.semantic_head is None:
+            return color, None
+        branches = [(part, chosen) for part in (geometry.implicit, geometry.explicit) if part is not None]
+        known = [(geometry.features, chosen), *branches]
+        logits = network_host.forward_of_parts(known, tuple(self.semantic_head.weights))
+        return color, logits if classes == "logits" else self._softmax(logits)
+
+    def _softmax(self, logits: torch.Tensor) -> torch.Tensor:
         if self.classes >= SHORT_ROW or logits.device.type != "cpu":
             return torch.softmax(logits, 1)
         return torch.softmax(logits.t().contiguous(), 0).t().contiguous()

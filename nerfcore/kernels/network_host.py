@@ -103,6 +103,21 @@ _TAKE = """
 """
 
 
+@wp.struct
+class PartArrays:
+    """Rows side by side of up to three arrays: of each, which row (N,) int64 and how wide it is; 0 for one that is not there."""
+
+    first: wp.array(dtype=float)
+    first_rows: wp.array(dtype=wp.int64)
+    first_width: int
+    second: wp.array(dtype=float)
+    second_rows: wp.array(dtype=wp.int64)
+    second_width: int
+    third: wp.array(dtype=float)
+    third_rows: wp.array(dtype=wp.int64)
+    third_width: int
+
+
 @wp.func_native(
     BLOCKS
     + _TAKE
@@ -192,6 +207,63 @@ def _backward(
     grad_weights: wp.array(dtype=float),
     block: int,
 ): ...
+
+
+@wp.func_native(
+    BLOCKS
+    + """
+    const int* widths = (const int*)sizes.data;
+    const int left = count - block * ROWS, rows = left < ROWS ? left : ROWS;
+    const size_t first = (size_t)block * ROWS;
+    float even[ROWS * MOST], odd[ROWS * MOST];
+    const int inputs = padded(widths[0]);
+    if (rows < ROWS) __builtin_memset(even, 0, sizeof(even));
+    int begin = 0;
+    for (int part = 0; part < 3; ++part) {
+        const auto& rows_of = part == 0 ? parts.first : (part == 1 ? parts.second : parts.third);
+        const auto& index = part == 0 ? parts.first_rows : (part == 1 ? parts.second_rows : parts.third_rows);
+        const int width = part == 0 ? parts.first_width : (part == 1 ? parts.second_width : parts.third_width);
+        for (int r = 0; r < rows; ++r) {
+            const long long row = ((const long long*)index.data)[first + r];
+            __builtin_memcpy(even + r * inputs + begin, (const float*)rows_of.data + row * width, width * sizeof(float));
+        }
+        begin += width;
+    }
+    const float* matrix = (const float*)weights.data;
+    float *from = even, *to = odd;
+    for (int layer = 0; layer < layers; ++layer) {
+        const int stride = padded(widths[layer]), columns = padded(widths[layer + 1]);
+        multiply(from, stride, widths[layer], matrix, columns, to, layer + 1 < layers);
+        matrix += stride * columns;
+        float* next = from; from = to; to = next;
+    }
+    const int width = widths[layers], columns = padded(width);
+    float* result = (float*)out.data + first * width;
+    for (int r = 0; r < rows; ++r) __builtin_memcpy(result + (size_t)r * width, from + r * columns, width * sizeof(float));
+"""
+)
+def _joined(
+    parts: PartArrays,
+    weights: wp.array(dtype=float),
+    sizes: wp.array(dtype=int),
+    layers: int,
+    count: int,
+    out: wp.array(dtype=float),
+    block: int,
+): ...
+
+
+@wp.kernel(module="fieldwork_network_host")
+def chain_of_parts(
+    parts: PartArrays,
+    weights: wp.array(dtype=float),
+    sizes: wp.array(dtype=int),
+    layers: int,
+    count: int,
+    out: wp.array(dtype=float),
+    offset: int,
+):
+    _joined(parts, weights, sizes, layers, count, out, wp.tid() + offset)
 
 
 @wp.kernel(module="fieldwork_network_host")
@@ -316,3 +388,25 @@ def backward(
         found.append(sums[begin : begin + count].view(padded(outside), padded(inside))[:outside, :inside])
         begin += count
     return grad_input, found
+
+
+def forward_of_parts(
+    parts: Sequence[tuple[torch.Tensor, torch.Tensor]], matrices: Sequence[torch.Tensor]
+) -> torch.Tensor:
+    """What layers (out, in) make of rows put together of one to three arrays, (array (M, width) float32, which of its rows
+    (N,) int64) each: (N, out), without gradients."""
+    init()
+    sizes = sizes_of(matrices)
+    count = len(parts[0][1])
+    given = PartArrays()
+    for name, (values, rows) in zip(("first", "second", "third"), [*parts, *[parts[0]] * (3 - len(parts))]):
+        setattr(given, name, array(values.contiguous().view(-1)))
+        setattr(given, f"{name}_rows", array(rows))
+        setattr(given, f"{name}_width", values.shape[1])
+    for name in ("second", "third")[len(parts) - 1 :]:
+        setattr(given, f"{name}_width", 0)
+    out = torch.empty(count, sizes[-1])
+    numbers = torch.tensor(sizes, dtype=torch.int32)
+    inputs = [given, array(packed(matrices, True)), array(numbers), len(matrices), count, array(out.view(-1))]
+    launch(chain_of_parts, -(-count // ROWS), inputs, out.device)
+    return out

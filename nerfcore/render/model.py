@@ -306,10 +306,16 @@ class Model(nn.Module):
         # Per ray first: a ray's samples share direction and code.
         harmonics = spherical_harmonics(directions).to(self.field.dtype)
         ray_indices = packed_info.ray_indices.long()
+        if not torch.is_grad_enabled() and isinstance(self.field, HybridField) and self.field.on_host(self.device):
+            assert chosen is not None  # two passes are made for gradients only
+            classes = self.config.render.accumulate if semantics else None
+            return self.field.shaded_on_host(geometry, chosen, harmonics, ray_indices, codes, classes)
 
         def shade(rays: torch.Tensor, rows: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor | None]:
             part = geometry if rows is None else geometry[rows]
-            color = self.field.color(part, harmonics[rays], None if codes is None else codes[rays])
+            # Half the time of indexing with brackets, forward and backward.
+            shown = harmonics.index_select(0, rays), None if codes is None else codes.index_select(0, rays)
+            color = self.field.color(part, *shown)
             if not semantics or self.field.semantic_head is None:
                 return color, None
             summed = self.config.render.accumulate == "probabilities"

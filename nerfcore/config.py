@@ -100,7 +100,8 @@ class FieldConfig(Stage):
     appearance: int = Field(default=0, ge=0, le=256, description="length of the per-image appearance code; 0: none")
     density_shift: float = Field(default=-1.0, ge=-20, le=20, description="added to the raw density before exp")
     precision: Literal["auto", "float32", "bfloat16", "float16"] = Field(
-        default="auto", description="of matrix products"
+        default="auto",
+        description="of matrix products; auto: single on a CPU, on a GPU the half precision that it multiplies",
     )
 
 

@@ -193,6 +193,8 @@ class HybridField(nn.Module):
 
     def density(self, points: torch.Tensor) -> torch.Tensor:
         """Density (N,) alone."""
+        if not torch.is_grad_enabled() and self.on_host(points.device):
+            return self._density_of(self._host_field().read(points, False, False)[0], points)
         return self.geometry(points).density
 
     def color(self, geometry: Geometry, directions: torch.Tensor, codes: torch.Tensor | None = None) -> torch.Tensor:

@@ -164,6 +164,7 @@ class FIELDWORK_OT_bench(VerbOperator):
         description="Evidence: which budget",
         items=[
             ("quick", "Quick", "A quarter of an hour: shows that everything works"),
+            ("evening", "Evening", "Five minutes of a processor for each method"),
             ("cpu", "CPU", "A day on a quiet CPU"),
             ("gpu", "Graphics Card", "Hours on a graphics card"),
         ],

@@ -131,8 +131,9 @@ class BenchParams(Params):
         default=None, description="Markdown page written anew from the folder figures beside it, which gets this table"
     )
     tests: Path | None = Field(default=None, description="gpu: JUnit file of the kernels' tests")
-    profile: Literal["quick", "cpu", "gpu"] = Field(
-        default="quick", description="evidence: which budget, a quarter of an hour, a day on a CPU, or a GPU's"
+    profile: Literal["quick", "evening", "cpu", "gpu"] = Field(
+        default="quick",
+        description="evidence: which budget, a quarter of an hour, an evening, a day on a CPU, or a GPU's",
     )
     lpips: Path | None = Field(
         default=None, description="evidence: torchvision's weights of VGG-16 for LPIPS; default: not measured"

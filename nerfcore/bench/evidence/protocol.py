@@ -19,7 +19,12 @@ from ..scenes import scene_name
 
 FILE = Path(__file__).with_name("protocol.toml")
 EVALUATION_SECONDS = 6.0  # for the estimate, of methods that the profile says nothing of
-SECONDS_PER_RAY = {"quick": 0.004, "cpu": 0.003, "gpu": 2e-5}  # for the estimate of trials that are to see so many rays
+SECONDS_PER_RAY = {
+    "quick": 0.004,
+    "evening": 0.003,
+    "cpu": 0.003,
+    "gpu": 2e-5,
+}  # for the estimate of trials that are to see so many rays
 
 
 class Part(BaseModel):

@@ -13,7 +13,7 @@ import warp as wp
 
 from . import march_host, march_torch
 from .device import backend_of, on_host
-from .march_host import LANES, CoarseArrays
+from .march_host import LANES, RAYS, CoarseArrays, SampleArrays
 from .packed_info import PackedInfo
 from .pdf_sampling import MarchedRays, advanced, ray_of, started
 from .runtime import array, init, launch
@@ -93,17 +93,6 @@ def march_weight(
     out.t_first[r] = front
     out.t_last[r] = back
     out.bin_counts[r] = occupied
-
-
-@wp.struct
-class SampleArrays:
-    """Where samples are written, see `Samples`; starts (R,): where those of a ray begin."""
-
-    starts: wp.array(dtype=int)
-    points: wp.array(dtype=wp.vec3)
-    t: wp.array(dtype=float)
-    deltas: wp.array(dtype=float)
-    ray_indices: wp.array(dtype=int)
 
 
 @wp.kernel(module="fieldwork_march")
@@ -252,5 +241,8 @@ def sample(
     out.points, out.t, out.deltas = array(points, wp.vec3), array(t), array(deltas)
     marched = marched_rays(origins, directions, total_weight, t_first, counts)
     inputs = [marched, array(shift), grid_arrays(cells, skip_distance), march_params(settings), out]
-    launch(march_sample, rays, inputs, device)
+    if on_host(device):
+        launch(march_host.march_sample, -(-rays // RAYS), inputs, device)
+    else:
+        launch(march_sample, rays, inputs, device)
     return Samples(points, t, deltas, packed_info, t_first, t_last)

@@ -14,6 +14,7 @@ from .unary import class_probabilities
 # See experiments.md, “Labels from a few strokes”.
 CERTAINTY = 3.0  # exponent that makes confidence the share that is right, where marks cannot tell
 SCALE, POWER = 4.7, 4 / 3  # exponent by what is found for the classifier: SCALE · τ^POWER
+STRENGTH = 0.003  # γ of the prior, of the median of what edges conduct, where marks cannot tell
 TAUS = np.linspace(0.05, 1.5, 30)
 LEAST, MOST = 0.3, 4.0  # exponents
 
@@ -21,10 +22,12 @@ LEAST, MOST = 0.3, 4.0  # exponents
 @dataclass(frozen=True)
 class Certainty:
     """How far marks can be trusted on other photos: exponent for `calibrated`; right: share of the marks of each photo,
-    each mark counting the same, that the marks on the others guess; None where no class is marked on two photos."""
+    each mark counting the same, that the marks on the others guess; None where no class is marked on two photos; strength:
+    γ of what surfels look like, against what lies around them."""
 
     exponent: float
     right: float | None
+    strength: float = STRENGTH
 
 
 def certainty(features: torch.Tensor, seeds: Seeds, classes: int, check: Callable[[], None]) -> Certainty:

@@ -85,3 +85,10 @@ def membership(cell: np.ndarray, count: int) -> csr_matrix:
     """Matrix (N, C) float32 that says which cell each surfel is in (N,)."""
     rows = np.arange(len(cell))
     return csr_matrix((np.ones(len(cell), np.float32), (rows, cell)), (len(cell), count))
+
+
+def held_groups(group: np.ndarray, seeds: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which groups, (N,) that of each node, have known nodes (S,), ascending, and the mean of their probabilities (S, C)."""
+    found, number, amount = np.unique(group[seeds], return_inverse=True, return_counts=True)
+    mean = np.stack([np.bincount(number, column, len(found)) for column in values.T], 1)
+    return found, (mean / amount[:, None]).astype(np.float32)

@@ -15,8 +15,9 @@ from ..project.store import load_project
 from .carry import carried_classes
 from .journal import marks_at, read_marks, shown_revision
 from .lookup import Labelling
+from .part_labels import by_parts
 from .preparation import Preparation, ensured
-from .propagation import by_parts, propagated, trusted
+from .propagation import propagated, trusted
 from .revisions import load, made_of, path_of, save, save_first
 from .seeds import UNMARKED, Seeds, seeds_of
 

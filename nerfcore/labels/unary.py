@@ -14,6 +14,8 @@ ROWS = 16384  # at once
 WAVES = 512
 BANDWIDTH = 0.4  # deviation of the waves' frequencies
 DECAY = 1e-5
+KNOWN_LOOK = 2.75  # distance to the nearest marked surfel, in feature columns, at which prior and void count the same
+SHARPNESS = 4
 SAMPLES = 48  # marked surfels of each mark that distances are taken to
 
 
@@ -98,6 +100,11 @@ def distance_to_samples(
         check()
         found.append(torch.cdist(rows, samples).amin(1))
     return torch.cat(found).numpy()
+
+
+def familiarity(distance: np.ndarray) -> np.ndarray:
+    """How much (N,) in [0, 1] something looks like any that is marked, by its distance (N,) to the nearest."""
+    return 0.5 ** ((distance / KNOWN_LOOK) ** SHARPNESS)
 
 
 def sampled(mark: torch.Tensor) -> torch.Tensor:

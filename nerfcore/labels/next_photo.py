@@ -17,7 +17,7 @@ from .preparation import Preparation, ensured
 from .revisions import computed
 
 BLANK_BONUS = 0.5  # of surfels that no class explains: what is there may be a class without marks; not tuned
-SAMPLES, SHOWN = 4000, 200  # surfels of the scene that are compared, and of each photo
+SAMPLES, SHOWN = 4000, 800  # surfels of the scene that are compared, and of each photo
 
 
 def next_photo(params: LabelNextParams, report: Reporter) -> dict[str, Any]:

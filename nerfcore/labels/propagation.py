@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -58,7 +57,7 @@ def propagated(
 def trusted(ready: Preparation, seeds: Seeds, classes: int, check: Callable[[], None] = lambda: None) -> Certainty:
     """How far the marks of a scene can be trusted on other photos, and how far looks are."""
     strength = best_strength(ready, seeds, classes, check)
-    return replace(certainty(ready.columns(seeds.surfel), seeds, classes, check), strength=strength)
+    return certainty(ready.columns(seeds.surfel), seeds, classes, check, strength)
 
 
 def appearance(

@@ -102,8 +102,8 @@ def most_alike(
     """Which surfel (M,) each point (M, 3) of colour lab (M, 3) is nearest to in place and colour, of the one (M,) given and
     `AROUND` of its neighbours (N, K). Surfels are at position (N, 3), infinite for none, and have colours (N, 3)."""
     candidates = np.concatenate([np.arange(len(neighbours))[:, None], neighbours[:, :AROUND]], 1)
-    apart = np.linalg.norm(position[neighbours[:, 0]] - position, axis=1)
-    spacing = max(float(np.median(apart[np.isfinite(apart)])), 1e-12)
+    there = np.isfinite(position[:, 0]) & np.isfinite(position[neighbours[:, 0], 0])
+    spacing = max(float(np.median(np.linalg.norm(position[neighbours[there, 0]] - position[there], axis=1))), 1e-12)
     own, centers = (
         torch.from_numpy(np.concatenate([place / spacing, color / UNLIKE], 1, dtype=np.float32))
         for place, color in ((points, lab), (position, surfel_lab))

@@ -13,7 +13,7 @@ from .unary import class_probabilities
 
 # See experiments.md, “Labels from a few strokes”.
 CERTAINTY = 3.0  # exponent that makes confidence the share that is right, where marks cannot tell
-SCALE, POWER = 4.7, 4 / 3  # exponent by what is found for the classifier: SCALE · τ^POWER
+SCALE = 4.2  # exponent by what is found for the classifier: SCALE · τ
 STRENGTH = 0.003  # γ of the prior, of the median of what edges conduct, where marks cannot tell
 TAUS = np.linspace(0.05, 1.5, 30)
 LEAST, MOST = 0.3, 4.0  # exponents
@@ -64,7 +64,7 @@ def certainty(
     weight = np.concatenate(share)
     tau = likeliest_power(probability, label, weight)
     correct = float((weight * (probability.argmax(1) == label)).sum() / weight.sum())
-    return Certainty(float(np.clip(SCALE * tau**POWER, LEAST, most)), correct, strength)
+    return Certainty(float(np.clip(SCALE * tau, LEAST, most)), correct, strength)
 
 
 def likeliest_power(probability: np.ndarray, label: np.ndarray, share: np.ndarray) -> float:

@@ -11,9 +11,10 @@ from .surfels import Surfels, cell_of
 from .walker import edge_matrix
 
 CELLS = 20_000  # of the coarse graph; not tuned
-# Weights of the columns in units of their deviation; see experiments.md, “Labels from a few strokes”.
-LAB, LAB_AROUND, CONTRAST, TEXTURE, NORMAL, HEIGHT, PLANARITY, FIELD, FIELD_AROUND = 0.5, 1, 0.5, 0.5, 1, 1, 0.3, 1.5, 1
-FILTERS, TOKENS = 1.5, 1.5
+# Weights of the columns in units of their deviation; see experiments.md, “Surfels that end where colours do”.
+LAB, LAB_AROUND, CONTRAST, TEXTURE = 1.0, 0.5, 0.5, 0.5
+NORMAL, HEIGHT, PLANARITY, FIELD, FIELD_AROUND = 0.85, 1.0, 0.3, 1.2, 1.0
+FILTERS, TOKENS = 1.05, 1.5
 EDGE_SCALE = 4.0  # b of an edge's weight exp(−Σ d²/(b·median d²))
 
 

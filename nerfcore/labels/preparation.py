@@ -70,7 +70,7 @@ CPU_PIXELS, GPU_PIXELS = 4e6, 1e8  # of all maps together
 CPU_SHARE = 0.5  # of a map's side that rays are rendered for on a CPU
 LEAST_SURFELS = 64
 PIXELS_EACH = 4  # at least, in the mean: what a surfel of one pixel looks like is noise
-VERSION = 5  # of what is made; another one makes it again
+VERSION = 6  # of what is made; another one makes it again
 MATRIX = ("data", "indices", "indptr")
 
 

@@ -14,7 +14,7 @@ ROWS = 16384  # at once
 WAVES = 512
 BANDWIDTH = 0.4  # deviation of the waves' frequencies
 DECAY = 1e-5
-KNOWN_LOOK = 2.75  # distance to the nearest marked surfel, in feature columns, at which prior and void count the same
+KNOWN_LOOK = 2.85  # distance to the nearest marked surfel, in feature columns, at which prior and void count the same
 SHARPNESS = 4
 SAMPLES = 48  # marked surfels of each mark that distances are taken to
 
@@ -47,9 +47,9 @@ class Waves:
     """Random Fourier features (Rahimi and Recht, "Random features for large-scale kernel machines", 2007): a linear
     function of them is one of a Gaussian kernel's. The same ones in every call."""
 
-    def __init__(self, inputs: int) -> None:
+    def __init__(self, inputs: int, bandwidth: float = BANDWIDTH) -> None:
         generator = torch.Generator().manual_seed(0)
-        self.frequency = torch.randn(inputs, WAVES, generator=generator) * BANDWIDTH
+        self.frequency = torch.randn(inputs, WAVES, generator=generator) * bandwidth
         self.phase = torch.rand(WAVES, generator=generator) * 2 * math.pi
 
     def __call__(self, features: torch.Tensor) -> torch.Tensor:

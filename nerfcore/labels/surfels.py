@@ -1,7 +1,8 @@
 """Surfels: small pieces of the surface that photos show, all of a scene in about 200 thousand, and what is known of each.
 
-A surfel is a cell of a regular grid in grid coordinates (contracted where the scene is) with all hits of rays in it. Cells
-and not meshes: what pixel shows which surfel is known without any search.
+A surfel begins as a cell of a regular grid in grid coordinates (contracted where the scene is) with all hits of rays in it.
+Hits then join the cell beside it that is more like them in colour, so that surfels, and with them all overlays, end where
+colours do. Cells and not meshes: what pixel shows which surfel is known without any search.
 """
 
 from __future__ import annotations

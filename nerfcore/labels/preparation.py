@@ -70,7 +70,8 @@ CPU_PIXELS, GPU_PIXELS = 4e6, 1e8  # of all maps together
 CPU_SHARE = 0.5  # of a map's side that rays are rendered for on a CPU
 LEAST_SURFELS = 64
 PIXELS_EACH = 4  # at least, in the mean: what a surfel of one pixel looks like is noise
-VERSION = 6  # of what is made; another one makes it again
+TELLING = 7  # pixels of a surfel, in the mean, from which on its colour says where it ends
+VERSION = 7  # of what is made; another one makes it again
 MATRIX = ("data", "indices", "indptr")
 
 
@@ -316,8 +317,10 @@ def surfel_arrays(
             "Train it longer (`fieldwork train`).",
         )
     report.progress(0.2)
-    around = nearest_neighbours(means(number, surfels, grid[clear]), AROUND, report.check)
-    number, surfels = by_colour(number, grid[clear], lab[clear], around, report.check)
+    telling = len(clear) >= TELLING * surfels
+    if telling:
+        around = nearest_neighbours(means(number, surfels, grid[clear]), AROUND, report.check)
+        number, surfels = by_colour(number, grid[clear], lab[clear], around, report.check)
     report.progress(0.3)
     position = means(number, surfels, grid[clear])
     normalised = means(number, surfels, places[clear])
@@ -348,9 +351,9 @@ def surfel_arrays(
     pixel_surfel[clear] = number
     torn = solid & edge
     pixel_surfel[torn] = nearest_surfel(position, grid[torn])
-    pixel_surfel[torn] = most_alike(
-        pixel_surfel[torn], grid[torn], lab[torn], position, color, neighbours, report.check
-    )
+    if telling:
+        beside = pixel_surfel[torn]
+        pixel_surfel[torn] = most_alike(beside, grid[torn], lab[torn], position, color, neighbours, report.check)
     parts = surface_parts(made, neighbours, report.check)
     matrices = {"edges": graph.edges, "coarse": graph.coarse, "part_edges": joined(graph.edges, parts[:, 0])}
     return {

@@ -161,6 +161,9 @@ def draw_state_of_marks(layout: UILayout, context: Context, folder: Path, settin
         box.operator("fieldwork.label_carry", text=t("They Are Right"), icon="CHECKMARK").confirm = True
     for conflict in facts.told.get("conflicts", [])[:MOST_CONFLICTS]:
         draw_wrapped(box, states.conflict_text(conflict, journal.marks(folder)), width, icon="ERROR")
+    for doubt in facts.told.get("doubtful", [])[:MOST_CONFLICTS]:
+        names = {item.id: item.name for item in settings.classes}
+        draw_wrapped(box, states.doubt_text(doubt, journal.marks(folder), names), width, icon="QUESTION")
 
 
 CLASSES = [FIELDWORK_UL_label_classes, FIELDWORK_PT_label, FIELDWORK_PT_label_photo]

@@ -140,8 +140,16 @@ def lines(known: Facts) -> list[str]:
 
 def conflict_text(conflict: dict[str, int], marks: list[dict[str, Any]]) -> str:
     """Two marks that contradict each other, with the photos on which they are."""
-    photos = [
-        marks[number - 1]["photo"] or t("the surface") if 0 < number <= len(marks) else "?"
-        for number in (conflict["revision"], conflict["other"])
-    ]
+    photos = [photo_of(conflict["revision"], marks), photo_of(conflict["other"], marks)]
     return t("Mark {} on {} contradicts mark {} on {}.", conflict["revision"], photos[0], conflict["other"], photos[1])
+
+
+def doubt_text(doubt: dict[str, int], marks: list[dict[str, Any]], names: dict[int, str]) -> str:
+    """A mark that looks like those of another class, by the names of the classes."""
+    name = names.get(doubt["looks_like"], "?")
+    return t("Mark {} on {} looks like {}: is it right?", doubt["revision"], photo_of(doubt["revision"], marks), name)
+
+
+def photo_of(revision: int, marks: list[dict[str, Any]]) -> str:
+    """The photo that a mark is on."""
+    return marks[revision - 1]["photo"] or t("the surface") if 0 < revision <= len(marks) else "?"

@@ -51,6 +51,7 @@ def parts_of_the_method(subject: Subject, seed: int, report: Reporter) -> dict[s
     them out, strokes that take whole parts of the surface, and what filters see in the photos. Each with those before it."""
     bare = copy.copy(subject.ready)
     bare.photo_features = bare.photo_features[:, :0]
+    bare.part_features = bare.part_features[:, : bare.features.shape[1]]
     plain = replace(subject, ready=bare)
     annotator, found = Annotator(plain, seed), {}
     seeds, class_ids = annotator.seeds()

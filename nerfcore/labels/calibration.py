@@ -13,21 +13,27 @@ from .unary import class_probabilities
 
 # See experiments.md, “Labels from a few strokes”.
 CERTAINTY = 3.0  # exponent that makes confidence the share that is right, where marks cannot tell
-SCALE, POWER = 4.7, 4 / 3  # exponent by what is found for the classifier: SCALE · τ^POWER
+SCALE = 4.2  # exponent by what is found for the classifier: SCALE · τ
+STRENGTH = 0.003  # γ of the prior, of the median of what edges conduct, where marks cannot tell
 TAUS = np.linspace(0.05, 1.5, 30)
 LEAST, MOST = 0.3, 4.0  # exponents
+DIFFUSE = 0.28  # power of the strength by which the most falls: the more looks count, the less a walker strays
 
 
 @dataclass(frozen=True)
 class Certainty:
     """How far marks can be trusted on other photos: exponent for `calibrated`; right: share of the marks of each photo,
-    each mark counting the same, that the marks on the others guess; None where no class is marked on two photos."""
+    each mark counting the same, that the marks on the others guess; None where no class is marked on two photos; strength:
+    γ of what surfels look like, against what lies around them."""
 
     exponent: float
     right: float | None
+    strength: float = STRENGTH
 
 
-def certainty(features: torch.Tensor, seeds: Seeds, classes: int, check: Callable[[], None]) -> Certainty:
+def certainty(
+    features: torch.Tensor, seeds: Seeds, classes: int, check: Callable[[], None], strength: float = STRENGTH
+) -> Certainty:
     """How a classifier taught by the marks on all photos but one does on that one.
 
     The power τ of its probabilities by which the marks left out are most likely (temperature scaling: Guo et al., "On
@@ -35,8 +41,9 @@ def certainty(features: torch.Tensor, seeds: Seeds, classes: int, check: Callabl
     are marked on one photo alone say nothing.
 
     Args:
-        features: (S, F) of the marked surfels.
+        features: (S, F) of the marked surfels. strength: of their looks in the random walker.
     """
+    most = MOST * (STRENGTH / strength) ** DIFFUSE
     found, right, share = [], [], []
     photos = np.unique(seeds.photo) if len(seeds.photo) else []
     for photo in photos if len(photos) > 1 else []:
@@ -52,12 +59,12 @@ def certainty(features: torch.Tensor, seeds: Seeds, classes: int, check: Callabl
         right.append(seeds.label[own])
         share.append(1 / amount[number])
     if not found:
-        return Certainty(CERTAINTY, None)
+        return Certainty(min(CERTAINTY, most), None, strength)
     probability, label = np.concatenate(found).clip(1e-6, 1), np.concatenate(right)
     weight = np.concatenate(share)
     tau = likeliest_power(probability, label, weight)
     correct = float((weight * (probability.argmax(1) == label)).sum() / weight.sum())
-    return Certainty(float(np.clip(SCALE * tau**POWER, LEAST, MOST)), correct)
+    return Certainty(float(np.clip(SCALE * tau, LEAST, most)), correct, strength)
 
 
 def likeliest_power(probability: np.ndarray, label: np.ndarray, share: np.ndarray) -> float:

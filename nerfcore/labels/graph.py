@@ -11,9 +11,10 @@ from .surfels import Surfels, cell_of
 from .walker import edge_matrix
 
 CELLS = 20_000  # of the coarse graph; not tuned
-# Weights of the columns in units of their deviation; see experiments.md, “Labels from a few strokes”.
-LAB, LAB_AROUND, CONTRAST, TEXTURE, NORMAL, HEIGHT, PLANARITY, FIELD, FIELD_AROUND = 0.5, 1, 0.5, 0.5, 1, 1, 0.3, 1.5, 1
-FILTERS, TOKENS = 1.5, 1.5
+# Weights of the columns in units of their deviation; see experiments.md, “Surfels that end where colours do”.
+LAB, LAB_AROUND, CONTRAST, TEXTURE = 1.0, 0.5, 0.5, 0.5
+NORMAL, HEIGHT, PLANARITY, FIELD, FIELD_AROUND = 0.85, 1.0, 0.3, 1.2, 1.0
+FILTERS, TOKENS = 1.05, 1.5
 EDGE_SCALE = 4.0  # b of an edge's weight exp(−Σ d²/(b·median d²))
 
 
@@ -85,3 +86,10 @@ def membership(cell: np.ndarray, count: int) -> csr_matrix:
     """Matrix (N, C) float32 that says which cell each surfel is in (N,)."""
     rows = np.arange(len(cell))
     return csr_matrix((np.ones(len(cell), np.float32), (rows, cell)), (len(cell), count))
+
+
+def held_groups(group: np.ndarray, seeds: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which groups, (N,) that of each node, have known nodes (S,), ascending, and the mean of their probabilities (S, C)."""
+    found, number, amount = np.unique(group[seeds], return_inverse=True, return_counts=True)
+    mean = np.stack([np.bincount(number, column, len(found)) for column in values.T], 1)
+    return found, (mean / amount[:, None]).astype(np.float32)

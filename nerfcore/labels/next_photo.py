@@ -14,11 +14,10 @@ from ..project.store import load_project
 from .journal import marks_at, read_marks, shown_revision
 from .lookup import Labelling
 from .preparation import Preparation, ensured
-from .propagation import appearance_columns
 from .revisions import computed
 
 BLANK_BONUS = 0.5  # of surfels that no class explains: what is there may be a class without marks; not tuned
-SAMPLES, SHOWN = 4000, 200  # surfels of the scene that are compared, and of each photo
+SAMPLES, SHOWN = 4000, 800  # surfels of the scene that are compared, and of each photo
 
 
 def next_photo(params: LabelNextParams, report: Reporter) -> dict[str, Any]:
@@ -95,12 +94,12 @@ def distances(ready: Preparation, names: list[str]) -> tuple[np.ndarray, np.ndar
     random = np.random.default_rng(0)
     total = len(ready.surfels)
     some = np.sort(random.choice(total, min(SAMPLES, total), replace=False))
-    columns = appearance_columns(ready, some)
+    columns = ready.columns(some)
     found = np.full((len(names), len(some)), np.nan, np.float32)
     for number, name in enumerate(names):
         seen = shown_by(ready, name)
         if len(seen):
-            own = appearance_columns(ready, np.sort(random.choice(seen, min(SHOWN, len(seen)), replace=False)))
+            own = ready.columns(np.sort(random.choice(seen, min(SHOWN, len(seen)), replace=False)))
             found[number] = torch.cdist(columns, own).amin(1).numpy()
     blank = np.isnan(found[:, :1])[:, 0]
     found[blank] = found[~blank].max(0) if not blank.all() else 0

@@ -88,12 +88,12 @@ def uplifted(count: int, pictures: Iterable[tuple[np.ndarray, np.ndarray]]) -> n
     total, amount = np.zeros((count, 0)), np.zeros(count)
     for surfel, values in pictures:
         seen = surfel >= 0
-        number = surfel[seen]
         if not total.shape[1]:
             total = np.zeros((count, values.shape[-1]))
+        shown, number, pixels = np.unique(surfel[seen], return_inverse=True, return_counts=True)
         for column, layer in enumerate(np.moveaxis(values, -1, 0)):
-            total[:, column] += np.bincount(number, layer[seen], count)
-        amount += np.bincount(number, minlength=count)
+            total[shown, column] += np.bincount(number, layer[seen], len(shown))
+        amount[shown] += pixels
     return (total / np.maximum(amount, 1)[:, None]).astype(np.float32)
 
 

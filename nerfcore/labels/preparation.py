@@ -50,7 +50,18 @@ from .models import load
 from .parts import surface_parts
 from .photo_features import identity, photo_features
 from .rays import Hits, hits_of
-from .surfels import Surfels, cell_of, field_features, means, nearest_neighbours, nearest_surfel, shape_at
+from .surfels import (
+    AROUND,
+    Surfels,
+    by_colour,
+    cell_of,
+    field_features,
+    means,
+    most_alike,
+    nearest_neighbours,
+    nearest_surfel,
+    shape_at,
+)
 from .tokens import TokenModel
 
 COUNT = 200_000
@@ -59,7 +70,8 @@ CPU_PIXELS, GPU_PIXELS = 4e6, 1e8  # of all maps together
 CPU_SHARE = 0.5  # of a map's side that rays are rendered for on a CPU
 LEAST_SURFELS = 64
 PIXELS_EACH = 4  # at least, in the mean: what a surfel of one pixel looks like is noise
-VERSION = 4  # of what is made; another one makes it again
+TELLING = 7  # pixels of a surfel, in the mean, from which on its colour says where it ends
+VERSION = 7  # of what is made; another one makes it again
 MATRIX = ("data", "indices", "indptr")
 
 
@@ -92,6 +104,10 @@ class Preparation:
         if photo is None:
             raise InputError(f"The photo “{name}” has no pose.", "Choose another photo, or run `fieldwork poses`.")
         return part_of(self.pixel_surfel, photo), part_of(self.pixel_edge, photo)
+
+    def columns(self, surfels: np.ndarray | slice) -> torch.Tensor:
+        """What some surfels look like (S, F + G): columns of the surface and of the photos."""
+        return torch.from_numpy(np.concatenate([self.features[surfels], self.photo_features[surfels]], 1))
 
     @cached_property
     def world(self) -> tuple[np.ndarray, np.ndarray]:
@@ -300,6 +316,11 @@ def surfel_arrays(
             f"The field shows no surface to label: the photos see {surfels} places of it.",
             "Train it longer (`fieldwork train`).",
         )
+    report.progress(0.2)
+    telling = len(clear) >= TELLING * surfels
+    if telling:
+        around = nearest_neighbours(means(number, surfels, grid[clear]), AROUND, report.check)
+        number, surfels = by_colour(number, grid[clear], lab[clear], around, report.check)
     report.progress(0.3)
     position = means(number, surfels, grid[clear])
     normalised = means(number, surfels, places[clear])
@@ -328,7 +349,11 @@ def surfel_arrays(
     report.progress(0.9)
     pixel_surfel = np.full(len(solid), -1, np.int32)
     pixel_surfel[clear] = number
-    pixel_surfel[solid & edge] = nearest_surfel(position, grid[solid & edge])
+    torn = solid & edge
+    pixel_surfel[torn] = nearest_surfel(position, grid[torn])
+    if telling:
+        beside = pixel_surfel[torn]
+        pixel_surfel[torn] = most_alike(beside, grid[torn], lab[torn], position, color, neighbours, report.check)
     parts = surface_parts(made, neighbours, report.check)
     matrices = {"edges": graph.edges, "coarse": graph.coarse, "part_edges": joined(graph.edges, parts[:, 0])}
     return {

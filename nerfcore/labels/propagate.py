@@ -13,10 +13,12 @@ from ..params import LabelPropagateParams
 from ..progress import Reporter
 from ..project.store import load_project
 from .carry import carried_classes
+from .doubts import doubtful
 from .journal import marks_at, read_marks, shown_revision
 from .lookup import Labelling
+from .part_labels import by_parts
 from .preparation import Preparation, ensured
-from .propagation import by_parts, propagated, trusted
+from .propagation import propagated, trusted
 from .revisions import load, made_of, path_of, save, save_first
 from .seeds import UNMARKED, Seeds, seeds_of
 
@@ -27,6 +29,7 @@ def propagate(params: LabelPropagateParams, report: Reporter) -> dict[str, Any]:
     Returns:
         {"revision", "marks", "surfels", "void": share of the surfels that no class explains, "carried": share that an earlier
         epoch says and nobody confirmed, "confidence": mean of the labelled ones, "classes": [{"id", "name", "surfels", "confidence"}], "conflicts": [{"revision", "other", "surfels"}],
+        "doubtful": [{"revision", "looks_like": class id}] of marks that look more like those of another class,
         "unused": revisions of marks that met no surface or whose class is gone, "self_check": share of the marks of each
         photo that those on the others guess, "parts_seconds": until the labels of whole
         parts were on disk, "seconds", "file"}
@@ -67,6 +70,9 @@ def propagate(params: LabelPropagateParams, report: Reporter) -> dict[str, Any]:
             for i in class_ids
         ],
         "conflicts": seeds.conflicts,
+        "doubtful": [
+            {"revision": mark, "looks_like": class_ids[index]} for mark, index in doubtful(ready, seeds, len(class_ids))
+        ],
         "unused": seeds.unused,
         "carried": 0.0 if labelling.carried is None else round(float(labelling.carried.mean()), 4),
         "self_check": None if trust.right is None else round(trust.right, 4),

@@ -100,6 +100,14 @@ def seeds_of(
     return Seeds(surfel, label[surfel], source[surfel], conflicts, unused, carried, photo)
 
 
+def one_hot(label: np.ndarray, classes: int) -> np.ndarray:
+    """Probabilities (S, classes) float32 of what is certain, by class index (S,) or VOID."""
+    found = np.zeros((len(label), classes), np.float32)
+    known = label != VOID
+    found[np.flatnonzero(known), label[known]] = 1
+    return found
+
+
 def marked_surfels(ready: Preparation, mark: Mark, size: tuple[int, int]) -> np.ndarray:
     """The surfels (S,) that a mark on a photo of this width and height covers, each once; with shape "part" all those of
     the parts that are covered (see parts.py)."""

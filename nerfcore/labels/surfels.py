@@ -1,7 +1,8 @@
 """Surfels: small pieces of the surface that photos show, all of a scene in about 200 thousand, and what is known of each.
 
-A surfel is a cell of a regular grid in grid coordinates (contracted where the scene is) with all hits of rays in it. Cells
-and not meshes: what pixel shows which surfel is known without any search.
+A surfel begins as a cell of a regular grid in grid coordinates (contracted where the scene is) with all hits of rays in it.
+Hits then join the cell beside it that is more like them in colour, so that surfels, and with them all overlays, end where
+colours do. Cells and not meshes: what pixel shows which surfel is known without any search.
 """
 
 from __future__ import annotations
@@ -19,6 +20,11 @@ NEIGHBOURS = 16
 COMPONENTS = 16  # principal components of the field's features
 FINEST = 1 << 20  # cells along a side: keys of three of them fit 63 bits
 POINTS = 8192  # at once
+# Of surfels that end where colours do:
+AROUND = 8  # cells that a point may join beside its own
+UNLIKE = 8.0  # difference of colours, in units of CIE Lab, that counts as much as the distance of two cells
+ROUNDS = 2
+CHUNK = 65536  # points at once
 
 
 @dataclass(frozen=True)
@@ -61,6 +67,55 @@ def cell_of(points: np.ndarray, wanted: int, check: Callable[[], None] = lambda:
         low -= max(1, low // 64)
     _, number = np.unique(_keys(points, low), return_inverse=True)
     return number.reshape(-1), int(number.max(initial=-1)) + 1
+
+
+def by_colour(
+    number: np.ndarray,
+    points: np.ndarray,
+    lab: np.ndarray,
+    neighbours: np.ndarray,
+    check: Callable[[], None] = lambda: None,
+) -> tuple[np.ndarray, int]:
+    """Number (M,) of the surfel of each point (M, 3), and how many there are, from the cell (M,) of each: points join the
+    one, of their cell and the cells around it (N, K), that is nearest in place and in colour lab (M, 3), so that surfels end
+    where colours do. Cells that lose all their points are gone.
+
+    Achanta et al., "SLIC superpixels compared to state-of-the-art superpixel methods", 2012, on a surface.
+    """
+    count = len(neighbours)
+    for _ in range(ROUNDS):
+        place, color = means(number, count, points), means(number, count, lab)
+        place[np.bincount(number, minlength=count) == 0] = np.inf
+        number = most_alike(number, points, lab, place, color, neighbours, check)
+    kept, renumbered = np.unique(number, return_inverse=True)
+    return renumbered.reshape(-1), len(kept)
+
+
+def most_alike(
+    nearest: np.ndarray,
+    points: np.ndarray,
+    lab: np.ndarray,
+    position: np.ndarray,
+    surfel_lab: np.ndarray,
+    neighbours: np.ndarray,
+    check: Callable[[], None] = lambda: None,
+) -> np.ndarray:
+    """Which surfel (M,) each point (M, 3) of colour lab (M, 3) is nearest to in place and colour, of the one (M,) given and
+    `AROUND` of its neighbours (N, K). Surfels are at position (N, 3), infinite for none, and have colours (N, 3)."""
+    candidates = np.concatenate([np.arange(len(neighbours))[:, None], neighbours[:, :AROUND]], 1)
+    there = np.isfinite(position[:, 0]) & np.isfinite(position[neighbours[:, 0], 0])
+    spacing = max(float(np.median(np.linalg.norm(position[neighbours[there, 0]] - position[there], axis=1))), 1e-12)
+    own, centers = (
+        torch.from_numpy(np.concatenate([place / spacing, color / UNLIKE], 1, dtype=np.float32))
+        for place, color in ((points, lab), (position, surfel_lab))
+    )
+    near, found = torch.from_numpy(candidates.astype(np.int32)), []
+    for rows, first in zip(own.split(CHUNK), torch.from_numpy(nearest.astype(np.int64)).split(CHUNK)):
+        check()
+        some = near[first]
+        distance = (centers[some] - rows[:, None]).square_().sum(2)
+        found.append(some.gather(1, distance.argmin(1, keepdim=True))[:, 0])
+    return torch.cat(found).numpy()
 
 
 def _keys(points: np.ndarray, side: int) -> np.ndarray:

@@ -14,6 +14,8 @@ ROWS = 16384  # at once
 WAVES = 512
 BANDWIDTH = 0.4  # deviation of the waves' frequencies
 DECAY = 1e-5
+KNOWN_LOOK = 2.85  # distance to the nearest marked surfel, in feature columns, at which prior and void count the same
+SHARPNESS = 4
 SAMPLES = 48  # marked surfels of each mark that distances are taken to
 
 
@@ -45,9 +47,9 @@ class Waves:
     """Random Fourier features (Rahimi and Recht, "Random features for large-scale kernel machines", 2007): a linear
     function of them is one of a Gaussian kernel's. The same ones in every call."""
 
-    def __init__(self, inputs: int) -> None:
+    def __init__(self, inputs: int, bandwidth: float = BANDWIDTH) -> None:
         generator = torch.Generator().manual_seed(0)
-        self.frequency = torch.randn(inputs, WAVES, generator=generator) * BANDWIDTH
+        self.frequency = torch.randn(inputs, WAVES, generator=generator) * bandwidth
         self.phase = torch.rand(WAVES, generator=generator) * 2 * math.pi
 
     def __call__(self, features: torch.Tensor) -> torch.Tensor:
@@ -98,6 +100,11 @@ def distance_to_samples(
         check()
         found.append(torch.cdist(rows, samples).amin(1))
     return torch.cat(found).numpy()
+
+
+def familiarity(distance: np.ndarray) -> np.ndarray:
+    """How much (N,) in [0, 1] something looks like any that is marked, by its distance (N,) to the nearest."""
+    return 0.5 ** ((distance / KNOWN_LOOK) ** SHARPNESS)
 
 
 def sampled(mark: torch.Tensor) -> torch.Tensor:

@@ -21,6 +21,7 @@ settings.project = project
 known = states.facts(bpy.context)
 seen = [states.lines(known), states.class_text(known, 1), states.class_line(known, "stone", 1)]
 seen.append(states.conflict_text(known.told["conflicts"][0], journal.marks(Path(project))))
+seen.append([states.doubt_text(doubt, journal.marks(Path(project)), {1: "stone"}) for doubt in known.told["doubtful"]])
 seen.append(list(states.label(bpy.context)))
 pending.mark(Path(project), {"photo": "a", "points": [[1, 1]], "width": 2, "class_id": 1})
 seen.append(states.class_text(states.facts(bpy.context), 1))
@@ -30,7 +31,7 @@ answer(seen)
 """,
         project=project_with_labels(tmp_path / "p"),
     )
-    lines, row, line, conflict, state, more, nothing = facts
+    lines, row, line, conflict, doubts, state, more, nothing = facts
     assert lines[0] == "Revision 2 of 2 is shown."
     assert "25% of the surface is void: nothing like it is marked." in lines
     assert "The last propagation took 1.5 s." in lines
@@ -40,6 +41,7 @@ answer(seen)
     assert row == "1 ✎  50%"
     assert line.startswith("stone: 1 mark, 50% of the surface, 7")
     assert conflict == "Mark 2 on a contradicts mark 1 on a."
+    assert doubts == ["Mark 2 on a looks like stone: is it right?", "Mark 9 on ? looks like ?: is it right?"]
     assert state == [True, "75% labelled"]
     assert more == "2 ✎  50%"
     assert nothing == ["Choose a class and draw over what belongs to it."]

@@ -61,6 +61,7 @@ def project_with_labels(folder: Path) -> Path:
         append_mark(folder, {**LINE, "class_id": class_id})
     probability = np.array([[0.9, 0.05], [0.2, 0.6], [0.1, 0.1], [0.55, 0.4]], np.float32)
     told = {"seconds": 1.5, "self_check": 0.75, "conflicts": [{"revision": 2, "other": 1, "surfels": 3}], "unused": [2]}
+    told["doubtful"] = [{"revision": 2, "looks_like": 1}, {"revision": 9, "looks_like": 7}]
     save(folder, "main", Labelling(2, probability, np.array([1, 2], np.int32), "made", told))
     return folder
 

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import torch
 from fieldwork.nerfcore.bench.label_trials import labelled
 from fieldwork.nerfcore.labels.next_photo import first_photos, next_photo, usefulness
 from fieldwork.nerfcore.labels.preparation import current
@@ -25,8 +26,7 @@ def scene(shows: dict[str, list[int]]) -> Any:
     maps = {name: np.flatnonzero(np.isin(kind, kinds))[None] for name, kinds in shows.items()}
     return SimpleNamespace(
         surfels=kind,
-        features=features,
-        photo_features=features[:, :0],
+        columns=lambda some: torch.from_numpy(features[some]),
         photos=[SimpleNamespace(name=name) for name in shows],
         map_of=lambda name: (maps[name].astype(np.int32), np.zeros(maps[name].shape, bool)),
     )

@@ -1,7 +1,7 @@
 """How a baked field must change to look as rays say: what each of its vertices has to do with the error of each ray.
 
 A ray is marched twice: for its colour, and then to hand its error to the vertices it met. The torch version is in
-`voxel_march_torch.py`.
+`voxel_march_torch.py`, what the CPU runs in `voxel_host.py`.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from functools import partial
 import torch
 import warp as wp
 
-from . import voxel_march_torch
-from .device import backend_of
+from . import voxel_host, voxel_march_torch
+from .device import backend_of, on_host
 from .runtime import array, init, launch, run_parallel, worker_count
 from .traversal import (
     EARLY_STOP,
@@ -26,9 +26,9 @@ from .traversal import (
     ray_interval,
     reciprocal,
 )
+from .voxel_arrays import VoxelArrays, voxel_arrays
 from .voxel_field import VoxelField
 from .voxel_march import (
-    VoxelArrays,
     block_of,
     cell_of,
     channel,
@@ -37,7 +37,6 @@ from .voxel_march import (
     leap,
     march_start,
     seen_color,
-    voxel_arrays,
 )
 
 _LEAST_WEIGHT = wp.constant(voxel_march_torch.LEAST_WEIGHT)
@@ -137,11 +136,12 @@ def add_errors(
         return voxel_march_torch.add_errors(sums, *rays, field, settings)
     init()
     errors = torch.empty(len(origins), device=device)
+    kernel = voxel_host.add_errors if on_host(device) else add_errors_kernel
 
     def add(part: slice, own: torch.Tensor) -> torch.Tensor:
         inputs = [array(value[part], wp.vec3) for value in rays]
         inputs += [voxel_arrays(field, settings), march_params(settings), array(own), array(errors[part])]
-        launch(add_errors_kernel, len(errors[part]), inputs, device, serial=True)
+        launch(kernel, len(errors[part]), inputs, device, serial=True)
         return own
 
     if device.type == "cuda":

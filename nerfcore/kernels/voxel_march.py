@@ -2,7 +2,7 @@
 
 A step stands for as much of the ray as it is long; outside the cube cells and steps grow alike, so that a step always
 is the same share of a cell. Opacity and colour are interpolated as they are coded; each corner's classes have as much of the
-opacity as the corner. The torch version is in `voxel_march_torch.py`.
+opacity as the corner. The torch version is in `voxel_march_torch.py`, what the CPU runs in `voxel_host.py`.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ from __future__ import annotations
 import torch
 import warp as wp
 
-from . import voxel_march_torch
-from .device import backend_of
+from . import voxel_host, voxel_march_torch
+from .device import backend_of, on_host
 from .runtime import array, init, launch
 from .traversal import (
     BEFORE_CUBE,
@@ -28,33 +28,11 @@ from .traversal import (
     ray_interval,
     reciprocal,
 )
-from .voxel_field import CELLS, VERTICES, VIEWS, VoxelField, VoxelRays, cell_length
+from .voxel_arrays import VoxelArrays, voxel_arrays
+from .voxel_field import CELLS, VERTICES, VIEWS, VoxelField, VoxelRays
 
 _CELLS, _VERTICES, _VIEWS = wp.constant(CELLS), wp.constant(VERTICES), wp.constant(VIEWS)
 _BLOCK = wp.constant(VERTICES**3)
-
-
-@wp.struct
-class VoxelArrays:
-    """A `VoxelField` as kernels take it; exponent: length of a step in cells."""
-
-    blocks: int
-    index: wp.array(dtype=int)
-    vertices: wp.array(dtype=int)
-    class_opacity: wp.array(dtype=float)
-    harmonic_range: float
-    classes: int
-    exponent: float
-
-
-def voxel_arrays(field: VoxelField, settings: MarchSettings) -> VoxelArrays:
-    """The field as kernels take it."""
-    arrays = VoxelArrays()
-    arrays.blocks, arrays.harmonic_range, arrays.classes = field.blocks, field.harmonic_range, field.classes
-    arrays.exponent = settings.step / cell_length(field.blocks, settings.contracted)
-    arrays.index, arrays.class_opacity = array(field.index), array(field.class_opacity)
-    arrays.vertices = array(field.vertices)
-    return arrays
 
 
 @wp.func
@@ -299,7 +277,8 @@ def march(
     out = torch.empty(rays, 5, device=device)
     probabilities = torch.zeros(rays, field.classes, device=device)
     inputs = [array(origins, wp.vec3), array(directions, wp.vec3), array(ends), voxel_arrays(field, settings)]
-    launch(march_voxels, rays, [*inputs, march_params(settings), array(out), array(probabilities)], device)
+    kernel = voxel_host.march_voxels if on_host(device) else march_voxels
+    launch(kernel, rays, [*inputs, march_params(settings), array(out), array(probabilities)], device)
     return VoxelRays(out[:, :3], out[:, 3], out[:, 4], probabilities if field.classes else None)
 
 
@@ -329,4 +308,4 @@ def add_views(
     init()
     inputs = [array(origins, wp.vec3), array(directions, wp.vec3), array(cameras), array(index), array(roots)]
     inputs += [blocks, march_params(settings), int(by_vertex), array(views)]
-    launch(note_views, rays, inputs, device, serial=True)
+    launch(voxel_host.note_views if on_host(device) else note_views, rays, inputs, device, serial=True)

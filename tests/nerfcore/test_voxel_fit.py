@@ -4,12 +4,19 @@ from __future__ import annotations
 
 import pytest
 import torch
-from fieldwork.nerfcore.kernels import voxel_march_torch
+from fieldwork.nerfcore.kernels import voxel_fit, voxel_march_torch
 from fieldwork.nerfcore.kernels.voxel_field import VERTICES, VoxelField
 from fieldwork.nerfcore.kernels.voxel_fit import add_errors
 from fieldwork.nerfcore.kernels.voxel_march import march
 
 from .test_voxel_march import CONTRACTED, moved, random_field, random_rays, settings
+
+
+@pytest.fixture(autouse=True, params=["host", "every device"])
+def kernels_of(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The CPU runs its own kernels, and those that GPUs run."""
+    if request.param == "every device":
+        monkeypatch.setattr(voxel_fit, "on_host", lambda device: False)
 
 
 def opaque(field: VoxelField) -> VoxelField:

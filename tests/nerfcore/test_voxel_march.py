@@ -8,13 +8,20 @@ import numpy as np
 import pytest
 import torch
 from fieldwork.nerfcore.bake.blocks import Blocks
-from fieldwork.nerfcore.kernels import voxel_march_torch
+from fieldwork.nerfcore.kernels import voxel_march, voxel_march_torch
 from fieldwork.nerfcore.kernels.traversal import MarchSettings
 from fieldwork.nerfcore.kernels.voxel_field import VERTICES, VIEWS, VoxelField, VoxelRays, cell_length
 from fieldwork.nerfcore.kernels.voxel_march import add_views, march
 
 SIDE, CLASSES = 8, 5
 CONTRACTED = pytest.mark.parametrize("contracted", [False, True])
+
+
+@pytest.fixture(autouse=True, params=["host", "every device"])
+def kernels_of(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The CPU runs its own kernels, and those that GPUs run."""
+    if request.param == "every device":
+        monkeypatch.setattr(voxel_march, "on_host", lambda device: False)
 
 
 def settings(contracted: bool, step: float = 1.0, side: int = SIDE) -> MarchSettings:

@@ -16,6 +16,7 @@ class VoxelArrays:
     blocks: int
     index: wp.array(dtype=int)
     vertices: wp.array(dtype=int)
+    changes: wp.array(dtype=int)
     class_opacity: wp.array(dtype=float)
     harmonic_range: float
     classes: int
@@ -28,5 +29,5 @@ def voxel_arrays(field: VoxelField, settings: MarchSettings) -> VoxelArrays:
     arrays.blocks, arrays.harmonic_range, arrays.classes = field.blocks, field.harmonic_range, field.classes
     arrays.exponent = settings.step / cell_length(field.blocks, settings.contracted)
     arrays.index, arrays.class_opacity = array(field.index), array(field.class_opacity)
-    arrays.vertices = array(field.vertices)
+    arrays.vertices, arrays.changes = array(field.vertices), array(field.changes)
     return arrays

@@ -36,7 +36,7 @@ from .colors import HARMONIC_RANGE, vertex_texels
 from .fit import fitted
 
 # Not tuned: the next three.
-FINEST = 64  # blocks along a side of the grid
+FINEST = 96  # blocks along a side of the grid
 MOST_CLASSES = 255  # that a byte tells apart, and void
 MOST_VIEWS = 1000  # training photos whose rays are asked
 # Measured (docs/experiments.md, “How fine must a baked field be?”):
@@ -70,14 +70,12 @@ def bake(params: BakeParams, report: Reporter) -> dict[str, Any]:
         report.warn("The photos show nothing of the field: what was baked is empty. Train longer.")
     report.stage("Reading colours")
     views = seen_by(blocks, rays, march_settings(trained.model, blocks.side, 1.0), True, report.check)
-    texels = vertex_texels(trained.model, blocks, views, rays.center, report.check)
+    texels, changes = vertex_texels(trained.model, blocks, views, rays.center, report.check)
     report.stage("Fitting to the photos")
     photos = training_photos(folder, params.run, trained, scene, trained.info.box(project).box_from_world, report)
-    texels = fitted(
-        trained.model, blocks, texels, photos, march_settings(trained.model, blocks.side, 1.0), report.check
-    )
-    report.stage("Writing")
     settings = march_settings(trained.model, blocks.side, 1.0)
+    blocks = fitted(trained.model, blocks, texels, changes, photos, settings, report.check)
+    report.stage("Writing")
     names = {c.id: c.name for c in scene.classes}
     meta = Meta(
         checkpoint=state_id(trained.state),
@@ -97,7 +95,8 @@ def bake(params: BakeParams, report: Reporter) -> dict[str, Any]:
     environment = panorama(trained.model, report.check) if meta.environment else None
     place = voxels_folder(folder, params.run)
     lut = class_table(scene, classes)
-    files = save_baked(place, meta, blocks.index().cpu().numpy(), texels.cpu().numpy(), lut, environment)
+    index = blocks.index().cpu().numpy()
+    files = save_baked(place, meta, index, texels.cpu().numpy(), changes.cpu().numpy(), lut, environment)
     result = {
         "run": params.run,
         "folder": str(place),

@@ -13,12 +13,13 @@ import numpy as np
 import pytest
 import torch
 from fieldwork.nerfcore.bake.blocks import march_settings, read_blocks, seen_by, side_for, visible_grid
-from fieldwork.nerfcore.bake.colors import HARMONIC_RANGE, vertex_texels
+from fieldwork.nerfcore.bake.colors import vertex_texels
+from fieldwork.nerfcore.bake.fit import baked_field
 from fieldwork.nerfcore.config import RunConfig
 from fieldwork.nerfcore.data.camera_rays import CameraRays
 from fieldwork.nerfcore.errors import Cancelled, DiskError, ProjectError, SettingError
 from fieldwork.nerfcore.field.hybrid import Geometry
-from fieldwork.nerfcore.kernels.voxel_field import VERTICES, VoxelField
+from fieldwork.nerfcore.kernels.voxel_field import VERTICES
 from fieldwork.nerfcore.params import BakeParams, EvaluateParams, RenderParams, TrainParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.render import baked
@@ -66,9 +67,8 @@ def bake_model(model: Model, side: int, cameras: int = 40) -> BakedField:
     blocks = read_blocks(model, grid, side, check)
     settings = march_settings(model, side, 1.0)
     views = seen_by(blocks, rays, settings, True, check)
-    texels = vertex_texels(model, blocks, views, rays.center, check)
-    vertices = texels.reshape(-1).view(torch.int32)
-    field = VoxelField(side, blocks.index(), vertices, torch.ones(256), HARMONIC_RANGE, model.field.classes)
+    texels, changes = vertex_texels(model, blocks, views, rays.center, check)
+    field = baked_field(blocks, texels, changes, model.field.classes)
     return BakedField(field, settings)
 
 
@@ -256,7 +256,7 @@ def loading(project: Path) -> BakedField:
     return load_baked(project, "main", load_info(project, "main"))
 
 
-@pytest.mark.parametrize("name", ["meta.json", "index.npy", "lut.npy", "T0.npy", "T1.npy", "T2.npy", "T3.npy"])
+@pytest.mark.parametrize("name", ["meta.json", "index.npy", "lut.npy", "T0.npy", "T1.npy", "T2.npy", "T4.npy"])
 @pytest.mark.parametrize("damage", ["truncated", "garbage", "empty", "gone"])
 def test_damaged_files_are_named(copied: Path, name: str, damage: str) -> None:
     path = baked.voxels_folder(copied, "main") / name
@@ -277,9 +277,9 @@ def test_an_index_or_classes_beyond_what_is_there_are_refused(copied: Path) -> N
     with pytest.raises(ProjectError, match="blocks that are not there"):
         loading(copied)
     np.save(folder / "index.npy", index)
-    texels = np.load(folder / "T3.npy")
-    texels[..., 3] = 9
-    np.save(folder / "T3.npy", texels)
+    texels = np.load(folder / "T1.npy")
+    texels[..., 2] = 9
+    np.save(folder / "T1.npy", texels)
     with pytest.raises(ProjectError, match="classes that are not there"):
         loading(copied)
 

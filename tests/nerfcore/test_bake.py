@@ -12,9 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fieldwork.nerfcore.bake.blocks import march_settings, read_blocks, seen_by, side_for, visible_grid
+from fieldwork.nerfcore.bake.blocks import Blocks, march_settings, read_blocks, seen_by, side_for, visible_grid
 from fieldwork.nerfcore.bake.colors import vertex_texels
 from fieldwork.nerfcore.bake.fit import baked_field
+from fieldwork.nerfcore.bake.verb import finest_blocks
 from fieldwork.nerfcore.config import RunConfig
 from fieldwork.nerfcore.data.camera_rays import CameraRays
 from fieldwork.nerfcore.errors import Cancelled, DiskError, ProjectError, SettingError
@@ -148,6 +149,28 @@ def train(folder: Path, steps: int, resume: bool = False, **settings: str) -> No
     asked = {**SMALL, **{name.replace("__", "."): value for name, value in settings.items()}}
     params = TrainParams(project=folder, preset="draft", steps=steps, set=asked, resume=resume)
     run_verb("train", params, Reporter())
+
+
+@pytest.mark.parametrize("memory", [3e6, 30e6, 100e6])
+@pytest.mark.parametrize("crowded", [(), (74,), (76, 75)])
+def test_the_grid_is_as_fine_as_fits(crowded: tuple[int, ...], memory: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However the number of blocks jumps with the side: memory is used, and never more than there is."""
+    monkeypatch.setattr("fieldwork.nerfcore.bake.verb.FINEST", 96)
+    sides = []
+
+    def seen(side: int) -> Blocks:
+        sides.append(side)
+        count = round(2.4 * side**2 * (1.3 if side in crowded else 1.0))
+        return Blocks(side, torch.zeros(count, 3, dtype=torch.long), torch.zeros(0, dtype=torch.uint8))
+
+    found = finest_blocks(seen, memory)
+    assert texture_bytes(len(found), found.side) <= memory
+    assert len(found) >= 0.75 * most_blocks(memory, found.side)
+    assert len(sides) <= 5
+
+
+def test_an_empty_field_is_baked() -> None:
+    assert len(finest_blocks(lambda side: Blocks(side, torch.zeros(0, 3), torch.zeros(0)), 100e6)) == 0
 
 
 @pytest.fixture(autouse=True, scope="module")

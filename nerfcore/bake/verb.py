@@ -43,9 +43,9 @@ MOST_VIEWS = 1000  # training photos whose rays are asked
 # Measured (docs/experiments.md, “How fine must a baked field be?”):
 RAYS = 2_000_000  # through training cameras, that tell what is seen
 PIXELS = 16_000_000  # of the photos that the baked field is fitted to; not tuned
-LEAST_SEEN = 0.03  # weight that a block has in one of these rays at least
-TRIES = 2  # of grids that fit into memory, each finer than the one before; not tuned
-ENOUGH = 0.85  # of the blocks that fit, with which no finer grid is tried; not tuned
+LEAST_SEEN = 0.05  # weight that a block has in one of these rays at least
+TRIES = 3  # of grids that fit into memory, each finer than the one before; not tuned
+ENOUGH = 0.92  # of the blocks that fit, with which no finer grid is tried; not tuned
 
 
 def bake(params: BakeParams, report: Reporter) -> dict[str, Any]:

@@ -22,10 +22,7 @@ from .voxel_field import (
 )
 
 LEAST_WEIGHT = 1e-3  # of a sample that is asked to change
-SHADER_STOP, SHADER_LEAST = (
-    0.004,
-    0.0005,
-)  # transmittance at which the shader stops, opacity from which it asks for colours
+SHADER_STOP = 0.01  # transmittance at which the shader stops
 _CORNERS = [(corner & 1, corner >> 1 & 1, corner >> 2) for corner in range(8)]
 
 
@@ -81,23 +78,26 @@ def _steps(
     looks: torch.Tensor | None = None,
 ) -> Iterator[_Step]:
     """The samples of rays (R, 3), one a ray at a time, while the caller lowers their transmittance (R,) in place; `looks`
-    (R,): how often each ray looked into the index, counted in place."""
+    (R,): how often each ray came into another block, counted in place."""
     inverse = 1 / torch.where(directions.abs() < 1e-9, 1e-9, directions)
     t, high = _bounds(origins, inverse, s)
     high = high if ends is None else torch.minimum(high, ends)
+    before = torch.full_like(t, -1, dtype=torch.long)
     for _ in range(int(MAX_BINS)):
         rays = ((t < high) & (transmittance >= float(EARLY_STOP))).nonzero()[:, 0]
         if len(rays) == 0:
             return
-        if looks is not None:
-            looks[rays] += 1
         now, d = t[rays], directions[rays]
         p = origins[rays] + d * now[:, None]
         r = p.abs().amax(1)
         length = torch.where(r > 1, s.step * r * r.sqrt(), s.step) if s.contracted else torch.full_like(now, s.step)
         u = grid_position(p, s.contracted).clamp(0, 1)
         block = (u * n).long().clamp(max=n - 1)
-        entry = index[(block[:, 2] * n + block[:, 1]) * n + block[:, 0]].long()
+        place = (block[:, 2] * n + block[:, 1]) * n + block[:, 0]
+        if looks is not None:
+            looks[rays] += (place != before[rays]).float()
+            before[rays] = place
+        entry = index[place].long()
         empty = entry <= 0
         half = ((u * n - block) >= 0.5).long()
         octant = half[:, 0] + 2 * half[:, 1] + 4 * half[:, 2]
@@ -112,8 +112,8 @@ def _steps(
         used = (~empty).nonzero()[:, 0]
         if len(used) == 0:
             continue
-        place, slot = u[used] * n - block[used], (entry[used] & ((1 << SLOT_BITS) - 1)) - 1
-        yield _Step(rays[used], now[used], *_around(place, slot, VERTICES), *_around(place, slot, COARSE))
+        local, slot = u[used] * n - block[used], (entry[used] & ((1 << SLOT_BITS) - 1)) - 1
+        yield _Step(rays[used], now[used], *_around(local, slot, VERTICES), *_around(local, slot, COARSE))
 
 
 def _around(place: torch.Tensor, slot: torch.Tensor, side: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -195,12 +195,9 @@ def texture_reads(origins: torch.Tensor, directions: torch.Tensor, field: VoxelF
     the index once in each block it meets, the colour and opacity at each sample, and three more times for the changes
     with the direction where something is."""
     transmittance, looks = torch.ones(len(origins), device=origins.device), torch.zeros_like(origins[:, 0])
-    reads, before = torch.zeros_like(looks), torch.full_like(looks, -1, dtype=torch.long)
+    reads = torch.zeros_like(looks)
     words = field.vertices.view(-1, TEXELS)
     for step in _steps(origins, directions, field.index, field.blocks, s, transmittance, looks=looks):
-        block = step.corners[:, 0] // VERTICES**3
-        looks[step.rays] -= (block == before[step.rays]).float()
-        before[step.rays] = block
         root = (step.shares * (words[step.corners][..., 0] >> 24 & 255) / 255).sum(1)
         reads[step.rays] += 1
         left = transmittance[step.rays] * (1 - (root * root).clamp(max=1))

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from fieldwork.addon.live.shaders import LEAST_LEFT
 from fieldwork.nerfcore.bake.blocks import Blocks
 from fieldwork.nerfcore.kernels import voxel_march, voxel_march_torch
 from fieldwork.nerfcore.kernels.traversal import MarchSettings
@@ -222,6 +223,10 @@ def test_the_index_tells_empty_octants() -> None:
     index = Blocks(4, torch.tensor([[0, 0, 0], [1, 0, 0]]), roots.view(-1)).index()
     assert [int(entry) >> SLOT_BITS for entry in index[:2]] == [0b00000010, 0b01010000]
     assert [int(entry) & ((1 << SLOT_BITS) - 1) for entry in index[:2]] == [1, 2]
+
+
+def test_reads_are_counted_to_where_the_shader_ends() -> None:
+    assert voxel_march_torch.SHADER_STOP == LEAST_LEFT
 
 
 def test_reads_of_textures_are_counted() -> None:

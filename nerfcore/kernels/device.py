@@ -109,11 +109,6 @@ def backend_of(device: torch.device) -> Backend:
     return _backend(device.type, _asked())
 
 
-def on_host(device: torch.device) -> bool:
-    """Whether kernels that are written with vector types of the CPU's compiler serve a device, where there are such."""
-    return device.type == "cpu"
-
-
 @contextmanager
 def using_kernels(kernels: Kernels | None) -> Iterator[None]:
     """Inside, kernels are Warp's or torch's whatever FIELDWORK_BACKEND says; for all threads."""

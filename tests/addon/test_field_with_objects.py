@@ -209,3 +209,35 @@ answer({"group": made.view_layers[0].layer_collection.children["group"].holdout}
     assert (np.abs(small[..., :3] - (0.2, 0.9, 0.2)).max(-1) < 0.03).sum() > 60, "objects are as they were"
     for color in ((0.9, 0.2, 0.1), (0.1, 0.8, 0.9)):
         assert (np.abs(small[..., :3] - color).max(-1) < 0.03).sum() == 0, color
+
+
+def test_the_surface_of_the_capture_as_a_holdout_hides_objects_and_leaves_the_field(bpy_script, ball, tmp_path):
+    facts = bpy_script(
+        START
+        + """
+for name in ("before", "through"):
+    bpy.data.objects.remove(bpy.data.objects[name])
+bpy.data.objects["behind"].location.z = -0.6
+bpy.ops.mesh.primitive_uv_sphere_add(radius=0.45, segments=32, ring_count=16)
+surface = bpy.context.object
+surface["fieldwork_role"], surface.is_holdout = "mesh", True
+render.resolution_x, render.resolution_y = 36, 24
+scene.cycles.samples = 16
+bpy.ops.fieldwork.setup_compositor()
+found = {}
+for name, hidden in (("held", False), ("plain", True)):
+    surface.hide_render = hidden
+    picture = shoot(name)
+    found[name] = [float(v) for v in picture[12, 18]]
+    render.use_compositing = False
+    found[name + " objects"] = float(shoot(name + "-objects")[12, 18, 3])
+    render.use_compositing = True
+answer(found)
+""",
+        project=ball,
+        folder=tmp_path,
+    )
+    assert facts["plain objects"] == pytest.approx(1, abs=1e-3), "the plate is behind the ball"
+    assert facts["held objects"] == pytest.approx(0, abs=1e-3)
+    assert facts["held"][3] > 0.95
+    assert facts["held"] == pytest.approx(facts["plain"], abs=0.03)

@@ -338,7 +338,8 @@ class _Film:
         """What is composited before and behind Blender's objects, so that Front over (Objects over Behind) is the mean over
         the samples also where an edge of an object crosses a pixel: with a share `a` of it covered, f what is before the
         object and b what is beside it, Front = a f + (1 − a) f.alpha b with f's alpha, Behind = b. Where part of it is a holdout, of
-        which the objects' picture has nothing, Behind is as much less than b as what the objects leave is more than 1 − a."""
+        which the objects' picture has nothing, Behind is as much less than b as what the objects leave is more than 1 − a;
+        the alpha of the whole is then too large by (1 − a) f.alpha (1 − b.alpha) where the field ends in the same pixel."""
         hits, held = self.hits[:, None], self.held[:, None]
         solid, rest = hits - held, self.colored - hits
         before = self.front / np.maximum(hits, 1)

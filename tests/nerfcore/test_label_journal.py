@@ -5,7 +5,11 @@ from __future__ import annotations
 import errno
 import json
 import os
+import signal
+import subprocess
+import sys
 import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -55,6 +59,37 @@ def test_marks_are_read_as_they_were_written_and_a_torn_line_is_dropped(
     again = append_mark(project, values[-1])
     assert again.revision == len(written)
     assert read_marks(project) == [*written[:-1], again]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL on Windows")
+def test_sigkill_while_marks_are_written_loses_none_that_was_acknowledged(tmp_path: Path) -> None:
+    """A process that writes marks as fast as it can dies in the middle of one, again and again."""
+    writer = (
+        "import sys\n"
+        "from pathlib import Path\n"
+        "from fieldwork.nerfcore.labels.journal import append_mark\n"
+        "points = [(float(i), 0.5) for i in range(2000)]\n"
+        "while True:\n"
+        "    mark = append_mark(Path(sys.argv[1]), {'photo': '00', 'shape': 'line', 'points': points, 'class_id': 1})\n"
+        "    print(mark.revision, flush=True)\n"
+    )
+    told = 0
+    for delay in (0.0, 0.003, 0.01, 0.02, 0.05):
+        with subprocess.Popen(
+            [sys.executable, "-c", writer, str(tmp_path)], stdout=subprocess.PIPE, text=True
+        ) as process:
+            assert process.stdout is not None
+            first = process.stdout.readline()  # it is at work
+            assert first, "the journal that a killed process leaves can be written to"
+            time.sleep(delay)
+            process.send_signal(signal.SIGKILL)
+            lines = [first, *process.stdout.read().split("\n")]
+            told = max(int(line) for line in lines if line.strip())
+        marks = read_marks(tmp_path)
+        assert [mark.revision for mark in marks] == list(range(1, len(marks) + 1))
+        # The last one may be on disk though nobody was told.
+        assert told <= len(marks) <= told + 1
+    assert told >= 5
 
 
 def test_undo_shows_an_earlier_revision_and_a_mark_then_grows_from_it(tmp_path: Path) -> None:

@@ -238,12 +238,12 @@ class HybridField(nn.Module):
         if self.config.appearance:
             shared = codes is None
             parts.append((self._mean_code()[None], torch.zeros_like(rays)) if shared else (codes, rays))  # type: ignore[arg-type]
-        color = torch.sigmoid(network_host.forward_of_parts(parts, tuple(self.color_head.weights)))
+        color = torch.sigmoid(network_host.forward(parts, tuple(self.color_head.weights))[0])
         if classes is None or self.semantic_head is None:
             return color, None
         branches = [(part, chosen) for part in (geometry.implicit, geometry.explicit) if part is not None]
         known = [(geometry.features, chosen), *branches]
-        logits = network_host.forward_of_parts(known, tuple(self.semantic_head.weights))
+        logits = network_host.forward(known, tuple(self.semantic_head.weights))[0]
         return color, logits if classes == "logits" else self._softmax(logits)
 
     def _softmax(self, logits: torch.Tensor) -> torch.Tensor:

@@ -88,7 +88,7 @@ class _HostChain(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, x: torch.Tensor, *weights: torch.Tensor) -> torch.Tensor:
-        out, kept = network_host.forward(x, weights, keep=True)
+        out, kept = network_host.forward([(x, None)], weights, keep=True)
         ctx.save_for_backward(x, *([] if kept is None else [kept]), *weights)
         ctx.layers = len(weights)
         return out
@@ -121,7 +121,7 @@ class MLP(nn.Module):
         if dtype == torch.float32 and on_host(x.device) and network_host.supported(tuple(self.weights)):
             if torch.is_grad_enabled():
                 return _HostChain.apply(x.float(), *self.weights)  # type: ignore[no-any-return]
-            return network_host.forward(x.float(), tuple(self.weights))[0]
+            return network_host.forward([(x.float(), None)], tuple(self.weights))[0]
         if torch.is_grad_enabled() or (x.device.type == "cpu" and len(x) > MOST_ROWS):
             return _Chain.apply(x, dtype, *self.weights)  # type: ignore[no-any-return]
         x = x.to(dtype)

@@ -105,7 +105,8 @@ _TAKE = """
 
 @wp.struct
 class PartArrays:
-    """Rows side by side of up to three arrays: of each, which row (N,) int64 and how wide it is; 0 for one that is not there."""
+    """Rows (N, …) put together of up to three arrays. Of each: its values, how wide its rows are (0: it is not there), and
+    which row stands for which, if `gathered`, else they follow each other."""
 
     first: wp.array(dtype=float)
     first_rows: wp.array(dtype=wp.int64)
@@ -116,14 +117,30 @@ class PartArrays:
     third: wp.array(dtype=float)
     third_rows: wp.array(dtype=wp.int64)
     third_width: int
+    gathered: int
 
 
 @wp.func_native(
     BLOCKS
-    + _TAKE
     + """
+    const int* widths = (const int*)sizes.data;
+    const int left = count - block * ROWS, rows = left < ROWS ? left : ROWS;
+    const size_t first = (size_t)block * ROWS;
     float even[ROWS * MOST], odd[ROWS * MOST];
-    take((const float*)given.data + first * widths[0], widths[0], rows, even, padded(widths[0]));
+    const int inputs = padded(widths[0]);
+    if (rows < ROWS) __builtin_memset(even, 0, sizeof(even));  // rows below the last one only have to be numbers
+    int begin = 0;
+    auto take = [&](const float* values, const long long* index, int width) {
+        if (width == 0) return;
+        for (int r = 0; r < rows; ++r) {
+            const size_t row = parts.gathered ? (size_t)index[first + r] : first + r;
+            __builtin_memcpy(even + r * inputs + begin, values + row * width, width * sizeof(float));
+        }
+        begin += width;
+    };
+    take((const float*)parts.first.data, (const long long*)parts.first_rows.data, parts.first_width);
+    take((const float*)parts.second.data, (const long long*)parts.second_rows.data, parts.second_width);
+    take((const float*)parts.third.data, (const long long*)parts.third_rows.data, parts.third_width);
     const float* matrix = (const float*)weights.data;
     float *from = even, *to = odd;
     int hidden = 0;
@@ -145,7 +162,7 @@ class PartArrays:
 """
 )
 def _forward(
-    given: wp.array(dtype=float),
+    parts: PartArrays,
     weights: wp.array(dtype=float),
     sizes: wp.array(dtype=int),
     layers: int,
@@ -209,66 +226,9 @@ def _backward(
 ): ...
 
 
-@wp.func_native(
-    BLOCKS
-    + """
-    const int* widths = (const int*)sizes.data;
-    const int left = count - block * ROWS, rows = left < ROWS ? left : ROWS;
-    const size_t first = (size_t)block * ROWS;
-    float even[ROWS * MOST], odd[ROWS * MOST];
-    const int inputs = padded(widths[0]);
-    if (rows < ROWS) __builtin_memset(even, 0, sizeof(even));
-    int begin = 0;
-    for (int part = 0; part < 3; ++part) {
-        const auto& rows_of = part == 0 ? parts.first : (part == 1 ? parts.second : parts.third);
-        const auto& index = part == 0 ? parts.first_rows : (part == 1 ? parts.second_rows : parts.third_rows);
-        const int width = part == 0 ? parts.first_width : (part == 1 ? parts.second_width : parts.third_width);
-        for (int r = 0; r < rows; ++r) {
-            const long long row = ((const long long*)index.data)[first + r];
-            __builtin_memcpy(even + r * inputs + begin, (const float*)rows_of.data + row * width, width * sizeof(float));
-        }
-        begin += width;
-    }
-    const float* matrix = (const float*)weights.data;
-    float *from = even, *to = odd;
-    for (int layer = 0; layer < layers; ++layer) {
-        const int stride = padded(widths[layer]), columns = padded(widths[layer + 1]);
-        multiply(from, stride, widths[layer], matrix, columns, to, layer + 1 < layers);
-        matrix += stride * columns;
-        float* next = from; from = to; to = next;
-    }
-    const int width = widths[layers], columns = padded(width);
-    float* result = (float*)out.data + first * width;
-    for (int r = 0; r < rows; ++r) __builtin_memcpy(result + (size_t)r * width, from + r * columns, width * sizeof(float));
-"""
-)
-def _joined(
-    parts: PartArrays,
-    weights: wp.array(dtype=float),
-    sizes: wp.array(dtype=int),
-    layers: int,
-    count: int,
-    out: wp.array(dtype=float),
-    block: int,
-): ...
-
-
-@wp.kernel(module="fieldwork_network_host")
-def chain_of_parts(
-    parts: PartArrays,
-    weights: wp.array(dtype=float),
-    sizes: wp.array(dtype=int),
-    layers: int,
-    count: int,
-    out: wp.array(dtype=float),
-    offset: int,
-):
-    _joined(parts, weights, sizes, layers, count, out, wp.tid() + offset)
-
-
 @wp.kernel(module="fieldwork_network_host")
 def chain_forward(
-    given: wp.array(dtype=float),
+    parts: PartArrays,
     weights: wp.array(dtype=float),
     sizes: wp.array(dtype=int),
     layers: int,
@@ -278,7 +238,7 @@ def chain_forward(
     out: wp.array(dtype=float),
     offset: int,
 ):
-    _forward(given, weights, sizes, layers, count, keep, kept, out, wp.tid() + offset)
+    _forward(parts, weights, sizes, layers, count, keep, kept, out, wp.tid() + offset)
 
 
 @wp.kernel(module="fieldwork_network_host")
@@ -331,27 +291,37 @@ def packed(matrices: Sequence[torch.Tensor], transposed: bool) -> torch.Tensor:
     return torch.cat(parts)
 
 
+Part = tuple[torch.Tensor, torch.Tensor | None]
+
+
 def forward(
-    x: torch.Tensor, matrices: Sequence[torch.Tensor], keep: bool = False
+    parts: Sequence[Part], matrices: Sequence[torch.Tensor], keep: bool = False
 ) -> tuple[torch.Tensor, torch.Tensor | None]:
-    """Rows x (N, in) float32 through layers (out, in): (N, out), and, to `keep`, what the hidden layers were (N, hidden),
-    their widths padded."""
+    """Rows put together of one to three arrays through layers (out, in): (N, out), and, to `keep`, what the hidden layers
+    were (N, hidden), their widths padded.
+
+    Args:
+        parts: values (M, width) float32, and which of their rows (N,) int64; None for all of them in their order, of all
+            parts alike.
+    """
     init()
     sizes = sizes_of(matrices)
+    values, rows = parts[0]
+    count = len(values) if rows is None else len(rows)
+    given = PartArrays()
+    given.gathered = int(rows is not None)
+    for name, (values, rows) in zip(("first", "second", "third"), parts):
+        setattr(given, name, array(values.contiguous().view(-1)))
+        setattr(given, f"{name}_width", values.shape[1])
+        if rows is not None:
+            setattr(given, f"{name}_rows", array(rows))
     width = sum(padded(size) for size in sizes[1:-1]) if keep else 0
-    kept = torch.empty(len(x), width) if width else None
-    out = torch.empty(len(x), sizes[-1])
+    kept = torch.empty(count, width) if width else None
+    out = torch.empty(count, sizes[-1])
     numbers = torch.tensor(sizes, dtype=torch.int32)
-    inputs = [
-        array(x.contiguous().view(-1)),
-        array(packed(matrices, True)),
-        array(numbers),
-        len(matrices),
-        len(x),
-        width,
-    ]
+    inputs = [given, array(packed(matrices, True)), array(numbers), len(matrices), count, width]
     results = [array(out.view(-1) if kept is None else kept.view(-1)), array(out.view(-1))]
-    launch(chain_forward, -(-len(x) // ROWS), [*inputs, *results], x.device)
+    launch(chain_forward, -(-count // ROWS), [*inputs, *results], out.device)
     return out, kept
 
 
@@ -388,25 +358,3 @@ def backward(
         found.append(sums[begin : begin + count].view(padded(outside), padded(inside))[:outside, :inside])
         begin += count
     return grad_input, found
-
-
-def forward_of_parts(
-    parts: Sequence[tuple[torch.Tensor, torch.Tensor]], matrices: Sequence[torch.Tensor]
-) -> torch.Tensor:
-    """What layers (out, in) make of rows put together of one to three arrays, (array (M, width) float32, which of its rows
-    (N,) int64) each: (N, out), without gradients."""
-    init()
-    sizes = sizes_of(matrices)
-    count = len(parts[0][1])
-    given = PartArrays()
-    for name, (values, rows) in zip(("first", "second", "third"), [*parts, *[parts[0]] * (3 - len(parts))]):
-        setattr(given, name, array(values.contiguous().view(-1)))
-        setattr(given, f"{name}_rows", array(rows))
-        setattr(given, f"{name}_width", values.shape[1])
-    for name in ("second", "third")[len(parts) - 1 :]:
-        setattr(given, f"{name}_width", 0)
-    out = torch.empty(count, sizes[-1])
-    numbers = torch.tensor(sizes, dtype=torch.int32)
-    inputs = [given, array(packed(matrices, True)), array(numbers), len(matrices), count, array(out.view(-1))]
-    launch(chain_of_parts, -(-count // ROWS), inputs, out.device)
-    return out

@@ -61,7 +61,7 @@ def test_chains_of_layers_and_their_gradients_are_those_of_torch(sizes: tuple[in
     x = torch.randn(count, sizes[0], generator=generator, requires_grad=True)
     layers = [torch.randn(b, a, generator=generator).requires_grad_() for a, b in pairwise(sizes)]
     upstream = torch.randn(count, sizes[-1], generator=generator)
-    out, kept = network_host.forward(x.detach(), layers, keep=True)
+    out, kept = network_host.forward([(x.detach(), None)], layers, keep=True)
     grad_input, grads = network_host.backward(upstream, x.detach(), kept, layers, True)
     expected = x
     for layer in layers[:-1]:
@@ -77,6 +77,19 @@ def test_chains_of_layers_and_their_gradients_are_those_of_torch(sizes: tuple[in
         assert float(off.float().sum()) <= 2e-3 * off.numel()
     if count:
         assert network_host.backward(upstream, x.detach(), kept, layers, False)[0] is None
+
+
+@pytest.mark.parametrize("number", [1, 2, 3])
+def test_rows_are_put_together_of_rows_of_several_arrays(number: int) -> None:
+    generator = torch.Generator().manual_seed(6)
+    arrays = [torch.randn(m, width, generator=generator) for m, width in ((40, 5), (7, 16), (100, 3))][:number]
+    width = sum(a.shape[1] for a in arrays)
+    layers = [torch.randn(32, width, generator=generator), torch.randn(4, 32, generator=generator)]
+    for count in (0, 1, 60):
+        parts = [(a, torch.randint(0, len(a), (count,), generator=generator)) for a in arrays]
+        joined = torch.cat([a[rows] for a, rows in parts], 1)
+        expected = (joined @ layers[0].t()).relu() @ layers[1].t()
+        assert relative(network_host.forward(parts, layers)[0], expected) < 1e-5
 
 
 def test_networks_use_them_unless_they_are_too_wide(monkeypatch: pytest.MonkeyPatch) -> None:

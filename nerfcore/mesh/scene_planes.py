@@ -3,7 +3,8 @@
 A white wall shows nothing that photos could be compared by, and a field that few cameras saw is off there by more than a
 pixel. But where a wall is known at one end, it mostly goes on: a depth that photos do not confirm is moved onto a plane
 of the scene, provided that the plane is known close by and the field's depth agrees with it as far as the field is sure.
-Where all that is known of a class lies on one plane, as of a floor, what label maps give this class lies on it too.
+Where all that is known of a class lies on one plane, with nothing behind it, as of a floor, what label maps give this class lies
+on it too.
 No wall is a perfect plane: depths are moved onto the mean height above it of what is known around.
 
 Sources: planes by random samples, Schnabel, Wahl and Klein, "Efficient RANSAC for point-cloud shape detection", 2007; floors and
@@ -41,7 +42,8 @@ AGREES, SPREADS, OFF = (
 )  # share by which depths may be off a plane: at least, spreads of the field, at most
 FLAT_CLASS = 0.75  # share of what is known of a class that lies on one plane, from which on all of it does
 LABELLED_OFF = 0.5  # share by which the field's depth may be off the plane of its class
-SMOOTHED = 6.0  # cells over which heights above a plane are averaged
+BEHIND = 0.01  # share of what is known that may lie behind such a plane: a floor bounds a scene, a table top does not
+SMOOTHED = 12.0  # cells over which heights above a plane are averaged
 STEEPEST = 0.05  # cosine under which a plane is not looked at
 FITTED_PIXELS = 3.0  # spread of a depth on a plane, in footprints
 
@@ -183,9 +185,11 @@ def _reaching(known: Known, on: np.ndarray, point: np.ndarray, normal: np.ndarra
 
 
 def _flat_classes(known: Known, point: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Which classes (256,) bool have nearly all of their known area within the errors of a plane."""
-    area, off = known.footprint**2, np.abs((known.points - point) @ normal)
-    own = np.bincount(known.kind, area * (off < BESIDE * known.error), 256)
+    """Which classes (256,) bool have nearly all of their known area within the errors of a plane behind which nothing lies."""
+    area, off = known.footprint**2, (known.points - point) @ normal / known.error
+    if area[off < -BESIDE].sum() > BEHIND * area.sum():
+        return np.zeros(256, bool)
+    own = np.bincount(known.kind, area * (off < BESIDE), 256)
     flat = own >= FLAT_CLASS * np.maximum(np.bincount(known.kind, area, 256), FEWEST * np.median(area))
     flat[VOID] = False
     return flat

@@ -117,6 +117,12 @@ def test_a_class_that_lies_elsewhere_too_has_no_plane(walls) -> None:
     planes = scene_planes(known_points(views, [as_map(d, 0.01) for d in bent], sure, of_class(4)), Reporter())
     assert planes
     assert not any(plane.classes.any() for plane in planes)
+    far = [np.where(np.arange(90)[:, None] < 60, d, 1.5 * d) for d in depths]  # a table's top, and what is under it
+    labels = [np.where(np.arange(90)[:, None] < 60, 4, 5).astype(np.uint8) * np.ones((1, 120), np.uint8)] * 3
+    planes = scene_planes(known_points(views, [as_map(d, 0.01) for d in far], sure, labels), Reporter())
+    top = min(planes, key=lambda plane: plane.point[2])
+    assert top.point[2] == pytest.approx(3.0, abs=0.02)
+    assert not top.classes.any()
     unnamed = scene_planes(known_points(views, [as_map(d, 0.01) for d in depths], sure, [None] * 3), Reporter())
     assert not any(plane.classes.any() for plane in unnamed)
 

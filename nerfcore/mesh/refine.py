@@ -21,7 +21,7 @@ from ..progress import Reporter
 from .depth_maps import DepthMap, FlatView, confirmed_maps, cosines, map_arrays, neighbours, smooth_normals
 from .planes import with_planes
 from .scene_planes import known_points, on_scene_planes, scene_planes
-from .sky import backdrop, farthest, labels_tell, nothing, things
+from .sky import backdrop, farthest, labels_tell, named_things, nothing
 
 VIEWS = 5  # neighbours whose photos are compared
 LEAST, GAIN = 0.6, 0.05  # correlation that is believed, and by how much it must exceed that of the field's depth
@@ -73,8 +73,9 @@ def refined_maps(
 ) -> tuple[MapArrays, float]:
     """Confirmed maps (see `depth_maps.confirmed_maps`) whose depths photos have moved, and the share of their depths that
     views do confirm. Where views do not confirm a moved depth, the field's is asked again, the plane through what is
-    known around (planes.py), or that of a wall or floor that goes on from elsewhere (scene_planes.py). Where they do not confirm that either, but three of them the field's own depth, it is taken, as
-    far away as photos confirm depths. What label maps say is nothing (sky.py) has an unknown depth.
+    known around (planes.py), or that of a wall or floor that goes on from elsewhere (scene_planes.py). Where they do not confirm
+    that either, but three of them the field's own depth, it is taken, as far away as photos confirm depths. What label maps say
+    is nothing, and backdrops without the name of a thing (sky.py), have an unknown depth.
     """
     arrays = map_arrays(views, maps, device)
     grey = torch.from_numpy(np.concatenate([g.reshape(-1) for g in grey_pictures(views, store, report)]))
@@ -93,7 +94,7 @@ def refined_maps(
     labels = [label_picture(view, store) for view in views]
     left_out = [None if label is None else label == VOID for label in labels]
     told = labels_tell(sure, left_out)
-    solid = things([map_.hit for map_ in maps], sure, labels)
+    labels = named_things([map_.hit for map_ in maps], sure, labels)
     known, fields = [], []
     for number, (view, old, new, label, unnamed) in enumerate(zip(views, maps, moved, labels, left_out)):
         safe = sure[number]
@@ -104,7 +105,7 @@ def refined_maps(
             sure[number] = safe
         behind = backdrop(depth, safe)
         if label is not None:
-            behind &= ~solid[label]
+            behind &= label == VOID
         depth = np.where(behind, 0, depth)
         spread = np.where(safe, np.minimum(old.spread, SURE * depth / view.camera.fx), old.spread)
         fields.append(trusted_field(old, depth, safe, unnamed if told else None))

@@ -32,8 +32,11 @@ def labels_tell(sure: list[np.ndarray], left_out: list[np.ndarray | None]) -> bo
     return total > 0 and sum(int((part & ~out).sum()) for part, out in labelled) >= NAMED * total
 
 
-def things(hit: list[np.ndarray], sure: list[np.ndarray], labels: list[np.ndarray | None]) -> np.ndarray:
-    """Which classes (256,) bool are things and no sky: photos confirm at least a fifth of what the field has of them.
+def named_things(
+    hit: list[np.ndarray], sure: list[np.ndarray], labels: list[np.ndarray | None]
+) -> list[np.ndarray | None]:
+    """Label maps (H, W) uint8 of only those classes that are things, and no sky or guess of the field: photos confirm at
+    least a fifth of what the field has of them. VOID elsewhere.
 
     Args:
         hit, sure: which pixels (H, W) of each view have a depth, and one that photos confirm; labels: class (H, W) uint8 of
@@ -44,9 +47,8 @@ def things(hit: list[np.ndarray], sure: list[np.ndarray], labels: list[np.ndarra
         if label is not None:
             there += np.bincount(label[own], minlength=256)
             confirmed += np.bincount(label[own & safe], minlength=256)
-    found = confirmed > CONFIRMED * there
-    found[VOID] = False
-    return found
+    thing = confirmed > CONFIRMED * there
+    return [None if label is None else np.where(thing[label], label, VOID).astype(np.uint8) for label in labels]
 
 
 def nothing(left_out: np.ndarray, sure: np.ndarray) -> np.ndarray:

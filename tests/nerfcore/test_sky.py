@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from fieldwork.nerfcore.data.pixels import VOID
 from fieldwork.nerfcore.kernels.depth_arrays import FREE
-from fieldwork.nerfcore.mesh.sky import backdrop, labels_tell, nothing, things
+from fieldwork.nerfcore.mesh.sky import backdrop, labels_tell, named_things, nothing
 
 SHAPE = (96, 128)
 
@@ -65,8 +65,12 @@ def test_a_class_that_photos_confirm_is_a_thing_and_a_sky_is_none() -> None:
     label[:8] = VOID
     hit, sure = np.ones(SHAPE, bool), ~half(64)
     sure[::4, 64::4] = True  # a sixteenth of the sky looks confirmed
-    found = things([hit, hit], [sure, sure], [label, None])
-    assert np.flatnonzero(found).tolist() == [2]
-    assert not things([hit], [sure], [None]).any()
+    found, other = named_things([hit, hit], [sure, sure], [label, None])
+    assert other is None
+    assert found is not None
+    assert (found[8:, :64] == 2).all()
+    assert (found[:, 64:] == VOID).all()
     # What nothing is known of is no thing either.
-    assert not things([~hit], [sure], [label]).any()
+    (unknown,) = named_things([~hit], [sure], [label])
+    assert unknown is not None
+    assert (unknown == VOID).all()

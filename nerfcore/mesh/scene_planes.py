@@ -209,7 +209,7 @@ def _heights(known: Known, plane: ScenePlane) -> np.ndarray:
     np.add.at(amount, index, weight)
     total, amount = (gaussian_filter(grid, SMOOTHED, mode="constant") for grid in (total, amount))
     known_there = amount > 1e-6 * amount.max()
-    nearest = distance_transform_edt(~known_there, return_distances=False, return_indices=True)
+    nearest = np.asarray(distance_transform_edt(~known_there, return_distances=False, return_indices=True))
     return np.where(known_there, total / np.where(known_there, amount, 1), 0)[tuple(nearest)]
 
 

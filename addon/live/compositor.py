@@ -63,12 +63,22 @@ def _share(scene: bpy.types.Scene, made: bpy.types.Scene) -> None:
     for obj in scene.collection.objects:
         if obj.name not in made.collection.objects:
             made.collection.objects.link(obj)
+    _share_collections(scene.view_layers[0].layer_collection, made.view_layers[0].layer_collection)
     made.fieldwork.project, made.fieldwork.run = scene.fieldwork.project, scene.fieldwork.run
     live = made.fieldwork_live
     live.objects_hide = True
     live.source, live.samples = scene.fieldwork_live.source, max(scene.fieldwork_live.samples, 16)
     for layer in made.view_layers:
         layer.update_render_passes()
+
+
+def _share_collections(seen: Any, made: Any) -> None:
+    """Let the collections of a view layer be excluded, or holdouts, in another one where they are so in the first."""
+    for child in seen.children:
+        other = made.children.get(child.name)
+        if other is not None:
+            other.exclude, other.holdout = child.exclude, child.holdout
+            _share_collections(child, other)
 
 
 def filter_width(scene: bpy.types.Scene) -> float:

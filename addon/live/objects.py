@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,10 +12,18 @@ from ..roles import ROLE
 SOLID = {"MESH", "CURVE", "SURFACE", "META", "FONT"}
 
 
-def triangles(depsgraph: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) in the scene and faces (F, 3) of all that is rendered, but for surfaces of captures, which are what
-    the field shows itself."""
+class Triangles(NamedTuple):
+    """Vertices (V, 3) in the scene, faces (F, 3), and which of these are holdouts (F,), behind which there is nothing."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    holdout: np.ndarray
+
+
+def triangles(depsgraph: Any) -> Triangles:
+    """The triangles of all that is rendered, but for surfaces of captures, which are what the field shows itself."""
     vertices, faces, count = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.int32)], 0
+    holdout = [np.zeros(0, bool)]
     for instance in depsgraph.object_instances:
         obj = instance.object
         if obj.type not in SOLID or not instance.show_self or obj.hide_render or ROLE in obj.original:
@@ -33,13 +41,20 @@ def triangles(depsgraph: Any) -> tuple[np.ndarray, np.ndarray]:
         matrix = np.array(instance.matrix_world, np.float32)
         vertices.append(place.reshape(-1, 3) @ matrix[:3, :3].T + matrix[:3, 3])
         faces.append(corners.reshape(-1, 3) + count)
+        holdout.append(np.full(len(faces[-1]), is_holdout(instance, depsgraph.view_layer)))
         count += len(vertices[-1])
-    return np.concatenate(vertices), np.concatenate(faces)
+    return Triangles(np.concatenate(vertices), np.concatenate(faces), np.concatenate(holdout))
+
+
+def is_holdout(instance: Any, view_layer: Any) -> bool:
+    """Whether an instance of the depsgraph is a holdout, by itself or by its collection in the view layer."""
+    obj = instance.object.original
+    placed = instance.parent.original if instance.parent is not None else obj
+    return obj.is_holdout or placed.is_holdout or placed.holdout_get(view_layer=view_layer)
 
 
 def write_triangles(path: Path, depsgraph: Any) -> Path:
     """The same in a file for the engine."""
-    vertices, faces = triangles(depsgraph)
     with open(path, "wb") as file:
-        np.savez(file, vertices=vertices, faces=faces)
+        np.savez(file, **triangles(depsgraph)._asdict())
     return path

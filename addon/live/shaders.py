@@ -13,6 +13,8 @@ LEAST_LEFT = 0.01  # of the light, at which a ray ends
 MARCH = """
 const int CELLS = 8;
 const int VERTICES = 9;
+const int COARSE = 5;
+const int SLOTS = 32768;
 
 vec3 grid_position(vec3 p)
 {
@@ -34,18 +36,18 @@ float exit_distance(vec3 u, vec3 inverse_d, float n, float radius, float border)
   return max(min(away.x, min(away.y, away.z)), 0.0);
 }
 
-float leap(vec3 u, vec3 inverse_d, vec3 p, float distance_)
+float leap(vec3 u, vec3 inverse_d, vec3 p, float distance_, float sides)
 {
   if (contracted == 0) {
-    return 2.0 * exit_distance(u, inverse_d, float(blocks), distance_ - 1.0, 0.0);
+    return 2.0 * exit_distance(u, inverse_d, sides, distance_ - 1.0, 0.0);
   }
   float r = max(abs(p.x), max(abs(p.y), abs(p.z)));
   if (r <= 1.0) {
-    return 4.0 * exit_distance(u, inverse_d, float(blocks), distance_ - 1.0, 0.25);
+    return 4.0 * exit_distance(u, inverse_d, sides, distance_ - 1.0, 0.25);
   }
-  vec3 block = floor(u * float(blocks));
-  vec3 below = u - (block - (distance_ - 1.0)) / float(blocks);
-  vec3 above = (block + distance_) / float(blocks) - u;
+  vec3 block = floor(u * sides);
+  vec3 below = u - (block - (distance_ - 1.0)) / sides;
+  vec3 above = (block + distance_) / sides - u;
   vec3 free = min(below, above);
   return max(min(free.x, min(free.y, free.z)), 0.0) * max(3.0, 0.5 * r);
 }
@@ -140,12 +142,19 @@ void main()
       block_before = block;
     }
     if (entry <= 0.5) {
-      t += leap(u, inverse_d, p, -entry) + 0.5 * bin;
+      t += leap(u, inverse_d, p, -entry, float(blocks)) + 0.5 * bin;
       continue;
     }
-    int slot = int(entry + 0.5) - 1;
-    ivec3 corner = ivec3(slot % across.x, (slot / across.x) % across.y, slot / (across.x * across.y)) * VERTICES;
     vec3 local = (x - vec3(block)) * float(CELLS);
+    int word = int(entry + 0.5);
+    ivec3 upper = ivec3(greaterThanEqual(local, vec3(CELLS / 2)));
+    if (((word / SLOTS) & (1 << (upper.x + 2 * upper.y + 4 * upper.z))) == 0) {
+      t += leap(u, inverse_d, p, 1.0, 2.0 * float(blocks)) + 0.5 * bin;
+      continue;
+    }
+    int slot = word % SLOTS - 1;
+    ivec3 number = ivec3(slot % across.x, (slot / across.x) % across.y, slot / (across.x * across.y));
+    ivec3 corner = number * VERTICES;
     vec3 place = (vec3(corner) + local + 0.5) / texels;
     vec4 base = texture(t0, place);
     if (base.a > 0.0) {
@@ -157,9 +166,10 @@ void main()
       float share = 0.0;
       if (classes_matter) {
         vertex = strongest(corner + cell, local - vec3(cell));
-        top = int(texelFetch(t1, vertex, 0).a * 255.0 + 0.5);
-        second = int(texelFetch(t3, vertex, 0).a * 255.0 + 0.5);
-        share = texelFetch(t2, vertex, 0).a;
+        vec4 named = texelFetch(t1, vertex, 0);
+        top = int(named.r * 255.0 + 0.5);
+        share = named.g;
+        second = int(named.b * 255.0 + 0.5);
         alpha *= share * texelFetch(lut, ivec2(top, 0), 0).a + (1.0 - share) * texelFetch(lut, ivec2(second, 0), 0).a;
       }
       if (alpha > 0.0005) {
@@ -180,7 +190,7 @@ void main()
         photographed += left * alpha * plain;
         if (left * alpha > most_weight) {
           most_weight = left * alpha;
-          surface = place;
+          surface = (vec3(number * COARSE) + local * (float(COARSE - 1) / float(CELLS)) + 0.5) / vec3(across * COARSE);
         }
         float before = left;
         left *= 1.0 - alpha;
@@ -198,8 +208,8 @@ void main()
     return;
   }
   if (photographed > 0.01) {
-    vec3 slope = (texture(t1, surface).rgb - 0.5) * d.x + (texture(t2, surface).rgb - 0.5) * d.y +
-                 (texture(t3, surface).rgb - 0.5) * d.z;
+    vec3 slope = (texture(t2, surface).rgb - 0.5) * d.x + (texture(t3, surface).rgb - 0.5) * d.y +
+                 (texture(t4, surface).rgb - 0.5) * d.z;
     color = clamp(color + photographed * slope * (2.0 * harmonic_range), 0.0, opacity);
   }
   /* Where it is thin all along, it stands at the end of it. */
@@ -239,7 +249,7 @@ def march_shader() -> Any:
 
     info = GPUShaderCreateInfo()
     for place, (kind, name) in enumerate(
-        [("FLOAT_3D", "index_"), *(("FLOAT_3D", f"t{n}") for n in range(4)), ("FLOAT_2D", "lut")]
+        [("FLOAT_3D", "index_"), *(("FLOAT_3D", f"t{n}") for n in range(5)), ("FLOAT_2D", "lut")]
     ):
         info.sampler(place, kind, name)
     for kind, name in (

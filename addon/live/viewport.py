@@ -50,9 +50,9 @@ class Asset:
             if self.index is None:
                 self.index = _texture((self.found.meta["side"],) * 3, "R32F", voxels.read_index(self.found))
             elif not self.ready:
-                name = voxels.TEXELS[len(self.texels)]
+                name = list(voxels.TEXELS)[len(self.texels)]
                 data = voxels.read_texels(self.found, name)
-                self.texels.append(_texture(voxels.texture_size(self.found.meta), "RGBA8", data))
+                self.texels.append(_texture(voxels.texture_size(self.found.meta, name), "RGBA8", data))
         except (*UNREADABLE_ARRAYS, RuntimeError, MemoryError) as error:
             self.error = str(error)
 

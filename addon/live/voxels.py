@@ -13,7 +13,11 @@ from mathutils import Matrix
 from ..project import snapshot
 
 VERTICES = 9  # along a side of a block
-TEXELS = ("T0", "T1", "T2", "T3")
+COARSE = 5  # of them that have changes of the colour
+TEXELS = {"T0": VERTICES, "T1": VERTICES, "T2": COARSE, "T3": COARSE, "T4": COARSE}  # texels along a side of a block
+SLOT_BITS = 22  # of an entry of the index that number its block
+SLOTS = 1 << 15  # more than there are blocks: a texture's float32 holds the number and, times this, the octants
+VERSION = 2  # of the files
 
 
 class Baked(NamedTuple):
@@ -28,7 +32,7 @@ def baked(project: Path, run: str) -> Baked | None:
     """The baked field of a run; None where there is none that can be read."""
     folder = project / "runs" / run / "voxels"
     meta = snapshot.cached_json(folder / "meta.json")
-    if not isinstance(meta, dict) or meta.get("version") != 1 or meta.get("cells") != VERTICES - 1:
+    if not isinstance(meta, dict) or meta.get("version") != VERSION or meta.get("cells") != VERTICES - 1:
         return None
     return Baked(folder, meta, (str(folder), (folder / "meta.json").stat().st_mtime_ns))
 
@@ -39,10 +43,10 @@ def world_from_box(project: Path, meta: dict[str, Any]) -> Matrix:
     return (Matrix(known) if known else Matrix.Identity(4)) @ Matrix(meta["sfm_from_box"])
 
 
-def texture_size(meta: dict[str, Any]) -> tuple[int, int, int]:
-    """Texels of the textures along x, y and z."""
+def texture_size(meta: dict[str, Any], name: str) -> tuple[int, int, int]:
+    """Texels of a texture along x, y and z."""
     x, y, z = meta["across"]
-    return VERTICES * x, VERTICES * y, VERTICES * z
+    return TEXELS[name] * x, TEXELS[name] * y, TEXELS[name] * z
 
 
 def read_texels(found: Baked, name: str) -> Any:
@@ -50,21 +54,23 @@ def read_texels(found: Baked, name: str) -> Any:
     import numpy as np
 
     array = np.load(found.folder / f"{name}.npy", mmap_mode="r")
-    x, y, z = texture_size(found.meta)
+    x, y, z = texture_size(found.meta, name)
     if array.shape != (z, y, x, 4) or array.dtype != np.uint8:
         raise ValueError(f"{name}.npy holds {array.dtype} {array.shape}")
     return np.multiply(array, np.float32(1 / 255), dtype=np.float32).reshape(-1)
 
 
 def read_index(found: Baked) -> Any:
-    """The index of the blocks: flat float32, x fastest. Raises one of UNREADABLE_ARRAYS: it is damaged."""
+    """The index of the blocks as the shader takes it: flat float32, x fastest; minus a distance, or number of the block + 1 and
+    `SLOTS` times which of its octants hold anything. Raises one of UNREADABLE_ARRAYS: it is damaged."""
     import numpy as np
 
     side = found.meta["side"]
     array = np.load(found.folder / "index.npy")
     if array.shape != (side,) * 3:
         raise ValueError(f"index.npy holds {array.shape}")
-    return np.ascontiguousarray(array, np.float32).reshape(-1)
+    block = (array & ((1 << SLOT_BITS) - 1)) + SLOTS * (array >> SLOT_BITS)
+    return np.where(array > 0, block, array).astype(np.float32).reshape(-1)
 
 
 def class_rows(meta: dict[str, Any], classes: Any, void: tuple[float, float, float] = (0, 0, 0)) -> list[float]:

@@ -15,7 +15,7 @@ from ..data.camera_rays import CameraRays
 from ..geometry.contraction import uncontract
 from ..kernels.runtime import run_parallel, worker_count
 from ..kernels.traversal import MarchSettings
-from ..kernels.voxel_field import CELLS, VERTICES, VIEWS, cell_length
+from ..kernels.voxel_field import CELLS, SLOT_BITS, VERTICES, VIEWS, cell_length, occupied_octants
 from ..kernels.voxel_march import add_views
 from ..render.model import Model
 from ..sampling.render_grid import RenderGrid
@@ -50,7 +50,8 @@ class Blocks:
         empty[z, y, x] = False
         away = distance_transform_cdt(empty, "chessboard") if len(self) else np.full(empty.shape, n)
         index = torch.from_numpy(-np.asarray(away, np.int32)).reshape(-1)
-        index[torch.from_numpy((z * n + y) * n + x)] = torch.arange(1, len(self) + 1, dtype=torch.int32)
+        entries = occupied_octants(self.roots.cpu()) << SLOT_BITS
+        index[torch.from_numpy((z * n + y) * n + x)] = entries + torch.arange(1, len(self) + 1, dtype=torch.int32)
         return index.to(device)
 
     def kept(self, which: torch.Tensor) -> Blocks:

@@ -10,9 +10,9 @@ from ..field.encoding import spherical_harmonics
 from ..field.hybrid import Geometry
 from ..geometry.contraction import uncontract
 from ..kernels.runtime import run_parallel
-from ..kernels.voxel_field import VERTICES, VIEWS
+from ..kernels.voxel_field import AXES, TEXELS, VERTICES, VIEWS
 from ..render.model import Model
-from .blocks import CHUNK, Blocks, Check, vertex_points, weights_and_cameras
+from .blocks import CHUNK, CHUNK_BLOCKS, Blocks, Check, vertex_points, weights_and_cameras
 
 HARMONIC_RANGE = 0.5  # largest change of a colour with the direction that is stored
 DAMPING = 0.003  # of that change, against the mean colour
@@ -21,8 +21,9 @@ DAMPING = 0.003  # of that change, against the mean colour
 @torch.no_grad()
 def vertex_texels(
     model: Model, blocks: Blocks, views: torch.Tensor, centers: torch.Tensor, check: Check
-) -> torch.Tensor:
-    """Texels (S · 9³, 4, 4) uint8 of the vertices of blocks, as `VoxelField` describes them.
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Texels (S · 9³, 2, 4) uint8 of the vertices of blocks and their changes (S · 5³, 3, 4) uint8, as `VoxelField`
+    describes them.
 
     Args:
         views: (S · 9³, VIEWS) which cameras see them (`blocks.seen_by`); vertices that none does look as the camera sees
@@ -30,9 +31,10 @@ def vertex_texels(
         centers: (C, 3) camera centres in the normalised frame.
     """
     device = blocks.roots.device
-    texels = torch.full((len(blocks.roots), 4, 4), 128, dtype=torch.uint8, device=device)
+    texels = torch.full((len(blocks.roots), TEXELS, 4), 128, dtype=torch.uint8, device=device)
     texels[:, 0, 3] = blocks.roots
-    texels[:, 1:, 3] = torch.tensor([0, 255, 0], dtype=torch.uint8, device=device)
+    texels[:, 1] = torch.tensor([0, 255, 0, 0], dtype=torch.uint8, device=device)
+    slopes = torch.full((len(blocks.roots), AXES, 3), 128, dtype=torch.uint8, device=device)
     best = views.view(-1, VERTICES**3 * VIEWS).amax(1).repeat_interleave(VERTICES**3)
     points = vertex_points(blocks.places, blocks.side)
     seen = (views > 0).any(1)
@@ -45,12 +47,29 @@ def vertex_texels(
         codes[:, 0] = torch.where(seen[rows], codes[:, 0], best[rows])
         there = points[rows].contiguous()
         geometry = model.field.geometry(there)
-        texels[rows, :, :3] = _colors(model, geometry, there, codes, centers)
+        colors = _colors(model, geometry, there, codes, centers)
+        texels[rows, 0, :3], slopes[rows] = colors[:, 0], colors[:, 1:]
         if model.field.classes:
-            texels[rows, 1:, 3] = _classes(model.field.class_probabilities(geometry))
+            texels[rows, 1, :3] = _classes(model.field.class_probabilities(geometry))
 
     run_parallel([partial(read, rows) for rows in used.split(CHUNK)], device)
-    return texels
+    known = torch.zeros(len(slopes), dtype=torch.bool, device=device)
+    known[used] = True
+    per_block = zip(slopes.split(CHUNK_BLOCKS * VERTICES**3), known.split(CHUNK_BLOCKS * VERTICES**3))
+    changes = [_coarse(some, mask) for some, mask in per_block]
+    return texels, torch.cat(changes) if changes else slopes.new_zeros(0, AXES, 4)
+
+
+def _coarse(slopes: torch.Tensor, known: torch.Tensor) -> torch.Tensor:
+    """Changes (S · 5³, 3, 4) uint8 of every second vertex: the mean of those (S · 9³, 3, 3) of the vertices around it that
+    are `known` (S · 9³,)."""
+    blocks = len(known) // VERTICES**3
+    weight = known.float().view(blocks, 1, VERTICES, VERTICES, VERTICES)
+    values = slopes.view(blocks, VERTICES, VERTICES, VERTICES, AXES * 3).permute(0, 4, 1, 2, 3).float() - 127.5
+    pooled = torch.nn.functional.avg_pool3d(torch.cat([values * weight, weight], 1), 3, 2, 1)
+    mean = 127.5 + pooled[:, :-1] / pooled[:, -1:].clamp(min=1e-6)
+    rgb = mean.permute(0, 2, 3, 4, 1).reshape(-1, AXES, 3).round().to(torch.uint8)
+    return torch.nn.functional.pad(rgb, (0, 1), value=0)
 
 
 def _colors(
@@ -76,7 +95,7 @@ def _colors(
 
 
 def _classes(probabilities: torch.Tensor) -> torch.Tensor:
-    """Most probable class, its probability and second class (N, 3) uint8 of probabilities (N, K).
+    """Most probable class, its probability, and second class (N, 3) uint8 of probabilities (N, K).
 
     The second class stands for all others: a probability below one half is stored as one half, or it would win.
     """

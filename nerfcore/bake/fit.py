@@ -7,6 +7,8 @@ simultaneous iterative reconstruction of Gilbert, 1972; for opacities a Gauss–
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 
 from ..data.pixels import Batch, PixelStore
@@ -31,29 +33,37 @@ EXPOSURES = 0.5, 2.0  # of a photo against the field
 
 @torch.no_grad()
 def fitted(
-    model: Model, blocks: Blocks, texels: torch.Tensor, photos: PixelStore, settings: MarchSettings, check: Check
-) -> torch.Tensor:
-    """Texels (S · 9³, 4, 4) uint8 of blocks as `colors.vertex_texels` makes them, fitted to photos.
+    model: Model,
+    blocks: Blocks,
+    texels: torch.Tensor,
+    changes: torch.Tensor,
+    photos: PixelStore,
+    settings: MarchSettings,
+    check: Check,
+) -> Blocks:
+    """Fit texels (S · 9³, 2, 4) uint8 of blocks as `colors.vertex_texels` makes them to photos, in place; returns the blocks
+    with the opacities that they have then.
 
     Args:
+        changes: (S · 5³, 3, 4) uint8 of the same, which stay.
         photos: of the run, with the poses that the field was trained with.
         settings: the step is as long as a cell.
     """
     if len(blocks) == 0 or len(photos) == 0:
-        return texels
+        return blocks
     device = texels.device
     generator = torch.Generator(device).manual_seed(0)
     same, count = shared_vertices(blocks)
     color, root = texels[:, 0, :3].float() / 255, texels[:, 0, 3].float() / 255
-    index, opaque = blocks.index(), torch.ones(256, device=device)
 
     def field() -> VoxelField:
         texels[:, 0] = (torch.cat([color, root[:, None]], 1) * 255).round().to(torch.uint8)
-        words = texels.reshape(-1).view(torch.int32)
-        return VoxelField(blocks.side, index, words, opaque, HARMONIC_RANGE, model.field.classes)
+        now = replace(blocks, roots=texels[:, 0, 3].contiguous())
+        return baked_field(now, texels, changes, model.field.classes)
 
     def drawn(rays: int) -> tuple[Batch, torch.Tensor]:
-        batch = photos.batch(photos.random_pixels(rays, generator))
+        # In their order, so that rays beside each other meet the same vertices.
+        batch = photos.batch(photos.random_pixels(rays, generator).sort().values)
         return batch, behind(model, batch.directions, generator, check)
 
     batch, background = drawn(min(EXPOSURE_RAYS, len(photos)))
@@ -72,7 +82,14 @@ def fitted(
         change = RATE * sums[:, 4] / (sums[:, 5] + DAMPING)
         root = (root + change.clamp(-LARGEST, LARGEST)).clamp(0, 1)
     field()
-    return texels
+    return replace(blocks, roots=texels[:, 0, 3].contiguous())
+
+
+def baked_field(blocks: Blocks, texels: torch.Tensor, changes: torch.Tensor, classes: int) -> VoxelField:
+    """The field of blocks with their texels (S · 9³, 2, 4) and changes (S · 5³, 3, 4) uint8, all classes opaque."""
+    words, coarse = (value.reshape(-1).view(torch.int32) for value in (texels, changes))
+    opaque = torch.ones(256, device=words.device)
+    return VoxelField(blocks.side, blocks.index(), words, coarse, opaque, HARMONIC_RANGE, classes)
 
 
 def shared_vertices(blocks: Blocks) -> tuple[torch.Tensor, int]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -36,13 +37,15 @@ from .colors import HARMONIC_RANGE, vertex_texels
 from .fit import fitted
 
 # Not tuned: the next three.
-FINEST = 64  # blocks along a side of the grid
+FINEST = 96  # blocks along a side of the grid
 MOST_CLASSES = 255  # that a byte tells apart, and void
 MOST_VIEWS = 1000  # training photos whose rays are asked
 # Measured (docs/experiments.md, “How fine must a baked field be?”):
 RAYS = 2_000_000  # through training cameras, that tell what is seen
 PIXELS = 16_000_000  # of the photos that the baked field is fitted to; not tuned
-LEAST_SEEN = 0.03  # weight that a block has in one of these rays at least
+LEAST_SEEN = 0.05  # weight that a block has in one of these rays at least
+TRIES = 3  # of grids that fit into memory, each finer than the one before; not tuned
+ENOUGH = 0.92  # of the blocks that fit, with which no finer grid is tried; not tuned
 
 
 def bake(params: BakeParams, report: Reporter) -> dict[str, Any]:
@@ -70,14 +73,12 @@ def bake(params: BakeParams, report: Reporter) -> dict[str, Any]:
         report.warn("The photos show nothing of the field: what was baked is empty. Train longer.")
     report.stage("Reading colours")
     views = seen_by(blocks, rays, march_settings(trained.model, blocks.side, 1.0), True, report.check)
-    texels = vertex_texels(trained.model, blocks, views, rays.center, report.check)
+    texels, changes = vertex_texels(trained.model, blocks, views, rays.center, report.check)
     report.stage("Fitting to the photos")
     photos = training_photos(folder, params.run, trained, scene, trained.info.box(project).box_from_world, report)
-    texels = fitted(
-        trained.model, blocks, texels, photos, march_settings(trained.model, blocks.side, 1.0), report.check
-    )
-    report.stage("Writing")
     settings = march_settings(trained.model, blocks.side, 1.0)
+    blocks = fitted(trained.model, blocks, texels, changes, photos, settings, report.check)
+    report.stage("Writing")
     names = {c.id: c.name for c in scene.classes}
     meta = Meta(
         checkpoint=state_id(trained.state),
@@ -97,7 +98,8 @@ def bake(params: BakeParams, report: Reporter) -> dict[str, Any]:
     environment = panorama(trained.model, report.check) if meta.environment else None
     place = voxels_folder(folder, params.run)
     lut = class_table(scene, classes)
-    files = save_baked(place, meta, blocks.index().cpu().numpy(), texels.cpu().numpy(), lut, environment)
+    index = blocks.index().cpu().numpy()
+    files = save_baked(place, meta, index, texels.cpu().numpy(), changes.cpu().numpy(), lut, environment)
     result = {
         "run": params.run,
         "folder": str(place),
@@ -150,20 +152,38 @@ def training_photos(
 
 
 def visible_blocks(trained: Trained, rays: CameraRays, memory: float, check: Check) -> Blocks:
-    """The blocks that rays of training cameras see, of the finest grid with which they fit into so many bytes."""
-    model, side, first = trained.model, max(1, FINEST // 2), True
+    """The blocks that rays of training cameras see, of the finest grid found with which they fit into so many bytes."""
+    model = trained.model
     model.refine(check=check, everywhere=True)
     grid = visible_grid(model, model.render_grid(), rays, check)
-    while True:
+
+    def seen(side: int) -> Blocks:
         found = read_blocks(model, grid, side, check)
         views = seen_by(found, rays, march_settings(model, side, 1.0), False, check)
         weights, _ = weights_and_cameras(views.amax(1))
-        blocks = found.kept(weights > LEAST_SEEN)
-        # The first grid only tells how fine the next may be.
-        if not first and len(blocks) <= most_blocks(memory, side):
-            return blocks
-        finest = FINEST if first else side - 1
-        side, first = min(finest, side_for(len(blocks), side, most_blocks(memory, finest))), False
+        return found.kept(weights > LEAST_SEEN)
+
+    return finest_blocks(seen, memory)
+
+
+def finest_blocks(seen: Callable[[int], Blocks], memory: float) -> Blocks:
+    """The blocks `seen` of a grid with so many along a side, as fine as fits into so many bytes.
+
+    How many there are depends on where their sides meet walls: 70 along a side can be more blocks than 74. So the first
+    grid, a coarse one, only tells how fine the next may be, and a next one is tried where the last left much over.
+    """
+    highest = min(FINEST, int((memory / 16) ** (1 / 3)))  # the index takes a quarter at most
+    found, best, fitting = seen(max(1, highest // 3)), None, 0
+    while True:
+        wanted = side_for(len(found), found.side, most_blocks(memory, highest))
+        found = seen(min(highest, wanted if best is None else max(wanted, best.side + 1)))
+        most = most_blocks(memory, found.side)
+        if len(found) > most:
+            highest = found.side - 1
+        else:
+            best, fitting = found, fitting + 1
+        if best is not None and (best.side >= highest or fitting == TRIES or len(best) >= ENOUGH * most):
+            return best
 
 
 def class_table(scene: Scene, class_ids: list[int]) -> np.ndarray:

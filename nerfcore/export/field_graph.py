@@ -3,11 +3,14 @@
 Inputs: `points` (N, 3) in the world, `directions` (N, 3) unit vectors from the eye to the point, in the world.
 Outputs: `density` (N) per world unit, `color` (N, 3) sRGB in [0, 1], and with classes `probabilities` (N, K) in the
 order of the metadata `class_ids`, `class_names`. All float32.
+
+Only operators that TensorRT takes as well, which knows none on bits of integers.
 """
 
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +31,8 @@ from ..kernels.encode_torch import PRIMES
 from ..project.schema import Project
 from ..render.run import Trained
 
-OPSET = 18  # the first with BitwiseXor
+OPSET = 18
+Rows = Callable[[int, int, int], str]  # of the corner (dx, dy, dz) of a cell
 
 
 def write_onnx(path: Path, trained: Trained, project: Project) -> None:
@@ -151,7 +155,37 @@ def _corners(g: _Graph, scaled: str, last: int) -> tuple[list[tuple[str, str]], 
     return list(zip(columns(low), columns(high))), list(zip(columns(rest), columns(share)))
 
 
-def _trilinear(g: _Graph, table: str, rows: Any, weights: list[tuple[str, str]]) -> str:
+def _dense_rows(g: _Graph, index: list[tuple[str, str]], side: int) -> Rows:
+    """Rows of the vertices of a cell in a table of side³."""
+    axes = [
+        [i if f == 1 else g.add("Mul", i, g.const(f, np.int64)) for i in index[axis]]
+        for axis, f in enumerate((1, side, side * side))
+    ]
+    return lambda dx, dy, dz: g.add("Add", g.add("Add", axes[0][dx], axes[1][dy]), axes[2][dz])
+
+
+def _hashed_rows(g: _Graph, index: list[tuple[str, str]], size: int) -> Rows:
+    """Rows of the vertices of a cell in a hashed table, whose size is a power of two: the exclusive or of one number for
+    each axis. With 1 and −1 for the bits 0 and 1 it is a product, and the row a sum of bits, exact in float32."""
+    powers = 2 ** np.arange(size.bit_length() - 1)
+
+    def signs(vertex: str, factor: int) -> str:
+        number = vertex if factor == 1 else g.add("Mul", vertex, g.const(factor, np.int64))
+        number = g.add("Mod", number, g.const(size, np.int64))
+        bits = g.add("Mod", g.add("Div", number, g.const(powers, np.int64)), g.const(2, np.int64))
+        return g.add("Sub", g.const(1.0), g.add("Mul", g.add("Cast", bits, to=TensorProto.FLOAT), g.const(2.0)))
+
+    axes = [[signs(vertex, factor) for vertex in index[axis]] for axis, factor in enumerate(PRIMES)]
+    worth, middle = g.const(-powers[:, None] / 2), g.const((size - 1) / 2)
+
+    def rows(dx: int, dy: int, dz: int) -> str:
+        product = g.add("Mul", g.add("Mul", axes[0][dx], axes[1][dy]), axes[2][dz])
+        return g.add("Cast", g.add("Add", g.add("MatMul", product, worth), middle), to=TensorProto.INT64)
+
+    return rows
+
+
+def _trilinear(g: _Graph, table: str, rows: Rows, weights: list[tuple[str, str]]) -> str:
     """Sum over the eight corners of weight · table[rows(dx, dy, dz)]."""
     total = ""
     for corner in range(8):
@@ -170,20 +204,7 @@ def _encode(g: _Graph, grid: VertexGrid, gains: list[float], points: str) -> str
         scaled = g.add("Mul", points, g.const(float(resolution - 1)))
         index, weights = _corners(g, scaled, resolution - 2)
         table = g.const(grid.table[base : base + size].detach().cpu().numpy() * gain)
-        dense = resolution**3 <= size
-        # Rows of a vertex are sums or exclusive ors of one number for each axis.
-        factors = (1, resolution, resolution**2) if dense else PRIMES
-        axes = [
-            [i if f == 1 else g.add("Mul", i, g.const(f, np.int64)) for i in index[axis]]
-            for axis, f in enumerate(factors)
-        ]
-
-        def rows(dx: int, dy: int, dz: int, axes: Any = axes, dense: bool = dense, size: int = size) -> str:
-            kind = "Add" if dense else "BitwiseXor"
-            row = g.add(kind, g.add(kind, axes[0][dx], axes[1][dy]), axes[2][dz])
-            # The size is a power of two: the remainder is what the kernels' mask leaves.
-            return row if dense else g.add("Mod", row, g.const(size, np.int64))
-
+        rows = _dense_rows(g, index, resolution) if resolution**3 <= size else _hashed_rows(g, index, size)
         features.append(_trilinear(g, table, rows, weights))
     return g.join(features)
 
@@ -221,12 +242,8 @@ def _evidence(g: _Graph, blend: BlendWeight, points: str) -> str:
     n = RESOLUTION
     scaled = g.add("Sub", g.add("Mul", points, g.const(float(n))), g.const(0.5))
     index, weights = _corners(g, scaled, n - 2)
-    axes = [
-        [i if f == 1 else g.add("Mul", i, g.const(f, np.int64)) for i in index[k]] for k, f in enumerate((1, n, n * n))
-    ]
     table = g.const(blend.evidence.detach().cpu().numpy()[:, None])
-    rows = lambda dx, dy, dz: g.add("Add", g.add("Add", axes[0][dx], axes[1][dy]), axes[2][dz])  # noqa: E731
-    evidence = _trilinear(g, table, rows, weights)
+    evidence = _trilinear(g, table, _dense_rows(g, index, n), weights)
     lack = g.add("Exp", g.add("Mul", evidence, g.const(-blend.rate)))
     return g.add("Sub", g.const(1.0), g.add("Mul", lack, g.const(1.0 - blend.floor)))
 

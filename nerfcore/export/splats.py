@@ -13,8 +13,7 @@ from ..errors import ProjectError
 from ..files import atomic_path
 from ..geometry.contraction import uncontract
 from ..geometry.similarity import similarity_scale
-from ..kernels.voxel_field import CELLS, VERTICES
-from ..kernels.voxel_march_torch import unpacked
+from ..kernels.voxel_field import AXES, CELLS, COARSE, TEXELS, VERTICES, occupied_blocks, texels_of
 from ..progress import Reporter
 from ..render.baked import BakedField
 from .gltf_splats import write_gltf_splats
@@ -38,7 +37,7 @@ def write_splats(path: Path, baked: BakedField, box: Box, class_ids: list[int], 
     """
     report.stage("Reading the baked field")
     field = baked.field
-    texels = unpacked(field.vertices.cpu().view(-1, 4)).numpy().astype(np.uint8)  # (S · 9³, 4 texels, 4 bytes)
+    texels, changes = texels_of(field.vertices, TEXELS), texels_of(field.changes, AXES)
     opacity = (texels[:, 0, 3].astype(np.float32) / 255) ** 2
     rows, places = _surface(field.index.cpu().numpy(), field.blocks, opacity)
     if not len(rows):
@@ -58,7 +57,8 @@ def write_splats(path: Path, baked: BakedField, box: Box, class_ids: list[int], 
     turn = box.world_from_box[:3, :3] / scale
     world = position.numpy() @ box.world_from_box[:3, :3].T + box.world_from_box[:3, 3]
     found = texels[rows].astype(np.float32)
-    slope = (found[:, 1:, :3] - 127.5) * (field.harmonic_range / 127.5)  # (N, xyz, rgb)
+    nearest = changes[_coarse_rows(rows), :, :3].astype(np.float32)
+    slope = (nearest - 127.5) * (field.harmonic_range / 127.5)  # (N, xyz, rgb)
     slope = np.einsum("ij,njc->nic", turn, slope)
     alpha = opacity[rows].clip(0, MOST)
     splats = np.zeros(len(rows), _layout())
@@ -73,9 +73,9 @@ def write_splats(path: Path, baked: BakedField, box: Box, class_ids: list[int], 
         splats[f"scale_{axis}"] = np.log(SPREAD * size.numpy() * scale)
     splats["rot_0"] = 1
     if class_ids:
-        share = found[:, 2, 3] / 255
+        share = found[:, 1, 1] / 255
         first = share >= 0.5
-        index = np.where(first, found[:, 1, 3], found[:, 3, 3]).astype(int)
+        index = np.where(first, found[:, 1, 0], found[:, 1, 2]).astype(int)
         splats["class_id"] = np.array(class_ids)[index]
         splats["class_probability"] = np.where(first, share, 1 - share)
     else:
@@ -89,11 +89,17 @@ def write_splats(path: Path, baked: BakedField, box: Box, class_ids: list[int], 
     return [path, beside]
 
 
+def _coarse_rows(rows: np.ndarray) -> np.ndarray:
+    """Of rows (N,) of vertices, the rows of the vertices nearest to them that have changes."""
+    block, local = np.divmod(rows, VERTICES**3)
+    z, y, x = ((local // VERTICES**axis % VERTICES + 1) // 2 for axis in (2, 1, 0))
+    return ((block * COARSE + z) * COARSE + y) * COARSE + x
+
+
 def _surface(index: np.ndarray, blocks: int, opacity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rows of the vertices within a cell of empty space, and where they are: (N, 3) in cells; vertices that blocks share
     come once."""
-    occupied = np.flatnonzero(index > 0)
-    order = index[occupied] - 1
+    occupied, order = occupied_blocks(index)
     corner = np.stack([occupied % blocks, occupied // blocks % blocks, occupied // blocks**2], 1) * CELLS
     cubes = opacity.reshape(-1, VERTICES, VERTICES, VERTICES)
     around = minimum_filter(cubes, size=(1, 3, 3, 3), mode="nearest")

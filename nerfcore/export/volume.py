@@ -10,8 +10,7 @@ from ..data.box import Box
 from ..errors import ProjectError
 from ..geometry.similarity import similarity_scale
 from ..images.picture import srgb_to_linear
-from ..kernels.voxel_field import CELLS, VERTICES
-from ..kernels.voxel_march_torch import unpacked
+from ..kernels.voxel_field import CELLS, TEXELS, VERTICES, occupied_blocks, texels_of
 from ..progress import Reporter
 from ..render.baked import BakedField
 from .vdb import Grid, write_vdb
@@ -31,7 +30,7 @@ def write_volume(path: Path, baked: BakedField, box: Box, class_names: list[str]
     """
     report.stage("Reading the baked field")
     field = baked.field
-    texels = unpacked(field.vertices.cpu().view(-1, 4)).numpy().astype(np.uint8)  # (S · 9³, 4 texels, 4 bytes)
+    texels = texels_of(field.vertices, TEXELS)
     rows, places = solid_vertices(field.index.cpu().numpy(), field.blocks, texels[:, 0, 3] > 0)
     side = field.blocks * CELLS
     if box.contracted:
@@ -44,9 +43,9 @@ def write_volume(path: Path, baked: BakedField, box: Box, class_names: list[str]
     density = -np.log1p(-opacity) / (cell * similarity_scale(box.world_from_box))
     color = srgb_to_linear(texels[rows, 0, :3].astype(np.float32) / 255)
     grids = [Grid("density", places, density), Grid("color", places, color)]
-    share = texels[rows, 2, 3] / np.float32(255)
+    share = texels[rows, 1, 1] / np.float32(255)
     for index, name in enumerate(class_names):
-        mine = np.where(texels[rows, 1, 3] == index, share, 0) + np.where(texels[rows, 3, 3] == index, 1 - share, 0)
+        mine = np.where(texels[rows, 1, 0] == index, share, 0) + np.where(texels[rows, 1, 2] == index, 1 - share, 0)
         some = mine > 0
         grids.append(Grid(f"class_{name}", places[some], mine[some]))
     report.check()
@@ -60,10 +59,10 @@ def write_volume(path: Path, baked: BakedField, box: Box, class_names: list[str]
 def solid_vertices(index: np.ndarray, blocks: int, solid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rows (N,) of the vertices that are `solid` (S · 9³,), and where they are (N, 3) in cells; those that blocks share
     come once."""
-    occupied = np.flatnonzero(index > 0)
+    occupied, order = occupied_blocks(index)
     corners = np.zeros((len(occupied), 3), np.int64)
     corner = np.stack([occupied % blocks, occupied // blocks % blocks, occupied // blocks**2], 1) * CELLS
-    corners[index[occupied] - 1] = corner
+    corners[order] = corner
     rows = np.flatnonzero(solid)
     block, local = np.divmod(rows, VERTICES**3)
     place = np.stack([local % VERTICES, local // VERTICES % VERTICES, local // VERTICES**2], 1)

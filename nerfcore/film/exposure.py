@@ -40,7 +40,7 @@ class Seen:
     """What one sample of N pixels shows, numpy: color (N, 4) linear with associated alpha (with what is behind, where that
     is shown); opacity, distance (N,) of the fields alone; origins, directions (N, 3); item (N,) number of the field in the
     shot, −1 for none; best (N,) its class index, −1 for void; share (N,) the probability; hit (N,) bool: an object is
-    met; behind (N, 4): what is behind that object; times (N,) while the shutter is open."""
+    met; held (N,) bool: it is a holdout; behind (N, 4): what is behind another one; times (N,) while the shutter is open."""
 
     def __init__(self, parts: list[dict[str, torch.Tensor]]) -> None:
         for name in parts[0]:
@@ -55,6 +55,7 @@ class Seen:
     best: np.ndarray
     share: np.ndarray
     hit: np.ndarray
+    held: np.ndarray
     behind: np.ndarray
     times: np.ndarray
 
@@ -121,15 +122,17 @@ class _Film:
         self.corners = torch.stack([x.reshape(-1), y.reshape(-1)], 1).float()
         generator = torch.Generator().manual_seed(0)
         self.turns = torch.rand(self.count, 3, generator=generator).to(self.device)
-        self.occluders = None
+        self.occluders = self.holdouts = None
         if shot.occluders is not None:
             with np.load(shot.occluders) as data:
                 self.occluders = FirstHits(data["vertices"], data["faces"])
+                if "holdout" in data and data["holdout"].any():
+                    self.holdouts = FirstHits(data["vertices"], data["faces"][data["holdout"]])
         self.sum = np.zeros((self.count, 4))
         self.class_sum = np.zeros((self.count, 4))
-        # Colour before objects, behind them, beside them; and how many samples met one.
+        # Colour before objects, behind them, beside them; and how many samples met one, and a holdout.
         self.front, self.behind, self.beside = (np.zeros((self.count, 4)) for _ in range(3))
-        self.hits = np.zeros(self.count)
+        self.hits, self.held = np.zeros(self.count), np.zeros(self.count)
         self.colored = 0
         self.geometry: Seen | None = None
         wanted = {name[:-2] for name in shot.passes}
@@ -181,15 +184,18 @@ class _Film:
             met = torch.where((met > begin) & (met < end), met, FAR)
             far = torch.minimum(end, met)
         hit = met < FAR
+        held = torch.zeros_like(hit)
+        if self.holdouts is not None:
+            held = hit & (self.holdouts.distances(origins, directions).to(self.device) <= met)
         times = None if chances is None else chances[:, 2]
         color, facts = self._merged(origins, directions, begin, far, ~hit, times)
         behind = torch.zeros_like(color)
-        if "FieldBehind" in shot.passes and bool(hit.any()):
-            rows = hit.nonzero()[:, 0]
+        rows = (hit & ~held).nonzero()[:, 0]
+        if "FieldBehind" in shot.passes and len(rows):
             then = None if times is None else times[rows]
             hidden, _ = self._merged(origins[rows], directions[rows], met[rows], end[rows], hit[rows], then)
             behind = behind.index_copy(0, rows, hidden)
-        found = {"color": color, "behind": behind, "hit": hit & valid, **facts}
+        found = {"color": color, "behind": behind, "hit": hit & valid, "held": held & valid, **facts}
         found = {name: value * valid.view(-1, *[1] * (value.ndim - 1)) for name, value in found.items()}
         found["item"] = torch.where(valid, facts["item"], -1)
         moments = torch.full_like(begin, 0.5) if times is None else times
@@ -246,6 +252,7 @@ class _Film:
         self.beside += seen.color * ~hit
         self.behind += seen.behind
         self.hits += seen.hit
+        self.held += seen.held
         for number, field in enumerate(self.fields):
             mine = (seen.item == number) & (seen.best >= 0)
             colors = np.asarray(to_linear(field.colors.cpu()))
@@ -330,14 +337,16 @@ class _Film:
     def _around_objects(self) -> tuple[np.ndarray, np.ndarray]:
         """What is composited before and behind Blender's objects, so that Front over (Objects over Behind) is the mean over
         the samples also where an edge of an object crosses a pixel: with a share `a` of it covered, f what is before the
-        object and b what is beside it, Front = a f + (1 − a) f.alpha b with f's alpha, Behind = b."""
-        hits, rest = self.hits[:, None], self.colored - self.hits[:, None]
-        covered = hits / self.colored
+        object and b what is beside it, Front = a f + (1 − a) f.alpha b with f's alpha, Behind = b. Where part of it is a holdout, of
+        which the objects' picture has nothing, Behind is as much less than b as what the objects leave is more than 1 − a;
+        the alpha of the whole is then too large by (1 − a) f.alpha (1 − b.alpha) where the field ends in the same pixel."""
+        hits, held = self.hits[:, None], self.held[:, None]
+        solid, rest = hits - held, self.colored - hits
         before = self.front / np.maximum(hits, 1)
-        beside = np.where(rest > 0, self.beside / np.maximum(rest, 1), self.behind / np.maximum(hits, 1))
         alpha = before[:, 3:]
-        front = covered * before + (1 - covered) * alpha * beside
-        return np.concatenate([front[:, :3], alpha], 1), beside
+        front = (hits * before + alpha * self.beside) / self.colored
+        behind = np.where(rest + held > 0, self.beside / np.maximum(rest + held, 1), self.behind / np.maximum(solid, 1))
+        return np.concatenate([front[:, :3], alpha], 1), behind
 
 
 def to_linear(srgb: torch.Tensor) -> torch.Tensor:

@@ -11,7 +11,7 @@ import torch
 from ..errors import InputError, ProjectError
 from ..geometry.contraction import uncontract
 from ..kernels.closest import ClosestPoints
-from ..kernels.voxel_field import VERTICES, VoxelField
+from ..kernels.voxel_field import TEXELS, VERTICES, VoxelField, occupied_blocks, texels_of
 from ..mesh.instances import read_instances
 from ..mesh.stored import load_surface, mesh_folder
 from ..render.baked import BakedField
@@ -42,7 +42,7 @@ class InstanceCells:
             )
         self._vertices, self._faces = surface.vertices.astype(np.float64), surface.faces
         self._face_instance = surface.face_instance.astype(np.int64)
-        texels = baked.field.vertices.view(torch.uint8).reshape(-1, 4, 4).cpu().numpy()
+        texels = texels_of(baked.field.vertices, TEXELS)
         solid = texels[:, 0, 3] > 0
         # Instance of each vertex as one of its more probable, and of its less probable class; 0: none.
         self._first, self._second = (np.zeros(len(texels), np.int32) for _ in range(2))
@@ -51,7 +51,7 @@ class InstanceCells:
             own = np.flatnonzero(surface.face_class == class_id)
             if not len(own) or not self._face_instance[own].any():
                 continue
-            first, second = solid & (texels[:, 1, 3] == index), solid & (texels[:, 3, 3] == index)
+            first, second = solid & (texels[:, 1, 0] == index), solid & (texels[:, 1, 2] == index)
             rows = np.flatnonzero(first | second)
             if points is None:
                 points = vertex_places(baked, world_from_box)
@@ -92,11 +92,11 @@ class InstanceCells:
 
     def _split(self, names: tuple[str, ...]) -> VoxelField:
         classes, words = self._field.classes, self._field.vertices.clone()
-        texels = words.view(torch.uint8).reshape(-1, 4, 4)
+        texels = words.view(torch.uint8).reshape(-1, TEXELS, 4)
         for number, name in enumerate(names):
-            for texel, of_vertex in ((1, self._first), (3, self._second)):
+            for byte, of_vertex in ((0, self._first), (2, self._second)):
                 rows = torch.from_numpy(np.flatnonzero(of_vertex == self._known[name].id)).to(words.device)
-                texels[rows, texel, 3] = classes + number
+                texels[rows, 1, byte] = classes + number
         opacity = self._field.class_opacity.clone()
         for number, name in enumerate(names):
             opacity[classes + number] = opacity[self._class_index[self._known[name].class_id]]
@@ -115,9 +115,8 @@ class InstanceCells:
 def vertex_places(baked: BakedField, world_from_box: np.ndarray) -> np.ndarray:
     """Where the vertices (S · 9³, 3) of a baked field are in the world, in the order of its texels."""
     field, n = baked.field, baked.field.blocks
-    index = field.index.cpu().numpy()
-    cells = np.flatnonzero(index > 0)
-    cells = cells[np.argsort(index[cells])]
+    cells, number = occupied_blocks(field.index.cpu().numpy())
+    cells = cells[np.argsort(number)]
     blocks = np.stack([cells % n, cells // n % n, cells // n**2], 1)
     z, y, x = np.meshgrid(*[np.arange(VERTICES)] * 3, indexing="ij")
     local = np.stack([x, y, z], -1).reshape(1, -1, 3)

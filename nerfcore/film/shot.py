@@ -113,7 +113,7 @@ class FieldItem(_Part):
 
 class Shot(_Part):
     """One frame. border: x0, y0, x1, y1 of the pixels that are rendered; world: linear colour behind everything, None
-    leaves it transparent; occluders: file of triangles (npz: vertices, faces) that hide the field; file: where the
+    leaves it transparent; occluders: file of triangles (npz: vertices, faces, and which of them are a holdout) that hide the field; file: where the
     pixels go; levels: Cryptomatte levels; filter_width: of the Blackman-Harris filter in pixels, as Blender's engines have it,
     0 for a pixel's own area."""
 

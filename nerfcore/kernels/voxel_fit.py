@@ -1,7 +1,7 @@
 """How a baked field must change to look as rays say: what each of its vertices has to do with the error of each ray.
 
 A ray is marched twice: for its colour, and then to hand its error to the vertices it met. The torch version is in
-`voxel_march_torch.py`.
+`voxel_march_torch.py`, what the CPU runs in `voxel_host.py`.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from functools import partial
 import torch
 import warp as wp
 
-from . import voxel_march_torch
-from .device import backend_of
+from . import voxel_host, voxel_march_torch
+from .device import backend_of, on_host
 from .runtime import array, init, launch, run_parallel, worker_count
 from .traversal import (
     EARLY_STOP,
@@ -26,18 +26,19 @@ from .traversal import (
     ray_interval,
     reciprocal,
 )
+from .voxel_arrays import VoxelArrays, voxel_arrays
 from .voxel_field import VoxelField
 from .voxel_march import (
-    VoxelArrays,
     block_of,
     cell_of,
     channel,
+    color_change,
     corner_vertex,
     corner_weight,
-    leap,
+    empty_way,
+    lit,
     march_start,
-    seen_color,
-    voxel_arrays,
+    plain_color,
 )
 
 _LEAST_WEIGHT = wp.constant(voxel_march_torch.LEAST_WEIGHT)
@@ -62,10 +63,13 @@ def add_errors_kernel(
     lo, hi = ray_interval(o, inverse, m)
     total = wp.vec3(0.0, 0.0, 0.0)
     error = wp.vec3(0.0, 0.0, 0.0)
+    zero = wp.vec3(0.0, 0.0, 0.0)
+    change = wp.vec3(0.0, 0.0, 0.0)
     for turn in range(2):
         t = march_start(o, inverse, lo, m)
         transmittance = float(1.0)
         color = wp.vec3(0.0, 0.0, 0.0)
+        most = float(0.0)
         for _ in range(MAX_BINS):
             if t >= hi or transmittance < EARLY_STOP:
                 break
@@ -74,28 +78,31 @@ def add_errors_kernel(
             u = inside(grid_position(p, m.contracted))
             x = u * float(field.blocks)
             entry = field.index[block_of(x, field.blocks)]
-            if entry <= 0:
-                t += leap(u, inverse, p, -entry, field.blocks, m.contracted) + 0.5 * length
+            away = empty_way(entry, u, x, inverse, p, field.blocks, m.contracted)
+            if away >= 0.0:
+                t += away + 0.5 * length
             else:
                 cell = cell_of(x, entry, field.blocks)
                 root = float(0.0)
                 for corner in range(8):
                     vertex = corner_vertex(cell, corner)
-                    root += corner_weight(cell, corner) * channel(field.vertices[4 * vertex], 3) / 255.0
+                    root += corner_weight(cell, corner) * channel(field.vertices[2 * vertex], 3) / 255.0
                 if root > 0.0:
                     alpha = wp.min(root * root, 1.0)
                     weight = transmittance * alpha
-                    seen = seen_color(field, cell, d)
-                    color += weight * seen
+                    plain = plain_color(field, cell)
+                    color += weight * plain
+                    if turn == 0 and weight > most:
+                        most = weight
+                        change = color_change(field, x, cell.slot, d)
                     if turn == 1 and transmittance * root > _LEAST_WEIGHT:
                         # What lies behind the sample, were it alone to be seen.
-                        rest = (total - color) / wp.max(transmittance * (1.0 - alpha), 1.0e-4)
-                        rest = wp.vec3(
-                            wp.clamp(rest[0], 0.0, 1.0), wp.clamp(rest[1], 0.0, 1.0), wp.clamp(rest[2], 0.0, 1.0)
-                        )
-                        change = (seen - rest) * (transmittance * 2.0 * root)
-                        slope = wp.dot(change, error)
-                        square = wp.dot(change, change)
+                        seen = lit(plain, 1.0, change)
+                        before = color + (1.0 - transmittance * (1.0 - alpha)) * change
+                        rest = lit((total - before) / wp.max(transmittance * (1.0 - alpha), 1.0e-4), 1.0, zero)
+                        effect = (seen - rest) * (transmittance * 2.0 * root)
+                        slope = wp.dot(effect, error)
+                        square = wp.dot(effect, effect)
                         for corner in range(8):
                             vertex = corner_vertex(cell, corner)
                             share = corner_weight(cell, corner)
@@ -109,7 +116,7 @@ def add_errors_kernel(
                     transmittance *= 1.0 - alpha
                 t += length
         if turn == 0:
-            total = color + behind[r] * transmittance
+            total = lit(color, 1.0 - transmittance, change) + behind[r] * transmittance
             error = wanted[r] - total
             errors[r] = wp.dot(error, error) / 3.0
 
@@ -137,11 +144,12 @@ def add_errors(
         return voxel_march_torch.add_errors(sums, *rays, field, settings)
     init()
     errors = torch.empty(len(origins), device=device)
+    kernel = voxel_host.add_errors if on_host(device) else add_errors_kernel
 
     def add(part: slice, own: torch.Tensor) -> torch.Tensor:
         inputs = [array(value[part], wp.vec3) for value in rays]
         inputs += [voxel_arrays(field, settings), march_params(settings), array(own), array(errors[part])]
-        launch(add_errors_kernel, len(errors[part]), inputs, device, serial=True)
+        launch(kernel, len(errors[part]), inputs, device, serial=True)
         return own
 
     if device.type == "cuda":

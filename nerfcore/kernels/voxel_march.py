@@ -2,7 +2,7 @@
 
 A step stands for as much of the ray as it is long; outside the cube cells and steps grow alike, so that a step always
 is the same share of a cell. Opacity and colour are interpolated as they are coded; each corner's classes have as much of the
-opacity as the corner. The torch version is in `voxel_march_torch.py`.
+opacity as the corner. How the colour changes with the direction is read once a ray, where most of its light comes from. The torch version is in `voxel_march_torch.py`, what the CPU runs in `voxel_host.py`.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ from __future__ import annotations
 import torch
 import warp as wp
 
-from . import voxel_march_torch
-from .device import backend_of
+from . import voxel_host, voxel_march_torch
+from .device import backend_of, on_host
 from .runtime import array, init, launch
 from .traversal import (
     BEFORE_CUBE,
@@ -28,33 +28,11 @@ from .traversal import (
     ray_interval,
     reciprocal,
 )
-from .voxel_field import CELLS, VERTICES, VIEWS, VoxelField, VoxelRays, cell_length
+from .voxel_arrays import VoxelArrays, voxel_arrays
+from .voxel_field import CELLS, COARSE, SLOT_BITS, VERTICES, VIEWS, VoxelField, VoxelRays
 
 _CELLS, _VERTICES, _VIEWS = wp.constant(CELLS), wp.constant(VERTICES), wp.constant(VIEWS)
-_BLOCK = wp.constant(VERTICES**3)
-
-
-@wp.struct
-class VoxelArrays:
-    """A `VoxelField` as kernels take it; exponent: length of a step in cells."""
-
-    blocks: int
-    index: wp.array(dtype=int)
-    vertices: wp.array(dtype=int)
-    class_opacity: wp.array(dtype=float)
-    harmonic_range: float
-    classes: int
-    exponent: float
-
-
-def voxel_arrays(field: VoxelField, settings: MarchSettings) -> VoxelArrays:
-    """The field as kernels take it."""
-    arrays = VoxelArrays()
-    arrays.blocks, arrays.harmonic_range, arrays.classes = field.blocks, field.harmonic_range, field.classes
-    arrays.exponent = settings.step / cell_length(field.blocks, settings.contracted)
-    arrays.index, arrays.class_opacity = array(field.index), array(field.class_opacity)
-    arrays.vertices = array(field.vertices)
-    return arrays
+_BLOCK, _COARSE, _SLOT_BITS = wp.constant(VERTICES**3), wp.constant(COARSE), wp.constant(SLOT_BITS)
 
 
 @wp.func
@@ -100,8 +78,9 @@ def block_of(x: wp.vec3, blocks: int):
 
 @wp.struct
 class Cell:
-    """Where a sample is: its cell's first vertex, and the place in the cell in [0, 1]³."""
+    """Where a sample is: its block, its cell's first vertex, and the place in the cell in [0, 1]³."""
 
+    slot: int
     first: int
     place: wp.vec3
 
@@ -116,7 +95,8 @@ def cell_of(x: wp.vec3, entry: int, blocks: int):
         block = wp.min(int(x[a]), blocks - 1)
         local[a] = (x[a] - float(block)) * float(_CELLS)
         corner[a] = wp.min(int(local[a]), _CELLS - 1)
-    cell.first = (entry - 1) * _BLOCK + (corner[2] * _VERTICES + corner[1]) * _VERTICES + corner[0]
+    cell.slot = (entry & ((1 << _SLOT_BITS) - 1)) - 1
+    cell.first = cell.slot * _BLOCK + (corner[2] * _VERTICES + corner[1]) * _VERTICES + corner[0]
     cell.place = local - wp.vec3(float(corner[0]), float(corner[1]), float(corner[2]))
     return cell
 
@@ -144,20 +124,63 @@ def march_start(o: wp.vec3, inverse: wp.vec3, lo: float, m: MarchParams):
 
 
 @wp.func
-def seen_color(field: VoxelArrays, cell: Cell, d: wp.vec3):
-    """Colour in [0, 1] of a sample seen along d."""
+def plain_color(field: VoxelArrays, cell: Cell):
+    """Colour in [0, 1] of a sample without its change with the direction."""
     value = wp.vec3(0.0, 0.0, 0.0)
+    for corner in range(8):
+        value += corner_weight(cell, corner) * texel_color(field.vertices[2 * corner_vertex(cell, corner)])
+    return value / 255.0
+
+
+@wp.func
+def color_change(field: VoxelArrays, x: wp.vec3, slot: int, d: wp.vec3):
+    """Change of the colour along d at a position in blocks, in the block with a number."""
+    place = wp.vec3(0.0, 0.0, 0.0)
+    low = wp.vec3i(0, 0, 0)
+    for a in range(3):
+        place[a] = (x[a] - float(wp.min(int(x[a]), field.blocks - 1))) * float(_COARSE - 1)
+        low[a] = wp.min(int(place[a]), _COARSE - 2)
+        place[a] -= float(low[a])
     slope = wp.vec3(0.0, 0.0, 0.0)
     for corner in range(8):
-        vertex = 4 * corner_vertex(cell, corner)
-        w = corner_weight(cell, corner)
-        value += w * texel_color(field.vertices[vertex])
-        slope += (w * d[0]) * texel_color(field.vertices[vertex + 1])
-        slope += (w * d[1]) * texel_color(field.vertices[vertex + 2])
-        slope += (w * d[2]) * texel_color(field.vertices[vertex + 3])
+        w = float(1.0)
+        row = slot
+        for k in range(3):
+            a = 2 - k
+            far = (corner >> a) & 1
+            row = row * _COARSE + low[a] + far
+            w *= wp.where(far == 1, place[a], 1.0 - place[a])
+        for a in range(3):
+            slope += (w * d[a]) * texel_color(field.changes[3 * row + a])
     slope -= wp.vec3(127.5, 127.5, 127.5) * (d[0] + d[1] + d[2])
-    color = value / 255.0 + slope * (field.harmonic_range / 127.5)
-    return wp.vec3(wp.clamp(color[0], 0.0, 1.0), wp.clamp(color[1], 0.0, 1.0), wp.clamp(color[2], 0.0, 1.0))
+    return slope * (field.harmonic_range / 127.5)
+
+
+@wp.func
+def octant_is_empty(entry: int, x: wp.vec3, blocks: int):
+    """Whether nothing is in the octant of a block, whose entry of the index this is, at a position in blocks."""
+    octant = int(0)
+    for a in range(3):
+        if x[a] - float(wp.min(int(x[a]), blocks - 1)) >= 0.5:
+            octant += 1 << a
+    return ((entry >> (_SLOT_BITS + octant)) & 1) == 0
+
+
+@wp.func
+def empty_way(entry: int, u: wp.vec3, x: wp.vec3, inverse: wp.vec3, p: wp.vec3, blocks: int, contracted: int):
+    """How far a ray may move from a position over what the index says is empty; negative where something may be."""
+    if entry <= 0:
+        return leap(u, inverse, p, -entry, blocks, contracted)
+    if octant_is_empty(entry, x, blocks):
+        return leap(u, inverse, p, 1, 2 * blocks, contracted)
+    return -1.0
+
+
+@wp.func
+def lit(color: wp.vec3, opacity: float, change: wp.vec3):
+    """A ray's colour with its change along the direction; no sample is brighter than white or darker than black."""
+    sum = color + opacity * change
+    return wp.vec3(wp.clamp(sum[0], 0.0, opacity), wp.clamp(sum[1], 0.0, opacity), wp.clamp(sum[2], 0.0, opacity))
 
 
 @wp.kernel(module="fieldwork_voxel_march")
@@ -181,6 +204,9 @@ def march_voxels(
     transmittance = float(1.0)
     color = wp.vec3(0.0, 0.0, 0.0)
     depth = float(0.0)
+    most = float(0.0)
+    surface = wp.vec3(0.0, 0.0, 0.0)
+    slot = int(0)
     for _ in range(MAX_BINS):
         if t >= hi or transmittance < EARLY_STOP:
             break
@@ -189,14 +215,15 @@ def march_voxels(
         u = inside(grid_position(p, m.contracted))
         x = u * float(field.blocks)
         entry = field.index[block_of(x, field.blocks)]
-        if entry <= 0:
-            t += leap(u, inverse, p, -entry, field.blocks, m.contracted) + 0.5 * length
+        away = empty_way(entry, u, x, inverse, p, field.blocks, m.contracted)
+        if away >= 0.0:
+            t += away + 0.5 * length
         else:
             cell = cell_of(x, entry, field.blocks)
             root = float(0.0)
             for corner in range(8):
                 root += (
-                    corner_weight(cell, corner) * channel(field.vertices[4 * corner_vertex(cell, corner)], 3) / 255.0
+                    corner_weight(cell, corner) * channel(field.vertices[2 * corner_vertex(cell, corner)], 3) / 255.0
                 )
             if root > 0.0:
                 alpha = 1.0 - wp.pow(wp.max(1.0 - root * root, 0.0), field.exponent)
@@ -204,22 +231,28 @@ def march_voxels(
                     full = alpha
                     alpha = float(0.0)
                     for corner in range(8):
-                        vertex = 4 * corner_vertex(cell, corner)
+                        vertex = 2 * corner_vertex(cell, corner)
                         part = full * corner_weight(cell, corner) * channel(field.vertices[vertex], 3) / (255.0 * root)
                         if part > 0.0:
-                            top = int(channel(field.vertices[vertex + 1], 3))
-                            second = int(channel(field.vertices[vertex + 3], 3))
-                            share = channel(field.vertices[vertex + 2], 3) / 255.0
+                            top = int(channel(field.vertices[vertex + 1], 0))
+                            share = channel(field.vertices[vertex + 1], 1) / 255.0
+                            second = int(channel(field.vertices[vertex + 1], 2))
                             first = part * share * field.class_opacity[top]
                             rest = part * (1.0 - share) * field.class_opacity[second]
                             alpha += first + rest
                             probabilities[r, top] = probabilities[r, top] + transmittance * first
                             probabilities[r, second] = probabilities[r, second] + transmittance * rest
                 weight = transmittance * alpha
-                color += weight * seen_color(field, cell, d)
+                color += weight * plain_color(field, cell)
+                if weight > most:
+                    most = weight
+                    surface = x
+                    slot = cell.slot
                 depth += weight * t
                 transmittance *= 1.0 - alpha
             t += length
+    if most > 0.0:
+        color = lit(color, 1.0 - transmittance, color_change(field, surface, slot, d))
     out[r, 0] = color[0]
     out[r, 1] = color[1]
     out[r, 2] = color[2]
@@ -256,8 +289,9 @@ def note_views(
         u = inside(grid_position(p, m.contracted))
         x = u * float(blocks)
         entry = index[block_of(x, blocks)]
-        if entry <= 0:
-            t += leap(u, inverse, p, -entry, blocks, m.contracted) + 0.5 * length
+        away = empty_way(entry, u, x, inverse, p, blocks, m.contracted)
+        if away >= 0.0:
+            t += away + 0.5 * length
         else:
             cell = cell_of(x, entry, blocks)
             root = float(0.0)
@@ -266,7 +300,7 @@ def note_views(
             alpha = wp.min(root * root, 1.0)
             weight = transmittance * alpha
             if by_vertex == 0:
-                wp.atomic_max(views, entry - 1, camera % _VIEWS, view_code(weight, camera))
+                wp.atomic_max(views, cell.slot, camera % _VIEWS, view_code(weight, camera))
             else:
                 for corner in range(8):
                     code = view_code(weight * corner_weight(cell, corner), camera)
@@ -299,7 +333,8 @@ def march(
     out = torch.empty(rays, 5, device=device)
     probabilities = torch.zeros(rays, field.classes, device=device)
     inputs = [array(origins, wp.vec3), array(directions, wp.vec3), array(ends), voxel_arrays(field, settings)]
-    launch(march_voxels, rays, [*inputs, march_params(settings), array(out), array(probabilities)], device)
+    kernel = voxel_host.march_voxels if on_host(device) else march_voxels
+    launch(kernel, rays, [*inputs, march_params(settings), array(out), array(probabilities)], device)
     return VoxelRays(out[:, :3], out[:, 3], out[:, 4], probabilities if field.classes else None)
 
 
@@ -329,4 +364,4 @@ def add_views(
     init()
     inputs = [array(origins, wp.vec3), array(directions, wp.vec3), array(cameras), array(index), array(roots)]
     inputs += [blocks, march_params(settings), int(by_vertex), array(views)]
-    launch(note_views, rays, inputs, device, serial=True)
+    launch(voxel_host.note_views if on_host(device) else note_views, rays, inputs, device, serial=True)

@@ -9,25 +9,34 @@ import torch
 
 from ..geometry.contraction import grid_position
 from .traversal import BEFORE_CUBE, EARLY_STOP, MAX_BINS, MarchSettings
-from .voxel_field import CELLS, VERTICES, VIEWS, VoxelField, VoxelRays, cell_length
+from .voxel_field import (
+    AXES,
+    COARSE,
+    SLOT_BITS,
+    TEXELS,
+    VERTICES,
+    VIEWS,
+    VoxelField,
+    VoxelRays,
+    cell_length,
+)
 
 LEAST_WEIGHT = 1e-3  # of a sample that is asked to change
-SHADER_STOP, SHADER_LEAST = (
-    0.004,
-    0.0005,
-)  # transmittance at which the shader stops, opacity from which it asks for colours
+SHADER_STOP = 0.01  # transmittance at which the shader stops
 _CORNERS = [(corner & 1, corner >> 1 & 1, corner >> 2) for corner in range(8)]
 
 
 @dataclass(frozen=True)
 class _Step:
     """Where N of the rays take a sample: rays (N,) their numbers, t (N,), corners (N, 8) the vertices around it and
-    shares (N, 8) their trilinear weights."""
+    shares (N, 8) their trilinear weights; coarse and coarse_shares (N, 8) the same of every second vertex."""
 
     rays: torch.Tensor
     t: torch.Tensor
     corners: torch.Tensor
     shares: torch.Tensor
+    coarse: torch.Tensor
+    coarse_shares: torch.Tensor
 
 
 def _bounds(origins: torch.Tensor, inverse: torch.Tensor, s: MarchSettings) -> tuple[torch.Tensor, torch.Tensor]:
@@ -69,42 +78,83 @@ def _steps(
     looks: torch.Tensor | None = None,
 ) -> Iterator[_Step]:
     """The samples of rays (R, 3), one a ray at a time, while the caller lowers their transmittance (R,) in place; `looks`
-    (R,): how often each ray looked into the index, counted in place."""
+    (R,): how often each ray came into another block, counted in place."""
     inverse = 1 / torch.where(directions.abs() < 1e-9, 1e-9, directions)
     t, high = _bounds(origins, inverse, s)
     high = high if ends is None else torch.minimum(high, ends)
+    before = torch.full_like(t, -1, dtype=torch.long)
     for _ in range(int(MAX_BINS)):
         rays = ((t < high) & (transmittance >= float(EARLY_STOP))).nonzero()[:, 0]
         if len(rays) == 0:
             return
-        if looks is not None:
-            looks[rays] += 1
         now, d = t[rays], directions[rays]
         p = origins[rays] + d * now[:, None]
         r = p.abs().amax(1)
         length = torch.where(r > 1, s.step * r * r.sqrt(), s.step) if s.contracted else torch.full_like(now, s.step)
         u = grid_position(p, s.contracted).clamp(0, 1)
         block = (u * n).long().clamp(max=n - 1)
-        entry = index[(block[:, 2] * n + block[:, 1]) * n + block[:, 0]].long()
+        place = (block[:, 2] * n + block[:, 1]) * n + block[:, 0]
+        if looks is not None:
+            looks[rays] += (place != before[rays]).float()
+            before[rays] = place
+        entry = index[place].long()
         empty = entry <= 0
-        away = _leap(u, inverse[rays], p, -entry, n, s.contracted) + 0.5 * length
-        t[rays] += torch.where(empty, away, length)
+        half = ((u * n - block) >= 0.5).long()
+        octant = half[:, 0] + 2 * half[:, 1] + 4 * half[:, 2]
+        hollow = ~empty & ((entry >> (SLOT_BITS + octant) & 1) == 0)
+        away = torch.where(
+            empty,
+            _leap(u, inverse[rays], p, -entry, n, s.contracted),
+            _leap(u, inverse[rays], p, torch.ones_like(entry), 2 * n, s.contracted),
+        )
+        empty |= hollow
+        t[rays] += torch.where(empty, away + 0.5 * length, length)
         used = (~empty).nonzero()[:, 0]
         if len(used) == 0:
             continue
-        local = (u[used] * n - block[used]) * CELLS
-        corner = local.long().clamp(max=CELLS - 1)
-        f = local - corner
-        first = (entry[used] - 1) * VERTICES**3 + (corner[:, 2] * VERTICES + corner[:, 1]) * VERTICES + corner[:, 0]
-        corners = torch.stack([first + (z * VERTICES + y) * VERTICES + x for x, y, z in _CORNERS], 1)
-        weights = [torch.where(torch.tensor(c, device=f.device) > 0, f, 1 - f).prod(1) for c in _CORNERS]
-        yield _Step(rays[used], now[used], corners, torch.stack(weights, 1))
+        local, slot = u[used] * n - block[used], (entry[used] & ((1 << SLOT_BITS) - 1)) - 1
+        yield _Step(rays[used], now[used], *_around(local, slot, VERTICES), *_around(local, slot, COARSE))
+
+
+def _around(place: torch.Tensor, slot: torch.Tensor, side: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """The eight of side³ vertices of blocks (N,) around places (N, 3) in [0, 1]³ of them, and their shares, (N, 8)."""
+    local = place * (side - 1)
+    corner = local.long().clamp(max=side - 2)
+    f = local - corner
+    first = slot * side**3 + (corner[:, 2] * side + corner[:, 1]) * side + corner[:, 0]
+    corners = torch.stack([first + (z * side + y) * side + x for x, y, z in _CORNERS], 1)
+    weights = [torch.where(torch.tensor(c, device=f.device) > 0, f, 1 - f).prod(1) for c in _CORNERS]
+    return corners, torch.stack(weights, 1)
 
 
 def unpacked(texels: torch.Tensor) -> torch.Tensor:
     """The bytes (…, 4) int64, lowest first, of texels (…) int32."""
     value = texels.long()
     return torch.stack([value >> shift & 255 for shift in (0, 8, 16, 24)], -1)
+
+
+class _Brightest:
+    """Where rays (R, 3) get most of their light, and how their colours change there with the direction."""
+
+    def __init__(self, directions: torch.Tensor, field: VoxelField) -> None:
+        self.directions, self.field = directions, field
+        self.most, self.change = torch.zeros_like(directions[:, 0]), torch.zeros_like(directions)
+
+    def see(self, step: _Step, weight: torch.Tensor) -> None:
+        """Take in samples of some rays with their weights (N,)."""
+        more = (weight > self.most[step.rays]).nonzero()[:, 0]
+        rays = step.rays[more]
+        texels = unpacked(self.field.changes.view(-1, AXES)[step.coarse[more]])[
+            ..., :3
+        ].float()  # (N, 8, axes, colours)
+        mean = (step.coarse_shares[more][..., None, None] * texels).sum(1) - 127.5
+        self.change[rays] = (mean * self.directions[rays][..., None]).sum(1) * (self.field.harmonic_range / 127.5)
+        self.most[rays] = weight[more]
+
+
+def _lit(color: torch.Tensor, opacity: torch.Tensor, change: torch.Tensor) -> torch.Tensor:
+    """As `voxel_march.lit` for N rays."""
+    return torch.minimum((color + opacity[:, None] * change).clamp(min=0), opacity[:, None])
 
 
 def march(
@@ -114,17 +164,17 @@ def march(
     count, device = len(origins), origins.device
     color, depth = torch.zeros(count, 3, device=device), torch.zeros(count, device=device)
     probabilities = torch.zeros(count, field.classes, device=device)
-    transmittance = torch.ones(count, device=device)
+    transmittance, brightest = torch.ones(count, device=device), _Brightest(directions, field)
     exponent = s.step / cell_length(field.blocks, s.contracted)
-    words = field.vertices.view(-1, 4)
+    words = field.vertices.view(-1, TEXELS)
     for step in _steps(origins, directions, field.index, field.blocks, s, transmittance, ends):
-        texels = unpacked(words[step.corners]).float()  # (N, 8, 4 texels, 4 bytes)
+        texels = unpacked(words[step.corners]).float()  # (N, 8, 2 texels, 4 bytes)
         parts = step.shares * texels[..., 0, 3] / 255
         root = parts.sum(1)
         alpha = 1 - (1 - root * root).clamp(min=0) ** exponent
         if field.classes:
             part = parts / root.clamp(min=1e-9)[:, None] * alpha[:, None]  # (N, 8)
-            top, second, share = texels[..., 1, 3].long(), texels[..., 3, 3].long(), texels[..., 2, 3] / 255
+            top, share, second = texels[..., 1, 0].long(), texels[..., 1, 1] / 255, texels[..., 1, 2].long()
             first = part * share * field.class_opacity[top]
             rest = part * (1 - share) * field.class_opacity[second]
             alpha = (first + rest).sum(1)
@@ -132,10 +182,11 @@ def march(
             probabilities.index_put_((rays, top), before * first, accumulate=True)
             probabilities.index_put_((rays, second), before * rest, accumulate=True)
         weight = transmittance[step.rays] * alpha
-        seen = _seen(texels, step.shares, directions[step.rays], field.harmonic_range)
-        color[step.rays] += weight[:, None] * seen
+        brightest.see(step, weight)
+        color[step.rays] += weight[:, None] * _plain(texels, step.shares)
         depth[step.rays] += weight * step.t
         transmittance[step.rays] *= 1 - alpha
+    color = _lit(color, 1 - transmittance, brightest.change)
     return VoxelRays(color, 1 - transmittance, depth, probabilities if field.classes else None)
 
 
@@ -144,12 +195,9 @@ def texture_reads(origins: torch.Tensor, directions: torch.Tensor, field: VoxelF
     the index once in each block it meets, the colour and opacity at each sample, and three more times for the changes
     with the direction where something is."""
     transmittance, looks = torch.ones(len(origins), device=origins.device), torch.zeros_like(origins[:, 0])
-    reads, before = torch.zeros_like(looks), torch.full_like(looks, -1, dtype=torch.long)
-    words = field.vertices.view(-1, 4)
+    reads = torch.zeros_like(looks)
+    words = field.vertices.view(-1, TEXELS)
     for step in _steps(origins, directions, field.index, field.blocks, s, transmittance, looks=looks):
-        block = step.corners[:, 0] // VERTICES**3
-        looks[step.rays] -= (block == before[step.rays]).float()
-        before[step.rays] = block
         root = (step.shares * (words[step.corners][..., 0] >> 24 & 255) / 255).sum(1)
         reads[step.rays] += 1
         left = transmittance[step.rays] * (1 - (root * root).clamp(max=1))
@@ -193,33 +241,34 @@ def add_errors(
     s: MarchSettings,
 ) -> torch.Tensor:
     """As `voxel_fit.add_errors`."""
-    words, total, error = field.vertices.view(-1, 4), behind, behind
+    words, brightest = field.vertices.view(-1, TEXELS), _Brightest(directions, field)
+    total, error = behind, behind
     for last in (False, True):
         transmittance, color = torch.ones(len(origins), device=origins.device), torch.zeros_like(behind)
         for step in _steps(origins, directions, field.index, field.blocks, s, transmittance):
             texels = unpacked(words[step.corners]).float()
             root = (step.shares * texels[..., 0, 3] / 255).sum(1)
             alpha, before = (root * root).clamp(max=1), transmittance[step.rays]
-            seen = _seen(texels, step.shares, directions[step.rays], field.harmonic_range)
-            color[step.rays] += (before * alpha)[:, None] * seen
-            if last:
-                rest = (total[step.rays] - color[step.rays]) / (before * (1 - alpha)).clamp(min=1e-4)[:, None]
-                change = (seen - rest.clamp(0, 1)) * (2 * before * root)[:, None]
+            plain, weight = _plain(texels, step.shares), before * alpha
+            color[step.rays] += weight[:, None] * plain
+            if not last:
+                brightest.see(step, weight)
+            else:
+                left, change = (before * (1 - alpha))[:, None], brightest.change[step.rays]
+                rest = (total[step.rays] - color[step.rays] - (1 - left) * change) / left.clamp(min=1e-4)
+                effect = ((plain + change).clamp(0, 1) - rest.clamp(0, 1)) * (2 * before * root)[:, None]
                 here = error[step.rays]
-                weight = (before * alpha)[:, None]
-                slope, square = (change * here).sum(1, keepdim=True), (change * change).sum(1, keepdim=True)
-                told = torch.cat([weight * here, weight, slope, square], 1) * (before * root > LEAST_WEIGHT)[:, None]
-                shared = step.shares[..., None] * told[:, None]
+                slope, square = (effect * here).sum(1, keepdim=True), (effect * effect).sum(1, keepdim=True)
+                told = torch.cat([weight[:, None] * here, weight[:, None], slope, square], 1)
+                shared = step.shares[..., None] * (told * (before * root > LEAST_WEIGHT)[:, None])[:, None]
                 sums.index_add_(0, step.corners.reshape(-1), shared.reshape(-1, 6))
             transmittance[step.rays] *= 1 - alpha
         if not last:
-            total = color + behind * transmittance[:, None]
+            total = _lit(color, 1 - transmittance, brightest.change) + behind * transmittance[:, None]
             error = wanted - total
     return error.square().mean(1)
 
 
-def _seen(texels: torch.Tensor, shares: torch.Tensor, directions: torch.Tensor, harmonic_range: float) -> torch.Tensor:
-    """Colours (N, 3) of samples along directions (N, 3), of the texels (N, 8, 4, 4) of their corners, shares (N, 8)."""
-    mixed = (shares[..., None, None] * texels[..., :3]).sum(1)  # (N, 4, 3)
-    slope = ((mixed[:, 1:] - 127.5) * directions[..., None]).sum(1)
-    return (mixed[:, 0] / 255 + slope * (harmonic_range / 127.5)).clamp(0, 1)
+def _plain(texels: torch.Tensor, shares: torch.Tensor) -> torch.Tensor:
+    """Colours (N, 3) of samples without their changes, of the texels (N, 8, 2, 4) of their corners, shares (N, 8)."""
+    return (shares[..., None] * texels[..., 0, :3]).sum(1) / 255

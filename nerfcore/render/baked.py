@@ -3,8 +3,9 @@
 | file | holds |
 | --- | --- |
 | meta.json | what it was baked from, and what the numbers mean (`Meta`) |
-| index.npy | (B, B, B) int32, z first: number of the block + 1, or minus the distance in blocks to the nearest one |
-| T0.npy … T3.npy | (Z, Y, X, 4) uint8: texels of all blocks side by side, as 3D textures want them |
+| index.npy | (B, B, B) int32, z first: see `VoxelField` |
+| T0.npy, T1.npy | (9 Z, 9 Y, 9 X, 4) uint8: texels of all blocks side by side, as 3D textures want them |
+| T2.npy … T4.npy | (5 Z, 5 Y, 5 X, 4) uint8: changes of their colours |
 | environment.npy | (H, 2H, 4) uint8, where the run has one: see `panorama.py` |
 | lut.npy | (256, 4) uint8: colour and opacity of each class index, which viewers change |
 
@@ -29,16 +30,17 @@ from ..field.environment import EnvironmentRays
 from ..files import UNREADABLE_ARRAYS, disk_errors, write_json
 from ..kernels.device import use_device
 from ..kernels.traversal import MarchSettings
-from ..kernels.voxel_field import CELLS, VERTICES, VoxelField, VoxelRays, cell_length
+from ..kernels.voxel_field import CELLS, COARSE, VERTICES, VoxelField, VoxelRays, cell_length, occupied_blocks
 from ..kernels.voxel_march import march
 from ..project.runs import VOXELS, checkpoint_id, run_folder
 from .panorama import HEIGHT, Panorama
 from .run import RunInfo
 
 META, INDEX, LUT, ENVIRONMENT = "meta.json", "index.npy", "lut.npy", "environment.npy"
-TEXELS = ("T0.npy", "T1.npy", "T2.npy", "T3.npy")
+FINE, COARSER = ("T0.npy", "T1.npy"), ("T2.npy", "T3.npy", "T4.npy")
 MOST_ACROSS = 28  # blocks along a side of the textures: 252 texels, 256 being what every GPU takes
 MOST_BLOCKS = MOST_ACROSS**3
+BLOCK_BYTES = 4 * (VERTICES**3 * len(FINE) + COARSE**3 * len(COARSER))
 STEP = 1.0  # length of a step in cells: docs/experiments.md, “How fine must a baked field be?”
 
 
@@ -48,7 +50,7 @@ class Meta(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    version: Literal[1] = 1
+    version: Literal[2] = 2
     checkpoint: str  # which field it was baked from
     side: int = Field(ge=1, le=1024)  # blocks along a side of the grid
     blocks: int = Field(ge=0, le=MOST_BLOCKS)  # that are occupied
@@ -73,31 +75,31 @@ def texture_shape(blocks: int) -> tuple[int, int, int]:
 
 def texture_bytes(blocks: int, side: int) -> int:
     """Graphics memory of the textures, with the index as float32."""
-    return math.prod(texture_shape(blocks)) * VERTICES**3 * 4 * len(TEXELS) + 4 * side**3 + 4 * 256
+    return math.prod(texture_shape(blocks)) * BLOCK_BYTES + 4 * side**3 + 4 * 256
 
 
 def most_blocks(memory: float, side: int) -> int:
     """The most blocks whose textures take no more than so many bytes; 0 where not even the index fits."""
-    most = min(MOST_BLOCKS, int((memory - 4 * side**3) / (VERTICES**3 * 4 * len(TEXELS))))
+    most = min(MOST_BLOCKS, int((memory - 4 * side**3) / BLOCK_BYTES))
     while most > 0 and texture_bytes(most, side) > memory:
         most -= 1
     return max(most, 0)
 
 
 def to_texture(texels: np.ndarray) -> np.ndarray:
-    """Texels (S, 9, 9, 9, 4) of blocks, z first, side by side: (Z, Y, X, 4)."""
-    x, y, z = texture_shape(len(texels))
+    """Texels (S, n, n, n, 4) of blocks, z first, side by side: (n Z, n Y, n X, 4)."""
+    (x, y, z), n = texture_shape(len(texels)), texels.shape[1]
     full = np.zeros((z * y * x, *texels.shape[1:]), np.uint8)
     full[: len(texels)] = texels
-    cube = full.reshape(z, y, x, VERTICES, VERTICES, VERTICES, 4).transpose(0, 3, 1, 4, 2, 5, 6)
-    return cube.reshape(z * VERTICES, y * VERTICES, x * VERTICES, 4)
+    cube = full.reshape(z, y, x, n, n, n, 4).transpose(0, 3, 1, 4, 2, 5, 6)
+    return cube.reshape(z * n, y * n, x * n, 4)
 
 
-def from_texture(texture: np.ndarray, blocks: int) -> np.ndarray:
-    """The texels (S, 9, 9, 9, 4) of the first S blocks of a texture (Z, Y, X, 4)."""
-    z, y, x = (side // VERTICES for side in texture.shape[:3])
-    cube = texture.reshape(z, VERTICES, y, VERTICES, x, VERTICES, 4).transpose(0, 2, 4, 1, 3, 5, 6)
-    return cube.reshape(-1, VERTICES, VERTICES, VERTICES, 4)[:blocks]
+def from_texture(texture: np.ndarray, blocks: int, n: int = VERTICES) -> np.ndarray:
+    """The texels (S, n, n, n, 4) of the first S blocks of a texture (n Z, n Y, n X, 4)."""
+    z, y, x = (side // n for side in texture.shape[:3])
+    cube = texture.reshape(z, n, y, n, x, n, 4).transpose(0, 2, 4, 1, 3, 5, 6)
+    return cube.reshape(-1, n, n, n, 4)[:blocks]
 
 
 def voxels_folder(project: Path, run: str) -> Path:
@@ -110,6 +112,7 @@ def save_baked(
     meta: Meta,
     index: np.ndarray,
     texels: np.ndarray,
+    changes: np.ndarray,
     lut: np.ndarray,
     environment: np.ndarray | None = None,
 ) -> list[Path]:
@@ -119,8 +122,8 @@ def save_baked(
     none, never a part.
 
     Args:
-        index: (B³,) int32, x fastest. texels: (S · 9³, 4, 4) uint8, x fastest. lut: (256, 4) uint8. environment: (H, 2H, 4)
-            uint8, or None.
+        index: (B³,) int32, x fastest. texels: (S · 9³, 2, 4) and changes (S · 5³, 3, 4) uint8, x fastest. lut: (256, 4)
+            uint8. environment: (H, 2H, 4) uint8, or None.
     Raises:
         DiskError: the disk is full, the folder is not writable, or the earlier field is open elsewhere (Windows).
     """
@@ -134,9 +137,10 @@ def save_baked(
             _write(fresh / LUT, lut)
             if environment is not None:
                 _write(fresh / ENVIRONMENT, environment)
-            by_block = texels.reshape(-1, VERTICES, VERTICES, VERTICES, len(TEXELS), 4)
-            for number, name in enumerate(TEXELS):
-                _write(fresh / name, to_texture(by_block[..., number, :]))
+            for names, n, values in ((FINE, VERTICES, texels), (COARSER, COARSE, changes)):
+                by_block = values.reshape(-1, n, n, n, len(names), 4)
+                for number, name in enumerate(names):
+                    _write(fresh / name, to_texture(by_block[..., number, :]))
             write_json(fresh / META, meta.model_dump(mode="json"))
             if folder.exists():
                 folder.rename(old)
@@ -145,7 +149,7 @@ def save_baked(
             shutil.rmtree(fresh, ignore_errors=True)
         shutil.rmtree(old, ignore_errors=True)
     behind = [] if environment is None else [ENVIRONMENT]
-    return [folder / name for name in (META, INDEX, LUT, *TEXELS, *behind)]
+    return [folder / name for name in (META, INDEX, LUT, *FINE, *COARSER, *behind)]
 
 
 def _write(path: Path, values: np.ndarray) -> None:
@@ -205,21 +209,20 @@ def load_baked(project: Path, run: str, info: RunInfo) -> BakedField:
             f"{folder} was baked from another training of the run “{run}” than is there now.",
             "Run `fieldwork bake` again.",
         )
-    x, y, z = (number * VERTICES for number in meta.across)
     index = _read(folder / INDEX, (meta.side,) * 3, np.int32)
     lut = _read(folder / LUT, (256, 4), np.uint8)
-    texels = np.empty((meta.blocks, VERTICES, VERTICES, VERTICES, len(TEXELS), 4), np.uint8)
-    for number, name in enumerate(TEXELS):
-        texels[..., number, :] = from_texture(_read(folder / name, (z, y, x, 4), np.uint8), meta.blocks)
-    if int(index.max()) > meta.blocks or (meta.blocks and int(index.min()) < -meta.side):
+    texels, changes = (_read_texels(folder, meta, names, n) for names, n in ((FINE, VERTICES), (COARSER, COARSE)))
+    named = occupied_blocks(index.reshape(-1))[1]
+    if (len(named) and not 0 <= named.min() <= named.max() < meta.blocks) or int(index.min()) < -meta.side:
         raise _damaged(folder / INDEX, "it names blocks that are not there")
     classes = len(meta.class_ids)
-    if classes and meta.blocks and int(texels[..., 1::2, 3].max()) >= classes:
-        raise _damaged(folder / TEXELS[1], "it names classes that are not there")
+    if classes and meta.blocks and int(texels[..., 1, ::2].max()) >= classes:
+        raise _damaged(folder / FINE[1], "it names classes that are not there")
     field = VoxelField(
         blocks=meta.side,
         index=torch.from_numpy(np.array(index)).reshape(-1).to(device),
         vertices=torch.from_numpy(texels.reshape(-1).view(np.int32)).to(device),
+        changes=torch.from_numpy(changes.reshape(-1).view(np.int32)).to(device),
         class_opacity=torch.from_numpy(lut[:, 3].astype(np.float32) / 255).to(device),
         harmonic_range=meta.harmonic_range,
         classes=classes,
@@ -231,6 +234,15 @@ def load_baked(project: Path, run: str, info: RunInfo) -> BakedField:
             raise _damaged(folder / ENVIRONMENT, "it names classes that are not there")
         environment = Panorama(picture, classes, device)
     return BakedField(field, march_settings(meta), environment)
+
+
+def _read_texels(folder: Path, meta: Meta, names: tuple[str, ...], n: int) -> np.ndarray:
+    """Texels (S, n, n, n, names, 4) of some textures."""
+    x, y, z = (number * n for number in meta.across)
+    texels = np.empty((meta.blocks, n, n, n, len(names), 4), np.uint8)
+    for number, name in enumerate(names):
+        texels[..., number, :] = from_texture(_read(folder / name, (z, y, x, 4), np.uint8), meta.blocks, n)
+    return texels
 
 
 def march_settings(meta: Meta) -> MarchSettings:

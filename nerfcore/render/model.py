@@ -313,7 +313,8 @@ class Model(nn.Module):
 
         def shade(rays: torch.Tensor, rows: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor | None]:
             part = geometry if rows is None else geometry[rows]
-            # Half the time of indexing with brackets, forward and backward.
+            # Half the time of indexing with brackets, forward and backward; unused entries get the first ray.
+            rays = rays.clamp(min=0)
             shown = harmonics.index_select(0, rays), None if codes is None else codes.index_select(0, rays)
             color = self.field.color(part, *shown)
             if not semantics or self.field.semantic_head is None:

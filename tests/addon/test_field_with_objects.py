@@ -144,12 +144,100 @@ bpy.context.view_layer.update()
 facts["one"] = [len(a) for a in triangles(bpy.context.evaluated_depsgraph_get())]
 bpy.data.objects["through"].location = (1, 2, 3)
 bpy.context.view_layer.update()
+through = bpy.data.objects["through"]
+def held():
+    bpy.context.view_layer.update()
+    found = triangles(bpy.context.evaluated_depsgraph_get())
+    return [len(found.faces), bool(found.holdout.all())]
+through.is_holdout = True
+facts["holdouts"] = [held()]
+through.is_holdout = False
+group = bpy.data.collections.new("group")
+scene.collection.children.link(group)
+group.objects.link(through)
+bpy.context.view_layer.layer_collection.children["group"].holdout = True
+facts["holdouts"].append(held())
 facts["place"] = [float(v) for v in triangles(bpy.context.evaluated_depsgraph_get())[0][0]]
 answer(facts)
 """,
         project=ball,
         folder=tmp_path,
     )
-    assert facts["all"] == [12, 6]
-    assert facts["one"] == [4, 2]
+    assert facts["all"] == [12, 6, 6]
+    assert facts["one"] == [4, 2, 2]
+    assert facts["holdouts"] == [[2, True], [2, True]]
     assert facts["place"] == pytest.approx([1.1, 1.3, 2.5], abs=1e-5)
+
+
+def test_holdouts_cut_the_field(bpy_script, ball, tmp_path):
+    """A holdout before the field leaves nothing of it, one within only what is before it; at edges, too, against sixteen times
+    the resolution. Its collection may be what makes it one, also in the field's scene."""
+    facts = bpy_script(
+        START
+        + """
+bpy.data.objects["before"].is_holdout = True
+group = bpy.data.collections.new("group")
+scene.collection.children.link(group)
+group.objects.link(bpy.data.objects["through"])
+scene.collection.objects.unlink(bpy.data.objects["through"])
+bpy.context.view_layer.layer_collection.children["group"].holdout = True
+render.resolution_x, render.resolution_y = 72, 48
+bpy.ops.fieldwork.setup_compositor()
+made = scene["fieldwork_field_scene"]
+made.fieldwork_live.samples = 64
+scene.cycles.samples = 128
+small = shoot("small")
+render.resolution_percentage = 1600
+scene.cycles.samples = 1
+bpy.ops.fieldwork.setup_compositor()
+made.fieldwork_live.samples = 1
+large = shoot("large")
+np.savez(f"{folder}/both.npz", small=small, large=large)
+answer({"group": made.view_layers[0].layer_collection.children["group"].holdout})
+""",
+        project=ball,
+        folder=tmp_path,
+    )
+    assert facts["group"]
+    pictures = np.load(tmp_path / "both.npz")
+    small, large = pictures["small"], pictures["large"]
+    truth = large.reshape(48, 16, 72, 16, 4).mean((1, 3))
+    print("mean error", 255 * np.abs(small - truth).mean())
+    assert np.abs(small - truth).mean() < 0.6 / 255
+    assert small[29, 28, 3] < 0.01, "nothing is behind the plate before the field"
+    assert small[16, 34, 3] > 0.95, "the field beside it is whole"
+    assert (np.abs(small[..., :3] - (0.2, 0.9, 0.2)).max(-1) < 0.03).sum() > 60, "objects are as they were"
+    for color in ((0.9, 0.2, 0.1), (0.1, 0.8, 0.9)):
+        assert (np.abs(small[..., :3] - color).max(-1) < 0.03).sum() == 0, color
+
+
+def test_the_surface_of_the_capture_as_a_holdout_hides_objects_and_leaves_the_field(bpy_script, ball, tmp_path):
+    facts = bpy_script(
+        START
+        + """
+for name in ("before", "through"):
+    bpy.data.objects.remove(bpy.data.objects[name])
+bpy.data.objects["behind"].location.z = -0.6
+bpy.ops.mesh.primitive_uv_sphere_add(radius=0.45, segments=32, ring_count=16)
+surface = bpy.context.object
+surface["fieldwork_role"], surface.is_holdout = "mesh", True
+render.resolution_x, render.resolution_y = 36, 24
+scene.cycles.samples = 16
+bpy.ops.fieldwork.setup_compositor()
+found = {}
+for name, hidden in (("held", False), ("plain", True)):
+    surface.hide_render = hidden
+    picture = shoot(name)
+    found[name] = [float(v) for v in picture[12, 18]]
+    render.use_compositing = False
+    found[name + " objects"] = float(shoot(name + "-objects")[12, 18, 3])
+    render.use_compositing = True
+answer(found)
+""",
+        project=ball,
+        folder=tmp_path,
+    )
+    assert facts["plain objects"] == pytest.approx(1, abs=1e-3), "the plate is behind the ball"
+    assert facts["held objects"] == pytest.approx(0, abs=1e-3)
+    assert facts["held"][3] > 0.95
+    assert facts["held"] == pytest.approx(facts["plain"], abs=0.03)

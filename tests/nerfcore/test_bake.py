@@ -12,13 +12,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fieldwork.nerfcore.bake.blocks import march_settings, read_blocks, seen_by, side_for, visible_grid
-from fieldwork.nerfcore.bake.colors import HARMONIC_RANGE, vertex_texels
+from fieldwork.nerfcore.bake.blocks import Blocks, march_settings, read_blocks, seen_by, side_for, visible_grid
+from fieldwork.nerfcore.bake.colors import vertex_texels
+from fieldwork.nerfcore.bake.fit import baked_field
+from fieldwork.nerfcore.bake.verb import finest_blocks
 from fieldwork.nerfcore.config import RunConfig
 from fieldwork.nerfcore.data.camera_rays import CameraRays
 from fieldwork.nerfcore.errors import Cancelled, DiskError, ProjectError, SettingError
 from fieldwork.nerfcore.field.hybrid import Geometry
-from fieldwork.nerfcore.kernels.voxel_field import VERTICES, VoxelField
+from fieldwork.nerfcore.kernels.voxel_field import VERTICES
 from fieldwork.nerfcore.params import BakeParams, EvaluateParams, RenderParams, TrainParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.render import baked
@@ -66,9 +68,8 @@ def bake_model(model: Model, side: int, cameras: int = 40) -> BakedField:
     blocks = read_blocks(model, grid, side, check)
     settings = march_settings(model, side, 1.0)
     views = seen_by(blocks, rays, settings, True, check)
-    texels = vertex_texels(model, blocks, views, rays.center, check)
-    vertices = texels.reshape(-1).view(torch.int32)
-    field = VoxelField(side, blocks.index(), vertices, torch.ones(256), HARMONIC_RANGE, model.field.classes)
+    texels, changes = vertex_texels(model, blocks, views, rays.center, check)
+    field = baked_field(blocks, texels, changes, model.field.classes)
     return BakedField(field, settings)
 
 
@@ -148,6 +149,28 @@ def train(folder: Path, steps: int, resume: bool = False, **settings: str) -> No
     asked = {**SMALL, **{name.replace("__", "."): value for name, value in settings.items()}}
     params = TrainParams(project=folder, preset="draft", steps=steps, set=asked, resume=resume)
     run_verb("train", params, Reporter())
+
+
+@pytest.mark.parametrize("memory", [3e6, 30e6, 100e6])
+@pytest.mark.parametrize("crowded", [(), (74,), (76, 75)])
+def test_the_grid_is_as_fine_as_fits(crowded: tuple[int, ...], memory: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However the number of blocks jumps with the side: memory is used, and never more than there is."""
+    monkeypatch.setattr("fieldwork.nerfcore.bake.verb.FINEST", 96)
+    sides = []
+
+    def seen(side: int) -> Blocks:
+        sides.append(side)
+        count = round(2.4 * side**2 * (1.3 if side in crowded else 1.0))
+        return Blocks(side, torch.zeros(count, 3, dtype=torch.long), torch.zeros(0, dtype=torch.uint8))
+
+    found = finest_blocks(seen, memory)
+    assert texture_bytes(len(found), found.side) <= memory
+    assert len(found) >= 0.75 * most_blocks(memory, found.side)
+    assert len(sides) <= 5
+
+
+def test_an_empty_field_is_baked() -> None:
+    assert len(finest_blocks(lambda side: Blocks(side, torch.zeros(0, 3), torch.zeros(0)), 100e6)) == 0
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -256,7 +279,7 @@ def loading(project: Path) -> BakedField:
     return load_baked(project, "main", load_info(project, "main"))
 
 
-@pytest.mark.parametrize("name", ["meta.json", "index.npy", "lut.npy", "T0.npy", "T1.npy", "T2.npy", "T3.npy"])
+@pytest.mark.parametrize("name", ["meta.json", "index.npy", "lut.npy", "T0.npy", "T1.npy", "T2.npy", "T4.npy"])
 @pytest.mark.parametrize("damage", ["truncated", "garbage", "empty", "gone"])
 def test_damaged_files_are_named(copied: Path, name: str, damage: str) -> None:
     path = baked.voxels_folder(copied, "main") / name
@@ -277,9 +300,9 @@ def test_an_index_or_classes_beyond_what_is_there_are_refused(copied: Path) -> N
     with pytest.raises(ProjectError, match="blocks that are not there"):
         loading(copied)
     np.save(folder / "index.npy", index)
-    texels = np.load(folder / "T3.npy")
-    texels[..., 3] = 9
-    np.save(folder / "T3.npy", texels)
+    texels = np.load(folder / "T1.npy")
+    texels[..., 2] = 9
+    np.save(folder / "T1.npy", texels)
     with pytest.raises(ProjectError, match="classes that are not there"):
         loading(copied)
 

@@ -23,7 +23,9 @@ from fieldwork.nerfcore.params import ExportParams, MeshParams, TrainParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.verbs import run_verb
 from fieldwork.tests.nerfcore.support.ball import SMALL, ball_project
+from onnx import TensorProto
 from onnx.reference import ReferenceEvaluator
+from onnxruntime import InferenceSession
 from PIL import Image
 from pxr import Usd, UsdGeom
 
@@ -183,6 +185,33 @@ def test_the_trained_field_as_a_graph(trained: Path) -> None:
     assert color.max() <= 1
 
 
+TENSORRT = json.loads((Path(__file__).parent / "support" / "tensorrt_operators.json").read_text())
+NAMES = {TensorProto.FLOAT: "FP32", TensorProto.INT64: "INT64", TensorProto.BOOL: "BOOL"}  # in that list
+
+
+def untaken(model: onnx.ModelProto) -> list[str]:
+    """Operators of a graph, with the types of what they read and give, that TensorRT's list does not have."""
+    graph = onnx.shape_inference.infer_shapes(model, strict_mode=True).graph
+    kinds = {one.name: one.data_type for one in graph.initializer}
+    for value in (*graph.input, *graph.value_info, *graph.output):
+        kinds[value.name] = value.type.tensor_type.elem_type
+    found = set()
+    for node in graph.node:
+        taken = TENSORRT["operators"].get(node.op_type, [])
+        # Of what is read the first may be of any type; others can be indices and axes.
+        for name in (node.input[0], *node.output):
+            if NAMES[kinds[name]] not in taken:
+                found.add(f"{node.op_type} {NAMES[kinds[name]]}")
+    return sorted(found)
+
+
+def test_what_tensorrt_does_not_take_is_found() -> None:
+    value = [onnx.helper.make_tensor_value_info(name, TensorProto.INT64, [3]) for name in "abc"]
+    graph = onnx.helper.make_graph([onnx.helper.make_node("BitwiseXor", ["a", "b"], ["c"])], "g", value[:2], value[2:])
+    model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 18)])
+    assert untaken(model) == ["BitwiseXor INT64"]
+
+
 WORLD = np.array([[2.4, -0.7, 0.0, 1.0], [0.7, 2.4, 0.0, 2.0], [0.0, 0.0, 2.5, 3.0], [0.0, 0.0, 0.0, 1.0]])
 
 
@@ -212,13 +241,18 @@ def test_the_graph_computes_what_the_field_does(settings: dict, contracted: bool
     field.set_progress(0.05, 0.2, 10**6)
     model = field_model(field, Box(WORLD, contracted))
     onnx.checker.check_model(model, full_check=True)
+    assert untaken(model) == []
+    assert TENSORRT["opsets"][0] <= model.opset_import[0].version <= TENSORRT["opsets"][1]
     random = np.random.default_rng(1)
     places = random.uniform(-1, 1, (200, 3)) * (2.5 if contracted else 1.0)
     directions = random.normal(size=(200, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     world = (places @ WORLD[:3, :3].T + WORLD[:3, 3]).astype(np.float32)
     turned = (directions @ WORLD[:3, :3].T / 2.5).astype(np.float32)
-    density, color, classes = ReferenceEvaluator(model).run(None, {"points": world, "directions": turned})
+    asked = {"points": world, "directions": turned}
+    density, color, classes = ReferenceEvaluator(model).run(None, asked)
+    for found, again in zip((density, color, classes), InferenceSession(model.SerializeToString()).run(None, asked)):
+        assert again == pytest.approx(found, rel=1e-3, abs=1e-4), "ONNX Runtime says the same"
     with torch.no_grad():
         geometry = field.geometry(grid_position(torch.from_numpy(places).float(), contracted))
         true_color = field.color(geometry, spherical_harmonics(torch.from_numpy(directions).float()))

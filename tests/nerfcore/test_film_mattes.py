@@ -85,10 +85,11 @@ def test_instances_are_those_of_the_mesh(ball: Path, store: FieldStore, tmp_path
 # Objects
 
 
-def plate(folder: Path, y: float, edge: float) -> Path:
+def plate(folder: Path, y: float, edge: float, holdout: bool = False) -> Path:
     """A plate at a distance, left of a slanted edge."""
     vertices = np.array([[-5, y, -5], [edge - 0.2, y, -5], [edge + 0.2, y, 5], [-5, y, 5]])
-    np.savez(folder / "plate.npz", vertices=vertices, faces=np.array([[0, 1, 2], [0, 2, 3]]))
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    np.savez(folder / "plate.npz", vertices=vertices, faces=faces, holdout=np.full(2, holdout))
     return folder / "plate.npz"
 
 
@@ -97,15 +98,24 @@ def over(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    "y", [pytest.param(-1.0, marks=pytest.mark.slow), -0.1, pytest.param(1.0, marks=pytest.mark.slow)]
+    ("y", "holdout"),
+    [
+        pytest.param(-1.0, False, marks=pytest.mark.slow),
+        (-0.1, False),
+        pytest.param(1.0, False, marks=pytest.mark.slow),
+        (-0.1, True),
+    ],
 )
-def test_composited_objects_are_exact_at_edges(ball: Path, store: FieldStore, tmp_path: Path, y: float) -> None:
-    """Before, within and behind the field: against the mean over samples of what each shows, with 64 of them."""
-    file, paint = plate(tmp_path, y, 0.05), np.array([0.9, 0.3, 0.1, 1.0])
+def test_composited_objects_are_exact_at_edges(
+    ball: Path, store: FieldStore, tmp_path: Path, y: float, holdout: bool
+) -> None:
+    """Before, within and behind the field: against the mean over samples of what each shows, with 64 of them. A holdout is
+    in no picture, and nothing is behind it."""
+    file, paint = plate(tmp_path, y, 0.05, holdout), np.array([0.9, 0.3, 0.1, 1.0]) * (not holdout)
     wanted = ["FieldFront", "FieldBehind"]
     found = take(ball, store, wanted, samples=64, occluders=file)
     # What a renderer of objects gives with the same samples: the share of the samples that meet the plate.
-    truth, objects = np.zeros((H, W, 4)), np.zeros((H, W, 4))
+    truth, objects, covered = np.zeros((H, W, 4)), np.zeros((H, W, 4)), np.zeros((H, W))
     from fieldwork.nerfcore.film.exposure import STEPS2
 
     for number in range(64):
@@ -117,12 +127,19 @@ def test_composited_objects_are_exact_at_edges(ball: Path, store: FieldStore, tm
         hit = x[None] < 0.05 + 0.04 * z[:, None]
         painted = np.where(hit[..., None], paint, 0)
         objects += painted / 64
+        covered += hit / 64
         truth += over(one["Combined"], painted) / 64
     mixed = over(found["FieldFront"], over(objects, found["FieldBehind"]))
-    edge = (objects[..., 3] > 0.02) & (objects[..., 3] < 0.98)
+    edge = (covered > 0.02) & (covered < 0.98)
     assert edge.sum() > H / 2
     assert np.abs(mixed - truth)[..., :3][edge].mean() < 1 / 255
     assert np.abs(mixed - truth)[..., :3].mean() < 1 / 255
+    if holdout:
+        # Two layers cannot hold the alpha of a pixel where the field itself ends as well; its colour is exact.
+        alone = take(ball, store, ["Combined"], samples=64)["Combined"][..., 3]
+        whole = edge & ((alone < 0.02) | (alone > 0.98))
+        assert whole.sum() > H / 2
+        assert np.abs(mixed - truth)[..., 3][whole].mean() < 1 / 255
     # Z Combine, which knows one depth a pixel, is worse: the pixel is one or the other.
     if y == -1.0:
         assert found["FieldBehind"][H // 2, W // 2 - 8, 3] > 0.9, "what is behind an object is kept for glass"

@@ -22,28 +22,30 @@ def first_of(folder: Path, revision: int) -> Labelling | None:
 
 
 class Watching(Reporter):
-    """Looks, whenever progress is told, at which labels of revision 2 Blender's side would show."""
+    """Looks, whenever progress is told, at which labels of a revision Blender's side would show."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, revision: int) -> None:
         super().__init__()
-        self.folder = folder
+        self.folder, self.revision = folder, revision
         self.seen: list[str | None] = []
 
     def progress(self, fraction: float, message: str = "") -> None:
-        found = results.to_show(self.folder, "main", 2)
+        found = results.to_show(self.folder, "main", self.revision)
         self.seen.append(None if found is None else found.made.rpartition(" ")[2])
 
 
 def test_parts_are_shown_while_surfels_are_computed(ball: Path) -> None:  # noqa: F811
-    two_strokes(ball)
-    watching = Watching(ball)
+    # From all sides: with strokes on one photo both are guesses on the far side, and not the same ones.
+    for photo in ("01", "05", "09"):
+        two_strokes(ball, photo)
+    watching = Watching(ball, 6)
     told = propagate(LabelPropagateParams(project=ball), watching)
     assert "parts" in watching.seen, "there was something to look at before the end"
     assert told["parts_seconds"] <= told["seconds"]
-    shown = results.to_show(ball, "main", 2)
+    shown = results.to_show(ball, "main", 6)
     assert shown is not None
     assert not shown.made.endswith("parts"), "in the end the surfels are shown"
-    first = first_of(ball, 2)
+    first = first_of(ball, 6)
     assert first is not None
     ready = current(ball, "main")
     assert ready is not None

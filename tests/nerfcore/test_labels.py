@@ -75,9 +75,9 @@ def mark(folder: Path, **values: Any) -> int:
     return stroke(LabelStrokeParams.model_validate(given), Reporter())["revision"]
 
 
-def two_strokes(folder: Path) -> None:
+def two_strokes(folder: Path, photo: str = "01") -> None:
     """One to and fro over the upper half of a photo, one over the lower."""
-    ids = truth(folder)["01"]
+    ids = truth(folder)[photo]
     for class_id in (TOP, BOTTOM):
         rows, columns = np.nonzero(ids == class_id)
         points = []
@@ -85,7 +85,7 @@ def two_strokes(folder: Path) -> None:
             inside = columns[rows == row]
             ends = [(float(inside.min()) + 3, row + 0.5), (float(inside.max()) - 3, row + 0.5)]
             points += ends[:: -1 if number % 2 else 1]
-        mark(folder, points=points, class_id=class_id)
+        mark(folder, points=points, class_id=class_id, photo=photo)
 
 
 def spread(folder: Path, **values: Any) -> dict[str, Any]:

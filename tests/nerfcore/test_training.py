@@ -226,14 +226,21 @@ def test_a_resumed_training_equals_an_uninterrupted_one(tiny_project: Path) -> N
 
 
 def test_cancel_takes_less_than_two_seconds_and_leaves_a_checkpoint(tiny_project: Path) -> None:
-    report = Reporter()
     asked: list[float] = []
 
-    def stop() -> None:
-        asked.append(time.monotonic())
-        report.cancel()
+    class Stopping(Reporter):
+        """Is cancelled half a second after the first step, however long it takes until then."""
 
-    threading.Timer(1.5, stop).start()
+        def progress(self, fraction: float, message: str = "") -> None:
+            if not asked:
+                asked.append(math.inf)
+                threading.Timer(0.5, self.stop).start()
+
+        def stop(self) -> None:
+            asked[0] = time.monotonic()
+            self.cancel()
+
+    report = Stopping()
     with pytest.raises(Cancelled):
         train(tiny_project, "cancelled", 100000, report)
     assert time.monotonic() - asked[0] < 2.0

@@ -3,18 +3,35 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from fieldwork.addon.live.shaders import LEAST_LEFT
 from fieldwork.nerfcore.bake.blocks import Blocks
-from fieldwork.nerfcore.kernels import voxel_march_torch
+from fieldwork.nerfcore.kernels import voxel_march, voxel_march_torch
 from fieldwork.nerfcore.kernels.traversal import MarchSettings
-from fieldwork.nerfcore.kernels.voxel_field import VERTICES, VIEWS, VoxelField, VoxelRays, cell_length
+from fieldwork.nerfcore.kernels.voxel_field import (
+    COARSE,
+    SLOT_BITS,
+    VERTICES,
+    VIEWS,
+    VoxelField,
+    VoxelRays,
+    cell_length,
+)
 from fieldwork.nerfcore.kernels.voxel_march import add_views, march
 
 SIDE, CLASSES = 8, 5
 CONTRACTED = pytest.mark.parametrize("contracted", [False, True])
+
+
+@pytest.fixture(autouse=True, params=["host", "every device"])
+def kernels_of(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The CPU runs its own kernels, and those that GPUs run."""
+    if request.param == "every device":
+        monkeypatch.setattr(voxel_march, "on_host", lambda device: False)
 
 
 def settings(contracted: bool, step: float = 1.0, side: int = SIDE) -> MarchSettings:
@@ -22,25 +39,42 @@ def settings(contracted: bool, step: float = 1.0, side: int = SIDE) -> MarchSett
 
 
 def random_field(seed: int = 0) -> tuple[Blocks, VoxelField]:
-    """Blocks at random places with random texels."""
+    """Blocks at random places with random texels; of each block one octant or more is empty."""
     generator = torch.Generator().manual_seed(seed)
-    places = (torch.rand(SIDE, SIDE, SIDE, generator=generator) < 0.06).nonzero()
-    texels = torch.randint(0, 256, (len(places) * VERTICES**3, 4, 4), generator=generator).to(torch.uint8)
+    places = (torch.rand(SIDE, SIDE, SIDE, generator=generator) < 0.08).nonzero()
+    texels = torch.randint(0, 256, (len(places) * VERTICES**3, 2, 4), generator=generator).to(torch.uint8)
     texels[:, 0, 3] //= 3
-    texels[:, 1, 3] %= CLASSES
-    texels[:, 3, 3] %= CLASSES
-    blocks = Blocks(SIDE, places, texels[:, 0, 3].contiguous())
-    vertices = texels.reshape(-1).view(torch.int32)
-    opacity = torch.rand(256, generator=generator)
-    return blocks, VoxelField(SIDE, blocks.index(), vertices, opacity, 0.4, CLASSES)
+    texels[:, 1, [0, 2]] %= CLASSES
+    roots = texels[:, 0, 3].view(-1, VERTICES, VERTICES, VERTICES)
+    roots[::2, :5, :5, :5], roots[1::2, 4:, 4:] = 0, 0
+    changes = torch.randint(0, 256, (len(places) * COARSE**3, 3, 4), generator=generator).to(torch.uint8)
+    return made(places, texels, changes, torch.rand(256, generator=generator), 0.4, CLASSES)
+
+
+def made(
+    places: torch.Tensor,
+    texels: torch.Tensor,
+    changes: torch.Tensor | None = None,
+    opacity: torch.Tensor | None = None,
+    harmonic_range: float = 0.0,
+    classes: int = 0,
+    side: int = SIDE,
+) -> tuple[Blocks, VoxelField]:
+    """Blocks at places (S, 3) and the field of their texels (S · 9³, 2, 4) and changes (S · 5³, 3, 4), bytes."""
+    if changes is None:
+        changes = torch.full((len(places) * COARSE**3, 3, 4), 128, dtype=torch.uint8)
+    blocks = Blocks(side, places, texels[:, 0, 3].contiguous())
+    words = [value.reshape(-1).view(torch.int32) for value in (texels, changes)]
+    return blocks, VoxelField(
+        side, blocks.index(), *words, torch.ones(256) if opacity is None else opacity, harmonic_range, classes
+    )
 
 
 def even_field(root: int, places: torch.Tensor, side: int = SIDE) -> VoxelField:
     """Blocks that are equally dense and grey everywhere, without classes."""
-    texels = torch.full((len(places) * VERTICES**3, 4, 4), 128, dtype=torch.uint8)
+    texels = torch.full((len(places) * VERTICES**3, 2, 4), 128, dtype=torch.uint8)
     texels[:, 0, :3], texels[:, 0, 3] = 51, root
-    blocks = Blocks(side, places, texels[:, 0, 3].contiguous())
-    return VoxelField(side, blocks.index(), texels.reshape(-1).view(torch.int32), torch.ones(256), 0.0, 0)
+    return made(places, texels, side=side)[1]
 
 
 def random_rays(count: int = 600, seed: int = 1) -> tuple[torch.Tensor, torch.Tensor]:
@@ -52,10 +86,8 @@ def random_rays(count: int = 600, seed: int = 1) -> tuple[torch.Tensor, torch.Te
 
 
 def moved(field: VoxelField, device: torch.device) -> VoxelField:
-    index, vertices = field.index.to(device), field.vertices.to(device)
-    return VoxelField(
-        field.blocks, index, vertices, field.class_opacity.to(device), field.harmonic_range, field.classes
-    )
+    there = {name: value.to(device) for name, value in vars(field).items() if isinstance(value, torch.Tensor)}
+    return replace(field, **there)
 
 
 def largest_difference(one: VoxelRays, other: VoxelRays) -> float:
@@ -103,14 +135,8 @@ def test_backends_note_the_same_views(device: torch.device, contracted: bool, by
 @CONTRACTED
 def test_leaping_over_empty_blocks_changes_nothing(contracted: bool) -> None:
     _, field = random_field()
-    slow = VoxelField(
-        SIDE,
-        torch.where(field.index <= 0, -1, field.index),
-        field.vertices,
-        field.class_opacity,
-        field.harmonic_range,
-        CLASSES,
-    )
+    full = field.index | 255 << SLOT_BITS
+    slow = replace(field, index=torch.where(field.index <= 0, -1, full))
     origins, directions = random_rays()
     # Samples do not fall on the same places: short steps make that a small difference.
     quick, careful = (march(origins, directions, f, settings(contracted, 0.1)) for f in (field, slow))
@@ -139,20 +165,19 @@ def test_opacity_of_a_slab_is_that_of_its_cells() -> None:
 
 def test_hiding_a_class_shows_what_is_behind() -> None:
     places = torch.tensor([[2, 4, 4], [5, 4, 4]])
-    texels = torch.full((2, VERTICES**3, 4, 4), 128, dtype=torch.uint8)
+    texels = torch.full((2, VERTICES**3, 2, 4), 128, dtype=torch.uint8)
     texels[:, :, 0] = torch.tensor([0, 0, 0, 255], dtype=torch.uint8)
     texels[0, :, 0, 0], texels[1, :, 0, 1] = 255, 255  # red before green
-    texels[:, :, 1, 3] = torch.tensor([[0], [1]], dtype=torch.uint8)
-    texels[:, :, 2, 3] = 255
-    texels[:, :, 3, 3] = 1
-    blocks = Blocks(SIDE, places, texels[:, :, 0, 3].reshape(-1))
+    texels[:, :, 1, 0] = torch.tensor([[0], [1]], dtype=torch.uint8)
+    texels[:, :, 1, 1] = 255
+    texels[:, :, 1, 2] = 1
     y = (4.5 / SIDE) * 2 - 1
     origins, directions = torch.tensor([[-3.0, y, y]]), torch.tensor([[1.0, 0.0, 0.0]])
     for hidden, color in ((None, [1.0, 0.0, 0.0]), (0, [0.0, 1.0, 0.0])):
         opacity = torch.ones(256)
         if hidden is not None:
             opacity[hidden] = 0
-        field = VoxelField(SIDE, blocks.index(), texels.reshape(-1).view(torch.int32), opacity, 0.0, 2)
+        _, field = made(places, texels.flatten(0, 1), None, opacity, 0.0, 2)
         found = march(origins, directions, field, settings(False))
         assert found.probabilities is not None
         assert found.color[0].tolist() == pytest.approx(color, abs=1e-3)
@@ -161,11 +186,11 @@ def test_hiding_a_class_shows_what_is_behind() -> None:
 
 def test_colours_change_with_the_direction() -> None:
     """The change along x is +½ · 0.4 for a ray towards +x and the opposite for one towards −x."""
-    texels = torch.full((VERTICES**3, 4, 4), 128, dtype=torch.uint8)
+    texels = torch.full((VERTICES**3, 2, 4), 128, dtype=torch.uint8)
     texels[:, 0, 3] = 255
-    texels[:, 1, :3] = 191  # half of the range
-    blocks = Blocks(SIDE, torch.tensor([[4, 4, 4]]), texels[:, 0, 3].contiguous())
-    field = VoxelField(SIDE, blocks.index(), texels.reshape(-1).view(torch.int32), torch.ones(256), 0.4, 0)
+    changes = torch.full((COARSE**3, 3, 4), 128, dtype=torch.uint8)
+    changes[:, 0, :3] = 191  # half of the range
+    _, field = made(torch.tensor([[4, 4, 4]]), texels, changes, None, 0.4)
     y = (4.5 / SIDE) * 2 - 1
     origins = torch.tensor([[-3.0, y, y], [3.0, y, y]])
     directions = torch.tensor([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
@@ -184,10 +209,24 @@ def test_an_empty_field_is_transparent(device: torch.device, contracted: bool) -
 
 def test_the_index_tells_distances() -> None:
     index = Blocks(4, torch.tensor([[0, 0, 0]]), torch.ones(VERTICES**3, dtype=torch.uint8)).index().view(4, 4, 4)
-    assert index[0, 0, 0] == 1
+    assert index[0, 0, 0] == 1 + (255 << SLOT_BITS)
     assert index[0, 0, 3] == -3
     assert index[2, 1, 0] == -2
-    assert np.unique(index.numpy()).tolist() == [-3, -2, -1, 1]
+    assert np.unique(index.numpy())[:-1].tolist() == [-3, -2, -1]
+
+
+def test_the_index_tells_empty_octants() -> None:
+    """A vertex in the middle of a side belongs to all octants beside it."""
+    roots = torch.zeros(2, VERTICES, VERTICES, VERTICES, dtype=torch.uint8)
+    roots[0, 0, 0, 8] = 1  # z, y low, x high
+    roots[1, 8, 4, 0] = 1
+    index = Blocks(4, torch.tensor([[0, 0, 0], [1, 0, 0]]), roots.view(-1)).index()
+    assert [int(entry) >> SLOT_BITS for entry in index[:2]] == [0b00000010, 0b01010000]
+    assert [int(entry) & ((1 << SLOT_BITS) - 1) for entry in index[:2]] == [1, 2]
+
+
+def test_reads_are_counted_to_where_the_shader_ends() -> None:
+    assert voxel_march_torch.SHADER_STOP == LEAST_LEFT
 
 
 def test_reads_of_textures_are_counted() -> None:

@@ -27,7 +27,7 @@ from .surface_labels import (
     surface_classes,
 )
 from .uv import UvMap, unwrap
-from .visibility import DepthBuffers, observe
+from .visibility import DepthBuffers, observe, with_flat_views
 
 LONGEST = (
     1 / 100
@@ -96,14 +96,15 @@ def paint_surface(
     report.stage("Reading classes")
     pieces = made.pieces
     contrast = colors[faces].mean(1)[pieces.parent] / 255
-    evidence = class_evidence(photos, pieces, made.seen, class_ids, field_classes, contrast, report)
+    seen = with_flat_views(made.seen, made.buffers, report)
+    evidence = class_evidence(photos, pieces, seen, class_ids, field_classes, contrast, report)
     classes = surface_classes(len(vertices), faces, pieces, evidence, class_ids, void)
     if size is None or uv is None:
         return Painted(classes)
     maps = None
     if class_ids:
         report.stage("Painting the classes")
-        maps = class_maps(photos, made.buffers, made.seen, evidence, class_ids, void, size, report)
+        maps = class_maps(photos, made.buffers, seen, evidence, class_ids, void, size, report)
     if kind == "field":
         return Painted(classes, uv, field_texture(vertices, faces, uv.corners, size, field_color, report), maps=maps)
     texture = photo_texture(made, field_color, report)

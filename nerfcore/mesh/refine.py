@@ -21,7 +21,7 @@ from ..progress import Reporter
 from .depth_maps import DepthMap, FlatView, confirmed_maps, cosines, map_arrays, neighbours, smooth_normals
 from .planes import with_planes
 from .scene_planes import known_points, on_scene_planes, scene_planes
-from .sky import backdrop, farthest, labels_tell, nothing
+from .sky import backdrop, farthest, labels_tell, named_things, nothing
 
 VIEWS = 5  # neighbours whose photos are compared
 LEAST, GAIN = 0.6, 0.05  # correlation that is believed, and by how much it must exceed that of the field's depth
@@ -56,15 +56,16 @@ def photo_pixels(view: FlatView, store: PixelStore) -> np.ndarray:
     return project(store.cameras[view.photo], directions @ turn.T)
 
 
-def nameless(view: FlatView, store: PixelStore) -> np.ndarray | None:
-    """Which pixels (H, W) of a flat view the label map of its photo leaves out; None without a label map."""
+def label_picture(view: FlatView, store: PixelStore) -> np.ndarray | None:
+    """Class (H, W) uint8 that the label map of its photo gives each pixel of a flat view, VOID for none; None without a
+    label map."""
     camera, shape = store.cameras[view.photo], (view.camera.height, view.camera.width)
     begin, end = int(store.first[view.photo]), int(store.first[view.photo + 1])
-    left_out = (store.label[begin:end].cpu().numpy() == VOID).reshape(camera.height, camera.width)
-    if left_out.all():
+    label = store.label[begin:end].cpu().numpy().reshape(camera.height, camera.width)
+    if (label == VOID).all():
         return None
     x, y = np.nan_to_num(photo_pixels(view, store)).clip(0, [camera.width - 1, camera.height - 1]).astype(int).T
-    return left_out[y, x].reshape(shape)
+    return label[y, x].reshape(shape)
 
 
 def refined_maps(
@@ -72,8 +73,9 @@ def refined_maps(
 ) -> tuple[MapArrays, float]:
     """Confirmed maps (see `depth_maps.confirmed_maps`) whose depths photos have moved, and the share of their depths that
     views do confirm. Where views do not confirm a moved depth, the field's is asked again, the plane through what is
-    known around (planes.py), or that of a wall or floor that goes on from elsewhere (scene_planes.py). Where they do not confirm that either, but three of them the field's own depth, it is taken, as
-    far away as photos confirm depths. What label maps say is nothing (sky.py) has an unknown depth.
+    known around (planes.py), or that of a wall or floor that goes on from elsewhere (scene_planes.py). Where they do not confirm
+    that either, but three of them the field's own depth, it is taken, as far away as photos confirm depths. What label maps say
+    is nothing, and backdrops without the name of a thing (sky.py), have an unknown depth.
     """
     arrays = map_arrays(views, maps, device)
     grey = torch.from_numpy(np.concatenate([g.reshape(-1) for g in grey_pictures(views, store, report)]))
@@ -89,25 +91,30 @@ def refined_maps(
     believed = confirmed_maps(views, moved, device, report, around)
     kept = hits(believed, maps)
     sure = [there & (new.depth != old.depth) for there, old, new in zip(kept, maps, moved)]
-    left_out = [nameless(view, store) for view in views]
+    labels = [label_picture(view, store) for view in views]
+    left_out = [None if label is None else label == VOID for label in labels]
     told = labels_tell(sure, left_out)
+    labels = named_things([map_.hit for map_ in maps], sure, labels)
     known, fields = [], []
-    for number, (view, old, new, unnamed) in enumerate(zip(views, maps, moved, left_out)):
+    for number, (view, old, new, label, unnamed) in enumerate(zip(views, maps, moved, labels, left_out)):
         safe = sure[number]
         depth = np.where(safe, new.depth, old.depth)
         if told and unnamed is not None:
             empty = nothing(unnamed, safe)
             depth, safe = np.where(empty & old.hit, 0, depth), safe & ~empty
             sure[number] = safe
-        depth = np.where(backdrop(depth, safe), 0, depth)
+        behind = backdrop(depth, safe)
+        if label is not None:
+            behind &= label == VOID
+        depth = np.where(behind, 0, depth)
         spread = np.where(safe, np.minimum(old.spread, SURE * depth / view.camera.fx), old.spread)
         fields.append(trusted_field(old, depth, safe, unnamed if told else None))
         known.append(replace(old, depth=depth, spread=spread.astype(np.float32)))
-    planes = scene_planes(known_points(views, known, kept), report)
+    planes = scene_planes(known_points(views, known, kept, labels), report)
     mixed = []
-    for view, map_, safe in zip(views, known, sure):
+    for view, map_, safe, label in zip(views, known, sure, labels):
         report.check()
-        mixed.append(on_scene_planes(view, map_, safe, with_planes(view, map_, safe), planes))
+        mixed.append(on_scene_planes(view, map_, safe, with_planes(view, map_, safe), planes, label))
     final = confirmed_maps(views, mixed, device, report, around)
     final = with_holes_filled(final, confirmed_maps(views, fields, device, report, around, FIELD_CONFIRMED))
     asked = sum(int(map_.hit.sum()) for map_ in mixed)

@@ -3,8 +3,12 @@
 A white wall shows nothing that photos could be compared by, and a field that few cameras saw is off there by more than a
 pixel. But where a wall is known at one end, it mostly goes on: a depth that photos do not confirm is moved onto a plane
 of the scene, provided that the plane is known close by and the field's depth agrees with it as far as the field is sure.
+Where all that is known of a class lies on one plane, with nothing behind it, as of a floor, what label maps give this class lies
+on it too.
+No wall is a perfect plane: depths are moved onto the mean height above it of what is known around.
 
-Source: planes by random samples, Schnabel, Wahl and Klein, "Efficient RANSAC for point-cloud shape detection", 2007.
+Sources: planes by random samples, Schnabel, Wahl and Klein, "Efficient RANSAC for point-cloud shape detection", 2007; floors and
+walls from labels, Guo et al., "Neural 3D scene reconstruction with the Manhattan-world assumption", 2022.
 """
 
 from __future__ import annotations
@@ -13,8 +17,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import distance_transform_edt, gaussian_filter
 
+from ..data.pixels import VOID
 from ..progress import Reporter
 from .depth_maps import DepthMap, FlatView, cosines, pixel_directions, smooth_normals
 
@@ -35,25 +40,31 @@ AGREES, SPREADS, OFF = (
     1.5,
     0.1,
 )  # share by which depths may be off a plane: at least, spreads of the field, at most
+FLAT_CLASS = 0.75  # share of what is known of a class that lies on one plane, from which on all of it does
+LABELLED_OFF = 0.5  # share by which the field's depth may be off the plane of its class
+BEHIND = 0.01  # share of what is known that may lie behind such a plane: a floor bounds a scene, a table top does not
+SMOOTHED = 12.0  # cells over which heights above a plane are averaged
 STEEPEST = 0.05  # cosine under which a plane is not looked at
 FITTED_PIXELS = 3.0  # spread of a depth on a plane, in footprints
 
 
 @dataclass(frozen=True)
 class Known:
-    """Points (N, 3) that views confirm, their unit normals (N, 3) towards the camera, the footprint (N,) of a pixel there, and
-    by how much their depth may be wrong (N,)."""
+    """Points (N, 3) that views confirm, their unit normals (N, 3) towards the camera, the footprint (N,) of a pixel there, by
+    how much their depth may be wrong (N,), and their class (N,) uint8, VOID where label maps do not say it."""
 
     points: np.ndarray
     normals: np.ndarray
     footprint: np.ndarray
     error: np.ndarray
+    kind: np.ndarray
 
 
 @dataclass(frozen=True)
 class ScenePlane:
     """Part of a plane: a point of it (3,), its unit normal (3,) towards the cameras, two axes (2, 3) in it, and which cells
-    (X, Y) bool it reaches into, of size `cell` from `low` (2,) on along the axes."""
+    (X, Y) bool it reaches into, of size `cell` from `low` (2,) on along the axes; height (X, Y) of what is known above the
+    plane, and which classes (256,) bool lie on it wholly."""
 
     point: np.ndarray
     normal: np.ndarray
@@ -61,6 +72,8 @@ class ScenePlane:
     low: np.ndarray
     cell: float
     reached: np.ndarray
+    height: np.ndarray
+    classes: np.ndarray
 
     def holds(self, points: np.ndarray) -> np.ndarray:
         """Whether points (N, 3) of the plane lie in what is reached."""
@@ -70,12 +83,23 @@ class ScenePlane:
         found[inside] = self.reached[tuple(place[inside].astype(int).T)]
         return found
 
+    def height_at(self, points: np.ndarray) -> np.ndarray:
+        """Height (N,) above the plane near points (N, 3) of it, beyond its cells that of the nearest one."""
+        place = np.floor(((points - self.point) @ self.axes.T - self.low) / self.cell)
+        return self.height[tuple(place.clip(0, np.array(self.height.shape) - 1).astype(int).T)]
 
-def known_points(views: Sequence[FlatView], maps: Sequence[DepthMap], confirmed: Sequence[np.ndarray]) -> Known:
-    """What views confirm, `confirmed` (H, W) bool of each map, thinned evenly."""
+
+def known_points(
+    views: Sequence[FlatView],
+    maps: Sequence[DepthMap],
+    confirmed: Sequence[np.ndarray],
+    labels: Sequence[np.ndarray | None] | None = None,
+) -> Known:
+    """What views confirm, `confirmed` (H, W) bool of each map, thinned evenly; labels: class (H, W) uint8 of each view's
+    pixels, None for views without."""
     step = max(1, -(-sum(int(there.sum()) for there in confirmed) // POINTS))
     parts = []
-    for view, map_, there in zip(views, maps, confirmed):
+    for view, map_, there, label in zip(views, maps, confirmed, labels or [None] * len(views)):
         rows, columns = (part[::step] for part in np.nonzero(there & map_.hit))
         normal = smooth_normals(view.camera, map_.depth, SMOOTH)[rows, columns]
         facing = (normal != 0).any(1)
@@ -85,7 +109,8 @@ def known_points(views: Sequence[FlatView], maps: Sequence[DepthMap], confirmed:
         points = local @ view.pose[:3, :3].T + view.pose[:3, 3]
         footprint = depth / view.camera.fx
         error = np.maximum(SOFT * map_.spread[rows, columns], footprint)
-        parts.append((points, normal @ view.pose[:3, :3].T, footprint, error))
+        kind = np.full(len(rows), VOID, np.uint8) if label is None else label[rows, columns]
+        parts.append((points, normal @ view.pose[:3, :3].T, footprint, error, kind))
     return Known(*(np.concatenate(part) for part in zip(*parts)))
 
 
@@ -152,31 +177,77 @@ def _reaching(known: Known, on: np.ndarray, point: np.ndarray, normal: np.ndarra
     index = ((place - low) / cell).astype(int)
     there = np.zeros(index.max(0) + rim + 1, bool)
     there[tuple(index.T)] = True
-    return ScenePlane(point, normal, axes, low, cell, np.asarray(distance_transform_edt(~there)) <= REACH)
+    reached = np.asarray(distance_transform_edt(~there)) <= REACH
+    plain = ScenePlane(
+        point, normal, axes, low, cell, reached, np.zeros(there.shape), _flat_classes(known, point, normal)
+    )
+    return replace(plain, height=_heights(known, plain))
+
+
+def _flat_classes(known: Known, point: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Which classes (256,) bool have nearly all of their known area within the errors of a plane behind which nothing lies."""
+    area, off = known.footprint**2, (known.points - point) @ normal / known.error
+    if area[off < -BESIDE].sum() > BEHIND * area.sum():
+        return np.zeros(256, bool)
+    own = np.bincount(known.kind, area * (off < BESIDE), 256)
+    flat = own >= FLAT_CLASS * np.maximum(np.bincount(known.kind, area, 256), FEWEST * np.median(area))
+    flat[VOID] = False
+    return flat
+
+
+def _heights(known: Known, plane: ScenePlane) -> np.ndarray:
+    """Mean height (X, Y) above a plane of what is known beside it, around each of its cells, weighted as in `_fit`; cells far
+    from all that have the height of the nearest."""
+    near = np.flatnonzero(_near(known, plane.point, plane.normal, BESIDE))
+    away = known.points[near] - plane.point
+    place = np.floor((away @ plane.axes.T - plane.low) / plane.cell)
+    inside = ((place >= 0) & (place < plane.reached.shape)).all(1)
+    near, away, index = near[inside], away[inside], tuple(place[inside].astype(int).T)
+    weight = known.footprint[near] ** 2 / known.error[near] ** 2
+    total, amount = np.zeros(plane.reached.shape), np.zeros(plane.reached.shape)
+    np.add.at(total, index, weight * (away @ plane.normal))
+    np.add.at(amount, index, weight)
+    total, amount = (gaussian_filter(grid, SMOOTHED, mode="constant") for grid in (total, amount))
+    known_there = amount > 1e-6 * amount.max()
+    nearest = np.asarray(distance_transform_edt(~known_there, return_distances=False, return_indices=True))
+    return np.where(known_there, total / np.where(known_there, amount, 1), 0)[tuple(nearest)]
 
 
 def on_scene_planes(
-    view: FlatView, field: DepthMap, sure: np.ndarray, map_: DepthMap, planes: list[ScenePlane]
+    view: FlatView,
+    field: DepthMap,
+    sure: np.ndarray,
+    map_: DepthMap,
+    planes: list[ScenePlane],
+    labels: np.ndarray | None = None,
 ) -> DepthMap:
     """A depth map whose depths that are not `sure` (H, W) bool lie on a plane of the scene, where the field's own depth
-    agrees with one: the one closest to it.
+    agrees with one: the one closest to it. With the plane of its class it need not agree much, however far it reaches.
 
     Args:
         field: the field's depths and spreads where it is not sure; map_: what becomes of them without such a plane.
+        labels: class (H, W) uint8 of each pixel.
     """
     rows, columns = np.nonzero(field.hit & ~sure)
     ray = pixel_directions(view.camera)[rows, columns] @ view.pose[:3, :3].T
     eye, depth = view.pose[:3, 3], field.depth[rows, columns]
     allowed = np.clip(SPREADS * field.spread[rows, columns] / depth, AGREES, OFF)
     moved = np.zeros(len(rows), np.float32)
+    kind = np.full(len(rows), VOID, np.uint8) if labels is None else labels[rows, columns]
     for plane in planes:
-        towards = np.negative(ray @ plane.normal)
-        facing = towards > STEEPEST
-        reached = np.where(facing, ((eye - plane.point) @ plane.normal) / np.where(facing, towards, 1), 0)
-        off = np.abs(reached - depth) / depth
-        close = np.flatnonzero(off < allowed)
-        close = close[plane.holds(eye + ray[close] * reached[close, None])]
-        moved[close], allowed[close] = reached[close], off[close]
+        towards, of_class = np.negative(ray @ plane.normal), plane.classes[kind]
+        above, facing = (eye - plane.point) @ plane.normal, towards > STEEPEST
+        reached = np.where(facing, above / np.where(facing, towards, 1), 0)
+        limit = np.where(of_class & (moved == 0), LABELLED_OFF, allowed)
+        close = np.flatnonzero((np.abs(reached - depth) < limit * depth) & (reached > 0))
+        place = eye + ray[close] * reached[close, None]
+        there = plane.holds(place) | of_class[close]
+        close, place = close[there], place[there]
+        reached = (above - plane.height_at(place)) / towards[close]
+        off = np.abs(reached - depth[close]) / depth[close]
+        better = off < limit[close]
+        close = close[better]
+        moved[close], allowed[close] = reached[better], off[better]
     new, spread = map_.depth.copy(), map_.spread.copy()
     found = moved > 0
     new[rows[found], columns[found]] = moved[found]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import distance_transform_edt, uniform_filter
 
+from ..data.pixels import VOID
 from ..kernels.depth_arrays import FREE
 
 NAMED = 0.5  # share of what photos confirm that label maps name, from which on what they leave out is mostly nothing
@@ -29,6 +30,25 @@ def labels_tell(sure: list[np.ndarray], left_out: list[np.ndarray | None]) -> bo
     labelled = [(part, out) for part, out in zip(sure, left_out) if out is not None]
     total = sum(int(part.sum()) for part, _ in labelled)
     return total > 0 and sum(int((part & ~out).sum()) for part, out in labelled) >= NAMED * total
+
+
+def named_things(
+    hit: list[np.ndarray], sure: list[np.ndarray], labels: list[np.ndarray | None]
+) -> list[np.ndarray | None]:
+    """Label maps (H, W) uint8 of only those classes that are things, and no sky or guess of the field: photos confirm at
+    least a fifth of what the field has of them. VOID elsewhere.
+
+    Args:
+        hit, sure: which pixels (H, W) of each view have a depth, and one that photos confirm; labels: class (H, W) uint8 of
+            each pixel or VOID, None for views without label maps.
+    """
+    there, confirmed = np.zeros(256, int), np.zeros(256, int)
+    for own, safe, label in zip(hit, sure, labels):
+        if label is not None:
+            there += np.bincount(label[own], minlength=256)
+            confirmed += np.bincount(label[own & safe], minlength=256)
+    thing = confirmed > CONFIRMED * there
+    return [None if label is None else np.where(thing[label], label, VOID).astype(np.uint8) for label in labels]
 
 
 def nothing(left_out: np.ndarray, sure: np.ndarray) -> np.ndarray:

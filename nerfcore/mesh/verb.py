@@ -31,6 +31,7 @@ from .lods import make_levels
 from .outputs import Made, write_outputs
 from .painted import Painted, paint_surface, training_photos
 from .parts import texture_of
+from .photo_texture import check_memory
 from .photos import Photo
 from .preview import preview
 from .shown import shown_share, silhouette
@@ -51,13 +52,15 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
         for a preview see `preview.preview`;
         with a texture of photos "painted_by_photos", the share of its texels that a photo shows
     Raises:
-        SettingError: unknown format or impossible region. ProjectError, TrainingError, DiskError.
+        SettingError: unknown format, impossible region, or no memory for the texture. ProjectError, TrainingError, DiskError.
     """
     if params.preview:
         return preview(params, report)
     folder = Path(params.project)
     if params.out is not None:
         check_format(params.out)
+    if params.texture is not None:
+        check_memory(params.texture)
     project, trained = load_project(folder), load_trained(folder, params.run)
     scene = load_scene(folder, trained.info.holdout)
     inputs = mesh_inputs(params)

@@ -18,6 +18,7 @@ from .facelets import Facelets
 
 CPU = torch.device("cpu")  # a thread draws one photo's buffer: there is one photo a core, and the rest is numpy
 STEEPEST = np.cos(np.radians(75))  # what is seen at a smaller cosine is not taken from a photo
+FLATTEST = np.cos(np.radians(85))  # and at a smaller one than this a photo does not even say what it is
 SLACK_PIXELS = 2.0  # how much nearer something may be before it hides a point, in footprints of a pixel
 PARTLY = 0.3  # weight of a facelet that something hides in part
 
@@ -154,18 +155,34 @@ class Observations:
         return face, column
 
 
-def observe(buffers: DepthBuffers, report: Reporter, most: int = 8) -> Observations:
-    """Find the `most` best views of each facelet among all that see its middle."""
+def observe(
+    buffers: DepthBuffers,
+    report: Reporter,
+    most: int = 8,
+    steepest: float = STEEPEST,
+    asked: np.ndarray | None = None,
+) -> Observations:
+    """Find the `most` best views of each facelet among all that see its middle, at a cosine above `steepest`; `asked` (F,)
+    bool: only of these."""
     count = len(buffers.pieces)
     best = np.full((count, most), -1, np.int16), np.zeros((count, most), np.float32), np.zeros((count, most), bool)
     for number, (face, weight, whole) in in_parallel(
-        lambda number: _seen_by(buffers, number), range(len(buffers.views)), report, "views"
+        lambda number: _seen_by(buffers, number, steepest, asked), range(len(buffers.views)), report, "views"
     ):
         worst = best[1][face].argmin(1)
         better = weight > best[1][face, worst]
         place = face[better], worst[better]
         best[0][place], best[1][place], best[2][place] = number, weight[better], whole[better]
     return Observations(*best)
+
+
+def with_flat_views(seen: Observations, buffers: DepthBuffers, report: Reporter) -> Observations:
+    """Observations in which facelets that no view sees well enough for their colour have those that see them at a flatter
+    angle: enough to read a class."""
+    unseen = (seen.view < 0).all(1)
+    flat = observe(buffers, report, seen.view.shape[1], FLATTEST, unseen)
+    pairs = ((flat.view, seen.view), (flat.weight, seen.weight), (flat.whole, seen.whole))
+    return Observations(*(np.where(unseen[:, None], new, old) for new, old in pairs))
 
 
 def in_parallel(work, items: Sequence, report: Reporter, noun: str) -> Iterator[tuple]:
@@ -177,13 +194,16 @@ def in_parallel(work, items: Sequence, report: Reporter, noun: str) -> Iterator[
         yield from enumerate(run_parallel([lambda item=item: work(item) for item in part], CPU), begin)
 
 
-def _seen_by(buffers: DepthBuffers, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Facelets (N,) that a view sees, their weight (N,) and whether they are seen as a whole (N,)."""
+def _seen_by(
+    buffers: DepthBuffers, number: int, steepest: float, asked: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Facelets (N,), of those `asked` (F,) bool, that a view sees at a cosine above `steepest`, their weight (N,) and whether
+    they are seen as a whole (N,)."""
     view, pieces = buffers.views[number], buffers.pieces
     towards = view.center - pieces.centers
     distance = _length(towards)
     cosine = np.einsum("ij,ij->i", towards, pieces.normals) / np.maximum(distance, 1e-12)
-    face = np.flatnonzero(cosine > STEEPEST)
+    face = np.flatnonzero(cosine > steepest if asked is None else asked & (cosine > steepest))
     local = view.local(pieces.centers[face])
     pixel, depth = view.pixels(local), view.depth(local)
     shown = within(pixel, view.camera.width, view.camera.height)

@@ -115,7 +115,7 @@ def test_where_planes_contradict_each_other_the_field_is_believed_as_far_as_phot
     monkeypatch.setattr(refine, "with_planes", apart)
     monkeypatch.setattr(refine, "scene_planes", lambda known, report: [])
     monkeypatch.setattr(refine, "grey_pictures", lambda views, store, report: [np.zeros(size, np.float32)] * len(flats))
-    monkeypatch.setattr(refine, "nameless", lambda view, store: None)
+    monkeypatch.setattr(refine, "label_picture", lambda view, store: None)
     field = depth_maps.map_arrays(flats, maps, CPU).depth
     final, _ = refined_maps(flats, maps, SimpleNamespace(), CPU, Reporter())  # type: ignore[arg-type]
     theirs = known(final) & (final.depth == field)

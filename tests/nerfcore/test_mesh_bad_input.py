@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import errno
+import hashlib
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from fieldwork.nerfcore.data.load import load_scene
-from fieldwork.nerfcore.errors import TrainingError
+from fieldwork.nerfcore.errors import DiskError, SettingError, TrainingError
 from fieldwork.nerfcore.geometry.cameras import pixel_centers, rays
 from fieldwork.nerfcore.kernels.depth_arrays import FREE
-from fieldwork.nerfcore.mesh import build, depth_maps
+from fieldwork.nerfcore.mesh import build, depth_maps, photo_texture
 from fieldwork.nerfcore.params import MeshParams, TrainParams
 from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.project.schema import SemanticClass
 from fieldwork.nerfcore.project.store import load_project, save_project
 from fieldwork.nerfcore.render.run import load_trained
 from fieldwork.nerfcore.verbs import run_verb
@@ -112,3 +115,59 @@ def test_what_nobody_labelled_is_void(tmp_path: Path, monkeypatch: pytest.Monkey
     with np.load(folder / "exports" / "main" / "mesh.npz") as mesh:
         assert (mesh["class_id"] == load_scene(folder, 8).ignore_id).all()
         assert np.median(np.abs(np.linalg.norm(mesh["vertices"], axis=1) - RADIUS)) < 0.02  # half a pixel
+
+
+def test_a_class_that_nobody_labelled_has_no_surface(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = ball_project(tmp_path / "ball")
+    project = load_project(folder)
+    unused = SemanticClass(id=9, name="moss", color=(0.2, 0.6, 0.2))
+    save_project(folder, project.model_copy(update={"classes": [*project.classes, unused]}))
+    run_verb("train", TrainParams(project=folder, preset="draft", steps=2, set=SMALL), Reporter())
+    result = run_verb("mesh", MeshParams(project=learned(folder, monkeypatch), resolution=32, texture=64), Reporter())
+    assert {"top", "bottom"} <= set(result["classes"]) <= {"top", "bottom", "void"}
+    with np.load(folder / "exports" / "main" / "mesh.npz") as mesh:
+        assert 9 not in mesh["face_class"]
+        assert 9 not in mesh["class_id"]
+
+
+def test_more_triangles_than_there_are_is_all_there_are(untrained: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    learned(untrained, monkeypatch)
+    whole = run_verb("mesh", MeshParams(project=untrained, resolution=32), Reporter())
+    asked = run_verb("mesh", MeshParams(project=untrained, resolution=32, faces=50_000_000), Reporter())
+    assert asked["faces"] == whole["faces"] > 1000
+
+
+def test_no_memory_for_a_texture_is_said_before_any_work(untrained: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Little:
+        available = 1_000_000_000
+
+    monkeypatch.setattr(photo_texture.psutil, "virtual_memory", lambda: Little)
+    report, before = Reporter(), contents(untrained)
+    with pytest.raises(SettingError, match="16384×16384 needs") as caught:
+        run_verb("mesh", MeshParams(project=untrained, texture=16384), report)
+    assert "8192 or less" in (caught.value.hint or "")
+    assert not report.warnings  # the field was not even looked at
+    assert contents(untrained) == before
+
+
+def contents(folder: Path) -> dict[Path, str]:
+    files = [path for path in folder.rglob("*") if path.is_file() and "jobs" not in path.parts]
+    return {path: hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+@pytest.mark.parametrize("writer", ["painted.write_picture", "outputs.np.savez", "files._write"])
+def test_on_a_full_disk_the_earlier_mesh_stays(
+    untrained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, writer: str
+) -> None:
+    learned(untrained, monkeypatch)
+    params = MeshParams(project=untrained, resolution=32, texture=64, out=tmp_path / "a.glb")
+    run_verb("mesh", params, Reporter())
+    before = contents(untrained), contents(tmp_path)
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(f"fieldwork.nerfcore.mesh.{writer}", full)
+    with pytest.raises(DiskError, match="No space left"):
+        run_verb("mesh", params.model_copy(update={"resolution": 30}), Reporter())
+    assert (contents(untrained), contents(tmp_path)) == before

@@ -88,3 +88,52 @@ def test_nothing_known_is_no_plane_and_cancelling_is_heard(walls) -> None:
     report.cancel()
     with pytest.raises(Cancelled):
         scene_planes(known_points(views, maps, sure), report)
+
+
+def of_class(number: int) -> list[np.ndarray]:
+    """Label maps in which three views show nothing but one class."""
+    return [np.full((90, 120), number, np.uint8)] * 3
+
+
+def test_the_plane_of_a_class_goes_on_wherever_label_maps_give_it(walls) -> None:
+    views, depths, sure = walls
+    planes = scene_planes(known_points(views, [as_map(d, 0.01) for d in depths], sure, of_class(4)), Reporter())
+    aside, nothing = looking(6.0, 0.0), np.zeros((90, 120), bool)
+    true = wall_depth(aside)
+    blurred = as_map(true * 1.3, 0.01)  # a field that is sure of another depth
+    label = np.where(np.arange(120) < 60, 4, 5) * np.ones((90, 1), int)
+    found = on_scene_planes(aside, blurred, nothing, blurred, planes, label.astype(np.uint8))
+    assert found.depth[:, :60] == pytest.approx(true[:, :60], rel=1e-3)
+    assert (found.depth[:, 60:] == blurred.depth[:, 60:]).all()
+    # A field that has it at twice the depth shows something else, and so does what photos confirm.
+    away = as_map(true * 2.2, 0.01)
+    assert (on_scene_planes(aside, away, nothing, away, planes, of_class(4)[0]).depth == away.depth).all()
+    assert (on_scene_planes(aside, blurred, ~nothing, blurred, planes, of_class(4)[0]).depth == blurred.depth).all()
+
+
+def test_a_class_that_lies_elsewhere_too_has_no_plane(walls) -> None:
+    views, depths, sure = walls
+    bent = [np.where(np.arange(120) < 40, d, 0.8 * d) for d in depths]  # half of it before the wall
+    planes = scene_planes(known_points(views, [as_map(d, 0.01) for d in bent], sure, of_class(4)), Reporter())
+    assert planes
+    assert not any(plane.classes.any() for plane in planes)
+    far = [np.where(np.arange(90)[:, None] < 60, d, 1.5 * d) for d in depths]  # a table's top, and what is under it
+    labels = [np.where(np.arange(90)[:, None] < 60, 4, 5).astype(np.uint8) * np.ones((1, 120), np.uint8)] * 3
+    planes = scene_planes(known_points(views, [as_map(d, 0.01) for d in far], sure, labels), Reporter())
+    top = min(planes, key=lambda plane: plane.point[2])
+    assert top.point[2] == pytest.approx(3.0, abs=0.02)
+    assert not top.classes.any()
+    unnamed = scene_planes(known_points(views, [as_map(d, 0.01) for d in depths], sure, [None] * 3), Reporter())
+    assert not any(plane.classes.any() for plane in unnamed)
+
+
+def test_depths_lie_at_the_height_of_what_is_known_around(walls) -> None:
+    """The upper half of the wall stands out by a pixel and a half: less than what tells planes apart."""
+    views, _, sure = walls
+    upper = np.arange(90)[:, None] < 30
+    stepped = [np.where(upper, wall_depth(view, 2.955), wall_depth(view)) for view in views]
+    planes = scene_planes(known_points(views, [as_map(d, 0.01) for d in stepped], sure), Reporter())
+    blurred = as_map(stepped[1] * np.where(sure[1], 1, 1.04), 0.2)
+    found = on_scene_planes(views[1], blurred, sure[1], blurred, planes)
+    for rows in (slice(0, 15), slice(60, 90)):
+        assert found.depth[rows, 82:90] == pytest.approx(stepped[1][rows, 82:90], abs=0.015)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from fieldwork.nerfcore.data.pixels import VOID
 from fieldwork.nerfcore.kernels.depth_arrays import FREE
-from fieldwork.nerfcore.mesh.sky import backdrop, labels_tell, nothing
+from fieldwork.nerfcore.mesh.sky import backdrop, labels_tell, named_things, nothing
 
 SHAPE = (96, 128)
 
@@ -57,3 +58,19 @@ def test_a_backdrop_is_far_and_nothing_near_it_is_confirmed() -> None:
     assert not backdrop(np.where(half(64), 2.2, depth).astype(np.float32), sure).any()
     # Where nothing is confirmed at all, nothing is known of what is far.
     assert not backdrop(depth, np.zeros(SHAPE, bool)).any()
+
+
+def test_a_class_that_photos_confirm_is_a_thing_and_a_sky_is_none() -> None:
+    label = np.where(half(64), 5, 2).astype(np.uint8)  # a sky beside a wall
+    label[:8] = VOID
+    hit, sure = np.ones(SHAPE, bool), ~half(64)
+    sure[::4, 64::4] = True  # a sixteenth of the sky looks confirmed
+    found, other = named_things([hit, hit], [sure, sure], [label, None])
+    assert other is None
+    assert found is not None
+    assert (found[8:, :64] == 2).all()
+    assert (found[:, 64:] == VOID).all()
+    # What nothing is known of is no thing either.
+    (unknown,) = named_things([~hit], [sure], [label])
+    assert unknown is not None
+    assert (unknown == VOID).all()

@@ -9,7 +9,7 @@ from fieldwork.nerfcore.mesh.facelets import facelets
 from fieldwork.nerfcore.mesh.photo_texture import Prepared, prepare
 from fieldwork.nerfcore.mesh.photos import Photo
 from fieldwork.nerfcore.mesh.surface_labels import class_evidence, class_maps, class_picture, surface_classes
-from fieldwork.nerfcore.mesh.visibility import DepthBuffers, observe
+from fieldwork.nerfcore.mesh.visibility import DepthBuffers, observe, with_flat_views
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.tests.nerfcore.support.flat import LENS, box_mesh, looking, on_plane, ring, wall_mesh, wall_photo
 
@@ -132,6 +132,24 @@ def test_surface_that_no_photo_sees_is_void_whatever_the_field_says() -> None:
     front = (vertices[faces][..., 2] > 0).all(1)
     assert (found.face_class[back] == VOID).all()
     assert (found.face_class[front] != VOID).all()
+
+
+def test_what_is_only_seen_at_a_flat_angle_has_a_class_and_no_colour() -> None:
+    vertices, faces, _ = wall_mesh()
+    pieces = facelets(vertices, faces, limit=0.1)
+    for angle, known in ((70, True), (80, True), (87, False)):
+        away = 2.5 * np.array([np.sin(np.radians(angle)), 0, np.cos(np.radians(angle))])
+        photos = [labelled(looking((0, 0, 0), tuple(away)), of=lambda xy: np.full(len(xy), DISC))]
+        buffers = DepthBuffers([photo.view for photo in photos], pieces)
+        well = observe(buffers, Reporter())
+        seen = with_flat_views(well, buffers, Reporter())
+        assert bool((well.view >= 0).any()) is (angle < 75)
+        evidence = class_evidence(photos, pieces, seen, IDS, None, None, Reporter())
+        found = surface_classes(len(vertices), faces, pieces, evidence, IDS, VOID).face_class
+        middle = np.abs(vertices[faces].mean(1)[:, 0]) < 0.3
+        assert (found[middle] == (DISC if known else VOID)).all()
+        if angle < 75:  # what is seen well is asked as before
+            assert (seen.view[(well.view >= 0).any(1)] == well.view[(well.view >= 0).any(1)]).all()
 
 
 def test_doubtful_label_maps_count_less() -> None:

@@ -33,6 +33,7 @@ from . import (
     raycast,
     surface,
     triangles,
+    voxel_fit,
     voxel_march,
 )
 from .fused import LANES
@@ -55,6 +56,7 @@ SOURCES = (
     raycast,
     closest,
     triangles,
+    voxel_fit,
     voxel_march,
     random_reads,
 )

@@ -20,7 +20,6 @@ from .runtime import array, init, launch
 from .traversal import (
     _DEFAULT,
     BEFORE_CUBE,
-    BLOCK,
     EARLY_STOP,
     MAX_BINS,
     GridArrays,
@@ -71,10 +70,7 @@ def march_weight(
         p = o + d * t
         length = bin_length(p, m)
         u = grid_position(p, m.contracted)
-        skip = int(grid.skip_distance[cell_index(u, m.n / BLOCK)])
-        cell = wp.vec2()
-        if skip == 0:  # the grid's cells are in no cache, their blocks are
-            cell = grid.cells[cell_index(u, m.n)]
+        cell = grid.cells[cell_index(u, m.n)]
         if cell[0] > 0.0:
             bin_transmittance = wp.exp(-cell[0] * length)
             weight += bin_weight(cell, transmittance, bin_transmittance, m)
@@ -88,7 +84,7 @@ def march_weight(
                     break
             t += length
         else:
-            t += skip_length(u, d, inverse, length, m, skip)
+            t += skip_length(u, d, inverse, length, m, grid.skip_distance)
     out.total_weight[r] = weight
     out.t_first[r] = front
     out.t_last[r] = back

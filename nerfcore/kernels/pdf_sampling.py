@@ -11,7 +11,6 @@ import warp as wp
 
 from .traversal import (
     _DEFAULT,
-    BLOCK,
     EARLY_STOP,
     MAX_BINS,
     GridArrays,
@@ -106,17 +105,14 @@ def advanced(ray: Ray, walk: Walk, shift: float, grid: GridArrays, m: MarchParam
             p = ray.origin + ray.direction * walk.t
             width = bin_length(p, m)
             u = grid_position(p, m.contracted)
-            skip = int(grid.skip_distance[cell_index(u, m.n / BLOCK)])
-            cell = wp.vec2()
-            if skip == 0:
-                cell = grid.cells[cell_index(u, m.n)]
+            cell = grid.cells[cell_index(u, m.n)]
             if cell[0] > 0.0:
                 walk.width = width
                 walk.bin_transmittance = wp.exp(-cell[0] * width)
                 walk.weight = bin_weight(cell, walk.transmittance, walk.bin_transmittance, m)
                 walk.t_last = walk.t
             else:
-                walk.t += skip_length(u, ray.direction, ray.inverse, width, m, skip)
+                walk.t += skip_length(u, ray.direction, ray.inverse, width, m, grid.skip_distance)
         if walk.width > 0.0:
             above = walk.below + walk.weight
             if t == NOT_FOUND and target <= above:

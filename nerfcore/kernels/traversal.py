@@ -152,19 +152,22 @@ def bin_length(p: wp.vec3, m: MarchParams):
 
 
 @wp.func
+def axis_exit(u: float, d: float, inverse: float, low: float, high: float):
+    """Distance until a ray at u leaves the interval low … high of one axis."""
+    return (wp.where(d > 0.0, high, low) - u) * inverse
+
+
+@wp.func
 def exit_distance(u: wp.vec3, d: wp.vec3, inverse: wp.vec3, n: float, radius: float, border: float):
     """Distance, in grid coordinates, until a ray at grid position u leaves its cell of an n³ grid and the `radius` cells
     around it, or the part of the grid that is `border` away from its sides."""
     away = float(1.0e9)
     for a in range(3):
-        # In cells, so that nothing is divided on the way.
-        place = u[a] * n
-        cell = wp.floor(place)
-        limit = wp.max(cell - radius, border * n)
-        if d[a] > 0.0:
-            limit = wp.min(cell + 1.0 + radius, n - border * n)
-        away = wp.min(away, (limit - place) * inverse[a])
-    return wp.max(away, 0.0) / n
+        cell = wp.floor(u[a] * n)
+        low = wp.max((cell - radius) / n, border)
+        high = wp.min((cell + 1.0 + radius) / n, 1.0 - border)
+        away = wp.min(away, axis_exit(u[a], d[a], inverse[a], low, high))
+    return wp.max(away, 0.0)
 
 
 @wp.func
@@ -174,10 +177,10 @@ def skip_length(
     inverse: wp.vec3,
     length: float,
     m: MarchParams,
-    skip: int,
+    skip_distance: wp.array(dtype=wp.uint8),
 ):
-    """How far to move from an empty cell: in whole steps until the ray leaves it, or the `skip` empty blocks around it
-    in all directions; one bin where space is contracted."""
+    """How far to move from an empty cell: in whole steps until the ray leaves it, or the empty blocks around it; one
+    bin where space is contracted."""
     side = float(2.0)
     border = float(0.0)
     if m.contracted == 1:
@@ -187,6 +190,7 @@ def skip_length(
         if wp.max(wp.abs(c[0]), wp.max(wp.abs(c[1]), wp.abs(c[2]))) >= 0.25:
             return length
     leave = float(0.0)
+    skip = int(skip_distance[cell_index(u, m.n / BLOCK)])
     if skip > 0:
         leave = exit_distance(u, d, inverse, float(m.n / BLOCK), float(skip - 1), border)
     else:

@@ -40,6 +40,7 @@ LIBRARIES = [
     ("rawpy", "rawpy", "rawpy"),
     ("fast-simplification", "fast_simplification", "fast_simplification"),
     ("onnx", "onnx", "onnx"),
+    ("onnxscript", "onnxscript", "onnxscript"),
     ("onnxruntime", "onnxruntime", "onnxruntime"),
 ]
 

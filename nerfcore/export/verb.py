@@ -95,7 +95,7 @@ def _write_field(
 ) -> tuple[list[Path], dict[str, Any]]:
     """The files written, and what else the result says."""
     if params.to == "onnx":
-        from .field_graph import write_onnx  # the library takes its time to load
+        from .onnx_field import write_onnx  # the library takes its time to load
 
         report.stage("Writing the field")
         write_onnx(out, load_trained(folder, params.run), project)

@@ -10,8 +10,8 @@ def grid_position(p: torch.Tensor, contracted: bool) -> torch.Tensor:
     """Normalised positions (..., 3) → grid coordinates in [0, 1]³."""
     if not contracted:
         return p * 0.5 + 0.5
-    r = p.abs().amax(-1, keepdim=True)
-    return torch.where(r > 1, p * ((2 - 1 / r.clamp(min=1)) / r.clamp(min=1)), p) * 0.25 + 0.5
+    r = p.abs().amax(-1, keepdim=True).clamp(min=1)
+    return p * ((2 - 1 / r) / r) * 0.25 + 0.5
 
 
 def uncontract(u: torch.Tensor) -> torch.Tensor:

@@ -14,7 +14,7 @@ import trimesh
 from fieldwork.nerfcore.config import FieldConfig
 from fieldwork.nerfcore.data.box import Box
 from fieldwork.nerfcore.errors import ProjectError, SettingError
-from fieldwork.nerfcore.export.field_graph import field_model
+from fieldwork.nerfcore.export.onnx_field import field_model
 from fieldwork.nerfcore.field.encoding import spherical_harmonics
 from fieldwork.nerfcore.field.hybrid import HybridField
 from fieldwork.nerfcore.geometry.contraction import grid_position

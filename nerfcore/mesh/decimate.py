@@ -10,7 +10,7 @@ from ..progress import Reporter
 from .clean import compact
 
 CHUNK = 60_000  # faces simplified at once: a fraction of a second
-SMALL_CHUNK = 1000  # of a closed mesh: a chunk that simplifying would fold is left as it is
+SMALL_CHUNK = 1000  # where edges of more than two triangles undo what was done to a chunk
 PASSES = 12
 AT_ONCE = 0.25  # share of a chunk's faces that at least remain in one pass: its border is kept as it is until the next
 
@@ -61,6 +61,8 @@ def _passes(
         ratio = max(target / len(faces), AT_ONCE)
         keep = not move_borders or number < PASSES - 2
         vertices, faces, patch = _one_pass(vertices, faces, patch, ratio, number, size, keep, not move_borders, report)
+        if not move_borders:
+            size = SMALL_CHUNK  # a chunk that simplifying would fold was left as it is
         if len(faces) > 0.98 * before:  # nothing but borders is left
             if not move_borders:
                 break

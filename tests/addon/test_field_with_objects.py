@@ -53,6 +53,19 @@ def shoot(name, target=None):
     import OpenImageIO as oiio
     source = oiio.ImageInput.open(render.filepath)
     return np.asarray(source.read_image(0, 0, 0, source.spec().nchannels, "float"))
+def small_and_large(samples, object_samples):
+    # A picture of 72×48, and one sixteen times as large with one sample a pixel, from which its truth is averaged.
+    render.resolution_x, render.resolution_y = 72, 48
+    bpy.ops.fieldwork.setup_compositor()
+    made = scene["fieldwork_field_scene"]
+    made.fieldwork_live.samples, scene.cycles.samples = samples, object_samples
+    small = shoot("small")
+    render.resolution_percentage = 1600
+    scene.cycles.samples = 1
+    bpy.ops.fieldwork.setup_compositor()
+    made.fieldwork_live.samples = 1
+    np.savez(f"{folder}/both.npz", small=small, large=shoot("large"))
+    return made
 """
 )
 
@@ -63,18 +76,7 @@ def test_edges_of_objects_are_exact_in_the_composite(bpy_script, ball, tmp_path)
     facts = bpy_script(
         START
         + """
-render.resolution_x, render.resolution_y = 72, 48
-bpy.ops.fieldwork.setup_compositor()
-made = scene["fieldwork_field_scene"]
-made.fieldwork_live.samples = 256
-scene.cycles.samples = 512
-small = shoot("small")
-render.resolution_percentage = 1600
-scene.cycles.samples = 1
-bpy.ops.fieldwork.setup_compositor()
-made.fieldwork_live.samples = 1
-large = shoot("large")
-np.savez(f"{folder}/both.npz", small=small, large=large)
+made = small_and_large(256, 512)
 answer({"scenes": len(bpy.data.scenes), "nodes": len(made.objects), "engine": made.render.engine})
 """,
         project=ball,
@@ -181,18 +183,7 @@ scene.collection.children.link(group)
 group.objects.link(bpy.data.objects["through"])
 scene.collection.objects.unlink(bpy.data.objects["through"])
 bpy.context.view_layer.layer_collection.children["group"].holdout = True
-render.resolution_x, render.resolution_y = 72, 48
-bpy.ops.fieldwork.setup_compositor()
-made = scene["fieldwork_field_scene"]
-made.fieldwork_live.samples = 64
-scene.cycles.samples = 128
-small = shoot("small")
-render.resolution_percentage = 1600
-scene.cycles.samples = 1
-bpy.ops.fieldwork.setup_compositor()
-made.fieldwork_live.samples = 1
-large = shoot("large")
-np.savez(f"{folder}/both.npz", small=small, large=large)
+made = small_and_large(64, 128)
 answer({"group": made.view_layers[0].layer_collection.children["group"].holdout})
 """,
         project=ball,

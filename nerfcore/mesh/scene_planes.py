@@ -26,6 +26,7 @@ from .depth_maps import DepthMap, FlatView, cosines, pixel_directions, smooth_no
 POINTS = 40_000  # that are looked at
 MOST = 12  # planes
 SHARE = 0.01  # of the area known that a plane must hold
+SHARP = 3.0  # footprints of a pixel by which a point may be wrong: what a soft field takes for a wall may be round
 SOFT = 0.5  # share of its spread by which a depth may be wrong, but at least a footprint of a pixel
 TRIES, KEPT = 100, 12  # points whose tangent plane is tried, and the best of them that are fitted
 WIDTHS = (3.0, 2.0, 1.5, 1.5)  # errors around a plane in which points are its own, from fit to fit
@@ -115,15 +116,18 @@ def known_points(
 
 
 def scene_planes(known: Known, report: Reporter) -> list[ScenePlane]:
-    """The largest planes among known points, by area."""
+    """The largest planes among known points, by area, of those that are known well."""
+    least = SHARE * (known.footprint**2).sum()
+    sharp = known.error <= SHARP * known.footprint
+    known = Known(*(values[sharp] for values in vars(known).values()))
     area, rng = known.footprint**2, np.random.default_rng(0)
     left, found = np.ones(len(area), bool), []
     for _ in range(MOST):
         report.check()
-        if area[left].sum() < SHARE * area.sum() or not left.any():
+        if area[left].sum() < least or not left.any():
             break
         best = _largest(known, area, left, rng)
-        if best is None or area[best].sum() < SHARE * area.sum():
+        if best is None or area[best].sum() < least:
             break
         point, normal = _fit(known, area, best)
         found.append(_reaching(known, best, point, normal))

@@ -51,6 +51,21 @@ def test_one_plane_is_found_where_it_is(walls) -> None:
     assert not plane.holds(np.array([[9.0, 0, 3], [0, -7, 3]])).any()
 
 
+@pytest.mark.parametrize(("spread", "found"), [(0.05, 1), (0.6, 0)])
+def test_what_a_soft_field_takes_for_a_plane_is_none(walls, spread: float, found: int) -> None:
+    """Depths may be wrong by half their spread: by less than a footprint of 0.03, and by ten."""
+    views, depths, sure = walls
+    assert len(scene_planes(known_points(views, [as_map(d, spread) for d in depths], sure), Reporter())) == found
+
+
+def test_a_little_that_is_sharp_makes_no_plane_of_a_soft_scene(walls) -> None:
+    views, depths, sure = walls
+    spread = np.full(depths[0].shape, 0.6, np.float32)
+    spread[:8, :8] = 0.05
+    maps = [DepthMap(d, spread, cosines(LENS, d)) for d in depths]
+    assert not scene_planes(known_points(views, maps, sure), Reporter())
+
+
 def test_unsure_depths_that_agree_lie_on_the_plane(walls) -> None:
     views, depths, sure = walls
     maps = [as_map(d, 0.01) for d in depths]

@@ -116,22 +116,21 @@ def known_points(
 
 
 def scene_planes(known: Known, report: Reporter) -> list[ScenePlane]:
-    """The largest planes among known points, by area, of those that are known well."""
+    """The largest planes among known points, by area: found in what is known well, and reaching as far as the rest says."""
     least = SHARE * (known.footprint**2).sum()
-    sharp = known.error <= SHARP * known.footprint
-    known = Known(*(values[sharp] for values in vars(known).values()))
-    area, rng = known.footprint**2, np.random.default_rng(0)
+    sharp = Known(*(values[known.error <= SHARP * known.footprint] for values in vars(known).values()))
+    area, rng = sharp.footprint**2, np.random.default_rng(0)
     left, found = np.ones(len(area), bool), []
     for _ in range(MOST):
         report.check()
         if area[left].sum() < least or not left.any():
             break
-        best = _largest(known, area, left, rng)
+        best = _largest(sharp, area, left, rng)
         if best is None or area[best].sum() < least:
             break
-        point, normal = _fit(known, area, best)
-        found.append(_reaching(known, best, point, normal))
-        left &= ~_near(known, point, normal, BESIDE)
+        point, normal = _fit(sharp, area, best)
+        found.append(_reaching(known, np.flatnonzero(_near(known, point, normal, WIDTHS[-1])), point, normal))
+        left &= ~_near(sharp, point, normal, BESIDE)
     return found
 
 

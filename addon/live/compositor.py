@@ -63,6 +63,7 @@ def _share(scene: bpy.types.Scene, made: bpy.types.Scene) -> None:
     for obj in scene.collection.objects:
         if obj.name not in made.collection.objects:
             made.collection.objects.link(obj)
+    made.view_layers[0].update()  # the view layer of a new scene has no collections before
     _share_collections(scene.view_layers[0].layer_collection, made.view_layers[0].layer_collection)
     made.fieldwork.project, made.fieldwork.run = scene.fieldwork.project, scene.fieldwork.run
     live = made.fieldwork_live

@@ -26,6 +26,28 @@ class FIELDWORK_MT_steps(Menu):
         layout.operator("fieldwork.train", text=t("Resume Training")).resume = True
         layout.operator("fieldwork.evaluate").baked = False
         layout.operator("fieldwork.render").baked = False
+        for name in ("label", "live", "mesh", "measure"):
+            layout.menu(f"FIELDWORK_MT_{name}")
+        layout.operator("fieldwork.report")
+        layout.operator("fieldwork.import_scene")
+        layout.operator("fieldwork.blend")
+        layout.operator("fieldwork.export")
+        layout.separator()
+        layout.operator("fieldwork.dataset", text=t("Dataset from Scene…"))
+        layout.operator("fieldwork.batch", text=t("Reconstruct Many…"))
+        layout.operator("fieldwork.blocks", text=t("Reconstruct in Blocks…"))
+        layout.operator("fieldwork.simulate", text=t("Simulate Capture…"))
+        layout.separator()
+        layout.operator("fieldwork.cancel")
+        layout.operator("fieldwork.doctor")
+        layout.operator("fieldwork.open_preferences", text=t("Preferences…"))
+
+
+class FIELDWORK_MT_label(Menu):
+    bl_label = "Label"
+
+    def draw(self, context: Context) -> None:
+        layout = self.layout
         layout.operator("fieldwork.label_photo")
         layout.operator("fieldwork.label_prepare")
         layout.operator("fieldwork.label_propagate")
@@ -40,34 +62,42 @@ class FIELDWORK_MT_steps(Menu):
         layout.operator("fieldwork.assist_suggest", text=t("Guess Classes…"))
         layout.operator("fieldwork.label_import", text=t("Import Labels…"))
         layout.operator("fieldwork.label_export", text=t("Export Labels…"))
+
+
+class FIELDWORK_MT_live(Menu):
+    bl_label = "Live View"
+
+    def draw(self, context: Context) -> None:
+        layout = self.layout
         layout.operator("fieldwork.bake")
         layout.operator("fieldwork.evaluate", text=t("Measure Baked Field")).baked = True
         layout.operator("fieldwork.render", text=t("Render Baked Field")).baked = True
         layout.operator("fieldwork.add_field")
         layout.operator("fieldwork.add_crop_box")
         layout.operator("fieldwork.setup_compositor")
+
+
+class FIELDWORK_MT_mesh(Menu):
+    bl_label = "Mesh"
+
+    def draw(self, context: Context) -> None:
+        layout = self.layout
         layout.operator("fieldwork.mesh")
         layout.operator("fieldwork.turntable")
-        layout.operator("fieldwork.measure")
         layout.operator("fieldwork.relations")
         layout.operator("fieldwork.instances")
+        layout.operator("fieldwork.pick_surface")
+
+
+class FIELDWORK_MT_measure(Menu):
+    bl_label = "Measure"
+
+    def draw(self, context: Context) -> None:
+        layout = self.layout
+        layout.operator("fieldwork.measure")
         layout.operator("fieldwork.plan")
         layout.operator("fieldwork.section")
         layout.operator("fieldwork.compare")
-        layout.operator("fieldwork.report")
-        layout.operator("fieldwork.import_scene")
-        layout.operator("fieldwork.pick_surface")
-        layout.operator("fieldwork.blend")
-        layout.operator("fieldwork.export")
-        layout.separator()
-        layout.operator("fieldwork.dataset", text=t("Dataset from Scene…"))
-        layout.operator("fieldwork.batch", text=t("Reconstruct Many…"))
-        layout.operator("fieldwork.blocks", text=t("Reconstruct in Blocks…"))
-        layout.operator("fieldwork.simulate", text=t("Simulate Capture…"))
-        layout.separator()
-        layout.operator("fieldwork.cancel")
-        layout.operator("fieldwork.doctor")
-        layout.operator("fieldwork.open_preferences", text=t("Preferences…"))
 
 
 class FIELDWORK_MT_recent(Menu):
@@ -100,7 +130,14 @@ def draw_export(self: Menu, context: Context) -> None:
     self.layout.operator("fieldwork.blend", text=t("Capture as .blend (Fieldwork)"))
 
 
-CLASSES = [FIELDWORK_MT_steps, FIELDWORK_MT_recent]
+CLASSES = [
+    FIELDWORK_MT_steps,
+    FIELDWORK_MT_label,
+    FIELDWORK_MT_live,
+    FIELDWORK_MT_mesh,
+    FIELDWORK_MT_measure,
+    FIELDWORK_MT_recent,
+]
 _ENTRIES = [
     ("VIEW3D_MT_object", draw_object_menu),
     ("TOPBAR_MT_file_import", draw_import),

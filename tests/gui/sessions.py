@@ -146,11 +146,11 @@ def tools(screen):
     screen.facts["searched"] = queue.current.verb
     yield from screen.idle(60)
 
-    # The menu, walked with the arrow keys: four below the first entry comes that of the poses.
+    # The menu, walked with the arrow keys: five below the first entry comes that of the poses.
     with bpy.context.temp_override(window=screen.window, area=screen.area, region=screen.view):
         bpy.ops.wm.call_menu("INVOKE_DEFAULT", name="FIELDWORK_MT_steps")
     yield 0.5
-    for _ in range(4):
+    for _ in range(5):
         screen.press("DOWN_ARROW", x, y)
         yield 0.2
     screen.shot("menu")

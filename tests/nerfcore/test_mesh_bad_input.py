@@ -75,7 +75,13 @@ def test_the_scraps_of_an_untrained_field_are_called_a_failure(tmp_path: Path) -
     assert result["verdict"]["level"] == "failed"
     assert "Train longer" in result["verdict"]["reasons"][0]
     assert "2 steps only" in report.warnings[0]
-    assert "surface will have holes" in report.warnings[1]
+
+
+@pytest.mark.parametrize(("share", "warned"), [(0.29, True), (0.31, False)])
+def test_little_that_views_agree_on_is_told(share: float, warned: bool) -> None:
+    report = Reporter()
+    build.check_agreement(share, report)
+    assert ["will have holes" in text for text in report.warnings] == [True] * warned
 
 
 def test_an_empty_field_has_no_surface(untrained: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -110,13 +110,13 @@ def _scenes(params: BenchParams, data: Path | None, root: Path, report: Reporter
 def command_of(params: BenchParams) -> str:
     """The command line that measures the same."""
     command = f"fieldwork bench --suite {params.suite}"
-    for name in ("profile", "scenes", "variants", "seconds", "steps", "seeds", "preset"):
+    for name in ("profile", "scenes", "variants", "tables", "seconds", "steps", "seeds", "preset"):
         value = getattr(params, name)
         if value != type(params).model_fields[name].default:
             text = (
                 ",".join(map(str, value)) if isinstance(value, list) else f"{value:g}" if name == "seconds" else value
             )
-            command += f' --{name} "{text}"' if name in ("scenes", "variants") else f" --{name} {text}"
+            command += f' --{name} "{text}"' if name in ("scenes", "variants", "tables") else f" --{name} {text}"
     return command + "".join(f" --set {name}={value}" for name, value in params.set.items())
 
 

@@ -114,6 +114,7 @@ class BenchParams(Params):
         default=None, description="data sets, simulated scenes (museum, facade, fence, vase), or capture projects"
     )
     variants: list[str] | None = Field(default=None, description="only these variants of the suite")
+    tables: list[str] | None = Field(default=None, description="only these tables of the suite evidence")
     seconds: float | None = Field(
         default=None, gt=0, le=LONGEST_RUN, description="seconds of training a run, instead of the suite's"
     )

@@ -68,6 +68,9 @@ def test_tables_share_trials_and_other_settings_are_other_trials() -> None:
     assert first != second
     with pytest.raises(SettingError, match="no variant “vqrf”"):
         trials_of("quick", variants=["vqrf"])
+    assert {table for table, _ in trials_of("quick", tables=["noise", "rays"])} == {"noise", "rays"}
+    with pytest.raises(SettingError, match="no table “colour”"):
+        trials_of("quick", tables=["colour"])
 
 
 def test_a_boundary_is_the_rim_of_a_mask() -> None:

@@ -130,22 +130,29 @@ def trials_of(
     seeds: Sequence[int] | None = None,
     seconds: float | None = None,
     settings: dict[str, str] | None = None,
+    tables: Sequence[str] | None = None,
 ) -> list[tuple[str, Trial]]:
     """(table, trial) of a profile, in its order; one trial may be of several tables.
 
     `scenes`: instead of those of the tables; `variants`: only these; `seconds`: of all trials limited by time;
-    `settings`: of ours, after those of the profile.
+    `settings`: of ours, after those of the profile; `tables`: only these.
 
     Raises:
-        SettingError: there is no such variant.
+        SettingError: there is no such variant or table.
     """
     known = protocol()
     plan = known.profiles[profile]
     for name in variants or []:
         if name not in known.variants:
             raise SettingError(f"The suite evidence has no variant “{name}”.", f"It has: {', '.join(known.variants)}.")
+    there = [table.name for table in plan.tables]
+    for name in tables or []:
+        if name not in there:
+            raise SettingError(f"The profile {profile} has no table “{name}”.", f"It has: {', '.join(there)}.")
     found = []
     for table in plan.tables:
+        if tables is not None and table.name not in tables:
+            continue
         chosen = [name for name in table.variants if variants is None or name in variants]
         named = [scene_name(scene) for scene in scenes or table.scenes]
         for scene, name, noise, seed in product(named, chosen, table.noise, seeds or plan.seeds):

@@ -34,7 +34,9 @@ def evidence_suite(params: BenchParams, out: Path, root: Path, command: str, rep
         raise SettingError("The suite evidence is limited by seconds or rays, not by steps.", "Leave out --steps.")
     if params.page is not None:
         check_page(params.page)
-    asked = trials_of(params.profile, params.scenes, params.variants, params.seeds, params.seconds, params.set)
+    asked = trials_of(
+        params.profile, params.scenes, params.variants, params.seeds, params.seconds, params.set, params.tables
+    )
     projects, notes = _projects(params, root, sorted({trial.scene for _, trial in asked}), report)
     tables = [(table, trial) for table, trial in asked if _fits(trial, projects)]
     trials = list({trial.name: trial for _, trial in tables}.values())

@@ -9,8 +9,10 @@ import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
 import numpy as np
+import psutil
 
 from ..errors import TrainingError
 from ..files import disk_errors
@@ -20,6 +22,7 @@ from ..progress import Reporter
 # xatlas takes longer than in proportion to the faces, docs/experiments.md, “Vector types of the CPU's compiler”.
 CHUNK_FACES = 1_000
 PACK_SIZE = 2048  # packing takes time in proportion to the area; charts then stand at steps of size / PACK_SIZE texels
+STANDSTILL = 30.0  # seconds without processor time, after which a process is started anew
 PADDING = 4  # texels between charts, as far as the packing's steps allow
 
 
@@ -162,32 +165,57 @@ def seams(faces: np.ndarray, corners: np.ndarray) -> np.ndarray:
     return np.unique(ends[order[1:]][same & apart], axis=0)
 
 
+def _worker(folder: Path, numbers: list, log: IO[bytes]) -> subprocess.Popen[bytes]:
+    command = [sys.executable, "-m", f"{__package__}.uv_worker", str(folder), *map(str, numbers)]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    # A session of its own: Ctrl-C reaches us first, and we decide how it ends.
+    return subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=log, stderr=log, env=environment, start_new_session=True
+    )
+
+
+class _Pulse:
+    """Whether a process has stood still: xatlas can wait for its own threads for ever when it frees an atlas."""
+
+    def __init__(self, process: subprocess.Popen[bytes]) -> None:
+        self.process, self.used, self.since = process, -1.0, time.monotonic()
+
+    def stopped(self) -> bool:
+        """No processor time for `STANDSTILL` seconds."""
+        now = time.monotonic()
+        if self.process.poll() is not None or now - self.since < STANDSTILL:
+            return False
+        try:
+            times = psutil.Process(self.process.pid).cpu_times()
+        except psutil.NoSuchProcess:
+            return False
+        before, self.used, self.since = self.used, times.user + times.system, now
+        return self.used == before
+
+
 def _work(folder: Path, numbers: list, report: Reporter, share: float, before: float) -> None:
     """Let processes work off FOLDER/in_<number>.npz; progress goes from `before` up by `share`."""
     workers = min(default_threads(), len(numbers))
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    shares = [numbers[worker::workers] for worker in range(workers)]
     processes: list[subprocess.Popen[bytes]] = []
     words = folder / "words.txt"
+    there = lambda number: (folder / f"out_{number}.npz").is_file()  # noqa: E731
     try:
         with open(words, "wb") as log:
-            for worker in range(workers):
-                command = [sys.executable, "-m", f"{__package__}.uv_worker", str(folder)]
-                command += [str(number) for number in numbers[worker::workers]]
-                processes.append(
-                    subprocess.Popen(
-                        command,
-                        stdin=subprocess.PIPE,
-                        stdout=log,
-                        stderr=log,
-                        env=environment,
-                        start_new_session=True,  # Ctrl-C reaches us first; we decide how it ends
-                    )
-                )
+            processes += [_worker(folder, own, log) for own in shares]
+            alive = [_Pulse(process) for process in processes]
         while any(process.poll() is None for process in processes):
-            done = sum((folder / f"out_{number}.npz").is_file() for number in numbers)
-            report.progress(before + share * done / len(numbers))
+            report.progress(before + share * sum(map(there, numbers)) / len(numbers))
             if any(process.poll() for process in processes):
                 break
+            for index, pulse in enumerate(alive):
+                if pulse.stopped():
+                    processes[index].kill()
+                    with open(words, "ab") as log:
+                        processes.append(_worker(folder, [n for n in shares[index] if not there(n)], log))
+                    processes[index].wait(timeout=10)
+                    processes[index] = processes.pop()
+                    alive[index] = _Pulse(processes[index])
             time.sleep(0.05)
     finally:
         for process in processes:

@@ -174,6 +174,14 @@ def _worker(folder: Path, numbers: list, log: IO[bytes]) -> subprocess.Popen[byt
     )
 
 
+def _end(process: subprocess.Popen[bytes]) -> None:
+    if process.poll() is None:
+        process.kill()
+    process.wait(timeout=10)
+    if process.stdin is not None:
+        process.stdin.close()
+
+
 class _Pulse:
     """Whether a process has stood still: xatlas can wait for its own threads for ever when it frees an atlas."""
 
@@ -210,21 +218,15 @@ def _work(folder: Path, numbers: list, report: Reporter, share: float, before: f
                 break
             for index, pulse in enumerate(alive):
                 if pulse.stopped():
-                    processes[index].kill()
+                    _end(processes[index])
                     with open(words, "ab") as log:
-                        processes.append(_worker(folder, [n for n in shares[index] if not there(n)], log))
-                    processes[index].wait(timeout=10)
-                    processes[index] = processes.pop()
+                        processes[index] = _worker(folder, [n for n in shares[index] if not there(n)], log)
                     alive[index] = _Pulse(processes[index])
             time.sleep(0.05)
     finally:
         for process in processes:
-            if process.poll() is None:
-                process.kill()
-            process.wait(timeout=10)
-            if process.stdin is not None:
-                process.stdin.close()
-    missing = [number for number in numbers if not (folder / f"out_{number}.npz").is_file()]
+            _end(process)
+    missing = [number for number in numbers if not there(number)]
     if missing:
         last = words.read_text("utf-8", "replace").strip().splitlines()[-1:] or ["nothing"]
         raise TrainingError(

@@ -24,6 +24,7 @@ MODULES = (
     "addon.live.engine",
     "addon.live.training",
     "addon.live.hint",
+    "addon.live.thing_texels",
     "addon.live.viewport",
     "addon.preferences",
     "addon.pictures.thumbnails",

@@ -138,7 +138,7 @@ class FIELDWORK_OT_refresh_field_classes(_OfField):
 
 
 class FIELDWORK_OT_place_thing(_OfField):
-    """Add an object where the thing stands: renders show the thing where this object is moved, turned and scaled to"""
+    """Add an object where the thing stands: the thing is shown where this object is moved, turned and scaled to"""
 
     bl_idname = "fieldwork.place_thing"
     bl_label = "Move Thing"

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import bpy
 from bpy.types import Context, Panel, UILayout, UIList
 
-from ..addon.live import fields, hint, voxels
+from ..addon.live import fields, hint, thing_texels, voxels
 from ..addon.live.engine import ENGINE
 from ..addon.live.settings import look_name
 from ..addon.live.training import trainings
@@ -76,7 +77,7 @@ def draw_field(layout: UILayout, context: Context, obj) -> None:
             column.prop(own.classes[own.class_index], "tint")
             column.prop(own.classes[own.class_index], "opacity")
     if own.things:
-        draw_things(layout, own)
+        draw_things(layout, context, own)
     if own.classes:
         layout.operator("fieldwork.refresh_field_classes", icon="FILE_REFRESH")
     row = layout.row(align=True)
@@ -84,10 +85,12 @@ def draw_field(layout: UILayout, context: Context, obj) -> None:
     row.operator("fieldwork.add_crop_box", text="", icon="ADD")
 
 
-def draw_things(layout: UILayout, own) -> None:
-    """The things of a field, and how renders show the chosen one."""
+def draw_things(layout: UILayout, context: Context, own) -> None:
+    """The things of a field, and how the chosen one is shown."""
     box = layout.box()
-    box.label(text=t("Things, in Renders of the Baked Field"))
+    box.label(text=t("Things of the Baked Field"))
+    if reason := why_things_are_not_drawn(own):
+        draw_wrapped(box, reason, text_width(context) - 6, icon="INFO")
     box.template_list("FIELDWORK_UL_field_things", "", own, "things", own, "thing_index", rows=3)
     if 0 <= own.thing_index < len(own.things):
         entry = own.things[own.thing_index]
@@ -116,6 +119,19 @@ def why_not_drawn(context: Context, own) -> list[str]:
     elif (asset := viewport.assets.get(baked.key)) is not None and asset.error:
         reasons.append(t("The baked field cannot be read: {} Bake it again.", asset.error))
     return reasons
+
+
+def why_things_are_not_drawn(own) -> str:
+    """A sentence that says why the viewport does not show edits of things; empty where it does, or there is nothing to edit in it.
+    What is needed for that is asked for."""
+    project = Path(fields.absolute(own.project))
+    baked = None if bpy.app.background else voxels.baked(project, own.run)
+    if baked is None:
+        return ""
+    known = thing_texels.answers.of(baked, project, own.run)
+    if known.waits:
+        return t("Telling the things apart: soon the viewport shows how they are edited.")
+    return t("Only renders show how things are edited: {}", known.error) if known.error else ""
 
 
 class _RenderProperties(Panel):

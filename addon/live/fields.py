@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,20 +22,31 @@ def field_objects(objects: Iterable[bpy.types.Object]) -> list[bpy.types.Object]
 
 
 class Part(NamedTuple):
-    """What a render shows: a field, or a copy of a thing of it."""
+    """What is shown: a field, or a copy of a thing of it."""
 
     field: bpy.types.Object
     copy: bpy.types.Object | None
 
+    @property
+    def object(self) -> bpy.types.Object:
+        """That says where it is."""
+        return self.copy or self.field
 
-def rendered_parts(depsgraph: bpy.types.Depsgraph) -> list[Part]:
-    """The fields that a render shows, each with the copies of its things; copies of a field that is hidden are shown."""
-    found, objects = [], list(depsgraph.view_layer.objects)
-    for field in field_objects(objects):
-        placed = [None] if not field.hide_render else []
-        placed += [copy for copy in things.copies(field, objects) if not copy.hide_render]
+
+def parts(objects: Iterable[bpy.types.Object], is_shown: Callable[[bpy.types.Object], bool]) -> list[Part]:
+    """The fields of some objects that are shown, each with the copies of its things; copies of a field that is hidden are shown."""
+    empties, found = [obj for obj in objects if obj.type == "EMPTY"], []
+    copied = [obj for obj in empties if obj.fieldwork_copy.thing]
+    for field in field_objects(empties):
+        placed = [None] if is_shown(field) else []
+        placed += [copy for copy in things.copies(field, copied) if is_shown(copy)]
         found += [Part(field, copy) for copy in placed]
     return found
+
+
+def rendered_parts(depsgraph: bpy.types.Depsgraph) -> list[Part]:
+    """Those that a render shows."""
+    return parts(depsgraph.view_layer.objects, lambda obj: not obj.hide_render)
 
 
 def rendered_items(depsgraph: bpy.types.Depsgraph) -> list[dict[str, Any]]:

@@ -168,6 +168,28 @@ class FrameEngine:
                 raise error
             return Frame({part: pixels.copy(part) for part in sizes.channels}, result or {})
 
+    def ask(
+        self, method: str, params: dict[str, Any], ended: Callable[[dict[str, Any] | None, EngineError | None], None]
+    ) -> bool:
+        """Send a request that `pump`, or a frame that is waited for, hands the answer of to `ended`; it is never called when the
+        engine is ended before. False: a frame is being rendered; ask again. Raises EngineError: there is no engine."""
+        if not self._lock.acquire(blocking=False):
+            return False
+        try:
+            name = f"{method}-{os.getpid()}-{next(self._numbers)}"
+            self._usable_link().request(method, {**params, "frame": name}, ended)
+        finally:
+            self._lock.release()
+        return True
+
+    def pump(self) -> None:
+        """Hand out what the engine said; a frame that is being rendered does so itself."""
+        if self._link is not None and self._lock.acquire(blocking=False):
+            try:
+                self._link.pump()
+            finally:
+                self._lock.release()
+
     def _usable_link(self) -> Link:
         if self._link is not None:
             self._link.pump()

@@ -14,6 +14,7 @@ from ..props import (
     StringProperty,
 )
 from ..text import t
+from .redraw import redraw_views
 
 SOURCES = [
     ("field", "Field", "The field itself: exact, but slow without a large graphics card"),
@@ -24,10 +25,7 @@ SOURCES = [
 def _changed(self: PropertyGroup, context: Context) -> None:
     """What the viewport shows has changed."""
     if not bpy.app.background:
-        for window in context.window_manager.windows:
-            for area in window.screen.areas:
-                if area.type == "VIEW_3D":
-                    area.tag_redraw()
+        redraw_views()
 
 
 class FieldworkFieldClass(PropertyGroup):
@@ -58,25 +56,24 @@ class FieldworkFieldClass(PropertyGroup):
 
 
 class FieldworkFieldThing(PropertyGroup):
-    """How renders show one thing of a field. `name` is that of the instance of the mesh."""
+    """How one thing of a baked field is shown. `name` is that of the instance of the mesh."""
 
     center: FloatVectorProperty(subtype="XYZ")  # in the capture's own frame
     color: FloatVectorProperty(
         name="Color", description="Color that the thing is tinted with", subtype="COLOR_GAMMA", min=0.0, max=1.0,
-        default=(1.0, 1.0, 1.0),
+        default=(1.0, 1.0, 1.0), update=_changed,
     )  # fmt: skip
     visible: BoolProperty(
-        name="Visible",
-        description="Render the thing where it stands; its copies are objects of their own",
-        default=True,
-    )
+        name="Visible", description="Show the thing where it stands; its copies are objects of their own", default=True,
+        update=_changed,
+    )  # fmt: skip
     opacity: FloatProperty(
-        name="Opacity", description="How much of the thing and of its copies is seen in renders", default=1.0, min=0.0,
-        max=1.0, subtype="FACTOR",
+        name="Opacity", description="How much of the thing and of its copies is seen", default=1.0, min=0.0, max=1.0,
+        subtype="FACTOR", update=_changed,
     )  # fmt: skip
     tint: FloatProperty(
-        name="Tint", description="How much of its color the thing and its copies get in renders", default=0.0, min=0.0,
-        max=1.0, subtype="FACTOR",
+        name="Tint", description="How much of its color the thing and its copies get", default=0.0, min=0.0, max=1.0,
+        subtype="FACTOR", update=_changed,
     )  # fmt: skip
 
     @property
@@ -91,7 +88,7 @@ class FieldworkFieldThing(PropertyGroup):
 
 
 class FieldworkThingCopy(PropertyGroup):
-    """What an object says of a thing that renders show where it stands: the field, the thing's name, and the place of the
+    """What an object says of a thing that is shown where it stands: the field, the thing's name, and the place of the
     thing in the capture's own frame that lies on the object's origin."""
 
     field: PointerProperty(type=bpy.types.Object)

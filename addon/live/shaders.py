@@ -164,24 +164,29 @@ void main()
       int top = 0;
       int second = 0;
       float share = 0.0;
+      vec4 first_look = vec4(0.0);
+      vec4 second_look = vec4(0.0);
       if (classes_matter) {
         vertex = strongest(corner + cell, local - vec3(cell));
         vec4 named = texelFetch(t1, vertex, 0);
         top = int(named.r * 255.0 + 0.5);
         share = named.g;
-        second = int(named.b * 255.0 + 0.5);
-        alpha *= share * texelFetch(lut, ivec2(top, 0), 0).a + (1.0 - share) * texelFetch(lut, ivec2(second, 0), 0).a;
+        second = share < 1.0 ? int(named.b * 255.0 + 0.5) : top;
+        first_look = texelFetch(lut, ivec2(top, 0), 0);
+        second_look = second == top ? first_look : texelFetch(lut, ivec2(second, 0), 0);
+        alpha *= share * first_look.a + (1.0 - share) * second_look.a;
       }
       if (alpha > 0.0005) {
         vec3 seen = base.rgb;
         float plain = 1.0;
         if (classes_matter) {
-          vec3 first_color = texelFetch(lut, ivec2(top, 0), 0).rgb;
-          vec3 second_color = texelFetch(lut, ivec2(second, 0), 0).rgb;
-          float first_tint = texelFetch(lut, ivec2(top, 1), 0).r;
-          float second_tint = texelFetch(lut, ivec2(second, 1), 0).r;
-          seen = share * mix(seen, first_color, first_tint) + (1.0 - share) * mix(seen, second_color, second_tint);
-          vec3 labels = share * first_color + (1.0 - share) * second_color;
+          /* tint, and the colour among the labels */
+          vec4 first_more = texelFetch(lut, ivec2(top, 1), 0);
+          vec4 second_more = second == top ? first_more : texelFetch(lut, ivec2(second, 1), 0);
+          float first_tint = first_more.r;
+          float second_tint = second_more.r;
+          seen = share * mix(seen, first_look.rgb, first_tint) + (1.0 - share) * mix(seen, second_look.rgb, second_tint);
+          vec3 labels = share * first_more.gba + (1.0 - share) * second_more.gba;
           seen = mix(seen, labels, min(look, 1.0));
           seen = mix(seen, vec3(max(share, 1.0 - share)), max(look - 1.0, 0.0));
           plain = (1.0 - share * first_tint - (1.0 - share) * second_tint) * (1.0 - min(look, 1.0));

@@ -15,6 +15,7 @@ import bpy
 from mathutils import Matrix
 
 from . import fields
+from .redraw import redraw_views
 
 HEADER = 64  # as nerfcore/film/shared_file.py writes it
 WATCHING, IDLE = 0.05, 0.5  # seconds between two looks for new pictures, and for trainings
@@ -234,10 +235,7 @@ trainings = Trainings()
 def tick() -> float:
     """What the timer does: redraw views when a picture has come, or a training has begun or ended."""
     if trainings.look():
-        for window in bpy.context.window_manager.windows:
-            for area in window.screen.areas:
-                if area.type == "VIEW_3D":
-                    area.tag_redraw()
+        redraw_views()
     return WATCHING if trainings.views else IDLE
 
 

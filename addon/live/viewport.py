@@ -11,12 +11,14 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import bpy
 from mathutils import Matrix
 
-from . import fields, hint, voxels
+from . import fields, hint, thing_texels, things, voxels
+from .assets import Asset, texture
+from .redraw import redraw_views
 from .training import Textures, trainings
 
 BUDGET = 0.05  # seconds of marching in a redraw once the view stands still, or as long as the rest of the redraw takes
@@ -26,49 +28,6 @@ MOVED = 0.15  # seconds a picture may take while the view moves, before it is ma
 STRIPS = 64  # redraws at most, in which a picture becomes fine: how long a few rows take says little
 SETTLED = 0.15  # seconds without a change, after which pictures become finer
 UNUSED = 30.0  # seconds after which what no viewport shows is given up
-
-
-class Asset:
-    """The textures of a baked field; they are loaded one in each redraw."""
-
-    def __init__(self, found: voxels.Baked) -> None:
-        self.found, self.used = found, time.monotonic()
-        self.error = ""
-        self.index: Any = None
-        self.texels: list[Any] = []
-        self._table: tuple[Any, Any] = (None, None)
-
-    @property
-    def ready(self) -> bool:
-        return self.index is not None and len(self.texels) == len(voxels.TEXELS)
-
-    def load(self) -> None:
-        """Load the next texture."""
-        from ...nerfcore.files import UNREADABLE_ARRAYS  # not at the top: enabling the extension must be quick
-
-        try:
-            if self.index is None:
-                self.index = _texture((self.found.meta["side"],) * 3, "R32F", voxels.read_index(self.found))
-            elif not self.ready:
-                name = list(voxels.TEXELS)[len(self.texels)]
-                data = voxels.read_texels(self.found, name)
-                self.texels.append(_texture(voxels.texture_size(self.found.meta, name), "RGBA8", data))
-        except (*UNREADABLE_ARRAYS, RuntimeError, MemoryError) as error:
-            self.error = str(error)
-
-    def table(self, rows: list[float]) -> Any:
-        """The table of the classes as a texture; a new one when it changed."""
-        if self._table[0] != rows:
-            import numpy as np
-
-            self._table = rows, _texture((256, 2), "RGBA16F", np.array(rows, np.float32))
-        return self._table[1]
-
-
-def _texture(size: tuple[int, ...], kind: str, values: Any) -> Any:
-    import gpu
-
-    return gpu.types.GPUTexture(size, format=kind, data=gpu.types.Buffer("FLOAT", len(values), values))
 
 
 class Picture:
@@ -101,6 +60,25 @@ class View:
         self.row_seconds = 1e-3  # a row of the finest picture takes
         self.marched = 0.0  # seconds of the last whole coarse picture
         self.refined = False
+        self._table: tuple[Any, Any] = (None, None)
+
+    def table(self, rows: list[float]) -> Any:
+        """The table of the looks as a texture; a new one when it changed."""
+        if self._table[0] != rows:
+            import numpy as np
+
+            self._table = rows, texture((256, 2), "RGBA16F", np.array(rows, np.float32))
+        return self._table[1]
+
+
+class Shown(NamedTuple):
+    """How a field is shown: looks of its class indices, the same as rows of the table, the scene from its cube [−1, 1]³, and from
+    the cube to which it is cut."""
+
+    looks: list[voxels.Look]
+    rows: list[float]
+    box: Matrix
+    crop: Matrix | None
 
 
 class Viewport:
@@ -124,16 +102,16 @@ class Viewport:
         scene, region, view3d = context.scene, context.region, context.region_data
         if not scene.fieldwork_live.viewport or view3d is None:
             return
-        found = fields.field_objects(context.view_layer.objects)
-        shown = [obj for obj in found if obj.visible_get(view_layer=context.view_layer, viewport=context.space_data)]
-        if not shown or self.error or hint.lacks_overlays(context.space_data):
+        layer, space = context.view_layer, context.space_data
+        shown = fields.parts(layer.objects, lambda obj: obj.visible_get(view_layer=layer, viewport=space))
+        if not shown or self.error or hint.lacks_overlays(space):
             return
         try:
             self._draw(context, region, view3d, shown)
         except Exception as error:  # noqa: BLE001 - a handler that raises in each redraw would fill the terminal
             self.error = f"{type(error).__name__}: {error}"
 
-    def _draw(self, context: Any, region: Any, view3d: Any, shown: list[bpy.types.Object]) -> None:
+    def _draw(self, context: Any, region: Any, view3d: Any, shown: list[fields.Part]) -> None:
         begin = time.perf_counter()
         if self._march is None:
             self._prepare()
@@ -143,16 +121,21 @@ class Viewport:
         quality = int(context.scene.fieldwork_live.quality)
         unfinished, marched = False, 0.0
         # The farthest first: pixels at edges of nearer ones mix with what is behind.
-        for obj in sorted(shown, key=lambda o: (view3d.view_matrix @ o.matrix_world.translation).z):
-            own = obj.fieldwork
+        for part in sorted(shown, key=lambda one: (view3d.view_matrix @ one.object.matrix_world.translation).z):
+            own = part.field.fieldwork
             project = Path(fields.absolute(own.project)) if own.project else None
-            key = (region.as_pointer(), obj.name_full)
-            size = max(1, region.width // quality), max(1, region.height // quality)
-            trained = trainings.textures(key, obj, project, size, scene_from_clip) if project is not None else None
-            if trained is not None:
-                self._lay_over(trained, region)
+            if project is None:
                 continue
-            baked = voxels.baked(project, own.run) if project is not None else None
+            key = (region.as_pointer(), part.object.name_full)
+            if part.copy is None:
+                size = max(1, region.width // quality), max(1, region.height // quality)
+                trained = trainings.textures(key, part.field, project, size, scene_from_clip)
+                if trained is not None:
+                    self._lay_over(trained, region)
+                    continue
+            elif trainings.run_of(project) == own.run:
+                continue
+            baked = voxels.baked(project, own.run)
             if baked is None:
                 continue
             asset = self.assets.setdefault(baked.key, Asset(baked))
@@ -162,17 +145,19 @@ class Viewport:
                     asset.load()
                 unfinished = unfinished or not asset.error
                 continue
-            rows = voxels.class_rows(baked.meta, own.classes)
-            box = obj.matrix_world @ voxels.world_from_box(project, baked.meta)
-            crop = fields.crop_matrix(own.crop) if own.crop is not None else None
+            shows = self._placed(part, project, asset)
+            if shows is None:
+                continue
             state = (
-                _numbers(view3d.perspective_matrix), _numbers(box), crop and _numbers(crop), own.look, tuple(rows),
-                baked.key, region.width, region.height, quality,
+                _numbers(view3d.perspective_matrix), _numbers(shows.box), shows.crop and _numbers(shows.crop), own.look,
+                tuple(shows.rows), baked.key, id(asset.told), region.width, region.height, quality,
             )  # fmt: skip
             view = self.views.setdefault(key, View())
             view.used = now
-            uniforms = _uniforms(baked.meta, view3d.perspective_matrix, scene_from_clip, box, crop, own.look, rows)
-            marched += self._bring_up(view, state, asset, rows, uniforms, (region.width, region.height), quality, now)
+            uniforms = _uniforms(baked.meta, view3d.perspective_matrix, scene_from_clip, shows, own.look)
+            marched += self._bring_up(
+                view, state, asset, shows.rows, uniforms, (region.width, region.height), quality, now
+            )
             unfinished = unfinished or not view.refined
             if view.shown is not None:
                 self._lay_over(view.shown, region)
@@ -184,6 +169,28 @@ class Viewport:
         self._ended = time.monotonic()
         if unfinished:
             _redraw_soon()
+
+    def _placed(self, part: fields.Part, project: Path, asset: Asset) -> Shown | None:
+        """How a part is shown; None: a copy whose thing is not told apart yet."""
+        own, meta = part.field.fieldwork, asset.found.meta
+        edited = things.looks(part.field)
+        if edited or part.copy is not None:
+            told = thing_texels.answers.of(asset.found, project, own.run).told
+            if told is not None and told is not asset.told:
+                asset.tell_apart(told)
+        told, looks = asset.told, voxels.class_looks(meta, own.classes)
+        world_from_box = voxels.world_from_box(project, meta)
+        if part.copy is None:
+            if told is not None:
+                looks = voxels.thing_looks(looks, told, edited)
+            crop = fields.crop_matrix(own.crop) if own.crop is not None else None
+            return Shown(looks, voxels.rows(looks), part.field.matrix_world @ world_from_box, crop)
+        thing, place = part.copy.fieldwork_copy.thing, things.scene_from_capture(part.copy)
+        if told is None or thing not in told.names:
+            return None
+        looks = voxels.thing_looks(looks, told, things.look_of_copies(part.field, thing), thing)
+        cube = told.cubes[told.names.index(thing)]
+        return Shown(looks, voxels.rows(looks), place @ world_from_box, place @ cube)
 
     def _prepare(self) -> None:
         from . import shaders
@@ -200,7 +207,7 @@ class Viewport:
             view.state, view.changed, view.refined, view.next = state, now, False, None
             scale = max(2 * quality, view.coarse)
             view.shown = _picture(view.shown, size, scale)
-            view.marched = self._march_rows(view.shown, asset, rows, uniforms, view.shown.height)
+            view.marched = self._march_rows(view.shown, asset, view.table(rows), uniforms, view.shown.height)
             # A weak card gets a coarser picture the next time, a strong one a finer one.
             if view.marched > MOVED and view.coarse < COARSEST:
                 view.coarse *= 2
@@ -214,15 +221,13 @@ class Viewport:
             view.next = _picture(None, size, quality)
         least = -(-view.next.height // STRIPS)
         count = max(least, int(max(BUDGET, self._rest) / max(view.row_seconds, 1e-6)))
-        seconds = self._march_rows(view.next, asset, rows, uniforms, count)
+        seconds = self._march_rows(view.next, asset, view.table(rows), uniforms, count)
         view.row_seconds = 0.5 * (view.row_seconds + seconds / count)
         if view.next.done:
             view.shown, view.next, view.refined = view.next, None, True
         return seconds
 
-    def _march_rows(
-        self, picture: Picture, asset: Asset, rows: list[float], uniforms: dict[str, Any], count: int
-    ) -> float:
+    def _march_rows(self, picture: Picture, asset: Asset, table: Any, uniforms: dict[str, Any], count: int) -> float:
         """Draw the next rows of a picture; returns how many seconds they took."""
         import gpu
 
@@ -243,7 +248,7 @@ class Viewport:
             shader.uniform_sampler("index_", asset.index)
             for number, texture in enumerate(asset.texels):
                 shader.uniform_sampler(f"t{number}", texture)
-            shader.uniform_sampler("lut", asset.table(rows))
+            shader.uniform_sampler("lut", table)
             for name, value in uniforms.items():
                 if isinstance(value, int):
                     shader.uniform_int(name, value)
@@ -291,12 +296,12 @@ def _numbers(matrix: Matrix) -> tuple[float, ...]:
 
 
 def _uniforms(
-    meta: dict[str, Any], clip_from_scene: Matrix, scene_from_clip: Matrix, box: Matrix, crop: Matrix | None,
-    look: float, rows: list[float],
-) -> dict[str, Any]:  # fmt: skip
+    meta: dict[str, Any], clip_from_scene: Matrix, scene_from_clip: Matrix, shows: Shown, look: float
+) -> dict[str, Any]:
     """What the march needs to know."""
     cell = (4.0 if meta["contracted"] else 2.0) / (meta["side"] * (voxels.VERTICES - 1))
-    edited = any(rows[4 * n + 3] < 1 or rows[1024 + 4 * n] > 0 for n in range(len(meta["class_ids"])))
+    box, crop = shows.box, shows.crop
+    edited = any(one.opacity < 1 or one.tint > 0 for one in shows.looks)
     return {
         "box_from_clip": box.inverted_safe() @ scene_from_clip,
         "clip_from_box": clip_from_scene @ box,
@@ -324,15 +329,8 @@ def _draw() -> None:
 
 
 def _redraw_soon() -> None:
-    if not bpy.app.timers.is_registered(_redraw):
-        bpy.app.timers.register(_redraw, first_interval=0.01)
-
-
-def _redraw() -> None:
-    for window in bpy.context.window_manager.windows:
-        for area in window.screen.areas:
-            if area.type == "VIEW_3D":
-                area.tag_redraw()
+    if not bpy.app.timers.is_registered(redraw_views):
+        bpy.app.timers.register(redraw_views, first_interval=0.01)
 
 
 def register() -> None:
@@ -346,6 +344,6 @@ def unregister() -> None:
     if _handle is not None:
         bpy.types.SpaceView3D.draw_handler_remove(_handle, "WINDOW")
         _handle = None
-    if bpy.app.timers.is_registered(_redraw):
-        bpy.app.timers.unregister(_redraw)
+    if bpy.app.timers.is_registered(redraw_views):
+        bpy.app.timers.unregister(redraw_views)
     viewport.__init__()

@@ -6,11 +6,14 @@ What the files hold stands in docs/bake.md.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mathutils import Matrix
 
 from ..project import snapshot
+
+if TYPE_CHECKING:
+    from .thing_texels import Told
 
 VERTICES = 9  # along a side of a block
 COARSE = 5  # of them that have changes of the colour
@@ -18,6 +21,7 @@ TEXELS = {"T0": VERTICES, "T1": VERTICES, "T2": COARSE, "T3": COARSE, "T4": COAR
 SLOT_BITS = 22  # of an entry of the index that number its block
 SLOTS = 1 << 15  # more than there are blocks: a texture's float32 holds the number and, times this, the octants
 VERSION = 2  # of the files
+BLACK = (0.0, 0.0, 0.0)
 
 
 class Baked(NamedTuple):
@@ -54,7 +58,14 @@ def read_texels(found: Baked, name: str) -> Any:
     import numpy as np
 
     array = np.load(found.folder / f"{name}.npy", mmap_mode="r")
-    x, y, z = texture_size(found.meta, name)
+    return numbers(array, found.meta, name)
+
+
+def numbers(array: Any, meta: dict[str, Any], name: str) -> Any:
+    """The bytes of a texture (Z, Y, X, 4) as numbers in [0, 1]: flat float32. Raises ValueError: they are not those of it."""
+    import numpy as np
+
+    x, y, z = texture_size(meta, name)
     if array.shape != (z, y, x, 4) or array.dtype != np.uint8:
         raise ValueError(f"{name}.npy holds {array.dtype} {array.shape}")
     return np.multiply(array, np.float32(1 / 255), dtype=np.float32).reshape(-1)
@@ -73,15 +84,52 @@ def read_index(found: Baked) -> Any:
     return np.where(array > 0, block, array).astype(np.float32).reshape(-1)
 
 
-def class_rows(meta: dict[str, Any], classes: Any, void: tuple[float, float, float] = (0, 0, 0)) -> list[float]:
-    """The table of the classes as a texture 256 × 2 holds it: colour and opacity of each, below that its tint.
+class Look(NamedTuple):
+    """How a class index is shown: colour that it is tinted with, opacity, tint, and colour among the labels."""
 
-    classes: the entries of a field object, by whose ids the indices of the field are found.
-    """
+    color: tuple[float, ...]
+    opacity: float
+    tint: float
+    label: tuple[float, ...]
+
+
+def class_looks(meta: dict[str, Any], classes: Any) -> list[Look]:
+    """The looks of a field's class indices. classes: the entries of a field object, by whose ids the indices are found."""
     known = {entry.id: entry for entry in classes}
-    colors, tints = [], []
-    for number in range(256):
-        entry = known.get(meta["class_ids"][number]) if number < len(meta["class_ids"]) else None
-        colors += (*entry.color, entry.shown) if entry is not None else (*void, 1.0)
-        tints += (entry.tint if entry is not None else 0.0, 0.0, 0.0, 1.0)
-    return colors + tints
+    found = []
+    for number in meta["class_ids"]:
+        entry = known.get(number)
+        if entry is None:
+            found.append(Look(BLACK, 1.0, 0.0, BLACK))
+        else:
+            color = tuple(entry.color)
+            found.append(Look(color, entry.shown, entry.tint, color))
+    return found
+
+
+def thing_looks(classes: list[Look], told: Told, edited: dict[str, dict[str, Any]], only: str = "") -> list[Look]:
+    """The same and after them those of things, as nerfcore/film/fields.py has it.
+
+    edited: how things look by name (`things.looks`); only: the thing that alone is shown, if any.
+    """
+    found = list(classes)
+    for name, index in zip(told.names, told.of_class):
+        look, own = classes[index], edited.get(name)
+        if own is not None:
+            color, tint = (own["color"], own["tint"]) if own["tint"] > 0 else (look.color, look.tint)
+            look = Look(color, own["opacity"] * look.opacity, tint, look.label)
+        found.append(look)
+    if only:
+        shown = len(classes) + told.names.index(only)
+        found = [look if number == shown else look._replace(opacity=0.0) for number, look in enumerate(found)]
+    return found
+
+
+def rows(looks: list[Look]) -> list[float]:
+    """Looks as the texture 256 × 2 holds them: colour and opacity of each, below that tint and colour among the labels."""
+    upper, lower = [], []
+    for look in looks:
+        upper += (*look.color, look.opacity)
+        lower += (look.tint, *look.label)
+    rest = 256 - len(looks)
+    return [*upper, *(*BLACK, 1.0) * rest, *lower, *(0.0,) * 4 * rest]

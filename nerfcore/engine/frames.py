@@ -3,6 +3,9 @@
 `frame {frame, …Shot}` answers {"seconds", "loaded", "manifests"} when the pixels are in the shared file; meanwhile it sends
 `progress {job: frame, …}` and `event {job: frame, kind: "pixels", counter}`. `cancel_frame {frame}` stops one, or all. A frame
 neither holds its project nor leaves a trace in it.
+
+`field_things {frame, project, run, file}` writes the texture that tells the things of a baked field apart, and answers what
+film/thing_texture.py says of them.
 """
 
 from __future__ import annotations
@@ -13,11 +16,13 @@ import threading
 import time
 import traceback
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from ..errors import wrong_value
+from ..params import RunName
 from ..progress import Reporter
 from . import protocol as rpc
 
@@ -28,6 +33,7 @@ log = logging.getLogger("fieldwork.engine")
 PERIOD = 0.1  # seconds between two notifications
 
 Send = Callable[[dict[str, Any]], None]
+Asked = TypeVar("Asked", bound=BaseModel)
 
 
 class _FrameReporter(Reporter):
@@ -92,7 +98,8 @@ class Frames:
                     from ..film.fields import FieldStore  # loads torch, which takes seconds
 
                     store = FieldStore()
-                message = rpc.answer(request.id, _exposed(request.params, reporter, store))
+                params = {name: value for name, value in request.params.items() if name != "frame"}
+                message = rpc.answer(request.id, METHODS[request.method](params, reporter, store))
             except BaseException as error:
                 tail = [line for block in traceback.format_exception(error)[-6:] for line in block.splitlines()]
                 wrong = error if isinstance(error, rpc.RpcError) else rpc.as_rpc_error(error, None, tail)
@@ -105,18 +112,32 @@ class Frames:
                 self._send(message)
 
 
+class _ThingsAsked(BaseModel):
+    """What is asked for things of a baked field; file: where the texture goes."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    project: Path
+    run: RunName = "main"
+    file: Path
+
+
+def _valid(model: type[Asked], params: dict[str, Any], method: str) -> Asked:
+    """The parameters of a request. Raises RpcError: one is wrong."""
+    try:
+        return model.model_validate(params)
+    except ValidationError as error:
+        clauses = [wrong_value(detail) for detail in error.errors(include_url=False)]
+        raise rpc.RpcError(rpc.INVALID_PARAMS, f"{method}: {'; '.join(clauses)}.") from error
+
+
 def _exposed(params: dict[str, Any], reporter: Reporter, store: FieldStore) -> dict[str, Any]:
     """Render a frame into its shared file."""
     from ..film.exposure import expose
     from ..film.shared_file import SharedFile
     from ..film.shot import Shot, channels_of
 
-    begin = time.perf_counter()
-    try:
-        shot = Shot.model_validate({name: value for name, value in params.items() if name != "frame"})
-    except ValidationError as error:
-        clauses = [wrong_value(detail) for detail in error.errors(include_url=False)]
-        raise rpc.RpcError(rpc.INVALID_PARAMS, f"frame: {'; '.join(clauses)}.") from error
+    begin, shot = time.perf_counter(), _valid(Shot, params, "frame")
     width, height = shot.size
     file = SharedFile(shot.file, {name: (height, width, channels_of(name)) for name in shot.passes})
 
@@ -131,3 +152,17 @@ def _exposed(params: dict[str, Any], reporter: Reporter, store: FieldStore) -> d
         "loaded": store.loaded,
         "manifests": exposure.manifests,
     }
+
+
+def _things(params: dict[str, Any], reporter: Reporter, store: FieldStore) -> dict[str, Any]:
+    """Write the texture of a field's things."""
+    from ..film.shot import FieldItem
+    from ..film.thing_texture import write_thing_texture
+
+    asked = _valid(_ThingsAsked, params, "field_things")
+    here = [[float(row == column) for column in range(4)] for row in range(4)]
+    item = FieldItem(name=asked.run, project=asked.project, run=asked.run, baked=True, scene_from_capture=here)
+    return write_thing_texture(store.field(item, 0, reporter), asked.file)
+
+
+METHODS = {"frame": _exposed, "field_things": _things}

@@ -2,7 +2,7 @@
 
 Requests: every verb of `verbs.py` (its parameters, and two of the engine's own: `job`, an id the caller chooses,
 and `detach`, true when the job is to outlive the caller); `cancel {job}`, `detach {job}`, `ping`, `status`,
-`shutdown`; `frame` and `cancel_frame` for pictures (frames.py). `classes` and `region` are no jobs: they are done at once, in order, also while a job works on the same
+`shutdown`; `frame`, `field_things` and `cancel_frame` for pictures (frames.py). `classes` and `region` are no jobs: they are done at once, in order, also while a job works on the same
 project. Notifications: `progress {job, stage, fraction, message, eta_s}`, `event {job, kind, …}`,
 `log {level, text}`.
 
@@ -34,7 +34,7 @@ from ..progress import Reporter
 from ..project.lock import project_lock
 from ..verbs import VERBS, load_verb, run_verb
 from . import protocol as rpc
-from .frames import Frames
+from .frames import METHODS, Frames
 from .jobs import Job
 
 log = logging.getLogger("fieldwork.engine")
@@ -92,12 +92,12 @@ class Server:
             if request.method in VERBS:
                 self._enqueue(request)
                 return True
-            if request.method == "frame":
+            if request.method in METHODS:
                 self._frames.ask(request)
                 return True
             method = getattr(self, f"_do_{request.method}", None)
             if method is None:
-                methods = [*VERBS, "cancel", "detach", "frame", "cancel_frame", "ping", "status", "shutdown"]
+                methods = [*VERBS, "cancel", "detach", *METHODS, "cancel_frame", "ping", "status", "shutdown"]
                 raise rpc.RpcError(
                     rpc.METHOD_NOT_FOUND, f"There is no method “{request.method}”. Methods: {', '.join(methods)}."
                 )

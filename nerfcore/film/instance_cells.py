@@ -90,6 +90,13 @@ class InstanceCells:
             self._made = made, field
         return field, list(made), [self._class_index[self._known[name].class_id] for name in made]
 
+    def all_told_apart(self) -> tuple[VoxelField, list[str], list[int]]:
+        """As `told_apart`, for all instances; where there are too many, for the largest. Nothing is kept."""
+        known = sorted(self._known.values(), key=lambda one: -one.area)
+        known = [one for one in known if one.class_id in self._class_index][: MOST_INDICES - self._field.classes]
+        names = tuple(one.name for one in known)
+        return self._split(names), list(names), [self._class_index[one.class_id] for one in known]
+
     def _split(self, names: tuple[str, ...]) -> VoxelField:
         classes, words = self._field.classes, self._field.vertices.clone()
         texels = words.view(torch.uint8).reshape(-1, TEXELS, 4)

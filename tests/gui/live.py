@@ -175,6 +175,72 @@ def viewport(screen):
     yield 0.5
 
 
+def things(screen):
+    """Single things of the field hidden, tinted, dimmed, moved and copied in the viewport; the panel."""
+    yield from ball(screen)
+    bpy.data.objects.remove(bpy.data.objects["front"])
+    field = next(obj for obj in bpy.data.objects if obj.fieldwork.is_field)
+    own, answers = field.fieldwork, screen.module("addon.live.thing_texels").answers
+    drawn = yield from settled(screen)
+    screen.shot("plain")
+    points = {
+        "left": (-0.25, -0.35, 0.25), "right": (0.25, -0.35, 0.25), "low": (0.1, -0.46, -0.2),
+        "moved": (0.65, -0.35, 0.25), "copied": (0.1, -0.35, 0.8),
+    }  # fmt: skip
+    screen.facts["points"] = points
+    screen.facts["places"] = {name: place(screen, point) for name, point in points.items()}
+    begin = time.perf_counter()
+    own.things["left"].visible = False
+    yield 0.3
+    yield from screen.wait(lambda: not answers.waiting, 60, "the things are not told apart")
+    screen.facts["told after"] = time.perf_counter() - begin
+    assert not any(known.error for known in answers._known.values()), [k.error for k in answers._known.values()]
+    yield from settled(screen)
+    screen.shot("hidden")
+    # From now on at the next redraw, before the picture becomes fine.
+    own.things["left"].visible = True
+    own.things["right"].tint, own.things["right"].color = 1.0, (0.0, 1.0, 0.0)
+    screen.shot("tinted")
+    own.look = 1.0
+    screen.shot("labels")
+    own.look = 0.0
+    own.things["right"].opacity = 0.02
+    screen.shot("dimmed")
+    own.things["right"].opacity = 1.0
+    bpy.ops.fieldwork.place_thing(thing="left")
+    moved = next(obj for obj in bpy.data.objects if obj.fieldwork_copy.thing == "left")
+    moved.location.x += 0.9
+    bpy.ops.fieldwork.place_thing(thing="right", copy=True)
+    copy = next(obj for obj in bpy.data.objects if obj.fieldwork_copy.thing == "right")
+    copy.location.x, copy.location.z = copy.location.x - 0.15, copy.location.z + 0.55
+    bpy.context.view_layer.update()
+    screen.shot("elsewhere at once")
+    yield from settled(screen)
+    screen.shot("elsewhere")
+    drawn.seconds.clear()
+    for _ in range(30):
+        bpy.ops.wm.redraw_timer(type="DRAW_WIN", iterations=1)
+    screen.facts["python"] = statistics.median(drawn.seconds)
+    drawn.frame_seconds.clear()
+    space = screen.area.spaces.active.region_3d
+    for turn in range(10):
+        space.view_rotation = Quaternion((0, 0, 1), 0.05 * turn) @ SIDE
+        bpy.ops.wm.redraw_timer(type="DRAW_WIN", iterations=1)
+    screen.facts["moving"] = statistics.median(drawn.frame_seconds)
+    look(screen)
+    yield from settled(screen)
+    copy.hide_set(True)
+    yield from settled(screen)
+    screen.shot("hidden copy")
+    screen.facts["viewport error"] = drawn.error
+    copy.hide_set(False)
+    screen.area.spaces.active.show_region_ui = True
+    yield from screen.show_sidebar()
+    yield from screen.toggle("live")
+    yield 1.0
+    screen.shot("panel")
+
+
 def live_panel(screen):
     """The Live View panel and the properties of the render engine."""
     yield from ball(screen, sidebar=True)

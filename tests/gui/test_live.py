@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from fieldwork.tests.gui import window
 from fieldwork.tests.nerfcore.support.ball import pattern
+from fieldwork.tests.nerfcore.support.halves import write_halves
 from fieldwork.tests.nerfcore.support.live import live_ball
 from PIL import Image
 
@@ -30,6 +31,16 @@ def project() -> Path:
     if not (folder / "runs/main/voxels/meta.json").is_file():
         shutil.rmtree(folder, ignore_errors=True)
         live_ball(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def things(project: Path) -> Path:
+    """The ball with a mesh whose upper class is two things."""
+    folder = window.BUILD / "ball-things"
+    shutil.rmtree(folder, ignore_errors=True)
+    shutil.copytree(project, folder)
+    write_halves(folder)
     return folder
 
 
@@ -88,6 +99,44 @@ def test_the_field_is_among_objects_in_every_shading_mode(project, suite):
     assert facts["viewport error"] == ""
     assert facts["kept"][1] == 1
     print(suite, {name: facts[name] for name in ("moving", "python", "refined after", "size")})
+
+
+@pytest.mark.parametrize("suite", ["sid", "trixie"])
+def test_single_things_are_edited_in_the_viewport(things, suite):
+    facts, folder = played(things, "things", suite)
+    places, points = facts["places"], facts["points"]
+
+    def seen(shot: str, name: str) -> np.ndarray:
+        return colour(folder, shot, places[name])
+
+    def photographed(x: float, y: float, z: float) -> np.ndarray:
+        return pattern(np.array([x, y, z]) / np.linalg.norm([x, y, z]) * 0.5)
+
+    truth = {name: photographed(*points[name]) for name in ("left", "right", "low")}
+    for name, color in truth.items():
+        assert seen("plain", name) == pytest.approx(color, abs=0.15)
+    empty = {name: seen("plain", name) for name in ("moved", "copied")}
+    assert np.abs(seen("hidden", "left") - truth["left"]).max() > 0.15
+    assert seen("hidden", "right") == pytest.approx(truth["right"], abs=0.15), "the other thing of the class stays"
+    assert seen("hidden", "low") == pytest.approx(truth["low"], abs=0.15)
+    assert seen("tinted", "right") == pytest.approx([0, 1, 0], abs=0.1)
+    assert seen("tinted", "left") == pytest.approx(truth["left"], abs=0.15)
+    for name in ("left", "right"):
+        assert seen("labels", name) == pytest.approx([0.8, 0.2, 0.2], abs=0.06), "labels have the color of the class"
+    assert seen("dimmed", "right")[1] < 0.8
+    assert seen("dimmed", "left") == pytest.approx(truth["left"], abs=0.15)
+    # “left” was carried 0.9 to the right, of “right” there is a copy above.
+    for shot in ("elsewhere at once", "elsewhere"):
+        assert seen(shot, "moved") == pytest.approx(truth["left"], abs=0.15), shot
+        assert seen(shot, "copied") == pytest.approx([0, 1, 0], abs=0.12), shot
+        assert np.abs(seen(shot, "left") - truth["left"]).max() > 0.15, shot
+        assert seen(shot, "right") == pytest.approx([0, 1, 0], abs=0.1), shot
+        assert seen(shot, "low") == pytest.approx(truth["low"], abs=0.15), shot
+    assert seen("hidden copy", "copied") == pytest.approx(empty["copied"], abs=0.05)
+    assert seen("hidden copy", "moved") == pytest.approx(truth["left"], abs=0.15)
+    assert facts["python"] < 0.002, "seconds of Python in a redraw"
+    assert facts["viewport error"] == ""
+    print(suite, {name: facts[name] for name in ("told after", "moving", "python")})
 
 
 def place_above(places: dict) -> list[int]:

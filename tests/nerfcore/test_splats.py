@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -16,13 +17,19 @@ from .support.film import SIDE, H, W, ball, store, take
 __all__ = ["ball", "store"]
 
 
-def test_splats_look_like_the_baked_field(ball: Path, store: FieldStore) -> None:
+@pytest.fixture(scope="module")
+def exported(ball: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the ball, into which exports may go."""
+    return Path(shutil.copytree(ball, tmp_path_factory.mktemp("splats") / "ball"))
+
+
+def test_splats_look_like_the_baked_field(exported: Path, store: FieldStore) -> None:
     """Read by another library, and drawn here as circles, the nearest over the others."""
     import trimesh
     from fieldwork.nerfcore.params import ExportParams
     from fieldwork.nerfcore.verbs import run_verb
 
-    path, _ = run_verb("export", ExportParams(project=ball, to="splats"), Reporter())["files"]
+    path, _ = run_verb("export", ExportParams(project=exported, to="splats"), Reporter())["files"]
     assert Path(path).name == "ball-splats.ply"
     data = trimesh.load(path).metadata["_ply_raw"]["vertex"]["data"]
     names = list(data) if isinstance(data, dict) else list(data.dtype.names)
@@ -55,7 +62,7 @@ def test_splats_look_like_the_baked_field(ball: Path, store: FieldStore) -> None
         alpha = peak[n] * np.exp(-distance / (2 * sigma[n] ** 2))
         picture[part] += (left[part] * alpha)[..., None] * color[n]
         left[part] *= 1 - alpha
-    field = take(ball, store, ["Combined"], {"baked": True})["Combined"]
+    field = take(exported, store, ["Combined"], {"baked": True})["Combined"]
     assert np.abs((1 - left) - field[..., 3]).mean() < 0.05
     inner = field[..., 3] > 0.99
     srgb = np.where(
@@ -65,8 +72,6 @@ def test_splats_look_like_the_baked_field(ball: Path, store: FieldStore) -> None
 
 
 def test_splats_need_a_baked_field(ball: Path, tmp_path: Path) -> None:
-    import shutil
-
     from fieldwork.nerfcore.params import ExportParams
     from fieldwork.nerfcore.verbs import run_verb
 
@@ -76,7 +81,7 @@ def test_splats_need_a_baked_field(ball: Path, tmp_path: Path) -> None:
         run_verb("export", ExportParams(project=project, to="splats"), Reporter())
 
 
-def test_splats_as_gltf_are_those_of_the_ply(ball: Path) -> None:
+def test_splats_as_gltf_are_those_of_the_ply(exported: Path) -> None:
     """Read by other libraries: trimesh, and where there is node with it, the validator of Khronos."""
     import json
     import subprocess
@@ -85,7 +90,7 @@ def test_splats_as_gltf_are_those_of_the_ply(ball: Path) -> None:
     from fieldwork.nerfcore.params import ExportParams
     from fieldwork.nerfcore.verbs import run_verb
 
-    ply, glb = run_verb("export", ExportParams(project=ball, to="splats"), Reporter())["files"]
+    ply, glb = run_verb("export", ExportParams(project=exported, to="splats"), Reporter())["files"]
     points = trimesh.load(ply).metadata["_ply_raw"]["vertex"]["data"]
     cloud = next(iter(trimesh.load(glb).geometry.values()))
     expected = np.stack([np.asarray(points[axis]).reshape(-1) for axis in "xzy"], 1) * [1, 1, -1]

@@ -9,7 +9,7 @@ import bpy
 from bpy.types import Context, Operator
 
 from ..addon.errors import SceneError
-from ..addon.live import compositor, fields, things
+from ..addon.live import compositor, fields, shadows, things
 from ..addon.live.training import trainings
 from ..addon.project import snapshot
 from ..addon.props import BoolProperty, IntProperty, StringProperty
@@ -212,6 +212,30 @@ class FIELDWORK_OT_setup_compositor(Operator):
         return {"FINISHED"}
 
 
+class FIELDWORK_OT_catch_shadows(Operator):
+    """Let the surface of the capture catch the shadows of the scene's objects and hide what is behind it, and composite the field,
+    darkened by them, with the objects"""
+
+    bl_idname = "fieldwork.catch_shadows"
+    bl_label = "Catch Shadows"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self, context: Context) -> set[str]:
+        scene = context.scene
+        if not shadows.surfaces(scene):
+            self.report({"ERROR"}, t("The scene has no surface of a capture: extract the mesh, or press Update Scene."))
+            return {"CANCELLED"}
+        try:
+            compositor.check(scene)
+            shadows.catch(scene)
+            compositor.set_up(scene)
+        except SceneError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        self.report({"INFO"}, t("The surface catches shadows; F12 renders the objects and the field with them."))
+        return {"FINISHED"}
+
+
 CLASSES = [
     FIELDWORK_OT_add_field,
     FIELDWORK_OT_add_crop_box,
@@ -220,4 +244,5 @@ CLASSES = [
     FIELDWORK_OT_place_thing,
     FIELDWORK_OT_save_field_edits,
     FIELDWORK_OT_setup_compositor,
+    FIELDWORK_OT_catch_shadows,
 ]

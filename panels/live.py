@@ -60,6 +60,7 @@ class FIELDWORK_PT_live(StepPanel):
         row.active = live.viewport
         row.prop(live, "quality")
         layout.operator("fieldwork.setup_compositor", icon="NODE_COMPOSITING")
+        layout.operator("fieldwork.catch_shadows", icon="LIGHT_SUN")
 
 
 def draw_field(layout: UILayout, context: Context, obj) -> None:

@@ -75,6 +75,7 @@ class FIELDWORK_MT_live(Menu):
         layout.operator("fieldwork.add_field")
         layout.operator("fieldwork.add_crop_box")
         layout.operator("fieldwork.setup_compositor")
+        layout.operator("fieldwork.catch_shadows")
 
 
 class FIELDWORK_MT_mesh(Menu):

@@ -1,7 +1,8 @@
 """A field among Blender's objects: a second scene that renders the field, and nodes that composite both.
 
 A scene has one render engine. The field's scene has the same camera, frames and objects, which hide the field there; its
-passes FieldFront and FieldBehind go over and under what this scene renders of the objects.
+passes FieldFront and FieldBehind go over and under what this scene renders of the objects. Shadows that the surface of the
+capture catches darken both.
 """
 
 from __future__ import annotations
@@ -12,23 +13,16 @@ import bpy
 
 from ..errors import SceneError
 from ..text import t
-from . import fields
+from . import fields, shadows
+from .shared_scene import filter_width, share
 
 FIELD_SCENE = "fieldwork_field_scene"  # on a scene: that of its fields
 NODE = "fieldwork_node"  # on nodes that are ours
 ENGINE = "FIELDWORK"
-SHARED = (
-    "resolution_x", "resolution_y", "resolution_percentage", "pixel_aspect_x", "pixel_aspect_y", "use_border",
-    "border_min_x", "border_max_x", "border_min_y", "border_max_y", "use_crop_to_border", "fps", "fps_base",
-    "use_motion_blur", "motion_blur_shutter", "motion_blur_position",
-)  # fmt: skip
 
 
-def set_up(scene: bpy.types.Scene) -> bpy.types.Scene:
-    """Make the scene that renders the field, or bring the one that is there up to date, and the nodes of this one.
-
-    Raises SceneError: this scene has no camera or no field, or renders fields itself.
-    """
+def check(scene: bpy.types.Scene) -> None:
+    """Raises SceneError: the scene has no camera or no field, or renders fields itself."""
     if scene.render.engine == ENGINE:
         raise SceneError(
             t("This scene renders the field itself. Choose the engine that renders the objects, such as Cycles.")
@@ -37,57 +31,28 @@ def set_up(scene: bpy.types.Scene) -> bpy.types.Scene:
         raise SceneError(t("The scene has no active camera."))
     if not fields.field_objects(scene.objects) and not scene.fieldwork.project:
         raise SceneError(t("The scene has no field: choose a project in the Fieldwork tab, or add a field."))
+
+
+def set_up(scene: bpy.types.Scene) -> bpy.types.Scene:
+    """Make the scene that renders the field, or bring the one that is there up to date, the one that renders shadows where it is
+    needed, and the nodes of this one. Raises SceneError as `check`."""
+    check(scene)
+    caught = shadows.set_up(scene)
     made = scene.get(FIELD_SCENE) or bpy.data.scenes.new(t("{} · Field", scene.name))
     scene[FIELD_SCENE] = made
-    _share(scene, made)
-    scene.render.film_transparent = True
-    scene.render.use_compositing = True
-    _connect(scene, made)
-    return made
-
-
-def _share(scene: bpy.types.Scene, made: bpy.types.Scene) -> None:
-    """Let the field's scene see what this scene sees."""
-    made.camera, made.world = scene.camera, scene.world
-    made.frame_start, made.frame_end, made.frame_step = scene.frame_start, scene.frame_end, scene.frame_step
-    made.unit_settings.scale_length = scene.unit_settings.scale_length
-    for name in SHARED:
-        setattr(made.render, name, getattr(scene.render, name))
+    share(scene, made)
     made.render.engine = ENGINE
     made.render.filter_size = filter_width(scene)
-    made.render.film_transparent = True
-    made.render.use_compositing = False
-    for child in scene.collection.children:
-        if child.name not in made.collection.children:
-            made.collection.children.link(child)
-    for obj in scene.collection.objects:
-        if obj.name not in made.collection.objects:
-            made.collection.objects.link(obj)
-    made.view_layers[0].update()  # the view layer of a new scene has no collections before
-    _share_collections(scene.view_layers[0].layer_collection, made.view_layers[0].layer_collection)
     made.fieldwork.project, made.fieldwork.run = scene.fieldwork.project, scene.fieldwork.run
     live = made.fieldwork_live
     live.objects_hide = True
     live.source, live.samples = scene.fieldwork_live.source, max(scene.fieldwork_live.samples, 16)
     for layer in made.view_layers:
         layer.update_render_passes()
-
-
-def _share_collections(seen: Any, made: Any) -> None:
-    """Let the collections of a view layer be excluded, or holdouts, in another one where they are so in the first."""
-    for child in seen.children:
-        other = made.children.get(child.name)
-        if other is not None:
-            other.exclude, other.holdout = child.exclude, child.holdout
-            _share_collections(child, other)
-
-
-def filter_width(scene: bpy.types.Scene) -> float:
-    """Width in pixels of the filter of the scene's engine: edges are composited well only where both have the same."""
-    if scene.render.engine == "CYCLES":
-        cycles = scene.cycles
-        return 0.0 if cycles.pixel_filter_type == "BOX" else cycles.filter_width
-    return scene.render.filter_size
+    scene.render.film_transparent = True
+    scene.render.use_compositing = True
+    _connect(scene, made, caught)
+    return made
 
 
 def tree_of(scene: bpy.types.Scene) -> tuple[Any, Any]:
@@ -106,9 +71,9 @@ def tree_of(scene: bpy.types.Scene) -> tuple[Any, Any]:
     return tree, out
 
 
-def _connect(scene: bpy.types.Scene, made: bpy.types.Scene) -> None:
-    """FieldFront over (objects over FieldBehind), before whatever the user makes of the picture; nodes that an earlier
-    call made are made anew."""
+def _connect(scene: bpy.types.Scene, made: bpy.types.Scene, caught: bpy.types.Scene | None) -> None:
+    """FieldFront over (objects over FieldBehind), both fields times the pass of the shadows if a scene has caught some, before
+    whatever the user makes of the picture; nodes that an earlier call made are made anew."""
     tree, out = tree_of(scene)
     ours = [node for node in tree.nodes if NODE in node]
     end = next((node for node in ours if node[NODE] == "front"), None)
@@ -123,8 +88,16 @@ def _connect(scene: bpy.types.Scene, made: bpy.types.Scene) -> None:
     field = _new(tree, "CompositorNodeRLayers", "field", (-600, -300))
     field.scene = made
     field.layer = made.view_layers[0].name
-    under = _over(tree, "behind", (-250, 0), field.outputs["FieldBehind"], layers.outputs["Image"])
-    over = _over(tree, "front", (0, -100), under, field.outputs["FieldFront"])
+    behind, front = field.outputs["FieldBehind"], field.outputs["FieldFront"]
+    if caught is not None:
+        shade = layers
+        if caught != scene:
+            shade = _new(tree, "CompositorNodeRLayers", "shadows", (-600, -700))
+            shade.scene = caught
+        behind = _times(tree, "shade behind", (-250, -200), behind, shade.outputs[shadows.PASS])
+        front = _times(tree, "shade front", (-250, -400), front, shade.outputs[shadows.PASS])
+    under = _over(tree, "behind", (0, 0), behind, layers.outputs["Image"])
+    over = _over(tree, "front", (250, -100), under, front)
     for socket in targets or [out.inputs[0]]:
         tree.links.new(over, socket)
 
@@ -145,3 +118,18 @@ def _over(tree: Any, role: str, place: tuple[float, float], background: Any, for
     tree.links.new(background, below)
     tree.links.new(foreground, above)
     return node.outputs[0]
+
+
+def _times(tree: Any, role: str, place: tuple[float, float], picture: Any, factor: Any) -> Any:
+    """A node that multiplies the colours of a picture, whose opacity stays; returns its result."""
+    if hasattr(bpy.types, "CompositorNodeMixRGB"):
+        node = _new(tree, "CompositorNodeMixRGB", role, place)
+    else:  # Blender 5 has one for colours of all kinds
+        node = _new(tree, "ShaderNodeMix", role, place)
+        node.data_type = "RGBA"
+    node.blend_type = "MULTIPLY"
+    amount, first, second = (socket for socket in node.inputs if socket.enabled)
+    amount.default_value = 1.0
+    tree.links.new(picture, first)
+    tree.links.new(factor, second)
+    return next(socket for socket in node.outputs if socket.enabled)

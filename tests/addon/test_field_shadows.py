@@ -2,11 +2,25 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from fieldwork.tests.addon.rendered import ball
 from fieldwork.tests.addon.test_field_with_objects import START
 
 __all__ = ["ball"]
+
+
+LIGHT = """
+sun = bpy.data.objects.new("sun", bpy.data.lights.new("sun", "SUN"))
+sun.data.energy, sun.data.angle = 3.0, 0.0
+scene.collection.objects.link(sun)  # it shines downwards
+scene.world.use_nodes = True
+scene.world.node_tree.nodes["Background"].inputs["Strength"].default_value = 0.0
+roof = plate("roof", (1, 1, 1), [(0, -1, 1.2), (1, -1, 1.2), (1, 1, 1.2), (0, 1, 1.2)])
+roof.visible_camera = False
+render.resolution_x, render.resolution_y = 90, 60
+scene.cycles.samples = 64
+"""
 
 
 @pytest.mark.slow
@@ -20,15 +34,9 @@ for obj in [o for o in scene.objects if o.type in ("MESH", "LIGHT")]:
 bpy.ops.mesh.primitive_uv_sphere_add(radius=0.5, segments=64, ring_count=32)
 surface = bpy.context.object
 surface["fieldwork_role"], surface.is_shadow_catcher = "mesh", True
-sun = bpy.data.objects.new("sun", bpy.data.lights.new("sun", "SUN"))
-sun.data.energy, sun.data.angle = 3.0, 0.0
-scene.collection.objects.link(sun)  # it shines downwards
-scene.world.use_nodes = True
-scene.world.node_tree.nodes["Background"].inputs["Strength"].default_value = 0.0
-roof = plate("roof", (1, 1, 1), [(0, -1, 1.2), (1, -1, 1.2), (1, 1, 1.2), (0, 1, 1.2)])
-roof.visible_camera = False
-render.resolution_x, render.resolution_y = 90, 60
-scene.cycles.samples = 64
+"""
+        + LIGHT
+        + """
 found = {}
 for name, hidden in (("lit", True), ("shadow", False)):
     roof.hide_render = hidden
@@ -46,3 +54,72 @@ answer(found)
     assert right[0] > 0.05
     assert left[1] == pytest.approx(left[0], abs=0.02), "beside the shadow it is as before"
     assert right[1] < 0.5 * right[0], "the field is dark where the roof hides the sun"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ["CYCLES", "EEVEE"])
+def test_one_button_lets_the_surface_catch_shadows(bpy_script, ball, tmp_path, engine):
+    """Shadows lie on the field, also before objects that are behind it; these are hidden, what is in front is not."""
+    facts = bpy_script(
+        START
+        + """
+for obj in [o for o in scene.objects if o.type in ("MESH", "LIGHT") and o.name not in ("before", "behind")]:
+    bpy.data.objects.remove(obj)
+bpy.data.objects["behind"].location.z = -0.7
+"""
+        + LIGHT
+        + """
+from fieldwork.addon.live import compositor
+facts = {"no surface": attempt(bpy.ops.fieldwork.catch_shadows)}
+bpy.ops.mesh.primitive_uv_sphere_add(radius=0.5, segments=64, ring_count=32)
+surface = bpy.context.object
+surface["fieldwork_role"] = "mesh"
+capture = bpy.data.collections.new("capture")
+scene.collection.children.link(capture)
+for collection in surface.users_collection:
+    collection.objects.unlink(surface)
+capture.objects.link(surface)
+surface.hide_render = True
+if engine == "EEVEE":
+    render.engine = "BLENDER_EEVEE" if bpy.app.version >= (5, 0) else "BLENDER_EEVEE_NEXT"
+    scene.eevee.taa_render_samples = 32
+for _ in range(2):
+    facts["pressed"] = attempt(bpy.ops.fieldwork.catch_shadows)
+tree, _ = compositor.tree_of(scene)
+facts["scenes"], facts["layers"] = len(bpy.data.scenes), len([n for n in tree.nodes if n.type == "R_LAYERS"])
+for name, hidden in (("lit", True), ("shadow", False)):
+    roof.hide_render = hidden
+    np.save(f"{folder}/{name}.npy", shoot(name))
+# Without the catcher, and in Cycles again.
+surface.hide_render, roof.hide_render = True, True
+facts["composited"] = attempt(bpy.ops.fieldwork.setup_compositor)
+facts["without"] = len([n for n in tree.nodes if n.type == "R_LAYERS"])
+np.save(f"{folder}/plain.npy", shoot("plain"))
+render.engine = "CYCLES"
+bpy.ops.fieldwork.catch_shadows()
+facts["held"] = bpy.context.view_layer.layer_collection.children["capture"].holdout
+answer(facts)
+""",
+        project=ball,
+        folder=tmp_path,
+        engine=engine,
+    )
+    assert "no surface" in facts["no surface"]
+    assert facts["pressed"] == ["FINISHED"]
+    assert facts["scenes"] == facts["layers"] == (2 if engine == "CYCLES" else 3), "however often it is pressed"
+    assert facts["without"] == 2
+    assert not facts["held"]
+    lit, shadow, plain = (np.load(tmp_path / f"{name}.npy") for name in ("lit", "shadow", "plain"))
+    # 30 pixels are 0.48 at the distance of the ball.
+    left, right, before = np.s_[14:20, 30:38], np.s_[14:20, 54:60], np.s_[34:37, 26:30]
+    for place in (left, right):
+        assert plain[place][..., 3].min() > 0.95
+        # The red plate shines on the ball a little.
+        assert np.abs(lit[place][..., :3] - plain[place][..., :3]).mean() < 0.02
+    assert shadow[left][..., :3].mean() == pytest.approx(lit[left][..., :3].mean(), abs=0.02)
+    assert shadow[right][..., :3].mean() < 0.5 * lit[right][..., :3].mean()
+    assert shadow[right][..., 3].min() > 0.95
+    for picture in (lit, shadow):
+        assert picture[before][..., :3] == pytest.approx(np.broadcast_to((0.9, 0.2, 0.1), (3, 4, 3)), abs=0.05)
+        assert (np.abs(picture[..., :3] - (0.2, 0.9, 0.2)).max(-1) < 0.05).sum() > 200, "beside the field"
+        assert (np.abs(picture[20:30, 35:40, :3] - (0.2, 0.9, 0.2)).max(-1) < 0.05).sum() == 0, "behind the field"

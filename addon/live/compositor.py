@@ -94,8 +94,10 @@ def _connect(scene: bpy.types.Scene, made: bpy.types.Scene, caught: bpy.types.Sc
         if caught != scene:
             shade = _new(tree, "CompositorNodeRLayers", "shadows", (-600, -700))
             shade.scene = caught
-        behind = _times(tree, "shade behind", (-250, -200), behind, shade.outputs[shadows.PASS])
-        front = _times(tree, "shade front", (-250, -400), front, shade.outputs[shadows.PASS])
+        # Only darker: where hardly any light falls, the pass says of what little objects add that it is many times as much.
+        shade = _mix(tree, "shade", (-400, -600), "DARKEN", shade.outputs[shadows.PASS])
+        behind = _mix(tree, "shade behind", (-200, -200), "MULTIPLY", behind, shade)
+        front = _mix(tree, "shade front", (-200, -400), "MULTIPLY", front, shade)
     under = _over(tree, "behind", (0, 0), behind, layers.outputs["Image"])
     over = _over(tree, "front", (250, -100), under, front)
     for socket in targets or [out.inputs[0]]:
@@ -120,16 +122,17 @@ def _over(tree: Any, role: str, place: tuple[float, float], background: Any, for
     return node.outputs[0]
 
 
-def _times(tree: Any, role: str, place: tuple[float, float], picture: Any, factor: Any) -> Any:
-    """A node that multiplies the colours of a picture, whose opacity stays; returns its result."""
+def _mix(tree: Any, role: str, place: tuple[float, float], blend: str, picture: Any, other: Any = None) -> Any:
+    """A node that blends the colours of a picture with another's, or with white, and leaves its opacity; returns its result."""
     if hasattr(bpy.types, "CompositorNodeMixRGB"):
         node = _new(tree, "CompositorNodeMixRGB", role, place)
     else:  # Blender 5 has one for colours of all kinds
         node = _new(tree, "ShaderNodeMix", role, place)
         node.data_type = "RGBA"
-    node.blend_type = "MULTIPLY"
+    node.blend_type = blend
     amount, first, second = (socket for socket in node.inputs if socket.enabled)
-    amount.default_value = 1.0
+    amount.default_value, second.default_value = 1.0, (1.0, 1.0, 1.0, 1.0)
     tree.links.new(picture, first)
-    tree.links.new(factor, second)
+    if other is not None:
+        tree.links.new(other, second)
     return next(socket for socket in node.outputs if socket.enabled)

@@ -95,12 +95,13 @@ def _colors(
 
 
 def _classes(probabilities: torch.Tensor) -> torch.Tensor:
-    """Most probable class, its probability, and second class (N, 3) uint8 of probabilities (N, K).
-
-    The second class stands for all others: a probability below one half is stored as one half, or it would win.
-    """
+    """Most probable class, its probability, and second class (N, 3) uint8 of probabilities (N, K)."""
     if probabilities.shape[1] == 1:
         probabilities = torch.nn.functional.pad(probabilities, (0, 1))
     value, number = probabilities.topk(2, 1)
-    share = (value[:, 0].clamp(min=0.5) * 255).ceil()
-    return torch.stack([number[:, 0].float(), share, number[:, 1].float()], 1).to(torch.uint8)
+    return torch.stack([number[:, 0], stored_shares(value[:, 0]), number[:, 1]], 1).to(torch.uint8)
+
+
+def stored_shares(probabilities: torch.Tensor) -> torch.Tensor:
+    """Bytes (N,) of the probabilities of the most probable classes: a half at least, for the second class has all the rest."""
+    return (probabilities.clamp(min=0.5) * 255).ceil().long()

@@ -33,6 +33,7 @@ from .blocks import (
     visible_grid,
     weights_and_cameras,
 )
+from .class_votes import vote
 from .colors import HARMONIC_RANGE, vertex_texels
 from .fit import fitted
 
@@ -75,9 +76,11 @@ def bake(params: BakeParams, report: Reporter) -> dict[str, Any]:
     views = seen_by(blocks, rays, march_settings(trained.model, blocks.side, 1.0), True, report.check)
     texels, changes = vertex_texels(trained.model, blocks, views, rays.center, report.check)
     report.stage("Fitting to the photos")
-    photos = training_photos(folder, params.run, trained, scene, trained.info.box(project).box_from_world, report)
+    box_from_world = trained.info.box(project).box_from_world
+    photos = training_photos(folder, params.run, trained, scene, classes, box_from_world, report)
     settings = march_settings(trained.model, blocks.side, 1.0)
     blocks = fitted(trained.model, blocks, texels, changes, photos, settings, report.check)
+    vote(blocks, texels, len(classes), photos, settings, report.check)
     report.stage("Writing")
     names = {c.id: c.name for c in scene.classes}
     meta = Meta(
@@ -139,13 +142,19 @@ def trained_poses(
 
 
 def training_photos(
-    folder: Path, run: str, trained: Trained, scene: Scene, box_from_world: np.ndarray, report: Reporter
+    folder: Path,
+    run: str,
+    trained: Trained,
+    scene: Scene,
+    classes: list[int],
+    box_from_world: np.ndarray,
+    report: Reporter,
 ) -> PixelStore:
-    """Training photos as large as in training, so many of them that there are about `PIXELS`."""
+    """Training photos and the labels of these classes, as large as in training, so many of them that there are about `PIXELS`."""
     size = sum(math.prod(training_size(scene.views[n].camera, trained.info.image_size)) for n in scene.train)
     count = max(1, min(len(scene.train), int(len(scene.train) * PIXELS / max(size, 1))))
     chosen = [scene.train[n] for n in np.unique(np.linspace(0, len(scene.train) - 1, count).round().astype(int))]
-    photos = PixelStore(scene, chosen, [], box_from_world, trained.info.image_size, trained.device, report)
+    photos = PixelStore(scene, chosen, classes, box_from_world, trained.info.image_size, trained.device, report)
     poses = trained_poses(folder, run, trained, photos.views, box_from_world)
     photos.rays = CameraRays(photos.cameras, poses, trained.device)
     return photos

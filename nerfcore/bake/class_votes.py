@@ -21,7 +21,7 @@ PRIOR = 1.0  # weight of what was read, in pixels
 ROUNDS = 8
 RAYS = 100_000  # in a round: so few that hardly two meet at a vertex, of which the nearer one counts
 LEAST = 0.01  # weight that a ray has at a vertex, below which it does not count; not tuned
-MOST_CLASSES = 256
+MOST_INDICES = 256  # of classes: a byte
 
 
 @torch.no_grad()
@@ -37,13 +37,15 @@ def vote(
         return
     same, count = shared_vertices(blocks)
     keys, sums = _votes(blocks, same, photos, settings, check)
-    places = torch.unique(keys // MOST_CLASSES)
+    if len(keys) == 0:  # no pixel that meets it has a label
+        return
+    places = torch.unique(keys // MOST_INDICES)
     # What was read, of one of the vertices at each place.
     row = torch.zeros(count, dtype=torch.long, device=keys.device)
     row[same] = torch.arange(len(same), device=keys.device)
     read = texels[row[places], 1].long()
     share = PRIOR * read[:, 1] / 255
-    more = (places * MOST_CLASSES + read[:, 0], places * MOST_CLASSES + read[:, 2])
+    more = (places * MOST_INDICES + read[:, 0], places * MOST_INDICES + read[:, 2])
     keys, sums = _summed(torch.cat([keys, *more]), torch.cat([sums, share, PRIOR - share]))
     found = _two_largest(keys, sums)
     row.fill_(-1)
@@ -55,7 +57,7 @@ def vote(
 def _votes(
     blocks: Blocks, same: torch.Tensor, photos: PixelStore, settings: MarchSettings, check: Check
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """How many pixels of which class each vertex has a part in: keys (N,) vertex · MOST_CLASSES + class, in order, and their
+    """How many pixels of which class each vertex has a part in: keys (N,) vertex · MOST_INDICES + class, in order, and their
     sums (N,)."""
     device = same.device
     generator = torch.Generator(device).manual_seed(0)
@@ -72,7 +74,7 @@ def _votes(
         vertex, column = labels.nonzero().T
         weight, number = weights_and_cameras(labels[vertex, column])
         kept = weight > LEAST
-        fresh = same[vertex[kept]] * MOST_CLASSES + number[kept]
+        fresh = same[vertex[kept]] * MOST_INDICES + number[kept]
         keys, sums = _summed(torch.cat([keys, fresh]), torch.cat([sums, weight[kept]]))
     return keys, sums
 
@@ -86,7 +88,7 @@ def _summed(keys: torch.Tensor, values: torch.Tensor) -> tuple[torch.Tensor, tor
 def _two_largest(keys: torch.Tensor, sums: torch.Tensor) -> torch.Tensor:
     """Class with the largest sum, its share and the class with the second largest (P, 3) uint8 of each vertex, in order; keys as
     in `_votes`, at least two of a vertex."""
-    vertex, order = keys // MOST_CLASSES, sums.argsort(descending=True, stable=True)
+    vertex, order = keys // MOST_INDICES, sums.argsort(descending=True, stable=True)
     order = order[vertex[order].argsort(stable=True)]
     vertex = vertex[order]
     first = torch.cat([vertex.new_ones(1, dtype=torch.bool), vertex[1:] != vertex[:-1]])
@@ -94,4 +96,4 @@ def _two_largest(keys: torch.Tensor, sums: torch.Tensor) -> torch.Tensor:
     begin = first.nonzero()[:, 0]
     top, second = order[begin], order[begin + 1]
     share = stored_shares(sums[top] / total)
-    return torch.stack([keys[top] % MOST_CLASSES, share, keys[second] % MOST_CLASSES], 1).to(torch.uint8)
+    return torch.stack([keys[top] % MOST_INDICES, share, keys[second] % MOST_INDICES], 1).to(torch.uint8)

@@ -190,19 +190,32 @@ def march(
     return VoxelRays(color, 1 - transmittance, depth, probabilities if field.classes else None)
 
 
-def texture_reads(origins: torch.Tensor, directions: torch.Tensor, field: VoxelField, s: MarchSettings) -> torch.Tensor:
-    """How often (R,) the viewport's shader (addon/live/shaders.py) reads a texture for each ray, all classes as they are:
-    the index once in each block it meets, the colour and opacity at each sample, and three more times for the changes
-    with the direction where something is."""
+def texture_reads(
+    origins: torch.Tensor, directions: torch.Tensor, field: VoxelField, s: MarchSettings, edited: bool = False
+) -> torch.Tensor:
+    """How often (R,) the viewport's shader (addon/live/shaders.py) reads a texture for each ray: the index once in each block
+    it meets, the colour and opacity at each sample, and three more times for the changes with the direction where something
+    is. Edited, classes or things are shown other than they are: where a sample holds something, the vertex that counts, or all
+    eight where the nearest one is empty, its classes, and two rows of the table of looks for each of these."""
     transmittance, looks = torch.ones(len(origins), device=origins.device), torch.zeros_like(origins[:, 0])
     reads = torch.zeros_like(looks)
     words = field.vertices.view(-1, TEXELS)
     for step in _steps(origins, directions, field.index, field.blocks, s, transmittance, looks=looks):
         root = (step.shares * (words[step.corners][..., 0] >> 24 & 255) / 255).sum(1)
         reads[step.rays] += 1
+        if edited:
+            reads[step.rays] += torch.where(root > 0, _reads_of_classes(step, words), 0.0)
         left = transmittance[step.rays] * (1 - (root * root).clamp(max=1))
         transmittance[step.rays] = torch.where(left < SHADER_STOP, 0.0, left)
     return looks + reads + 3 * (transmittance < 1)
+
+
+def _reads_of_classes(step: _Step, words: torch.Tensor) -> torch.Tensor:
+    """Reads (N,) for the classes of samples that hold something."""
+    nearest = step.corners.gather(1, step.shares.argmax(1, keepdim=True))[:, 0]
+    hollow = (words[nearest][:, 0] >> 24 & 255) == 0
+    sure = (words[nearest][:, 1] >> 8 & 255) == 255
+    return 2 + 8 * hollow + torch.where(sure, 2, 4)
 
 
 def add_views(

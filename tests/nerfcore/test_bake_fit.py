@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from fieldwork.nerfcore.bake import fit
-from fieldwork.nerfcore.bake.blocks import Blocks
-from fieldwork.nerfcore.data.pixels import Batch
+from fieldwork.nerfcore.bake import class_votes, fit
+from fieldwork.nerfcore.bake.blocks import Blocks, vertex_points
+from fieldwork.nerfcore.data.pixels import VOID, Batch
 from fieldwork.nerfcore.errors import Cancelled
-from fieldwork.nerfcore.kernels.voxel_field import VERTICES
+from fieldwork.nerfcore.kernels.voxel_field import VERTICES, cell_length
 from fieldwork.nerfcore.kernels.voxel_march import march
 from fieldwork.nerfcore.params import BakeParams, EvaluateParams, TrainParams
 from fieldwork.nerfcore.progress import Reporter
@@ -89,6 +90,66 @@ def test_photos_are_taken_as_bright_as_the_field_shows_them() -> None:
     gains = fit.exposures(field, batch(shown * darker[image][:, None], image), background, here, 3)
     assert torch.allclose(gains[:2], (1 / darker[:2])[:, None].expand(2, 3), atol=0.03)
     assert torch.allclose(gains[2], torch.tensor(fit.EXPOSURES[1]), atol=1e-6), "no photo counts for more than that"
+
+
+class Labelled:
+    """Pixels whose rays meet the side x = −1 of the cube: class 1 where y < 0, else 2."""
+
+    def __init__(self, label: int | None = None, confidence: float = 1.0) -> None:
+        generator = torch.Generator().manual_seed(3)
+        self.origins = torch.rand(3000, 3, generator=generator) * 1.9 - 0.95
+        self.origins[:, 0] = -3
+        self.label = torch.where(self.origins[:, 1] < 0, 1, 2) if label is None else torch.full((3000,), label)
+        self.confidence = torch.full((3000,), confidence)
+
+    def __len__(self) -> int:
+        return len(self.origins)
+
+    def random_pixels(self, count: int, generator: torch.Generator) -> torch.Tensor:
+        return torch.randint(0, len(self), (count,), generator=generator)
+
+    def batch(self, pixels: torch.Tensor) -> Batch:
+        along = torch.tensor([1.0, 0.0, 0.0]).expand(len(pixels), 3).contiguous()
+        one = torch.ones(len(pixels))
+        label, confidence = self.label[pixels], self.confidence[pixels]
+        return Batch(self.origins[pixels], along, one[:, None].expand(-1, 3), one, label, label, label, confidence, one)
+
+
+def voted(photos: Labelled) -> tuple[torch.Tensor, torch.Tensor]:
+    """Places (N, 3) in the cube of the vertices of an opaque one, and their classes (N, 3), read as 0 with 0.6 and else 3."""
+    side = 2
+    places = torch.ones(side, side, side).nonzero()
+    blocks = Blocks(side, places, torch.full((len(places) * VERTICES**3,), 255, dtype=torch.uint8))
+    texels = torch.zeros(len(blocks.roots), 2, 4, dtype=torch.uint8)
+    texels[:, 1, :3] = torch.tensor([0, 153, 3])
+    step = replace(settings(False), resolution=8 * side, step=cell_length(side, False))
+    class_votes.vote(blocks, texels, 4, photos, step, lambda: None)  # pyright: ignore[reportArgumentType]
+    return vertex_points(places, side) * 2 - 1, texels[:, 1, :3].long()
+
+
+def test_vertices_take_the_classes_of_the_labels_they_are_seen_with() -> None:
+    place, found = voted(Labelled())
+    front, inner = place[:, 0] < -0.999, place[:, 0] > -0.7
+    within = (place[:, 1:].abs() < 0.9).all(1)
+    for chosen, label in ((place[:, 1] < -0.1, 1), (place[:, 1] > 0.1, 2)):
+        seen = found[front & within & chosen]
+        assert len(seen) > 50
+        assert (seen[:, 0] == label).all()
+        assert (seen[:, 1] > 153).all()
+        assert (seen[:, 2] == 0).all(), "what was read comes after it"
+    between = found[front & within & (place[:, 1] == 0)]
+    assert ((between[:, 0] > 0) & (between[:, 2] > 0) & (between[:, 1] < 200)).all(), "on the border both have a part"
+    assert (found[inner] == torch.tensor([0, 153, 3])).all(), "what no ray meets is as it was read"
+    # Blocks that share a vertex say the same of it.
+    twice = (front & (place[:, 1] == 0) & (place[:, 2] == 0)).nonzero()[:, 0]
+    assert len(twice) == 4
+    assert (found[twice] == found[twice[0]]).all()
+
+
+@pytest.mark.parametrize("photos", [Labelled(label=VOID), Labelled(confidence=0.0)])
+def test_pixels_without_a_sure_label_change_nothing(photos: Labelled) -> None:
+    _, found = voted(photos)
+    assert (found == torch.tensor([0, 153, 3])).all()
 
 
 def test_vertices_between_blocks_are_one() -> None:

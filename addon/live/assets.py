@@ -38,8 +38,13 @@ class Asset:
 
     def tell_apart(self, told: Told) -> None:
         """Give things class indices of their own, once everything is loaded."""
-        self.texels[1] = self._texels("T1", voxels.numbers(told.texels, self.found.meta, "T1"))
         self.told = told
+        try:
+            self.texels[1] = self._texels("T1", voxels.numbers(told.texels, self.found.meta, "T1"))
+        except ValueError:
+            pass  # of a field that was baked meanwhile, which is another asset
+        except (RuntimeError, MemoryError) as error:
+            self.error = str(error)
 
     def _texels(self, name: str, values: Any) -> Any:
         return texture(voxels.texture_size(self.found.meta, name), "RGBA8", values)

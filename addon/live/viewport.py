@@ -96,6 +96,7 @@ class Viewport:
         self._ended = 0.0  # when the last redraw was done here
         self._rest = 0.0  # seconds that a redraw takes beside what is done here
         self._waited = 0.0  # seconds of this redraw in which the card did what was asked of it before
+        self._looks: dict[str, list[voxels.Look]] = {}  # of the classes of fields, in this redraw
 
     def draw(self, context: bpy.types.Context) -> None:
         """Draw the fields of a view; what goes wrong is told in the panel, not in each redraw."""
@@ -116,7 +117,7 @@ class Viewport:
         if self._march is None:
             self._prepare()
         now = time.monotonic()
-        self._rest, self._waited = min(now - self._ended, LONGEST), 0.0
+        self._rest, self._waited, self._looks = min(now - self._ended, LONGEST), 0.0, {}
         scene_from_clip = view3d.perspective_matrix.inverted_safe()
         quality = int(context.scene.fieldwork_live.quality)
         unfinished, marched = False, 0.0
@@ -172,25 +173,32 @@ class Viewport:
 
     def _placed(self, part: fields.Part, project: Path, asset: Asset) -> Shown | None:
         """How a part is shown; None: a copy whose thing is not told apart yet."""
-        own, meta = part.field.fieldwork, asset.found.meta
-        edited = things.looks(part.field)
-        if edited or part.copy is not None:
-            told = thing_texels.answers.of(asset.found, project, own.run).told
-            if told is not None and told is not asset.told:
-                asset.tell_apart(told)
-        told, looks = asset.told, voxels.class_looks(meta, own.classes)
+        field, own, meta = part.field, part.field.fieldwork, asset.found.meta
+        looks = self._looks.get(field.name_full)
+        if looks is None:
+            looks = self._looks[field.name_full] = voxels.class_looks(meta, own.classes)
         world_from_box = voxels.world_from_box(project, meta)
         if part.copy is None:
-            if told is not None:
-                looks = voxels.thing_looks(looks, told, edited)
+            edited = things.looks(field)
+            if edited:
+                self._tell_apart(asset, project, own.run)
+            if asset.told is not None:
+                looks = voxels.thing_looks(looks, asset.told, edited)
             crop = fields.crop_matrix(own.crop) if own.crop is not None else None
-            return Shown(looks, voxels.rows(looks), part.field.matrix_world @ world_from_box, crop)
-        thing, place = part.copy.fieldwork_copy.thing, things.scene_from_capture(part.copy)
+            return Shown(looks, voxels.rows(looks), field.matrix_world @ world_from_box, crop)
+        self._tell_apart(asset, project, own.run)
+        told, thing, place = asset.told, part.copy.fieldwork_copy.thing, things.scene_from_capture(part.copy)
         if told is None or thing not in told.names:
             return None
-        looks = voxels.thing_looks(looks, told, things.look_of_copies(part.field, thing), thing)
+        looks = voxels.alone(looks, told, thing, things.look_of_copies(field, thing).get(thing))
         cube = told.cubes[told.names.index(thing)]
         return Shown(looks, voxels.rows(looks), place @ world_from_box, place @ cube)
+
+    def _tell_apart(self, asset: Asset, project: Path, run: str) -> None:
+        """Give the things of a field class indices of their own, once the engine has found them."""
+        told = thing_texels.answers.of(asset.found, project, run).told
+        if told is not None and told is not asset.told:
+            asset.tell_apart(told)
 
     def _prepare(self) -> None:
         from . import shaders

@@ -93,6 +93,9 @@ class Look(NamedTuple):
     label: tuple[float, ...]
 
 
+HIDDEN = Look(BLACK, 0.0, 0.0, BLACK)
+
+
 def class_looks(meta: dict[str, Any], classes: Any) -> list[Look]:
     """The looks of a field's class indices. classes: the entries of a field object, by whose ids the indices are found."""
     known = {entry.id: entry for entry in classes}
@@ -107,21 +110,27 @@ def class_looks(meta: dict[str, Any], classes: Any) -> list[Look]:
     return found
 
 
-def thing_looks(classes: list[Look], told: Told, edited: dict[str, dict[str, Any]], only: str = "") -> list[Look]:
-    """The same and after them those of things, as nerfcore/film/fields.py has it.
+def thing_look(look: Look, own: dict[str, Any] | None) -> Look:
+    """How a thing of a class of this look is shown, `own` of which is its own (`FieldworkFieldThing.look`), as
+    nerfcore/film/fields.py has it."""
+    if own is None:
+        return look
+    color, tint = (own["color"], own["tint"]) if own["tint"] > 0 else (look.color, look.tint)
+    return Look(color, own["opacity"] * look.opacity, tint, look.label)
 
-    edited: how things look by name (`things.looks`); only: the thing that alone is shown, if any.
-    """
-    found = list(classes)
-    for name, index in zip(told.names, told.of_class):
-        look, own = classes[index], edited.get(name)
-        if own is not None:
-            color, tint = (own["color"], own["tint"]) if own["tint"] > 0 else (look.color, look.tint)
-            look = Look(color, own["opacity"] * look.opacity, tint, look.label)
-        found.append(look)
-    if only:
-        shown = len(classes) + told.names.index(only)
-        found = [look if number == shown else look._replace(opacity=0.0) for number, look in enumerate(found)]
+
+def thing_looks(classes: list[Look], told: Told, edited: dict[str, dict[str, Any]]) -> list[Look]:
+    """The looks of class indices with those of things after them. edited: what is their own by name (`things.looks`)."""
+    return [
+        *classes, *(thing_look(classes[index], edited.get(name)) for name, index in zip(told.names, told.of_class))
+    ]  # fmt: skip
+
+
+def alone(classes: list[Look], told: Told, thing: str, own: dict[str, Any] | None) -> list[Look]:
+    """The same where one thing alone is shown."""
+    number = told.names.index(thing)
+    found = [HIDDEN] * (len(classes) + len(told.names))
+    found[len(classes) + number] = thing_look(classes[told.of_class[number]], own)
     return found
 
 

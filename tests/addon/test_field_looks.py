@@ -41,8 +41,9 @@ def test_things_look_as_their_classes_but_for_what_is_edited() -> None:
     cup, plate = voxels.thing_looks(classes, TOLD, edited)[3:]
     assert cup == (GREEN, 0.25, 1.0, BLUE), "factors of opacity; among the labels it has the color of its class"
     assert plate == (RED, 0.0, 0.5, RED), "without a tint of its own it has that of its class"
-    only = voxels.thing_looks(classes, TOLD, {}, "cup")
-    assert [look.opacity for look in only] == [0, 0, 0, 0.5, 0]
+    only = voxels.alone(classes, TOLD, "cup", edited["cup"])
+    assert [look.opacity for look in only] == [0, 0, 0, 0.25, 0]
+    assert only[3] == cup
 
 
 def test_rows_of_the_table_are_those_that_the_shader_reads() -> None:

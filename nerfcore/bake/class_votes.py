@@ -18,7 +18,7 @@ from .fit import shared_vertices
 
 # Measured (docs/experiments.md, “Classes of a baked field from label maps”):
 PRIOR = 1.0  # weight of what was read, in pixels
-ROUNDS = 8
+ROUNDS = 16
 RAYS = 100_000  # in a round: so few that hardly two meet at a vertex, of which the nearer one counts
 LEAST = 0.01  # weight that a ray has at a vertex, below which it does not count; not tuned
 MOST_INDICES = 256  # of classes: a byte

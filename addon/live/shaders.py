@@ -120,7 +120,9 @@ void main()
   vec3 color = vec3(0.0);
   float sure = 0.0;
   float half_way = -1.0;
-  bool classes_matter = classes > 0 && (look > 0.0 || edited == 1);
+  /* Of a photo only blocks are asked for classes that have something of an edited one. */
+  bool all_matter = classes > 0 && look > 0.0;
+  bool classes_matter = all_matter;
   ivec3 block_before = ivec3(-1);
   float entry = 0.0;
   /* Changes with the direction are read once, where most of the light comes from: they vary little on a surface. */
@@ -140,6 +142,10 @@ void main()
     if (any(notEqual(block, block_before))) {
       entry = texelFetch(index_, block, 0).r;
       block_before = block;
+      if (edited == 1 && !all_matter && entry > 0.5) {
+        int number = int(entry + 0.5) % SLOTS - 1;
+        classes_matter = classes > 0 && texelFetch(marks, ivec2(number % 256, number / 256), 0).r > 0.5;
+      }
     }
     if (entry <= 0.5) {
       t += leap(u, inverse_d, p, -entry, float(blocks)) + 0.5 * bin;
@@ -254,7 +260,7 @@ def march_shader() -> Any:
 
     info = GPUShaderCreateInfo()
     for place, (kind, name) in enumerate(
-        [("FLOAT_3D", "index_"), *(("FLOAT_3D", f"t{n}") for n in range(5)), ("FLOAT_2D", "lut")]
+        [("FLOAT_3D", "index_"), *(("FLOAT_3D", f"t{n}") for n in range(5)), ("FLOAT_2D", "lut"), ("FLOAT_2D", "marks")]
     ):
         info.sampler(place, kind, name)
     for kind, name in (

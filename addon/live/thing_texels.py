@@ -22,12 +22,14 @@ RETRY = 30.0  # seconds after which what went wrong is tried again
 
 class Told(NamedTuple):
     """Things that have class indices of their own, those after the field's classes: their names, the indices of their classes, the
-    parts of the world in which they lie (from the cube [−1, 1]³), and the texture T1 (Z, Y, X, 4) uint8 with these indices."""
+    parts of the world in which they lie (from the cube [−1, 1]³), the texture T1 (Z, Y, X, 4) uint8 with these indices, and which of
+    the S blocks have something of which index, (S, indices) bool."""
 
     names: list[str]
     of_class: list[int]
     cubes: list[Matrix]
     texels: Any
+    marks: Any
 
 
 class Answer:
@@ -101,16 +103,17 @@ def _attend(known: Answer) -> None:
 
     engine = frames()
     engine.pump()
-    file = engine.folder() / f"things-{id(known)}.npy"
+    file = engine.folder() / f"things-{id(known)}.npz"
     if known.outcome:
         result, error = known.outcome.pop()
         if error is not None:
             raise error
         assert result is not None
-        texels = np.load(file)
+        with np.load(file) as found:
+            texels, marks = found["texels"], found["marks"]
         file.unlink()
         cubes = [Matrix(cube) for cube in result["cubes"]]
-        known.told = Told(result["names"], result["of_class"], cubes, texels)
+        known.told = Told(result["names"], result["of_class"], cubes, texels, marks)
         known.ended = time.monotonic()
     elif known.process is None or known.process is not engine.process:
         params = {"project": str(known.project), "run": known.run, "file": str(file)}

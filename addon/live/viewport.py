@@ -60,15 +60,17 @@ class View:
         self.row_seconds = 1e-3  # a row of the finest picture takes
         self.marched = 0.0  # seconds of the last whole coarse picture
         self.refined = False
-        self._table: tuple[Any, Any] = (None, None)
+        self._tables: tuple[Any, Any, Any] = (None, None, None)
 
-    def table(self, rows: list[float]) -> Any:
-        """The table of the looks as a texture; a new one when it changed."""
-        if self._table[0] != rows:
+    def tables(self, shows: Shown, told: thing_texels.Told | None) -> dict[str, Any]:
+        """The looks, and the marks of blocks in which they are edited, as textures; new ones when they changed."""
+        key = shows.rows, told
+        if self._tables[0] is None or self._tables[0][0] != key[0] or self._tables[0][1] is not told:
             import numpy as np
 
-            self._table = rows, texture((256, 2), "RGBA16F", np.array(rows, np.float32))
-        return self._table[1]
+            looks = texture((256, 2), "RGBA16F", np.array(shows.rows, np.float32))
+            self._tables = key, looks, texture(voxels.MARKS, "R16F", voxels.marks(shows.looks, told))
+        return {"lut": self._tables[1], "marks": self._tables[2]}
 
 
 class Shown(NamedTuple):
@@ -156,9 +158,7 @@ class Viewport:
             view = self.views.setdefault(key, View())
             view.used = now
             uniforms = _uniforms(baked.meta, view3d.perspective_matrix, scene_from_clip, shows, own.look)
-            marched += self._bring_up(
-                view, state, asset, shows.rows, uniforms, (region.width, region.height), quality, now
-            )
+            marched += self._bring_up(view, state, asset, shows, uniforms, (region.width, region.height), quality, now)
             unfinished = unfinished or not view.refined
             if view.shown is not None:
                 self._lay_over(view.shown, region)
@@ -207,15 +207,16 @@ class Viewport:
         self._batches = [shaders.whole_view(self._march), shaders.whole_view(self._lay)]
 
     def _bring_up(
-        self, view: View, state: Any, asset: Asset, rows: list[float], uniforms: dict[str, Any],
+        self, view: View, state: Any, asset: Asset, shows: Shown, uniforms: dict[str, Any],
         size: tuple[int, int], quality: int, now: float,
     ) -> float:  # fmt: skip
         """March what is to be marched of a view in this redraw; returns the seconds that took."""
+        tables = view.tables(shows, asset.told)
         if state != view.state:
             view.state, view.changed, view.refined, view.next = state, now, False, None
             scale = max(2 * quality, view.coarse)
             view.shown = _picture(view.shown, size, scale)
-            view.marched = self._march_rows(view.shown, asset, view.table(rows), uniforms, view.shown.height)
+            view.marched = self._march_rows(view.shown, asset, tables, uniforms, view.shown.height)
             # A weak card gets a coarser picture the next time, a strong one a finer one.
             if view.marched > MOVED and view.coarse < COARSEST:
                 view.coarse *= 2
@@ -229,13 +230,15 @@ class Viewport:
             view.next = _picture(None, size, quality)
         least = -(-view.next.height // STRIPS)
         count = max(least, int(max(BUDGET, self._rest) / max(view.row_seconds, 1e-6)))
-        seconds = self._march_rows(view.next, asset, view.table(rows), uniforms, count)
+        seconds = self._march_rows(view.next, asset, tables, uniforms, count)
         view.row_seconds = 0.5 * (view.row_seconds + seconds / count)
         if view.next.done:
             view.shown, view.next, view.refined = view.next, None, True
         return seconds
 
-    def _march_rows(self, picture: Picture, asset: Asset, table: Any, uniforms: dict[str, Any], count: int) -> float:
+    def _march_rows(
+        self, picture: Picture, asset: Asset, tables: dict[str, Any], uniforms: dict[str, Any], count: int
+    ) -> float:
         """Draw the next rows of a picture; returns how many seconds they took."""
         import gpu
 
@@ -256,7 +259,8 @@ class Viewport:
             shader.uniform_sampler("index_", asset.index)
             for number, texture in enumerate(asset.texels):
                 shader.uniform_sampler(f"t{number}", texture)
-            shader.uniform_sampler("lut", table)
+            for name, found in tables.items():
+                shader.uniform_sampler(name, found)
             for name, value in uniforms.items():
                 if isinstance(value, int):
                     shader.uniform_int(name, value)
@@ -309,7 +313,7 @@ def _uniforms(
     """What the march needs to know."""
     cell = (4.0 if meta["contracted"] else 2.0) / (meta["side"] * (voxels.VERTICES - 1))
     box, crop = shows.box, shows.crop
-    edited = any(one.opacity < 1 or one.tint > 0 for one in shows.looks)
+    edited = any(look.edited for look in shows.looks)
     return {
         "box_from_clip": box.inverted_safe() @ scene_from_clip,
         "clip_from_box": clip_from_scene @ box,

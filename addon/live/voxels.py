@@ -92,6 +92,11 @@ class Look(NamedTuple):
     tint: float
     label: tuple[float, ...]
 
+    @property
+    def edited(self) -> bool:
+        """Whether it is shown other than it is."""
+        return self.opacity < 1 or self.tint > 0
+
 
 HIDDEN = Look(BLACK, 0.0, 0.0, BLACK)
 
@@ -131,6 +136,20 @@ def alone(classes: list[Look], told: Told, thing: str, own: dict[str, Any] | Non
     number = told.names.index(thing)
     found = [HIDDEN] * (len(classes) + len(told.names))
     found[len(classes) + number] = thing_look(classes[told.of_class[number]], own)
+    return found
+
+
+MARKS = (256, 86)  # texels of the texture of marks, one a block: 28³ at most
+
+
+def marks(looks: list[Look], told: Told | None) -> Any:
+    """Which blocks have something of edited indices, all of them where that is not known: flat float32, as the texture holds it."""
+    import numpy as np
+
+    found = np.ones(MARKS[0] * MARKS[1], np.float32)
+    if told is not None:
+        edited = [number for number, look in enumerate(looks) if look.edited]
+        found[: len(told.marks)] = told.marks[:, edited].any(1)
     return found
 
 

@@ -14,7 +14,8 @@ from .fields import LoadedField
 
 
 def write_thing_texture(field: LoadedField, path: Path) -> dict[str, Any]:
-    """Write what takes the place of `T1.npy` of a baked field.
+    """Write a file (npz) with what takes the place of `T1.npy` of a baked field, `texels`, and which of its S blocks have something of
+    which class index, `marks` (S, indices) bool.
 
     Returns:
         {"names", "of_class", "cubes"}: of the things that have the indices after the classes, the index of the class of each,
@@ -24,7 +25,18 @@ def write_thing_texture(field: LoadedField, path: Path) -> dict[str, Any]:
     """
     things = field.instances
     told, names, of_class = things.all_told_apart()
-    texels = texels_of(told.vertices, TEXELS)[:, 1].reshape(-1, *(VERTICES,) * 3, 4)
+    texels = texels_of(told.vertices, TEXELS).reshape(-1, VERTICES**3, TEXELS, 4)
     with disk_errors(path), open(path, "wb") as file:
-        np.save(file, to_texture(texels))
+        texture = to_texture(texels[:, :, 1].reshape(-1, *(VERTICES,) * 3, 4))
+        np.savez(file, texels=texture, marks=occurring(texels, told.classes))
     return {"names": names, "of_class": of_class, "cubes": [things.world_from_cube(name).tolist() for name in names]}
+
+
+def occurring(texels: np.ndarray, indices: int) -> np.ndarray:
+    """Which of so many class indices occur in each block, (S, indices) bool, of the texels (S, 9³, 2, 4) of its vertices."""
+    found = np.zeros((len(texels), indices), bool)
+    solid, sure = texels[..., 0, 3] > 0, texels[..., 1, 1] == 255
+    for byte, there in ((0, solid), (2, solid & ~sure)):
+        block, vertex = there.nonzero()
+        found[block, texels[block, vertex, 1, byte]] = True
+    return found

@@ -191,20 +191,27 @@ def march(
 
 
 def texture_reads(
-    origins: torch.Tensor, directions: torch.Tensor, field: VoxelField, s: MarchSettings, edited: bool = False
+    origins: torch.Tensor,
+    directions: torch.Tensor,
+    field: VoxelField,
+    s: MarchSettings,
+    marked: torch.Tensor | None = None,
 ) -> torch.Tensor:
     """How often (R,) the viewport's shader (addon/live/shaders.py) reads a texture for each ray: the index once in each block
     it meets, the colour and opacity at each sample, and three more times for the changes with the direction where something
-    is. Edited, classes or things are shown other than they are: where a sample holds something, the vertex that counts, or all
-    eight where the nearest one is empty, its classes, and two rows of the table of looks for each of these."""
+    is. Where classes or things are shown other than they are, `marked` (S,) bool says which blocks have something of these. Then
+    it also reads a mark in each block that is not empty; and in marked ones, where a sample holds something, the vertex that
+    counts, or all eight where the nearest one is empty, its classes, and two rows of the table of looks for each of these."""
     transmittance, looks = torch.ones(len(origins), device=origins.device), torch.zeros_like(origins[:, 0])
     reads = torch.zeros_like(looks)
-    words = field.vertices.view(-1, TEXELS)
+    words, before = field.vertices.view(-1, TEXELS), torch.full_like(reads, -1, dtype=torch.long)
     for step in _steps(origins, directions, field.index, field.blocks, s, transmittance, looks=looks):
         root = (step.shares * (words[step.corners][..., 0] >> 24 & 255) / 255).sum(1)
         reads[step.rays] += 1
-        if edited:
-            reads[step.rays] += torch.where(root > 0, _reads_of_classes(step, words), 0.0)
+        if marked is not None:
+            slot = step.corners[:, 0] // VERTICES**3
+            reads[step.rays] += (slot != before[step.rays]) + marked[slot] * (root > 0) * _reads_of_classes(step, words)
+            before[step.rays] = slot
         left = transmittance[step.rays] * (1 - (root * root).clamp(max=1))
         transmittance[step.rays] = torch.where(left < SHADER_STOP, 0.0, left)
     return looks + reads + 3 * (transmittance < 1)

@@ -15,7 +15,8 @@ from fieldwork.addon.live import thing_texels, voxels
 
 RED, BLUE, GREEN = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)
 META = {"class_ids": [7, 9, 11]}
-TOLD = thing_texels.Told(["cup", "plate"], [1, 0], [], None)
+MARKS = np.array([[1, 0, 0, 0, 0], [0, 0, 1, 1, 0], [1, 0, 0, 0, 1]], bool)  # three blocks, five indices
+TOLD = thing_texels.Told(["cup", "plate"], [1, 0], [], None, MARKS)
 
 
 def entry(number: int, color: tuple, shown: float = 1.0, tint: float = 0.0) -> SimpleNamespace:
@@ -55,6 +56,21 @@ def test_rows_of_the_table_are_those_that_the_shader_reads() -> None:
     assert (table[1, 5:] == 0).all()
 
 
+def test_blocks_are_marked_that_have_something_edited() -> None:
+    classes = voxels.class_looks(META, [entry(7, RED), entry(9, BLUE)])
+    hidden = {"opacity": 0.0, "tint": 0.0, "color": GREEN}
+
+    def marked(looks: list) -> list:
+        return voxels.marks(looks, TOLD)[:3].tolist()
+
+    assert marked(voxels.thing_looks(classes, TOLD, {})) == [0, 0, 0]
+    assert marked(voxels.thing_looks(classes, TOLD, {"cup": hidden})) == [0, 1, 0]
+    assert marked(voxels.thing_looks(classes, TOLD, {"cup": hidden, "plate": hidden})) == [0, 1, 1]
+    assert marked(voxels.alone(classes, TOLD, "cup", None)) == [1, 1, 1], "also where there is only what is hidden"
+    assert voxels.marks(classes, None).min() == 1, "nothing is known of the blocks"
+    assert len(voxels.marks(classes, None)) == voxels.MARKS[0] * voxels.MARKS[1] >= 28**3
+
+
 class Engine:
     """An engine of frames that answers when it is told to."""
 
@@ -75,7 +91,7 @@ class Engine:
 
     def answer(self) -> None:
         _, params, ended = self.asked[-1]
-        np.save(params["file"], np.zeros((9, 9, 9, 4), np.uint8))
+        np.savez(params["file"], texels=np.zeros((9, 9, 9, 4), np.uint8), marks=MARKS)
         ended({"names": ["cup"], "of_class": [0], "cubes": [np.eye(4).tolist()]}, None)
 
 
@@ -115,7 +131,7 @@ def test_things_are_asked_for_once_for_each_bake_and_mesh(engine, tmp_path):
     assert thing_texels.attend() is None, "the timer ends"
     assert first.told is not None
     assert first.told.names == ["cup"]
-    assert not list(tmp_path.glob("*.npy")), "the file is gone"
+    assert not list(tmp_path.glob("*.npz")), "the file is gone"
     assert known(tmp_path) is first
     mesh(tmp_path)
     again = known(tmp_path)

@@ -39,11 +39,11 @@ def vertices(texture: np.ndarray, field: LoadedField) -> np.ndarray:
 
 def test_each_thing_has_an_index_after_the_classes(things: Path, tmp_path: Path) -> None:
     field = load_field(things, "main", True)
-    told = write_thing_texture(field, tmp_path / "told.npy")
+    told = write_thing_texture(field, tmp_path / "told.npz")
     assert sorted(told["names"]) == ["left", "right"]
     assert told["of_class"] == [0, 0]
     folder = voxels_folder(things, "main")
-    plain, found = np.load(folder / "T1.npy"), np.load(tmp_path / "told.npy")
+    plain, found = np.load(folder / "T1.npy"), np.load(tmp_path / "told.npz")["texels"]
     assert (found.shape, found.dtype) == (plain.shape, plain.dtype)
     assert isinstance(field.shown, BakedField)
     place = vertex_places(field.shown, np.linalg.inv(field.box_from_world))
@@ -59,6 +59,16 @@ def test_each_thing_has_an_index_after_the_classes(things: Path, tmp_path: Path)
             # Between the upper half and the lower one, where the mesh has no such face, the nearest counts.
             assert (after[top & side & (place[:, 2] > 0.05), byte] == index[name]).all()
         assert np.array_equal(after[~top, byte], before[~top, byte])
+    marks = np.load(tmp_path / "told.npz")["marks"]
+    by_block = after[:, 0].reshape(-1, VERTICES**3)
+    assert marks.shape == (len(by_block), 4)
+    for number in range(2):
+        has = ((by_block == 2 + number) & solid.reshape(by_block.shape)).any(1)
+        assert has.any()
+        assert not has.all()
+        assert marks[has, 2 + number].all()
+    assert not marks[:, 0].any(), "all of that class is told apart"
+    assert (marks.sum(1) > 0).all()
     for name, cube in zip(told["names"], told["cubes"]):
         corner = np.array([[x, y, z, 1] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) @ np.array(cube).T
         low, high = corner[:, :3].min(0), corner[:, :3].max(0)
@@ -71,9 +81,9 @@ def test_where_there_is_no_room_for_all_the_largest_are_told_apart(
     things: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(instance_cells, "MOST_INDICES", 3)
-    told = write_thing_texture(load_field(things, "main", True), tmp_path / "told.npy")
+    told = write_thing_texture(load_field(things, "main", True), tmp_path / "told.npz")
     assert len(told["names"]) == len(told["cubes"]) == 1
-    assert np.load(tmp_path / "told.npy")[..., 0].max() == 2
+    assert np.load(tmp_path / "told.npz")["texels"][..., 0].max() == 2
 
 
 def test_the_engine_answers_and_says_what_is_wrong(things: Path, ball: Path, tmp_path: Path) -> None:
@@ -86,11 +96,11 @@ def test_the_engine_answers_and_says_what_is_wrong(things: Path, ball: Path, tmp
             pass
         return message
 
-    answer = asked(1, project=str(things), run="main", file=str(tmp_path / "told.npy"))
+    answer = asked(1, project=str(things), run="main", file=str(tmp_path / "told.npz"))
     assert sorted(answer["result"]["names"]) == ["left", "right"]
-    assert (tmp_path / "told.npy").is_file()
-    assert "no mesh yet" in asked(2, project=str(ball), file=str(tmp_path / "no.npy"))["error"]["message"]
-    wrong = asked(3, project=str(things), file=str(tmp_path / "no.npy"), colour=1)["error"]
+    assert (tmp_path / "told.npz").is_file()
+    assert "no mesh yet" in asked(2, project=str(ball), file=str(tmp_path / "no.npz"))["error"]["message"]
+    wrong = asked(3, project=str(things), file=str(tmp_path / "no.npz"), colour=1)["error"]
     assert wrong["code"] == rpc.INVALID_PARAMS
     assert "field_things" in wrong["message"]
     assert "colour" in wrong["message"]

@@ -240,8 +240,12 @@ def test_reads_of_textures_are_counted() -> None:
     assert float(reads(meeting, along, even_field(255, full), here)[0]) == 1 + 1 + 3
     thin = float(reads(meeting, along, even_field(1, full), here)[0])
     assert thin == pytest.approx(SIDE * 8 + SIDE + 3, abs=2)
-    edited = float(reads(meeting, along, even_field(255, full), here, edited=True)[0])
-    assert edited == 1 + 1 + 3 + 2 + 4, "the vertex, its classes, and two rows of the table for each of these"
+    for marked, more in ((False, 0), (True, 2 + 4)):
+        marks = torch.full((len(full),), marked)
+        edited = float(reads(meeting, along, even_field(255, full), here, marks)[0])
+        assert edited == 1 + 1 + 3 + 1 + more, (
+            "the mark; the vertex, its classes, two rows of the table for each of these"
+        )
     one = torch.tensor([[0, SIDE // 2, SIDE // 2]])
     assert float(reads(meeting, along, even_field(255, one), here)[0]) == 1 + 1 + 3
     behind = torch.tensor([[SIDE - 1, SIDE // 2, SIDE // 2]])

@@ -99,3 +99,37 @@ def test_frames_of_several_threads_wait_for_each_other(ball, tmp_path):
     frames.close()
     assert len(found) == 4
     assert min(found) > 0.9
+
+
+def test_what_is_asked_beside_frames_is_answered_by_pumping_and_by_frames(ball, tmp_path):
+    """The viewport asks without waiting; while a frame is rendered it asks again later."""
+    from fieldwork.addon.live.frames import FrameEngine, Sizes
+
+    frames = FrameEngine(lambda: Link(sys.executable, tmp_path / "engine.log"))
+    outcomes: list = []
+    params = {"project": str(ball), "run": "main", "file": str(tmp_path / "told.npz")}
+
+    def ended(*outcome) -> None:
+        outcomes.append(outcome)
+
+    try:
+        assert frames.ask("field_things", params, ended)
+        end = time.monotonic() + 120
+        while not outcomes and time.monotonic() < end:
+            frames.pump()
+            time.sleep(0.05)
+        assert "no mesh yet" in str(outcomes[0][1]), "the ball has no mesh"
+        asked = []
+
+        def stop() -> bool:
+            asked.append(frames.ask("field_things", params, ended))
+            return False
+
+        sizes = Sizes(64, 48, {"Combined": 4})
+        assert frames.ask("field_things", params, ended)
+        frames.render(shot(ball, 1, True), sizes, stop, lambda *said: None)
+        assert len(outcomes) == 2, "the frame's wait hands the answer out"
+        assert asked
+        assert not any(asked)
+    finally:
+        frames.close()

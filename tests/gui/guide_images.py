@@ -42,6 +42,7 @@ IMAGES = {
     "label-kept": ("labels-sid/kept", SIDEBAR, 260),
     "render": ("panels/all-render", SIDEBAR, 260),
     "live": ("live_panel-sid/panel", VIEW, 900),
+    "things": ("things-sid/panel", VIEW, 900),
     "mesh": ("panels/all-mesh", SIDEBAR, 260),
     "export": ("panels/all-export", SIDEBAR, 260),
     "engine": ("panels/all-engine", SIDEBAR, 260),

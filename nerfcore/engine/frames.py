@@ -162,7 +162,7 @@ def _things(params: dict[str, Any], reporter: Reporter, store: FieldStore) -> di
     asked = _valid(_ThingsAsked, params, "field_things")
     here = [[float(row == column) for column in range(4)] for row in range(4)]
     item = FieldItem(name=asked.run, project=asked.project, run=asked.run, baked=True, scene_from_capture=here)
-    return write_thing_texture(store.field(item, 0, reporter), asked.file)
+    return write_thing_texture(store.field(item, reporter), asked.file)
 
 
 METHODS = {"frame": _exposed, "field_things": _things}

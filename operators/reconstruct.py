@@ -169,6 +169,7 @@ class FIELDWORK_OT_bench(VerbOperator):
             ("gpu", "Graphics Card", "Hours on a graphics card"),
         ],
     )
+    tables: StringProperty(name="Tables", description="Evidence: only these tables, separated by commas; empty: all")
     lpips: StringProperty(
         name="LPIPS", description="Evidence: torchvision's weights of VGG-16; empty: not measured", subtype="FILE_PATH"
     )
@@ -190,6 +191,7 @@ class FIELDWORK_OT_bench(VerbOperator):
             "set": parse_settings(self.settings),
             "keep": self.keep,
             "profile": self.profile,
+            "tables": _words(self.tables),
             **{name: absolute(getattr(self, name)) for name in ("out", "data", "yardstick", "page", "tests", "lpips")},
         }
 

@@ -17,6 +17,7 @@ from .fused_network import (
     half_feature,
     half_vector,
     hidden_layers,
+    lane,
     last_layer,
     layer,
     padded,
@@ -115,7 +116,11 @@ def _joined(shape: FusedShape, lanes: int) -> Any:
             added = int(0)
             # Where the whole block is certain of its grid the implicit branch is not read.
             if wp.tile_sum(wp.tile(wp.where(w < CERTAIN, 1, 0)))[0] > 0:
+                point = wp.tile_empty(shape=(3, lanes), dtype=float, storage="shared")
+                for k in range(3):
+                    put(point, k, p[k])
                 implicit_features(p, field, x, inner, place, 1.0 - w)
+                p = wp.vec3(point[0, lane()], point[1, lane()], point[2, lane()])
                 added = wp.static(0 if concat else 1)
             else:
                 w = 1.0

@@ -95,8 +95,8 @@ def _density_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
         lane = wp.tid()
         index = int(-1)
         walk = Walk()
-        optical_depth = float(0.0)
-        interval = wp.tile_empty(shape=(2, lanes), dtype=float, storage="shared")
+        # What need not be in registers, which the products need: distance and length of the sample, optical depth so far.
+        interval = wp.tile_zeros(shape=(3, lanes), dtype=float, storage="shared")
         active_lanes = int(1)
         last_place = wp.min(queue.ray_count[0], queue.end)
         while active_lanes > 0:
@@ -105,7 +105,7 @@ def _density_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
                 if place < last_place:
                     index = queue.indices[place]
                     walk = started(rays, index)
-                    optical_depth = 0.0
+                    put(interval, 2, 0.0)
             active = wp.where(index >= 0, 1, 0)
             active_lanes = wp.tile_sum(wp.tile(active))[0]
             if active_lanes > 0:
@@ -118,14 +118,15 @@ def _density_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
                     walk, t, length = advanced(ray, walk, 0.5, grid, m)
                     p = inside(grid_position(ray.origin + ray.direction * t, m.contracted))
                     out.evaluated[lane] = out.evaluated[lane] + 1
-                # Not in registers, which the products need.
                 put(interval, 0, t)
                 put(interval, 1, length)
                 head, density = density_at(p, active, field)
                 t = interval[0, own_lane()]
                 length = interval[1, own_lane()]
+                optical_depth = interval[2, own_lane()]
                 before = wp.exp(-optical_depth)
                 optical_depth += density * length
+                put(interval, 2, optical_depth)
                 after = wp.exp(-optical_depth)
                 weight = before - after
                 if active == 1 and weight > cull:

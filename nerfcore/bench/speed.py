@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from dataclasses import asdict, dataclass
@@ -19,6 +20,7 @@ from ..progress import Reporter
 from ..project.store import load_project
 from ..render.image import CPU_RAYS, render_view
 from ..render.run import Trained, load_trained
+from ..render.sparse_rays import sparse_rays
 from ..train.prepare import make_trainer, plan_run
 from ..train.trainer import Trainer
 from .jobs import Job
@@ -93,7 +95,7 @@ def _frame(trained: Trained, project: Path, report: Reporter) -> dict[str, Any]:
     box = info.box(load_project(project))
     pose = box_poses([view], box.box_from_world)[0]
     camera = view.camera.undistorted().resized(SIDE, SIDE)
-    model.refine(check=report.check)
+    model.refine(math.inf, report.check, sparse_rays([camera], pose[None], model.device))
     times = []
     for _ in range(4):
         begin = time.perf_counter()

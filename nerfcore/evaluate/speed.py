@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from typing import Any
 
@@ -22,6 +23,7 @@ from ..render.fused import FusedRenderer, ray_renderer
 from ..render.image import render_view
 from ..render.model import Model
 from ..render.run import Trained
+from ..render.sparse_rays import sparse_rays
 
 SPEED_KEYS = ("fps", "fps_size", "spr", "ms_sampling", "ms_network", "fused")
 
@@ -50,7 +52,10 @@ def measure_speed(
     draws its samples there too); `spr` is the number of field samples per ray; `fused` says which kernels rendered.
     """
     model, device = trained.model, trained.device
-    model.refine(check=report.check)
+    report.stage("Preparing")
+    views = [scene.views[index] for index in indices]
+    cameras = [_camera(scene, index, side) for index in indices]
+    model.refine(math.inf, report.check, sparse_rays(cameras, box_poses(views, box_from_world), device))
     report.stage(f"Measuring speed at {side}×{side}")
     asynchronous = backend_of(device).asynchronous
     frame = _device_frame if asynchronous else _host_frame

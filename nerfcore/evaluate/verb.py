@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -33,6 +34,7 @@ from ..render.image import Frame, background_of, render_view
 from ..render.model import Model
 from ..render.pictures import colorize_depth, colorize_labels, side_by_side
 from ..render.run import Trained, load_info, load_trained, refined_poses
+from ..render.sparse_rays import sparse_rays
 from ..verdict import evaluate_verdict
 from .advice import advice
 from .documentation import results_of
@@ -184,9 +186,13 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
     shown = load_baked(folder, params.run, trained.info) if params.baked else trained.model
     refined = refined_poses(folder, params.run, trained.info)
     report.stage("Preparing")
-    if not params.baked or refined:  # poses are fitted to the field
-        trained.model.refine(check=report.check)
     box_from_world = trained.info.box(project).box_from_world
+    views = [scene.views[index] for index in indices]
+    if not params.baked or refined:  # poses are fitted to the field
+        cameras = [view.camera.resized(*size) for view, size in zip(views, sizes)]
+        pixels = math.inf if refined else sum(camera.width * camera.height for camera in cameras)
+        rays = sparse_rays(cameras, box_poses(views, box_from_world), trained.device)
+        trained.model.refine(pixels, report.check, rays)
     compared = Comparison(
         trained,
         shown,

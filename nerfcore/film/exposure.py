@@ -12,11 +12,12 @@ import torch
 from ..kernels.raycast import FirstHits
 from ..kernels.runtime import run_parallel
 from ..progress import Reporter
+from ..render.sparse_rays import sparse_pixels, stride_of
 from .cryptomatte import Coverage, id_of, manifest
 from .fields import FAR, FieldStore, PlacedField, light_left
 from .instances import InstanceNames
 from .lens_rays import axis_cosine, scene_rays
-from .shot import CRYPTOMATTES, Shot
+from .shot import CRYPTOMATTES, FieldItem, Shot
 
 EMPTY_DEPTH = 1e10  # as Blender has it
 TILE = 1 << 13  # rays at once on the CPU
@@ -71,9 +72,7 @@ def expose(
         ProjectError: a field cannot be read. Cancelled.
     """
     report.stage("Preparing")
-    width, height = shot.size
-    pixels = width * height * shot.samples
-    fields = [PlacedField(store.field(item, pixels, report), item, width * height) for item in shot.fields]
+    fields = [_placed(shot, item, store, report) for item in shot.fields]
     film = _Film(shot, fields)
     report.stage("Rendering")
     samples = list(_samples(shot))
@@ -84,6 +83,18 @@ def expose(
             if show is not None and number + 1 < len(samples):
                 show(film.combined())
     return Exposure(film.passes(), film.manifests())
+
+
+def _placed(shot: Shot, item: FieldItem, store: FieldStore, report: Reporter) -> PlacedField:
+    """A field of the shot, read as finely as the shot is worth where its rays meet it. Raises ProjectError."""
+    x0, y0, x1, y1 = shot.border
+    width, height = shot.size
+    placed = PlacedField(store.field(item, report), item, width * height)
+    pixels = (x1 - x0) * (y1 - y0)
+    corner = torch.tensor([x0, y0], device=placed.device)
+    place = sparse_pixels(x1 - x0, y1 - y0, stride_of(pixels), placed.device) + corner + 0.5
+    placed.refine(*scene_rays(shot.lens, place), pixels * shot.samples, report.check)
+    return placed
 
 
 def _samples(shot: Shot) -> Iterator[tuple[tuple[float, float], int | None, str]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -13,7 +14,7 @@ from ..data.load import load_scene
 from ..data.scene import Scene
 from ..errors import ProjectError, SettingError
 from ..kernels.march import Samples
-from ..kernels.traversal import BEFORE_CUBE, PDF_UNIFORM, MarchSettings
+from ..kernels.traversal import BEFORE_CUBE, PDF_UNIFORM
 from ..mesh.stored import MESH, mesh_folder
 from ..progress import Reporter
 from ..project.runs import INSTANCES, checkpoint_id
@@ -121,8 +122,8 @@ class FieldStore:
         self.loaded = 0  # how often a field was read from disk
         self._fields: dict[tuple, LoadedField] = {}
 
-    def field(self, item: FieldItem, pixels: float, report: Reporter) -> LoadedField:
-        """The field of an item, for so many rays. Raises ProjectError."""
+    def field(self, item: FieldItem, report: Reporter) -> LoadedField:
+        """The field of an item. Raises ProjectError."""
         folder = item.project
         state = [checkpoint_id(folder, item.run), (folder / "project.json").stat().st_mtime_ns]
         if item.baked:
@@ -137,8 +138,6 @@ class FieldStore:
             self._fields = {k: v for k, v in self._fields.items() if k[:3] != key[:3]}
             found = load_field(folder, item.run, item.baked)
             self.loaded += 1
-            if isinstance(found.shown, Model):
-                found.shown.refine(pixels, report.check)
         self._fields[key] = found
         for old in list(self._fields)[: -self.KEPT]:
             del self._fields[old]
@@ -180,8 +179,24 @@ class PlacedField:
         self.tint = self._tensor([look.tint for look in looks])
         self.tint_colors = self._tensor([look.color for look in looks]).reshape(-1, 3)
         self.hides = bool(looks) and bool((self.opacity < 1).any())
-        self.settings = self._settings()
-        self._plain = None if isinstance(self.shown, BakedField) else ray_renderer(self.shown, pixels, True)
+        self.pixels = pixels
+        self._prepare()
+
+    def _prepare(self) -> None:
+        shown = self.shown
+        baked = isinstance(shown, BakedField)
+        self.settings = shown.settings if baked else shown.render_grid().settings
+        self._plain = None if baked else ray_renderer(shown, self.pixels, True)
+
+    def refine(self, origins: torch.Tensor, directions: torch.Tensor, pixels: float, check: Callable[[], None]) -> None:
+        """Read the field more finely where rays of the scene (R, 3) meet it, if that pays for so many pixels."""
+        if isinstance(self.shown, BakedField):
+            return
+        valid = ~directions[:, 0].isnan()
+        places, turned = _moved(self.box_from_scene, origins[valid], directions[valid], None)
+        turned = turned / turned.norm(dim=1, keepdim=True)
+        self.shown.refine(pixels, check, [(places.contiguous(), turned.contiguous())])
+        self._prepare()
 
     def _looks(self, instances: list[str], of_class: list[int]) -> list[ClassLook]:
         """How the classes are shown, and after them the instances that are told apart."""
@@ -205,10 +220,6 @@ class PlacedField:
         """`after` times the inverses of poses (P, 4, 4), one where it stands still."""
         poses = np.array(motion if len(motion) > 1 else [still])
         return self._tensor(after @ np.linalg.inv(poses))
-
-    def _settings(self) -> MarchSettings:
-        shown = self.shown
-        return shown.settings if isinstance(shown, BakedField) else shown.render_grid().settings
 
     def still(self, points: torch.Tensor, times: torch.Tensor | None) -> torch.Tensor:
         """Where points (R, 3) of the field, which are in the scene at `times`, would be if it stood where it does now."""

@@ -150,16 +150,15 @@ def density_function(shape: FusedShape, lanes: int) -> Any:
     def density(p: wp.vec3, active: int, field: FieldArrays):
         x = wp.tile_empty(shape=(rows, lanes), dtype=wp.float16, storage="shared")
         inner = wp.tile_empty(shape=(width, lanes), dtype=wp.float16, storage="shared")
+        # Before the networks: the point need not be kept until after them.
+        thinned = wp.where(field.thinning == 1, thinning(p), 1.0)
         features(p, active, field, x, inner)
         hidden(x, field.weights, first, inner)
         head = last(inner, field.weights, later)
         out = vector()
         for k in range(geometry):
             out[k] = wp.float16(head[k])
-        sigma = wp.exp(wp.clamp(head[0] + field.density_shift, -15.0, 11.0))
-        if field.thinning == 1:
-            sigma *= thinning(p)
-        return out, sigma
+        return out, thinned * wp.exp(wp.clamp(head[0] + field.density_shift, -15.0, 11.0))
 
     return wp.func(density, name=f"density_{shape_name(shape, lanes)}")
 

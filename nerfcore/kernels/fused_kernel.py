@@ -19,7 +19,8 @@ from functools import cache
 import warp as wp
 
 from .fused_field import FieldArrays, class_function, color_function, density_function, shape_name
-from .fused_network import half_vector
+from .fused_network import half_vector, put
+from .fused_network import lane as own_lane
 from .fused_shape import FusedShape
 from .pdf_sampling import MarchedRays, Walk, advanced, ray_of, started
 from .traversal import EARLY_STOP, GridArrays, MarchParams, grid_position, inside
@@ -95,6 +96,7 @@ def _density_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
         index = int(-1)
         walk = Walk()
         optical_depth = float(0.0)
+        interval = wp.tile_empty(shape=(2, lanes), dtype=float, storage="shared")
         active_lanes = int(1)
         last_place = wp.min(queue.ray_count[0], queue.end)
         while active_lanes > 0:
@@ -110,15 +112,18 @@ def _density_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
                 t = float(0.0)
                 length = float(0.0)
                 p = wp.vec3(0.5, 0.5, 0.5)
-                done = int(0)
                 if active == 1:
                     # Read again for each sample: kept, it would take registers that the products need.
                     ray = ray_of(rays, index, m)
                     walk, t, length = advanced(ray, walk, 0.5, grid, m)
                     p = inside(grid_position(ray.origin + ray.direction * t, m.contracted))
-                    done = wp.where(walk.ended == 1 or walk.sample >= rays.counts[index], 1, 0)
                     out.evaluated[lane] = out.evaluated[lane] + 1
+                # Not in registers, which the products need.
+                put(interval, 0, t)
+                put(interval, 1, length)
                 head, density = density_at(p, active, field)
+                t = interval[0, own_lane()]
+                length = interval[1, own_lane()]
                 before = wp.exp(-optical_depth)
                 optical_depth += density * length
                 after = wp.exp(-optical_depth)
@@ -133,8 +138,9 @@ def _density_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
                     visible.weights[place] = weight
                     for k in range(geometry):
                         visible.features[place, k] = head[k]
-                if active == 1 and (done == 1 or after < EARLY_STOP):
-                    index = -1
+                if active == 1:  # noqa: SIM102 (Warp evaluates both sides of "and")
+                    if walk.sample >= rays.counts[index] or after < EARLY_STOP:
+                        index = -1
 
     return _named(fused_density, "density", shape, lanes)
 

@@ -34,8 +34,8 @@ def half_vector(length: int) -> Any:
 
 
 @wp.func_native("tile.data.ptr[row * WP_TILE_BLOCK_DIM + WP_TILE_THREAD_IDX] = value;")
-def put(tile: Any, row: int, value: wp.float16):
-    """Write a row of the thread's own column of a tile (rows, lanes) half in shared memory."""
+def put(tile: Any, row: int, value: Any):
+    """Write a row of the thread's own column of a tile (rows, lanes) in shared memory."""
 
 
 @wp.func_native("return WP_TILE_THREAD_IDX;")

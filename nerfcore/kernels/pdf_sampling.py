@@ -49,6 +49,9 @@ class Ray:
     share: float  # weight of an interval
 
 
+ENDED = wp.constant(1 << 30)  # more than a ray has samples
+
+
 @wp.struct
 class Walk:
     """How far along a ray is, from bin to bin and from sample to sample."""
@@ -62,8 +65,7 @@ class Walk:
     bin_transmittance: float  # of the present bin alone
     used: float  # part of the present bin given to intervals already
     gathered: float  # occupied length of the next sample's interval so far
-    sample: int
-    ended: int
+    sample: int  # number of the next sample; ENDED: there is nothing behind the last one
 
 
 @wp.func
@@ -137,8 +139,7 @@ def advanced(ray: Ray, walk: Walk, shift: float, grid: GridArrays, m: MarchParam
         # Rounding left this interval just short of the total; nothing is behind it.
         length = walk.gathered
         walk.gathered = 0.0
-        walk.ended = 1
         if t == NOT_FOUND:
             t = walk.t_last
-    walk.sample += 1
+    walk.sample = wp.where(complete == 1, walk.sample + 1, ENDED)
     return walk, t, length

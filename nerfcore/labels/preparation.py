@@ -43,6 +43,7 @@ from ..project.fingerprints import digest, rounded
 from ..project.runs import geometry_id, run_folder
 from ..project.store import load_project, world_from_sfm
 from ..render.run import Trained, load_info, load_trained, refined_poses
+from ..render.sparse_rays import sparse_rays
 from .graph import Graph, feature_columns, joined, make_graph
 from .lookup import RECORD, UNREADABLE, part_of, photo_maps
 from .lookup import SURFELS as FOLDER
@@ -237,7 +238,8 @@ def _made(folder: Path, run: str, report: Reporter, count: int, features: Path |
     sizes = map_sizes(scene, trained.device)
     report.stage("Rendering depth")
     pixels = float(sum(width * height for width, height in sizes))
-    trained.model.refine(pixels, report.check)
+    cameras = [view.camera.resized(*size) for view, size in zip(scene.views, sizes)]
+    trained.model.refine(pixels, report.check, sparse_rays(cameras, poses, trained.device))
     seen = []
     for number, (view, pose, size) in enumerate(zip(scene.views, poses, sizes)):
         report.progress(number / len(sizes), view.name)

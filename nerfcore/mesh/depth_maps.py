@@ -24,6 +24,7 @@ from ..kernels.runtime import run_parallel
 from ..kernels.surface import agreement, depth_quantiles
 from ..progress import Reporter
 from ..render.model import Model
+from ..render.sparse_rays import sparse_rays
 
 CPU_SIDE, GPU_SIDE = 640, 1600  # longest side of a map
 CPU_PIXELS, GPU_PIXELS = 8e6, 2e8  # of all maps together
@@ -129,7 +130,8 @@ def _flat(photo: Camera, flat: Camera, pose: np.ndarray, turn: np.ndarray, index
 def depth_maps(model: Model, views: list[FlatView], report: Reporter) -> list[DepthMap]:
     """Depth maps of all views; the reporter hears how long it will take."""
     small = [reduced(view) if model.priorities.device.type == "cpu" else view for view in views]
-    model.refine(float(sum(v.inside.size for v in small)), report.check)
+    rays = sparse_rays([v.camera for v in small], np.stack([v.pose for v in small]), model.device)
+    model.refine(float(sum(v.inside.size for v in small)), report.check, rays)
     begin, maps = time.monotonic(), []
     for number, (view, rendered) in enumerate(zip(views, small)):
         left = (time.monotonic() - begin) / number * (len(views) - number) if number else 0.0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import torch
@@ -20,13 +20,23 @@ from ..kernels.device import backend_of
 from ..kernels.march import Samples, sample
 from ..kernels.packed_info import PackedInfo
 from ..sampling.occupancy import OccupancyGrid, class_importance
-from ..sampling.render_grid import RenderGrid, present_grid, read_fine, refined_grid
+from ..sampling.render_grid import (
+    FineDensity,
+    RenderGrid,
+    largest_factor,
+    met_cells,
+    present_grid,
+    read_fine,
+    refined_grid,
+    worth_reading,
+)
 from .kept_grid import KeptGrid
 
 # Factor (N,) of the density of samples, from what the field knows of them.
 Thin = Callable[[Geometry, Samples], torch.Tensor]
 ONE_PASS_SHARE = 0.67  # of visible samples: 3k + 1 against 3 forward costs, equal at k = 2/3 (see `render`)
-# Not tuned: the next two.
+# Not tuned: the next three.
+FEW = 0.05  # of the cells that a picture needs: so many are not worth another grid
 CAPACITY_FACTOR = 1.6  # entries for visible samples, as a multiple of how many there were lately
 LEAST_CAPACITY = 1 / 16  # of all samples, or nothing would be visible ever again after a while in which nothing was
 
@@ -98,6 +108,7 @@ class Model(nn.Module):
         self.labelled = 1.0  # share of the training pixels that have a label
         self.register_buffer("visible_share", torch.ones(()))
         self.visible_share: torch.Tensor
+        self._fine: FineDensity | None = None
         self._refined: RenderGrid | None = None
         self.kept_grid: KeptGrid | None = None  # where the finer grid of a finished field is kept
         # What is differentiated has a fixed capacity, so that the host need not wait for the number of samples; None:
@@ -145,26 +156,51 @@ class Model(nn.Module):
         return s.beta > 0 and (s.importance == "boundary" or (s.importance == "priority" and not flat))
 
     def refine(
-        self, pixels: float = math.inf, check: Callable[[], None] | None = None, everywhere: bool = False
+        self,
+        pixels: float = math.inf,
+        check: Callable[[], None] | None = None,
+        rays: Iterable[tuple[torch.Tensor, torch.Tensor]] | None = None,
+        everywhere: bool = False,
     ) -> None:
-        """Render from now on with a finer grid if it pays for so many pixels, or has been kept. Training leaves it behind:
-        for fields that are finished.
+        """Render from now on with a finer grid where it has been kept or pays for so many pixels. Training leaves it
+        behind: for fields that are finished.
 
-        `everywhere`: also where no training ray had weight, for those who ask which cells hide others; never kept.
+        `rays`: some of those of the pictures to come, as origins and directions (R, 3); only what they meet is read.
+        None: all cells where training rays had weight. `everywhere`: also the others, for those who ask which cells
+        hide others; never kept.
         """
-        c, kept = self.config.render, None if everywhere else self.kept_grid
-        if self._refined is not None or c.refine == 1:
+        occupancy = self.occupancy
+        factor = largest_factor(occupancy.config.resolution, self.config.render.refine)
+        if factor == 1:
             return
-        fine = kept.load(c.refine, self.device) if kept is not None else None
-        if fine is None:
-            blend = None if everywhere else self.field.blend
-            shown = None if blend is None else blend.shown(self.config.sampling.resolution)
-            fine = read_fine(self.occupancy, self.field.density, c.refine, pixels, shown, check)
-            if fine is None:
-                return
+        if everywhere:
+            cells = (occupancy.cells[:, 0] > 0).nonzero()[:, 0]
+            self._use(read_fine(occupancy, self.field.density, factor, cells, check))
+            return
+        if self._fine is None and self.kept_grid is not None:
+            kept = self.kept_grid.load(factor, self.device)
             if kept is not None:
-                kept.save(c.refine, fine)
-        self._refined = refined_grid(self.occupancy, fine, c.per_bin)
+                self._use(kept)
+        wanted = occupancy.cells[:, 0] > 0
+        shown = None if self.field.blend is None else self.field.blend.shown(occupancy.config.resolution)
+        for part in (shown, None if rays is None else met_cells(occupancy, rays)):
+            wanted = wanted if part is None else wanted & part
+        needed = int(wanted.sum())
+        if self._fine is not None:
+            wanted[self._fine.coarse.long()] = False
+        cells = wanted.nonzero()[:, 0]
+        enough = self._fine is not None and len(cells) <= FEW * needed
+        if enough or not worth_reading(len(cells), factor, pixels):
+            return
+        fine = read_fine(occupancy, self.field.density, factor, cells, check)
+        fine = fine if self._fine is None else self._fine.with_more(fine)
+        if self.kept_grid is not None:
+            self.kept_grid.save(factor, fine)
+        self._use(fine)
+
+    def _use(self, fine: FineDensity) -> None:
+        """Render with what was read in finer cells."""
+        self._fine, self._refined = fine, refined_grid(self.occupancy, fine, self.config.render.per_bin)
 
     @property
     def label_pull(self) -> float:

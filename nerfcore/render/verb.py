@@ -42,6 +42,7 @@ from .image import Frame, background_of, render_view
 from .model import Model
 from .pictures import colorize_depth, colorize_labels, depth_range
 from .run import RunInfo, load_info, load_trained
+from .sparse_rays import sparse_rays
 
 ORBIT_PIXELS = 800  # longest side of orbit frames unless a size is asked for
 # Not tuned:
@@ -78,7 +79,7 @@ def render(params: RenderParams, report: Reporter, shown: Model | BakedField | N
             (name, (camera.resized if photos else camera.reframed)(*params.size), pose)
             for name, camera, pose in cameras
         ]
-    pixels = sum(camera.width * camera.height for _, camera, _ in cameras)  # of all parts, which are to look alike
+    planned = cameras  # of all parts, which are to look alike
     cameras = _part(cameras, params.frame_range)
     kept = {} if params.frame_range else parts.rendered_parts(out, inputs, [name for name, _, _ in cameras])
     if kept:
@@ -86,7 +87,9 @@ def render(params: RenderParams, report: Reporter, shown: Model | BakedField | N
     todo = [camera for camera in cameras if camera[0] not in kept]
     report.stage("Preparing")
     if isinstance(shown, Model) and todo:
-        shown.refine(pixels, report.check)
+        pixels = sum(camera.width * camera.height for _, camera, _ in planned)
+        poses = box_poses([View(name, camera, pose, Path()) for name, camera, pose in planned], box.box_from_world)
+        shown.refine(pixels, report.check, sparse_rays([camera for _, camera, _ in planned], poses, shown.device))
     with disk_errors(out):
         out.mkdir(parents=True, exist_ok=True)
     colors = {c.id: c.color for c in scene.classes}

@@ -1,27 +1,31 @@
 """The grid that rays traverse when a trained field is rendered: the occupancy grid's occupied cells, cut finer and read anew.
 
 Fewer of its cells are occupied, and their densities are nearer to what a ray meets, so that a picture needs fewer samples.
-`read_fine` reads the field, which takes seconds; `refined_grid` makes the grid of it.
+`met_cells` tells which cells a picture needs; `read_fine` reads the field there, `refined_grid` makes the grid of it.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
 
 from ..kernels.cells import MOST_CELLS_A_SIDE
+from ..kernels.march import sample
 from ..kernels.runtime import run_parallel
 from ..kernels.traversal import MarchSettings, skip_distances
 from .occupancy import OccupancyGrid
 
-PROBES = 4  # points read in each fine cell; not tuned
+# One point is read in each of these octants of a fine cell: each half of it has two of them.
+OCTANTS = ((0, 0, 0), (1, 1, 0), (1, 0, 1), (0, 1, 1))
+PROBES = len(OCTANTS)
 SAVED = 8  # samples that a pixel needs less with it, about; not tuned
 LARGEST_HALF = 65504.0  # of float16
 CHUNK = 1 << 14
+OFFSETS, SPREAD = 1 << 16, 40503  # places within cells, and an odd number that scatters neighbours among them
+MET_SAMPLES, MET_PER_BIN = 16, 1.25  # of rays that ask for cells; not tuned
 
 
 @dataclass(frozen=True)
@@ -48,11 +52,34 @@ def largest_factor(resolution: int, factor: int) -> int:
 
 @dataclass(frozen=True)
 class FineDensity:
-    """What was read of the field in finer cells: `coarse` (C,) int32, the occupied cells that were cut, `density` (C,
+    """What was read of the field in finer cells: `coarse` (C,) int32 rising, the occupied cells that were cut, `density` (C,
     factor³) float16 per normalised unit length, 0 where a finer cell is empty; x runs slowest within a cell."""
 
     coarse: torch.Tensor
     density: torch.Tensor
+
+    def with_more(self, other: FineDensity) -> FineDensity:
+        """Both, which have no cell in common."""
+        coarse, order = torch.cat([self.coarse, other.coarse]).sort()
+        return FineDensity(coarse, torch.cat([self.density, other.density])[order])
+
+
+@torch.no_grad()
+def met_cells(occupancy: OccupancyGrid, rays: Iterable[tuple[torch.Tensor, torch.Tensor]]) -> torch.Tensor:
+    """Cells (resolution³,) bool in which rays, given as origins and directions (R, 3), have samples, and those beside them."""
+    n = occupancy.config.resolution
+    met = torch.zeros(n, n, n, device=occupancy.density.device)
+    grid = present_grid(occupancy, MET_PER_BIN)
+    for origins, directions in rays:
+        found = sample(origins, directions, grid.cells, grid.skip_distance, grid.settings, MET_SAMPLES)
+        x, y, z = (found.points * n).long().clamp(0, n - 1).unbind(1)
+        met[z, y, x] = 1
+    return torch.nn.functional.max_pool3d(met[None], 3, 1, 1).view(-1) > 0
+
+
+def worth_reading(cells: int, factor: int, pixels: float) -> bool:
+    """Whether cutting so many cells into factor³ takes less time than it saves in rendering so many pixels."""
+    return cells * factor**3 * PROBES <= pixels * SAVED
 
 
 @torch.no_grad()
@@ -60,25 +87,20 @@ def read_fine(
     occupancy: OccupancyGrid,
     density: Callable[[torch.Tensor], torch.Tensor],
     factor: int,
-    pixels: float = math.inf,
-    shown: torch.Tensor | None = None,
+    cells: torch.Tensor,
     check: Callable[[], None] | None = None,
-) -> FineDensity | None:
-    """Every occupied cell cut into factor³, of which those stay occupied where `density` (points (N, 3) in grid coordinates →
-    (N,), per normalised unit length) is not negligible at one of a few random points; their mean is the density.
+) -> FineDensity:
+    """Cells (C,) int64 cut into factor³, of which those stay occupied where `density` (points (N, 3) in grid coordinates →
+    (N,), per normalised unit length) is not negligible at one of a few points; their mean is the density.
 
-    None where there is nothing to cut, or where reading takes longer than it saves in rendering so many `pixels`.
-    `shown` (resolution³,) bool: only these cells are cut. `check` is called often, on the CPU by several threads, and may
-    raise to stop.
+    What is found in a cell does not depend on which others are read. `check` is called often, on the CPU by several
+    threads, and may raise to stop.
     """
-    factor = largest_factor(occupancy.config.resolution, factor)
-    occupied = occupancy.cells[:, 0] > 0
-    coarse = (occupied if shown is None else occupied & shown).nonzero()[:, 0]
-    if factor == 1 or len(coarse) * factor**3 * PROBES > pixels * SAVED:
-        return None
-    fine, side = _parts(coarse, occupancy.config.resolution, factor), occupancy.config.resolution * factor
-    generator = torch.Generator(coarse.device).manual_seed(0)  # the same picture every time
-    largest, mean = (torch.zeros(len(fine), device=coarse.device) for _ in range(2))
+    fine, side = _parts(cells, occupancy.config.resolution, factor), occupancy.config.resolution * factor
+    generator = torch.Generator().manual_seed(0)
+    offsets = torch.rand(OFFSETS, 3, generator=generator).to(cells.device)
+    row = (fine[:, 2] * side + fine[:, 1]) * side + fine[:, 0]
+    largest, mean = (torch.zeros(len(fine), device=cells.device) for _ in range(2))
 
     @torch.no_grad()
     def read(points: torch.Tensor) -> torch.Tensor:
@@ -86,15 +108,16 @@ def read_fine(
             check()
         return density(points)
 
-    for _ in range(PROBES):
-        points = (fine + torch.rand(fine.shape, device=coarse.device, generator=generator)) / side
-        fresh = torch.cat(run_parallel([partial(read, some) for some in points.split(CHUNK)], coarse.device))
+    for probe, octant in enumerate(OCTANTS):
+        within = (offsets[(row * PROBES + probe) * SPREAD % OFFSETS] + torch.tensor(octant, device=cells.device)) / 2
+        points = (fine + within) / side
+        fresh = torch.cat(run_parallel([partial(read, some) for some in points.split(CHUNK)], cells.device))
         mean += fresh / PROBES
         torch.maximum(largest, fresh, out=largest)
     step = occupancy.step / factor
     mean = mean.clamp(1e-3, min(occupancy.config.optical_depth / step, LARGEST_HALF))
     kept = torch.where(largest * step > occupancy.config.threshold, mean, 0.0)
-    return FineDensity(coarse.int(), kept.view(len(coarse), factor**3).half())
+    return FineDensity(cells.int(), kept.view(len(cells), factor**3).half())
 
 
 def _parts(coarse: torch.Tensor, n: int, factor: int) -> torch.Tensor:

@@ -10,7 +10,7 @@ import torch
 from fieldwork.nerfcore.bench.baselines import mip_nerf, nerf, nerf_w, network
 from fieldwork.nerfcore.bench.baselines.hash_grid import HashGrid, hash_levels
 from fieldwork.nerfcore.bench.baselines.hierarchical import sample_pdf, stratified, uniforms
-from fieldwork.nerfcore.bench.baselines.instant_ngp import MOST_SAMPLES, STEP, InstantNGP
+from fieldwork.nerfcore.bench.baselines.instant_ngp import LEAST_TRANSMITTANCE, MOST_SAMPLES, STEP, InstantNGP
 from fieldwork.nerfcore.bench.baselines.method import (
     CONE,
     Baseline,
@@ -22,11 +22,13 @@ from fieldwork.nerfcore.bench.baselines.method import (
 )
 from fieldwork.nerfcore.bench.baselines.mip_nerf import cone_gaussians, integrated_encoding, widened
 from fieldwork.nerfcore.bench.baselines.nerf import COARSE, FINE
+from fieldwork.nerfcore.bench.baselines.ngp_occupancy import NGPOccupancy
 from fieldwork.nerfcore.bench.baselines.registry import BASELINES, make_baseline
 from fieldwork.nerfcore.bench.baselines.semantic_nerf import logits_loss
 from fieldwork.nerfcore.data.load import load_scene
 from fieldwork.nerfcore.data.pixels import VOID, PixelStore
 from fieldwork.nerfcore.errors import SettingError
+from fieldwork.nerfcore.kernels.composite import render_weights, sums_in_front
 from fieldwork.nerfcore.kernels.device import using_kernels
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.tests.nerfcore.support.ball import ball_project
@@ -185,7 +187,6 @@ def test_the_march_takes_one_sample_in_every_occupied_step() -> None:
     method = InstantNGP(SETUP)
     method.occupancy.density.fill_(0)
     method.occupancy.density.view(128, 128, 128)[64, 64, 32:96] = 1000
-    method.occupancy.mean.copy_(method.occupancy.density)
     method.occupancy.rebuild()
     cell = 2 / 128
     rays = rays_from([-3.0, cell / 2, cell / 2], [1.0, 0.0, 0.0])
@@ -193,6 +194,57 @@ def test_the_march_takes_one_sample_in_every_occupied_step() -> None:
     occupied = float((method.occupancy.cells[:, 0].view(128, 128, 128)[64, 64] > 0).sum()) * cell
     assert len(samples) == pytest.approx(min(occupied / STEP, MOST_SAMPLES), abs=2)
     assert samples.deltas.tolist() == pytest.approx([STEP] * len(samples), rel=1e-3)
+
+
+def test_samples_behind_what_a_ray_cannot_pass_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    method = InstantNGP(SETUP)
+    method.occupancy.density.fill_(1000)
+    method.occupancy.rebuild()
+    origins = torch.tensor([[-3.0, 0.1, 0.1], [-3.0, 0.1, 0.1], [-3.0, 5.0, 0.1]])
+    directions = torch.nn.functional.normalize(torch.tensor([[1.0, 0, 0], [1.0, 0.2, 0], [1.0, 0, 0]]), dim=1)
+    samples = method.march(Rays(origins, directions, torch.zeros(3)), None)
+    density = torch.where(samples.points[:, 0] > 0.6, 500.0, 2.0)
+    monkeypatch.setattr(method, "density", lambda points: torch.where(points[:, 0] > 0.6, 500.0, 2.0))
+    weights = render_weights(density, samples.deltas, samples.packed_info)
+    transmittance = 1 - sums_in_front(weights, samples.packed_info)
+    visible = method.visible(samples)
+    assert 0 < len(visible) < 0.7 * len(samples)
+    assert torch.equal(visible.t, samples.t[transmittance > LEAST_TRANSMITTANCE])
+    assert visible.packed_info.counts[2] == 0
+    assert int(visible.packed_info.counts.sum()) == len(visible)
+
+
+def test_every_cell_fades_and_is_read_again() -> None:
+    grid = NGPOccupancy(InstantNGP(SETUP).occupancy.config, False, 1 << 18)
+    generator = torch.Generator().manual_seed(0)
+
+    def right_half(points: torch.Tensor) -> torch.Tensor:
+        return torch.where(points[:, 0] > 0.5, 100.0, 0.0)
+
+    grid.refresh(0, right_half, generator)
+    assert torch.equal(grid.cells[:, 0].view(128, 128, 128)[0, 0] > 0, torch.arange(128) >= 64)
+    for update in range(75):  # 100 · 0.95^75 is below the threshold, 100 · 0.95^60 is not
+        if update == 60:
+            assert grid.occupied_share() > 0.99
+        grid.refresh(16, lambda points: 100 - right_half(points), generator)
+    assert torch.equal(grid.cells[:, 0].view(128, 128, 128)[0, 0] > 0, torch.arange(128) < 64)
+
+
+def test_with_few_samples_a_step_few_cells_are_read_and_the_others_stay_occupied() -> None:
+    grid = NGPOccupancy(InstantNGP(SETUP).occupancy.config, False, 1 << 14)
+    generator = torch.Generator().manual_seed(0)
+    reads = []
+
+    def empty(points: torch.Tensor) -> torch.Tensor:
+        reads.append(len(points))
+        return torch.zeros(len(points))
+
+    grid.refresh(0, empty, generator)
+    assert sum(reads) == 128**3 // 16
+    assert grid.occupied_share() == pytest.approx(math.exp(-1 / 16), abs=1e-3)
+    reads.clear()
+    grid.refresh(256, empty, generator)
+    assert sum(reads) == 128**3 // 32
 
 
 def test_composited_logits_are_the_weighted_sum_of_those_of_samples(store: PixelStore) -> None:

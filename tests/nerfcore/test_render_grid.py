@@ -19,9 +19,11 @@ from fieldwork.nerfcore.sampling.render_grid import (
     SAVED,
     RenderGrid,
     largest_factor,
+    met_cells,
     present_grid,
     read_fine,
     refined_grid,
+    worth_reading,
 )
 
 N = 32
@@ -45,11 +47,14 @@ def shell_grid() -> OccupancyGrid:
     return grid
 
 
-def finer(factor: int, shown: torch.Tensor | None = None) -> RenderGrid:
+def occupied(grid: OccupancyGrid, among: torch.Tensor | None = None) -> torch.Tensor:
+    cells = grid.cells[:, 0] > 0
+    return (cells if among is None else cells & among).nonzero()[:, 0]
+
+
+def finer(factor: int, among: torch.Tensor | None = None) -> RenderGrid:
     coarse = shell_grid()
-    fine = read_fine(coarse, shell, factor, shown=shown)
-    assert fine is not None
-    return refined_grid(coarse, fine, 1.0)
+    return refined_grid(coarse, read_fine(coarse, shell, factor, occupied(coarse, among)), 1.0)
 
 
 def parallel_rays() -> tuple[torch.Tensor, torch.Tensor]:
@@ -64,11 +69,11 @@ def test_the_refined_grid_closes_what_is_empty_and_keeps_every_surface() -> None
     fine = finer(2)
     assert fine.settings.resolution == 2 * N
     assert fine.settings.step == pytest.approx(coarse.step / 2)
-    occupied = fine.cells[:, 0] > 0
-    assert float(occupied.float().mean()) < 0.6 * coarse.occupied_share()
+    inside_of = fine.cells[:, 0] > 0
+    assert float(inside_of.float().mean()) < 0.6 * coarse.occupied_share()
     points = torch.nn.functional.normalize(torch.randn(2000, 3, generator=torch.Generator().manual_seed(1)), dim=1) / 4
     x, y, z = ((points + 0.5) * 2 * N).long().unbind(1)
-    assert float(occupied[(z * 2 * N + y) * 2 * N + x].float().mean()) > 0.9
+    assert float(inside_of[(z * 2 * N + y) * 2 * N + x].float().mean()) > 0.9
     origins, directions = parallel_rays()
     found = sample(origins, directions, fine.cells, fine.skip_distance, fine.settings, 16)
     met = found.packed_info.counts > 0
@@ -82,34 +87,50 @@ def test_the_refined_grid_closes_what_is_empty_and_keeps_every_surface() -> None
 
 
 def test_cells_are_not_refined_where_it_does_not_pay() -> None:
+    pays = 1000 * 2**3 * PROBES / SAVED
+    assert not worth_reading(1000, 2, 0.9 * pays)
+    assert worth_reading(1000, 2, 1.1 * pays)
+
+
+def test_what_is_found_in_a_cell_does_not_depend_on_which_others_are_read() -> None:
     coarse = shell_grid()
-    cells = int((coarse.cells[:, 0] > 0).sum())
-    pays = cells * 2**3 * PROBES / SAVED
-    assert read_fine(coarse, shell, 2, 0.9 * pays) is None
-    assert read_fine(coarse, shell, 2, 1.1 * pays) is not None
-    assert read_fine(coarse, shell, 1) is None
+    cells = occupied(coarse)
+    whole = read_fine(coarse, shell, 2, cells)
+    chosen = torch.rand(len(cells), generator=torch.Generator().manual_seed(3)) < 0.3
+    one, other = (read_fine(coarse, shell, 2, cells[which]) for which in (chosen, ~chosen))
+    assert 0 < len(one.coarse) < len(whole.coarse)
+    together = one.with_more(other)
+    assert torch.equal(together.coarse, whole.coarse)
+    assert torch.equal(together.density, whole.density)
 
 
-def test_cells_that_no_photo_shows_are_not_read_and_keep_their_density() -> None:
+def test_rays_ask_for_the_cells_they_meet_and_those_beside_them() -> None:
+    coarse = shell_grid()
+    origins = torch.tensor([[0.01, 0.01, -2.0], [0.9, 0.9, -2.0]])
+    directions = torch.tensor([[0.0, 0.0, 1.0]]).expand(2, 3).contiguous()
+    met = met_cells(coarse, [(origins, directions)]).view(N, N, N)
+    _, y, x = met.nonzero().unbind(1)
+    assert set(x.tolist()) | set(y.tolist()) == {15, 16, 17}  # the second ray meets nothing
+    front = round((0.5 - 0.25) * N)
+    assert bool(met[front - 1 : front + 1, 16, 16].any())
+    assert not bool(met[: front - 3].any())
+
+    none = met_cells(coarse, [(origins[1:], directions[1:])])
+    assert not bool(none.any())
+
+
+def test_cells_that_are_not_read_keep_their_density() -> None:
     coarse = shell_grid()
     shown = (torch.arange(N**3) % N) < N // 2  # the half of small x
     half = finer(2, shown)
     side = 2 * N
     x = torch.arange(side**3) % side
-    occupied = int((coarse.cells[shown, 0] > 0).sum()) * 2**3
-    assert 0 < int((half.cells[x < N, 0] > 0).sum()) < 0.6 * occupied
+    parts = len(occupied(coarse, shown)) * 2**3
+    assert 0 < int((half.cells[x < N, 0] > 0).sum()) < 0.6 * parts
     kept = half.cells[x >= N].view(side, side, N, 2)
     given = coarse.cells.view(N, N, N, 2)[:, :, N // 2 :]
     expected = given.repeat_interleave(2, 0).repeat_interleave(2, 1).repeat_interleave(2, 2)
     assert torch.equal(kept, expected)
-    read: list[int] = []
-
-    def counting(points: torch.Tensor) -> torch.Tensor:
-        read.append(int((points[:, 0] >= 0.5).sum()))
-        return shell(points)
-
-    assert read_fine(coarse, counting, 2, shown=shown) is not None
-    assert sum(read) == 0
 
 
 def test_rays_through_more_open_cells_get_more_samples() -> None:
@@ -154,7 +175,7 @@ def test_reading_the_finer_cells_stops_as_soon_as_asked(monkeypatch: pytest.Monk
             raise Cancelled
 
     with pytest.raises(Cancelled):
-        read_fine(shell_grid(), density, 2, check=check)
+        read_fine(shell_grid(), density, 2, occupied(shell_grid()), check)
     assert len(read) <= worker_count()  # what was under way already
 
 
@@ -166,8 +187,3 @@ def test_grids_are_not_made_finer_than_kernels_can_number_their_cells() -> None:
     for resolution in range(8, 513, 4):
         for factor in (1, 2, 4):
             assert resolution * largest_factor(resolution, factor) <= MOST_CELLS_A_SIDE
-
-
-def test_a_grid_is_refined_as_far_as_its_cells_can_be_numbered(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(render_grid, "MOST_CELLS_A_SIDE", 3 * N)
-    assert finer(4).settings.resolution == 2 * N

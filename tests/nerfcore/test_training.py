@@ -192,7 +192,7 @@ def test_a_render_is_cancelled_within_a_picture(trained: Path, tmp_path: Path, m
             super().progress(fraction, message)
             self.cancel()
 
-    monkeypatch.setattr(Model, "refine", lambda model, pixels, check=None: asked.append(check))
+    monkeypatch.setattr(Model, "refine", lambda model, pixels, check, rays: asked.append(check))
     report = StopsInThePicture()
     with pytest.raises(Cancelled):
         run_verb("render", RenderParams(project=trained, out=tmp_path, orbit=1, size=(32, 32)), report)

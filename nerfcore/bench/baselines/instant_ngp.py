@@ -1,11 +1,14 @@
 """Instant-NGP: a hash grid, two small networks, samples at fixed steps in occupied cells.
 
 Source: Müller et al., “Instant Neural Graphics Primitives with a Multiresolution Hash Encoding”, 2022, sections 4, 5.4
-and appendix E. Differences: the occupancy grid is ours and updates itself from fewer points a time, which is cheaper;
-space beyond the cube is contracted instead of cascaded; the number of samples a step is the protocol's.
+and appendices C and E. Differences: space beyond the cube is contracted instead of cascaded; the number of samples a step
+is the protocol's.
 """
 
 from __future__ import annotations
+
+import math
+from dataclasses import replace
 
 import torch
 from torch import nn
@@ -16,10 +19,10 @@ from ...field.encoding import spherical_harmonics
 from ...field.mlp import MLP, compute_dtype
 from ...kernels.composite import render_weights, weighted_sum
 from ...kernels.march import Samples, sample
-from ...sampling.occupancy import OccupancyGrid
 from ...train.schedule import bias_correction
 from .hash_grid import HashGrid, hash_levels
 from .method import Baseline, Rays, Rendered, Setup
+from .ngp_occupancy import UPDATE_EVERY, NGPOccupancy
 
 GEOMETRY, WIDTH = 16, 64
 CELLS = 128
@@ -28,11 +31,14 @@ MOST_SAMPLES = 1024
 RATE, BETAS, EPSILON = 1e-2, (0.9, 0.99), 1e-15
 NETWORK_DECAY = 1e-6
 DECAY, MILESTONES = 0.33, (20 / 35, 30 / 35)  # at 20 000 and 30 000 of 35 000 steps
-SAMPLES_PER_RAY = 16  # of the first steps
+SAMPLES_PER_RAY = 16  # times the protocol's rays: visible samples of a step
+FIRST_SAMPLES_PER_RAY = 256  # expected before anything is learnt
+LEAST_TRANSMITTANCE = 1e-4
+PIECE = 32  # samples of a ray read at once before it is asked whether it goes on
 
 
 class InstantNGP(Baseline):
-    """`rays` of the setup: rays of the first step; later steps have as many as give as many samples."""
+    """`rays` of the setup, times 16: visible samples of a step; a step has as many rays as give them."""
 
     chunk = 8192
 
@@ -48,9 +54,10 @@ class InstantNGP(Baseline):
             importance="none",
             bins_per_cell=(4.0 if setup.contracted else 2.0) / (CELLS * STEP),
         )
-        self.occupancy = OccupancyGrid(settings, setup.contracted)
-        self.to(setup.device)
         self.samples = setup.rays * SAMPLES_PER_RAY
+        self.rays = max(self.samples // FIRST_SAMPLES_PER_RAY, 16)
+        self.occupancy = NGPOccupancy(settings, setup.contracted, self.samples)
+        self.to(setup.device)
         self.optimizer = torch.optim.Adam(self.network_parameters(), RATE, BETAS, EPSILON, weight_decay=NETWORK_DECAY)
 
     def network_parameters(self) -> list[nn.Parameter]:
@@ -70,15 +77,42 @@ class InstantNGP(Baseline):
     def march(self, rays: Rays, jitter: torch.Tensor | None) -> Samples:
         """One sample in every occupied step of the rays."""
         grid = self.occupancy
-        settings = grid.march_settings()
-        settings = type(settings)(**{**vars(settings), "per_bin": 1.0})
+        settings = replace(grid.march_settings(), per_bin=1.0)
         origins, directions = rays.origins.contiguous(), rays.directions.contiguous()
         return sample(origins, directions, grid.cells, grid.skip_distance, settings, MOST_SAMPLES, jitter)
 
-    def composite(
-        self, rays: Rays, samples: Samples, semantics: bool
-    ) -> tuple[Rendered, torch.Tensor, torch.Tensor | None]:
-        """What the rays show; densities (N,) of the samples; composited logits (R, K) or None."""
+    @torch.no_grad()
+    def visible(self, samples: Samples) -> Samples:
+        """The samples up to where a ray's transmittance falls below `LEAST_TRANSMITTANCE`; what lies behind is not read."""
+        info, least = samples.packed_info, -math.log(LEAST_TRANSMITTANCE)
+        kept = torch.zeros(len(samples), dtype=torch.bool, device=samples.t.device)
+        rays = torch.arange(len(info.counts), device=kept.device)
+        depth = torch.zeros(len(rays), device=kept.device)
+        along = torch.arange(PIECE, device=kept.device)
+        while True:
+            rays = rays[(info.counts[rays] > along[0]) & (depth[rays] < least)]
+            if len(rays) == 0:
+                break
+            exists = along < info.counts[rays, None]
+            indices = (info.starts[rays, None] + along)[exists]
+            optical = torch.zeros(exists.shape, device=kept.device)
+            with self.network():
+                optical[exists] = self.density(samples.points[indices]) * samples.deltas[indices]
+            behind = depth[rays, None] + optical.cumsum(1)
+            kept[indices] = (behind - optical)[exists] < least
+            depth[rays] = behind[:, -1]
+            along = along + PIECE
+        indices, packed = info.subset(kept)
+        return replace(
+            samples,
+            points=samples.points[indices],
+            t=samples.t[indices],
+            deltas=samples.deltas[indices],
+            packed_info=packed,
+        )
+
+    def composite(self, rays: Rays, samples: Samples, semantics: bool) -> tuple[Rendered, torch.Tensor | None]:
+        """What the rays show; composited logits (R, K) or None."""
         info = samples.packed_info
         with self.network():
             raw = self.raw(samples.points)
@@ -90,7 +124,7 @@ class InstantNGP(Baseline):
         ones = torch.ones_like(samples.t)
         summed = weighted_sum(torch.cat([color, ones[:, None], samples.t[:, None]], 1), weights, info)
         labelled = None if logits is None else weighted_sum(logits, weights, info)
-        return Rendered(summed[:, :3], summed[:, 3], summed[:, 4]), density.detach(), labelled
+        return Rendered(summed[:, :3], summed[:, 3], summed[:, 4]), labelled
 
     def logits(self, points: torch.Tensor, raw: torch.Tensor) -> torch.Tensor | None:
         """Logits (N, K) of samples; None: this method has no classes."""
@@ -100,16 +134,15 @@ class InstantNGP(Baseline):
         return 0.0
 
     def train_step(self, batch: Batch, rays: Rays, progress: float, generator: torch.Generator) -> float:
-        grid = self.occupancy
-        if self.steps % grid.config.update_every == 0:
-            grid.update(self.steps, self.density, generator=generator)
+        if self.steps % UPDATE_EVERY == 0:
+            self.occupancy.refresh(self.steps, self.density, generator)
         jitter = torch.rand(len(rays), device=self.setup.device, generator=generator)
-        samples = self.march(rays, jitter)
+        samples = self.visible(self.march(rays, jitter))
         self.steps += 1
-        self.adapt(len(rays), len(samples))
         if len(samples) == 0:
             return float(((self.setup.background - self.target(batch)) ** 2).mean())
-        rendered, density, logits = self.composite(rays, samples, True)
+        self.adapt(len(rays), len(samples))
+        rendered, logits = self.composite(rays, samples, True)
         mse = ((self.behind(rendered.color, rendered.opacity) - self.target(batch)) ** 2).mean()
         self.optimizer.zero_grad(set_to_none=True)
         (mse + self.label_loss(logits, batch)).backward()
@@ -118,7 +151,6 @@ class InstantNGP(Baseline):
             group["lr"] = RATE * factor
         self.optimizer.step()
         self.grid.step(RATE * factor * bias_correction(self.steps, *BETAS), BETAS, EPSILON)
-        grid.observe(samples.points, density, self.steps < grid.config.warmup)
         return mse.item()
 
     def adapt(self, rays: int, samples: int) -> None:
@@ -128,7 +160,7 @@ class InstantNGP(Baseline):
 
     @torch.no_grad()
     def render(self, rays: Rays, semantics: bool = True) -> Rendered:
-        rendered, _, logits = self.composite(rays, self.march(rays, None), semantics)
+        rendered, logits = self.composite(rays, self.visible(self.march(rays, None)), semantics)
         if logits is None:
             return rendered
         probabilities = logits.softmax(1) * rendered.opacity[:, None]

@@ -23,7 +23,7 @@ from ..kernels.depth_arrays import MapArrays
 from ..kernels.device import use_device
 from ..mesh.appearance import Photos
 from ..mesh.build import Built, agreed_maps, read_photos, vertex_colors
-from ..mesh.clean import FEWEST_VIEWS, compact, cross, seen_by, unit
+from ..mesh.clean import compact, shown
 from ..mesh.decimate import decimate_patches
 from ..mesh.depth_maps import MOST_VIEWS, flat_views, map_size, spread_views
 from ..mesh.extract import extract
@@ -168,8 +168,7 @@ def core_surface(
     vertices, faces = extract(bricks, report)
     if len(faces):
         tolerance = TRUNCATION * region.voxel
-        views = seen_by(vertices[faces].mean(1), unit(cross(vertices, faces)), maps, tolerance, report)
-        vertices, faces = compact(vertices, faces[views >= FEWEST_VIEWS])
+        vertices, faces = compact(vertices, faces[shown(vertices, faces, maps, tolerance, report)])
     place = (vertices[faces].mean(1) - origin) / brick
     shared = np.stack([low > 0, high < counts], 1)
     inside = ((place >= np.where(shared[:, 0], low, -np.inf)) & (place < np.where(shared[:, 1], high, np.inf))).all(1)

@@ -285,3 +285,46 @@ def sight(points: torch.Tensor, normals: torch.Tensor, maps: MapArrays, toleranc
     inputs = [array(points.contiguous(), wp.vec3), array(normals.contiguous(), wp.vec3)]
     launch(sight_kernel, len(points), [*inputs, map_struct(maps), tolerance, array(out)], points.device)
     return out
+
+
+@wp.kernel(module="fieldwork_surface")
+def slopes_kernel(
+    points: wp.array(dtype=wp.vec3),
+    normals: wp.array(dtype=wp.vec3),
+    maps: Maps,
+    tolerance: float,
+    turned: float,
+    out: wp.array(dtype=wp.vec2),
+    offset: int,
+):
+    i = wp.tid() + offset
+    p = points[i]
+    n = normals[i]
+    own = float(0.0)
+    other = float(0.0)
+    for v in range(maps.first.shape[0]):
+        q, pixel, inside = seen_at(maps, v, p)
+        if inside:
+            depth, place = read_depth(maps, v, pixel, GAP)
+            if depth > 0.0 and wp.abs(q[2] - depth) < tolerance:
+                facing = wp.clamp(-wp.dot(n, wp.transpose(maps.rotation[v]) * q) / wp.length(q), -1.0, 1.0)
+                shown = wp.acos(wp.min(maps.cosine[place], 1.0))
+                if facing > 0.0 and wp.abs(wp.acos(facing) - shown) <= turned:
+                    own += 1.0
+                else:
+                    other += 1.0
+    out[i] = wp.vec2(own, other)
+
+
+def slopes(
+    points: torch.Tensor, normals: torch.Tensor, maps: MapArrays, tolerance: float, turned: float
+) -> torch.Tensor:
+    """How many views show something within `tolerance` of surface points (N, 3) that is as steep to their ray as the point
+    with its normal (N, 3), to `turned` (radians), and how many something that is not: (N, 2)."""
+    init()
+    out = torch.empty(len(points), 2, device=points.device)
+    inputs = [array(points.contiguous(), wp.vec3), array(normals.contiguous(), wp.vec3)]
+    launch(
+        slopes_kernel, len(points), [*inputs, map_struct(maps), tolerance, turned, array(out, wp.vec2)], points.device
+    )
+    return out

@@ -6,10 +6,12 @@ import numpy as np
 import torch
 
 from ..kernels.depth_arrays import MapArrays
-from ..kernels.surface import sight
+from ..kernels.surface import sight, slopes
 from ..progress import Reporter
 
 FEWEST_VIEWS = 2
+TURNED = np.radians(35)  # by which a face may be steeper or flatter than what a view shows there
+AROUND = 6  # rings of faces over which views are averaged: single faces have noisy normals
 SCRAP = 1e-3  # of the area
 LONGEST_LOOP = 30  # edges of a hole that is filled
 CHUNK = 1 << 16
@@ -42,15 +44,37 @@ def seen_by(points: np.ndarray, normals: np.ndarray, maps: MapArrays, tolerance:
 def clean(
     vertices: np.ndarray, faces: np.ndarray, maps: MapArrays, tolerance: float, report: Reporter
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices, triangles, and which triangles (F,) bool fill a hole: without faces that fewer than two views see and
+    """Vertices, triangles, and which triangles (F,) bool fill a hole: without faces that views do not show (`shown`) and
     parts below a thousandth of the area; holes of at most 30 edges filled."""
-    views = seen_by(vertices[faces].mean(1), unit(cross(vertices, faces)), maps, tolerance, report)
-    faces = faces[views >= FEWEST_VIEWS]
-    faces = drop_scraps(vertices, faces)
+    faces = drop_scraps(vertices, faces[shown(vertices, faces, maps, tolerance, report)])
     report.check()
     vertices, faces, filled = fill_holes(vertices, faces)
     vertices, faces = compact(vertices, faces)
     return vertices, faces, filled
+
+
+def shown(vertices: np.ndarray, faces: np.ndarray, maps: MapArrays, tolerance: float, report: Reporter) -> np.ndarray:
+    """Which triangles (F,) bool at least two views see, less what spans outlines: where a view shows something of another
+    slope, and fewer than two show something as steep as the triangle. Between the edge of a thing and the wall behind it
+    there is nothing, but distances fused from both have a surface there, in thin strands beside the thing."""
+    middle, normals = vertices[faces].mean(1), unit(cross(vertices, faces))
+    seen = seen_by(middle, normals, maps, tolerance, report) >= FEWEST_VIEWS
+    device, counts = maps.depth.device, [np.zeros((0, 2))]
+    for p, n in zip(*(torch.from_numpy(np.asarray(a, np.float32)).split(CHUNK) for a in (middle, normals))):
+        report.check()
+        counts.append(slopes(p.to(device), n.to(device), maps, tolerance, TURNED).cpu().numpy())
+    own, other = (mean_around(faces, count, len(vertices), AROUND) for count in np.concatenate(counts).T)
+    return seen & ~((own < FEWEST_VIEWS) & (other >= 1))
+
+
+def mean_around(faces: np.ndarray, values: np.ndarray, count: int, rings: int) -> np.ndarray:
+    """Values (F,) of triangles, each the mean of those of its `count` vertices, and these of all their triangles, `rings`
+    times."""
+    corner = faces.reshape(-1)
+    amount = np.maximum(np.bincount(corner, minlength=count), 1)
+    for _ in range(rings):
+        values = (np.bincount(corner, np.repeat(values, 3), count) / amount)[faces].mean(1)
+    return values
 
 
 def drop_scraps(vertices: np.ndarray, faces: np.ndarray, share: float = SCRAP) -> np.ndarray:

@@ -97,10 +97,7 @@ def in_blocks(each: list[MapArrays], plan: Plan, cells: int = CELLS) -> tuple[li
 def in_one(each: list[MapArrays], plan: Plan, cells: int = CELLS) -> Surface:
     region, maps = shared_region(None, plan, sights_in(each, plan), cells), joined_maps(each)
     vertices, faces = extract(fuse_maps(maps, region, Reporter()), Reporter())
-    views = clean.seen_by(
-        vertices[faces].mean(1), clean.unit(clean.cross(vertices, faces)), maps, 4 * region.voxel, Reporter()
-    )
-    vertices, faces = clean.compact(vertices, faces[views >= clean.FEWEST_VIEWS])
+    vertices, faces = clean.compact(vertices, faces[clean.shown(vertices, faces, maps, 4 * region.voxel, Reporter())])
     return joined([Part(classed(vertices, faces), np.zeros((0, 2)), region.voxel)])
 
 

@@ -18,7 +18,7 @@ from fieldwork.nerfcore.blocks.sights import load_sights
 from fieldwork.nerfcore.blocks.surface import MAPS, SIGHTS, Part, load_part, shared_region
 from fieldwork.nerfcore.data.load import load_scene
 from fieldwork.nerfcore.errors import SettingError
-from fieldwork.nerfcore.mesh.clean import FEWEST_VIEWS, border_edges, compact, cross, seen_by, unit
+from fieldwork.nerfcore.mesh.clean import border_edges, compact, shown
 from fieldwork.nerfcore.mesh.extract import extract
 from fieldwork.nerfcore.mesh.fusion import fuse_maps
 from fieldwork.nerfcore.mesh.instances import read_instances
@@ -58,8 +58,7 @@ def in_one_piece(project: Path, plan: Plan) -> Surface:
     sights = [load_sights(run_folder(block_folder(project, b), "main") / SIGHTS) for b in plan.blocks]
     region = shared_region(BOUNDS, plan, sights, 48)
     vertices, faces = extract(fuse_maps(maps, region, Reporter()), Reporter())
-    views = seen_by(vertices[faces].mean(1), unit(cross(vertices, faces)), maps, 4 * region.voxel, Reporter())
-    vertices, faces = compact(vertices, faces[views >= FEWEST_VIEWS])
+    vertices, faces = compact(vertices, faces[shown(vertices, faces, maps, 4 * region.voxel, Reporter())])
     nothing = np.zeros(len(vertices), np.int32)
     surface = Surface(
         vertices.astype(np.float32),

@@ -140,6 +140,15 @@ def test_views_see_points_as_well_as_their_reference_says(device: str, rough: Ma
     assert float(same.float().mean()) > 0.999
 
 
+@pytest.mark.parametrize("device", WARP_DEVICES)
+def test_slopes_are_compared_as_their_reference_says(device: str, rough: MapArrays) -> None:
+    points, directions = on_ball(4000)
+    ours = surface.slopes(points.to(device), directions.to(device), on(device, rough), 0.03, 0.3).cpu()
+    expected = surface_reference.slopes(points, directions, rough, 0.03, 0.3)
+    assert (expected.mean(0) > 0.2).all()
+    assert float((ours == expected).float().mean()) > 0.995
+
+
 @pytest.fixture(scope="module")
 def painted() -> tuple[MapArrays, np.ndarray, np.ndarray]:
     """A painted ball whose depths are up to 1.5 % off: maps, photos (P,) and normals (H·W, 3) of the first view."""

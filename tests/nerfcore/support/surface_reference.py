@@ -134,3 +134,23 @@ def sight(points: torch.Tensor, normals: torch.Tensor, maps: MapArrays, toleranc
         shown = inside & (depth > 0) & (facing > 0) & ((q[:, 2] - depth).abs() < tolerance)
         columns.append(torch.where(shown, facing * (maps.lens[view, 0] / q[:, 2]) ** 2, 0.0))
     return torch.stack(columns, 1)
+
+
+def slopes(
+    points: torch.Tensor, normals: torch.Tensor, maps: MapArrays, tolerance: float, turned: float
+) -> torch.Tensor:
+    """As `surface.slopes`."""
+    counts = torch.zeros(len(points), 2)
+    for view in range(len(maps)):
+        q = camera_axes(maps, view, points)
+        x, y, inside = pixels_of(maps, view, q)
+        depth = read_depth(maps, view, x, y, LOOKED_UP)
+        center = -maps.translation[view] @ maps.rotation[view]
+        facing = (normals * torch.nn.functional.normalize(center - points, dim=1)).sum(1).clamp(-1, 1)
+        width, height = maps.size[view].tolist()
+        column, row = x.nan_to_num().floor().clamp(0, width - 1), y.nan_to_num().floor().clamp(0, height - 1)
+        cosine = maps.cosine[(maps.first[view] + row * width + column).long()]
+        near = inside & (depth > 0) & ((q[:, 2] - depth).abs() < tolerance)
+        own = near & (facing > 0) & ((facing.acos() - cosine.clamp(max=1).acos()).abs() <= turned)
+        counts += torch.stack([own, near & ~own], 1)
+    return counts

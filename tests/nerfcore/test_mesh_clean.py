@@ -1,0 +1,43 @@
+"""What a fused surface keeps of its triangles."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+import trimesh
+from fieldwork.nerfcore.mesh import depth_maps
+from fieldwork.nerfcore.mesh.clean import FEWEST_VIEWS, cross, mean_around, seen_by, shown, unit
+from fieldwork.nerfcore.progress import Reporter
+from fieldwork.tests.nerfcore.support.depth_views import box, maps_of, orbit
+
+NEAR = 0.06  # within which a view sees what it shows
+
+
+def grid(across: np.ndarray, up: np.ndarray, cells: int = 24) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and triangles of a rectangle from the origin along two directions (3,), its normal their cross product."""
+    i, j = np.meshgrid(np.arange(cells + 1), np.arange(cells + 1), indexing="ij")
+    vertices = (i[..., None] * across + j[..., None] * up).reshape(-1, 3) / cells
+    corner = (i * (cells + 1) + j)[:-1, :-1].reshape(-1, 1)
+    faces = np.concatenate([corner + [0, cells + 1, cells + 2], corner + [0, cells + 2, 1]])
+    return vertices, faces
+
+
+def test_what_stands_upright_on_a_table_is_left_out_though_views_see_it() -> None:
+    table = box(np.array([-0.6, -0.6, -0.2]), np.array([0.6, 0.6, 0.0]))
+    flats, maps = maps_of(table, orbit(30, 1.8, (0.95, 0.9, 0.97)))
+    known = depth_maps.confirmed_maps(flats, maps, torch.device("cpu"), Reporter())
+    x, y, z = 0.4 * np.eye(3)
+    for (vertices, faces), expected in ((grid(x, y), True), (grid(x, 0.05 * z), False)):
+        seen = seen_by(vertices[faces].mean(1), unit(cross(vertices, faces)), known, NEAR, Reporter())
+        assert (seen >= FEWEST_VIEWS).all()
+        assert (shown(vertices, faces, known, NEAR, Reporter()) == expected).all()
+
+
+def test_values_of_triangles_spread_over_their_neighbours() -> None:
+    mesh = trimesh.creation.icosphere(3)
+    faces, random = np.asarray(mesh.faces), np.random.default_rng(0)
+    noise = random.normal(2.0, 1.0, len(faces))
+    calm = mean_around(faces, noise, len(mesh.vertices), 6)
+    assert calm.std() < 0.2 * noise.std()
+    assert abs(calm.mean() - noise.mean()) < 0.05
+    np.testing.assert_allclose(mean_around(faces, np.ones(len(faces)), len(mesh.vertices), 3), 1)

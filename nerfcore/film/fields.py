@@ -322,7 +322,7 @@ class PlacedField:
                 settings = replace(settings, mode=PDF_UNIFORM) if self.hides else settings
                 grid = replace(shown.render_grid(), settings=settings)
                 thin = self._thin(shown, ends) if limited or self.hides else None
-                out = shown.render(places, directions, count, grid=grid, thin=thin)
+                out = shown.render(places, directions, count, grid=grid, thin=thin, ends=ends if limited else None)
         behind = out.environment
         sky = None if behind is None else behind.color
         return out.color, out.opacity, out.depth, out.probabilities, sky

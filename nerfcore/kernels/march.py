@@ -45,6 +45,7 @@ FEWEST_SAMPLES = 4  # samples on a ray whose number of samples follows that of i
 def march_weight(
     origins: wp.array(dtype=wp.vec3),
     directions: wp.array(dtype=wp.vec3),
+    ends: wp.array(dtype=float),
     jitter: wp.array(dtype=float),
     grid: GridArrays,
     m: MarchParams,
@@ -56,6 +57,7 @@ def march_weight(
     d = directions[r]
     inverse = reciprocal(d)
     lo, hi = ray_interval(o, inverse, m)
+    hi = wp.min(hi, ends[r])
     if m.contracted == 1 and m.empty_distance > 0.0:
         lo = wp.max(lo, wp.min(m.empty_distance, BEFORE_CUBE * cube_entry(o, inverse)))
     t = lo + jitter[r] * m.step
@@ -94,6 +96,7 @@ def march_weight(
 @wp.kernel(module="fieldwork_march")
 def march_sample(
     rays: MarchedRays,
+    ends: wp.array(dtype=float),
     shift: wp.array(dtype=float),
     grid: GridArrays,
     m: MarchParams,
@@ -105,6 +108,7 @@ def march_sample(
     if count == 0:
         return
     ray = ray_of(rays, r, m)
+    ray.high = wp.min(ray.high, ends[r])
     walk = started(rays, r)
     begin = out.starts[r]
     for i in range(begin, begin + count):
@@ -142,20 +146,23 @@ def coarse_march(
     skip_distance: torch.Tensor,
     settings: MarchSettings,
     jitter: torch.Tensor | None = None,
+    ends: torch.Tensor | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
     """The coarse march of rays, arguments as for `sample`: weight of all occupied bins (R,), 0 where there is none,
     distances (R,) of the first and the last of them, −1 where there is none, and their number (R,) int32."""
     device, rays = origins.device, len(origins)
     jitter = torch.full((rays,), 0.5, device=device) if jitter is None else jitter
+    ends = torch.full((rays,), settings.far, device=device) if ends is None else ends
     if not backend_of(device).warp:
-        return march_torch.coarse_march(origins, directions, cells, settings, jitter)
+        return march_torch.coarse_march(origins, directions, ends, cells, settings, jitter)
     init()
     total_weight, t_first, t_last = (torch.empty(rays, device=device) for _ in range(3))
     bin_counts = torch.empty(rays, dtype=torch.int32, device=device)
     out = CoarseArrays()
     out.total_weight, out.bin_counts = array(total_weight), array(bin_counts)
     out.t_first, out.t_last = array(t_first), array(t_last)
-    inputs = [array(origins, wp.vec3), array(directions, wp.vec3), array(jitter), grid_arrays(cells, skip_distance)]
+    rays_in = [array(origins, wp.vec3), array(directions, wp.vec3), array(ends), array(jitter)]
+    inputs = [*rays_in, grid_arrays(cells, skip_distance)]
     if on_host(device):
         launch(march_host.march_weight, -(-rays // LANES), [*inputs, march_params(settings), out, rays], device)
     else:
@@ -195,6 +202,7 @@ def sample(
     jitter: torch.Tensor | None = None,
     shift: torch.Tensor | None = None,
     capacity: int | None = None,
+    ends: torch.Tensor | None = None,
 ) -> Samples:
     """Draw `count` samples on every ray that meets an occupied cell.
 
@@ -206,11 +214,13 @@ def sample(
         shift: (R · count,) in [0, 1) position of each sample within its share of the PDF; 0.5 when None.
         capacity: the fixed number of rays that may get samples, so that no count is read back from the device; rays
             beyond it are dropped and counted, unused entries have ray index −1 and delta 0.
+        ends: (R,) distances at which single rays end before the settings' far end.
     """
     device, rays = origins.device, len(origins)
     jitter = torch.full((rays,), 0.5, device=device) if jitter is None else jitter
+    ends = torch.full((rays,), settings.far, device=device) if ends is None else ends
     total_weight, t_first, t_last, bin_counts = coarse_march(
-        origins, directions, cells, skip_distance, settings, jitter
+        origins, directions, cells, skip_distance, settings, jitter, ends
     )
     counts = sample_counts(bin_counts, count, settings.per_bin)
     end = torch.cumsum(counts, 0, dtype=torch.int32)
@@ -230,13 +240,13 @@ def sample(
     packed_info = PackedInfo(starts, counts, ray_indices, dropped)
     if not backend_of(device).warp:
         out = points, t, deltas, ray_indices
-        march_torch.draw(origins, directions, cells, settings, jitter, shift, starts, counts, out)
+        march_torch.draw(origins, directions, ends, cells, settings, jitter, shift, starts, counts, out)
         return Samples(points, t, deltas, packed_info, t_first, t_last)
     out = SampleArrays()
     out.starts, out.ray_indices = array(starts), array(ray_indices)
     out.points, out.t, out.deltas = array(points, wp.vec3), array(t), array(deltas)
     marched = marched_rays(origins, directions, total_weight, t_first, counts)
-    inputs = [marched, array(shift), grid_arrays(cells, skip_distance), march_params(settings), out]
+    inputs = [marched, array(ends), array(shift), grid_arrays(cells, skip_distance), march_params(settings), out]
     if on_host(device):
         launch(march_host.march_sample, -(-rays // RAYS), inputs, device)
     else:

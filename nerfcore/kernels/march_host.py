@@ -125,7 +125,7 @@ _LANES = """
     _LANES
     + """
     const int first = group * LANES, left = count - first;
-    F o[3] = {}, d[3], inverse[3], shift{};
+    F o[3] = {}, d[3], inverse[3], shift{}, limit{};
     for (int a = 0; a < 3; ++a) d[a] = F{} + 1.0f;
     for (int lane = 0; lane < LANES && lane < left; ++lane) {
         for (int a = 0; a < 3; ++a) {
@@ -133,8 +133,9 @@ _LANES = """
             d[a][lane] = ((const float*)directions.data)[3 * (size_t)(first + lane) + a];
         }
         shift[lane] = ((const float*)jitter.data)[first + lane];
+        limit[lane] = ((const float*)ends.data)[first + lane];
     }
-    F lo = F{} + m.near, hi = F{} + m.far, entry = F{} - 1.0e9f;
+    F lo = F{} + m.near, hi = least(limit, F{} + m.far), entry = F{} - 1.0e9f;
     for (int a = 0; a < 3; ++a) {
         inverse[a] = inverse_of(d[a]);
         const F t0 = (-1.0f - o[a]) * inverse[a], t1 = (1.0f - o[a]) * inverse[a];
@@ -180,6 +181,7 @@ _LANES = """
 def _march(
     origins: wp.array(dtype=wp.vec3),
     directions: wp.array(dtype=wp.vec3),
+    ends: wp.array(dtype=float),
     jitter: wp.array(dtype=float),
     grid: GridArrays,
     m: MarchParams,
@@ -193,6 +195,7 @@ def _march(
 def march_weight(
     origins: wp.array(dtype=wp.vec3),
     directions: wp.array(dtype=wp.vec3),
+    ends: wp.array(dtype=float),
     jitter: wp.array(dtype=float),
     grid: GridArrays,
     m: MarchParams,
@@ -200,7 +203,7 @@ def march_weight(
     count: int,
     offset: int,
 ):
-    _march(origins, directions, jitter, grid, m, out, count, wp.tid() + offset)
+    _march(origins, directions, ends, jitter, grid, m, out, count, wp.tid() + offset)
 
 
 # The steps of `pdf_sampling.advanced`, of all lanes at once: each reads a bin, or ends the interval of a sample, or goes on
@@ -210,6 +213,7 @@ def march_weight(
     + """
     const int* counts = (const int*)rays.counts.data;
     const int* starts = (const int*)out.starts.data;
+    const float* limits = (const float*)ends.data;
     const float* moved = (const float*)shift.data;
     const int total = (int)rays.counts.shape[0];
     const int end = (group + 1) * 512 < total ? (group + 1) * 512 : total;
@@ -229,7 +233,7 @@ def march_weight(
         alive[lane] = next_ray < end ? -1 : 0;
         if (next_ray >= end) return;
         const int r = next_ray++;
-        float hi = m.far;
+        float hi = m.far < limits[r] ? m.far : limits[r];
         for (int a = 0; a < 3; ++a) {
             const float from = ((const float*)rays.origins.data)[3 * (size_t)r + a];
             const float along = ((const float*)rays.directions.data)[3 * (size_t)r + a];
@@ -308,6 +312,7 @@ def march_weight(
 )
 def _sample(
     rays: MarchedRays,
+    ends: wp.array(dtype=float),
     shift: wp.array(dtype=float),
     grid: GridArrays,
     m: MarchParams,
@@ -319,10 +324,11 @@ def _sample(
 @wp.kernel(module="fieldwork_march_host")
 def march_sample(
     rays: MarchedRays,
+    ends: wp.array(dtype=float),
     shift: wp.array(dtype=float),
     grid: GridArrays,
     m: MarchParams,
     out: SampleArrays,
     offset: int,
 ):
-    _sample(rays, shift, grid, m, out, wp.tid() + offset)
+    _sample(rays, ends, shift, grid, m, out, wp.tid() + offset)

@@ -28,13 +28,13 @@ class _Bins:
 
 
 def _interval(
-    origins: torch.Tensor, directions: torch.Tensor, s: MarchSettings
+    origins: torch.Tensor, directions: torch.Tensor, ends: torch.Tensor, s: MarchSettings
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Where rays begin and end (R,), and where rays enter the cube [−1, 1]³, negative from inside."""
     inverse = 1 / torch.where(directions.abs() < 1e-9, 1e-9, directions)
     one, other = (-1 - origins) * inverse, (1 - origins) * inverse
     entry, leave = torch.minimum(one, other).amax(1), torch.maximum(one, other).amin(1)
-    low, high = torch.full_like(entry, s.near), torch.full_like(entry, s.far)
+    low, high = torch.full_like(entry, s.near), ends.clamp(max=s.far)
     if not s.contracted:
         return torch.maximum(low, entry), torch.minimum(high, leave), entry
     if s.empty_distance > 0:
@@ -43,10 +43,10 @@ def _interval(
 
 
 def _bin_midpoints(
-    origins: torch.Tensor, directions: torch.Tensor, jitter: torch.Tensor, s: MarchSettings
+    origins: torch.Tensor, directions: torch.Tensor, ends: torch.Tensor, jitter: torch.Tensor, s: MarchSettings
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Middle and length of each bin of R rays, and whether the ray gets there: (R, M) each."""
-    low, high, _ = _interval(origins, directions, s)
+    low, high, _ = _interval(origins, directions, ends, s)
     begin = low + jitter * s.step
     most = int(MAX_BINS)
     if not s.contracted:
@@ -70,9 +70,14 @@ def _bin_midpoints(
 
 
 def _bins(
-    origins: torch.Tensor, directions: torch.Tensor, cells: torch.Tensor, s: MarchSettings, jitter: torch.Tensor
+    origins: torch.Tensor,
+    directions: torch.Tensor,
+    ends: torch.Tensor,
+    cells: torch.Tensor,
+    s: MarchSettings,
+    jitter: torch.Tensor,
 ) -> _Bins:
-    middle, length, there = _bin_midpoints(origins, directions, jitter, s)
+    middle, length, there = _bin_midpoints(origins, directions, ends, jitter, s)
     points = origins[:, None] + directions[:, None] * middle[..., None]
     cell = cells[cell_index(grid_position(points, s.contracted).view(-1, 3), s.resolution)].view(*middle.shape, 2)
     occupied = there & (cell[..., 0] > 0)
@@ -97,7 +102,12 @@ def _parts(origins: torch.Tensor, s: MarchSettings) -> list[slice]:
 
 @torch.no_grad()
 def coarse_march(
-    origins: torch.Tensor, directions: torch.Tensor, cells: torch.Tensor, s: MarchSettings, jitter: torch.Tensor
+    origins: torch.Tensor,
+    directions: torch.Tensor,
+    ends: torch.Tensor,
+    cells: torch.Tensor,
+    s: MarchSettings,
+    jitter: torch.Tensor,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
     """As `march.coarse_march`."""
     rays, device = len(origins), origins.device
@@ -107,7 +117,7 @@ def coarse_march(
     )
     bin_counts = torch.zeros(rays, dtype=torch.int32, device=device)
     for part in _parts(origins, s):
-        bins = _bins(origins[part], directions[part], cells, s, jitter[part])
+        bins = _bins(origins[part], directions[part], ends[part], cells, s, jitter[part])
         if bins.occupied.shape[1] == 0:
             continue
         some = bins.occupied.any(1)
@@ -122,6 +132,7 @@ def coarse_march(
 def draw(
     origins: torch.Tensor,
     directions: torch.Tensor,
+    ends: torch.Tensor,
     cells: torch.Tensor,
     s: MarchSettings,
     jitter: torch.Tensor,
@@ -138,7 +149,7 @@ def draw(
             continue
         ray = some + part.start
         o, d = origins[ray], directions[ray]
-        bins = _bins(o, d, cells, s, jitter[ray])
+        bins = _bins(o, d, ends[ray], cells, s, jitter[ray])
         number = torch.arange(int(count.max()), device=o.device)
         used = number < count[some][:, None]
         index = (starts[ray].long()[:, None] + number)[used]

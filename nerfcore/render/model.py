@@ -224,12 +224,14 @@ class Model(nn.Module):
         grid: RenderGrid | None = None,
         capacity: int | None = None,
         thin: Thin | None = None,
+        ends: torch.Tensor | None = None,
     ) -> Rendered:
         """Render rays (R, 3) of the normalised frame; differentiable in the field.
 
         `grid`: what the rays traverse, by default the occupancy grid, as in training; `jitter`, `shift`: see
         kernels.march.sample; `codes` (R, A): appearance code of each ray; `capacity`: the most rays that get samples
-        where the capacity is fixed, all when None; `thin`: what of the density is shown, where not all.
+        where the capacity is fixed, all when None; `thin`: what of the density is shown, where not all; `ends` (R,): distances
+        at which rays end.
         """
         grid = grid or present_grid(self.occupancy, 0.0)
         learning = torch.is_grad_enabled()
@@ -241,7 +243,7 @@ class Model(nn.Module):
         two_passes = learning and self.fixed_shares()[0]
         capacity = min(len(origins), capacity or len(origins))
         samples, points = self._sample(
-            origins, directions, grid, samples_per_ray, jitter, shift, capacity if fixed else None
+            origins, directions, grid, samples_per_ray, jitter, shift, capacity if fixed else None, ends
         )
         if not learning and thin is None and isinstance(self.field, HybridField) and self.field.on_host(points.device):
             cull = self.config.render.cull
@@ -279,6 +281,7 @@ class Model(nn.Module):
         jitter: torch.Tensor | None,
         shift: torch.Tensor | None,
         capacity: int | None,
+        ends: torch.Tensor | None,
     ) -> tuple[Samples, torch.Tensor]:
         """Samples of the rays, and their points (N, 3) in grid coordinates as functions of the rays."""
         samples = sample(
@@ -291,6 +294,7 @@ class Model(nn.Module):
             jitter,
             shift,
             capacity,
+            ends,
         )
         if not origins.requires_grad:
             return samples, samples.points

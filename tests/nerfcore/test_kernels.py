@@ -3,6 +3,8 @@ invariants."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from fieldwork.nerfcore.kernels import cells, composite, march, traversal
@@ -158,6 +160,32 @@ def test_samples_are_sorted_inside_the_open_interval_and_their_lengths_add_up(
     bins = (deltas.sum(1) / s.step).round()
     assert torch.allclose(deltas.sum(1), bins * s.step, atol=1e-4)
     assert bool(((samples.points >= 0) & (samples.points <= 1)).all())
+
+
+@pytest.mark.parametrize("kernels", ["warp", "torch"])
+@pytest.mark.parametrize("contracted", [False, True])
+def test_a_ray_that_ends_early_gets_all_of_its_samples_before_its_end(kernels: Kernels, contracted: bool) -> None:
+    """As if the march ended there for all rays."""
+    generator = torch.Generator().manual_seed(8)
+    grid, skip_distance = random_cells(16, 0.3, generator)
+    origin, direction = random_rays(60, generator)
+    s = MarchSettings(16, 0.06, far=50.0, contracted=contracted)
+    on = origin, direction, grid, skip_distance
+    jitter = torch.rand(60, generator=generator)
+    with using_kernels(kernels):
+        whole = march.sample(*on, s, 8, jitter)
+        for end in (0.5, 2.5, 3.1):
+            expected = march.sample(*on, replace(s, far=end), 8, jitter)
+            every_other = torch.where(torch.arange(60) % 2 == 0, end, 1000.0)
+            found = march.sample(*on, s, 8, jitter, ends=every_other)
+            for rays, other in ((slice(0, None, 2), expected), (slice(1, None, 2), whole)):
+                assert torch.equal(found.packed_info.counts[rays], other.packed_info.counts[rays])
+                assert torch.equal(found.t_last[rays], other.t_last[rays])
+            of_cut = found.packed_info.ray_indices % 2 == 0
+            theirs = expected.packed_info.ray_indices % 2 == 0
+            for name in ("t", "deltas"):
+                assert torch.allclose(getattr(found, name)[of_cut], getattr(expected, name)[theirs], atol=1e-5)
+    assert len(whole) > 200
 
 
 def test_an_empty_grid_gives_no_samples(device: torch.device) -> None:

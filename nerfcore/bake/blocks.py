@@ -24,8 +24,10 @@ Check = Callable[[], None]
 CHUNK = 1 << 14  # points read at once
 CHUNK_BLOCKS = 64  # blocks whose vertices are made at once
 CHUNK_RAYS = 1 << 15
+FOOTPRINTS, LEAST_WIDE = 20_000, 0.05  # places at which pixels' widths are taken; not tuned; quantile that counts
 MOST_PARTS = 4  # of the cameras that threads ask side by side: each needs 12 kB a block
 # Measured (docs/experiments.md, “How fine must a baked field be?”):
+FINEST_CELL = 0.25  # of a pixel's width: what is finer no photo shows, and haze is lost in it
 LEAST_OPACITY = 0.03  # of a cell; what is thinner is haze
 GROWTH = 2.3  # power of the side with which the number of occupied blocks grows: surfaces, but thick ones
 
@@ -186,6 +188,26 @@ def seen_by(blocks: Blocks, rays: CameraRays, settings: MarchSettings, by_vertex
 def weights_and_cameras(views: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Weight in [0, 1] and number of the cameras in the codes of `seen_by`, of their shape."""
     return (views >> 16).float() / 32767, views & 0xFFFF
+
+
+@torch.no_grad()
+def finest_side(grid: RenderGrid, centers: torch.Tensor, angles: torch.Tensor) -> int:
+    """How many blocks along a side make cells of blocks `FINEST_CELL` of a pixel wide, in nearly all occupied cells.
+
+    `centers` (V, 3): of the cameras; `angles` (V,): the width of a pixel over its distance; that of the camera whose pixel
+    is the smallest counts, whether or not it sees the cell.
+    """
+    n, contracted = grid.settings.resolution, grid.settings.contracted
+    occupied = (grid.cells[:, 0] > 0).nonzero()[:, 0]
+    if len(occupied) == 0:
+        return 1
+    occupied = occupied[:: max(1, len(occupied) // FOOTPRINTS)]
+    points = (torch.stack([occupied % n, occupied // n % n, occupied // n**2], 1) + 0.5) / n
+    places = uncontract(points) if contracted else points * 2 - 1
+    width = (torch.cdist(places, centers) * angles).amin(1)
+    if contracted:  # cells grow outside the cube
+        width = width / places.abs().amax(1).clamp(min=1) ** 1.5
+    return max(1, round(cell_length(1, contracted) / (FINEST_CELL * float(width.quantile(LEAST_WIDE)))))
 
 
 def side_for(seen: int, side: int, most: int) -> int:

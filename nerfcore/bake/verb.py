@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from ..data.box import box_poses
 from ..data.camera_rays import CameraRays
@@ -16,6 +17,7 @@ from ..data.load import load_scene
 from ..data.pixels import PixelStore, training_size
 from ..data.scene import Scene, View
 from ..errors import SettingError
+from ..geometry.cameras import Camera
 from ..params import BakeParams
 from ..progress import Reporter
 from ..project.runs import state_id
@@ -26,6 +28,7 @@ from ..render.run import Trained, load_trained, refined_poses
 from .blocks import (
     Blocks,
     Check,
+    finest_side,
     march_settings,
     read_blocks,
     seen_by,
@@ -68,15 +71,19 @@ def bake(params: BakeParams, report: Reporter) -> dict[str, Any]:
         )
     scene = load_scene(folder, trained.info.holdout)
     report.stage("Looking for what the photos show")
-    rays = training_rays(folder, params.run, trained, scene, trained.info.box(project).box_from_world)
-    blocks = visible_blocks(trained, rays, params.memory * 1e6, report.check)
+    box_from_world = trained.info.box(project).box_from_world
+    chosen = np.unique(np.linspace(0, len(scene.train) - 1, MOST_VIEWS).round().astype(int))
+    asked = [scene.views[scene.train[number]] for number in chosen]
+    cameras = [view.camera.resized(*training_size(view.camera, trained.info.image_size)) for view in asked]
+    poses = trained_poses(folder, params.run, trained, asked, box_from_world)
+    rays = sparser_rays(cameras, poses, trained.device)
+    blocks = visible_blocks(trained, rays, [1 / camera.fx for camera in cameras], params.memory * 1e6, report.check)
     if len(blocks) == 0:
         report.warn("The photos show nothing of the field: what was baked is empty. Train longer.")
     report.stage("Reading colours")
     views = seen_by(blocks, rays, march_settings(trained.model, blocks.side, 1.0), True, report.check)
     texels, changes = vertex_texels(trained.model, blocks, views, rays.center, report.check)
     report.stage("Fitting to the photos")
-    box_from_world = trained.info.box(project).box_from_world
     photos = training_photos(folder, params.run, trained, scene, classes, box_from_world, report)
     settings = march_settings(trained.model, blocks.side, 1.0)
     blocks = fitted(trained.model, blocks, texels, changes, photos, settings, report.check)
@@ -116,18 +123,12 @@ def bake(params: BakeParams, report: Reporter) -> dict[str, Any]:
     return result
 
 
-def training_rays(folder: Path, run: str, trained: Trained, scene: Scene, box_from_world: np.ndarray) -> CameraRays:
-    """Rays through the training photos, made so small that there are about `RAYS`."""
-    chosen = np.unique(np.linspace(0, len(scene.train) - 1, MOST_VIEWS).round().astype(int))
-    views = [scene.views[scene.train[number]] for number in chosen]
-    sizes = [training_size(view.camera, trained.info.image_size) for view in views]
-    pixels = sum(width * height for width, height in sizes)
+def sparser_rays(cameras: list[Camera], poses: np.ndarray, device: torch.device) -> CameraRays:
+    """Rays of cameras (poses (V, 4, 4)), made so small that there are about `RAYS`."""
+    pixels = sum(camera.width * camera.height for camera in cameras)
     scale = min(1.0, (RAYS / max(pixels, 1)) ** 0.5)
-    cameras = [
-        view.camera.resized(max(1, round(width * scale)), max(1, round(height * scale)))
-        for view, (width, height) in zip(views, sizes)
-    ]
-    return CameraRays(cameras, trained_poses(folder, run, trained, views, box_from_world), trained.device)
+    small = [c.resized(max(1, round(c.width * scale)), max(1, round(c.height * scale))) for c in cameras]
+    return CameraRays(small, poses, device)
 
 
 def trained_poses(
@@ -160,11 +161,15 @@ def training_photos(
     return photos
 
 
-def visible_blocks(trained: Trained, rays: CameraRays, memory: float, check: Check) -> Blocks:
-    """The blocks that rays of training cameras see, of the finest grid found with which they fit into so many bytes."""
+def visible_blocks(trained: Trained, rays: CameraRays, angles: list[float], memory: float, check: Check) -> Blocks:
+    """The blocks that rays of training cameras see, of the finest grid found with which they fit into so many bytes.
+
+    `angles`: the width of a pixel of each camera's photo over its distance.
+    """
     model = trained.model
     model.refine(check=check, everywhere=True)
     grid = visible_grid(model, model.render_grid(), rays, check)
+    finest = min(FINEST, finest_side(grid, rays.center, torch.tensor(angles, device=rays.device)))
 
     def seen(side: int) -> Blocks:
         found = read_blocks(model, grid, side, check)
@@ -172,16 +177,16 @@ def visible_blocks(trained: Trained, rays: CameraRays, memory: float, check: Che
         weights, _ = weights_and_cameras(views.amax(1))
         return found.kept(weights > LEAST_SEEN)
 
-    return finest_blocks(seen, memory)
+    return finest_blocks(seen, finest, memory)
 
 
-def finest_blocks(seen: Callable[[int], Blocks], memory: float) -> Blocks:
-    """The blocks `seen` of a grid with so many along a side, as fine as fits into so many bytes.
+def finest_blocks(seen: Callable[[int], Blocks], finest: int, memory: float) -> Blocks:
+    """The blocks `seen` of a grid with so many along a side, at most `finest`, as fine as fits into so many bytes.
 
     How many there are depends on where their sides meet walls: 70 along a side can be more blocks than 74. So the first
     grid, a coarse one, only tells how fine the next may be, and a next one is tried where the last left much over.
     """
-    highest = min(FINEST, int((memory / 16) ** (1 / 3)))  # the index takes a quarter at most
+    highest = min(finest, int((memory / 16) ** (1 / 3)))  # the index takes a quarter at most
     found, best, fitting = seen(max(1, highest // 3)), None, 0
     while True:
         wanted = side_for(len(found), found.side, most_blocks(memory, highest))

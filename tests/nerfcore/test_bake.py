@@ -7,12 +7,21 @@ import json
 import math
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from fieldwork.nerfcore.bake.blocks import Blocks, march_settings, read_blocks, seen_by, side_for, visible_grid
+from fieldwork.nerfcore.bake.blocks import (
+    Blocks,
+    finest_side,
+    march_settings,
+    read_blocks,
+    seen_by,
+    side_for,
+    visible_grid,
+)
 from fieldwork.nerfcore.bake.colors import vertex_texels
 from fieldwork.nerfcore.bake.fit import baked_field
 from fieldwork.nerfcore.bake.verb import finest_blocks
@@ -20,7 +29,8 @@ from fieldwork.nerfcore.config import RunConfig
 from fieldwork.nerfcore.data.camera_rays import CameraRays
 from fieldwork.nerfcore.errors import Cancelled, DiskError, ProjectError, SettingError
 from fieldwork.nerfcore.field.hybrid import Geometry
-from fieldwork.nerfcore.kernels.voxel_field import VERTICES
+from fieldwork.nerfcore.kernels.traversal import MarchSettings
+from fieldwork.nerfcore.kernels.voxel_field import VERTICES, cell_length
 from fieldwork.nerfcore.params import BakeParams, EvaluateParams, RenderParams, TrainParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.render import baked
@@ -39,6 +49,7 @@ from fieldwork.nerfcore.render.image import render_view
 from fieldwork.nerfcore.render.model import Model
 from fieldwork.nerfcore.render.run import load_info
 from fieldwork.nerfcore.render.verb import look_at
+from fieldwork.nerfcore.sampling.render_grid import RenderGrid
 from fieldwork.nerfcore.verbs import run_verb
 from fieldwork.tests.nerfcore.support.ball import SMALL, ball_project
 
@@ -153,9 +164,8 @@ def train(folder: Path, steps: int, resume: bool = False, **settings: str) -> No
 
 @pytest.mark.parametrize("memory", [3e6, 30e6, 100e6])
 @pytest.mark.parametrize("crowded", [(), (74,), (76, 75)])
-def test_the_grid_is_as_fine_as_fits(crowded: tuple[int, ...], memory: float, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_grid_is_as_fine_as_fits(crowded: tuple[int, ...], memory: float) -> None:
     """However the number of blocks jumps with the side: memory is used, and never more than there is."""
-    monkeypatch.setattr("fieldwork.nerfcore.bake.verb.FINEST", 96)
     sides = []
 
     def seen(side: int) -> Blocks:
@@ -163,14 +173,27 @@ def test_the_grid_is_as_fine_as_fits(crowded: tuple[int, ...], memory: float, mo
         count = round(2.4 * side**2 * (1.3 if side in crowded else 1.0))
         return Blocks(side, torch.zeros(count, 3, dtype=torch.long), torch.zeros(0, dtype=torch.uint8))
 
-    found = finest_blocks(seen, memory)
+    found = finest_blocks(seen, 96, memory)
     assert texture_bytes(len(found), found.side) <= memory
     assert len(found) >= 0.75 * most_blocks(memory, found.side)
     assert len(sides) <= 5
 
 
 def test_an_empty_field_is_baked() -> None:
-    assert len(finest_blocks(lambda side: Blocks(side, torch.zeros(0, 3), torch.zeros(0)), 100e6)) == 0
+    assert len(finest_blocks(lambda side: Blocks(side, torch.zeros(0, 3), torch.zeros(0)), 96, 100e6)) == 0
+
+
+@pytest.mark.parametrize("contracted", [False, True])
+def test_cells_are_no_finer_than_a_quarter_of_the_nearest_pixel(contracted: bool) -> None:
+    n = 16
+    cells = torch.zeros(n**3, 2)
+    cells[(n // 2 * n + n // 2) * n + n // 2, 0] = 1.0  # its middle is beside the origin
+    grid = RenderGrid(cells, torch.zeros(0), MarchSettings(n, 0.1, contracted=contracted))
+    place = (0.5 / n) * (4 if contracted else 2)
+    centers = torch.tensor([[place, place, place - 2.0], [place, place, place + 5.0]])
+    side = finest_side(grid, centers, torch.tensor([0.01, 0.003]))  # 0.02 and 0.015 wide
+    assert cell_length(side, contracted) == pytest.approx(0.015 / 4, rel=0.02)
+    assert finest_side(replace(grid, cells=torch.zeros(n**3, 2)), centers, torch.ones(2)) == 1
 
 
 @pytest.fixture(autouse=True, scope="module")

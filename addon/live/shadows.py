@@ -31,6 +31,30 @@ def catch(scene: bpy.types.Scene) -> None:
     """Let the surfaces of a scene catch shadows."""
     for obj in surfaces(scene):
         obj.is_shadow_catcher, obj.is_holdout, obj.hide_render = True, False, False
+        for slot in obj.material_slots:
+            if slot.material is not None and slot.material.use_nodes:
+                _receive_light(slot.material.node_tree)
+
+
+def _receive_light(tree: bpy.types.NodeTree) -> None:
+    """Let an unlit material be white and matt on objects that catch shadows: light of its own has none."""
+    for output in (node for node in tree.nodes if node.type == "OUTPUT_MATERIAL"):
+        links = output.inputs["Surface"].links
+        if not links or links[0].from_node.type != "EMISSION":
+            continue
+        unlit = links[0].from_socket
+        catches, matt, mix = (
+            tree.nodes.new(kind) for kind in ("ShaderNodeAttribute", "ShaderNodeBsdfDiffuse", "ShaderNodeMixShader")
+        )
+        catches.attribute_type, catches.attribute_name = "OBJECT", "is_shadow_catcher"
+        matt.inputs["Color"].default_value = (1, 1, 1, 1)
+        tree.links.new(catches.outputs["Fac"], mix.inputs[0])
+        tree.links.new(unlit, mix.inputs[1])
+        tree.links.new(matt.outputs[0], mix.inputs[2])
+        tree.links.new(mix.outputs[0], output.inputs["Surface"])
+        for column, node in enumerate((catches, matt, mix)):
+            node.location = output.location.x + 220 * (column - 2), output.location.y - 200 * (column < 2)
+        output.location.x += 220
 
 
 def set_up(scene: bpy.types.Scene) -> bpy.types.Scene | None:

@@ -74,6 +74,11 @@ facts = {"no surface": attempt(bpy.ops.fieldwork.catch_shadows)}
 bpy.ops.mesh.primitive_uv_sphere_add(radius=0.5, segments=64, ring_count=32)
 surface = bpy.context.object
 surface["fieldwork_role"] = "mesh"
+from fieldwork.addon.roles import Owner
+from fieldwork.addon.scene import look, materials
+owner, root = Owner("capture", "1"), bpy.data.objects.new("root", None)
+look.set_switch(root)
+surface.data.materials.append(materials.make_material(owner, "one", [1, 1, 1], look.shader_group(owner, "mesh", root)))
 capture = bpy.data.collections.new("capture")
 scene.collection.children.link(capture)
 for collection in surface.users_collection:

@@ -37,7 +37,7 @@ def catch(scene: bpy.types.Scene) -> None:
 
 
 def _receive_light(tree: bpy.types.NodeTree) -> None:
-    """Let an unlit material be white and matt on objects that catch shadows: light of its own has none."""
+    """Let an unlit material be grey and matt on objects that catch shadows: light of its own has none."""
     for output in (node for node in tree.nodes if node.type == "OUTPUT_MATERIAL"):
         links = output.inputs["Surface"].links
         if not links or links[0].from_node.type != "EMISSION":
@@ -47,7 +47,7 @@ def _receive_light(tree: bpy.types.NodeTree) -> None:
             tree.nodes.new(kind) for kind in ("ShaderNodeAttribute", "ShaderNodeBsdfDiffuse", "ShaderNodeMixShader")
         )
         catches.attribute_type, catches.attribute_name = "OBJECT", "is_shadow_catcher"
-        matt.inputs["Color"].default_value = (1, 1, 1, 1)
+        matt.inputs["Color"].default_value = (0.5, 0.5, 0.5, 1)
         tree.links.new(catches.outputs["Fac"], mix.inputs[0])
         tree.links.new(unlit, mix.inputs[1])
         tree.links.new(matt.outputs[0], mix.inputs[2])

@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 ROLE, PROJECT, UUID = "fieldwork_role", "fieldwork_project", "fieldwork_uuid"
+FOLDER = "fieldwork_folder"  # on the parent, in files of `fieldwork blend`: the project's folder, seen from the file
 
 
 class Owner(NamedTuple):

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import bpy
 
+from ..roles import FOLDER
 from ..scene.build import Imported, import_package
 from ..scene.package import Package, read_package
 
@@ -16,9 +19,11 @@ PACKED_LIMIT = 256 * 2**20  # bytes of photos above which they stay outside the 
 def write_blend(request: dict[str, Any], emit: Callable[..., None]) -> dict[str, Any]:
     """Build the package folder `request["package"]` in a new file and save it as `request["out"]`.
 
-    `request["split"]`: "none", "classes" or "instances", one mesh object for each of them.
+    `request["split"]`: "none", "classes" or "instances", one mesh object for each of them. `request["project"]`: the
+    project's folder, which the file remembers.
     """
     package, imported = _build(request, emit, "Building the Blender file")
+    imported.root[FOLDER] = _seen_from(Path(request["project"]).absolute(), Path(request["out"]).absolute().parent)
     prepare_scene(bpy.context.scene, len(package.cameras))
     _show_colors(imported)
     warnings = imported.warnings
@@ -38,6 +43,14 @@ def write_blend(request: dict[str, Any], emit: Callable[..., None]) -> dict[str,
         "mesh": len(package.mesh["faces"]) if package.mesh is not None else None,
         "warnings": warnings,
     }
+
+
+def _seen_from(folder: Path, start: Path) -> str:
+    """A folder as Blender writes paths: beside the file's own, or absolute on another disk."""
+    try:
+        return "//" + Path(os.path.relpath(folder, start)).as_posix()
+    except ValueError:
+        return str(folder)
 
 
 def _build(request: dict[str, Any], emit: Callable[..., None], stage: str) -> tuple[Package, Imported]:

@@ -86,6 +86,7 @@ def _file_loaded(*_: Any) -> None:
     with _told():
         region.forget()
         for scene in bpy.data.scenes:
+            lists.adopt(scene)
             if scene.fieldwork.project:
                 lists.refresh(scene.fieldwork)
         folder = snapshot.folder_of(bpy.context.scene.fieldwork) if bpy.context.scene else None

@@ -39,7 +39,7 @@ def blend(params: BlendParams, report: Reporter) -> dict[str, Any]:
         warnings.append("There is no mesh yet: the .blend holds cameras and points only. Run `fieldwork mesh` first.")
     if not len(scene.points) and load_poses(folder).source == "sfm":  # poses of data sets often come without
         warnings.append("The project has no sparse points: its cameras come without them. Run `fieldwork poses` again.")
-    result = write_in_blender(package, out, params.split, report)
+    result = write_in_blender(package, out, folder, params.split, report)
     for warning in [*warnings, *result.pop("warnings")]:
         report.warn(warning)
     done = {"file": str(out), **result, "seconds": round(time.monotonic() - started, 1)}

@@ -95,13 +95,13 @@ def run_in_blender(
                     stream.close()
 
 
-def write_in_blender(package: Path, out: Path, split: str, report: Reporter) -> dict[str, Any]:
+def write_in_blender(package: Path, out: Path, project: Path, split: str, report: Reporter) -> dict[str, Any]:
     """Let Blender write a package folder as the .blend `out`, see addon/child/package.py; returns the task's result."""
     with atomic_path(out) as temporary:
         # Blender writes beside its target and renames; the two names must stay on one disk.
         return run_in_blender(
             "blend",
-            {"package": str(package), "out": str(temporary), "split": split},
+            {"package": str(package), "out": str(temporary), "project": str(project), "split": split},
             report,
             lambda event: report.progress(event["fraction"], event.get("message", "")),
         )

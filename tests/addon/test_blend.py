@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -278,6 +279,34 @@ def test_what_the_file_holds(tmp_path, bpy_script):
     assert facts["packed"]
     np.testing.assert_allclose(facts["path"], facts["cameras"], atol=1e-5)
     assert [step.verb for step in load_project(tmp_path / "p").provenance] == ["blend"]
+
+
+OPENED = """
+import fieldwork
+fieldwork.register()
+found = {}
+for name, file in files.items():
+    bpy.ops.wm.open_mainfile(filepath=file)
+    settings = bpy.context.scene.fieldwork
+    found[name] = [settings.project, len(settings.images), settings.project_uuid]
+answer(found)
+"""
+
+
+def test_the_file_knows_its_project_where_that_is(tmp_path, bpy_script):
+    """Opened beside its project, or moved with it; not where another project is in that place."""
+    make_project(tmp_path / "one/p", [CAMERAS["centred"]] * 3)
+    blend(BlendParams(project=tmp_path / "one/p", out=tmp_path / "one/scene.blend"), Reporter())
+    shutil.copytree(tmp_path / "one", tmp_path / "moved")
+    make_project(tmp_path / "other/p", [CAMERAS["centred"]] * 2)
+    (tmp_path / "alone").mkdir()
+    for folder in ("other", "alone"):
+        shutil.copy(tmp_path / "one/scene.blend", tmp_path / folder)
+    files = {name: tmp_path / name / "scene.blend" for name in ("one", "moved", "other", "alone")}
+    facts = bpy_script(OPENED, files=files)
+    uuid = load_project(tmp_path / "one/p").uuid
+    assert facts["one"] == facts["moved"] == ["//p", 3, uuid]
+    assert facts["other"] == facts["alone"] == ["", 0, ""]
 
 
 AGAIN = """

@@ -10,9 +10,8 @@ import torch
 
 from .preparation import Preparation
 from .seeds import VOID, Seeds
-from .unary import Waves, sampled
+from .unary import LANDMARKS, Kernel, sampled
 
-BANDWIDTH = 0.25  # of the waves: strokes are compared more broadly than surfels
 MARGIN = 0.1  # by how much more a mark is like those of another class
 MOST = 0.4  # share of the marks in doubt beyond which looks tell nothing of marks
 
@@ -54,8 +53,9 @@ def alikeness(ready: Preparation, surfel: np.ndarray, mark: np.ndarray) -> np.nd
     """How alike (M, M) marks are, ascending, by what the surfels (S,) that they cover look like."""
     chosen = sampled(torch.from_numpy(mark))
     columns = ready.columns(surfel[chosen])
-    waves = Waves(columns.shape[1], BANDWIDTH)(columns)
+    landmarks = columns[sampled(torch.from_numpy(mark[chosen]), LANDMARKS)]
+    features = Kernel(landmarks).features(columns)
     _, number, amount = np.unique(mark[chosen], return_inverse=True, return_counts=True)
-    total = torch.zeros(len(amount), waves.shape[1]).index_add(0, torch.from_numpy(number), waves)
+    total = torch.zeros(len(amount), features.shape[1]).index_add(0, torch.from_numpy(number), features)
     mean = total / torch.from_numpy(amount)[:, None]
     return (mean @ mean.T).numpy()

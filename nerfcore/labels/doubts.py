@@ -12,6 +12,7 @@ from .preparation import Preparation
 from .seeds import VOID, Seeds
 from .unary import LANDMARKS, Kernel, sampled
 
+BANDWIDTH = 0.35  # of the kernel
 MARGIN = 0.1  # by how much more a mark is like those of another class
 MOST = 0.4  # share of the marks in doubt beyond which looks tell nothing of marks
 
@@ -54,7 +55,7 @@ def alikeness(ready: Preparation, surfel: np.ndarray, mark: np.ndarray) -> np.nd
     chosen = sampled(torch.from_numpy(mark))
     columns = ready.columns(surfel[chosen])
     landmarks = columns[sampled(torch.from_numpy(mark[chosen]), LANDMARKS)]
-    features = Kernel(landmarks).features(columns)
+    features = Kernel(landmarks, BANDWIDTH).features(columns)
     _, number, amount = np.unique(mark[chosen], return_inverse=True, return_counts=True)
     total = torch.zeros(len(amount), features.shape[1]).index_add(0, torch.from_numpy(number), features)
     mean = total / torch.from_numpy(amount)[:, None]

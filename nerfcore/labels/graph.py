@@ -11,10 +11,11 @@ from .surfels import Surfels, cell_of
 from .walker import edge_matrix
 
 CELLS = 20_000  # of the coarse graph; not tuned
-# Weights of the columns in units of their deviation; see experiments.md, “Surfels that end where colours do”.
+# Weights of the columns in units of their deviation; see experiments.md, “Surfels that end where colours do”, and for the
+# filters “Exact kernels for labels”.
 LAB, LAB_AROUND, CONTRAST, TEXTURE = 1.0, 0.5, 0.5, 0.5
 NORMAL, HEIGHT, PLANARITY, FIELD, FIELD_AROUND = 0.85, 1.0, 0.3, 1.2, 1.0
-FILTERS, TOKENS = 1.05, 1.5
+FILTERS, TOKENS = 0.42, 1.5
 EDGE_SCALE = 4.0  # b of an edge's weight exp(−Σ d²/(b·median d²))
 
 

@@ -18,8 +18,8 @@ from ..progress import Reporter
 from .graph import FILTERS, TOKENS, standardised
 from .tokens import TokenModel
 
-SCALES = (1, 2, 4)  # deviations of the filters in pixels of the map
-COMPONENTS = 12  # principal components of the filters' answers
+SCALES = (1, 2)  # deviations of the filters in pixels of the map; wider ones mix what lies side by side
+ANSWERS = 6 * len(SCALES)
 TOKEN_COMPONENTS = 24  # of a model's features
 THREADS = min(8, os.cpu_count() or 1)
 SAMPLED = 4096  # patches of each photo that the components are found by
@@ -42,9 +42,8 @@ def photo_features(count: int, pictures: Sequence[Picture], model: TokenModel | 
         return picture[1], texture_filters(picture[2])
 
     with ThreadPoolExecutor(THREADS) as pool:
-        values = standardised(uplifted(count, pool.map(filtered, pictures)))
-    found = values @ principal_axes(values, COMPONENTS)
-    columns = [FILTERS * found / max(float(found[:, 0].std()), 1e-6)]
+        values = uplifted(count, pool.map(filtered, pictures))
+    columns = [FILTERS * standardised(np.sign(values) * np.log1p(np.abs(values)))]
     if model is not None:
         columns.append(TOKENS * token_features(count, pictures, model, report))
     return np.concatenate(columns, 1).astype(np.float32)
@@ -60,8 +59,8 @@ def identity(path: Path) -> tuple[str, int, int]:
 
 
 def texture_filters(lab: np.ndarray) -> np.ndarray:
-    """Answers (H, W, 27) float32 of filters to a picture in CIE Lab (H, W, 3): at each scale strength of the gradient of the
-    lightness, eigenvalues of its second derivatives, and mean and deviation of each channel."""
+    """Answers (H, W, ANSWERS) float32 of filters to a picture in CIE Lab (H, W, 3): at each scale strength of the gradient of
+    the lightness, eigenvalues of its second derivatives, and deviation of each channel."""
     lightness, found = lab[..., 0], []
     for scale in SCALES:
         found.append(gaussian_gradient_magnitude(lightness, scale))
@@ -70,7 +69,7 @@ def texture_filters(lab: np.ndarray) -> np.ndarray:
         found += [(xx + yy + root) / 2, (xx + yy - root) / 2]
         for channel in np.moveaxis(lab, -1, 0):
             mean = gaussian_filter(channel, 2 * scale)
-            found += [mean, np.sqrt((gaussian_filter(channel**2, 2 * scale) - mean**2).clip(0))]
+            found.append(np.sqrt((gaussian_filter(channel**2, 2 * scale) - mean**2).clip(0)))
     return np.stack(found, -1).astype(np.float32)
 
 

@@ -72,7 +72,7 @@ CPU_SHARE = 0.5  # of a map's side that rays are rendered for on a CPU
 LEAST_SURFELS = 64
 PIXELS_EACH = 4  # at least, in the mean: what a surfel of one pixel looks like is noise
 TELLING = 7  # pixels of a surfel, in the mean, from which on its colour says where it ends
-VERSION = 7  # of what is made; another one makes it again
+VERSION = 8  # of what is made; another one makes it again
 MATRIX = ("data", "indices", "indptr")
 
 

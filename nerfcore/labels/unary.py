@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 
 import numpy as np
@@ -10,9 +9,10 @@ import torch
 
 STEPS = 60  # of the optimiser
 ROWS = 16384  # at once
-# See experiments.md, “Labels from a few strokes”.
-WAVES = 512
-BANDWIDTH = 0.4  # deviation of the waves' frequencies
+# See experiments.md, “Exact kernels for labels” and “Labels from a few strokes”.
+LANDMARKS = 512  # marked surfels, about, that a kernel is taken to
+BANDWIDTH = 0.25  # inverse deviation of the Gaussian kernel, in feature columns
+RIDGE = 1e-4  # added to the kernel's diagonal, which is 1: marked surfels may be the same
 DECAY = 1e-5
 KNOWN_LOOK = 2.85  # distance to the nearest marked surfel, in feature columns, at which prior and void count the same
 SHARPNESS = 4
@@ -27,34 +27,47 @@ def class_probabilities(
     classes: int,
     check: Callable[[], None],
 ) -> np.ndarray:
-    """Probability (N, classes) float32 of each class by features (N, F): logistic regression on random waves of them. Of
+    """Probability (N, classes) float32 of each class by features (N, F): logistic regression with a Gaussian kernel. Of
     classes without a marked surfel it is 0.
 
     Args:
         marked: (S,) indices of the marked surfels; target: (S,) their class indices; mark: (S,) which mark each is of.
     """
-    waves = Waves(features.shape[1])
-    matrix, bias = logistic_regression(waves(features[marked]), target, balanced(target, mark), classes)
+    kernel = Kernel(features[marked[sampled(mark, LANDMARKS)]])
+    matrix, bias = logistic_regression(kernel.features(features[marked]), target, balanced(target, mark), classes)
     bias[torch.bincount(target, minlength=classes) == 0] = -torch.inf
-    found = []
+    weights, found = kernel.weights(matrix), []
     for rows in features.split(ROWS):
         check()
-        found.append(torch.softmax(waves(rows) @ matrix + bias, 1))
+        found.append(torch.softmax(torch.addmm(bias, kernel(rows), weights), 1))
     return torch.cat(found).numpy()
 
 
-class Waves:
-    """Random Fourier features (Rahimi and Recht, "Random features for large-scale kernel machines", 2007): a linear
-    function of them is one of a Gaussian kernel's. The same ones in every call."""
+class Kernel:
+    """A Gaussian kernel to landmarks (M, F), and features whose products are the kernel's as far as these tell (Nyström's
+    method: Williams and Seeger, "Using the Nyström method to speed up kernel machines", 2001)."""
 
-    def __init__(self, inputs: int, bandwidth: float = BANDWIDTH) -> None:
-        generator = torch.Generator().manual_seed(0)
-        self.frequency = torch.randn(inputs, WAVES, generator=generator) * bandwidth
-        self.phase = torch.rand(WAVES, generator=generator) * 2 * math.pi
+    def __init__(self, landmarks: torch.Tensor, bandwidth: float = BANDWIDTH) -> None:
+        self._bandwidth = bandwidth
+        scaled = landmarks * bandwidth
+        self._across, self._size = scaled.T.contiguous(), -0.5 * scaled.square().sum(1)
+        own = self(landmarks).double()
+        own.diagonal().add_(RIDGE)
+        self._root = torch.linalg.cholesky(own)
 
-    def __call__(self, features: torch.Tensor) -> torch.Tensor:
-        """(N, F) → (N, WAVES)."""
-        return torch.addmm(self.phase, features, self.frequency).cos_().mul_(math.sqrt(2 / WAVES))
+    def __call__(self, rows: torch.Tensor) -> torch.Tensor:
+        """The kernel (N, M) of rows (N, F) and the landmarks: exp(−½ (bandwidth · distance)²)."""
+        scaled = rows * self._bandwidth
+        half = torch.addmm(self._size, scaled, self._across).sub_(0.5 * scaled.square().sum(1, keepdim=True))
+        return half.clamp_(max=0).exp_()
+
+    def features(self, rows: torch.Tensor) -> torch.Tensor:
+        """(N, F) → (N, M): their products are the kernel between rows."""
+        return torch.linalg.solve_triangular(self._root, self(rows).T.double(), upper=False).T.float()
+
+    def weights(self, matrix: torch.Tensor) -> torch.Tensor:
+        """Weights (M, C) of the kernel itself that do what those (M, C) of `features` do."""
+        return torch.linalg.solve_triangular(self._root.T, matrix.double(), upper=True).float()
 
 
 def balanced(target: torch.Tensor, mark: torch.Tensor) -> torch.Tensor:
@@ -107,11 +120,13 @@ def familiarity(distance: np.ndarray) -> np.ndarray:
     return 0.5 ** ((distance / KNOWN_LOOK) ** SHARPNESS)
 
 
-def sampled(mark: torch.Tensor) -> torch.Tensor:
-    """Indices of at most `SAMPLES` of the marked surfels (S,) of each mark, drawn at random, the same in every call."""
+def sampled(mark: torch.Tensor, most: int | None = None) -> torch.Tensor:
+    """Indices of at most `SAMPLES` of the marked surfels (S,) of each mark, and of about `most` in all, drawn at random, the
+    same in every call."""
     generator = torch.Generator().manual_seed(0)
-    chosen = []
-    for number in mark.unique():
+    numbers, chosen = mark.unique(), []
+    each = SAMPLES if most is None else min(SAMPLES, max(1, most // max(len(numbers), 1)))
+    for number in numbers:
         own = torch.nonzero(mark == number).reshape(-1)
-        chosen.append(own[torch.randperm(len(own), generator=generator)[:SAMPLES]])
+        chosen.append(own[torch.randperm(len(own), generator=generator)[:each]])
     return torch.cat(chosen)

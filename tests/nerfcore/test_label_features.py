@@ -10,7 +10,7 @@ import pytest
 from fieldwork.nerfcore.cli import main
 from fieldwork.nerfcore.errors import InputError
 from fieldwork.nerfcore.labels.models import load
-from fieldwork.nerfcore.labels.photo_features import COMPONENTS, spread, texture_filters, uplifted
+from fieldwork.nerfcore.labels.photo_features import ANSWERS, spread, texture_filters, uplifted
 from fieldwork.nerfcore.labels.preparation import FOLDER, Preparation, ensured, prepare
 from fieldwork.nerfcore.labels.tokens import TokenModel
 from fieldwork.nerfcore.params import LabelPrepareParams
@@ -61,7 +61,7 @@ def test_filters_tell_texture_from_plain(tmp_path: Path) -> None:
     lab[..., 0] = 50
     lab[:, 32:, 0] += np.random.default_rng(0).normal(0, 10, (48, 32))
     found = texture_filters(lab)
-    assert found.shape[:2] == (48, 64)
+    assert found.shape == (48, 64, ANSWERS)
     assert np.abs(found[:, :12, 0]).max() < 1e-3
     assert found[:, 52:, 0].mean() > 1
 
@@ -80,11 +80,11 @@ def of(folder: Path) -> Preparation:
 
 
 def test_a_model_adds_columns_and_stays_until_another_is_given(ball: Path, tmp_path: Path) -> None:  # noqa: F811
-    assert of(ball).photo_features.shape[1] == COMPONENTS
+    assert of(ball).photo_features.shape[1] == ANSWERS
     model = tiny.dino(tmp_path / "m.onnx")
     told = prepare(LabelPrepareParams(project=ball, surfels=3000, features=model), Reporter())
     assert not told["reused"]
-    assert of(ball).photo_features.shape[1] > COMPONENTS
+    assert of(ball).photo_features.shape[1] > ANSWERS
     assert np.isfinite(of(ball).photo_features).all()
     assert prepare(LabelPrepareParams(project=ball, surfels=3000, features=model), Reporter())["reused"]
     _, reused = ensured(ball, "main", Reporter())
@@ -93,10 +93,10 @@ def test_a_model_adds_columns_and_stays_until_another_is_given(ball: Path, tmp_p
     assert propagated(ball)["marks"] == 2
     fewer, reused = ensured(ball, "main", Reporter(), 2000)
     assert not reused
-    assert fewer.photo_features.shape[1] > COMPONENTS, "made anew with the model of before"
+    assert fewer.photo_features.shape[1] > ANSWERS, "made anew with the model of before"
     model.unlink()
     again, _ = ensured(ball, "main", Reporter(), 3000)
-    assert again.photo_features.shape[1] == COMPONENTS, "its file is gone"
+    assert again.photo_features.shape[1] == ANSWERS, "its file is gone"
 
 
 def test_a_model_that_does_not_fit_leaves_the_preparation(
@@ -108,4 +108,4 @@ def test_a_model_that_does_not_fit_leaves_the_preparation(
     assert main(["label", "prepare", str(ball), "--features", str(model), "--json"]) != 0
     assert "expected inputs" in json.loads(capfd.readouterr().out)["error"]["message"]
     assert main(["label", "prepare", str(ball), "--features", str(tmp_path / "no.onnx"), "--json"]) != 0
-    assert of(ball).photo_features.shape[1] == COMPONENTS
+    assert of(ball).photo_features.shape[1] == ANSWERS

@@ -11,7 +11,7 @@ import pytest
 import torch
 from fieldwork.nerfcore.errors import Cancelled
 from fieldwork.nerfcore.labels.calibration import CERTAINTY, MOST, STRENGTH, certainty
-from fieldwork.nerfcore.labels.part_labels import STRENGTHS, best_strength
+from fieldwork.nerfcore.labels.part_labels import STRENGTHS, best_strength, simplest
 from fieldwork.nerfcore.labels.photo_features import uplifted
 from fieldwork.nerfcore.labels.seeds import Seeds
 from fieldwork.nerfcore.labels.surfels import by_colour, cell_of, means, most_alike, nearest_neighbours
@@ -139,6 +139,13 @@ def test_looks_are_believed_more_where_classes_do_not_end_with_the_surface() -> 
     whole, patches = (best_strength(*strip(kind), 2) for kind in (False, True))  # type: ignore[arg-type]
     assert whole == STRENGTH == min(STRENGTHS)
     assert patches > whole
+
+
+def test_a_way_that_is_hardly_better_is_not_taken() -> None:
+    one_more = np.array([[1, 1, 1], [1, 1, 1], [0, 0, 1], [1, 1, 1]], float)
+    assert simplest(one_more) == 0, "one example proves nothing"
+    assert simplest(np.repeat([[0.0, 1, 1]], 12, 0)) == 1
+    assert simplest(np.array([[0.2, 0.9, 0.91], [0.3, 0.8, 0.82], [0.4, 0.9, 0.88]])) == 1
 
 
 def test_without_a_second_photo_the_usual_strength_holds() -> None:

@@ -9,7 +9,17 @@ from fieldwork.nerfcore.errors import Cancelled
 from fieldwork.nerfcore.labels.calibration import CERTAINTY, calibrated
 from fieldwork.nerfcore.labels.drawing import covered
 from fieldwork.nerfcore.labels.surfels import cell_of, nearest_neighbours, shape_at
-from fieldwork.nerfcore.labels.unary import balanced, class_probabilities, distance_to_samples, logistic_regression
+from fieldwork.nerfcore.labels.unary import (
+    BANDWIDTH,
+    LANDMARKS,
+    SAMPLES,
+    Kernel,
+    balanced,
+    class_probabilities,
+    distance_to_samples,
+    logistic_regression,
+    sampled,
+)
 from fieldwork.nerfcore.labels.walker import edge_matrix, random_walk
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -93,6 +103,33 @@ def test_the_classifier_knows_what_is_marked_and_how_far_all_else_is() -> None:
     distance = distance_to_samples(features, marked, target, lambda: None)
     truth = np.linalg.norm(features.numpy()[:, None] - features.numpy()[None, :60], axis=2).min(1)
     np.testing.assert_allclose(distance, truth, atol=1e-2)
+
+
+def test_features_of_the_kernel_have_its_values_as_products() -> None:
+    """Also where landmarks are the same, and in as many columns as surfels have."""
+    random = np.random.default_rng(0)
+    rows = torch.from_numpy(random.normal(size=(40, 60)).astype(np.float32))
+    kernel = Kernel(torch.cat([rows, rows[:5]]))
+    features = kernel.features(rows)
+    distance = np.linalg.norm(rows.numpy()[:, None] - rows.numpy()[None], axis=2)
+    np.testing.assert_allclose(features @ features.T, np.exp(-0.5 * (BANDWIDTH * distance) ** 2), atol=2e-4)
+    matrix = torch.from_numpy(random.normal(size=(45, 3)).astype(np.float32))
+    np.testing.assert_allclose(kernel(rows) @ kernel.weights(matrix), features @ matrix, atol=1e-2)
+
+
+def test_many_marks_have_fewer_landmarks_each_and_few_have_enough() -> None:
+    few, many = (torch.arange(count).repeat_interleave(100) for count in (3, 200))
+    assert len(sampled(few, LANDMARKS)) == 3 * SAMPLES
+    chosen = sampled(many, LANDMARKS)
+    assert len(chosen) <= LANDMARKS
+    assert set(many[chosen].tolist()) == set(range(200))
+
+
+def test_what_looks_like_nothing_that_is_marked_is_of_no_class_more_than_another() -> None:
+    features = torch.tensor([[0.0, 0], [4, 0], [400, 300]])
+    found = class_probabilities(features, torch.arange(2), torch.tensor([0, 1]), torch.tensor([0, 1]), 2, lambda: None)
+    np.testing.assert_allclose(found[2], 0.5, atol=0.02)
+    assert found[0, 0] > 0.9
 
 
 def test_a_short_mark_counts_as_much_as_a_long_one_of_its_class() -> None:

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt, gaussian_filter
+from scipy.ndimage import distance_transform_edt, gaussian_filter, maximum_filter, minimum_filter
 
 from ..data.pixels import VOID
 from ..progress import Reporter
@@ -45,6 +45,7 @@ FLAT_CLASS = 0.75  # share of what is known of a class that lies on one plane, f
 LABELLED_OFF = 0.5  # share by which the field's depth may be off the plane of its class
 BEHIND = 0.01  # share of what is known that may lie behind such a plane: a floor bounds a scene, a table top does not
 SMOOTHED = 12.0  # cells over which heights above a plane are averaged
+INNER = 7  # pixels a side of the window in which a label map must give the same class, not to be at an outline
 STEEPEST = 0.05  # cosine under which a plane is not looked at
 FITTED_PIXELS = 3.0  # spread of a depth on a plane, in footprints
 
@@ -226,7 +227,8 @@ def on_scene_planes(
 ) -> tuple[DepthMap, np.ndarray]:
     """A depth map whose depths that are not `sure` (H, W) bool lie on a plane of the scene, where the field's own depth
     agrees with one: the one closest to it. With the plane of its class it need not agree much, however far it reaches.
-    And which depths (H, W) bool lie on the plane of their class.
+    And which depths (H, W) bool lie on the plane of their class, away from outlines: a label map may have a wire thinner than
+    it is.
 
     Args:
         field: the field's depths and spreads where it is not sure; map_: what becomes of them without such a plane.
@@ -258,4 +260,6 @@ def on_scene_planes(
     spread[rows[found], columns[found]] = FITTED_PIXELS / view.camera.fx * moved[found]
     named = np.zeros(new.shape, bool)
     named[rows, columns] = by_class
+    if labels is not None:
+        named &= maximum_filter(labels, INNER) == minimum_filter(labels, INNER)
     return replace(map_, depth=new, spread=spread, cosine=cosines(view.camera, new)), named

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.ndimage import minimum_filter
@@ -30,6 +31,7 @@ ENOUGH = 3  # cameras that see what a mesh is asked to hold
 FAR = 2.5  # of the median depth of the photos: what is farther is a background
 MOST_CAPPED = 0.25  # share of a body's area that may stand on something
 HIDDEN = 0.5  # footprints of a pixel that something lies in front of what it hides
+NEAR_CORNER = 0.7  # of the way from a piece's middle to a corner
 STEEPEST = 0.1  # cosine under which a camera is not said to see a place
 MARGIN = 2.0  # radii of a piece by which it may lie beside a picture that shows some of it
 ACROSS = 50  # pieces across what the photos show, from which points of the truth are taken
@@ -110,8 +112,28 @@ class Sight:
         closest = ClosestPoints(pieces.vertices, pieces.faces[seen]).find(points)[0]
         return self.truth.face_class[pieces.parent[seen[closest]]]
 
+    def visible_near(self, points: np.ndarray) -> np.ndarray:
+        """Whether enough cameras see what is closest to points (N, 3), of all that any camera sees: what no camera sees,
+        as the inside of a thing or the floor under a carpet, takes nothing from what lies before it."""
+        pieces, looked_at = self.pieces, self._looked_at
+        closest, weights, _ = ClosestPoints(pieces.vertices, pieces.faces[looked_at]).find(points)
+        nearest = np.einsum("nk,nkc->nc", weights, pieces.vertices[pieces.faces[looked_at[closest]]])
+        return self.visible(nearest, pieces.normals[looked_at[closest]])
+
+    @cached_property
+    def _looked_at(self) -> np.ndarray:
+        """The pieces (L,) of which a camera sees the middle, or a place near a corner."""
+        pieces = self.pieces
+        corners = pieces.vertices[pieces.faces]
+        places = [pieces.centers, *(corners[:, k] * NEAR_CORNER + pieces.centers * (1 - NEAR_CORNER) for k in range(3))]
+        return np.flatnonzero(np.any([self.cameras_at(place, pieces.normals) > 0 for place in places], axis=0))
+
     def visible(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """Whether enough cameras see points (N, 3) of the truth with normals (N, 3): (N,).
+        """Whether enough cameras see points (N, 3) of the truth with normals (N, 3): (N,)."""
+        return self.cameras_at(points, normals) >= ENOUGH
+
+    def cameras_at(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """How many cameras see points (N, 3) of the truth with normals (N, 3): (N,).
 
         What hides a point is the plane of the face that its pixel shows, cut with the ray to the point: a floor just under
         a carpet is hidden, however flat the camera looks on it.
@@ -132,7 +154,7 @@ class Sight:
                 reached = ((corner - camera.center) * normal).sum(1) / (ray[rows] * normal).sum(1)
             slack = HIDDEN * camera.footprint(depth[rows]) / distance[rows]
             seen[rows] += ~((face >= 0) & (reached > 0) & (reached < 1 - slack))
-        return seen >= ENOUGH
+        return seen
 
 
 def posed(views: Sequence[View]) -> list[PosedCamera]:
@@ -235,8 +257,9 @@ def class_figures(found: Distances, surface: Surface, painted: Painted, sight: S
     areas are those of what enough cameras see: two may show a mesh more of one thing, which is no error."""
     near = found.to_truth < CLOSE * sight.size
     points, _ = sample_surface(surface.vertices.astype(np.float64), surface.faces, len(found.face))
-    ours, theirs = classes_at(surface, painted, points, found.face)[near], sight.class_near(points[near])
-    shown = surface.face_class[found.face[near & found.shown]]
+    points, face = points[near], found.face[near]
+    ours, theirs = classes_at(surface, painted, points, face), sight.class_near(points)
+    shown = surface.face_class[face[sight.visible_near(points)]]
     seen = sight.truth.face_class[found.true_face]
     ious, off = [], []
     for number in np.unique(seen):

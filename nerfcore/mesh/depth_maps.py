@@ -268,16 +268,22 @@ def confirmed_maps(
     report: Reporter,
     around: list[list[int]] | None = None,
     needed: int = CONFIRMED,
+    one_suffices: list[np.ndarray] | None = None,
 ) -> MapArrays:
     """The maps as the kernels read them, without what cannot be trusted: see `map_arrays`, and what `needed` other views
-    (all others where they are fewer) do not confirm. `around`: the neighbours of each view where they are known."""
+    (all others where they are fewer) do not confirm. `around`: the neighbours of each view where they are known;
+    `one_suffices`: for which pixels (H, W) bool of each map one other view is enough."""
     arrays = map_arrays(views, maps, device)
     confirmed, needed = [], min(needed, len({view.photo for view in views}) - 1)
     for index, near in enumerate(around or neighbours(views, maps)):
         report.progress(index / len(views))
         others = torch.tensor(near, dtype=torch.int32, device=arrays.depth.device)
         share = max(AGREE, AGREE_PIXELS / views[index].camera.fx)
-        confirmed.append(agreement(arrays, index, others, share, ROUND_TRIP, needed) >= needed)
+        found = agreement(arrays, index, others, share, ROUND_TRIP, needed)
+        enough = found >= needed
+        if one_suffices is not None:
+            enough |= (found >= 1) & torch.from_numpy(one_suffices[index].reshape(-1)).to(found.device)
+        confirmed.append(enough)
     keep = torch.cat(confirmed) | (arrays.depth >= FREE)
     return replace(arrays, depth=torch.where(keep, arrays.depth, 0.0))
 

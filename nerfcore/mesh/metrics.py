@@ -51,15 +51,14 @@ def sample_surface(
 class Distances:
     """What lies between a mesh and the true one, sampled evenly by area.
 
-    face (N,) of the mesh and to_truth (N,) from there to the truth; of the nearest point there, its face truth_face (N,)
-    and whether it is visible: shown (N,) bool; angle (N,) between the two normals, degrees, 0 to 90; true_face (M,) of the
-    visible truth and to_mesh (M,) from there; area and true_area: of the mesh, and of the visible truth.
+    face (N,) of the mesh and to_truth (N,) from there to the truth, whose nearest point lies in its face truth_face (N,);
+    angle (N,) between the two normals, degrees, 0 to 90; true_face (M,) of the visible truth and to_mesh (M,) from there;
+    area and true_area: of the mesh, and of the visible truth.
     """
 
     face: np.ndarray
     to_truth: np.ndarray
     truth_face: np.ndarray
-    shown: np.ndarray
     angle: np.ndarray
     true_face: np.ndarray
     to_mesh: np.ndarray
@@ -92,9 +91,8 @@ def distances(
     the truth to the closest triangle of the other.
 
     `visible`: points and normals (N, 3) of the truth → (N,) bool; distances from the truth are those of visible
-    points, and `Distances.shown` tells where the mesh lies next to them. `true`: points (M, 3) spread over the visible
-    truth, their triangles (M,) and its area, where they are known: of a large truth of which little is visible, few of
-    the points would be.
+    points. `true`: points (M, 3) spread over the visible truth, their triangles (M,) and its area, where they are known: of
+    a large truth of which little is visible, few of the points would be.
     """
     points, face = sample_surface(*mesh, count=count, seed=seed)
     normals = unit(cross(*truth))
@@ -102,15 +100,13 @@ def distances(
         place, true_face = sample_surface(*truth, count=2 * count, seed=seed + 1)
         shown = np.ones(len(place), bool) if visible is None else visible(place, normals[true_face])
         true = place[shown], true_face[shown], float(areas(*truth).sum() * shown.mean())
-    truth_face, weights, to_truth = ClosestPoints(*truth).find(points)
-    nearest = np.einsum("nk,nkc->nc", weights, truth[0][truth[1][truth_face]])
+    truth_face, _, to_truth = ClosestPoints(*truth).find(points)
     to_mesh = ClosestPoints(*mesh).find(true[0])[2]
     cosine = np.abs((unit(cross(*mesh))[face] * normals[truth_face]).sum(1))
     return Distances(
         face,
         to_truth,
         truth_face,
-        np.ones(len(points), bool) if visible is None else visible(nearest, normals[truth_face]),
         np.degrees(np.arccos(np.clip(cosine, 0, 1))),
         true[1],
         to_mesh,

@@ -73,8 +73,8 @@ def refined_maps(
 ) -> tuple[MapArrays, float]:
     """Confirmed maps (see `depth_maps.confirmed_maps`) whose depths photos have moved, and the share of their depths that
     views do confirm. Where views do not confirm a moved depth, the field's is asked again, the plane through what is
-    known around (planes.py), or that of a wall or floor that goes on from elsewhere (scene_planes.py). Where they do not confirm
-    that either, but three of them the field's own depth, it is taken, as far away as photos confirm depths. What label maps say
+    known around (planes.py), or that of a wall or floor that goes on from elsewhere (scene_planes.py); where label maps say that
+    it is this floor, one view suffices. Where they do not confirm that either, but three of them the field's own depth, it is taken, as far away as photos confirm depths. What label maps say
     is nothing, and backdrops without the name of a thing (sky.py), have an unknown depth.
     """
     arrays = map_arrays(views, maps, device)
@@ -111,11 +111,13 @@ def refined_maps(
         fields.append(trusted_field(old, depth, safe, unnamed if told else None))
         known.append(replace(old, depth=depth, spread=spread.astype(np.float32)))
     planes = scene_planes(known_points(views, known, kept, labels), report)
-    mixed = []
+    mixed, named = [], []
     for view, map_, safe, label in zip(views, known, sure, labels):
         report.check()
-        mixed.append(on_scene_planes(view, map_, safe, with_planes(view, map_, safe), planes, label))
-    final = confirmed_maps(views, mixed, device, report, around)
+        on_planes, by_class = on_scene_planes(view, map_, safe, with_planes(view, map_, safe), planes, label)
+        mixed.append(on_planes)
+        named.append(by_class)
+    final = confirmed_maps(views, mixed, device, report, around, one_suffices=named)
     final = with_holes_filled(final, confirmed_maps(views, fields, device, report, around, FIELD_CONFIRMED))
     asked = sum(int(map_.hit.sum()) for map_ in mixed)
     return final, sum(int(part.sum()) for part in hits(final, mixed)) / max(asked, 1)

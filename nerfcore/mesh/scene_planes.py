@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt, gaussian_filter
+from scipy.ndimage import distance_transform_edt, gaussian_filter, maximum_filter, minimum_filter
 
 from ..data.pixels import VOID
 from ..progress import Reporter
@@ -45,6 +45,7 @@ FLAT_CLASS = 0.75  # share of what is known of a class that lies on one plane, f
 LABELLED_OFF = 0.5  # share by which the field's depth may be off the plane of its class
 BEHIND = 0.01  # share of what is known that may lie behind such a plane: a floor bounds a scene, a table top does not
 SMOOTHED = 12.0  # cells over which heights above a plane are averaged
+INNER = 7  # pixels a side of the window in which a label map must give the same class, not to be at an outline
 STEEPEST = 0.05  # cosine under which a plane is not looked at
 FITTED_PIXELS = 3.0  # spread of a depth on a plane, in footprints
 
@@ -223,9 +224,11 @@ def on_scene_planes(
     map_: DepthMap,
     planes: list[ScenePlane],
     labels: np.ndarray | None = None,
-) -> DepthMap:
+) -> tuple[DepthMap, np.ndarray]:
     """A depth map whose depths that are not `sure` (H, W) bool lie on a plane of the scene, where the field's own depth
     agrees with one: the one closest to it. With the plane of its class it need not agree much, however far it reaches.
+    And which depths (H, W) bool lie on the plane of their class, away from outlines: a label map may have a wire thinner than
+    it is.
 
     Args:
         field: the field's depths and spreads where it is not sure; map_: what becomes of them without such a plane.
@@ -235,7 +238,7 @@ def on_scene_planes(
     ray = pixel_directions(view.camera)[rows, columns] @ view.pose[:3, :3].T
     eye, depth = view.pose[:3, 3], field.depth[rows, columns]
     allowed = np.clip(SPREADS * field.spread[rows, columns] / depth, AGREES, OFF)
-    moved = np.zeros(len(rows), np.float32)
+    moved, by_class = np.zeros(len(rows), np.float32), np.zeros(len(rows), bool)
     kind = np.full(len(rows), VOID, np.uint8) if labels is None else labels[rows, columns]
     for plane in planes:
         towards, of_class = np.negative(ray @ plane.normal), plane.classes[kind]
@@ -250,9 +253,13 @@ def on_scene_planes(
         off = np.abs(reached - depth[close]) / depth[close]
         better = off < limit[close]
         close = close[better]
-        moved[close], allowed[close] = reached[better], off[better]
+        moved[close], allowed[close], by_class[close] = reached[better], off[better], of_class[close]
     new, spread = map_.depth.copy(), map_.spread.copy()
     found = moved > 0
     new[rows[found], columns[found]] = moved[found]
     spread[rows[found], columns[found]] = FITTED_PIXELS / view.camera.fx * moved[found]
-    return replace(map_, depth=new, spread=spread, cosine=cosines(view.camera, new))
+    named = np.zeros(new.shape, bool)
+    named[rows, columns] = by_class
+    if labels is not None:
+        named &= maximum_filter(labels, INNER) == minimum_filter(labels, INNER)
+    return replace(map_, depth=new, spread=spread, cosine=cosines(view.camera, new)), named

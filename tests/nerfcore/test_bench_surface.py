@@ -155,6 +155,22 @@ def test_classes_are_those_of_what_can_be_seen() -> None:
     assert sight.class_near(inside).tolist() == [1, 1, 2]
 
 
+def test_what_no_camera_sees_takes_no_area_from_what_lies_before_it() -> None:
+    """What a mesh has of a carpet, sunk into it, lies closest to its underside; a surface deep inside counts as well."""
+    import trimesh
+
+    carpet = trimesh.creation.box((0.5, 0.5, 0.01)).subdivide_to_size(0.1).apply_translation((0, 0, 0.005))
+    plate = trimesh.creation.box((0.8, 0.8, 0.2)).subdivide_to_size(0.1).apply_translation((0, 0, -0.1))
+    whole = trimesh.util.concatenate([plate, carpet])
+    kinds = np.repeat([2, 1], [len(plate.faces), len(carpet.faces)])
+    sight = Sight(Truth(np.asarray(whole.vertices), np.asarray(whole.faces), kinds), scene_around().views)
+    x, y = np.meshgrid(np.linspace(-0.2, 0.2, 5), np.linspace(-0.2, 0.2, 5))
+    sunk = np.stack([x, y, 0 * x + 0.002], -1).reshape(-1, 3)
+    assert not sight.visible(sunk - [0, 0, 0.002], np.array([[0.0, 0, -1]]).repeat(25, 0)).any()
+    assert sight.visible_near(sunk).all()
+    assert sight.visible_near(np.array([[0.0, 0, -0.05]])).all()
+
+
 def test_volumes_of_bodies_are_compared() -> None:
     truth = ball_and_plate()
     ball = truth.faces[truth.face_class == 1]

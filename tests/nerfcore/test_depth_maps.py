@@ -73,6 +73,20 @@ def test_more_views_can_be_asked_to_confirm(room: Room) -> None:
     )
 
 
+def test_one_other_view_is_enough_where_it_is_said_to_be(room: Room) -> None:
+    flats, maps = room
+    half = [np.arange(m.depth.shape[1]) * np.ones((len(m.depth), 1)) < m.depth.shape[1] / 2 for m in maps]
+    strict, loose, mixed = (
+        known(depth_maps.confirmed_maps(flats, maps, CPU, Reporter(), needed=needed, one_suffices=where))
+        for needed, where in ((3, None), (1, None), (3, half))
+    )
+    chosen = torch.from_numpy(np.concatenate([h.reshape(-1) for h in half]))
+    assert int((loose & ~strict & chosen).sum()) > 0
+    assert torch.equal(mixed, torch.where(chosen, loose, strict))
+    alone = depth_maps.confirmed_maps(flats[:1], maps[:1], CPU, Reporter(), one_suffices=half[:1])
+    assert torch.equal(known(alone), known(depth_maps.map_arrays(flats[:1], maps[:1], CPU)))
+
+
 def test_holes_are_filled_and_nothing_else() -> None:
     def arrays(*depths: float) -> MapArrays:
         depth = torch.tensor(depths)

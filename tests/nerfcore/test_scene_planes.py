@@ -72,14 +72,14 @@ def test_unsure_depths_that_agree_lie_on_the_plane(walls) -> None:
     planes = scene_planes(known_points(views, maps, sure), Reporter())
     off = np.where(sure[1], 1, 1.04)  # the field is 4 % too far where photos say nothing
     blurred = as_map(depths[1] * off, 0.2)
-    found = on_scene_planes(views[1], blurred, sure[1], blurred, planes)
+    found, _ = on_scene_planes(views[1], blurred, sure[1], blurred, planes)
     near = slice(80, 100)
     assert found.depth[:, near] == pytest.approx(depths[1][:, near], rel=1e-3)
     assert (found.spread[:, near] < 0.1).all()
     assert (found.depth[sure[1]] == blurred.depth[sure[1]]).all()
     # A field that is sure of another depth is believed: a picture that hangs before the wall.
     sharp = as_map(depths[1] * np.where(sure[1], 1, 0.95), 0.01)
-    assert (on_scene_planes(views[1], sharp, sure[1], sharp, planes).depth == sharp.depth).all()
+    assert (on_scene_planes(views[1], sharp, sure[1], sharp, planes)[0].depth == sharp.depth).all()
 
 
 def test_a_plane_ends_and_has_one_side(walls) -> None:
@@ -88,11 +88,11 @@ def test_a_plane_ends_and_has_one_side(walls) -> None:
     aside = looking(6.0, 0.0)  # the same wall, far from what is known of it
     blurred = as_map(wall_depth(aside) * 1.04, 0.2)
     nothing = np.zeros((90, 120), bool)
-    assert (on_scene_planes(aside, blurred, nothing, blurred, planes).depth == blurred.depth).all()
+    assert (on_scene_planes(aside, blurred, nothing, blurred, planes)[0].depth == blurred.depth).all()
     behind = looking(0.0, np.pi)
     behind.pose[2, 3] = 6.0
     seen = as_map(np.full((90, 120), 3.1), 0.2)
-    assert (on_scene_planes(behind, seen, nothing, seen, planes).depth == seen.depth).all()
+    assert (on_scene_planes(behind, seen, nothing, seen, planes)[0].depth == seen.depth).all()
 
 
 def test_nothing_known_is_no_plane_and_cancelling_is_heard(walls) -> None:
@@ -117,13 +117,16 @@ def test_the_plane_of_a_class_goes_on_wherever_label_maps_give_it(walls) -> None
     true = wall_depth(aside)
     blurred = as_map(true * 1.3, 0.01)  # a field that is sure of another depth
     label = np.where(np.arange(120) < 60, 4, 5) * np.ones((90, 1), int)
-    found = on_scene_planes(aside, blurred, nothing, blurred, planes, label.astype(np.uint8))
+    found, named = on_scene_planes(aside, blurred, nothing, blurred, planes, label.astype(np.uint8))
     assert found.depth[:, :60] == pytest.approx(true[:, :60], rel=1e-3)
     assert (found.depth[:, 60:] == blurred.depth[:, 60:]).all()
+    assert named[:, :57].all()
+    assert not named[:, 57:].any()  # the class ends at column 60
     # A field that has it at twice the depth shows something else, and so does what photos confirm.
-    away = as_map(true * 2.2, 0.01)
-    assert (on_scene_planes(aside, away, nothing, away, planes, of_class(4)[0]).depth == away.depth).all()
-    assert (on_scene_planes(aside, blurred, ~nothing, blurred, planes, of_class(4)[0]).depth == blurred.depth).all()
+    for field, sure_there in ((as_map(true * 2.2, 0.01), nothing), (blurred, ~nothing)):
+        found, named = on_scene_planes(aside, field, sure_there, field, planes, of_class(4)[0])
+        assert (found.depth == field.depth).all()
+        assert not named.any()
 
 
 def test_a_class_that_lies_elsewhere_too_has_no_plane(walls) -> None:
@@ -149,6 +152,6 @@ def test_depths_lie_at_the_height_of_what_is_known_around(walls) -> None:
     stepped = [np.where(upper, wall_depth(view, 2.955), wall_depth(view)) for view in views]
     planes = scene_planes(known_points(views, [as_map(d, 0.01) for d in stepped], sure), Reporter())
     blurred = as_map(stepped[1] * np.where(sure[1], 1, 1.04), 0.2)
-    found = on_scene_planes(views[1], blurred, sure[1], blurred, planes)
+    found, _ = on_scene_planes(views[1], blurred, sure[1], blurred, planes)
     for rows in (slice(0, 15), slice(60, 90)):
         assert found.depth[rows, 82:90] == pytest.approx(stepped[1][rows, 82:90], abs=0.015)

@@ -17,7 +17,6 @@ SCALE = 4.2  # exponent by what is found for the classifier: SCALE · τ
 STRENGTH = 0.003  # γ of the prior, of the median of what edges conduct, where marks cannot tell
 TAUS = np.linspace(0.05, 1.5, 30)
 LEAST, MOST = 0.3, 4.0  # exponents
-DIFFUSE = 0.28  # power of the strength by which the most falls: the more looks count, the less a walker strays
 
 
 @dataclass(frozen=True)
@@ -43,7 +42,7 @@ def certainty(
     Args:
         features: (S, F) of the marked surfels. strength: of their looks in the random walker.
     """
-    most = MOST * (STRENGTH / strength) ** DIFFUSE
+    most = 1 + (MOST - 1) * STRENGTH / strength  # the more looks count, the less a walker strays
     found, right, share = [], [], []
     photos = np.unique(seeds.photo) if len(seeds.photo) else []
     for photo in photos if len(photos) > 1 else []:

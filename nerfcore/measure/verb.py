@@ -58,7 +58,8 @@ def measure(params: MeasureParams, report: Reporter) -> dict[str, Any]:
     Returns:
         {"unit": "m" or "scene units", "scale": {"u_percent", "source", "factor"}, "classes" and "instances":
         [{"id", "name", "area", "area_low", "area_high", "volume", "volume_low", "volume_high"}], "distances": [{"name",
-        "use", "length", "low", "high", "known", "difference"}], "file"}; lows and highs are the ends of 95 % intervals,
+        "use", "length", "low", "high", "known", "difference"}], "label_revision": of the marks that the mesh's classes are
+        from, or None, "file"}; lows and highs are the ends of 95 % intervals,
         volumes None where a thing is open.
     Raises:
         ProjectError: there is no mesh, or the project was aligned anew since. InputError: the file of distances.
@@ -66,7 +67,8 @@ def measure(params: MeasureParams, report: Reporter) -> dict[str, Any]:
     folder = Path(params.project)
     project, poses = load_project(folder), load_poses(folder)
     surface, _ = load_surface(folder, params.run)
-    voxel = float(mesh_record(folder, params.run).result["voxel"])
+    made = mesh_record(folder, params.run).result
+    voxel = float(made["voxel"])
     target = mesh_folder(folder, params.run)
     distances = [] if params.distances is None else read_distances(params.distances, world_from_sfm(project), poses)
     scale = scale_of(project, poses, distances, voxel, params.scale_error)
@@ -103,6 +105,7 @@ def measure(params: MeasureParams, report: Reporter) -> dict[str, Any]:
             for i, area, volume in zip(instances, measured.instance_areas, measured.instance_volumes)
         ],
         "distances": [distance_entry(d, scale, voxel) for d in distances],
+        "label_revision": made.get("label_revision"),
     }
     report.stage("Writing")
     write_json(target / MEASURES, result)

@@ -23,6 +23,7 @@ from fieldwork.nerfcore.labels.preparation import FOLDER, Preparation, current, 
 from fieldwork.nerfcore.labels.propagate import propagate
 from fieldwork.nerfcore.labels.revisions import computed, load
 from fieldwork.nerfcore.labels.stroke import checkout, stroke
+from fieldwork.nerfcore.measure.verb import measure
 from fieldwork.nerfcore.mesh.verb import mesh
 from fieldwork.nerfcore.params import (
     LabelAcceptParams,
@@ -32,6 +33,7 @@ from fieldwork.nerfcore.params import (
     LabelPrepareParams,
     LabelPropagateParams,
     LabelStrokeParams,
+    MeasureParams,
     MeshParams,
     RenderParams,
     TrainParams,
@@ -225,6 +227,7 @@ def test_accepted_labels_are_the_fields_and_renders_name_the_revision(ball: Path
     assert result["label_revision"] == 2
     surface = mesh(MeshParams(project=ball, resolution=48), Reporter())
     assert surface["label_revision"] == 2
+    assert measure(MeasureParams(project=ball), Reporter())["label_revision"] == 2
     area = {name: values["area"] for name, values in surface["classes"].items()}
     assert min(area["top"], area["bottom"]) > 0.15 * sum(area.values())
     held_out, right = {load_scene(ball).views[i].name for i in load_scene(ball).test}, []

@@ -37,24 +37,23 @@ def catch(scene: bpy.types.Scene) -> None:
 
 
 def _receive_light(tree: bpy.types.NodeTree) -> None:
-    """Let an unlit material be grey and matt on objects that catch shadows: light of its own has none."""
-    for output in (node for node in tree.nodes if node.type == "OUTPUT_MATERIAL"):
-        links = output.inputs["Surface"].links
-        if not links or links[0].from_node.type != "EMISSION":
-            continue
-        unlit = links[0].from_socket
-        catches, matt, mix = (
-            tree.nodes.new(kind) for kind in ("ShaderNodeAttribute", "ShaderNodeBsdfDiffuse", "ShaderNodeMixShader")
-        )
-        catches.attribute_type, catches.attribute_name = "OBJECT", "is_shadow_catcher"
-        matt.inputs["Color"].default_value = (0.5, 0.5, 0.5, 1)
-        tree.links.new(catches.outputs["Fac"], mix.inputs[0])
-        tree.links.new(unlit, mix.inputs[1])
-        tree.links.new(matt.outputs[0], mix.inputs[2])
-        tree.links.new(mix.outputs[0], output.inputs["Surface"])
-        for column, node in enumerate((catches, matt, mix)):
-            node.location = output.location.x + 220 * (column - 2), output.location.y - 200 * (column < 2)
-        output.location.x += 220
+    """Let Cycles see an unlit material as grey and matt on objects that catch shadows: light of its own has none. Other engines
+    and the viewport's preview show it as it is."""
+    output = tree.get_output_node("CYCLES")
+    links = output.inputs["Surface"].links if output is not None else ()
+    if not links or links[0].from_node.type != "EMISSION":
+        return
+    kinds = ("ShaderNodeAttribute", "ShaderNodeBsdfDiffuse", "ShaderNodeMixShader", "ShaderNodeOutputMaterial")
+    catches, matt, mix, seen = nodes = [tree.nodes.new(kind) for kind in kinds]
+    catches.attribute_type, catches.attribute_name = "OBJECT", "is_shadow_catcher"
+    matt.inputs["Color"].default_value = (0.5, 0.5, 0.5, 1)
+    seen.target = "CYCLES"
+    tree.links.new(catches.outputs["Fac"], mix.inputs[0])
+    tree.links.new(links[0].from_socket, mix.inputs[1])
+    tree.links.new(matt.outputs[0], mix.inputs[2])
+    tree.links.new(mix.outputs[0], seen.inputs["Surface"])
+    for column, node in enumerate(nodes):
+        node.location = output.location.x + 220 * (column - 1), output.location.y - 250
 
 
 def set_up(scene: bpy.types.Scene) -> bpy.types.Scene | None:

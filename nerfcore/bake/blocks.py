@@ -82,6 +82,12 @@ def march_settings(model: Model, side: int, step: float) -> MarchSettings:
     )
 
 
+def growth(places: torch.Tensor) -> torch.Tensor:
+    """How many times as long (N,) cells and bins are at places (N, 3) as in the cube [−1, 1]³, where space is contracted: as in
+    `kernels.traversal.bin_length`."""
+    return places.abs().amax(1).clamp(min=1) ** 1.5
+
+
 def candidates(grid: RenderGrid, side: int) -> torch.Tensor:
     """Places (S, 3) of the blocks that an occupied cell of the grid reaches into."""
     n = grid.settings.resolution
@@ -147,8 +153,8 @@ def read_blocks(model: Model, grid: RenderGrid, side: int, check: Check) -> Bloc
             check()
             there = points[part].contiguous()
             length = torch.full((len(part),), cell, device=points.device)
-            if model.contracted:  # cells and bins grow outside the cube, as in `kernels.traversal.bin_length`
-                length = length * uncontract(there).abs().amax(1).clamp(min=1) ** 1.5
+            if model.contracted:
+                length = length * growth(uncontract(there))
             opacity = 1 - torch.exp(-model.field.density(there) * length)
             roots[part] = torch.where(opacity > LEAST_OPACITY, opacity.sqrt(), 0.0)
         return (roots * 255).round().to(torch.uint8)
@@ -205,8 +211,8 @@ def finest_side(grid: RenderGrid, centers: torch.Tensor, angles: torch.Tensor) -
     points = (torch.stack([occupied % n, occupied // n % n, occupied // n**2], 1) + 0.5) / n
     places = uncontract(points) if contracted else points * 2 - 1
     width = (torch.cdist(places, centers) * angles).amin(1)
-    if contracted:  # cells grow outside the cube
-        width = width / places.abs().amax(1).clamp(min=1) ** 1.5
+    if contracted:
+        width = width / growth(places)
     return max(1, round(cell_length(1, contracted) / (FINEST_CELL * float(width.quantile(LEAST_WIDE)))))
 
 

@@ -72,8 +72,7 @@ def bake(params: BakeParams, report: Reporter) -> dict[str, Any]:
     scene = load_scene(folder, trained.info.holdout)
     report.stage("Looking for what the photos show")
     box_from_world = trained.info.box(project).box_from_world
-    chosen = np.unique(np.linspace(0, len(scene.train) - 1, MOST_VIEWS).round().astype(int))
-    asked = [scene.views[scene.train[number]] for number in chosen]
+    asked = [scene.views[number] for number in evenly(scene.train, MOST_VIEWS)]
     cameras = [view.camera.resized(*training_size(view.camera, trained.info.image_size)) for view in asked]
     poses = trained_poses(folder, params.run, trained, asked, box_from_world)
     rays = sparser_rays(cameras, poses, trained.device)
@@ -123,6 +122,11 @@ def bake(params: BakeParams, report: Reporter) -> dict[str, Any]:
     return result
 
 
+def evenly(numbers: list[int], most: int) -> list[int]:
+    """So many of the numbers at most, evenly from first to last."""
+    return [numbers[n] for n in np.unique(np.linspace(0, len(numbers) - 1, most).round().astype(int))]
+
+
 def sparser_rays(cameras: list[Camera], poses: np.ndarray, device: torch.device) -> CameraRays:
     """Rays of cameras (poses (V, 4, 4)), made so small that there are about `RAYS`."""
     pixels = sum(camera.width * camera.height for camera in cameras)
@@ -154,7 +158,7 @@ def training_photos(
     """Training photos and the labels of these classes, as large as in training, so many of them that there are about `PIXELS`."""
     size = sum(math.prod(training_size(scene.views[n].camera, trained.info.image_size)) for n in scene.train)
     count = max(1, min(len(scene.train), int(len(scene.train) * PIXELS / max(size, 1))))
-    chosen = [scene.train[n] for n in np.unique(np.linspace(0, len(scene.train) - 1, count).round().astype(int))]
+    chosen = evenly(scene.train, count)
     photos = PixelStore(scene, chosen, classes, box_from_world, trained.info.image_size, trained.device, report)
     poses = trained_poses(folder, run, trained, photos.views, box_from_world)
     photos.rays = CameraRays(photos.cameras, poses, trained.device)

@@ -29,8 +29,9 @@ def by_parts(ready: Preparation, seeds: Seeds, classes: int, check: Callable[[],
 
 
 def best_strength(ready: Preparation, seeds: Seeds, classes: int, check: Callable[[], None] = lambda: None) -> float:
-    """The strength of the prior with which labels of parts, by the marks on some photos, are most often those of the marks
-    on the others, each mark counting the same: where classes do not end where surfaces do, looks are to be believed more."""
+    """The least strength of the prior with which labels of parts, by the marks on some photos, are as often those of the marks
+    on the others as with any (`simplest`), each mark counting the same: where classes do not end where surfaces do, looks are
+    to be believed more."""
     found, photos = [], np.unique(seeds.photo)
     for left_out in np.array_split(photos, min(FOLDS, len(photos))) if len(photos) > 1 else []:
         out = np.isin(seeds.photo, left_out)

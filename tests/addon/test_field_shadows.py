@@ -90,6 +90,8 @@ if engine == "EEVEE":
     scene.eevee.taa_render_samples = 32
 for _ in range(2):
     facts["pressed"] = attempt(bpy.ops.fieldwork.catch_shadows)
+output = surface.active_material.node_tree.get_output_node
+facts["shown"] = [output(engine).inputs["Surface"].links[0].from_node.type for engine in ("CYCLES", "EEVEE")]
 tree, _ = compositor.tree_of(scene)
 facts["scenes"], facts["layers"] = len(bpy.data.scenes), len([n for n in tree.nodes if n.type == "R_LAYERS"])
 for name, hidden in (("lit", True), ("shadow", False)):
@@ -113,6 +115,7 @@ answer(facts)
     assert facts["pressed"] == ["FINISHED"]
     assert facts["scenes"] == facts["layers"] == (2 if engine == "CYCLES" else 3), "however often it is pressed"
     assert facts["without"] == 2
+    assert facts["shown"] == ["MIX_SHADER", "EMISSION"], "other engines show the photos' colours"
     assert not facts["held"]
     lit, shadow, plain = (np.load(tmp_path / f"{name}.npy") for name in ("lit", "shadow", "plain"))
     # 30 pixels are 0.48 at the distance of the ball.

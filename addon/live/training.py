@@ -234,9 +234,10 @@ trainings = Trainings()
 
 def tick() -> float:
     """What the timer does: redraw views when a picture has come, or a training has begun or ended."""
-    if trainings.look():
-        redraw_views()
-    return WATCHING if trainings.views else IDLE
+    changed = trainings.look()
+    if changed:
+        redraw_views()  # views that begin to look at a training do so while they are drawn, after this
+    return WATCHING if changed or trainings.views else IDLE
 
 
 def register() -> None:

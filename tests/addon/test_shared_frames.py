@@ -117,3 +117,26 @@ def test_what_is_being_written_is_not_shown(tmp_path: Path) -> None:
         file._counter[0] += 1
         assert pixels.whole("Combined") is None
         assert pixels.whole("Normal") is None, "a pass that was not asked for"
+
+
+def test_new_trainings_are_looked_at_soon_again(bpy_script, tmp_path: Path) -> None:
+    """Views begin to watch a training while they are drawn: had the timer a long pause then, the first picture waited for it."""
+    facts = bpy_script(
+        """
+from fieldwork.addon.live import training
+from fieldwork.nerfcore.project import live
+own = training.trainings
+facts = {"before": [own.run_of(Path(project)), training.tick()]}
+live.write(live.training_file(Path(project)), {"run": "main", "pid": 1})
+own._runs[Path(project)] = (own._runs[Path(project)][0] - training.IDLE, None)  # as if it was asked a while ago
+facts["begun"] = training.tick()
+facts["quiet"] = training.tick()
+facts["pauses"] = [training.IDLE, training.WATCHING]
+answer(facts)
+""",
+        project=tmp_path,
+    )
+    idle, watching = facts["pauses"]
+    assert facts["before"] == [None, idle]
+    assert facts["begun"] == watching < idle
+    assert facts["quiet"] == idle

@@ -93,7 +93,7 @@ class Window:
         """
         blender = ["blender", "--factory-startup", "-noaudio", "--gpu-backend", "opengl", "--enable-event-simulate"]
         blender += ["--window-geometry", "0", "0", *map(str, size)]
-        blender += ["--python", str(Path(__file__).with_name("driver.py"))]
+        blender += ["--python", str(ROOT / "tests" / "gui" / "driver.py")]
         runs = [shlex.join([*blender, "--", scenario, str(self.folder)]) for scenario in scenarios]
         for scenario in scenarios:
             (self.folder / f"{scenario}.json").unlink(missing_ok=True)

@@ -26,7 +26,8 @@ class Package:
 
     `texture` is a picture for the mesh's "uv" (F, 3, 2), v upwards; None where colours are the vertices'. `instances` are
     the entries {"id", "name", "class_id"} for the mesh's "face_instance", `measures` the areas and volumes of measures.json,
-    `relations` how the instances stand to each other: {"subject", "relation", "object"} with their ids.
+    `relations` how the instances stand to each other: {"subject", "relation", "object"} with their ids; `label_revision`: of
+    the marks that the mesh's classes are from, None where they are from none.
     """
 
     folder: Path
@@ -42,6 +43,7 @@ class Package:
     instances: list[dict[str, Any]]
     measures: dict[str, Any]
     relations: list[dict[str, Any]] = field(default_factory=list)
+    label_revision: int | None = None
 
 
 @dataclass(frozen=True)
@@ -108,6 +110,7 @@ def read_package(folder: Path | str) -> Package:
         instances=value.get("instances") or [],
         measures=value.get("measures") or {},
         relations=value.get("relations") or [],
+        label_revision=value.get("label_revision"),
     )
 
 

@@ -31,6 +31,7 @@ CLASS_ATTRIBUTE, VERTEX_CLASS_ATTRIBUTE = "class_id", "vertex_class_id"
 INSTANCE_ATTRIBUTE = "instance_id"
 RELATIONS = "relations"  # custom property of the objects of instances
 INSTANCE_NAMES = "instances"  # custom property of the objects: names by the numbers of the attribute
+LABEL_REVISION = "label_revision"  # custom property of the objects: of the marks that classes are from
 UV_MAP = "UVMap"
 # Custom properties, in `unit`² and `unit`³: the value and the ends of its 95 % interval.
 MEASURED = tuple(f"{name}{end}" for name in ("area", "volume") for end in ("", "_low", "_high"))
@@ -53,6 +54,10 @@ def surface(owned: Owned, package: Package, part: Part, groups: Callable[[], tup
     add_viewport_colors(item, groups()[1])
     item[INSTANCE_NAMES] = {str(entry["id"]): entry["name"] for entry in package.instances}
     describe(item, part.measured, package.measures)
+    if package.label_revision is not None:
+        item[LABEL_REVISION] = package.label_revision
+    elif LABEL_REVISION in item:
+        del item[LABEL_REVISION]
     relate(item, {entry["id"]: entry["name"] for entry in package.instances}, package.relations)
     return item
 

@@ -103,6 +103,7 @@ def bake(params: BakeParams, report: Reporter) -> dict[str, Any]:
         class_names=[names.get(number, str(number)) for number in classes],
         sfm_from_box=trained.info.sfm_from_box,
         environment=trained.model.environment is not None,
+        label_revision=trained.info.label_revision,
     )
     environment = panorama(trained.model, report.check) if meta.environment else None
     place = voxels_folder(folder, params.run)
@@ -114,6 +115,7 @@ def bake(params: BakeParams, report: Reporter) -> dict[str, Any]:
         "folder": str(place),
         "blocks": len(blocks),
         "cells": settings.resolution,
+        "label_revision": meta.label_revision,
         "memory_mb": round(texture_bytes(len(blocks), blocks.side) / 1e6, 1),
         "seconds": round(time.perf_counter() - begin, 1),
         "files": [str(path) for path in files],

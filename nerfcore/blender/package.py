@@ -1,7 +1,8 @@
 """The package: what Blender needs of a capture, readable with numpy and JSON alone.
 
 package.json        name and UUID of the project, classes, cameras (camera-to-world in the world frame, OpenGL axes);
-                    instances, their relations and measures of the mesh, empty where there are none
+                    instances, their relations and measures of the mesh, empty where there are none; the revision of the
+                    marks that its classes are from, or null
 renders/            rendered photos, without lens distortion too, where there are any
 images/             the photos without lens distortion, in the size of their camera
 points.npz          xyz (N, 3) float32 world, rgb (N, 3) uint8 sRGB
@@ -36,6 +37,7 @@ from ..project.fingerprints import read_made
 from ..project.runs import (
     CHECKPOINT,
     INSTANCES,
+    LABEL_REVISION,
     MEASURES,
     MESH_RECORD,
     RENDER_RECORD,
@@ -103,6 +105,7 @@ def write_package(
             "instances": _beside(source / INSTANCES, []) if has_mesh else [],
             "relations": _relations(source) if has_mesh else [],
             "measures": _beside(source / MEASURES, {}) if has_mesh else {},
+            LABEL_REVISION: made.result.get(LABEL_REVISION) if has_mesh and made else None,
             "checkpoint": checkpoint_id(project, run),
             "mesh_checkpoint": made.checkpoint if has_mesh and made else "",
         },

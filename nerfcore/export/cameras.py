@@ -18,14 +18,16 @@ from ..files import atomic_path, staged, write_json, write_text
 from ..geometry.cameras import Camera, flip_camera_axes
 from ..geometry.colmap_cameras import camera_to_colmap
 from ..geometry.points import Points
+from ..project.runs import label_facts
 
 RADIAL = ("k1", "k2", "p1", "p2", "k3")  # in the order of Camera.distortion
 FISHEYE = ("k1", "k2", "k3", "k4")
 
 
-def write_transforms(out: Path, scene: Scene, metres: bool) -> list[Path]:
+def write_transforms(out: Path, scene: Scene, metres: bool, label_revision: int | None = None) -> list[Path]:
     """A transforms.json as nerfstudio and Instant-NGP read it: camera-to-world with OpenGL axes, intrinsics of each frame
-    in pixels, which photos are held out; and the sparse points beside it.
+    in pixels, which photos are held out, and the revision of the marks that label maps are from, if they are from any; and the
+    sparse points beside it.
 
     Returns:
         the files written.
@@ -41,6 +43,7 @@ def write_transforms(out: Path, scene: Scene, metres: bool) -> list[Path]:
         )
     frames = [_frame(view, out.parent) for view in scene.views]
     head: dict[str, Any] = {"camera_convention": "OpenGL axes, z up" + (", metres" if metres else "")}
+    head |= label_facts(label_revision)
     head |= {
         f"{split}_filenames": [frames[i]["file_path"] for i in indices]
         for split, indices in (("train", scene.train), ("test", scene.test))

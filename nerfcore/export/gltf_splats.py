@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ..files import atomic_path
+from ..mesh.gltf import extras
 
 EXTENSION = "KHR_gaussian_splatting"
 C0 = 0.28209479177387814  # spherical harmonics of degree 0
@@ -17,8 +18,9 @@ FLOAT, ARRAY_BUFFER, POINTS = 5126, 34962, 0
 KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 
-def write_gltf_splats(path: Path, splats: np.ndarray) -> None:
-    """Write splats as `splats.py` makes them, z up, with their classes as the attributes _CLASS_ID and _CLASS_PROBABILITY.
+def write_gltf_splats(path: Path, splats: np.ndarray, label_revision: int | None) -> None:
+    """Write splats as `splats.py` makes them, z up, with their classes as the attributes _CLASS_ID and _CLASS_PROBABILITY, which are
+    from a revision of the marks or from none.
 
     Raises DiskError.
     """
@@ -41,7 +43,7 @@ def write_gltf_splats(path: Path, splats: np.ndarray) -> None:
         blocks.append(block.tobytes())
         offset += block.nbytes
     tree = {
-        "asset": {"version": "2.0", "generator": "Fieldwork"},
+        "asset": {"version": "2.0", "generator": "Fieldwork", **extras(label_revision)},
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],

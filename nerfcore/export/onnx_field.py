@@ -2,7 +2,7 @@
 
 Inputs: `points` (N, 3) in the world, `directions` (N, 3) unit vectors from the eye to the point, in the world.
 Outputs: `density` (N) per world unit, `color` (N, 3) sRGB in [0, 1], and with classes `probabilities` (N, K) in the
-order of the metadata `class_ids`, `class_names`. All float32.
+order of the metadata `class_ids`, `class_names`; `label_revision` says which marks they are from, if any. All float32.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from .. import __version__
 from ..data.box import Box
 from ..field.hybrid import HybridField
 from ..files import atomic_path
+from ..project.runs import label_facts
 from ..project.schema import Project
 from ..render.run import Trained
 from .field_function import FieldFunction
@@ -39,6 +40,7 @@ def write_onnx(path: Path, trained: Trained, project: Project) -> None:
             "class_ids": json.dumps(ids),
             "class_names": json.dumps([names.get(i, str(i)) for i in ids], ensure_ascii=False),
             "world_from_box": json.dumps(box.world_from_box.tolist()),
+            **{fact: str(value) for fact, value in label_facts(trained.info.label_revision).items()},
         },
     )
     with atomic_path(path) as temporary:

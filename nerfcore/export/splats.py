@@ -15,6 +15,7 @@ from ..geometry.contraction import uncontract
 from ..geometry.similarity import similarity_scale
 from ..kernels.voxel_field import AXES, CELLS, COARSE, TEXELS, VERTICES, occupied_blocks, texels_of
 from ..progress import Reporter
+from ..project.runs import label_facts
 from ..render.baked import BakedField
 from .gltf_splats import write_gltf_splats
 
@@ -26,11 +27,14 @@ SPREAD = 0.6  # standard deviation in cells: neighbours overlap to a closed surf
 MOST = 0.99  # opacity of a splat, whose logit is finite
 
 
-def write_splats(path: Path, baked: BakedField, box: Box, class_ids: list[int], report: Reporter) -> list[Path]:
+def write_splats(
+    path: Path, baked: BakedField, box: Box, class_ids: list[int], label_revision: int | None, report: Reporter
+) -> list[Path]:
     """Write a splat for each vertex at the surface of a baked field, and beside it the same as glTF; returns both files.
 
     A splat is round, in the world, z up: x, y, z; nx, ny, nz (0); f_dc_* and f_rest_* (degree 1, by channel); opacity
     (logit); scale_* (logarithm); rot_* (w first); class_id and class_probability, −1 and 0 without classes.
+    A comment of the header names the `label_revision` of the marks that the classes are from, if they are from any.
 
     Raises:
         ProjectError: the baked field is empty. DiskError.
@@ -82,10 +86,10 @@ def write_splats(path: Path, baked: BakedField, box: Box, class_ids: list[int], 
         splats["class_id"] = -1
     report.stage("Writing")
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        file.write(_header(splats))
+        file.write(_header(splats, label_revision))
         file.write(splats.tobytes())
     beside = path.with_suffix(".glb")
-    write_gltf_splats(beside, splats)
+    write_gltf_splats(beside, splats, label_revision)
     return [path, beside]
 
 
@@ -120,8 +124,10 @@ def _layout() -> np.dtype:
     return np.dtype([*((name, "<f4") for name in names), ("class_id", "<i4"), ("class_probability", "<f4")])
 
 
-def _header(splats: np.ndarray) -> bytes:
+def _header(splats: np.ndarray, label_revision: int | None) -> bytes:
     kinds = {"<f4": "float", "<i4": "int"}
-    lines = ["ply", "format binary_little_endian 1.0", "comment sRGB, z up", f"element vertex {len(splats)}"]
+    lines = ["ply", "format binary_little_endian 1.0", "comment sRGB, z up"]
+    lines += [f"comment {fact} {value}" for fact, value in label_facts(label_revision).items()]
+    lines.append(f"element vertex {len(splats)}")
     lines += [f"property {kinds[kind]} {name}" for name, kind in splats.dtype.descr]
     return "\n".join([*lines, "end_header", ""]).encode()

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import struct
 import uuid
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -33,8 +33,11 @@ class Grid:
     values: np.ndarray
 
 
-def write_vdb(path: Path, grids: Iterable[Grid], world_from_index: np.ndarray) -> None:
-    """Write grids into one file. A voxel's value is that at its index, which the matrix (4, 4) carries into the world.
+def write_vdb(
+    path: Path, grids: Iterable[Grid], world_from_index: np.ndarray, facts: dict[str, int] | None = None
+) -> None:
+    """Write grids into one file. A voxel's value is that at its index, which the matrix (4, 4) carries into the world; `facts`
+    are metadata of the file.
 
     Raises:
         DiskError.
@@ -43,7 +46,7 @@ def write_vdb(path: Path, grids: Iterable[Grid], world_from_index: np.ndarray) -
     with disk_errors(path), atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.write(struct.pack("<qIII?", MAGIC, FORMAT, *LIBRARY, True))
         file.write(str(uuid.uuid4()).encode())
-        file.write(_metadata({}))
+        file.write(_metadata(facts or {}))
         file.write(struct.pack("<I", len(grids)))
         for grid in grids:
             _write_grid(file, grid, world_from_index)
@@ -54,10 +57,16 @@ def _text(value: str) -> bytes:
     return struct.pack("<I", len(data)) + data
 
 
-def _metadata(values: dict[str, str | bool]) -> bytes:
+def _metadata(values: Mapping[str, str | bool | int]) -> bytes:
     found = struct.pack("<I", len(values))
     for name, value in values.items():
-        kind, data = ("bool", struct.pack("<?", value)) if isinstance(value, bool) else ("string", value.encode())
+        match value:
+            case bool():
+                kind, data = "bool", struct.pack("<?", value)
+            case int():
+                kind, data = "int32", struct.pack("<i", value)
+            case str():
+                kind, data = "string", value.encode()
         found += _text(name) + _text(kind) + struct.pack("<I", len(data)) + data
     return found
 

@@ -8,11 +8,12 @@ from typing import Any
 from ..blender.package import stale
 from ..data.load import load_scene
 from ..errors import SettingError
+from ..labels.accept import accepted_revision
 from ..mesh.features import features_of
 from ..mesh.files import write_surface
 from ..mesh.formats import USD
 from ..mesh.instances import read_instances
-from ..mesh.stored import load_class_map, load_surface, mesh_folder
+from ..mesh.stored import load_class_map, load_surface, mesh_folder, mesh_label_revision
 from ..params import ExportParams
 from ..progress import Reporter
 from ..project.runs import holdout_of
@@ -38,7 +39,8 @@ def export(params: ExportParams, report: Reporter) -> dict[str, Any]:
     on a regular grid; splats is the baked field, as .ply and beside it as .glb; vdb is the baked field as a volume.
 
     Returns:
-        {"files": [paths], "to": format, "grids": names, of vdb}
+        {"files": [paths], "to": format, "grids": names, of vdb, "label_revision": of the marks that classes are from, or
+        None}
     Raises:
         SettingError: the file has another ending, or the format has no words for a lens. ProjectError: there is no mesh, no
         trained run or no pose. DiskError: a file cannot be written.
@@ -49,18 +51,22 @@ def export(params: ExportParams, report: Reporter) -> dict[str, Any]:
     suffixes = SUFFIXES[params.to]
     if suffixes and out.suffix.lower() not in suffixes:
         raise SettingError(f"{out}: {params.to} files end in {' or '.join(suffixes)}.", "Choose one of these endings.")
-    result: dict[str, Any] = {"to": params.to}
+    revision = label_revision(folder, project, params)
+    result: dict[str, Any] = {"to": params.to, "label_revision": revision}
     if params.to in OF_THE_MESH:
         for warning in stale(folder, params.run, pictures=False):
             report.warn(warning)
-        files = _write_mesh(folder, project, params, out, report)
+        files = _write_mesh(folder, project, params, out, revision, report)
     elif params.to in OF_THE_CAMERAS:
         from .cameras import write_colmap, write_transforms
 
         report.stage("Writing")
         scene = load_scene(folder, holdout_of(folder, params.run))
         metres = project.frame.scale_known
-        files = write_colmap(out, scene) if params.to == "colmap" else write_transforms(out, scene, metres)
+        if params.to == "colmap":
+            files = write_colmap(out, scene)
+        else:
+            files = write_transforms(out, scene, metres, revision)
     else:
         files, more = _write_field(folder, project, params, out, report)
         result |= more
@@ -75,7 +81,19 @@ def _default_name(folder: Path, to: str) -> str:
     return f"{folder.name}{'-splats' if to == 'splats' else ''}{SUFFIXES[to][0]}"
 
 
-def _write_mesh(folder: Path, project: Project, params: ExportParams, out: Path, report: Reporter) -> list[Path]:
+def label_revision(folder: Path, project: Project, params: ExportParams) -> int | None:
+    """The revision of the marks that the classes of what is exported are from: of the mesh, of the field, or of the label
+    maps of the photos; None where they are from none. Raises ProjectError."""
+    if params.to in OF_THE_MESH:
+        return mesh_label_revision(folder, params.run)
+    if params.to in OF_THE_FIELD:
+        return load_info(folder, params.run).label_revision
+    return accepted_revision(project) if params.to == "transforms" else None
+
+
+def _write_mesh(
+    folder: Path, project: Project, params: ExportParams, out: Path, revision: int | None, report: Reporter
+) -> list[Path]:
     report.stage("Writing")
     surface, texture = load_surface(folder, params.run)
     scene = load_scene(folder, holdout_of(folder, params.run)) if params.to in ("usd", "masks") else None
@@ -85,7 +103,7 @@ def _write_mesh(folder: Path, project: Project, params: ExportParams, out: Path,
         ids = load_class_map(folder, params.run) if texture is not None else None
         return write_masks(out, surface, ids, scene.views, scene.classes, report)
     instances = read_instances(mesh_folder(folder, params.run))
-    features = features_of(surface, project.classes, project.ignore_id, instances)
+    features = features_of(surface, project.classes, project.ignore_id, instances, revision)
     views = scene.views if scene is not None else []
     return write_surface(out, surface, features, params.split, texture, views, report.check)
 
@@ -110,9 +128,10 @@ def _write_field(
     if params.to == "splats":
         from .splats import write_splats
 
-        return write_splats(out, baked, info.box(project), info.class_ids if baked.classes else [], report), {}
+        ids = info.class_ids if baked.classes else []
+        return write_splats(out, baked, info.box(project), ids, info.label_revision, report), {}
     from .volume import write_volume
 
     names = {entry.id: entry.name for entry in project.classes}
     classes = [names.get(number, f"class {number}") for number in info.class_ids] if baked.classes else []
-    return [out], {"grids": write_volume(out, baked, info.box(project), classes, report)}
+    return [out], {"grids": write_volume(out, baked, info.box(project), classes, info.label_revision, report)}

@@ -12,17 +12,21 @@ from ..geometry.similarity import similarity_scale
 from ..images.picture import srgb_to_linear
 from ..kernels.voxel_field import CELLS, TEXELS, VERTICES, occupied_blocks, texels_of
 from ..progress import Reporter
+from ..project.runs import label_facts
 from ..render.baked import BakedField
 from .vdb import Grid, write_vdb
 
 DENSEST = 0.995  # opacity of a cell; an opaque one would be infinitely dense
 
 
-def write_volume(path: Path, baked: BakedField, box: Box, class_names: list[str], report: Reporter) -> list[str]:
+def write_volume(
+    path: Path, baked: BakedField, box: Box, class_names: list[str], label_revision: int | None, report: Reporter
+) -> list[str]:
     """Write the grids and return their names.
 
     A voxel is a vertex of the baked field, in the world, z up. `density`: extinction for each unit of the world; `color`: linear
-    (primaries of sRGB), without its changes with the direction; `class_NAME`: the class's probability. Of a field with a
+    (primaries of sRGB), without its changes with the direction; `class_NAME`: the class's probability; metadata of the file
+    name the `label_revision` of the marks that classes are from, if they are from any. Of a field with a
     background beyond its cube only the cube is written: outside of it cells grow.
 
     Raises:
@@ -52,7 +56,7 @@ def write_volume(path: Path, baked: BakedField, box: Box, class_names: list[str]
     report.stage("Writing")
     world_from_index = box.world_from_box @ np.diag([cell, cell, cell, 1.0])
     world_from_index[:3, 3] = box.world_from_box[:3, 3] - world_from_index[:3, :3] @ np.full(3, side / 2)
-    write_vdb(path, grids, world_from_index)
+    write_vdb(path, grids, world_from_index, label_facts(label_revision))
     return [grid.name for grid in grids]
 
 

@@ -10,6 +10,7 @@ from ..files import atomic_path
 from ..geometry.similarity import make_similarity, similarity_scale
 from ..mesh.field_values import density_volume, shade, surface_level
 from ..progress import Reporter
+from ..project.runs import label_facts
 from ..project.schema import Project
 from ..render.run import Trained
 
@@ -18,7 +19,8 @@ def write_voxels(path: Path, trained: Trained, project: Project, resolution: int
     """Write an .npz with the nodes of a grid of `resolution` cells along each side of the field's cube:
 
     density (X, Y, Z) float32 per world unit; color (X, Y, Z, 3) uint8 sRGB and class_id (X, Y, Z) int32, as seen from
-    outside, 0 where it is empty; world_from_voxel (4, 4): indices of nodes to the world; class_ids, class_names.
+    outside, 0 where it is empty; world_from_voxel (4, 4): indices of nodes to the world; class_ids, class_names;
+    label_revision of the marks that they are from, if they are from any.
     """
     report.stage("Reading the density")
     volume, spacing = density_volume(trained.model, resolution, np.full(3, -1.0), np.full(3, 1.0), report)
@@ -45,4 +47,5 @@ def write_voxels(path: Path, trained: Trained, project: Project, resolution: int
             world_from_voxel=world_from_box @ make_similarity(spacing, np.eye(3), np.full(3, -1.0)),
             class_ids=np.array([c.id for c in project.classes], np.int32),
             class_names=np.array([c.name for c in project.classes], np.str_),
+            **{fact: np.array(value) for fact, value in label_facts(trained.info.label_revision).items()},
         )

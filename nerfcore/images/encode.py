@@ -58,8 +58,9 @@ def png_bytes(pixels: np.ndarray, check: Callable[[], None] = go_on) -> bytes:
         return path.read_bytes()
 
 
-def write_layers(path: Path, layers: dict[str, np.ndarray]) -> None:
-    """One multilayer EXR with float channels (H, W) named as the keys, whose colours have the primaries of sRGB.
+def write_layers(path: Path, layers: dict[str, np.ndarray], facts: dict[str, int] | None = None) -> None:
+    """One multilayer EXR with float channels (H, W) named as the keys, whose colours have the primaries of sRGB; `facts` are
+    attributes of its header.
 
     Raises:
         DiskError: it cannot be written.
@@ -69,6 +70,8 @@ def write_layers(path: Path, layers: dict[str, np.ndarray]) -> None:
     spec = oiio.ImageSpec(width, height, len(names), oiio.FLOAT)
     spec.channelnames = tuple(names)
     spec.attribute("chromaticities", "float[8]", SRGB_PRIMARIES)
+    for name, value in (facts or {}).items():
+        spec.attribute(name, value)
     buffer = oiio.ImageBuf(spec)
     buffer.set_pixels(spec.roi, np.ascontiguousarray(np.stack([layers[n] for n in names], -1), np.float32))
     if not buffer.write(str(path)):

@@ -150,7 +150,19 @@ def agreement(predicted: np.ndarray, labelling: Labelling) -> float | None:
 
 def is_accepted(path: str) -> bool:
     """Whether a label map of the project was written by this verb."""
-    return re.match(MAPS.format(r"\d+") + "/", path) is not None
+    return revision_of(path) is not None
+
+
+def revision_of(path: str) -> int | None:
+    """The revision of the marks that a label map of the project was made from by this verb; None: it is another one."""
+    found = re.match(MAPS.format(r"(\d+)") + "/", path)
+    return None if found is None else int(found.group(1))
+
+
+def accepted_revision(project: Project) -> int | None:
+    """The revision of the marks that label maps of photos were made from by this verb; None where none was."""
+    known = (revision_of(image.label) for image in project.images if image.label)
+    return next((revision for revision in known if revision is not None), None)
 
 
 def write_maps(

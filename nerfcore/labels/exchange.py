@@ -20,7 +20,7 @@ from ..progress import Reporter
 from ..project.classes import class_color
 from ..project.schema import ImageRecord, Project, SemanticClass
 from ..project.store import edit_project, load_project
-from .accept import is_accepted
+from .accept import accepted_revision, is_accepted
 from .formats import known
 from .formats.regions import LabelClass, Picture, Region, Source
 from .history import write_history
@@ -181,7 +181,8 @@ def export_labels(params: LabelExportParams, report: Reporter) -> dict[str, Any]
     """Write labels of the photos for another tool, as large as the photos of the project.
 
     Returns:
-        {"format", "photos", "classes": names, "files", "revision": of the marks, None for label maps}
+        {"format", "photos", "classes": names, "files", "revision": of the marks, None for label maps that are
+        from none}
     Raises:
         SettingError: the name of the file does not fit the format, or the class is unknown. InputError: the folder is not
         empty, or there are no labels. ProjectError: the revision was not propagated. DiskError, Cancelled: nothing is
@@ -198,7 +199,7 @@ def export_labels(params: LabelExportParams, report: Reporter) -> dict[str, Any]
             f"No photo of {folder} has labels.", "Mark some, or export what was propagated: --source marks."
         )
     report.stage("Writing labels")
-    written = _written(followed(pictures, count, report), params, label_classes(project), out, project.ignore_id)
+    written = _written(followed(pictures, count, report), params, project, out, revision)
     return {
         "format": params.format,
         "photos": count,
@@ -240,7 +241,11 @@ def pictures_of(params: LabelExportParams, project: Project, folder: Path) -> tu
     names = {c.id: c.name for c in project.classes}
     if params.source == "maps":
         images = [image for image in project.images if image.label and image.status != "rejected"]
-        return None, (_picture(image, *_maps(folder, image), names) for image in images), len(images)
+        return (
+            accepted_revision(project),
+            (_picture(image, *_maps(folder, image), names) for image in images),
+            len(images),
+        )
     ready, labelling = computed(folder, params.run, params.revision)
     images = [image for image in project.images if image.name in ready.of_photo]
 
@@ -283,15 +288,16 @@ def followed(pictures: Iterator[Picture], count: int, report: Reporter) -> Itera
 
 
 def _written(
-    pictures: Iterator[Picture], params: LabelExportParams, classes: list[LabelClass], out: Path, void: int
+    pictures: Iterator[Picture], params: LabelExportParams, project: Project, out: Path, revision: int | None
 ) -> list[Path]:
     """Write a file, or a folder as a whole."""
+    classes, void, name = label_classes(project), project.ignore_id, params.class_name
     if params.format in known.FILES:
-        return known.write(pictures, params.format, classes, out, void, params.class_name)
+        return known.write(pictures, params.format, classes, out, void, name, revision)
     part = out.with_name(f".{out.name}.part")
     shutil.rmtree(part, ignore_errors=True)
     try:
-        files = known.write(pictures, params.format, classes, part, void, params.class_name)
+        files = known.write(pictures, params.format, classes, part, void, name, revision)
         with disk_errors(out):
             if out.is_dir():
                 out.rmdir()

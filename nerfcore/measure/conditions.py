@@ -16,13 +16,14 @@ from ..files import atomic_path
 from ..mesh.clean import areas
 from ..mesh.instances import Instance
 from ..mesh.surface import Surface
+from ..project.runs import LABEL_REVISION
 from .sheet import Color, Entry, Mark, Sheet, Zone
 from .views import Picture
 
 HATCHES = ("///", "\\\\\\", "xxx", "...", "---", "+++", "|||", "ooo", "***")
 ALL = "all"
 SPECK = 1.0  # mm² on paper: what is smaller is not drawn; the areas have it
-COLUMNS = ("number", "class", "instance", "area", "area_low", "area_high", "x", "y", "z")
+COLUMNS = ("number", "class", "instance", "area", "area_low", "area_high", "x", "y", "z", LABEL_REVISION)
 
 
 @dataclass(frozen=True)
@@ -129,15 +130,15 @@ def widest(mask: np.ndarray) -> tuple[int, int]:
     return int(row), int(column)
 
 
-def write_places(path: Path, places: Sequence[Place], names: dict[int, str]) -> Path:
-    """Write the numbered places as a table (.csv). Raises DiskError."""
+def write_places(path: Path, places: Sequence[Place], names: dict[int, str], label_revision: int | None) -> Path:
+    """Write the numbered places as a table (.csv), each with the revision of the marks that it is from, if any. Raises
+    DiskError."""
     with atomic_path(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
         rows = csv.writer(file)
         rows.writerow(COLUMNS)
         for place in places:
             low, high = ("", "") if place.interval is None else (f"{value:.6g}" for value in place.interval)
             center = [f"{value:.6g}" for value in place.center]
-            rows.writerow(
-                [place.number, names.get(place.class_id, ""), place.name, f"{place.area:.6g}", low, high, *center]
-            )
+            name = names.get(place.class_id, "")
+            rows.writerow([place.number, name, place.name, f"{place.area:.6g}", low, high, *center, label_revision])
     return path

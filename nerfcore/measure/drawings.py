@@ -16,11 +16,12 @@ from ..mesh.stored import load_surface, mesh_folder, mesh_record
 from ..mesh.surface import Surface
 from ..params import PlanParams, SectionParams
 from ..progress import Reporter
+from ..project.runs import LABEL_REVISION
 from ..project.schema import Project
 from ..project.store import load_project, record_step
 from .conditions import chosen_classes, condition_sheet, find_places, write_places
 from .sections import profile, write_profile
-from .sheet import DPI, MM, Color, Entry, Sheet, chosen_scale, write_sheet
+from .sheet import DPI, MM, Color, Entry, Sheet, chosen_scale, label_note, write_sheet
 from .stored import read_measures
 from .views import Picture, Projection, Window, picture, plane, projection
 
@@ -32,7 +33,8 @@ VOID = (0.35, 0.35, 0.35)
 
 @dataclass(frozen=True)
 class Subject:
-    """What is drawn: the mesh of a run in the world, and how its classes are called and shown."""
+    """What is drawn: the mesh of a run in the world, how its classes are called and shown, and which revision of the marks
+    they are from, if any."""
 
     title: str
     surface: Surface
@@ -44,6 +46,7 @@ class Subject:
     void: int
     instances: list[Instance]
     instance_measures: dict[int, dict[str, Any]]
+    label_revision: int | None
 
     def class_ids(self) -> list[int]:
         """The classes that occur; void is none."""
@@ -65,7 +68,6 @@ def load_subject(folder: Path, run: str) -> Subject:
     """The mesh of a run as drawings need it. Raises ProjectError when there is none, or it lies elsewhere by now."""
     project: Project = load_project(folder)
     surface, texture = load_surface(folder, run)
-    mesh_record(folder, run)
     measures = read_measures(folder, run) or {}
     return Subject(
         folder.absolute().name,
@@ -78,6 +80,7 @@ def load_subject(folder: Path, run: str) -> Subject:
         project.ignore_id,
         read_instances(mesh_folder(folder, run)),
         {row["id"]: row for row in measures.get("instances", [])},
+        mesh_record(folder, run).result.get(LABEL_REVISION),
     )
 
 
@@ -85,7 +88,8 @@ def plan(params: PlanParams, report: Reporter) -> dict[str, Any]:
     """Draw plans and elevations of the mesh, in its colours, as maps of its classes and of conditions, to scale.
 
     Returns:
-        {"scales": {view: N of 1:N, None while the scale is not known}, "files"}
+        {"scales": {view: N of 1:N, None while the scale is not known}, "label_revision": of the marks that classes are from,
+        or None, "files"}
     Raises:
         ProjectError: there is no mesh. SettingError: a scale that no paper is large enough for, or an unknown class.
     """
@@ -105,7 +109,8 @@ def plan(params: PlanParams, report: Reporter) -> dict[str, Any]:
         seen = picture(subject.surface, subject.texture, view, window, before, report)
         scales[name] = scale if subject.metric else None
         title = f"{subject.title}: {name}"
-        sheet = Sheet(title, window.low, window.high, scale, subject.metric, seen.color, axis_names(view, params.turn))
+        axes, note = axis_names(view, params.turn), label_note(subject.label_revision)
+        sheet = Sheet(title, window.low, window.high, scale, subject.metric, seen.color, axes, note=note)
         files += write_sheet(target / name, sheet)
         if subject.class_ids():
             files += write_sheet(target / f"{name}_classes", class_sheet(sheet, subject, seen))
@@ -113,8 +118,8 @@ def plan(params: PlanParams, report: Reporter) -> dict[str, Any]:
             conditions = condition_sheet(sheet, subject.surface, seen, places, legend)
             files += write_sheet(target / f"{name}_conditions", conditions)
     if mapped:
-        files.append(write_places(target / "conditions.csv", places, subject.names))
-    result = {"scales": scales, "files": [str(path) for path in files]}
+        files.append(write_places(target / "conditions.csv", places, subject.names, subject.label_revision))
+    result = {"scales": scales, "label_revision": subject.label_revision, "files": [str(path) for path in files]}
     record_step(folder, "plan", params.model_dump(mode="json"), result)
     return result
 
@@ -123,7 +128,7 @@ def section(params: SectionParams, report: Reporter) -> dict[str, Any]:
     """Draw the section of the mesh by a plane, over a pale picture of what lies behind it, to scale.
 
     Returns:
-        {"scale": N of 1:N or None, "lengths": {class: length of the section}, "files"}
+        {"scale": N of 1:N or None, "lengths": {class: length of the section}, "label_revision": as of `plan`, "files"}
     Raises:
         ProjectError: there is no mesh. SettingError: no plane, it misses the mesh, or the scale is too large.
     """
@@ -158,16 +163,18 @@ def section(params: SectionParams, report: Reporter) -> dict[str, Any]:
         "Length of the section",
         view(cut.segments)[..., :2],
         np.array([line_color(subject, c) for c in cut.label.tolist()]),
+        note=label_note(subject.label_revision),
     )
     target = params.out or mesh_folder(folder, params.run) / "drawings"
     stem = "section_" + params.plane.replace(" ", "").replace("=", "_")
     files = write_sheet(target / stem, sheet)
     files.append(target / f"{stem}.csv")
-    write_profile(files[-1], cut, subject.names)
+    write_profile(files[-1], cut, subject.names, subject.label_revision)
     named = {subject.names.get(c, str(c)): length for c, length in lengths.items()}
     result = {
         "scale": scale if subject.metric else None,
         "lengths": named,
+        "label_revision": subject.label_revision,
         "files": [str(path) for path in files],
     }
     record_step(folder, "section", params.model_dump(mode="json"), result)
@@ -218,6 +225,7 @@ def class_sheet(sheet: Sheet, subject: Subject, seen: Picture) -> Sheet:
         sheet.axes,
         legend,
         "Area on the whole surface" + (", 95 %" if subject.measures else ""),
+        note=sheet.note,
     )
 
 

@@ -44,7 +44,8 @@ def compare(params: CompareParams, report: Reporter) -> dict[str, Any]:
     Returns:
         {"unit", "transform": (4×4) world of this project from that of the other, "rms": of the registration, "detectable":
         distance from which on a change is none of noise (95 %), "changed_area", "unmatched_area", "p05", "median", "p95"
-        of the distances, "classes": [{"name", "before", "after", "change", "change_low", "change_high"}], "files"}
+        of the distances, "classes": [{"name", "before", "after", "change", "change_low", "change_high"}], "label_revision" and
+        "other_label_revision": of the marks that the classes of the two are from, or None, "files"}
     Raises:
         ProjectError: one of them has no mesh. InputError: the file of common points.
     """
@@ -123,6 +124,8 @@ def summary(now: Subject, before: Subject, registered: Registered, distance: np.
         "median": middle,
         "p95": p95,
         "classes": class_changes(now, before, similarity_scale(registered.transform)),
+        "label_revision": now.label_revision,
+        "other_label_revision": before.label_revision,
     }
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..files import atomic_path
 from ..mesh.surface import Surface
+from ..project.runs import LABEL_REVISION
 from .views import Projection
 
 
@@ -36,10 +37,11 @@ def profile(surface: Surface, view: Projection, at: float) -> Profile:
     return Profile(np.asarray(segments).reshape(-1, 2, 3), surface.face_class[face])
 
 
-def write_profile(path: Path, found: Profile, names: dict[int, str]) -> None:
-    """Write the pieces of a section as .csv: class, and both ends in the world. Raises DiskError."""
+def write_profile(path: Path, found: Profile, names: dict[int, str], label_revision: int | None) -> None:
+    """Write the pieces of a section as .csv: class, both ends in the world, and the revision of the marks that the class is
+    from, if any. Raises DiskError."""
     with atomic_path(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
-        table.writerow(["class", "x0", "y0", "z0", "x1", "y1", "z1"])
+        table.writerow(["class", "x0", "y0", "z0", "x1", "y1", "z1", LABEL_REVISION])
         for ends, label in zip(found.segments.reshape(-1, 6).round(6).tolist(), found.label.tolist()):
-            table.writerow([names.get(label, label), *ends])
+            table.writerow([names.get(label, label), *ends, label_revision])

@@ -57,7 +57,8 @@ class Mark:
 @dataclass(frozen=True)
 class Sheet:
     """What is drawn: the window low, high (2,) of the drawing in world units; image (H, W, 3) uint8 over all of it;
-    lines (S, 2, 2) with a colour (S, 3) each; zones of the image, and marks. scale: 1 : scale on paper; metric: whether a unit is a metre."""
+    lines (S, 2, 2) with a colour (S, 3) each; zones of the image, and marks. scale: 1 : scale on paper; metric: whether a unit is a metre; note: stands below it, and
+    in the metadata of its files."""
 
     title: str
     low: np.ndarray
@@ -72,6 +73,12 @@ class Sheet:
     line_colors: np.ndarray | None = None
     zones: list[Zone] = field(default_factory=list)
     marks: list[Mark] = field(default_factory=list)
+    note: str = ""
+
+
+def label_note(revision: int | None) -> str:
+    """What a drawing says of the revision of the marks that its classes are from; empty where they are from none."""
+    return "" if revision is None else f"labels of revision {revision}"
 
 
 def chosen_scale(size: np.ndarray, asked: float | None) -> float:
@@ -103,7 +110,10 @@ def write_sheet(stem: Path, sheet: Sheet) -> list[Path]:
     for kind in FORMATS:
         path = stem.with_name(f"{stem.name}.{kind}")
         with atomic_path(path) as temporary:
-            figure.savefig(temporary, format=kind, dpi=DPI, metadata=None if kind == "png" else {"Title": sheet.title})
+            told = {"Title": sheet.title} | (
+                {"Subject" if kind == "pdf" else "Description": sheet.note} if sheet.note else {}
+            )
+            figure.savefig(temporary, format=kind, dpi=DPI, metadata=told)
         paths.append(path)
     return paths
 
@@ -139,7 +149,8 @@ def _figure(sheet: Sheet) -> Figure:
         spine.set_linewidth(0.4)
     stated = f"1:{sheet.scale:g}" if sheet.metric else "not to scale: the scale of the capture is not known"
     figure.text(LEFT / width, 1 - 9 / height, sheet.title, fontsize=10, weight="bold")
-    figure.text(LEFT / width, 3 / height, f"{stated} · grid {step:g} {unit}", fontsize=8)
+    stated = f"{stated} · grid {step:g} {unit}" + (f" · {sheet.note}" if sheet.note else "")
+    figure.text(LEFT / width, 3 / height, stated, fontsize=8)
     _scale_bar(figure, sheet, float(width), float(height))
     _legend(figure, sheet, float(width), float(height))
     return figure

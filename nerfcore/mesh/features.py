@@ -34,10 +34,12 @@ class Feature:
 
 @dataclass(frozen=True)
 class Features:
-    """`rows`: all features that occur, by class and instance; `face` (F,) row of each face."""
+    """`rows`: all features that occur, by class and instance; `face` (F,) row of each face; label_revision: of the marks that
+    the classes are from, None where they are from none."""
 
     rows: list[Feature]
     face: np.ndarray
+    label_revision: int | None = None
 
     def groups(self, split: str) -> dict[str, np.ndarray]:
         """Indices of the faces of each object by its name, for `split` "none", "classes" or "instances"."""
@@ -48,7 +50,11 @@ class Features:
 
 
 def features_of(
-    surface: Surface, classes: Sequence[ClassInfo | SemanticClass], void: int, instances: Sequence[Instance] = ()
+    surface: Surface,
+    classes: Sequence[ClassInfo | SemanticClass],
+    void: int,
+    instances: Sequence[Instance] = (),
+    label_revision: int | None = None,
 ) -> Features:
     """The features of a surface's faces.
 
@@ -64,4 +70,4 @@ def features_of(
         name, color = known.get(class_id, ("void" if class_id == void else f"class {class_id}", VOID_COLOR))
         label = called.get(instance, f"{name}.{instance:03d}") if instance else ""
         rows.append(Feature(class_id, name, color, instance, label))
-    return Features(rows, face.reshape(-1))
+    return Features(rows, face.reshape(-1), label_revision)

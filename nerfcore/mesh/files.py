@@ -21,6 +21,7 @@ from ..files import atomic_path
 from ..images.encode import png_bytes
 from ..images.names import file_names
 from ..progress import go_on
+from ..project.runs import label_facts
 from .features import Features
 from .formats import TEXTURED, USD, Y_UP
 from .obj import write_obj
@@ -64,7 +65,7 @@ def write_surface(
     if kind == ".glb":
         from .gltf import write_glb
 
-        write_glb(path, parts, features.rows, png, check)
+        write_glb(path, parts, features, png, check)
         return [path]
     if split == "none":
         return _write_one(path, parts["mesh"], features, png, check)
@@ -102,7 +103,13 @@ def _write_one(path: Path, part: Part, features: Features, png: bytes | None, ch
     mesh.face_attributes["face_class"] = np.array([row.class_id for row in rows], np.uint32)[part.face_feature]
     if any(row.instance for row in rows):
         mesh.face_attributes["face_instance"] = np.array([row.instance for row in rows], np.uint32)[part.face_feature]
-    return _write(path, export_ply(mesh, vertex_normal=True))
+    return _write(path, with_comments(export_ply(mesh, vertex_normal=True), label_facts(features.label_revision)))
+
+
+def with_comments(ply: bytes, facts: dict[str, int]) -> bytes:
+    """A PLY file with facts as comments of its header."""
+    told = "".join(f"comment {name} {value}\n" for name, value in facts.items())
+    return ply.replace(b"\nelement ", f"\n{told}element ".encode(), 1)
 
 
 def _write(path: Path, content: Any) -> list[Path]:

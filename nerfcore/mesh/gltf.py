@@ -19,7 +19,8 @@ from trimesh.visual.material import PBRMaterial
 
 from ..files import atomic_path
 from ..images.picture import srgb_to_linear
-from .features import Feature
+from ..project.runs import label_facts
+from .features import Feature, Features
 from .parts import Part
 
 # Exporters keep attributes with a leading underscore; this one becomes glTF's COLOR_0.
@@ -42,14 +43,15 @@ PROPERTIES = {
 
 
 def write_glb(
-    path: Path, parts: dict[str, Part], rows: list[Feature], png: bytes | None, check: Callable[[], None]
+    path: Path, parts: dict[str, Part], features: Features, png: bytes | None, check: Callable[[], None]
 ) -> None:
-    """Write parts, y up, as one GLB of a named mesh each; `rows`: the features that `Part.feature` counts; `png`: the
+    """Write parts, y up, as one GLB of a named mesh each; `Part.feature` counts the rows of `features`; `png`: the
     file of the texture, if they have one.
 
     Raises:
         DiskError: the file cannot be written. What `check` raises, between steps.
     """
+    rows = features.rows
     arrays = _columns(rows)
     first: list[int] = []  # number of the first buffer view of the table, known once those of the meshes are
 
@@ -73,6 +75,7 @@ def write_glb(
         for name, view in views.items():
             tree["bufferViews"][view]["byteLength"] = len(arrays[name])
         tree["extensions"] = {"EXT_structural_metadata": _metadata(views, len(rows))}
+        tree["asset"] |= extras(features.label_revision)
         tree["extensionsUsed"] = ["EXT_mesh_features", "EXT_structural_metadata"]
 
     scene = trimesh.Scene({name: _mesh(part) for name, part in parts.items()})
@@ -80,6 +83,12 @@ def write_glb(
     content = export_glb(scene, include_normals=True, buffer_postprocessor=add_table, tree_postprocessor=finish)
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
+
+
+def extras(label_revision: int | None) -> dict[str, Any]:
+    """What `asset` of a file says beside glTF's own words; nothing where there is nothing to say."""
+    facts = label_facts(label_revision)
+    return {"extras": facts} if facts else {}
 
 
 def _mesh(part: Part) -> trimesh.Trimesh:

@@ -15,6 +15,7 @@ from typing import TextIO
 import numpy as np
 
 from ..files import atomic_path, write_text
+from ..project.runs import label_facts
 from .features import Features
 from .parts import Part
 
@@ -41,6 +42,7 @@ def write_obj(path: Path, part: Part, features: Features, png: bytes | None, che
     ordered = part.face_feature[order]
     starts = [0, *(np.flatnonzero(np.diff(ordered)) + 1).tolist(), len(order)]
     with atomic_path(path) as temporary, open(temporary, "w", encoding="utf-8", newline="\n") as file:
+        file.writelines(f"# {fact} {value}\n" for fact, value in label_facts(features.label_revision).items())
         if png is None:
             _lines(file, "v %.9g %.9g %.9g %.4f %.4f %.4f\n", np.hstack([part.vertices, part.colors / 255]), check)
         else:

@@ -29,7 +29,7 @@ from .surface import Surface
 @dataclass(frozen=True)
 class Made:
     """A finished mesh in the world: `built`, in the frame of `box`, is what it was made of; pictures: by file name, of
-    the turntable."""
+    the turntable; label_revision: of the marks that its classes are from, if they are from any."""
 
     surface: Surface
     texture: Texture | None
@@ -39,6 +39,7 @@ class Made:
     instances: list[Instance]
     levels: list[Level]
     pictures: dict[str, np.ndarray]
+    label_revision: int | None = None
 
 
 def write_outputs(target: Path, made: Made, scene: Scene, params: MeshParams, report: Reporter) -> list[Path]:
@@ -65,7 +66,7 @@ def write_outputs(target: Path, made: Made, scene: Scene, params: MeshParams, re
         files = _write_arrays(here, made) + [write_instances(here, made.instances)]
         files += write_maps(here, made.painted, {c.id: c.color for c in scene.classes}, report.check)
         surface = made.surface
-        features = features_of(surface, scene.classes, scene.ignore_id, made.instances)
+        features = features_of(surface, scene.classes, scene.ignore_id, made.instances, made.label_revision)
         files += write_surface(here / "mesh.ply", surface, features, "none", check=report.check)
         if params.out is not None:
             out = there / params.out.name
@@ -73,7 +74,7 @@ def write_outputs(target: Path, made: Made, scene: Scene, params: MeshParams, re
         for number, level in enumerate(made.levels, 1):
             report.progress(number / (len(made.levels) + 1))
             files += write_level(here, number, level, report.check)
-            features = features_of(level.surface, scene.classes, scene.ignore_id, made.instances)
+            features = features_of(level.surface, scene.classes, scene.ignore_id, made.instances, made.label_revision)
             base = Path("mesh.glb") if params.out is None else params.out
             path = there / f"{base.stem}_lod{number}{base.suffix}"
             files += write_surface(path, level.surface, features, params.split, level.texture, check=report.check)

@@ -88,6 +88,12 @@ def _reading(path: Path, missing: str) -> Iterator[Any]:
         raise ProjectError(f"{path} is damaged: {error}.", "Run `fieldwork mesh` again.") from error
 
 
+def mesh_label_revision(project: Path, run: str) -> int | None:
+    """The revision of the marks that the classes of a run's mesh are from; None where they are from none."""
+    made = read_made(mesh_folder(project, run) / MESH_RECORD)
+    return None if made is None else made.result.get("label_revision")
+
+
 def mesh_record(project: Path, run: str) -> ProvenanceStep:
     """What the mesh of a run was made from, provided that it still lies where the project does.
 

@@ -18,6 +18,7 @@ from ..errors import DiskError
 from ..files import atomic_path
 from ..geometry.cameras import flip_camera_axes
 from ..images.picture import srgb_to_linear
+from ..project.runs import label_facts
 from .features import Feature, Features
 from .parts import Texture
 from .surface import Surface
@@ -88,6 +89,8 @@ def _write_stage(
     root.GetPrim().SetDisplayName(name)
     Usd.ModelAPI(root).SetKind(Kind.Tokens.component)
     stage.SetDefaultPrim(root.GetPrim())
+    for fact, value in label_facts(features.label_revision).items():
+        root.GetPrim().SetCustomDataByKey(fact, value)
     if texture is not None:
         assert png is not None
         file.with_name(picture).write_bytes(png)

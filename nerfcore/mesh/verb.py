@@ -91,7 +91,8 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
     if params.turntable is not None:
         report.stage("Looking at it")
         pictures = look_around(surface, texture, colors, report)
-    made = Made(surface, texture, painted, built, box, instances, levels, pictures)
+    revision = trained.info.label_revision
+    made = Made(surface, texture, painted, built, box, instances, levels, pictures, revision)
     report.stage("Writing")
     files = write_outputs(target, made, scene, params, report)
     result = {
@@ -102,7 +103,7 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
         "classes": class_table(surface, names),
         "instances": len(instances),
         "lods": [{"faces": len(level.surface.faces), "deviation": level.deviation} for level in levels],
-        "label_revision": trained.info.label_revision,
+        "label_revision": revision,
         "files": [str(path) for path in files],
         **judged,
     }

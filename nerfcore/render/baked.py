@@ -65,6 +65,7 @@ class Meta(BaseModel):
     class_names: list[str]
     sfm_from_box: list[list[float]]
     environment: bool = False  # whether there is one behind it
+    label_revision: int | None = None  # of the marks that classes are from, if they are from any
 
 
 def texture_shape(blocks: int) -> tuple[int, int, int]:

@@ -33,7 +33,7 @@ from ..project.fingerprints import (
     rounded,
     write_made,
 )
-from ..project.runs import INSTANCES, MESH_RECORD, checkpoint_id
+from ..project.runs import INSTANCES, MESH_RECORD, checkpoint_id, label_facts
 from ..project.schema import step
 from ..project.store import load_project, world_from_sfm
 from . import parts
@@ -108,7 +108,7 @@ def render(params: RenderParams, report: Reporter, shown: Model | BakedField | N
             unknown="unknown" in params.passes,
         )
         seconds += time.perf_counter() - begin
-        frames += write_frame(out, name, frame, params.passes, info.class_ids, scene.ignore_id, colors, box)
+        frames += write_frame(out, name, frame, params.passes, info, scene.ignore_id, colors, box)
     result: dict[str, Any] = {"frames": [str(path) for path in sorted(frames)] if kept else [str(p) for p in frames]}
     result["ms_per_frame"] = round(seconds / max(len(todo), 1) * 1e3, 1)
     result["label_revision"] = info.label_revision
@@ -273,7 +273,7 @@ def write_frame(
     name: str,
     frame: Frame,
     passes: list,
-    class_ids: list[int],
+    info: RunInfo,
     void: int,
     colors: dict[int, tuple[float, float, float]],
     box: Box,
@@ -281,11 +281,12 @@ def write_frame(
     """Write NAME.png, NAME_depth.png, … and NAME.exr with all asked passes. Returns the paths of these pictures.
 
     The PNG shows the field on its background; the EXR has the field alone, linear and with associated alpha, to be put
-    over anything, and beside it the environment, if the run has one.
+    over anything, and beside it the environment, if the run has one; `label_revision` in its
+    header names the marks that the classes are from, if they are from any.
     """
     scale = similarity_scale(box.world_from_box)
     rotation = box.world_from_box[:3, :3] / scale
-    label = frame.label(class_ids, void)
+    label = frame.label(info.class_ids, void)
     unknown = np.zeros(frame.depth.shape, np.float32) if frame.unknown is None else frame.unknown
     world_normal = frame.normal() @ rotation.T
     pictures = {
@@ -322,5 +323,5 @@ def write_frame(
         layers |= {f"Environment.{channel}": environment[..., index] for index, channel in enumerate("RGB")}
     path = out / f"{name}.exr"
     with atomic_path(path) as temporary:
-        write_layers(temporary, layers)
+        write_layers(temporary, layers, label_facts(info.label_revision))
     return [*written, path]

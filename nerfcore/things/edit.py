@@ -16,7 +16,7 @@ from ..mesh.instances import Instance, joined, read_instances, write_instances
 from ..mesh.stored import MESH, mesh_folder, mesh_record
 from ..params import InstancesParams
 from ..progress import Reporter
-from ..project.runs import MEASURES
+from ..project.runs import LABEL_REVISION, MEASURES
 from ..project.store import load_project, record_step
 
 LEAST_SHARE = 0.01  # of the area of what is split, below which a piece stays with the nearest other one
@@ -26,14 +26,15 @@ def instances(params: InstancesParams, report: Reporter) -> dict[str, Any]:
     """List the instances of a mesh, or change one thing about them.
 
     Returns:
-        {"instances": [{"id", "name", "class_id", "class", "area"}], "changed": names that are new, "file"}
+        {"instances": [{"id", "name", "class_id", "class", "area"}], "changed": names that are new, "label_revision": of the
+        marks that classes are from, or None, "file"}
     Raises:
         ProjectError: there is no mesh or its files are damaged. InputError: there is no such instance, the new name is
         taken, instances of several classes are to be one, or one is not to be split. DiskError.
     """
     folder = Path(params.project)
     project, target = load_project(folder), mesh_folder(folder, params.run)
-    mesh_record(folder, params.run)
+    record = mesh_record(folder, params.run)
     before = read_instances(target)
     after, changed = before, []
     if params.rename:
@@ -59,6 +60,7 @@ def instances(params: InstancesParams, report: Reporter) -> dict[str, Any]:
             for i in after
         ],
         "changed": changed,
+        LABEL_REVISION: record.result.get(LABEL_REVISION),
         "file": str(target / "instances.json"),
     }
 

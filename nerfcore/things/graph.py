@@ -2,7 +2,8 @@
 
 exports/RUN/scene_graph.json
     {"made": digest of the mesh and its instances, "things": [{"id", "name", "class_id", "class", "area", "center", "low",
-    "high"}], "relations": [{"subject", "relation", "object", "gap"}]}; ids are those of `face_instance`, lengths in the world
+    "high"}], "relations": [{"subject", "relation", "object", "gap"}], "label_revision": of the marks that classes are
+    from, or null}; ids are those of `face_instance`, lengths in the world
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from ..mesh.surface import Surface
 from ..params import RelationsParams
 from ..progress import Reporter
 from ..project.fingerprints import digest
-from ..project.runs import SCENE_GRAPH
+from ..project.runs import LABEL_REVISION, SCENE_GRAPH
 from ..project.store import load_project, record_step
 from .query import answer
 from .relations import TOUCH, Thing, relations
@@ -31,7 +32,7 @@ from .relations import TOUCH, Thing, relations
 MOST_POINTS = 8_000  # of a thing
 LEAST_POINTS = 500
 DENSITY = 0.7  # distance of points in units of the gap that is contact
-VERSION = 1
+VERSION = 2
 
 
 def relate(params: RelationsParams, report: Reporter) -> dict[str, Any]:
@@ -39,7 +40,7 @@ def relate(params: RelationsParams, report: Reporter) -> dict[str, Any]:
 
     Returns:
         {"things": number, "relations": [{"subject", "relation", "object", "gap"}] by names, "found": names of the things
-        that `query` means, "reused", "file"}
+        that `query` means, "label_revision": of the marks that classes are from, or None, "reused", "file"}
     Raises:
         ProjectError: there is no mesh, it has no instances, or its files are damaged. InputError: the question.
     """
@@ -52,6 +53,7 @@ def relate(params: RelationsParams, report: Reporter) -> dict[str, Any]:
         "things": len(names),
         "relations": [{**r, "subject": names[r["subject"]], "object": names[r["object"]]} for r in graph["relations"]],
         "found": found,
+        LABEL_REVISION: graph[LABEL_REVISION],
         "reused": reused,
         "file": str(mesh_folder(folder, params.run) / SCENE_GRAPH),
     }
@@ -83,6 +85,7 @@ def scene_graph(folder: Path, run: str, report: Reporter) -> tuple[dict[str, Any
     things = things_of(surface, instances, names, report)
     report.stage("Finding relations")
     graph = {"made": made, **as_json(things, relations(things), instances)}
+    graph[LABEL_REVISION] = record.result.get(LABEL_REVISION)
     write_json(target / SCENE_GRAPH, graph)
     return graph, False
 

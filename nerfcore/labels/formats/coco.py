@@ -12,6 +12,7 @@ from PIL import Image
 
 from ...errors import InputError
 from ...files import atomic_path, write_json
+from ...project.runs import label_facts
 from .regions import (
     LabelClass,
     Picture,
@@ -148,7 +149,9 @@ def packed(runs: list[int]) -> str:
     return bytes(letters).decode("ascii")
 
 
-def write(pictures: Iterable[Picture], classes: list[LabelClass], out: Path) -> list[Path]:
+def write(
+    pictures: Iterable[Picture], classes: list[LabelClass], out: Path, label_revision: int | None = None
+) -> list[Path]:
     """Write an instances file: every region one annotation with run lengths, regions that are no instance as crowds."""
     images, annotations = [], []
     ids = {c.name: c.id for c in classes}
@@ -168,7 +171,8 @@ def write(pictures: Iterable[Picture], classes: list[LabelClass], out: Path) -> 
                     "iscrowd": int(region.instance == 0),
                 }
             )
-    write_json(out, {"images": images, "annotations": annotations, "categories": _categories(classes)})
+    info = label_facts(label_revision)
+    write_json(out, {"info": info, "images": images, "annotations": annotations, "categories": _categories(classes)})
     return [out]
 
 
@@ -176,7 +180,9 @@ def _categories(classes: list[LabelClass]) -> list[dict[str, Any]]:
     return [{"id": c.id, "name": c.name, "supercategory": "", "isthing": 1, "color": list(c.color)} for c in classes]
 
 
-def write_panoptic(pictures: Iterable[Picture], classes: list[LabelClass], out: Path) -> list[Path]:
+def write_panoptic(
+    pictures: Iterable[Picture], classes: list[LabelClass], out: Path, label_revision: int | None = None
+) -> list[Path]:
     """Write panoptic labels into a folder: panoptic.json, and PNGs of segment ids in `panoptic`."""
     images, annotations, files = [], [], []
     ids = {c.name: c.id for c in classes}
@@ -202,5 +208,6 @@ def write_panoptic(pictures: Iterable[Picture], classes: list[LabelClass], out: 
         images.append({"id": number, "file_name": picture.name, "width": picture.width, "height": picture.height})
         annotations.append({"image_id": number, "file_name": name, "segments_info": segments})
     table = out / "panoptic.json"
-    write_json(table, {"images": images, "annotations": annotations, "categories": _categories(classes)})
+    info = label_facts(label_revision)
+    write_json(table, {"info": info, "images": images, "annotations": annotations, "categories": _categories(classes)})
     return [table, *files]

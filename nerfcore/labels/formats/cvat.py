@@ -12,6 +12,7 @@ import numpy as np
 
 from ...errors import InputError
 from ...files import atomic_path
+from ...project.runs import label_facts
 from .regions import (
     LabelClass,
     Picture,
@@ -101,11 +102,16 @@ def _mask(shape: xml.Element, width: int, height: int) -> np.ndarray | None:
     return None
 
 
-def write(pictures: Iterable[Picture], classes: list[LabelClass], out: Path) -> list[Path]:
+def write(
+    pictures: Iterable[Picture], classes: list[LabelClass], out: Path, label_revision: int | None = None
+) -> list[Path]:
     """Write one XML file: every region a mask, regions of one instance in one group."""
     root = xml.Element("annotations")
     xml.SubElement(root, "version").text = "1.1"
-    labels = xml.SubElement(xml.SubElement(xml.SubElement(root, "meta"), "task"), "labels")
+    meta = xml.SubElement(root, "meta")
+    for fact, value in label_facts(label_revision).items():
+        xml.SubElement(meta, fact).text = str(value)
+    labels = xml.SubElement(xml.SubElement(meta, "task"), "labels")
     for c in classes:
         label = xml.SubElement(labels, "label")
         for tag, text in (("name", c.name), ("color", color_hex(c.color)), ("type", "mask")):

@@ -80,11 +80,18 @@ def read(path: Path, kind: str, classes: list[LabelClass], void: int, class_name
 
 
 def write(
-    pictures: Iterable[Picture], kind: str, classes: list[LabelClass], out: Path, void: int, class_name: str
+    pictures: Iterable[Picture],
+    kind: str,
+    classes: list[LabelClass],
+    out: Path,
+    void: int,
+    class_name: str,
+    label_revision: int | None = None,
 ) -> list[Path]:
-    """Write labels; returns the files. Raises DiskError."""
+    """Write labels, and where the format has a place for it the revision of the marks that they are from; returns the
+    files. Raises DiskError."""
     if kind in ("png", "png-colors"):
         return masks.write_maps(pictures, classes, out, void, kind == "png-colors")
     if kind == "masks":
         return masks.write_masks(pictures, class_name, out)
-    return WRITERS[kind](pictures, classes, out)
+    return WRITERS[kind](pictures, classes, out, label_revision)

@@ -12,6 +12,7 @@ import numpy as np
 
 from ...errors import InputError
 from ...files import write_json
+from ...project.runs import label_facts
 from .regions import (
     LabelClass,
     Picture,
@@ -150,7 +151,9 @@ def packed(flat: np.ndarray) -> list[int]:
     return [int(bits[i : i + 8], 2) for i in range(0, len(bits), 8)]
 
 
-def write(pictures: Iterable[Picture], classes: list[LabelClass], out: Path) -> list[Path]:
+def write(
+    pictures: Iterable[Picture], classes: list[LabelClass], out: Path, label_revision: int | None = None
+) -> list[Path]:
     """Write a JSON file to import: every region a brush stroke of the control “label” on “image”."""
     tasks = []
     for number, picture in numbered(pictures):
@@ -170,8 +173,8 @@ def write(pictures: Iterable[Picture], classes: list[LabelClass], out: Path) -> 
                     "value": value,
                 }
             )
-        tasks.append(
-            {"id": number, "data": {"image": picture.name}, "annotations": [{"id": number, "result": results}]}
-        )
+        annotations = [{"id": number, "result": results}]
+        meta = label_facts(label_revision)
+        tasks.append({"id": number, "data": {"image": picture.name}, "meta": meta, "annotations": annotations})
     write_json(out, tasks)
     return [out]

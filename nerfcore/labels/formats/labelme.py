@@ -11,6 +11,7 @@ import numpy as np
 
 from ...errors import InputError
 from ...files import write_json
+from ...project.runs import label_facts
 from .regions import (
     LabelClass,
     Picture,
@@ -79,7 +80,9 @@ def _mask(shape: dict[str, Any], width: int, height: int, name: str) -> np.ndarr
     return None
 
 
-def write(pictures: Iterable[Picture], classes: list[LabelClass], out: Path) -> list[Path]:
+def write(
+    pictures: Iterable[Picture], classes: list[LabelClass], out: Path, label_revision: int | None = None
+) -> list[Path]:
     """Write a folder with a JSON file for each picture: every region a mask, instances as groups."""
     files = []
     for picture in pictures:
@@ -106,6 +109,7 @@ def write(pictures: Iterable[Picture], classes: list[LabelClass], out: Path) -> 
             "imageData": None,
             "imageHeight": picture.height,
             "imageWidth": picture.width,
+            **label_facts(label_revision),
         }
         files.append(out / f"{Path(picture.name).stem}.json")
         write_json(files[-1], value)

@@ -12,6 +12,7 @@ from PIL import Image
 
 from ...errors import InputError
 from ...files import atomic_path, write_json
+from ...project.runs import label_facts
 from .regions import (
     LabelClass,
     Picture,
@@ -102,7 +103,9 @@ def bitmap_place(folder: Path, name: str, address: str) -> Path:
     )
 
 
-def write(pictures: Iterable[Picture], classes: list[LabelClass], out: Path) -> list[Path]:
+def write(
+    pictures: Iterable[Picture], classes: list[LabelClass], out: Path, label_revision: int | None = None
+) -> list[Path]:
     """Write a folder with a release file and a PNG of segment ids for each picture."""
     ids, samples, files = {c.name: c.id for c in classes}, [], [out / RELEASE]
     stuff: set[str] = set()
@@ -135,5 +138,6 @@ def write(pictures: Iterable[Picture], classes: list[LabelClass], out: Path) -> 
         "task_attributes": attributes,
         "samples": samples,
     }
-    write_json(files[0], {"name": "fieldwork", "dataset": dataset})
+    description = " ".join(f"{fact} {value}" for fact, value in label_facts(label_revision).items())
+    write_json(files[0], {"name": "fieldwork", "description": description, "dataset": dataset})
     return files

@@ -12,6 +12,7 @@ import numpy as np
 
 from ...errors import InputError
 from ...files import write_json
+from ...project.runs import label_facts
 from .regions import (
     LabelClass,
     Picture,
@@ -84,7 +85,9 @@ def _mask(entry: dict[str, Any], width: int, height: int, name: str) -> np.ndarr
     return None
 
 
-def write(pictures: Iterable[Picture], classes: list[LabelClass], out: Path) -> list[Path]:
+def write(
+    pictures: Iterable[Picture], classes: list[LabelClass], out: Path, label_revision: int | None = None
+) -> list[Path]:
     """Write a project folder without the photos: every region a bitmap."""
     entries = [{"title": c.name, "shape": "bitmap", "color": color_hex(c.color).upper()} for c in classes]
     files = [out / META]
@@ -100,5 +103,6 @@ def write(pictures: Iterable[Picture], classes: list[LabelClass], out: Path) -> 
             objects.append({**named, **instance, "bitmap": bitmap})
         size = {"height": picture.height, "width": picture.width}
         files.append(out / DATASET / "ann" / f"{picture.name}.json")
-        write_json(files[-1], {"description": "", "tags": [], "size": size, "objects": objects})
+        description = " ".join(f"{fact} {value}" for fact, value in label_facts(label_revision).items())
+        write_json(files[-1], {"description": description, "tags": [], "size": size, "objects": objects})
     return files

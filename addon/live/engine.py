@@ -138,7 +138,8 @@ class FieldworkRenderEngine(bpy.types.RenderEngine):
                 found.rect.foreach_set(values.reshape(-1))
 
     def _note_names(self, frame: Frame, layer: str) -> None:
-        """The names behind the ids of a Cryptomatte, as metadata that nodes and files have."""
+        """The names behind the ids of a Cryptomatte, and the revision of the marks that the classes of each field are from, as
+        metadata that nodes and files have."""
         result = self.get_result()
         for kind, manifest in (frame.facts.get("manifests") or {}).items():
             name = f"{layer}.{kind}"
@@ -147,6 +148,8 @@ class FieldworkRenderEngine(bpy.types.RenderEngine):
             result.stamp_data_add_field(key + "hash", "MurmurHash3_32")
             result.stamp_data_add_field(key + "conversion", "uint32_to_float32")
             result.stamp_data_add_field(key + "manifest", manifest)
+        for name, revision in frame.facts.get("label_revisions", {}).items():
+            result.stamp_data_add_field(f"label_revision/{name}", str(revision))
 
     def _shot(self, depsgraph: bpy.types.Depsgraph, asked: list[passes.RenderPass]) -> dict[str, Any]:
         """What is rendered, as nerfcore/film/shot.py describes it. Raises SceneError."""

@@ -34,10 +34,10 @@ from ..images.working import read_picture, shows_transparency
 from ..params import PackageParams
 from ..progress import Reporter
 from ..project.fingerprints import read_made
+from ..project.label_revision import LABEL_REVISION
 from ..project.runs import (
     CHECKPOINT,
     INSTANCES,
-    LABEL_REVISION,
     MEASURES,
     MESH_RECORD,
     RENDER_RECORD,

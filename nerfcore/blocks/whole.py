@@ -27,6 +27,7 @@ from ..mesh.uv import unwrap
 from ..params import BlocksParams
 from ..progress import Reporter
 from ..project.fingerprints import digest, rounded, write_made
+from ..project.label_revision import map_revision
 from ..project.runs import MESH_RECORD, read_metrics, run_folder
 from ..project.schema import step
 from ..project.store import load_project, world_from_sfm
@@ -44,7 +45,7 @@ def write_whole(folder: Path, plan: Plan, params: BlocksParams, report: Reporter
 
     Returns:
         {"blocks": [{"name", "photos", "psnr_train", "faces"}], "vertices", "faces", "open_at_seams": edges, "voxel",
-        "classes", "instances", "lods": [{"faces", "deviation"}], "files"}; with a texture "painted_by_photos"
+        "classes", "instances", "label_revision": of the marks that label maps are from, or None, "lods": [{"faces", "deviation"}], "files"}; with a texture "painted_by_photos"
     Raises:
         ProjectError, SettingError, TrainingError, DiskError, Cancelled.
     """
@@ -65,7 +66,8 @@ def write_whole(folder: Path, plan: Plan, params: BlocksParams, report: Reporter
     levels = make_levels(surface, texture, params.lods, report)
     report.stage("Writing")
     target, out = folder / "exports" / NAME, params.out
-    features = features_of(surface, scene.classes, scene.ignore_id, instances)
+    revision = map_revision(load_project(folder))
+    features = features_of(surface, scene.classes, scene.ignore_id, instances, revision)
     with staged(target) as here:
         written = _write_arrays(here, surface, painted) + [write_instances(here, instances)]
         written += write_surface(here / "mesh.ply", surface, features, "none", check=report.check)
@@ -81,7 +83,7 @@ def write_whole(folder: Path, plan: Plan, params: BlocksParams, report: Reporter
     if out is not None:
         files += write_surface(out, surface, features, "none", texture, check=report.check)
         for number, level in enumerate(levels, 1):
-            features = features_of(level.surface, scene.classes, scene.ignore_id, instances)
+            features = features_of(level.surface, scene.classes, scene.ignore_id, instances, revision)
             path = out.with_name(f"{out.stem}_lod{number}{out.suffix}")
             files += write_surface(path, level.surface, features, "none", level.texture, check=report.check)
     if params.turntable is not None:
@@ -95,6 +97,7 @@ def write_whole(folder: Path, plan: Plan, params: BlocksParams, report: Reporter
         "voxel": voxel,
         "classes": class_table(surface, names),
         "instances": len(instances),
+        "label_revision": revision,
         "lods": [{"faces": len(level.surface.faces), "deviation": level.deviation} for level in levels],
         "files": [str(path) for path in files],
     }

@@ -1,6 +1,6 @@
 """Frames for Blender: rendered one after the other in a thread of their own, beside the jobs, from fields that stay loaded.
 
-`frame {frame, …Shot}` answers {"seconds", "loaded", "manifests"} when the pixels are in the shared file; meanwhile it sends
+`frame {frame, …Shot}` answers {"seconds", "loaded", "manifests", "label_revisions"} when the pixels are in the shared file; meanwhile it sends
 `progress {job: frame, …}` and `event {job: frame, kind: "pixels", counter}`. `cancel_frame {frame}` stops one, or all. A frame
 neither holds its project nor leaves a trace in it.
 
@@ -151,6 +151,7 @@ def _exposed(params: dict[str, Any], reporter: Reporter, store: FieldStore) -> d
         "seconds": round(time.perf_counter() - begin, 3),
         "loaded": store.loaded,
         "manifests": exposure.manifests,
+        "label_revisions": exposure.label_revisions,
     }
 
 

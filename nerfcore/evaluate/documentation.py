@@ -243,6 +243,8 @@ def _settings(folder: Path, run: str) -> Section:
     if isinstance(accepted, dict):
         told = f"revision {accepted.get('revision')} of the marks, accepted {accepted.get('time')}"
         rows.append(["labels", told, ""])
+    elif value.get("map_revision") is not None:
+        rows.append(["labels", f"label maps of revision {value['map_revision']} of the marks", ""])
     for stage, settings in stages.items():
         if isinstance(settings, dict):
             rows += [

@@ -18,7 +18,7 @@ from ..files import atomic_path, staged, write_json, write_text
 from ..geometry.cameras import Camera, flip_camera_axes
 from ..geometry.colmap_cameras import camera_to_colmap
 from ..geometry.points import Points
-from ..project.runs import label_facts
+from ..project.label_revision import label_facts
 
 RADIAL = ("k1", "k2", "p1", "p2", "k3")  # in the order of Camera.distortion
 FISHEYE = ("k1", "k2", "k3", "k4")

@@ -19,7 +19,7 @@ from .. import __version__
 from ..data.box import Box
 from ..field.hybrid import HybridField
 from ..files import atomic_path
-from ..project.runs import label_facts
+from ..project.label_revision import label_facts
 from ..project.schema import Project
 from ..render.run import Trained
 from .field_function import FieldFunction

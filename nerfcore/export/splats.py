@@ -15,7 +15,7 @@ from ..geometry.contraction import uncontract
 from ..geometry.similarity import similarity_scale
 from ..kernels.voxel_field import AXES, CELLS, COARSE, TEXELS, VERTICES, occupied_blocks, texels_of
 from ..progress import Reporter
-from ..project.runs import label_facts
+from ..project.label_revision import label_facts
 from ..render.baked import BakedField
 from .gltf_splats import write_gltf_splats
 

@@ -8,7 +8,6 @@ from typing import Any
 from ..blender.package import stale
 from ..data.load import load_scene
 from ..errors import SettingError
-from ..labels.accept import accepted_revision
 from ..mesh.features import features_of
 from ..mesh.files import write_surface
 from ..mesh.formats import USD
@@ -16,6 +15,7 @@ from ..mesh.instances import read_instances
 from ..mesh.stored import load_class_map, load_surface, mesh_folder, mesh_label_revision
 from ..params import ExportParams
 from ..progress import Reporter
+from ..project.label_revision import map_revision
 from ..project.runs import holdout_of
 from ..project.schema import Project
 from ..project.store import load_project, record_step
@@ -88,7 +88,7 @@ def label_revision(folder: Path, project: Project, params: ExportParams) -> int 
         return mesh_label_revision(folder, params.run)
     if params.to in OF_THE_FIELD:
         return load_info(folder, params.run).label_revision
-    return accepted_revision(project) if params.to == "transforms" else None
+    return map_revision(project) if params.to == "transforms" else None
 
 
 def _write_mesh(

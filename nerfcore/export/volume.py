@@ -12,7 +12,7 @@ from ..geometry.similarity import similarity_scale
 from ..images.picture import srgb_to_linear
 from ..kernels.voxel_field import CELLS, TEXELS, VERTICES, occupied_blocks, texels_of
 from ..progress import Reporter
-from ..project.runs import label_facts
+from ..project.label_revision import label_facts
 from ..render.baked import BakedField
 from .vdb import Grid, write_vdb
 

@@ -10,7 +10,7 @@ from ..files import atomic_path
 from ..geometry.similarity import make_similarity, similarity_scale
 from ..mesh.field_values import density_volume, shade, surface_level
 from ..progress import Reporter
-from ..project.runs import label_facts
+from ..project.label_revision import label_facts
 from ..project.schema import Project
 from ..render.run import Trained
 

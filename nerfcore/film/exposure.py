@@ -31,10 +31,12 @@ STEPS3 = (0.8191725133961645, 0.6710436067037893, 0.5497004779019703)
 @dataclass(frozen=True)
 class Exposure:
     """A rendered shot: its passes by name, (H, W, channels) float32, bottom row first as Blender has them; the manifests of
-    its Cryptomattes by name."""
+    its Cryptomattes by name, and the revision of the marks that the classes of a field are from by its name, of those that are
+    from any."""
 
     passes: dict[str, np.ndarray]
     manifests: dict[str, str]
+    label_revisions: dict[str, int]
 
 
 class Seen:
@@ -82,7 +84,8 @@ def expose(
             film.add(film.look(offset, chance, report, begin, 1 / len(samples)), counts)
             if show is not None and number + 1 < len(samples):
                 show(film.combined())
-    return Exposure(film.passes(), film.manifests())
+    revisions = {f.item.name: f.field.label_revision for f in fields if f.field.label_revision is not None}
+    return Exposure(film.passes(), film.manifests(), revisions)
 
 
 def _placed(shot: Shot, item: FieldItem, store: FieldStore, report: Reporter) -> PlacedField:

@@ -58,7 +58,7 @@ def light_left(rays: list[FieldRays]) -> torch.Tensor:
 @dataclass(frozen=True)
 class LoadedField:
     """A field as it lies in its capture: box_from_world (4, 4), ids, names and colours (K, 3) of its classes; the project
-    and the run that it is of."""
+    and the run that it is of, and the revision of the marks that its classes are from, if any."""
 
     shown: Model | BakedField
     box_from_world: np.ndarray
@@ -68,6 +68,7 @@ class LoadedField:
     void: int
     project: Path
     run: str
+    label_revision: int | None = None
 
     @cached_property
     def instances(self) -> InstanceCells:
@@ -93,7 +94,7 @@ def described(shown: Model | BakedField, project: Path, run: str, info: RunInfo,
     names = [known[i].name if i in known else f"class {i}" for i in ids]
     colors = np.array([known[i].color if i in known else (0.5, 0.5, 0.5) for i in ids], np.float32).reshape(-1, 3)
     box = info.box(load_project(project)).box_from_world
-    return LoadedField(shown, box, list(ids), names, colors, scene.ignore_id, project, run)
+    return LoadedField(shown, box, list(ids), names, colors, scene.ignore_id, project, run, info.label_revision)
 
 
 def shown_classes(shown: Model | BakedField) -> int:

@@ -7,7 +7,6 @@ meshes and later trainings have the classes as well; held-out photos get none, f
 
 from __future__ import annotations
 
-import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ from ..images.encode import write_picture
 from ..images.working import nearest
 from ..params import LabelAcceptParams
 from ..progress import Reporter
+from ..project.label_revision import MAPS, revision_of
 from ..project.runs import ACCEPTED, CHECKPOINT, fresh_folder, run_folder, swap_in
 from ..project.schema import Project, now
 from ..project.store import edit_project, load_project
@@ -35,8 +35,6 @@ from .overlay import photo_labels
 from .preparation import Preparation
 from .revisions import computed
 from .seeds import VOID, seeds_of
-
-MAPS = "labels/revision_{}"  # of the project, for the label maps of a revision
 
 
 def accept(params: LabelAcceptParams, report: Reporter) -> dict[str, Any]:
@@ -151,18 +149,6 @@ def agreement(predicted: np.ndarray, labelling: Labelling) -> float | None:
 def is_accepted(path: str) -> bool:
     """Whether a label map of the project was written by this verb."""
     return revision_of(path) is not None
-
-
-def revision_of(path: str) -> int | None:
-    """The revision of the marks that a label map of the project was made from by this verb; None: it is another one."""
-    found = re.match(MAPS.format(r"(\d+)") + "/", path)
-    return None if found is None else int(found.group(1))
-
-
-def accepted_revision(project: Project) -> int | None:
-    """The revision of the marks that label maps of photos were made from by this verb; None where none was."""
-    known = (revision_of(image.label) for image in project.images if image.label)
-    return next((revision for revision in known if revision is not None), None)
 
 
 def write_maps(

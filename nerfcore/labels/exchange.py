@@ -18,9 +18,10 @@ from ..images.working import nearest, read_label
 from ..params import LabelExportParams, LabelImportParams
 from ..progress import Reporter
 from ..project.classes import class_color
+from ..project.label_revision import map_revision
 from ..project.schema import ImageRecord, Project, SemanticClass
 from ..project.store import edit_project, load_project
-from .accept import accepted_revision, is_accepted
+from .accept import is_accepted
 from .formats import known
 from .formats.regions import LabelClass, Picture, Region, Source
 from .history import write_history
@@ -241,11 +242,8 @@ def pictures_of(params: LabelExportParams, project: Project, folder: Path) -> tu
     names = {c.id: c.name for c in project.classes}
     if params.source == "maps":
         images = [image for image in project.images if image.label and image.status != "rejected"]
-        return (
-            accepted_revision(project),
-            (_picture(image, *_maps(folder, image), names) for image in images),
-            len(images),
-        )
+        pictures = (_picture(image, *_maps(folder, image), names) for image in images)
+        return map_revision(project), pictures, len(images)
     ready, labelling = computed(folder, params.run, params.revision)
     images = [image for image in project.images if image.name in ready.of_photo]
 

@@ -16,7 +16,7 @@ from ..files import atomic_path
 from ..mesh.clean import areas
 from ..mesh.instances import Instance
 from ..mesh.surface import Surface
-from ..project.runs import LABEL_REVISION
+from ..project.label_revision import LABEL_REVISION
 from .sheet import Color, Entry, Mark, Sheet, Zone
 from .views import Picture
 

@@ -16,7 +16,7 @@ from ..mesh.stored import load_surface, mesh_folder, mesh_record
 from ..mesh.surface import Surface
 from ..params import PlanParams, SectionParams
 from ..progress import Reporter
-from ..project.runs import LABEL_REVISION
+from ..project.label_revision import LABEL_REVISION
 from ..project.schema import Project
 from ..project.store import load_project, record_step
 from .conditions import chosen_classes, condition_sheet, find_places, write_places

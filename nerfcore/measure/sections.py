@@ -10,7 +10,7 @@ import numpy as np
 
 from ..files import atomic_path
 from ..mesh.surface import Surface
-from ..project.runs import LABEL_REVISION
+from ..project.label_revision import LABEL_REVISION
 from .views import Projection
 
 

@@ -21,7 +21,7 @@ from ..files import atomic_path
 from ..images.encode import png_bytes
 from ..images.names import file_names
 from ..progress import go_on
-from ..project.runs import label_facts
+from ..project.label_revision import label_facts
 from .features import Features
 from .formats import TEXTURED, USD, Y_UP
 from .obj import write_obj

@@ -19,7 +19,7 @@ from trimesh.visual.material import PBRMaterial
 
 from ..files import atomic_path
 from ..images.picture import srgb_to_linear
-from ..project.runs import label_facts
+from ..project.label_revision import label_facts
 from .features import Feature, Features
 from .parts import Part
 

@@ -15,7 +15,7 @@ from typing import TextIO
 import numpy as np
 
 from ..files import atomic_path, write_text
-from ..project.runs import label_facts
+from ..project.label_revision import label_facts
 from .features import Features
 from .parts import Part
 

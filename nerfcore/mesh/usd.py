@@ -18,7 +18,7 @@ from ..errors import DiskError
 from ..files import atomic_path
 from ..geometry.cameras import flip_camera_axes
 from ..images.picture import srgb_to_linear
-from ..project.runs import label_facts
+from ..project.label_revision import label_facts
 from .features import Feature, Features
 from .parts import Texture
 from .surface import Surface

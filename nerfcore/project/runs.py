@@ -27,7 +27,6 @@ SCENE_GRAPH = "scene_graph.json"  # in exports/<run>: how the instances of the m
 MEASURES = "measures.json"  # in exports/<run>: areas and volumes of the mesh beside it
 RENDER_RECORD = "render.json"  # in a folder of renders: what they were made from
 NEW, OLD = ".new", ".old"
-LABEL_REVISION = "label_revision"
 ACCEPTED = "accepted"  # in a checkpoint's state: which revision of the marks its classes are from, and when
 # Every so many photos one is held out, unless a run says otherwise: as usual since NeRF (Mildenhall et al., 2020).
 HOLDOUT = 8
@@ -186,9 +185,3 @@ def read_metrics(folder: Path) -> dict[str, Any]:
     except (OSError, ValueError):
         return {}
     return value if isinstance(value, dict) else {}
-
-
-def label_facts(revision: int | None) -> dict[str, int]:
-    """How files say from which revision of the marks their classes are: {"label_revision": number}; empty where they are
-    from none."""
-    return {} if revision is None else {LABEL_REVISION: revision}

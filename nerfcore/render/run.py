@@ -69,11 +69,12 @@ class RunInfo(BaseModel):
     holdout: int = HOLDOUT  # every so many photos one was held out, where the project does not say which
     origin: Origin = Origin()
     accepted: AcceptedLabels | None = None  # None: its classes are those of the label maps it was trained on
+    map_revision: int | None = None  # of the marks that these maps were made from, if they were
 
     @property
     def label_revision(self) -> int | None:
         """The revision of the marks that the classes are from, if they are from any."""
-        return None if self.accepted is None else self.accepted.revision
+        return self.map_revision if self.accepted is None else self.accepted.revision
 
     @field_validator("config")
     @classmethod

@@ -33,7 +33,8 @@ from ..project.fingerprints import (
     rounded,
     write_made,
 )
-from ..project.runs import INSTANCES, MESH_RECORD, checkpoint_id, label_facts
+from ..project.label_revision import label_facts
+from ..project.runs import INSTANCES, MESH_RECORD, checkpoint_id
 from ..project.schema import step
 from ..project.store import load_project, world_from_sfm
 from . import parts

@@ -16,7 +16,8 @@ from ..mesh.instances import Instance, joined, read_instances, write_instances
 from ..mesh.stored import MESH, mesh_folder, mesh_record
 from ..params import InstancesParams
 from ..progress import Reporter
-from ..project.runs import LABEL_REVISION, MEASURES
+from ..project.label_revision import LABEL_REVISION
+from ..project.runs import MEASURES
 from ..project.store import load_project, record_step
 
 LEAST_SHARE = 0.01  # of the area of what is split, below which a piece stays with the nearest other one

@@ -24,7 +24,8 @@ from ..mesh.surface import Surface
 from ..params import RelationsParams
 from ..progress import Reporter
 from ..project.fingerprints import digest
-from ..project.runs import LABEL_REVISION, SCENE_GRAPH
+from ..project.label_revision import LABEL_REVISION
+from ..project.runs import SCENE_GRAPH
 from ..project.store import load_project, record_step
 from .query import answer
 from .relations import TOUCH, Thing, relations

@@ -19,6 +19,7 @@ from ..geometry.similarity import transform_points
 from ..images.working import read_label, shows_transparency
 from ..kernels.device import free_memory
 from ..progress import Reporter
+from ..project.label_revision import map_revision
 from ..project.runs import HOLDOUT
 from ..project.store import load_project, load_visibility, world_from_sfm
 from ..render.run import CPU_IMAGE_SIZE, GPU_IMAGE_SIZE, RunInfo, new_model
@@ -105,6 +106,7 @@ def plan_run(
         contracted=box.contracted,
         transparent=transparent,
         holdout=holdout,
+        map_revision=map_revision(project) if class_ids else None,
     )
     return info, scene
 

@@ -12,7 +12,7 @@ from PIL import Image
 
 from ...errors import InputError
 from ...files import atomic_path, write_json
-from ...project.runs import label_facts
+from ...project.label_revision import label_facts
 from .regions import (
     LabelClass,
     Picture,

@@ -12,7 +12,7 @@ import numpy as np
 
 from ...errors import InputError
 from ...files import write_json
-from ...project.runs import label_facts
+from ...project.label_revision import label_facts
 from .regions import (
     LabelClass,
     Picture,

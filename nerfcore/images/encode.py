@@ -20,9 +20,14 @@ SRGB_PRIMARIES = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)  # x, y of re
 BAND = 1 << 22  # values that are written between two questions whether to go on: a fraction of a second
 
 
-def write_picture(path: Path, picture: Picture | np.ndarray, check: Callable[[], None] = go_on) -> None:
+def write_picture(
+    path: Path,
+    picture: Picture | np.ndarray,
+    check: Callable[[], None] = go_on,
+    facts: dict[str, int] | None = None,
+) -> None:
     """Write a picture as 8-bit sRGB with straight alpha, if any; or (H, W, 3 or 1) values in [0, 1], or uint8/uint16 as
-    they are, in the format of the suffix. `check` is called between bands of rows, and may raise.
+    they are, in the format of the suffix. `check` is called between bands of rows, and may raise. `facts` are texts in a PNG.
 
     Raises:
         DiskError: the file cannot be written.
@@ -35,6 +40,8 @@ def write_picture(path: Path, picture: Picture | np.ndarray, check: Callable[[],
     height, width, channels = pixels.shape
     spec = oiio.ImageSpec(width, height, channels, str(pixels.dtype))
     spec.attribute("oiio:UnassociatedAlpha", 1)  # else colours are divided by alpha once more
+    for name, value in (facts or {}).items():
+        spec.attribute(name, str(value))
     out = oiio.ImageOutput.create(str(path))
     written = out is not None and out.open(str(path), spec)
     rows = max(1, BAND // (width * channels))

@@ -45,6 +45,7 @@ from .pictures import colorize_depth, colorize_labels, depth_range
 from .run import RunInfo, load_info, load_trained
 from .sparse_rays import sparse_rays
 
+OF_CLASSES = ("semantic", "confidence")  # passes
 ORBIT_PIXELS = 800  # longest side of orbit frames unless a size is asked for
 # Not tuned:
 OPEN_ANGLE = np.pi / 2  # around the subject without a photo: from there on an orbit is an arc
@@ -283,7 +284,7 @@ def write_frame(
 
     The PNG shows the field on its background; the EXR has the field alone, linear and with associated alpha, to be put
     over anything, and beside it the environment, if the run has one; `label_revision` in its
-    header names the marks that the classes are from, if they are from any.
+    header, and in the PNGs of classes, names the marks that the classes are from, if they are from any.
     """
     scale = similarity_scale(box.world_from_box)
     rotation = box.world_from_box[:3, :3] / scale
@@ -307,12 +308,12 @@ def write_frame(
         "normal": ("Normal.", ["X", "Y", "Z"], world_normal),
         "unknown": ("Unknown.", ["V"], unknown[..., None]),
     }
-    written = []
+    written, facts = [], label_facts(info.label_revision)
     for kind in passes:
         suffix, picture = pictures[kind]
         path = out / f"{name}{suffix}.png"
         with atomic_path(path) as temporary:
-            write_picture(temporary, picture)
+            write_picture(temporary, picture, facts=facts if kind in OF_CLASSES else None)
         written.append(path)
         if kind == "depth":
             write_json(path.with_suffix(".json"), depth_legend(frame, scale))
@@ -324,5 +325,5 @@ def write_frame(
         layers |= {f"Environment.{channel}": environment[..., index] for index, channel in enumerate("RGB")}
     path = out / f"{name}.exr"
     with atomic_path(path) as temporary:
-        write_layers(temporary, layers, label_facts(info.label_revision))
+        write_layers(temporary, layers, facts)
     return [*written, path]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+
 import numpy as np
 import pytest
 from fieldwork.tests.addon.rendered import START, ball
@@ -31,6 +33,7 @@ facts = {
 import OpenImageIO as oiio
 spec = oiio.ImageInput.open(f"{folder}/passes.exr").spec()
 facts["metadata"] = {a.name: a.value for a in spec.extra_attribs if a.name.startswith("cryptomatte/")}
+facts["revisions"] = {a.name: a.value for a in spec.extra_attribs if a.name.startswith("label_revision")}
 np.savez(f"{folder}/mine.npz", **{n: v for n, v in found.items() if n.startswith("CryptoMaterial")})
 
 # What Blender's own node makes of it, from the render and from the file.
@@ -69,8 +72,14 @@ answer(facts)
 
 def test_passes_and_cryptomatte_from_the_render_and_from_the_file(bpy_script, ball, tmp_path):
     from fieldwork.nerfcore.film.cryptomatte import id_of
+    from fieldwork.nerfcore.project.runs import run_folder
+    from fieldwork.nerfcore.render.run import load_info, save_info
 
+    ball = shutil.copytree(ball, tmp_path / "ball")
+    # As if its label maps were from the seventh revision of marks.
+    save_info(run_folder(ball, "main"), load_info(ball, "main").model_copy(update={"map_revision": 7}))
     facts = bpy_script(PASSES, project=ball, folder=tmp_path)
+    assert facts["revisions"] == {"label_revision/ball": "7"}
     assert facts["depth"] == pytest.approx(1.5, abs=0.08)
     assert facts["far"] == pytest.approx(1e10)
     assert facts["index"] == [1, 2, 0]

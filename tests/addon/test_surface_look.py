@@ -33,6 +33,7 @@ def package(tmp_path):
     np.savez(folder / "mesh.npz", **arrays)
     value = json.loads((folder / "package.json").read_text())
     value |= {"measures": MEASURES, "instances": [{"id": 1, "name": "gold.001", "class_id": 2}]}
+    value["label_revision"] = 7
     value["classes"] = [
         {"id": 1, "name": "stone", "color": [0.1, 0.2, 0.9]},
         {"id": 2, "name": "gold", "color": [0.9, 0.8, 0.0]},
@@ -127,6 +128,7 @@ answer({
     "faces": {name: len(m.data.polygons) for name, m in meshes.items()},
     "instances": {name: sorted({v.value for v in m.data.attributes["instance_id"].data}) for name, m in meshes.items()},
     "left": {name: len(m.evaluated_get(depsgraph).data.polygons) for name, m in meshes.items()},
+    "revisions": sorted({m["label_revision"] for m in meshes.values()}),
     "again": sorted(m.name for m in import_package(scene, read_package(package), split="none").meshes),
     "after": sorted(c.name for c in bpy.data.collections),
 })
@@ -147,6 +149,7 @@ def test_objects_are_named_and_sorted_by_class_and_say_what_was_measured(package
         assert facts["measured"]["gold.001"]["volume"] == 0.25
         assert facts["measured"]["gold"] == {}, "what is left beside the instances was not measured"
         assert facts["instances"] == {"gold": [0], "gold.001": [1], "stone": [0]}
+    assert facts["revisions"] == [7]
     assert sum(facts["faces"].values()) == 128
     assert {name: left for name, left in facts["left"].items() if left} == {"stone": facts["faces"]["stone"]}
     assert facts["again"] == ["Surface"]

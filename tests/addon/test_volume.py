@@ -33,6 +33,7 @@ def test_grids_are_read_by_blender_with_their_places(bpy_script, tmp_path: Path)
         tmp_path / "a.vdb",
         [Grid("density", places, values), Grid("color", places, colors), Grid("class_Wand ü", places[:2], values[:2])],
         matrix,
+        {"label_revision": 3},
     )
     facts = bpy_script(
         READ

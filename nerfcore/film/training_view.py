@@ -229,10 +229,11 @@ class TrainingView:
         end = time.perf_counter()
         view.pixels, view.step = width * height, self._steps
         self._ray_seconds = (end - begin) / view.pixels
-        # A view that moves must not wait for a fine picture's share of the time.
+        # A view that moves must not wait for a fine picture's share of the time, and no view for a moment in which the
+        # machine was busy with something else.
         self._free = {
             True: end + min(end - begin, FIRST) * (1 / MOVING_SHARE - 1),
-            False: end + (end - begin) * (1 / SHARE - 1),
+            False: end + min(end - begin, LONGEST) * (1 / SHARE - 1),
         }
 
 

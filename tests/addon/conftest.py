@@ -7,8 +7,10 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
+import fieldwork
 import pytest
 from fieldwork.tests.nerfcore.support.windows_files import each_file_system
 
@@ -23,14 +25,18 @@ def bpy_script(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Any]:
     FIELDWORK_BPY_PYTHON, a Python with bpy, numpy and OpenImageIO, if it is set: `matrix.py --renders` does so.
     """
     python = os.environ.get("FIELDWORK_BPY_PYTHON")
+    packages = tmp_path_factory.mktemp("packages")
     if python is None:
         pytest.importorskip("bpy", reason="needs the bpy package")
+    else:  # where this checkout is not installed
+        (packages / "fieldwork").symlink_to(Path(fieldwork.__file__).parent)
 
     def run(code: str, **variables: Any) -> Any:
         folder = tmp_path_factory.mktemp("bpy")
         answer = folder / "answer.json"
         prologue = (
             "import json, os, sys, bpy\nfrom pathlib import Path\n"
+            f"sys.path.append({str(packages)!r})\n"
             f"ENGINE_PYTHON = {sys.executable!r}\n"
             f"globals().update(json.loads({json.dumps(json.dumps(variables, default=str))}))\n"
             f"def answer(value): Path({str(answer)!r}).write_text(json.dumps(value))\n"

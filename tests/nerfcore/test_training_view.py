@@ -198,7 +198,37 @@ def test_pictures_take_a_small_part_of_the_time(project, tmp_path, monkeypatch):
     train(project, lambda step: viewer.ask(FRONT) if step == 1 else None, 100)
     assert len(spent) >= 2
     for (begin, end), (following, _) in zip(spent, spent[1:]):
-        assert following - end >= (1 / training_view.SHARE - 1.05) * (end - begin)
+        taken = min(end - begin, training_view.LONGEST)
+        assert following - end >= (1 / training_view.SHARE - 1.05) * taken
+
+
+def test_a_picture_in_a_busy_moment_does_not_keep_the_next_away_for_long(project, tmp_path, monkeypatch):
+    """What took twenty seconds is not waited for eleven times over."""
+    viewer, ends, clock = Viewer(project, tmp_path, side=64), [], [0.0]
+    make = training_view.view_picture
+
+    def slow(field, request, width, height, check):
+        begin, made = clock[0], make(field, request, width, height, check)
+        clock[0] += 0.01 if ends else 20.0
+        ends.append((begin, clock[0], width))
+        return made
+
+    class Clock:
+        time = staticmethod(time.time)
+        perf_counter = staticmethod(lambda: clock[0])
+
+    monkeypatch.setattr(training_view, "view_picture", slow)
+    monkeypatch.setattr(training_view, "time", Clock)
+
+    def act(step: int) -> None:
+        clock[0] += 0.2
+        if step == 1:
+            viewer.ask(FRONT)
+
+    train(project, act, 60)
+    longest = training_view.LONGEST * (1 / training_view.SHARE - 1)
+    assert ends[1][0] - ends[0][1] <= longest + 0.21
+    assert ends[-1][2] > ends[0][2], "the pictures become finer again"
 
 
 @pytest.mark.usefixtures("eager")

@@ -19,11 +19,8 @@ from ..files import write_json, write_text
 from ..kernels.device import use_device
 from ..params import BenchParams
 from ..progress import Reporter, shortened
-from . import gpu, live, machine, speed, surface, tables
-from .evidence.suite import evidence_suite
-from .jobs import run_all, unknown_origin
-from .labels import labels_suite
-from .measures import measures_suite
+from . import gpu, machine, tables
+from .jobs import Measure, run_all, unknown_origin
 from .page import check_page, figures_folder, write_page
 from .results import Asked, ResultSet, Row, grouped, write_set
 from .scenes import available, data_folder, is_labelled, prepare, scene_name
@@ -40,24 +37,27 @@ def bench(params: BenchParams, report: Reporter) -> dict[str, Any]:
     """
     root = Path(params.out)
     out = root / params.suite
-    if params.suite == "evidence":
+    if params.suite == "evidence":  # what one suite alone needs loads with it
+        from .evidence.suite import evidence_suite
+
         return evidence_suite(params, out, root, command_of(params), report)
     if params.page is not None:
         check_page(params.page)
     if params.suite == "gpu" and use_device().type != "cuda":
         return _without_gpu(params, out, report)
     if params.suite == "measures":
+        from .measures import measures_suite
+
         return measures_suite(params, out, command_of(params), report)
     data = data_folder(params.data)
     projects, notes = _scenes(params, data, root, report)
     if params.suite == "labels":
+        from .labels import labels_suite
+
         result = labels_suite(params, projects, out, command_of(params), report)
         return {**result, "notes": [*notes, *result["notes"]]}
     jobs = plan(params, list(projects))
-    more = {"surface": partial(surface.measure, root=root), "speed": speed.measure, "live": live.measure}.get(
-        params.suite
-    )
-    results = run_all(jobs, projects, out, report, params.keep, more)
+    results = run_all(jobs, projects, out, report, params.keep, _measure_of(params.suite, root))
     rows = tables.make_rows(params.suite, results)
     described = machine.describe()
     if params.yardstick is not None and params.suite == "speed":
@@ -86,6 +86,23 @@ def bench(params: BenchParams, report: Reporter) -> dict[str, Any]:
     }
 
 
+def _measure_of(suite: str, root: Path) -> Measure | None:
+    """What a suite measures of each trained run beside the figures of all."""
+    if suite == "surface":
+        from .surface import measure
+
+        return partial(measure, root=root)
+    if suite == "speed":
+        from .speed import measure
+
+        return measure
+    if suite == "live":
+        from .live import measure
+
+        return measure
+    return None
+
+
 def _scenes(params: BenchParams, data: Path | None, root: Path, report: Reporter) -> tuple[dict[str, Path], list[str]]:
     """Projects of the suite's scenes, and a note for each that is left out. Scenes named by the user must be there."""
     notes, projects = [], {}
@@ -95,7 +112,9 @@ def _scenes(params: BenchParams, data: Path | None, root: Path, report: Reporter
             continue
         project = prepare(scene, data, root, report)
         if params.suite == "surface":
-            surface.read_truth(root, scene_name(scene))  # before anything is trained for nothing
+            from .surface import read_truth
+
+            read_truth(root, scene_name(scene))  # before anything is trained for nothing
         if not params.scenes and params.suite in ("ablation", "robustness", "labels") and not is_labelled(project):
             notes.append(f"{scene} is left out: it has no labels.")
             continue

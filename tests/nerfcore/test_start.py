@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import gc
 import subprocess
 import sys
 
 import pytest
+from fieldwork.nerfcore import verbs
 
 HEAVY = {
     "cli": ("torch", "warp", "scipy", "matplotlib", "pycolmap", "trimesh"),
@@ -26,3 +28,17 @@ def test_a_verb_loads_no_library_before_it_needs_it(module: str) -> None:
     loaded = set(done.stdout.split())
     assert f"fieldwork.nerfcore.{module}" in loaded
     assert loaded.isdisjoint(HEAVY[module]), loaded & set(HEAVY[module])
+
+
+@pytest.mark.parametrize("collecting", [True, False])
+def test_loading_a_verb_does_not_look_for_garbage_and_leaves_that_as_it_was(monkeypatch, collecting: bool) -> None:
+    seen = []
+    monkeypatch.setattr(verbs.importlib, "import_module", lambda *names: seen.append(gc.isenabled()))
+    before = gc.isenabled()
+    try:
+        gc.enable() if collecting else gc.disable()
+        verbs.load_verb("train")
+        assert seen == [False]
+        assert gc.isenabled() is collecting
+    finally:
+        gc.enable() if before else gc.disable()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
@@ -76,6 +77,19 @@ def require_readable(folder: Path) -> None:
             os.listdir(folder)
     except PermissionError as error:
         raise InputError(f"{folder} cannot be read: {error.strerror}.", "Check its permissions.") from error
+
+
+def require_writable(path: Path) -> None:
+    """Raise DiskError unless a file can be made at `path`, whose folder need not be there yet: to be asked before the work
+    whose result it shall hold."""
+    import tempfile  # see `atomic_path`
+
+    path = Path(path).absolute()
+    with disk_errors(path):
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        with tempfile.TemporaryFile(dir=next(folder for folder in path.parents if folder.exists())):
+            pass
 
 
 @contextmanager

@@ -12,6 +12,7 @@ from ..data.box import Box
 from ..data.load import class_inputs, load_scene, view_inputs
 from ..data.scene import Scene
 from ..errors import ProjectError
+from ..files import require_writable
 from ..geometry.similarity import similarity_scale
 from ..images.picture import to_bytes
 from ..params import MeshParams
@@ -59,6 +60,9 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
     folder = Path(params.project)
     if params.out is not None:
         check_format(params.out)
+        require_writable(params.out)
+    if params.turntable is not None:
+        require_writable(params.turntable / "color_0.png")
     if params.texture is not None:
         check_memory(params.texture)
     project, trained = load_project(folder), load_trained(folder, params.run)

@@ -20,6 +20,7 @@ from ..cluster.worker import require_inside
 from ..config import make_config
 from ..data.load import class_inputs, load_scene, view_inputs
 from ..errors import FieldworkError
+from ..files import require_writable
 from ..mesh.formats import check_format
 from ..progress import Reporter
 from ..project.fingerprints import Fingerprint, compare, digest, read_made, write_made
@@ -54,6 +55,9 @@ def blocks(params: p.BlocksParams, report: Reporter) -> dict[str, Any]:
     folder = Path(params.project)
     if params.out is not None:
         check_format(params.out)
+        require_writable(params.out)
+    if params.turntable is not None:
+        require_writable(params.turntable / "color_0.png")
     make_config(params.preset, settings_of(params))  # says what is wrong with the settings before anything is made
     link = Link(params.cluster, params.wheel) if params.cluster else None
     report.stage("Cutting into blocks")

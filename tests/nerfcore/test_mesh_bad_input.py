@@ -156,6 +156,18 @@ def test_no_memory_for_a_texture_is_said_before_any_work(untrained: Path, monkey
     assert contents(untrained) == before
 
 
+@pytest.mark.parametrize("asked", [{"out": "file/a.glb"}, {"out": "folder.glb"}, {"turntable": "file/around"}])
+def test_where_no_file_can_be_is_said_before_any_work(untrained: Path, tmp_path: Path, asked: dict[str, str]) -> None:
+    (tmp_path / "file").touch()
+    (tmp_path / "folder.glb").mkdir()
+    report, before = Reporter(), contents(tmp_path)
+    params = MeshParams(project=untrained, **{name: tmp_path / place for name, place in asked.items()})
+    with pytest.raises(DiskError, match="in its way"):
+        run_verb("mesh", params, report)
+    assert not report.warnings  # the field was not even looked at
+    assert contents(tmp_path) == before
+
+
 def contents(folder: Path) -> dict[Path, str]:
     files = [path for path in folder.rglob("*") if path.is_file() and "jobs" not in path.parts]
     return {path: hashlib.sha256(path.read_bytes()).hexdigest() for path in files}

@@ -113,13 +113,16 @@ def _ends(
     return torch.cat([center[None], center + directions * far[:, None]]), longest
 
 
+PER_PIXEL = ("depth", "cosine", "spread", "certain")
+
+
 def chosen(maps: MapArrays, keep: np.ndarray) -> MapArrays:
     """The maps (V,) bool that are kept, in their order."""
     views = np.flatnonzero(keep).tolist()
     counts = maps.size.long().prod(1).tolist()
     begins = [int(maps.first[view]) for view in views]
     pieces = [slice(begin, begin + counts[view]) for begin, view in zip(begins, views)]
-    flat = {name: torch.cat([getattr(maps, name)[piece] for piece in pieces]) for name in ("depth", "cosine", "spread")}
+    flat = {name: torch.cat([getattr(maps, name)[piece] for piece in pieces]) for name in PER_PIXEL}
     ends = np.cumsum([0, *[counts[view] for view in views[:-1]]])
     first = torch.tensor(ends, dtype=torch.int32, device=maps.first.device)
     rest = {name: getattr(maps, name)[views] for name in ("size", "lens", "rotation", "translation")}

@@ -21,6 +21,7 @@ class Maps:
     depth: wp.array(dtype=float)
     cosine: wp.array(dtype=float)
     spread: wp.array(dtype=float)
+    certain: wp.array(dtype=float)
     first: wp.array(dtype=int)
     size: wp.array(dtype=int, ndim=2)
     lens: wp.array(dtype=wp.vec4)
@@ -32,6 +33,7 @@ def map_struct(maps: MapArrays) -> Maps:
     """The maps as kernels take them."""
     out = Maps()
     out.depth, out.cosine, out.spread = array(maps.depth), array(maps.cosine), array(maps.spread)
+    out.certain = array(maps.certain)
     out.first, out.size, out.lens = array(maps.first), array(maps.size), array(maps.lens, wp.vec4)
     out.rotation, out.translation = array(maps.rotation, wp.mat33), array(maps.translation, wp.vec3)
     return out

@@ -56,7 +56,8 @@ def clean(
 def shown(vertices: np.ndarray, faces: np.ndarray, maps: MapArrays, tolerance: float, report: Reporter) -> np.ndarray:
     """Which triangles (F,) bool at least two views see, less what spans outlines: where a view shows something of another
     slope, and fewer than two show something as steep as the triangle. Between the edge of a thing and the wall behind it
-    there is nothing, but distances fused from both have a surface there, in thin strands beside the thing."""
+    there is nothing, but distances fused from both have a surface there, in thin strands beside the thing. A view whose
+    slope there is not certain, as neither photos confirm its depth nor is the field sharp, contradicts nothing."""
     middle, normals = vertices[faces].mean(1), unit(cross(vertices, faces))
     seen = seen_by(middle, normals, maps, tolerance, report) >= FEWEST_VIEWS
     device, counts = maps.depth.device, [np.zeros((0, 2))]

@@ -32,6 +32,7 @@ CPU_RAYS, GPU_RAYS = 8192, 1 << 18  # a tile; the CPU's fits a core's cache
 FIELD_SHARE, FIELD_SIDE = 0.5, 160  # of a map's side on a CPU, and pixels at least: a field is soft, photos refine it
 MOST_VIEWS = 96
 OPAQUE, EMPTY = 0.5, 0.1  # opacities: something is there, nothing is there
+CERTAIN = 20.0  # footprints of a pixel: spread of a depth up to which its slope can be relied on
 STEEPEST = np.cos(np.radians(80))
 EDGE, EDGE_PIXELS = 0.03, 5.5  # share, or footprints of a pixel, by which the depth of neighbours differs at an outline
 NEIGHBOURS = 48  # views asked to confirm a depth: what lies at a picture's rim is seen by views that share little else
@@ -253,12 +254,18 @@ def map_arrays(views: list[FlatView], maps: list[DepthMap], device: torch.device
         flat([np.where(m.hit & (m.cosine < STEEPEST), 0, m.depth) for m in maps]),
         flat([np.where(m.hit, m.cosine, 1) for m in maps]),
         flat([np.where(m.hit, m.spread, 0) for m in maps]),
+        flat([certain_slopes(v, m) for v, m in zip(views, maps)]),
         torch.nn.functional.pad(sizes.prod(1).cumsum(0)[:-1], (1, 0)).int().to(device),
         sizes.to(device),
         torch.tensor([[v.camera.fx, v.camera.fy, v.camera.cx, v.camera.cy] for v in views]).float().to(device),
         torch.from_numpy(np.ascontiguousarray(inverse[:, :3, :3])).to(device),
         torch.from_numpy(np.ascontiguousarray(inverse[:, :3, 3])).to(device),
     )
+
+
+def certain_slopes(view: FlatView, map_: DepthMap) -> np.ndarray:
+    """Where (H, W) bool the spread of a map's depths is so small that their slope can be relied on."""
+    return map_.hit & (map_.spread <= CERTAIN * map_.depth / view.camera.fx)
 
 
 def confirmed_maps(

@@ -18,7 +18,16 @@ from ..geometry.cameras import pixel_centers, project, rays
 from ..kernels.depth_arrays import FREE, MapArrays
 from ..kernels.patches import refine
 from ..progress import Reporter
-from .depth_maps import DepthMap, FlatView, confirmed_maps, cosines, map_arrays, neighbours, smooth_normals
+from .depth_maps import (
+    DepthMap,
+    FlatView,
+    certain_slopes,
+    confirmed_maps,
+    cosines,
+    map_arrays,
+    neighbours,
+    smooth_normals,
+)
 from .planes import with_planes
 from .scene_planes import known_points, on_scene_planes, scene_planes
 from .sky import backdrop, farthest, labels_tell, named_things, nothing
@@ -119,8 +128,16 @@ def refined_maps(
         named.append(by_class)
     final = confirmed_maps(views, mixed, device, report, around, one_suffices=named)
     final = with_holes_filled(final, confirmed_maps(views, fields, device, report, around, FIELD_CONFIRMED))
+    final = replace(final, certain=relied_on(views, maps, sure).to(final.depth.device))
     asked = sum(int(map_.hit.sum()) for map_ in mixed)
     return final, sum(int(part.sum()) for part in hits(final, mixed)) / max(asked, 1)
+
+
+def relied_on(views: list[FlatView], fields: list[DepthMap], sure: list[np.ndarray]) -> torch.Tensor:
+    """Which slopes (P,) float32 of corrected maps can be relied on: where photos confirm the depth, `sure` (H, W) bool of
+    each, or the field's own is sharp; planes put through unsure depths are guesses."""
+    parts = [(safe | certain_slopes(*both)).reshape(-1) for *both, safe in zip(views, fields, sure)]
+    return torch.from_numpy(np.concatenate(parts).astype(np.float32))
 
 
 def trusted_field(field: DepthMap, depth: np.ndarray, sure: np.ndarray, unnamed: np.ndarray | None) -> DepthMap:

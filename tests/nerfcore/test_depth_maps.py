@@ -91,7 +91,7 @@ def test_holes_are_filled_and_nothing_else() -> None:
     def arrays(*depths: float) -> MapArrays:
         depth = torch.tensor(depths)
         nothing = torch.zeros(1)
-        return MapArrays(depth, depth + 1, depth + 2, nothing, nothing, nothing, nothing, nothing)
+        return MapArrays(depth, depth + 1, depth + 2, nothing, nothing, nothing, nothing, nothing, nothing)
 
     filled = refine.with_holes_filled(arrays(0, 0, 0, 1, FREE), arrays(3, 0, FREE, 4, 5))
     assert filled.depth.tolist() == arrays(3, 0, 0, 1, FREE).depth.tolist()
@@ -291,3 +291,15 @@ def test_what_is_seen_at_a_grazing_angle_is_unknown_not_free() -> None:
     view = depth_maps.FlatView(camera, np.eye(4), 0, np.ones((1, 4), bool))
     arrays = depth_maps.map_arrays([view], [depth_maps.DepthMap(depth, np.zeros_like(depth), cosine)], CPU)
     assert arrays.depth.tolist() == np.array([1, 0, FREE, 0], np.float32).tolist()
+
+
+def test_slopes_are_relied_on_where_photos_confirm_or_the_field_is_sharp() -> None:
+    flats, maps = maps_of(sphere(0.5), orbit(2, 1.8))
+    soft = [replace(m, spread=30 * m.depth / view.camera.fx) for view, m in zip(flats, maps)]
+    sure = [np.zeros(m.depth.shape, bool) for m in maps]
+    sure[0][:, ::2] = True
+    sharp = refine.relied_on(flats, maps, sure).reshape(2, *maps[0].depth.shape) > 0
+    assert torch.equal(sharp[1], torch.from_numpy(maps[1].hit))
+    found = refine.relied_on(flats, soft, sure).reshape(2, *maps[0].depth.shape)
+    assert torch.equal(found[0] > 0, torch.from_numpy(sure[0]))
+    assert not found[1].any()

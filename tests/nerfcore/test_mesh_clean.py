@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 import trimesh
+from fieldwork.nerfcore.kernels.depth_arrays import FREE
 from fieldwork.nerfcore.mesh import depth_maps
 from fieldwork.nerfcore.mesh.clean import FEWEST_VIEWS, cross, mean_around, seen_by, shown, unit
 from fieldwork.nerfcore.progress import Reporter
@@ -31,6 +34,18 @@ def test_what_stands_upright_on_a_table_is_left_out_though_views_see_it() -> Non
         seen = seen_by(vertices[faces].mean(1), unit(cross(vertices, faces)), known, NEAR, Reporter())
         assert (seen >= FEWEST_VIEWS).all()
         assert (shown(vertices, faces, known, NEAR, Reporter()) == expected).all()
+
+
+def test_slopes_that_are_not_certain_contradict_nothing() -> None:
+    table = box(np.array([-0.6, -0.6, -0.2]), np.array([0.6, 0.6, 0.0]))
+    flats, maps = maps_of(table, orbit(30, 1.8, (0.95, 0.9, 0.97)))
+    known = depth_maps.confirmed_maps(flats, maps, torch.device("cpu"), Reporter())
+    x, _, z = 0.4 * np.eye(3)
+    strand = grid(x, 0.05 * z)
+    assert (known.certain[known.depth < FREE] == 1).all()
+    for certain, expected in ((1.0, False), (0.0, True)):
+        believed = replace(known, certain=torch.full_like(known.certain, certain))
+        assert (shown(*strand, believed, NEAR, Reporter()) == expected).all()
 
 
 def test_values_of_triangles_spread_over_their_neighbours() -> None:

@@ -46,7 +46,7 @@ def rough(views: tuple[list[FlatView], list[DepthMap]]) -> MapArrays:
     depth = torch.where(maps.depth < FREE, depth, maps.depth)
     holes = torch.rand(depth.shape, generator=random) < 0.05
     spread = 0.05 * torch.rand(depth.shape, generator=random)
-    return replace(maps, depth=torch.where(holes, 0.0, depth), spread=spread)
+    return replace(maps, depth=torch.where(holes, 0.0, depth), spread=spread, certain=(spread < 0.03).float())
 
 
 def on_ball(count: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -146,6 +146,8 @@ def test_slopes_are_compared_as_their_reference_says(device: str, rough: MapArra
     ours = surface.slopes(points.to(device), directions.to(device), on(device, rough), 0.03, 0.3).cpu()
     expected = surface_reference.slopes(points, directions, rough, 0.03, 0.3)
     assert (expected.mean(0) > 0.2).all()
+    everything = replace(rough, certain=torch.ones_like(rough.certain))
+    assert (surface_reference.slopes(points, directions, everything, 0.03, 0.3).mean(0) > 1.2 * expected.mean(0))[1]
     assert float((ours == expected).float().mean()) > 0.995
 
 

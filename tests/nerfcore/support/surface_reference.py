@@ -149,8 +149,9 @@ def slopes(
         facing = (normals * torch.nn.functional.normalize(center - points, dim=1)).sum(1).clamp(-1, 1)
         width, height = maps.size[view].tolist()
         column, row = x.nan_to_num().floor().clamp(0, width - 1), y.nan_to_num().floor().clamp(0, height - 1)
-        cosine = maps.cosine[(maps.first[view] + row * width + column).long()]
+        place = (maps.first[view] + row * width + column).long()
+        cosine, sure = maps.cosine[place], maps.certain[place] > 0.5
         near = inside & (depth > 0) & ((q[:, 2] - depth).abs() < tolerance)
         own = near & (facing > 0) & ((facing.acos() - cosine.clamp(max=1).acos()).abs() <= turned)
-        counts += torch.stack([own, near & ~own], 1)
+        counts += torch.stack([own, near & ~own & sure], 1)
     return counts

@@ -136,7 +136,7 @@ def refined_maps(
 def relied_on(views: list[FlatView], fields: list[DepthMap], sure: list[np.ndarray]) -> torch.Tensor:
     """Which slopes (P,) float32 of corrected maps can be relied on: where photos confirm the depth, `sure` (H, W) bool of
     each, or the field's own is sharp; planes put through unsure depths are guesses."""
-    parts = [(safe | certain_slopes(*both)).reshape(-1) for *both, safe in zip(views, fields, sure)]
+    parts = [(safe | certain_slopes(view, map_)).reshape(-1) for view, map_, safe in zip(views, fields, sure)]
     return torch.from_numpy(np.concatenate(parts).astype(np.float32))
 
 

@@ -203,6 +203,11 @@ def row(
     }
 
 
+def worst_of_losses(figure: str, lost: Sequence[float]) -> Row:
+    """A row that nothing is asked of, whose worst value is the largest."""
+    return {**row(figure, lost, most=1.0), "asked": "–", "reached": None}
+
+
 def accuracy(name: str, trials: list[dict[str, Any]], most: dict[str, Any]) -> list[Row]:
     """How right labels are after the first strokes, after the corrections, and by all label maps."""
     share = ASKED_SHARE.get(name)
@@ -232,7 +237,9 @@ def studied(
 ) -> tuple[list[Row], list[str]]:
     """The other studies of a scene, and what is to be said of them."""
     report.stage("Wrong strokes")
-    lost = [t["steps"][0]["miou"] - wrong_strokes(subject, t["seed"], report) for t in trials]
+    right = [t["steps"][0]["miou"] for t in trials]
+    found = [wrong_strokes(subject, t["seed"], report) for t in trials]
+    lost, least = ([miou - values[way] for miou, values in zip(right, found)] for way in (0, 1))
     report.stage("Classes without strokes")
     shares = withheld(subject, seeds[0], report)
     report.stage("Parts of the method")
@@ -240,7 +247,10 @@ def studied(
     report.stage("Next photos")
     curves = [photo_curves(subject, seed, report) for seed in seeds[:CURVES]]
     needed = photos_needed(curves)
-    rows = [row("mIoU lost by 30 % wrong strokes", lost, most=0.05)]
+    rows = [
+        row("mIoU lost by 30 % wrong strokes", lost, most=0.05),
+        worst_of_losses("mIoU lost where just these are left out", least),
+    ]
     if shares:
         rows.append(row("void share of a class without strokes", list(shares.values()), 0.8))
     chance = row("photos needed by the next photo, of those by chance", [needed], most=0.5)

@@ -40,7 +40,7 @@ SUITES = {
         "field saw no label map. mIoU is of the pixels of held-out photos, those without a class counting as wrong; “all "
         "label maps” is the most that the same surfels can show. Worst: of the seeds, or the 95th percentile of times, "
         "beside whose median “mean” shows. “+ parts”: strokes take whole parts; each of the four rows of the method stands "
-        "on those before it. Strokes of a user do not take whole parts: “two photos” and all other rows have the graph and "
+        "on those before it. “Where just these are left out”: what even one who knows the wrong strokes loses. Strokes of a user do not take whole parts: “two photos” and all other rows have the graph and "
         "image features, without that.",
     ),
     "live": (

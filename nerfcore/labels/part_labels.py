@@ -10,6 +10,7 @@ import torch
 
 from .calibration import CERTAINTY, STRENGTH, calibrated
 from .graph import held_groups
+from .likeness import strangeness
 from .preparation import Preparation
 from .seeds import VOID, Seeds, one_hot
 from .unary import class_probabilities, distance_to_samples, familiarity, sampled
@@ -77,7 +78,17 @@ def looks_of_parts(
     mark, rows = torch.from_numpy(seeds.mark[chosen]), torch.arange(len(chosen))
     look = class_probabilities(both, rows, target, mark, classes + void_marked, check)[len(chosen) :, :classes]
     distance = distance_to_samples(both[:, : ready.features.shape[1]], rows, mark, check)[len(chosen) :]
-    return look, familiarity(distance)
+    return look, familiarity(distance, strangeness(*ready.likeness, distance, check))
+
+
+def strange_parts(
+    ready: Preparation, marked: torch.Tensor, mark: torch.Tensor, check: Callable[[], None]
+) -> np.ndarray:
+    """How strange (P,) in [0, 1] parts are to the marked surfels (S,), of which `mark` (S,) says which mark each is of."""
+    size = ready.features.shape[1]
+    both = torch.from_numpy(np.concatenate([ready.features[marked.numpy()], ready.part_features[:, :size]]))
+    distance = distance_to_samples(both, torch.arange(len(marked)), mark, check)[len(marked) :]
+    return strangeness(*ready.likeness, distance, check)
 
 
 def walked_parts(

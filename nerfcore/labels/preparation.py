@@ -45,6 +45,7 @@ from ..project.store import load_project, world_from_sfm
 from ..render.run import Trained, load_info, load_trained, refined_poses
 from ..render.sparse_rays import sparse_rays
 from .graph import Graph, feature_columns, joined, make_graph
+from .likeness import likeness
 from .lookup import RECORD, UNREADABLE, part_of, photo_maps
 from .lookup import SURFELS as FOLDER
 from .models import load
@@ -72,7 +73,7 @@ CPU_SHARE = 0.5  # of a map's side that rays are rendered for on a CPU
 LEAST_SURFELS = 64
 PIXELS_EACH = 4  # at least, in the mean: what a surfel of one pixel looks like is noise
 TELLING = 7  # pixels of a surfel, in the mean, from which on its colour says where it ends
-VERSION = 8  # of what is made; another one makes it again
+VERSION = 9  # of what is made; another one makes it again
 MATRIX = ("data", "indices", "indptr")
 
 
@@ -134,6 +135,11 @@ class Preparation:
     def conductance(self) -> float:
         """What the edges of a surfel conduct together, in the mean."""
         return float(self._array("edges_data").sum(dtype=np.float64)) / max(1, len(self.surfels))
+
+    @cached_property
+    def likeness(self) -> tuple[csr_matrix, float]:
+        """Which fine parts look alike, as `likeness.likeness` says it."""
+        return self._matrix("likeness"), float(self._array("likeness_scale"))
 
     @cached_property
     def part_edges(self) -> csr_matrix:
@@ -252,6 +258,9 @@ def _made(folder: Path, run: str, report: Reporter, count: int, features: Path |
     arrays["part_features"] = means(arrays["parts"][:, 0], int(arrays["parts"][:, 0].max()) + 1, columns).astype(
         np.float32
     )
+    surface = arrays["part_features"][:, : arrays["features"].shape[1]]
+    alike, scale = likeness(surface, report.check)
+    arrays |= {**stored("likeness", alike), "likeness_scale": np.array(scale)}
     place = run_folder(folder, run) / FOLDER
     firsts = np.cumsum([0, *(width * height for width, height in sizes)])
     photos = [
@@ -364,10 +373,15 @@ def surfel_arrays(
         "features": feature_columns(made, neighbours),
         "cell": graph.cell,
         "parts": parts,
-        **{f"{name}_{part}": getattr(matrix, part) for name, matrix in matrices.items() for part in MATRIX},
+        **{key: values for name, matrix in matrices.items() for key, values in stored(name, matrix).items()},
         "pixel_surfel": pixel_surfel,
         "pixel_edge": edge,
     }
+
+
+def stored(name: str, matrix: csr_matrix) -> dict[str, np.ndarray]:
+    """The arrays that a sparse matrix is kept as."""
+    return {f"{name}_{part}": getattr(matrix, part) for part in MATRIX}
 
 
 def _write(place: Path, arrays: dict[str, np.ndarray], record: dict[str, Any]) -> None:

@@ -9,7 +9,7 @@ import torch
 
 from .calibration import Certainty, calibrated, certainty
 from .graph import Graph, held_groups, membership
-from .part_labels import best_strength
+from .part_labels import best_strength, strange_parts
 from .preparation import Preparation
 from .seeds import VOID, Carried, Seeds, one_hot
 from .unary import class_probabilities, distance_to_samples, familiarity
@@ -75,7 +75,8 @@ def appearance(
     look = class_probabilities(columns, marked, target, mark, classes + void_marked, check)
     # What photos show is too fine to say what is known: every place has another texture.
     distance = distance_to_samples(features, marked, mark, check)
-    return look[:, :classes], familiarity(distance)
+    strange = strange_parts(ready, marked, mark, check)[np.asarray(ready.parts[:, 0])]
+    return look[:, :classes], familiarity(distance, strange)
 
 
 def with_carried(look: np.ndarray, familiar: np.ndarray, carried: Carried) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

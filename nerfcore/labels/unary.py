@@ -9,12 +9,14 @@ import torch
 
 STEPS = 60  # of the optimiser
 ROWS = 16384  # at once
-# See experiments.md, “Exact kernels for labels” and “Labels from a few strokes”.
+# See experiments.md, “Exact kernels for labels”, “Labels from a few strokes” and “Looks that no small steps lead to”.
 LANDMARKS = 512  # marked surfels, about, that a kernel is taken to
 BANDWIDTH = 0.25  # inverse deviation of the Gaussian kernel, in feature columns
 RIDGE = 1e-4  # added to the kernel's diagonal, which is 1: marked surfels may be the same
 DECAY = 1e-5
 KNOWN_LOOK = 2.85  # distance to the nearest marked surfel, in feature columns, at which prior and void count the same
+KNOWN_KIND = 2.5  # the same of that distance times (how strange it is + STRANGE)
+STRANGE = 0.3
 SHARPNESS = 4
 SAMPLES = 48  # marked surfels of each mark that distances are taken to
 
@@ -115,9 +117,10 @@ def distance_to_samples(
     return torch.cat(found).numpy()
 
 
-def familiarity(distance: np.ndarray) -> np.ndarray:
-    """How much (N,) in [0, 1] something looks like any that is marked, by its distance (N,) to the nearest."""
-    return 0.5 ** ((distance / KNOWN_LOOK) ** SHARPNESS)
+def familiarity(distance: np.ndarray, strange: np.ndarray) -> np.ndarray:
+    """How much (N,) in [0, 1] something looks like any that is marked, by its distance (N,) to the nearest and how strange
+    (N,) in [0, 1] it is to all (see likeness.py)."""
+    return 0.5 ** ((distance * np.maximum(1 / KNOWN_LOOK, (strange + STRANGE) / KNOWN_KIND)) ** SHARPNESS)
 
 
 def sampled(mark: torch.Tensor, most: int | None = None) -> torch.Tensor:

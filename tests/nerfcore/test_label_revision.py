@@ -89,7 +89,7 @@ def test_exported_meshes_and_fields_name_it_in_their_files(labelled: Path, tmp_p
     assert trimesh.load(tmp_path / "ply.ply", process=False).faces.shape[1] == 3, "it is still read"  # type: ignore[union-attr]
     assert gltf(written("glb", ".glb"))["asset"]["extras"] == {"label_revision": REVISION}
     assert written("obj", ".obj").read_text().splitlines()[0] == f"# label_revision {REVISION}"
-    stage = Usd.Stage.Open(str(written("usd", ".usda")))
+    stage = Usd.Stage.Open(str(written("usd", ".usda")))  # pyright: ignore[reportAttributeAccessIssue]
     assert stage.GetDefaultPrim().GetCustomDataByKey("label_revision") == REVISION
     written("stl", ".stl")
     written("masks", "")

@@ -139,7 +139,7 @@ class Preparation:
     @cached_property
     def likeness(self) -> tuple[csr_matrix, float]:
         """Which fine parts look alike, as `likeness.likeness` says it."""
-        return self._matrix("likeness"), float(self._array("likeness_scale"))
+        return self._matrix("likeness"), float(self._array("likeness_scale").item())
 
     @cached_property
     def part_edges(self) -> csr_matrix:

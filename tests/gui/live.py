@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 import bpy
+import numpy as np
 from bpy_extras.view3d_utils import location_3d_to_region_2d
 from mathutils import Quaternion, Vector
 from steps import alias
@@ -173,6 +174,45 @@ def viewport(screen):
     screen.facts["viewport error"] = drawn.error
     screen.facts["kept"] = [len(drawn.views), len(drawn.assets)]
     yield 0.5
+
+
+def speed(screen):
+    """Frames a second of the march of the viewport at three sizes, as the view has them: colour, depth and classes."""
+    yield from ball(screen)
+    for name in ("front", "back"):
+        bpy.data.objects.remove(bpy.data.objects[name])
+    if "FIELDWORK_INSIDE" in os.environ:  # seen from within, as photos of a room are
+        region = screen.area.spaces.active.region_3d
+        region.view_location, region.view_distance = (0, 0, 1), 1.5
+        region.update()
+    drawn, asked = screen.module("addon.live.viewport").viewport, []
+    march = drawn._march_rows
+
+    def listening(picture, *arguments):
+        asked[:] = arguments[:-1]
+        return march(picture, *arguments)
+
+    drawn._march_rows = listening
+    yield from settled(screen, 300)
+    module, found = screen.module("addon.live.viewport"), {}
+
+    def measure():
+        for name, size in (("400", (400, 400)), ("800", (800, 800)), ("1080", (1920, 1080))):
+            times = []
+            for _ in range(4):
+                picture = module.Picture(*size)
+                times.append(march(picture, *asked, size[1]))
+            pixels = picture.buffer.read_color(0, 0, *size, 4, 0, "FLOAT")
+            found[name] = [1 / statistics.median(times[1:]), float(np.asarray(pixels)[..., 3].mean())]
+
+    # Only while a view is drawn is its context the card's.
+    handle = bpy.types.SpaceView3D.draw_handler_add(lambda: found or measure(), (), "WINDOW", "POST_VIEW")
+    screen.area.tag_redraw()
+    yield from screen.wait(lambda: len(found) == 3, 120, "nothing is measured")
+    bpy.types.SpaceView3D.draw_handler_remove(handle, "WINDOW")
+    screen.facts["frames"] = found
+    screen.facts["viewport error"] = drawn.error
+    screen.shot("speed")
 
 
 def things(screen):

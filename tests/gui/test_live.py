@@ -145,6 +145,19 @@ def place_above(places: dict) -> list[int]:
     return [x + 10, y - 30]
 
 
+def test_frames_of_each_size_show_the_same(project):
+    """How many of them a second is printed: it is software that draws here."""
+    facts, _ = played(project, "speed")
+    rates, covered = ({name: values[k] for name, values in facts["frames"].items()} for k in (0, 1))
+    print("frames a second of the viewport's march", {name: round(rate, 1) for name, rate in rates.items()})
+    assert facts["viewport error"] == ""
+    assert covered["400"] > 0.02
+    # The view is as wide as before, whatever the picture's form: it is stretched.
+    for name in ("800", "1080"):
+        assert covered[name] == pytest.approx(covered["400"], rel=0.03)
+    assert rates["400"] > rates["800"] > rates["1080"]
+
+
 def test_the_panel_and_the_properties_show_the_field(project):
     _, folder = played(project, "live_panel")
     assert {"panel", "engine", "passes"} <= {path.stem for path in folder.glob("*.png")}

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -202,15 +203,26 @@ def test_pictures_take_a_small_part_of_the_time(project, tmp_path, monkeypatch):
         assert following - end >= (1 / training_view.SHARE - 1.05) * taken
 
 
-def test_a_picture_in_a_busy_moment_does_not_keep_the_next_away_for_long(project, tmp_path, monkeypatch):
-    """What took twenty seconds is not waited for eleven times over."""
-    viewer, ends, clock = Viewer(project, tmp_path, side=64), [], [0.0]
-    make = training_view.view_picture
+class Making(NamedTuple):
+    """A picture: the number of its request, when it was made by the clock of the test, and its width."""
+
+    number: int
+    begin: float
+    end: float
+    width: int
+
+
+def clocked(
+    monkeypatch: pytest.MonkeyPatch, seconds: Callable[[int, list[Making]], float]
+) -> tuple[list[float], list[Making]]:
+    """A clock [now] that stands still but for pictures, which take `seconds` (of the request's number and the pictures before),
+    and the pictures that are made."""
+    makings, clock, make = [], [0.0], training_view.view_picture
 
     def slow(field, request, width, height, check):
         begin, made = clock[0], make(field, request, width, height, check)
-        clock[0] += 0.01 if ends else 20.0
-        ends.append((begin, clock[0], width))
+        clock[0] += seconds(request.number, makings)
+        makings.append(Making(request.number, begin, clock[0], width))
         return made
 
     class Clock:
@@ -219,6 +231,13 @@ def test_a_picture_in_a_busy_moment_does_not_keep_the_next_away_for_long(project
 
     monkeypatch.setattr(training_view, "view_picture", slow)
     monkeypatch.setattr(training_view, "time", Clock)
+    return clock, makings
+
+
+def test_a_picture_in_a_busy_moment_does_not_keep_the_next_away_for_long(project, tmp_path, monkeypatch):
+    """What took twenty seconds is not waited for eleven times over."""
+    viewer = Viewer(project, tmp_path, side=64)
+    clock, makings = clocked(monkeypatch, lambda _, before: 0.01 if before else 20.0)
 
     def act(step: int) -> None:
         clock[0] += 0.2
@@ -227,28 +246,15 @@ def test_a_picture_in_a_busy_moment_does_not_keep_the_next_away_for_long(project
 
     train(project, act, 60)
     longest = training_view.LONGEST * (1 / training_view.SHARE - 1)
-    assert ends[1][0] - ends[0][1] <= longest + 0.21
-    assert ends[-1][2] > ends[0][2], "the pictures become finer again"
+    assert makings[1].begin - makings[0].end <= longest + 0.21
+    assert makings[-1].width > makings[0].width, "the pictures become finer again"
 
 
 @pytest.mark.usefixtures("eager")
 def test_a_view_that_moves_does_not_wait_for_the_fine_picture_before(project, tmp_path, monkeypatch):
     """A picture that took three seconds keeps finer ones away for long, but not the first one of another view."""
-    viewer, makings, clock = Viewer(project, tmp_path), [], [0.0]
-    make = training_view.view_picture
-
-    def slow(field, request, width, height, check):
-        begin, made = clock[0], make(field, request, width, height, check)
-        clock[0] += 0.01 if request.number == 1 and not makings else 3.0
-        makings.append((request.number, begin, clock[0]))
-        return made
-
-    class Clock:
-        time = staticmethod(time.time)
-        perf_counter = staticmethod(lambda: clock[0])
-
-    monkeypatch.setattr(training_view, "view_picture", slow)
-    monkeypatch.setattr(training_view, "time", Clock)
+    viewer = Viewer(project, tmp_path)
+    clock, makings = clocked(monkeypatch, lambda number, before: 0.01 if number == 1 and not before else 3.0)
 
     def act(step: int) -> None:
         clock[0] += 0.05
@@ -258,9 +264,8 @@ def test_a_view_that_moves_does_not_wait_for_the_fine_picture_before(project, tm
             viewer.ask(perspective((0.05, -1.2, 0)))
 
     train(project, act, 60)
-    numbers = [number for number, _, _ in makings]
-    assert numbers[:3] == [1, 1, 2]
-    wait = makings[2][1] - makings[1][2]
+    assert [making.number for making in makings[:3]] == [1, 1, 2]
+    wait = makings[2].begin - makings[1].end
     assert wait <= training_view.FIRST * (1 / training_view.MOVING_SHARE - 1) + 0.11
 
 

@@ -17,6 +17,7 @@ from ..files import UNREADABLE_ARRAYS, atomic_path
 from ..kernels.depth_arrays import FREE, MapArrays
 
 MOST_HITS = 1 << 15  # points and pixel sizes that are kept of a block
+PER_PIXEL = ("depth", "cosine", "spread", "certain")  # of MapArrays
 
 
 @dataclass(frozen=True)
@@ -111,9 +112,6 @@ def _ends(
     far = torch.maximum((low - center) / along, (high - center) / along).amin(1).clamp(min=0.0)
     longest = far.amax() if len(far) else torch.zeros((), dtype=torch.float64, device=center.device)
     return torch.cat([center[None], center + directions * far[:, None]]), longest
-
-
-PER_PIXEL = ("depth", "cosine", "spread", "certain")
 
 
 def chosen(maps: MapArrays, keep: np.ndarray) -> MapArrays:

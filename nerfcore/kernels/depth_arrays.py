@@ -14,8 +14,9 @@ class MapArrays:
     """V depth maps in one frame, P pixels together.
 
     depth (P,); cosine (P,) of the angle between ray and surface normal; spread (P,) between transmittance 3/4 and 1/4
-    along the axis; certain (P,) 1 where its slope can be relied on, else 0; first (V,) int32 first pixel of a map; size (V, 2) int32 width and height; lens (V, 4) fx, fy,
-    cx, cy; rotation (V, 3, 3) and translation (V, 3): camera axes from the frame.
+    along the axis; certain (P,) 1 where the depth's slope can be relied on, else 0; first (V,) int32 first pixel of a map;
+    size (V, 2) int32 width and height; lens (V, 4) fx, fy, cx, cy; rotation (V, 3, 3) and translation (V, 3): camera axes
+    from the frame.
     """
 
     depth: torch.Tensor

@@ -320,8 +320,7 @@ def slopes(
     points: torch.Tensor, normals: torch.Tensor, maps: MapArrays, tolerance: float, turned: float
 ) -> torch.Tensor:
     """How many views show something within `tolerance` of surface points (N, 3) that is as steep to their ray as the point
-    with its normal (N, 3), to `turned` (radians), and how many something that is not and whose
-    slope is certain: (N, 2)."""
+    with its normal (N, 3), to `turned` (radians), and how many something that is not and whose slope is certain: (N, 2)."""
     init()
     out = torch.empty(len(points), 2, device=points.device)
     inputs = [array(points.contiguous(), wp.vec3), array(normals.contiguous(), wp.vec3)]

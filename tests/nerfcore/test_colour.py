@@ -6,6 +6,8 @@ import io
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
@@ -38,6 +40,8 @@ from fieldwork.nerfcore.train.prepare import has_transparency
 from fieldwork.tests.nerfcore.support.ball import ball_project
 from fieldwork.tests.nerfcore.support.photos import new, picture
 from PIL import Image, ImageCms
+
+UNLABELLED: Any = SimpleNamespace(class_ids=[], label_revision=None)  # a run without classes
 
 
 def write(path: Path, pixels: np.ndarray, **attributes: object) -> Path:
@@ -234,7 +238,7 @@ def test_a_render_holds_its_colours_without_the_background(tmp_path: Path) -> No
     nowhere = np.full((2, 3, 3), np.nan, np.float32)
     frame = Frame(Picture(pixels, "srgb", "associated"), 1.0, nowhere[..., 0], None, nowhere)
     box = Box(np.eye(4), False)
-    png, exr = write_frame(tmp_path, "a", frame, ["rgb"], [], 0, {}, box)
+    png, exr = write_frame(tmp_path, "a", frame, ["rgb"], UNLABELLED, 0, {}, box)
     with Image.open(png) as image:
         assert image.mode == "RGB"
         # 100 / 4 + 255 · 3 / 4
@@ -312,7 +316,7 @@ def test_a_depth_picture_has_a_legend(tmp_path: Path) -> None:
         Picture(np.ones((20, 20, 4), np.float32), "srgb", "associated"), 1.0, depth, None, np.ones((20, 20, 3))
     )
     box = Box(np.diag([2.0, 2, 2, 1]), False)
-    picture, _ = write_frame(tmp_path, "a", frame, ["depth"], [], 0, {}, box)
+    picture, _ = write_frame(tmp_path, "a", frame, ["depth"], UNLABELLED, 0, {}, box)
     legend = json.loads(picture.with_suffix(".json").read_text())
     assert (legend["near"], legend["far"]) == pytest.approx((2 * 1.04, 2 * 2.96), abs=0.01)
     with Image.open(picture) as image:
@@ -320,5 +324,5 @@ def test_a_depth_picture_has_a_legend(tmp_path: Path) -> None:
     assert near[0] > near[2], "near is red"
     assert far[2] > far[0], "far is blue"
     nothing = np.full_like(depth, np.nan)
-    write_frame(tmp_path, "b", replace(frame, depth=nothing), ["depth"], [], 0, {}, box)
+    write_frame(tmp_path, "b", replace(frame, depth=nothing), ["depth"], UNLABELLED, 0, {}, box)
     assert json.loads((tmp_path / "b_depth.json").read_text())["near"] is None

@@ -11,6 +11,7 @@ import pytest
 import torch
 from fieldwork.nerfcore.errors import Cancelled
 from fieldwork.nerfcore.labels.calibration import CERTAINTY, MOST, STRENGTH, certainty
+from fieldwork.nerfcore.labels.likeness import likeness
 from fieldwork.nerfcore.labels.part_labels import STRENGTHS, best_strength, simplest
 from fieldwork.nerfcore.labels.photo_features import uplifted
 from fieldwork.nerfcore.labels.seeds import Seeds
@@ -108,6 +109,7 @@ class Strip:
         self.features, self.photo_features = self.look, np.zeros((count, 0), np.float32)
         self.part_features, self.parts = self.look, np.arange(count)[:, None]
         self.part_edges, self.conductance = self.edges, 2.0
+        self.likeness = likeness(self.look, lambda: None)
 
     def columns(self, some: np.ndarray) -> torch.Tensor:
         return torch.from_numpy(self.look[some])

@@ -31,7 +31,7 @@ def ball() -> Path:
     with edit_project(folder) as project:
         for image in project.images:
             image.label = None
-    run_verb("train", TrainParams(project=folder, preset="draft", steps=250, set=SMALL), Reporter())
+    run_verb("train", TrainParams(project=folder, preset="draft", steps=800, set=SMALL), Reporter())
     run_verb("mesh", MeshParams(project=folder, resolution=48), Reporter())
     run_verb("label prepare", LabelPrepareParams(project=folder, surfels=3000), Reporter())
     return folder

@@ -28,6 +28,7 @@ from .traversal import (
 )
 from .voxel_arrays import VoxelArrays, voxel_arrays
 from .voxel_field import VoxelField
+from .voxel_lanes import groups
 from .voxel_march import (
     block_of,
     cell_of,
@@ -149,7 +150,7 @@ def add_errors(
         inputs = [array(value[part], wp.vec3) for value in rays]
         inputs += [voxel_arrays(field, settings), march_params(settings), array(own), array(errors[part])]
         if on_host(device):
-            launch(voxel_host.add_errors, voxel_host.groups(len(errors[part])), inputs, device, serial=True)
+            launch(voxel_host.add_errors, groups(len(errors[part])), inputs, device, serial=True)
         else:
             launch(add_errors_kernel, len(errors[part]), inputs, device, serial=True)
         return own

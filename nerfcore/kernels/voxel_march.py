@@ -30,6 +30,7 @@ from .traversal import (
 )
 from .voxel_arrays import VoxelArrays, voxel_arrays
 from .voxel_field import CELLS, COARSE, SLOT_BITS, VERTICES, VIEWS, VoxelField, VoxelRays
+from .voxel_lanes import groups
 
 _CELLS, _VERTICES, _VIEWS = wp.constant(CELLS), wp.constant(VERTICES), wp.constant(VIEWS)
 _BLOCK, _COARSE, _SLOT_BITS = wp.constant(VERTICES**3), wp.constant(COARSE), wp.constant(SLOT_BITS)
@@ -335,7 +336,7 @@ def march(
     inputs = [array(origins, wp.vec3), array(directions, wp.vec3), array(ends), voxel_arrays(field, settings)]
     inputs += [march_params(settings), array(out), array(probabilities)]
     if on_host(device):
-        launch(voxel_host.march_voxels, voxel_host.groups(rays), inputs, device)
+        launch(voxel_host.march_voxels, groups(rays), inputs, device)
     else:
         launch(march_voxels, rays, inputs, device)
     return VoxelRays(out[:, :3], out[:, 3], out[:, 4], probabilities if field.classes else None)
@@ -368,6 +369,6 @@ def add_views(
     inputs = [array(origins, wp.vec3), array(directions, wp.vec3), array(cameras), array(index), array(roots)]
     inputs += [blocks, march_params(settings), int(by_vertex), array(views)]
     if on_host(device):
-        launch(voxel_host.note_views, voxel_host.groups(rays), inputs, device, serial=True)
+        launch(voxel_host.note_views, groups(rays), inputs, device, serial=True)
     else:
         launch(note_views, rays, inputs, device, serial=True)

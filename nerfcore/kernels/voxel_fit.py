@@ -28,6 +28,7 @@ from .traversal import (
 )
 from .voxel_arrays import VoxelArrays, voxel_arrays
 from .voxel_field import VoxelField
+from .voxel_lanes import groups
 from .voxel_march import (
     block_of,
     cell_of,
@@ -144,12 +145,14 @@ def add_errors(
         return voxel_march_torch.add_errors(sums, *rays, field, settings)
     init()
     errors = torch.empty(len(origins), device=device)
-    kernel = voxel_host.add_errors if on_host(device) else add_errors_kernel
 
     def add(part: slice, own: torch.Tensor) -> torch.Tensor:
         inputs = [array(value[part], wp.vec3) for value in rays]
         inputs += [voxel_arrays(field, settings), march_params(settings), array(own), array(errors[part])]
-        launch(kernel, len(errors[part]), inputs, device, serial=True)
+        if on_host(device):
+            launch(voxel_host.add_errors, groups(len(errors[part])), inputs, device, serial=True)
+        else:
+            launch(add_errors_kernel, len(errors[part]), inputs, device, serial=True)
         return own
 
     if device.type == "cuda":

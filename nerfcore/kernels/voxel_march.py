@@ -30,6 +30,7 @@ from .traversal import (
 )
 from .voxel_arrays import VoxelArrays, voxel_arrays
 from .voxel_field import CELLS, COARSE, SLOT_BITS, VERTICES, VIEWS, VoxelField, VoxelRays
+from .voxel_lanes import groups
 
 _CELLS, _VERTICES, _VIEWS = wp.constant(CELLS), wp.constant(VERTICES), wp.constant(VIEWS)
 _BLOCK, _COARSE, _SLOT_BITS = wp.constant(VERTICES**3), wp.constant(COARSE), wp.constant(SLOT_BITS)
@@ -333,8 +334,11 @@ def march(
     out = torch.empty(rays, 5, device=device)
     probabilities = torch.zeros(rays, field.classes, device=device)
     inputs = [array(origins, wp.vec3), array(directions, wp.vec3), array(ends), voxel_arrays(field, settings)]
-    kernel = voxel_host.march_voxels if on_host(device) else march_voxels
-    launch(kernel, rays, [*inputs, march_params(settings), array(out), array(probabilities)], device)
+    inputs += [march_params(settings), array(out), array(probabilities)]
+    if on_host(device):
+        launch(voxel_host.march_voxels, groups(rays), inputs, device)
+    else:
+        launch(march_voxels, rays, inputs, device)
     return VoxelRays(out[:, :3], out[:, 3], out[:, 4], probabilities if field.classes else None)
 
 
@@ -364,4 +368,7 @@ def add_views(
     init()
     inputs = [array(origins, wp.vec3), array(directions, wp.vec3), array(cameras), array(index), array(roots)]
     inputs += [blocks, march_params(settings), int(by_vertex), array(views)]
-    launch(voxel_host.note_views if on_host(device) else note_views, rays, inputs, device, serial=True)
+    if on_host(device):
+        launch(voxel_host.note_views, groups(rays), inputs, device, serial=True)
+    else:
+        launch(note_views, rays, inputs, device, serial=True)

@@ -203,7 +203,8 @@ def speed(screen):
                 picture = module.Picture(*size)
                 times.append(march(picture, *asked, size[1]))
             pixels = picture.buffer.read_color(0, 0, *size, 4, 0, "FLOAT")
-            found[name] = [1 / statistics.median(times[1:]), float(np.asarray(pixels)[..., 3].mean())]
+            pixels.dimensions = math.prod(size) * 4  # Blender 4.3 tells wrong strides of more than one
+            found[name] = [1 / statistics.median(times[1:]), float(np.asarray(pixels)[3::4].mean())]
 
     # Only while a view is drawn is its context the card's.
     handle = bpy.types.SpaceView3D.draw_handler_add(lambda: found or measure(), (), "WINDOW", "POST_VIEW")

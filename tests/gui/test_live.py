@@ -145,11 +145,12 @@ def place_above(places: dict) -> list[int]:
     return [x + 10, y - 30]
 
 
-def test_frames_of_each_size_show_the_same(project):
+@pytest.mark.parametrize("suite", ["sid", "trixie"])
+def test_frames_of_each_size_show_the_same(project, suite):
     """How many of them a second is printed: it is software that draws here."""
-    facts, _ = played(project, "speed")
+    facts, _ = played(project, "speed", suite)
     rates, covered = ({name: values[k] for name, values in facts["frames"].items()} for k in (0, 1))
-    print("frames a second of the viewport's march", {name: round(rate, 1) for name, rate in rates.items()})
+    print(suite, "frames a second of the viewport's march", {name: round(rate, 1) for name, rate in rates.items()})
     assert facts["viewport error"] == ""
     assert covered["400"] > 0.02
     # The view is as wide as before, whatever the picture's form: it is stretched.

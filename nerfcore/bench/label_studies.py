@@ -14,7 +14,7 @@ from ..labels.preparation import Preparation
 from ..labels.propagation import appearance, propagated
 from ..progress import Reporter
 from .annotator import LEAST_PIXELS, first_strokes
-from .label_bounds import best_order, every_pixel
+from .label_bounds import every_pixel
 from .label_trials import Annotator, Subject, all_labels, labelled, read_subject, scores
 
 WRONG = 0.3  # share of the strokes that get another class
@@ -61,8 +61,8 @@ def parts_of_the_method(subject: Subject, seed: int, report: Reporter) -> dict[s
 
 
 def photo_curves(subject: Subject, seed: int, report: Reporter) -> dict[str, list[float]]:
-    """mIoU after each photo on which all classes were stroked, {"next": as `label next` says, "random": as chance does,
-    "best": as one does who knows the held-out photos}; all begin with the same one."""
+    """mIoU after each photo on which all classes were stroked, {"next": as `label next` says, "random": as chance does};
+    both begin with the same one."""
     curves: dict[str, list[float]] = {}
     for way in ("next", "random"):
         random = np.random.default_rng([seed, 11])
@@ -83,7 +83,7 @@ def photo_curves(subject: Subject, seed: int, report: Reporter) -> dict[str, lis
             taken.append(photo)
             annotator.add(first_strokes(photo, subject.truth[photo], subject.class_ids, seed))
         curves[way] = curve
-    return {**curves, "best": best_order(subject, seed, PHOTOS, report)}
+    return curves
 
 
 def photos_needed(curves: list[dict[str, list[float]]], way: str = "next") -> float | None:

@@ -20,7 +20,7 @@ from ..project.fingerprints import digest
 from ..project.runs import has_checkpoint, read_metrics, run_folder
 from ..project.store import edit_project, is_project
 from ..train.verb import train
-from .label_bounds import class_overlaps, every_pixel, held_out, seen_before, withheld
+from .label_bounds import best_order, class_overlaps, every_pixel, held_out, seen_before, withheld
 from .label_studies import (
     CURVES,
     MANY_PHOTOS,
@@ -261,6 +261,7 @@ def studied(
     report.stage("Next photos")
     curves = [photo_curves(subject, seed, report) for seed in seeds[:CURVES]]
     needed = photos_needed(curves)
+    order = {**curves[0], "best": best_order(subject, seeds[0], PHOTOS, report)}
     rows = [
         row("mIoU lost by 30 % wrong strokes", lost, most=0.05),
         worst_of_losses("mIoU lost where just these are left out", least),
@@ -272,11 +273,12 @@ def studied(
         )
     chance = row("photos needed by the next photo, of those by chance", [needed], most=0.5)
     rows.append(chance if needed is not None else {**chance, "reached": "no"})
-    rows.append(row("photos needed by the best order, of those by chance", [photos_needed(curves, "best")]))
+    rows.append(row("photos needed by the best order, of those by chance", [photos_needed([order], "best")]))
     rows += [row(f"mIoU, two photos, {words}", [found[words] for found in ablation]) for words in ablation[0]]
     means = {way: np.mean([curve[way] for curve in curves], 0).round(3).tolist() for way in curves[0]}
     told = [
-        f"mIoU after each of {PHOTOS} photos: next photo {means['next']}, by chance {means['random']}, best {means['best']}.",
+        f"mIoU after each of {PHOTOS} photos: next photo {means['next']}, by chance {means['random']}; seed {seeds[0]}: "
+        f"next photo {rounded(order['next'])}, by chance {rounded(order['random'])}, best order {rounded(order['best'])}.",
         "void without strokes (by the best threshold; what most of the rest is taken for): "
         + "; ".join(
             f"class {i} {h.void:.0%} ({h.void_at_best:.0%}; {h.other} {h.as_other:.0%})" for i, h in hidden.items()
@@ -291,6 +293,10 @@ def studied(
         rows.append(row(f"mIoU, {count} classes from {MANY_PHOTOS} photos", found, round(asked * most, 4), words=words))
         rows.append(row(f"mIoU, {count} classes, every pixel of {MANY_PHOTOS} photos marked", [marked]))
     return rows, told
+
+
+def rounded(values: list[float]) -> list[float]:
+    return [round(value, 3) for value in values]
 
 
 def timed(bare: Path, place: Path, subject: Subject, seed: int, report: Reporter) -> list[Row]:

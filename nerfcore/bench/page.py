@@ -43,7 +43,7 @@ SUITES = {
         "on those before it. “Where just these are left out”: what even one who knows the wrong strokes loses. "
         "“Every pixel”: the same method where the annotator draws all that there is on these photos. “Best threshold”: the "
         "probability of void from which surfels are void, chosen by one who knows the held-out photos, at a loss of 0.01 mIoU "
-        "at most where all classes are marked. “Best order”: of photos, by one who knows the held-out ones. Strokes of a user "
+        "at most where all classes are marked. “Best order”: the best of 16 photos each time, by one who knows the held-out ones; first seed. Strokes of a user "
         "do not take whole parts: “two photos” and all other rows have the graph and image features, without that.",
     ),
     "live": (

@@ -182,7 +182,7 @@ def test_the_suite_measures_and_writes_its_page(tmp_path: Path, monkeypatch: pyt
     assert most + 0.05 >= rows["mIoU, two photos, every pixel of them marked"]["worst"] > 0.5
     assert 0.3 < rows["held-out pixels whose surface the two photos show"]["worst"] <= 1
     assert any("IoU by strokes" in note for note in result["notes"])
-    assert any("best [" in note for note in result["notes"])
+    assert any("best order [" in note for note in result["notes"])
     assert (
         rows["from a stroke to whole parts (s), 95 %"]["worst"]
         <= rows["from a stroke to all surfels (s), 95 %"]["worst"]

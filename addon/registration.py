@@ -25,6 +25,7 @@ MODULES = (
     "addon.live.training",
     "addon.live.hint",
     "addon.live.thing_texels",
+    "addon.live.scene_depth",
     "addon.live.viewport",
     "addon.preferences",
     "addon.pictures.thumbnails",

@@ -88,8 +88,12 @@ def require_writable(path: Path) -> None:
     with disk_errors(path):
         if path.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-        with tempfile.TemporaryFile(dir=next(folder for folder in path.parents if folder.exists())):
-            pass
+        there = next(folder for folder in path.parents if folder.exists())
+        try:
+            with tempfile.TemporaryFile(dir=there):
+                pass
+        except FileNotFoundError as error:  # what Linux says of files below /proc
+            raise DiskError(f"{path} cannot be written: {there} takes no files.", "Choose another folder.") from error
 
 
 @contextmanager

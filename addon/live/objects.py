@@ -28,22 +28,28 @@ def triangles(depsgraph: Any) -> Triangles:
         obj = instance.object
         if obj.type not in SOLID or not instance.show_self or obj.hide_render or ROLE in obj.original:
             continue
-        mesh = obj.to_mesh()
-        if mesh is None:
-            continue
-        place = np.empty(3 * len(mesh.vertices), np.float32)
-        mesh.vertices.foreach_get("co", place)
-        if hasattr(mesh, "calc_loop_triangles"):
-            mesh.calc_loop_triangles()
-        corners = np.empty(3 * len(mesh.loop_triangles), np.int32)
-        mesh.loop_triangles.foreach_get("vertices", corners)
-        obj.to_mesh_clear()
+        places, corners = mesh_of(obj)
         matrix = np.array(instance.matrix_world, np.float32)
-        vertices.append(place.reshape(-1, 3) @ matrix[:3, :3].T + matrix[:3, 3])
-        faces.append(corners.reshape(-1, 3) + count)
+        vertices.append(places @ matrix[:3, :3].T + matrix[:3, 3])
+        faces.append(corners + count)
         holdout.append(np.full(len(faces[-1]), is_holdout(instance, depsgraph.view_layer)))
         count += len(vertices[-1])
     return Triangles(np.concatenate(vertices), np.concatenate(faces), np.concatenate(holdout))
+
+
+def mesh_of(obj: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) float32 and triangles (F, 3) int32 of an evaluated object, in its own frame."""
+    mesh = obj.to_mesh()
+    if mesh is None:
+        return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32)
+    places = np.empty(3 * len(mesh.vertices), np.float32)
+    mesh.vertices.foreach_get("co", places)
+    if hasattr(mesh, "calc_loop_triangles"):
+        mesh.calc_loop_triangles()
+    corners = np.empty(3 * len(mesh.loop_triangles), np.int32)
+    mesh.loop_triangles.foreach_get("vertices", corners)
+    obj.to_mesh_clear()
+    return places.reshape(-1, 3), corners.reshape(-1, 3)
 
 
 def is_holdout(instance: Any, view_layer: Any) -> bool:

@@ -243,11 +243,13 @@ void main()
 {
   ivec2 texel = min(ivec2(gl_FragCoord.xy / size * vec2(textureSize(picture, 0))), textureSize(picture, 0) - 1);
   vec4 seen = texelFetch(picture, texel, 0);
-  if (seen.a < 0.02) {
+  float depth = texelFetch(depths, texel, 0).r;
+  float object_depth = texelFetch(objects, min(ivec2(gl_FragCoord.xy), textureSize(objects, 0) - 1), 0).r;
+  if (seen.a < 0.02 || depth > object_depth) {
     discard;
   }
   out_color = vec4(light(clamp(seen.rgb / seen.a, 0.0, 1.0)) * seen.a, seen.a);
-  gl_FragDepth = texelFetch(depths, texel, 0).r;
+  gl_FragDepth = depth;
 }
 """
 
@@ -284,6 +286,7 @@ def lay_shader() -> Any:
     info = GPUShaderCreateInfo()
     info.sampler(0, "FLOAT_2D", "picture")
     info.sampler(1, "FLOAT_2D", "depths")
+    info.sampler(2, "FLOAT_2D", "objects")  # depth of objects, where the view has none; else a pixel that hides nothing
     info.push_constant("VEC2", "size")
     if hasattr(info, "depth_write"):  # Blender before 4.4 knows OpenGL only, which takes any depth
         info.depth_write("ANY")

@@ -19,6 +19,7 @@ from mathutils import Matrix
 from . import fields, hint, thing_texels, things, voxels
 from .assets import Asset, texture
 from .redraw import redraw_views
+from .scene_depth import lacks_depth, scene_depth
 from .training import Textures, trainings
 
 BUDGET = 0.05  # seconds of marching in a redraw once the view stands still, or as long as the rest of the redraw takes
@@ -122,6 +123,7 @@ class Viewport:
         self._rest, self._waited, self._looks = min(now - self._ended, LONGEST), 0.0, {}
         scene_from_clip = view3d.perspective_matrix.inverted_safe()
         quality = int(context.scene.fieldwork_live.quality)
+        objects = scene_depth.texture(context, region, view3d) if lacks_depth(context.space_data) else None
         unfinished, marched = False, 0.0
         # The farthest first: pixels at edges of nearer ones mix with what is behind.
         for part in sorted(shown, key=lambda one: (view3d.view_matrix @ one.object.matrix_world.translation).z):
@@ -134,7 +136,7 @@ class Viewport:
                 size = max(1, region.width // quality), max(1, region.height // quality)
                 trained = trainings.textures(key, part.field, project, size, scene_from_clip)
                 if trained is not None:
-                    self._lay_over(trained, region)
+                    self._lay_over(trained, region, objects)
                     continue
             elif trainings.run_of(project) == own.run:
                 continue
@@ -161,7 +163,7 @@ class Viewport:
             marched += self._bring_up(view, state, asset, shows, uniforms, (region.width, region.height), quality, now)
             unfinished = unfinished or not view.refined
             if view.shown is not None:
-                self._lay_over(view.shown, region)
+                self._lay_over(view.shown, region, objects)
         self._give_up(now)
         spent = time.perf_counter() - begin
         self.seconds = [*self.seconds[-99:], spent - marched - self._waited]
@@ -274,15 +276,17 @@ class Viewport:
         picture.rows = first + count
         return spent
 
-    def _lay_over(self, picture: Picture | Textures, region: Any) -> None:
+    def _lay_over(self, picture: Picture | Textures, region: Any, objects: Any) -> None:
+        """Lay a picture over the view; `objects`: depth of its objects where the view itself has none."""
         import gpu
 
         gpu.state.blend_set("ALPHA_PREMULT")
-        gpu.state.depth_test_set("LESS_EQUAL")
+        gpu.state.depth_test_set("LESS_EQUAL" if objects is None else "ALWAYS")
         gpu.state.depth_mask_set(True)
         self._lay.bind()
         self._lay.uniform_sampler("picture", picture.color)
         self._lay.uniform_sampler("depths", picture.depth)
+        self._lay.uniform_sampler("objects", scene_depth.none() if objects is None else objects)
         self._lay.uniform_float("size", (region.width, region.height))
         self._batches[1].draw(self._lay)
         gpu.state.depth_mask_set(False)

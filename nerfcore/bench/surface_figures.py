@@ -254,12 +254,15 @@ def hit_share(mesh: tuple[np.ndarray, np.ndarray], truth: Truth, views: Sequence
 def class_figures(found: Distances, surface: Surface, painted: Painted, sight: Sight) -> dict[str, float | None]:
     """mIoU by area of the texture's classes (of the faces', without a texture) where the mesh is close to the truth, and
     by how much the faces' area of the worst class is off, of classes that have at least a hundredth of what is seen; both
-    areas are those of what enough cameras see: two may show a mesh more of one thing, which is no error."""
+    are of what enough cameras see: two may show a mesh more of one thing, which is no error, nor is it the class of what
+    enough of them see nearby."""
     near = found.to_truth < CLOSE * sight.size
     points, _ = sample_surface(surface.vertices.astype(np.float64), surface.faces, len(found.face))
     points, face = points[near], found.face[near]
+    there = sight.visible_near(points)
+    points, face = points[there], face[there]
     ours, theirs = classes_at(surface, painted, points, face), sight.class_near(points)
-    shown = surface.face_class[face[sight.visible_near(points)]]
+    shown = surface.face_class[face]
     seen = sight.truth.face_class[found.true_face]
     ious, off = [], []
     for number in np.unique(seen):

@@ -16,6 +16,7 @@ from ..params import ReportParams
 from ..progress import Reporter
 from ..project.runs import read_events, read_metrics
 from ..project.store import load_project
+from ..render.pictures import ENDINGS
 from ..render.run import run_folder
 from .documentation import JUDGEMENT, Section, results_of, sections
 
@@ -114,7 +115,7 @@ def write_report(path: Path, folder: Path, run: str, renders: Path, result: dict
             pictures=pictures_of(compared),
             scores=scores,
             drawings=pictures_of(drawn),
-            renders=pictures_of(rendered),
+            renders=[pictures_of(view) for view in by_view(rendered)],
             curve=training_curve(run_folder(folder, run)),
             classes=project.classes,
             labelled=bool(evaluation.get("per_class_iou")),
@@ -122,6 +123,15 @@ def write_report(path: Path, folder: Path, run: str, renders: Path, result: dict
     )
     write_text(path, html)
     return [table.title for table in tables]
+
+
+def by_view(files: list[Path]) -> list[list[Path]]:
+    """Pictures with those together that are passes of one view: `orbit_0000`, `orbit_0000_depth`."""
+    views: dict[str, list[Path]] = {}
+    for file in files:
+        ending = next((e for e in ENDINGS.values() if e and file.stem.endswith(e)), "")
+        views.setdefault(file.stem.removesuffix(ending), []).append(file)
+    return list(views.values())
 
 
 def pictures_of(files: list[Path]) -> list[dict[str, str]]:

@@ -154,8 +154,13 @@ def fuse_kernel(
             fused = with_view(fused, d, w, f)
     total = fused.distance
     total_weight = fused.weight
-    # A thin sheet: enough views look through this place, so what others see behind it is another side.
+    behind = float(0.0)  # how far this place lies behind the surfaces of those that have it inside, on average
+    if fused.weight > fused.outer_weight:
+        behind = (fused.outer - fused.distance) / (fused.weight - fused.outer_weight)
+    # A thin sheet: enough views look through this place, so what others see before it is another side. Where that is
+    # close, views contradict each other: some have what is behind a wire in the wire's place.
     through = fused.free >= FEWEST_THROUGH and float(fused.free) >= THROUGH_SHARE * float(fused.seen)
+    through = through and behind > f.free_at
     if through and fused.outer_weight > 0.0:
         total = fused.outer
         total_weight = fused.outer_weight
@@ -176,7 +181,8 @@ def fuse(
     there to its plane; beyond `truncation` behind the surface the view says nothing. Weights: cos θ (f/z)² ·
     min(1, voxel/spread)², falling off quadratically behind the surface, a tenth where a view looks through: that it
     does so says little about where the surface is. Where at least two views and 15 % of those that see a point find it
-    more than `free_at` in front of their surface, only non-negative distances count: both sides of thin sheets remain.
+    more than `free_at` in front of their surface, and those that have it behind theirs have it farther behind than that on
+    average, only non-negative distances count: both sides of thin sheets remain, and wires that some views miss.
     `gap`: share by which depths of neighbouring pixels may differ and still be interpolated.
     """
     init()

@@ -23,7 +23,8 @@ from ..data.pixels import VOID
 from ..progress import Reporter
 from .depth_maps import DepthMap, FlatView, cosines, pixel_directions, smooth_normals
 
-POINTS = 40_000  # that are looked at
+POINTS = 400_000  # that heights are of, and
+LOOKED_AT = 40_000  # among which planes are looked for
 MOST = 12  # planes
 SHARE = 0.01  # of the area known that a plane must hold
 SHARP = 3.0  # footprints of a pixel by which a point may be wrong: what a soft field takes for a wall may be round
@@ -45,6 +46,7 @@ FLAT_CLASS = 0.75  # share of what is known of a class that lies on one plane, f
 LABELLED_OFF = 0.5  # share by which the field's depth may be off the plane of its class
 BEHIND = 0.01  # share of what is known that may lie behind such a plane: a floor bounds a scene, a table top does not
 SMOOTHED = 12.0  # cells over which heights above a plane are averaged
+UNEVEN = 2.0  # footprints by which the heights of cells differ, so that many points of one say no more than some
 INNER = 7  # pixels a side of the window in which a label map must give the same class, not to be at an outline
 STEEPEST = 0.05  # cosine under which a plane is not looked at
 FITTED_PIXELS = 3.0  # spread of a depth on a plane, in footprints
@@ -118,6 +120,8 @@ def known_points(
 
 def scene_planes(known: Known, report: Reporter) -> list[ScenePlane]:
     """The largest planes among known points, by area: found in what is known well, and reaching as far as the rest says."""
+    everything, step = known, max(1, -(-len(known.points) // LOOKED_AT))
+    known = Known(*(values[::step] for values in vars(known).values()))
     least = SHARE * (known.footprint**2).sum()
     sharp = Known(*(values[known.error <= SHARP * known.footprint] for values in vars(known).values()))
     area, rng = sharp.footprint**2, np.random.default_rng(0)
@@ -130,7 +134,8 @@ def scene_planes(known: Known, report: Reporter) -> list[ScenePlane]:
         if best is None or area[best].sum() < least:
             break
         point, normal = _fit(sharp, area, best)
-        found.append(_reaching(known, np.flatnonzero(_near(known, point, normal, WIDTHS[-1])), point, normal))
+        plane = _reaching(known, np.flatnonzero(_near(known, point, normal, WIDTHS[-1])), point, normal)
+        found.append(replace(plane, height=_heights(everything, plane)))
         left &= ~_near(sharp, point, normal, BESIDE)
     return found
 
@@ -170,7 +175,7 @@ def _fit(known: Known, area: np.ndarray, on: np.ndarray) -> tuple[np.ndarray, np
 
 
 def _reaching(known: Known, on: np.ndarray, point: np.ndarray, normal: np.ndarray) -> ScenePlane:
-    """The plane through points, as far as it reaches."""
+    """The plane through points, as far as it reaches; its heights are 0."""
     first = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
     first /= np.linalg.norm(first)
     axes = np.stack([first, np.cross(normal, first)])
@@ -182,10 +187,8 @@ def _reaching(known: Known, on: np.ndarray, point: np.ndarray, normal: np.ndarra
     there = np.zeros(index.max(0) + rim + 1, bool)
     there[tuple(index.T)] = True
     reached = np.asarray(distance_transform_edt(~there)) <= REACH
-    plain = ScenePlane(
-        point, normal, axes, low, cell, reached, np.zeros(there.shape), _flat_classes(known, point, normal)
-    )
-    return replace(plain, height=_heights(known, plain))
+    classes = _flat_classes(known, point, normal)
+    return ScenePlane(point, normal, axes, low, cell, reached, np.zeros(there.shape), classes)
 
 
 def _flat_classes(known: Known, point: np.ndarray, normal: np.ndarray) -> np.ndarray:
@@ -200,8 +203,9 @@ def _flat_classes(known: Known, point: np.ndarray, normal: np.ndarray) -> np.nda
 
 
 def _heights(known: Known, plane: ScenePlane) -> np.ndarray:
-    """Mean height (X, Y) above a plane of what is known beside it, around each of its cells, weighted as in `_fit`; cells far
-    from all that have the height of the nearest."""
+    """Mean height (X, Y) above a plane of what is known beside it, around each of its cells, weighted as in `_fit` but for
+    cells that hold much, as a paving that photos know well beside a meadow: none counts more than one whose height is known
+    to `UNEVEN` footprints. Cells far from all that is known have the height of the nearest."""
     near = np.flatnonzero(_near(known, plane.point, plane.normal, BESIDE))
     away = known.points[near] - plane.point
     place = np.floor((away @ plane.axes.T - plane.low) / plane.cell)
@@ -211,7 +215,8 @@ def _heights(known: Known, plane: ScenePlane) -> np.ndarray:
     total, amount = np.zeros(plane.reached.shape), np.zeros(plane.reached.shape)
     np.add.at(total, index, weight * (away @ plane.normal))
     np.add.at(amount, index, weight)
-    total, amount = (gaussian_filter(grid, SMOOTHED, mode="constant") for grid in (total, amount))
+    bounded = 1 / (1 + UNEVEN**2 * amount)
+    total, amount = (gaussian_filter(bounded * grid, SMOOTHED, mode="constant") for grid in (total, amount))
     known_there = amount > 1e-6 * amount.max()
     nearest = np.asarray(distance_transform_edt(~known_there, return_distances=False, return_indices=True))
     return np.where(known_there, total / np.where(known_there, amount, 1), 0)[tuple(nearest)]

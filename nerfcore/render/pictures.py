@@ -5,6 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 VOID_COLOR = (0.0, 0.0, 0.0)
+# What is added to the name of a view in the names of its passes' files.
+ENDINGS = {
+    "rgb": "",
+    "depth": "_depth",
+    "semantic": "_labels",
+    "confidence": "_confidence",
+    "normal": "_normal",
+    "unknown": "_unknown",
+}
 
 
 def colorize_depth(depth: np.ndarray, opacity: np.ndarray) -> np.ndarray:

@@ -41,7 +41,7 @@ from . import parts
 from .baked import META, BakedField, load_baked, voxels_folder
 from .image import Frame, background_of, render_view
 from .model import Model
-from .pictures import colorize_depth, colorize_labels, depth_range
+from .pictures import ENDINGS, colorize_depth, colorize_labels, depth_range
 from .run import RunInfo, load_info, load_trained
 from .sparse_rays import sparse_rays
 
@@ -292,12 +292,12 @@ def write_frame(
     unknown = np.zeros(frame.depth.shape, np.float32) if frame.unknown is None else frame.unknown
     world_normal = frame.normal() @ rotation.T
     pictures = {
-        "rgb": ("", frame.color),
-        "depth": ("_depth", colorize_depth(frame.depth, frame.opacity)),
-        "semantic": ("_labels", colorize_labels(label, colors)),
-        "confidence": ("_confidence", frame.confidence()[..., None]),
-        "normal": ("_normal", world_normal * 0.5 + 0.5),
-        "unknown": ("_unknown", unknown[..., None]),
+        "rgb": frame.color,
+        "depth": colorize_depth(frame.depth, frame.opacity),
+        "semantic": colorize_labels(label, colors),
+        "confidence": frame.confidence()[..., None],
+        "normal": world_normal * 0.5 + 0.5,
+        "unknown": unknown[..., None],
     }
     layers: dict[str, np.ndarray] = {}
     values = {
@@ -310,10 +310,9 @@ def write_frame(
     }
     written, facts = [], label_facts(info.label_revision)
     for kind in passes:
-        suffix, picture = pictures[kind]
-        path = out / f"{name}{suffix}.png"
+        path = out / f"{name}{ENDINGS[kind]}.png"
         with atomic_path(path) as temporary:
-            write_picture(temporary, picture, facts=facts if kind in OF_CLASSES else None)
+            write_picture(temporary, pictures[kind], facts=facts if kind in OF_CLASSES else None)
         written.append(path)
         if kind == "depth":
             write_json(path.with_suffix(".json"), depth_legend(frame, scale))

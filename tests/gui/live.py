@@ -12,7 +12,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 from bpy_extras.view3d_utils import location_3d_to_region_2d
-from mathutils import Quaternion, Vector
+from mathutils import Matrix, Quaternion, Vector
 from steps import alias
 
 SIDE = Quaternion((1, 0, 0), math.pi / 2)  # looks along y, z is up
@@ -67,7 +67,6 @@ def viewport(screen):
     """The field among cubes in each shading mode; its classes, crop box, transform; frame times."""
     yield from ball(screen)
     drawn = yield from settled(screen)
-    screen.shot("solid")
     points = {
         "field": (0.2, -0.45, 0.1), "low": (0.1, -0.46, -0.2), "front": (-0.2, -1.02, 0.15), "back": (0.6, 0.9, 0.55),
         "top": (0.15, -0.42, 0.25), "grid": (0, 0, -1.1),
@@ -75,19 +74,39 @@ def viewport(screen):
     screen.facts["points"] = points
     screen.facts["places"] = {name: place(screen, point) for name, point in points.items()}
     space = screen.area.spaces.active
-    space.overlay.show_overlays = False
-    yield 1.0
-    screen.shot("no-overlays")
-    space.overlay.show_overlays = True
+
+    def shaded(name, seconds):
+        yield seconds
+        screen.shot(name)
+        space.overlay.show_overlays = False
+        yield 2.0
+        screen.shot(f"{name}-no-overlays")
+        # The cube in front away: at first the object, then its vertices alone.
+        front = bpy.data.objects["front"]
+        if name == "eevee":
+            front.location.z += 5
+            yield 2.0
+            screen.shot("object-away")
+            front.location.z -= 5
+        if name == "cycles":
+            front.data.transform(Matrix.Translation((0, 0, 5)))
+            front.data.update()
+            yield 4.0
+            screen.shot("vertices-away")
+            front.data.transform(Matrix.Translation((0, 0, -5)))
+            front.data.update()
+        space.overlay.show_overlays = True
+
+    yield from shaded("solid", 0.1)
     space.shading.type = "MATERIAL"
-    yield 35.0  # software OpenGL compiles EEVEE's shaders
-    screen.shot("material")
+    yield from shaded("material", 35.0)  # software OpenGL compiles EEVEE's shaders
+    space.shading.type = "RENDERED"
+    assert "EEVEE" in bpy.context.scene.render.engine
+    yield from shaded("eevee", 10.0)
     bpy.context.scene.render.engine = "CYCLES"
     bpy.context.scene.cycles.use_denoising = False
     bpy.context.scene.cycles.preview_samples = 1
-    space.shading.type = "RENDERED"
-    yield 6.0
-    screen.shot("cycles")
+    yield from shaded("cycles", 6.0)
     bpy.context.scene.render.engine = "FIELDWORK"
     yield 2.0
     screen.shot("fieldwork")

@@ -70,12 +70,15 @@ def test_the_field_is_among_objects_in_every_shading_mode(project, suite):
     truth = {name: pattern(np.array(points[name]) / np.linalg.norm(points[name]) * 0.5) for name in ("field", "low")}
     grey = colour(folder, "solid", places["front"])
     assert np.ptp(grey) < 0.05, "the cube in front hides the field"
-    for shot in ("solid", "no-overlays", "material", "cycles"):
+    modes = ("solid", "material", "eevee", "cycles")
+    for shot in (*modes, *(f"{mode}-no-overlays" for mode in modes)):
         for name in ("field", "low"):
             found = colour(folder, shot, places[name])
             assert found == pytest.approx(truth[name], abs=0.15), f"{shot}: {name} is not as photographed"
         assert np.ptp(colour(folder, shot, places["front"])) < 0.06, f"{shot}: the field shows through the cube"
         assert np.ptp(colour(folder, shot, places["back"])) < 0.06, f"{shot}: what is behind is not beside the field"
+    for shot in ("object-away", "vertices-away"):
+        assert np.ptp(colour(folder, shot, places["front"])) > 0.2, f"{shot}: hidden by what is no longer there"
     assert colour(folder, "fieldwork", places["field"]) == pytest.approx(truth["field"], abs=0.15)
     back = colour(folder, "solid", places["back"])
     # A class that is hidden, in the next redraw; what is behind it shows.

@@ -13,6 +13,7 @@ from fieldwork.nerfcore.bench.surface_figures import (
     Sight,
     Truth,
     both_sides,
+    class_figures,
     hit_share,
     seam_ratio,
     surface_figures,
@@ -24,6 +25,7 @@ from fieldwork.nerfcore.data.scene import Scene, View
 from fieldwork.nerfcore.errors import InputError
 from fieldwork.nerfcore.geometry.cameras import Camera
 from fieldwork.nerfcore.mesh.clean import cross, unit
+from fieldwork.nerfcore.mesh.metrics import distances
 from fieldwork.nerfcore.mesh.painted import Painted
 from fieldwork.nerfcore.mesh.photos import Photo
 from fieldwork.nerfcore.mesh.surface import Surface
@@ -33,7 +35,7 @@ from fieldwork.nerfcore.mesh.visibility import PosedCamera
 from fieldwork.nerfcore.params import BenchParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.verbs import run_verb
-from fieldwork.tests.nerfcore.support.depth_views import orbit
+from fieldwork.tests.nerfcore.support.depth_views import look_at, orbit
 from fieldwork.tests.nerfcore.test_bench import TINY
 from fieldwork.tests.nerfcore.test_training import tiny_project  # noqa: F401
 
@@ -153,6 +155,23 @@ def test_classes_are_those_of_what_can_be_seen() -> None:
     sight = Sight(Truth(np.asarray(whole.vertices), np.asarray(whole.faces), kinds), scene.views)
     inside = np.array([[0, 0, -0.002], [0.02, 0.01, 0.004], [0.3, 0.3, 0.001]])
     assert sight.class_near(inside).tolist() == [1, 1, 2]
+
+
+def test_a_ground_that_few_cameras_see_is_none_of_what_stands_on_it() -> None:
+    """Two cameras look from the other side of the box; one sees what they do not, of the plate beside it."""
+    import trimesh
+
+    box = trimesh.creation.box((0.2, 0.2, 0.06)).subdivide_to_size(0.1).apply_translation((0, 0, 0.03))
+    plate = trimesh.creation.box((0.8, 0.8, 0.2)).subdivide_to_size(0.1).apply_translation((0, 0, -0.1))
+    whole = trimesh.util.concatenate([plate, box])
+    kinds = np.repeat([2, 1], [len(plate.faces), len(box.faces)])
+    places = np.array([[2, 0, 0.5], [2, 0.3, 0.5], [-2, 0, 0.5]])
+    views = [View(f"{k}", CAMERA, look_at(p, np.zeros(3)), image=None) for k, p in enumerate(places)]  # type: ignore[arg-type]
+    sight = Sight(Truth(np.asarray(whole.vertices), np.asarray(whole.faces), kinds), views)
+    assert sight.cameras_at(np.array([[-0.13, 0, 0]]), np.array([[0.0, 0, 1]])).tolist() == [1]
+    mesh = np.asarray(whole.vertices), np.asarray(whole.faces)
+    found = distances(mesh, mesh, count=20_000, true=sight.seen)
+    assert class_figures(found, as_surface(*mesh, kinds), unpainted(), sight)["surface_miou"] > 0.98
 
 
 def test_what_no_camera_sees_takes_no_area_from_what_lies_before_it() -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from fieldwork.nerfcore.errors import DiskError
-from fieldwork.nerfcore.files import atomic_path, write_json, write_section, write_text
+from fieldwork.nerfcore.files import atomic_path, require_writable, write_json, write_section, write_text
 
 pytestmark = pytest.mark.usefixtures("each_file_system")
 
@@ -75,6 +75,12 @@ def test_read_only_folder_is_named(small_disk: Path) -> None:
         assert path.read_text() == "old"
     finally:
         subprocess.run(["mount", "-o", "remount,rw", str(small_disk)], check=True)
+
+
+@pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="needs Linux, whose /proc takes no files")
+def test_a_folder_that_takes_no_files_is_named() -> None:
+    with pytest.raises(DiskError, match=r"/proc/sub/a\.glb cannot be written: /proc takes no files"):
+        require_writable(Path("/proc/sub/a.glb"))
 
 
 def test_keeps_the_suffix_for_image_writers(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import torch
 from fieldwork.nerfcore.data.scene import View
 from fieldwork.nerfcore.errors import Cancelled, TrainingError
 from fieldwork.nerfcore.geometry.cameras import Camera
-from fieldwork.nerfcore.kernels.depth_arrays import MapArrays
+from fieldwork.nerfcore.kernels.depth_arrays import FREE, MapArrays
 from fieldwork.nerfcore.mesh import clean, depth_maps, metrics
 from fieldwork.nerfcore.mesh.decimate import decimate
 from fieldwork.nerfcore.mesh.extract import extract, weld
@@ -68,6 +68,19 @@ def test_a_plate_of_two_voxels_keeps_both_sides() -> None:
         assert area[chosen].sum() > 0.95 * 0.72**2
         assert np.median(np.abs(center[chosen, 2])) == pytest.approx(voxel, abs=voxel)
     assert not (core & (np.abs(center[:, 2]) < 0.3 * voxel)).any()
+
+
+def test_a_rod_that_some_views_miss_stays_whole() -> None:
+    """Four pixels wide; every fourth view shows what is behind it instead."""
+    voxel, half = 0.02, np.array([0.03, 0.03, 0.4])
+    flats, maps = maps_of(box(-half, half), orbit(32, 1.7))
+    for map_ in maps[::4]:
+        map_.depth[:] = FREE
+    arrays = depth_maps.map_arrays(flats, maps, CPU)
+    vertices, faces = extract(fuse_maps(arrays, choose_region(arrays, None, 64, voxel), Reporter()), Reporter())
+    core = np.abs(vertices[faces].mean(1)[:, 2]) < 0.35
+    assert clean.areas(vertices, faces[core]).sum() == pytest.approx(0.7 * 4 * 0.06, rel=0.2)
+    assert np.abs(np.abs(vertices[np.unique(faces[core]), :2]).max(1) - 0.03).max() < voxel
 
 
 def room_poses(count: int) -> list[np.ndarray]:

@@ -3,31 +3,22 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
 import struct
-import subprocess
 import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
-from fieldwork.nerfcore import __file__ as package
 from fieldwork.nerfcore.geometry.cameras import project
 from fieldwork.nerfcore.geometry.similarity import transform_points
 from fieldwork.nerfcore.mesh.files import write_surface
+from fieldwork.tests.nerfcore.support import gltf_validator
 from fieldwork.tests.nerfcore.support import painted_box as box
 from PIL import Image
 from pxr import Gf, Usd, UsdGeom, UsdSemantics, UsdShade
 
 SPLITS = {"none": 1, "classes": 3, "instances": 4}
-VALIDATOR = Path(package).parents[1] / "build" / "node"
-VALIDATE = """
-const validator = require("gltf-validator"), fs = require("fs");
-validator.validateBytes(new Uint8Array(fs.readFileSync(process.argv[1]))).then(
-  (report) => console.log(JSON.stringify(report)));
-"""
 
 
 def write(path: Path, split: str = "none", textured: bool = True) -> list[Path]:
@@ -107,16 +98,13 @@ def test_glb_says_class_and_instance_of_each_face(tmp_path: Path, split: str) ->
 @pytest.mark.parametrize("textured", [True, False])
 @pytest.mark.parametrize("split", SPLITS)
 def test_the_gltf_validator_finds_nothing(tmp_path: Path, split: str, textured: bool) -> None:
-    node = shutil.which("node")
-    if node is None or not (VALIDATOR / "node_modules/gltf-validator").is_dir():
-        pytest.skip("needs node and `npm install --prefix build/node gltf-validator`")
+    if not gltf_validator.is_there():
+        pytest.skip(gltf_validator.MISSING)
     (path,) = write(tmp_path / "a.glb", split, textured)
-    environment = {**os.environ, "NODE_PATH": str(VALIDATOR / "node_modules")}
-    done = subprocess.run([node, "-e", VALIDATE, str(path)], env=environment, capture_output=True, check=True)
-    report = json.loads(done.stdout)
+    report = gltf_validator.report_of(path)
     assert report["issues"]["numErrors"] == report["issues"]["numWarnings"] == 0, report["issues"]["messages"]
     # What it does not know of, it says so.
-    unknown = {m["code"] for m in report["issues"]["messages"] if m["severity"] == 2}
+    unknown = {m["code"] for m in report["issues"]["messages"] if m["severity"] == gltf_validator.HINT}
     assert unknown <= {"UNSUPPORTED_EXTENSION", "UNUSED_OBJECT"}
     assert report["info"]["totalTriangleCount"] == 12
 

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 from fieldwork.nerfcore.errors import SettingError
 from fieldwork.nerfcore.evaluate.documentation import Section
-from fieldwork.nerfcore.evaluate.report import report
+from fieldwork.nerfcore.evaluate.report import by_view, report
 from fieldwork.nerfcore.evaluate.report_pdf import write_pdf
 from fieldwork.nerfcore.files import write_json
 from fieldwork.nerfcore.params import ReconstructParams, ReportParams
@@ -108,3 +108,10 @@ def test_other_endings_are_refused_before_anything_is_done(project: Path, tmp_pa
     with pytest.raises(SettingError, match=r"\.html or \.pdf"):
         reconstruct(ReconstructParams(photos=tmp_path, out=tmp_path / "p", report=tmp_path / "r.doc"), Reporter())
     assert not (tmp_path / "p").exists()
+
+
+def test_passes_of_a_view_stand_together() -> None:
+    names = ["a", "a_2", "a_2_labels", "a_depth", "orbit_0_depth", "orbit_0_normal"]
+    found = by_view([Path(f"{name}.png") for name in names])
+    views = [[file.stem for file in view] for view in found]
+    assert views == [["a", "a_depth"], ["a_2", "a_2_labels"], ["orbit_0_depth", "orbit_0_normal"]]

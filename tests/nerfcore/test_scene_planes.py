@@ -7,7 +7,7 @@ import pytest
 from fieldwork.nerfcore.errors import Cancelled
 from fieldwork.nerfcore.geometry.cameras import Camera
 from fieldwork.nerfcore.mesh.depth_maps import DepthMap, FlatView, cosines, pixel_directions
-from fieldwork.nerfcore.mesh.scene_planes import known_points, on_scene_planes, scene_planes
+from fieldwork.nerfcore.mesh.scene_planes import Known, known_points, on_scene_planes, scene_planes
 from fieldwork.nerfcore.progress import Reporter
 
 LENS = Camera(width=120, height=90, fx=100.0, fy=100.0, cx=60.0, cy=45.0)
@@ -155,3 +155,25 @@ def test_depths_lie_at_the_height_of_what_is_known_around(walls) -> None:
     found, _ = on_scene_planes(views[1], blurred, sure[1], blurred, planes)
     for rows in (slice(0, 15), slice(60, 90)):
         assert found.depth[rows, 82:90] == pytest.approx(stepped[1][rows, 82:90], abs=0.015)
+
+
+def test_what_is_known_well_does_not_set_the_height_of_what_lies_beside_it() -> None:
+    """A paving of many sharp points, and beside it a meadow two footprints lower, of few that are less sharp."""
+    pixel = 0.01
+    paving = np.stack(np.meshgrid(np.arange(-3, 0, 0.02), np.arange(-2, 2, 0.02)), -1).reshape(-1, 2)
+    meadow = np.stack(np.meshgrid(np.arange(0, 3, 0.08), np.arange(-2, 2, 0.08)), -1).reshape(-1, 2)
+    place = np.concatenate([paving, meadow])
+    low = place[:, 0] >= 0
+    points = np.column_stack([place, np.where(low, -2 * pixel, 0)])
+    known = Known(
+        points,
+        np.tile([0.0, 0, 1], (len(points), 1)),
+        np.full(len(points), pixel),
+        np.where(low, 2, 1) * pixel,
+        np.zeros(len(points), np.uint8),
+    )
+    (plane,) = scene_planes(known, Reporter())
+    beside = np.array([[0.5, 0, 0], [-0.5, 0, 0]])  # half of what heights are averaged over away from the edge
+    height = plane.height_at(beside) + plane.point[2]
+    assert height[0] < -0.8 * pixel
+    assert height[1] > -0.8 * pixel

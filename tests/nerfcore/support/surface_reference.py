@@ -96,7 +96,9 @@ def fuse(
     free = through.sum(0)
     weight = torch.where(through, 0.1 * weight, weight)
     outer = weight * (value >= 0)
-    thin = (free >= 2) & (free >= 0.15 * seen.sum(0)) & (outer.sum(0) > 0)
+    inner = weight - outer
+    behind = -(inner * value).sum(0) / inner.sum(0).clamp(min=1e-30)
+    thin = (free >= 2) & (free >= 0.15 * seen.sum(0)) & (outer.sum(0) > 0) & (behind > free_at)
     used = torch.where(thin, outer, weight)
     total = used.sum(0)
     fused = torch.where(total > 0, (used * value).sum(0) / total.clamp(min=1e-30), 0.0)

@@ -47,13 +47,18 @@ def things(project: Path) -> Path:
 def played(
     project: Path, scenario: str, suite: str = "sid", timeout: float = 500, size: tuple[int, int] = (1920, 1080)
 ) -> tuple[dict, Path]:
-    root = window.BLENDER_ROOT if suite == "sid" else window.OLDER_ROOT
-    reason = window.missing(root, suite)
+    """`suite`: of Debian, which says which Blender; "sid-vulkan" draws by Vulkan instead of OpenGL."""
+    root = window.OLDER_ROOT if suite == "trixie" else window.BLENDER_ROOT
+    vulkan = suite == "sid-vulkan"
+    reason = window.missing(root, suite) or (window.missing_vulkan(root) if vulkan else None)
     if reason:
         pytest.skip(reason)
     session = window.Window(f"{scenario}-{suite}", root)
     session.environment["FIELDWORK_BALL"] = str(project)
-    return session.play(scenario, timeout=timeout, size=size), session.folder
+    if vulkan:
+        session.environment["VK_DRIVER_FILES"] = f"/{window.SOFTWARE_VULKAN}"
+    facts = session.play(scenario, timeout=timeout, size=size, backend="vulkan" if vulkan else "opengl")
+    return facts, session.folder
 
 
 def colour(folder: Path, shot: str, place: list[int]) -> np.ndarray:
@@ -63,7 +68,7 @@ def colour(folder: Path, shot: str, place: list[int]) -> np.ndarray:
     return pixels[y - 2 : y + 3, x - 2 : x + 3].mean((0, 1))
 
 
-@pytest.mark.parametrize("suite", ["sid", "trixie"])
+@pytest.mark.parametrize("suite", ["sid", "sid-vulkan", "trixie"])
 def test_the_field_is_among_objects_in_every_shading_mode(project, suite):
     facts, folder = played(project, "viewport", suite, 700)
     places, points = facts["places"], facts["points"]
@@ -104,7 +109,7 @@ def test_the_field_is_among_objects_in_every_shading_mode(project, suite):
     print(suite, {name: facts[name] for name in ("moving", "python", "refined after", "size")})
 
 
-@pytest.mark.parametrize("suite", ["sid", "trixie"])
+@pytest.mark.parametrize("suite", ["sid", "sid-vulkan", "trixie"])
 def test_single_things_are_edited_in_the_viewport(things, suite):
     facts, folder = played(things, "things", suite)
     places, points = facts["places"], facts["points"]
@@ -148,7 +153,7 @@ def place_above(places: dict) -> list[int]:
     return [x + 10, y - 30]
 
 
-@pytest.mark.parametrize("suite", ["sid", "trixie"])
+@pytest.mark.parametrize("suite", ["sid", "sid-vulkan", "trixie"])
 def test_frames_of_each_size_show_the_same(project, suite):
     """How many of them a second is printed: it is software that draws here."""
     facts, _ = played(project, "speed", suite)

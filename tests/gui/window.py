@@ -16,6 +16,7 @@ BLENDER_ROOT = Path(os.environ.get("FIELDWORK_GUI_ROOT", "/var/tmp/blender-sid")
 OLDER_ROOT = Path(os.environ.get("FIELDWORK_GUI_OLDER_ROOT", "/var/tmp/blender-trixie"))  # Blender 4.3
 BUILD = ROOT / "build" / "gui"
 PATIENCE = float(os.environ.get("FIELDWORK_GUI_PATIENCE", "1"))  # factor of all waiting, for a machine under load
+SOFTWARE_VULKAN = "usr/share/vulkan/icd.d/lvp_icd.json"
 MUSEUM = BUILD / "museum"  # a small simulated capture with labels
 
 
@@ -27,6 +28,13 @@ def missing(root: Path = BLENDER_ROOT, suite: str = "sid") -> str | None:
         return "a windowed Blender in its own root folder needs root"
     if not (root / ".complete").exists():
         return f"there is no Blender root at {root}: {TOOLS / 'make-root'} {suite} {root}"
+    return None
+
+
+def missing_vulkan(root: Path = BLENDER_ROOT) -> str | None:
+    """Why no Blender in a root can draw by Vulkan here, which is software as well."""
+    if not (root / SOFTWARE_VULKAN).is_file():
+        return f"there is no software Vulkan in {root}: chroot {root} apt-get install mesa-vulkan-drivers"
     return None
 
 
@@ -85,13 +93,15 @@ class Window:
             done = enter(["blender", "--command", "extension", *arguments], self.environment, 120, root)
             assert done.returncode == 0, done.stdout + done.stderr
 
-    def play(self, *scenarios: str, timeout: float = 300, size: tuple[int, int] = (1920, 1080)) -> dict:
+    def play(
+        self, *scenarios: str, timeout: float = 300, size: tuple[int, int] = (1920, 1080), backend: str = "opengl"
+    ) -> dict:
         """Drive scenarios one after the other, each in a Blender of its own whose window lies at the lower left corner of the
         screen; returns the facts of the last.
 
         Fails with the traceback of the scenario and Blender's output.
         """
-        blender = ["blender", "--factory-startup", "-noaudio", "--gpu-backend", "opengl", "--enable-event-simulate"]
+        blender = ["blender", "--factory-startup", "-noaudio", "--gpu-backend", backend, "--enable-event-simulate"]
         blender += ["--window-geometry", "0", "0", *map(str, size)]
         blender += ["--python", str(ROOT / "tests" / "gui" / "driver.py")]
         runs = [shlex.join([*blender, "--", scenario, str(self.folder)]) for scenario in scenarios]

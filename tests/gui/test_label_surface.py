@@ -37,7 +37,7 @@ def ball() -> Path:
     return folder
 
 
-@pytest.mark.parametrize("suite", ["sid", "trixie"])
+@pytest.mark.parametrize("suite", ["sid", "sid-vulkan", "trixie"])
 def test_strokes_on_the_surface_become_marks(ball: Path, suite: str) -> None:
     facts, folder = played(ball, "labels_on_surface", suite, 600)
     *marks, first, second = facts["marks"]

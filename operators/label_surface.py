@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import bpy
@@ -9,12 +10,11 @@ from bpy.types import Context, Event, Operator, WorkSpaceTool
 from mathutils import Vector
 
 from ..addon.labels import draw, session, surface
+from ..addon.labels.trail import Trail
 from ..addon.project import snapshot
 from ..addon.text import t
 from .base import engine_reason, need_run
 from .label_tool import LabelTool, keymap, mark_parameters
-
-LEAST_STEP = 3.0  # pixels of the screen between two places of a stroke
 
 
 class FIELDWORK_OT_label_surface(Operator):
@@ -35,17 +35,10 @@ class FIELDWORK_OT_label_surface(Operator):
         if params is None:
             self.report({"ERROR"}, reason or t("Add a class first: the + beside the list of classes"))
             return {"CANCELLED"}
-        self._owner, self._last = snapshot.owner(snapshot.folder_of(settings)), (-1e9, -1e9)
-        draw.live = draw.Live("", params)
+        self._owner, self._trail = snapshot.owner(snapshot.folder_of(settings)), Trail(params["width"])
+        draw.live = draw.Live("", params, pieces=self._trail.pieces)
         self._add(context, event)
-        if not draw.live.places:
-            draw.live = None
-            self.report(
-                {"WARNING"}, t("There is no surface of the capture here: extract the mesh and press Update Scene.")
-            )
-            return {"CANCELLED"}
-        session.begin(settings)
-        if params["shape"] == "part":
+        if params["shape"] == "part" or not surface.is_shown(context.visible_objects, self._owner):
             return self._finish(context)
         context.window_manager.modal_handler_add(self)
         return {"RUNNING_MODAL"}
@@ -64,17 +57,19 @@ class FIELDWORK_OT_label_surface(Operator):
 
     def _add(self, context: Context, event: Event) -> None:
         place = (event.mouse_x - context.region.x, event.mouse_y - context.region.y)
-        if max(abs(a - b) for a, b in zip(place, self._last)) >= LEAST_STEP:
-            found = surface.under_mouse(context, self._owner, *place)
-            if found is not None:
-                self._last = place
-                draw.live.places.append(found)
+        self._trail.go(*place, partial(surface.under_mouse, context, self._owner))
 
     def _finish(self, context: Context) -> set[str]:
         stroke, draw.live = draw.live, None
         context.area.tag_redraw()
-        width = surface.width_at(context, stroke.places[0], stroke.params["width"])
-        deliver(context.scene, stroke.params, stroke.places, width)
+        if not stroke.pieces:
+            missing = "There is no surface of the capture here: extract the mesh and press Update Scene."
+            shown = surface.is_shown(context.visible_objects, self._owner)
+            self.report({"WARNING"}, t("The stroke met no surface of the capture.") if shown else t(missing))
+            return {"CANCELLED"}
+        session.begin(context.scene.fieldwork)
+        widths = [surface.width_at(context, piece[0], stroke.params["width"]) for piece in stroke.pieces]
+        deliver(context.scene, stroke.params, stroke.pieces, widths)
         return {"FINISHED"}
 
 
@@ -86,10 +81,13 @@ def surface_parameters(settings: Any, erase: bool) -> dict[str, Any] | None:
     return params
 
 
-def deliver(scene: bpy.types.Scene, params: dict[str, Any], places: list[Vector], width: float) -> None:
-    """Hand a mark in the scene to the engine."""
+def deliver(scene: bpy.types.Scene, params: dict[str, Any], pieces: list[list[Vector]], widths: list[float]) -> None:
+    """Hand a stroke in the scene to the engine: a mark for each piece of it, all of them one step of undo."""
     folder = snapshot.folder_of(scene.fieldwork)
-    session.mark(folder, {**params, **surface.parameters(scene, snapshot.owner(folder), places, max(width, 1e-6))})
+    owner = snapshot.owner(folder)
+    for number, (places, width) in enumerate(zip(pieces, widths), 1):
+        values = surface.parameters(scene, owner, places, max(width, 1e-6))
+        session.mark(folder, {**params, **values}, more=number < len(pieces))
 
 
 class FIELDWORK_TOOL_label_surface(LabelTool, WorkSpaceTool):

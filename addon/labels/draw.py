@@ -22,12 +22,12 @@ CIRCLE = 24  # corners
 @dataclass
 class Live:
     """The stroke under the mouse: on which photo, parameters of `label stroke` but for its points, points in pixels;
-    a stroke on the surface has no photo, and places in the scene."""
+    a stroke on the surface has no photo, and pieces of places in the scene (see trail.py)."""
 
     photo: str
     params: dict[str, Any]
     points: list[tuple[float, float]] = field(default_factory=list)
-    places: list[Any] = field(default_factory=list)
+    pieces: list[list[Any]] = field(default_factory=list)
 
 
 live: Live | None = None

@@ -26,7 +26,8 @@ Ask = Callable[[str, dict[str, Any], Answer], object]  # verb, parameters, what 
 
 @dataclass
 class Wish:
-    """What the engine is to do with the marks of a project: `label stroke` or `label checkout`."""
+    """What the engine is to do with the marks of a project: `label stroke` or `label checkout`. more: the mark after it is of
+    the same step of undo."""
 
     folder: Path
     verb: str
@@ -34,15 +35,17 @@ class Wish:
     key: str = field(default_factory=lambda: uuid.uuid4().hex)
     sent: bool = False
     due: float = 0.0  # when to send (again), by the monotonic clock
+    more: bool = False
 
 
 @dataclass(frozen=True)
 class Taken:
-    """A wish that the engine has fulfilled, and the revision that is shown by it."""
+    """A wish that the engine has fulfilled, and the revision that is shown by it; more: as of the wish."""
 
     folder: Path
     verb: str
     revision: int
+    more: bool = False
 
 
 _wishes: list[Wish] = []
@@ -50,9 +53,9 @@ _taken: list[Taken] = []
 _errors: dict[Path, EngineError] = {}
 
 
-def mark(folder: Path, params: dict[str, Any]) -> Wish:
+def mark(folder: Path, params: dict[str, Any], more: bool = False) -> Wish:
     """Let a mark (parameters of `label stroke`, but for the project) wait for `send`."""
-    wish = Wish(folder, "label stroke", params)
+    wish = Wish(folder, "label stroke", params, more=more)
     wish.params = {**params, "key": wish.key}
     _errors.pop(folder, None)
     _wishes.append(wish)
@@ -135,7 +138,7 @@ def _answered(wish: Wish, result: dict[str, Any] | None, error: EngineError | No
     if error is None and result is not None:
         _wishes.remove(wish)
         _errors.pop(wish.folder, None)
-        _taken.append(Taken(wish.folder, wish.verb, int(result["revision"])))
+        _taken.append(Taken(wish.folder, wish.verb, int(result["revision"]), wish.more))
         return
     if error is not None:
         _errors[wish.folder] = error

@@ -32,14 +32,15 @@ def begin(settings: Any) -> None:
         settings.label_revision = pending.shown(folder)
 
 
-def mark(folder: Path, params: dict[str, Any]) -> None:
-    """Take a mark (parameters of `label stroke`) to the engine; without a window, wait until it is on disk.
+def mark(folder: Path, params: dict[str, Any], more: bool = False) -> None:
+    """Take a mark (parameters of `label stroke`) to the engine; without a window, wait until it is on disk. `more`: the next
+    one belongs to the same step of undo.
 
     Raises:
         EngineError: without a window, the engine did not take it.
     """
     _live.add(folder)
-    pending.mark(folder, params)
+    pending.mark(folder, params, more)
     hurry()
     wrong = pending.error(folder)
     if bpy.app.background and wrong is not None:
@@ -85,7 +86,7 @@ def _land() -> None:
             for scene in bpy.data.scenes:
                 if snapshot.folder_of(scene.fieldwork) == taken.folder:
                     scene.fieldwork.label_revision = taken.revision
-            if not bpy.app.background:
+            if not bpy.app.background and not taken.more:
                 bpy.ops.ed.undo_push(message="Label")
         if not bpy.app.background:
             redraw.panels()

@@ -21,6 +21,13 @@ LIFT = 0.002  # of the way to the eye, by which marks are drawn in front of the 
 _handle: Any = None
 
 
+def is_shown(objects: Iterable[bpy.types.Object], owner: Owner) -> bool:
+    """Whether the project's surface is among some objects."""
+    from ..scene.visibility import is_surface
+
+    return any(is_surface(item) and owner.owns(item) for item in objects)
+
+
 def under(
     scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph, owner: Owner, origin: Vector, direction: Vector
 ) -> Vector | None:
@@ -88,7 +95,7 @@ def _draw() -> None:
     if folder is None or not settings.label_strokes or not snapshot.has_project(folder):
         return
     shown = marks(folder)
-    live = draw.live if draw.live is not None and draw.live.places else None
+    live = draw.live if draw.live is not None and draw.live.pieces else None
     if not shown and live is None:
         return
     import gpu
@@ -99,8 +106,8 @@ def _draw() -> None:
     for mark, places in shown:
         if not mark.get("erase"):
             _draw_line([way @ place for place in places], eye, draw.mark_color(mark, colors), context.region)
-    if live is not None:
-        _draw_line(live.places, eye, draw.mark_color(live.params, colors), context.region)
+    for piece in live.pieces if live is not None else ():
+        _draw_line(piece, eye, draw.mark_color(live.params, colors), context.region)
     gpu.state.depth_test_set("NONE")
 
 

@@ -1,5 +1,5 @@
-"""What the suite `labels` asks beside the strokes on two photos: wrong strokes, classes without strokes, which photo is
-next, what each part of the method adds, and scenes of many classes."""
+"""What the suite `labels` asks beside the strokes on two photos: wrong strokes, which photo is next, what each part of the
+method adds, and scenes of many classes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from ..labels.preparation import Preparation
 from ..labels.propagation import appearance, propagated
 from ..progress import Reporter
 from .annotator import LEAST_PIXELS, first_strokes
-from .label_trials import Annotator, Subject, all_labels, hidden_void, labelled, read_subject, scores
+from .label_bounds import every_pixel
+from .label_trials import Annotator, Subject, all_labels, labelled, read_subject, scores
 
 WRONG = 0.3  # share of the strokes that get another class
 PHOTOS = 6  # that are marked one after the other, to see which were worth it
@@ -37,16 +38,6 @@ def wrong_strokes(subject: Subject, seed: int, report: Reporter) -> tuple[float,
     found = scores(subject, annotator.look(report))["miou"]
     annotator.marks = [mark for number, mark in enumerate(annotator.marks) if number not in wrong]
     return found, scores(subject, annotator.look(report))["miou"]
-
-
-def withheld(subject: Subject, seed: int, report: Reporter) -> dict[int, float]:
-    """Of each class the share of its held-out pixels that is void when it gets no stroke."""
-    shares = {}
-    for class_id in subject.class_ids:
-        share = hidden_void(subject, Annotator(subject, seed, class_id).look(report), class_id)
-        if share is not None:
-            shares[class_id] = round(share, 4)
-    return shares
 
 
 def parts_of_the_method(subject: Subject, seed: int, report: Reporter) -> dict[str, float]:
@@ -95,10 +86,10 @@ def photo_curves(subject: Subject, seed: int, report: Reporter) -> dict[str, lis
     return curves
 
 
-def photos_needed(curves: list[dict[str, list[float]]]) -> float | None:
-    """Photos that the better choice needs for what chance has in the end, as a share of those that chance took: means over
+def photos_needed(curves: list[dict[str, list[float]]], way: str = "next") -> float | None:
+    """Photos that a choice needs for what chance has in the end, as a share of those that chance took: means over
     seeds, between photos linearly. None where it does not come that far."""
-    chosen, chance = (np.mean([curve[way] for curve in curves], 0) for way in ("next", "random"))
+    chosen, chance = (np.mean([curve[key] for curve in curves], 0) for key in (way, "random"))
     wanted = float(chance.max())
     above = np.flatnonzero(chosen >= wanted)
     if not len(above):
@@ -113,14 +104,15 @@ def photos_needed(curves: list[dict[str, list[float]]]) -> float | None:
 
 def many_classes(
     ready: Preparation, project: Path, seeds: list[int], report: Reporter
-) -> tuple[int, list[float], float]:
-    """All classes of a scene from several photos: number of classes, mIoU of each seed, and that of all label maps. The
-    photos are those that together show most of them."""
+) -> tuple[int, list[float], float, float]:
+    """All classes of a scene from several photos: number of classes, mIoU of each seed, that of every pixel of these photos,
+    and that of all label maps. The photos are those that together show most of the classes."""
     subject = read_subject(ready, project, ["?"], least_share=0.0)
     sizes = {n: np.array([np.count_nonzero(subject.truth[n] == i) for i in subject.class_ids]) for n in subject.train}
     subject = replace(subject, first=photos_that_show(sizes))
     found = [scores(subject, Annotator(subject, seed).look(report))["miou"] for seed in seeds]
-    return len(subject.class_ids), found, scores(subject, all_labels(subject))["miou"]
+    bounds = (scores(subject, labels)["miou"] for labels in (every_pixel(subject, report), all_labels(subject)))
+    return len(subject.class_ids), found, *bounds
 
 
 def photos_that_show(sizes: dict[str, np.ndarray]) -> list[str]:

@@ -161,17 +161,6 @@ def scores(subject: Subject, labelling: Labelling) -> dict[str, Any]:
     }
 
 
-def hidden_void(subject: Subject, labelling: Labelling, hidden: int) -> float | None:
-    """Share of the held-out pixels of a class without strokes that are void; None where it is not in them."""
-    found = total = 0
-    for name in subject.test:
-        truth = subject.truth[name] == hidden
-        ids, _ = photo_labels(subject.ready, labelling, name, subject.void)
-        ids = nearest(ids, truth.shape[1], truth.shape[0])
-        found, total = found + np.count_nonzero(truth & (ids == subject.void)), total + np.count_nonzero(truth)
-    return found / total if total else None
-
-
 def all_labels(subject: Subject) -> Labelling:
     """What surfels would be by the label maps of all photos: the most frequent class of their pixels. No marks can make
     more of them."""

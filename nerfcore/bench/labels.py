@@ -20,6 +20,7 @@ from ..project.fingerprints import digest
 from ..project.runs import has_checkpoint, read_metrics, run_folder
 from ..project.store import edit_project, is_project
 from ..train.verb import train
+from .label_bounds import best_order, class_overlaps, every_pixel, held_out, seen_before, withheld
 from .label_studies import (
     CURVES,
     MANY_PHOTOS,
@@ -28,7 +29,6 @@ from .label_studies import (
     parts_of_the_method,
     photo_curves,
     photos_needed,
-    withheld,
     wrong_strokes,
 )
 from .label_times import accepted, figures_of, waiting_times, without_marks
@@ -146,14 +146,28 @@ def scene_figures(
         f"{' and '.join(subject.first)}."
     )
     own = scene_trials(subject, seeds, report)
-    most = scores(subject, all_labels(subject))
+    marked, most = every_pixel(subject, report), all_labels(subject)
+    bounds = [
+        row("held-out pixels whose surface the two photos show", [seen_before(subject, held_out(subject))]),
+        row("mIoU, two photos, every pixel of them marked", [scores(subject, marked)["miou"]]),
+    ]
+    shown = Annotator(subject, seeds[0]).look(report)
+    ious = [class_overlaps(subject, labels) for labels in (shown, marked, most)]
     found, told = studied(name, subject, labelled, seeds, own, report)
     times = timed(bare, out / "accepted" / name, subject, seeds[0], report)
     return {
-        "rows": [{"scene": name, **row} for row in [*accuracy(name, own, most), *found, *times]],
+        "rows": [
+            {"scene": name, **row} for row in [*accuracy(name, own, scores(subject, most)), *bounds, *found, *times]
+        ],
         "trials": [{"scene": name, **trial} for trial in own],
-        "notes": [about, *(f"{name}: {line}" for line in told)],
+        "notes": [about, *(f"{name}: {line}" for line in [overlap_text(subject.class_ids, ious), *told])],
     }
+
+
+def overlap_text(class_ids: list[int], ious: list[dict[int, float]]) -> str:
+    """What is to be said of the IoU of each class, by strokes, by every pixel of the photos and by all label maps."""
+    each = [f"class {i} {', '.join(f'{found[i]:.2f}' for found in ious)}" for i in class_ids if i in ious[0]]
+    return f"IoU by strokes, by every pixel of the two photos, by all label maps: {'; '.join(each)}."
 
 
 def without_labels(labelled: Path, target: Path) -> Path:
@@ -241,33 +255,48 @@ def studied(
     found = [wrong_strokes(subject, t["seed"], report) for t in trials]
     lost, least = ([miou - values[way] for miou, values in zip(right, found)] for way in (0, 1))
     report.stage("Classes without strokes")
-    shares = withheld(subject, seeds[0], report)
+    hidden = withheld(subject, seeds[0], report)
     report.stage("Parts of the method")
     ablation = [parts_of_the_method(subject, seed, report) for seed in seeds]
     report.stage("Next photos")
     curves = [photo_curves(subject, seed, report) for seed in seeds[:CURVES]]
     needed = photos_needed(curves)
+    order = {**curves[0], "best": best_order(subject, seeds[0], PHOTOS, report)}
     rows = [
         row("mIoU lost by 30 % wrong strokes", lost, most=0.05),
         worst_of_losses("mIoU lost where just these are left out", least),
     ]
-    if shares:
-        rows.append(row("void share of a class without strokes", list(shares.values()), 0.8))
+    if hidden:
+        rows.append(row("void share of a class without strokes", [h.void for h in hidden.values()], 0.8))
+        rows.append(
+            row("void share of a class without strokes, best threshold", [h.void_at_best for h in hidden.values()])
+        )
     chance = row("photos needed by the next photo, of those by chance", [needed], most=0.5)
     rows.append(chance if needed is not None else {**chance, "reached": "no"})
+    rows.append(row("photos needed by the best order, of those by chance", [photos_needed([order], "best")]))
     rows += [row(f"mIoU, two photos, {words}", [found[words] for found in ablation]) for words in ablation[0]]
-    means = {way: np.mean([curve[way] for curve in curves], 0).round(3).tolist() for way in ("next", "random")}
+    means = {way: np.mean([curve[way] for curve in curves], 0).round(3).tolist() for way in curves[0]}
     told = [
-        f"mIoU after each of {PHOTOS} photos: next photo {means['next']}, by chance {means['random']}.",
-        "void without strokes: " + ", ".join(f"class {i} {share:.0%}" for i, share in shares.items()) + ".",
+        f"mIoU after each of {PHOTOS} photos: next photo {means['next']}, by chance {means['random']}; seed {seeds[0]}: "
+        f"next photo {rounded(order['next'])}, by chance {rounded(order['random'])}, best order {rounded(order['best'])}.",
+        "void without strokes (by the best threshold; what most of the rest is taken for): "
+        + "; ".join(
+            f"class {i} {h.void:.0%} ({h.void_at_best:.0%}; {h.other} {h.as_other:.0%})" for i, h in hidden.items()
+        )
+        + ".",
     ]
     if name in ASKED_MANY:
         report.stage("All classes")
-        count, found, most = many_classes(subject.ready, project, seeds, report)
+        count, found, marked, most = many_classes(subject.ready, project, seeds, report)
         asked = ASKED_MANY[name]
         words = f" ({asked:g} × all label maps, {most:g})"
         rows.append(row(f"mIoU, {count} classes from {MANY_PHOTOS} photos", found, round(asked * most, 4), words=words))
+        rows.append(row(f"mIoU, {count} classes, every pixel of {MANY_PHOTOS} photos marked", [marked]))
     return rows, told
+
+
+def rounded(values: list[float]) -> list[float]:
+    return [round(value, 3) for value in values]
 
 
 def timed(bare: Path, place: Path, subject: Subject, seed: int, report: Reporter) -> list[Row]:

@@ -123,7 +123,8 @@ def marked_surfels(ready: Preparation, mark: Mark, size: tuple[int, int]) -> np.
 
 def placed_surfels(ready: Preparation, mark: Mark) -> np.ndarray:
     """The surfels (S,) that a mark on the surface covers, each once: those no farther from it than half of its width that
-    face as the nearest one does, so that a brush on one side of a sheet leaves the other side alone."""
+    face as the nearest one does, so that a brush on one side of a sheet leaves the other side alone. Between two places the
+    brush marks nothing where it is off the surface: over a gap, or from a near thing to what is behind it."""
     world_from_sfm_ = world_from_sfm(load_project(ready.folder.parents[2]))
     places = transform_points(world_from_sfm_, np.array(mark.places, np.float64))
     radius = mark.width / 2 * similarity_scale(world_from_sfm_)
@@ -133,7 +134,12 @@ def placed_surfels(ready: Preparation, mark: Mark) -> np.ndarray:
         steps = int(np.ceil(float(np.linalg.norm(end - begin)) / max(radius / 2, 1e-9)))
         corners.append(begin + (end - begin) * (np.arange(1, min(steps, MOST_STEPS) + 1) / max(steps, 1))[:, None])
     along = np.concatenate(corners) if mark.shape == "line" else places
-    nearest = np.asarray(tree.query(along)[1])
+    distance, nearest = (np.asarray(part) for part in tree.query(along))
+    if mark.shape == "line":
+        spacing = np.linalg.norm(ready.world[0][ready.neighbours[nearest, -1]] - ready.world[0][nearest], axis=1)
+        on_it = distance <= np.maximum(radius, spacing)
+        on_it[np.cumsum([0, *(len(part) for part in corners[1:])])] = True  # where it was drawn
+        along, nearest = along[on_it], nearest[on_it]
     if mark.shape == "part":
         return whole_parts(ready, mark, np.unique(nearest))
     found = [nearest]

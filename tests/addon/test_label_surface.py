@@ -34,6 +34,7 @@ def test_a_stroke_in_the_viewport_reaches_the_journal_in_the_frame_of_the_poses(
         + """
 from mathutils import Matrix, Vector
 from fieldwork.addon.labels import session, surface
+from fieldwork.addon.labels.trail import Trail
 from fieldwork.addon.project import snapshot
 from fieldwork.operators import label_surface
 settings.project = folder
@@ -59,16 +60,23 @@ place = surface.under(scene, graph, owner, Vector((3, 6, 9)), down)
 beside = surface.under(scene, graph, owner, Vector((30, 6, 9)), down)
 settings.class_index = 0
 sent = []
-session.mark = lambda folder, params: sent.append(params)
+session.mark = lambda folder, params, more: sent.append((params, more))
 params = {"shape": "line", "width": 12.0, "author": "Ada", "class_id": 1}
-label_surface.deliver(scene, params, [place, place + Vector((3, 0, 0))], 0.6)
+shown = [surface.is_shown(items, owner) for items in (scene.objects, [front, root])]
+# A stroke that begins beside the sheet, goes over it and ends beside it, seen from above.
+trail = Trail(12.0)
+for x in (-15, 15):
+    trail.go(x, 6, lambda x, y: surface.under(scene, graph, owner, Vector((x, y, 9)), down))
+ends = [list(trail.pieces[0][0]), list(trail.pieces[-1][-1])]
+label_surface.deliver(scene, params, [[place, place + Vector((3, 0, 0))], [place]], [0.6, 0.3])
 class Asked:
     label_tool, label_width, label_author, class_index = "click", 12.0, "", 0
     label_encoder = label_decoder = "model.onnx"
     classes = settings.classes
 settings.classes.add().id = 1
 tool = label_surface.surface_parameters(Asked, False)
-answer({"place": list(place), "beside": beside is None, "sent": sent, "tool": tool})
+answer({"place": list(place), "beside": beside is None, "sent": sent, "tool": tool, "shown": shown,
+        "pieces": len(trail.pieces), "ends": ends})
 """,
         folder=folder,
     )
@@ -76,7 +84,14 @@ answer({"place": list(place), "beside": beside is None, "sent": sent, "tool": to
     assert facts["beside"]
     assert facts["tool"]["shape"] == "part", "models cut out of photos, not of the surface"
     assert "box" not in facts["tool"]
-    (sent,) = facts["sent"]
+    assert facts["shown"] == [True, False]
+    assert facts["pieces"] == 1, "a stroke may begin and end beside the surface"
+    for end, x in zip(facts["ends"], (-9, 9)):
+        assert abs(end[0]) <= 9
+        assert abs(end[0] - x) <= 8, "it is as long as what it meets, but for a step of the mouse"
+    assert [more for _, more in facts["sent"]] == [True, False], "its pieces are one step of undo"
+    (sent, _), (last, _) = facts["sent"]
+    assert last["width"] == pytest.approx(0.1)
     # The capture lies five units up in the scene, three times as large.
     np.testing.assert_allclose(sent["places"], [[1, 2, -5 / 3], [2, 2, -5 / 3]], atol=1e-4)
     assert sent["width"] == pytest.approx(0.2)

@@ -88,6 +88,14 @@ def test_a_mark_that_the_engine_does_not_answer_is_sent_again_and_written_once(t
         assert [(taken.verb, taken.revision) for taken in pending.take()] == [("label stroke", 1), ("label stroke", 2)]
 
 
+def test_pieces_of_a_stroke_are_told_from_marks_of_their_own(tmp_path):
+    for more in (True, True, False, False):
+        pending.mark(tmp_path, LINE, more)
+    for _ in range(4):
+        pending.send(Engine(tmp_path), at_once=True)
+    assert [(taken.revision, taken.more) for taken in pending.take()] == [(1, True), (2, True), (3, False), (4, False)]
+
+
 def test_a_mark_that_is_refused_is_dropped_and_the_next_one_goes_on(tmp_path):
     refused = EngineError("input", "The mark lies outside the photo.")
     pending.mark(tmp_path, {**LINE, "photo": "nowhere"})

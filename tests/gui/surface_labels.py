@@ -19,7 +19,8 @@ RADIUS = 0.5
 
 
 def labels_on_surface(screen):
-    """A stroke over the upper half, one over the lower, a click beside the ball, and undo."""
+    """A stroke over the upper half, one over the lower, a click beside the ball, a stroke that begins beside it, leaves it and
+    comes back, and undo of that and of the one before."""
     for obj in list(bpy.data.objects):
         bpy.data.objects.remove(obj)
     settings = bpy.context.scene.fieldwork
@@ -51,9 +52,16 @@ def labels_on_surface(screen):
     x, y = screen.area.x + screen.area.width * 0.25, screen.area.y + 60
     yield from screen.click(x, y)
     screen.facts["after a click beside it"] = len(journal.marks(folder))
-    with bpy.context.temp_override(window=screen.window, area=screen.area, region=screen.view):
-        bpy.ops.ed.undo()
-    yield from screen.wait(lambda: journal.shown(folder) == 1, 60, "undo does not show the revision before")
+    settings.class_index = 0
+    upper, lower = (on_screen(screen, -math.pi / 2, height)[1] for height in (0.4, -0.4))
+    middle, right = on_screen(screen, -math.pi / 2, 0)[0], on_screen(screen, 0, 0)[0] + 60
+    yield from drag(screen, [(2 * middle - right, upper), (right, upper), (right, lower), (middle, lower)])
+    yield from screen.wait(lambda: settings.label_revision == 4, 60, "the pieces of the stroke are not taken")
+    screen.shot("pieces")
+    for revision, words in ((2, "undo does not take all pieces"), (1, "undo does not show the revision before")):
+        with bpy.context.temp_override(window=screen.window, area=screen.area, region=screen.view):
+            bpy.ops.ed.undo()
+        yield from screen.wait(lambda r=revision: journal.shown(folder) == r, 60, words)
     screen.facts["marks"] = journal.marks(folder)
     yield from finish(screen)
 
@@ -73,7 +81,11 @@ def seen(screen, azimuth, height):
 
 def stroke(screen, height):
     """Draw along the ball's side that is seen."""
-    places = [on_screen(screen, -math.pi / 2 + step * 0.1, height) for step in range(-8, 9)]
+    yield from drag(screen, [on_screen(screen, -math.pi / 2 + step * 0.1, height) for step in range(-8, 9)])
+
+
+def drag(screen, places):
+    """Draw with the left button from place to place of the screen."""
     send = screen.window.event_simulate
     screen.move(*places[0])
     yield 0.2

@@ -40,9 +40,15 @@ def ball() -> Path:
 @pytest.mark.parametrize("suite", ["sid", "sid-vulkan", "trixie"])
 def test_strokes_on_the_surface_become_marks(ball: Path, suite: str) -> None:
     facts, folder = played(ball, "labels_on_surface", suite, 600)
-    marks = facts["marks"]
+    *marks, first, second = facts["marks"]
     assert facts["after a click beside it"] == 2, "a click beside the surface marks nothing"
     assert [mark["class_id"] for mark in marks] == [1, 2]
+    for piece, side in ((first, 1), (second, -1)):
+        places = np.array(piece["places"])
+        assert piece["class_id"] == 1
+        np.testing.assert_allclose(np.linalg.norm(places, axis=1), RADIUS, atol=0.05)
+        assert (places[:, 2] * side > 0).all()
+    assert len(first["places"]) > len(second["places"]) > 5, "over the whole ball, and over half of it"
     for mark, height in zip(marks, (0.5, -0.5)):
         places = np.array(mark["places"])
         assert len(places) > 5

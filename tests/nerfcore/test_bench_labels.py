@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from fieldwork.nerfcore.bench import label_times
 from fieldwork.nerfcore.bench.annotator import LONGEST, correction, first_strokes, largest_component, medial_stroke
+from fieldwork.nerfcore.bench.label_bounds import HeldOut, boldest, class_overlaps, held_out, of_pixels, seen_before
 from fieldwork.nerfcore.bench.label_studies import photos_needed, photos_that_show
-from fieldwork.nerfcore.bench.label_trials import best_pair, calibration_error
+from fieldwork.nerfcore.bench.label_trials import Subject, best_pair, calibration_error, labelled, scores
 from fieldwork.nerfcore.bench.labels import row
 from fieldwork.nerfcore.params import BenchParams, LabelAcceptParams
 from fieldwork.nerfcore.progress import Reporter
@@ -87,6 +88,53 @@ def test_photos_that_are_needed_are_counted_between_photos() -> None:
     assert photos_needed([{"next": [0.5, 0.6], "random": [0.2, 0.3]}]) == pytest.approx(1 / 2)
 
 
+def test_other_orders_are_counted_the_same() -> None:
+    assert photos_needed([{"best": [0.2, 0.6], "random": [0.2, 0.4]}], "best") == pytest.approx(1.5 / 2)
+
+
+class FourSurfels:
+    """A prepared run of four surfels on a photo of two rows: the first two on the left, the others on the right; the photo
+    "b" shows the left ones alone."""
+
+    surfels = range(4)
+
+    def map_of(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        shown = np.array([[0, 0, 2, 2], [1, 1, 3, -1]]) if name == "a" else np.array([[0, 1]])
+        return shown, np.zeros(shown.shape, bool)
+
+
+@pytest.fixture
+def half_and_half() -> Subject:
+    truth = {"a": np.array([[5, 5, 7, 7], [5, 5, 7, 7]]), "b": np.array([[5, 5]])}
+    return Subject(FourSurfels(), truth, [5, 7], ["b"], ["b"], ["a"], 0)  # type: ignore[arg-type]
+
+
+def test_overlaps_of_held_out_pixels_are_those_of_photos(half_and_half: Subject) -> None:
+    shown = labelled(np.array([[0.9, 0.1], [0.2, 0.8], [0.1, 0.9], [0.1, 0.2]], np.float32), [5, 7])
+    assert class_overlaps(half_and_half, shown) == pytest.approx({5: 2 / 4, 7: 2 / 6})
+    assert np.mean(list(class_overlaps(half_and_half, shown).values())) == pytest.approx(
+        scores(half_and_half, shown)["miou"], abs=1e-4
+    )
+    only_one = labelled(
+        np.array([[0.9], [0.2], [0.9], [0.1]], np.float32), [7]
+    )  # void, where no class is likely enough
+    assert class_overlaps(half_and_half, only_one) == pytest.approx({5: 0, 7: 2 / 6})
+
+
+def test_the_first_photos_show_half_of_the_other_one(half_and_half: Subject) -> None:
+    assert seen_before(half_and_half, held_out(half_and_half)) == pytest.approx(4 / 8)
+
+
+def test_the_best_threshold_makes_no_more_void_than_may_be(half_and_half: Subject) -> None:
+    pixels = HeldOut(np.repeat(np.arange(4), 100), np.repeat([0, 0, 1, 1], 100))
+    sure = labelled(np.array([[0.95, 0], [0.8, 0], [0, 0.9], [0.6, 0.1]], np.float32), [5, 7])
+    # Only the last surfel is wrong: as void it costs nothing, and any other would.
+    threshold = boldest(half_and_half, pixels, sure)
+    void = of_pixels(pixels, 1 - sure.probability.sum(1), 1.0)
+    assert (void > threshold).sum() == 100
+    assert void[-1] > threshold
+
+
 def test_each_further_photo_shows_classes_that_were_missing() -> None:
     sizes = {
         "a": np.array([900, 0, 0]),
@@ -130,6 +178,11 @@ def test_the_suite_measures_and_writes_its_page(tmp_path: Path, monkeypatch: pyt
     (trial,) = result["trials"]
     assert len(trial["seconds"]) == len(trial["steps"]) <= 6
     assert 0 <= rows["void share of a class without strokes"]["worst"] <= 1
+    assert 0 <= rows["void share of a class without strokes, best threshold"]["worst"] <= 1
+    assert most + 0.05 >= rows["mIoU, two photos, every pixel of them marked"]["worst"] > 0.5
+    assert 0.3 < rows["held-out pixels whose surface the two photos show"]["worst"] <= 1
+    assert any("IoU by strokes" in note for note in result["notes"])
+    assert any("best order [" in note for note in result["notes"])
     assert (
         rows["from a stroke to whole parts (s), 95 %"]["worst"]
         <= rows["from a stroke to all surfels (s), 95 %"]["worst"]

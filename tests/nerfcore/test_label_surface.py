@@ -86,6 +86,17 @@ def test_a_stroke_on_the_surface_marks_what_lies_under_it(ball: Path) -> None:  
     assert np.array_equal(placed_surfels(prepared_anew(ball), mark), marked)
 
 
+def test_a_stroke_marks_nothing_where_it_is_off_the_surface(ball: Path) -> None:  # noqa: F811
+    ends = [on_ball(0, 0.2), on_ball(np.pi, 0.2)]  # the way between them goes through the ball
+    place(ball, TOP, ends)
+    ready = prepared(ball)
+    (mark,) = read_marks(ball)
+    marked = ready.world[0][placed_surfels(ready, mark)]
+    distance = np.linalg.norm(marked[:, None] - np.array(ends)[None], axis=2)
+    assert (distance.min(0) < 0.1).all(), "both ends are marked"
+    assert distance.min(1).max() < 0.2
+
+
 def prepared_anew(folder: Path) -> Preparation:
     """The same surfels where the world lies otherwise."""
     return Preparation(folder / "runs/main/surfels")

@@ -62,11 +62,11 @@ class SceneDepth:
 
     def texture(self, context: Any, region: Any, view3d: Any) -> Any:
         """Depth in [0, 1] (red, as large as the region) of what the view's objects cover, 1 where there are none."""
-        now, size = time.monotonic(), (region.width, region.height)
+        size = region.width, region.height
         target = self._targets.get(region.as_pointer())
         if target is None or target.size != size:
             target = self._targets[region.as_pointer()] = Target(size)
-        target.used = now
+        target.used = time.monotonic()
         state = (
             self.changes,
             tuple(value for row in view3d.perspective_matrix for value in row),
@@ -75,8 +75,13 @@ class SceneDepth:
         if state != target.state:
             self._draw(target, context, view3d.perspective_matrix)
             target.state = state
-        self._targets = {key: one for key, one in self._targets.items() if now - one.used < UNUSED}
         return target.buffer.texture_color
+
+    def give_up(self, now: float) -> None:
+        """Let go of what no viewport asks for any more."""
+        self._targets = {key: one for key, one in self._targets.items() if now - one.used < UNUSED}
+        if not self._targets:
+            self._shapes = {}
 
     def changed(self, names: set[str] | None) -> None:
         """The scene changed; of the objects and data so called also the shape, None: of all."""

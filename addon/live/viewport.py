@@ -297,6 +297,7 @@ class Viewport:
         """Let go of textures and pictures that nothing shows any more."""
         self.assets = {key: asset for key, asset in self.assets.items() if now - asset.used < UNUSED}
         self.views = {key: view for key, view in self.views.items() if now - view.used < UNUSED}
+        scene_depth.give_up(now)
 
 
 def _picture(old: Picture | None, size: tuple[int, int], scale: int) -> Picture:

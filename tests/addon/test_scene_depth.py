@@ -11,7 +11,7 @@ pytest.importorskip("bpy")
 
 import bpy
 from fieldwork.addon.live.objects import mesh_of
-from fieldwork.addon.live.scene_depth import SceneDepth, Shape, _covers, lacks_depth
+from fieldwork.addon.live.scene_depth import UNUSED, SceneDepth, Shape, _covers, lacks_depth
 
 
 def space(overlays: bool, shading: str) -> SimpleNamespace:
@@ -39,6 +39,18 @@ def test_only_what_changed_is_made_anew() -> None:
     depth.changed(None)
     assert not depth._shapes
     assert depth.changes == 3, "each change is drawn anew"
+
+
+def test_nothing_is_kept_that_no_viewport_asks_for() -> None:
+    depth = SceneDepth()
+    depth._targets = {1: SimpleNamespace(used=10.0), 2: SimpleNamespace(used=30.0)}
+    depth._shapes = {("cup", 1): Shape(frozenset({"cup"}), 1)}
+    depth.give_up(10.0 + UNUSED)
+    assert list(depth._targets) == [2]
+    assert depth._shapes, "a viewport still needs them"
+    depth.give_up(30.0 + UNUSED)
+    assert not depth._targets
+    assert not depth._shapes
 
 
 def test_what_is_drawn_as_wires_hides_nothing() -> None:

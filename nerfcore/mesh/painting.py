@@ -14,24 +14,32 @@ from .photos import halvings, sample
 from .visibility import CPU, DepthBuffer, PosedCamera, within
 
 BLOCK = 1 << 19  # texels painted at once
+BESIDE_FADES = 2  # power of the weight of a view that sees a facelet's border alone
 
 
 @dataclass(frozen=True)
 class Jobs:
     """Which view paints which facelet: face (J,), view (J,); weight (J, 3) at the facelet's corners; factor (J, 3, 3)
-    what multiplies the photo's linear colours there (corner, channel)."""
+    what multiplies the photo's linear colours there (corner, channel). beside (J,) bool: the view does not see the facelet
+    well, only what borders on it."""
 
     face: np.ndarray
     view: np.ndarray
     weight: np.ndarray
     factor: np.ndarray
+    beside: np.ndarray
+
+    def of(self, rows: np.ndarray) -> Jobs:
+        """Only those of some rows: indices (N,) or (J,) bool."""
+        return Jobs(*(values[rows] for values in vars(self).values()))
 
 
 def crossings(pieces: Facelets, view: np.ndarray, column: np.ndarray, keep: np.ndarray, log_factor: np.ndarray) -> Jobs:
     """Every facelet from its chosen view, and beside a change of view from the neighbours' too.
 
     A vertex mixes the views of the facelets around it in equal parts, and a facelet mixes its corners' mixtures, so the
-    colour does not jump where the choice changes. The factors are averaged at the vertices as well.
+    colour does not jump where the choice changes. The factors are averaged at the vertices as well. A neighbour's view that
+    does not see the facelet, as around the sharp edges of a wire, sees its border all the same: it fades from there, faster.
 
     Args:
         view (F, K): candidates; column (F,): the chosen one, −1 for none; keep (F, K): which may be used; log_factor
@@ -55,20 +63,24 @@ def crossings(pieces: Facelets, view: np.ndarray, column: np.ndarray, keep: np.n
         row, corner = np.nonzero(begin + step < end)
         pairs.append(np.stack([border[row], mixed[begin[row, corner] + step] % span], 1))
     face, number = np.unique(np.concatenate(pairs), axis=0).T
-    match = (view[face] == number[:, None]) & keep[face]
-    usable = match.any(1)
-    face, number, at = face[usable], number[usable], match[usable].argmax(1)
+    match = view[face] == number[:, None]
+    at = match.argmax(1)
+    seen = match.any(1) & keep[face, at]
+    usable = seen | ~match.any(1)  # all but views that show something else
+    face, number, at, seen = face[usable], number[usable], at[usable], seen[usable]
     keys = pieces.faces[face].astype(np.int64) * span + number[:, None]
     place = np.minimum(np.searchsorted(mixed, keys), len(mixed) - 1)
     weight = np.where(mixed[place] == keys, share[place], 0)
-    # The mean factor of each view at each vertex, over the facelets that it paints there.
+    # The mean factor of each view at each vertex, over the facelets that it sees there.
     unique, inverse = np.unique(keys, return_inverse=True)
     inverse = inverse.reshape(-1)
-    mine = np.repeat(log_factor[face, at], 3, axis=0)
-    number_at = np.bincount(inverse)
+    mine = np.repeat(log_factor[face, at] * seen[:, None], 3, axis=0)
+    number_at = np.maximum(np.bincount(inverse, np.repeat(seen, 3)), 1)
     mean = np.stack([np.bincount(inverse, mine[:, c], len(unique)) / number_at for c in range(3)], 1)
     factor = np.exp(mean)[inverse].reshape(-1, 3, 3)
-    return Jobs(face.astype(np.int64), number.astype(np.int64), weight.astype(np.float32), factor.astype(np.float32))
+    return Jobs(
+        face.astype(np.int64), number.astype(np.int64), weight.astype(np.float32), factor.astype(np.float32), ~seen
+    )
 
 
 @dataclass(frozen=True)
@@ -112,8 +124,9 @@ def paint(
     todo: np.ndarray,
     careful: np.ndarray,
     buffer: DepthBuffer | None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """What one photo gives: texels (N,) as places of the tile, and (N, 4) its linear colours times weight, and weight.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What one photo gives: texels (N,) as places of the tile, (N, 4) its linear colours times weight, and weight, and which
+    (N,) bool it sees and not only what borders on them.
 
     Args:
         rgba: (H, W, 4) uint8. jobs: those of this photo. todo (tile area,): places that want paint.
@@ -122,7 +135,7 @@ def paint(
     picture = torch.from_numpy(rgba[..., :3].astype(np.float32) / 255).permute(2, 0, 1)
     levels = halvings(picture, 6)
     masked = bool((rgba[..., 3] == 0).any())
-    places, values = [], []
+    places, values, seen = [], [], []
     texel, row = texels.of(jobs.face)
     wanted = todo[texels.place[texel]]
     texel, row = texel[wanted], row[wanted]
@@ -150,11 +163,14 @@ def paint(
         second, third = texels.barycentric[some].T[..., None]
         first = 1 - second - third
         weight, factor = jobs.weight[job], jobs.factor[job]
-        weight = first[:, 0] * weight[:, 0] + second[:, 0] * weight[:, 1] + third[:, 0] * weight[:, 2]
+        share = np.concatenate([first, second, third], 1)
+        share = np.where(jobs.beside[job, None], share**BESIDE_FADES, share)
+        weight = np.einsum("nk,nk->n", share, weight)
         factor = first * factor[:, 0] + second * factor[:, 1] + third * factor[:, 2]
         weight = np.maximum(weight, 1e-4)
         values.append(np.concatenate([color * factor * weight[:, None], weight[:, None]], 1).astype(np.float32))
         places.append(texels.place[some])
+        seen.append(~jobs.beside[job])
     if not places:
-        return np.zeros(0, np.int32), np.zeros((0, 4), np.float32)
-    return np.concatenate(places), np.concatenate(values)
+        return np.zeros(0, np.int32), np.zeros((0, 4), np.float32), np.zeros(0, bool)
+    return np.concatenate(places), np.concatenate(values), np.concatenate(seen)

@@ -31,7 +31,7 @@ PIECE_TEXELS = 40  # longest edge of a piece for which one photo is chosen
 SECOND_BEST = 3  # further photos that are tried where the chosen one is hidden
 MARGIN = 4  # texels around charts that repeat their border
 BAND = 1 << 22  # texels that are spread at once: a fraction of a second
-BYTES_PER_TEXEL, BYTES_PER_TILE_TEXEL = 8, 70
+BYTES_PER_TEXEL, BYTES_PER_TILE_TEXEL = 8, 71
 
 Fill = Callable[[np.ndarray, np.ndarray], np.ndarray]
 GAP, UNSEEN, PHOTO = 0, 1, 2  # what a texel holds
@@ -197,7 +197,8 @@ def _second_best(seen: Observations, worth: np.ndarray, column: np.ndarray, log_
         face = np.flatnonzero(left[np.arange(len(left)), at] > 0)
         factor = np.repeat(np.exp(log_factor[face, at[face]])[:, None], 3, axis=1)
         view = seen.view[face, at[face]].astype(np.int64)
-        rounds.append(Jobs(face, view, np.ones((len(face), 3), np.float32), factor.astype(np.float32)))
+        whole = np.ones((len(face), 3), np.float32)
+        rounds.append(Jobs(face, view, whole, factor.astype(np.float32), np.zeros(len(face), bool)))
     return rounds
 
 
@@ -222,27 +223,31 @@ def _tile(
         if turn:
             open_ = np.zeros(len(pieces), bool)
             open_[face_of[todo[texels.place]]] = True
-            chosen = open_[jobs.face]
-            jobs = Jobs(jobs.face[chosen], jobs.view[chosen], jobs.weight[chosen], jobs.factor[chosen])
+            jobs = jobs.of(open_[jobs.face])
         order = np.argsort(jobs.view, kind="stable")
         numbers, begins = np.unique(jobs.view[order], return_index=True)
         strict = careful if turn == 0 else np.ones(len(pieces), bool)
+        painted = np.zeros(width * height, bool)
 
-        def work(item: tuple[int, np.ndarray], jobs: Jobs = jobs, strict: np.ndarray = strict) -> None:
+        def work(
+            item: tuple[int, np.ndarray], jobs: Jobs = jobs, strict: np.ndarray = strict, painted: np.ndarray = painted
+        ) -> None:
             report.check()
             number, rows = item
-            mine = Jobs(jobs.face[rows], jobs.view[rows], jobs.weight[rows], jobs.factor[rows])
+            mine = jobs.of(rows)
             rgba = photos[number].read()
             buffer = buffers[number] if strict[mine.face].any() else None
-            place, value = paint(photos[number].view, rgba, mine, pieces, texels, todo, strict, buffer)
+            place, value, seen = paint(photos[number].view, rgba, mine, pieces, texels, todo, strict, buffer)
             with lock:
                 total[place] += value
+                painted[place[seen]] = True
 
         items = list(zip(numbers.tolist(), np.split(order, begins[1:]))) if len(numbers) else []
         part = _Part(report, 0.6 if turn else 0, 0.1 if turn else 0.6)
         for _ in in_parallel(work, items, part, "photos"):
             continue
-        np.logical_and(todo, total[:, 3] == 0, out=todo)
+        np.logical_and(todo, ~painted, out=todo)
+        total[todo] = 0
         if not todo.any():
             break
     report.progress(0.9)

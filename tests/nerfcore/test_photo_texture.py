@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from fieldwork.nerfcore.errors import Cancelled, SettingError
 from fieldwork.nerfcore.mesh import photo_texture as module
+from fieldwork.nerfcore.mesh.facelets import facelets
 from fieldwork.nerfcore.mesh.painting import crossings, texels_of
 from fieldwork.nerfcore.mesh.photo_texture import PhotoTexture, photo_texture, prepare
 from fieldwork.nerfcore.mesh.photos import Photo
@@ -101,6 +102,28 @@ def test_where_the_photo_changes_colours_do_not_jump(monkeypatch: pytest.MonkeyP
         seam = np.diff(view.reshape(512, 512), axis=axis) != 0
         assert seam.sum() > 100
         assert difference[seam].mean() < 1.5 * difference[~seam].mean()
+
+
+def test_around_a_sharp_edge_both_photos_paint_its_vertices() -> None:
+    corners = np.array([[0, 0, 0], [0, 1, 0], [1, 0, 0], [0, 0, 1.0]])
+    pieces = facelets(corners, np.array([[0, 1, 3], [1, 0, 2]]))
+    column, log_factor = np.zeros(2, np.int8), np.log(np.array([[[2.0] * 3], [[3.0] * 3]]))
+    jobs = crossings(pieces, np.array([[5], [7]]), column, np.ones((2, 1), bool), log_factor)
+    assert jobs.beside.tolist() == [False, True, True, False]
+    assert jobs.face.tolist() == [0, 0, 1, 1]
+    assert jobs.view.tolist() == [5, 7, 5, 7]
+    assert jobs.weight.tolist() == [[0.5, 0.5, 1], [0.5, 0.5, 0], [0.5, 0.5, 0], [0.5, 0.5, 1]]
+    for factor, view in zip(jobs.factor[:, :2, 0], jobs.view):
+        assert factor == pytest.approx({5: 2, 7: 3}[view])
+
+
+def test_a_photo_that_shows_something_else_paints_no_border_either() -> None:
+    corners = np.array([[0, 0, 0], [0, 1, 0], [1, 0, 0], [0, 0, 1.0]])
+    pieces = facelets(corners, np.array([[0, 1, 3], [1, 0, 2]]))
+    keep = np.array([[True, False], [False, True]])  # each facelet's other view has something before it
+    column = np.array([0, 1], np.int8)
+    jobs = crossings(pieces, np.array([[5, 7], [5, 7]]), column, keep, np.zeros((2, 2, 3)))
+    assert list(zip(jobs.face.tolist(), jobs.view.tolist())) == [(0, 5), (1, 7)]
 
 
 def test_without_gains_the_same_photos_would_cost_more(plain: PhotoTexture, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -349,6 +349,26 @@ class FIELDWORK_OT_label_size(Operator):
         return {"FINISHED"}
 
 
+class FIELDWORK_OT_label_undo(Operator):
+    """Take back a mark that the engine is about to take"""
+
+    bl_idname = "fieldwork.label_undo"
+    bl_label = "Undo Mark"
+    bl_options = {"INTERNAL"}
+
+    @classmethod
+    def poll(cls, context: Context) -> bool:
+        folder = snapshot.folder_of(context.scene.fieldwork)
+        return folder is not None and pending.unfinished(folder)  # else the key is Blender's
+
+    def execute(self, context: Context) -> set[str]:
+        folder = snapshot.folder_of(context.scene.fieldwork)
+        if folder is None:
+            return {"CANCELLED"}
+        session.undo_later(folder)
+        return {"FINISHED"}
+
+
 class FIELDWORK_OT_label_retry(Operator):
     """Send the marks that the engine did not take, and propagate again"""
 
@@ -371,5 +391,6 @@ CLASSES = [
     FIELDWORK_OT_label_photo,
     FIELDWORK_OT_label_class,
     FIELDWORK_OT_label_size,
+    FIELDWORK_OT_label_undo,
     FIELDWORK_OT_label_retry,
 ]

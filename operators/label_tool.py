@@ -20,6 +20,8 @@ KEYS = (
     ("fieldwork.label_size", {"type": "LEFT_BRACKET", "value": "PRESS"}, {"properties": [("factor", 0.8)]}),
     ("fieldwork.label_size", {"type": "RIGHT_BRACKET", "value": "PRESS"}, {"properties": [("factor", 1.25)]}),
     ("fieldwork.label_next", {"type": "N", "value": "PRESS", "shift": True}, None),
+    ("fieldwork.label_undo", {"type": "Z", "value": "PRESS", "ctrl": True}, None),
+    ("fieldwork.label_undo", {"type": "Z", "value": "PRESS", "oskey": True}, None),
     *(
         ("fieldwork.label_class", {"type": key, "value": "PRESS"}, {"properties": [("number", number)]})
         for number, key in enumerate(NUMBERS, 1)

@@ -73,6 +73,11 @@ def marks_of(folder: Path) -> list[dict[str, Any]]:
     return [wish.params for wish in _wishes if wish.folder == folder and wish.verb == "label stroke"]
 
 
+def unfinished(folder: Path) -> bool:
+    """Whether a mark is no step of undo yet: the engine has not answered, or nobody called `take` since."""
+    return bool(marks_of(folder)) or any(t.folder == folder and t.verb == "label stroke" for t in _taken)
+
+
 def shown(folder: Path) -> int:
     """The revision that is to be shown: what undo asked for, else what the project says."""
     wanted = [w.params["revision"] for w in _wishes if w.folder == folder and w.verb == "label checkout"]

@@ -22,6 +22,7 @@ VERBS = ("label prepare", "label propagate")
 
 _live: set[Path] = set()  # projects that are being labelled in this Blender
 _tried: dict[tuple[Path, str], int] = {}  # the revision for which the last propagation of a run was asked
+_undo: dict[Path, int] = {}  # how many steps to undo once all marks are steps
 
 
 def begin(settings: Any) -> None:
@@ -45,6 +46,11 @@ def mark(folder: Path, params: dict[str, Any], more: bool = False) -> None:
     wrong = pending.error(folder)
     if bpy.app.background and wrong is not None:
         raise wrong
+
+
+def undo_later(folder: Path) -> None:
+    """Undo a step as soon as the marks on their way are steps themselves: Blender would undo the one before them."""
+    _undo[folder] = _undo.get(folder, 0) + 1
 
 
 def taken(folder: Path, revision: int) -> None:
@@ -86,10 +92,26 @@ def _land() -> None:
             for scene in bpy.data.scenes:
                 if snapshot.folder_of(scene.fieldwork) == taken.folder:
                     scene.fieldwork.label_revision = taken.revision
-            if not bpy.app.background and not taken.more:
-                bpy.ops.ed.undo_push(message="Label")
+            if not taken.more:
+                _step("Label")
         if not bpy.app.background:
             redraw.panels()
+    for folder in [folder for folder in _undo if not pending.unfinished(folder)]:
+        steps = _undo.pop(folder)
+        if pending.error(folder) is None:  # else the last mark is none
+            _undo_steps(steps)
+
+
+def _step(message: str) -> None:
+    if not bpy.app.background:
+        bpy.ops.ed.undo_push(message=message)
+
+
+def _undo_steps(count: int) -> None:
+    with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):  # a timer has none
+        for _ in range(count):
+            if bpy.ops.ed.undo.poll():
+                bpy.ops.ed.undo()
 
 
 def _propagate(scene: bpy.types.Scene) -> None:
@@ -163,3 +185,4 @@ def unregister() -> None:
     ahead.clear()
     _live.clear()
     _tried.clear()
+    _undo.clear()

@@ -256,6 +256,66 @@ answer(seen)
     assert facts == [[0, 0], [1, 1], [2, 2], [1, 1], [0, 0], [1, 1], [3, 3]]
 
 
+def test_undo_of_a_mark_on_its_way_waits_until_it_is_a_step(bpy_script, tmp_path):
+    facts = bpy_script(
+        SETUP
+        + """
+from fieldwork.addon.errors import EngineError
+from fieldwork.addon.jobs.queue import queue
+from fieldwork.addon.labels import journal, pending, session
+from fieldwork.nerfcore.labels.journal import append_mark, show
+folder, answers = Path(project), []
+def engine(verb, params, on_done):
+    if verb == "label checkout":
+        show(folder, params["revision"])
+        on_done({"revision": params["revision"]}, None)
+    else:
+        values = {name: value for name, value in params.items() if name not in ("project", "revision")}
+        answers.append(lambda: on_done({"revision": append_mark(folder, values).revision}, None))
+        refusals.append(lambda: on_done(None, EngineError("input", "It lies outside the photo.")))
+queue.ask_and_wait, refusals = engine, []
+session._step = lambda message: bpy.ops.ed.undo_push(message=message)  # without a window nothing is one
+mark = lambda: session.mark(folder, {"photo": "a", "shape": "line", "points": [[1, 1]], "width": 2.0, "class_id": 1})
+look = lambda: [bpy.context.scene.fieldwork.label_revision, journal.shown(folder), bpy.ops.fieldwork.label_undo.poll()]
+settings.project = project
+session.begin(settings)
+bpy.ops.ed.undo_push(message="begin")
+seen = []
+def land():
+    seen.append(look())
+    answers.pop(0)()
+    session.work()
+    session.work()
+    seen.append(look())
+mark()
+land()
+mark()
+bpy.ops.fieldwork.label_undo()
+land()
+# Twice: the mark and the one before it.
+mark()
+bpy.ops.fieldwork.label_undo()
+bpy.ops.fieldwork.label_undo()
+land()
+# What the engine refuses is no step.
+mark()
+bpy.ops.fieldwork.label_undo()
+try:
+    refusals[-1]()
+    session.work()
+except EngineError:
+    pass
+seen.append(look())
+answer(seen)
+""",
+        project=project_without_marks(tmp_path / "p"),
+    )
+    on_the_way, taken = facts[0:-1:2], facts[1:-1:2]
+    assert on_the_way == [[0, 0, True], [1, 1, True], [1, 1, True]]
+    assert taken == [[1, 1, False], [1, 1, False], [0, 0, False]]
+    assert facts[-1] == [0, 0, False]
+
+
 def project_without_marks(folder: Path) -> Path:
     project_with_labels(folder)
     for path in (folder / "marks").iterdir():

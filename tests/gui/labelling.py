@@ -195,6 +195,17 @@ def undo(screen, desk):
         seen.append(desk.shown)
     yield from desk.settled()
     screen.facts["undo"] = [newest, seen, json.loads((desk.folder / "marks/shown.json").read_text())["revision"]]
+    # Ctrl-Z while the engine is still taking the mark, which is stopped so that there is time for it.
+    engine = screen.queue.link.process.pid
+    os.kill(engine, signal.SIGSTOP)
+    yield from desk.stroke(desk.plan["strokes"][-1]["points"])
+    on_the_way = len(desk.module("pending").marks_of(desk.folder))
+    yield from desk.key("Z", ctrl=True)
+    os.kill(engine, signal.SIGCONT)
+    yield from screen.wait(lambda: not desk.module("pending").unfinished(desk.folder), 20, "the mark was not taken")
+    yield from desk.settled()
+    count = len((desk.folder / "marks/journal.jsonl").read_text().splitlines())
+    screen.facts["undo at once"] = [on_the_way, count, desk.shown]
 
 
 def other_tools(screen, desk):
@@ -221,13 +232,14 @@ def other_tools(screen, desk):
 def part(screen, desk):
     """The outlines of the parts are shown, and a click takes a whole one; Ctrl-Z takes it back."""
     before, stroke = desk.shown, desk.plan["strokes"][-1]
+    count = len((desk.folder / "marks/journal.jsonl").read_text().splitlines())  # with those that were undone
     yield from desk.show(stroke["photo"])
     desk.settings.class_index = stroke["class"] - 1
     desk.settings.label_tool, desk.settings.label_level, desk.settings.label_view = "part", "coarse", "parts"
     yield 0.5
     screen.shot("parts")
     yield from desk.stroke(stroke["points"][:1])
-    yield from screen.wait(lambda: desk.shown == before + 4, 60, "the part is not marked")  # three were undone
+    yield from screen.wait(lambda: desk.shown == count + 1, 60, "the part is not marked")
     yield from desk.settled()
     screen.shot("part")
     mark = json.loads((desk.folder / "marks/journal.jsonl").read_text().splitlines()[-1])

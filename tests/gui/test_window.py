@@ -309,6 +309,7 @@ def test_labels_from_strokes_on_photos(suite):
     newest, seen, stored = facts["undo"]
     assert seen == [newest - 1, newest - 2, newest - 1, newest]
     assert stored == newest
+    assert facts["undo at once"] == [1, newest + 1, newest], "Ctrl-Z takes back the mark, not what was before it"
     click, erased, void = facts["tools"]
     assert (click["shape"], erased["erase"], void["class_id"], void["erase"]) == ("part", True, None, False)
     mark, revision = facts["part"]["mark"], facts["part"]["revision"]

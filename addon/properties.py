@@ -279,7 +279,11 @@ class FieldworkScene(LabelSettings, PropertyGroup):
         subtype="DIR_PATH",
     )
     faces: IntProperty(
-        name="Faces", description="Target number of triangles; 0: keep all", default=200_000, min=0, soft_max=2_000_000
+        name="Faces",
+        description="Target number of triangles, at least 100; 0: keep all",
+        default=200_000,
+        min=0,
+        soft_max=2_000_000,
     )
     all_faces: BoolProperty(
         name="All",

@@ -13,6 +13,7 @@ from ..files import is_text, name_problem, printable
 LARGEST_PICTURE = 32768  # pixels on a side
 MANY = 1_000_000  # photos, frames
 LONGEST_RUN = 1_000_000_000  # steps or seconds
+FEWEST_FACES, MOST_FACES = 100, 1_000_000_000  # of a mesh: fewer have no shape
 MASK_MODE = (
     "what black mask pixels mean; default: empty where masks cut an object out of nearly all photos, else ignore"
 )
@@ -36,6 +37,15 @@ Holdout = Annotated[
     ),
     AfterValidator(_leaves_some),
 ]
+
+
+def _enough_faces(faces: int) -> int:
+    if 0 < faces < FEWEST_FACES:
+        raise ValueError(f"{faces} is too few for a surface; give 0 for all there are, or {FEWEST_FACES} and more")
+    return faces
+
+
+FacesOrAll = Annotated[int, Field(ge=0, le=MOST_FACES), AfterValidator(_enough_faces)]
 
 
 def _checked_name(name: str) -> str:

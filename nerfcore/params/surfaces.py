@@ -7,14 +7,14 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from .base import Params, RunName, Split
+from .base import FEWEST_FACES, MOST_FACES, Params, RunName, Split
 
 
 class MeshParams(Params):
     project: Path
     run: RunName = "main"
     out: Path | None = None
-    faces: int | None = Field(default=None, gt=0, le=1_000_000_000, description="target number of triangles")
+    faces: int | None = Field(default=None, ge=FEWEST_FACES, le=MOST_FACES, description="target number of triangles")
     resolution: int | None = Field(
         default=None,
         ge=16,

@@ -7,7 +7,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from .base import LONGEST_RUN, MANY, MASK_MODE, Holdout, Params, Preset
+from .base import LONGEST_RUN, MANY, MASK_MODE, FacesOrAll, Holdout, Params, Preset
 
 
 class ReconstructParams(Params):
@@ -27,7 +27,7 @@ class ReconstructParams(Params):
     )
     holdout: Holdout = 8
     set: dict[str, str] = Field(default_factory=dict)
-    faces: int = Field(default=200_000, ge=0, le=1_000_000_000, description="triangles of the mesh; 0: all there are")
+    faces: FacesOrAll = Field(default=200_000, description="triangles of the mesh; 0: all there are")
     texture: int = Field(
         default=4096, ge=0, le=16384, description="size of the mesh's texture in pixels; 0: vertex colours only"
     )
@@ -74,7 +74,7 @@ class BlocksParams(Params):
     )
     set: dict[str, str] = Field(default_factory=dict)
     holdout: Holdout = 8
-    faces: int = Field(default=200_000, ge=0, le=1_000_000_000, description="triangles of each block; 0: all there are")
+    faces: FacesOrAll = Field(default=200_000, description="triangles of each block; 0: all there are")
     resolution: int = Field(default=512, ge=16, le=2048, description="cells along the longest side of a block")
     out: Path | None = Field(default=None, description="file for the whole mesh: .ply, .obj, .glb, .stl, .usdc")
     texture: int | None = Field(

@@ -8,13 +8,14 @@ from typing import Any
 import pytest
 from fieldwork.nerfcore.capture.ingest import new
 from fieldwork.nerfcore.geometry.cameras import Camera
-from fieldwork.nerfcore.params import NewParams, Params, ReconstructParams
+from fieldwork.nerfcore.params import MeshParams, NewParams, Params, ReconstructParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.store import load_project
 from fieldwork.nerfcore.verdict import verdict
 from fieldwork.nerfcore.workflows import reconstruct as module
 from fieldwork.tests.nerfcore.support.photos import folder_of
 from PIL import Image
+from pydantic import ValidationError
 
 
 class Reached(Exception):
@@ -80,6 +81,15 @@ def test_the_mesh_is_of_a_size_one_can_use(
 ) -> None:
     seen, _ = all_stages(monkeypatch, tmp_path, {}, **asked)
     assert (seen["mesh"].faces, seen["mesh"].texture) == made
+
+
+def test_too_few_triangles_are_refused_before_any_work(tmp_path: Path) -> None:
+    photos = folder_of(tmp_path / "photos", 3)
+    with pytest.raises(ValidationError, match="3 is too few for a surface; give 0 for all there are, or 100 and more"):
+        ReconstructParams(photos=photos, out=tmp_path / "p", faces=3)
+    with pytest.raises(ValidationError, match="greater than or equal to 100"):
+        MeshParams(project=tmp_path, faces=99)
+    assert MeshParams(project=tmp_path, faces=100).faces == 100
 
 
 def test_as_many_views_are_rendered_as_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

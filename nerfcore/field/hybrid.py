@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -196,6 +197,14 @@ class HybridField(nn.Module):
         if not torch.is_grad_enabled() and self.on_host(points.device):
             return self._density_of(self._host_field().read(points, False, False)[0], points)
         return self.geometry(points).density
+
+    def density_along(self, points: torch.Tensor, deltas: torch.Tensor, packed_info: PackedInfo) -> torch.Tensor:
+        """Density (N,) of packed samples at points (N, 3) of lengths deltas (N,), without gradients. On the CPU what lies
+        behind where a ray is opaque is not read and has 0."""
+        with torch.no_grad():
+            if self.on_host(points.device):
+                return self._host_field().render(points, deltas, packed_info, math.inf, False)[0].clamp_(min=0)
+            return self.density(points)
 
     def color(self, geometry: Geometry, directions: torch.Tensor, codes: torch.Tensor | None = None) -> torch.Tensor:
         """Colour (N, 3) in [0, 1]; `directions` (N, 16) spherical harmonics, `codes` (N, A) appearance."""

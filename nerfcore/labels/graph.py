@@ -62,14 +62,20 @@ def standardised(columns: np.ndarray) -> np.ndarray:
     return (columns - columns.mean(0)) / np.maximum(columns.std(0), 1e-6)
 
 
-def make_graph(surfels: Surfels, neighbours: np.ndarray) -> Graph:
-    """The graph of surfels with these neighbours (N, K), by colour, normal and features of the field; and that of
-    the cells of a coarser grid, whose weights are sums."""
+def unlikeness(surfels: Surfels, neighbours: np.ndarray) -> np.ndarray:
+    """How much (N, K) surfels differ from their neighbours (N, K): squared distances of colour, normal and features of the
+    field, each in units of its median, in sum."""
     total = np.zeros(neighbours.shape, np.float32)
     for values in (surfels.lab, surfels.normal, surfels.field):
         square = ((values[neighbours] - values[:, None]) ** 2).sum(2)
         total += square / max(float(np.median(square)), 1e-12)
-    edges = edge_matrix(neighbours, np.exp(-total / EDGE_SCALE))
+    return total
+
+
+def make_graph(surfels: Surfels, neighbours: np.ndarray, unlike: np.ndarray) -> Graph:
+    """The graph of surfels with these neighbours (N, K), which are as `unlike` (N, K) as `unlikeness` says; and that of the
+    cells of a coarser grid, whose weights are sums."""
+    edges = edge_matrix(neighbours, np.exp(-unlike / EDGE_SCALE))
     cell, count = cell_of(np.asarray(surfels.position, np.float64), min(CELLS, max(1, len(surfels) // 4)))
     return Graph(edges, joined(edges, cell, count), cell.astype(np.int32))
 

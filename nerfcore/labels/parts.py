@@ -8,29 +8,21 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import minimum_spanning_tree
 
-from .surfels import Surfels
-
 # Of each level; see experiments.md, “Labels from a few strokes”.
 STIFFNESS = (2.0, 10.0)  # k, in units of the median difference of neighbours
 LEAST = (10, 50)  # surfels of a part
 CHECKED = 50_000  # edges between two looks at whether to stop
 
 
-def surface_parts(surfels: Surfels, neighbours: np.ndarray, check: Callable[[], None] = lambda: None) -> np.ndarray:
-    """Number (N, 2) int32 of the part that each surfel is of, at the fine and at the coarse level.
-
-    Neighbours (N, K) differ by colour, normal and features of the field.
-    """
-    total = np.zeros(neighbours.shape, np.float32)
-    for values in (surfels.lab, surfels.normal, surfels.field):
-        square = ((values[neighbours] - values[:, None]) ** 2).sum(2)
-        total += square / max(float(np.median(square)), 1e-12)
-    difference = np.sqrt(total)
+def surface_parts(neighbours: np.ndarray, unlike: np.ndarray, check: Callable[[], None] = lambda: None) -> np.ndarray:
+    """Number (N, 2) int32 of the part that each surfel is of, at the fine and at the coarse level, by its neighbours (N, K)
+    and how `unlike` (N, K) they are (`graph.unlikeness`)."""
+    difference = np.sqrt(unlike)
     difference /= max(float(np.median(difference)), 1e-6)
     tree = spanning_tree(neighbours, difference)
-    return np.stack([segments(len(surfels), *tree, k, least, check) for k, least in zip(STIFFNESS, LEAST)], 1).astype(
-        np.int32
-    )
+    return np.stack(
+        [segments(len(neighbours), *tree, k, least, check) for k, least in zip(STIFFNESS, LEAST)], 1
+    ).astype(np.int32)
 
 
 def spanning_tree(neighbours: np.ndarray, difference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -73,9 +65,13 @@ def segments(
         size[a] += size[b]
         limit[a] = value + stiffness / size[a]
 
-    pairs, values = edges.tolist(), difference.tolist()
     for small in (False, True):
-        for number, ((first, second), value) in enumerate(zip(pairs, values)):
+        if small:  # what is as large already stays as it is
+            own = np.array([root(node) for node in range(count)])
+            ends = np.bincount(own, minlength=count)[own[edges]]
+            asked = (ends.min(1) < least) & (own[edges[:, 0]] != own[edges[:, 1]])
+            edges, difference = edges[asked], difference[asked]
+        for number, ((first, second), value) in enumerate(zip(edges.tolist(), difference.tolist())):
             if number % CHECKED == 0:
                 check()
             a, b = root(first), root(second)

@@ -44,7 +44,7 @@ from ..project.runs import geometry_id, run_folder
 from ..project.store import load_project, world_from_sfm
 from ..render.run import Trained, load_info, load_trained, refined_poses
 from ..render.sparse_rays import sparse_rays
-from .graph import Graph, feature_columns, joined, make_graph
+from .graph import Graph, feature_columns, joined, make_graph, unlikeness
 from .likeness import likeness
 from .lookup import RECORD, UNREADABLE, part_of, photo_maps
 from .lookup import SURFELS as FOLDER
@@ -356,7 +356,8 @@ def surfel_arrays(
         pixels=np.bincount(number, minlength=surfels).astype(np.int32),
     )
     report.progress(0.8)
-    graph = make_graph(made, neighbours)
+    unlike = unlikeness(made, neighbours)
+    graph = make_graph(made, neighbours, unlike)
     report.progress(0.9)
     pixel_surfel = np.full(len(solid), -1, np.int32)
     pixel_surfel[clear] = number
@@ -365,7 +366,7 @@ def surfel_arrays(
     if telling:
         beside = pixel_surfel[torn]
         pixel_surfel[torn] = most_alike(beside, grid[torn], lab[torn], position, color, neighbours, report.check)
-    parts = surface_parts(made, neighbours, report.check)
+    parts = surface_parts(neighbours, unlike, report.check)
     matrices = {"edges": graph.edges, "coarse": graph.coarse, "part_edges": joined(graph.edges, parts[:, 0])}
     return {
         **vars(made),

@@ -79,7 +79,8 @@ def ray_distances(
         valid = ~directions[:, 0].isnan()
         directions = torch.where(valid[:, None], directions, axis.expand_as(directions)).contiguous()
         s = sample(origins, directions, grid.cells, grid.skip_distance, grid.settings, count)
-        near, middle, far, opacity = depth_quantiles(model.field.density(s.points), s.deltas, s.t, s.packed_info)
+        density = model.field.density_along(s.points, s.deltas, s.packed_info)
+        near, middle, far, opacity = depth_quantiles(density, s.deltas, s.t, s.packed_info)
         # A ray that stays more transparent than 1/4 has no third quantile: it is unsure as well.
         spread = torch.where(far > 0, far - near, middle)
         return torch.stack([torch.where(valid & (opacity >= OPAQUE), middle, 0.0), spread], 1)

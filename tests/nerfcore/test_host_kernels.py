@@ -12,7 +12,9 @@ from fieldwork.nerfcore.field.encoding import encoded_positions, frequency_encod
 from fieldwork.nerfcore.field.hybrid import HybridField
 from fieldwork.nerfcore.kernels import cells, march, network_host
 from fieldwork.nerfcore.kernels.device import using_kernels
+from fieldwork.nerfcore.kernels.field_host import EARLY_STOP
 from fieldwork.nerfcore.kernels.inputs_host import blend_weights, encode_frequencies
+from fieldwork.nerfcore.kernels.packed_info import PackedInfo
 from fieldwork.nerfcore.kernels.traversal import PDF_DEFAULT, PDF_LITERAL, PDF_UNIFORM, MarchSettings, skip_distances
 
 CORNERS = torch.tensor([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
@@ -130,6 +132,24 @@ def test_a_field_is_read_as_its_separate_operations_read_it(
                 for a, b in zip(vars(ours).values(), vars(theirs).values()):
                     assert (a is None) == (b is None)
                     assert a is None or relative(a, b) < 1e-4
+
+
+def test_the_density_along_rays_is_read_until_they_are_opaque() -> None:
+    torch.manual_seed(4)
+    field = HybridField(FieldConfig(precision="float32", levels=3, finest=64, octaves=4, density_shift=0.0), 0)
+    counts = torch.tensor([40, 0, 25, 60], dtype=torch.int32)
+    starts = torch.tensor([0, 40, 40, 65], dtype=torch.int32)
+    points, deltas = points_of(125), torch.full((125,), 0.5)
+    rays = PackedInfo(starts, counts, torch.repeat_interleave(torch.arange(4, dtype=torch.int32), counts.long()))
+    found, every = field.density_along(points, deltas, rays), field.density(points).detach()
+    for start, count in zip(starts.tolist(), counts.tolist()):
+        own = every[start : start + count]
+        passed = torch.cumsum(own * deltas[:count], 0)
+        seen = torch.cat([torch.ones(1), torch.exp(-passed)])[:count] >= EARLY_STOP
+        assert count == 0 or 0 < seen.sum() < count, "the ray becomes opaque on its way"
+        torch.testing.assert_close(found[start : start + count], own * seen, rtol=1e-4, atol=1e-6)
+    with using_kernels("torch"):
+        torch.testing.assert_close(field.density_along(points, deltas, rays), every, rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.parametrize("contracted", [False, True])

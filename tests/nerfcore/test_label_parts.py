@@ -11,6 +11,7 @@ import pytest
 from fieldwork.nerfcore.cli import main
 from fieldwork.nerfcore.errors import Cancelled, InputError
 from fieldwork.nerfcore.images.working import read_image
+from fieldwork.nerfcore.labels.graph import unlikeness
 from fieldwork.nerfcore.labels.journal import read_marks
 from fieldwork.nerfcore.labels.lookup import outlines
 from fieldwork.nerfcore.labels.part_picture import parts
@@ -48,7 +49,8 @@ def plane(columns: int = 60, rows: int = 40) -> tuple[Surfels, np.ndarray]:
 
 def test_parts_end_where_looks_change() -> None:
     surfels, kind = plane()
-    found = surface_parts(surfels, nearest_neighbours(surfels.position))
+    neighbours = nearest_neighbours(surfels.position)
+    found = surface_parts(neighbours, unlikeness(surfels, neighbours))
     assert found.shape == (len(kind), 2)
     for level in (0, 1):
         number = found[:, level]

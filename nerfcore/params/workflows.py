@@ -136,6 +136,9 @@ class BenchParams(Params):
         default="quick",
         description="evidence: which budget, a quarter of an hour, an evening, a day on a CPU, or a GPU's",
     )
+    add_to_page: bool = Field(
+        default=False, description="evidence: what stands on the page counts as measured; what it lacks is added"
+    )
     lpips: Path | None = Field(
         default=None, description="evidence: torchvision's weights of VGG-16 for LPIPS; default: not measured"
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -149,6 +150,16 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, 
         before = {p: p.stat().st_mtime_ns for p in (folder / "out" / "evidence" / "trials").glob("*.json")}
         run_verb("bench", params, Recorder())
         assert before == {p: p.stat().st_mtime_ns for p in before}
+        record = json.loads((folder_of(page) / "quick.json").read_text("utf-8"))
+        lacking = [row for row in record["rows"] if (row["table"], row["trial"]["seed"]) != ("noise", 1)]
+        copied = folder / "copied" / "docs" / "evidence.md"
+        shutil.copytree(page.parent, copied.parent)
+        (folder_of(copied) / "quick.json").write_text(json.dumps({**record, "rows": lacking}), encoding="utf-8")
+        elsewhere = params.model_copy(update={"out": folder / "elsewhere", "page": copied, "add_to_page": True})
+        only = elsewhere.model_copy(update={"tables": ["rays"]})
+        run_verb("bench", only, Recorder())
+        assert "11 of 12 trials are measured" in copied.read_text("utf-8")
+        run_verb("bench", elsewhere, Recorder())
     return folder, result, page, notes
 
 
@@ -175,6 +186,26 @@ def test_a_profile_is_measured_once_and_told(measured: tuple[Path, dict[str, Any
         assert 0 <= by[name]["boundary_iou"] <= 1
     assert 0 < by["ours"]["depth_error"] < 1
     assert over_seeds(record["rows"], "psnr", variant="ours", noise=0.05).count == 2  # type: ignore[union-attr]
+
+
+def test_a_page_is_added_to_where_the_trials_are_gone(measured: tuple[Path, dict[str, Any], Path, list[str]]) -> None:
+    """Only what the page lacks is trained; its other rows and plots stay as they are."""
+    folder, _, page, notes = measured
+    assert sum("1 of 12 trials to do" in note for note in notes) == 1
+    assert sum("0 of 2 trials to do" in note for note in notes) == 1
+    copied = folder / "copied" / "docs" / "evidence.md"
+    old, new = (json.loads((folder_of(p) / "quick.json").read_text("utf-8"))["rows"] for p in (page, copied))
+    anew = [row for row in new if (row["table"], row["trial"]["noise"], row["trial"]["seed"]) == ("noise", 0.05, 1)]
+    assert len(anew) == 1
+    assert anew[0] not in old
+    assert [row for row in new if row not in anew] == [row for row in old if row["trial"] != anew[0]["trial"]]
+    assert "trials are measured" not in copied.read_text("utf-8")
+    assert (folder_of(copied) / "quick-crops.png").read_bytes() == (folder_of(page) / "quick-crops.png").read_bytes()
+
+
+def test_adding_needs_a_page(tmp_path: Path) -> None:
+    with pytest.raises(SettingError, match="page"):
+        run_verb("bench", BenchParams(suite="evidence", out=tmp_path, add_to_page=True), Reporter())
 
 
 def test_the_page_has_a_table_for_each_published_one(measured: tuple[Path, dict[str, Any], Path, list[str]]) -> None:

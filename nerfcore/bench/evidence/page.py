@@ -78,9 +78,8 @@ def check_page(page: Path) -> None:
 
 def add_results(page: Path, record: dict[str, Any], pictures: Path) -> list[Path]:
     """Store a record with its plots beside the page, in the place of that of the same profile; returns the files."""
-    kept = [{key: value for key, value in row.items() if key != "curve"} for row in record["rows"]]
     path = folder_of(page) / f"{record['profile']}.json"
-    write_json(path, {**record, "rows": kept})
+    write_json(path, record)
     return [path, *write_plots(record, pictures, folder_of(page))]
 
 

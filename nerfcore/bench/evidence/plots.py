@@ -55,16 +55,19 @@ def _colour(variants: list[str], variant: str) -> str:
 
 
 def _time(record: dict[str, Any]) -> Any:
-    """PSNR of the rays being trained on, over the budget's seconds; a line a seed."""
+    """PSNR of the rays being trained on, over the budget's seconds; a line a seed.
+
+    None where a row has no curve, which records of before did not keep: a plot that has it stays.
+    """
     rows = finished(record, "time")
-    if not rows:
+    if not rows or any(not row.get("curve") for row in rows):
         return None
     scenes, variants = distinct(rows, "scene"), distinct(rows, "variant")
     figure, axes = _axes(len(scenes))
     for axis, scene in zip(axes, scenes):
         for row in rows:
             trial = row["trial"]
-            if trial["scene"] != scene or not row["curve"]:
+            if trial["scene"] != scene:
                 continue
             label = title_of(trial["variant"]) if trial["seed"] == min(distinct(rows, "seed")) else None
             curve = np.array(row["curve"])
@@ -140,9 +143,12 @@ def _ablation(record: dict[str, Any]) -> Any:
 
 
 def _crops(record: dict[str, Any], pictures: Path) -> Any:
-    """One held-out photo of each scene beside the renders of all methods, seed by seed the first."""
+    """One held-out photo of each scene beside the renders of all methods, of the first seed.
+
+    None where a render is not there, as of trials that ran elsewhere: a plot that has it stays.
+    """
     rows = finished(record, "time")
-    if not rows:
+    if not rows or not all((pictures / name).is_file() for row in rows for name in row["pictures"]):
         return None
     from matplotlib.figure import Figure
 

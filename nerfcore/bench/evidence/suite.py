@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,17 +16,21 @@ from ...params import BenchParams
 from ...progress import Reporter
 from ..machine import describe
 from ..scenes import available, data_folder, is_labelled, prepare, scene_name
-from .page import add_results, check_page, write_page
+from .page import add_results, check_page, folder_of, read_records, write_page
 from .perceptual import Perceptual
 from .protocol import Trial, expected_seconds, planned, protocol, trials_of
-from .trial import failed, run_trial, stored
+from .summary import trial_of
+from .trial import failed, run_trial, stored, trial_file
 
 
 def evidence_suite(params: BenchParams, out: Path, root: Path, command: str, report: Reporter) -> dict[str, Any]:
     """Run a profile of the protocol, or what is missing of it.
 
+    The page is written after each trial, so that a stopped run leaves what it measured.
+
     Args:
-        out: folder of the suite; a trial whose figures are there is not repeated. root: where the scenes are.
+        out: folder of the suite; a trial whose figures are there is not repeated, nor, with `add_to_page`, one on the
+            page. root: where the scenes are.
     Returns:
         {"suite", "machine", "runs", "failed", "rows", "notes", "files"}
     Raises:
@@ -34,6 +40,10 @@ def evidence_suite(params: BenchParams, out: Path, root: Path, command: str, rep
         raise SettingError("The suite evidence is limited by seconds or rays, not by steps.", "Leave out --steps.")
     if params.page is not None:
         check_page(params.page)
+    if params.add_to_page:
+        if params.page is None:
+            raise SettingError("add_to_page needs the page that is added to.", "Name it with --page.")
+        _adopt(params.page, params.profile, out)
     asked = trials_of(
         params.profile, params.scenes, params.variants, params.seeds, params.seconds, params.set, params.tables
     )
@@ -46,19 +56,20 @@ def evidence_suite(params: BenchParams, out: Path, root: Path, command: str, rep
     out.mkdir(parents=True, exist_ok=True)
     try:
         with FileLock(out / ".lock", timeout=0):
-            results = _run(trials, params.profile, projects, out, perceptual, report)
+            shown, shown_command = tables, command
+            if params.add_to_page:  # all of the profile that there is, whatever part is measured now
+                shown = list(
+                    {(t, trial.name): (t, trial) for t, trial in [*trials_of(params.profile), *tables]}.values()
+                )
+                shown_command = f"fieldwork bench --suite evidence --profile {params.profile}"
+            keep = partial(_kept, params, out, shown_command, shown, notes)
+            results = _run(trials, params.profile, projects, out, perceptual, keep, report)
     except Timeout as error:
         hint = "Wait for it, or choose another folder: trainings beside each other would change the times."
         raise InputError(f"Another benchmark is at work in {out}.", hint) from error
     good = [result for result in results.values() if "error" not in result]
     rows = [{"table": table, **results[trial.name]} for table, trial in tables]
-    record = {"profile": params.profile, "command": command, "rows": rows, "notes": notes}
-    files = [out / f"{params.profile}.json"]
-    write_json(files[0], record)
-    if params.page is not None:
-        files += add_results(params.page, record, out / "pictures")
-        write_page(params.page)
-        files.append(params.page)
+    files = keep(results)
     return {
         "suite": "evidence",
         "machine": describe(),
@@ -68,6 +79,43 @@ def evidence_suite(params: BenchParams, out: Path, root: Path, command: str, rep
         "notes": notes,
         "files": [str(path) for path in files],
     }
+
+
+def _adopt(page: Path, profile: str, out: Path) -> None:
+    """Write the figures on a page as finished trials into the suite's folder `out`, where it has none of them.
+
+    Raises:
+        InputError: the page's record cannot be read.
+    """
+    record = next((r for r in read_records(folder_of(page)) if r["profile"] == profile), {"rows": []})
+    for row in record["rows"]:
+        trial = trial_of(row)
+        if "error" not in row and stored(trial, out) is None:
+            figures = {key: value for key, value in row.items() if key != "table"}
+            write_json(trial_file(trial, out), figures)
+
+
+def _kept(
+    params: BenchParams,
+    out: Path,
+    command: str,
+    tables: list[tuple[str, Trial]],
+    notes: list[str],
+    results: dict[str, dict[str, Any]],
+) -> list[Path]:
+    """Write the record of what is measured by now, and the page with it; returns the files."""
+    found = {trial.name: results.get(trial.name) or stored(trial, out) for _, trial in tables}
+    rows = [{"table": table, **known} for table, trial in tables if (known := found[trial.name]) is not None]
+    left = sum(known is None for known in found.values())
+    part = [f"{len(found) - left} of {len(found)} trials are measured."] if left else []
+    record = {"profile": params.profile, "command": command, "rows": rows, "notes": [*notes, *part]}
+    files = [out / f"{params.profile}.json"]
+    write_json(files[0], record)
+    if params.page is not None:
+        files += add_results(params.page, record, out / "pictures")
+        write_page(params.page)
+        files.append(params.page)
+    return files
 
 
 def _projects(params: BenchParams, root: Path, names: list[str], report: Reporter) -> tuple[dict[str, Path], list[str]]:
@@ -96,9 +144,10 @@ def _run(
     projects: dict[str, Path],
     out: Path,
     perceptual: Perceptual | None,
+    keep: Callable[[dict[str, dict[str, Any]]], object],
     report: Reporter,
 ) -> dict[str, dict[str, Any]]:
-    """Figures by the trial's name; a trial that fails does not stop the others."""
+    """Figures by the trial's name, kept after each trial; one that fails does not stop the others."""
     known = {trial.name: stored(trial, out) for trial in trials}
     for line in planned(trials, profile, [known[trial.name] is not None for trial in trials]):
         report.note(line)
@@ -115,6 +164,7 @@ def _run(
             except FieldworkError as error:
                 report.warn(f"{title} failed: {error}")
                 found = failed(trial, error)
+            keep({**results, trial.name: found})
         results[trial.name] = found
         done += share
         report.progress(min(done, 1.0), title)

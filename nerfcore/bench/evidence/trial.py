@@ -34,9 +34,13 @@ def _peak(device: torch.device) -> int | None:
     return round(torch.cuda.max_memory_allocated(device) / 2**20) if device.type == "cuda" else None
 
 
+def trial_file(trial: Trial, out: Path) -> Path:
+    return out / "trials" / f"{trial.name}.json"
+
+
 def stored(trial: Trial, out: Path) -> dict[str, Any] | None:
     """The figures of a trial that was finished before."""
-    path = out / "trials" / f"{trial.name}.json"
+    path = trial_file(trial, out)
     if not path.is_file():
         return None
     found = json.loads(path.read_text(encoding="utf-8"))
@@ -71,7 +75,7 @@ def run_trial(
         "memory_training_mb": training,
         "memory_rendering_mb": _peak(device),
     }
-    write_json(out / "trials" / f"{trial.name}.json", result)
+    write_json(trial_file(trial, out), result)
     return result
 
 

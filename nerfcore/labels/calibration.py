@@ -17,6 +17,7 @@ SCALE = 4.2  # exponent by what is found for the classifier: SCALE · τ
 STRENGTH = 0.003  # γ of the prior, of the median of what edges conduct, where marks cannot tell
 TAUS = np.linspace(0.05, 1.5, 30)
 LEAST, MOST = 0.3, 4.0  # exponents
+HELD = 1.4  # most where looks count more than STRENGTH: a walker that they hold hardly strays
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ def certainty(
     Args:
         features: (S, F) of the marked surfels. strength: of their looks in the random walker.
     """
-    most = 1 + (MOST - 1) * STRENGTH / strength  # the more looks count, the less a walker strays
+    most = MOST if strength <= STRENGTH else HELD
     found, right, share = [], [], []
     photos = np.unique(seeds.photo) if len(seeds.photo) else []
     for photo in photos if len(photos) > 1 else []:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from fieldwork.nerfcore.labels.calibration import CERTAINTY, LEAST, MOST, certainty, likeliest_power
+from fieldwork.nerfcore.labels.calibration import CERTAINTY, HELD, LEAST, MOST, STRENGTH, certainty, likeliest_power
 from fieldwork.nerfcore.labels.seeds import VOID, Seeds
 
 
@@ -55,6 +55,14 @@ def test_where_marks_cannot_tell_the_usual_holds() -> None:
     assert found(features, void) == CERTAINTY
     nothing = Seeds(*(np.zeros(0, np.int32) for _ in range(3)), [], [])
     assert found(features[:0], nothing) == CERTAINTY
+
+
+def test_a_walker_that_looks_hold_is_less_sure() -> None:
+    clear = scene(0.0)
+    usual, held = (certainty(*clear, 2, lambda: None, strength=s).exponent for s in (STRENGTH, 3 * STRENGTH))
+    assert held == HELD < usual
+    misled = certainty(*scene(5.0), 2, lambda: None, strength=3 * STRENGTH).exponent
+    assert misled < 1, "marks that mislead count more"
 
 
 def test_the_likeliest_power_makes_shares_right() -> None:

@@ -1,5 +1,6 @@
 """`python -m nerfcore serve` is the engine; every other verb is the command line's."""
 
+import gc
 import os
 import signal
 import sys
@@ -22,6 +23,7 @@ def main() -> None:
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)
+    gc.freeze()  # at its end Python looks for garbage in all that libraries made: up to a second
     sys.exit(code)
 
 

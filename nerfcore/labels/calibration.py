@@ -13,7 +13,7 @@ from .unary import class_probabilities
 
 # See experiments.md, “Labels from a few strokes”.
 CERTAINTY = 3.0  # exponent that makes confidence the share that is right, where marks cannot tell
-SCALE = 4.2  # exponent by what is found for the classifier: SCALE · τ
+SCALE = 4.5  # exponent by what is found for the classifier: SCALE · τ
 STRENGTH = 0.003  # γ of the prior, of the median of what edges conduct, where marks cannot tell
 TAUS = np.linspace(0.05, 1.5, 30)
 LEAST, MOST = 0.3, 4.0  # exponents

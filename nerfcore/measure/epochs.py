@@ -7,9 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
-from matplotlib import colormaps
-from trimesh.exchange.ply import export_ply
 
 from ..errors import ProjectError
 from ..files import atomic_path, write_json
@@ -167,6 +164,8 @@ def _area(subject: Subject, class_id: int | None) -> Area:
 def distance_colors(distance: np.ndarray, unit: str) -> tuple[np.ndarray, list[Entry]]:
     """Colours (N, 3) uint8 of distances (N,) from blue (less) over white to red (more), and their legend; the scale ends
     where 98 % of them lie."""
+    from matplotlib import colormaps  # only where distances are drawn: it takes long
+
     found = distance[np.isfinite(distance)]
     reach = max(float(np.quantile(np.abs(found), 0.98)), 1e-9)
     ramp = colormaps["RdBu_r"]
@@ -183,6 +182,9 @@ def distance_colors(distance: np.ndarray, unit: str) -> tuple[np.ndarray, list[E
 def write_distances(path: Path, surface: Surface, distance: np.ndarray, colors: np.ndarray) -> Path:
     """Write the mesh as PLY with the float attribute `distance` of each vertex (NaN: nothing to compare with). Raises
     DiskError."""
+    import trimesh  # the library takes its time to load
+    from trimesh.exchange.ply import export_ply
+
     mesh = trimesh.Trimesh(
         surface.vertices,
         surface.faces,

@@ -1,20 +1,22 @@
-"""A drawing on paper at a stated scale: picture, section lines, grid with coordinates, scale bar, legend."""
+"""A drawing on paper at a stated scale: picture, section lines, grid with coordinates, scale bar, legend.
+
+Matplotlib takes long to load: only what draws loads it.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib import rc_context
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 
 from ..errors import SettingError
 from ..files import atomic_path
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 MM = 1 / 25.4  # inches
 DPI = 200
@@ -120,6 +122,10 @@ def write_sheet(stem: Path, sheet: Sheet) -> list[Path]:
 
 def _figure(sheet: Sheet) -> Figure:
     """The sheet as a figure whose axes are as large on paper as the scale says."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.collections import LineCollection
+    from matplotlib.figure import Figure
+
     extent = sheet.high - sheet.low
     drawn = extent * 1000 / sheet.scale
     width, height = np.maximum(drawn, SMALLEST) + [LEFT + RIGHT, TOP + BOTTOM]
@@ -158,6 +164,8 @@ def _figure(sheet: Sheet) -> Figure:
 
 def _hatched(axes: Axes, zone: Zone, sheet: Sheet) -> None:
     """A zone as outlines and hatching, which stay lines in SVG and PDF."""
+    from matplotlib import rc_context
+
     height, width = zone.mask.shape
     step = (sheet.high - sheet.low) / [width, height]
     # With a border around it, so that what reaches the side is closed too.
@@ -173,6 +181,8 @@ def _hatched(axes: Axes, zone: Zone, sheet: Sheet) -> None:
 
 def _scale_bar(figure: Figure, sheet: Sheet, width: float, height: float) -> None:
     """Four alternating fields below the drawing, of a round length."""
+    from matplotlib.patches import Rectangle
+
     length = nice_step(50.0 * sheet.scale / 1000, 1) / 4
     if 4 * length * 1000 / sheet.scale > 60:
         length /= 2
@@ -192,6 +202,8 @@ def _scale_bar(figure: Figure, sheet: Sheet, width: float, height: float) -> Non
 
 
 def _legend(figure: Figure, sheet: Sheet, width: float, height: float) -> None:
+    from matplotlib.patches import Rectangle
+
     left = (width - RIGHT + 4) / width
     top = height - TOP
     if sheet.heading:

@@ -134,6 +134,9 @@ class FIELDWORK_OT_bench(VerbOperator):
             ("evidence", "Evidence", "The published tables beside other methods, by a protocol"),
             ("gpu", "GPU", "What is asked of a graphics card"),
             ("surface", "Surfaces", "Textured meshes of simulated scenes beside their true surfaces"),
+            ("labels", "Labels", "Scenes labelled by a few strokes of a simulated annotator"),
+            ("measures", "Measures", "How often the true area lies in the interval that is given"),
+            ("live", "Live View", "Baked fields: time, size, and what is lost"),
         ],
     )
     out: StringProperty(name="Folder", description="Folder for results and scenes", subtype="DIR_PATH")
@@ -170,6 +173,9 @@ class FIELDWORK_OT_bench(VerbOperator):
         ],
     )
     tables: StringProperty(name="Tables", description="Evidence: only these tables, separated by commas; empty: all")
+    add_to_page: BoolProperty(
+        name="Add to Page", description="Evidence: what stands on the page counts as measured; what it lacks is added"
+    )
     lpips: StringProperty(
         name="LPIPS", description="Evidence: torchvision's weights of VGG-16; empty: not measured", subtype="FILE_PATH"
     )
@@ -192,6 +198,7 @@ class FIELDWORK_OT_bench(VerbOperator):
             "keep": self.keep,
             "profile": self.profile,
             "tables": _words(self.tables),
+            "add_to_page": self.add_to_page,
             **{name: absolute(getattr(self, name)) for name in ("out", "data", "yardstick", "page", "tests", "lpips")},
         }
 

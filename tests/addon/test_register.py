@@ -29,6 +29,7 @@ def run(script: str, **environment: str) -> dict:
     return json.loads(done.stdout.splitlines()[-1])
 
 
+ADDING = 0.025  # seconds in which an ordinary machine adds a million numbers one by one
 REGISTER = """
     import json, os, sys, time
     import bpy
@@ -37,7 +38,14 @@ REGISTER = """
     import fieldwork
     fieldwork.register()
     busy = time.process_time() - busy_since
-    print(json.dumps({"busy": busy, "new": sorted(set(sys.modules) - before)}))
+
+    def adding():
+        since, total = time.process_time(), 0
+        for number in range(10**6):
+            total += number
+        return time.process_time() - since
+
+    print(json.dumps({"busy": busy, "adding": min(adding() for _ in range(3)), "new": sorted(set(sys.modules) - before)}))
     sys.stdout.flush()
     os._exit(0)
     """
@@ -53,8 +61,8 @@ def test_enabling_takes_less_than_50_ms_and_imports_nothing_heavy(tmp_path):
         foreign = {name.partition(".")[0] for name in facts["new"]} - {"fieldwork", "bpy"}
         assert foreign & {"torch", "pycolmap", "OpenImageIO", "pydantic", "warp", "av", "PIL", "scipy"} == set()
         assert foreign & {"numpy", "subprocess", "tempfile", "logging", "urllib", "hashlib", "ssl"} == set()
-    # Processor time: other programs on the machine do not count.
-    assert min(facts["busy"] for facts in runs) < 0.05
+    # Processor time: other programs on the machine do not count; slower where Python is, on old or throttled processors.
+    assert min(facts["busy"] / max(1.0, facts["adding"] / ADDING) for facts in runs) < 0.05
 
 
 def test_nothing_is_left_after_unregister():

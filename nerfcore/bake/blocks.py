@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from functools import partial, reduce
 
 import numpy as np
+import scipy
 import torch
-from scipy.ndimage import distance_transform_cdt
 
 from ..data.camera_rays import CameraRays
 from ..geometry.contraction import uncontract
@@ -50,7 +50,7 @@ class Blocks:
         empty = np.ones((n, n, n), bool)
         x, y, z = self.places.cpu().numpy().T
         empty[z, y, x] = False
-        away = distance_transform_cdt(empty, "chessboard") if len(self) else np.full(empty.shape, n)
+        away = scipy.ndimage.distance_transform_cdt(empty, "chessboard") if len(self) else np.full(empty.shape, n)
         index = torch.from_numpy(-np.asarray(away, np.int32)).reshape(-1)
         entries = occupied_octants(self.roots.cpu()) << SLOT_BITS
         index[torch.from_numpy((z * n + y) * n + x)] = entries + torch.arange(1, len(self) + 1, dtype=torch.int32)

@@ -17,7 +17,7 @@ from ..geometry.cameras import Camera, pixel_centers, rays
 from ..geometry.points import Points
 from ..images.picture import linear_to_srgb, to_bytes
 from ..kernels.raycast import FrontFaces
-from ..mesh.clean import areas, cross, unit
+from ..mesh.triangles import areas, cross, unit
 from ..project.schema import ImageRecord, PosedImage, Poses, Project, SemanticClass
 from ..project.store import save_poses, save_project
 from ..render.verb import look_at

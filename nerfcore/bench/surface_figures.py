@@ -17,12 +17,12 @@ from ..images.picture import resized
 from ..images.working import read_picture
 from ..kernels.closest import ClosestPoints
 from ..measure.closing import closed
-from ..mesh.clean import areas, components, cross, unit
 from ..mesh.facelets import PIECES, Facelets, facelets, small_pieces
 from ..mesh.metrics import Distances, distances, sample_surface
 from ..mesh.painted import Painted
 from ..mesh.surface import Surface
 from ..mesh.surface_picture import surface_picture
+from ..mesh.triangles import areas, components, cross, unit
 from ..mesh.visibility import DepthBuffer, PosedCamera, depth_buffer, within
 from .surface_outlines import outline_texels, true_outline
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import KDTree
 
-from ..mesh.clean import cross, unit
 from ..mesh.facelets import facelets
 from ..mesh.painted import Painted
 from ..mesh.painting import texels_of
+from ..mesh.triangles import cross, unit
 
 TILE = 2048  # texels a side that are looked at at once
 SPACING = 0.25  # texels between points of a true outline

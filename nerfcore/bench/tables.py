@@ -7,8 +7,6 @@ from pathlib import Path
 from statistics import mean
 from typing import Any
 
-import matplotlib
-
 from ..files import atomic_path
 from .jobs import COUNTING_SIDE, Job
 from .live import live_table
@@ -221,6 +219,8 @@ def markdown(suite: str, rows: Sequence[Row], machine: str, command: str, notes:
 
 def plot(path: Path, suite: str, rows: Sequence[Row], results: Sequence[dict[str, Any]]) -> None:
     """A picture of the suite: training curves for speed and gpu, bars of two figures for the rest."""
+    import matplotlib  # only where a suite has a plot
+
     matplotlib.use("Agg")
     from matplotlib.figure import Figure
 

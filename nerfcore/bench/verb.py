@@ -19,7 +19,7 @@ from ..files import write_json, write_text
 from ..kernels.device import use_device
 from ..params import BenchParams
 from ..progress import Reporter, shortened
-from . import gpu, machine, tables
+from . import machine, tables
 from .jobs import Measure, run_all, unknown_origin
 from .page import check_page, figures_folder, write_page
 from .results import Asked, ResultSet, Row, grouped, write_set
@@ -65,6 +65,8 @@ def bench(params: BenchParams, report: Reporter) -> dict[str, Any]:
         notes.append(f"Yardstick {params.yardstick.name}: {machine.run_yardstick(params.yardstick, seconds, report)}")
     asked = None
     if params.suite == "gpu":
+        from . import gpu
+
         synchronisations, waits, recorded = gpu.step_synchronisations(next(iter(projects.values())), report)
         checks, values = gpu.kernel_checks(params.tests), gpu.figures(rows, synchronisations, recorded)
         asked = Asked(figures=values, checks=checks, waits=waits)
@@ -191,6 +193,8 @@ def _write_page(
 def _without_gpu(params: BenchParams, out: Path, report: Reporter) -> dict[str, Any]:
     """The result where there is no GPU: every figure is there and says that it was not measured."""
     report.warn("No NVIDIA GPU: nothing of this suite was measured.")
+    from . import gpu
+
     values = dict.fromkeys(gpu.ASKED)
     if params.page is not None:
         write_page(params.page)

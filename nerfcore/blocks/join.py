@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import KDTree
+import scipy
 
-from ..mesh.clean import SCRAP, areas, border_edges, components, fill_holes
+from ..mesh.clean import SCRAP, fill_holes
 from ..mesh.surface import Surface, vertex_normals
+from ..mesh.triangles import areas, border_edges, components
 from .surface import Part
 
 SAME = 1e-3  # voxels that vertices of two blocks at a seam differ by at most
@@ -56,13 +55,15 @@ def _same(vertices: np.ndarray, faces: np.ndarray, block: np.ndarray, distance: 
     other than `distance`, are at one."""
     border = np.unique(border_edges(faces))
     pairs = (
-        KDTree(vertices[border]).query_pairs(distance, output_type="ndarray") if len(border) else np.zeros((0, 2), int)
+        scipy.spatial.KDTree(vertices[border]).query_pairs(distance, output_type="ndarray")
+        if len(border)
+        else np.zeros((0, 2), int)
     )
     a, b = border[pairs[:, 0]], border[pairs[:, 1]]
     other = block[a] != block[b]
     ones = np.ones(int(other.sum()), bool)
-    graph = coo_matrix((ones, (a[other], b[other])), (len(vertices), len(vertices)))
-    return connected_components(graph, False)[1]
+    graph = scipy.sparse.coo_matrix((ones, (a[other], b[other])), (len(vertices), len(vertices)))
+    return scipy.sparse.csgraph.connected_components(graph, False)[1]
 
 
 def _by_area(vertices: np.ndarray, faces: np.ndarray, face_class: np.ndarray) -> np.ndarray:

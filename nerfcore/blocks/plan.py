@@ -17,6 +17,8 @@ from ..geometry.cameras import project
 from ..geometry.similarity import make_similarity, transform_points
 
 FOLDER, PLAN = "blocks", "plan.json"
+RUN = "main"  # of a block's project
+MAPS, SIGHTS, PART = "depth_maps.npz", "sights.npz", "part.npz"  # in the run's folder
 OVERLAP = 0.2  # of a block's width, that its region reaches beyond each side that it shares
 LEAST_SEEN = 0.1  # share of what a photo shows that lies in a block, from which on it is one of the block's photos
 FEWEST_PHOTOS = 2  # to train a block on

@@ -23,7 +23,7 @@ from ..kernels.depth_arrays import MapArrays
 from ..kernels.device import use_device
 from ..mesh.appearance import Photos
 from ..mesh.build import Built, agreed_maps, read_photos, vertex_colors
-from ..mesh.clean import compact, shown
+from ..mesh.clean import shown
 from ..mesh.decimate import decimate_patches
 from ..mesh.depth_maps import MOST_VIEWS, flat_views, map_size, spread_views
 from ..mesh.extract import extract
@@ -31,6 +31,7 @@ from ..mesh.fusion import BRICK, NEAR, TRUNCATION, fuse_maps, grid_of
 from ..mesh.painted import training_photos
 from ..mesh.region import Region, region_around
 from ..mesh.surface import Surface, to_world, vertex_normals
+from ..mesh.triangles import compact
 from ..mesh.verb import paint
 from ..params import MeshParams
 from ..progress import Reporter
@@ -38,11 +39,9 @@ from ..project.runs import run_folder
 from ..project.store import load_project
 from ..render.run import Trained, load_trained, refined_poses
 from .maps import cut_maps, joined_maps, load_maps, moved, save_maps
-from .plan import BlockPlan, Plan, block_folder
+from .plan import MAPS, PART, RUN, SIGHTS, BlockPlan, Plan, block_folder
 from .sights import Sights, chosen, load_sights, save_sights, sights_of
 
-RUN = "main"  # of a block's project
-MAPS, SIGHTS, PART = "depth_maps.npz", "sights.npz", "part.npz"  # in the run's folder
 BEYOND = 0.5  # how far beyond the blocks surfaces are looked for at most, in the shared frame, which is 2 wide
 
 

@@ -32,8 +32,8 @@ from ..project.runs import MESH_RECORD, read_metrics, run_folder
 from ..project.schema import step
 from ..project.store import load_project, world_from_sfm
 from .join import joined, open_at_seams
-from .plan import Plan, block_folder
-from .surface import RUN, load_part
+from .plan import RUN, Plan, block_folder
+from .surface import load_part
 
 UNSEEN = "texture_unseen.png"
 NAME = "blocks"  # folder in exports

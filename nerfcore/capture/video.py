@@ -9,8 +9,8 @@ from typing import Any
 
 import av
 import numpy as np
+import scipy
 from PIL import Image
-from scipy import ndimage
 
 from ..errors import InputError
 from ..files import atomic_path, write_json
@@ -142,7 +142,7 @@ def frame_sharpness(frame: Any) -> float:
     """Variance of the Laplacian of a frame's grey values at a width of 640 pixels."""
     height = max(2, round(frame.height * GREY_WIDTH / frame.width))
     grey = frame.reformat(GREY_WIDTH, height, "gray").to_ndarray()
-    return float(ndimage.laplace(grey.astype(np.float32)).var())
+    return float(scipy.ndimage.laplace(grey.astype(np.float32)).var())
 
 
 def _upright(frame: Any) -> Image.Image:

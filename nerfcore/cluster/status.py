@@ -11,7 +11,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-import jinja2
 from PIL import Image
 
 from ..errors import disk_refusal
@@ -86,6 +85,8 @@ def write_status(folder: Path, value: dict[str, Any], page: bool) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         write_json(folder / STATUS_FILE, value)
         if page:
+            import jinja2
+
             when = time.strftime("%Y-%m-%d %H:%M:%S")
             template = jinja2.Template(TEMPLATE.read_text(encoding="utf-8"), autoescape=True)
             write_text(folder / PAGE, template.render(**value, told=STATES, link=_link, when=when))

@@ -7,17 +7,14 @@ import io
 from pathlib import Path
 from typing import Any
 
-import jinja2
-
 from ..errors import SettingError
 from ..files import write_text
 from ..mesh.stored import mesh_folder
 from ..params import ReportParams
 from ..progress import Reporter
-from ..project.runs import read_events, read_metrics
+from ..project.runs import read_events, read_metrics, run_folder
 from ..project.store import load_project
 from ..render.pictures import ENDINGS
-from ..render.run import run_folder
 from .documentation import JUDGEMENT, Section, results_of, sections
 
 FORMATS = (".html", ".pdf")
@@ -102,6 +99,8 @@ def write_report(path: Path, folder: Path, run: str, renders: Path, result: dict
         write_pdf(path, name, tables, pictures)
         return [table.title for table in tables]
     scores = {Path(s["name"]).stem: s for s in evaluation.get("per_image", [])}
+    import jinja2
+
     html = (
         jinja2.Environment(autoescape=True)
         .from_string(TEMPLATE.read_text(encoding="utf-8"))

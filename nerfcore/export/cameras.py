@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 import trimesh
-from scipy.spatial.transform import Rotation
 from trimesh.exchange.ply import export_ply
 
 from ..data.scene import Scene, View
@@ -124,7 +124,7 @@ def _image_rows(views: Sequence[View], cameras: Sequence[Camera], root: Path) ->
     rows = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "# POINTS2D[] as (X, Y, POINT3D_ID)"]
     for number, view in enumerate(views, 1):
         camera_from_world = np.linalg.inv(view.camera_to_world)
-        x, y, z, w = Rotation.from_matrix(camera_from_world[:3, :3]).as_quat()
+        x, y, z, w = scipy.spatial.transform.Rotation.from_matrix(camera_from_world[:3, :3]).as_quat()
         pose = _numbers([w, x, y, z, *camera_from_world[:3, 3]])
         name = view.image.relative_to(root).as_posix()
         # The second line lists the image's points: which photo shows which is not told.

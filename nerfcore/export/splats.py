@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import scipy
 import torch
-from scipy.ndimage import minimum_filter
 
 from ..data.box import Box
 from ..errors import ProjectError
@@ -106,7 +106,7 @@ def _surface(index: np.ndarray, blocks: int, opacity: np.ndarray) -> tuple[np.nd
     occupied, order = occupied_blocks(index)
     corner = np.stack([occupied % blocks, occupied // blocks % blocks, occupied // blocks**2], 1) * CELLS
     cubes = opacity.reshape(-1, VERTICES, VERTICES, VERTICES)
-    around = minimum_filter(cubes, size=(1, 3, 3, 3), mode="nearest")
+    around = scipy.ndimage.minimum_filter(cubes, size=(1, 3, 3, 3), mode="nearest")
     kept = (cubes >= LEAST) & (around < LEAST)
     block, z, y, x = np.nonzero(kept)
     corners = np.zeros((len(cubes), 3), np.int64)

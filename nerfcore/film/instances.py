@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import KDTree
+import scipy
 
 from ..errors import ProjectError
 from ..mesh.instances import read_instances
@@ -20,7 +20,7 @@ class InstanceNames:
     def __init__(self, field: LoadedField, item: FieldItem) -> None:
         self.names = [*(f"{item.name}.{name}" for name in field.class_names), item.name]
         self._plain = np.array([id_of(name) for name in self.names], np.float32)
-        self._trees: dict[int, tuple[KDTree, np.ndarray]] = {}
+        self._trees: dict[int, tuple[scipy.spatial.KDTree, np.ndarray]] = {}
         self._capture_from_scene = np.linalg.inv(np.array(item.scene_from_capture))
         try:
             surface, _ = load_surface(item.project, item.run)
@@ -37,7 +37,7 @@ class InstanceNames:
                 self.names += sorted(set(called) - set(self.names))
                 known = {name: id_of(name) for name in set(called)}
                 ids = np.array([known[name] for name in called], np.float32)
-                self._trees[index] = KDTree(centers[own]), ids
+                self._trees[index] = scipy.spatial.KDTree(centers[own]), ids
 
     def ids(self, points: np.ndarray, classes: np.ndarray) -> np.ndarray:
         """Ids (N,) of points (N, 3) of the scene that have these class indices (N,), −1 for void."""

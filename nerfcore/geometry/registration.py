@@ -12,8 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import KDTree
-from scipy.spatial.transform import Rotation
+import scipy
 
 from ..errors import InputError
 from ..progress import Reporter
@@ -69,12 +68,12 @@ def by_surfaces(
         here: points (N, 3) and unit normals (N, 3) of this epoch. with_scale: the sizes may differ too.
     """
     points, normals = here
-    tree, few = KDTree(points), there[:: max(1, len(there) // FEW)]
+    tree, few = scipy.spatial.KDTree(points), there[:: max(1, len(there) // FEW)]
     sizes = [float(np.sqrt(((p - np.median(p, 0)) ** 2).sum(1).mean())) for p in (points, there)]
     factor = sizes[0] / max(sizes[1], 1e-12) if with_scale else 1.0
     starts = [np.eye(4)]
     for turn in range(TURNS):
-        rotation = Rotation.from_euler("z", 360 * turn / TURNS, degrees=True).as_matrix()
+        rotation = scipy.spatial.transform.Rotation.from_euler("z", 360 * turn / TURNS, degrees=True).as_matrix()
         middle = np.median(points, 0) - factor * rotation @ np.median(there, 0)
         starts.append(make_similarity(factor, rotation, middle))
     tried = []
@@ -86,7 +85,7 @@ def by_surfaces(
 
 
 def _refined(
-    tree: KDTree,
+    tree: scipy.spatial.KDTree,
     points: np.ndarray,
     normals: np.ndarray,
     moving: np.ndarray,
@@ -124,5 +123,8 @@ def _to_planes(
     arm, off = moved - middle, ((moved - target) * normal).sum(1)
     columns = [np.cross(arm, normal), normal, *([(arm * normal).sum(1)[:, None]] if scaled else [])]
     solved = np.linalg.lstsq(np.concatenate(columns, 1), -off, rcond=1e-9)[0]
-    rotation, factor = Rotation.from_rotvec(solved[:3]).as_matrix(), 1 + (float(solved[6]) if scaled else 0.0)
+    rotation, factor = (
+        scipy.spatial.transform.Rotation.from_rotvec(solved[:3]).as_matrix(),
+        1 + (float(solved[6]) if scaled else 0.0),
+    )
     return make_similarity(factor, rotation, middle + solved[3:6] - factor * rotation @ middle), off

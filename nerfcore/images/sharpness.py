@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy
 from PIL import Image
-from scipy import ndimage
 
 # Not tuned.
 WORKING_SIZE = 1000  # pixels of the long side
@@ -41,7 +41,7 @@ def _grey(image: Image.Image) -> Image.Image:
 
 
 def _energy(grey: Image.Image) -> float:
-    laplacian = ndimage.laplace(np.asarray(grey, np.float32))
+    laplacian = scipy.ndimage.laplace(np.asarray(grey, np.float32))
     rows = np.array_split(laplacian, 8, axis=0)
     return float(np.percentile([tile.var() for row in rows for tile in np.array_split(row, 8, axis=1)], 90))
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial import KDTree
+import scipy
 
 from ..errors import InputError, ProjectError
 from ..files import UNREADABLE_ARRAYS, atomic_path
@@ -127,7 +127,7 @@ def counterparts(
     rotation = found.transform[:3, :3] / similarity_scale(found.transform)
     then, facing = transform_points(found.transform, past.world[0]), past.world[1] @ rotation.T
     spacing = float(np.median(np.asarray(now.tree.query(places, k=2)[0])[:, 1]))
-    distance, nearest = (np.asarray(part) for part in KDTree(then).query(places))
+    distance, nearest = (np.asarray(part) for part in scipy.spatial.KDTree(then).query(places))
     there = (distance <= REACH * spacing) & ((normals * facing[nearest]).sum(1) > SAME_SIDE)
     # Exposure may differ between the epochs as a whole: only what differs more than the rest has changed.
     shift = np.asarray(now.surfels.lab) - np.asarray(past.surfels.lab)[nearest]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from skimage.draw import polygon2mask
+import skimage
 
 THINNEST = 1.42  # diagonal of a pixel: a thinner line would pass between the centres of pixels
 
@@ -18,7 +18,7 @@ def covered(shape: str, points: np.ndarray, width: float, columns: int, rows: in
     """
     found = np.zeros((rows, columns), bool)
     if shape == "outline" and len(points) >= 3:
-        return polygon2mask((rows, columns), points[:, ::-1] - 0.5)
+        return skimage.draw.polygon2mask((rows, columns), points[:, ::-1] - 0.5)
     ends = zip(points, points) if shape in ("click", "part") or len(points) == 1 else zip(points[:-1], points[1:])
     radius = max(width, THINNEST) / 2
     for begin, end in ends:

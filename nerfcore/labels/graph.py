@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import csr_matrix
+import scipy
 
 from .surfels import Surfels, cell_of
 from .walker import edge_matrix
@@ -24,8 +24,8 @@ class Graph:
     """Edges of N surfels and of C cells of a coarser grid: symmetric weights edges (N, N), coarse (C, C); cell (N,) of each
     surfel."""
 
-    edges: csr_matrix
-    coarse: csr_matrix
+    edges: scipy.sparse.csr_matrix
+    coarse: scipy.sparse.csr_matrix
     cell: np.ndarray
 
 
@@ -80,7 +80,7 @@ def make_graph(surfels: Surfels, neighbours: np.ndarray, unlike: np.ndarray) -> 
     return Graph(edges, joined(edges, cell, count), cell.astype(np.int32))
 
 
-def joined(edges: csr_matrix, group: np.ndarray, count: int | None = None) -> csr_matrix:
+def joined(edges: scipy.sparse.csr_matrix, group: np.ndarray, count: int | None = None) -> scipy.sparse.csr_matrix:
     """Weights (C, C) between groups of nodes, (N,) the group of each: sums of those between nodes (N, N)."""
     members = membership(group, int(group.max()) + 1 if count is None else count)
     found = (members.T @ edges @ members).tocsr()
@@ -89,10 +89,10 @@ def joined(edges: csr_matrix, group: np.ndarray, count: int | None = None) -> cs
     return found
 
 
-def membership(cell: np.ndarray, count: int) -> csr_matrix:
+def membership(cell: np.ndarray, count: int) -> scipy.sparse.csr_matrix:
     """Matrix (N, C) float32 that says which cell each surfel is in (N,)."""
     rows = np.arange(len(cell))
-    return csr_matrix((np.ones(len(cell), np.float32), (rows, cell)), (len(cell), count))
+    return scipy.sparse.csr_matrix((np.ones(len(cell), np.float32), (rows, cell)), (len(cell), count))
 
 
 def held_groups(group: np.ndarray, seeds: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

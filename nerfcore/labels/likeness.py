@@ -11,8 +11,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+import scipy
 import torch
-from scipy.sparse import csr_matrix
 
 from .walker import edge_matrix, random_walk
 
@@ -23,12 +23,12 @@ LOST = 0.1  # conductance of each part to nowhere
 ROWS = 1024  # at once
 
 
-def likeness(features: np.ndarray, check: Callable[[], None]) -> tuple[csr_matrix, float]:
+def likeness(features: np.ndarray, check: Callable[[], None]) -> tuple[scipy.sparse.csr_matrix, float]:
     """Edges (P, P) from each part to those that look most like it, by features (P, F), and the distance of looks that they
     are weighed by: the median of that to the last neighbour."""
     count = min(NEIGHBOURS, len(features) - 1)
     if count < 1:
-        return csr_matrix((len(features), len(features)), dtype=np.float32), 1.0
+        return scipy.sparse.csr_matrix((len(features), len(features)), dtype=np.float32), 1.0
     columns, found = torch.from_numpy(features), []
     for rows in columns.split(ROWS):
         check()
@@ -39,7 +39,9 @@ def likeness(features: np.ndarray, check: Callable[[], None]) -> tuple[csr_matri
     return edge_matrix(neighbours, np.exp(-((distance / scale) ** 2))), scale
 
 
-def strangeness(edges: csr_matrix, scale: float, distance: np.ndarray, check: Callable[[], None]) -> np.ndarray:
+def strangeness(
+    edges: scipy.sparse.csr_matrix, scale: float, distance: np.ndarray, check: Callable[[], None]
+) -> np.ndarray:
     """How strange (P,) in [0, 1] parts are: the probability that a walk over `likeness` ends before it comes to a part that a
     mark looks like, by the distance (P,) of each to the look of the nearest mark."""
     marked = MARKED * np.exp(-((distance / scale) ** 2))

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnxruntime
 
 from ..errors import InputError
 
@@ -67,6 +66,8 @@ class Model:
     def __init__(self, path: Path) -> None:
         """Raises InputError where it is no ONNX file that can be run here."""
         self.path = path
+        import onnxruntime  # only who brings a model waits for it
+
         options = onnxruntime.SessionOptions()
         options.log_severity_level = 4
         try:

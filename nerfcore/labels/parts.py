@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import minimum_spanning_tree
+import scipy
 
 # Of each level; see experiments.md, “Labels from a few strokes”.
 STIFFNESS = (2.0, 10.0)  # k, in units of the median difference of neighbours
@@ -34,7 +33,9 @@ def spanning_tree(neighbours: np.ndarray, difference: np.ndarray) -> tuple[np.nd
     count, each = neighbours.shape
     starts = np.arange(0, count * each + 1, each)
     given = np.maximum(difference, 1e-6).reshape(-1)  # zeros would be no edges
-    tree = minimum_spanning_tree(csr_matrix((given, neighbours.reshape(-1), starts), (count, count))).tocoo()
+    tree = scipy.sparse.csgraph.minimum_spanning_tree(
+        scipy.sparse.csr_matrix((given, neighbours.reshape(-1), starts), (count, count))
+    ).tocoo()
     order = np.argsort(tree.data, kind="stable")
     return np.stack([tree.row, tree.col], 1)[order], tree.data[order]
 

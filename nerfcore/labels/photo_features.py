@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
-from scipy.ndimage import gaussian_filter, gaussian_filter1d, gaussian_gradient_magnitude, map_coordinates
+import scipy
 
 from ..data.scene import View
 from ..errors import InputError
@@ -63,19 +63,21 @@ def texture_filters(lab: np.ndarray) -> np.ndarray:
     the lightness, eigenvalues of its second derivatives, and deviation of each channel."""
     lightness, found = lab[..., 0], []
     for scale in SCALES:
-        found.append(gaussian_gradient_magnitude(lightness, scale))
+        found.append(scipy.ndimage.gaussian_gradient_magnitude(lightness, scale))
         xx, xy, yy = (derivative(lightness, scale, *orders) for orders in ((0, 2), (1, 1), (2, 0)))
         root = np.sqrt((xx - yy) ** 2 + 4 * xy**2)
         found += [(xx + yy + root) / 2, (xx + yy - root) / 2]
         for channel in np.moveaxis(lab, -1, 0):
-            mean = gaussian_filter(channel, 2 * scale)
-            found.append(np.sqrt((gaussian_filter(channel**2, 2 * scale) - mean**2).clip(0)))
+            mean = scipy.ndimage.gaussian_filter(channel, 2 * scale)
+            found.append(np.sqrt((scipy.ndimage.gaussian_filter(channel**2, 2 * scale) - mean**2).clip(0)))
     return np.stack(found, -1).astype(np.float32)
 
 
 def derivative(values: np.ndarray, scale: float, along_y: int, along_x: int) -> np.ndarray:
     """Derivative (H, W) of these orders of values (H, W) that are smoothed by a Gaussian."""
-    return gaussian_filter1d(gaussian_filter1d(values, scale, 0, along_y), scale, 1, along_x)
+    return scipy.ndimage.gaussian_filter1d(
+        scipy.ndimage.gaussian_filter1d(values, scale, 0, along_y), scale, 1, along_x
+    )
 
 
 def uplifted(count: int, pictures: Iterable[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
@@ -129,5 +131,6 @@ def spread(values: np.ndarray, height: int, width: int) -> np.ndarray:
     x = (np.arange(width) + 0.5) * columns / width - 0.5
     place = np.meshgrid(y, x, indexing="ij")
     return np.stack(
-        [map_coordinates(layer, place, order=1, mode="nearest") for layer in np.moveaxis(values, -1, 0)], -1
+        [scipy.ndimage.map_coordinates(layer, place, order=1, mode="nearest") for layer in np.moveaxis(values, -1, 0)],
+        -1,
     )

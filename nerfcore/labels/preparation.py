@@ -22,10 +22,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
+import skimage
 import torch
-from scipy.sparse import csr_matrix
-from scipy.spatial import KDTree
-from skimage.color import rgb2lab
 
 from ..data.box import Box, box_poses
 from ..data.load import load_scene
@@ -122,9 +121,9 @@ class Preparation:
         return transform_points(box.world_from_box, inside.numpy()), np.asarray(self.surfels.normal) @ rotation.T
 
     @cached_property
-    def tree(self) -> KDTree:
+    def tree(self) -> scipy.spatial.KDTree:
         """The places of the surfels in the world, to be searched."""
-        return KDTree(self.world[0])
+        return scipy.spatial.KDTree(self.world[0])
 
     @cached_property
     def graph(self) -> Graph:
@@ -137,19 +136,19 @@ class Preparation:
         return float(self._array("edges_data").sum(dtype=np.float64)) / max(1, len(self.surfels))
 
     @cached_property
-    def likeness(self) -> tuple[csr_matrix, float]:
+    def likeness(self) -> tuple[scipy.sparse.csr_matrix, float]:
         """Which fine parts look alike, as `likeness.likeness` says it."""
         return self._matrix("likeness"), float(self._array("likeness_scale").item())
 
     @cached_property
-    def part_edges(self) -> csr_matrix:
+    def part_edges(self) -> scipy.sparse.csr_matrix:
         """Weights (P, P) between the fine parts."""
         return self._matrix("part_edges")
 
-    def _matrix(self, name: str) -> csr_matrix:
+    def _matrix(self, name: str) -> scipy.sparse.csr_matrix:
         parts = [np.array(self._array(f"{name}_{part}")) for part in MATRIX]
         count = len(parts[2]) - 1
-        return csr_matrix(tuple(parts), (count, count))
+        return scipy.sparse.csr_matrix(tuple(parts), (count, count))
 
 
 def prepare(params: LabelPrepareParams, report: Reporter) -> dict[str, Any]:
@@ -296,7 +295,7 @@ def _look(
         inside = nearest(read_image(view.mask)[..., 0], *size) > 127
         hits = Hits(np.where(inside, hits.distance, 0), hits.places, hits.edge & inside)
     color = over(resized(read_picture(view.image), *size), 1.0).pixels[..., :3]
-    return hits, rgb2lab(color).astype(np.float32)
+    return hits, skimage.color.rgb2lab(color).astype(np.float32)
 
 
 def surfel_arrays(
@@ -380,7 +379,7 @@ def surfel_arrays(
     }
 
 
-def stored(name: str, matrix: csr_matrix) -> dict[str, np.ndarray]:
+def stored(name: str, matrix: scipy.sparse.csr_matrix) -> dict[str, np.ndarray]:
     """The arrays that a sparse matrix is kept as."""
     return {f"{name}_{part}": getattr(matrix, part) for part in MATRIX}
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
+import scipy
 import torch
-from scipy.ndimage import map_coordinates, minimum_filter
 
 from ..data.camera_rays import CameraRays
 from ..geometry.cameras import Camera
@@ -50,8 +50,8 @@ def hits_of(model: Model, camera: Camera, pose: np.ndarray, share: float, check:
     row, column = (np.arange(n) + 0.5 for n in (camera.height, camera.width))
     place = np.meshgrid(row * height / camera.height - 0.5, column * width / camera.width - 0.5, indexing="ij")
     nearest = tuple(np.clip(np.round(p), 0, n - 1).astype(int) for p, n in zip(place, (height, width)))
-    smooth = minimum_filter((distance > 0) & ~edge, 3, mode="nearest")[nearest]
-    between = map_coordinates(distance, place, order=1, mode="nearest")
+    smooth = scipy.ndimage.minimum_filter((distance > 0) & ~edge, 3, mode="nearest")[nearest]
+    between = scipy.ndimage.map_coordinates(distance, place, order=1, mode="nearest")
     found = np.where(smooth, between, distance[nearest])
     through = CameraRays([camera], pose[None], torch.device("cpu"))
     pixels = torch.arange(camera.width * camera.height)

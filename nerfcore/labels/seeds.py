@@ -8,7 +8,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import KDTree
+import scipy
 
 from ..errors import ProjectError
 from ..files import UNREADABLE_ARRAYS
@@ -170,7 +170,7 @@ def carried_labels(ready: Preparation, path: Path, class_ids: Sequence[int]) -> 
             "Show the revision before them (`fieldwork label checkout`), and carry them again.",
         ) from error
     sfm_from_world = np.linalg.inv(world_from_sfm(load_project(ready.folder.parents[2])))
-    distance, nearest = KDTree(places).query(transform_points(sfm_from_world, ready.world[0]))
+    distance, nearest = scipy.spatial.KDTree(places).query(transform_points(sfm_from_world, ready.world[0]))
     index = np.full(max([*class_ids, int(told.max(initial=0))]) + 1, UNMARKED, np.int32)
     index[list(class_ids)] = np.arange(len(class_ids))
     label = np.where(np.asarray(distance) <= reach, index[told[nearest]], UNMARKED).astype(np.int32)

@@ -11,8 +11,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 import torch
-from scipy.spatial import KDTree
 
 from ..field.hybrid import HybridField
 
@@ -138,7 +138,7 @@ def nearest_neighbours(
 ) -> np.ndarray:
     """Indices (N, K) int32 of the nearest other points of each point (N, 3), K at most `count`."""
     count = min(count, len(position) - 1)
-    tree, found = KDTree(position), []
+    tree, found = scipy.spatial.KDTree(position), []
     for first in range(0, len(position), POINTS):
         check()
         found.append(np.asarray(tree.query(position[first : first + POINTS], k=count + 1)[1])[:, 1:].astype(np.int32))
@@ -188,4 +188,4 @@ def field_features(field: HybridField, position: np.ndarray, components: int = C
 
 def nearest_surfel(position: np.ndarray, points: np.ndarray) -> np.ndarray:
     """The nearest of the positions (N, 3) to each point (M, 3), int32."""
-    return np.asarray(KDTree(position).query(points)[1]).astype(np.int32)
+    return np.asarray(scipy.spatial.KDTree(position).query(points)[1]).astype(np.int32)

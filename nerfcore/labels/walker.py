@@ -10,13 +10,13 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy.sparse import csr_matrix
+import scipy
 
 TOLERANCE = 1e-3  # of the residual, relative to the right side
 MOST_STEPS = 200
 
 
-def edge_matrix(neighbours: np.ndarray, weights: np.ndarray) -> csr_matrix:
+def edge_matrix(neighbours: np.ndarray, weights: np.ndarray) -> scipy.sparse.csr_matrix:
     """Symmetric weights (N, N) float32 of a graph; where both ends name each other, the larger weight counts.
 
     Args:
@@ -24,12 +24,14 @@ def edge_matrix(neighbours: np.ndarray, weights: np.ndarray) -> csr_matrix:
     """
     count, each = neighbours.shape
     starts = np.arange(0, count * each + 1, each)
-    one_way = csr_matrix((weights.reshape(-1).astype(np.float32), neighbours.reshape(-1), starts), (count, count))
+    one_way = scipy.sparse.csr_matrix(
+        (weights.reshape(-1).astype(np.float32), neighbours.reshape(-1), starts), (count, count)
+    )
     return one_way.maximum(one_way.T).tocsr()
 
 
 def random_walk(
-    edges: csr_matrix,
+    edges: scipy.sparse.csr_matrix,
     prior: np.ndarray,
     strength: np.ndarray,
     sink: float | np.ndarray,

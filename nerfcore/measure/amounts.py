@@ -14,10 +14,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import KDTree
+import scipy
 
-from ..mesh.clean import areas
 from ..mesh.facelets import facelets
+from ..mesh.triangles import areas
 from .closing import Closed, closed
 
 K = 1.96  # normal deviates on either side of 95 %
@@ -71,7 +71,7 @@ def transferred(
         voxel: side of a fine cell.
     """
     pieces = facelets(*coarse, limit=FINE * voxel)  # as a face may lie on both sides of a border
-    found = KDTree(centers).query(pieces.centers)
+    found = scipy.spatial.KDTree(centers).query(pieces.centers)
     far, nearest = np.asarray(found[0]), np.asarray(found[1])
     near = far < FAR * 2 * voxel
     return [Labelled(pieces.vertices, pieces.faces[near], label[nearest[near]]) for label in labels]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..mesh.clean import areas
+from ..mesh.triangles import areas
 
 MOST_CAPPED = 0.1  # of a part's area that may be caps
 

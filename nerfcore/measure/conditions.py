@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import cast
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt, label
+import scipy
 
 from ..errors import SettingError
 from ..files import atomic_path
-from ..mesh.clean import areas
 from ..mesh.instances import Instance
 from ..mesh.surface import Surface
+from ..mesh.triangles import areas
 from ..project.label_revision import LABEL_REVISION
 from .sheet import Color, Entry, Mark, Sheet, Zone
 from .views import Picture
@@ -117,7 +117,7 @@ def condition_sheet(
 
 def without_specks(mask: np.ndarray, fewest: float) -> np.ndarray:
     """A mask (H, W) without its connected parts of fewer pixels."""
-    parts, count = cast(tuple[np.ndarray, int], label(mask, np.ones((3, 3))))
+    parts, count = cast(tuple[np.ndarray, int], scipy.ndimage.label(mask, np.ones((3, 3))))
     large = np.bincount(parts.reshape(-1), minlength=count + 1) >= fewest
     large[0] = False
     return large[parts]
@@ -125,7 +125,7 @@ def without_specks(mask: np.ndarray, fewest: float) -> np.ndarray:
 
 def widest(mask: np.ndarray) -> tuple[int, int]:
     """Row and column of the pixel of a mask (H, W) that is farthest from its outline."""
-    inside = np.asarray(distance_transform_edt(np.pad(mask, 1)))[1:-1, 1:-1]
+    inside = np.asarray(scipy.ndimage.distance_transform_edt(np.pad(mask, 1)))[1:-1, 1:-1]
     row, column = np.unravel_index(int(inside.argmax()), mask.shape)
     return int(row), int(column)
 

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from ..errors import SettingError
-from ..mesh.clean import areas
 from ..mesh.instances import Instance, read_instances
 from ..mesh.parts import Texture
 from ..mesh.stored import load_surface, mesh_folder, mesh_record
 from ..mesh.surface import Surface
+from ..mesh.triangles import areas
 from ..params import PlanParams, SectionParams
 from ..progress import Reporter
 from ..project.label_revision import LABEL_REVISION

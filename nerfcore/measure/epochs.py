@@ -13,10 +13,10 @@ from ..files import atomic_path, write_json
 from ..geometry.registration import Registered, by_points, by_surfaces
 from ..geometry.similarity import similarity_scale
 from ..kernels.closest import ClosestPoints
-from ..mesh.clean import areas, cross, unit
 from ..mesh.metrics import sample_surface
 from ..mesh.stored import mesh_folder, mesh_record
 from ..mesh.surface import Surface, to_world
+from ..mesh.triangles import areas, cross, unit
 from ..params import CompareParams
 from ..progress import Reporter
 from ..project.store import record_step

@@ -14,8 +14,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..data.pixels import training_size
-from ..mesh.clean import areas
 from ..mesh.surface import vertex_normals
+from ..mesh.triangles import areas
 from ..mesh.visibility import PosedCamera, within
 
 MOST = 20_000  # pieces that are asked for the footprint

@@ -9,8 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.spatial import KDTree
+import scipy
 
 REPLICATES = 200
 CHUNK = 20  # replicates at once
@@ -63,7 +62,7 @@ def area_deviations(
     of = index[votes.piece]
     used = np.flatnonzero(of >= 0)
     place = (of[used, None] * classes + np.arange(classes)).ravel()
-    table = coo_matrix(
+    table = scipy.sparse.coo_matrix(
         (votes.vote[used].ravel(), (place, np.repeat(votes.photo[used], classes))), (len(rows) * classes, photos)
     ).tocsr()
     joins = instances_joined(pieces, rows, classes)
@@ -92,6 +91,6 @@ def instances_joined(pieces: Pieces, rows: np.ndarray, classes: int) -> np.ndarr
         own = np.flatnonzero(pieces.label == number)
         if not len(own):
             continue
-        nearest = own[KDTree(pieces.centers[own]).query(pieces.centers[rows])[1]]
+        nearest = own[scipy.spatial.KDTree(pieces.centers[own]).query(pieces.centers[rows])[1]]
         joins[:, number] = pieces.instance[np.where(pieces.label[rows] == number, rows, nearest)]
     return joins

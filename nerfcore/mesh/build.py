@@ -22,7 +22,7 @@ from ..render.run import Trained
 from ..verdict import LITTLE_IN_ONE
 from . import depth_maps as dm
 from .appearance import Photos
-from .clean import areas, clean, compact, components
+from .clean import clean
 from .closed import closed_surface, unseen_faces
 from .decimate import decimate
 from .extract import extract
@@ -31,6 +31,7 @@ from .fusion import TRUNCATION, Bricks, coarser, fuse_maps
 from .refine import refined_maps
 from .region import Region, choose_region, on_sides
 from .surface import vertex_normals
+from .triangles import areas, compact, components
 
 FEW_STEPS = 300  # of training, below which a field is a sketch
 LITTLE_AGREEMENT = 0.3  # share below which the user is told

@@ -8,6 +8,7 @@ import torch
 from ..kernels.depth_arrays import MapArrays
 from ..kernels.surface import sight, slopes
 from ..progress import Reporter
+from .triangles import areas, border_edges, compact, components, cross, mean_around, unit
 
 FEWEST_VIEWS = 2
 TURNED = np.radians(35)  # by which a face may be steeper or flatter than what a view shows there
@@ -15,20 +16,6 @@ AROUND = 6  # rings of faces over which views are averaged: single faces have no
 SCRAP = 1e-3  # of the area
 LONGEST_LOOP = 30  # edges of a hole that is filled
 CHUNK = 1 << 16
-
-
-def cross(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Normals (F, 3) of triangles, twice their area long."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    return np.cross(b - a, c - a)
-
-
-def areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    return np.linalg.norm(cross(vertices, faces), axis=1) / 2
-
-
-def unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-20)
 
 
 def seen_by(points: np.ndarray, normals: np.ndarray, maps: MapArrays, tolerance: float, report: Reporter) -> np.ndarray:
@@ -68,47 +55,11 @@ def shown(vertices: np.ndarray, faces: np.ndarray, maps: MapArrays, tolerance: f
     return seen & ~((own < FEWEST_VIEWS) & (other >= 1))
 
 
-def mean_around(faces: np.ndarray, values: np.ndarray, count: int, rings: int) -> np.ndarray:
-    """Values (F,) of triangles, each the mean of those of its `count` vertices, and these of all their triangles, `rings`
-    times."""
-    corner = faces.reshape(-1)
-    amount = np.maximum(np.bincount(corner, minlength=count), 1)
-    for _ in range(rings):
-        values = (np.bincount(corner, np.repeat(values, 3), count) / amount)[faces].mean(1)
-    return values
-
-
 def drop_scraps(vertices: np.ndarray, faces: np.ndarray, share: float = SCRAP) -> np.ndarray:
     """The triangles (F, 3) of connected parts that have at least `share` of the area."""
     part = components(faces, len(vertices))
     area = np.bincount(part, areas(vertices, faces))
     return faces[area[part] >= share * area.sum()] if len(faces) else faces
-
-
-def components(faces: np.ndarray, count: int) -> np.ndarray:
-    """Number (F,) of the connected part of each triangle; triangles that share a vertex are connected."""
-    rows = np.concatenate([faces[:, 0], faces[:, 1]])
-    columns = np.concatenate([faces[:, 1], faces[:, 2]])
-    from scipy.sparse import coo_matrix  # with what it loads, a twentieth of a second for every verb
-    from scipy.sparse.csgraph import connected_components
-
-    _, label = connected_components(coo_matrix((np.ones(len(rows), bool), (rows, columns)), (count, count)), False)
-    _, part = np.unique(label[faces[:, 0]], return_inverse=True)
-    return part
-
-
-def compact(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Only the vertices that are used."""
-    used, index = np.unique(faces, return_inverse=True)
-    return vertices[used], index.reshape(-1, 3)
-
-
-def border_edges(faces: np.ndarray) -> np.ndarray:
-    """Directed edges (E, 2) that have a triangle on one side only."""
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
-    stride = int(faces.max(initial=0)) + 1
-    forward, back = edges[:, 0] * stride + edges[:, 1], edges[:, 1] * stride + edges[:, 0]
-    return edges[~np.isin(forward, back)]
 
 
 def fill_holes(

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
+import skimage
 import torch
-from skimage.measure import marching_cubes
 
 from ..kernels.depth_arrays import MapArrays
 from ..kernels.surface import fuse
 from ..progress import Reporter
-from .clean import FEWEST_VIEWS, areas, compact, components, cross, drop_scraps, seen_by, unit
+from .clean import FEWEST_VIEWS, drop_scraps, seen_by
 from .decimate import decimate_closed
 from .extract import BLOCK, assemble, off_corners, weld
 from .fusion import BRICK, FREE_AT, TRUNCATION, Bricks, depth_gap
+from .triangles import areas, compact, components, cross, unit
 
 CHUNK = 1 << 16  # bricks asked about at once
 SEEN = 0.1  # share of a part's area
@@ -54,7 +55,7 @@ def extract_closed(bricks: Bricks, maps: MapArrays, report: Reporter) -> tuple[n
         distance = _distances(bricks, free, corner)
         if distance.min() > 0 or distance.max() < 0:
             continue
-        vertices, faces, _, _ = marching_cubes(distance, 0.0, gradient_direction="descent")
+        vertices, faces, _, _ = skimage.measure.marching_cubes(distance, 0.0, gradient_direction="descent")
         places.append(vertices.astype(np.float64) + corner * BRICK - 1)
         triangles.append(faces.astype(np.int64) + first)
         first += len(vertices)

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import binary_fill_holes, minimum_filter, uniform_filter
+import scipy
 
 from ..data.box import box_poses
 from ..data.scene import Scene, View
@@ -72,9 +72,9 @@ def coverage(
         near = flat.inside & (depth > 0) & (depth < min(FAR * middle, FREE)) & within_bounds(flat, depth, bounds)
         solid = near & shown
         asked, found = asked + int(solid.sum()), found + int((solid & hit).sum())
-        whole = np.asarray(binary_fill_holes(hit))
+        whole = np.asarray(scipy.ndimage.binary_fill_holes(hit))
         # A pixel beside the mesh may show its outline.
-        holes = minimum_filter(whole & ~hit, 3) & near
+        holes = scipy.ndimage.minimum_filter(whole & ~hit, 3) & near
         filled, missing = filled + int(whole.sum()), missing + int(holes.sum())
     return Coverage(found / asked if asked >= FEWEST else None, missing / max(filled, 1))
 
@@ -98,9 +98,11 @@ def detailed(view: View, mask_mode: str, flat: FlatView, pose: np.ndarray) -> np
     cut away."""
     small = view.camera.resized(*looked_at(view.camera))
     photo = resized(read_picture(view.image), small.width, small.height).pixels[..., :3].astype(np.float32).mean(2)
-    detail = uniform_filter(photo**2, WINDOW) - uniform_filter(photo, WINDOW) ** 2 > DETAIL**2
+    detail = (
+        scipy.ndimage.uniform_filter(photo**2, WINDOW) - scipy.ndimage.uniform_filter(photo, WINDOW) ** 2 > DETAIL**2
+    )
     # An outline alone is none on either side.
-    detail = minimum_filter(detail, WINDOW, mode="nearest")
+    detail = scipy.ndimage.minimum_filter(detail, WINDOW, mode="nearest")
     cut = cut_out(view, mask_mode)
     pixel = project(small, pixel_rays(flat) @ flat.pose[:3, :3].T @ pose[:3, :3])
     x, y = (np.clip(np.nan_to_num(p), 0, n - 1).astype(int) for p, n in zip(pixel.T, (small.width, small.height)))

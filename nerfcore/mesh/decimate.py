@@ -7,7 +7,7 @@ import fast_simplification
 import numpy as np
 
 from ..progress import Reporter
-from .clean import compact
+from .triangles import compact
 
 CHUNK = 60_000  # faces simplified at once: a fraction of a second
 SMALL_CHUNK = 1000  # where edges of more than two triangles undo what was done to a chunk

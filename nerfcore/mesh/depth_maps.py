@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+import scipy
 import torch
-from scipy.ndimage import map_coordinates, maximum_filter, minimum_filter, uniform_filter
 
 from ..data.box import box_poses
 from ..data.camera_rays import CameraRays
@@ -162,11 +162,11 @@ def enlarged(small: DepthMap, view: FlatView) -> DepthMap:
         return small
     nearest = _nearest(camera.width, camera.height, width, height)
     inverse = np.where(small.hit, 1 / np.where(small.hit, small.depth, 1), 0)
-    low = minimum_filter(inverse, 3, mode="nearest")
-    high = maximum_filter(inverse, 3, mode="nearest")
+    low = scipy.ndimage.minimum_filter(inverse, 3, mode="nearest")
+    high = scipy.ndimage.maximum_filter(inverse, 3, mode="nearest")
     place = np.meshgrid(*((np.arange(n) + 0.5) * m / n - 0.5 for n, m in ((camera.height, height), (camera.width, width))),
                         indexing="ij")  # fmt: skip
-    between = map_coordinates(inverse, place, order=1, mode="nearest")
+    between = scipy.ndimage.map_coordinates(inverse, place, order=1, mode="nearest")
     edge = max(EDGE, EDGE_PIXELS / (camera.fx * width / camera.width))
     smooth = ((low > 0) & (high - low < 2 * edge * low))[nearest]
     depth = np.where(smooth, 1 / np.where(smooth, between, 1), small.depth[nearest])
@@ -228,7 +228,7 @@ def normals(camera: Camera, depth: np.ndarray) -> np.ndarray:
 def smooth_normals(camera: Camera, depth: np.ndarray, size: int) -> np.ndarray:
     """Normals (H, W, 3) as `normals` gives them, averaged over windows of `size` pixels; 0 where there is none."""
     found = normals(camera, depth)
-    mean = np.stack([uniform_filter(found[..., k], size) for k in range(3)], -1)
+    mean = np.stack([scipy.ndimage.uniform_filter(found[..., k], size) for k in range(3)], -1)
     length = np.linalg.norm(mean, axis=-1, keepdims=True)
     return np.where(length > 0.1, mean / np.maximum(length, 1e-9), 0).astype(np.float32)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from skimage.measure import marching_cubes
+import skimage
 
 from ..progress import Reporter
 from .fusion import BRICK, Bricks
@@ -55,7 +55,7 @@ def _block(bricks: Bricks, corner: np.ndarray) -> tuple[np.ndarray, np.ndarray] 
     if min(side) < 2 or not len(inside) or inside.min() > 0 or inside.max() < 0:
         return None
     try:
-        vertices, faces, _, _ = marching_cubes(distance, 0.0, mask=whole, gradient_direction="descent")
+        vertices, faces, _, _ = skimage.measure.marching_cubes(distance, 0.0, mask=whole, gradient_direction="descent")
     except (RuntimeError, ValueError):  # no cell is crossed
         return None
     return vertices.astype(np.float64) + corner * BRICK, faces.astype(np.int64)

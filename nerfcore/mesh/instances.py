@@ -13,7 +13,7 @@ import numpy as np
 from ..errors import ProjectError
 from ..files import write_json
 from ..project.runs import INSTANCES
-from .clean import areas, border_edges, components
+from .triangles import areas, border_edges, components
 
 GAP = 3.0  # voxels that a thing may be torn apart by: a crack of the reconstruction is one or two wide
 LEAST_SHARE = 0.01  # of the area of its class, below which a part is no instance

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from ..kernels.closest import ClosestPoints
-from .clean import areas, cross, unit
+from .triangles import areas, cross, unit
 
 SAMPLES = 200_000
 

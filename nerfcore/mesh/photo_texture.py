@@ -14,8 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import psutil
+import scipy
 import torch
-from scipy.ndimage import binary_dilation
 
 from ..errors import SettingError
 from ..images.picture import linear_to_srgb, to_bytes
@@ -280,9 +280,9 @@ def spread(image: np.ndarray, known: np.ndarray, check: Callable[[], None] = go_
         for top, end in bands:
             check()
             above = max(top - 1, 0)
-            grown = np.asarray(binary_dilation(known[above : end + 1], np.ones((3, 3), bool)))[top - above :][
-                : end - top
-            ]
+            grown = np.asarray(scipy.ndimage.binary_dilation(known[above : end + 1], np.ones((3, 3), bool)))[
+                top - above :
+            ][: end - top]
             rows, columns = np.nonzero(np.logical_and(grown, ~known[top:end]))
             rows += top
             total, number = np.zeros((len(rows), image.shape[2]), np.float32), np.zeros(len(rows), np.float32)

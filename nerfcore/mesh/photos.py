@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 import torch
-from scipy.ndimage import minimum_filter
 
 from ..data.scene import View
 from ..images.picture import resized, srgb_to_linear, with_alpha
@@ -44,7 +44,7 @@ def posed_photo(view: View, pose: np.ndarray) -> Photo:
             rgba[..., 3][~inside] = 0
         if (rgba[..., 3] == 0).any():
             # What borders on nothing is mixed with it.
-            rgba[..., 3] = minimum_filter(rgba[..., 3], 3, mode="nearest")
+            rgba[..., 3] = scipy.ndimage.minimum_filter(rgba[..., 3], 3, mode="nearest")
         return rgba
 
     def labels() -> tuple[np.ndarray, np.ndarray]:

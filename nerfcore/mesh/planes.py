@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.ndimage import uniform_filter
+import scipy
 
 from ..kernels.depth_arrays import FREE
 from .depth_maps import EDGE, EDGE_PIXELS, DepthMap, FlatView, cosines
@@ -63,7 +63,7 @@ def fitted(depth: np.ndarray, sigma: np.ndarray, radius: int) -> tuple[np.ndarra
     base = np.where(known, 1 / deviation**2, 0)
 
     def mean(values: np.ndarray) -> np.ndarray:
-        return np.asarray(uniform_filter(values, 2 * radius + 1, mode="constant"))
+        return np.asarray(scipy.ndimage.uniform_filter(values, 2 * radius + 1, mode="constant"))
 
     def regression(weight: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Inverse depth on the plane, weighted sum of squared deviations over the window's area, and whether the window

@@ -17,12 +17,13 @@ from ..project.store import load_project
 from ..render.run import Trained, load_trained
 from . import depth_maps as dm
 from .build import wanted_bounds
-from .clean import compact, drop_scraps
+from .clean import drop_scraps
 from .extract import extract
 from .field_values import shade
 from .fusion import fuse_maps
 from .region import choose_region
 from .surface import Surface, to_world, vertex_normals
+from .triangles import compact
 
 FILE = "preview.npz"  # in the exports of a run, with the arrays of mesh.npz
 VIEWS, SIDE = 20, 128  # of the depth maps: how many, and pixels along the longest side

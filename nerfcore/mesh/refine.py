@@ -10,8 +10,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import scipy
 import torch
-from scipy import ndimage
 
 from ..data.pixels import VOID, PixelStore
 from ..geometry.cameras import pixel_centers, project, rays
@@ -51,9 +51,9 @@ def grey_pictures(views: list[FlatView], store: PixelStore, report: Reporter) ->
         grey = pixels @ (LUMA / 255)
         shrunk = flat.fx / photo.fx  # what is made smaller is smoothed before
         if shrunk < 0.7:
-            grey = ndimage.gaussian_filter(grey, 0.5 / shrunk)
+            grey = scipy.ndimage.gaussian_filter(grey, 0.5 / shrunk)
         place = np.nan_to_num(photo_pixels(view, store), nan=-1.0) - 0.5
-        shown = ndimage.map_coordinates(grey, place[:, ::-1].T, order=1, mode="nearest")
+        shown = scipy.ndimage.map_coordinates(grey, place[:, ::-1].T, order=1, mode="nearest")
         made.append(shown.reshape(flat.height, flat.width).astype(np.float32))
     return made
 

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt, gaussian_filter, maximum_filter, minimum_filter
+import scipy
 
 from ..data.pixels import VOID
 from ..progress import Reporter
@@ -186,7 +186,7 @@ def _reaching(known: Known, on: np.ndarray, point: np.ndarray, normal: np.ndarra
     index = ((place - low) / cell).astype(int)
     there = np.zeros(index.max(0) + rim + 1, bool)
     there[tuple(index.T)] = True
-    reached = np.asarray(distance_transform_edt(~there)) <= REACH
+    reached = np.asarray(scipy.ndimage.distance_transform_edt(~there)) <= REACH
     classes = _flat_classes(known, point, normal)
     return ScenePlane(point, normal, axes, low, cell, reached, np.zeros(there.shape), classes)
 
@@ -216,9 +216,13 @@ def _heights(known: Known, plane: ScenePlane) -> np.ndarray:
     np.add.at(total, index, weight * (away @ plane.normal))
     np.add.at(amount, index, weight)
     bounded = 1 / (1 + UNEVEN**2 * amount)
-    total, amount = (gaussian_filter(bounded * grid, SMOOTHED, mode="constant") for grid in (total, amount))
+    total, amount = (
+        scipy.ndimage.gaussian_filter(bounded * grid, SMOOTHED, mode="constant") for grid in (total, amount)
+    )
     known_there = amount > 1e-6 * amount.max()
-    nearest = np.asarray(distance_transform_edt(~known_there, return_distances=False, return_indices=True))
+    nearest = np.asarray(
+        scipy.ndimage.distance_transform_edt(~known_there, return_distances=False, return_indices=True)
+    )
     return np.where(known_there, total / np.where(known_there, amount, 1), 0)[tuple(nearest)]
 
 
@@ -266,5 +270,5 @@ def on_scene_planes(
     named = np.zeros(new.shape, bool)
     named[rows, columns] = by_class
     if labels is not None:
-        named &= maximum_filter(labels, INNER) == minimum_filter(labels, INNER)
+        named &= scipy.ndimage.maximum_filter(labels, INNER) == scipy.ndimage.minimum_filter(labels, INNER)
     return replace(map_, depth=new, spread=spread, cosine=cosines(view.camera, new)), named

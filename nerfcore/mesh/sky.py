@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt, uniform_filter
+import scipy
 
 from ..data.pixels import VOID
 from ..kernels.depth_arrays import FREE
@@ -55,9 +55,9 @@ def nothing(left_out: np.ndarray, sure: np.ndarray) -> np.ndarray:
     """Which pixels (H, W) show nothing that has a depth: those left out by the label map that photos do not confirm, and
     those beside a named thing whose surroundings photos do not confirm: windows of pixels that reach over an outline find
     the thing's depth outside of it."""
-    away = left_out & (np.asarray(distance_transform_edt(left_out)) > RIM)
-    around = uniform_filter(away.astype(np.float32), WINDOW)
-    confirmed = uniform_filter((away & sure).astype(np.float32), WINDOW)
+    away = left_out & (np.asarray(scipy.ndimage.distance_transform_edt(left_out)) > RIM)
+    around = scipy.ndimage.uniform_filter(away.astype(np.float32), WINDOW)
+    confirmed = scipy.ndimage.uniform_filter((away & sure).astype(np.float32), WINDOW)
     rim = left_out & ~away & (around > 1e-4) & (confirmed < CONFIRMED * around)
     return (left_out & ~sure) | rim
 
@@ -85,6 +85,8 @@ def backdrop(depth: np.ndarray, sure: np.ndarray) -> np.ndarray:
     out = np.zeros(depth.shape, bool)
     for number in np.unique(step[far]):
         near = hit & (np.abs(step - number) <= 1)
-        there, confirmed = (uniform_filter(m.astype(np.float32), size, mode="constant") for m in (near, near & sure))
+        there, confirmed = (
+            scipy.ndimage.uniform_filter(m.astype(np.float32), size, mode="constant") for m in (near, near & sure)
+        )
         out |= far & (step == number) & (confirmed < SUPPORT * there)
     return out

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..geometry.similarity import similarity_scale, transform_points
-from .clean import areas, cross, unit
+from .triangles import areas, cross, unit
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import maximum_filter
+import scipy
 
 from ..progress import Reporter
 from .facelets import Facelets
@@ -322,7 +322,7 @@ def _widened(ids: np.ndarray, sure: np.ndarray, known: np.ndarray, report: Repor
         for band in bands:
             report.check()
             around = pair[band.start : band.stop + 2]
-            near = np.asarray(maximum_filter(around, 3, mode="nearest"), np.uint32)[1:-1]
+            near = np.asarray(scipy.ndimage.maximum_filter(around, 3, mode="nearest"), np.uint32)[1:-1]
             rim = ~known[band] & (near > 0)
             ids[band][rim] = np.bitwise_and(near[rim] - 1, 0xFFFF).astype(ids.dtype)
             sure[band][rim] = np.right_shift(near[rim] - 1, 16)

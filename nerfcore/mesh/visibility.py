@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import scipy
 import torch
-from scipy.ndimage import minimum_filter
 
 from ..geometry.cameras import Camera, project
 from ..kernels.runtime import run_parallel, worker_count
@@ -118,7 +118,7 @@ def depth_buffer(view: PosedCamera, vertices: np.ndarray, faces: np.ndarray) -> 
     size = view.camera.width, view.camera.height
     widest = size[0] / 2 if view.camera.model == "EQUIRECTANGULAR" else 1e9
     face, nearest = nearest_triangle(view.pixels(local), view.depth(local), faces, *size, CPU, widest)
-    return DepthBuffer(view, face, nearest, minimum_filter(nearest, 3, mode="nearest"))
+    return DepthBuffer(view, face, nearest, scipy.ndimage.minimum_filter(nearest, 3, mode="nearest"))
 
 
 class DepthBuffers:

@@ -68,7 +68,7 @@ PictureSize = Annotated[tuple[int, int], AfterValidator(_picture)]
 
 
 class Params(BaseModel):
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, defer_build=True)
 
     @model_validator(mode="after")
     def _paths_are_text(self) -> Self:

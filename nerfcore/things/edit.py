@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial import KDTree
+import scipy
 
 from ..errors import InputError, ProjectError
 from ..files import UNREADABLE_ARRAYS, atomic_path
-from ..mesh.clean import areas, components
 from ..mesh.instances import Instance, joined, read_instances, write_instances
 from ..mesh.stored import MESH, mesh_folder, mesh_record
+from ..mesh.triangles import areas, components
 from ..params import InstancesParams
 from ..progress import Reporter
 from ..project.label_revision import LABEL_REVISION
@@ -110,7 +110,7 @@ def split(
     middle = vertices[faces].mean(1)
     big = np.isin(part, kept)
     if not big.all():
-        part[~big] = part[big][np.asarray(KDTree(middle[big]).query(middle[~big])[1])]
+        part[~big] = part[big][np.asarray(scipy.spatial.KDTree(middle[big]).query(middle[~big])[1])]
     face_instance, made = arrays["face_instance"].copy(), []
     number, taken = max(i.id for i in known), {i.name for i in known}
     for p in kept[1:]:

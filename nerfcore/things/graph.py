@@ -16,11 +16,11 @@ import numpy as np
 
 from ..errors import ProjectError
 from ..files import write_json
-from ..mesh.clean import areas, cross, unit
 from ..mesh.instances import Instance, read_instances
 from ..mesh.metrics import sample_surface
 from ..mesh.stored import load_surface, mesh_folder, mesh_record
 from ..mesh.surface import Surface
+from ..mesh.triangles import areas, cross, unit
 from ..params import RelationsParams
 from ..progress import Reporter
 from ..project.fingerprints import digest

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
-from scipy.spatial import ConvexHull, KDTree, QhullError
+import scipy
 
 Kind = Literal["on", "in", "next to", "part of", "hangs on"]
 KINDS: tuple[Kind, ...] = ("on", "in", "next to", "part of", "hangs on")
@@ -78,7 +78,7 @@ def relations(things: Sequence[Thing]) -> list[Relation]:
         return []
     every = np.concatenate([thing.points for thing in things])
     touch = TOUCH * float(np.linalg.norm(np.ptp(every, axis=0)))
-    trees = [KDTree(thing.points) for thing in things]
+    trees = [scipy.spatial.KDTree(thing.points) for thing in things]
     hulls = [_hull(thing.points) for thing in things]
     found: dict[tuple[int, int], Relation] = {}
     contacts = {
@@ -118,7 +118,7 @@ def is_branch(branch: tuple[str, ...], trunk: tuple[str, ...]) -> bool:
     return len(branch) > len(trunk) and branch[: len(trunk)] == trunk
 
 
-def contact(one: Thing, other: Thing, tree: KDTree, touch: float) -> Contact:
+def contact(one: Thing, other: Thing, tree: scipy.spatial.KDTree, touch: float) -> Contact:
     """How the points of one thing come close to another one, whose points the tree holds."""
     distance, nearest = (np.asarray(part) for part in tree.query(one.points))
     gap = float(distance.min())
@@ -138,7 +138,9 @@ def is_on(one: Thing, near: Contact) -> bool:
     return near.foot > 0.5 and near.carried > 0.3 and float(np.median(one.points[:, 2])) >= near.height
 
 
-def is_in(one: Thing, other: Thing, own: ConvexHull | None, hull: ConvexHull | None) -> bool:
+def is_in(
+    one: Thing, other: Thing, own: scipy.spatial.ConvexHull | None, hull: scipy.spatial.ConvexHull | None
+) -> bool:
     """Whether a thing lies within the hull of another, which stands around it and is larger."""
     if hull is None or (own is not None and own.volume >= hull.volume):
         return False
@@ -154,7 +156,7 @@ def is_in(one: Thing, other: Thing, own: ConvexHull | None, hull: ConvexHull | N
     return len(np.unique(sector)) >= WALLED * SECTORS
 
 
-def beside(one: Thing, other: Thing, tree: KDTree) -> float | None:
+def beside(one: Thing, other: Thing, tree: scipy.spatial.KDTree) -> float | None:
     """The gap between two things that stand next to each other; None where they do not."""
     width = min(float(np.ptp(thing.points[:, :2], axis=0).min()) for thing in (one, other))
     if _distance_of_boxes(one, other) > BESIDE * width:
@@ -181,11 +183,11 @@ def _direct(found: dict[tuple[int, int], Relation]) -> dict[tuple[int, int], Rel
     return {(a, b): r for (a, b), r in found.items() if r.kind not in ("on", "in") or not follows(a, b)}
 
 
-def _hull(points: np.ndarray) -> ConvexHull | None:
+def _hull(points: np.ndarray) -> scipy.spatial.ConvexHull | None:
     """The convex hull of points; None where they are flat."""
     try:
-        return ConvexHull(points)
-    except QhullError:
+        return scipy.spatial.ConvexHull(points)
+    except scipy.spatial.QhullError:
         return None
 
 

@@ -1,4 +1,6 @@
-"""The verb `blocks`: one large posed capture, trained and meshed in parts that overlap, joined into one mesh."""
+"""The verb `blocks`: one large posed capture, trained and meshed in parts that overlap, joined into one mesh.
+
+What a stage needs loads when it is reached."""
 
 from __future__ import annotations
 
@@ -8,10 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from .. import params as p
-from ..blocks.plan import BlockPlan, Plan, block_folder, cut, load_plan, save_plan
+from ..blocks.plan import MAPS, PART, RUN, SIGHTS, BlockPlan, Plan, block_folder, cut, load_plan, save_plan
 from ..blocks.projects import write_block
-from ..blocks.surface import MAPS, PART, RUN, SIGHTS, make_maps, make_part
-from ..blocks.whole import write_whole
 from ..cluster.estimate import Durations
 from ..cluster.link import Link
 from ..cluster.run import Options, Progress, Runner
@@ -28,7 +28,6 @@ from ..project.lock import project_lock
 from ..project.runs import checkpoint_id, run_folder
 from ..project.schema import step
 from ..project.store import load_project, record_step
-from ..train.reuse import finished, train_or_keep, unfinished
 from .campaign import held_gb, need_of
 
 TASK = f"{__name__}:run_stage"
@@ -68,6 +67,8 @@ def blocks(params: p.BlocksParams, report: Reporter) -> dict[str, Any]:
         report.check()
         write_block(folder, plan, block, params.holdout)
     made = _here(params, plan, report) if link is None else _on_cluster(params, plan, link, report)
+    from ..blocks.whole import write_whole
+
     result = write_whole(folder, plan, params, report)
     result["stages"] = {name: answer["seconds"] for name, answer in made.items()}
     result["reused"] = [name for name, answer in made.items() if answer["reused"]]
@@ -91,6 +92,8 @@ def training_of(params: p.BlocksParams, block: BlockPlan) -> p.TrainParams:
         set=settings_of(params),
         holdout=params.holdout,
     )
+    from ..train.reuse import unfinished
+
     return training.model_copy(update={"resume": unfinished(training)})
 
 
@@ -169,12 +172,16 @@ def _on_cluster(params: p.BlocksParams, plan: Plan, link: Link, report: Reporter
 
 
 def _train(params: p.BlocksParams, plan: Plan, block: BlockPlan, report: Reporter) -> tuple[dict[str, Any], bool]:
+    from ..train.reuse import finished, train_or_keep
+
     training = training_of(params, block)
     earlier = finished(training)
     return (earlier.result, True) if earlier.result is not None else (train_or_keep(training, report), False)
 
 
 def _maps(params: p.BlocksParams, plan: Plan, block: BlockPlan, report: Reporter) -> tuple[dict[str, Any], bool]:
+    from ..blocks.surface import make_maps
+
     folder, own = Path(params.project), block_folder(Path(params.project), block)
     inputs = {"field": checkpoint_id(own, RUN), "plan": digest(plan.model_dump(mode="json"))}
     run = run_folder(own, RUN)
@@ -183,6 +190,8 @@ def _maps(params: p.BlocksParams, plan: Plan, block: BlockPlan, report: Reporter
 
 
 def _part(params: p.BlocksParams, plan: Plan, block: BlockPlan, report: Reporter) -> tuple[dict[str, Any], bool]:
+    from ..blocks.surface import make_part
+
     folder, own = Path(params.project), block_folder(Path(params.project), block)
     scene = load_scene(own, params.holdout)
     inputs = {

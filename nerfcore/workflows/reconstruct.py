@@ -3,48 +3,23 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from .. import params as p
-from ..blender.blend import blend, blended
-from ..capture.ingest import ingested, new
 from ..data.load import load_scene
 from ..data.readers import colmap, transforms
 from ..errors import ProjectError
 from ..evaluate.report import check_report, write_report
-from ..evaluate.verb import evaluate, evaluated
-from ..mesh.verb import mesh, meshed
-from ..poses.estimate import estimate_poses, posed
 from ..progress import Reporter
 from ..project.fingerprints import Earlier
 from ..project.runs import holdout_of, read_metrics, run_folder
 from ..project.store import is_project, load_project
-from ..render.verb import orbit_cameras, render, rendered
-from ..train.reuse import finished, held_out, train_or_keep, unfinished
 from ..verdict import worst
 from . import budget
+from .stages import STAGES
 
-
-class Stage(NamedTuple):
-    """`earlier` says whether what an earlier call made may be used again."""
-
-    run: Callable[[Any, Reporter], dict[str, Any]]
-    earlier: Callable[[Any], Earlier]
-
-
-# The mesh and the .blend come before what says how good they are.
-STAGES = {
-    "new": Stage(new, ingested),
-    "poses": Stage(estimate_poses, posed),
-    "train": Stage(train_or_keep, finished),
-    "mesh": Stage(mesh, meshed),
-    "blend": Stage(blend, blended),
-    "evaluate": Stage(evaluate, evaluated),
-    "render": Stage(render, rendered),
-}
 AFTER_TRAINING = ("mesh", "blend", "evaluate")
 
 
@@ -64,7 +39,7 @@ class Pipeline:
         """Run a stage, unless what an earlier call made of the same inputs is there."""
         begin = time.perf_counter()
         self.report.check()
-        stage = STAGES[verb]
+        stage = STAGES[verb]()
         earlier = stage.earlier(values) if is_project(self.project) else Earlier()
         if earlier.result is not None:
             self.results[verb], self.seconds[verb] = earlier.result, 0.0
@@ -109,6 +84,8 @@ def stage_params(params: p.ReconstructParams, verb: str, spent: float = 0.0) -> 
         case "poses":
             return p.PosesParams(project=project)
         case "train":
+            from ..train.reuse import unfinished
+
             training = p.TrainParams(
                 project=project,
                 preset=params.preset,
@@ -121,6 +98,8 @@ def stage_params(params: p.ReconstructParams, verb: str, spent: float = 0.0) -> 
         case "mesh":
             return p.MeshParams(project=project, run=run, faces=params.faces or None, texture=params.texture or None)
         case "evaluate":
+            from ..train.reuse import held_out
+
             if not held_out(project, run):
                 return None
             seconds = budget.share_of(params.time_limit, budget.EVALUATION, spent)
@@ -201,6 +180,8 @@ def _render_params(params: p.ReconstructParams, project: Path, run: str, spent: 
     """Pictures of new views, as many and as large as there is time for."""
     size, count = None, params.render_count
     if params.time_limit is not None:
+        from ..render.verb import orbit_cameras
+
         camera = orbit_cameras(load_scene(project, holdout_of(project, run)), count)[0][1]
         seconds = budget.share_of(params.time_limit, budget.PICTURES, spent)
         speed = (read_metrics(run_folder(project, run)).get("test") or {}).get("rps")

@@ -18,7 +18,8 @@ from ..poses.spread import find_features, match_part
 from ..progress import Reporter
 from ..project.fingerprints import digest
 from ..project.lock import lockable, project_lock
-from .reconstruct import STAGES, run_stages, stage_params
+from .reconstruct import run_stages, stage_params
+from .stages import STAGES
 
 READ = ("photos", "labels", "masks", "classes")
 WRITTEN = ("out", "blend", "report", "renders")
@@ -81,7 +82,7 @@ def _render_part(params: ReconstructParams, frames: tuple[int, int], report: Rep
     values = stage_params(params, "render")
     assert isinstance(values, RenderParams)
     part = values.model_copy(update={"frame_range": frames})
-    stage = STAGES["render"]
+    stage = STAGES["render"]()
     earlier = stage.earlier(part)
     result = stage.run(part, report) if earlier.result is None else earlier.result
     seconds = round(time.perf_counter() - begin, 1)

@@ -12,7 +12,7 @@ from fieldwork.nerfcore.bench import measures
 from fieldwork.nerfcore.bench.still_life import TABLE, photographed, still_life
 from fieldwork.nerfcore.data.load import load_scene
 from fieldwork.nerfcore.errors import TrainingError
-from fieldwork.nerfcore.mesh.clean import areas
+from fieldwork.nerfcore.mesh.triangles import areas
 from fieldwork.nerfcore.params import BenchParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.verbs import run_verb

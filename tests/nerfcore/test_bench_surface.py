@@ -24,12 +24,12 @@ from fieldwork.nerfcore.bench.surface_table import FIGURES, figure_table
 from fieldwork.nerfcore.data.scene import Scene, View
 from fieldwork.nerfcore.errors import InputError
 from fieldwork.nerfcore.geometry.cameras import Camera
-from fieldwork.nerfcore.mesh.clean import cross, unit
 from fieldwork.nerfcore.mesh.metrics import distances
 from fieldwork.nerfcore.mesh.painted import Painted
 from fieldwork.nerfcore.mesh.photos import Photo
 from fieldwork.nerfcore.mesh.surface import Surface
 from fieldwork.nerfcore.mesh.surface_labels import ClassMaps, SurfaceClasses
+from fieldwork.nerfcore.mesh.triangles import cross, unit
 from fieldwork.nerfcore.mesh.uv import UvMap
 from fieldwork.nerfcore.mesh.visibility import PosedCamera
 from fieldwork.nerfcore.params import BenchParams

@@ -29,7 +29,7 @@ from fieldwork.nerfcore.geometry.cameras import Camera
 from fieldwork.nerfcore.geometry.points import Points
 from fieldwork.nerfcore.geometry.similarity import make_similarity
 from fieldwork.nerfcore.kernels.depth_arrays import FREE, MapArrays
-from fieldwork.nerfcore.mesh import clean, depth_maps
+from fieldwork.nerfcore.mesh import clean, depth_maps, triangles
 from fieldwork.nerfcore.mesh.extract import extract
 from fieldwork.nerfcore.mesh.fusion import fuse_maps
 from fieldwork.nerfcore.mesh.instances import GAP, find_instances
@@ -97,7 +97,9 @@ def in_blocks(each: list[MapArrays], plan: Plan, cells: int = CELLS) -> tuple[li
 def in_one(each: list[MapArrays], plan: Plan, cells: int = CELLS) -> Surface:
     region, maps = shared_region(None, plan, sights_in(each, plan), cells), joined_maps(each)
     vertices, faces = extract(fuse_maps(maps, region, Reporter()), Reporter())
-    vertices, faces = clean.compact(vertices, faces[clean.shown(vertices, faces, maps, 4 * region.voxel, Reporter())])
+    vertices, faces = triangles.compact(
+        vertices, faces[clean.shown(vertices, faces, maps, 4 * region.voxel, Reporter())]
+    )
     return joined([Part(classed(vertices, faces), np.zeros((0, 2)), region.voxel)])
 
 
@@ -120,11 +122,11 @@ def test_two_blocks_make_the_mesh_of_one(shape: str) -> None:
     assert is_watertight(one.faces)
     # No double layer: there is as much surface as in one piece, and every triangle of it.
     assert len(both.faces) == len(one.faces)
-    area = [clean.areas(s.vertices.astype(float), s.faces).sum() for s in (both, one)]
+    area = [triangles.areas(s.vertices.astype(float), s.faces).sum() for s in (both, one)]
     assert area[0] == pytest.approx(area[1], rel=1e-5)
     # Labels agree: so do the areas of each class, and things that the seam cuts through are one.
     for kind in (1, 2):
-        shares = [clean.areas(s.vertices.astype(float), s.faces)[s.face_class == kind].sum() for s in (both, one)]
+        shares = [triangles.areas(s.vertices.astype(float), s.faces)[s.face_class == kind].sum() for s in (both, one)]
         assert shares[0] == pytest.approx(shares[1], rel=1e-5)
     found = [find_instances(s.vertices, s.faces, s.face_class, NAMES, 0, GAP * parts[0].voxel)[1] for s in (both, one)]
     assert [i.name for i in found[0]] == [i.name for i in found[1]] == ["upper.001", "lower.001"]

@@ -13,17 +13,18 @@ import torch
 from fieldwork.nerfcore.blender.blend import blend
 from fieldwork.nerfcore.blocks.join import joined, open_at_seams
 from fieldwork.nerfcore.blocks.maps import joined_maps, load_maps
-from fieldwork.nerfcore.blocks.plan import Plan, block_folder, cut
+from fieldwork.nerfcore.blocks.plan import MAPS, SIGHTS, Plan, block_folder, cut
 from fieldwork.nerfcore.blocks.sights import load_sights
-from fieldwork.nerfcore.blocks.surface import MAPS, SIGHTS, Part, load_part, shared_region
+from fieldwork.nerfcore.blocks.surface import Part, load_part, shared_region
 from fieldwork.nerfcore.data.load import load_scene
 from fieldwork.nerfcore.errors import SettingError
-from fieldwork.nerfcore.mesh.clean import border_edges, compact, shown
+from fieldwork.nerfcore.mesh.clean import shown
 from fieldwork.nerfcore.mesh.extract import extract
 from fieldwork.nerfcore.mesh.fusion import fuse_maps
 from fieldwork.nerfcore.mesh.instances import read_instances
 from fieldwork.nerfcore.mesh.stored import load_surface
 from fieldwork.nerfcore.mesh.surface import Surface, vertex_normals
+from fieldwork.nerfcore.mesh.triangles import border_edges, compact
 from fieldwork.nerfcore.params import BlendParams, BlocksParams, InstancesParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.runs import run_folder

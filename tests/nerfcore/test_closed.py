@@ -7,7 +7,7 @@ import pytest
 import torch
 import trimesh
 from fieldwork.nerfcore.errors import Cancelled
-from fieldwork.nerfcore.mesh import clean, depth_maps
+from fieldwork.nerfcore.mesh import clean, depth_maps, triangles
 from fieldwork.nerfcore.mesh.closed import closed_surface, drop_unseen, extract_closed, unseen_faces
 from fieldwork.nerfcore.mesh.decimate import decimate, decimate_closed
 from fieldwork.nerfcore.mesh.fusion import BRICK, Bricks, fuse_maps
@@ -22,7 +22,7 @@ def closed_sphere(front: float, cells: int = 48) -> tuple[trimesh.Trimesh, np.nd
     maps = depth_maps.confirmed_maps(*maps_of(sphere(0.5), poses), torch.device("cpu"), Reporter())
     region = choose_region(maps, None, cells)
     vertices, faces = extract_closed(fuse_maps(maps, region, Reporter()), maps, Reporter())
-    vertices, faces = clean.compact(vertices, clean.drop_scraps(vertices, faces))
+    vertices, faces = triangles.compact(vertices, clean.drop_scraps(vertices, faces))
     unseen = unseen_faces(vertices, faces, maps, 4 * region.voxel, Reporter())
     return trimesh.Trimesh(vertices, faces, process=False), unseen, region.voxel
 

@@ -19,8 +19,9 @@ from fieldwork.nerfcore.params import ReconstructParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.workflows.campaign import plan
 from fieldwork.nerfcore.workflows.captures import Capture
-from fieldwork.nerfcore.workflows.reconstruct import STAGES, reconstruct, stages_of
+from fieldwork.nerfcore.workflows.reconstruct import reconstruct, stages_of
 from fieldwork.nerfcore.workflows.stage_task import capture_name, run_stage, tracked_paths
+from fieldwork.nerfcore.workflows.stages import STAGES
 from fieldwork.tests.nerfcore.support import reconstructed as support
 
 pytest.importorskip("fsspec", reason="the extra “cluster” is not installed")

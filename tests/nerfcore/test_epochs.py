@@ -13,9 +13,9 @@ from fieldwork.nerfcore.files import write_json
 from fieldwork.nerfcore.geometry.registration import by_points, by_surfaces
 from fieldwork.nerfcore.geometry.similarity import make_similarity, similarity_scale, transform_points
 from fieldwork.nerfcore.measure.epochs import compare, distance_colors
-from fieldwork.nerfcore.mesh.clean import cross, unit
 from fieldwork.nerfcore.mesh.metrics import sample_surface
 from fieldwork.nerfcore.mesh.stored import mesh_folder
+from fieldwork.nerfcore.mesh.triangles import cross, unit
 from fieldwork.nerfcore.params import CompareParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.runs import MEASURES

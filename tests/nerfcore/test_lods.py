@@ -11,11 +11,11 @@ import trimesh
 from fieldwork.nerfcore.errors import Cancelled
 from fieldwork.nerfcore.kernels.closest import ClosestPoints
 from fieldwork.nerfcore.mesh import decimate as decimation
-from fieldwork.nerfcore.mesh.clean import border_edges
 from fieldwork.nerfcore.mesh.decimate import decimate_patches
 from fieldwork.nerfcore.mesh.lods import level_files, make_levels, write_level
 from fieldwork.nerfcore.mesh.parts import texture_of
 from fieldwork.nerfcore.mesh.surface import Surface, is_watertight
+from fieldwork.nerfcore.mesh.triangles import border_edges
 from fieldwork.nerfcore.progress import Reporter
 from skimage.measure import marching_cubes
 

@@ -9,7 +9,8 @@ import torch
 import trimesh
 from fieldwork.nerfcore.kernels.depth_arrays import FREE
 from fieldwork.nerfcore.mesh import depth_maps
-from fieldwork.nerfcore.mesh.clean import FEWEST_VIEWS, cross, mean_around, seen_by, shown, unit
+from fieldwork.nerfcore.mesh.clean import FEWEST_VIEWS, seen_by, shown
+from fieldwork.nerfcore.mesh.triangles import cross, mean_around, unit
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.tests.nerfcore.support.depth_views import box, maps_of, orbit
 

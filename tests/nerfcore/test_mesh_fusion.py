@@ -11,7 +11,7 @@ from fieldwork.nerfcore.data.scene import View
 from fieldwork.nerfcore.errors import Cancelled, TrainingError
 from fieldwork.nerfcore.geometry.cameras import Camera
 from fieldwork.nerfcore.kernels.depth_arrays import FREE, MapArrays
-from fieldwork.nerfcore.mesh import clean, depth_maps, metrics
+from fieldwork.nerfcore.mesh import clean, depth_maps, metrics, triangles
 from fieldwork.nerfcore.mesh.decimate import decimate
 from fieldwork.nerfcore.mesh.extract import extract, weld
 from fieldwork.nerfcore.mesh.fusion import BRICK, Bricks, fuse_maps
@@ -49,9 +49,9 @@ def test_a_sphere_comes_back_as_a_closed_sphere(lens: str) -> None:
     # Half a pixel is 0.008 here: distances along the ray taken for depths, or corners for centres, would show.
     assert np.median(radius) == pytest.approx(0.5, abs=0.0015)
     assert np.quantile(np.abs(radius - 0.5), 0.95) < 0.25 * voxel
-    outward = (clean.cross(vertices, faces) * vertices[faces].mean(1)).sum(1)
+    outward = (triangles.cross(vertices, faces) * vertices[faces].mean(1)).sum(1)
     assert (outward > 0).all()
-    assert clean.areas(vertices, faces).sum() == pytest.approx(np.pi, rel=0.01)
+    assert triangles.areas(vertices, faces).sum() == pytest.approx(np.pi, rel=0.01)
 
 
 def test_a_plate_of_two_voxels_keeps_both_sides() -> None:
@@ -59,10 +59,10 @@ def test_a_plate_of_two_voxels_keeps_both_sides() -> None:
     half = np.array([0.4, 0.4, voxel])
     vertices, faces, maps, _ = surface_of(box(-half, half), orbit(30, 1.7), 64, voxel=voxel)
     vertices, faces, _ = clean.clean(vertices, faces, maps, 4 * voxel, Reporter())
-    normal = clean.unit(clean.cross(vertices, faces))[:, 2]
+    normal = triangles.unit(triangles.cross(vertices, faces))[:, 2]
     center = vertices[faces].mean(1)
     core = (np.abs(center[:, :2]) < 0.36).all(1)
-    area = clean.areas(vertices, faces)
+    area = triangles.areas(vertices, faces)
     for side in (-1, 1):
         chosen = core & (side * normal > 0.8) & (side * center[:, 2] > 0)
         assert area[chosen].sum() > 0.95 * 0.72**2
@@ -79,7 +79,7 @@ def test_a_rod_that_some_views_miss_stays_whole() -> None:
     arrays = depth_maps.map_arrays(flats, maps, CPU)
     vertices, faces = extract(fuse_maps(arrays, choose_region(arrays, None, 64, voxel), Reporter()), Reporter())
     core = np.abs(vertices[faces].mean(1)[:, 2]) < 0.35
-    assert clean.areas(vertices, faces[core]).sum() == pytest.approx(0.7 * 4 * 0.06, rel=0.2)
+    assert triangles.areas(vertices, faces[core]).sum() == pytest.approx(0.7 * 4 * 0.06, rel=0.2)
     assert np.abs(np.abs(vertices[np.unique(faces[core]), :2]).max(1) - 0.03).max() < voxel
 
 
@@ -100,8 +100,8 @@ def test_a_room_from_inside_keeps_its_walls_and_stays_open_outside() -> None:
     vertices, faces, _ = clean.clean(vertices, faces, maps, 4 * voxel, Reporter())
     off = np.abs(np.abs(vertices) - high).min(1)
     assert np.quantile(off, 0.95) < voxel  # no shell around the room, no cap at its region
-    normal, center = clean.unit(clean.cross(vertices, faces)), vertices[faces].mean(1)
-    area = clean.areas(vertices, faces)
+    normal, center = triangles.unit(triangles.cross(vertices, faces)), vertices[faces].mean(1)
+    area = triangles.areas(vertices, faces)
     for axis in range(3):
         for side in (-1, 1):
             wall = (side * center[:, axis] > 0.9 * high[axis]) & (side * normal[:, axis] < -0.8)  # facing inwards
@@ -113,7 +113,7 @@ def test_what_no_two_views_see_stays_open() -> None:
     vertices, faces, maps, voxel = surface_of(sphere(0.5), front, 64)
     vertices, faces, _ = clean.clean(vertices, faces, maps, 4 * voxel, Reporter())
     assert not is_watertight(faces)
-    assert len(clean.border_edges(faces)) > 20
+    assert len(triangles.border_edges(faces)) > 20
     assert (vertices[:, 0] < -0.45).sum() == 0
     assert np.abs(np.linalg.norm(vertices, axis=1) - 0.5).max() < 2 * voxel
 
@@ -209,19 +209,19 @@ def test_scraps_go_and_small_holes_are_filled() -> None:
     points, filled, new = clean.fill_holes(moved, kept)
     assert new.sum() >= 3
     assert is_watertight(filled)
-    outward = (clean.cross(points, filled) * points[filled].mean(1)).sum(1)
+    outward = (triangles.cross(points, filled) * points[filled].mean(1)).sum(1)
     assert (outward > 0).all()
 
 
 def test_fewer_triangles_keep_shape_and_border() -> None:
     vertices, faces, *_ = surface_of(sphere(0.5), orbit(24, 1.8), 96)
     faces = faces[vertices[faces].mean(1)[:, 2] < 0.2]
-    vertices, faces = clean.compact(vertices, faces)
-    border = {tuple(v) for v in vertices[np.unique(clean.border_edges(faces))].tolist()}
+    vertices, faces = triangles.compact(vertices, faces)
+    border = {tuple(v) for v in vertices[np.unique(triangles.border_edges(faces))].tolist()}
     points, fewer = decimate(vertices, faces, len(faces) // 6, Reporter())
     assert len(fewer) < len(faces) / 5
     assert np.abs(np.linalg.norm(points[fewer].mean(1), axis=1) - 0.5).max() < 0.015
-    kept = {tuple(v) for v in points[np.unique(clean.border_edges(fewer))].tolist()}
+    kept = {tuple(v) for v in points[np.unique(triangles.border_edges(fewer))].tolist()}
     assert kept == border
 
 

@@ -96,7 +96,7 @@ def test_a_long_render_of_a_campaign_is_spread_over_workers(place, monkeypatch):
     assert by_stage["render 2-3"].needs == by_stage["render 0-1"].needs == (by_stage[before[-1]].id,)
     assert set(by_stage["render"].needs) == {by_stage["render 0-1"].id, by_stage["render 2-3"].id}
     asked_for = []
-    stage = stage_task.STAGES["render"]
+    stage = stage_task.STAGES["render"]()
 
     def run(values, report):
         asked_for.append(values.frame_range)
@@ -105,7 +105,7 @@ def test_a_long_render_of_a_campaign_is_spread_over_workers(place, monkeypatch):
     def earlier(values):
         return rendered(values.model_copy(update={"orbit": 4, "size": (16, 16), "passes": ["rgb"]}))
 
-    monkeypatch.setitem(stage_task.STAGES, "render", stage._replace(run=run, earlier=earlier))
+    monkeypatch.setitem(stage_task.STAGES, "render", lambda: stage._replace(run=run, earlier=earlier))
     for _ in range(2):
         made = [stage_task.run_stage(task.values, Reporter()) for task in tasks if task.stage.startswith("render")]
     assert asked_for == [(0, 1), (2, 3), None], "a second time nothing is rendered"

@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import scipy.linalg
+import scipy
 
 from ...errors import InputError
 from ...geometry.cameras import Camera

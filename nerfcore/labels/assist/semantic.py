@@ -6,8 +6,8 @@ import json
 from pathlib import Path
 
 import numpy as np
+import scipy
 from PIL import Image
-from scipy.special import softmax
 
 from ...errors import InputError
 from ..models import Model, Wanted, normalised
@@ -37,7 +37,7 @@ class Semantic:
         ]
         values = normalised(resized(photo, size[1], size[0]))[None]
         (logits,) = self.model.run({self.input.name: self.input.array(values)}, [self.output.name])
-        return softmax(logits[0].astype(np.float32), axis=0)
+        return scipy.special.softmax(logits[0].astype(np.float32), axis=0)
 
 
 def read_mapping(path: Path, names: list[str]) -> dict[int, str]:

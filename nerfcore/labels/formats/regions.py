@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import skimage
 from PIL import Image, UnidentifiedImageError
-from skimage.draw import polygon2mask
 
 from ...errors import InputError
 from ...params import LARGEST_PICTURE
@@ -88,7 +88,7 @@ def polygon_mask(points: Sequence[float] | Sequence[Sequence[float]], width: int
     corners = np.asarray(points, np.float64).reshape(-1, 2)
     if len(corners) < 3 or not np.isfinite(corners).all():
         return np.zeros((height, width), bool)
-    return polygon2mask((height, width), corners[:, ::-1] - 0.5)
+    return skimage.draw.polygon2mask((height, width), corners[:, ::-1] - 0.5)
 
 
 def box_mask(left: float, top: float, right: float, bottom: float, width: int, height: int) -> np.ndarray:

@@ -18,7 +18,7 @@ from fieldwork.nerfcore.poses.estimate import posed, posing_inputs
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.schema import PosedImage, Poses
 from fieldwork.nerfcore.project.store import edit_project, save_poses
-from fieldwork.nerfcore.workflows import reconstruct as workflow
+from fieldwork.nerfcore.workflows import stages
 from fieldwork.nerfcore.workflows.reconstruct import reconstruct
 from fieldwork.tests.nerfcore.support.ball import SMALL, camera_poses, draw
 from PIL import Image
@@ -65,14 +65,14 @@ def reconstructed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def fake(patch: pytest.MonkeyPatch) -> None:
     patch.setattr("fieldwork.nerfcore.mesh.verb.build", triangle)
-    patch.setitem(workflow.STAGES, "poses", workflow.Stage(known_poses, posed))
+    patch.setitem(stages.STAGES, "poses", lambda: stages.Stage(known_poses, posed))
     # Small enough for a test (a texture of 4096 takes 20 s); what is asked of each stage stays the same from call to call.
     small = {
         "mesh": {"resolution": 24, "texture": 64},
         "render": {"orbit": 1, "size": (16, 16), "passes": ["rgb"]},
     }
     for verb, values in small.items():
-        patch.setitem(workflow.STAGES, verb, smaller(workflow.STAGES[verb], values))
+        patch.setitem(stages.STAGES, verb, smaller(stages.STAGES[verb], values))
 
 
 def triangle(*_: Any) -> Built:
@@ -82,11 +82,11 @@ def triangle(*_: Any) -> Built:
     return Built(corners, face, corners, np.full((3, 3), 128, np.uint8), region, (corners, face))
 
 
-def smaller(stage: workflow.Stage, values: dict[str, Any]) -> workflow.Stage:
+def smaller(stage: Callable[[], stages.Stage], values: dict[str, Any]) -> Callable[[], stages.Stage]:
     def changed(function: Callable) -> Callable:
         return lambda params, *rest: function(params.model_copy(update=values), *rest)
 
-    return workflow.Stage(changed(stage.run), changed(stage.earlier))
+    return lambda: stages.Stage(*map(changed, stage()))
 
 
 def call(place: Path, **values: Any) -> dict[str, Any]:

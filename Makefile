@@ -28,7 +28,7 @@ TRAIN_SECONDS ?= 240
 
 demo: venv
 ifndef PHOTOS
-	$(BIN)/fieldwork simulate $(DEMO)/capture
+	$(BIN)/fieldwork simulate $(DEMO)/capture --overviews 10
 endif
 	rm -rf $(DEMO)/project
 	$(BIN)/fieldwork reconstruct "$(or $(PHOTOS),$(DEMO)/capture/photos)" --out $(DEMO)/project $(if $(PHOTOS),$(OWN),$(SIMULATED)) \

@@ -226,6 +226,12 @@ class FIELDWORK_OT_simulate(VerbOperator):
         ],
     )
     views: IntProperty(name="Photos", description="Number of photos", default=48, min=4, soft_max=200)
+    overviews: IntProperty(
+        name="Overviews",
+        description="How many of them show the whole from farther away, the last ones",
+        min=0,
+        soft_max=50,
+    )
     size: IntVectorProperty(
         name="Size", description="Width and height of the photos", size=2, default=(480, 320), min=16
     )
@@ -242,6 +248,7 @@ class FIELDWORK_OT_simulate(VerbOperator):
             "out": absolute(self.out),
             "scene": self.scene,
             "views": self.views,
+            "overviews": self.overviews,
             "size": list(self.size),
             "seed": self.seed,
             "samples": self.samples,

@@ -30,6 +30,7 @@ COLORS = {  # sRGB, 0 to 255
 }
 TARGET = np.array([-0.05, 0.0, 1.25])
 LEVELS = [(0.34, 3.9, 1.6), (0.33, 3.1, 0.75), (0.33, 3.4, 2.35)]
+OVERVIEW = [(1.0, 6.0, 3.0)]
 SPREAD, WANDER = 150.0, (0.3, 0.0, 0.14)
 
 DOOR = Opening(-0.6, 0.3, 1.4, 0.46)
@@ -78,6 +79,11 @@ def build(seed: int) -> bpy.types.Scene:
 def poses(views: int, seed: int) -> list[np.ndarray]:
     """Camera-to-world (4, 4), OpenGL axes, of a photographer's walks to and fro before the facade."""
     return arc(views, LEVELS, TARGET, SPREAD, WANDER, seed)
+
+
+def overviews(views: int, seed: int) -> list[np.ndarray]:
+    """The same, of photos of the whole from farther away."""
+    return arc(views, OVERVIEW, TARGET, SPREAD, WANDER, seed + 1)
 
 
 def light(scene: bpy.types.Scene) -> None:

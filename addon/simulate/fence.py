@@ -26,6 +26,7 @@ COLORS = {  # sRGB, 0 to 255
 }
 TARGET = np.array([0.0, 0.0, 0.42])
 RINGS = [(0.38, 1.7, 10.0), (0.37, 1.75, 28.0), (0.25, 1.65, 52.0)]
+OVERVIEW = [(1.0, 2.8, 35.0)]
 HALF, TOP, GAP = 0.75, 0.82, 0.13  # of the fence: half its length, its height, between its wires
 WIRE = 0.006  # radius
 SIGN = (0.56, 0.010, 0.36)  # two voxels thick where 512 span the scene
@@ -52,6 +53,11 @@ def build(seed: int) -> bpy.types.Scene:
 def poses(views: int, seed: int) -> list[np.ndarray]:
     """Camera-to-world (4, 4), OpenGL axes, of a walk around the fence."""
     return rings(views, RINGS, TARGET, seed)
+
+
+def overviews(views: int, seed: int) -> list[np.ndarray]:
+    """The same, of photos of the whole from farther away."""
+    return rings(views, OVERVIEW, TARGET, seed + 1)
 
 
 def _rod(bm: bmesh.types.BMesh, start: Vector, end: Vector, radius: float) -> None:

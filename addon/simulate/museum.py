@@ -28,6 +28,7 @@ COLORS = {  # sRGB, 0 to 255
 HALF, HEIGHT = 2.1, 1.35  # of the room's walls, metres
 TARGET = np.array([0.0, 0.0, 0.56])
 RINGS = [(0.38, 1.75, 16.0), (0.37, 1.8, 33.0), (0.25, 1.7, 56.0)]
+OVERVIEW = [(1.0, 3.1, 37.0)]  # over the walls, which are low: what stands before them is seen from behind
 
 
 def build(seed: int) -> bpy.types.Scene:
@@ -51,6 +52,11 @@ def build(seed: int) -> bpy.types.Scene:
 def poses(views: int, seed: int) -> list[np.ndarray]:
     """Camera-to-world (4, 4), OpenGL axes, of a photographer's walk around the bust."""
     return rings(views, RINGS, TARGET, seed)
+
+
+def overviews(views: int, seed: int) -> list[np.ndarray]:
+    """The same, of photos of the whole from farther away."""
+    return rings(views, OVERVIEW, TARGET, seed + 1)
 
 
 def _light(scene: bpy.types.Scene) -> None:

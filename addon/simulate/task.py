@@ -17,13 +17,14 @@ ANGLE_OF_VIEW_FOCAL = 28 / 36  # focal length over sensor width: a 28 mm lens on
 def simulate(request: dict[str, Any], emit: Callable[..., None]) -> dict[str, Any]:
     """Render the views of `request["pending"]` (indices) into `request["folder"]`.
 
-    Request: scene, seed, views, size [w, h], samples, folder, truth (folder of the mesh), pending. Each finished view
+    Request: scene, seed, views, overviews (how many of them), size [w, h], samples, folder, truth (folder of the mesh), pending. Each finished view
     is told as {"kind": "view", "index": i}. The result holds everything that describes the capture.
     """
     module = SCENES[request["scene"]]
     emit(kind="stage", name="Building the scene")
     scene = module.build(request["seed"])
-    poses = module.poses(request["views"], request["seed"])
+    whole = request.get("overviews", 0)
+    poses = module.poses(request["views"] - whole, request["seed"]) + module.overviews(whole, request["seed"])
     width, height = request["size"]
     lens = Lens(width, height, ANGLE_OF_VIEW_FOCAL * max(width, height))
     truth = Path(request["truth"])

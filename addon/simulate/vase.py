@@ -25,6 +25,7 @@ COLORS = {  # sRGB, 0 to 255
 }
 TARGET = np.array([0.0, 0.0, 0.62])
 RINGS = [(0.38, 1.5, 8.0), (0.37, 1.55, 26.0), (0.25, 1.5, 50.0)]
+OVERVIEW = [(1.0, 2.6, 35.0)]
 TABLE = 0.4  # height of its top
 # (radius, height) from the foot to the knob of the lid, which is one body with the vase.
 PROFILE = [(0.1, 0), (0.11, 0.02), (0.085, 0.05), (0.12, 0.12), (0.18, 0.23), (0.195, 0.32), (0.17, 0.4), (0.11, 0.45)]
@@ -51,6 +52,11 @@ def build(seed: int) -> bpy.types.Scene:
 def poses(views: int, seed: int) -> list[np.ndarray]:
     """Camera-to-world (4, 4), OpenGL axes, of a walk around the table."""
     return rings(views, RINGS, TARGET, seed)
+
+
+def overviews(views: int, seed: int) -> list[np.ndarray]:
+    """The same, of photos of the whole from farther away."""
+    return rings(views, OVERVIEW, TARGET, seed + 1)
 
 
 def _cloth(textile: bpy.types.Material, shift: Vector) -> None:

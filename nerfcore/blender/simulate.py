@@ -48,8 +48,14 @@ def simulate(params: SimulateParams, report: Reporter) -> dict[str, Any]:
         raise SettingError(f"There is no scene {params.scene!r}.", f"Choose one of: {', '.join(SCENES)}.")
     if not all(16 <= side <= 8192 for side in params.size):
         raise SettingError(f"Photos of {params.size[0]}×{params.size[1]} pixels cannot be made.", "Use 16 to 8192.")
+    if params.overviews > params.views - 4:
+        raise SettingError(
+            f"{params.overviews} of {params.views} photos cannot show the whole.",
+            "At least 4 have to be taken close by.",
+        )
     out = params.out.absolute()
-    settings = params.model_dump(mode="json", exclude={"out"})
+    # Without overviews a capture stays the one that it was before there were any.
+    settings = params.model_dump(mode="json", exclude={"out"} if params.overviews else {"out", "overviews"})
     claim_folder(out, SETTINGS, settings, ["photos", "labels", "depth", "ground_truth"])
     pending = [index for index in range(params.views) if not _is_finished(out, index)]
     raw = out / ".raw"

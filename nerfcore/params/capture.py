@@ -22,6 +22,9 @@ class SimulateParams(Params):
         "wire, leaves, a sign) or vase (closed bodies on a table)",
     )
     views: int = Field(default=48, ge=4, le=MANY, description="number of photos")
+    overviews: int = Field(
+        default=0, ge=0, le=MANY, description="how many of them show the whole from farther away, the last ones"
+    )
     size: PictureSize = Field(default=(480, 320), description="photo width and height in pixels")
     seed: int = Field(default=0, ge=0, le=MANY, description="seed of the scene and of the camera path")
     samples: int = Field(default=4, ge=1, le=65536, description="Cycles samples per pixel")

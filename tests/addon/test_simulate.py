@@ -228,7 +228,20 @@ def test_other_settings_or_foreign_files_are_refused(capture, tmp_path):
         simulate(params(tmp_path), Reporter())
     with pytest.raises(SettingError, match="no scene"):
         simulate(params(tmp_path / "x", scene="palace"), Reporter())
+    with pytest.raises(SettingError, match="cannot show the whole"):
+        simulate(params(tmp_path / "x", overviews=2), Reporter())
     assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_overviews_are_the_last_photos_and_taken_from_farther_away(scene, tmp_path):
+    pytest.importorskip("bpy", reason="needs the bpy package")
+    simulate(params(tmp_path / "c", scene=scene, views=6, overviews=2, size=(48, 32)), Reporter())
+    frames = json.loads((tmp_path / "c/ground_truth/transforms.json").read_text())["frames"]
+    place = np.array([frame["transform_matrix"] for frame in frames])[:, :3, 3]
+    away = np.linalg.norm(place, axis=1)
+    assert len(away) == 6
+    assert away[4:].min() > 1.3 * away[:4].max()
 
 
 def test_cancel_is_prompt_and_the_next_run_goes_on(tmp_path):

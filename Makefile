@@ -28,7 +28,7 @@ TRAIN_SECONDS ?= 240
 
 demo: venv
 ifndef PHOTOS
-	$(BIN)/fieldwork simulate $(DEMO)/capture --overviews 10
+	$(BIN)/fieldwork simulate $(DEMO)/capture --overviews 14
 endif
 	rm -rf $(DEMO)/project
 	$(BIN)/fieldwork reconstruct "$(or $(PHOTOS),$(DEMO)/capture/photos)" --out $(DEMO)/project $(if $(PHOTOS),$(OWN),$(SIMULATED)) \

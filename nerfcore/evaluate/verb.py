@@ -134,11 +134,13 @@ class Comparison:
         }
 
     def details(self, folder: Path) -> dict[str, Any]:
-        """Scores of each view, and the pictures by their path in the project's folder."""
-        rounded = [{k: (round(v, 4) if isinstance(v, float) else v) for k, v in s.items()} for s in self.scores]
+        """Scores of each view, and the pictures by their path in the project's folder, in the order of the photos."""
+        place = {view.name: number for number, view in enumerate(self.scene.views)}
+        taken = sorted(range(len(self.scores)), key=lambda i: place[self.scores[i]["name"]])
+        rounded = [{k: (round(v, 4) if isinstance(v, float) else v) for k, v in self.scores[i].items()} for i in taken]
         result: dict[str, Any] = {
             "per_image": rounded,
-            "pictures": [str(path.relative_to(folder)) for path in self.pictures],
+            "pictures": [str(self.pictures[i].relative_to(folder)) for i in taken],
         }
         if any("psnr_given_pose" in score for score in self.scores):
             result["psnr_given_poses"] = self._mean("psnr_given_pose", 3)

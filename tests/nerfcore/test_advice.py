@@ -81,3 +81,10 @@ def test_evaluate_writes_a_report_that_judges_the_capture(tmp_path: Path) -> Non
     assert text.count("data:image/png;base64,") >= 2  # held-out photos beside their renders
     assert 0 <= result["per_image"][0]["unknown"] <= 1
     assert np.isfinite(result["psnr"])
+    # Where time is short, photos are compared in another order than they are told.
+    params = EvaluateParams(project=project, split="train", time_limit=1000)
+    result = run_verb("evaluate", params, Reporter())
+    names = [score["name"] for score in result["per_image"]]
+    assert len(names) == 14
+    assert names == sorted(names)
+    assert [Path(picture).stem for picture in result["pictures"]] == [Path(name).stem for name in names]

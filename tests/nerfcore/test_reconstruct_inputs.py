@@ -70,7 +70,7 @@ def all_stages(
         self.results[verb], self.seconds[verb] = made.get(verb, {}), 0.0
 
     monkeypatch.setattr(module.Pipeline, "do", do)
-    monkeypatch.setattr(module, "held_out", lambda project, run: False)
+    monkeypatch.setattr("fieldwork.nerfcore.train.reuse.held_out", lambda project, run: False)
     params = ReconstructParams(photos=folder_of(folder / "photos", 3), out=folder / "p", **asked)
     return seen, module.reconstruct(params, Reporter())
 
@@ -104,7 +104,7 @@ def test_the_blend_comes_before_what_says_how_good_it_is(tmp_path: Path, monkeyp
 
 def test_pictures_after_a_short_training_are_small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     camera = Camera(width=800, height=600, fx=700, fy=700, cx=400, cy=300)
-    monkeypatch.setattr(module, "orbit_cameras", lambda scene, count: [("a", camera, None)])
+    monkeypatch.setattr("fieldwork.nerfcore.render.verb.orbit_cameras", lambda scene, count: [("a", camera, None)])
     monkeypatch.setattr(module, "load_scene", lambda folder, holdout: None)
     monkeypatch.setattr(module, "holdout_of", lambda folder, run: 8)
     unknown, _ = all_stages(monkeypatch, tmp_path / "a", {}, time_limit=60)

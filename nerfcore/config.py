@@ -91,7 +91,8 @@ class FieldConfig(Stage):
     voxel_init: Literal["rgb_stats", "cnn", "none"] = Field(
         default="none",
         description="what is written into the dense levels after the coarse stage: mean and variance over the photos "
-        "of what they show at a vertex, as colours or as features of a small network",
+        "of what they show at a vertex, as colours or as features of a small network; only to compare with the publication: "
+        "it gained nothing where it was measured (docs/evidence.md)",
     )
     voxel_init_step: int = Field(default=128, ge=1, le=MANY, description="steps of the coarse stage before voxel_init")
     voxel_init_weights: str | None = Field(

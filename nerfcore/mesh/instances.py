@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 
 from ..errors import ProjectError
 from ..files import write_json
@@ -148,11 +149,6 @@ def distance_if_alike(one: Piece, other: Piece) -> float | None:
 
 def _joined(vertices: np.ndarray, faces: np.ndarray, gap: float) -> np.ndarray:
     """Number (F,) of the part of each face (F, 3), where parts with borders nearer than `gap` to each other are one."""
-    # Most of those who ask about instances join none.
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import KDTree
-
     part = components(faces, len(vertices))
     count = int(part.max(initial=-1)) + 1
     at_border = np.unique(border_edges(faces))
@@ -160,9 +156,10 @@ def _joined(vertices: np.ndarray, faces: np.ndarray, gap: float) -> np.ndarray:
         return part
     of_vertex = np.zeros(len(vertices), np.int64)
     of_vertex[faces] = part[:, None]
-    pairs = KDTree(vertices[at_border]).query_pairs(gap, output_type="ndarray")
+    pairs = scipy.spatial.KDTree(vertices[at_border]).query_pairs(gap, output_type="ndarray")
     a, b = of_vertex[at_border[pairs]].T
-    _, joined = connected_components(coo_matrix((np.ones(len(a), bool), (a, b)), (count, count)), False)
+    linked = scipy.sparse.coo_matrix((np.ones(len(a), bool), (a, b)), (count, count))
+    _, joined = scipy.sparse.csgraph.connected_components(linked, False)
     return joined[part]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy
 
 
 def cross(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -33,10 +34,8 @@ def components(faces: np.ndarray, count: int) -> np.ndarray:
     """Number (F,) of the connected part of each triangle; triangles that share a vertex are connected."""
     rows = np.concatenate([faces[:, 0], faces[:, 1]])
     columns = np.concatenate([faces[:, 1], faces[:, 2]])
-    from scipy.sparse import coo_matrix  # with what it loads, a twentieth of a second for every verb
-    from scipy.sparse.csgraph import connected_components
-
-    _, label = connected_components(coo_matrix((np.ones(len(rows), bool), (rows, columns)), (count, count)), False)
+    linked = scipy.sparse.coo_matrix((np.ones(len(rows), bool), (rows, columns)), (count, count))
+    _, label = scipy.sparse.csgraph.connected_components(linked, False)
     _, part = np.unique(label[faces[:, 0]], return_inverse=True)
     return part
 

@@ -18,6 +18,7 @@ from ..errors import TrainingError
 from ..files import disk_errors
 from ..kernels.host import default_threads
 from ..progress import Reporter
+from .triangles import components
 
 # xatlas takes longer than in proportion to the faces, docs/experiments.md, “Vector types of the CPU's compiler”.
 CHUNK_FACES = 1_000
@@ -73,7 +74,7 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, size: int, report: Reporter)
                 corners.append(cut["faces"] + sum(map(len, uv)))
                 uv.append(cut["uv"])
         joined, flat = np.concatenate(corners), np.concatenate(uv)
-        chart = _pieces(joined, len(flat))
+        chart = components(joined, len(flat)).astype(np.int32)
         step = max(1, size // PACK_SIZE)
         with disk_errors(folder):
             np.savez(
@@ -110,16 +111,6 @@ def spatial_chunks(centers: np.ndarray, most: int) -> list[np.ndarray]:
         ordered = part[np.argsort(centers[part, axis], kind="stable")]
         open_ += [ordered[: len(part) // 2], ordered[len(part) // 2 :]]
     return done
-
-
-def _pieces(faces: np.ndarray, vertices: int) -> np.ndarray:
-    """Number (F,) of the connected piece that each face belongs to."""
-    from scipy.sparse import coo_array  # the library takes its time to load
-    from scipy.sparse.csgraph import connected_components
-
-    ends = faces[:, [0, 1, 1, 2]].reshape(-1, 2).T
-    _, label = connected_components(coo_array((np.ones(ends.shape[1], bool), (ends[0], ends[1])), (vertices,) * 2))
-    return np.unique(label[faces[:, 0]], return_inverse=True)[1].astype(np.int32)
 
 
 def _settled(faces: np.ndarray, corners: np.ndarray) -> np.ndarray:

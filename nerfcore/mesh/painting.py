@@ -10,10 +10,11 @@ import torch
 from ..images.picture import srgb_to_linear
 from ..kernels.triangles import triangle_texels
 from .facelets import Facelets
-from .photos import halvings, sample
+from .photos import halvings, sample, sharpened
 from .visibility import CPU, DepthBuffer, PosedCamera, within
 
 BLOCK = 1 << 19  # texels painted at once
+FINE = 0.7  # width of a texel in pixels: a finer one shows less than a pixel does, so that the pixel's blur is undone
 BESIDE_FADES = 2  # power of the weight of a view that sees a facelet's border alone
 
 
@@ -133,7 +134,7 @@ def paint(
         careful (F,): facelets whose every texel has to be looked for in the depth buffer.
     """
     picture = torch.from_numpy(rgba[..., :3].astype(np.float32) / 255).permute(2, 0, 1)
-    levels = halvings(picture, 6)
+    levels, finest = halvings(picture, 6), [sharpened(rgba)]
     masked = bool((rgba[..., 3] == 0).any())
     places, values, seen = [], [], []
     texel, row = texels.of(jobs.face)
@@ -157,9 +158,13 @@ def paint(
             good[at] = rgba[y, x, 3] > 0
         some, job, face, pixel, depth = some[good], job[good], face[good], pixel[good], depth[good]
         # A texel wider than a pixel takes the mean of what it covers.
-        level = np.round(np.log2(np.maximum(texels.width[face] / view.footprint(depth), 1))).astype(int)
+        pixels = texels.width[face] / view.footprint(depth)
+        level = np.round(np.log2(np.maximum(pixels, 1))).astype(int)
         # Interpolated as the photo is stored: in linear light a cubic would overshoot visibly beside highlights.
-        color = srgb_to_linear(sample(levels, pixel, level, "bicubic").numpy().clip(0, 1))
+        stored = sample(levels, pixel, level, "bicubic").numpy()
+        fine = np.flatnonzero(pixels < FINE)
+        stored[fine] = sample(finest, pixel[fine], level[fine], "bicubic").numpy()
+        color = srgb_to_linear(stored.clip(0, 1))
         second, third = texels.barycentric[some].T[..., None]
         first = 1 - second - third
         weight, factor = jobs.weight[job], jobs.factor[job]

@@ -9,7 +9,7 @@ from fieldwork.nerfcore.mesh import photo_texture as module
 from fieldwork.nerfcore.mesh.facelets import facelets
 from fieldwork.nerfcore.mesh.painting import crossings, texels_of
 from fieldwork.nerfcore.mesh.photo_texture import PhotoTexture, photo_texture, prepare
-from fieldwork.nerfcore.mesh.photos import Photo
+from fieldwork.nerfcore.mesh.photos import Photo, sharpened
 from fieldwork.nerfcore.mesh.surface_picture import surface_picture
 from fieldwork.nerfcore.mesh.visibility import PosedCamera
 from fieldwork.nerfcore.progress import Reporter
@@ -211,3 +211,21 @@ def test_cancelled_at_every_stage() -> None:
         report = Stops(at)
         with pytest.raises(Cancelled):
             photo_texture(prepare(*wall_mesh(), photos, 128, report), None, report)
+
+
+def test_the_blur_of_a_pixel_is_half_taken_back():
+    fine = np.sin(2 * np.pi * np.arange(64 * 16) / (16 * 8)) * 80 + 128  # 16 points a pixel, 8 pixels a wave
+    photo = np.full((64, 64, 4), 255, np.uint8)
+    photo[..., :3] = np.round(fine.reshape(64, 16).mean(1))[None, :, None]
+    middle = (fine[7::16] + fine[8::16]) / 2
+    before, after = (np.abs(p[5, 1:-1] - middle[1:-1]) for p in (photo[..., 0], sharpened(photo)[0].numpy() * 255))
+    peak = np.abs(middle[1:-1] - 128) > 60
+    assert after[peak].mean() < 0.7 * before[peak].mean()
+
+
+def test_sharpening_asks_nothing_of_what_is_masked():
+    photo = np.full((8, 8, 4), 255, np.uint8)
+    photo[..., :3] = 100
+    assert np.allclose(sharpened(photo).numpy() * 255, 100)
+    photo[:, 4:] = 0
+    assert np.allclose(sharpened(photo)[:, :, :4].numpy() * 255, 100)

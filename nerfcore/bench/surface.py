@@ -125,7 +125,8 @@ def measure(job: Job, project: Path, report: Reporter, root: Path) -> dict[str, 
         report,
     )
     texture = texture_of(built.faces, painted.uv.corners, painted.image)
-    write_turntable(pictures, surface, texture, {c.id: c.color for c in scene.classes}, report)
+    class_map = painted.maps.ids if painted.maps else None
+    write_turntable(pictures, surface, texture, {c.id: c.color for c in scene.classes}, report, class_map)
     figures |= {
         "border_faces": int(on_sides(built.vertices, built.faces, region, region.voxel / 2).sum()),
         "faces": len(built.faces),

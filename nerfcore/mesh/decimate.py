@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import fast_simplification
 import numpy as np
+import scipy
 
 from ..progress import Reporter
 from .triangles import compact
@@ -12,6 +13,7 @@ from .triangles import compact
 CHUNK = 60_000  # faces simplified at once: a fraction of a second
 SMALL_CHUNK = 1000  # where edges of more than two triangles undo what was done to a chunk
 PASSES = 12
+STEP = 2.0**-20  # of a mesh's size: what is nearer than that would be one vertex in a file of single precision
 AT_ONCE = 0.25  # share of a chunk's faces that at least remain in one pass: its border is kept as it is until the next
 
 
@@ -53,6 +55,7 @@ def _passes(
     report: Reporter,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     total = max(len(faces) - target, 1)
+    step = STEP * float(np.ptp(vertices, axis=0).max()) if len(faces) > target else 1.0
     for number in range(PASSES):
         if len(faces) <= target:
             break
@@ -60,14 +63,18 @@ def _passes(
         before = len(faces)
         ratio = max(target / len(faces), AT_ONCE)
         keep = not move_borders or number < PASSES - 2
-        vertices, faces, patch = _one_pass(vertices, faces, patch, ratio, number, size, keep, not move_borders, report)
+        vertices, faces, patch = _one_pass(
+            vertices, faces, patch, ratio, number, size, keep, not move_borders, step, report
+        )
         if not move_borders:
             size = SMALL_CHUNK  # a chunk that simplifying would fold was left as it is
         if len(faces) > 0.98 * before:  # nothing but borders is left
             if not move_borders:
                 break
             if keep:
-                vertices, faces, patch = _one_pass(vertices, faces, patch, ratio, number, size, False, False, report)
+                vertices, faces, patch = _one_pass(
+                    vertices, faces, patch, ratio, number, size, False, False, step, report
+                )
     return vertices, faces, patch
 
 
@@ -80,6 +87,7 @@ def _one_pass(
     size: int,
     keep_border: bool,
     keep_manifold: bool,
+    step: float,
     report: Reporter,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     centers = vertices[faces].mean(1)
@@ -97,7 +105,7 @@ def _one_pass(
     folded, kept = _folded(faces), set[int]()
     manifold = np.array([not folded[chunk].any() for chunk in chunks])
     while True:
-        joined, corners, chunk = _join(made)
+        joined, corners, chunk = _join(made, step)
         # Collapses on two sides of a border, or in a thin thing, may have made an edge of more than two triangles.
         undone = {i for i in np.unique(chunk[_folded(corners)]).tolist() if manifold[i]} - kept
         if not undone or not keep_manifold:
@@ -145,14 +153,31 @@ def _chunks(centers: np.ndarray, number: int, size: int) -> list[np.ndarray]:
     return done
 
 
-def _join(parts: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Chunks as one mesh, with the number of the chunk of each triangle, welded at the borders they kept: their vertices
-    are equal to the last bit."""
+def _join(parts: list[tuple[np.ndarray, np.ndarray]], step: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Chunks as one mesh, with the number of the chunk of each triangle, welded at the borders they kept, whose vertices are
+    equal to the last bit, and along edges shorter than `step`, without triangles that lie on one another."""
     first = np.cumsum([0, *(len(points) for points, _ in parts)])
     vertices = np.concatenate([np.asarray(points, np.float64) for points, _ in parts])
     faces = np.concatenate([np.asarray(f, np.int64) + begin for (_, f), begin in zip(parts, first)])
     chunk = np.repeat(np.arange(len(parts)), [len(f) for _, f in parts])
     places, index = np.unique(vertices, axis=0, return_inverse=True)
     faces = index.reshape(-1)[faces]
-    proper = (faces != np.roll(faces, 1, axis=1)).all(1)
-    return (*compact(places, faces[proper]), chunk[proper])
+    one, other = faces, np.roll(faces, -1, axis=1)
+    short = np.linalg.norm(places[one] - places[other], axis=2) < step
+    linked = scipy.sparse.coo_matrix((np.ones(short.sum(), bool), (one[short], other[short])), (len(places),) * 2)
+    _, label = scipy.sparse.csgraph.connected_components(linked, False)
+    faces = np.unique(label, return_index=True)[1][label[faces]]
+    kept = np.flatnonzero((faces != np.roll(faces, 1, axis=1)).all(1))
+    kept = kept[single(faces[kept])]
+    return (*compact(places, faces[kept]), chunk[kept])
+
+
+def single(faces: np.ndarray) -> np.ndarray:
+    """Indices of the triangles (F, 3) that are left where some have the same vertices: none of a pair that looks both
+    ways, as a flap without thickness does, and one of those that look the same way."""
+    order = np.argsort(faces, axis=1)
+    turned = np.where((order[:, 1] - order[:, 0]) % 3 == 1, 1, -1)
+    _, group = np.unique(np.take_along_axis(faces, order, 1), axis=0, return_inverse=True)
+    side = np.sign(np.bincount(group.reshape(-1), turned)).astype(int)[group.reshape(-1)]
+    candidates = np.flatnonzero(side == turned)
+    return candidates[np.unique(group.reshape(-1)[candidates], return_index=True)[1]]

@@ -16,7 +16,7 @@ from ..params import TurntableParams
 from ..progress import Reporter
 from ..project.store import load_project, record_step
 from .parts import Texture
-from .stored import load_surface, mesh_folder
+from .stored import load_class_map, load_surface, mesh_folder
 from .surface import Surface
 from .surface_picture import TexturedMesh
 
@@ -25,6 +25,7 @@ ELEVATION = np.radians(30)
 LENS = 1.4  # focal length over the picture's side
 MARGIN = 0.03  # of the picture's side, left free around the mesh
 BACKGROUND = 70
+UNKNOWN = (0.15, 0.15, 0.15)  # of a class without a colour
 LIGHT = np.array([0.35, -0.5, 0.8]) / np.linalg.norm([0.35, -0.5, 0.8])
 
 
@@ -61,7 +62,9 @@ def turntable(params: TurntableParams, report: Reporter) -> dict[str, Any]:
     surface, texture = load_surface(folder, params.run)
     target = params.out or mesh_folder(folder, params.run) / "turntable"
     report.stage("Looking at it")
-    files = write_turntable(target, surface, texture, {c.id: c.color for c in project.classes}, report)
+    class_map = None if texture is None else load_class_map(folder, params.run)
+    colors = {c.id: c.color for c in project.classes}
+    files = write_turntable(target, surface, texture, colors, report, class_map)
     result = {"files": [str(path) for path in files]}
     record_step(folder, "turntable", params.model_dump(mode="json"), result)
     return result
@@ -73,13 +76,14 @@ def write_turntable(
     texture: Texture | None,
     colors: dict[int, tuple[float, float, float]],
     report: Reporter,
+    class_map: np.ndarray | None = None,
 ) -> list[Path]:
     """Write the pictures of `look_around` as color_0.png … and class_0.png …; all of them, or none where it is stopped.
 
     Returns:
         the files written.
     """
-    pictures = look_around(surface, texture, colors, report)
+    pictures = look_around(surface, texture, colors, report, class_map)
     with staged(folder) as place:
         for name, picture in pictures.items():
             report.check()
@@ -93,23 +97,22 @@ def look_around(
     texture: Texture | None,
     colors: dict[int, tuple[float, float, float]],
     report: Reporter,
+    class_map: np.ndarray | None = None,
 ) -> dict[str, np.ndarray]:
     """Eight views (SIDE, SIDE, 3) uint8 of a surface in the world by the names of their files, in its colours and in those
     of its classes, triangles seen from their front only, as one looks into a room without its near walls.
 
     Args:
-        texture: of the surface; without one its vertices' colours are shown. colors: sRGB in [0, 1] of each class id;
-            others are dark.
+        texture: of the surface; without one its vertices' colours are shown. class_map: class (S, S) of each texel of the
+            texture; without one the faces' are shown. colors: sRGB in [0, 1] of each class id; others are dark.
     """
     mesh = FrontFaces(surface.vertices, surface.faces)
-    textured = None
+    textured, uv = None, None
     if texture is not None:
-        corners = texture.unwrapped.uv[texture.unwrapped.faces]
-        textured = TexturedMesh(surface.vertices, surface.faces, corners, texture.image)
+        uv = texture.unwrapped.uv[texture.unwrapped.faces]
+        textured = TexturedMesh(surface.vertices, surface.faces, uv, texture.image)
     camera = Camera(width=SIDE, height=SIDE, fx=LENS * SIDE, fy=LENS * SIDE, cx=SIDE / 2, cy=SIDE / 2)
     local, _ = rays(camera, pixel_centers(SIDE, SIDE).reshape(-1, 2))
-    ids = np.unique(surface.face_class)
-    shades = np.array([colors.get(int(c), (0.15, 0.15, 0.15)) for c in ids]) * 255
     pictures: dict[str, np.ndarray] = {}
     for number, pose in enumerate(turntable_poses(surface.vertices, VIEWS)):
         report.progress(number / VIEWS)
@@ -124,7 +127,14 @@ def look_around(
             away = np.linalg.norm(_mixed(surface.vertices[corners], weights) - pose[:3, 3], axis=1)
             color[hit] = to_bytes(linear_to_srgb(textured.light(face[hit], weights, away / camera.fx).numpy()))
         light = 0.55 + 0.45 * (_mixed(surface.normals[corners], weights) @ LIGHT)[:, None]
-        label[hit] = (shades[np.searchsorted(ids, surface.face_class[face[hit]])] * light).clip(0, 255)
+        ids = surface.face_class[face[hit]]
+        if class_map is not None and uv is not None:
+            size = len(class_map)
+            x, y = np.clip((_mixed(uv[face[hit]], weights) * [1, -1] + [0, 1]) * size, 0, size - 1).astype(int).T
+            ids = class_map[y, x]
+        shown, number_of = np.unique(ids, return_inverse=True)
+        shades = np.array([colors.get(int(c), UNKNOWN) for c in shown]).reshape(-1, 3) * 255
+        label[hit] = (shades[number_of] * light).clip(0, 255)
         for name, picture in (("color", color), ("class", label)):
             pictures[f"{name}_{number}.png"] = picture.reshape(SIDE, SIDE, 3)
     return pictures

@@ -94,7 +94,7 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
     pictures: dict[str, np.ndarray] = {}
     if params.turntable is not None:
         report.stage("Looking at it")
-        pictures = look_around(surface, texture, colors, report)
+        pictures = look_around(surface, texture, colors, report, painted.maps.ids if painted.maps else None)
     revision = trained.info.label_revision
     made = Made(surface, texture, painted, built, box, instances, levels, pictures, revision)
     report.stage("Writing")

@@ -9,7 +9,7 @@ import trimesh
 from fieldwork.nerfcore.errors import Cancelled
 from fieldwork.nerfcore.mesh import clean, depth_maps, triangles
 from fieldwork.nerfcore.mesh.closed import closed_surface, drop_unseen, extract_closed, unseen_faces
-from fieldwork.nerfcore.mesh.decimate import decimate, decimate_closed
+from fieldwork.nerfcore.mesh.decimate import decimate, decimate_closed, single
 from fieldwork.nerfcore.mesh.fusion import BRICK, Bricks, fuse_maps
 from fieldwork.nerfcore.mesh.region import choose_region
 from fieldwork.nerfcore.progress import Reporter
@@ -73,6 +73,14 @@ def test_noise_over_several_blocks_of_bricks_is_closed_too() -> None:
     fewer = trimesh.Trimesh(*decimate_closed(vertices, faces, len(faces) // 3, Reporter()), process=False)
     assert len(fewer.faces) < len(faces)  # noise leaves little to take away
     assert fewer.is_watertight
+    for mesh in plain, fewer:  # no flap of two triangles, and single precision keeps vertices apart
+        assert len(np.unique(np.sort(mesh.faces, 1), axis=0)) == len(mesh.faces)
+        assert len(np.unique(mesh.vertices.astype(np.float32), axis=0)) == len(mesh.vertices)
+
+
+def test_of_triangles_with_the_same_corners_one_is_left_or_none() -> None:
+    faces = np.array([[0, 1, 2], [1, 2, 0], [3, 4, 5], [5, 4, 3], [2, 4, 6], [6, 2, 4], [4, 2, 6]])
+    assert single(faces).tolist() == [0, 4]
 
 
 def test_fewer_triangles_stay_closed() -> None:

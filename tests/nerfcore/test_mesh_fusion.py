@@ -304,7 +304,11 @@ def test_a_turntable_shows_fronts_in_their_colours(tmp_path: Path) -> None:
     image[:, :4, 1] = image[:, 4:, 0] = 200  # green on the left, red on the right
     left = np.broadcast_to(np.where(vertices[faces].mean(1)[:, :1, None] > 0, 0.25, 0.75), (len(faces), 3, 1))
     texture = texture_of(faces, np.concatenate([left, np.full_like(left, 0.5)], 2), image)
-    write_turntable(tmp_path, surface, texture, {}, Reporter())
+    class_map = np.where(image[..., 1] > 0, 5, 6)
+    write_turntable(tmp_path, surface, texture, {5: (0.0, 0.0, 1.0), 6: (1.0, 1.0, 0.0)}, Reporter(), class_map)
+    near, far = (np.array(Image.open(tmp_path / f"class_{number}.png")).astype(int) for number in (0, 4))
+    assert near[320, 320, 2] > 100 > near[320, 320, 0]  # classes of texels rather than of triangles
+    assert far[320, 320, 0] > 100 > far[320, 320, 2]
     front, back = (np.array(Image.open(tmp_path / f"color_{number}.png")).astype(int) for number in (0, 4))
     assert front[320, 320] == pytest.approx([0, 200, 0], abs=2)
     assert back[320, 320] == pytest.approx([200, 0, 0], abs=2)

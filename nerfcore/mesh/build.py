@@ -61,8 +61,8 @@ def build(trained: Trained, project: Project, scene: Scene, params: MeshParams, 
         SettingError: an impossible region, or `detail` without a known scale.
     """
     box = trained.info.box(project)
-    flats, store, maps = agreed_maps(trained, scene, box, report)
     bounds, voxel = wanted_bounds(params, scene, box), wanted_voxel(params, project, box)
+    flats, store, maps = agreed_maps(trained, scene, box, report)
     region = choose_region(maps, bounds, params.resolution, voxel)
     report.stage("Fusing")
     bricks = fuse_maps(maps, region, report)
@@ -73,7 +73,7 @@ def build(trained: Trained, project: Project, scene: Scene, params: MeshParams, 
     else:
         vertices, faces = open_surface(bricks, maps, tolerance, region, params.faces, report)
     if not len(faces):
-        raise TrainingError("The field has no surface in the region of interest.", "Train longer, or check the box.")
+        raise no_surface(params)
     check_parts(vertices, faces, report)
     report.stage("Reading colours")
     vertices, faces = vertices.astype(np.float32), faces.astype(np.int32)
@@ -82,6 +82,16 @@ def build(trained: Trained, project: Project, scene: Scene, params: MeshParams, 
     colors = vertex_colors(trained.model, region, photos, vertices, normals, report)
     unseen = unseen_faces(vertices, faces, maps, tolerance, report) if params.watertight else None
     return Built(vertices, faces, normals, colors, region, coarse, unseen)
+
+
+def no_surface(params: MeshParams) -> TrainingError:
+    """What to say where there is none in the region."""
+    if params.region in ("auto", "photos"):
+        return TrainingError("The field has no surface in the region of interest.", "Train longer, or check the box.")
+    return TrainingError(
+        f"There is no surface in the region {params.region}.",
+        "Its corners are in the aligned world, in its units; `photos` looks at all that the photos show.",
+    )
 
 
 def agreed_maps(

@@ -16,7 +16,7 @@ from ..progress import Reporter
 from ..project.store import load_project
 from ..render.run import Trained, load_trained
 from . import depth_maps as dm
-from .build import wanted_bounds
+from .build import no_surface, wanted_bounds
 from .clean import drop_scraps
 from .extract import extract
 from .field_values import shade
@@ -41,16 +41,17 @@ def preview(params: MeshParams, report: Reporter) -> dict[str, Any]:
     project, trained = load_project(params.project), load_trained(params.project, params.run)
     scene = load_scene(params.project, trained.info.holdout)
     box = trained.info.box(project)
+    bounds = wanted_bounds(params, scene, box)
     report.stage("A first look: depth maps")
     views = dm.spread_views([scene.views[i] for i in scene.train], VIEWS)
     flats = dm.flat_views(views, box.box_from_world, SIDE)
     maps = dm.confirmed_maps(flats, dm.depth_maps(trained.model, flats, report), trained.device, report)
     report.stage("A first look: surface")
-    region = choose_region(maps, wanted_bounds(params, scene, box), min(CELLS, params.resolution or CELLS))
+    region = choose_region(maps, bounds, min(CELLS, params.resolution or CELLS))
     vertices, faces = extract(fuse_maps(maps, region, report), report)
     vertices, faces = compact(vertices, drop_scraps(vertices, faces)) if len(faces) else (vertices, faces)
     if not len(faces):
-        raise TrainingError("The field has no surface in the region of interest.", "Train longer, or check the box.")
+        raise no_surface(params)
     vertices, faces = vertices.astype(np.float32), faces.astype(np.int32)
     surface, confidence = _shaded(trained, vertices, faces, region.voxel, scene.ignore_id, report)
     surface = to_world(surface, box.world_from_box)

@@ -102,6 +102,15 @@ def test_a_region_that_misses_everything_is_said_to(untrained: Path, monkeypatch
     assert written(untrained) == []
 
 
+@pytest.mark.parametrize("preview", [False, True])
+def test_an_empty_region_is_said_to_before_the_work(
+    untrained: Path, monkeypatch: pytest.MonkeyPatch, preview: bool
+) -> None:
+    monkeypatch.setattr(depth_maps, "depth_maps", lambda *_: pytest.fail("depth maps were rendered"))
+    with pytest.raises(SettingError, match="is empty"):
+        run_verb("mesh", MeshParams(project=untrained, region="1,0,0,0,1,1", preview=preview), Reporter())
+
+
 def test_one_photo_is_no_surface(untrained: Path) -> None:
     trained = load_trained(untrained, "main")
     scene = load_scene(untrained, trained.info.holdout)

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from ..data.load import load_scene
-from ..errors import TrainingError
 from ..files import atomic_path
 from ..geometry.similarity import similarity_scale
 from ..images.picture import to_bytes

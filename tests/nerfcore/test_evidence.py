@@ -188,6 +188,16 @@ def test_a_profile_is_measured_once_and_told(measured: tuple[Path, dict[str, Any
     assert over_seeds(record["rows"], "psnr", variant="ours", noise=0.05).count == 2  # type: ignore[union-attr]
 
 
+def test_trials_that_no_scene_fits_are_not_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(suite, "is_labelled", lambda project: project.name != "lego_400")
+    projects = {name: tmp_path / name for name in ("lego_400", "museum")}
+    left = {(trial.scene, trial.variant) for _, trial in suite._possible("evening", projects)}
+    assert ("lego_400", "ours") in left
+    assert ("lego_400", "semantic-nerf") not in left
+    assert ("museum", "semantic-nerf") in left
+    assert ("facade", "semantic-nerf") in left  # not looked at yet
+
+
 def test_a_page_is_added_to_where_the_trials_are_gone(measured: tuple[Path, dict[str, Any], Path, list[str]]) -> None:
     """Only what the page lacks is trained; its other rows and plots stay as they are."""
     folder, _, page, notes = measured

@@ -59,7 +59,9 @@ def evidence_suite(params: BenchParams, out: Path, root: Path, command: str, rep
             shown, shown_command = tables, command
             if params.add_to_page:  # all of the profile that there is, whatever part is measured now
                 shown = list(
-                    {(t, trial.name): (t, trial) for t, trial in [*trials_of(params.profile), *tables]}.values()
+                    {
+                        (t, trial.name): (t, trial) for t, trial in [*_possible(params.profile, projects), *tables]
+                    }.values()
                 )
                 shown_command = f"fieldwork bench --suite evidence --profile {params.profile}"
             keep = partial(_kept, params, out, shown_command, shown, notes)
@@ -129,6 +131,11 @@ def _projects(params: BenchParams, root: Path, names: list[str], report: Reporte
             continue
         projects[name] = prepare(scene, data, root, report)
     return projects, notes
+
+
+def _possible(profile: str, projects: dict[str, Path]) -> list[tuple[str, Trial]]:
+    """Tables and trials of a profile, without those of which a scene of `projects` is known not to have what they need."""
+    return [each for each in trials_of(profile) if each[1].scene not in projects or _fits(each[1], projects)]
 
 
 def _fits(trial: Trial, projects: dict[str, Path]) -> bool:

@@ -161,9 +161,9 @@ def paint(
         pixels = texels.width[face] / view.footprint(depth)
         level = np.round(np.log2(np.maximum(pixels, 1))).astype(int)
         # Interpolated as the photo is stored: in linear light a cubic would overshoot visibly beside highlights.
-        stored = sample(levels, pixel, level, "bicubic").numpy()
-        fine = np.flatnonzero(pixels < FINE)
-        stored[fine] = sample(finest, pixel[fine], level[fine], "bicubic").numpy()
+        stored, fine = np.empty((len(pixel), 3), np.float32), pixels < FINE
+        for rows, read in ((fine, finest), (~fine, levels)):
+            stored[rows] = sample(read, pixel[rows], level[rows], "bicubic").numpy()
         color = srgb_to_linear(stored.clip(0, 1))
         second, third = texels.barycentric[some].T[..., None]
         first = 1 - second - third

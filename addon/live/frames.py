@@ -142,7 +142,7 @@ class FrameEngine:
             outcome: list[tuple[dict[str, Any] | None, EngineError | None]] = []
 
             def heard(kind: str, data: dict[str, Any]) -> None:
-                if data.get("job") != name:
+                if data.get("job") != name or pixels.closed:  # the engine had said it before it heard of the cancelling
                     return
                 if kind == "progress":
                     tell(str(data.get("stage") or ""), float(data.get("fraction") or 0.0))
@@ -245,6 +245,10 @@ class _SharedPixels:
             self._file.close()
         with contextlib.suppress(OSError):  # Windows keeps it while the engine looks at it; the folder goes in the end
             self.path.unlink()
+
+    @property
+    def closed(self) -> bool:
+        return self._map is None or self._map.closed
 
     def _counter(self) -> int:
         assert self._map is not None

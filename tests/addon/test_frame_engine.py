@@ -81,6 +81,27 @@ def test_an_engine_that_does_not_give_up_a_frame_is_ended(ball, tmp_path):
         frames.close()
 
 
+def test_what_the_engine_says_of_a_frame_that_was_cancelled_is_not_passed_on(ball, tmp_path):
+    from fieldwork.addon.live.frames import FrameEngine, Sizes
+
+    frames = FrameEngine(lambda: Link(sys.executable, tmp_path / "engine.log"))
+    sizes, said = Sizes(64, 48, {"Combined": 4}), []
+    try:
+        frames.render(shot(ball, 1, True), sizes, lambda: False, lambda *_: None)
+        os.kill(frames.process.pid, signal.SIGSTOP)
+        with pytest.raises(EngineError):
+            frames.render(shot(ball, 1, True), sizes, lambda: True, lambda *told: said.append(told), said.append)
+        (name,) = frames._left
+        for kind in ("progress", "event"):
+            frames._link._messages.put({"method": kind, "params": {"job": name, "stage": "Rendering", "fraction": 0.5}})
+        frames.pump()
+        assert frames._link._messages.empty()
+        assert said == []
+        os.kill(frames.process.pid, signal.SIGCONT)
+    finally:
+        frames.close()
+
+
 def test_frames_of_several_threads_wait_for_each_other(ball, tmp_path):
     from fieldwork.addon.live.frames import FrameEngine, Sizes
 

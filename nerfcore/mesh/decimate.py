@@ -12,7 +12,9 @@ from .triangles import compact
 
 CHUNK = 60_000  # faces simplified at once: a fraction of a second
 SMALL_CHUNK = 1000  # where edges of more than two triangles undo what was done to a chunk
+WHOLE = 1_000_000  # faces simplified as one piece, so that open borders can move and those of chunks need not: seconds
 PASSES = 12
+STALLED = 0.98  # share of its faces that a pass leaves, from which on the next ones are in vain
 STEP = 2.0**-20  # of a mesh's size: what is nearer than that would be one vertex in a file of single precision
 AT_ONCE = 0.25  # share of a chunk's faces that at least remain in one pass: its border is kept as it is until the next
 
@@ -57,24 +59,21 @@ def _passes(
     total = max(len(faces) - target, 1)
     step = STEP * float(np.ptp(vertices, axis=0).max()) if len(faces) > target else 1.0
     for number in range(PASSES):
-        if len(faces) <= target:
-            break
-        report.progress(min(1.0, 1 - (len(faces) - target) / total))
         before = len(faces)
-        ratio = max(target / len(faces), AT_ONCE)
-        keep = not move_borders or number < PASSES - 2
+        if before <= target:
+            break
+        report.progress(min(1.0, 1 - (before - target) / total))
+        ratio = max(target / before, AT_ONCE)
         vertices, faces, patch = _one_pass(
-            vertices, faces, patch, ratio, number, size, keep, not move_borders, step, report
+            vertices, faces, patch, ratio, number, size, True, not move_borders, step, report
         )
         if not move_borders:
             size = SMALL_CHUNK  # a chunk that simplifying would fold was left as it is
-        if len(faces) > 0.98 * before:  # nothing but borders is left
-            if not move_borders:
-                break
-            if keep:
-                vertices, faces, patch = _one_pass(
-                    vertices, faces, patch, ratio, number, size, False, False, step, report
-                )
+        if len(faces) > STALLED * before:
+            break
+    if move_borders and target < len(faces) <= WHOLE:  # nothing but borders is left
+        ratio = target / len(faces)
+        vertices, faces, patch = _one_pass(vertices, faces, patch, ratio, 0, WHOLE, False, False, step, report)
     return vertices, faces, patch
 
 

@@ -235,6 +235,21 @@ def test_edges_of_three_triangles_do_not_keep_a_mesh_from_getting_smaller() -> N
     assert len(fewer) < len(faces) / 4
 
 
+def test_a_mesh_full_of_holes_gets_as_small_as_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    from fieldwork.nerfcore.mesh import decimate as module
+
+    side = 41
+    x, y = np.meshgrid(np.arange(side), np.arange(side), indexing="ij")
+    vertices = np.stack([x, y, 0 * x], -1).reshape(-1, 3).astype(np.float64)
+    corner = np.flatnonzero(((x % 2 == 0) | (y % 2 == 0)) & (x < side - 1) & (y < side - 1))
+    quads = np.stack([corner, corner + side, corner + side + 1, corner + 1], 1)
+    faces = np.concatenate([quads[:, :3], quads[:, [0, 2, 3]]])
+    monkeypatch.setattr(module, "CHUNK", 300)
+    points, fewer = decimate(vertices, faces, len(faces) // 2, Reporter())
+    assert len(fewer) <= len(faces) // 2
+    assert np.abs(points[:, 2]).max() < 1e-6
+
+
 def test_scores_of_known_shapes() -> None:
     import trimesh
 

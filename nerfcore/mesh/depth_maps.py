@@ -276,17 +276,20 @@ def confirmed_maps(
     around: list[list[int]] | None = None,
     needed: int = CONFIRMED,
     one_suffices: list[np.ndarray] | None = None,
+    agree: float = AGREE,
+    round_trip: float = ROUND_TRIP,
 ) -> MapArrays:
     """The maps as the kernels read them, without what cannot be trusted: see `map_arrays`, and what `needed` other views
     (all others where they are fewer) do not confirm. `around`: the neighbours of each view where they are known;
-    `one_suffices`: for which pixels (H, W) bool of each map one other view is enough."""
+    `one_suffices`: for which pixels (H, W) bool of each map one other view is enough; `agree`: share by which a depth may
+    differ at least; `round_trip`: pixels by which it may miss the pixel."""
     arrays = map_arrays(views, maps, device)
     confirmed, needed = [], min(needed, len({view.photo for view in views}) - 1)
     for index, near in enumerate(around or neighbours(views, maps)):
         report.progress(index / len(views))
         others = torch.tensor(near, dtype=torch.int32, device=arrays.depth.device)
-        share = max(AGREE, AGREE_PIXELS / views[index].camera.fx)
-        found = agreement(arrays, index, others, share, ROUND_TRIP, needed)
+        share = max(agree, AGREE_PIXELS / views[index].camera.fx)
+        found = agreement(arrays, index, others, share, round_trip, needed)
         enough = found >= needed
         if one_suffices is not None:
             enough |= (found >= 1) & torch.from_numpy(one_suffices[index].reshape(-1)).to(found.device)

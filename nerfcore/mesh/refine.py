@@ -18,6 +18,7 @@ from ..geometry.cameras import pixel_centers, project, rays
 from ..kernels.depth_arrays import FREE, MapArrays
 from ..kernels.patches import refine
 from ..progress import Reporter
+from .completion import moved_as_around
 from .depth_maps import (
     DepthMap,
     FlatView,
@@ -34,7 +35,7 @@ from .sky import backdrop, farthest, labels_tell, named_things, nothing
 
 VIEWS = 5  # neighbours whose photos are compared
 LEAST, GAIN = 0.6, 0.05  # correlation that is believed, and by how much it must exceed that of the field's depth
-FIELD_CONFIRMED = 3  # other views that must confirm a depth of the field where planes and photos found none
+FIELD_AGREES, FIELD_RETURNS = 0.05, 6.0  # share and pixels to which views must confirm depths of the field in holes
 SMOOTH = 5  # pixels over which normals are averaged
 SURE = 2.0  # pixels: the spread of a depth that photos confirm
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
@@ -83,8 +84,9 @@ def refined_maps(
     """Confirmed maps (see `depth_maps.confirmed_maps`) whose depths photos have moved, and the share of their depths that
     views do confirm. Where views do not confirm a moved depth, the field's is asked again, the plane through what is
     known around (planes.py), or that of a wall or floor that goes on from elsewhere (scene_planes.py); where label maps say that
-    it is this floor, one view suffices. Where they do not confirm that either, but three of them the field's own depth, it is taken, as far away as photos confirm depths. What label maps say
-    is nothing, and backdrops without the name of a thing (sky.py), have an unknown depth.
+    it is this floor, one view suffices. Where they do not confirm that either, but roughly the field's own depth, moved as the
+    known ones around were (completion.py), it is taken, as far away as photos confirm depths. What label maps say is nothing,
+    and backdrops without the name of a thing (sky.py), have an unknown depth.
     """
     arrays = map_arrays(views, maps, device)
     grey = torch.from_numpy(np.concatenate([g.reshape(-1) for g in grey_pictures(views, store, report)]))
@@ -127,7 +129,9 @@ def refined_maps(
         mixed.append(on_planes)
         named.append(by_class)
     final = confirmed_maps(views, mixed, device, report, around, one_suffices=named)
-    final = with_holes_filled(final, confirmed_maps(views, fields, device, report, around, FIELD_CONFIRMED))
+    carried = [moved_as_around(*parts) for parts in zip(views, fields, depths(final, maps))]
+    filling = confirmed_maps(views, carried, device, report, around, agree=FIELD_AGREES, round_trip=FIELD_RETURNS)
+    final = with_holes_filled(final, filling)
     final = replace(final, certain=relied_on(views, maps, sure).to(final.depth.device))
     asked = sum(int(map_.hit.sum()) for map_ in mixed)
     return final, sum(int(part.sum()) for part in hits(final, mixed)) / max(asked, 1)
@@ -160,11 +164,15 @@ def with_holes_filled(maps: MapArrays, others: MapArrays) -> MapArrays:
     )
 
 
+def depths(arrays: MapArrays, maps: list[DepthMap]) -> list[np.ndarray]:
+    """Depths (H, W) of each of the maps as they are in the arrays."""
+    ends = np.cumsum([m.depth.size for m in maps])
+    return [part.reshape(m.depth.shape) for part, m in zip(np.split(arrays.depth.cpu().numpy(), ends[:-1]), maps)]
+
+
 def hits(arrays: MapArrays, maps: list[DepthMap]) -> list[np.ndarray]:
     """Where (H, W) each of the maps shows something."""
-    shown = ((arrays.depth > 0) & (arrays.depth < FREE)).cpu().numpy()
-    ends = np.cumsum([m.depth.size for m in maps])
-    return [part.reshape(m.depth.shape) for part, m in zip(np.split(shown, ends[:-1]), maps)]
+    return [(depth > 0) & (depth < FREE) for depth in depths(arrays, maps)]
 
 
 def _with_depth(view: FlatView, map_: DepthMap, depth: np.ndarray) -> DepthMap:

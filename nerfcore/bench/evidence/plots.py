@@ -54,22 +54,29 @@ def _colour(variants: list[str], variant: str) -> str:
     return COLOURS[variants.index(variant) % len(COLOURS)] if variant != "ours" else "#d1495b"
 
 
+def _methods(rows: list[dict[str, Any]]) -> set[tuple[str, str]]:
+    """Scene and variant of all rows."""
+    return {(row["trial"]["scene"], row["trial"]["variant"]) for row in rows}
+
+
 def _time(record: dict[str, Any]) -> Any:
     """PSNR of the rays being trained on, over the budget's seconds; a line a seed.
 
-    None where a row has no curve, which records of before did not keep: a plot that has it stays.
+    None where a method has no curve on a scene, which records of before did not keep: a plot that has it stays.
     """
-    rows = finished(record, "time")
-    if not rows or any(not row.get("curve") for row in rows):
+    rows = [row for row in finished(record, "time") if row.get("curve")]
+    if not rows or _methods(rows) != _methods(finished(record, "time")):
         return None
     scenes, variants = distinct(rows, "scene"), distinct(rows, "variant")
     figure, axes = _axes(len(scenes))
     for axis, scene in zip(axes, scenes):
+        named = set[str]()
         for row in rows:
             trial = row["trial"]
             if trial["scene"] != scene:
                 continue
-            label = title_of(trial["variant"]) if trial["seed"] == min(distinct(rows, "seed")) else None
+            label = None if trial["variant"] in named else title_of(trial["variant"])
+            named.add(trial["variant"])
             curve = np.array(row["curve"])
             axis.plot(curve[:, 0], curve[:, 2], color=_colour(variants, trial["variant"]), linewidth=1.2, label=label)
         clock = "processor" if rows[0]["trial"]["clock"] == "processor" else "clock"
@@ -148,19 +155,17 @@ def _crops(record: dict[str, Any], pictures: Path) -> Any:
     None where a render is not there, as of trials that ran elsewhere: a plot that has it stays.
     """
     rows = finished(record, "time")
-    if not rows or not all((pictures / name).is_file() for row in rows for name in row["pictures"]):
+    first = min(distinct(rows, "seed"), default=0)
+    shown = [row for row in rows if row["trial"]["seed"] == first]
+    if not shown or not all((pictures / name).is_file() for row in shown for name in row["pictures"]):
         return None
     from matplotlib.figure import Figure
 
-    scenes, variants, first = distinct(rows, "scene"), distinct(rows, "variant"), min(distinct(rows, "seed"))
+    scenes, variants = distinct(rows, "scene"), distinct(rows, "variant")
     figure = Figure(figsize=(1.7 * (len(variants) + 1), 1.9 * len(scenes)), layout="constrained")
     axes = figure.subplots(len(scenes), len(variants) + 1, squeeze=False)
     for line, scene in zip(axes, scenes):
-        own = {
-            row["trial"]["variant"]: row
-            for row in rows
-            if row["trial"]["scene"] == scene and row["trial"]["seed"] == first
-        }
+        own = {row["trial"]["variant"]: row for row in shown if row["trial"]["scene"] == scene}
         photo = next((row["pictures"][1] for row in own.values() if row["pictures"]), None)
         cells = [("photo", photo)] + [(title_of(v), own[v]["pictures"][0] if v in own else None) for v in variants]
         for axis, (title, name) in zip(line, cells):

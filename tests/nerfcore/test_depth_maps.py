@@ -133,7 +133,8 @@ def test_where_planes_contradict_each_other_the_field_is_believed_as_far_as_phot
     field = depth_maps.map_arrays(flats, maps, CPU).depth
     final, _ = refined_maps(flats, maps, SimpleNamespace(), CPU, Reporter())  # type: ignore[arg-type]
     theirs = known(final) & (final.depth == field)
-    asked = depth_maps.confirmed_maps(flats, maps, CPU, Reporter(), needed=3)
+    roughly = {"agree": refine.FIELD_AGREES, "round_trip": refine.FIELD_RETURNS}
+    asked = depth_maps.confirmed_maps(flats, maps, CPU, Reporter(), **roughly)
     if np.isinf(reach):
         assert int(theirs.sum()) > 0.95 * int(known(asked).sum())
         assert torch.equal(theirs & ~known(asked), torch.zeros_like(theirs))

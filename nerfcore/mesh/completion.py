@@ -39,9 +39,7 @@ def push_pull(values: np.ndarray, known: np.ndarray) -> np.ndarray:
 
     Source: Gortler, Grzeszczuk, Szeliski and Cohen, "The lumigraph", 1996, section 3.3.
     """
-    weight = torch.from_numpy(known.astype(np.float32))[None, None]
-    sums = [torch.from_numpy(np.where(known, values, 0).astype(np.float32))[None, None]]
-    weights = [weight]
+    sums, weights = ([torch.from_numpy(a.astype(np.float32))[None, None]] for a in (np.where(known, values, 0), known))
     while max(sums[-1].shape[2:]) > 1:
         sums.append(avg_pool2d(sums[-1], 2, ceil_mode=True))
         weights.append(avg_pool2d(weights[-1], 2, ceil_mode=True))

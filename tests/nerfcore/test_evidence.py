@@ -188,6 +188,23 @@ def test_a_profile_is_measured_once_and_told(measured: tuple[Path, dict[str, Any
     assert over_seeds(record["rows"], "psnr", variant="ours", noise=0.05).count == 2  # type: ignore[union-attr]
 
 
+def test_one_seed_with_a_curve_is_enough_for_a_plot_over_time() -> None:
+    from fieldwork.nerfcore.bench.evidence import plots
+
+    def row(variant: str, seed: int, curve: list[list[float]]) -> dict[str, Any]:
+        return {
+            "table": "time",
+            "trial": {"scene": "ball", "variant": variant, "seed": seed, "clock": "processor"},
+            "curve": curve,
+        }
+
+    curve = [[1.0, 10, 20.0], [2.0, 20, 25.0]]
+    rows = [row("ours", 0, []), row("ours", 1, curve), row("nerf", 0, curve)]
+    lines = plots._time({"rows": rows}).axes[0].get_lines()
+    assert sorted(line.get_label() for line in lines) == sorted(plots.title_of(v) for v in ("ours", "nerf"))
+    assert plots._time({"rows": [*rows, row("mip-nerf", 0, [])]}) is None
+
+
 def test_trials_that_no_scene_fits_are_not_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(suite, "is_labelled", lambda project: project.name != "lego_400")
     projects = {name: tmp_path / name for name in ("lego_400", "museum")}

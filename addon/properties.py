@@ -156,6 +156,10 @@ class FieldworkScene(LabelSettings, PropertyGroup):
     frames: IntProperty(
         name="Video Frames", description="How many frames are taken from a video", default=80, min=4, soft_max=400
     )
+    keep_backdrop: BoolProperty(
+        name="Keep Dark Surroundings",
+        description="Make no masks where the photos show an object before dark surroundings",
+    )
     keep_blurry: BoolProperty(name="Keep Blurry Photos", description="Use photos that look blurred too")
     images: CollectionProperty(type=FieldworkImage)
     image_index: IntProperty(name="Image", description="Selected photo")

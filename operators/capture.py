@@ -68,8 +68,8 @@ def choose_source(scene: bpy.types.Scene, source: Path) -> None:
 
 
 @scene_settings(
-    photos="photos", labels="labels", masks="masks", classes="class_file", mask_mode="mask_mode", max_size="max_size",
-    frames="frames", keep_blurry="keep_blurry",
+    photos="photos", labels="labels", masks="masks", classes="class_file", mask_mode="mask_mode",
+    keep_backdrop="keep_backdrop", max_size="max_size", frames="frames", keep_blurry="keep_blurry",
 )  # fmt: skip
 class FIELDWORK_OT_new(ProjectOperator):
     """Read the photos, or frames of the video, into the project"""
@@ -91,7 +91,7 @@ class FIELDWORK_OT_new(ProjectOperator):
             raise ValueError(t("Choose a folder of photos, or a video, first."))
         project = self.project_path(context)
         set_if_empty(context.scene, project)
-        plain = ("max_size", "frames", "keep_blurry")
+        plain = ("keep_backdrop", "max_size", "frames", "keep_blurry")
         return {
             "project": project,
             "photos": photos,
@@ -120,6 +120,11 @@ class FIELDWORK_OT_import_dataset(ProjectOperator):
         default="automatic",
         options={"SKIP_SAVE"},
     )
+    keep_backdrop: BoolProperty(
+        name="Keep Dark Surroundings",
+        description="Make no masks where the photos show an object before dark surroundings",
+        options={"SKIP_SAVE"},
+    )
 
     def invoke(self, context: Context, event: bpy.types.Event) -> set[str]:
         context.window_manager.fileselect_add(self)
@@ -138,6 +143,7 @@ class FIELDWORK_OT_import_dataset(ProjectOperator):
             "project": str(project),
             "format": self.format,
             "mask_mode": mask_mode(self.mask_mode),
+            "keep_backdrop": self.keep_backdrop,
         }
 
 

@@ -39,7 +39,8 @@ def need_source(context: Context) -> str | None:
 
 
 @scene_settings(
-    photos="photos", labels="labels", masks="masks", classes="class_file", mask_mode="mask_mode", preset="preset",
+    photos="photos", labels="labels", masks="masks", classes="class_file", mask_mode="mask_mode",
+    keep_backdrop="keep_backdrop", preset="preset",
     time_limit="time_limit", settings="settings", faces="faces", texture="texture",
 )  # fmt: skip
 class FIELDWORK_OT_reconstruct(VerbOperator):
@@ -79,10 +80,12 @@ class FIELDWORK_OT_reconstruct(VerbOperator):
         out = absolute(self.out or context.scene.fieldwork.project)
         given = {name: self.path(context, name) for name in ("photos", "labels", "masks", "classes")}
         given["mask_mode"] = mask_mode(self.value(context, "mask_mode"))
+        given["keep_backdrop"] = self.value(context, "keep_backdrop")
         if given["photos"] is None and out:
             # A project that was opened knows its photos.
             known = snapshot.source(Path(out))
             given = {name: known.get(name) for name in given}
+            given["keep_backdrop"] = bool(given["keep_backdrop"])
         if not given["photos"]:
             raise ValueError(t("Choose a folder of photos, or a video, first."))
         if not out:

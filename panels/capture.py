@@ -62,7 +62,7 @@ class FIELDWORK_PT_capture_options(FieldworkPanel, Panel):
     def draw(self, context: Context) -> None:
         column = columns(self.layout)
         column.enabled = not states.training(context)
-        for name in ("max_size", "frames", "mask_mode", "keep_blurry"):
+        for name in ("max_size", "frames", "mask_mode", "keep_backdrop", "keep_blurry"):
             column.prop(context.scene.fieldwork, name)
 
 

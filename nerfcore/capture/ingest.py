@@ -19,6 +19,7 @@ from ..project.classes import make_classes, read_classes, unnamed_values
 from ..project.fingerprints import Earlier, Fingerprint, compare, digest, files_digest, stamps_digest
 from ..project.schema import ImageRecord, Project
 from ..project.store import PROJECT_FILE, create_folder, edit_project, load_project
+from .backdrop import mask_objects
 from .find import Source, classes_beside, find_sources, list_photos, subfolder
 from .mask_mode import MaskMode, chosen_mask_mode
 from .select import reject_blurred, reject_duplicates
@@ -63,6 +64,7 @@ def new(params: NewParams, report: Reporter) -> dict[str, Any]:
         reject_blurred(records, folder)
     records = kept + records
     _check_usable(records, photos, skipped)
+    cut_out = _masks_wanted(params, previous, records) and mask_objects(_without_mask(records), folder, report)
     present = _present_ids(folder, records, report)
     result = _summary(records, skipped)
     _warn(records, result["rejected"], report)
@@ -70,7 +72,7 @@ def new(params: NewParams, report: Reporter) -> dict[str, Any]:
         for text in unnamed_values(present, *classes[:2], classes_file):
             report.warn(text)
     origin = {"video_sha256": file_hash(photos)} if photos.is_file() else {}
-    mask_mode = _mask_mode(params, previous, folder, records, report)
+    mask_mode = "empty" if cut_out else _mask_mode(params, previous, folder, records, report)
     with edit_project(folder, Project()) as project:
         _put_in(project, records, set(present), classes, params, previous is not None)
         project.mask_mode = mask_mode
@@ -104,7 +106,7 @@ def ingest_inputs(params: NewParams) -> Fingerprint:
             "masks": [s.mask for s in sources],
         }
     classes_file = params.classes or classes_beside(labels)
-    chosen = params.model_dump(mode="json", include={"mask_mode", "max_size", "frames", "keep_blurry"})
+    chosen = params.model_dump(mode="json", include={"mask_mode", "keep_backdrop", "max_size", "frames", "keep_blurry"})
     return {
         "photos": digest([[str(path.relative_to(root)) for path in paths], stamps_digest(paths)]),
         **{name: stamps_digest(files) for name, files in sources_of.items()},
@@ -250,6 +252,22 @@ def _warn(records: list[ImageRecord], rejected: list[dict[str, str]], report: Re
     if len(used) < 3:
         number = "one usable photo" if len(used) == 1 else f"{len(used)} usable photos"
         report.warn(f"Only {number}: camera poses need at least three, better twenty.")
+
+
+def _masks_wanted(params: NewParams, previous: Project | None, records: list[ImageRecord]) -> bool:
+    """Whether objects may be cut out of photos without masks: nobody gave masks, labels, or another meaning of black; photos
+    that are added to others shall be like these."""
+    if params.keep_backdrop or params.mask_mode == "ignore" or any(record.label for record in records):
+        return False
+    if previous is not None and params.add:
+        masked = [record for record in previous.images if record.status != "rejected" and record.mask]
+        return previous.mask_mode == "empty" and bool(masked)
+    return not any(record.mask for record in records)
+
+
+def _without_mask(records: list[ImageRecord]) -> list[ImageRecord]:
+    """Photos that are used and have no mask."""
+    return [record for record in records if record.status != "rejected" and record.mask is None]
 
 
 def _mask_mode(

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ..capture.backdrop import mask_objects
 from ..capture.mask_mode import chosen_mask_mode
 from ..errors import InputError, ProjectError
 from ..files import file_hash, require_readable
@@ -65,8 +66,10 @@ def import_dataset(params: ImportParams, report: Reporter) -> dict[str, Any]:
         "labelled": sum(record.label is not None for record in records),
         "classes": [c.name for c in classes],
     }
+    told = params.keep_backdrop or params.mask_mode == "ignore" or any(r.mask or r.label for r in records)
+    cut_out = not told and mask_objects(records, folder, report)
     masks = [folder / record.mask for record in records if record.mask]
-    mask_mode = chosen_mask_mode(params.mask_mode, masks, len(records), report)
+    mask_mode = "empty" if cut_out else chosen_mask_mode(params.mask_mode, masks, len(records), report)
     save_poses(folder, Poses(source=dataset.format, cameras=cameras, images=images), dataset.points)
     with edit_project(folder, Project()) as project:
         project.images, project.classes, project.ignore_id = records, classes, dataset.ignore_id

@@ -4,6 +4,7 @@ Imports nothing heavy. The verbs themselves are listed in `verbs.py`.
 """
 
 from .base import (
+    KEEP_BACKDROP,
     LARGEST_PICTURE,
     LONGEST_RUN,
     MANY,
@@ -62,6 +63,7 @@ from .things import InstancesParams, RelationsParams
 from .workflows import BatchParams, BenchParams, BlocksParams, ReconstructParams
 
 __all__ = [
+    "KEEP_BACKDROP",
     "LARGEST_PICTURE",
     "LONGEST_RUN",
     "MANY",

@@ -17,6 +17,10 @@ FEWEST_FACES, MOST_FACES = 100, 1_000_000_000  # of a mesh: fewer have no shape
 MASK_MODE = (
     "what black mask pixels mean; default: empty where masks cut an object out of nearly all photos, else ignore"
 )
+KEEP_BACKDROP = (
+    "make no masks where nearly all photos show an object before dark surroundings, which is done unless masks or labels are "
+    "given"
+)
 Preset = Literal["draft", "standard", "high"]
 Split = Literal["none", "classes", "instances"]
 Pass = Literal["rgb", "depth", "semantic", "confidence", "normal", "unknown"]

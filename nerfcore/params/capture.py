@@ -7,7 +7,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from .base import LARGEST_PICTURE, MANY, MASK_MODE, Params, PictureSize
+from .base import KEEP_BACKDROP, LARGEST_PICTURE, MANY, MASK_MODE, Params, PictureSize
 
 
 class DoctorParams(Params):
@@ -70,6 +70,7 @@ class NewParams(Params):
     masks: Path | None = Field(default=None, description="folder of foreground masks named like the photos")
     classes: Path | None = Field(default=None, description="classes.json: names of the label ids")
     mask_mode: Literal["ignore", "empty"] | None = Field(default=None, description=MASK_MODE)
+    keep_backdrop: bool = Field(default=False, description=KEEP_BACKDROP)
     max_size: int = Field(
         default=1600, ge=64, le=LARGEST_PICTURE, description="long side of the working copies in pixels"
     )
@@ -96,6 +97,7 @@ class ImportParams(Params):
         "meshroom",
     ] = "auto"
     mask_mode: Literal["ignore", "empty"] | None = Field(default=None, description=MASK_MODE)
+    keep_backdrop: bool = Field(default=False, description=KEEP_BACKDROP)
 
 
 class PosesParams(Params):

@@ -80,6 +80,7 @@ def stage_params(params: p.ReconstructParams, verb: str, spent: float = 0.0) -> 
                 masks=params.masks,
                 classes=params.classes,
                 mask_mode=params.mask_mode,
+                keep_backdrop=params.keep_backdrop,
             )
         case "poses":
             return p.PosesParams(project=project)

@@ -1,0 +1,141 @@
+"""Masks of objects that photos show before dark surroundings, where the user gave none.
+
+An object on black velvet, or in a dark room by the light of a flash: what is around it does not matter, hardly agrees
+between photos, and the dark itself says nothing about depth. Cut out, it is empty space, which a field learns at once.
+Dark sides of the object are the danger: a mask rather keeps some of the surroundings than loses some of the object, and
+masks are made only where nearly all photos leave no doubt.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import scipy
+import skimage
+from PIL import Image
+
+from ..files import atomic_path
+from ..images.working import read_picture
+from ..progress import Reporter
+from ..project.schema import ImageRecord
+from .mask_mode import NEARLY_ALL, cuts_out
+
+SIDE = 384  # longer side of the pictures in which outlines are looked for, in pixels
+AROUND = (
+    15  # pixels of it over which the brightness on both sides of an outline is averaged, and that parts may lie apart
+)
+DIMMEST = 0.7  # of Otsu's threshold, which parts dark sides of an object from it
+EDGE = 0.25  # where an outline runs, from the brightness outside of it to that inside
+SPECK = 0.02  # of the largest part's area, below which a part is left out
+DARK, CONTRAST = 80, 2.0  # of 255: the brightest of the surroundings, and by how much the object outshines them
+RIM = 2  # pixels of the small picture around its outline that the whole picture decides about
+
+
+def mask_objects(records: Sequence[ImageRecord], folder: Path, report: Reporter) -> bool:
+    """Write a mask for each of the photos (`record.mask`) if nearly all show an object before dark surroundings; whether
+    they do.
+
+    Args:
+        records: photos of a project in `folder`, without masks.
+    Raises:
+        InputError: a photo cannot be read. DiskError: a mask cannot be written. What `report` raises to stop.
+    """
+    if not all_before_dark([folder / record.file for record in records], report):
+        return False
+    report.stage("Cutting the object out")
+    for number, record in enumerate(records):
+        report.progress(number / len(records), record.name)
+        mask = object_mask(read_picture(folder / record.file).pixels)
+        record.mask = f"masks/{record.name}.png"
+        with atomic_path(folder / record.mask) as path:
+            Image.fromarray(mask.astype(np.uint8) * 255).save(path, compress_level=2)
+    report.note(
+        f"The photos show an object before dark surroundings: {len(records)} masks were made, and what is dark around it is "
+        "taken as empty space. Give masks of your own with --masks, or keep the surroundings with --keep-backdrop."
+    )
+    return True
+
+
+def all_before_dark(photos: Sequence[Path], report: Reporter) -> bool:
+    """Whether nearly all photos show an object before dark surroundings; gives up as soon as too many do not.
+
+    Raises:
+        InputError: one cannot be read.
+    """
+    doubtful, most = 0, math.floor((1 - NEARLY_ALL) * len(photos))
+    for photo in photos:
+        report.check()
+        picture = read_picture(photo)
+        if picture.alpha != "none":  # says by itself what is empty
+            return False
+        doubtful += not before_dark(picture.pixels)
+        if doubtful > most:
+            return False
+    return len(photos) > 0
+
+
+def before_dark(picture: np.ndarray) -> bool:
+    """Whether a photo (H, W, 3) uint8 shows something bright that dark surroundings enclose, on all sides but perhaps one."""
+    bright = _small(picture)
+    mask, _ = _outlined(bright)
+    if not mask.any() or not cuts_out(mask):
+        return False
+    around, within = np.percentile(bright[~mask], 90), np.median(bright[mask])
+    return bool(around <= DARK and within >= CONTRAST * around)
+
+
+def object_mask(picture: np.ndarray) -> np.ndarray:
+    """Mask (H, W) bool of what stands out from dark surroundings in a photo (H, W, 3) uint8, its own dark places within."""
+    mask, threshold = _outlined(_small(picture))
+    size = picture.shape[1], picture.shape[0]
+    middle = _enlarged(scipy.ndimage.binary_erosion(mask, iterations=RIM, border_value=1), size)
+    reach = _enlarged(scipy.ndimage.binary_dilation(mask, iterations=RIM), size)
+    bright = scipy.ndimage.gaussian_filter(picture.max(2).astype(np.float32), 1.0)
+    least = np.asarray(Image.fromarray(threshold).resize(size, Image.Resampling.BILINEAR))
+    return middle | (reach & (bright > least))
+
+
+def _small(picture: np.ndarray) -> np.ndarray:
+    """Brightness (h, w) float32 of a photo's brightest channel, at most `SIDE` pixels a side, smoothed."""
+    image = Image.fromarray(picture.max(2))
+    image.thumbnail((SIDE, SIDE))
+    return scipy.ndimage.gaussian_filter(np.asarray(image, np.float32), 1.0)
+
+
+def _outlined(bright: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What stands out of a small picture: a mask (h, w) bool, and the brightness (h, w) float32 from which each place does.
+
+    First all that is brighter than most of Otsu's threshold; then the threshold follows the brightness on either side of
+    the outline found, as the shaded side of an object is darker than its lit one.
+    """
+    lowest, highest = float(bright.min()), float(bright.max())
+    otsu = DIMMEST * skimage.filters.threshold_otsu(bright) if highest > lowest else highest
+    first = _parts(bright > otsu)
+    within = scipy.ndimage.gaussian_filter(first.astype(np.float32), AROUND)
+    inside = scipy.ndimage.gaussian_filter(bright * first, AROUND) / np.maximum(within, 1e-3)
+    outside = scipy.ndimage.gaussian_filter(bright * ~first, AROUND) / np.maximum(1 - within, 1e-3)
+    threshold = np.minimum(outside + EDGE * (inside - outside), otsu).astype(np.float32)
+    beside = (within > 0.02) & (within < 0.98)
+    return _parts(np.where(beside, bright > threshold, first)), threshold
+
+
+def _parts(bright: np.ndarray) -> np.ndarray:
+    """The largest part of a mask (h, w) and those near it that are more than specks, without holes."""
+    labels, count = scipy.ndimage.label(bright)
+    if count == 0:
+        return np.zeros(bright.shape, bool)
+    sizes = np.bincount(labels.ravel())
+    sizes[0] = 0
+    apart = scipy.ndimage.distance_transform_edt(labels != sizes.argmax())
+    near = np.isin(np.arange(count + 1), labels[apart <= AROUND])
+    kept = near & (sizes >= SPECK * sizes.max())
+    kept[0] = False
+    return scipy.ndimage.binary_fill_holes(kept[labels])
+
+
+def _enlarged(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """A mask at the size (width, height) of the whole picture."""
+    return np.asarray(Image.fromarray(mask.astype(np.uint8) * 255).resize(size, Image.Resampling.BILINEAR)) > 127

@@ -174,6 +174,10 @@ class FieldworkScene(LabelSettings, PropertyGroup):
         min=0,
         soft_max=5,
     )
+    keep_exposure: BoolProperty(
+        name="Keep Exposures",
+        description="Do not bring photos that differ in exposure or white balance to a common one",
+    )
     up: EnumProperty(name="Up", description="Which direction of the scene is up", items=UP)
     point_a: FloatVectorProperty(name="Point A", description="One end of a known distance", subtype="TRANSLATION")
     point_b: FloatVectorProperty(name="Point B", description="Other end of a known distance", subtype="TRANSLATION")

@@ -18,7 +18,7 @@ from .base import ProjectOperator, need_poses, need_project, refresh_scenes, sce
 from .scene import update_scene
 
 
-@scene_settings(preset="pose_preset", group="pose_group")
+@scene_settings(preset="pose_preset", group="pose_group", keep_exposure="keep_exposure")
 class FIELDWORK_OT_poses(ProjectOperator):
     """Estimate where each photo was taken"""
 
@@ -41,6 +41,7 @@ class FIELDWORK_OT_poses(ProjectOperator):
             "project": self.project_path(context),
             "preset": self.value(context, "preset"),
             "group": self.value(context, "group"),
+            "keep_exposure": self.value(context, "keep_exposure"),
             "restart": self.restart,
         }
 

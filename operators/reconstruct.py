@@ -40,7 +40,7 @@ def need_source(context: Context) -> str | None:
 
 @scene_settings(
     photos="photos", labels="labels", masks="masks", classes="class_file", mask_mode="mask_mode",
-    keep_backdrop="keep_backdrop", preset="preset",
+    keep_backdrop="keep_backdrop", keep_exposure="keep_exposure", preset="preset",
     time_limit="time_limit", settings="settings", faces="faces", texture="texture",
 )  # fmt: skip
 class FIELDWORK_OT_reconstruct(VerbOperator):
@@ -92,6 +92,7 @@ class FIELDWORK_OT_reconstruct(VerbOperator):
             raise ValueError(t("Choose a project folder first."))
         return {
             **given,
+            "keep_exposure": self.value(context, "keep_exposure"),
             "out": out,
             "preset": self.value(context, "preset"),
             "time_limit": self.value(context, "time_limit") or None,

@@ -59,7 +59,9 @@ class FIELDWORK_PT_poses_options(FieldworkPanel):
 
     def draw(self, context: Context) -> None:
         settings = context.scene.fieldwork
-        columns(self.layout).prop(settings, "pose_group")
+        column = columns(self.layout)
+        column.prop(settings, "keep_exposure")
+        column.prop(settings, "pose_group")
         groups = snapshot.last_result(project_folder(context), "poses").get("groups", [])
         if len(groups) > 1:
             text = t("The photos fall into groups of {}.", ", ".join(map(str, groups)))

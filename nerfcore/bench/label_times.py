@@ -13,10 +13,11 @@ import torch
 
 from ..data.box import box_poses
 from ..data.load import load_scene
+from ..data.photo import photo_of
 from ..evaluate.metrics import Confusion, psnr
 from ..files import linked
 from ..images.picture import over, resized, to_bytes
-from ..images.working import nearest, read_picture
+from ..images.working import nearest
 from ..labels.accept import accept
 from ..labels.assist.verbs import segment
 from ..labels.journal import Mark
@@ -150,7 +151,7 @@ def rendered(project: Path, subject: Subject, report: Reporter) -> tuple[float, 
         size = subject.ready.of_photo[view.name]
         camera, pose = view.camera.resized(size.width, size.height), box_poses([view], box.box_from_world)[0]
         frame = render_view(trained.model, camera, pose, background_of(trained.info), check=report.check)
-        photo = over(resized(read_picture(view.image), camera.width, camera.height), background_of(trained.info))
+        photo = over(resized(photo_of(view), camera.width, camera.height), background_of(trained.info))
         found.append(psnr(to_bytes(frame.color), to_bytes(photo.pixels[..., :3])))
         truth = subject.truth[view.name]
         if trained.info.class_ids:

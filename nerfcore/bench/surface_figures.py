@@ -12,9 +12,9 @@ from scipy.spatial import KDTree
 from skimage.color import deltaE_ciede2000, rgb2lab
 from trimesh.triangles import points_to_barycentric
 
+from ..data.photo import photo_of
 from ..data.scene import Scene, View
 from ..images.picture import resized
-from ..images.working import read_picture
 from ..kernels.closest import ClosestPoints
 from ..measure.closing import closed
 from ..mesh.facelets import PIECES, Facelets, facelets, small_pieces
@@ -300,7 +300,7 @@ def picture_figures(
     psnr, off, energy = [], [], np.zeros(2)
     for view, camera in zip(views, posed(views)):
         picture, hit = surface_picture(camera, *mesh, painted.uv.corners, painted.image)
-        photo = resized(read_picture(view.image), view.camera.width, view.camera.height).pixels[..., :3]
+        photo = resized(photo_of(view), view.camera.width, view.camera.height).pixels[..., :3]
         covered = hit > 0.99
         error = (picture.astype(float) - photo)[covered] / 255
         psnr.append(-10 * np.log10(max(float((error**2).mean()), 1e-10)))

@@ -37,6 +37,7 @@ def load_scene(folder: Path, holdout: int = HOLDOUT) -> Scene:
                 mask=folder / record.mask if record.mask else None,
                 confidence=folder / record.confidence if record.confidence else None,
                 depth=folder / record.depth if record.depth else None,
+                gain=posed.gain,
             )
         )
         splits.append(record.split)
@@ -62,8 +63,9 @@ def view_inputs(scene: Scene, indices: list[int], files: bool) -> Fingerprint:
     cameras = [[v.name, v.camera.model_dump(mode="json"), rounded(v.camera_to_world)] for v in views]
     inputs = {"cameras": digest(cameras)}
     if files:
+        photos, gains = files_digest((v.name, v.image) for v in views), [v.gain for v in views]
         inputs |= {
-            "photos": files_digest((v.name, v.image) for v in views),
+            "photos": digest([photos, gains]) if any(gains) else photos,
             "labels": files_digest((v.name, v.label) for v in views),
             "masks": digest([scene.mask_mode, files_digest((v.name, v.mask) for v in views)]),
         }

@@ -10,10 +10,11 @@ import torch
 
 from ..geometry.cameras import Camera
 from ..images.picture import cut_out, resized, with_alpha
-from ..images.working import nearest, read_image, read_label, read_picture
+from ..images.working import nearest, read_image, read_label
 from ..progress import Reporter
 from .box import box_poses
 from .camera_rays import CameraRays
+from .photo import photo_of
 from .scene import Scene
 
 VOID = 255  # class index of unlabelled pixels
@@ -91,7 +92,7 @@ class PixelStore:
         for number, view in enumerate(self.views):
             report.progress(number / len(self.views), view.name)
             width, height = training_size(view.camera, longest)
-            photo = resized(read_picture(view.image), width, height)
+            photo = resized(photo_of(view), width, height)
             label = np.full((height, width), VOID, np.uint8)
             if view.label is not None:
                 label = lookup[nearest(read_label(view.label), width, height)]

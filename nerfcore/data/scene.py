@@ -24,6 +24,7 @@ class View:
     mask: Path | None = None
     depth: Path | None = None
     confidence: Path | None = None
+    gain: tuple[float, float, float] | None = None  # of its colours, see `photo.photo_of`
 
 
 @dataclass(frozen=True)

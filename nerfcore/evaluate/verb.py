@@ -14,6 +14,7 @@ import numpy as np
 
 from ..data.box import box_poses
 from ..data.load import class_inputs, load_scene, view_inputs
+from ..data.photo import photo_of
 from ..data.pixels import training_size
 from ..data.scene import Scene, View
 from ..errors import InputError, SettingError
@@ -21,7 +22,7 @@ from ..files import atomic_path, write_json
 from ..geometry.cameras import Camera
 from ..images.encode import write_picture
 from ..images.picture import cut_out, over, resized, to_bytes
-from ..images.working import nearest, read_image, read_label, read_picture
+from ..images.working import nearest, read_image, read_label
 from ..kernels.runtime import compile_seconds
 from ..params import EvaluateParams
 from ..progress import Reporter
@@ -300,7 +301,7 @@ def compared_with(
 ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
     """What a render of a view is compared with: photo (H, W, 3) uint8 on the background, mask of pixels that count (or
     None), label ids (or None)."""
-    picture = resized(read_picture(view.image), width, height)
+    picture = resized(photo_of(view), width, height)
     keep = None
     if view.mask is not None:
         inside = nearest(read_image(view.mask)[..., 0], width, height) > 127

@@ -28,6 +28,7 @@ import torch
 
 from ..data.box import Box, box_poses
 from ..data.load import load_scene
+from ..data.photo import photo_of
 from ..data.pixels import training_size
 from ..data.scene import Scene, View
 from ..errors import InputError, TrainingError
@@ -35,7 +36,7 @@ from ..files import disk_errors, write_json
 from ..geometry.contraction import grid_position, uncontract
 from ..geometry.similarity import similarity_scale, transform_points
 from ..images.picture import over, resized
-from ..images.working import nearest, read_image, read_picture
+from ..images.working import nearest, read_image
 from ..params import LabelPrepareParams
 from ..progress import Reporter
 from ..project.fingerprints import digest, rounded
@@ -294,7 +295,7 @@ def _look(
     if view.mask is not None:
         inside = nearest(read_image(view.mask)[..., 0], *size) > 127
         hits = Hits(np.where(inside, hits.distance, 0), hits.places, hits.edge & inside)
-    color = over(resized(read_picture(view.image), *size), 1.0).pixels[..., :3]
+    color = over(resized(photo_of(view), *size), 1.0).pixels[..., :3]
     return hits, skimage.color.rgb2lab(color).astype(np.float32)
 
 

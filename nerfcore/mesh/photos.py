@@ -9,9 +9,10 @@ import numpy as np
 import scipy
 import torch
 
+from ..data.photo import photo_of
 from ..data.scene import View
 from ..images.picture import resized, srgb_to_linear, with_alpha
-from ..images.working import nearest, read_image, read_label, read_picture
+from ..images.working import nearest, read_image, read_label
 from .visibility import PosedCamera
 
 LINEAR = srgb_to_linear(np.arange(256) / 255).astype(np.float32)  # light of a byte of sRGB
@@ -40,7 +41,7 @@ def posed_photo(view: View, pose: np.ndarray) -> Photo:
         return None if view.mask is None else nearest(read_image(view.mask)[..., 0], *size) > 127
 
     def read() -> np.ndarray:
-        rgba, inside = with_alpha(resized(read_picture(view.image), *size)).pixels.copy(), mask()
+        rgba, inside = with_alpha(resized(photo_of(view), *size)).pixels.copy(), mask()
         rgba[..., 3] = np.where(rgba[..., 3] > 127, 255, 0)
         if inside is not None:
             rgba[..., 3][~inside] = 0

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from ..images.exposure import common_gains
 from ..progress import Reporter
 from .facelets import Facelets
 from .photos import LINEAR, Photo, halvings, sample
@@ -75,37 +76,14 @@ def weighted_median(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def photo_gains(view: np.ndarray, looks: Looks, photos: int, most: int = 60_000) -> np.ndarray:
-    """What each photo's colours must be multiplied with to agree with the others: (photos, 3).
-
-    Least squares in the logarithm over facelets that several photos show, reweighted by Huber's rule; the mean over
-    photos stays.
-    """
-    log = np.log(np.maximum(looks.color, 1e-4))
+    """What each photo's colours must be multiplied with to agree with the others where several show a facelet: (photos, 3),
+    see `exposure.common_gains`."""
     plain = (looks.worth > 0) & (looks.color.min(2) > 0.004) & (looks.color.max(2) < 0.95)
     shared = np.flatnonzero(plain.sum(1) >= 2)
     if not len(shared):
         return np.ones((photos, 3), np.float32)
     shared = shared[:: -(-len(shared) // most)]
-    index, use, log = np.where(plain[shared], view[shared], 0).astype(np.int64), plain[shared], log[shared]
-    gain = np.zeros((photos, 3))
-    for channel in range(3):
-        y = log[..., channel].astype(np.float64)
-        for _ in range(4):
-            left = y - gain[index, channel]
-            middle = weighted_median(left[..., None].astype(np.float32), use.astype(np.float32))
-            off = np.abs(left - middle)
-            weight = use * np.minimum(1, 0.05 / np.maximum(off, 1e-9))
-            total = weight.sum(1)
-            mean = (weight * y).sum(1) / total
-            pair = weight[:, :, None] * weight[:, None, :] / total[:, None, None]
-            cells = index[:, :, None] * photos + index[:, None, :]
-            matrix = -np.bincount(cells.reshape(-1), pair.reshape(-1), photos**2).reshape(photos, photos)
-            matrix[np.diag_indices(photos)] += np.bincount(index.reshape(-1), weight.reshape(-1), photos)
-            right = np.bincount(index.reshape(-1), (weight * (y - mean[:, None])).reshape(-1), photos)
-            # Photos that share little keep their colours.
-            few = 1e-3 * max(float(np.trace(matrix)) / photos, 1e-6)
-            gain[:, channel] = np.linalg.solve(matrix + few * np.eye(photos), right)
-    return np.exp(gain.mean(0) - gain).astype(np.float32)
+    return common_gains(view[shared], np.maximum(looks.color[shared], 1e-4), plain[shared], photos)
 
 
 def agreeing(pieces: Facelets, view: np.ndarray, looks: Looks) -> np.ndarray:

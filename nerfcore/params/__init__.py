@@ -5,6 +5,7 @@ Imports nothing heavy. The verbs themselves are listed in `verbs.py`.
 
 from .base import (
     KEEP_BACKDROP,
+    KEEP_EXPOSURE,
     LARGEST_PICTURE,
     LONGEST_RUN,
     MANY,
@@ -64,6 +65,7 @@ from .workflows import BatchParams, BenchParams, BlocksParams, ReconstructParams
 
 __all__ = [
     "KEEP_BACKDROP",
+    "KEEP_EXPOSURE",
     "LARGEST_PICTURE",
     "LONGEST_RUN",
     "MANY",

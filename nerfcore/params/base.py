@@ -21,6 +21,7 @@ KEEP_BACKDROP = (
     "make no masks where nearly all photos show an object before dark surroundings, which is done unless masks or labels are "
     "given"
 )
+KEEP_EXPOSURE = "do not bring photos that differ in exposure or white balance to a common one"
 Preset = Literal["draft", "standard", "high"]
 Split = Literal["none", "classes", "instances"]
 Pass = Literal["rgb", "depth", "semantic", "confidence", "normal", "unknown"]

@@ -7,7 +7,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from .base import KEEP_BACKDROP, LARGEST_PICTURE, MANY, MASK_MODE, Params, PictureSize
+from .base import KEEP_BACKDROP, KEEP_EXPOSURE, LARGEST_PICTURE, MANY, MASK_MODE, Params, PictureSize
 
 
 class DoctorParams(Params):
@@ -110,6 +110,7 @@ class PosesParams(Params):
         le=MANY,
         description="where photos fall into separate groups: which to use, 0 being the largest",
     )
+    keep_exposure: bool = Field(default=False, description=KEEP_EXPOSURE)
 
 
 class AlignParams(Params):

@@ -7,7 +7,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from .base import KEEP_BACKDROP, LONGEST_RUN, MANY, MASK_MODE, FacesOrAll, Holdout, Params, Preset
+from .base import KEEP_BACKDROP, KEEP_EXPOSURE, LONGEST_RUN, MANY, MASK_MODE, FacesOrAll, Holdout, Params, Preset
 
 
 class ReconstructParams(Params):
@@ -18,6 +18,7 @@ class ReconstructParams(Params):
     masks: Path | None = None
     mask_mode: Literal["ignore", "empty"] | None = Field(default=None, description=MASK_MODE)
     keep_backdrop: bool = Field(default=False, description=KEEP_BACKDROP)
+    keep_exposure: bool = Field(default=False, description=KEEP_EXPOSURE)
     classes: Path | None = None
     blend: Path | None = None
     time_limit: float | None = Field(

@@ -22,6 +22,7 @@ from ..project.schema import Frame, ImageRecord, PosedImage, Poses, Project
 from ..project.store import POSES_FILE, edit_project, load_poses, load_project, save_poses
 from ..verdict import poses_verdict
 from .align import gps_frame
+from .exposure import exposure_gains
 from .process import run_worker
 
 WORK_FOLDER = "poses/sfm"
@@ -62,6 +63,8 @@ def estimate_poses(params: PosesParams, report: Reporter) -> dict[str, Any]:
     with edit_project(folder) as project:
         records = _usable(project)
         poses, points, visibility = _poses(result, records)
+        if not params.keep_exposure:
+            poses = with_gains(folder, records, poses, points, visibility, report)
         _update_project(project, records, poses, points, result, keep_frame=job["start"] is not None)
         save_poses(folder, poses, points, visibility)
         answer = {
@@ -87,6 +90,32 @@ def estimate_poses(params: PosesParams, report: Reporter) -> dict[str, Any]:
         where = f"{len(missing)} of {answer['total']} photos have no pose"
         report.warn(f"{shortened(where, missing)} {folder / REPORT_FILE} says why.")
     return answer
+
+
+def with_gains(
+    folder: Path,
+    records: list[ImageRecord],
+    poses: Poses,
+    points: Points,
+    visibility: tuple[np.ndarray, np.ndarray],
+    report: Reporter,
+) -> Poses:
+    """Poses that say what brings each photo to the common exposure, where photos differ; a note tells."""
+    report.stage("Comparing exposures")
+    files = {record.name: folder / record.file for record in records}
+    gains = exposure_gains(poses, points, visibility, [files[image.name] for image in poses.images], report)
+    if gains is None:
+        return poses
+    brightest, darkest = 1 / gains.mean(1).min(), 1 / gains.mean(1).max()
+    report.note(
+        f"The photos differ in exposure or white balance ({darkest:.2f} to {brightest:.2f} of their mean) and are brought to a "
+        "common one for training. --keep-exposure leaves them as they are."
+    )
+    images = [
+        image.model_copy(update={"gain": tuple(round(float(value), 4) for value in gain)})
+        for image, gain in zip(poses.images, gains)
+    ]
+    return poses.model_copy(update={"images": images})
 
 
 def pose_job(folder: Path, project: Project, params: PosesParams, report: Reporter) -> dict[str, Any]:
@@ -139,7 +168,7 @@ def posing_inputs(folder: Path, project: Project, params: PosesParams) -> Finger
         ),
         "masks": files_digest((r.name, folder / r.mask if r.mask else None) for r in records),
         "GPS": digest([[r.name, r.exif.get("gps")] for r in records]),
-        "settings": digest([params.preset, params.group]),
+        "settings": digest([params.preset, params.group, *(["keep_exposure"] if params.keep_exposure else [])]),
     }
 
 

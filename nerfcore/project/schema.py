@@ -141,11 +141,13 @@ def step(
 
 
 class PosedImage(Model):
-    """Pose of one registered image: camera-to-world 4×4 in the SfM frame, OpenCV axes."""
+    """Pose of one registered image: camera-to-world 4×4 in the SfM frame, OpenCV axes; `gain`: what its red, green and blue
+    are multiplied with to have the capture's common exposure."""
 
     name: ImageName
     camera: int
     camera_to_world: list[list[float]]
+    gain: tuple[float, float, float] | None = None
 
 
 class Poses(Model):

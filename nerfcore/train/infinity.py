@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..data.photo import photo_of
 from ..data.scene import Scene, View
 from ..geometry.cameras import pixel_centers, rays
 from ..images.picture import resized
-from ..images.working import read_picture
 
 # Measured: docs/experiments.md, “Is there a sky?”.
 MOST_PHOTOS, SIDE = 40, 120  # that are looked at, and their longest side in pixels
@@ -44,7 +44,7 @@ def share_at_infinity(scene: Scene) -> float:
 def _colored_directions(view: View) -> tuple[np.ndarray, np.ndarray]:
     """Unit directions (N, 3) in the world of a small version of a photo, NaN where the lens does not see, and its colours
     (N, 3) in [0, 255]."""
-    photo = read_picture(view.image)
+    photo = photo_of(view)
     scale = min(1.0, SIDE / max(photo.size))
     camera = view.camera.resized(*(max(1, round(n * scale)) for n in photo.size))
     small = resized(photo, camera.width, camera.height).pixels[..., :3].reshape(-1, 3)

@@ -83,7 +83,7 @@ def stage_params(params: p.ReconstructParams, verb: str, spent: float = 0.0) -> 
                 keep_backdrop=params.keep_backdrop,
             )
         case "poses":
-            return p.PosesParams(project=project)
+            return p.PosesParams(project=project, keep_exposure=params.keep_exposure)
         case "train":
             from ..train.reuse import unfinished
 

@@ -91,7 +91,7 @@ def _render_part(params: ReconstructParams, frames: tuple[int, int], report: Rep
 
 def _matching(params: ReconstructParams, what: str | list[int], report: Reporter) -> dict[str, Any]:
     """The features of a large capture, or a part of its pairs while others match the rest."""
-    begin, values = time.perf_counter(), PosesParams(project=Path(params.out))
+    begin, values = time.perf_counter(), PosesParams(project=Path(params.out), keep_exposure=params.keep_exposure)
     if isinstance(what, str):
         with _project(params, report):
             result = find_features(values, report)

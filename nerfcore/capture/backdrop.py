@@ -2,8 +2,9 @@
 
 An object on black velvet, or in a dark room by the light of a flash: what is around it does not matter, hardly agrees
 between photos, and the dark itself says nothing about depth. Cut out, it is empty space, which a field learns at once.
-Dark sides of the object are the danger: a mask rather keeps some of the surroundings than loses some of the object, and
-masks are made only where nearly all photos leave no doubt.
+Dark sides of the object are the danger: a mask rather keeps some of the surroundings than loses some of the object, leaves
+open what dark places are that the object encloses – an opening or a shadow –, and masks are made only where nearly all
+photos leave no doubt.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import skimage
 from PIL import Image
 
 from ..files import atomic_path
-from ..images.working import read_picture
+from ..images.working import MASK_UNKNOWN, read_picture
 from ..progress import Reporter
 from ..project.schema import ImageRecord
 from .mask_mode import NEARLY_ALL, cuts_out
@@ -29,7 +30,9 @@ AROUND = (
 )
 DIMMEST = 0.7  # of Otsu's threshold, which parts dark sides of an object from it
 EDGE = 0.25  # where an outline runs, from the brightness outside of it to that inside
+FAINT = 0.6  # of the first threshold: what is darker is never taken for the object's shaded side
 SPECK = 0.02  # of the largest part's area, below which a part is left out
+OPENING = 0.005  # of the object's area, from which a dark place within it may be an opening
 DARK, CONTRAST = 80, 2.0  # of 255: the brightest of the surroundings, and by how much the object outshines them
 RIM = 2  # pixels of the small picture around its outline that the whole picture decides about
 
@@ -51,7 +54,7 @@ def mask_objects(records: Sequence[ImageRecord], folder: Path, report: Reporter)
         mask = object_mask(read_picture(folder / record.file).pixels)
         record.mask = f"masks/{record.name}.png"
         with atomic_path(folder / record.mask) as path:
-            Image.fromarray(mask.astype(np.uint8) * 255).save(path, compress_level=2)
+            Image.fromarray(mask).save(path, compress_level=2)
     report.note(
         f"The photos show an object before dark surroundings: {len(records)} masks were made, and what is dark around it is "
         "taken as empty space. Give masks of your own with --masks, or keep the surroundings with --keep-backdrop."
@@ -88,14 +91,19 @@ def before_dark(picture: np.ndarray) -> bool:
 
 
 def object_mask(picture: np.ndarray) -> np.ndarray:
-    """Mask (H, W) bool of what stands out from dark surroundings in a photo (H, W, 3) uint8, its own dark places within."""
-    mask, threshold = _outlined(_small(picture))
+    """What stands out from dark surroundings in a photo (H, W, 3) uint8: (H, W) uint8, 255 where it does, `MASK_UNKNOWN`
+    in large dark places within it, 0 around it."""
+    shown = _small(picture)
+    mask, threshold = _outlined(shown)
     size = picture.shape[1], picture.shape[0]
     middle = _enlarged(scipy.ndimage.binary_erosion(mask, iterations=RIM, border_value=1), size)
     reach = _enlarged(scipy.ndimage.binary_dilation(mask, iterations=RIM), size)
     bright = scipy.ndimage.gaussian_filter(picture.max(2).astype(np.float32), 1.0)
     least = np.asarray(Image.fromarray(threshold).resize(size, Image.Resampling.BILINEAR))
-    return middle | (reach & (bright > least))
+    made = np.where(middle | (reach & (bright > least)), 255, 0).astype(np.uint8)
+    openings = _openings(mask & (shown <= threshold), OPENING * np.count_nonzero(mask))
+    made[_enlarged(openings, size) & (bright <= least)] = MASK_UNKNOWN
+    return made
 
 
 def _small(picture: np.ndarray) -> np.ndarray:
@@ -117,7 +125,7 @@ def _outlined(bright: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     within = scipy.ndimage.gaussian_filter(first.astype(np.float32), AROUND)
     inside = scipy.ndimage.gaussian_filter(bright * first, AROUND) / np.maximum(within, 1e-3)
     outside = scipy.ndimage.gaussian_filter(bright * ~first, AROUND) / np.maximum(1 - within, 1e-3)
-    threshold = np.minimum(outside + EDGE * (inside - outside), otsu).astype(np.float32)
+    threshold = np.clip(outside + EDGE * (inside - outside), FAINT * otsu, otsu).astype(np.float32)
     beside = (within > 0.02) & (within < 0.98)
     return _parts(np.where(beside, bright > threshold, first)), threshold
 
@@ -134,6 +142,14 @@ def _parts(bright: np.ndarray) -> np.ndarray:
     kept = near & (sizes >= SPECK * sizes.max())
     kept[0] = False
     return scipy.ndimage.binary_fill_holes(kept[labels])
+
+
+def _openings(dark: np.ndarray, least: float) -> np.ndarray:
+    """Connected places of a mask (h, w) of at least so many pixels."""
+    labels, _ = scipy.ndimage.label(dark)
+    sizes = np.bincount(labels.ravel())
+    sizes[0] = 0
+    return (sizes >= max(least, 1))[labels]
 
 
 def _enlarged(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:

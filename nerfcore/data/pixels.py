@@ -10,7 +10,7 @@ import torch
 
 from ..geometry.cameras import Camera
 from ..images.picture import cut_out, resized, with_alpha
-from ..images.working import nearest, read_image, read_label
+from ..images.working import MASK_UNKNOWN, nearest, read_image, read_label
 from ..progress import Reporter
 from .box import box_poses
 from .camera_rays import CameraRays
@@ -102,9 +102,10 @@ class PixelStore:
             confidences.append(torch.from_numpy(np.ascontiguousarray(confidence)).reshape(-1))
             keep = np.ones((height, width), bool)
             if view.mask is not None:
-                inside = nearest(read_image(view.mask)[..., 0], width, height) > 127
+                mask = nearest(read_image(view.mask)[..., 0], width, height)
+                inside = mask > 127
                 if scene.mask_mode == "empty":
-                    photo = cut_out(photo, inside)
+                    photo, keep = cut_out(photo, inside), mask != MASK_UNKNOWN
                 else:
                     keep = inside
             cameras.append(view.camera.resized(width, height))

@@ -22,7 +22,7 @@ from ..files import atomic_path, write_json
 from ..geometry.cameras import Camera
 from ..images.encode import write_picture
 from ..images.picture import cut_out, over, resized, to_bytes
-from ..images.working import nearest, read_image, read_label
+from ..images.working import MASK_UNKNOWN, nearest, read_image, read_label
 from ..kernels.runtime import compile_seconds
 from ..params import EvaluateParams
 from ..progress import Reporter
@@ -304,9 +304,11 @@ def compared_with(
     picture = resized(photo_of(view), width, height)
     keep = None
     if view.mask is not None:
-        inside = nearest(read_image(view.mask)[..., 0], width, height) > 127
+        mask = nearest(read_image(view.mask)[..., 0], width, height)
+        inside = mask > 127
         if scene.mask_mode == "empty":
             picture = cut_out(picture, inside)
+            keep = None if (mask != MASK_UNKNOWN).all() else mask != MASK_UNKNOWN
         else:
             keep = inside
     photo = to_bytes(over(picture, background).pixels)

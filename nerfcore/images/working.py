@@ -10,6 +10,8 @@ import OpenImageIO as oiio
 from ..errors import InputError
 from .picture import Picture, from_channels, is_transparent, to_srgb8
 
+MASK_UNKNOWN = 64  # in masks that Fieldwork makes, where black is empty: nobody knows whether something is there
+
 
 def read_image(path: Path) -> np.ndarray:
     """Pixels (H, W, C) uint8, C 1 to 4, of an image file. Raises InputError naming the file."""

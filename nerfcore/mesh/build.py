@@ -24,6 +24,7 @@ from . import depth_maps as dm
 from .appearance import Photos
 from .clean import clean
 from .closed import closed_surface, unseen_faces
+from .cut_outs import left_out
 from .decimate import decimate
 from .extract import extract
 from .field_values import shade
@@ -72,6 +73,10 @@ def build(trained: Trained, project: Project, scene: Scene, params: MeshParams, 
         vertices, faces = closed_surface(bricks, maps, tolerance, params.faces, report)
     else:
         vertices, faces = open_surface(bricks, maps, tolerance, region, params.faces, report)
+        if scene.mask_mode == "empty":
+            world = transform_points(box.world_from_box, vertices)
+            outside = left_out(world, faces, [scene.views[i] for i in scene.train], report)
+            vertices, faces = compact(vertices, faces[~outside])
     if not len(faces):
         raise no_surface(params)
     check_parts(vertices, faces, report)

@@ -64,7 +64,7 @@ def fitted(
     def drawn(rays: int) -> tuple[Batch, torch.Tensor]:
         # In their order, so that rays beside each other meet the same vertices.
         batch = photos.batch(photos.random_pixels(rays, generator).sort().values)
-        return batch, behind(model, batch.directions, generator, check)
+        return batch, batch.before(behind(model, batch.directions, generator, check))
 
     batch, background = drawn(min(EXPOSURE_RAYS, len(photos)))
     gains = exposures(field(), batch, background, settings, len(photos.views))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
@@ -38,7 +38,8 @@ class Batch:
     origins, directions (R, 3) float32, unit directions; rgb (R, 3) and alpha (R,) float32 in [0, 1] (sRGB, straight
     alpha); label (R,) int64 class index or VOID; image (R,) int64 index into the store; pixel (R,) int64 its place;
     confidence (R,) float32 in [0, 1], how sure the label is; weight (R,) float32, how much of a pixel drawn as often as
-    any other the ray stands for.
+    any other the ray stands for; unknown (R,) bool, where a mask does not know whether something is there, alpha being 0;
+    None: nowhere.
     """
 
     origins: torch.Tensor
@@ -50,17 +51,24 @@ class Batch:
     pixel: torch.Tensor
     confidence: torch.Tensor
     weight: torch.Tensor
+    unknown: torch.Tensor | None = None
 
     def part(self, rays: slice) -> Batch:
         """Some of the rays."""
-        return Batch(*(getattr(self, field.name)[rays] for field in fields(self)))
+        known = {field.name: getattr(self, field.name) for field in fields(self)}
+        return replace(self, **{name: values[rays] for name, values in known.items() if values is not None})
+
+    def before(self, background: torch.Tensor) -> torch.Tensor:
+        """What rays end on, (R, 3), given a background (R, 3): where a mask does not know whether something is there, it is
+        the photo's own colour, with which an opening explains the pixel as well as a surface does."""
+        return background if self.unknown is None else torch.where(self.unknown[:, None], self.rgb, background)
 
 
 class PixelStore:
     """Photos, labels and masks of some views as flat byte tensors.
 
     rgba (P, 4) uint8; label (P,) uint8 class index (VOID where unlabelled); usable: int64 positions of the pixels that
-    count, None where all do; first (V+1,) int64 first pixel of a view. All but `first` are at `home`: the device, or
+    count, None where all do; unknown (P,) bool, see `Batch`, or None; first (V+1,) int64 first pixel of a view. All but `first` are at `home`: the device, or
     the host's memory where they are larger than `budget` bytes; `at` reads them wherever they are.
 
     Args:
@@ -88,7 +96,7 @@ class PixelStore:
         lookup = np.full(65536, VOID, np.uint8)
         for index, class_id in enumerate(class_ids):
             lookup[class_id] = index
-        cameras, colours, labels, usable, confidences = [], [], [], [], []
+        cameras, colours, labels, usable, confidences, unknown = [], [], [], [], [], []
         for number, view in enumerate(self.views):
             report.progress(number / len(self.views), view.name)
             width, height = training_size(view.camera, longest)
@@ -100,27 +108,30 @@ class PixelStore:
             if view.confidence is not None:
                 confidence = nearest(read_image(view.confidence)[..., 0], width, height)
             confidences.append(torch.from_numpy(np.ascontiguousarray(confidence)).reshape(-1))
-            keep = np.ones((height, width), bool)
+            keep, open_ = np.ones((height, width), bool), np.zeros((height, width), bool)
             if view.mask is not None:
                 mask = nearest(read_image(view.mask)[..., 0], width, height)
                 inside = mask > 127
                 if scene.mask_mode == "empty":
-                    photo, keep = cut_out(photo, inside), mask != MASK_UNKNOWN
+                    photo, open_ = cut_out(photo, inside), mask == MASK_UNKNOWN
                 else:
                     keep = inside
             cameras.append(view.camera.resized(width, height))
             colours.append(torch.from_numpy(np.ascontiguousarray(with_alpha(photo).pixels)).reshape(-1, 4))
             labels.append(torch.from_numpy(label).reshape(-1))
             usable.append(torch.from_numpy(keep).reshape(-1))
+            unknown.append(torch.from_numpy(open_).reshape(-1))
         self.cameras = cameras
         keep = torch.cat(usable)
         has_confidence = any(view.confidence is not None for view in self.views)
-        size = len(keep) * (5 + has_confidence + (0 if bool(keep.all()) else 8))
+        left_open = torch.cat(unknown)
+        size = len(keep) * (5 + has_confidence + bool(left_open.any()) + (0 if bool(keep.all()) else 8))
         self.home = home_of(size, budget, device)
         left = budget - size if size <= budget else budget
         self.rgba = self._keep(torch.cat(colours))
         self.label = self._keep(torch.cat(labels))
         self.confidence = self._keep(torch.cat(confidences)) if has_confidence else None
+        self.unknown = self._keep(left_open) if bool(left_open.any()) else None
         sizes = torch.tensor([c.width * c.height for c in cameras])
         self.first = torch.cat([torch.zeros(1, dtype=torch.long), sizes.cumsum(0)]).to(device)
         self.rays = CameraRays(cameras, box_poses(self.views, box_from_world), device, left)
@@ -155,7 +166,8 @@ class PixelStore:
         value = read(self.rgba).float() / 255
         confidences = torch.ones_like(value[:, 3]) if self.confidence is None else read(self.confidence).float() / 255
         rgb, alpha, label = value[:, :3], value[:, 3], read(self.label).long()
-        return Batch(origins, directions, rgb, alpha, label, image, pixel, confidences, torch.ones_like(confidences))
+        unknown, ones = None if self.unknown is None else read(self.unknown), torch.ones_like(confidences)
+        return Batch(origins, directions, rgb, alpha, label, image, pixel, confidences, ones, unknown)
 
     def labelled_share(self) -> float:
         """Share of the usable pixels with something in them that have a label; 1 where there are no labels at all."""

@@ -215,6 +215,7 @@ class Trainer:
             background = torch.rand(batch.rgb.shape, device=self.device, generator=self.generator)
         else:
             background = torch.full_like(batch.rgb, self.background)
+        background = batch.before(background)
         counted = label_weights(batch)
         labelled = counted.sum().clamp(min=1e-6)
         shard_count = 1

@@ -76,7 +76,7 @@ def test_dark_places_within_an_object_are_part_of_it() -> None:
 
 
 def test_what_may_be_an_opening_is_left_open(tmp_path: Path) -> None:
-    """Neither empty nor something: it is not trained on, and no held-out photo is judged there."""
+    """Neither empty nor something: training takes either, and no held-out photo is judged there."""
     photo, egg = velvet(0)
     photo[150:170, 220:250] = 20
     mask = object_mask(photo)
@@ -89,10 +89,11 @@ def test_what_may_be_an_opening_is_left_open(tmp_path: Path) -> None:
     view = View("photo", camera, np.eye(4), tmp_path / "photo.png", mask=tmp_path / "mask.png")
     scene = Scene([view], [0], [], mask_mode="empty")
     store = PixelStore(scene, [0], [], np.eye(4), WIDTH, torch.device("cpu"), Reporter())
-    assert store.usable is not None
-    assert np.array_equal(
-        np.setdiff1d(np.arange(mask.size), store.usable.numpy()), np.flatnonzero(mask == MASK_UNKNOWN)
-    )
+    batch = store.batch(torch.arange(mask.size))
+    assert batch.unknown is not None
+    assert np.array_equal(batch.unknown.numpy(), (mask == MASK_UNKNOWN).reshape(-1))
+    ends = batch.part(slice(1000, None)).before(torch.ones(mask.size - 1000, 3))
+    assert torch.equal(ends, torch.where(batch.unknown[:, None], batch.rgb, torch.ones(1))[1000:])
     assert np.array_equal(store.rgba[:, 3].numpy() > 0, (mask == 255).reshape(-1))
     _, counted, _ = compared_with(view, scene, WIDTH, HEIGHT, 1.0)
     assert counted is not None

@@ -106,6 +106,9 @@ def test_a_tiny_budget_gives_the_same_batches(masked: Path) -> None:
     one, other = (store.batch(places) for store, places in zip((plenty, tiny), drawn))
     for field in dataclasses.fields(one):
         a, b = getattr(one, field.name), getattr(other, field.name)
+        if a is None or b is None:
+            assert a is b, field.name
+            continue
         assert torch.allclose(a, b, atol=1e-7) if field.name in ("origins", "directions") else torch.equal(a, b)
     lines = [Outlines(store, 0.2) for store in (plenty, tiny)]
     picked = [o.draw(100, torch.Generator().manual_seed(2)) for o in lines]

@@ -9,7 +9,7 @@ import numpy as np
 from ..data.scene import Scene, View
 from ..geometry.cameras import rays
 from ..images.picture import resized
-from ..images.working import nearest, read_image, read_picture
+from ..images.working import MASK_UNKNOWN, nearest, read_image, read_picture
 from ..kernels.raycast import FrontFaces
 from ..progress import go_on
 from .facelets import small_pieces
@@ -30,6 +30,14 @@ def cut_out(view: View, mask_mode: str) -> np.ndarray | None:
     return pixels[..., 3] > 127
 
 
+def _unknown(view: View) -> np.ndarray:
+    """Which pixels (H, W) bool of a photo its mask does not know anything of."""
+    width, height = view.camera.width, view.camera.height
+    if view.mask is None:
+        return np.zeros((height, width), bool)
+    return nearest(read_image(view.mask)[..., 0], width, height) == MASK_UNKNOWN
+
+
 def silhouette(scene: Scene, vertices: np.ndarray, faces: np.ndarray, check: Callable[[], None]) -> float | None:
     """Intersection over union of what held-out photos cut out (of all photos where none is held out) and what a mesh,
     vertices (V, 3) and faces (F, 3) in the scene's frame, covers there; None where nothing is cut out."""
@@ -43,7 +51,8 @@ def silhouette(scene: Scene, vertices: np.ndarray, faces: np.ndarray, check: Cal
             continue
         camera = PosedCamera(view.camera, np.asarray(view.camera_to_world, np.float64))
         hit = depth_buffer(camera, pieces.vertices, pieces.faces).face >= 0
-        both, either = both + int((hit & shown).sum()), either + int((hit | shown).sum())
+        counts = ~_unknown(view)
+        both, either = both + int((hit & shown & counts).sum()), either + int(((hit | shown) & counts).sum())
     return both / either if either else None
 
 

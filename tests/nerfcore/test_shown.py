@@ -9,6 +9,7 @@ import pytest
 import trimesh
 from fieldwork.nerfcore.data.scene import Scene, View
 from fieldwork.nerfcore.geometry.cameras import Camera, pixel_centers, rays
+from fieldwork.nerfcore.images.working import MASK_UNKNOWN
 from fieldwork.nerfcore.mesh.shown import silhouette
 from fieldwork.tests.nerfcore.support.depth_views import orbit
 from PIL import Image
@@ -55,3 +56,18 @@ def test_photos_that_cut_nothing_out_say_nothing(tmp_path: Path) -> None:
     ball = trimesh.creation.icosphere(2, RADIUS)
     scene = Scene(views, [0, 1, 2, 3], [4, 5], mask_mode="ignore")  # black is what one must not look at
     assert silhouette(scene, ball.vertices, np.asarray(ball.faces), nothing) is None
+
+
+def test_a_silhouette_is_not_held_against_what_nobody_knows(tmp_path: Path) -> None:
+    """Grey in a mask that Fieldwork made: a ball whose right half may be an opening is neither right nor wrong there."""
+    views = ball_views(tmp_path, True)
+    for view in views:
+        assert view.mask is not None
+        mask = np.asarray(Image.open(view.mask)).copy()
+        mask[:, 60:][mask[:, 60:] > 0] = MASK_UNKNOWN
+        Image.fromarray(mask).save(view.mask)
+    scene = Scene(views, [0, 1, 2, 3], [4, 5], mask_mode="empty")
+    ball = trimesh.creation.icosphere(4, RADIUS)
+    whole = silhouette(scene, ball.vertices, np.asarray(ball.faces), nothing)
+    assert whole is not None
+    assert whole > 0.97

@@ -25,9 +25,7 @@ from ..project.schema import ImageRecord
 from .mask_mode import NEARLY_ALL, cuts_out
 
 SIDE = 384  # longer side of the pictures in which outlines are looked for, in pixels
-AROUND = (
-    15  # pixels of it over which the brightness on both sides of an outline is averaged, and that parts may lie apart
-)
+AROUND = 15  # pixels of it that brightness on both sides of an outline is averaged over, and that parts may lie apart
 DIMMEST = 0.7  # of Otsu's threshold, which parts dark sides of an object from it
 EDGE = 0.25  # where an outline runs, from the brightness outside of it to that inside
 FAINT = 0.6  # of the first threshold: what is darker is never taken for the object's shaded side

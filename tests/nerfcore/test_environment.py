@@ -262,11 +262,13 @@ def test_baked_fields_have_the_environment_too(seen: Seen, tmp_path: Path) -> No
     project = load_project(seen.project)
     scene = load_scene(seen.project)
     poses = box_poses(scene.views, seen.trained.info.box(project).box_from_world)
-    camera = scene.views[5].camera
-    field, frame = (render_view(shown, camera, poses[5], 0.0) for shown in (seen.trained.model, baked))
-    beside = (frame.opacity < 0.02) & (field.opacity < 0.02)
-    assert beside.mean() > 0.1
-    assert np.abs(frame.color - field.color)[beside].max() < 0.05
+    share = 0.0  # which photo sees most beside the ball depends on the field
+    for view, pose in zip(scene.views, poses):
+        field, frame = (render_view(shown, view.camera, pose, 0.0) for shown in (seen.trained.model, baked))
+        beside = (frame.opacity < 0.02) & (field.opacity < 0.02)
+        share = max(share, float(beside.mean()))
+        assert np.abs(frame.color - field.color)[beside].max(initial=0) < 0.05
+    assert share > 0.2
     (seen.project / "runs" / "main" / "voxels" / "environment.npy").unlink()
     with pytest.raises(ProjectError, match=r"environment\.npy is damaged"):
         load_baked(seen.project, "main", seen.trained.info)

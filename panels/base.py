@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import textwrap
 from collections.abc import Iterable
 from pathlib import Path
@@ -118,16 +119,29 @@ def draw_verdict(layout: UILayout, context: Context, result: dict[str, Any]) -> 
         draw_wrapped(box, judged[0], text_width(context) - 4, icon="ERROR" if judged[1] else "INFO")
 
 
+def with_labels(text: str, context: Context) -> str:
+    """A message of the engine in which options of the command line are named as the panels name them: “Keep Exposures”
+    for --keep-exposure. What the panels do not have stays as it is."""
+    settings = context.scene.fieldwork.bl_rna.properties
+
+    def label(option: re.Match[str]) -> str:
+        name = option[1].replace("-", "_")
+        found = settings.get(name) or settings.get(f"pose_{name}")
+        return f"“{t(found.name)}”" if found else option[0]
+
+    return re.sub(r"--([a-z]+(?:-[a-z]+)*)", label, text)
+
+
 def draw_outcome(layout: UILayout, context: Context, job: Job) -> None:
     """A job that failed, or has something to say: what happened, what to do, and the report."""
     width, box = text_width(context) - 4, layout.box()
     if job.error is not None:
-        draw_wrapped(box, job.error.message, width, icon="ERROR")
+        draw_wrapped(box, with_labels(job.error.message, context), width, icon="ERROR")
         if job.error.hint:
-            draw_wrapped(box, job.error.hint, width, icon="INFO")
+            draw_wrapped(box, with_labels(job.error.hint, context), width, icon="INFO")
     else:
         for warning in job.warnings[:MOST_WARNINGS]:
-            draw_wrapped(box, warning, width, icon="INFO")
+            draw_wrapped(box, with_labels(warning, context), width, icon="INFO")
         if len(job.warnings) > MOST_WARNINGS:
             box.label(text=t("{} more in the report", len(job.warnings) - MOST_WARNINGS), icon="BLANK1")
     row = box.row()

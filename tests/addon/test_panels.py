@@ -43,6 +43,26 @@ def test_a_stage_says_what_is_wrong_with_its_result():
     assert verdict_of({"verdict": {"level": "failed", "reasons": ["Scraps."]}}) == ("Scraps.", True)
 
 
+def test_messages_name_the_settings_of_the_panels_instead_of_options(bpy_script):
+    said = bpy_script(
+        """
+import fieldwork
+fieldwork.register()
+from fieldwork.panels.base import with_labels
+answer([with_labels(text, bpy.context) for text in [
+    "Keep the surroundings with --keep-backdrop.", "--keep-exposure leaves them.", "--group 1 uses the next one",
+    "Set it with --no-such-thing.",
+]])
+"""
+    )
+    assert said == [
+        "Keep the surroundings with “Keep Dark Surroundings”.",
+        "“Keep Exposures” leaves them.",
+        "“Group” 1 uses the next one",
+        "Set it with --no-such-thing.",
+    ]
+
+
 def test_the_next_step_leads_from_nothing_to_the_model(bpy_script, tmp_path):
     steps = bpy_script(
         """

@@ -114,11 +114,19 @@ def evaluate_verdict(
     return verdict(found)
 
 
-def mesh_verdict(hit: float, solid: float | None = None, holes: float = 0.0, largest: float = 1.0) -> Verdict:
+def mesh_verdict(
+    hit: float,
+    solid: float | None = None,
+    holes: float = 0.0,
+    largest: float = 1.0,
+    overlapped: float | None = None,
+    few: float = 0.0,
+) -> Verdict:
     """Of `mesh`.
 
     Args:
-        hit: share of the photos' pixels that show it. solid, holes: shares as `mesh.coverage.Coverage` has them.
+        hit: share of the photos' pixels that show it. solid, holes, overlapped, few: shares as `mesh.coverage.Coverage` has
+            them.
         largest: share of the area that its largest connected part has.
     """
     found = []
@@ -129,10 +137,11 @@ def mesh_verdict(hit: float, solid: float | None = None, holes: float = 0.0, lar
         )
         found.append(("failed" if hit < MISSED else "weak", text))
     elif solid is not None and solid < SOLID:
-        text = (
-            f"Of what the photos show near, {1 - solid:.0%} is missing in the mesh. Train longer, add photos of what is "
-            "missing, or enlarge the region."
-        )
+        text = f"Of what the photos show near, {1 - solid:.0%} is missing in the mesh. "
+        if overlapped is not None and overlapped >= SOLID:
+            text += f"Fewer than three photos show {few:.0%} of it at all: take more photos of that from other places."
+        else:
+            text += "Train longer, add photos of what is missing, or enlarge the region."
         found.append(("failed" if solid < HALF_GONE else "weak", text))
     if holes > HOLES:
         found.append(("weak", f"The mesh has holes: {holes:.0%} of it in the photos. Train longer, or add photos."))

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy
+import torch
 
 from ..data.box import box_poses
 from ..data.scene import Scene, View
@@ -19,7 +20,7 @@ from ..geometry.cameras import Camera, pixel_centers, project, rays
 from ..images.picture import resized
 from ..images.working import nearest, read_picture
 from ..kernels.depth_arrays import FREE
-from ..kernels.raycast import FrontFaces
+from ..kernels.raycast import FirstHits, FrontFaces
 from ..render.model import Model
 from .depth_maps import FlatView, flat_views, render_depth
 from .shown import cut_out
@@ -28,16 +29,22 @@ MOST_PHOTOS, ACROSS = 12, 96  # photos that are asked, evenly spread, and pixels
 DETAIL, WINDOW = 3.0, 5  # standard deviation, of 255, that is more than noise, within so many pixels
 FAR = 2.5  # of the median depth of the mesh: what is farther is a background
 FEWEST = 100  # pixels below which nothing is said
+TRIANGULATED = 3  # training photos that must show a place, before its depth is more than a guess of the field
+BEFORE = 0.97  # of a place's distance: what is nearer hides it
+MOST_PLACES = 2000  # that are looked for in the training photos
 
 
 @dataclass(frozen=True)
 class Coverage:
     """Shares: `solid`, of the pixels that show something near with detail, how many hit the mesh, None where there are too few such
     pixels; `holes`, of what the mesh fills in the pictures, holes included, how much is holes through which
-    the field sees something near."""
+    the field sees something near; `overlapped`, as `solid`, of those pixels alone whose place three training photos show; `few`,
+    how many of the pixels show a place that fewer do."""
 
     solid: float | None
     holes: float
+    overlapped: float | None = None
+    few: float = 0.0
 
 
 def coverage(
@@ -67,25 +74,60 @@ def coverage(
         seen.append((hit, render_depth(model, flat, check).depth, shown))
     there = [depth[hit & (depth > 0) & (depth < FREE)] for hit, depth, _ in seen]
     middle = float(np.median(np.concatenate(there))) if sum(map(len, there)) else np.inf
-    asked = found = filled = missing = 0
+    filled = missing = 0
+    places, hits = [], []
     for flat, (hit, depth, shown) in zip(flats, seen):
         near = flat.inside & (depth > 0) & (depth < min(FAR * middle, FREE)) & within_bounds(flat, depth, bounds)
         solid = near & shown
-        asked, found = asked + int(solid.sum()), found + int((solid & hit).sum())
+        places.append(points_of(flat, depth)[solid.reshape(-1)])
+        hits.append(hit[solid])
         whole = np.asarray(scipy.ndimage.binary_fill_holes(hit))
         # A pixel beside the mesh may show its outline.
         holes = scipy.ndimage.minimum_filter(whole & ~hit, 3) & near
         filled, missing = filled + int(whole.sum()), missing + int(holes.sum())
-    return Coverage(found / asked if asked >= FEWEST else None, missing / max(filled, 1))
+    place, hit = np.concatenate(places), np.concatenate(hits)
+    holes = missing / max(filled, 1)
+    if len(place) < FEWEST:
+        return Coverage(None, holes)
+    some = np.unique(np.linspace(0, len(place) - 1, MOST_PLACES).round().astype(int))
+    trained = [scene.views[i] for i in scene.train]
+    by = shown_by(place[some], trained, box_poses(trained, box_from_world), FirstHits(vertices, faces), check)
+    enough = by >= min(TRIANGULATED, len(trained))
+    overlapped = float(hit[some][enough].mean()) if enough.sum() >= FEWEST else None
+    return Coverage(float(hit.mean()), holes, overlapped, float(1 - enough.mean()))
+
+
+def shown_by(
+    places: np.ndarray, views: list[View], poses: np.ndarray, mesh: FirstHits, check: Callable[[], None]
+) -> np.ndarray:
+    """How many (N,) of the views, with camera-to-box poses (V, 4, 4), show each of the places (N, 3): inside of the picture, and
+    nothing of the mesh before it."""
+    count = np.zeros(len(places), int)
+    for view, pose in zip(views, poses):
+        check()
+        apart = places - pose[:3, 3]
+        with np.errstate(invalid="ignore"):
+            pixel = project(view.camera, apart @ pose[:3, :3])
+            inside = ((pixel >= 0) & (pixel <= [view.camera.width, view.camera.height])).all(1)
+        away = np.linalg.norm(apart[inside], axis=1)
+        origins = torch.from_numpy(np.broadcast_to(pose[:3, 3], (len(away), 3)).astype(np.float32))
+        directions = torch.from_numpy((apart[inside] / away[:, None]).astype(np.float32))
+        count[inside] += mesh.distances(origins, directions).numpy() >= BEFORE * away
+    return count
 
 
 def within_bounds(flat: FlatView, depth: np.ndarray, bounds: tuple[np.ndarray, np.ndarray] | None) -> np.ndarray:
     """Which pixels (H, W) bool of a flat view with depths (H, W) show what lies between two corners."""
     if bounds is None:
         return np.ones(depth.shape, bool)
-    local = pixel_rays(flat)
-    points = local / local[:, 2:] * depth.reshape(-1, 1) @ flat.pose[:3, :3].T + flat.pose[:3, 3]
+    points = points_of(flat, depth)
     return ((points >= bounds[0]) & (points <= bounds[1])).all(1).reshape(depth.shape)
+
+
+def points_of(flat: FlatView, depth: np.ndarray) -> np.ndarray:
+    """Points (N, 3) of the box frame that the pixels of a flat view with depths (H, W) show, row by row."""
+    local = pixel_rays(flat)
+    return local / local[:, 2:] * depth.reshape(-1, 1) @ flat.pose[:3, :3].T + flat.pose[:3, 3]
 
 
 def pixel_rays(flat: FlatView) -> np.ndarray:

@@ -47,8 +47,8 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
         {"vertices", "faces", "watertight", "voxel": in world units, "classes": {name: {"faces", "area"}},
         "instances": how many, "lods": [{"faces", "deviation": in world units}],
         "label_revision": of the marks that the classes are from, or None, "files"};
-        "shown": the share of the photos' pixels that show the mesh; "solid_shown" and "holes": see
-        `coverage.Coverage`; "verdict";
+        "shown": the share of the photos' pixels that show the mesh; "solid_shown", "holes",
+        "overlap_shown" and "seen_by_few": see `coverage.Coverage` (solid, holes, overlapped, few); "verdict";
         "silhouette" of a capture with masks: see `shown.silhouette`;
         for a preview see `preview.preview`;
         with a texture of photos "painted_by_photos", the share of its texels that a photo shows
@@ -140,15 +140,17 @@ def judge(
     params: MeshParams,
     report: Reporter,
 ) -> dict[str, Any]:
-    """What photos say of a surface: "shown", "solid_shown", "holes", "verdict" and "silhouette" of `mesh`."""
+    """What photos say of a surface: "shown", "solid_shown", "holes", "overlap_shown", "seen_by_few", "verdict" and "silhouette" of
+    `mesh`."""
     report.stage("Comparing it with the photos")
     shown = shown_share(photos, built.vertices, built.faces, report.check)
     bounds = wanted_bounds(params, scene, box)
     found = coverage(trained.model, scene, box.box_from_world, built.vertices, built.faces, bounds, report.check)
-    solid = None if found.solid is None else round(found.solid, 4)
+    solid, overlapped = (None if share is None else round(share, 4) for share in (found.solid, found.overlapped))
     largest, _ = largest_share(built.vertices, built.faces)
     result: dict[str, Any] = {"shown": round(shown, 4), "solid_shown": solid, "holes": round(found.holes, 4)}
-    result["verdict"] = mesh_verdict(shown, found.solid, found.holes, largest)
+    result |= {"overlap_shown": overlapped, "seen_by_few": round(found.few, 4)}
+    result["verdict"] = mesh_verdict(shown, found.solid, found.holes, largest, found.overlapped, found.few)
     outlines = silhouette(scene, surface.vertices, surface.faces, report.check)
     return result if outlines is None else {**result, "silhouette": round(outlines, 4)}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,9 @@ import trimesh
 from fieldwork.nerfcore.data.load import load_scene
 from fieldwork.nerfcore.data.scene import Scene
 from fieldwork.nerfcore.geometry.cameras import pixel_centers, rays
+from fieldwork.nerfcore.kernels.raycast import FirstHits
 from fieldwork.nerfcore.mesh import coverage as module
-from fieldwork.nerfcore.mesh.coverage import Coverage, coverage
+from fieldwork.nerfcore.mesh.coverage import Coverage, coverage, shown_by
 from fieldwork.nerfcore.mesh.depth_maps import DepthMap, FlatView
 from fieldwork.nerfcore.verdict import mesh_verdict
 from fieldwork.tests.nerfcore.support.ball import RADIUS, ball_project
@@ -98,6 +100,37 @@ def test_a_room_that_can_be_seen_is_missing(room: tuple[Path, Scene]) -> None:
     assert seen.solid is not None
     assert seen.solid < 0.7
     assert level(seen) != "good"
+
+
+def test_places_are_shown_by_the_photos_that_see_them(room: tuple[Path, Scene]) -> None:
+    """A place p of a ball about the origin is seen from c where p · c > r²."""
+    views = room[1].views
+    poses, ball = np.stack([view.camera_to_world for view in views]), trimesh.creation.icosphere(5, RADIUS)
+    places = RADIUS * np.asarray(trimesh.creation.icosphere(3, 1.0).vertices)
+    above = places @ poses[:, :3, 3].T / RADIUS**2 - 1
+    clear = (np.abs(above) > 0.5).all(1)  # what is hidden by less than three hundredths counts as seen
+    count = shown_by(places, views, poses, FirstHits(np.asarray(ball.vertices), np.asarray(ball.faces)), lambda: None)
+    assert clear.sum() > 100
+    assert (count[clear] == (above > 0).sum(1)[clear]).all()
+    assert len(np.unique(count[clear])) > 1
+    assert (shown_by(places, views, poses, FirstHits(np.zeros((0, 3)), np.zeros((0, 3), int)), lambda: None) == 6).all()
+
+
+def test_what_fewer_than_three_photos_show_is_told_apart(room: tuple[Path, Scene]) -> None:
+    """The first photo is held out; of the others three are trained on, and what each of them sees is on the mesh."""
+    views = room[1].views
+    scene = replace(room[1], test=[0], train=[1, 2, 3])
+    toward = np.stack([view.camera_to_world[:3, 3] for view in views[1:4]])
+    seen_by = (middles() @ toward.T > RADIUS**2).sum(1)
+    by_one, by_two = found(scene, seen_by >= 1), found(scene, seen_by >= 2)
+    assert by_one.solid is not None
+    assert by_two.solid is not None
+    assert by_two.solid < by_one.solid
+    assert by_two.few > 0.2
+    told = mesh_verdict(0.3, 0.7, 0.0, 1.0, 0.95, 0.25)
+    assert told["level"] == "weak"
+    assert "Fewer than three photos show 25% of it" in told["reasons"][0]
+    assert "Train longer" in mesh_verdict(0.3, 0.7, 0.0, 1.0, 0.8, 0.25)["reasons"][0]
 
 
 def test_scraps_are_told_whatever_they_cover() -> None:

@@ -26,6 +26,7 @@ LENS = 1.4  # focal length over the picture's side
 MARGIN = 0.03  # of the picture's side, left free around the mesh
 BACKGROUND = 70
 UNKNOWN = (0.15, 0.15, 0.15)  # of a class without a colour
+CLAY = (0.75, 0.75, 0.75)  # of everything where there are no classes: only the shape is to be seen
 LIGHT = np.array([0.35, -0.5, 0.8]) / np.linalg.norm([0.35, -0.5, 0.8])
 
 
@@ -104,7 +105,7 @@ def look_around(
 
     Args:
         texture: of the surface; without one its vertices' colours are shown. class_map: class (S, S) of each texel of the
-            texture; without one the faces' are shown. colors: sRGB in [0, 1] of each class id; others are dark.
+            texture; without one the faces' are shown. colors: sRGB in [0, 1] of each class id; others are dark, but light where there is none at all.
     """
     mesh = FrontFaces(surface.vertices, surface.faces)
     textured, uv = None, None
@@ -114,6 +115,7 @@ def look_around(
     camera = Camera(width=SIDE, height=SIDE, fx=LENS * SIDE, fy=LENS * SIDE, cx=SIDE / 2, cy=SIDE / 2)
     local, _ = rays(camera, pixel_centers(SIDE, SIDE).reshape(-1, 2))
     pictures: dict[str, np.ndarray] = {}
+    unknown = UNKNOWN if colors else CLAY
     for number, pose in enumerate(turntable_poses(surface.vertices, VIEWS)):
         report.progress(number / VIEWS)
         face, corner = mesh.cast(np.broadcast_to(pose[:3, 3], local.shape), local @ pose[:3, :3].T)
@@ -133,7 +135,7 @@ def look_around(
             x, y = np.clip((_mixed(uv[face[hit]], weights) * [1, -1] + [0, 1]) * size, 0, size - 1).astype(int).T
             ids = class_map[y, x]
         shown, number_of = np.unique(ids, return_inverse=True)
-        shades = np.array([colors.get(int(c), UNKNOWN) for c in shown]).reshape(-1, 3) * 255
+        shades = np.array([colors.get(int(c), unknown) for c in shown]).reshape(-1, 3) * 255
         label[hit] = (shades[number_of] * light).clip(0, 255)
         for name, picture in (("color", color), ("class", label)):
             pictures[f"{name}_{number}.png"] = picture.reshape(SIDE, SIDE, 3)

@@ -312,7 +312,11 @@ def test_a_turntable_shows_fronts_in_their_colours(tmp_path: Path) -> None:
     assert label[rows[0] + 20, 320, 1] > 100 > label[rows[-1] - 20, 320, 1]
     inside_out = Surface(vertices, faces[:, ::-1], -vertices, colors, ids, surface.face_class)
     write_turntable(tmp_path, inside_out, None, {}, Reporter())
-    within = np.array(Image.open(tmp_path / "color_0.png")).astype(int)
+    within, clay = (np.array(Image.open(tmp_path / f"{name}_0.png")).astype(int) for name in ("color", "class"))
+    # Without any class only the shape is shown, light before the dark background.
+    assert (clay == clay[..., :1]).all()
+    assert np.median(clay[shown]) > 100 > clay[0, 0, 0]
+    assert np.ptp(clay[shown]) > 50
     assert color[320, 320, 0] > 200 > color[320, 320, 2]
     assert within[320, 320, 2] > 200 > within[320, 320, 0]  # through the near upper side, onto the far lower one
     image = np.zeros((8, 8, 3), np.uint8)

@@ -27,7 +27,7 @@ from ..mesh.clean import shown
 from ..mesh.decimate import decimate_patches
 from ..mesh.depth_maps import MOST_VIEWS, flat_views, map_size, spread_views
 from ..mesh.extract import extract
-from ..mesh.fusion import BRICK, NEAR, TRUNCATION, fuse_maps, grid_of
+from ..mesh.fusion import BRICK, NEAR, TRUNCATION, fuse_maps, grid_of, tolerances
 from ..mesh.painted import training_photos
 from ..mesh.region import Region, region_around
 from ..mesh.surface import Surface, to_world, vertex_normals
@@ -166,7 +166,7 @@ def core_surface(
     report.stage("Extracting the surface")
     vertices, faces = extract(bricks, report)
     if len(faces):
-        tolerance = TRUNCATION * region.voxel
+        tolerance = tolerances(bricks, vertices, faces, TRUNCATION * region.voxel)
         vertices, faces = compact(vertices, faces[shown(vertices, faces, maps, tolerance, report)])
     place = (vertices[faces].mean(1) - origin) / brick
     shared = np.stack([low > 0, high < counts], 1)

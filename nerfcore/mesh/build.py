@@ -28,7 +28,7 @@ from .cut_outs import left_out
 from .decimate import decimate
 from .extract import extract
 from .field_values import shade
-from .fusion import TRUNCATION, Bricks, coarser, fuse_maps
+from .fusion import TRUNCATION, Bricks, coarser, fuse_maps, tolerances
 from .refine import refined_maps
 from .region import Region, choose_region, on_sides
 from .surface import vertex_normals
@@ -133,7 +133,7 @@ def open_surface(
     if not len(faces):
         return vertices, faces
     report.stage("Cleaning the surface")
-    vertices, faces, _ = clean(vertices, faces, maps, tolerance, report)
+    vertices, faces, _ = clean(vertices, faces, maps, tolerances(bricks, vertices, faces, tolerance), report)
     if most is not None and len(faces) > most:
         report.stage("Simplifying")
         vertices, faces = decimate(vertices, faces, most, report)

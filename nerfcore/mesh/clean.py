@@ -29,10 +29,10 @@ def seen_by(points: np.ndarray, normals: np.ndarray, maps: MapArrays, tolerance:
 
 
 def clean(
-    vertices: np.ndarray, faces: np.ndarray, maps: MapArrays, tolerance: float, report: Reporter
+    vertices: np.ndarray, faces: np.ndarray, maps: MapArrays, tolerance: float | np.ndarray, report: Reporter
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Vertices, triangles, and which triangles (F,) bool fill a hole: without faces that views do not show (`shown`) and
-    parts below a thousandth of the area; holes of at most 30 edges filled."""
+    parts below a thousandth of the area; holes of at most 30 edges filled. `tolerance`: of all faces, or (F,) of each."""
     faces = drop_scraps(vertices, faces[shown(vertices, faces, maps, tolerance, report)])
     report.check()
     vertices, faces, filled = fill_holes(vertices, faces)
@@ -40,19 +40,34 @@ def clean(
     return vertices, faces, filled
 
 
-def shown(vertices: np.ndarray, faces: np.ndarray, maps: MapArrays, tolerance: float, report: Reporter) -> np.ndarray:
+def shown(
+    vertices: np.ndarray, faces: np.ndarray, maps: MapArrays, tolerance: float | np.ndarray, report: Reporter
+) -> np.ndarray:
     """Which triangles (F,) bool at least two views see, less what spans outlines: where a view shows something of another
     slope, and fewer than two show something as steep as the triangle. Between the edge of a thing and the wall behind it
     there is nothing, but distances fused from both have a surface there, in thin strands beside the thing. A view whose
-    slope there is not certain, as neither photos confirm its depth nor is the field sharp, contradicts nothing."""
+    slope there is not certain, as neither photos confirm its depth nor is the field sharp, contradicts nothing.
+    `tolerance`: distance from what a view shows up to which it sees a triangle, of all or (F,) of each."""
     middle, normals = vertices[faces].mean(1), unit(cross(vertices, faces))
-    seen = seen_by(middle, normals, maps, tolerance, report) >= FEWEST_VIEWS
+    each = np.broadcast_to(tolerance, len(faces))
+    seen, counts = np.zeros(len(faces), bool), np.zeros((len(faces), 2))
+    for near in np.unique(each):
+        some = np.flatnonzero(each == near)
+        seen[some] = seen_by(middle[some], normals[some], maps, near, report) >= FEWEST_VIEWS
+        counts[some] = slopes_around(middle[some], normals[some], maps, near, report)
+    own, other = (mean_around(faces, count, len(vertices), AROUND) for count in counts.T)
+    return seen & ~((own < FEWEST_VIEWS) & (other >= 1))
+
+
+def slopes_around(
+    points: np.ndarray, normals: np.ndarray, maps: MapArrays, tolerance: float, report: Reporter
+) -> np.ndarray:
+    """How many maps (N, 2) show something as steep as each of the points (N, 3) with normals (N, 3), and of another slope."""
     device, counts = maps.depth.device, [np.zeros((0, 2))]
-    for p, n in zip(*(torch.from_numpy(np.asarray(a, np.float32)).split(CHUNK) for a in (middle, normals))):
+    for p, n in zip(*(torch.from_numpy(np.asarray(a, np.float32)).split(CHUNK) for a in (points, normals))):
         report.check()
         counts.append(slopes(p.to(device), n.to(device), maps, tolerance, TURNED).cpu().numpy())
-    own, other = (mean_around(faces, count, len(vertices), AROUND) for count in np.concatenate(counts).T)
-    return seen & ~((own < FEWEST_VIEWS) & (other >= 1))
+    return np.concatenate(counts)
 
 
 def drop_scraps(vertices: np.ndarray, faces: np.ndarray, share: float = SCRAP) -> np.ndarray:

@@ -309,6 +309,14 @@ def hit_points(arrays: MapArrays, view: int) -> torch.Tensor:
     return (local - arrays.translation[view]) @ arrays.rotation[view]
 
 
+def hit_values(arrays: MapArrays, values: torch.Tensor, view: int) -> torch.Tensor:
+    """Of `values` (P,) those (N,) of the points that `hit_points` gives."""
+    begin = int(arrays.first[view])
+    some = slice(begin, begin + int(arrays.size[view].prod()))
+    depth = arrays.depth[some]
+    return values[some][(depth > 0) & (depth < FREE)]
+
+
 def neighbours(views: list[FlatView], maps: list[DepthMap], most: int = NEIGHBOURS) -> list[list[int]]:
     """Of each view the others that show the same best: those that see most of its surface, at an angle that is not too
     wide."""

@@ -6,15 +6,16 @@ sheets and the weights are in kernels/surface.py.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
+import scipy
 import torch
 
 from ..kernels.depth_arrays import MapArrays
 from ..kernels.surface import fuse
 from ..progress import Reporter
-from .depth_maps import hit_points
+from .depth_maps import hit_points, hit_values
 from .region import Region
 
 BRICK = 8  # corners along each side of a brick
@@ -26,19 +27,23 @@ GAP, GAP_PIXELS = (
     5.5,
 )  # share, or footprints of a pixel, by which depths of one surface differ from pixel to pixel
 CHUNK = 256  # bricks
+STEP = 1.3  # voxels by which distances of neighbouring corners differ at most on either side of one surface
+UNSTEADY = 0.15  # share of the crossings in a brick that step farther, from which on its views disagree
+WIDER = 4.0  # times the truncation with which such bricks are fused anew
 
 
 @dataclass(frozen=True)
 class Bricks:
     """Distances on a sparse grid. index (X, Y, Z) int32: place of each brick, −1 where there is none; distance
     (B, 8, 8, 8) float32 in normalised units, negative inside, and weight, 0 where no view says anything, of the corners
-    origin + voxel · (8 · brick + (i, j, k))."""
+    origin + voxel · (8 · brick + (i, j, k)); wide (B,) bool: bricks fused with a wider truncation."""
 
     origin: np.ndarray
     voxel: float
     index: np.ndarray
     distance: np.ndarray
     weight: np.ndarray
+    wide: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
 
     def __len__(self) -> int:
         return len(self.distance)
@@ -51,7 +56,9 @@ def fuse_maps(
     part: tuple[np.ndarray, np.ndarray] | None = None,
     focal: float | None = None,
 ) -> Bricks:
-    """Fuse depth maps within a region.
+    """Fuse depth maps within a region. Where depths of different views lie farther apart than the truncation, each makes a
+    surface of its own, and these break each other up: bricks where distances step are fused anew with a wider one, which
+    takes the mean of all.
 
     Args:
         focal: the smallest focal length in pixels of all maps, where these are not all there are.
@@ -67,19 +74,60 @@ def fuse_maps(
     device = maps.depth.device
     axis = torch.arange(BRICK, device=device)
     inner = torch.cartesian_prod(axis, axis, axis)
-    start = torch.from_numpy(origin).float().to(device)
-    distance, weight = [], []
-    for begin in range(0, len(bricks), CHUNK):
-        report.progress(begin / len(bricks))
-        some = torch.from_numpy(bricks[begin : begin + CHUNK]).to(device)
-        points = (some[:, None] * BRICK + inner).reshape(-1, 3) * h + start
-        d, w = fuse(points.float(), maps, h, TRUNCATION * h, FREE_AT * h, depth_gap(maps, focal))
-        for parts, values in ((distance, d), (weight, w)):
-            parts.append(values.view(-1, BRICK, BRICK, BRICK).cpu().numpy())
-    if not distance:
-        empty = np.zeros((0, BRICK, BRICK, BRICK), np.float32)
-        return Bricks(origin, h, index, empty, empty)
-    return Bricks(origin, h, index, np.concatenate(distance), np.concatenate(weight))
+    start, gap = torch.from_numpy(origin).float().to(device), depth_gap(maps, focal)
+    distance, weight = (np.zeros((len(bricks), BRICK, BRICK, BRICK), np.float32) for _ in range(2))
+
+    def fuse_bricks(numbers: np.ndarray, wider: float, begin: float, end: float) -> None:
+        for number in range(0, len(numbers), CHUNK):
+            report.progress(begin + (end - begin) * number / len(numbers))
+            chunk = numbers[number : number + CHUNK]
+            some = torch.from_numpy(bricks[chunk]).to(device)
+            points = (some[:, None] * BRICK + inner).reshape(-1, 3) * h + start
+            values = fuse(points.float(), maps, h, wider * TRUNCATION * h, wider * FREE_AT * h, gap)
+            for all_of, some_of in zip((distance, weight), values):
+                all_of[chunk] = some_of.view(-1, BRICK, BRICK, BRICK).cpu().numpy()
+
+    fuse_bricks(np.arange(len(bricks)), 1.0, 0.0, 0.8)
+    soft = mean_spread(maps, origin, h, counts)[tuple(bricks.T)] > TRUNCATION * h
+    wide = soft & unsteady(distance, weight, h)
+    fuse_bricks(np.flatnonzero(wide), WIDER, 0.8, 1.0)
+    return Bricks(origin, h, index, distance, weight, wide)
+
+
+def mean_spread(maps: MapArrays, origin: np.ndarray, voxel: float, counts: np.ndarray) -> np.ndarray:
+    """Mean spread (X, Y, Z) of the depths that maps show in each brick of a grid and in those around it."""
+    total, amount = (np.zeros(np.prod(counts)) for _ in range(2))
+    start = torch.from_numpy(origin).float().to(maps.depth.device)
+    for view in range(len(maps)):
+        points, spread = hit_points(maps, view), hit_values(maps, maps.spread, view)
+        brick = torch.div(points - start, BRICK * voxel, rounding_mode="floor").long().cpu().numpy()
+        inside = ((brick >= 0) & (brick < counts)).all(1)
+        number = np.ravel_multi_index(tuple(brick[inside].T), tuple(counts))
+        total += np.bincount(number, spread.cpu().numpy()[inside], len(total))
+        amount += np.bincount(number, minlength=len(amount))
+    total, amount = (scipy.ndimage.uniform_filter(a.reshape(counts), 3, mode="constant") for a in (total, amount))
+    return total / np.maximum(amount, 0.01)  # one depth in 27 bricks is the least
+
+
+def unsteady(distance: np.ndarray, weight: np.ndarray, voxel: float) -> np.ndarray:
+    """Which bricks (B,) bool with distances and weights (B, 8, 8, 8) have no single surface: where the sign changes between
+    neighbouring corners, a distance differs by a voxel at most."""
+    crossings, steps = (np.zeros(len(distance), int) for _ in range(2))
+    for axis in (1, 2, 3):
+        near, far = (np.take(distance, side, axis) for side in (range(BRICK - 1), range(1, BRICK)))
+        known = (np.take(weight, range(BRICK - 1), axis) > 0) & (np.take(weight, range(1, BRICK), axis) > 0)
+        crossing = known & ((near < 0) != (far < 0))
+        crossings += crossing.sum((1, 2, 3))
+        steps += (crossing & (np.abs(near - far) > STEP * voxel)).sum((1, 2, 3))
+    return steps > UNSTEADY * crossings
+
+
+def tolerances(bricks: Bricks, vertices: np.ndarray, faces: np.ndarray, tolerance: float) -> np.ndarray:
+    """How far (F,) triangles of a fused surface may lie from what a view shows: `tolerance`, wider in proportion to the
+    truncation of their bricks."""
+    brick = np.floor((vertices[faces].mean(1) - bricks.origin) / (BRICK * bricks.voxel)).astype(int)
+    number = bricks.index[tuple(np.clip(brick, 0, np.array(bricks.index.shape) - 1).T)]
+    return np.where((number >= 0) & bricks.wide[number], WIDER * tolerance, tolerance)
 
 
 def grid_of(region: Region) -> tuple[np.ndarray, np.ndarray]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from fieldwork.nerfcore.kernels.depth_arrays import FREE, MapArrays
 from fieldwork.nerfcore.mesh import clean, depth_maps, metrics, triangles
 from fieldwork.nerfcore.mesh.decimate import decimate
 from fieldwork.nerfcore.mesh.extract import extract, weld
-from fieldwork.nerfcore.mesh.fusion import BRICK, Bricks, fuse_maps
+from fieldwork.nerfcore.mesh.fusion import BRICK, Bricks, fuse_maps, mean_spread, tolerances
 from fieldwork.nerfcore.mesh.parts import texture_of
 from fieldwork.nerfcore.mesh.region import Region, choose_region, on_sides
 from fieldwork.nerfcore.mesh.surface import Surface, is_watertight
@@ -81,6 +82,43 @@ def test_a_rod_that_some_views_miss_stays_whole() -> None:
     core = np.abs(vertices[faces].mean(1)[:, 2]) < 0.35
     assert triangles.areas(vertices, faces[core]).sum() == pytest.approx(0.7 * 4 * 0.06, rel=0.2)
     assert np.abs(np.abs(vertices[np.unique(faces[core]), :2]).max(1) - 0.03).max() < voxel
+
+
+def test_views_that_disagree_make_one_surface_where_the_field_is_soft() -> None:
+    """Every view has a sphere of another size, up to ten voxels apart: of the surfaces they make, which break each other up,
+    one remains."""
+    voxel, flats, maps = 0.015, [], []
+    for number, pose in enumerate(orbit(32, 1.8)):
+        (flat,), (map_,) = maps_of(sphere(0.5 + 2.5 * voxel * (number % 5 - 2)), [pose])
+        flats.append(replace(flat, photo=number))
+        maps.append(map_)
+    border = {}
+    for spread in (voxel, 12 * voxel):
+        arrays = depth_maps.map_arrays(flats, [replace(m, spread=np.full_like(m.spread, spread)) for m in maps], CPU)
+        bricks = fuse_maps(arrays, choose_region(arrays, None, 128, voxel), Reporter())
+        assert bricks.wide.any() == (spread > voxel)
+        vertices, faces = extract(bricks, Reporter())
+        near = tolerances(bricks, vertices, faces, 4 * voxel)
+        assert set(near) == ({4 * voxel, 16 * voxel} if spread > voxel else {4 * voxel})
+        vertices, faces, _ = clean.clean(vertices, faces, arrays, near, Reporter())
+        radius = np.linalg.norm(vertices, axis=1)
+        assert 0.5 - 5 * voxel < np.median(radius) < 0.5 + 5 * voxel
+        border[spread] = len(triangles.border_edges(faces))
+    assert border[12 * voxel] < 0.2 * border[voxel]
+
+
+def test_spread_of_a_brick_is_that_of_what_is_seen_in_it_and_around_it() -> None:
+    flats, maps = maps_of(sphere(0.5), orbit(12, 1.8))
+    left = [flat.pose[0, 3] < 0 for flat in flats]
+    maps = [replace(m, spread=np.full_like(m.spread, 0.3 if side else 0.1)) for m, side in zip(maps, left)]
+    arrays = depth_maps.map_arrays(flats, maps, CPU)
+    found = mean_spread(arrays, np.full(3, -0.8), 0.02, np.full(3, 10))
+    assert found.shape == (10, 10, 10)
+    assert abs(found[0, 0, 0]) < 1e-9  # nothing is shown there
+    assert found[1, 5, 5] > 0.25
+    assert found[8, 5, 5] < 0.15
+    assert (found[found > 1e-9] > 0.1 - 1e-6).all()
+    assert found.max() < 0.3 + 1e-6
 
 
 def room_poses(count: int) -> list[np.ndarray]:

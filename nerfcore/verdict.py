@@ -137,11 +137,11 @@ def mesh_verdict(
         )
         found.append(("failed" if hit < MISSED else "weak", text))
     elif solid is not None and solid < SOLID:
-        text = f"Of what the photos show near, {1 - solid:.0%} is missing in the mesh. "
+        text = f"Of what the photos show near, {1 - solid:.0%} is missing in the mesh"
         if overlapped is not None and overlapped >= SOLID:
-            text += f"Fewer than three photos show {few:.0%} of it at all: take more photos of that from other places."
+            text += f", and {few:.0%} is in fewer than three photos: take more photos of that, from other places."
         else:
-            text += "Train longer, add photos of what is missing, or enlarge the region."
+            text += ". Train longer, add photos of what is missing, or enlarge the region."
         found.append(("failed" if solid < HALF_GONE else "weak", text))
     if holes > HOLES:
         found.append(("weak", f"The mesh has holes: {holes:.0%} of it in the photos. Train longer, or add photos."))

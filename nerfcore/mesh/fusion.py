@@ -114,9 +114,10 @@ def unsteady(distance: np.ndarray, weight: np.ndarray, voxel: float) -> np.ndarr
     neighbouring corners, a distance differs by a voxel at most."""
     crossings, steps = (np.zeros(len(distance), int) for _ in range(2))
     for axis in (1, 2, 3):
-        near, far = (np.take(distance, side, axis) for side in (range(BRICK - 1), range(1, BRICK)))
-        known = (np.take(weight, range(BRICK - 1), axis) > 0) & (np.take(weight, range(1, BRICK), axis) > 0)
-        crossing = known & ((near < 0) != (far < 0))
+        sides = range(BRICK - 1), range(1, BRICK)
+        near, far = (np.take(distance, side, axis) for side in sides)
+        known, also = (np.take(weight, side, axis) > 0 for side in sides)
+        crossing = known & also & ((near < 0) != (far < 0))
         crossings += crossing.sum((1, 2, 3))
         steps += (crossing & (np.abs(near - far) > STEP * voxel)).sum((1, 2, 3))
     return steps > UNSTEADY * crossings

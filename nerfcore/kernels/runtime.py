@@ -28,6 +28,8 @@ from .device import backend_of
 wp.config.log_level = 30  # warnings; stdout belongs to results
 # The adjoints are written by hand (`torch.autograd.Function`), so that nothing is compiled that is never called.
 wp.config.enable_backward = False
+# For the GPU at hand: the oldest one's instructions, Warp's default, are compiled a second time by the driver.
+wp.config.cuda_output = "cubin"
 
 _MINIMUM_CHUNK = 256
 NVIDIA = "0x10de"  # vendor number of PCI

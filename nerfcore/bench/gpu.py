@@ -58,8 +58,7 @@ def step_synchronisations(project: Path, report: Reporter) -> tuple[float, dict[
     """Host synchronisations a training step, outside of updates of the occupancy grid, and where; the share of the steps
     that replayed a recording. Needs a GPU."""
     device = use_device()
-    # All levels from the start: while they fade in nothing is recorded.
-    info, scene = plan_run(project, "standard", make_config("standard", {"train.fade": "0"}), device)
+    info, scene = plan_run(project, "standard", make_config("standard"), device)
     trainer = make_trainer(project, info, scene, device, report)
     report.stage("Looking for host synchronisation")
     for index in range(WARM_STEPS):

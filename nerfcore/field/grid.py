@@ -13,6 +13,7 @@ from torch import nn
 from ..kernels import encode
 from ..kernels.encode import BLOCK, FEATURES
 from ..kernels.encode_points import backward_points
+from ..kernels.runtime import small_tensor
 
 Levels = list[tuple[int, int, int]]
 Part = tuple[torch.Tensor, torch.Tensor]
@@ -46,7 +47,7 @@ class _Encode(torch.autograd.Function):
     ):
         ctx.grid, ctx.gains, ctx.collected = grid, gains, grid.collected()
         ctx.save_for_backward(points)
-        return encode.forward(grid.table, grid.levels, gains, points) if precomputed is None else precomputed
+        return grid.encode(points, gains) if precomputed is None else precomputed
 
     @staticmethod
     def backward(ctx, *grads):
@@ -74,6 +75,7 @@ class VertexGrid(nn.Module):
         super().__init__()
         self.levels = levels
         self.point_gains = [1.0] * len(levels)  # weights of the levels in the gradient of the points
+        self._kept_gains: tuple[list[float], torch.Tensor] | None = None
         self._thread = threading.local()
         rows = levels[-1][1] + -(-levels[-1][2] // BLOCK) * BLOCK
         self.register_buffer("table", torch.empty(rows, FEATURES).uniform_(-initial, initial))
@@ -108,9 +110,24 @@ class VertexGrid(nn.Module):
         `precomputed`: the result, when a pass without gradients computed it already; only its gradient is added.
         """
         if not torch.is_grad_enabled():
-            return encode.forward(self.table, self.levels, gains, points)
+            return self.encode(points, gains)
         # The anchor only tells autograd that the result depends on something trainable.
         return _Encode.apply(points, precomputed, self.anchor.requires_grad_(), self, gains)  # type: ignore[no-any-return]
+
+    def encode(self, points: torch.Tensor, gains: list[float]) -> torch.Tensor:
+        """Encode points (N, 3) without their gradient."""
+        return encode.forward(self.table, self.levels, gains, points, self._factors(gains))
+
+    def keep_gains(self, gains: list[float]) -> None:
+        """Keep the gains of the steps to come in one place of the device, where recorded steps read them too."""
+        if self._kept_gains is None:
+            self._kept_gains = list(gains), small_tensor(gains, torch.float32, self.table.device)
+        elif self._kept_gains[0] != gains:
+            self._kept_gains[1].copy_(small_tensor(gains, torch.float32, self.table.device))
+            self._kept_gains = list(gains), self._kept_gains[1]
+
+    def _factors(self, gains: list[float]) -> torch.Tensor | None:
+        return self._kept_gains[1] if self._kept_gains is not None and self._kept_gains[0] == gains else None
 
     def collected(self) -> list[Part] | None:
         """Where this thread's gradients go instead of the grid, see `collecting`."""
@@ -129,7 +146,7 @@ class VertexGrid(nn.Module):
 
     def scatter(self, parts: list[Part], gains: list[float]) -> None:
         """Add the gradients of encoded points, (points (N, 3), gradient (N, width)) each, to the grid's."""
-        encode.scatter(self.gradient, self.touched, self.levels, gains, parts)
+        encode.scatter(self.gradient, self.touched, self.levels, gains, parts, self._factors(gains))
 
     def clear(self) -> None:
         """Forget the gradient gathered since the last step."""

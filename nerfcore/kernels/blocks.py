@@ -9,7 +9,7 @@ from typing import Any
 import torch
 import warp as wp
 
-from .runtime import _load_lock, _loaded
+from .runtime import _load_lock, _loaded, current_stream
 
 _one_at_a_time = threading.Lock()  # tiles of all CPU threads lie in the same memory
 
@@ -29,7 +29,7 @@ def launch_blocks(kernel: wp.Kernel, blocks: int, lanes: int, inputs: list[Any],
     """Run `blocks` blocks of `lanes` threads; on the CPU one after the other."""
     load_blocks(kernel, lanes, device)
     if device.type == "cuda":
-        target, stream = wp.device_from_torch(str(device)), wp.stream_from_torch(torch.cuda.current_stream(device))
+        target, stream = wp.device_from_torch(str(device)), current_stream(device)
         wp.launch(kernel, dim=blocks * lanes, inputs=inputs, device=target, stream=stream, block_dim=lanes)
         return
     with _one_at_a_time:

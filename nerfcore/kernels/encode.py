@@ -126,9 +126,11 @@ def encode_backward(
     if gain == 0.0:
         return
     i = index - level * points.shape[0]
+    g = grad_out[i, level] * gain
+    if wp.dot(g, g) == 0.0:
+        return  # unused entries all lie at one point, where their threads would wait for each other
     layout = levels[level]
     low, high, f = cell_of(points[i], layout[0], layout[1], layout[2])
-    g = grad_out[i, level] * gain
     g0 = g * (1.0 - f[0])
     g1 = g * f[0]
     w00 = (1.0 - f[1]) * (1.0 - f[2])
@@ -184,7 +186,11 @@ def adam_touched(
 
 
 def forward(
-    table: torch.Tensor, levels: list[tuple[int, int, int]], gains: list[float], points: torch.Tensor
+    table: torch.Tensor,
+    levels: list[tuple[int, int, int]],
+    gains: list[float],
+    points: torch.Tensor,
+    factors: torch.Tensor | None = None,
 ) -> torch.Tensor:
     """Encode `points` (N, 3) in [0, 1]³ → features (N, levels · FEATURES) float32.
 
@@ -192,26 +198,30 @@ def forward(
         table: (rows, FEATURES) float32.
         levels: (resolution, first row, rows) of each level.
         gains: factor of each level's features (coarse-to-fine fading).
+        factors: `gains` (L,) float32 on the device, where the caller keeps them: a recording of this reads them there.
     """
     device = points.device
     if not backend_of(device).warp:
         return encode_torch.forward(table, levels, gains, points)
     init()
     out = torch.empty(len(points), len(levels), FEATURES, device=device)
-    layout, factors = _on_device(tuple(levels), tuple(gains), device)
+    layout, factors = _on_device(levels, gains, factors, device)
     inputs = [array(table, feature), array(points, wp.vec3), array(layout, wp.vec3i), array(factors)]
     kernel = encode_host.encode_forward if on_host(device) else encode_forward
     launch(kernel, len(points), [*inputs, array(out, feature)], device)
     return out.flatten(1)
 
 
-@lru_cache(maxsize=64)
 def _on_device(
-    levels: tuple[tuple[int, int, int], ...], gains: tuple[float, ...], device: torch.device
+    levels: list[tuple[int, int, int]], gains: list[float], factors: torch.Tensor | None, device: torch.device
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Layout (L, 3) int32 and factors (L,) float32 of the levels. Kept: a step reads them many times, and they change
-    only while levels fade in."""
-    return small_tensor(levels, torch.int32, device), small_tensor(gains, torch.float32, device)
+    """Layout (L, 3) int32 and factors (L,) float32 of the levels."""
+    factors = _kept(tuple(gains), torch.float32, device) if factors is None else factors
+    return _kept(tuple(levels), torch.int32, device), factors
+
+
+# A step reads them many times, and they change only while levels fade in.
+_kept = lru_cache(maxsize=64)(small_tensor)
 
 
 def scatter(
@@ -220,10 +230,12 @@ def scatter(
     levels: list[tuple[int, int, int]],
     gains: list[float],
     parts: list[tuple[torch.Tensor, torch.Tensor]],
+    factors: torch.Tensor | None = None,
 ) -> None:
     """Add the gradient of `forward` to `grad_table` (rows, FEATURES) and mark touched blocks (uint8).
 
     Args:
+        factors: as for `forward`.
         parts: points (N, 3) and the gradient (N, levels · FEATURES) float32 of their features, any number of times.
 
     On the CPU each level is one task, so no two threads write the same row and the sum has a fixed order.
@@ -240,7 +252,7 @@ def scatter(
     ]
     device = grad_table.device
 
-    layout, factors = _on_device(tuple(levels), tuple(gains), device)
+    layout, factors = _on_device(levels, gains, factors, device)
     shared = [array(layout, wp.vec3i), array(factors), rows, flags]
     if not backend_of(device).host_threads:
         for where, grad in arrays:

@@ -141,6 +141,17 @@ def compile_seconds() -> float:
     return sum(_loaded.values())
 
 
+@cache
+def _warp_stream(stream: torch.cuda.Stream) -> wp.Stream:
+    # Kept, as torch keeps its own: a Warp stream that goes ends a recording that is under way on the same stream.
+    return wp.stream_from_torch(stream)
+
+
+def current_stream(device: torch.device) -> wp.Stream:
+    """Torch's current stream of a CUDA device, as Warp sees it."""
+    return _warp_stream(torch.cuda.current_stream(device))
+
+
 def launch(kernel: wp.Kernel, count: int, inputs: list[Any], device: torch.device, serial: bool = False) -> None:
     """Run `kernel` for indices 0 … count−1 with `inputs` followed by the chunk's offset.
 
@@ -150,7 +161,7 @@ def launch(kernel: wp.Kernel, count: int, inputs: list[Any], device: torch.devic
         return
     load(kernel, device)
     if device.type == "cuda":
-        stream = wp.stream_from_torch(torch.cuda.current_stream(device))
+        stream = current_stream(device)
         wp.launch(kernel, dim=count, inputs=[*inputs, 0], device=wp.device_from_torch(str(device)), stream=stream)
         return
     workers = 1 if in_pool() else worker_count()

@@ -20,6 +20,7 @@ import torch
 import warp as wp
 
 from ..errors import SettingError
+from ..kernels.runtime import current_stream
 
 log = logging.getLogger("fieldwork")
 Result = TypeVar("Result")
@@ -55,8 +56,7 @@ class CudaRecording(Generic[Result]):
         self.graph.register_generator_state(generator)
         # The autograd engine launches from a thread of its own, on the stream that is recorded.
         with torch.cuda.graph(self.graph, capture_error_mode="thread_local"):
-            stream = wp.stream_from_torch(torch.cuda.current_stream(device))
-            with wp.ScopedCapture(stream=stream, force_module_load=False, external=True):
+            with wp.ScopedCapture(stream=current_stream(device), force_module_load=False, external=True):
                 self.result = work()
 
     def replay(self) -> None:

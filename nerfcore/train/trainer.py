@@ -106,6 +106,8 @@ class Trainer:
         """One optimisation step at `progress` in [0, 1] of the schedule."""
         config, model = self.config, self.model
         model.field.set_progress(progress, config.train.fade, self.steps)
+        if self.replay.active and model.field.grid is not None:
+            model.field.grid.keep_gains(model.field.gains)
         model.warming_up = self.steps < config.sampling.warmup
         if config.field.voxel_init != "none" and self.steps == config.field.voxel_init_step:
             self._initialise(progress)
@@ -166,7 +168,7 @@ class Trainer:
         blend, hit = model.field.blend, self.cache.hit
         return (
             (self.rays, self._capacity(progress, 1), *model.fixed_shares()),
-            (tuple(model.field.gains), None if blend is None else blend.warming_up),
+            None if blend is None else blend.warming_up,
             (self.steps < c.loss.rgb_warmup, progress >= c.loss.entropy_start, progress >= c.loss.distortion_start),
             (None if hit is None else (hit.data_ptr(), len(hit)), model.occupancy.march_settings()),
             0 if self.depths is None else len(self.depths),

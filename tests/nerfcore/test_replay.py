@@ -176,6 +176,41 @@ def test_the_mode_is_one_of_three(monkeypatch: pytest.MonkeyPatch) -> None:
         asked_mode()
 
 
+# So that only the levels' gains change between two steps.
+EVEN = {"train.batch_samples": "2048", "train.max_rays": "64", "loss.entropy_start": "0.5", "loss.distortion_start": "0.5"}
+
+
+def assert_finest_level_fades_in(trainer: Trainer) -> None:
+    """It has no part in the first steps, and learns in a step that was recorded among those."""
+    grid, replay = trainer.model.field.grid, trainer.replay
+    assert grid is not None
+    first, rows = grid.levels[-1][1:]
+    finest = grid.table[first : first + rows]
+    for _ in range(40):
+        before = finest.clone()
+        for _ in range(5):
+            trainer.step(0.02)
+        assert torch.equal(finest, before)
+        recorded, replayed = replay.recorded, replay.replayed
+        trainer.step(0.19)
+        if recorded and (replay.recorded, replay.replayed) == (recorded, replayed + 1):
+            assert float((finest - before).abs().max()) > 1e-3
+            return
+    pytest.fail("no step was replayed")
+
+
+def test_one_recording_is_enough_while_levels_fade_in(ball: Path) -> None:
+    assert_finest_level_fades_in(static(ball, True, **EVEN))
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no NVIDIA GPU")
+def test_a_graph_reads_the_gains_of_levels_that_fade_in(ball: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FIELDWORK_GRAPHS", "on")
+    info, scene = plan_run(ball, "draft", config_of(**EVEN), torch.device("cuda"))
+    assert_finest_level_fades_in(make_trainer(ball, info, scene, torch.device("cuda"), Reporter()))
+
+
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no NVIDIA GPU")
 @pytest.mark.parametrize("settings", [{}, {"loss.depth_weight": "0.1"}, {"field.appearance": "2"}], ids=str)

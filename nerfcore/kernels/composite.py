@@ -107,6 +107,38 @@ def sum_backward(
     grad_weights[k] = g
 
 
+@wp.kernel(module="fieldwork_composite")
+def in_front(
+    values: wp.array(dtype=float),
+    starts: wp.array(dtype=int),
+    counts: wp.array(dtype=int),
+    out: wp.array(dtype=float),
+    offset: int,
+):
+    r = wp.tid() + offset
+    base = starts[r]
+    total = float(0.0)
+    for k in range(base, base + counts[r]):
+        out[k] = total
+        total += values[k]
+
+
+@wp.kernel(module="fieldwork_composite")
+def behind(
+    values: wp.array(dtype=float),
+    starts: wp.array(dtype=int),
+    counts: wp.array(dtype=int),
+    out: wp.array(dtype=float),
+    offset: int,
+):
+    r = wp.tid() + offset
+    last = starts[r] + counts[r] - 1
+    total = float(0.0)
+    for step in range(counts[r]):
+        out[last - step] = total
+        total += values[last - step]
+
+
 class _Weights(torch.autograd.Function):
     @staticmethod
     def forward(ctx, density: torch.Tensor, deltas: torch.Tensor, packed_info: PackedInfo) -> torch.Tensor:
@@ -161,6 +193,26 @@ class _Sum(torch.autograd.Function):
         return grad_values.to(ctx.dtype), grad_weights, None
 
 
+class _SumsInFront(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, values: torch.Tensor, packed_info: PackedInfo) -> torch.Tensor:
+        ctx.packed_info = packed_info
+        return _running(in_front, values, packed_info)
+
+    @staticmethod
+    def backward(ctx, *grads):
+        return _running(behind, grads[0], ctx.packed_info), None
+
+
+def _running(kernel: wp.Kernel, values: torch.Tensor, packed_info: PackedInfo) -> torch.Tensor:
+    init()
+    values = values.contiguous()
+    out = torch.zeros_like(values)
+    inputs = [array(values), array(packed_info.starts), array(packed_info.counts), array(out)]
+    launch(kernel, len(packed_info.starts), inputs, values.device)
+    return out
+
+
 def render_weights(density: torch.Tensor, deltas: torch.Tensor, packed_info: PackedInfo) -> torch.Tensor:
     """Rendering weights (N,) of packed samples from their densities and lengths (N,); differentiable in `density`."""
     if not backend_of(density.device).warp:
@@ -169,12 +221,10 @@ def render_weights(density: torch.Tensor, deltas: torch.Tensor, packed_info: Pac
 
 
 def sums_in_front(values: torch.Tensor, packed_info: PackedInfo) -> torch.Tensor:
-    """Sum (N,) of the values (N,) in front of each sample on its ray; differentiable."""
+    """Sum (N,) of the values (N,) float32 in front of each sample on its ray, 0 in unused entries; differentiable."""
     if not backend_of(values.device).warp:
         return composite_torch.sums_in_front(values, packed_info)
-    first = packed_info.starts.clamp(min=0).long()[packed_info.ray_indices.long()]
-    running = torch.cumsum(values.double(), 0) - values
-    return (running - running[first]).float()
+    return _SumsInFront.apply(values, packed_info)  # type: ignore[no-any-return]
 
 
 def weighted_sum(values: torch.Tensor, weights: torch.Tensor, packed_info: PackedInfo) -> torch.Tensor:

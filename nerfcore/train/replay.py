@@ -4,8 +4,8 @@ What is recorded keeps the numbers that the host gave it and the memory that it 
 all of these stay the same: they make up its key. With another key steps run as usual until the key has come twice in a
 row, and then a recording is made.
 
-FIELDWORK_GRAPHS (off, auto, on): off, unless something else is asked for: every step runs as usual; auto records where it
-can and goes on without where that fails; on: a failure is an error.
+FIELDWORK_GRAPHS (auto, on, off): auto, unless something else is asked for, records where it can and goes on without where
+that fails; on: a failure is an error; off: every step runs as usual.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from ..kernels.runtime import current_stream
 log = logging.getLogger("fieldwork")
 Result = TypeVar("Result")
 Result_co = TypeVar("Result_co", covariant=True)
-MODES = ("off", "auto", "on")  # the first one where nothing is asked for: no GPU has compared the others yet
+MODES = ("auto", "on", "off")  # the first one where nothing is asked for
 
 
 class Recording(Protocol[Result_co]):
@@ -55,9 +55,11 @@ class CudaRecording(Generic[Result]):
         self.graph = torch.cuda.CUDAGraph()
         self.graph.register_generator_state(generator)
         # The autograd engine launches from a thread of its own, on the stream that is recorded.
-        with torch.cuda.graph(self.graph, capture_error_mode="thread_local"):
-            with wp.ScopedCapture(stream=current_stream(device), force_module_load=False, external=True):
-                self.result = work()
+        with (
+            torch.cuda.graph(self.graph, capture_error_mode="thread_local"),  # makes another stream the current one
+            wp.ScopedCapture(stream=current_stream(device), force_module_load=False, external=True),
+        ):
+            self.result = work()
 
     def replay(self) -> None:
         self.graph.replay()
@@ -77,7 +79,7 @@ def asked_mode() -> str:
     """
     mode = os.environ.get("FIELDWORK_GRAPHS", "") or MODES[0]
     if mode not in MODES:
-        raise SettingError(f"FIELDWORK_GRAPHS is “{mode}”.", "Set it to off, auto or on, or leave it out.")
+        raise SettingError(f"FIELDWORK_GRAPHS is “{mode}”.", "Set it to auto, on or off, or leave it out.")
     return mode
 
 

@@ -53,6 +53,24 @@ def test_weights_and_sums_equal_their_references_and_so_do_their_gradients(devic
         assert relative(ours, theirs) <= 1e-5 if ours.shape != density.shape else relative(ours, theirs) <= 1e-4
 
 
+def test_sums_in_front_equal_their_reference_and_unused_entries_have_none(device: torch.device) -> None:
+    generator = torch.Generator().manual_seed(6)
+    packed = random_packed_info(60, generator, device)
+    n, unused = len(packed.ray_indices), 5
+    packed_info = PackedInfo(
+        packed.starts, packed.counts, torch.nn.functional.pad(packed.ray_indices, (0, unused), value=-1)
+    )
+    values = torch.randn(n + unused, generator=generator).to(device).requires_grad_()
+    upstream = torch.randn(n + unused, generator=generator).to(device)
+    results = []
+    for module in (composite, composite_reference):
+        sums = module.sums_in_front(values, packed_info)
+        results.append((sums, *torch.autograd.grad((sums * upstream).sum(), values)))
+        assert bool((sums[n:] == 0).all())
+    for ours, theirs in zip(*results):
+        assert relative(ours, theirs) <= 1e-5
+
+
 def test_weight_gradient_agrees_with_finite_differences(device: torch.device) -> None:
     start, count, ray = (torch.tensor(x, dtype=torch.int32, device=device) for x in ([0], [6], [0] * 6))
     packed_info = PackedInfo(start, count, ray)

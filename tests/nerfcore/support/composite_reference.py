@@ -24,3 +24,12 @@ def weighted_sum(values: torch.Tensor, weights: torch.Tensor, packed_info: Packe
     for start, count in zip(packed_info.starts.tolist(), packed_info.counts.tolist()):
         rows.append((values[start : start + count] * weights[start : start + count, None]).sum(0))
     return torch.stack(rows)
+
+
+def sums_in_front(values: torch.Tensor, packed_info: PackedInfo) -> torch.Tensor:
+    """As `composite.sums_in_front`, differentiable by autograd."""
+    out = torch.zeros_like(values)
+    for start, count in zip(packed_info.starts.tolist(), packed_info.counts.tolist()):
+        part = values[start : start + count]
+        out = out.index_put((torch.arange(start, start + count, device=out.device),), torch.cumsum(part, 0) - part)
+    return out

@@ -39,6 +39,11 @@ class Learned:
     loss: torch.Tensor
     squared_error: torch.Tensor
 
+    @property
+    def rendered(self) -> list[Rendered]:
+        """What was rendered, of the shards that met something."""
+        return [shard.rendered for shard in self.shards if shard.rendered is not None]
+
 
 @dataclass
 class Measured:

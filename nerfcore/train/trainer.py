@@ -121,7 +121,7 @@ class Trainer:
         if moving is not None and model.field.grid is not None:
             model.field.grid.point_gains = level_weights(config.field.levels, progress)
         key = self._key(progress) if moving is None else None
-        learned = self.replay.run(key, partial(self._learn, progress, moving))
+        learned = self.replay.run(key, partial(self._learn_and_observe, progress, moving))
         self._take(learned)
         batch, shards = learned.batch, learned.shards
         if moving is not None:
@@ -134,8 +134,7 @@ class Trainer:
         self.guard.update()
         if model.field.grid is not None:
             model.field.grid.step(config.train.grid_rate * factor * bias_correction(self.steps, *BETAS), BETAS)
-        rendered = [part.rendered for part in shards if part.rendered is not None]
-        model.observe(rendered)
+        rendered = learned.rendered
         if model.environment is not None and batch.label.numel():
             # Rays of known length, which are rendered as well, come after those of the batch.
             behind = [r.environment.weight for r in rendered if r.environment is not None]
@@ -161,22 +160,33 @@ class Trainer:
         self.measured = measured
 
     def _key(self, progress: float) -> Hashable:
-        """All that the host tells `_learn`; None where that reads back from the device or from the host's memory."""
+        """All that the host tells `_learn_and_observe`, which is recorded; None where that reads back from the device or from the host's memory."""
         model, c, store = self.model, self.config, self.store
         if not self.replay.active or not model.has_fixed_capacity() or store.home != self.device:
             return None
         blend, hit = model.field.blend, self.cache.hit
         return (
             (self.rays, self._capacity(progress, 1), *model.fixed_shares()),
-            None if blend is None else blend.warming_up,
+            (model.warming_up, None if blend is None else blend.warming_up),
             (self.steps < c.loss.rgb_warmup, progress >= c.loss.entropy_start, progress >= c.loss.distortion_start),
             (None if hit is None else (hit.data_ptr(), len(hit)), model.occupancy.march_settings()),
             0 if self.depths is None else len(self.depths),
         )
 
+    def _learn_and_observe(self, progress: float, moving: PoseRefinement | None = None) -> Learned:
+        """`_learn`; and the occupancy grid and the counters take in what was rendered."""
+        learned = self._learn(progress, moving)
+        self.model.observe(learned.rendered)
+        if self.model.has_fixed_capacity():
+            # How many entries were used only the device knows; `_ask_device` reads it.
+            dropped = [r.samples.packed_info.dropped for r in learned.rendered]
+            self._counted[0] += sum((r.evaluated_density >= 0).sum() for r in learned.rendered)
+            self._counted[1] += sum(d for d in dropped if d is not None)
+        return learned
+
     def _learn(self, progress: float, moving: PoseRefinement | None = None) -> Learned:
         """Gradients of the composite loss of rays drawn here, summed in the order of the shards; only the grid's, and the
-        random numbers, are changed: with a fixed capacity it can be recorded and replayed."""
+        random numbers, are changed."""
         batch = self.draw() if moving is None else moving.move(self.draw())
         tasks = self._shard_tasks(batch, progress)
         if self.config.loss.regularization * self.config.loss.sparsity_weight > 0:
@@ -319,10 +329,6 @@ class Trainer:
         m.steps += 1
         m.rays += rays
         if self.model.has_fixed_capacity():
-            # How many entries were used only the device knows; `_ask_device` reads it.
-            dropped = [r.samples.packed_info.dropped for r in rendered]
-            self._counted[0] += sum((r.evaluated_density >= 0).sum() for r in rendered)
-            self._counted[1] += sum(d for d in dropped if d is not None)
             self._drawn += rays
             return
         evaluated = sum(r.evaluated for r in rendered)

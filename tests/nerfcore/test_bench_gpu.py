@@ -114,7 +114,7 @@ def test_the_check_of_steps_runs_as_far_as_the_cpu_goes(tmp_path: Path, monkeypa
     """What a GPU machine runs first must not stop at a name that is wrong."""
     monkeypatch.setattr(torch.cuda, "set_sync_debug_mode", _Cpu.set_sync_debug_mode)
     monkeypatch.setattr(gpu, "use_device", lambda: torch.device("cpu"))
-    monkeypatch.setattr(gpu, "make_config", lambda preset, settings: config_of(**settings))
+    monkeypatch.setattr(gpu, "make_config", lambda preset: config_of())
     monkeypatch.setattr(gpu, "WARM_STEPS", 3)
     monkeypatch.setattr(gpu, "COUNTED_STEPS", 2)
     project = ball_project(tmp_path / "ball", views=4, side=16)

@@ -112,16 +112,16 @@ def figures(
 
 
 def section(
-    machine: str | None, checks: str | None, values: dict[str, float | None], table: str, places: dict[str, int]
+    origin: str | None, checks: str | None, values: dict[str, float | None], table: str, places: dict[str, int]
 ) -> str:
-    """The text of the page's GPU section."""
-    if machine is None:
+    """The text of the page's GPU section; `origin`: the sentence that tells machine and commit."""
+    if origin is None:
         return (
             "Not measured: no NVIDIA GPU was at hand. Every kernel compiles for sm_75, 86, 89, 90 and 120\n"
             "(`make gpu-compile`, resources in [kernels.md](kernels.md)); `make gpu-check` fills this section in where\n"
             "there is a GPU.\n"
         )
-    lines = [f"Machine: {machine}. Command: `make gpu-check`. Kernels: {checks or 'not measured'}.", ""]
+    lines = [f"{origin} Command: `make gpu-check`. Kernels: {checks or 'not measured'}.", ""]
     lines += ["| what | asked | measured | |", "| --- | --- | --- | --- |"]
     for name, (relation, limit) in ASKED.items():
         value = values.get(name)

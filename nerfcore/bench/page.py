@@ -116,6 +116,7 @@ def _gpu_text(sets: Sequence[ResultSet]) -> str:
         asked = result.asked
         checks, figures, waits = (asked.checks, asked.figures, asked.waits) if asked else (None, {}, {})
         texts.append(gpu.section(result.origin(), checks, figures, _table(result), waits))
+        texts += [f"- {note}" for note in result.notes] + [""] * bool(result.notes)
     return "\n".join(texts)
 
 

@@ -156,7 +156,8 @@ def correlation(grey: wp.array(dtype=float), maps: Maps, patch: Patch, pixel: Pi
 def photo_agreement(
     grey: wp.array(dtype=float), maps: Maps, params: RefineParams, patch: Patch, pixel: Pixel, z: float
 ):
-    """Mean correlation of the three views that agree best, were the pixel's depth z; −1 for each that is missing."""
+    """Mean correlation of the three views that agree best, were the pixel's depth z, or of the fewer whose pictures show the
+    place; −1 where none does."""
     first = float(-1.0)
     second = float(-1.0)
     third = float(-1.0)
@@ -173,7 +174,15 @@ def photo_agreement(
                 second = c
             elif c > third:
                 third = c
-    return (first + second + third) / 3.0
+    total = first
+    shown = float(1.0)
+    if second > -1.0:
+        total += second
+        shown += 1.0
+    if third > -1.0:
+        total += third
+        shown += 1.0
+    return total / shown
 
 
 @wp.func

@@ -261,6 +261,50 @@ def agreement(
 
 
 @wp.kernel(module="fieldwork_surface")
+def able_kernel(
+    maps: Maps,
+    view: int,
+    neighbours: wp.array(dtype=int),
+    share: float,
+    enough: int,
+    out: wp.array(dtype=int),
+    offset: int,
+):
+    i = wp.tid() + offset
+    out[i] = 0
+    z = maps.depth[maps.first[view] + i]
+    if z <= 0.0 or z > FARTHEST:
+        return
+    ray = pixel_ray(maps.lens[view], float(i % maps.size[view, 0]) + 0.5, float(i / maps.size[view, 0]) + 0.5)
+    q = wp.vec3(ray[0] * z, ray[1] * z, z)
+    p = wp.transpose(maps.rotation[view]) * (q - maps.translation[view])
+    able = int(0)
+    for n in range(neighbours.shape[0]):
+        if able >= enough:
+            break
+        v = neighbours[n]
+        o, place, inside = seen_at(maps, v, p)
+        if inside:
+            depth, _ = read_depth(maps, v, place, GAP)
+            if depth <= 0.0 or depth > (1.0 - share) * o[2]:
+                able += 1
+    out[i] = able
+
+
+def able_views(
+    maps: MapArrays, view: int, neighbours: torch.Tensor, share: float, enough: int = 1 << 30
+) -> torch.Tensor:
+    """How many of the maps `neighbours` (K,) int32 could show what each pixel (H·W,) int32 of one map does: it lies in their
+    picture, and nothing they know is nearer there by more than `share`. Counted no farther than to `enough`."""
+    init()
+    count = int(maps.size[view].prod())
+    out = torch.empty(count, dtype=torch.int32, device=maps.depth.device)
+    inputs = [map_struct(maps), view, array(neighbours), share, enough, array(out)]
+    launch(able_kernel, count, inputs, maps.depth.device)
+    return out
+
+
+@wp.kernel(module="fieldwork_surface")
 def sight_kernel(
     points: wp.array(dtype=wp.vec3),
     normals: wp.array(dtype=wp.vec3),

@@ -21,7 +21,7 @@ from ..kernels.depth_normals import depth_normals
 from ..kernels.device import backend_of
 from ..kernels.march import sample
 from ..kernels.runtime import run_parallel
-from ..kernels.surface import agreement, depth_quantiles
+from ..kernels.surface import able_views, agreement, depth_quantiles
 from ..progress import Reporter
 from ..render.model import Model
 from ..render.sparse_rays import sparse_rays
@@ -42,6 +42,7 @@ AGREE, AGREE_PIXELS, ROUND_TRIP = (
     1.65,
     1.5,
 )  # of the depth, or footprints of a pixel where photos are small; pixels
+HIDDEN = 0.03  # share of a place's distance by which what hides it is nearer
 SMALLEST_FACE = 0.05  # share of a cube's face that a photo must show
 
 
@@ -280,7 +281,7 @@ def confirmed_maps(
     round_trip: float = ROUND_TRIP,
 ) -> MapArrays:
     """The maps as the kernels read them, without what cannot be trusted: see `map_arrays`, and what `needed` other views
-    (all others where they are fewer) do not confirm. `around`: the neighbours of each view where they are known;
+    do not confirm; where fewer could show a place, those, but at least one. `around`: the neighbours of each view where they are known;
     `one_suffices`: for which pixels (H, W) bool of each map one other view is enough; `agree`: share by which a depth may
     differ at least; `round_trip`: pixels by which it may miss the pixel."""
     arrays = map_arrays(views, maps, device)
@@ -290,7 +291,7 @@ def confirmed_maps(
         others = torch.tensor(near, dtype=torch.int32, device=arrays.depth.device)
         share = max(agree, AGREE_PIXELS / views[index].camera.fx)
         found = agreement(arrays, index, others, share, round_trip, needed)
-        enough = found >= needed
+        enough = found >= able_views(arrays, index, others, HIDDEN, needed).clamp(min=min(1, needed))
         if one_suffices is not None:
             enough |= (found >= 1) & torch.from_numpy(one_suffices[index].reshape(-1)).to(found.device)
         confirmed.append(enough)

@@ -31,7 +31,7 @@ from .depth_maps import (
 )
 from .planes import with_planes
 from .scene_planes import known_points, on_scene_planes, scene_planes
-from .sky import backdrop, farthest, labels_tell, named_things, nothing
+from .sky import FAR, backdrop, farthest, labels_tell, named_things, nothing
 
 VIEWS = 5  # neighbours whose photos are compared
 LEAST, GAIN = 0.6, 0.05  # correlation that is believed, and by how much it must exceed that of the field's depth
@@ -145,9 +145,9 @@ def relied_on(views: list[FlatView], fields: list[DepthMap], sure: list[np.ndarr
 
 
 def trusted_field(field: DepthMap, depth: np.ndarray, sure: np.ndarray, unnamed: np.ndarray | None) -> DepthMap:
-    """The field's own depths that may fill holes: not where `depth` (H, W) is unknown, nor farther away than photos
+    """The field's own depths that may fill holes: not where `depth` (H, W) is unknown, nor much farther away than photos
     confirm it, `sure` (H, W) bool, nor where label maps leave a place out, `unnamed` (H, W) bool."""
-    doubtful = (depth == 0) | (field.depth > farthest(depth, sure))
+    doubtful = (depth == 0) | (field.depth > FAR * farthest(depth, sure))
     if unnamed is not None:
         doubtful |= unnamed
     return replace(field, depth=np.where(field.hit & doubtful, 0, field.depth))

@@ -130,6 +130,17 @@ def test_as_many_views_agree_as_their_reference_says(device: str, rough: MapArra
 
 
 @pytest.mark.parametrize("device", WARP_DEVICES)
+def test_as_many_views_could_show_a_place_as_their_reference_says(device: str, rough: MapArrays) -> None:
+    others = [1, 2, 3, 4, 5, 6, 7, 8]
+    near = torch.tensor(others, dtype=torch.int32, device=device)
+    ours = surface.able_views(on(device, rough), 0, near, 0.03).cpu()
+    expected = surface_reference.able_views(rough, 0, others, 0.03)
+    assert torch.equal(surface.able_views(on(device, rough), 0, near, 0.03, 2).cpu(), ours.clamp(max=2))
+    assert len(expected.unique()) >= 4
+    assert float((ours == expected)[expected > 0].float().mean()) > 0.99
+
+
+@pytest.mark.parametrize("device", WARP_DEVICES)
 def test_views_see_points_as_well_as_their_reference_says(device: str, rough: MapArrays) -> None:
     points, directions = on_ball(4000)
     ours = surface.sight(points.to(device), directions.to(device), on(device, rough), 0.03).cpu()

@@ -86,7 +86,8 @@ def refined(
         for number in numbers:
             depth = z + (number - 6) * step
             agreed = [views.correlation(view, v, pixel, normal, depth) if depth > 1e-4 else -1 for v in neighbours]
-            found[number] = np.mean(sorted([*agreed, -1, -1, -1], reverse=True)[:3])
+            showing = sorted((c for c in agreed if c > -1), reverse=True)
+            found[number] = np.mean(showing[:3]) if showing else -1
 
     rate_tries([*range(0, 13, 2)])
     coarse = int(np.argmax(found))

@@ -124,6 +124,21 @@ def agreement(maps: MapArrays, view: int, neighbours: list[int], share: float, p
     return torch.where((z > 0) & (z < FREE), found, 0)
 
 
+def able_views(maps: MapArrays, view: int, neighbours: list[int], share: float) -> torch.Tensor:
+    """As `surface.able_views`."""
+    width, height = maps.size[view].tolist()
+    z = maps.depth[int(maps.first[view]) :][: width * height]
+    pixel = torch.arange(width * height)
+    points = unprojected(maps, view, pixel % width + 0.5, pixel // width + 0.5, z)
+    able = torch.zeros(len(z), dtype=torch.int32)
+    for other in neighbours:
+        q = camera_axes(maps, other, points)
+        x, y, inside = pixels_of(maps, other, q)
+        value = read_depth(maps, other, x, y, LOOKED_UP)
+        able += inside & ~((value > 0) & (value <= (1 - share) * q[:, 2]))
+    return torch.where((z > 0) & (z < FREE), able, 0)
+
+
 def sight(points: torch.Tensor, normals: torch.Tensor, maps: MapArrays, tolerance: float) -> torch.Tensor:
     """As `surface.sight`."""
     columns = []

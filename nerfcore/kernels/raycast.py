@@ -85,7 +85,7 @@ class FirstHits:
         """Distance (N,) of what rays (N, 3) with unit directions meet first, 1e9 where that is nothing; on the host."""
         o, d = origins.detach().cpu().contiguous(), directions.detach().cpu().contiguous()
         found = torch.full((len(o),), 1.0e9)
-        if self._mesh is not None:
+        if self._mesh is not None and len(o):  # Warp takes no array of no vectors
             launch(
                 distance_kernel, len(o), [self._mesh.id, array(o, wp.vec3), array(d, wp.vec3), array(found)], o.device
             )

@@ -116,6 +116,16 @@ def test_places_are_shown_by_the_photos_that_see_them(room: tuple[Path, Scene]) 
     assert (shown_by(places, views, poses, FirstHits(np.zeros((0, 3)), np.zeros((0, 3), int)), lambda: None) == 6).all()
 
 
+def test_photos_that_show_none_of_the_places_count_for_nothing(room: tuple[Path, Scene]) -> None:
+    _, scene = room
+    views = scene.views[:1]
+    pose = views[0].camera_to_world
+    behind = pose[:3, 3] - pose[:3, 2] * np.array([[1.0], [2.0]])
+    ball = trimesh.creation.icosphere(2)
+    hits = FirstHits(np.asarray(ball.vertices), np.asarray(ball.faces))
+    assert (shown_by(behind, views, pose[None], hits, lambda: None) == 0).all()
+
+
 def test_what_fewer_than_three_photos_show_is_told_apart(room: tuple[Path, Scene]) -> None:
     """The first photo is held out; of the others three are trained on, and what each of them sees is on the mesh."""
     views = room[1].views

@@ -222,7 +222,14 @@ def test_resources_of_a_compiled_kernel_are_read_without_a_gpu(tmp_path: Path) -
     init()
     wp.compile_aot_module(composite.sum_forward.module, device=None, arch=90, module_dir=str(tmp_path), use_ptx=False)
     rows = read_resources(next(tmp_path.glob("*.cubin")), next(tmp_path.glob("*.meta")), 90)
-    assert {r.kernel for r in rows} == {"sum_forward", "sum_backward", "weights_forward", "weights_backward"}
+    assert {r.kernel for r in rows} == {
+        "sum_forward",
+        "sum_backward",
+        "in_front",
+        "behind",
+        "weights_forward",
+        "weights_backward",
+    }
     for row in rows:
         assert 8 <= row.registers <= 255
         assert row.stack == 0

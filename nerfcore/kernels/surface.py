@@ -196,12 +196,18 @@ def fuse(
 
 
 @wp.func
+def point_at(maps: Maps, view: int, pixel: wp.vec2, depth: float):
+    """The point of the frame that a view's pixel shows at a depth."""
+    ray = pixel_ray(maps.lens[view], pixel[0], pixel[1])
+    q = wp.vec3(ray[0] * depth, ray[1] * depth, depth)
+    return wp.transpose(maps.rotation[view]) * (q - maps.translation[view])
+
+
+@wp.func
 def returns_to(maps: Maps, view: int, pixel: wp.vec2, other: int, place: wp.vec2, depth: float):
     """Distance in pixels, squared, of a view's pixel from where that view sees what another one shows at `place`,
     `depth` from its camera."""
-    q = pixel_ray(maps.lens[other], place[0], place[1])
-    q = wp.vec3(q[0] * depth, q[1] * depth, depth)
-    p = wp.transpose(maps.rotation[other]) * (q - maps.translation[other])
+    p = point_at(maps, other, place, depth)
     back = maps.rotation[view] * p + maps.translation[view]
     apart = float(NOWHERE)
     if back[2] > NEAREST:
@@ -229,9 +235,7 @@ def agree_kernel(
     if z <= 0.0 or z > FARTHEST:
         return
     pixel = wp.vec2(float(i % maps.size[view, 0]) + 0.5, float(i / maps.size[view, 0]) + 0.5)
-    ray = pixel_ray(maps.lens[view], pixel[0], pixel[1])
-    q = wp.vec3(ray[0] * z, ray[1] * z, z)
-    p = wp.transpose(maps.rotation[view]) * (q - maps.translation[view])
+    p = point_at(maps, view, pixel, z)
     found = int(0)
     for n in range(neighbours.shape[0]):
         if found >= enough:
@@ -275,9 +279,8 @@ def able_kernel(
     z = maps.depth[maps.first[view] + i]
     if z <= 0.0 or z > FARTHEST:
         return
-    ray = pixel_ray(maps.lens[view], float(i % maps.size[view, 0]) + 0.5, float(i / maps.size[view, 0]) + 0.5)
-    q = wp.vec3(ray[0] * z, ray[1] * z, z)
-    p = wp.transpose(maps.rotation[view]) * (q - maps.translation[view])
+    pixel = wp.vec2(float(i % maps.size[view, 0]) + 0.5, float(i / maps.size[view, 0]) + 0.5)
+    p = point_at(maps, view, pixel, z)
     able = int(0)
     for n in range(neighbours.shape[0]):
         if able >= enough:

@@ -15,6 +15,7 @@ import torch
 from ..errors import ProjectError
 from ..files import UNREADABLE_ARRAYS, atomic_path
 from ..kernels.depth_arrays import FREE, MapArrays
+from ..mesh.fusion import spread_of
 
 MOST_HITS = 1 << 15  # points and pixel sizes that are kept of a block
 PER_PIXEL = ("depth", "cosine", "spread", "certain")  # of MapArrays
@@ -27,8 +28,8 @@ class Sights:
     low, high (V, 3): corners around each camera and what it sees, (∞, −∞) where that is nothing; behind_low, behind_high
     (V, 3): bounds of the steps behind the hits by which the distance to their surface falls by one; free_low, free_high
     (V, 3): corners around the rays that meet nothing, up to where surfaces are looked for at most, or (∞, −∞); pixel (V,): the
-    widest pixel at a hit; focal: the smallest focal length in pixels; hits (N, 3) and sizes (N,): some of the points, and how
-    wide a pixel is there.
+    widest pixel at a hit; focal: the smallest focal length in pixels; spread (2,): what `fusion.spread_of` says; hits (N, 3)
+    and sizes (N,): some of the points, and how wide a pixel is there.
     """
 
     low: np.ndarray
@@ -39,6 +40,7 @@ class Sights:
     free_high: np.ndarray
     pixel: np.ndarray
     focal: np.ndarray
+    spread: np.ndarray
     hits: np.ndarray
     sizes: np.ndarray
 
@@ -65,7 +67,8 @@ def sights_of(maps: MapArrays, limit: tuple[np.ndarray, np.ndarray]) -> Sights:
     names = [field.name for field in fields(Sights)][:7]
     stacked = {name: np.stack([one[name] for one in each]) for name in names}
     together = {name: np.concatenate([one[name] for one in each]) for name in ("hits", "sizes")}
-    return Sights(**stacked, focal=maps.lens[:, 0].min().cpu().numpy(), **together)
+    focal, spread = maps.lens[:, 0].min().cpu().numpy(), np.array(spread_of(maps))
+    return Sights(**stacked, focal=focal, spread=spread, **together)
 
 
 def _sight(maps: MapArrays, view: int, step: int, limit: tuple[np.ndarray, np.ndarray]) -> dict[str, np.ndarray]:

@@ -27,7 +27,7 @@ from ..mesh.clean import shown
 from ..mesh.decimate import decimate_patches
 from ..mesh.depth_maps import MOST_VIEWS, flat_views, map_size, spread_views
 from ..mesh.extract import extract
-from ..mesh.fusion import BRICK, NEAR, TRUNCATION, fuse_maps, grid_of, tolerances
+from ..mesh.fusion import BRICK, NEAR, TRUNCATION, WIDER, fuse_maps, grid_of, is_soft, tolerances
 from ..mesh.painted import training_photos
 from ..mesh.region import Region, region_around
 from ..mesh.surface import Surface, to_world, vertex_normals
@@ -94,12 +94,11 @@ def make_part(
     device = use_device()
     sights = [load_sights(run_folder(block_folder(folder, b), RUN) / SIGHTS) for b in plan.blocks]
     region = shared_region(load_project(folder).frame.bounds, plan, sights, resolution)
-    heard = [seen.speak_of(*part_box(region, plan, block)) for seen in sights]
+    heard = [seen.speak_of(*part_box(region, plan, block, sights)) for seen in sights]
     read = {b.name: load_maps(run_folder(block_folder(folder, b), RUN) / MAPS, device)
             for b, keep in zip(plan.blocks, heard) if keep.any() or b is block}  # fmt: skip
     maps = joined_maps([chosen(read[b.name], keep) for b, keep in zip(plan.blocks, heard) if keep.any()])
-    focal = min(float(seen.focal) for seen in sights)
-    vertices, triangles, inside, seams = core_surface(maps, region, plan, block, report, focal)
+    vertices, triangles, inside, seams = core_surface(maps, region, plan, block, report, sights)
     if not inside.any():
         raise TrainingError(f"Block {block.name} has no surface.", "Train longer, or cut into fewer blocks.")
     if faces is not None and inside.sum() > faces:
@@ -139,30 +138,40 @@ def shared_region(bounds: list[list[float]] | None, plan: Plan, sights: Sequence
     return replace(found, low=np.maximum(found.low, limit[0]), high=np.minimum(found.high, limit[1]))
 
 
-def part_box(region: Region, plan: Plan, block: BlockPlan) -> tuple[np.ndarray, np.ndarray, float, float]:
+def part_box(
+    region: Region, plan: Plan, block: BlockPlan, sights: Sequence[Sights]
+) -> tuple[np.ndarray, np.ndarray, float, float]:
     """What `Sights.speak_of` is asked for a block: corners (3,) of the part of the grid that it computes, how far behind a
-    surface maps are heard, and room for what they mark and what is looked up in them."""
+    surface maps are heard, and room for what they mark and what is looked up in them. `sights`: of all blocks."""
     origin, counts = grid_of(region)
     brick, truncation = BRICK * region.voxel, TRUNCATION * region.voxel
+    if is_soft([_spread(seen) for seen in sights], region.voxel):
+        truncation *= WIDER
     first, end = _bricks(_corners(np.linalg.inv(plan.world_from_common), plan.reach(block)), origin, brick, counts)
     return origin + brick * first, origin + brick * (end + 1), truncation, 1.5 * truncation + NEAR * region.voxel
 
 
 def core_surface(
-    maps: MapArrays, region: Region, plan: Plan, block: BlockPlan, report: Reporter, focal: float | None = None
+    maps: MapArrays,
+    region: Region,
+    plan: Plan,
+    block: BlockPlan,
+    report: Reporter,
+    sights: Sequence[Sights],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """The surface of a block and of its overlap with others, in the shared frame: vertices (V, 3), triangles (F, 3), which
     of them (F,) bool are in the core, and the planes (S, 2) between it and its neighbours: axis, place.
 
     Args:
-        maps: those of all blocks that speak of this one, in the order of the blocks. focal: see `fuse_maps`.
+        maps: those of all blocks that speak of this one, in the order of the blocks. sights: of all blocks.
     """
     origin, counts = grid_of(region)
     common_from_world, brick = np.linalg.inv(plan.world_from_common), BRICK * region.voxel
     low, high = _bricks(_corners(common_from_world, plan.core(block)), origin, brick, counts)
     first, end = _bricks(_corners(common_from_world, plan.reach(block)), origin, brick, counts)
     # A cell at the far side of a brick needs corners of the next one.
-    bricks = fuse_maps(maps, region, report, (first, end + 1), focal)
+    focal = min(float(seen.focal) for seen in sights)
+    bricks = fuse_maps(maps, region, report, (first, end + 1), focal, [_spread(seen) for seen in sights])
     report.stage("Extracting the surface")
     vertices, faces = extract(bricks, report)
     if len(faces):
@@ -178,6 +187,10 @@ def core_surface(
         if cut
     ]
     return vertices, faces, inside, np.array(planes, np.float64).reshape(-1, 2)
+
+
+def _spread(sights: Sights) -> tuple[float, int]:
+    return float(sights.spread[0]), int(sights.spread[1])
 
 
 def save_part(path: Path, part: Part) -> None:

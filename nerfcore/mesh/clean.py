@@ -12,6 +12,7 @@ from .triangles import areas, border_edges, compact, components, cross, mean_aro
 
 FEWEST_VIEWS = 2
 TURNED = np.radians(35)  # by which a face may be steeper or flatter than what a view shows there
+MOSTLY = 4  # rings of faces of which most must be seen: single ones are missed by noise, and each would be a hole
 AROUND = 6  # rings of faces over which views are averaged: single faces have noisy normals
 SCRAP = 1e-3  # of the area
 LONGEST_LOOP = 30  # edges of a hole that is filled
@@ -43,7 +44,7 @@ def clean(
 def shown(
     vertices: np.ndarray, faces: np.ndarray, maps: MapArrays, tolerance: float | np.ndarray, report: Reporter
 ) -> np.ndarray:
-    """Which triangles (F,) bool at least two views see, less what spans outlines: where a view shows something of another
+    """Which triangles (F,) bool at least two views see, of those around most, less what spans outlines: where a view shows something of another
     slope, and fewer than two show something as steep as the triangle. Between the edge of a thing and the wall behind it
     there is nothing, but distances fused from both have a surface there, in thin strands beside the thing. A view whose
     slope there is not certain, as neither photos confirm its depth nor is the field sharp, contradicts nothing.
@@ -56,6 +57,7 @@ def shown(
         seen[some] = seen_by(middle[some], normals[some], maps, near, report) >= FEWEST_VIEWS
         counts[some] = slopes_around(middle[some], normals[some], maps, near, report)
     own, other = (mean_around(faces, count, len(vertices), AROUND) for count in counts.T)
+    seen = mean_around(faces, seen.astype(float), len(vertices), MOSTLY) > 0.5
     return seen & ~((own < FEWEST_VIEWS) & (other >= 1))
 
 

@@ -6,13 +6,14 @@ sheets and the weights are in kernels/surface.py.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 import scipy
 import torch
 
-from ..kernels.depth_arrays import MapArrays
+from ..kernels.depth_arrays import FREE, MapArrays
 from ..kernels.surface import fuse
 from ..progress import Reporter
 from .depth_maps import hit_points, hit_values
@@ -55,13 +56,16 @@ def fuse_maps(
     report: Reporter,
     part: tuple[np.ndarray, np.ndarray] | None = None,
     focal: float | None = None,
+    spreads: Sequence[tuple[float, int]] | None = None,
 ) -> Bricks:
     """Fuse depth maps within a region. Where depths of different views lie farther apart than the truncation, each makes a
     surface of its own, and these break each other up: bricks where distances step are fused anew with a wider one, which
-    takes the mean of all.
+    takes the mean of all. Only of a soft field, though: where another one is unsure, as between leaves, there are several
+    surfaces, and a mean would make a lump of them.
 
     Args:
-        focal: the smallest focal length in pixels of all maps, where these are not all there are.
+        focal, spreads: the smallest focal length in pixels of all maps, and what `spread_of` says of them, where these are
+            not all there are.
         part: first bricks (3,) and those after the last (3,), where only a part of the region's grid is wanted: what is
             there is the same, to the bit, as on the whole grid.
     """
@@ -88,10 +92,24 @@ def fuse_maps(
                 all_of[chunk] = some_of.view(-1, BRICK, BRICK, BRICK).cpu().numpy()
 
     fuse_bricks(np.arange(len(bricks)), 1.0, 0.0, 0.8)
-    soft = mean_spread(maps, origin, h, counts)[tuple(bricks.T)] > TRUNCATION * h
-    wide = soft & unsteady(distance, weight, h)
-    fuse_bricks(np.flatnonzero(wide), WIDER, 0.8, 1.0)
+    wide = np.zeros(len(bricks), bool)
+    if is_soft([spread_of(maps)] if spreads is None else spreads, h):
+        unsure = mean_spread(maps, origin, h, counts)[tuple(bricks.T)] > TRUNCATION * h
+        wide = unsure & unsteady(distance, weight, h)
+        fuse_bricks(np.flatnonzero(wide), WIDER, 0.8, 1.0)
     return Bricks(origin, h, index, distance, weight, wide)
+
+
+def spread_of(maps: MapArrays) -> tuple[float, int]:
+    """Sum of the spreads of all depths that maps show, and how many these are."""
+    shown = maps.spread[(maps.depth > 0) & (maps.depth < FREE)]
+    return float(shown.double().sum()), len(shown)
+
+
+def is_soft(spreads: Sequence[tuple[float, int]], voxel: float) -> bool:
+    """Whether the depths of maps, of each group what `spread_of` says, have a mean spread above the truncation."""
+    total, number = (sum(values) for values in zip(*spreads))
+    return total > TRUNCATION * voxel * number
 
 
 def mean_spread(maps: MapArrays, origin: np.ndarray, voxel: float, counts: np.ndarray) -> np.ndarray:

@@ -10,9 +10,9 @@ import trimesh
 from fieldwork.nerfcore.kernels.depth_arrays import FREE
 from fieldwork.nerfcore.mesh import depth_maps
 from fieldwork.nerfcore.mesh.clean import FEWEST_VIEWS, seen_by, shown
-from fieldwork.nerfcore.mesh.triangles import cross, mean_around, unit
+from fieldwork.nerfcore.mesh.triangles import border_edges, cross, mean_around, unit
 from fieldwork.nerfcore.progress import Reporter
-from fieldwork.tests.nerfcore.support.depth_views import box, maps_of, orbit
+from fieldwork.tests.nerfcore.support.depth_views import box, maps_of, orbit, sphere
 
 NEAR = 0.06  # within which a view sees what it shows
 
@@ -35,6 +35,20 @@ def test_what_stands_upright_on_a_table_is_left_out_though_views_see_it() -> Non
         seen = seen_by(vertices[faces].mean(1), unit(cross(vertices, faces)), known, NEAR, Reporter())
         assert (seen >= FEWEST_VIEWS).all()
         assert (shown(vertices, faces, known, NEAR, Reporter()) == expected).all()
+
+
+def test_single_triangles_that_no_view_sees_are_no_holes_and_single_ones_seen_are_no_surface() -> None:
+    ball, random = trimesh.creation.icosphere(4, 0.5), np.random.default_rng(0)
+    flats, maps = maps_of(sphere(0.5), orbit(30, 1.8, (0.95, 0.9, 0.97)))
+    for map_ in maps:
+        map_.depth[random.random(map_.depth.shape) < 0.1] = 0
+    known = depth_maps.map_arrays(flats[:12], maps[:12], torch.device("cpu"))
+    vertices, faces = np.asarray(ball.vertices), np.asarray(ball.faces)
+    single = seen_by(vertices[faces].mean(1), unit(cross(vertices, faces)), known, NEAR, Reporter()) >= FEWEST_VIEWS
+    kept = shown(vertices, faces, known, NEAR, Reporter())
+    assert 0.2 < kept.mean() < 0.8
+    assert len(border_edges(faces[kept])) < 0.5 * len(border_edges(faces[single]))
+    assert (kept != single).mean() < 0.1
 
 
 def test_slopes_that_are_not_certain_contradict_nothing() -> None:

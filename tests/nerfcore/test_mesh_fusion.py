@@ -15,7 +15,7 @@ from fieldwork.nerfcore.kernels.depth_arrays import FREE, MapArrays
 from fieldwork.nerfcore.mesh import clean, depth_maps, metrics, triangles
 from fieldwork.nerfcore.mesh.decimate import decimate
 from fieldwork.nerfcore.mesh.extract import extract, weld
-from fieldwork.nerfcore.mesh.fusion import BRICK, Bricks, fuse_maps, mean_spread, tolerances
+from fieldwork.nerfcore.mesh.fusion import BRICK, Bricks, fuse_maps, is_soft, mean_spread, spread_of, tolerances
 from fieldwork.nerfcore.mesh.parts import texture_of
 from fieldwork.nerfcore.mesh.region import Region, choose_region, on_sides
 from fieldwork.nerfcore.mesh.surface import Surface, is_watertight
@@ -105,6 +105,24 @@ def test_views_that_disagree_make_one_surface_where_the_field_is_soft() -> None:
         assert 0.5 - 5 * voxel < np.median(radius) < 0.5 + 5 * voxel
         border[spread] = len(triangles.border_edges(faces))
     assert border[12 * voxel] < 0.2 * border[voxel]
+
+
+def test_a_field_that_is_unsure_in_one_place_only_keeps_what_is_there() -> None:
+    """A ball before a wall: views disagree about the ball, but all around it is sure, so that it is no soft field."""
+    voxel, flats, maps = 0.015, [], []
+    for number, pose in enumerate(orbit(32, 1.8)):
+        ball = sphere(0.5 + 2.5 * voxel * (number % 5 - 2))
+        (flat,), (map_,) = maps_of(ball, [pose])
+        flats.append(replace(flat, photo=number))
+        maps.append(replace(map_, spread=np.full_like(map_.spread, 12 * voxel)))
+    unsure = depth_maps.map_arrays(flats, maps, CPU)
+    region = choose_region(unsure, None, 128, voxel)
+    assert fuse_maps(unsure, region, Reporter()).wide.any()
+    total, number = spread_of(unsure)
+    assert total == pytest.approx(12 * voxel * number)
+    sure = (0.5 * voxel * 9 * number, 9 * number)  # of maps that show something else
+    assert not is_soft([(total, number), sure], voxel)
+    assert not fuse_maps(unsure, region, Reporter(), spreads=[(total, number), sure]).wide.any()
 
 
 def test_spread_of_a_brick_is_that_of_what_is_seen_in_it_and_around_it() -> None:

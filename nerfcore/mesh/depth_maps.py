@@ -279,11 +279,12 @@ def confirmed_maps(
     one_suffices: list[np.ndarray] | None = None,
     agree: float = AGREE,
     round_trip: float = ROUND_TRIP,
+    few_suffice: bool = True,
 ) -> MapArrays:
     """The maps as the kernels read them, without what cannot be trusted: see `map_arrays`, and what `needed` other views
-    do not confirm; where fewer could show a place, those, but at least one. `around`: the neighbours of each view where they are known;
-    `one_suffices`: for which pixels (H, W) bool of each map one other view is enough; `agree`: share by which a depth may
-    differ at least; `round_trip`: pixels by which it may miss the pixel."""
+    do not confirm; where fewer could show a place, those, but at least one, if `few_suffice`. `around`: the neighbours of each view
+    where they are known; `one_suffices`: for which pixels (H, W) bool of each map one other view is enough; `agree`: share by
+    which a depth may differ at least; `round_trip`: pixels by which it may miss the pixel."""
     arrays = map_arrays(views, maps, device)
     confirmed, needed = [], min(needed, len({view.photo for view in views}) - 1)
     for index, near in enumerate(around or neighbours(views, maps)):
@@ -291,7 +292,9 @@ def confirmed_maps(
         others = torch.tensor(near, dtype=torch.int32, device=arrays.depth.device)
         share = max(agree, AGREE_PIXELS / views[index].camera.fx)
         found = agreement(arrays, index, others, share, round_trip, needed)
-        enough = found >= able_views(arrays, index, others, HIDDEN, needed).clamp(min=min(1, needed))
+        enough = found >= needed
+        if few_suffice:
+            enough = found >= able_views(arrays, index, others, HIDDEN, needed).clamp(min=min(1, needed))
         if one_suffices is not None:
             enough |= (found >= 1) & torch.from_numpy(one_suffices[index].reshape(-1)).to(found.device)
         confirmed.append(enough)

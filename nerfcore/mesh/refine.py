@@ -99,7 +99,8 @@ def refined_maps(
         near = torch.tensor(around[number][:VIEWS], dtype=torch.int32, device=grey.device)
         depth, _ = refine(grey, facing, arrays, number, near, LEAST, GAIN)
         moved.append(_with_depth(view, map_, depth.cpu().numpy().reshape(map_.depth.shape)))
-    believed = confirmed_maps(views, moved, device, report, around)
+    # What one other view has moved to the same place as well may be wrong, and planes are put through what is known here.
+    believed = confirmed_maps(views, moved, device, report, around, few_suffice=False)
     kept = hits(believed, maps)
     sure = [there & (new.depth != old.depth) for there, old, new in zip(kept, maps, moved)]
     labels = [label_picture(view, store) for view in views]

@@ -88,6 +88,7 @@ def test_where_one_other_view_could_show_a_place_it_is_enough() -> None:
         return float(known(maps_)[int(maps_.first[2]) :].float().mean())
 
     assert right(depth_maps.confirmed_maps(flats, maps, CPU, Reporter())) > 0.7
+    assert right(depth_maps.confirmed_maps(flats, maps, CPU, Reporter(), few_suffice=False)) == 0
     # Another one that looks there and sees something else contradicts it; a thing before it hides it.
     beside = look_at(np.array([1.5, 0.0, -0.1]), np.array([1.5, 2.0, 0]))
     for factor, most, least in ((1.5, 0.1, 0.0), (0.5, 1.0, 0.6)):

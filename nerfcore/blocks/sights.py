@@ -67,8 +67,7 @@ def sights_of(maps: MapArrays, limit: tuple[np.ndarray, np.ndarray]) -> Sights:
     names = [field.name for field in fields(Sights)][:7]
     stacked = {name: np.stack([one[name] for one in each]) for name in names}
     together = {name: np.concatenate([one[name] for one in each]) for name in ("hits", "sizes")}
-    focal, spread = maps.lens[:, 0].min().cpu().numpy(), np.array(spread_of(maps))
-    return Sights(**stacked, focal=focal, spread=spread, **together)
+    return Sights(**stacked, focal=maps.lens[:, 0].min().cpu().numpy(), spread=spread_of(maps), **together)
 
 
 def _sight(maps: MapArrays, view: int, step: int, limit: tuple[np.ndarray, np.ndarray]) -> dict[str, np.ndarray]:

@@ -145,7 +145,7 @@ def part_box(
     surface maps are heard, and room for what they mark and what is looked up in them. `sights`: of all blocks."""
     origin, counts = grid_of(region)
     brick, truncation = BRICK * region.voxel, TRUNCATION * region.voxel
-    if is_soft([_spread(seen) for seen in sights], region.voxel):
+    if is_soft([seen.spread for seen in sights], region.voxel):
         truncation *= WIDER
     first, end = _bricks(_corners(np.linalg.inv(plan.world_from_common), plan.reach(block)), origin, brick, counts)
     return origin + brick * first, origin + brick * (end + 1), truncation, 1.5 * truncation + NEAR * region.voxel
@@ -171,7 +171,7 @@ def core_surface(
     first, end = _bricks(_corners(common_from_world, plan.reach(block)), origin, brick, counts)
     # A cell at the far side of a brick needs corners of the next one.
     focal = min(float(seen.focal) for seen in sights)
-    bricks = fuse_maps(maps, region, report, (first, end + 1), focal, [_spread(seen) for seen in sights])
+    bricks = fuse_maps(maps, region, report, (first, end + 1), focal, [seen.spread for seen in sights])
     report.stage("Extracting the surface")
     vertices, faces = extract(bricks, report)
     if len(faces):
@@ -187,10 +187,6 @@ def core_surface(
         if cut
     ]
     return vertices, faces, inside, np.array(planes, np.float64).reshape(-1, 2)
-
-
-def _spread(sights: Sights) -> tuple[float, int]:
-    return float(sights.spread[0]), int(sights.spread[1])
 
 
 def save_part(path: Path, part: Part) -> None:

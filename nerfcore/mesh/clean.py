@@ -44,10 +44,10 @@ def clean(
 def shown(
     vertices: np.ndarray, faces: np.ndarray, maps: MapArrays, tolerance: float | np.ndarray, report: Reporter
 ) -> np.ndarray:
-    """Which triangles (F,) bool at least two views see, of those around most, less what spans outlines: where a view shows something of another
-    slope, and fewer than two show something as steep as the triangle. Between the edge of a thing and the wall behind it
-    there is nothing, but distances fused from both have a surface there, in thin strands beside the thing. A view whose
-    slope there is not certain, as neither photos confirm its depth nor is the field sharp, contradicts nothing.
+    """Which triangles (F,) bool stay: at least two views see most of those around, less what spans outlines: where a view shows
+    something of another slope, and fewer than two show something as steep as the triangle. Between the edge of a thing and the
+    wall behind it there is nothing, but distances fused from both have a surface there, in thin strands beside the thing. A view
+    whose slope there is not certain, as neither photos confirm its depth nor is the field sharp, contradicts nothing.
     `tolerance`: distance from what a view shows up to which it sees a triangle, of all or (F,) of each."""
     middle, normals = vertices[faces].mean(1), unit(cross(vertices, faces))
     each = np.broadcast_to(tolerance, len(faces))

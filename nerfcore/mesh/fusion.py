@@ -56,7 +56,7 @@ def fuse_maps(
     report: Reporter,
     part: tuple[np.ndarray, np.ndarray] | None = None,
     focal: float | None = None,
-    spreads: Sequence[tuple[float, int]] | None = None,
+    spreads: Sequence[np.ndarray] | None = None,
 ) -> Bricks:
     """Fuse depth maps within a region. Where depths of different views lie farther apart than the truncation, each makes a
     surface of its own, and these break each other up: bricks where distances step are fused anew with a wider one, which
@@ -100,16 +100,16 @@ def fuse_maps(
     return Bricks(origin, h, index, distance, weight, wide)
 
 
-def spread_of(maps: MapArrays) -> tuple[float, int]:
-    """Sum of the spreads of all depths that maps show, and how many these are."""
+def spread_of(maps: MapArrays) -> np.ndarray:
+    """Sum of the spreads of all depths that maps show, and how many these are: (2,)."""
     shown = maps.spread[(maps.depth > 0) & (maps.depth < FREE)]
-    return float(shown.double().sum()), len(shown)
+    return np.array([float(shown.double().sum()), len(shown)])
 
 
-def is_soft(spreads: Sequence[tuple[float, int]], voxel: float) -> bool:
+def is_soft(spreads: Sequence[np.ndarray], voxel: float) -> bool:
     """Whether the depths of maps, of each group what `spread_of` says, have a mean spread above the truncation."""
-    total, number = (sum(values) for values in zip(*spreads))
-    return total > TRUNCATION * voxel * number
+    total, number = np.sum(spreads, axis=0)
+    return bool(total > TRUNCATION * voxel * number)
 
 
 def mean_spread(maps: MapArrays, origin: np.ndarray, voxel: float, counts: np.ndarray) -> np.ndarray:

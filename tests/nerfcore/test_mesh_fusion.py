@@ -108,7 +108,7 @@ def test_views_that_disagree_make_one_surface_where_the_field_is_soft() -> None:
 
 
 def test_a_field_that_is_unsure_in_one_place_only_keeps_what_is_there() -> None:
-    """A ball before a wall: views disagree about the ball, but all around it is sure, so that it is no soft field."""
+    """Views disagree about a ball, as in the test above, but are sure of most of what they show besides: no soft field."""
     voxel, flats, maps = 0.015, [], []
     for number, pose in enumerate(orbit(32, 1.8)):
         ball = sphere(0.5 + 2.5 * voxel * (number % 5 - 2))
@@ -118,11 +118,12 @@ def test_a_field_that_is_unsure_in_one_place_only_keeps_what_is_there() -> None:
     unsure = depth_maps.map_arrays(flats, maps, CPU)
     region = choose_region(unsure, None, 128, voxel)
     assert fuse_maps(unsure, region, Reporter()).wide.any()
-    total, number = spread_of(unsure)
-    assert total == pytest.approx(12 * voxel * number)
-    sure = (0.5 * voxel * 9 * number, 9 * number)  # of maps that show something else
-    assert not is_soft([(total, number), sure], voxel)
-    assert not fuse_maps(unsure, region, Reporter(), spreads=[(total, number), sure]).wide.any()
+    own = spread_of(unsure)
+    assert own[0] == pytest.approx(12 * voxel * own[1])
+    others = np.array([0.5 * voxel, 1.0]) * 9 * own[1]  # of maps that show something else
+    assert is_soft([own], voxel)
+    assert not is_soft([own, others], voxel)
+    assert not fuse_maps(unsure, region, Reporter(), spreads=[own, others]).wide.any()
 
 
 def test_spread_of_a_brick_is_that_of_what_is_seen_in_it_and_around_it() -> None:

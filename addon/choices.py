@@ -56,6 +56,15 @@ EXPORTS = [
         "The baked field as a volume with density, color and a grid for each class; bake it first",
     ),
 ]
+TEXTURE_SIZES = [
+    ("0", "None", "Vertex colors only"),
+    ("auto", "Automatic", "As many pixels as the photos show of the surface"),
+    ("1024", "1024", "1024 × 1024 pixels"),
+    ("2048", "2048", "2048 × 2048 pixels"),
+    ("4096", "4096", "4096 × 4096 pixels"),
+    ("8192", "8192", "8192 × 8192 pixels"),
+    ("16384", "16384", "16384 × 16384 pixels"),
+]
 SIDES = [
     ("top", "Plan", "From above"),
     ("front", "Front", "From the negative Y side"),

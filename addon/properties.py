@@ -3,7 +3,7 @@
 import bpy
 from bpy.types import Context, PropertyGroup
 
-from .choices import EXPORTS, MASK_MODES, PASSES, POSE_PRESETS, PRESETS, SIDES, SPLITS, UP
+from .choices import EXPORTS, MASK_MODES, PASSES, POSE_PRESETS, PRESETS, SIDES, SPLITS, TEXTURE_SIZES, UP
 from .label_settings import LabelSettings
 from .props import (
     BoolProperty,
@@ -313,15 +313,8 @@ class FieldworkScene(LabelSettings, PropertyGroup):
     texture: EnumProperty(
         name="Texture",
         description="Size of the texture in pixels",
-        items=[
-            ("0", "None", "Vertex colors only"),
-            ("1024", "1024", "1024 × 1024 pixels"),
-            ("2048", "2048", "2048 × 2048 pixels"),
-            ("4096", "4096", "4096 × 4096 pixels"),
-            ("8192", "8192", "8192 × 8192 pixels"),
-            ("16384", "16384", "16384 × 16384 pixels"),
-        ],
-        default="4096",
+        items=TEXTURE_SIZES,
+        default="auto",
     )
     texture_kind: EnumProperty(
         name="Texture From",

@@ -116,7 +116,8 @@ def _box(ctx: click.Context, param: click.Parameter, value: tuple[float, ...] | 
 def _plain(annotation: Any) -> Any:
     """The type without None, and without the checks that come with it."""
     if get_origin(annotation) in (Union, UnionType):
-        return _plain(next(a for a in get_args(annotation) if a is not type(None)))
+        kinds = [a for a in get_args(annotation) if a is not type(None)]
+        return _plain(kinds[0]) if len(kinds) == 1 else str  # a number or a word: the model checks which
     return _plain(get_args(annotation)[0]) if get_origin(annotation) is Annotated else annotation
 
 

@@ -7,7 +7,8 @@ from typing import Any
 import bpy
 from bpy.types import Context
 
-from ..addon.props import BoolProperty, FloatProperty, IntProperty, StringProperty
+from ..addon.choices import TEXTURE_SIZES
+from ..addon.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
 from ..addon.text import t
 from .base import HoldoutProperty, ProjectOperator, VerbOperator, absolute, hold_out, need_poses, scene_settings
 from .train import parse_settings
@@ -92,11 +93,8 @@ class FIELDWORK_OT_blocks(ProjectOperator):
         name="File", description="File for the whole mesh: .ply, .obj, .glb, .stl, .usdc; empty: in the project alone",
         subtype="FILE_PATH", options={"SKIP_SAVE"},
     )  # fmt: skip
-    texture: IntProperty(
-        name="Texture",
-        description="Size of the whole mesh's texture in pixels; 0: colours at its vertices only",
-        min=0,
-        max=16384,
+    texture: EnumProperty(
+        name="Texture", description="Size of the whole mesh's texture in pixels", items=TEXTURE_SIZES, default="0"
     )
     lods: IntProperty(
         name="Levels of Detail", description="Levels of detail to write as well, each with a quarter of the triangles",
@@ -139,7 +137,7 @@ class FIELDWORK_OT_blocks(ProjectOperator):
             "faces": self.value(context, "faces"),
             "resolution": self.resolution,
             "out": absolute(self.out),
-            "texture": self.texture or None,
+            "texture": None if self.texture == "0" else self.texture,
             "lods": self.lods,
             "turntable": absolute(self.turntable),
             "cluster": self.cluster or None,

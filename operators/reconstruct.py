@@ -99,7 +99,7 @@ class FIELDWORK_OT_reconstruct(VerbOperator):
             "holdout": hold_out(self, context),
             "set": parse_settings(self.value(context, "settings")),
             "faces": self.value(context, "faces"),
-            "texture": int(self.value(context, "texture")),
+            "texture": self.value(context, "texture"),
             "blend": absolute(self.blend),
             "report": absolute(self.report_file),
             "renders": absolute(self.renders),

@@ -31,7 +31,7 @@ from .machine import peak_memory
 from .surface_exposure import exposure_cost
 from .surface_figures import Truth, surface_figures
 
-FACES, TEXTURE = 200_000, 4096
+FACES = 200_000
 THIN = {"fence": 1}  # class of the plate whose two sides are looked for, by scene
 BODIES = {"vase": ((1, 2), (3,))}  # classes of the closed bodies whose volumes are compared, by scene
 
@@ -102,7 +102,7 @@ def measure(job: Job, project: Path, report: Reporter, root: Path) -> dict[str, 
     clock, begin = StageClock(report), time.monotonic()
     known, trained = load_project(project), load_trained(project, job.name)
     scene, box = load_scene(project, trained.info.holdout), trained.info.box(known)
-    params = MeshParams(project=project, run=job.name, faces=FACES, texture=TEXTURE)
+    params = MeshParams(project=project, run=job.name, faces=FACES, texture="auto")
     built = build(trained, known, scene, params, clock)
     photos = training_photos(scene, box.box_from_world, refined_poses(project, job.name, trained.info))
     painted = paint(trained, built, photos, params, scene.ignore_id, clock)
@@ -130,6 +130,7 @@ def measure(job: Job, project: Path, report: Reporter, root: Path) -> dict[str, 
     figures |= {
         "border_faces": int(on_sides(built.vertices, built.faces, region, region.voxel / 2).sum()),
         "faces": len(built.faces),
+        "texture": len(painted.image),
         "mesh_seconds": duration,
         "mesh_processor": sum(clock.seconds.values()),
         "memory_mb": peak_memory(),

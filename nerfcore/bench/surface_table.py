@@ -30,6 +30,7 @@ FIGURES = {
     "outline_texels": ("outlines of painted classes, off by (texels, median)", "≤ 2", 1),
     "volume_error": ("volume of the worst closed body, off by", "", 3),
     "faces": ("faces", "", 0),
+    "texture": ("texels along a side of the texture", "", 0),
     "mesh_seconds": ("mesh (s)", "≤ 360 on two cores", 0),
     "mesh_processor": ("mesh (processor s)", "", 0),
     "memory_mb": ("peak memory (MiB)", "≤ 6144", 0),

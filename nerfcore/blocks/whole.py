@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -17,13 +17,12 @@ from ..kernels.closest import ClosestPoints
 from ..mesh.features import features_of
 from ..mesh.instances import GAP, find_instances, write_instances
 from ..mesh.lods import level_files, make_levels, write_level
-from ..mesh.painted import training_photos
+from ..mesh.painted import training_photos, unwrapped
 from ..mesh.parts import texture_of
-from ..mesh.photo_texture import check_memory, photo_texture, prepare
+from ..mesh.photo_texture import photo_texture, prepare
 from ..mesh.stored import MESH, TEXTURE
 from ..mesh.surface import Surface, class_table, to_world
 from ..mesh.turntable import write_turntable
-from ..mesh.uv import unwrap
 from ..params import BlocksParams
 from ..progress import Reporter
 from ..project.fingerprints import digest, rounded, write_made
@@ -119,18 +118,16 @@ class Paint:
     seen: float
 
 
-def paint(surface: Surface, plan: Plan, scene: Scene, size: int, report: Reporter) -> Paint:
+def paint(surface: Surface, plan: Plan, scene: Scene, size: int | Literal["auto"], report: Reporter) -> Paint:
     """A texture of the photos for the whole surface, in the frame that blocks share; what no photo shows has the colours of the
     vertices.
 
     Raises:
         SettingError: no memory for the texture. TrainingError: the mesh cannot be unwrapped.
     """
-    check_memory(size)
-    report.stage("Unwrapping")
-    uv = unwrap(surface.vertices, surface.faces, size, report).corners
     photos = training_photos(scene, np.linalg.inv(plan.world_from_common), {})
-    prepared = prepare(surface.vertices, surface.faces, uv, photos, size, report)
+    uv = unwrapped(surface.vertices, surface.faces, photos, size, report)
+    prepared = prepare(surface.vertices, surface.faces, uv.corners, photos, uv.size, report)
     closest = ClosestPoints(surface.vertices, surface.faces)
 
     def color(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -140,7 +137,7 @@ def paint(surface: Surface, plan: Plan, scene: Scene, size: int, report: Reporte
         return (mixed + 0.5).clip(0, 255).astype(np.uint8)
 
     made = photo_texture(prepared, color, report)
-    return Paint(uv, made.image, made.unseen, made.seen)
+    return Paint(uv.corners, made.image, made.unseen, made.seen)
 
 
 def _write_arrays(folder: Path, surface: Surface, painted: Paint | None) -> list[Path]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -26,6 +27,7 @@ from .surface_labels import (
     class_picture,
     surface_classes,
 )
+from .texture_size import texels_needed, texture_size
 from .uv import UvMap, unwrap
 from .visibility import DepthBuffers, observe, with_flat_views
 
@@ -65,7 +67,7 @@ def paint_surface(
     faces: np.ndarray,
     colors: np.ndarray,
     photos: list[Photo],
-    size: int | None,
+    size: int | Literal["auto"] | None,
     kind: Literal["photo", "field"],
     class_ids: list[int],
     void: int,
@@ -76,7 +78,7 @@ def paint_surface(
     """Texture and classes of a mesh in the frame of the photos.
 
     Args:
-        vertices (V, 3), faces (F, 3), colors (V, 3) uint8 sRGB. size: of the texture; None for none.
+        vertices (V, 3), faces (F, 3), colors (V, 3) uint8 sRGB. size: of the texture; "auto" for what the photos need, None for none.
         kind: what the texture shows. void: id of what nothing says anything about.
         field_color, field_classes: points (N, 3) and normals (N, 3) → colours (N, 3) uint8, probabilities (N, C).
     Raises:
@@ -89,26 +91,42 @@ def paint_surface(
         buffers = DepthBuffers([photo.view for photo in photos], pieces)
         made = Prepared(photos, pieces, buffers, observe(buffers, report), 0)
     else:
-        check_memory(size)
-        report.stage("Unwrapping")
-        uv = unwrap(vertices, faces, size, report)
-        made = prepare(vertices, faces, uv.corners, photos, size, report)
+        uv = unwrapped(vertices, faces, photos, size, report)
+        made = prepare(vertices, faces, uv.corners, photos, uv.size, report)
     report.stage("Reading classes")
     pieces = made.pieces
     contrast = colors[faces].mean(1)[pieces.parent] / 255
     seen = with_flat_views(made.seen, made.buffers, report)
     evidence = class_evidence(photos, pieces, seen, class_ids, field_classes, contrast, report)
     classes = surface_classes(len(vertices), faces, pieces, evidence, class_ids, void)
-    if size is None or uv is None:
+    if uv is None:
         return Painted(classes)
     maps = None
     if class_ids:
         report.stage("Painting the classes")
-        maps = class_maps(photos, made.buffers, seen, evidence, class_ids, void, size, report)
+        maps = class_maps(photos, made.buffers, seen, evidence, class_ids, void, uv.size, report)
     if kind == "field":
-        return Painted(classes, uv, field_texture(vertices, faces, uv.corners, size, field_color, report), maps=maps)
+        return Painted(classes, uv, field_texture(vertices, faces, uv.corners, uv.size, field_color, report), maps=maps)
     texture = photo_texture(made, field_color, report)
     return Painted(classes, uv, texture.image, texture.unseen, texture.seen, maps)
+
+
+def unwrapped(
+    vertices: np.ndarray, faces: np.ndarray, photos: list[Photo], size: int | Literal["auto"], report: Reporter
+) -> UvMap:
+    """UV of a mesh in the frame of the photos for a texture of `size`, or of the size that they need.
+
+    Raises:
+        SettingError: no memory for the texture. TrainingError: the mesh cannot be unwrapped.
+    """
+    if size != "auto":
+        check_memory(size)
+        report.stage("Unwrapping")
+        return unwrap(vertices, faces, size, report)
+    report.stage("Choosing the size of the texture")
+    texels = texels_needed(vertices, faces, photos, report)
+    report.stage("Unwrapping")
+    return unwrap(vertices, faces, partial(texture_size, texels), report)
 
 
 def write_maps(

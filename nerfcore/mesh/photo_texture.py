@@ -59,11 +59,20 @@ class PhotoTexture:
     gains: np.ndarray
 
 
+def bytes_needed(size: int) -> int:
+    """Memory that painting a texture of `size` takes."""
+    return BYTES_PER_TEXEL * size**2 + BYTES_PER_TILE_TEXEL * min(size, TILE) ** 2
+
+
+def fits(size: int) -> bool:
+    """Whether there is memory to paint a texture of `size`."""
+    return bytes_needed(size) <= psutil.virtual_memory().available
+
+
 def check_memory(size: int) -> None:
     """Raise SettingError when a texture of `size` does not fit into free memory."""
-    needed = BYTES_PER_TEXEL * size**2 + BYTES_PER_TILE_TEXEL * min(size, TILE) ** 2
-    free = psutil.virtual_memory().available
-    if needed > free:
+    if not fits(size):
+        needed, free = bytes_needed(size), psutil.virtual_memory().available
         raise SettingError(
             f"A texture of {size}×{size} needs {needed / 1e9:.1f} GB of memory, and {free / 1e9:.1f} GB are free.",
             f"Choose a size of {size // 2} or less, or close other programs.",

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
@@ -23,7 +24,9 @@ from .triangles import components
 # xatlas takes longer than in proportion to the faces, docs/experiments.md, “Vector types of the CPU's compiler”.
 CHUNK_FACES = 1_000
 PACK_SIZE = 2048  # packing takes time in proportion to the area; charts then stand at steps of size / PACK_SIZE texels
+CUT_SIZE = 4096  # texels for which charts are cut where the size is not known yet; they are scaled afterwards
 STANDSTILL = 30.0  # seconds without processor time, after which a process is started anew
+COVERED = 0.6  # share of the texture that charts are scaled to cover
 PADDING = 4  # texels between charts, as far as the packing's steps allow
 
 
@@ -32,21 +35,25 @@ class UvMap:
     """Where each face lies on the texture.
 
     corners (F, 3, 2) UV of the faces' corners in [0, 1], v upwards; chart (F,) number of the connected piece; seams
-    (E, 2) edges, as vertex indices, along which the texture is cut; utilization: share of the square that charts cover.
+    (E, 2) edges, as vertex indices, along which the texture is cut; utilization: share of the square that charts cover;
+    size: of the texture that it is made for.
     """
 
     corners: np.ndarray
     chart: np.ndarray
     seams: np.ndarray
     utilization: float
+    size: int
 
 
-def unwrap(vertices: np.ndarray, faces: np.ndarray, size: int, report: Reporter) -> UvMap:
+def unwrap(vertices: np.ndarray, faces: np.ndarray, size: int | Callable[[int], int], report: Reporter) -> UvMap:
     """Cut a mesh (V, 3), (F, 3) into charts of even scale and pack them into a square of `size` texels.
 
     Chunks of about `CHUNK_FACES` neighbouring faces are cut one by one, in as many processes as there are cores to use,
     and packed together at the end.
 
+    Args:
+        size: or what makes it of the number of charts.
     Raises:
         TrainingError: xatlas failed on the mesh. DiskError: no room for its temporary files.
         Cancelled: through `report`; the processes are gone then.
@@ -55,6 +62,7 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, size: int, report: Reporter)
     if not np.isfinite(area) or area <= 0:
         raise TrainingError("The mesh has no area to unwrap.", "Extract it again.")
     chunks = spatial_chunks(vertices[faces].mean(1), CHUNK_FACES)
+    cut_for = CUT_SIZE if callable(size) else size
     with tempfile.TemporaryDirectory(prefix="fieldwork-uv-") as name:
         folder = Path(name)
         with disk_errors(folder):
@@ -64,7 +72,7 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, size: int, report: Reporter)
                     folder / f"in_{number}.npz",
                     vertices=vertices[used],
                     faces=corners.reshape(-1, 3),
-                    texels_per_unit=np.sqrt(0.6 * size**2 / area),
+                    texels_per_unit=np.sqrt(COVERED * cut_for**2 / area),
                 )
         _work(folder, list(range(len(chunks))), report, 0.7, 0.0)
         order = np.concatenate(chunks)
@@ -75,6 +83,8 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, size: int, report: Reporter)
                 uv.append(cut["uv"])
         joined, flat = np.concatenate(corners), np.concatenate(uv)
         chart = components(joined, len(flat)).astype(np.int32)
+        if callable(size):
+            size = size(int(chart.max()) + 1)
         step = max(1, size // PACK_SIZE)
         with disk_errors(folder):
             np.savez(
@@ -91,7 +101,7 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, size: int, report: Reporter)
     placed = _settled(faces, placed)
     numbers = np.empty(len(faces), np.int32)
     numbers[order] = chart
-    return UvMap(placed, numbers, seams(faces, placed), utilization)
+    return UvMap(placed, numbers, seams(faces, placed), utilization, size)
 
 
 def _sides(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -47,6 +47,7 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
         {"vertices", "faces", "watertight", "voxel": in world units, "classes": {name: {"faces", "area"}},
         "instances": how many, "lods": [{"faces", "deviation": in world units}],
         "label_revision": of the marks that the classes are from, or None, "files"};
+        "texture": its size in pixels, or None;
         "shown": the share of the photos' pixels that show the mesh; "solid_shown", "holes",
         "overlap_shown" and "seen_by_few": see `coverage.Coverage` (solid, holes, overlapped, few); "verdict";
         "silhouette" of a capture with masks: see `shown.silhouette`;
@@ -63,7 +64,7 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
         require_writable(params.out)
     if params.turntable is not None:
         require_writable(params.turntable / "color_0.png")
-    if params.texture is not None:
+    if isinstance(params.texture, int):
         check_memory(params.texture)
     project, trained = load_project(folder), load_trained(folder, params.run)
     scene = load_scene(folder, trained.info.holdout)
@@ -108,6 +109,7 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
         "instances": len(instances),
         "lods": [{"faces": len(level.surface.faces), "deviation": level.deviation} for level in levels],
         "label_revision": revision,
+        "texture": None if painted.image is None else len(painted.image),
         "files": [str(path) for path in files],
         **judged,
     }

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from ..files import is_text, name_problem, printable
 
@@ -14,6 +14,7 @@ LARGEST_PICTURE = 32768  # pixels on a side
 MANY = 1_000_000  # photos, frames
 LONGEST_RUN = 1_000_000_000  # steps or seconds
 FEWEST_FACES, MOST_FACES = 100, 1_000_000_000  # of a mesh: fewer have no shape
+SMALLEST_TEXTURE, LARGEST_TEXTURE = 64, 16384  # pixels on a side
 MASK_MODE = (
     "what black mask pixels mean; default: empty where masks cut an object out of nearly all photos, else ignore"
 )
@@ -51,6 +52,27 @@ def _enough_faces(faces: int) -> int:
 
 
 FacesOrAll = Annotated[int, Field(ge=0, le=MOST_FACES), AfterValidator(_enough_faces)]
+
+
+def _texture_size(size: object) -> object:
+    if size == "auto":
+        return size
+    try:
+        pixels = int(str(size))
+    except ValueError:
+        pixels = -1
+    if not SMALLEST_TEXTURE <= pixels <= LARGEST_TEXTURE:
+        raise ValueError(
+            f"{size} is no size of a texture; give {SMALLEST_TEXTURE} to {LARGEST_TEXTURE} pixels, or auto for as many as "
+            "the photos have"
+        )
+    return pixels
+
+
+TextureSize = Annotated[int | Literal["auto"], BeforeValidator(_texture_size)]
+TextureSizeOrNone = Annotated[
+    int | Literal["auto"], BeforeValidator(lambda size: 0 if size in (0, "0") else _texture_size(size))
+]
 
 
 def _checked_name(name: str) -> str:

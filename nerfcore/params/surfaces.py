@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from .base import FEWEST_FACES, MOST_FACES, Params, RunName, Split
+from .base import FEWEST_FACES, MOST_FACES, Params, RunName, Split, TextureSize
 
 
 class MeshParams(Params):
@@ -32,8 +32,9 @@ class MeshParams(Params):
         description="where to look: auto (the region of interest, or what the photos show where there is none), photos "
         "(what they show), or x0,y0,z0,x1,y1,z1 in the aligned world",
     )
-    texture: int | None = Field(
-        default=None, ge=64, le=16384, description="texture size in pixels; none: vertex colours only"
+    texture: TextureSize | None = Field(
+        default=None,
+        description="texture size in pixels, or auto: what the photos' pixels need; none: vertex colours only",
     )
     watertight: bool = Field(
         default=False, description="close the surface: what no photo shows counts as inside, and its faces are marked"

@@ -7,7 +7,19 @@ from typing import Literal
 
 from pydantic import Field
 
-from .base import KEEP_BACKDROP, KEEP_EXPOSURE, LONGEST_RUN, MANY, MASK_MODE, FacesOrAll, Holdout, Params, Preset
+from .base import (
+    KEEP_BACKDROP,
+    KEEP_EXPOSURE,
+    LONGEST_RUN,
+    MANY,
+    MASK_MODE,
+    FacesOrAll,
+    Holdout,
+    Params,
+    Preset,
+    TextureSize,
+    TextureSizeOrNone,
+)
 
 
 class ReconstructParams(Params):
@@ -30,8 +42,9 @@ class ReconstructParams(Params):
     holdout: Holdout = 8
     set: dict[str, str] = Field(default_factory=dict)
     faces: FacesOrAll = Field(default=200_000, description="triangles of the mesh; 0: all there are")
-    texture: int = Field(
-        default=4096, ge=0, le=16384, description="size of the mesh's texture in pixels; 0: vertex colours only"
+    texture: TextureSizeOrNone = Field(
+        default="auto",
+        description="size of the mesh's texture in pixels; auto: what the photos' pixels need; 0: vertex colours only",
     )
     report: Path | None = Field(default=None, description="report to write, .html or .pdf")
     renders: Path | None = Field(default=None, description="folder for renders of new views")
@@ -79,11 +92,10 @@ class BlocksParams(Params):
     faces: FacesOrAll = Field(default=200_000, description="triangles of each block; 0: all there are")
     resolution: int = Field(default=512, ge=16, le=2048, description="cells along the longest side of a block")
     out: Path | None = Field(default=None, description="file for the whole mesh: .ply, .obj, .glb, .stl, .usdc")
-    texture: int | None = Field(
+    texture: TextureSize | None = Field(
         default=None,
-        ge=64,
-        le=16384,
-        description="size of the whole mesh's texture in pixels; none: vertex colours only",
+        description="size of the whole mesh's texture in pixels, or auto: what the photos' pixels need; none: vertex colours "
+        "only",
     )
     lods: int = Field(
         default=0, ge=0, le=6, description="levels of detail to write as well, each with a quarter of the triangles"

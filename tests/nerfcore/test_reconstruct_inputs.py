@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from fieldwork.nerfcore.capture.ingest import new
 from fieldwork.nerfcore.geometry.cameras import Camera
-from fieldwork.nerfcore.params import MeshParams, NewParams, Params, ReconstructParams
+from fieldwork.nerfcore.params import BlocksParams, MeshParams, NewParams, Params, ReconstructParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.store import load_project
 from fieldwork.nerfcore.verdict import verdict
@@ -75,12 +75,22 @@ def all_stages(
     return seen, module.reconstruct(params, Reporter())
 
 
-@pytest.mark.parametrize(("asked", "made"), [({}, (200_000, 4096)), ({"faces": 0, "texture": 0}, (None, None))])
+@pytest.mark.parametrize(("asked", "made"), [({}, (200_000, "auto")), ({"faces": 0, "texture": 0}, (None, None))])
 def test_the_mesh_is_of_a_size_one_can_use(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, asked: dict[str, int], made: tuple[int | None, int | None]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, asked: dict[str, int], made: tuple[int | None, int | str | None]
 ) -> None:
     seen, _ = all_stages(monkeypatch, tmp_path, {}, **asked)
     assert (seen["mesh"].faces, seen["mesh"].texture) == made
+
+
+def test_a_texture_has_a_size_or_as_many_texels_as_the_photos_need(tmp_path: Path) -> None:
+    for given, taken in (("auto", "auto"), ("512", 512), (16384, 16384), (None, None)):
+        assert MeshParams.model_validate({"project": tmp_path, "texture": given}).texture == taken
+        assert BlocksParams.model_validate({"project": tmp_path, "texture": given}).texture == taken
+    for wrong in (0, 63, 16385, "large", 0.5):
+        with pytest.raises(ValidationError, match=f"{wrong} is no size of a texture; give 64 to 16384 pixels, or auto"):
+            MeshParams.model_validate({"project": tmp_path, "texture": wrong})
+    assert ReconstructParams.model_validate({"photos": tmp_path, "out": tmp_path, "texture": "0"}).texture == 0
 
 
 def test_too_few_triangles_are_refused_before_any_work(tmp_path: Path) -> None:

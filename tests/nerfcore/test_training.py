@@ -132,12 +132,17 @@ def test_a_textured_mesh_has_uvs_and_colours(trained: Path, tmp_path: Path) -> N
     params = MeshParams(project=trained, resolution=32, texture=128, faces=600, out=out)
     result = run_verb("mesh", params, Reporter())
     assert result["faces"] <= 660
+    assert result["texture"] == 128
     loaded = trimesh.load(out, force="mesh")
     assert loaded.visual.uv.shape[1] == 2
     with np.load(trained / "exports" / "main" / "mesh.npz") as data:
         assert data["uv"].shape == (len(data["faces"]), 3, 2)
     texture = np.array(Image.open(trained / "exports" / "main" / "texture.png"))
     assert texture.shape == (128, 128, 3)
+    # Small photos need no more than the smallest texture.
+    assert run_verb("mesh", params.model_copy(update={"texture": "auto"}), Reporter())["texture"] == 512
+    with Image.open(trained / "exports" / "main" / "texture.png") as image:
+        assert image.size == (512, 512)
     red, blue = (texture[..., 0] > texture[..., 2] + 50).mean(), (texture[..., 2] > texture[..., 0] + 50).mean()
     assert min(red, blue) > 0.2
 

@@ -24,7 +24,7 @@ from .triangles import components
 # xatlas takes longer than in proportion to the faces, docs/experiments.md, “Vector types of the CPU's compiler”.
 CHUNK_FACES = 1_000
 PACK_SIZE = 2048  # packing takes time in proportion to the area; charts then stand at steps of size / PACK_SIZE texels
-CUT_SIZE = 4096  # texels for which charts are cut where the size is not known yet; they are scaled afterwards
+CUT_SIZE = 2048  # texels for which charts are cut where the size is not known yet: small ones, as of wires, then come out larger
 STANDSTILL = 30.0  # seconds without processor time, after which a process is started anew
 COVERED = 0.6  # share of the texture that charts are scaled to cover
 PADDING = 4  # texels between charts, as far as the packing's steps allow

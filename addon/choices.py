@@ -56,14 +56,14 @@ EXPORTS = [
         "The baked field as a volume with density, color and a grid for each class; bake it first",
     ),
 ]
-TEXTURE_SIZES = [
+TEXTURE_SIZES = [  # saved files hold their places in the list: new ones come last
     ("0", "None", "Vertex colors only"),
-    ("auto", "Automatic", "As many pixels as the photos show of the surface"),
     ("1024", "1024", "1024 × 1024 pixels"),
     ("2048", "2048", "2048 × 2048 pixels"),
     ("4096", "4096", "4096 × 4096 pixels"),
     ("8192", "8192", "8192 × 8192 pixels"),
     ("16384", "16384", "16384 × 16384 pixels"),
+    ("auto", "Automatic", "As many pixels as the photos show of the surface"),
 ]
 SIDES = [
     ("top", "Plan", "From above"),

@@ -206,7 +206,7 @@ def test_the_outline_of_a_class_map_is_measured_in_texels() -> None:
     """A square of two triangles with 64 texels a side, whose class changes at column 40."""
     vertices = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
     faces = np.array([[0, 1, 2], [0, 2, 3]])
-    uv = UvMap(vertices[faces][..., :2].astype(np.float32), np.zeros(2, np.int32), np.zeros((0, 2), int), 1.0)
+    uv = UvMap(vertices[faces][..., :2].astype(np.float32), np.zeros(2, np.int32), np.zeros((0, 2), int), 1.0, 64)
     ids = np.where(np.arange(64) < 40, 1, 2).astype(np.uint8)[None].repeat(64, 0)
     painted = replace(unpainted(), uv=uv, maps=ClassMaps(ids, np.full((64, 64), 255, np.uint8)))
     for texels in (0, 3):
@@ -228,7 +228,7 @@ def test_seams_are_told_from_other_edges() -> None:
     corners[1, 2] = [0.3, 0.8]
     image = np.full((64, 64, 3), 90, np.uint8)
     image[:, :] += (np.arange(64) // 2).astype(np.uint8)[None, :, None]
-    uv = UvMap(corners.astype(np.float32), np.zeros(3, int), np.array([[1, 2]]), 1.0)
+    uv = UvMap(corners.astype(np.float32), np.zeros(3, int), np.array([[1, 2]]), 1.0, 64)
     smooth = seam_ratio(faces, Painted(unpainted().classes, uv, image))
     image[:32, 32:] = 250  # the other chart
     assert seam_ratio(faces, Painted(unpainted().classes, uv, image)) > 2 * smooth

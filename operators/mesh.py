@@ -65,7 +65,7 @@ class FIELDWORK_OT_mesh(ProjectOperator):
             "turntable": self.path(context, "turntable"),
             "faces": self.value(context, "faces") or None,
             "lods": self.value(context, "lods"),
-            "texture": None if self.value(context, "texture") == "0" else self.value(context, "texture"),
+            "texture": None if (size := self.value(context, "texture")) == "0" else size,
             "watertight": self.value(context, "watertight"),
             "texture_kind": self.value(context, "texture_kind"),
             "out": self.path(context, "out"),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..errors import TrainingError
 from ..progress import Reporter
 from .facelets import small_pieces
 from .photo_texture import fits
@@ -31,14 +30,8 @@ def texture_size(texels: float, charts: int) -> int:
 def texels_needed(vertices: np.ndarray, faces: np.ndarray, photos: list[Photo], report: Reporter) -> float:
     """Side, in texels, of a square as large as a mesh (V, 3), (F, 3) in the photos' frame, if it has `TEXELS` a pixel; 0 where
     no photo shows it.
-
-    Raises:
-        TrainingError: the mesh has no area.
     """
     pieces = small_pieces(vertices, faces)
-    total = float(pieces.areas.sum())
-    if not np.isfinite(total) or total <= 0:
-        raise TrainingError("The mesh has no area to unwrap.", "Extract it again.")
     seen = observe(DepthBuffers(_smaller([photo.view for photo in photos]), pieces), report, most=1)
     pixels = area = 0.0
     for number, photo in enumerate(photos):
@@ -50,7 +43,7 @@ def texels_needed(vertices: np.ndarray, faces: np.ndarray, photos: list[Photo], 
         # Off the optical axis a pixel is a smaller angle.
         pixels += float((pieces.areas[face] * cosine * distance / depth / photo.view.footprint(depth) ** 2).sum())
         area += float(pieces.areas[face].sum())
-    return TEXELS * float(np.sqrt(pixels / max(area, 1e-30) * total))
+    return TEXELS * float(np.sqrt(pixels / max(area, 1e-30) * pieces.areas.sum()))
 
 
 def _smaller(views: list[PosedCamera]) -> list[PosedCamera]:

@@ -9,6 +9,8 @@ import trimesh
 from fieldwork.nerfcore.errors import TrainingError
 from fieldwork.nerfcore.geometry.cameras import Camera
 from fieldwork.nerfcore.mesh import texture_size as module
+from fieldwork.nerfcore.mesh.painted import unwrapped
+from fieldwork.nerfcore.mesh.photo_texture import bytes_needed
 from fieldwork.nerfcore.mesh.photos import Photo
 from fieldwork.nerfcore.mesh.texture_size import TEXELS, texels_needed, texture_size
 from fieldwork.nerfcore.mesh.uv import COVERED, PADDING, unwrap
@@ -74,12 +76,15 @@ def test_charts_cut_from_a_rough_ball_leave_what_is_reckoned_with() -> None:
 
 def test_what_does_not_fit_into_memory_is_halved(monkeypatch: pytest.MonkeyPatch) -> None:
     plenty = texture_size(2500, 100)
-    monkeypatch.setattr(psutil, "virtual_memory", lambda: type("Memory", (), {"available": 79 * (plenty // 2) ** 2})())
+    half = bytes_needed(plenty // 2)
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: type("Memory", (), {"available": half})())
     assert texture_size(2500, 100) == plenty // 2
     monkeypatch.setattr(psutil, "virtual_memory", lambda: type("Memory", (), {"available": 0})())
     assert texture_size(2500, 100) == module.SMALLEST
 
 
 def test_a_mesh_without_area_is_told() -> None:
+    nothing, photos = (np.zeros((3, 3)), np.array([[0, 1, 2]])), [photo(300)]
+    assert texels_needed(*nothing, photos, Reporter()) == 0
     with pytest.raises(TrainingError, match="no area to unwrap"):
-        texels_needed(np.zeros((3, 3)), np.array([[0, 1, 2]]), [photo(300)], Reporter())
+        unwrapped(*nothing, photos, "auto", Reporter())

@@ -31,7 +31,7 @@ from .depth_maps import (
 )
 from .planes import with_planes
 from .scene_planes import known_points, on_scene_planes, scene_planes
-from .sky import FAR, backdrop, farthest, labels_tell, named_things, nothing
+from .sky import FAR, backdrop, confirmed_share, farthest, labels_tell, named_things, nothing
 
 VIEWS = 5  # neighbours whose photos are compared
 LEAST, GAIN = 0.6, 0.05  # correlation that is believed, and by how much it must exceed that of the field's depth
@@ -106,21 +106,21 @@ def refined_maps(
     labels = [label_picture(view, store) for view in views]
     left_out = [None if label is None else label == VOID for label in labels]
     told = labels_tell(sure, left_out)
-    labels = named_things([map_.hit for map_ in maps], sure, labels)
+    confirmed, usual = confirmed_share([map_.hit for map_ in maps], sure, labels)
+    labels = named_things(labels, confirmed, usual)
     known, fields = [], []
     for number, (view, old, new, label, unnamed) in enumerate(zip(views, maps, moved, labels, left_out)):
         safe = sure[number]
         depth = np.where(safe, new.depth, old.depth)
-        if told and unnamed is not None:
-            empty = nothing(unnamed, safe)
-            depth, safe = np.where(empty & old.hit, 0, depth), safe & ~empty
-            sure[number] = safe
+        empty = nothing(unnamed, safe, usual) if told and unnamed is not None else np.zeros(depth.shape, bool)
+        depth, safe = np.where(empty & old.hit, 0, depth), safe & ~empty
+        sure[number] = safe
         behind = backdrop(depth, safe)
         if label is not None:
             behind &= label == VOID
         depth = np.where(behind, 0, depth)
         spread = np.where(safe, np.minimum(old.spread, SURE * depth / view.camera.fx), old.spread)
-        fields.append(trusted_field(old, depth, safe, unnamed if told else None))
+        fields.append(trusted_field(old, depth, safe, empty))
         known.append(replace(old, depth=depth, spread=spread.astype(np.float32)))
     planes = scene_planes(known_points(views, known, kept, labels), report)
     mixed, named = [], []
@@ -145,12 +145,10 @@ def relied_on(views: list[FlatView], fields: list[DepthMap], sure: list[np.ndarr
     return torch.from_numpy(np.concatenate(parts).astype(np.float32))
 
 
-def trusted_field(field: DepthMap, depth: np.ndarray, sure: np.ndarray, unnamed: np.ndarray | None) -> DepthMap:
+def trusted_field(field: DepthMap, depth: np.ndarray, sure: np.ndarray, empty: np.ndarray) -> DepthMap:
     """The field's own depths that may fill holes: not where `depth` (H, W) is unknown, nor much farther away than photos
-    confirm it, `sure` (H, W) bool, nor where label maps leave a place out, `unnamed` (H, W) bool."""
-    doubtful = (depth == 0) | (field.depth > FAR * farthest(depth, sure))
-    if unnamed is not None:
-        doubtful |= unnamed
+    confirm it, `sure` (H, W) bool, nor where label maps say that there is nothing, `empty` (H, W) bool."""
+    doubtful = (depth == 0) | (field.depth > FAR * farthest(depth, sure)) | empty
     return replace(field, depth=np.where(field.hit & doubtful, 0, field.depth))
 
 

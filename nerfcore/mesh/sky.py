@@ -17,7 +17,7 @@ FARTHEST, FAR = (
 )  # percentile of the depths that photos confirm in a view, beyond which, times this, things are far
 AROUND = 0.125  # of the picture's width: window in which far things need depths that photos confirm
 SIMILAR, SUPPORT = 0.12, 0.05  # share by which depths there may differ, and share of them that must be confirmed
-CONFIRMED = 0.2  # share of it that photos must confirm, to be a thing without a name and not sky
+CONFIRMED = 0.2  # as much as of what has a name, times this, photos must confirm of a thing, and not of sky
 
 
 def labels_tell(sure: list[np.ndarray], left_out: list[np.ndarray | None]) -> bool:
@@ -32,11 +32,10 @@ def labels_tell(sure: list[np.ndarray], left_out: list[np.ndarray | None]) -> bo
     return total > 0 and sum(int((part & ~out).sum()) for part, out in labelled) >= NAMED * total
 
 
-def named_things(
+def confirmed_share(
     hit: list[np.ndarray], sure: list[np.ndarray], labels: list[np.ndarray | None]
-) -> list[np.ndarray | None]:
-    """Label maps (H, W) uint8 of only those classes that are things, and no sky or guess of the field: photos confirm at
-    least a fifth of what the field has of them. VOID elsewhere.
+) -> tuple[np.ndarray, float]:
+    """Share (256,) that photos confirm of what the field has of each class, and of all that have a name.
 
     Args:
         hit, sure: which pixels (H, W) of each view have a depth, and one that photos confirm; labels: class (H, W) uint8 of
@@ -47,19 +46,35 @@ def named_things(
         if label is not None:
             there += np.bincount(label[own], minlength=256)
             confirmed += np.bincount(label[own & safe], minlength=256)
-    thing = confirmed > CONFIRMED * there
+    named = np.arange(256) != VOID
+    return confirmed / np.maximum(there, 1), float(confirmed[named].sum() / max(there[named].sum(), 1))
+
+
+def named_things(labels: list[np.ndarray | None], confirmed: np.ndarray, usual: float) -> list[np.ndarray | None]:
+    """Label maps (H, W) uint8 of only those classes that are things, and no sky or guess of the field: photos confirm at
+    least a fifth as much of them as of all. VOID elsewhere. For the last two see `confirmed_share`."""
+    thing = confirmed > CONFIRMED * usual
     return [None if label is None else np.where(thing[label], label, VOID).astype(np.uint8) for label in labels]
 
 
-def nothing(left_out: np.ndarray, sure: np.ndarray) -> np.ndarray:
-    """Which pixels (H, W) show nothing that has a depth: those left out by the label map that photos do not confirm, and
-    those beside a named thing whose surroundings photos do not confirm: windows of pixels that reach over an outline find
-    the thing's depth outside of it."""
+def nothing(left_out: np.ndarray, sure: np.ndarray, usual: float) -> np.ndarray:
+    """Which pixels (H, W) of those left out by the label map show nothing that has a depth: photos confirm little of what is
+    left out around them. One that they do confirm shows something, unless it is beside a named thing: windows of pixels that reach over an
+    outline find the thing's depth outside of it.
+
+    Args:
+        sure: which pixels photos confirm; usual: share that they confirm of what has a name.
+    """
     away = left_out & (np.asarray(scipy.ndimage.distance_transform_edt(left_out)) > RIM)
-    around = scipy.ndimage.uniform_filter(away.astype(np.float32), WINDOW)
-    confirmed = scipy.ndimage.uniform_filter((away & sure).astype(np.float32), WINDOW)
-    rim = left_out & ~away & (around > 1e-4) & (confirmed < CONFIRMED * around)
-    return (left_out & ~sure) | rim
+    rim = ~away & (_around(away) > 1e-4)
+    judged = [_around(part & sure) < CONFIRMED * usual * _around(part) for part in (away, left_out)]
+    doubted = np.where(away | rim, *judged)
+    return left_out & doubted & (rim | ~sure)
+
+
+def _around(there: np.ndarray) -> np.ndarray:
+    """Share (H, W) of the pixels around each."""
+    return np.asarray(scipy.ndimage.uniform_filter(there.astype(np.float32), WINDOW))
 
 
 def farthest(depth: np.ndarray, sure: np.ndarray) -> float:

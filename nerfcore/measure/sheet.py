@@ -117,6 +117,7 @@ def write_sheet(stem: Path, sheet: Sheet) -> list[Path]:
             )
             figure.savefig(temporary, format=kind, dpi=DPI, metadata=told)
         paths.append(path)
+    figure.clear()  # it refers to itself, and its picture would stay until garbage is collected
     return paths
 
 

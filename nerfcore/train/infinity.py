@@ -1,25 +1,30 @@
-"""Whether photos show something infinitely far away, as the sky: it has the same colour in the same direction from everywhere."""
+"""Whether photos show something infinitely far away, as the sky: it has the same colour in the same direction from everywhere,
+and no points of the reconstruction around it."""
 
 from __future__ import annotations
 
 import numpy as np
+import scipy
 
 from ..data.photo import photo_of
 from ..data.scene import Scene, View
-from ..geometry.cameras import pixel_centers, rays
+from ..geometry.cameras import Camera, pixel_centers, project, rays
 from ..images.picture import resized
 
 # Measured: docs/experiments.md, “Is there a sky?”.
 MOST_PHOTOS, SIDE = 40, 120  # that are looked at, and their longest side in pixels
 ALIKE = 4.0  # standard deviation of colours, of 255
+BETWEEN = 0.5  # share of what looks infinitely far that may lie between points: plain floors and walls do, sky mostly does not
 # Not tuned: the next two.
 CELL, CELL_PIXELS = 1.0, 3.0  # degrees, and pixels at least, in which directions count as the same
 CAMERAS = 3  # that must look there
+FEWEST = 20  # points in a photo, from which on they have a hull
 
 
 def share_at_infinity(scene: Scene) -> float:
     """Share of the training photos' pixels that lie infinitely far away: at least `CAMERAS` cameras look that way, and what
     all of them see there has one colour. Walls with a texture have several; plain ones have light that changes along them.
+    Where that is too little, points tell: a plain floor lies between points of its joints and of what stands on it.
     """
     chosen = np.unique(np.linspace(0, len(scene.train) - 1, MOST_PHOTOS).round().astype(int))
     views = [scene.views[scene.train[i]] for i in chosen]
@@ -37,17 +42,37 @@ def share_at_infinity(scene: Scene) -> float:
     for channel in colors.T:
         mean = np.bincount(cell, channel) / pixels
         variance += np.bincount(cell, (channel - mean[cell]) ** 2) / pixels / 3
-    far = (cameras >= CAMERAS) & (variance < ALIKE**2)
-    return float(far[cell].mean())
+    far = ((cameras >= CAMERAS) & (variance < ALIKE**2))[cell]
+    between = np.concatenate([_between_points(view, scene.points.xyz) for view in views])[usable]
+    return float(far.mean()) if (far & between).sum() <= BETWEEN * far.sum() else 0.0
 
 
 def _colored_directions(view: View) -> tuple[np.ndarray, np.ndarray]:
     """Unit directions (N, 3) in the world of a small version of a photo, NaN where the lens does not see, and its colours
     (N, 3) in [0, 255]."""
-    photo = photo_of(view)
-    scale = min(1.0, SIDE / max(photo.size))
-    camera = view.camera.resized(*(max(1, round(n * scale)) for n in photo.size))
+    photo, camera = photo_of(view), _small(view.camera)
     small = resized(photo, camera.width, camera.height).pixels[..., :3].reshape(-1, 3)
     directions, _ = rays(camera, pixel_centers(camera.width, camera.height).reshape(-1, 2))
     directions = directions @ view.camera_to_world[:3, :3].T
     return directions / np.linalg.norm(directions, axis=1, keepdims=True), small.astype(np.float64)
+
+
+def _between_points(view: View, points: np.ndarray) -> np.ndarray:
+    """Which pixels (N,) bool of a small version of a photo lie in the convex hull of those of the points (P, 3) that are in
+    its picture."""
+    camera = _small(view.camera)
+    local = (points - view.camera_to_world[:3, 3]) @ view.camera_to_world[:3, :3]
+    with np.errstate(invalid="ignore"):
+        pixel = project(camera, local)
+        inside = (local[:, 2] > 0) & ((pixel >= 0) & (pixel < [camera.width, camera.height])).all(1)
+    centers = pixel_centers(camera.width, camera.height).reshape(-1, 2)
+    if inside.sum() < FEWEST:
+        return np.zeros(len(centers), bool)
+    return (
+        scipy.spatial.Delaunay(pixel[inside], qhull_options="QJ").find_simplex(centers) >= 0
+    )  # QJ: they may lie in a line
+
+
+def _small(camera: Camera) -> Camera:
+    scale = min(1.0, SIDE / max(camera.width, camera.height))
+    return camera.resized(*(max(1, round(n * scale)) for n in (camera.width, camera.height)))

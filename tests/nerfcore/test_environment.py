@@ -17,6 +17,7 @@ from fieldwork.nerfcore.data.load import load_scene
 from fieldwork.nerfcore.errors import ProjectError, SettingError
 from fieldwork.nerfcore.field.environment import NAMED, Environment
 from fieldwork.nerfcore.geometry.contraction import grid_position, horizon, thinning
+from fieldwork.nerfcore.geometry.points import Points
 from fieldwork.nerfcore.images.picture import linear_to_srgb
 from fieldwork.nerfcore.kernels.device import use_device
 from fieldwork.nerfcore.kernels.voxel_field import VoxelRays
@@ -125,6 +126,22 @@ def test_what_has_a_place_is_not_at_infinity(tmp_path: Path) -> None:
     for path in (project / "images").iterdir():
         first.save(path)
     assert share_at_infinity(load_scene(project)) < INFINITE
+
+
+def test_what_lies_between_points_is_not_at_infinity(tmp_path: Path) -> None:
+    """A plain floor has the same colour from everywhere, like a sky, but points of its joints around it."""
+    scene = load_scene(under_the_sky(tmp_path / "p"))
+    alone = share_at_infinity(replace(scene, points=Points.empty()))
+    directions = np.random.default_rng(0).normal(size=(2000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+
+    def points(radius: float) -> Points:
+        return Points(radius * directions, np.zeros((2000, 3), np.uint8), np.zeros(2000))
+
+    assert share_at_infinity(replace(scene, points=points(0.3))) == alone  # of the ball
+    assert share_at_infinity(replace(scene, points=points(30))) == 0
+    in_a_line = replace(points(1), xyz=np.linspace([-1, 0, 0], [1, 0, 0], 2000))
+    assert share_at_infinity(replace(scene, points=in_a_line)) == alone
 
 
 def test_the_sky_is_learned_and_the_field_stays_empty_before_it(seen: Seen) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import torch
@@ -10,8 +11,8 @@ import torch
 from ..images.picture import srgb_to_linear
 from ..kernels.triangles import triangle_texels
 from .facelets import Facelets
-from .photos import halvings, sample, sharpened
-from .visibility import CPU, DepthBuffer, PosedCamera, within
+from .photos import Photo, halvings, sample, sharpened
+from .visibility import CPU, DepthBuffer, within
 
 BLOCK = 1 << 19  # texels painted at once
 FINE = 0.7  # width of a texel in pixels: a finer one shows less than a pixel does, so that the pixel's blur is undone
@@ -117,8 +118,7 @@ def texels_of(pieces: Facelets, size: int, tile: tuple[int, int, int, int]) -> T
 
 
 def paint(
-    view: PosedCamera,
-    rgba: np.ndarray,
+    photo: Photo,
     jobs: Jobs,
     pieces: Facelets,
     texels: Texels,
@@ -130,16 +130,24 @@ def paint(
     (N,) bool it sees and not only what borders on them.
 
     Args:
-        rgba: (H, W, 4) uint8. jobs: those of this photo. todo (tile area,): places that want paint.
+        jobs: those of this photo, which is read where there are any. todo (tile area,): places that want paint.
         careful (F,): facelets whose every texel has to be looked for in the depth buffer.
     """
-    picture = torch.from_numpy(rgba[..., :3].astype(np.float32) / 255).permute(2, 0, 1)
-    levels, finest = halvings(picture, 6), [sharpened(rgba)]
-    masked = bool((rgba[..., 3] == 0).any())
-    places, values, seen = [], [], []
+    view, places, values, seen = photo.view, [], [], []
     texel, row = texels.of(jobs.face)
     wanted = todo[texels.place[texel]]
     texel, row = texel[wanted], row[wanted]
+    if not len(texel):
+        return np.zeros(0, np.int32), np.zeros((0, 4), np.float32), np.zeros(0, bool)
+    rgba = photo.read()
+    masked = bool((rgba[..., 3] == 0).any())
+
+    @cache
+    def pictures(fine: bool) -> list[torch.Tensor]:
+        if fine:
+            return [sharpened(rgba)]
+        return halvings(torch.from_numpy(rgba[..., :3].astype(np.float32) / 255).permute(2, 0, 1), 6)
+
     for begin in range(0, len(texel), BLOCK):
         some, job = texel[begin : begin + BLOCK], row[begin : begin + BLOCK]
         face = jobs.face[job]
@@ -162,8 +170,9 @@ def paint(
         level = np.round(np.log2(np.maximum(pixels, 1))).astype(int)
         # Interpolated as the photo is stored: in linear light a cubic would overshoot visibly beside highlights.
         stored, fine = np.empty((len(pixel), 3), np.float32), pixels < FINE
-        for rows, read in ((fine, finest), (~fine, levels)):
-            stored[rows] = sample(read, pixel[rows], level[rows], "bicubic").numpy()
+        for finer, rows in ((True, fine), (False, ~fine)):
+            if rows.any():
+                stored[rows] = sample(pictures(finer), pixel[rows], level[rows], "bicubic").numpy()
         color = srgb_to_linear(stored.clip(0, 1))
         second, third = texels.barycentric[some].T[..., None]
         first = 1 - second - third
@@ -176,6 +185,4 @@ def paint(
         values.append(np.concatenate([color * factor * weight[:, None], weight[:, None]], 1).astype(np.float32))
         places.append(texels.place[some])
         seen.append(~jobs.beside[job])
-    if not places:
-        return np.zeros(0, np.int32), np.zeros((0, 4), np.float32), np.zeros(0, bool)
     return np.concatenate(places), np.concatenate(values), np.concatenate(seen)

@@ -29,6 +29,10 @@ from .visibility import DepthBuffers, Observations, in_parallel, observe
 TILE = 4096  # texels a side that are worked on at once
 PIECE_TEXELS = 40  # longest edge of a piece for which one photo is chosen
 SECOND_BEST = 3  # further photos that are tried where the chosen one is hidden
+FILL_STEP, FILLED = (
+    2,
+    1 << 18,
+)  # texels along a square that has one colour of the field, where no photo shows more; at once
 MARGIN = 4  # texels around charts that repeat their border
 BAND = 1 << 22  # texels that are spread at once: a fraction of a second
 BYTES_PER_TEXEL, BYTES_PER_TILE_TEXEL = 8, 71
@@ -244,9 +248,8 @@ def _tile(
             report.check()
             number, rows = item
             mine = jobs.of(rows)
-            rgba = photos[number].read()
             buffer = buffers[number] if strict[mine.face].any() else None
-            place, value, seen = paint(photos[number].view, rgba, mine, pieces, texels, todo, strict, buffer)
+            place, value, seen = paint(photos[number], mine, pieces, texels, todo, strict, buffer)
             with lock:
                 total[place] += value
                 painted[place[seen]] = True
@@ -270,12 +273,24 @@ def _tile(
         source[begin : begin + (1 << 22)][good] = PHOTO
     source[todo] = UNSEEN
     if fill is not None and todo.any():
-        wanted = np.flatnonzero(todo[texels.place])
-        for some in np.array_split(wanted, -(-len(wanted) // (1 << 18))):
+        wanted, shared = _sharing(texels.place, todo, width, FILL_STEP if rounds and prepared.size >= TILE else 1)
+        colors = np.empty((len(wanted), 3), np.uint8)
+        for begin in range(0, len(wanted), FILLED):
             report.check()
+            some = wanted[begin : begin + FILLED]
             face = face_of[some]
-            image[texels.place[some]] = fill(texels.points(pieces, face, some), pieces.normals[face])
+            colors[begin : begin + FILLED] = fill(texels.points(pieces, face, some), pieces.normals[face])
+        image[texels.place[todo[texels.place]]] = colors[shared]
     return image.reshape(height, width, 3), source.reshape(height, width)
+
+
+def _sharing(place: np.ndarray, todo: np.ndarray, width: int, step: int) -> tuple[np.ndarray, np.ndarray]:
+    """Of the texels (N,) at a place of a tile that want a colour, `todo` (tile area,), one in each square of `step`: which
+    (M,), and for each that wants one its number among these."""
+    wanted = np.flatnonzero(todo[place])
+    row, column = np.divmod(place[wanted].astype(np.int64), width)
+    _, first, shared = np.unique(row // step * width + column // step, return_index=True, return_inverse=True)
+    return wanted[first], shared.reshape(-1)
 
 
 def spread(image: np.ndarray, known: np.ndarray, check: Callable[[], None] = go_on) -> None:

@@ -81,10 +81,13 @@ def sharpened(rgba: np.ndarray) -> torch.Tensor:
     color, known = rgba[..., :3].astype(np.float32) / 255, rgba[..., 3] > 0
     padded, there = np.pad(color, ((1, 1), (1, 1), (0, 0)), mode="edge"), np.pad(known, 1)
     height, width = known.shape
-    around = np.zeros_like(color)
+    around, masked = np.zeros_like(color), not known.all()
     for y, x in ((0, 1), (2, 1), (1, 0), (1, 2)):
         beside = np.s_[y : y + height, x : x + width]
-        around += np.where((there[beside] & known)[..., None], padded[beside] - color, 0)
+        apart = padded[beside] - color
+        if masked:
+            apart[~(there[beside] & known)] = 0
+        around += apart
     return torch.from_numpy((color - PIXEL_BLUR / 24 * around).clip(0, 1)).permute(2, 0, 1)
 
 

@@ -29,10 +29,8 @@ from .visibility import DepthBuffers, Observations, in_parallel, observe
 TILE = 4096  # texels a side that are worked on at once
 PIECE_TEXELS = 40  # longest edge of a piece for which one photo is chosen
 SECOND_BEST = 3  # further photos that are tried where the chosen one is hidden
-FILL_STEP, FILLED = (
-    2,
-    1 << 18,
-)  # texels along a square that has one colour of the field, where no photo shows more; at once
+FILL_STEP = 2  # texels along squares with one colour of the field, where no photo shows more and texels are many
+FILLED = 1 << 18  # of these colours at once
 MARGIN = 4  # texels around charts that repeat their border
 BAND = 1 << 22  # texels that are spread at once: a fraction of a second
 BYTES_PER_TEXEL, BYTES_PER_TILE_TEXEL = 8, 71
@@ -273,7 +271,9 @@ def _tile(
         source[begin : begin + (1 << 22)][good] = PHOTO
     source[todo] = UNSEEN
     if fill is not None and todo.any():
-        wanted, shared = _sharing(texels.place, todo, width, FILL_STEP if rounds and prepared.size >= TILE else 1)
+        wanted, shared = one_of_each_square(
+            texels.place, todo, width, FILL_STEP if rounds and prepared.size >= TILE else 1
+        )
         colors = np.empty((len(wanted), 3), np.uint8)
         for begin in range(0, len(wanted), FILLED):
             report.check()
@@ -284,13 +284,18 @@ def _tile(
     return image.reshape(height, width, 3), source.reshape(height, width)
 
 
-def _sharing(place: np.ndarray, todo: np.ndarray, width: int, step: int) -> tuple[np.ndarray, np.ndarray]:
+def one_of_each_square(place: np.ndarray, todo: np.ndarray, width: int, step: int) -> tuple[np.ndarray, np.ndarray]:
     """Of the texels (N,) at a place of a tile that want a colour, `todo` (tile area,), one in each square of `step`: which
     (M,), and for each that wants one its number among these."""
     wanted = np.flatnonzero(todo[place])
-    row, column = np.divmod(place[wanted].astype(np.int64), width)
-    _, first, shared = np.unique(row // step * width + column // step, return_index=True, return_inverse=True)
-    return wanted[first], shared.reshape(-1)
+    row, column = np.divmod(place[wanted], width)
+    square = row // step * width + column // step
+    chosen = np.zeros(todo.size, np.int32)
+    chosen[square] = np.arange(len(wanted))
+    of_square = chosen[square]
+    one = np.zeros(len(wanted), bool)
+    one[of_square] = True
+    return wanted[one], (np.cumsum(one, dtype=np.int32) - 1)[of_square]
 
 
 def spread(image: np.ndarray, known: np.ndarray, check: Callable[[], None] = go_on) -> None:

@@ -59,8 +59,8 @@ def named_things(labels: list[np.ndarray | None], confirmed: np.ndarray, usual: 
 
 def nothing(left_out: np.ndarray, sure: np.ndarray, usual: float) -> np.ndarray:
     """Which pixels (H, W) of those left out by the label map show nothing that has a depth: photos confirm little of what is
-    left out around them. One that they do confirm shows something, unless it is beside a named thing: windows of pixels that reach over an
-    outline find the thing's depth outside of it.
+    left out around them. One that they do confirm shows something, unless it is beside a named thing: windows of pixels
+    that reach over an outline find the thing's depth outside of it.
 
     Args:
         sure: which pixels photos confirm; usual: share that they confirm of what has a name.

@@ -8,7 +8,7 @@ from fieldwork.nerfcore.errors import Cancelled, SettingError
 from fieldwork.nerfcore.mesh import photo_texture as module
 from fieldwork.nerfcore.mesh.facelets import facelets
 from fieldwork.nerfcore.mesh.painting import crossings, texels_of
-from fieldwork.nerfcore.mesh.photo_texture import PhotoTexture, photo_texture, prepare
+from fieldwork.nerfcore.mesh.photo_texture import PhotoTexture, one_of_each_square, photo_texture, prepare
 from fieldwork.nerfcore.mesh.photos import Photo, sharpened
 from fieldwork.nerfcore.mesh.surface_picture import surface_picture
 from fieldwork.nerfcore.mesh.visibility import PosedCamera
@@ -229,3 +229,22 @@ def test_sharpening_asks_nothing_of_what_is_masked():
     assert np.allclose(sharpened(photo).numpy() * 255, 100)
     photo[:, 4:] = 0
     assert np.allclose(sharpened(photo)[:, :, :4].numpy() * 255, 100)
+
+
+@pytest.mark.parametrize("step", [1, 2, 3])
+def test_texels_of_a_square_share_one_of_them(step: int) -> None:
+    random = np.random.default_rng(step)
+    width, height = 17, 12
+    place = random.permutation(width * height)[:150].astype(np.int32)
+    todo = random.random(width * height) < 0.6
+    chosen, shared = one_of_each_square(place, todo, width, step)
+    wanted = place[todo[place]]
+    assert len(shared) == len(wanted)
+    assert todo[place[chosen]].all()
+    row, column = np.divmod(wanted, width)
+    own = np.stack([row // step, column // step])
+    row, column = np.divmod(place[chosen][shared], width)
+    assert (own == np.stack([row // step, column // step])).all()
+    assert len(chosen) == len(np.unique(own, axis=1).T)
+    if step == 1:
+        assert (place[chosen][shared] == wanted).all()

@@ -18,6 +18,7 @@ FARTHEST, FAR = (
 AROUND = 0.125  # of the picture's width: window in which far things need depths that photos confirm
 SIMILAR, SUPPORT = 0.12, 0.05  # share by which depths there may differ, and share of them that must be confirmed
 CONFIRMED = 0.2  # as much as of what has a name, times this, photos must confirm of a thing, and not of sky
+USUAL = 0.3  # share of what has a name that counts as confirmed at least: of an untrained field it is 0.04, by chance
 
 
 def labels_tell(sure: list[np.ndarray], left_out: list[np.ndarray | None]) -> bool:
@@ -35,7 +36,7 @@ def labels_tell(sure: list[np.ndarray], left_out: list[np.ndarray | None]) -> bo
 def confirmed_share(
     hit: list[np.ndarray], sure: list[np.ndarray], labels: list[np.ndarray | None]
 ) -> tuple[np.ndarray, float]:
-    """Share (256,) that photos confirm of what the field has of each class, and of all that have a name.
+    """Share (256,) that photos confirm of what the field has of each class, and of all that have a name, but at least `USUAL`.
 
     Args:
         hit, sure: which pixels (H, W) of each view have a depth, and one that photos confirm; labels: class (H, W) uint8 of
@@ -47,7 +48,7 @@ def confirmed_share(
             there += np.bincount(label[own], minlength=256)
             confirmed += np.bincount(label[own & safe], minlength=256)
     named = np.arange(256) != VOID
-    return confirmed / np.maximum(there, 1), float(confirmed[named].sum() / max(there[named].sum(), 1))
+    return confirmed / np.maximum(there, 1), max(float(confirmed[named].sum() / max(there[named].sum(), 1)), USUAL)
 
 
 def named_things(labels: list[np.ndarray | None], confirmed: np.ndarray, usual: float) -> list[np.ndarray | None]:

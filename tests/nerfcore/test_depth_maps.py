@@ -209,7 +209,6 @@ def test_photos_move_soft_depths_onto_the_surface() -> None:
     assert float(((after.depth > 0) & (after.depth < FREE)).float().mean()) > 0.9 * float(
         ((before.depth > 0) & (before.depth < FREE)).float().mean()
     )
-    # What label maps leave out is only there where photos say so.
     row = torch.arange(CAMERA.height * CAMERA.width) // CAMERA.width
 
     def labelled_below(share: float) -> MapArrays:
@@ -217,11 +216,19 @@ def test_photos_move_soft_depths_onto_the_surface() -> None:
         store.label = torch.where(left_out, VOID, 0).to(torch.uint8).repeat(len(flats))
         return refined_maps(flats, soft, store, CPU, Reporter())[0]  # type: ignore[arg-type]
 
-    named = labelled_below(0.4)
+    def there(maps: MapArrays) -> torch.Tensor:
+        return (row < 0.4 * CAMERA.height).repeat(len(flats)) & (maps.depth > 0) & (maps.depth < FREE)
+
+    # What label maps leave out is there where photos say so, and what is beside that,
+    assert int(there(labelled_below(0.4)).sum()) > 0.9 * int(there(after).sum()) > 900
+    painted = store.rgba
+    store.rgba = torch.where((row < 0.45 * CAMERA.height).repeat(len(flats))[:, None], 128, painted).to(torch.uint8)
     field = torch.from_numpy(np.concatenate([m.depth.reshape(-1) for m in soft]))
-    left_out = (row < 0.4 * CAMERA.height).repeat(len(flats)) & (named.depth > 0) & (named.depth < FREE)
-    assert int(left_out.sum()) > 1000
-    assert bool((named.depth != field)[left_out].all())
+    named = labelled_below(0.4)
+    # and nowhere else: of a plain part nothing is left of the field's own depths.
+    assert bool((named.depth != field)[there(named)].all())
+    assert int(there(named).sum()) < 0.1 * int(there(after).sum())
+    store.rgba = painted
     # Label maps that name little of what photos confirm say nothing of the rest.
     torch.testing.assert_close(labelled_below(0.7).depth, after.depth)
 

@@ -92,6 +92,12 @@ def test_a_class_that_photos_confirm_is_a_thing_and_a_sky_is_none() -> None:
     (room,) = named_things([label], confirmed, 0.2)
     assert room is not None
     assert (room[8:, 64:] == 5).all()
+    # Of an untrained field photos confirm a little by chance, which makes nothing a thing.
+    chance = np.zeros(SHAPE, bool)
+    chance[::5, ::5] = True
+    (scraps,) = named_things([label], *confirmed_share([hit], [chance], [label]))
+    assert scraps is not None
+    assert (scraps == VOID).all()
     # What nothing is known of is no thing either.
     (unknown,) = named_things([label], *confirmed_share([~hit], [sure], [label]))
     assert unknown is not None

@@ -7,8 +7,9 @@ import numpy as np
 import scipy
 
 from ..data.photo import photo_of
+from ..data.pixels import training_size
 from ..data.scene import Scene, View
-from ..geometry.cameras import Camera, pixel_centers, project, rays
+from ..geometry.cameras import pixel_centers, project, rays
 from ..images.picture import resized
 
 # Measured: docs/experiments.md, “Is there a sky?”.
@@ -50,8 +51,8 @@ def share_at_infinity(scene: Scene) -> float:
 def _colored_directions(view: View) -> tuple[np.ndarray, np.ndarray]:
     """Unit directions (N, 3) in the world of a small version of a photo, NaN where the lens does not see, and its colours
     (N, 3) in [0, 255]."""
-    photo, camera = photo_of(view), _small(view.camera)
-    small = resized(photo, camera.width, camera.height).pixels[..., :3].reshape(-1, 3)
+    camera = view.camera.resized(*training_size(view.camera, SIDE))
+    small = resized(photo_of(view), camera.width, camera.height).pixels[..., :3].reshape(-1, 3)
     directions, _ = rays(camera, pixel_centers(camera.width, camera.height).reshape(-1, 2))
     directions = directions @ view.camera_to_world[:3, :3].T
     return directions / np.linalg.norm(directions, axis=1, keepdims=True), small.astype(np.float64)
@@ -60,7 +61,7 @@ def _colored_directions(view: View) -> tuple[np.ndarray, np.ndarray]:
 def _between_points(view: View, points: np.ndarray) -> np.ndarray:
     """Which pixels (N,) bool of a small version of a photo lie in the convex hull of those of the points (P, 3) that are in
     its picture."""
-    camera = _small(view.camera)
+    camera = view.camera.resized(*training_size(view.camera, SIDE))
     local = (points - view.camera_to_world[:3, 3]) @ view.camera_to_world[:3, :3]
     with np.errstate(invalid="ignore"):
         pixel = project(camera, local)
@@ -68,11 +69,5 @@ def _between_points(view: View, points: np.ndarray) -> np.ndarray:
     centers = pixel_centers(camera.width, camera.height).reshape(-1, 2)
     if inside.sum() < FEWEST:
         return np.zeros(len(centers), bool)
-    return (
-        scipy.spatial.Delaunay(pixel[inside], qhull_options="QJ").find_simplex(centers) >= 0
-    )  # QJ: they may lie in a line
-
-
-def _small(camera: Camera) -> Camera:
-    scale = min(1.0, SIDE / max(camera.width, camera.height))
-    return camera.resized(*(max(1, round(n * scale)) for n in (camera.width, camera.height)))
+    hull = scipy.spatial.Delaunay(pixel[inside], qhull_options="QJ")  # they may lie in a line
+    return hull.find_simplex(centers) >= 0

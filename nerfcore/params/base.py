@@ -69,9 +69,9 @@ def _texture_size(size: object) -> object:
     return pixels
 
 
-TextureSize = Annotated[int | Literal["auto"], BeforeValidator(_texture_size)]
-TextureSizeOrNone = Annotated[
-    int | Literal["auto"], BeforeValidator(lambda size: 0 if size in (0, "0") else _texture_size(size))
+TextureSize = Annotated[  # None: no texture
+    int | Literal["auto"] | None,
+    BeforeValidator(lambda size: None if size in (None, 0, "0", "none") else _texture_size(size)),
 ]
 
 

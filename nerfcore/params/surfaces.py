@@ -32,7 +32,7 @@ class MeshParams(Params):
         description="where to look: auto (the region of interest, or what the photos show where there is none), photos "
         "(what they show), or x0,y0,z0,x1,y1,z1 in the aligned world",
     )
-    texture: TextureSize | None = Field(
+    texture: TextureSize = Field(
         default=None,
         description="texture size in pixels, or auto: what the photos' pixels need; none: vertex colours only",
     )

@@ -18,7 +18,6 @@ from .base import (
     Params,
     Preset,
     TextureSize,
-    TextureSizeOrNone,
 )
 
 
@@ -42,9 +41,9 @@ class ReconstructParams(Params):
     holdout: Holdout = 8
     set: dict[str, str] = Field(default_factory=dict)
     faces: FacesOrAll = Field(default=200_000, description="triangles of the mesh; 0: all there are")
-    texture: TextureSizeOrNone = Field(
+    texture: TextureSize = Field(
         default="auto",
-        description="size of the mesh's texture in pixels; auto: what the photos' pixels need; 0: vertex colours only",
+        description="size of the mesh's texture in pixels; auto: what the photos' pixels need; none: vertex colours only",
     )
     report: Path | None = Field(default=None, description="report to write, .html or .pdf")
     renders: Path | None = Field(default=None, description="folder for renders of new views")
@@ -92,7 +91,7 @@ class BlocksParams(Params):
     faces: FacesOrAll = Field(default=200_000, description="triangles of each block; 0: all there are")
     resolution: int = Field(default=512, ge=16, le=2048, description="cells along the longest side of a block")
     out: Path | None = Field(default=None, description="file for the whole mesh: .ply, .obj, .glb, .stl, .usdc")
-    texture: TextureSize | None = Field(
+    texture: TextureSize = Field(
         default=None,
         description="size of the whole mesh's texture in pixels, or auto: what the photos' pixels need; none: vertex colours "
         "only",

@@ -87,10 +87,11 @@ def test_a_texture_has_a_size_or_as_many_texels_as_the_photos_need(tmp_path: Pat
     for given, taken in (("auto", "auto"), ("512", 512), (16384, 16384), (None, None)):
         assert MeshParams.model_validate({"project": tmp_path, "texture": given}).texture == taken
         assert BlocksParams.model_validate({"project": tmp_path, "texture": given}).texture == taken
-    for wrong in (0, 63, 16385, "large", 0.5):
+    for wrong in (1, 63, 16385, "large", 0.5):
         with pytest.raises(ValidationError, match=f"{wrong} is no size of a texture; give 64 to 16384 pixels, or auto"):
             MeshParams.model_validate({"project": tmp_path, "texture": wrong})
-    assert ReconstructParams.model_validate({"photos": tmp_path, "out": tmp_path, "texture": "0"}).texture == 0
+    for said in ("0", "none"):
+        assert ReconstructParams.model_validate({"photos": tmp_path, "out": tmp_path, "texture": said}).texture is None
 
 
 def test_too_few_triangles_are_refused_before_any_work(tmp_path: Path) -> None:

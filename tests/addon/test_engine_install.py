@@ -127,8 +127,9 @@ def test_engine_that_does_not_run_is_not_installed(options, lock, tmp_path):
     assert place.installed(options.folder) is None
 
 
-def test_unexpected_device_is_refused(options, lock, tmp_path, content_doctor):
+def test_unexpected_device_is_refused(options, lock, tmp_path, content_doctor, monkeypatch):
     make_wheel(tmp_path / "wheels")
+    monkeypatch.setattr(module.shutil, "disk_usage", lambda folder: SimpleNamespace(free=100e9))
     with pytest.raises(InstallError, match="runs on cpu, not on cuda"):
         go(Options(**{**vars(options), "device": "cuda"}), lock)
 

@@ -102,6 +102,22 @@ class Points(click.ParamType):
         return points
 
 
+class Word(click.ParamType):
+    """A number or one of some words: the model of the parameters checks which."""
+
+    def __init__(self, kinds: list[Any]) -> None:
+        self.name = "|".join(
+            "|".join(get_args(k)) if get_origin(k) is Literal else click.types.convert_type(k).name.upper()
+            for k in kinds
+        )
+
+    def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
+        return self.name
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        return str(value)
+
+
 class CommaList(click.ParamType):
     name = "A,B,…"
 
@@ -117,7 +133,7 @@ def _plain(annotation: Any) -> Any:
     """The type without None, and without the checks that come with it."""
     if get_origin(annotation) in (Union, UnionType):
         kinds = [a for a in get_args(annotation) if a is not type(None)]
-        return _plain(kinds[0]) if len(kinds) == 1 else str  # a number or a word: the model checks which
+        return _plain(kinds[0]) if len(kinds) == 1 else Word(kinds)
     return _plain(get_args(annotation)[0]) if get_origin(annotation) is Annotated else annotation
 
 
@@ -138,11 +154,16 @@ def _option(name: str, info: FieldInfo) -> click.Option:
     if get_origin(kind) is tuple and get_args(kind) == (int, int) and name == "size":
         return click.Option(flags, type=Size(), default=default, show_default=default is not None, **shared)
     if get_origin(kind) is tuple:
-        return click.Option(flags, nargs=len(get_args(kind)), type=tuple(get_args(kind)), default=default, **shared)
+        each = tuple(get_args(kind))
+        names = " ".join(click.types.convert_type(t).name.upper() for t in each)
+        return click.Option(flags, nargs=len(each), type=each, default=default, metavar=names, **shared)
     if kind in (list[tuple[float, float]], list[tuple[float, float, float]]):
         return click.Option(flags, type=Points(len(get_args(get_args(kind)[0]))), **shared)
     if get_origin(kind) is list:
-        return click.Option(flags, type=CommaList(), default=default, **shared)
+        (each,) = get_args(kind)
+        if get_origin(each) is Literal:
+            shared["help"] += ": any of " + ", ".join(get_args(each))
+        return click.Option(flags, type=CommaList(), default=default, show_default=bool(default), **shared)
     if get_origin(kind) is Literal:
         kind = click.Choice([str(choice) for choice in get_args(kind)])
     elif kind is Path:

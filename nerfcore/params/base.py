@@ -22,8 +22,23 @@ KEEP_BACKDROP = (
     "make no masks where nearly all photos show an object before dark surroundings, which is done unless masks or labels are "
     "given"
 )
+LABELS = (
+    "folder of label maps (or .npy, .npz, .exr probability maps) named like the photos; confidence/ in it may hold grey maps "
+    "of how sure they are"
+)
+MASKS = "folder of foreground masks named like the photos"
+CLASSES = "classes.json: names of the label ids"
 KEEP_EXPOSURE = "do not bring photos that differ in exposure or white balance to a common one"
-Preset = Literal["draft", "standard", "high"]
+Preset = Annotated[
+    Literal["draft", "standard", "high"],
+    Field(description="how large the field is and how long it is trained, unless steps or seconds are given"),
+]
+Settings = Annotated[
+    dict[str, str],
+    Field(
+        default_factory=dict, description="a setting of training by its name, e.g. loss.semantic=0.1; may be repeated"
+    ),
+]
 Split = Literal["none", "classes", "instances"]
 Pass = Literal["rgb", "depth", "semantic", "confidence", "normal", "unknown"]
 
@@ -45,13 +60,15 @@ Holdout = Annotated[
 ]
 
 
-def _enough_faces(faces: int) -> int:
-    if 0 < faces < FEWEST_FACES:
+def _enough_faces(faces: int | None) -> int | None:
+    if faces is not None and 0 < faces < FEWEST_FACES:
         raise ValueError(f"{faces} is too few for a surface; give 0 for all there are, or {FEWEST_FACES} and more")
-    return faces
+    return faces or None
 
 
-FacesOrAll = Annotated[int, Field(ge=0, le=MOST_FACES), AfterValidator(_enough_faces)]
+FaceCount = Annotated[  # None: all there are
+    Annotated[int, Field(ge=0, le=MOST_FACES)] | None, AfterValidator(_enough_faces)
+]
 
 
 def _texture_size(size: object) -> object:

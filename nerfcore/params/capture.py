@@ -7,7 +7,18 @@ from typing import Literal
 
 from pydantic import Field
 
-from .base import KEEP_BACKDROP, KEEP_EXPOSURE, LARGEST_PICTURE, MANY, MASK_MODE, Params, PictureSize
+from .base import (
+    CLASSES,
+    KEEP_BACKDROP,
+    KEEP_EXPOSURE,
+    LABELS,
+    LARGEST_PICTURE,
+    MANY,
+    MASK_MODE,
+    MASKS,
+    Params,
+    PictureSize,
+)
 
 
 class DoctorParams(Params):
@@ -62,13 +73,9 @@ class DatasetParams(Params):
 class NewParams(Params):
     project: Path
     photos: Path = Field(description="folder of photos, or a video file")
-    labels: Path | None = Field(
-        default=None,
-        description="folder of label maps (or .npy, .npz, .exr probability maps) named like the photos; "
-        "confidence/ in it may hold grey maps of how sure they are",
-    )
-    masks: Path | None = Field(default=None, description="folder of foreground masks named like the photos")
-    classes: Path | None = Field(default=None, description="classes.json: names of the label ids")
+    labels: Path | None = Field(default=None, description=LABELS)
+    masks: Path | None = Field(default=None, description=MASKS)
+    classes: Path | None = Field(default=None, description=CLASSES)
     mask_mode: Literal["ignore", "empty"] | None = Field(default=None, description=MASK_MODE)
     keep_backdrop: bool = Field(default=False, description=KEEP_BACKDROP)
     max_size: int = Field(
@@ -95,14 +102,16 @@ class ImportParams(Params):
         "metashape",
         "realityscan",
         "meshroom",
-    ] = "auto"
+    ] = Field(default="auto", description="how the dataset is laid out; auto finds it out")
     mask_mode: Literal["ignore", "empty"] | None = Field(default=None, description=MASK_MODE)
     keep_backdrop: bool = Field(default=False, description=KEEP_BACKDROP)
 
 
 class PosesParams(Params):
     project: Path
-    preset: Literal["fast", "standard", "robust"] = "standard"
+    preset: Literal["fast", "standard", "robust"] = Field(
+        default="standard", description="how many features and pairs of photos are tried: robust takes longest"
+    )
     restart: bool = Field(default=False, description="place all photos anew, also those that have a pose")
     group: int = Field(
         default=0,

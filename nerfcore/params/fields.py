@@ -7,7 +7,7 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from .base import LONGEST_RUN, MANY, Holdout, Params, Pass, PictureSize, Preset, RunName
+from .base import LONGEST_RUN, MANY, Holdout, Params, Pass, PictureSize, Preset, RunName, Settings
 
 
 class TrainParams(Params):
@@ -17,14 +17,16 @@ class TrainParams(Params):
     holdout: Holdout = 8
     time_limit: float | None = Field(default=None, gt=0, le=LONGEST_RUN, description="seconds of training")
     steps: int | None = Field(default=None, gt=0, le=LONGEST_RUN, description="optimisation steps")
-    set: dict[str, str] = Field(default_factory=dict, description="settings by name, e.g. loss.semantic=0.1")
-    resume: bool = False
+    set: Settings
+    resume: bool = Field(default=False, description="go on with the training of this run that was stopped")
 
 
 class EvaluateParams(Params):
     project: Path
     run: RunName = "main"
-    split: Literal["test", "train"] = "test"
+    split: Literal["test", "train"] = Field(
+        default="test", description="the photos that were held out, or those trained on"
+    )
     speed: bool = Field(default=False, description="measure frames of 800x800 too; on a CPU this can take minutes")
     baked: bool = Field(default=False, description="measure the baked field, and what it lost against the field")
     time_limit: float | None = Field(
@@ -45,16 +47,25 @@ class BakeParams(Params):
 
 class RenderParams(Params):
     project: Path
-    out: Path
+    out: Path = Field(description="folder for the pictures")
     run: RunName = "main"
     test: bool = Field(default=False, description="from the held-out photos")
     all: bool = Field(default=False, description="from every photo, also those of training")
-    camera: Path | None = None
-    orbit: int | None = Field(default=None, gt=0, le=MANY)
+    camera: Path | None = Field(
+        default=None,
+        description="from the cameras of this file, written like a transforms.json: w, h, fl_x (pixels), and frames with a "
+        "transform_matrix each, in the aligned world",
+    )
+    orbit: int | None = Field(
+        default=None,
+        gt=0,
+        le=MANY,
+        description="from so many places around the subject, or along the arc that was photographed",
+    )
     size: PictureSize | None = Field(
         default=None, description="WxH; cut where a camera has other proportions (held-out and all photos: resampled)"
     )
-    passes: list[Pass] = ["rgb", "depth", "semantic"]
+    passes: list[Pass] = Field(default=["rgb", "depth", "semantic"], description="what to render")
     baked: bool = Field(default=False, description="from the baked field, which is faster, instead of the field")
     edits: Path | None = Field(
         default=None,

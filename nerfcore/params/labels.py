@@ -163,7 +163,7 @@ class LabelImportParams(Params):
 
 class LabelExportParams(Params):
     project: Path
-    out: Path
+    out: Path = Field(description="file or folder to write, as the format has it")
     format: Literal[
         "coco",
         "coco-panoptic",

@@ -20,7 +20,7 @@ class ReportParams(Params):
 
 class BlendParams(Params):
     project: Path
-    out: Path
+    out: Path = Field(description="Blender file to write")
     run: RunName = "main"
     split: Split = Field(default="none", description="classes, instances: one mesh object for each of them")
     renders: Path | None = Field(

@@ -7,14 +7,17 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from .base import FEWEST_FACES, MOST_FACES, Params, RunName, Split, TextureSize
+from .base import FaceCount, Params, RunName, Split, TextureSize
 
 
 class MeshParams(Params):
     project: Path
     run: RunName = "main"
-    out: Path | None = None
-    faces: int | None = Field(default=None, ge=FEWEST_FACES, le=MOST_FACES, description="target number of triangles")
+    out: Path | None = Field(
+        default=None,
+        description="file to write the mesh to as well: .ply, .obj, .glb, .stl, .usdc, .usda, .usd or .usdz",
+    )
+    faces: FaceCount = Field(default=None, description="triangles of the mesh; 0 or nothing: all there are")
     resolution: int | None = Field(
         default=None,
         ge=16,
@@ -97,7 +100,7 @@ PaperScale = Annotated[
 class PlanParams(Params):
     project: Path
     run: RunName = "main"
-    views: list[Side] = ["top", "front", "right", "back", "left"]
+    views: list[Side] = Field(default=["top", "front", "right", "back", "left"], description="sides to draw")
     conditions: list[str] = Field(
         default=[],
         description="classes to map as conditions, such as damages: hatched over the drawing, numbered, listed with their "
@@ -136,7 +139,7 @@ class CompareParams(Params):
         le=1e9,
         description="distance beyond which surfaces do not belong together, world units; default: 20 cells of the mesh",
     )
-    views: list[Side] = ["top", "front", "right", "back", "left"]
+    views: list[Side] = Field(default=["top", "front", "right", "back", "left"], description="sides to draw")
     scale: PaperScale = None
     out: Path | None = Field(
         default=None, description="folder to write to; default: exports/RUN/compare of the project"

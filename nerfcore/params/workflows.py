@@ -8,30 +8,34 @@ from typing import Literal
 from pydantic import Field
 
 from .base import (
+    CLASSES,
     KEEP_BACKDROP,
     KEEP_EXPOSURE,
+    LABELS,
     LONGEST_RUN,
     MANY,
     MASK_MODE,
-    FacesOrAll,
+    MASKS,
+    FaceCount,
     Holdout,
     Params,
     Preset,
+    Settings,
     TextureSize,
 )
 
 
 class ReconstructParams(Params):
-    photos: Path
-    out: Path
+    photos: Path = Field(description="folder of photos, or a video file")
+    out: Path = Field(description="folder of the project, made anew or gone on with")
     preset: Preset = "standard"
-    labels: Path | None = None
-    masks: Path | None = None
+    labels: Path | None = Field(default=None, description=LABELS)
+    masks: Path | None = Field(default=None, description=MASKS)
     mask_mode: Literal["ignore", "empty"] | None = Field(default=None, description=MASK_MODE)
     keep_backdrop: bool = Field(default=False, description=KEEP_BACKDROP)
     keep_exposure: bool = Field(default=False, description=KEEP_EXPOSURE)
-    classes: Path | None = None
-    blend: Path | None = None
+    classes: Path | None = Field(default=None, description=CLASSES)
+    blend: Path | None = Field(default=None, description="Blender file to write: cameras, points, mesh and materials")
     time_limit: float | None = Field(
         default=None,
         gt=0,
@@ -39,8 +43,8 @@ class ReconstructParams(Params):
         description="seconds of training; all that comes after it gets half as much and a minute",
     )
     holdout: Holdout = 8
-    set: dict[str, str] = Field(default_factory=dict)
-    faces: FacesOrAll = Field(default=200_000, description="triangles of the mesh; 0: all there are")
+    set: Settings
+    faces: FaceCount = Field(default=200_000, description="triangles of the mesh; 0: all there are")
     texture: TextureSize = Field(
         default="auto",
         description="size of the mesh's texture in pixels; auto: what the photos' pixels need; none: vertex colours only",
@@ -86,11 +90,13 @@ class BlocksParams(Params):
     time_limit: float | None = Field(
         default=None, gt=0, le=LONGEST_RUN, description="seconds of training of each block"
     )
-    set: dict[str, str] = Field(default_factory=dict)
+    set: Settings
     holdout: Holdout = 8
-    faces: FacesOrAll = Field(default=200_000, description="triangles of each block; 0: all there are")
+    faces: FaceCount = Field(default=200_000, description="triangles of each block; 0: all there are")
     resolution: int = Field(default=512, ge=16, le=2048, description="cells along the longest side of a block")
-    out: Path | None = Field(default=None, description="file for the whole mesh: .ply, .obj, .glb, .stl, .usdc")
+    out: Path | None = Field(
+        default=None, description="file for the whole mesh: .ply, .obj, .glb, .stl, .usdc, .usda, .usd or .usdz"
+    )
     texture: TextureSize = Field(
         default=None,
         description="size of the whole mesh's texture in pixels, or auto: what the photos' pixels need; none: vertex colours "

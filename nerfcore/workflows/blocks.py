@@ -202,8 +202,7 @@ def _part(params: p.BlocksParams, plan: Plan, block: BlockPlan, report: Reporter
         "settings": digest([params.resolution, params.faces]),
         **view_inputs(scene, scene.train, files=True),
     }
-    faces = params.faces or None
-    make = lambda: make_part(folder, plan, block, params.resolution, faces, report)  # noqa: E731
+    make = lambda: make_part(folder, plan, block, params.resolution, params.faces, report)  # noqa: E731
     return _kept([run_folder(own, RUN) / PART], inputs, make)
 
 

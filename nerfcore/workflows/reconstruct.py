@@ -97,7 +97,7 @@ def stage_params(params: p.ReconstructParams, verb: str, spent: float = 0.0) -> 
             )
             return training.model_copy(update={"resume": unfinished(training)})
         case "mesh":
-            return p.MeshParams(project=project, run=run, faces=params.faces or None, texture=params.texture)
+            return p.MeshParams(project=project, run=run, faces=params.faces, texture=params.texture)
         case "evaluate":
             from ..train.reuse import held_out
 

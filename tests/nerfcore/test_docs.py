@@ -8,6 +8,7 @@ import tomllib
 from functools import cache
 from pathlib import Path
 
+import click
 import pytest
 from fieldwork.nerfcore.cli import _command
 from fieldwork.nerfcore.config import RunConfig
@@ -123,6 +124,21 @@ def test_every_verb_is_explained() -> None:
     for page in (ROOT / "README.md", ROOT / "docs" / "cli.md"):
         named = code(page)
         assert [verb for verb in VERBS if not any(f"{text} ".startswith(f"{verb} ") for text in named)] == [], page.name
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_option_says_what_it_is_for(verb: str) -> None:
+    silent = [o.opts[0] for o in _command(verb).params if isinstance(o, click.Option) and not (o.help or "").strip()]
+    assert not silent
+
+
+def test_help_names_the_words_that_an_option_takes() -> None:
+    shown = {o.name: o.get_help_record(click.Context(_command("render"))) for o in _command("render").params}
+    assert "any of rgb, depth, semantic, confidence, normal, unknown" in shown["passes"][1]
+    assert "default: rgb, depth, semantic" in shown["passes"][1]
+    assert shown["frame_range"][0] == "--frame-range INTEGER INTEGER"
+    (texture,) = (o for o in _command("mesh").params if o.name == "texture")
+    assert texture.get_help_record(click.Context(_command("mesh")))[0] == "--texture INTEGER|auto"
 
 
 def test_experiments_are_dated_newest_first() -> None:

@@ -98,9 +98,11 @@ def test_too_few_triangles_are_refused_before_any_work(tmp_path: Path) -> None:
     photos = folder_of(tmp_path / "photos", 3)
     with pytest.raises(ValidationError, match="3 is too few for a surface; give 0 for all there are, or 100 and more"):
         ReconstructParams(photos=photos, out=tmp_path / "p", faces=3)
-    with pytest.raises(ValidationError, match="greater than or equal to 100"):
+    with pytest.raises(ValidationError, match="99 is too few for a surface; give 0 for all there are, or 100 and more"):
         MeshParams(project=tmp_path, faces=99)
     assert MeshParams(project=tmp_path, faces=100).faces == 100
+    for every in (MeshParams(project=tmp_path, faces=0), BlocksParams(project=tmp_path, faces=0)):
+        assert every.faces is None
 
 
 def test_as_many_views_are_rendered_as_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -114,5 +114,6 @@ def _describe(out: Path, described: dict[str, Any], folders: list[str]) -> None:
         head = {"camera_model": "PINHOLE"}
     if described["classes"]:
         write_json(out / "classes.json", {"ignore_id": 0, "classes": described["classes"]})
+    head["camera_convention"] = "OpenGL axes, z up, metres"
     unit = {"depth_unit_scale_factor": 1.0} if "depth" in folders else {}
     write_json(out / "transforms.json", {**head, **unit, "frames": frames})

@@ -15,6 +15,7 @@ from fieldwork.nerfcore.errors import BlenderError, InputError
 from fieldwork.nerfcore.geometry.cameras import Camera, flip_camera_axes, pixel_centers, rays
 from fieldwork.nerfcore.params import DatasetParams, ImportParams
 from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.project.store import load_project
 from PIL import Image
 
 # A floor of 4 m at z = 0 and a cube of 1 m on it; a camera with a vertical sensor fit and a shift that moves for ten
@@ -140,8 +141,11 @@ def test_transparent_photos_have_alpha_only_where_something_is(blend, tmp_path):
 
 def test_the_data_set_becomes_a_project_in_the_scene_s_own_frame(blend, tmp_path):
     take(blend, tmp_path / "out", path="camera", labels="object")
-    result = import_dataset(ImportParams(dataset=tmp_path / "out", project=tmp_path / "project"), Reporter())
+    report = Reporter()
+    result = import_dataset(ImportParams(dataset=tmp_path / "out", project=tmp_path / "project"), report)
     assert result["images"] == result["labelled"] == 4
+    assert not report.warnings
+    assert load_project(tmp_path / "project").frame.scale_known
     scene = load_scene(tmp_path / "project")
     truth = json.loads((tmp_path / "out/transforms.json").read_text())["frames"]
     for view, frame in zip(scene.views, truth):

@@ -25,6 +25,7 @@ from ..mesh.appearance import Photos
 from ..mesh.build import Built, agreed_maps, read_photos, vertex_colors
 from ..mesh.clean import shown
 from ..mesh.decimate import decimate_patches
+from ..mesh.denoise import denoised
 from ..mesh.depth_maps import MOST_VIEWS, flat_views, map_size, spread_views
 from ..mesh.extract import extract
 from ..mesh.fusion import BRICK, NEAR, TRUNCATION, WIDER, fuse_maps, grid_of, is_soft, tolerances
@@ -42,6 +43,7 @@ from .maps import cut_maps, joined_maps, load_maps, moved, save_maps
 from .plan import MAPS, PART, RUN, SIGHTS, BlockPlan, Plan, block_folder
 from .sights import Sights, chosen, load_sights, save_sights, sights_of
 
+FADE = 16  # voxels from a seam, where vertices stay where they are, to where noise is taken off as it is elsewhere
 BEYOND = 0.5  # how far beyond the blocks surfaces are looked for at most, in the shared frame, which is 2 wide
 
 
@@ -101,6 +103,7 @@ def make_part(
     vertices, triangles, inside, seams = core_surface(maps, region, plan, block, report, sights)
     if not inside.any():
         raise TrainingError(f"Block {block.name} has no surface.", "Train longer, or cut into fewer blocks.")
+    vertices = denoised(vertices, triangles, device, report, away_from(seams, vertices, FADE * region.voxel))
     if faces is not None and inside.sum() > faces:
         report.stage("Simplifying")
         target = round(faces * len(triangles) / inside.sum())
@@ -114,6 +117,15 @@ def make_part(
     save_part(run_folder(own, RUN) / PART, part)
     counts = {"vertices": len(part.surface.vertices), "faces": len(part.surface.faces)}
     return {**counts, "maps": len(maps), "of": sum(map(len, heard)), "read": list(read)}
+
+
+def away_from(seams: np.ndarray, vertices: np.ndarray, distance: float) -> np.ndarray:
+    """How far vertices (V, 3) are from the nearest of the planes (S, 2), axis and place: (V,) from 0 on it to 1 at `distance`
+    and beyond. Neighbours so have one vertex in one place at their seam."""
+    near = np.full(len(vertices), distance)
+    for axis, place in seams:
+        near = np.minimum(near, np.abs(vertices[:, int(axis)] - place))
+    return near / distance
 
 
 def limit_of(plan: Plan) -> tuple[np.ndarray, np.ndarray]:

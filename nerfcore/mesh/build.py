@@ -26,6 +26,7 @@ from .clean import clean
 from .closed import closed_surface, unseen_faces
 from .cut_outs import left_out
 from .decimate import decimate
+from .denoise import denoised
 from .extract import extract
 from .field_values import shade
 from .fusion import TRUNCATION, Bricks, coarser, fuse_maps, tolerances
@@ -69,6 +70,7 @@ def build(trained: Trained, project: Project, scene: Scene, params: MeshParams, 
     bricks = fuse_maps(maps, region, report)
     report.stage("Extracting the surface")
     coarse, tolerance = extract(coarser(bricks), report), TRUNCATION * region.voxel
+    coarse = denoised(*coarse, maps.depth.device, report), coarse[1]
     if params.watertight:
         vertices, faces = closed_surface(bricks, maps, tolerance, params.faces, report)
     else:
@@ -134,6 +136,7 @@ def open_surface(
         return vertices, faces
     report.stage("Cleaning the surface")
     vertices, faces, _ = clean(vertices, faces, maps, tolerances(bricks, vertices, faces, tolerance), report)
+    vertices = denoised(vertices, faces, maps.depth.device, report)
     if most is not None and len(faces) > most:
         report.stage("Simplifying")
         vertices, faces = decimate(vertices, faces, most, report)

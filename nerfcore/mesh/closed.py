@@ -11,6 +11,7 @@ from ..kernels.surface import fuse
 from ..progress import Reporter
 from .clean import FEWEST_VIEWS, drop_scraps, seen_by
 from .decimate import decimate_closed
+from .denoise import denoised
 from .extract import BLOCK, assemble, off_corners, weld
 from .fusion import BRICK, FREE_AT, TRUNCATION, Bricks, depth_gap
 from .triangles import areas, compact, components, cross, unit
@@ -31,6 +32,7 @@ def closed_surface(
     report.stage("Cleaning the surface")
     faces = drop_unseen(vertices, faces, maps, tolerance, report)
     vertices, faces = compact(vertices, drop_scraps(vertices, faces))
+    vertices = denoised(vertices, faces, maps.depth.device, report)
     if most is not None and len(faces) > most:
         report.stage("Simplifying")
         vertices, faces = decimate_closed(vertices, faces, most, report)

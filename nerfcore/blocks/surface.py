@@ -103,12 +103,12 @@ def make_part(
     vertices, triangles, inside, seams = core_surface(maps, region, plan, block, report, sights)
     if not inside.any():
         raise TrainingError(f"Block {block.name} has no surface.", "Train longer, or cut into fewer blocks.")
-    vertices = denoised(vertices, triangles, device, report, away_from(seams, vertices, FADE * region.voxel))
     if faces is not None and inside.sum() > faces:
         report.stage("Simplifying")
         target = round(faces * len(triangles) / inside.sum())
         vertices, triangles, inside = decimate_patches(vertices, triangles, inside.astype(np.int64), target, report)
         inside = inside.astype(bool)
+    vertices = denoised(vertices, triangles, device, report, away_from(seams, vertices, FADE * region.voxel))
     box = trained.info.box(project)
     box_from_common = box.box_from_world @ plan.world_from_common
     own_maps = moved(read[block.name], box_from_common)

@@ -136,10 +136,10 @@ def open_surface(
         return vertices, faces
     report.stage("Cleaning the surface")
     vertices, faces, _ = clean(vertices, faces, maps, tolerances(bricks, vertices, faces, tolerance), report)
-    vertices = denoised(vertices, faces, maps.depth.device, report)
     if most is not None and len(faces) > most:
         report.stage("Simplifying")
         vertices, faces = decimate(vertices, faces, most, report)
+    vertices = denoised(vertices, faces, maps.depth.device, report)
     return compact(vertices, faces[~on_sides(vertices, faces, region, region.voxel / 2)])
 
 

@@ -32,13 +32,12 @@ def closed_surface(
     report.stage("Cleaning the surface")
     faces = drop_unseen(vertices, faces, maps, tolerance, report)
     vertices, faces = compact(vertices, drop_scraps(vertices, faces))
-    vertices = denoised(vertices, faces, maps.depth.device, report)
     if most is not None and len(faces) > most:
         report.stage("Simplifying")
         vertices, faces = decimate_closed(vertices, faces, most, report)
         if len(faces) > MUCH_MORE * most:
             report.warn(f"The surface keeps {len(faces)} triangles: with {most} it would not stay closed.")
-    return vertices, faces
+    return denoised(vertices, faces, maps.depth.device, report), faces
 
 
 def extract_closed(bricks: Bricks, maps: MapArrays, report: Reporter) -> tuple[np.ndarray, np.ndarray]:

@@ -1,8 +1,8 @@
 """Noise taken off a surface, edges kept: normals of neighbouring triangles are averaged where they differ little, then
 vertices follow them (Zheng, Fu, Au and Tai, "Bilateral normal filtering for mesh denoising", 2011).
 
-Fused depths leave bumps of a fraction of a cell on what is flat. They turn normals, cost triangles when the surface is
-simplified, and shade what is plain.
+Fused depths leave bumps of a fraction of a cell on what is flat, which turn its normals. It is done after a surface was
+simplified: where there are none, triangles become large, and classes have their borders between triangles.
 """
 
 from __future__ import annotations
@@ -12,9 +12,10 @@ import torch
 
 from ..progress import Reporter
 
-DIFFERENCE = 0.45  # of unit normals: beyond it one triangle tells another little, so that edges stay
-NORMAL_ROUNDS = 20
-VERTEX_ROUNDS = 30
+DIFFERENCE = 0.35  # of unit normals: beyond it one triangle tells another little, so that edges stay
+NORMAL_ROUNDS = 5
+VERTEX_ROUNDS = 10
+FLAT = 0.15  # difference of the normals around a vertex from their mean, from which on it follows them little: wires shrink
 
 
 def denoised(
@@ -27,26 +28,51 @@ def denoised(
     """Vertices (V, 3) float64 of triangles (F, 3) without noise, computed on `device`. Those of open borders stay where they
     are, and others move by the share `free` (V,) of the way, 1 where nothing is given.
     """
-    place = torch.from_numpy(np.asarray(vertices, np.float32)).to(device)
+    before = torch.from_numpy(np.asarray(vertices, np.float32)).to(device)
     corner = torch.from_numpy(np.asarray(faces, np.int64)).to(device)
     beside = neighbours(corner)
-    normals = _filtered(place, corner, beside, report)
-    flat = corner.reshape(-1)
-    follow = (
-        torch.ones(len(place), device=device) if free is None else torch.from_numpy(free.astype(np.float32)).to(device)
-    )
-    open_edge = beside == torch.arange(len(corner), device=device)[:, None]
-    for first, second in ((0, 1), (1, 2), (2, 0)):
-        follow[corner[open_edge[:, first]][:, [first, second]].reshape(-1)] = 0
-    amount = torch.zeros(len(place), device=device).index_add_(0, flat, torch.ones(len(flat), device=device))
-    share = (follow / amount.clamp(min=1))[:, None]
+    normals = _filtered(before, corner, beside, report)
+    mean = _around(normals, corner, len(before))
+    follow = torch.exp(-2 * (1 - mean.norm(dim=1).clamp(max=1)) / FLAT**2)
+    if free is not None:
+        follow *= torch.from_numpy(free.astype(np.float32)).to(device)
+    for number, ends in enumerate(([0, 1], [1, 2], [2, 0])):
+        is_open = beside[:, number] == torch.arange(len(corner), device=device)
+        follow[corner[is_open][:, ends].reshape(-1)] = 0
+    after = _moved(before, corner, normals, follow, report)
+    old, new = _normals(before, corner), _normals(after, corner)
+    follow[corner[(old * new).sum(1) < 0].reshape(-1)] = 0  # what would be turned over
+    place = torch.where(follow[:, None] > 0, after, before)
+    return place.double().cpu().numpy()
+
+
+def _moved(
+    place: torch.Tensor, corner: torch.Tensor, normals: torch.Tensor, follow: torch.Tensor, report: Reporter
+) -> torch.Tensor:
+    """Vertices (V, 3) moved by the share `follow` (V,) towards the planes with `normals` (F, 3) through the middles of their
+    triangles."""
     for _ in range(VERTEX_ROUNDS):
         report.check()
         corners = place[corner]
         off = corners.mean(1, keepdim=True) - corners
         step = normals[:, None] * (normals[:, None] * off).sum(2, keepdim=True)
-        place = place + share * torch.zeros_like(place).index_add_(0, flat, step.reshape(-1, 3))
-    return place.double().cpu().numpy()
+        place = place + follow[:, None] * _around(step, corner, len(place))
+    return place
+
+
+def _around(values: torch.Tensor, corner: torch.Tensor, count: int) -> torch.Tensor:
+    """The mean (count, 3) for each vertex of values (F, 3) of triangles, or (F, 3, 3) of their corners."""
+    each = values.reshape(-1, 3) if values.dim() == 3 else values.repeat_interleave(3, 0)
+    flat = corner.reshape(-1)
+    amount = torch.zeros(count, device=each.device).index_add_(0, flat, torch.ones(len(flat), device=each.device))
+    total = torch.zeros(count, 3, device=each.device).index_add_(0, flat, each)
+    return total / amount.clamp(min=1)[:, None]
+
+
+def _normals(place: torch.Tensor, corner: torch.Tensor) -> torch.Tensor:
+    """Normals (F, 3) of triangles, twice their area long."""
+    a, b, c = place[corner].unbind(1)
+    return torch.linalg.cross(b - a, c - a)
 
 
 def neighbours(corner: torch.Tensor) -> torch.Tensor:
@@ -69,8 +95,7 @@ def neighbours(corner: torch.Tensor) -> torch.Tensor:
 def _filtered(place: torch.Tensor, corner: torch.Tensor, beside: torch.Tensor, report: Reporter) -> torch.Tensor:
     """Unit normals (F, 3), each the mean of its own and those of its neighbours `beside` (F, 3), by their area and by how
     little they differ from it."""
-    a, b, c = place[corner].unbind(1)
-    normals = torch.linalg.cross(b - a, c - a)
+    normals = _normals(place, corner)
     area = normals.norm(dim=1, keepdim=True)
     normals = normals / area.clamp(min=1e-30)
     other = beside != torch.arange(len(corner), device=corner.device)[:, None]

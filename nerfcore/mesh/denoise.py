@@ -15,7 +15,7 @@ from ..progress import Reporter
 DIFFERENCE = 0.35  # of unit normals: beyond it one triangle tells another little, so that edges stay
 NORMAL_ROUNDS = 5
 VERTEX_ROUNDS = 10
-FLAT = 0.15  # difference of the normals around a vertex from their mean, from which on it follows them little: wires shrink
+FLAT = 0.08  # of unit normals, from their mean around a vertex: one with more stays, as thin things shrink and edges wear off
 
 
 def denoised(

@@ -15,7 +15,7 @@ from ..progress import Reporter
 DIFFERENCE = 0.35  # of unit normals: beyond it one triangle tells another little, so that edges stay
 NORMAL_ROUNDS = 5
 VERTEX_ROUNDS = 10
-FLAT = 0.08  # of unit normals, from their mean around a vertex: one with more stays, as thin things shrink and edges wear off
+FLAT = 0.5  # of the noise: what normals around a vertex may differ from their mean; thin things would shrink, edges wear off
 
 
 def denoised(
@@ -31,9 +31,9 @@ def denoised(
     before = torch.from_numpy(np.asarray(vertices, np.float32)).to(device)
     corner = torch.from_numpy(np.asarray(faces, np.int64)).to(device)
     beside = neighbours(corner)
-    normals = _filtered(before, corner, beside, report)
+    normals, noise = _filtered(before, corner, beside, report)
     mean = _around(normals, corner, len(before))
-    follow = torch.exp(-2 * (1 - mean.norm(dim=1).clamp(max=1)) / FLAT**2)
+    follow = torch.exp(-2 * (1 - mean.norm(dim=1).clamp(max=1)) / max(FLAT * noise, 1e-6) ** 2)
     if free is not None:
         follow *= torch.from_numpy(free.astype(np.float32)).to(device)
     for number, ends in enumerate(([0, 1], [1, 2], [2, 0])):
@@ -92,13 +92,17 @@ def neighbours(corner: torch.Tensor) -> torch.Tensor:
     return beside.reshape(3, count).T.contiguous()
 
 
-def _filtered(place: torch.Tensor, corner: torch.Tensor, beside: torch.Tensor, report: Reporter) -> torch.Tensor:
+def _filtered(
+    place: torch.Tensor, corner: torch.Tensor, beside: torch.Tensor, report: Reporter
+) -> tuple[torch.Tensor, float]:
     """Unit normals (F, 3), each the mean of its own and those of its neighbours `beside` (F, 3), by their area and by how
-    little they differ from it."""
+    little they differ from it; and their noise, the median difference of neighbours before."""
     normals = _normals(place, corner)
     area = normals.norm(dim=1, keepdim=True)
     normals = normals / area.clamp(min=1e-30)
     other = beside != torch.arange(len(corner), device=corner.device)[:, None]
+    differ = (normals[beside] - normals[:, None]).norm(dim=2)[other]
+    noise = float(differ.median()) if len(differ) else 0.0
     weight = area[:, 0][beside] * other
     for _ in range(NORMAL_ROUNDS):
         report.check()
@@ -106,4 +110,4 @@ def _filtered(place: torch.Tensor, corner: torch.Tensor, beside: torch.Tensor, r
         alike = torch.exp(-((around - normals[:, None]) ** 2).sum(2) / (2 * DIFFERENCE**2))
         total = normals * area + ((weight * alike)[:, :, None] * around).sum(1)
         normals = total / total.norm(dim=1, keepdim=True).clamp(min=1e-30)
-    return normals
+    return normals, noise

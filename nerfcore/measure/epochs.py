@@ -66,7 +66,8 @@ def compare(params: CompareParams, report: Reporter) -> dict[str, Any]:
     report.stage("Drawing")
     colors, legend = distance_colors(distance, result["unit"])
     files = [write_distances(target / "distance.ply", now.surface, distance, colors)]
-    files += draw_distances(target, now, colors, legend, params, report)
+    noise = f"noise ±{length(result['detectable'], result['unit'])} (95 %)"
+    files += draw_distances(target, now, colors, legend, noise, params, report)
     write_json(target / "compare.json", result)
     result["files"] = [str(path) for path in [*files, target / "compare.json"]]
     record_step(folder, "compare", params.model_dump(mode="json"), result)
@@ -171,12 +172,16 @@ def distance_colors(distance: np.ndarray, unit: str) -> tuple[np.ndarray, list[E
     ramp = colormaps["RdBu_r"]
     shown = ramp(np.nan_to_num(distance) / reach / 2 + 0.5)[:, :3]
     shown[~np.isfinite(distance)] = NOTHING
-    factor, name = (1000, "mm") if unit == "m" else (1, "units")
     legend = [
-        Entry(f"{factor * reach * share:+.3g} {name}", tuple(ramp(share / 2 + 0.5)[:3]))
+        Entry(("+" if share > 0 else "") + length(reach * share, unit), tuple(ramp(share / 2 + 0.5)[:3]))
         for share in np.linspace(1, -1, STEPS).tolist()
     ]
     return (shown * 255).round().astype(np.uint8), [*legend, Entry("nothing to compare with", NOTHING)]
+
+
+def length(value: float, unit: str) -> str:
+    """A length in words: millimetres where the unit is "m", else scene units."""
+    return f"{1000 * value:.3g} mm" if unit == "m" else f"{value:.3g} units"
 
 
 def write_distances(path: Path, surface: Surface, distance: np.ndarray, colors: np.ndarray) -> Path:
@@ -198,9 +203,15 @@ def write_distances(path: Path, surface: Surface, distance: np.ndarray, colors: 
 
 
 def draw_distances(
-    folder: Path, subject: Subject, colors: np.ndarray, legend: list[Entry], params: CompareParams, report: Reporter
+    folder: Path,
+    subject: Subject,
+    colors: np.ndarray,
+    legend: list[Entry],
+    note: str,
+    params: CompareParams,
+    report: Reporter,
 ) -> list[Path]:
-    """Draw the distances as seen from some sides; the files."""
+    """Draw the distances as seen from some sides, with a note below; the files."""
     shown, files = replace(subject.surface, colors=colors), []
     for name in params.views:
         report.progress(params.views.index(name) / len(params.views), name)
@@ -210,7 +221,16 @@ def draw_distances(
         seen = picture(shown, None, view, window, float(found[:, 2].max()) + window.pixel, report)
         title, axes = f"{subject.title}: change, {name}", axis_names(view, 0)
         sheet = Sheet(
-            title, window.low, window.high, scale, subject.metric, seen.color, axes, legend, "Distance from before"
+            title,
+            window.low,
+            window.high,
+            scale,
+            subject.metric,
+            seen.color,
+            axes,
+            legend,
+            "Distance from the earlier surface",
+            note=note,
         )
         files += write_sheet(folder / f"distance_{name}", sheet)
     return files

@@ -43,7 +43,7 @@ def denoised(
     old, new = _normals(before, corner), _normals(after, corner)
     follow[corner[(old * new).sum(1) < 0].reshape(-1)] = 0  # what would be turned over
     place = torch.where(follow[:, None] > 0, after, before)
-    return place.double().cpu().numpy()
+    return place.cpu().double().numpy()
 
 
 def _moved(

@@ -142,6 +142,8 @@ def test_readers_notice_pixels_that_are_being_written(tmp_path: Path) -> None:
     def write() -> None:
         for number in range(10_000):
             file.write({"Combined": np.full((1, size // 4, 4), number, np.float32)})
+            if number % 100 == 0:
+                time.sleep(1e-4)  # between two frames, so that the reader's thread has its turn there too
         done.set()
 
     pixels = np.memmap(path, np.uint8, "r")

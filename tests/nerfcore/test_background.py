@@ -79,8 +79,8 @@ def test_photos_that_are_mostly_black_do_not_turn_the_field_black(
     """With Huber's price from the first step, colours and densities ran to zero in ten steps and stayed there, at the
     11.6 dB of a black picture."""
     run_verb("import", ImportParams(dataset=shared_data("temple_ring"), project=tmp_path / "p"), Reporter())
-    settings = {"scene.image_size": "320", "scene.contraction": "on"}
-    result = run_verb("train", TrainParams(project=tmp_path / "p", steps=100, set=settings), Reporter())
+    settings = {"scene.image_size": "160", "scene.contraction": "on"}
+    result = run_verb("train", TrainParams(project=tmp_path / "p", steps=50, set=settings), Reporter())
     assert result["psnr_train"] > 18
 
 

@@ -154,6 +154,7 @@ def test_the_sky_is_learned_and_the_field_stays_empty_before_it(seen: Seen) -> N
     assert np.isnan(seen.frame.depth[beside]).mean() > 0.5
 
 
+@pytest.mark.slow
 def test_without_an_environment_the_sky_is_somewhere(tmp_path: Path) -> None:
     filled = trained_under_the_sky(tmp_path / "p", scene__background="random")
     assert filled.frame.opacity[~filled.ball].mean() > 0.9

@@ -21,5 +21,8 @@ def photo_of(view: View) -> Picture:
     if view.gain is None:
         return picture
     pixels = picture.pixels.copy()
-    pixels[..., :3] = np.clip(np.round(pixels[..., :3] * np.array(view.gain, np.float32)), 0, 255).astype(np.uint8)
+    gained = np.arange(256, dtype=np.float32)[:, None] * np.array(view.gain, np.float32)
+    table = np.clip(np.round(gained), 0, 255).astype(np.uint8)
+    for channel in range(3):
+        pixels[..., channel] = table[pixels[..., channel], channel]
     return replace(picture, pixels=pixels)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -30,6 +31,12 @@ class Facelets:
 
     def __len__(self) -> int:
         return len(self.faces)
+
+    @cached_property
+    def spans(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The first corner of each, and from there to the second and to the third: (F, 3) float32 each."""
+        a, b, c = self.vertices[self.faces].transpose(1, 0, 2)
+        return a.astype(np.float32), (b - a).astype(np.float32), (c - a).astype(np.float32)
 
 
 def facelets(

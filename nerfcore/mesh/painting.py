@@ -102,10 +102,10 @@ class Texels:
         return np.arange(len(row)) - np.repeat(np.cumsum(counts) - counts, counts) + self.first[faces][row], row
 
     def points(self, pieces: Facelets, faces: np.ndarray, texel: np.ndarray) -> np.ndarray:
-        """Where texels (N,) of the facelets (N,) lie on the surface: (N, 3)."""
+        """Where texels (N,) of the facelets (N,) lie on the surface: (N, 3) float32."""
         second, third = self.barycentric[texel].T[..., None]
-        a, b, c = (pieces.vertices[pieces.faces[faces, k]] for k in range(3))
-        return a + second * (b - a) + third * (c - a)
+        corner, to_second, to_third = pieces.spans
+        return corner[faces] + second * to_second[faces] + third * to_third[faces]
 
 
 def texels_of(pieces: Facelets, size: int, tile: tuple[int, int, int, int]) -> Texels:
@@ -130,20 +130,24 @@ def paint(
     (N,) bool it sees and not only what borders on them.
 
     Args:
-        jobs: those of this photo, which is read where there are any. todo (tile area,): places that want paint.
+        jobs: those of this photo, which is read where it sees any of them. todo (tile area,): places that want paint.
         careful (F,): facelets whose every texel has to be looked for in the depth buffer.
     """
-    view, places, values, seen = photo.view, [], [], []
+    view = photo.view
+    places, values, seen = [np.zeros(0, np.int32)], [np.zeros((0, 4), np.float32)], [np.zeros(0, bool)]
     texel, row = texels.of(jobs.face)
     wanted = todo[texels.place[texel]]
     texel, row = texel[wanted], row[wanted]
-    if not len(texel):
-        return np.zeros(0, np.int32), np.zeros((0, 4), np.float32), np.zeros(0, bool)
-    rgba = photo.read()
-    masked = bool((rgba[..., 3] == 0).any())
+
+    @cache
+    def read() -> tuple[np.ndarray, bool]:
+        """The photo, and whether any of it is masked."""
+        rgba = photo.read()
+        return rgba, bool((rgba[..., 3] == 0).any())
 
     @cache
     def pictures(fine: bool) -> list[torch.Tensor]:
+        rgba, _ = read()
         if fine:
             return [sharpened(rgba)]
         return halvings(torch.from_numpy(rgba[..., :3].astype(np.float32) / 255).permute(2, 0, 1), 6)
@@ -160,6 +164,9 @@ def paint(
             towards = view.center - points[check]
             cosine = np.einsum("ij,ij->i", towards, pieces.normals[face[check]]) / np.linalg.norm(towards, axis=1)
             good[check] = buffer.sees(pixel[check], depth[check], np.maximum(cosine, 0.05))
+        if not good.any():
+            continue
+        rgba, masked = read()
         if masked:
             at = np.flatnonzero(good)
             x, y = pixel[at].astype(int).T

@@ -41,8 +41,11 @@ def posed_photo(view: View, pose: np.ndarray) -> Photo:
         return None if view.mask is None else nearest(read_image(view.mask)[..., 0], *size) > 127
 
     def read() -> np.ndarray:
-        rgba, inside = with_alpha(resized(photo_of(view), *size)).pixels.copy(), mask()
-        rgba[..., 3] = np.where(rgba[..., 3] > 127, 255, 0)
+        photo, inside = resized(photo_of(view), *size), mask()
+        rgba = with_alpha(photo).pixels
+        if photo.alpha != "none":
+            rgba = rgba.copy()
+            rgba[..., 3] = np.where(rgba[..., 3] > 127, 255, 0)
         if inside is not None:
             rgba[..., 3][~inside] = 0
         if (rgba[..., 3] == 0).any():
@@ -79,16 +82,14 @@ def sharpened(rgba: np.ndarray) -> torch.Tensor:
     are: a pixel is the mean over its square, which blurs by a 24th of the Laplacian; `PIXEL_BLUR` of that is subtracted.
     What is masked has no part in it."""
     color, known = rgba[..., :3].astype(np.float32) / 255, rgba[..., 3] > 0
-    padded, there = np.pad(color, ((1, 1), (1, 1), (0, 0)), mode="edge"), np.pad(known, 1)
-    height, width = known.shape
-    around, masked = np.zeros_like(color), not known.all()
-    for y, x in ((0, 1), (2, 1), (1, 0), (1, 2)):
-        beside = np.s_[y : y + height, x : x + width]
-        apart = padded[beside] - color
+    sharp, masked = color.copy(), not known.all()
+    for one, other in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
+        apart = (color[other] - color[one]) * np.float32(PIXEL_BLUR / 24)
         if masked:
-            apart[~(there[beside] & known)] = 0
-        around += apart
-    return torch.from_numpy((color - PIXEL_BLUR / 24 * around).clip(0, 1)).permute(2, 0, 1)
+            apart[~(known[one] & known[other])] = 0
+        sharp[one] -= apart
+        sharp[other] += apart
+    return torch.from_numpy(np.clip(sharp, 0, 1, out=sharp)).permute(2, 0, 1)
 
 
 def sample(levels: list[torch.Tensor], pixels: np.ndarray, level: np.ndarray, mode: str = "bilinear") -> torch.Tensor:

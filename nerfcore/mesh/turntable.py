@@ -9,6 +9,7 @@ import numpy as np
 
 from ..files import atomic_path, staged
 from ..geometry.cameras import Camera, pixel_centers, rays
+from ..geometry.orbit import orbit_angles
 from ..images.encode import write_picture
 from ..images.picture import linear_to_srgb, to_bytes
 from ..kernels.raycast import FrontFaces
@@ -22,6 +23,7 @@ from .surface_picture import TexturedMesh
 
 VIEWS, SIDE = 8, 640
 ELEVATION = np.radians(30)
+DIRECTIONS, LEAST_FRONT = 72, 0.4  # angles that are asked, and share of the most front seen from any, for a view
 LENS = 1.4  # focal length over the picture's side
 MARGIN = 0.03  # of the picture's side, left free around the mesh
 BACKGROUND = 70
@@ -30,12 +32,27 @@ CLAY = (0.75, 0.75, 0.75)  # of everything where there are no classes: only the 
 LIGHT = np.array([0.35, -0.5, 0.8]) / np.linalg.norm([0.35, -0.5, 0.8])
 
 
-def turntable_poses(vertices: np.ndarray, count: int) -> list[np.ndarray]:
-    """Camera-to-world poses (4, 4) in a ring around a mesh with z up, as near as all of it is in every picture."""
+def outwards(angle: np.ndarray) -> np.ndarray:
+    """Unit vectors (…, 3) towards cameras at angles (…) about the z axis."""
+    flat = np.cos(ELEVATION)
+    return np.stack([np.cos(angle) * flat, np.sin(angle) * flat, np.full(np.shape(angle), np.sin(ELEVATION))], -1)
+
+
+def front_angles(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Angles (N,) about the z axis from which much of a mesh shows its front, and not the back of what stands before it."""
+    angles = np.linspace(-np.pi, np.pi, DIRECTIONS, endpoint=False)
+    a, b, c = vertices[faces].transpose(1, 0, 2)
+    facing = np.maximum(np.cross(b - a, c - a) @ outwards(angles).T, 0).sum(0)
+    return angles[facing >= LEAST_FRONT * facing.max()]
+
+
+def turntable_poses(vertices: np.ndarray, faces: np.ndarray, count: int) -> list[np.ndarray]:
+    """Camera-to-world poses (4, 4) in a ring around a mesh with z up, or on an arc before one that has a front alone, as
+    near as all of it is in every picture."""
     middle = (vertices.min(0) + vertices.max(0)) / 2
     turns, distance = [], 0.0
-    for angle in 2 * np.pi * np.arange(count) / count:
-        outward = np.array([np.cos(angle) * np.cos(ELEVATION), np.sin(angle) * np.cos(ELEVATION), np.sin(ELEVATION)])
+    for angle in orbit_angles(front_angles(vertices, faces), count):
+        outward = outwards(angle)
         right = np.array([-np.sin(angle), np.cos(angle), 0])
         turn = np.stack([right, np.cross(-outward, right), -outward], 1)
         x, y, z = ((vertices - middle) @ turn).T
@@ -101,7 +118,7 @@ def look_around(
     class_map: np.ndarray | None = None,
 ) -> dict[str, np.ndarray]:
     """Eight views (SIDE, SIDE, 3) uint8 of a surface in the world by the names of their files, in its colours and in those
-    of its classes, triangles seen from their front only, as one looks into a room without its near walls.
+    of its classes, triangles seen from their front only, as one looks into a room without its near walls; of what has a front alone, as a facade, views of that.
 
     Args:
         texture: of the surface; without one its vertices' colours are shown. class_map: class (S, S) of each texel of the
@@ -116,7 +133,7 @@ def look_around(
     local, _ = rays(camera, pixel_centers(SIDE, SIDE).reshape(-1, 2))
     pictures: dict[str, np.ndarray] = {}
     unknown = UNKNOWN if colors else CLAY
-    for number, pose in enumerate(turntable_poses(surface.vertices, VIEWS)):
+    for number, pose in enumerate(turntable_poses(surface.vertices, surface.faces, VIEWS)):
         report.progress(number / VIEWS)
         face, corner = mesh.cast(np.broadcast_to(pose[:3, 3], local.shape), local @ pose[:3, :3].T)
         hit = face >= 0

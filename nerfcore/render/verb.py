@@ -17,6 +17,7 @@ from ..errors import InputError, SettingError
 from ..files import atomic_path, disk_errors, write_json
 from ..geometry.cameras import Camera, flip_camera_axes
 from ..geometry.frames import focus_point
+from ..geometry.orbit import orbit_angles
 from ..geometry.similarity import similarity_scale
 from ..images.encode import write_layers, write_picture
 from ..images.names import frame_names
@@ -48,7 +49,6 @@ from .sparse_rays import sparse_rays
 OF_CLASSES = ("semantic", "confidence")  # passes
 ORBIT_PIXELS = 800  # longest side of orbit frames unless a size is asked for
 # Not tuned:
-OPEN_ANGLE = np.pi / 2  # around the subject without a photo: from there on an orbit is an arc
 
 
 def render(params: RenderParams, report: Reporter, shown: Model | BakedField | None = None) -> dict[str, Any]:
@@ -231,24 +231,10 @@ def orbit_cameras(scene: Scene, count: int) -> list[tuple[str, Camera, np.ndarra
     camera = views[0].camera.undistorted()
     camera = camera.resized(*training_size(camera, ORBIT_PIXELS))
     frames = []
-    for number, angle in enumerate(orbit_angles(offsets, count)):
+    for number, angle in enumerate(orbit_angles(np.arctan2(offsets[:, 1], offsets[:, 0]), count)):
         center = focus + [radius * np.cos(angle), radius * np.sin(angle), height]
         frames.append((f"orbit_{number:04d}", camera, look_at(center, focus)))
     return frames
-
-
-def orbit_angles(offsets: np.ndarray, count: int) -> np.ndarray:
-    """Angles (count,) about the z axis, evenly around it or between the cameras beside the widest gap.
-
-    Args:
-        offsets: (N, 3) camera centers from the subject.
-    """
-    taken = np.sort(np.arctan2(offsets[:, 1], offsets[:, 0]))
-    gaps = np.diff(taken, append=taken[0] + 2 * np.pi)
-    widest = int(gaps.argmax())
-    if gaps[widest] < OPEN_ANGLE:
-        return 2 * np.pi * np.arange(count) / count
-    return taken[widest] + gaps[widest] + (2 * np.pi - gaps[widest]) * (np.arange(count) + 0.5) / count
 
 
 def look_at(center: np.ndarray, target: np.ndarray, up: np.ndarray | None = None) -> np.ndarray:

@@ -19,7 +19,7 @@ from fieldwork.nerfcore.mesh.fusion import BRICK, Bricks, fuse_maps, is_soft, me
 from fieldwork.nerfcore.mesh.parts import texture_of
 from fieldwork.nerfcore.mesh.region import Region, choose_region, on_sides
 from fieldwork.nerfcore.mesh.surface import Surface, is_watertight
-from fieldwork.nerfcore.mesh.turntable import write_turntable
+from fieldwork.nerfcore.mesh.turntable import front_angles, write_turntable
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.tests.nerfcore.support.depth_views import CAMERA, Hit, box, look_at, maps_of, orbit, sphere
 from PIL import Image
@@ -388,6 +388,25 @@ def test_a_turntable_shows_fronts_in_their_colours(tmp_path: Path) -> None:
     front, back = (np.array(Image.open(tmp_path / f"color_{number}.png")).astype(int) for number in (0, 4))
     assert front[320, 320] == pytest.approx([0, 200, 0], abs=2)
     assert back[320, 320] == pytest.approx([200, 0, 0], abs=2)
+
+
+def test_a_turntable_stays_before_what_has_a_front_alone(tmp_path: Path) -> None:
+    """A wall that faces +x, and its narrow sides: eight different views of it, none of its back."""
+    import trimesh
+
+    wall = trimesh.creation.box((0.2, 3.0, 2.0))
+    vertices, faces = np.asarray(wall.vertices), np.asarray(wall.faces)
+    faces = faces[wall.face_normals[:, 0] > -0.5]
+    angles = np.degrees(front_angles(vertices, faces))
+    assert angles.min() == pytest.approx(-angles.max(), abs=6)
+    assert 60 < angles.max() < 90
+    plain = np.full(vertices.shape, 250, np.uint8)
+    ids = np.zeros(len(vertices), int)
+    write_turntable(tmp_path, Surface(vertices, faces, vertices, plain, ids, ids[faces[:, 0]]), None, {}, Reporter())
+    views = [np.array(Image.open(tmp_path / f"color_{number}.png")) for number in range(8)]
+    shares = [(view > 200).all(-1).mean() for view in views]
+    assert min(shares) > 0.1
+    assert len(np.unique(np.round(shares, 3))) >= 4
 
 
 def test_vertices_of_a_grid_beyond_32_bits_are_told_apart() -> None:

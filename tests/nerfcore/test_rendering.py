@@ -13,11 +13,12 @@ from fieldwork.nerfcore.config import RunConfig
 from fieldwork.nerfcore.errors import Cancelled
 from fieldwork.nerfcore.field.hybrid import Geometry
 from fieldwork.nerfcore.geometry.cameras import Camera
+from fieldwork.nerfcore.geometry.orbit import orbit_angles
 from fieldwork.nerfcore.kernels.runtime import worker_count
 from fieldwork.nerfcore.render import image
 from fieldwork.nerfcore.render.image import Frame, render_view
 from fieldwork.nerfcore.render.model import Model
-from fieldwork.nerfcore.render.verb import look_at, orbit_angles
+from fieldwork.nerfcore.render.verb import look_at
 
 RADIUS, DENSITY = 0.6, 4.0
 COLOR = torch.tensor([0.9, 0.4, 0.1])
@@ -165,21 +166,17 @@ def test_the_pdf_puts_samples_where_the_light_is_absorbed() -> None:
     assert errors["default"] < 0.5 * errors["uniform"]
 
 
-def on_circle(degrees: np.ndarray) -> np.ndarray:
-    return np.stack([np.cos(np.radians(degrees)), np.sin(np.radians(degrees)), np.full(len(degrees), 0.4)], 1)
-
-
 def test_an_orbit_goes_once_around_what_was_photographed_from_all_sides():
-    angles = orbit_angles(on_circle(np.arange(0, 360, 45) + 7.0), 8)
+    angles = orbit_angles(np.radians(np.arange(0, 360, 45) + 7.0), 8)
     assert np.allclose(np.degrees(angles), np.arange(8) * 45)
 
 
 @pytest.mark.parametrize("middle", [-90.0, 0.0, 178.0])
 def test_an_orbit_before_a_facade_stays_where_photos_were_taken(middle: float):
     shots = np.random.default_rng(3).permutation(np.linspace(middle - 50, middle + 50, 15))
-    away = (np.degrees(orbit_angles(on_circle(shots), 10)) - middle + 180) % 360 - 180
+    away = (np.degrees(orbit_angles(np.radians(shots), 10)) - middle + 180) % 360 - 180
     assert np.allclose(away, np.linspace(-45, 45, 10))
 
 
 def test_an_orbit_of_one_photo_stays_with_it():
-    assert np.allclose(orbit_angles(on_circle(np.array([30.0])), 3) % (2 * math.pi), math.radians(30))
+    assert np.allclose(orbit_angles(np.radians([30.0]), 3) % (2 * math.pi), math.radians(30))

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
 import torch
 
-from ..images.picture import srgb_to_linear
+from ..images.picture import linear_to_srgb, srgb_to_linear, to_bytes
 from ..kernels.triangles import triangle_texels
+from ..progress import Reporter
 from .facelets import Facelets
 from .photos import Photo, halvings, sample, sharpened
-from .visibility import CPU, DepthBuffer, within
+from .visibility import CPU, DepthBuffer, DepthBuffers, in_parallel, within
 
 BLOCK = 1 << 19  # texels painted at once
+BAND = 1 << 22  # texels whose colours are made bytes at once
 FINE = 0.7  # width of a texel in pixels: a finer one shows less than a pixel does, so that the pixel's blur is undone
 BESIDE_FADES = 2  # power of the weight of a view that sees a facelet's border alone
 
@@ -87,13 +91,25 @@ def crossings(pieces: Facelets, view: np.ndarray, column: np.ndarray, keep: np.n
 
 @dataclass(frozen=True)
 class Texels:
-    """The texels of a tile, facelet by facelet: first (F + 1,), place (N,) in the tile, barycentric (N, 2); texel (F,)
-    width of a texel on the surface."""
+    """Texels of a texture, facelet by facelet: first (F + 1,), place (N,) in a tile or in the texture, barycentric (N, 2);
+    width (F,) of a texel on the surface."""
 
     first: np.ndarray
     place: np.ndarray
     barycentric: np.ndarray
     width: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.place)
+
+    def owner(self) -> np.ndarray:
+        """The facelet of each: (N,)."""
+        return np.repeat(np.arange(len(self.first) - 1), np.diff(self.first))
+
+    def only(self, wanted: np.ndarray) -> Texels:
+        """Those that are `wanted`: (N,) bool."""
+        before = np.concatenate([[0], np.cumsum(wanted)])
+        return Texels(before[self.first], self.place[wanted], self.barycentric[wanted], self.width)
 
     def of(self, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Texels (N,) of facelets, and for each the row in `faces` (N,)."""
@@ -117,27 +133,72 @@ def texels_of(pieces: Facelets, size: int, tile: tuple[int, int, int, int]) -> T
     return Texels(*triangle_texels(corners, *tile, CPU), np.sqrt(pieces.areas / np.maximum(area, 1e-9)))
 
 
+def joined(parts: list[Texels]) -> Texels:
+    """Texels of the same facelets in several tiles, whose places are those of the texture."""
+    owner = np.concatenate([part.owner() for part in parts])
+    order = np.argsort(owner, kind="stable")
+    first = np.searchsorted(owner[order], np.arange(len(parts[0].first)))
+    place, barycentric = (np.concatenate([getattr(p, name) for p in parts])[order] for name in ("place", "barycentric"))
+    return Texels(first, place, barycentric, parts[0].width)
+
+
+def paint_all(
+    photos: Sequence[Photo],
+    buffers: DepthBuffers,
+    texels: Texels,
+    jobs: Jobs,
+    careful: np.ndarray,
+    report: Reporter,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Colours (N, 3) uint8 sRGB that photos mix for texels, and which (N,) bool any of them sees, and not only its border.
+
+    Args:
+        careful (F,): facelets whose every texel has to be looked for in the depth buffer.
+    """
+    total, painted = np.zeros((len(texels), 4), np.float32), np.zeros(len(texels), bool)
+    jobs = jobs.of(np.diff(texels.first)[jobs.face] > 0)
+    order = np.argsort(jobs.view, kind="stable")
+    numbers, begins = np.unique(jobs.view[order], return_index=True)
+    lock = threading.Lock()
+
+    def work(item: tuple[int, np.ndarray]) -> None:
+        report.check()
+        number, rows = item
+        mine = jobs.of(rows)
+        buffer = buffers[number] if careful[mine.face].any() else None
+        texel, value, seen = paint(photos[number], mine, buffers.pieces, texels, careful, buffer)
+        with lock:
+            total[texel] += value
+            painted[texel[seen]] = True
+
+    items = list(zip(numbers.tolist(), np.split(order, begins[1:]))) if len(numbers) else []
+    for _ in in_parallel(work, items, report, "photos"):
+        continue
+    color = np.zeros((len(texels), 3), np.uint8)
+    for begin in range(0, len(texels), BAND):
+        some = begin + np.flatnonzero(painted[begin : begin + BAND])
+        color[some] = to_bytes(linear_to_srgb(total[some, :3] / total[some, 3:]))
+    return color, painted
+
+
 def paint(
     photo: Photo,
     jobs: Jobs,
     pieces: Facelets,
     texels: Texels,
-    todo: np.ndarray,
     careful: np.ndarray,
     buffer: DepthBuffer | None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What one photo gives: texels (N,) as places of the tile, (N, 4) its linear colours times weight, and weight, and which
-    (N,) bool it sees and not only what borders on them.
+    """What one photo gives: the numbers (N,) of texels, (N, 4) its linear colours times weight, and weight, and which (N,)
+    bool it sees and not only what borders on them.
 
     Args:
-        jobs: those of this photo, which is read where it sees any of them. todo (tile area,): places that want paint.
+        jobs: those of this photo, which is read where it sees any of them.
         careful (F,): facelets whose every texel has to be looked for in the depth buffer.
     """
     view = photo.view
-    places, values, seen = [np.zeros(0, np.int32)], [np.zeros((0, 4), np.float32)], [np.zeros(0, bool)]
+    numbers, values, seen = [np.zeros(0, np.int64)], [np.zeros((0, 4), np.float32)], [np.zeros(0, bool)]
     texel, row = texels.of(jobs.face)
-    wanted = todo[texels.place[texel]]
-    texel, row = texel[wanted], row[wanted]
 
     @cache
     def read() -> tuple[np.ndarray, bool]:
@@ -190,6 +251,6 @@ def paint(
         factor = first * factor[:, 0] + second * factor[:, 1] + third * factor[:, 2]
         weight = np.maximum(weight, 1e-4)
         values.append(np.concatenate([color * factor * weight[:, None], weight[:, None]], 1).astype(np.float32))
-        places.append(texels.place[some])
+        numbers.append(some)
         seen.append(~jobs.beside[job])
-    return np.concatenate(places), np.concatenate(values), np.concatenate(seen)
+    return np.concatenate(numbers), np.concatenate(values), np.concatenate(seen)

@@ -8,23 +8,20 @@ linear light, where exposure is a product and a mixture of light is a sum.
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import psutil
-import scipy
 import torch
 
 from ..errors import SettingError
-from ..images.picture import linear_to_srgb, to_bytes
 from ..progress import Reporter, go_on
 from .facelets import Facelets, facelets
-from .painting import Jobs, Texels, crossings, paint, texels_of
+from .painting import Jobs, Texels, crossings, joined, paint_all, texels_of
 from .photos import Photo
 from .view_choice import agreeing, choose, look, matches, photo_gains, towards_common
-from .visibility import DepthBuffers, Observations, in_parallel, observe
+from .visibility import DepthBuffers, Observations, observe
 
 TILE = 4096  # texels a side that are worked on at once
 PIECE_TEXELS = 40  # longest edge of a piece for which one photo is chosen
@@ -158,17 +155,66 @@ def _texture(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Colours (S, S, 3) uint8, spread beyond the charts, and where they come from (S, S)."""
     size = prepared.size
-    image, source = np.zeros((size, size, 3), np.uint8), np.full((size, size), GAP, np.uint8)
+    canvas = _Canvas(np.zeros((size * size, 3), np.uint8), np.full(size * size, GAP, np.uint8))
     tiles = [(x, y) for y in range(0, size, TILE) for x in range(0, size, TILE)]
+    unpainted: list[Texels] = []
     for number, (left, top) in enumerate(tiles):
-        tile = left, top, min(TILE, size - left), min(TILE, size - top)
         part = _Part(report, number / len(tiles), 1 / len(tiles))
-        texels = texels_of(prepared.pieces, size, tile)
-        block = np.s_[top : top + tile[3], left : left + tile[2]]
-        image[block], source[block] = _tile(prepared, texels, tile, rounds, careful, fill, part)
+        width = min(TILE, size - left)
+        texels = texels_of(prepared.pieces, size, (left, top, width, min(TILE, size - top)))
+        row, column = np.divmod(texels.place, width)
+        texels = replace(texels, place=(row + top) * size + column + left)
+        canvas.source[texels.place] = UNSEEN
+        for jobs in rounds[:1]:
+            texels = canvas.paint(prepared, texels, jobs, careful, _Part(part, 0, 0.7))
+        # Photos are read once for the further rounds of many tiles, of which little is left.
+        if unpainted and sum(map(len, unpainted)) + len(texels) > TILE**2:
+            _finish(canvas, prepared, joined(unpainted), rounds[1:], fill, _Part(part, 0.7, 0.3))
+            unpainted = []
+        unpainted.append(texels)
+    _finish(
+        canvas, prepared, joined(unpainted), rounds[1:], fill, _Part(report, 1 - 0.3 / len(tiles), 0.3 / len(tiles))
+    )
+    image, source = canvas.image.reshape(size, size, 3), canvas.source.reshape(size, size)
     report.stage("Spreading borders")
     spread(image, source > (GAP if fill else UNSEEN), report.check)
     return image, source
+
+
+@dataclass(frozen=True)
+class _Canvas:
+    """A texture that is painted: image (texels, 3) uint8, source (texels,) uint8."""
+
+    image: np.ndarray
+    source: np.ndarray
+
+    def paint(self, prepared: Prepared, texels: Texels, jobs: Jobs, careful: np.ndarray, report: Reporter) -> Texels:
+        """Paint texels from photos; returns those that none of them sees."""
+        color, seen = paint_all(prepared.photos, prepared.buffers, texels, jobs, careful, report)
+        self.image[texels.place[seen]] = color[seen]
+        self.source[texels.place[seen]] = PHOTO
+        return texels.only(~seen)
+
+
+def _finish(
+    canvas: _Canvas, prepared: Prepared, texels: Texels, rounds: list[Jobs], fill: Fill | None, report: Reporter
+) -> None:
+    """Paint what the chosen photos did not: from the next best ones, then by `fill`."""
+    pieces = prepared.pieces
+    for number, jobs in enumerate(rounds):
+        part = _Part(report, number / len(rounds), 1 / len(rounds))
+        texels = canvas.paint(prepared, texels, jobs, np.ones(len(pieces), bool), part)
+    if fill is None or not len(texels):
+        return
+    owner = texels.owner()
+    step = FILL_STEP if rounds and prepared.size >= TILE else 1
+    chosen, shared = one_of_each_square(texels.place, prepared.size, step)
+    colors = np.empty((len(chosen), 3), np.uint8)
+    for begin in range(0, len(chosen), FILLED):
+        report.check()
+        some = chosen[begin : begin + FILLED]
+        colors[begin : begin + FILLED] = fill(texels.points(pieces, owner[some], some), pieces.normals[owner[some]])
+    canvas.image[texels.place] = colors[shared]
 
 
 class _Part(Reporter):
@@ -213,89 +259,17 @@ def _second_best(seen: Observations, worth: np.ndarray, column: np.ndarray, log_
     return rounds
 
 
-def _tile(
-    prepared: Prepared,
-    texels: Texels,
-    tile: tuple[int, int, int, int],
-    rounds: list[Jobs],
-    careful: np.ndarray,
-    fill: Fill | None,
-    report: Reporter,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Colours (H, W, 3) uint8 of a tile and where they come from (H, W)."""
-    width, height = tile[2:]
-    photos, pieces, buffers = prepared.photos, prepared.pieces, prepared.buffers
-    total = np.zeros((width * height, 4), np.float32)
-    todo = np.zeros(width * height, bool)
-    todo[texels.place] = True
-    face_of = np.repeat(np.arange(len(pieces)), np.diff(texels.first))
-    lock = threading.Lock()
-    for turn, jobs in enumerate(rounds):
-        if turn:
-            open_ = np.zeros(len(pieces), bool)
-            open_[face_of[todo[texels.place]]] = True
-            jobs = jobs.of(open_[jobs.face])
-        order = np.argsort(jobs.view, kind="stable")
-        numbers, begins = np.unique(jobs.view[order], return_index=True)
-        strict = careful if turn == 0 else np.ones(len(pieces), bool)
-        painted = np.zeros(width * height, bool)
-
-        def work(
-            item: tuple[int, np.ndarray], jobs: Jobs = jobs, strict: np.ndarray = strict, painted: np.ndarray = painted
-        ) -> None:
-            report.check()
-            number, rows = item
-            mine = jobs.of(rows)
-            buffer = buffers[number] if strict[mine.face].any() else None
-            place, value, seen = paint(photos[number], mine, pieces, texels, todo, strict, buffer)
-            with lock:
-                total[place] += value
-                painted[place[seen]] = True
-
-        items = list(zip(numbers.tolist(), np.split(order, begins[1:]))) if len(numbers) else []
-        part = _Part(report, 0.6 if turn else 0, 0.1 if turn else 0.6)
-        for _ in in_parallel(work, items, part, "photos"):
-            continue
-        np.logical_and(todo, ~painted, out=todo)
-        total[todo] = 0
-        if not todo.any():
-            break
-    report.progress(0.9)
-    image = np.zeros((width * height, 3), np.uint8)
-    source = np.full(width * height, GAP, np.uint8)
-    for begin in range(0, len(total), 1 << 22):
-        part_ = total[begin : begin + (1 << 22)]
-        good = part_[:, 3] > 0
-        linear = part_[good, :3] / part_[good, 3:]
-        image[begin : begin + (1 << 22)][good] = to_bytes(linear_to_srgb(linear))
-        source[begin : begin + (1 << 22)][good] = PHOTO
-    source[todo] = UNSEEN
-    if fill is not None and todo.any():
-        wanted, shared = one_of_each_square(
-            texels.place, todo, width, FILL_STEP if rounds and prepared.size >= TILE else 1
-        )
-        colors = np.empty((len(wanted), 3), np.uint8)
-        for begin in range(0, len(wanted), FILLED):
-            report.check()
-            some = wanted[begin : begin + FILLED]
-            face = face_of[some]
-            colors[begin : begin + FILLED] = fill(texels.points(pieces, face, some), pieces.normals[face])
-        image[texels.place[todo[texels.place]]] = colors[shared]
-    return image.reshape(height, width, 3), source.reshape(height, width)
-
-
-def one_of_each_square(place: np.ndarray, todo: np.ndarray, width: int, step: int) -> tuple[np.ndarray, np.ndarray]:
-    """Of the texels (N,) at a place of a tile that want a colour, `todo` (tile area,), one in each square of `step`: which
-    (M,), and for each that wants one its number among these."""
-    wanted = np.flatnonzero(todo[place])
-    row, column = np.divmod(place[wanted], width)
-    square = row // step * width + column // step
-    chosen = np.zeros(todo.size, np.int32)
-    chosen[square] = np.arange(len(wanted))
-    of_square = chosen[square]
-    one = np.zeros(len(wanted), bool)
-    one[of_square] = True
-    return wanted[one], (np.cumsum(one, dtype=np.int32) - 1)[of_square]
+def one_of_each_square(place: np.ndarray, width: int, step: int) -> tuple[np.ndarray, np.ndarray]:
+    """Of the texels at places (N,) of a picture so wide, one in each square of `step`: which (M,), and for each of the
+    texels its number among these (N,)."""
+    row, column = np.divmod(place, width)
+    begin = row.min() // step if len(row) else 0
+    square = (row // step - begin) * (width // step + 1) + column // step
+    last = np.zeros(int(square.max(initial=0)) + 1, np.int32)
+    last[square] = np.arange(len(place))
+    one = np.zeros(len(place), bool)
+    one[last[square]] = True
+    return np.flatnonzero(one), (np.cumsum(one, dtype=np.int32) - 1)[last[square]]
 
 
 def spread(image: np.ndarray, known: np.ndarray, check: Callable[[], None] = go_on) -> None:
@@ -309,17 +283,16 @@ def spread(image: np.ndarray, known: np.ndarray, check: Callable[[], None] = go_
         for top, end in bands:
             check()
             above = max(top - 1, 0)
-            grown = np.asarray(scipy.ndimage.binary_dilation(known[above : end + 1], np.ones((3, 3), bool)))[
-                top - above :
-            ][: end - top]
+            grown = _grown(known[above : end + 1])[top - above :][: end - top]
             rows, columns = np.nonzero(np.logical_and(grown, ~known[top:end]))
             rows += top
             total, number = np.zeros((len(rows), image.shape[2]), np.float32), np.zeros(len(rows), np.float32)
             for dy in (-1, 0, 1):
+                begin = np.clip(rows + dy, 0, height - 1) * width
                 for dx in (-1, 0, 1):
-                    y, x = np.clip(rows + dy, 0, height - 1), np.clip(columns + dx, 0, width - 1)
-                    good = known[y, x]
-                    total += image[y, x] * good[:, None]
+                    place = begin + np.clip(columns + dx, 0, width - 1)
+                    good = known.reshape(-1)[place]
+                    total += image.reshape(-1, image.shape[2])[place] * good[:, None]
                     number += good
             image[rows, columns] = (total / np.maximum(number, 1)[:, None] + 0.5).astype(np.uint8)
             reached.append((rows, columns))
@@ -337,6 +310,17 @@ def spread(image: np.ndarray, known: np.ndarray, check: Callable[[], None] = go_
         rows += top
         values = filled[:, torch.from_numpy(rows // step), torch.from_numpy(columns // step)]
         image[rows, columns] = values.T.clamp(0, 255).to(torch.uint8).numpy()
+
+
+def _grown(known: np.ndarray) -> np.ndarray:
+    """What is known (H, W), and its eight neighbours."""
+    across = known.copy()
+    across[:, 1:] |= known[:, :-1]
+    across[:, :-1] |= known[:, 1:]
+    grown = across.copy()
+    grown[1:] |= across[:-1]
+    grown[:-1] |= across[1:]
+    return grown
 
 
 def _pushed(values: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:

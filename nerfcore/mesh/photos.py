@@ -17,6 +17,7 @@ from .visibility import PosedCamera
 
 LINEAR = srgb_to_linear(np.arange(256) / 255).astype(np.float32)  # light of a byte of sRGB
 
+ROWS = 128  # of a photo that are sharpened at once: what stays in a processor's cache
 PIXEL_BLUR = 0.5  # share of the blur of a pixel's own width that is taken back
 
 
@@ -73,7 +74,14 @@ def halvings(picture: torch.Tensor, levels: int) -> list[torch.Tensor]:
     for _ in range(levels - 1):
         if min(result[-1].shape[1:]) < 2:
             break
-        result.append(torch.nn.functional.avg_pool2d(result[-1][None], 2, ceil_mode=True, count_include_pad=False)[0])
+        finer = result[-1]
+        height, width = finer.shape[1:]
+        if height % 2 or width % 2:
+            finer = torch.nn.functional.pad(finer[None], (0, width % 2, 0, height % 2), mode="replicate")[0]
+        mean = finer[:, ::2, ::2] + finer[:, 1::2, ::2]
+        mean += finer[:, ::2, 1::2]
+        mean += finer[:, 1::2, 1::2]
+        result.append(mean.mul_(0.25))
     return result
 
 
@@ -81,6 +89,15 @@ def sharpened(rgba: np.ndarray) -> torch.Tensor:
     """Colours (3, H, W) of a photo (H, W, 4) uint8 as stored, in [0, 1], with a part of the blur taken back that its pixels
     are: a pixel is the mean over its square, which blurs by a 24th of the Laplacian; `PIXEL_BLUR` of that is subtracted.
     What is masked has no part in it."""
+    sharp = np.empty((*rgba.shape[:2], 3), np.float32)
+    for top in range(0, len(rgba), ROWS):
+        low = max(top - 1, 0)
+        sharp[top : top + ROWS] = _sharpened(rgba[low : top + ROWS + 1])[top - low :][:ROWS]
+    return torch.from_numpy(sharp).permute(2, 0, 1)
+
+
+def _sharpened(rgba: np.ndarray) -> np.ndarray:
+    """See `sharpened`; (H, W, 3)."""
     color, known = rgba[..., :3].astype(np.float32) / 255, rgba[..., 3] > 0
     sharp, masked = color.copy(), not known.all()
     for one, other in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
@@ -89,7 +106,7 @@ def sharpened(rgba: np.ndarray) -> torch.Tensor:
             apart[~(known[one] & known[other])] = 0
         sharp[one] -= apart
         sharp[other] += apart
-    return torch.from_numpy(np.clip(sharp, 0, 1, out=sharp)).permute(2, 0, 1)
+    return np.clip(sharp, 0, 1, out=sharp)
 
 
 def sample(levels: list[torch.Tensor], pixels: np.ndarray, level: np.ndarray, mode: str = "bilinear") -> torch.Tensor:

@@ -17,7 +17,7 @@ from .picture import Picture, to_bytes, to_srgb8
 SRGB_PRIMARIES = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)  # x, y of red, green, blue and white: IEC 61966-2-1
 
 
-PNG_LEVEL = 2  # of 9: a texture is packed three times as fast as with the usual 6, and an eighth larger
+PNG_LEVEL = 2  # of 9: a texture is packed three times as fast as with the usual 6, and an eighth to a sixth larger
 BAND = 1 << 22  # values that are written between two questions whether to go on: a fraction of a second
 
 

@@ -68,7 +68,8 @@ def seen_at(maps: Maps, view: int, p: wp.vec3):
 def read_depth(maps: Maps, view: int, pixel: wp.vec2, gap: float):
     """Depth at pixel coordinates: interpolated (in 1/z, in which planes are linear) where the four pixels around lie
     within the share `gap` of each other; at an outline the nearest pixel's if it is in front, else unknown: half a pixel
-    beside an outline nobody knows what is behind. And the nearest pixel's place."""
+    beside an outline nobody knows what is behind. Beside what lies outside of the photo (below 0) the nearest pixel's, as at
+    the picture's border. And the nearest pixel's place."""
     width = maps.size[view, 0]
     height = maps.size[view, 1]
     x = pixel[0]
@@ -87,7 +88,7 @@ def read_depth(maps: Maps, view: int, pixel: wp.vec2, gap: float):
         d = maps.depth[corner + width + 1]
         low = wp.min(wp.min(a, b), wp.min(c, d))
         high = wp.max(wp.max(a, b), wp.max(c, d))
-        if value - low >= gap * low:
+        if low >= 0.0 and value - low >= gap * low:
             value = 0.0
         elif low > 0.0 and high - low < gap * low:
             fx = x - 0.5 - float(x0)

@@ -289,7 +289,7 @@ def able_kernel(
         o, place, inside = seen_at(maps, v, p)
         if inside:
             depth, _ = read_depth(maps, v, place, GAP)
-            if depth <= 0.0 or depth > (1.0 - share) * o[2]:
+            if depth == 0.0 or depth > (1.0 - share) * o[2]:
                 able += 1
     out[i] = able
 
@@ -298,7 +298,7 @@ def able_views(
     maps: MapArrays, view: int, neighbours: torch.Tensor, share: float, enough: int = 1 << 30
 ) -> torch.Tensor:
     """How many of the maps `neighbours` (K,) int32 could show what each pixel (H·W,) int32 of one map does: it lies in their
-    picture, and nothing they know is nearer there by more than `share`. Counted no farther than to `enough`."""
+    photo (outside of it their depth is below 0), and nothing they know is nearer there by more than `share`. Counted no farther than to `enough`."""
     init()
     count = int(maps.size[view].prod())
     out = torch.empty(count, dtype=torch.int32, device=maps.depth.device)

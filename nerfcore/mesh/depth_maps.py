@@ -42,6 +42,7 @@ AGREE, AGREE_PIXELS, ROUND_TRIP = (
     1.65,
     1.5,
 )  # of the depth, or footprints of a pixel where photos are small; pixels
+OUTSIDE = -1.0  # depth of pixels beside the photo, whose lens bends its borders, where views are asked for others'
 HIDDEN = 0.03  # share of a place's distance by which what hides it is nearer
 SMALLEST_FACE = 0.05  # share of a cube's face that a photo must show
 
@@ -150,8 +151,8 @@ def reduced(view: FlatView) -> FlatView:
     if share == 1:
         return view
     camera = view.camera.resized(max(1, round(share * width)), max(1, round(share * height)))
-    rows, columns = _nearest(camera.width, camera.height, width, height)
-    return replace(view, camera=camera, inside=view.inside[rows, columns])
+    # All of it is rendered: a pixel whose centre lies beside the photo is in part within.
+    return replace(view, camera=camera, inside=np.ones((camera.height, camera.width), bool))
 
 
 def enlarged(small: DepthMap, view: FlatView) -> DepthMap:
@@ -286,15 +287,17 @@ def confirmed_maps(
     where they are known; `one_suffices`: for which pixels (H, W) bool of each map one other view is enough; `agree`: share by
     which a depth may differ at least; `round_trip`: pixels by which it may miss the pixel."""
     arrays = map_arrays(views, maps, device)
+    photographed = torch.from_numpy(np.concatenate([view.inside.reshape(-1) for view in views])).to(arrays.depth.device)
+    seen = replace(arrays, depth=torch.where(photographed, arrays.depth, OUTSIDE))
     confirmed, needed = [], min(needed, len({view.photo for view in views}) - 1)
     for index, near in enumerate(around or neighbours(views, maps)):
         report.progress(index / len(views))
         others = torch.tensor(near, dtype=torch.int32, device=arrays.depth.device)
         share = max(agree, AGREE_PIXELS / views[index].camera.fx)
-        found = agreement(arrays, index, others, share, round_trip, needed)
+        found = agreement(seen, index, others, share, round_trip, needed)
         enough = found >= needed
         if few_suffice:
-            enough = found >= able_views(arrays, index, others, HIDDEN, needed).clamp(min=min(1, needed))
+            enough = found >= able_views(seen, index, others, HIDDEN, needed).clamp(min=min(1, needed))
         if one_suffices is not None:
             enough |= (found >= 1) & torch.from_numpy(one_suffices[index].reshape(-1)).to(found.device)
         confirmed.append(enough)

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import scipy
 import torch
 from fieldwork.nerfcore.config import SamplingConfig
 from fieldwork.nerfcore.data.pixels import VOID
@@ -317,6 +318,37 @@ def test_an_enlarged_depth_map_knows_nothing_where_its_photo_shows_nothing() -> 
     free = np.full((2, 4), FREE, np.float32)
     small = depth_maps.DepthMap(free, np.zeros_like(free), np.zeros_like(free))
     assert (depth_maps.enlarged(small, view).depth == np.where(inside, np.float32(FREE), 0)).all()
+
+
+def test_borders_of_a_lens_picture_leave_no_gaps() -> None:
+    """Three photos of a wall, the other two shifted: what lies just beside one of them need not be confirmed by it."""
+    lens = CAMERA.model_copy(update={"model": "OPENCV", "distortion": (0.06, 0.0, 0.0, 0.0)})
+    poses = []
+    for shift in (0.0, 0.5, -0.5):
+        pose = np.eye(4)
+        pose[:3, 3] = shift, 0.3 * shift, -2.0
+        poses.append(pose)
+
+    def wall(origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        return -origin[2] / directions[:, 2]
+
+    flats, maps = maps_of(wall, poses, lens)
+    assert 0.001 < 1 - flats[1].inside.mean() < 0.2
+    kept = depth_maps.confirmed_maps(flats, maps, CPU, Reporter())
+    width, height = flats[0].camera.width, flats[0].camera.height
+    first = known(kept)[: width * height].reshape(height, width).numpy()
+    local = depth_maps.pixel_directions(flats[0].camera) * 2.0
+    shown = np.zeros((height, width), int)
+    for flat in flats[1:]:
+        c = flat.camera
+        x, y = ((local - (flat.pose - flats[0].pose)[:3, 3]) / 2.0)[..., :2].transpose(2, 0, 1)
+        u, v = x * c.fx + c.cx, y * c.fy + c.cy
+        there = (u >= 0) & (v >= 0) & (u < c.width) & (v < c.height)
+        inside = flat.inside[v.astype(int).clip(0, c.height - 1), u.astype(int).clip(0, c.width - 1)]
+        shown += there & inside
+    lost = (shown > 0) & flats[0].inside & ~first
+    assert lost.sum() <= 2  # on the edges of pixels, where rounding decides
+    assert not first[scipy.ndimage.maximum_filter(shown, 3) == 0].any()
 
 
 def test_what_is_seen_at_a_grazing_angle_is_unknown_not_free() -> None:

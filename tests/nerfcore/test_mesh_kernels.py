@@ -49,6 +49,15 @@ def rough(views: tuple[list[FlatView], list[DepthMap]]) -> MapArrays:
     return replace(maps, depth=torch.where(holes, 0.0, depth), spread=spread, certain=(spread < 0.03).float())
 
 
+@pytest.fixture(scope="module")
+def beside(rough: MapArrays) -> MapArrays:
+    """The same of photos that end within their picture, as those of lenses do: beside them depths are negative."""
+    depth = rough.depth.clone()
+    for first, (width, height) in zip(rough.first.tolist(), rough.size.tolist()):
+        depth[first : first + width * height].view(height, width)[:, 2 * width // 3 :] = -1.0
+    return replace(rough, depth=torch.where(torch.arange(len(depth)) < int(rough.first[1]), rough.depth, depth))
+
+
 def on_ball(count: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Points (N, 3) within 5 % of a ball's surface, and directions (N, 3) of all kinds beside its normals."""
     random = torch.Generator().manual_seed(3)
@@ -117,7 +126,11 @@ def test_normals_of_depths_equal_their_reference() -> None:
 
 
 @pytest.mark.parametrize("device", WARP_DEVICES)
-def test_as_many_views_agree_as_their_reference_says(device: str, rough: MapArrays) -> None:
+@pytest.mark.parametrize("ends", [False, True])
+def test_as_many_views_agree_as_their_reference_says(
+    device: str, rough: MapArrays, beside: MapArrays, ends: bool
+) -> None:
+    rough = beside if ends else rough
     others = [1, 2, 3, 4, 5, 6, 7, 8]
     near = torch.tensor(others, dtype=torch.int32, device=device)
     ours = surface.agreement(on(device, rough), 0, near, 0.02, 1.5).cpu()
@@ -130,11 +143,17 @@ def test_as_many_views_agree_as_their_reference_says(device: str, rough: MapArra
 
 
 @pytest.mark.parametrize("device", WARP_DEVICES)
-def test_as_many_views_could_show_a_place_as_their_reference_says(device: str, rough: MapArrays) -> None:
+@pytest.mark.parametrize("ends", [False, True])
+def test_as_many_views_could_show_a_place_as_their_reference_says(
+    device: str, rough: MapArrays, beside: MapArrays, ends: bool
+) -> None:
     others = [1, 2, 3, 4, 5, 6, 7, 8]
+    everywhere, rough = surface_reference.able_views(rough, 0, others, 0.03), beside if ends else rough
     near = torch.tensor(others, dtype=torch.int32, device=device)
     ours = surface.able_views(on(device, rough), 0, near, 0.03).cpu()
     expected = surface_reference.able_views(rough, 0, others, 0.03)
+    assert bool((expected <= everywhere).all())
+    assert (int((expected < everywhere).sum()) > 500) == ends
     assert torch.equal(surface.able_views(on(device, rough), 0, near, 0.03, 2).cpu(), ours.clamp(max=2))
     assert len(expected.unique()) >= 4
     assert float((ours == expected)[expected > 0].float().mean()) > 0.99

@@ -63,7 +63,7 @@ def read_depth(maps: MapArrays, view: int, x: torch.Tensor, y: torch.Tensor, gap
     share = torch.stack([(1 - fy) * (1 - fx), (1 - fy) * fx, fy * (1 - fx), fy * fx])
     smooth = (low > 0) & (high - low < gap * low)
     inverse = (share / corners.clamp(min=1e-9)).sum(0)
-    out = torch.where(value - low >= gap * low, 0.0, torch.where(smooth, 1 / inverse, value))
+    out = torch.where((low >= 0) & (value - low >= gap * low), 0.0, torch.where(smooth, 1 / inverse, value))
     return torch.where(inner, out, value)
 
 
@@ -135,7 +135,7 @@ def able_views(maps: MapArrays, view: int, neighbours: list[int], share: float) 
         q = camera_axes(maps, other, points)
         x, y, inside = pixels_of(maps, other, q)
         value = read_depth(maps, other, x, y, LOOKED_UP)
-        able += inside & ~((value > 0) & (value <= (1 - share) * q[:, 2]))
+        able += inside & (value >= 0) & ~((value > 0) & (value <= (1 - share) * q[:, 2]))
     return torch.where((z > 0) & (z < FREE), able, 0)
 
 

@@ -298,7 +298,8 @@ def able_views(
     maps: MapArrays, view: int, neighbours: torch.Tensor, share: float, enough: int = 1 << 30
 ) -> torch.Tensor:
     """How many of the maps `neighbours` (K,) int32 could show what each pixel (H·W,) int32 of one map does: it lies in their
-    photo (outside of it their depth is below 0), and nothing they know is nearer there by more than `share`. Counted no farther than to `enough`."""
+    photo (their depths are below 0 beside it), and nothing they know is nearer there by more than `share`. Counted no
+    farther than to `enough`."""
     init()
     count = int(maps.size[view].prod())
     out = torch.empty(count, dtype=torch.int32, device=maps.depth.device)

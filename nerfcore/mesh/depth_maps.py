@@ -42,7 +42,7 @@ AGREE, AGREE_PIXELS, ROUND_TRIP = (
     1.65,
     1.5,
 )  # of the depth, or footprints of a pixel where photos are small; pixels
-OUTSIDE = -1.0  # depth of pixels beside the photo, whose lens bends its borders, where views are asked for others'
+OUTSIDE = -1.0  # depth of pixels beside the photo, which can confirm nothing
 HIDDEN = 0.03  # share of a place's distance by which what hides it is nearer
 SMALLEST_FACE = 0.05  # share of a cube's face that a photo must show
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import psutil
+import scipy
 import torch
 
 from ..errors import SettingError
@@ -283,7 +284,9 @@ def spread(image: np.ndarray, known: np.ndarray, check: Callable[[], None] = go_
         for top, end in bands:
             check()
             above = max(top - 1, 0)
-            grown = _grown(known[above : end + 1])[top - above :][: end - top]
+            grown = np.asarray(scipy.ndimage.binary_dilation(known[above : end + 1], np.ones((3, 3), bool)))[
+                top - above :
+            ][: end - top]
             rows, columns = np.nonzero(np.logical_and(grown, ~known[top:end]))
             rows += top
             total, number = np.zeros((len(rows), image.shape[2]), np.float32), np.zeros(len(rows), np.float32)
@@ -310,17 +313,6 @@ def spread(image: np.ndarray, known: np.ndarray, check: Callable[[], None] = go_
         rows += top
         values = filled[:, torch.from_numpy(rows // step), torch.from_numpy(columns // step)]
         image[rows, columns] = values.T.clamp(0, 255).to(torch.uint8).numpy()
-
-
-def _grown(known: np.ndarray) -> np.ndarray:
-    """What is known (H, W), and its eight neighbours."""
-    across = known.copy()
-    across[:, 1:] |= known[:, :-1]
-    across[:, :-1] |= known[:, 1:]
-    grown = across.copy()
-    grown[1:] |= across[:-1]
-    grown[:-1] |= across[1:]
-    return grown
 
 
 def _pushed(values: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:

@@ -74,14 +74,7 @@ def halvings(picture: torch.Tensor, levels: int) -> list[torch.Tensor]:
     for _ in range(levels - 1):
         if min(result[-1].shape[1:]) < 2:
             break
-        finer = result[-1]
-        height, width = finer.shape[1:]
-        if height % 2 or width % 2:
-            finer = torch.nn.functional.pad(finer[None], (0, width % 2, 0, height % 2), mode="replicate")[0]
-        mean = finer[:, ::2, ::2] + finer[:, 1::2, ::2]
-        mean += finer[:, ::2, 1::2]
-        mean += finer[:, 1::2, 1::2]
-        result.append(mean.mul_(0.25))
+        result.append(torch.nn.functional.avg_pool2d(result[-1][None], 2, ceil_mode=True, count_include_pad=False)[0])
     return result
 
 

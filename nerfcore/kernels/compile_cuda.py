@@ -36,7 +36,7 @@ from . import (
     voxel_fit,
     voxel_march,
 )
-from .fused import LANES
+from .fused import lanes_of
 from .fused_kernel import class_kernel, color_kernel, density_kernel
 from .fused_shape import FusedShape
 from .host import default_threads
@@ -74,11 +74,12 @@ FUSED = {
 }
 
 
-def modules() -> dict[str, tuple[wp.Module, int]]:
-    """Every kernel module by name, with the threads a block it is launched with."""
+def modules(architecture: int) -> dict[str, tuple[wp.Module, int]]:
+    """Every kernel module by name, with the threads a block it is launched with on an architecture."""
     kernels = [kernel for source in SOURCES for kernel in vars(source).values() if isinstance(kernel, wp.Kernel)]
     found = {kernel.module.name: (kernel.module, CUDA_BLOCK) for kernel in kernels}
-    return found | {name: (kernel(shape, LANES).module, LANES) for name, (kernel, shape) in FUSED.items()}
+    lanes = lanes_of(architecture)
+    return found | {name: (kernel(shape, lanes).module, lanes) for name, (kernel, shape) in FUSED.items()}
 
 
 def compile_architecture(folder: Path, architecture: int, only: str = "") -> list[tuple[str, float, list[Resources]]]:
@@ -89,7 +90,7 @@ def compile_architecture(folder: Path, architecture: int, only: str = "") -> lis
     """
     init()
     rows = []
-    for name, (module, block) in modules().items():
+    for name, (module, block) in modules(architecture).items():
         if only not in name:
             continue
         target = folder / f"sm_{architecture}" / name.replace(", ", "_").replace(" ", "_")

@@ -20,14 +20,19 @@ from .fused_kernel import (
     color_kernel,
     density_kernel,
 )
-from .fused_network import half_feature
+from .fused_network import half_feature, padded
 from .fused_shape import FusedShape
 from .runtime import array, init
 from .traversal import MarchSettings, grid_arrays, march_params
 
-LANES = 64  # samples a block works on, on CUDA; two to eight blocks fit a multiprocessor of sm_75 and later
 MOST_CLASSES = 64
 CAPACITY = 1 << 22  # visible samples between two kernels; 44 bytes each with 16 features for the heads
+
+
+def lanes_of(architecture: int) -> int:
+    """Threads of a block on a GPU of compute capability `architecture` / 10: as many as leave room for two blocks in a
+    multiprocessor's shared memory, or for one where that is 64 KB."""
+    return 128 if architecture < 80 else 256
 
 
 @dataclass(frozen=True)
@@ -113,19 +118,21 @@ def render_coarse(
 ) -> FusedRays:
     """Colour, opacity, depth and class probabilities of rays after their coarse march, at most `count` samples a ray.
 
-    `lanes`: samples a block, by default `LANES` on CUDA and 1 on the CPU, where more need Warp's `enable_cpu_blocks`;
-    `capacity`: visible samples there is room for: so many rays are rendered at a time that it is enough for any.
+    `lanes`: samples a block, by default `lanes_of` on CUDA and 1 on the CPU, where more need Warp's `enable_cpu_blocks`;
+    `capacity`: visible samples there is room for, of at least two rays a thread.
     """
     init()
     device, number = rays.origins.device, len(rays.origins)
     cuda = backend_of(device).fused
-    lanes = lanes or (LANES if cuda else 1)
-    resident = 2 if lanes > 1 else 1  # blocks at a time; more than one on the CPU only to test that they share
+    resident = 2  # blocks at a time; more than one on the CPU only to test that they share
     if cuda:
-        resident = torch.cuda.get_device_properties(device).multi_processor_count * BLOCKS_PER_MULTIPROCESSOR
+        properties = torch.cuda.get_device_properties(device)
+        resident = properties.multi_processor_count * BLOCKS_PER_MULTIPROCESSOR
+    lanes = lanes or (lanes_of(10 * properties.major + properties.minor) if cuda else 1)
     counts = march.sample_counts(rays.bin_counts, count, settings.per_bin)
-    at_once = max(1, min(number, capacity // count))
-    groups = max(1, min(-(-at_once // lanes), resident))
+    # Threads promise room for rays that they follow; with twice the room a launch ends half of it or more of the rays.
+    at_once = max(1, min(number, capacity // (2 * count)))
+    groups = max(1, min(-(-number // lanes), at_once // lanes, resident))
     pixels = torch.zeros(number, 5, device=device)
     classes = field.class_count
     probabilities = torch.zeros(number, max(classes, 1), device=device)
@@ -134,14 +141,18 @@ def render_coarse(
     out.pixels, out.probabilities, out.evaluated = array(pixels), array(probabilities), array(evaluated)
     marched = march.marched_rays(rays.origins, rays.directions, rays.total_weight, rays.t_first, counts)
     grid, params, arrays = grid_arrays(cells, skip_distance), march_params(settings), _field_arrays(field)
-    visible, places = _visible_samples(at_once * count, field.shape.geometry, device)
-    heads = max(1, min(-(-at_once * count // lanes), resident))
+    room = min(capacity, number * count)
+    visible, places = _visible_samples(room, field.shape.geometry, device)
+    heads = max(1, min(-(-room // lanes), resident))
     stride = heads * lanes
-    for begin in range(0, number, at_once):
-        queue, next_ray = RayQueue(), torch.full((1,), begin, dtype=torch.int32, device=device)
-        queue.indices, queue.next_ray, queue.ray_count = array(rays.queue), array(next_ray), array(rays.ray_count)
-        queue.end = begin + at_once
+    next_ray, promised = (torch.zeros(1, dtype=torch.int32, device=device) for _ in range(2))
+    queue = RayQueue()
+    queue.indices, queue.next_ray, queue.ray_count = array(rays.queue), array(next_ray), array(rays.ray_count)
+    queue.promised, queue.most, queue.capacity = array(promised), count, room
+    # As often as the worst case asks for, so that nothing is read back: most launches find nothing left.
+    for _ in range(-(-number // at_once)):
         places.zero_()
+        promised.zero_()
         inputs = [marched, queue, grid, params, arrays, cull, visible, out]
         launch_blocks(density_kernel(field.shape, lanes), groups, lanes, inputs, device)
         inputs = [marched, visible, stride, arrays, out]
@@ -158,7 +169,7 @@ def _visible_samples(capacity: int, features: int, device: torch.device) -> tupl
     out = VisibleSamples()
     out.rays = array(torch.empty(capacity, dtype=torch.int32, device=device))
     out.t, out.weights = (array(torch.empty(capacity, device=device)) for _ in range(2))
-    out.features = array(torch.empty(capacity, features, dtype=torch.float16, device=device))
+    out.features = array(torch.empty(capacity, padded(features), dtype=torch.float16, device=device))
     out.count = array(count)
     return out, count
 

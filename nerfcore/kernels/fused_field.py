@@ -1,7 +1,7 @@
-"""Device functions that read the field for a block of samples: features, density, colour and classes.
+"""Device functions that read the field for a warp of samples: features, density, colour and classes.
 
-They are made for a `FusedShape` and a number of lanes. Every thread of a block calls them together, also those without
-a sample, because layers are shared (`fused_network`).
+They are made for a `FusedShape`. Every thread of a warp calls them together, also those without a sample, because
+networks are shared (`fused_network`). `memory` is a block's shared memory: matrices, then a row of each thread.
 """
 
 from functools import cache
@@ -12,16 +12,19 @@ import warp as wp
 from .cells import trilinear_at
 from .encode import FEATURES
 from .fused_network import (
+    any_of_warp,
     frequency_encoding,
     grid_encoding,
     half_feature,
-    half_vector,
-    hidden_layers,
-    lane,
-    last_layer,
-    layer,
+    network,
+    network_to_pixels,
+    network_to_row,
+    output,
+    packed_size,
     padded,
     put,
+    read_head,
+    row_length,
     spherical_harmonics,
 )
 from .fused_shape import HARMONICS, FusedShape
@@ -47,48 +50,56 @@ class FieldArrays:
     class_count: int
 
 
-def shape_name(shape: FusedShape, lanes: int) -> str:
-    """A name for what is compiled for a shape, as part of an identifier."""
+def shape_name(shape: FusedShape, number: int) -> str:
+    """A name for what is compiled for a shape and a number, as part of an identifier."""
     classes = f"{shape.classes}{'l' if shape.logits else ''}"
     joined = f"{shape.octaves}{'c' if shape.concat else ''}"
     return (
         f"{shape.levels}_{joined}_{shape.width}_{shape.geometry}_{shape.color_layers}_{shape.appearance}"
-        f"_{classes}_{lanes}"
+        f"_{classes}_{number}"
     )
 
 
-def input_rows(*networks: tuple[int, ...]) -> int:
-    """Rows of the tile from which networks of these sizes take their input, see `hidden_layers`."""
-    return max(rows for sizes in networks for rows in (sizes[0], *sizes[2:-1]))
+def density_row(shape: FusedShape) -> int:
+    """Numbers of a thread's row for the density."""
+    return row_length(*((shape.implicit, shape.density) if shape.octaves else (shape.density,)))
+
+
+def color_row(shape: FusedShape) -> int:
+    """The same for the colour."""
+    return row_length(shape.color)
+
+
+def class_row(shape: FusedShape) -> int:
+    """The same for the classes, whose scores never lie in it."""
+    return row_length(*((shape.implicit,) if shape.octaves else ()), (shape.semantic[0], 0))
 
 
 @cache
 def _explicit(shape: FusedShape) -> Any:
-    """A device function: point in [0, 1]³ → features of the grid, see `grid_encoding`; rows beyond them are zeroed."""
+    """A device function: point in [0, 1]³ → features of the grid, see `grid_encoding`; what is beyond them is zeroed."""
     encoding, used, features = grid_encoding(shape.levels), shape.levels * FEATURES, shape.features
 
-    def explicit_features(p: wp.vec3, field: FieldArrays, into: Any, place: int, share: float, added: int):
-        encoding(p, field.table, field.layout, field.gains, into, place, share, added)
+    def explicit_features(p: wp.vec3, field: FieldArrays, memory: Any, place: int, share: float, added: int):
+        encoding(p, field.table, field.layout, field.gains, memory, place, share, added)
         for k in range(used, features):
-            put(into, place + k, wp.float16(0.0))
+            put(memory, place + k, wp.float16(0.0))
 
     return wp.func(explicit_features, name=f"explicit_features_{shape.levels}")
 
 
 @cache
-def _implicit(shape: FusedShape, lanes: int) -> Any:
-    """A device function: point in [0, 1]³ → features of the implicit branch, times `share`, in rows of the tile `x`
-    from `place` on; overwrites all of `x`, and `inner`."""
+def _implicit(shape: FusedShape, length: int) -> Any:
+    """A device function: point in [0, 1]³ → features of the implicit branch, times `share`, in the thread's row from
+    number `place` on; overwrites the row from its beginning. The branch's matrices lie at the beginning of `memory`."""
     sizes, first = shape.implicit, shape.places()["implicit"]
-    frequencies, hidden = frequency_encoding(shape.octaves, sizes[0]), hidden_layers(sizes, lanes)
-    last, later = layer(sizes[1], sizes[2], lanes, False), first + sizes[0] * sizes[1]
+    frequencies, features = frequency_encoding(shape.octaves, sizes[0]), network_to_row(sizes, length)
 
-    def implicit_features(p: wp.vec3, field: FieldArrays, x: Any, inner: Any, place: int, share: float):
-        frequencies(p, x)
-        hidden(x, field.weights, first, inner)
-        last(inner, field.weights, later, x, place, share)
+    def implicit_features(p: wp.vec3, field: FieldArrays, memory: Any, row: int, place: int, share: float):
+        frequencies(p, memory, row)
+        features(memory, row, 0, field.weights, first, place, share)
 
-    return wp.func(implicit_features, name=f"implicit_features_{shape_name(shape, lanes)}")
+    return wp.func(implicit_features, name=f"implicit_features_{shape.octaves}_{shape.width}_{shape.features}_{length}")
 
 
 @wp.func
@@ -102,36 +113,32 @@ def grid_share(p: wp.vec3, active: int, field: FieldArrays):
 
 
 @cache
-def _joined(shape: FusedShape, lanes: int) -> Any:
-    """A device function: point, active → the input of the density head in the first rows of the tile `x`: blended
+def _joined(shape: FusedShape, length: int) -> Any:
+    """A device function: point, active → the input of the density head at the beginning of the thread's row: blended
     features; or those of the grid and of the implicit branch, each weighed by its share, one after the other."""
     features, concat, branches = shape.features, shape.concat, bool(shape.octaves)
     explicit_features = _explicit(shape)
-    implicit_features = _implicit(shape, lanes) if shape.octaves else None
+    implicit_features = _implicit(shape, length) if shape.octaves else None
     place = features if concat else 0
 
-    def joined_features(p: wp.vec3, active: int, field: FieldArrays, x: Any, inner: Any):
+    def joined_features(p: wp.vec3, active: int, field: FieldArrays, memory: Any, row: int):
         if wp.static(branches):
             w = grid_share(p, active, field)
             added = int(0)
-            # Where the whole block is certain of its grid the implicit branch is not read.
-            if wp.tile_sum(wp.tile(wp.where(w < CERTAIN, 1, 0)))[0] > 0:
-                point = wp.tile_empty(shape=(3, lanes), dtype=float, storage="shared")
-                for k in range(3):
-                    put(point, k, p[k])
-                implicit_features(p, field, x, inner, place, 1.0 - w)
-                p = wp.vec3(point[0, lane()], point[1, lane()], point[2, lane()])
+            # Where the whole warp is certain of its grid the implicit branch is not read.
+            if any_of_warp(wp.where(w < CERTAIN, 1, 0)) != 0:
+                implicit_features(p, field, memory, row, place, 1.0 - w)
                 added = wp.static(0 if concat else 1)
             else:
                 w = 1.0
                 if wp.static(concat):
                     for k in range(features):
-                        put(x, features + k, wp.float16(0.0))
-            explicit_features(p, field, x, 0, w, added)
+                        put(memory, row + features + k, wp.float16(0.0))
+            explicit_features(p, field, memory, row, w, added)
         else:
-            explicit_features(p, field, x, 0, 1.0, 0)
+            explicit_features(p, field, memory, row, 1.0, 0)
 
-    return wp.func(joined_features, name=f"joined_features_{shape_name(shape, lanes)}")
+    return wp.func(joined_features, name=f"joined_features_{shape_name(shape, length)}")
 
 
 @wp.func
@@ -143,95 +150,73 @@ def thinning(p: wp.vec3):
 
 
 @cache
-def density_function(shape: FusedShape, lanes: int) -> Any:
-    """A device function: point, active → features for the other heads (geometry,) half, and density per normalised
-    unit length."""
-    sizes, first, geometry = shape.density, shape.places()["density"], shape.geometry
-    networks = (shape.implicit, sizes) if shape.octaves else (sizes,)
-    rows, width, vector = input_rows(*networks), sizes[1], half_vector(geometry)
-    features, hidden = _joined(shape, lanes), hidden_layers(sizes, lanes)
-    last, later = last_layer(sizes[1], sizes[2], lanes), first + sizes[0] * sizes[1]
+def density_function(shape: FusedShape) -> Any:
+    """A device function: point, active → density per normalised unit length; the features for the other heads are left
+    in the thread's row as `network` leaves them. The matrices of the implicit branch and of the density head lie one
+    after the other at the beginning of `memory`."""
+    sizes, length, first = shape.density, density_row(shape), shape.places()["density"]
+    features, head = _joined(shape, length), network(sizes, length)
 
-    def density(p: wp.vec3, active: int, field: FieldArrays):
-        x = wp.tile_empty(shape=(rows, lanes), dtype=wp.float16, storage="shared")
-        inner = wp.tile_empty(shape=(width, lanes), dtype=wp.float16, storage="shared")
+    def density(p: wp.vec3, active: int, field: FieldArrays, memory: Any, row: int):
         # Before the networks: the point need not be kept until after them.
         thinned = wp.where(field.thinning == 1, thinning(p), 1.0)
-        features(p, active, field, x, inner)
-        hidden(x, field.weights, first, inner)
-        head = last(inner, field.weights, later)
-        out = vector()
-        for k in range(geometry):
-            out[k] = wp.float16(head[k])
-        return out, thinned * wp.exp(wp.clamp(head[0] + field.density_shift, -15.0, 11.0))
+        features(p, active, field, memory, row)
+        head(memory, row, first, field.weights, first)
+        return thinned * wp.exp(wp.clamp(output(memory, row, 0) + field.density_shift, -15.0, 11.0))
 
-    return wp.func(density, name=f"density_{shape_name(shape, lanes)}")
+    return wp.func(density, name=f"density_{shape_name(shape, length)}")
 
 
 @cache
-def color_function(shape: FusedShape, lanes: int) -> Any:
-    """A device function: features for the heads and the ray's direction → logits of red, green and blue."""
-    sizes, first = shape.color, shape.places()["color"]
+def color_function(shape: FusedShape) -> Any:
+    """A device function: features for the heads, at the beginning of the thread's row, and the ray's direction → logits
+    of red, green and blue. The matrices of the colour head lie at the beginning of `memory`."""
+    sizes, length, first = shape.color, color_row(shape), shape.places()["color"]
     geometry, appearance, code = shape.geometry, shape.appearance, shape.geometry + HARMONICS
-    hidden, last = hidden_layers(sizes, lanes), last_layer(sizes[-2], sizes[-1], lanes)
-    later, vector = first + sum(a * b for a, b in zip(sizes[:-2], sizes[1:-1])), half_vector(geometry)
-    rows, width, used, inputs = input_rows(sizes), sizes[1], code + appearance, sizes[0]
+    head, used, inputs = network(sizes, length), code + appearance, sizes[0]
 
-    def color(features: vector, direction: wp.vec3, field: FieldArrays):
-        x = wp.tile_empty(shape=(rows, lanes), dtype=wp.float16, storage="shared")
-        inner = wp.tile_empty(shape=(width, lanes), dtype=wp.float16, storage="shared")
-        for k in range(geometry):
-            put(x, k, features[k])
+    def color(direction: wp.vec3, field: FieldArrays, memory: Any, row: int):
         sh = spherical_harmonics(direction)
         for k in range(HARMONICS):
-            put(x, geometry + k, wp.float16(sh[k]))
+            put(memory, row + geometry + k, wp.float16(sh[k]))
         for k in range(appearance):
-            put(x, code + k, wp.float16(field.code[k]))
+            put(memory, row + code + k, wp.float16(field.code[k]))
         for k in range(used, inputs):
-            put(x, k, wp.float16(0.0))
-        hidden(x, field.weights, first, inner)
-        out = last(inner, field.weights, later)
-        return wp.vec3(out[0], out[1], out[2])
+            put(memory, row + k, wp.float16(0.0))
+        head(memory, row, 0, field.weights, first)
+        return wp.vec3(output(memory, row, 0), output(memory, row, 1), output(memory, row, 2))
 
-    return wp.func(color, name=f"color_{shape_name(shape, lanes)}")
+    return wp.func(color, name=f"color_{shape_name(shape, length)}")
 
 
 @cache
-def class_function(shape: FusedShape, lanes: int) -> Any:
-    """A device function: features for the heads and the point → scores (classes,) float, probabilities or logits."""
-    sizes, first = shape.semantic, shape.places()["semantic"]
-    hidden, last = hidden_layers(sizes, lanes), last_layer(sizes[1], sizes[2], lanes)
-    later, branches = first + sizes[0] * sizes[1], bool(shape.octaves)
-    geometry, features, logits, classes = shape.geometry, shape.features, shape.logits, shape.classes
-    implicit_row = padded(geometry)
-    explicit_row = implicit_row + (features if branches else 0)
-    rows = input_rows(shape.implicit, sizes) if branches else input_rows(sizes)
-    explicit_features = _explicit(shape)
-    implicit_features = _implicit(shape, lanes) if shape.octaves else None
-    width, vector = sizes[1], half_vector(geometry)
+def class_function(shape: FusedShape) -> Any:
+    """A device function: of the visible sample `index`, at a point, the scores times `weight`, probabilities or logits,
+    added to row `pixel` of `pixels`. The matrices of the implicit branch and of the class head lie one after the other
+    at the beginning of `memory`."""
+    sizes, length, first = shape.semantic, class_row(shape), shape.places()["semantic"]
+    held, branches = packed_size(shape.implicit) if shape.octaves else 0, bool(shape.octaves)
+    implicit_row = padded(shape.geometry)
+    explicit_row = implicit_row + (shape.features if branches else 0)
+    explicit_features, head = _explicit(shape), read_head(shape.geometry)
+    implicit_features = _implicit(shape, length) if shape.octaves else None
+    scores = network_to_pixels(sizes, length, shape.logits)
 
-    def class_scores(head: vector, p: wp.vec3, field: FieldArrays):
-        x = wp.tile_empty(shape=(rows, lanes), dtype=wp.float16, storage="shared")
-        inner = wp.tile_empty(shape=(width, lanes), dtype=wp.float16, storage="shared")
+    def classes(
+        p: wp.vec3,
+        features: wp.array2d(dtype=wp.float16),
+        index: int,
+        field: FieldArrays,
+        memory: Any,
+        row: int,
+        pixels: wp.array2d(dtype=float),
+        pixel: int,
+        weight: float,
+    ):
         if wp.static(branches):
-            implicit_features(p, field, x, inner, implicit_row, 1.0)
-        for k in range(geometry):
-            put(x, k, head[k])
-        for k in range(geometry, implicit_row):
-            put(x, k, wp.float16(0.0))
-        explicit_features(p, field, x, explicit_row, 1.0, 0)
-        hidden(x, field.weights, first, inner)
-        scores = last(inner, field.weights, later)
-        if wp.static(not logits):
-            largest = float(-1.0e30)
-            for k in range(classes):
-                largest = wp.where(k < field.class_count, wp.max(largest, scores[k]), largest)
-            total = float(0.0)
-            for k in range(classes):
-                e = wp.where(k < field.class_count, wp.exp(scores[k] - largest), 0.0)
-                scores[k] = e
-                total += e
-            scores = scores / total
-        return scores
+            implicit_features(p, field, memory, row, implicit_row, 1.0)
+        head(memory, row, features, index)
+        explicit_features(p, field, memory, row + explicit_row, 1.0, 0)
+        scores(memory, row, held, field.weights, first, pixels, pixel, weight, field.class_count)
 
-    return wp.func(class_scores, name=f"class_scores_{shape_name(shape, lanes)}")
+    return wp.func(classes, name=f"classes_{shape_name(shape, length)}")

@@ -1,12 +1,12 @@
 """The kernels of the fused renderer: second march, encodings, networks and compositing of whole rays.
 
 The coarse march (`march_weight`) says which rays meet occupied cells and how much weight their bins have. `density_kernel`
-takes those rays from a queue. Every thread of a block follows one ray: it advances to the ray's next sample
-(`pdf_sampling`), the block reads the density of its samples together on the matrix units (`fused_field`), and the thread
-composites its own. A ray that is used up, or opaque, makes room for the next one, so blocks stay full. Samples whose
-weight is worth shading are written one after the other, and `color_kernel` and `class_kernel` read colour and classes of
-those, full blocks of them again, and add them to their pixels. Samples are those of `march.sample` with all shifts ½;
-the unfused path in `render/model.py` is the oracle (equal within half precision). `fused.py` launches them.
+takes those rays from a queue. Every thread follows one ray: it advances to the ray's next sample (`pdf_sampling`), the
+warp reads the density of its samples together on the matrix units (`fused_field`), and the thread composites its own. A
+ray that is used up, or opaque, makes room for the next one, so warps stay full. Samples whose weight is worth shading are
+written one after the other, and `color_kernel` and `class_kernel` read colour and classes of those, full warps of them
+again, and add them to their pixels. Samples are those of `march.sample` with all shifts ½; the unfused path in
+`render/model.py` is the oracle (equal within half precision). `fused.py` launches them.
 
 The same source runs on the CPU for tests, on one thread and slowly.
 """
@@ -18,31 +18,42 @@ from functools import cache
 
 import warp as wp
 
-from .fused_field import FieldArrays, class_function, color_function, density_function, shape_name
-from .fused_network import half_vector, put
-from .fused_network import lane as own_lane
+from .fused_field import (
+    FieldArrays,
+    class_function,
+    class_row,
+    color_function,
+    color_row,
+    density_function,
+    density_row,
+    shape_name,
+)
+from .fused_network import WARP, any_of_warp, bring, keep_head, packed_size, read_head, thread_of_block
 from .fused_shape import FusedShape
 from .pdf_sampling import MarchedRays, Walk, advanced, ray_of, started
 from .traversal import EARLY_STOP, GridArrays, MarchParams, grid_position, inside
 
 MOST_UNROLLED = 64
-BLOCKS_PER_MULTIPROCESSOR = 8
+BLOCKS_PER_MULTIPROCESSOR = 2
 
 
 @wp.struct
 class RayQueue:
     """The rays that meet something: their indices, their number `ray_count` (1,), and `next_ray` (1,), the place of the
-    next one; those from place `end` on wait for another launch."""
+    next one. A thread takes a ray only while there is room for `most` visible samples of it: `promised` (1,) of
+    `capacity`."""
 
     indices: wp.array(dtype=int)
     next_ray: wp.array(dtype=int)
     ray_count: wp.array(dtype=int)
-    end: int
+    promised: wp.array(dtype=int)
+    most: int
+    capacity: int
 
 
 @wp.struct
 class VisibleSamples:
-    """Samples worth shading: their rays, distances and weights (N,), features for the heads (N, G), and their number
+    """Samples worth shading: their rays, distances and weights (N,), features for the heads (N, G padded), and their number
     `count` (1,). They stand in any order, those of a ray front to back."""
 
     rays: wp.array(dtype=int)
@@ -64,12 +75,17 @@ class RenderedArrays:
 
 def _named(function: object, kind: str, shape: FusedShape, lanes: int) -> wp.Kernel:
     module = f"fieldwork_fused_{kind}_{shape_name(shape, lanes)}"
-    # So many blocks a multiprocessor leave a thread 65536 / (8 · 64) = 128 registers.
+    # So many blocks a multiprocessor leave a thread 65536 / (2 · 256) = 128 registers.
     bounds = (lanes, BLOCKS_PER_MULTIPROCESSOR)
     kernel = wp.kernel(function, name=f"fused_{kind}", module=module, launch_bounds=bounds, grid_stride=False)
     # Vectors indexed in loops that are not unrolled would live in local memory.
     kernel.module.options["max_unroll"] = MOST_UNROLLED
     return kernel
+
+
+def _held(lanes: int, *networks: tuple[int, ...]) -> int:
+    """Numbers that matrices take of a block's shared memory: on the CPU, whose blocks are smaller than a warp, none."""
+    return sum(packed_size(sizes) for sizes in networks) if lanes >= WARP else 0
 
 
 def density_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
@@ -80,7 +96,10 @@ def density_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
 
 @cache
 def _density_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
-    density_at, geometry = density_function(shape, lanes), shape.geometry
+    density_at, keep, length = density_function(shape), keep_head(shape.geometry), density_row(shape)
+    networks = (shape.implicit, shape.density) if shape.octaves else (shape.density,)
+    matrices, first = _held(lanes, *networks), shape.places()["implicit" if shape.octaves else "density"]
+    size = (matrices + lanes * length) // 2
 
     def fused_density(
         rays: MarchedRays,
@@ -92,41 +111,44 @@ def _density_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
         visible: VisibleSamples,
         out: RenderedArrays,
     ):
-        lane = wp.tid()
+        thread = wp.tid()
+        memory = wp.tile_empty(shape=(size,), dtype=float, storage="shared")
+        bring(memory, 0, field.weights, first, matrices)
+        row = matrices + thread_of_block() * length
         index = int(-1)
         walk = Walk()
-        # What need not be in registers, which the products need: distance and length of the sample, optical depth so far.
-        interval = wp.tile_zeros(shape=(3, lanes), dtype=float, storage="shared")
-        active_lanes = int(1)
-        last_place = wp.min(queue.ray_count[0], queue.end)
-        while active_lanes > 0:
-            if index < 0:
-                place = wp.atomic_add(queue.next_ray, 0, 1)
-                if place < last_place:
+        optical_depth = float(0.0)
+        needed = queue.most  # room for visible samples that a ray may take, less what the last one left
+        busy = int(1)
+        while busy != 0:
+            if index < 0 and needed >= 0:
+                place = queue.ray_count[0]
+                if queue.next_ray[0] < place:
+                    if wp.atomic_add(queue.promised, 0, needed) + needed <= queue.capacity:
+                        place = wp.atomic_add(queue.next_ray, 0, 1)
+                    else:
+                        wp.atomic_sub(queue.promised, 0, needed)
+                needed = -1  # takes no other one
+                if place < queue.ray_count[0]:
                     index = queue.indices[place]
                     walk = started(rays, index)
-                    put(interval, 2, 0.0)
+                    optical_depth = 0.0
+                    needed = 0
             active = wp.where(index >= 0, 1, 0)
-            active_lanes = wp.tile_sum(wp.tile(active))[0]
-            if active_lanes > 0:
+            busy = any_of_warp(active)
+            if busy != 0:
                 t = float(0.0)
-                length = float(0.0)
+                length_of = float(0.0)
                 p = wp.vec3(0.5, 0.5, 0.5)
                 if active == 1:
                     # Read again for each sample: kept, it would take registers that the products need.
                     ray = ray_of(rays, index, m)
-                    walk, t, length = advanced(ray, walk, 0.5, grid, m)
+                    walk, t, length_of = advanced(ray, walk, 0.5, grid, m)
                     p = inside(grid_position(ray.origin + ray.direction * t, m.contracted))
-                    out.evaluated[lane] = out.evaluated[lane] + 1
-                put(interval, 0, t)
-                put(interval, 1, length)
-                head, density = density_at(p, active, field)
-                t = interval[0, own_lane()]
-                length = interval[1, own_lane()]
-                optical_depth = interval[2, own_lane()]
+                    out.evaluated[thread] = out.evaluated[thread] + 1
+                density = density_at(p, active, field, memory, row)
                 before = wp.exp(-optical_depth)
-                optical_depth += density * length
-                put(interval, 2, optical_depth)
+                optical_depth += density * length_of
                 after = wp.exp(-optical_depth)
                 weight = before - after
                 if active == 1 and weight > cull:
@@ -137,8 +159,8 @@ def _density_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
                     visible.rays[place] = index
                     visible.t[place] = t
                     visible.weights[place] = weight
-                    for k in range(geometry):
-                        visible.features[place, k] = head[k]
+                    keep(memory, row, visible.features, place)
+                    needed += 1
                 if active == 1:  # noqa: SIM102 (Warp evaluates both sides of "and")
                     if walk.sample >= rays.counts[index] or after < EARLY_STOP:
                         index = -1
@@ -153,19 +175,23 @@ def color_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
 
 @cache
 def _color_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
-    color_at, geometry, vector = color_function(shape, lanes), shape.geometry, half_vector(shape.geometry)
+    color_at, head, length = color_function(shape), read_head(shape.geometry), color_row(shape)
+    matrices, first = _held(lanes, shape.color), shape.places()["color"]
+    size = (matrices + lanes * length) // 2
 
     def fused_color(rays: MarchedRays, visible: VisibleSamples, stride: int, field: FieldArrays, out: RenderedArrays):
-        lane = wp.tid() % lanes
+        thread = thread_of_block()
+        memory = wp.tile_empty(shape=(size,), dtype=float, storage="shared")
+        bring(memory, 0, field.weights, first, matrices)
+        row = matrices + thread * length
+        in_warp = thread % WARP
         count = visible.count[0]
-        for begin in range(wp.tid() - lane, count, stride):
-            index = wp.min(begin + lane, count - 1)
-            head = vector()
-            for k in range(geometry):
-                head[k] = visible.features[index, k]
+        for begin in range(wp.tid() - in_warp, count, stride):
+            index = wp.min(begin + in_warp, count - 1)
             ray = visible.rays[index]
-            logits = color_at(head, rays.directions[ray], field)
-            if begin + lane < count:
+            head(memory, row, visible.features, index)
+            logits = color_at(rays.directions[ray], field, memory, row)
+            if begin + in_warp < count:
                 weight = visible.weights[index]
                 for k in range(3):
                     wp.atomic_add(out.pixels, ray, k, weight / (1.0 + wp.exp(-logits[k])))
@@ -180,8 +206,10 @@ def class_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
 
 @cache
 def _class_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
-    scores_at, geometry, vector = class_function(shape, lanes), shape.geometry, half_vector(shape.geometry)
-    classes = shape.classes
+    classes_at, length, first = class_function(shape), class_row(shape), shape.places()["semantic"]
+    branch = (shape.implicit,) if shape.octaves else ()
+    matrices, begin_of_head = _held(lanes, *branch, shape.semantic), _held(lanes, *branch)
+    size, of_head = (matrices + lanes * length) // 2, matrices - begin_of_head
 
     def fused_classes(
         rays: MarchedRays,
@@ -191,20 +219,19 @@ def _class_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
         field: FieldArrays,
         out: RenderedArrays,
     ):
-        lane = wp.tid() % lanes
+        thread = thread_of_block()
+        memory = wp.tile_empty(shape=(size,), dtype=float, storage="shared")
+        bring(memory, 0, field.weights, 0, begin_of_head)
+        bring(memory, begin_of_head, field.weights, first, of_head)
+        row = matrices + thread * length
+        in_warp = thread % WARP
         count = visible.count[0]
-        for begin in range(wp.tid() - lane, count, stride):
-            index = wp.min(begin + lane, count - 1)
-            head = vector()
-            for k in range(geometry):
-                head[k] = visible.features[index, k]
+        for begin in range(wp.tid() - in_warp, count, stride):
+            index = wp.min(begin + in_warp, count - 1)
             ray = visible.rays[index]
             point = rays.origins[ray] + rays.directions[ray] * visible.t[index]
-            scores = scores_at(head, inside(grid_position(point, m.contracted)), field)
-            if begin + lane < count:
-                weight = visible.weights[index]
-                for k in range(classes):
-                    if k < field.class_count:
-                        wp.atomic_add(out.probabilities, ray, k, weight * scores[k])
+            weight = wp.where(begin + in_warp < count, visible.weights[index], 0.0)
+            p = inside(grid_position(point, m.contracted))
+            classes_at(p, visible.features, index, field, memory, row, out.probabilities, ray, weight)
 
     return _named(fused_classes, "classes", shape, lanes)

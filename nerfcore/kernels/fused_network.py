@@ -1,10 +1,13 @@
-"""Device functions of the fused renderer: encodings of one sample, and layers shared by a block of samples.
+"""Device functions of the fused renderer: encodings of one sample, and networks shared by a warp of samples.
 
-A block of `lanes` threads works on one sample each. What enters a network is a tile (features × lanes) in shared memory,
-a column a sample; so is what passes from layer to layer, and only the last layer hands each thread its column. Matrices
-are brought to shared memory and multiplied `MOST_ROWS` rows at a time (`wp.tile_matmul`, half precision in, single
-precision sums): a thread holds as many sums in registers. Shared memory is taken inside the functions that need it, so
-that a kernel needs no more than its largest network.
+Each thread works on one sample, whose inputs are a row of half precision numbers in shared memory. The 32 threads of a
+warp multiply their rows together on the matrix units, 16 rows at a time (`network`): what passes from layer to layer stays
+in registers, since the sums of one product lie there as the next one takes its factors. Matrices lie in shared memory,
+brought there once for a block (`bring`). Half precision in, single precision sums. No warp waits for another one.
+
+On the CPU the same functions compute one sample at a time, from the matrices as they are packed.
+
+Layout of the factors in registers: PTX ISA, “Matrix fragments for mma.m16n8k16”.
 """
 
 from functools import cache
@@ -15,8 +18,10 @@ import warp as wp
 from .encode import FEATURES, across, cell_of
 
 half_feature = wp.types.vector(length=FEATURES, dtype=wp.float16)
-MOST_ROWS = 32  # measured: docs/experiments.md
 GRANULE = 16  # sides of matrices are multiples of this, as the matrix units want them
+WARP = 32
+GAP = 8  # unused numbers behind each row in memory: eight rows then lie in different banks
+LEAST_SCORE = 1e-7  # weight of a class that is added to a pixel
 
 
 def padded(size: int) -> int:
@@ -24,47 +29,56 @@ def padded(size: int) -> int:
     return -(-size // GRANULE) * GRANULE
 
 
-@cache
-def half_vector(length: int) -> Any:
-    return wp.types.vector(length=length, dtype=wp.float16)
+def packed_size(sizes: tuple[int, ...]) -> int:
+    """Numbers that the matrices of a network take, row by row and layer by layer, with the gap behind each row."""
+    return sum((inputs + GAP) * outputs for inputs, outputs in zip(sizes, sizes[1:]))
 
 
-# Warp's own ways from a thread to a tile and back compute every place by divisions, which the compiler moves out of the
-# loop over samples into registers that the products need. These take a column as what it is: one of a block's threads.
-
-
-@wp.func_native("tile.data.ptr[row * WP_TILE_BLOCK_DIM + WP_TILE_THREAD_IDX] = value;")
-def put(tile: Any, row: int, value: Any):
-    """Write a row of the thread's own column of a tile (rows, lanes) in shared memory."""
+def row_length(*networks: tuple[int, ...]) -> int:
+    """Numbers of a thread's row of inputs, which outputs of single precision may overwrite; with the gap behind it."""
+    return max(max(sizes[0], 2 * sizes[-1]) for sizes in networks) + GAP
 
 
 @wp.func_native("return WP_TILE_THREAD_IDX;")
-def lane() -> int:
-    """The thread's own column of tiles."""
+def thread_of_block() -> int:
+    """Number of this thread in its block."""
 
 
-@wp.func_native("WP_TILE_SYNC();")
-def wait():
-    """Wait for the other threads of the block."""
+# Shared memory is a tile of single precision numbers, and places in it count half precision ones.
+
+
+@wp.func_native("reinterpret_cast<wp::half*>(memory.data.ptr)[place] = value;")
+def put(memory: Any, place: int, value: wp.float16):
+    """Write to shared memory."""
+
+
+@wp.func
+def output(memory: Any, row: int, k: int):
+    """Number `k` of what `network` left in the thread's row."""
+    return memory[row // 2 + k]
 
 
 @wp.func_native("""
-    WP_TILE_SYNC();  // what others read may lie where the matrix goes
 #if defined(__CUDA_ARCH__)
     const float4* from = reinterpret_cast<const float4*>(weights.data + first);  // 8 weights at a time
-    float4* to = reinterpret_cast<float4*>(matrix.data.ptr);
-    const int pieces = size / 8;
-#else
-    const wp::half* from = weights.data + first;
-    wp::half* to = matrix.data.ptr;
-    const int pieces = size;
-#endif
-    for (int i = WP_TILE_THREAD_IDX; i < pieces; i += WP_TILE_BLOCK_DIM)
-        to[i] = from[i];
+    float4* to = reinterpret_cast<float4*>(memory.data.ptr + place / 2);
+    for (int i = WP_TILE_THREAD_IDX; i < size / 8; i += WP_TILE_BLOCK_DIM) to[i] = from[i];
     WP_TILE_SYNC();
+#endif
 """)
-def bring(matrix: Any, weights: wp.array(dtype=wp.float16), first: int, size: int):
-    """Copy `size` weights from `first` on to a matrix in shared memory; all that threads wrote before is there then."""
+def bring(memory: Any, place: int, weights: wp.array(dtype=wp.float16), first: int, size: int):
+    """Copy `size` weights from `first` on to `place` in the block's shared memory; the CPU reads them where they are."""
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __any_sync(0xffffffffu, yes);
+#else
+    return yes;
+#endif
+""")
+def any_of_warp(yes: int) -> int:
+    """Whether `yes` is not 0 in any thread of the warp, all of which must ask."""
 
 
 # Without the reduction of large angles, which takes an array of its own.
@@ -95,127 +109,353 @@ def widened(v: half_feature):
     return wp.vec4(float(v[0]), float(v[1]), float(v[2]), float(v[3]))
 
 
-def part_rows(outputs: int) -> int:
-    """Rows of a matrix that are multiplied at a time: as many as divide it, up to `MOST_ROWS`."""
-    return next(rows for rows in range(MOST_ROWS, 0, -GRANULE) if outputs % rows == 0)
+# What the matrix units do. Of 32 threads, thread 4g + t holds of 16 rows the numbers 2t, 2t + 1 of the rows g and g + 8.
+INSTRUCTIONS = """
+    const int thread = WP_TILE_THREAD_IDX & 31, group = thread >> 2, pair = 2 * (thread & 3);
+    // Four 8×8 matrices of half precision; thread 8m + r has the address of row r of matrix m.
+    auto load = [](unsigned* to, const wp::half* from) {
+        asm volatile("ldmatrix.sync.aligned.m8n8.x4.shared.b16 {%0, %1, %2, %3}, [%4];"
+            : "=r"(to[0]), "=r"(to[1]), "=r"(to[2]), "=r"(to[3])
+            : "r"(static_cast<unsigned>(__cvta_generic_to_shared(from))) : "memory");
+    };
+    // sum (16×8) += a (16×16) · b (16×8)
+    auto multiply = [](float* sum, const unsigned* a, unsigned b0, unsigned b1) {
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ < 800
+        asm volatile("mma.sync.aligned.m16n8k8.row.col.f32.f16.f16.f32 {%0, %1, %2, %3}, {%4, %5}, {%6}, {%0, %1, %2, %3};"
+            : "+f"(sum[0]), "+f"(sum[1]), "+f"(sum[2]), "+f"(sum[3]) : "r"(a[0]), "r"(a[1]), "r"(b0));
+        asm volatile("mma.sync.aligned.m16n8k8.row.col.f32.f16.f16.f32 {%0, %1, %2, %3}, {%4, %5}, {%6}, {%0, %1, %2, %3};"
+            : "+f"(sum[0]), "+f"(sum[1]), "+f"(sum[2]), "+f"(sum[3]) : "r"(a[2]), "r"(a[3]), "r"(b1));
+#else
+        asm volatile("mma.sync.aligned.m16n8k16.row.col.f32.f16.f16.f32 {%0, %1, %2, %3}, {%4, %5, %6, %7}, {%8, %9}, {%0, %1, %2, %3};"
+            : "+f"(sum[0]), "+f"(sum[1]), "+f"(sum[2]), "+f"(sum[3])
+            : "r"(a[0]), "r"(a[1]), "r"(a[2]), "r"(a[3]), "r"(b0), "r"(b1));
+#endif
+    };
+    auto both = [](float low, float high) {  // as two halves
+        return static_cast<unsigned>(wp::half(low).u) | static_cast<unsigned>(wp::half(high).u) << 16;
+    };
+    auto from_thread = [](auto value, int other) { return __shfl_sync(0xffffffffu, value, other); };
+    auto over_row = [](float value, auto join) {  // over the four threads that hold a row
+        value = join(value, __shfl_xor_sync(0xffffffffu, value, 1));
+        return join(value, __shfl_xor_sync(0xffffffffu, value, 2));
+    };
+    auto wait = [] { __syncwarp(); };
+"""
+
+
+def _layer(k: int, inputs: int, outputs: int, last: bool) -> str:
+    """A product of the factors `a` (16, inputs) with a matrix (outputs, inputs) at `matrix`, into `sum_k`; rectified and
+    back into `a` unless it is the last one."""
+    text = f"""
+        float sum_{k}[{outputs // 8}][4];
+        #pragma unroll
+        for (int n = 0; n < {outputs // 8}; ++n)
+            #pragma unroll
+            for (int e = 0; e < 4; ++e) sum_{k}[n][e] = 0.0f;
+        #pragma unroll
+        for (int q = 0; q < {inputs // 16}; ++q)
+            #pragma unroll
+            for (int n = 0; n < {outputs // 16}; ++n) {{
+                unsigned b[4];
+                load(b, matrix + (16 * n + 8 * (thread >> 4) + (thread & 7)) * {inputs + GAP} + 16 * q + 8 * ((thread >> 3) & 1));
+                multiply(sum_{k}[2 * n], a[q], b[0], b[1]);
+                multiply(sum_{k}[2 * n + 1], a[q], b[2], b[3]);
+            }}
+        matrix += {outputs * (inputs + GAP)};
+    """
+    if last:
+        return text
+    return (
+        text
+        + f"""
+        #pragma unroll
+        for (int q = 0; q < {outputs // 16}; ++q) {{
+            const float* low = sum_{k}[2 * q];
+            const float* high = sum_{k}[2 * q + 1];
+            a[q][0] = both(fmaxf(low[0], 0.0f), fmaxf(low[1], 0.0f));
+            a[q][1] = both(fmaxf(low[2], 0.0f), fmaxf(low[3], 0.0f));
+            a[q][2] = both(fmaxf(high[0], 0.0f), fmaxf(high[1], 0.0f));
+            a[q][3] = both(fmaxf(high[2], 0.0f), fmaxf(high[3], 0.0f));
+        }}
+    """
+    )
+
+
+def _warp_body(sizes: tuple[int, ...], length: int, take: str) -> str:
+    """CUDA: a ReLU network of the rows of a warp; `take` uses the sums of its last layer, `sum` (N/8, 4), of the rows
+    `first_row` + group and + 8."""
+    layers = list(zip(sizes, sizes[1:]))
+    products = "".join(_layer(k, *layer, last=k == len(layers) - 1) for k, layer in enumerate(layers))
+    return f"""
+    {INSTRUCTIONS}
+    wp::half* halves = reinterpret_cast<wp::half*>(memory.data.ptr);
+    wp::half* rows = halves + row - thread * {length};
+    wait();
+    #pragma unroll 1
+    for (int first_row = 0; first_row < 32; first_row += 16) {{
+        unsigned a[{max(sizes[:-1]) // 16}][4];
+        #pragma unroll
+        for (int q = 0; q < {sizes[0] // 16}; ++q)
+            load(a[q], rows + (first_row + (thread & 15)) * {length} + 16 * q + 8 * (thread >> 4));
+        const wp::half* matrix = halves + held;
+        {products}
+        auto& sum = sum_{len(layers) - 1};
+        wait();
+        {take}
+    }}
+    wait();
+    """
+
+
+def _host_body(sizes: tuple[int, ...], take: str) -> str:
+    """The CPU: a ReLU network of one row; `take` uses the sums of its last layer, `sum` (N,)."""
+    most, layers = max(sizes), list(zip(sizes, sizes[1:]))
+    text = f"""
+    float x[{most}], sum[{most}];
+    wp::half* own = reinterpret_cast<wp::half*>(memory.data.ptr) + row;
+    const wp::half* matrix = weights.data + first;
+    for (int k = 0; k < {sizes[0]}; ++k) x[k] = float(own[k]);
+    """
+    for number, (inputs, outputs) in enumerate(layers):
+        text += f"""
+    for (int n = 0; n < {outputs}; ++n) {{
+        sum[n] = 0.0f;
+        for (int k = 0; k < {inputs}; ++k) sum[n] += float(matrix[n * {inputs + GAP} + k]) * x[k];
+    }}
+    matrix += {outputs * (inputs + GAP)};
+    """
+        if number < len(layers) - 1:
+            text += f"for (int n = 0; n < {outputs}; ++n) x[n] = float(wp::half(sum[n] > 0.0f ? sum[n] : 0.0f));"
+    return text + take
+
+
+def _both(sizes: tuple[int, ...], length: int, on_warp: str, on_host: str) -> str:
+    return f"""
+#if defined(__CUDA_ARCH__)
+{_warp_body(sizes, length, on_warp)}
+#else
+{_host_body(sizes, on_host)}
+#endif
+"""
+
+
+def _name(kind: str, sizes: tuple[int, ...], length: int) -> str:
+    return f"{kind}_{'_'.join(map(str, sizes))}_{length}"
+
+
+# Of the functions below: `memory`: the block's shared memory; `row`: place of the thread's inputs in it; `held`: place of
+# the network's matrices in it; `weights`, `first`: where the CPU finds them. `sizes`: of the network, padded; `length`: of
+# a row. All threads of a warp call them together.
 
 
 @cache
-def product(inputs: int, rows: int, lanes: int, then: Any) -> Any:
-    """A device function: `rows` rows, the first weight of which is at `first`, times a tile (inputs, lanes) half;
-    `then` (sums as a tile (rows, lanes) float, `into`, `place`, `scale`) takes the result up."""
+def network_to_row(sizes: tuple[int, ...], length: int) -> Any:
+    """A device function: the outputs of a network, times `share`, in half precision into the thread's row, from number
+    `place` on."""
 
-    def multiplied(x: Any, weights: wp.array(dtype=wp.float16), first: int, into: Any, place: int, scale: float):
-        matrix = wp.tile_empty(shape=(rows, inputs), dtype=wp.float16, storage="shared")
-        total = wp.tile_empty(shape=(rows, lanes), dtype=float, storage="shared")
-        bring(matrix, weights, first, rows * inputs)
-        wp.tile_matmul(matrix, x, total, beta=0.0)
-        then(total, into, place, scale)
+    def outputs(
+        memory: Any,
+        row: int,
+        held: int,
+        weights: wp.array(dtype=wp.float16),
+        first: int,
+        place: int,
+        share: float,
+    ):
+        """See above."""
 
-    return wp.func(multiplied, name=f"product_{inputs}_{rows}_{lanes}_{then.key}")
-
-
-@cache
-def _rectified(rows: int) -> Any:
-    def rectified(total: Any, into: Any, place: int, scale: float):
-        for k in range(rows):
-            put(into, place + k, wp.float16(wp.max(total[k, lane()], 0.0)))
-
-    return wp.func(rectified, name=f"rectified_{rows}")
-
-
-@cache
-def _scaled(rows: int) -> Any:
-    def scaled(total: Any, into: Any, place: int, scale: float):
-        for k in range(rows):
-            put(into, place + k, wp.float16(scale * total[k, lane()]))
-
-    return wp.func(scaled, name=f"scaled_{rows}")
-
-
-@cache
-def layer(inputs: int, outputs: int, lanes: int, hidden: bool) -> Any:
-    """A device function: a layer from a tile (inputs, lanes) half, rectified if hidden, else times `scale`, into the
-    rows from `place` on of another one."""
-    rows = part_rows(outputs)
-    part, parts = product(inputs, rows, lanes, (_rectified if hidden else _scaled)(rows)), outputs // rows
-
-    def run(x: Any, weights: wp.array(dtype=wp.float16), first: int, into: Any, place: int, scale: float):
-        for k in range(parts):
-            part(x, weights, first + k * rows * inputs, into, place + k * rows, scale)
-
-    return wp.func(run, name=f"layer_{inputs}_{outputs}_{lanes}_{int(hidden)}")
+    on_warp = f"""
+        #pragma unroll
+        for (int r = 0; r < 2; ++r) {{
+            const int of_row = first_row + group + 8 * r;
+            const float factor = from_thread(share, of_row);
+            #pragma unroll
+            for (int n = 0; n < {sizes[-1] // 8}; ++n)
+                *reinterpret_cast<unsigned*>(rows + of_row * {length} + place + 8 * n + pair) =
+                    both(factor * sum[n][2 * r], factor * sum[n][2 * r + 1]);
+        }}
+    """
+    on_host = f"for (int n = 0; n < {sizes[-1]}; ++n) own[place + n] = wp::half(share * sum[n]);"
+    outputs.__name__ = outputs.__qualname__ = _name("network_to_row", sizes, length)
+    return wp.func_native(_both(sizes, length, on_warp, on_host))(outputs)
 
 
 @cache
-def last_layer(inputs: int, outputs: int, lanes: int) -> Any:
-    """A device function: a layer from a tile (inputs, lanes) half to a vector (outputs,) float."""
-    rows = part_rows(outputs)
-    parts, vector = outputs // rows, wp.types.vector(length=outputs, dtype=wp.float32)
-    part_vector = wp.types.vector(length=rows, dtype=wp.float32)
+def network(sizes: tuple[int, ...], length: int) -> Any:
+    """A device function: the outputs of a network, in single precision at the beginning of the thread's row (`output`)."""
 
-    def part(x: Any, weights: wp.array(dtype=wp.float16), first: int):
-        matrix = wp.tile_empty(shape=(rows, inputs), dtype=wp.float16, storage="shared")
-        total = wp.tile_empty(shape=(rows, lanes), dtype=float, storage="shared")
-        bring(matrix, weights, first, rows * inputs)
-        wp.tile_matmul(matrix, x, total, beta=0.0)
-        out = part_vector()
-        for k in range(rows):
-            out[k] = total[k, lane()]
-        wait()
-        return out
+    def outputs(memory: Any, row: int, held: int, weights: wp.array(dtype=wp.float16), first: int):
+        """See above."""
 
-    part_of = wp.func(part, name=f"last_part_{inputs}_{outputs}_{lanes}")
-
-    def last(x: Any, weights: wp.array(dtype=wp.float16), first: int):
-        out = vector()
-        for k in range(parts):
-            values = part_of(x, weights, first + k * rows * inputs)
-            for i in range(rows):
-                out[k * rows + i] = values[i]
-        return out
-
-    return wp.func(last, name=f"last_{inputs}_{outputs}_{lanes}")
+    on_warp = f"""
+        #pragma unroll
+        for (int r = 0; r < 2; ++r) {{
+            float* to = reinterpret_cast<float*>(rows + (first_row + group + 8 * r) * {length}) + pair;
+            #pragma unroll
+            for (int n = 0; n < {sizes[-1] // 8}; ++n) {{
+                to[8 * n] = sum[n][2 * r];
+                to[8 * n + 1] = sum[n][2 * r + 1];
+            }}
+        }}
+    """
+    on_host = f"__builtin_memcpy(own, sum, {sizes[-1]} * sizeof(float));"
+    outputs.__name__ = outputs.__qualname__ = _name("network", sizes, length)
+    return wp.func_native(_both(sizes, length, on_warp, on_host))(outputs)
 
 
 @cache
-def hidden_layers(sizes: tuple[int, ...], lanes: int) -> Any:
-    """A device function: all but the last layer of a ReLU network, of two or three matrix products, from the rows
-    0 … sizes[0] − 1 of the tile `x` into the tile `inner` (sizes[-2], lanes), both half; it may overwrite `x`, which
-    must have as many rows as the network is wide if there are three. Weights lie row by row and layer by layer from
-    `first` on."""
-    inputs, width = sizes[0], sizes[1]
-    start = layer(inputs, width, lanes, True)
-    if len(sizes) == 3:
+def network_to_pixels(sizes: tuple[int, ...], length: int, logits: bool) -> Any:
+    """A device function: the scores of a network with `count` classes, as probabilities unless `logits`, times `weight`,
+    added to row `pixel` of `pixels` (R, count); nothing is added where the weight is 0."""
 
-        def run(x: Any, weights: wp.array(dtype=wp.float16), first: int, inner: Any):
-            start(wp.tile_view(x, offset=(0, 0), shape=(inputs, lanes)), weights, first, inner, 0, 1.0)
+    def scores(
+        memory: Any,
+        row: int,
+        held: int,
+        weights: wp.array(dtype=wp.float16),
+        first: int,
+        pixels: wp.array2d(dtype=float),
+        pixel: int,
+        weight: float,
+        count: int,
+    ):
+        """See above."""
 
-    elif len(sizes) == 4:
-        second = layer(width, width, lanes, True)
+    probabilities = f"""
+            float largest = -1e30f, total = 0.0f;
+            #pragma unroll
+            for (int n = 0; n < {sizes[-1] // 8}; ++n)
+                #pragma unroll
+                for (int e = 0; e < 2; ++e)
+                    if (8 * n + pair + e < count) largest = fmaxf(largest, sum[n][2 * r + e]);
+            largest = over_row(largest, [](float a, float b) {{ return fmaxf(a, b); }});
+            #pragma unroll
+            for (int n = 0; n < {sizes[-1] // 8}; ++n)
+                #pragma unroll
+                for (int e = 0; e < 2; ++e) {{
+                    const float one = 8 * n + pair + e < count ? __expf(sum[n][2 * r + e] - largest) : 0.0f;
+                    sum[n][2 * r + e] = one;
+                    total += one;
+                }}
+            total = over_row(total, [](float a, float b) {{ return a + b; }});
+            factor /= total;
+    """
+    on_warp = f"""
+        #pragma unroll
+        for (int r = 0; r < 2; ++r) {{
+            const int of_row = first_row + group + 8 * r;
+            float factor = from_thread(weight, of_row);
+            float* to = pixels.data + size_t(from_thread(pixel, of_row)) * count;
+            {"" if logits else probabilities}
+            #pragma unroll
+            for (int n = 0; n < {sizes[-1] // 8}; ++n)
+                #pragma unroll
+                for (int e = 0; e < 2; ++e) {{
+                    const float value = factor * sum[n][2 * r + e];
+                    // Less than half precision tells apart is not worth a write.
+                    if (8 * n + pair + e < count && fabsf(value) > {LEAST_SCORE:g}f) atomicAdd(to + 8 * n + pair + e, value);
+                }}
+        }}
+    """
+    on_host = f"""
+    float total = 1.0f;
+    if (!{int(logits)}) {{
+        float largest = -1e30f;
+        for (int k = 0; k < count; ++k) largest = sum[k] > largest ? sum[k] : largest;
+        total = 0.0f;
+        for (int k = 0; k < count; ++k) total += sum[k] = wp::exp(sum[k] - largest);
+    }}
+    for (int k = 0; k < count; ++k) pixels.data[size_t(pixel) * count + k] += weight / total * sum[k];
+    """
+    scores.__name__ = scores.__qualname__ = _name("network_to_pixels", sizes, length) + ("_logits" if logits else "")
+    return wp.func_native(_both(sizes, length, on_warp, on_host))(scores)
 
-        def run(x: Any, weights: wp.array(dtype=wp.float16), first: int, inner: Any):
-            start(wp.tile_view(x, offset=(0, 0), shape=(inputs, lanes)), weights, first, inner, 0, 1.0)
-            second(inner, weights, first + inputs * width, x, 0, 1.0)
-            for k in range(width):
-                put(inner, k, x[k, lane()])
 
-    else:
-        raise ValueError(f"networks of {len(sizes) - 1} matrix products are not supported")
-    return wp.func(run, name="hidden_" + "_".join(map(str, (*sizes[:-1], lanes))))
+
+
+
+@cache
+def keep_head(geometry: int) -> Any:
+    """A device function: the outputs of a network in the thread's row, half precision, to row `place` of `features`
+    (N, padded(geometry))."""
+
+    def keep(memory: Any, row: int, features: wp.array2d(dtype=wp.float16), place: int):
+        """See above."""
+
+    size = padded(geometry)
+    body = f"""
+    wp::half* to = features.data + size_t(place) * {size};
+    const float* values = memory.data.ptr + row / 2;
+    wp::half halves[{size}];
+    for (int k = 0; k < {size}; ++k) halves[k] = k < {geometry} ? wp::half(values[k]) : wp::half(0.0f);
+#if defined(__CUDA_ARCH__)
+    #pragma unroll
+    for (int k = 0; k < {size}; k += 8) {{
+        uint4 eight;
+        unsigned* two = &eight.x;
+        #pragma unroll
+        for (int i = 0; i < 4; ++i) two[i] = halves[k + 2 * i].u | unsigned(halves[k + 2 * i + 1].u) << 16;
+        *reinterpret_cast<uint4*>(to + k) = eight;
+    }}
+#else
+    __builtin_memcpy(to, halves, sizeof(halves));
+#endif
+    """
+    keep.__name__ = keep.__qualname__ = f"keep_head_{geometry}"
+    return wp.func_native(body)(keep)
+
+
+@cache
+def read_head(geometry: int) -> Any:
+    """A device function: row `index` of `features` (N, padded(geometry)) to the beginning of the thread's row."""
+
+    def head(memory: Any, row: int, features: wp.array2d(dtype=wp.float16), index: int):
+        """See above."""
+
+    size = padded(geometry)
+    body = f"""
+    const wp::half* from = features.data + size_t(index) * {size};
+#if defined(__CUDA_ARCH__)
+    #pragma unroll
+    for (int k = 0; k < {size}; k += 8)
+        *reinterpret_cast<uint4*>(memory.data.ptr + (row + k) / 2) = *reinterpret_cast<const uint4*>(from + k);
+#else
+    __builtin_memcpy(memory.data.ptr + row / 2, from, {size} * sizeof(wp::half));
+#endif
+    """
+    head.__name__ = head.__qualname__ = f"read_head_{geometry}"
+    return wp.func_native(body)(head)
+
+
+@wp.func_native("""
+    float four[4] = {a, b, c, d};
+    wp::half* to = reinterpret_cast<wp::half*>(memory.data.ptr) + place;
+    for (int k = 0; k < 4; ++k) four[k] = share * float(wp::half(four[k])) + (added ? float(to[k]) : 0.0f);
+#if defined(__CUDA_ARCH__)
+    uint2 packed;
+    packed.x = wp::half(four[0]).u | unsigned(wp::half(four[1]).u) << 16;
+    packed.y = wp::half(four[2]).u | unsigned(wp::half(four[3]).u) << 16;
+    *reinterpret_cast<uint2*>(to) = packed;
+#else
+    for (int k = 0; k < 4; ++k) to[k] = wp::half(four[k]);
+#endif
+""")
+def put_four(memory: Any, place: int, a: float, b: float, c: float, d: float, share: float, added: int):
+    """Four numbers, times `share`, added to what is in shared memory from `place` on if `added` is 1, else written there;
+    `place` is a multiple of four."""
 
 
 @cache
 def grid_encoding(levels: int) -> Any:
-    """A device function: point in [0, 1]³ → features of all levels, trilinear, times `share`, added to the rows of the
-    tile `into` from `place` on if `added` is 1, else written there."""
+    """A device function: point in [0, 1]³ → features of all levels, trilinear, times `share`, added to what is in shared
+    memory from `place` on if `added` is 1, else written there."""
 
     def encode(
         p: wp.vec3,
         table: wp.array(dtype=half_feature),
         layout: wp.array2d(dtype=int),
         gains: wp.array(dtype=float),
-        into: Any,
+        memory: Any,
         place: int,
         share: float,
         added: int,
@@ -227,12 +467,7 @@ def grid_encoding(levels: int) -> Any:
             v01 = across(widened(table[low[2]]), widened(table[high[2]]), f[0])
             v11 = across(widened(table[low[3]]), widened(table[high[3]]), f[0])
             value = across(across(v00, v10, f[1]), across(v01, v11, f[1]), f[2]) * gains[level]
-            row = place + level * FEATURES
-            for k in range(FEATURES):
-                feature = share * float(wp.float16(value[k]))
-                if added == 1:
-                    feature += float(into[row + k, lane()])
-                put(into, row + k, wp.float16(feature))
+            put_four(memory, place + level * FEATURES, value[0], value[1], value[2], value[3], share, added)
 
     return wp.func(encode, name=f"grid_encoding_{levels}")
 
@@ -240,23 +475,23 @@ def grid_encoding(levels: int) -> Any:
 @cache
 def frequency_encoding(octaves: int, length: int) -> Any:
     """A device function: point in [0, 1]³ → x, then sin and cos of 2^k π x, as `field.encoding` has them, padded with
-    zeros to `length`, in the first rows of a tile."""
+    zeros to `length`, in shared memory from `place` on."""
     used = 3 + 6 * octaves
 
-    def encode(p: wp.vec3, into: Any):
+    def encode(p: wp.vec3, memory: Any, place: int):
         for a in range(3):
             x = p[a] * 2.0 - 1.0
             sine = sine_of_pi(x)
             cosine = cosine_of_pi(x)
-            put(into, a, wp.float16(x))
+            put(memory, place + a, wp.float16(x))
             for k in range(octaves):
-                put(into, 3 + 6 * k + a, wp.float16(sine))
-                put(into, 6 + 6 * k + a, wp.float16(cosine))
+                put(memory, place + 3 + 6 * k + a, wp.float16(sine))
+                put(memory, place + 6 + 6 * k + a, wp.float16(cosine))
                 twice = 2.0 * sine * cosine
                 cosine = 1.0 - 2.0 * sine * sine
                 sine = twice
         for k in range(used, length):
-            put(into, k, wp.float16(0.0))
+            put(memory, place + k, wp.float16(0.0))
 
     return wp.func(encode, name=f"frequency_encoding_{octaves}_{length}")
 

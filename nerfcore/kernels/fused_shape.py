@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from .fused_network import GRANULE, padded
+from .fused_network import GRANULE, packed_size, padded
 
 HARMONICS = 16
 
@@ -63,5 +63,5 @@ class FusedShape:
         place, first = 0, {}
         for name, sizes in self.networks().items():
             first[name] = place
-            place += sum(inputs * outputs for inputs, outputs in zip(sizes, sizes[1:]))
+            place += packed_size(sizes)
         return {**first, "all": place}

@@ -13,7 +13,7 @@ from ..field.hybrid import HybridField
 from ..field.mlp import MLP
 from ..kernels.device import backend_of
 from ..kernels.fused import MOST_CLASSES, CoarseRays, FusedField, FusedRays, coarse_march, render_coarse
-from ..kernels.fused_network import padded
+from ..kernels.fused_network import GAP, padded
 from ..kernels.fused_shape import FusedShape
 from ..kernels.runtime import small_tensor
 from .model import Model, Rendered
@@ -99,12 +99,12 @@ def _spread(matrix: torch.Tensor, parts: list[tuple[int, int]], columns: int) ->
 
 
 def _flat(network: MLP, first: list[tuple[int, int]], sizes: tuple[int, ...]) -> list[torch.Tensor]:
-    """The weights of a network's layers, padded to `sizes`, row by row, float16."""
+    """The weights of a network's layers, padded to `sizes`, row by row with a gap behind each, float16."""
     layers = []
     for index, weight in enumerate(network.weights):
         value = weight.detach().float()
         value = _spread(value, first if index == 0 else [(value.shape[1], value.shape[1])], sizes[index])
-        layers.append(torch.nn.functional.pad(value, (0, 0, 0, sizes[index + 1] - len(value))).half().flatten())
+        layers.append(torch.nn.functional.pad(value, (0, GAP, 0, sizes[index + 1] - len(value))).half().flatten())
     return layers
 
 

@@ -10,6 +10,7 @@ import torch
 from . import march
 from .blocks import launch_blocks
 from .device import backend_of
+from .fused_encoding import half_feature
 from .fused_field import FieldArrays
 from .fused_kernel import (
     BLOCKS_PER_MULTIPROCESSOR,
@@ -20,7 +21,7 @@ from .fused_kernel import (
     color_kernel,
     density_kernel,
 )
-from .fused_network import half_feature, padded
+from .fused_network import padded
 from .fused_shape import FusedShape
 from .runtime import array, init
 from .traversal import MarchSettings, grid_arrays, march_params
@@ -130,9 +131,9 @@ def render_coarse(
         resident = properties.multi_processor_count * BLOCKS_PER_MULTIPROCESSOR
     lanes = lanes or (lanes_of(10 * properties.major + properties.minor) if cuda else 1)
     counts = march.sample_counts(rays.bin_counts, count, settings.per_bin)
-    # Threads promise room for rays that they follow; with twice the room a launch ends half of it or more of the rays.
-    at_once = max(1, min(number, capacity // (2 * count)))
-    groups = max(1, min(-(-number // lanes), at_once // lanes, resident))
+    room = min(capacity, number * count)
+    # Threads promise room for the rays that they follow: half of it, so that a launch fills the other half at least.
+    groups = max(1, min(-(-number // lanes), room // (2 * count * lanes), resident))
     pixels = torch.zeros(number, 5, device=device)
     classes = field.class_count
     probabilities = torch.zeros(number, max(classes, 1), device=device)
@@ -141,7 +142,6 @@ def render_coarse(
     out.pixels, out.probabilities, out.evaluated = array(pixels), array(probabilities), array(evaluated)
     marched = march.marched_rays(rays.origins, rays.directions, rays.total_weight, rays.t_first, counts)
     grid, params, arrays = grid_arrays(cells, skip_distance), march_params(settings), _field_arrays(field)
-    room = min(capacity, number * count)
     visible, places = _visible_samples(room, field.shape.geometry, device)
     heads = max(1, min(-(-room // lanes), resident))
     stride = heads * lanes
@@ -149,8 +149,7 @@ def render_coarse(
     queue = RayQueue()
     queue.indices, queue.next_ray, queue.ray_count = array(rays.queue), array(next_ray), array(rays.ray_count)
     queue.promised, queue.most, queue.capacity = array(promised), count, room
-    # As often as the worst case asks for, so that nothing is read back: most launches find nothing left.
-    for _ in range(-(-number // at_once)):
+    while True:
         places.zero_()
         promised.zero_()
         inputs = [marched, queue, grid, params, arrays, cull, visible, out]
@@ -160,6 +159,9 @@ def render_coarse(
         if classes:
             inputs = [marched, visible, stride, params, arrays, out]
             launch_blocks(class_kernel(field.shape, lanes), heads, lanes, inputs, device)
+        # Read back only where there may be rays left: launches for nothing take longer.
+        if room == number * count or bool(next_ray >= rays.ray_count):
+            break
     return FusedRays(pixels[:, :3], pixels[:, 3], pixels[:, 4], probabilities if classes else None, evaluated.sum())
 
 

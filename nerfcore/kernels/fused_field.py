@@ -11,21 +11,17 @@ import warp as wp
 
 from .cells import trilinear_at
 from .encode import FEATURES
+from .fused_encoding import frequency_encoding, grid_encoding, half_feature, put, spherical_harmonics
 from .fused_network import (
     any_of_warp,
-    frequency_encoding,
-    grid_encoding,
-    half_feature,
     network,
     network_to_pixels,
     network_to_row,
     output,
     packed_size,
     padded,
-    put,
     read_head,
     row_length,
-    spherical_harmonics,
 )
 from .fused_shape import HARMONICS, FusedShape
 

@@ -138,17 +138,17 @@ def _density_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
             busy = any_of_warp(active)
             if busy != 0:
                 t = float(0.0)
-                length_of = float(0.0)
+                interval = float(0.0)
                 p = wp.vec3(0.5, 0.5, 0.5)
                 if active == 1:
                     # Read again for each sample: kept, it would take registers that the products need.
                     ray = ray_of(rays, index, m)
-                    walk, t, length_of = advanced(ray, walk, 0.5, grid, m)
+                    walk, t, interval = advanced(ray, walk, 0.5, grid, m)
                     p = inside(grid_position(ray.origin + ray.direction * t, m.contracted))
                     out.evaluated[thread] = out.evaluated[thread] + 1
                 density = density_at(p, active, field, memory, row)
                 before = wp.exp(-optical_depth)
-                optical_depth += density * length_of
+                optical_depth += density * interval
                 after = wp.exp(-optical_depth)
                 weight = before - after
                 if active == 1 and weight > cull:

@@ -25,7 +25,8 @@ def random_network(sizes: tuple[int, ...]) -> tuple[list[np.ndarray], np.ndarray
     """Matrices (outputs, inputs) and the same packed, with something in the gaps that must not count."""
     generator = np.random.default_rng(1)
     matrices = [
-        generator.normal(0, inputs**-0.5, (outputs, inputs)).astype(np.float16) for inputs, outputs in zip(sizes, sizes[1:])
+        generator.normal(0, inputs**-0.5, (outputs, inputs)).astype(np.float16)
+        for inputs, outputs in zip(sizes, sizes[1:])
     ]
     packed = np.concatenate([np.pad(m, ((0, 0), (0, GAP)), constant_values=99).ravel() for m in matrices])
     assert len(packed) == packed_size(sizes)

@@ -15,7 +15,7 @@ _one_at_a_time = threading.Lock()  # tiles of all CPU threads lie in the same me
 
 
 def load_blocks(kernel: wp.Kernel, lanes: int, device: torch.device) -> None:
-    """Compile the kernel for blocks of `lanes` threads (a minute on CUDA, the first time ever), or take it from
+    """Compile the kernel for blocks of `lanes` threads (seconds, the first time ever), or take it from
     Warp's cache."""
     key = (kernel.module.name, str(device))
     with _load_lock:

@@ -20,7 +20,7 @@ from .model import Model, Rendered
 
 log = logging.getLogger("fieldwork")
 # Not tuned.
-LEAST_RAYS = 1 << 17  # of a picture that "auto" renders fused: previews are not worth a minute of compilation
+LEAST_RAYS = 1 << 17  # of a picture that "auto" renders fused: previews are not worth seconds of compilation
 
 
 def unsupported(model: Model) -> str | None:

@@ -19,8 +19,14 @@ from ..kernels.runtime import small_tensor
 from .model import Model, Rendered
 
 log = logging.getLogger("fieldwork")
+OLDEST = (7, 5)  # GPUs that multiply halves as the kernel does
 # Not tuned.
 LEAST_RAYS = 1 << 17  # of a picture that "auto" renders fused: previews are not worth seconds of compilation
+
+
+def _capability(device: torch.device) -> tuple[int, int] | None:
+    """The compute capability of a CUDA device."""
+    return torch.cuda.get_device_capability(device) if device.type == "cuda" else None
 
 
 def unsupported(model: Model) -> str | None:
@@ -30,6 +36,9 @@ def unsupported(model: Model) -> str | None:
         return "the torch backend has no such kernel"
     if not isinstance(field, HybridField):
         return f"the field is a {type(field).__name__}"
+    capability = _capability(model.priorities.device)
+    if capability is not None and capability < OLDEST:
+        return "the GPU is of compute capability {}.{}, below {}.{}".format(*capability, *OLDEST)
     c = field.config
     if c.branch == "implicit":
         return "field.branch is “implicit”"

@@ -11,6 +11,7 @@ import torch
 import warp as wp
 from fieldwork.nerfcore.config import make_config
 from fieldwork.nerfcore.kernels.fused import render_coarse
+from fieldwork.nerfcore.render import fused as fused_render
 from fieldwork.nerfcore.render.fused import FusedRenderer, UnfusedRenderer, _log_once, ray_renderer, unsupported
 from fieldwork.nerfcore.render.model import Model
 
@@ -203,6 +204,14 @@ def test_the_setting_chooses_the_kernel_and_says_why_not(caplog: pytest.LogCaptu
     with caplog.at_level(logging.WARNING, "fieldwork"):
         assert chosen(render__fused="on", field__implicit_layers="3") is UnfusedRenderer
     assert "field.implicit_layers is 3" in caplog.text
+
+
+def test_an_old_gpu_renders_with_the_separate_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = random_model(2)
+    monkeypatch.setattr(fused_render, "_capability", lambda device: (7, 5))
+    assert unsupported(model) is None
+    monkeypatch.setattr(fused_render, "_capability", lambda device: (6, 1))
+    assert unsupported(model) == "the GPU is of compute capability 6.1, below 7.5"
 
 
 def test_every_preset_is_supported() -> None:

@@ -3,8 +3,10 @@
 import bpy
 from bpy.types import Context, PropertyGroup
 
-from .choices import EXPORTS, MASK_MODES, PASSES, POSE_PRESETS, PRESETS, SIDES, SPLITS, TEXTURE_SIZES, UP
+from .choices import EXPORTS, MASK_MODES, PASSES, POSE_PRESETS, PRESETS, SPLITS, UP
 from .label_settings import LabelSettings
+from .measure_settings import MeasureSettings
+from .mesh_settings import MeshSettings
 from .props import (
     BoolProperty,
     CollectionProperty,
@@ -16,8 +18,6 @@ from .props import (
     PointerProperty,
     StringProperty,
 )
-
-SOME_FACES = 200_000  # where the user wants fewer than all, at first
 
 
 def _project_changed(self: "FieldworkScene", context: Context) -> None:
@@ -45,10 +45,6 @@ def _row_chosen(self: "FieldworkScene", context: Context) -> None:
     camera = viewing.photo_camera_of(self.id_data, snapshot.owner(folder), self.images[self.pose_index].name)
     if camera is not None:
         viewing.look_through(self.id_data, camera)
-
-
-def _keep_all_faces(self: "FieldworkScene", keep: bool) -> None:
-    self.faces = 0 if keep else SOME_FACES
 
 
 def _run_changed(self: "FieldworkScene", context: Context) -> None:
@@ -112,7 +108,7 @@ class FieldworkClass(PropertyGroup):
     area: FloatProperty(name="Area", description="Area of the class on the mesh", unit="AREA")
 
 
-class FieldworkScene(LabelSettings, PropertyGroup):
+class FieldworkScene(LabelSettings, MeshSettings, MeasureSettings, PropertyGroup):
     project: StringProperty(
         name="Project",
         description="Folder that holds everything known about the capture",
@@ -257,166 +253,6 @@ class FieldworkScene(LabelSettings, PropertyGroup):
         ],
     )
 
-    # Mesh
-    resolution: IntProperty(
-        name="Resolution",
-        description="Cells along the longest side of what the photos show; memory grows with the square. 0: 512, or up "
-        "to 1024 where the photos are finer",
-        default=0,
-        min=0,
-        max=2048,
-    )
-    detail: FloatProperty(
-        name="Detail",
-        description="Side of a cell in millimetres, instead of the resolution; needs a known scale. 0: the resolution",
-        default=0.0,
-        min=0.0,
-        soft_max=100.0,
-    )
-    mesh_region: EnumProperty(
-        name="Region",
-        description="What part of the capture becomes surface",
-        items=[
-            ("auto", "Automatic", "The training region, or what the photos show where there is none"),
-            ("photos", "All Photos Show", "Everything that the photos show, whatever the training region"),
-        ],
-    )
-    turntable: StringProperty(
-        name="Turntable",
-        description="Folder for pictures of the mesh from eight sides, its colors and its classes; empty: none",
-        subtype="DIR_PATH",
-    )
-    faces: IntProperty(
-        name="Faces",
-        description="Target number of triangles, at least 100; 0: keep all",
-        default=200_000,
-        min=0,
-        soft_max=2_000_000,
-    )
-    all_faces: BoolProperty(
-        name="All",
-        description="Keep all triangles, however many",
-        get=lambda self: self.faces == 0,
-        set=_keep_all_faces,
-    )
-    lods: IntProperty(
-        name="Levels of Detail",
-        description="Coarser meshes to write as well, each with a quarter of the triangles",
-        default=0,
-        min=0,
-        max=6,
-    )
-    watertight: BoolProperty(
-        name="Watertight",
-        description="Close the surface: what no photo shows counts as inside, and its faces are marked as unseen",
-    )
-    texture: EnumProperty(
-        name="Texture",
-        description="Size of the texture in pixels",
-        items=TEXTURE_SIZES,
-        default="auto",
-    )
-    texture_kind: EnumProperty(
-        name="Texture From",
-        description="What the texture shows",
-        items=[
-            ("photo", "Photos", "The photos, as sharp as they are"),
-            ("field", "Field", "The field's colors, without what differs from photo to photo"),
-        ],
-    )
-    mesh_file: StringProperty(
-        name="Also Write",
-        description="File for other programs: .glb, .usdc, .obj, .ply or .stl; empty: none",
-        subtype="FILE_PATH",
-    )
-    split: EnumProperty(
-        name="Objects",
-        description="What the file holds: one object, or one for each class or instance",
-        items=SPLITS,
-    )
-
-    # Measure
-    distances: StringProperty(
-        name="Distances",
-        description="Table (.csv) of distances to measure, some known to scale by or to check with; empty: none",
-        subtype="FILE_PATH",
-    )
-    scale_error: FloatProperty(
-        name="Scale Error",
-        description="Standard uncertainty of the scale in percent; 0: by the distances, or by how the scale was set",
-        default=0.0,
-        min=0.0,
-        soft_max=5.0,
-    )
-    caps: FloatProperty(
-        name="Caps",
-        description="How much of its area caps over openings may have of a thing whose volume is given",
-        default=0.1,
-        min=0.0,
-        max=0.95,
-        subtype="FACTOR",
-    )
-    sides: EnumProperty(
-        name="Views",
-        description="Which sides are drawn",
-        items=SIDES,
-        options={"ENUM_FLAG"},
-        default={"top", "front", "right", "back", "left"},
-    )
-    conditions: StringProperty(
-        name="Conditions",
-        description="Classes to map as conditions, such as damages, with commas between them: hatched over the drawings, "
-        "numbered, listed with their areas; or all",
-    )
-    turn: FloatProperty(
-        name="Turn",
-        description="Degrees about Z from the world to the front that is drawn, for slanted fronts",
-        default=0.0,
-        min=-180.0,
-        max=180.0,
-    )
-    paper_scale: FloatProperty(
-        name="Scale 1:",
-        description="Scale of drawings on paper; 0: the largest that fits on A3",
-        default=0.0,
-        min=0.0,
-        soft_max=1000.0,
-    )
-    section_plane: StringProperty(
-        name="Section", description="Plane of the section in the aligned world: x=…, y=… or z=…", default="z=1"
-    )
-    drawings: StringProperty(
-        name="Drawings",
-        description="Folder for drawings; empty: in the exports of the project",
-        subtype="DIR_PATH",
-    )
-    other_project: StringProperty(
-        name="Earlier Epoch", description="Project of an earlier epoch of the same object", subtype="DIR_PATH"
-    )
-    other_run: StringProperty(name="Its Run", description="Training run of the earlier epoch", default="main")
-    common_points: StringProperty(
-        name="Common Points",
-        description="Table (.csv) of points in both worlds; empty: the surfaces themselves say how they lie",
-        subtype="FILE_PATH",
-    )
-    compare_limit: FloatProperty(
-        name="Limit",
-        description="Distance beyond which surfaces do not belong together; 0: 20 cells of the mesh",
-        default=0.0,
-        min=0.0,
-        unit="LENGTH",
-    )
-    compare_path: StringProperty(
-        name="Comparison",
-        description="Folder for the comparison; empty: in the exports of the project",
-        subtype="DIR_PATH",
-    )
-    report_path: StringProperty(
-        name="Report",
-        description="Report to write, .html or .pdf; empty: report.html in the exports of the project",
-        subtype="FILE_PATH",
-    )
-
     # Export
     export_to: EnumProperty(name="Format", description="What is written", items=EXPORTS)
     export_split: EnumProperty(
@@ -435,7 +271,8 @@ class FieldworkScene(LabelSettings, PropertyGroup):
 
 
 # By name, those that a scene has from its parts too: a class knows only its own.
-SETTINGS = LabelSettings.__annotations__ | FieldworkScene.__annotations__
+PARTS = (LabelSettings, MeshSettings, MeasureSettings, FieldworkScene)
+SETTINGS = {name: made for part in PARTS for name, made in part.__annotations__.items()}
 CLASSES = [FieldworkImage, FieldworkClass, FieldworkScene]
 
 

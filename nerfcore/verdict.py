@@ -19,6 +19,7 @@ NOTHING = 0.01  # mean opacity of renders before an environment
 FLAT = 1.02  # 95th percentile of depth over the 5th
 MISSED, PARTLY = 0.02, 0.1  # share of the photos' pixels that show the mesh
 SOLID, HALF_GONE = 0.9, 0.5  # share of the pixels that show something near with detail which hit the mesh
+MANY_FEW = 0.5  # of what is missing that fewer than three photos may show, before photos are asked for first
 HOLES = 0.02  # share of what the mesh fills in pictures that is holes
 LITTLE_IN_ONE = 0.5  # share of the area that the largest part has
 FEW_LABELS_RIGHT = 0.3  # mIoU
@@ -140,6 +141,8 @@ def mesh_verdict(
         text = f"Of what the photos show near, {1 - solid:.0%} is missing in the mesh"
         if overlapped is not None and overlapped >= SOLID:
             text += f", and {few:.0%} is in fewer than three photos: take more photos of that, from other places."
+        elif few > MANY_FEW * (1 - solid):
+            text += f", and {few:.0%} is in fewer than three photos: take more photos of that, and train longer."
         else:
             text += ". Train longer, add photos of what is missing, or enlarge the region."
         found.append(("failed" if solid < HALF_GONE else "weak", text))

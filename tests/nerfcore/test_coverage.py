@@ -142,7 +142,10 @@ def test_what_fewer_than_three_photos_show_is_told_apart(room: tuple[Path, Scene
     assert told["reasons"][0].startswith(
         "Of what the photos show near, 30% is missing in the mesh, and 25% is in fewer"
     )
-    assert "Train longer" in mesh_verdict(0.3, 0.7, 0.0, 1.0, 0.8, 0.25)["reasons"][0]
+    assert "Train longer" in mesh_verdict(0.3, 0.7, 0.0, 1.0, 0.8, 0.1)["reasons"][0]
+    both = mesh_verdict(0.3, 0.7, 0.0, 1.0, 0.8, 0.25)["reasons"][0]
+    assert "25% is in fewer than three photos" in both
+    assert "train longer" in both
 
 
 def test_scraps_are_told_whatever_they_cover() -> None:

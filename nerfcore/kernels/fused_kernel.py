@@ -118,7 +118,7 @@ def _density_kernel(shape: FusedShape, lanes: int) -> wp.Kernel:
         index = int(-1)
         walk = Walk()
         optical_depth = float(0.0)
-        needed = queue.most  # room for visible samples that a ray may take, less what the last one left
+        needed = queue.most  # room to ask for before the next ray: what the last one has used of its own
         busy = int(1)
         while busy != 0:
             if index < 0 and needed >= 0:

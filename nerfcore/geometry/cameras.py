@@ -183,4 +183,4 @@ def project(camera: Camera, points: np.ndarray) -> np.ndarray:
 
 def flip_camera_axes(camera_to_world: np.ndarray) -> np.ndarray:
     """Turn OpenCV camera axes into OpenGL/Blender ones, or back: (..., 4, 4) → (..., 4, 4)."""
-    return camera_to_world * [1.0, -1.0, -1.0, 1.0]
+    return camera_to_world * [1.0, -1.0, -1.0, 1.0] + 0.0  # no −0, which files would show

@@ -120,7 +120,7 @@ def render_coarse(
     """Colour, opacity, depth and class probabilities of rays after their coarse march, at most `count` samples a ray.
 
     `lanes`: samples a block, by default `lanes_of` on CUDA and 1 on the CPU, where more need Warp's `enable_cpu_blocks`;
-    `capacity`: visible samples there is room for, of at least two rays a thread.
+    `capacity`: visible samples there is room for at a time; what does not fit is rendered in further rounds.
     """
     init()
     device, number = rays.origins.device, len(rays.origins)

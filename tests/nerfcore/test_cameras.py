@@ -140,6 +140,7 @@ def test_axes_flip_is_its_own_inverse() -> None:
     pose[:3, 3] = 1, 2, 3
     flipped = flip_camera_axes(pose)
     assert np.array_equal(flip_camera_axes(flipped), pose)
+    assert not np.signbit(flip_camera_axes(np.eye(4))[3]).any()  # files would show −0
     # A Blender camera looks along −z: the OpenCV viewing axis must come out as its −z.
     assert np.array_equal(flipped[:3, 2], -pose[:3, 2])
     assert np.array_equal(flipped[:3, 0], pose[:3, 0])

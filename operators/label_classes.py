@@ -37,8 +37,7 @@ class ClassEdit(Operator):
         settings = context.scene.fieldwork
         folder = snapshot.folder_of(settings)
         deliver_edits()
-        fields = ("id", *classes.FIELDS)
-        known = [{name: value[name] for name in fields} for value in classes.shown(folder)]
+        known = classes.wanted(folder)
         wanted = self.changed(settings, known)
         if wanted is None:
             return {"CANCELLED"}
@@ -49,13 +48,16 @@ class ClassEdit(Operator):
             if error is not None:
                 refused.append(error)
                 pending.tell(folder, error)
+            classes.answered(folder, wanted)
             refresh(folder, chosen_id)
 
+        classes.on_its_way(folder, wanted)
         try:
             ask = queue.ask_and_wait if bpy.app.background else queue.ask
             ask("classes", {"project": str(folder), "classes": wanted}, answered)
             session.hurry()
         except EngineError as error:
+            classes.answered(folder, wanted)
             refused.append(error)
         if refused:
             self.report({"ERROR"}, str(refused[0]))

@@ -12,8 +12,10 @@ from .history import History
 
 VERB = "classes"
 FIELDS = ("name", "color", "priority")
+UNKNOWN = {"color": (0.5, 0.5, 0.5), "priority": 1.0}  # of a class that was added, until the engine has said
 
 _quiet = False
+_sent: dict[Path, list[dict[str, Any]]] = {}  # lists with added or removed classes that the engine did not answer yet
 
 
 @contextmanager
@@ -29,7 +31,23 @@ def quiet() -> Iterator[None]:
 
 def shown(folder: Path | None) -> list[dict[str, Any]]:
     """The classes of the project, with the edits that are under way."""
-    return _with_changes(folder, edits.pending(folder, VERB) or {})
+    return [UNKNOWN | value for value in _with_changes(folder, edits.pending(folder, VERB) or {})]
+
+
+def wanted(folder: Path | None) -> list[dict[str, Any]]:
+    """As `shown`, but as the engine is told, which has yet to choose the color of a class that was added."""
+    return [told(value) for value in _with_changes(folder, edits.pending(folder, VERB) or {})]
+
+
+def on_its_way(folder: Path, values: list[dict[str, Any]]) -> None:
+    """A list with classes added or removed is sent to the engine: it stands over the file until `answered`."""
+    _sent[folder] = values
+
+
+def answered(folder: Path, values: list[dict[str, Any]]) -> None:
+    """The engine took or refused this list; a newer one stays on its way."""
+    if _sent.get(folder) is values:
+        del _sent[folder]
 
 
 def fill(settings: Any) -> None:
@@ -114,12 +132,18 @@ def _put(folder: Path, changes: dict[tuple[int, str], Any]) -> None:
 
 
 def _params(folder: Path, changes: dict[tuple[int, str], Any]) -> dict[str, Any]:
-    """All classes as they shall be: those of the project as it is when the edit is sent, changed."""
-    return {"classes": [{name: value[name] for name in ("id", *FIELDS)} for value in _with_changes(folder, changes)]}
+    """All classes as they shall be: those that are known when the edit is sent, changed."""
+    return {"classes": [told(value) for value in _with_changes(folder, changes)]}
+
+
+def told(value: dict[str, Any]) -> dict[str, Any]:
+    """What the engine is told of a class."""
+    return {name: value[name] for name in ("id", *FIELDS) if name in value}
 
 
 def _with_changes(folder: Path | None, changes: dict[tuple[int, str], Any]) -> list[dict[str, Any]]:
-    known = [{"priority": 1.0, **value} for value in (snapshot.project(folder) or {}).get("classes", [])]
+    project = (snapshot.project(folder) or {}).get("classes", [])
+    known = project if folder is None else _sent.get(folder, project)
     changed = {field: {number: value for (number, name), value in changes.items() if name == field} for field in FIELDS}
     return [
         {**value, **{field: changed[field][value["id"]] for field in FIELDS if value["id"] in changed[field]}}

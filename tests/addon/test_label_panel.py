@@ -95,6 +95,33 @@ answer(seen)
     assert beyond == ["CANCELLED"]
 
 
+def test_edits_before_the_engine_answered_keep_the_added_class(bpy_script, tmp_path):
+    lists = bpy_script(
+        SETUP
+        + CLASSES
+        + """
+from fieldwork.addon.project import edits
+held, seen = [], []
+queue.ask_and_wait = lambda *request: held.append(request)
+rows = lambda: [[entry.id, entry.name] for entry in settings.classes]
+bpy.ops.fieldwork.class_add(name="wood")
+bpy.ops.fieldwork.class_add()
+settings.classes[0].color = (1, 0, 0)
+edits.send(lambda *request: held.append(request), at_once=True)
+seen = [[c["name"] for c in params["classes"]] for _, params, _ in held]
+for request in held:
+    engine(*request)
+answer([seen, rows(), [round(c, 3) for c in settings.classes[0].color]])
+""",
+        project=make_posed_project(tmp_path / "p"),
+    )
+    assert lists == [
+        [["stone", "gold", "wood"], ["stone", "gold", "wood", "Class 4"], ["stone", "gold", "wood", "Class 4"]],
+        [[1, "stone"], [2, "gold"], [3, "wood"], [4, "Class 4"]],
+        [1, 0, 0],
+    ]
+
+
 def test_a_refused_class_is_told(bpy_script, tmp_path):
     message = bpy_script(
         SETUP

@@ -39,6 +39,8 @@ class FIELDWORK_OT_blend(ProjectOperator):
         out = self.path(context, "out") or str(Path(project, "exports", run, f"{Path(project).name}.blend"))
         if not out.endswith(".blend"):
             raise ValueError(t("Name a file that ends in .blend."))
+        if bpy.data.filepath and Path(out).resolve() == Path(bpy.data.filepath).resolve():
+            raise ValueError(t("{} is open here: choose another file in the Export panel.", Path(out).name))
         split, renders = self.value(context, "split"), absolute(self.renders)
         return {"project": project, "run": run, "out": out, "split": split, "renders": renders}
 

@@ -33,7 +33,7 @@ from ..images.picture import Picture, as_float, associated, to_srgb8
 from ..images.working import read_picture, shows_transparency
 from ..params import PackageParams
 from ..progress import Reporter
-from ..project.fingerprints import read_made
+from ..project.fingerprints import moved, read_made
 from ..project.label_revision import LABEL_REVISION
 from ..project.runs import (
     CHECKPOINT,
@@ -119,14 +119,19 @@ def photo_renders(project: Path, renders: Path | None) -> Path:
 
 
 def stale(project: Path, run: str, renders: Path | None = None, pictures: bool = True) -> list[str]:
-    """Warnings about what would be delivered of a run but was made from an earlier training of it."""
+    """Warnings about what would be delivered of a run but was made from an earlier training of it, or lies elsewhere."""
     folder, state = project / "exports" / run, checkpoint_state(run_folder(project, run) / CHECKPOINT)
     notes = []
-    if (folder / "mesh.npz").is_file() and state is not None:
+    if (folder / "mesh.npz").is_file():
         made = read_made(folder / MESH_RECORD)
         # Without a record it is of a version that wrote none; so may the field be.
-        older = made.checkpoint != state_id(state) if made is not None else bool(state.get("training"))
-        if older:
+        trained = state is not None and (made.checkpoint != state_id(state) if made else bool(state.get("training")))
+        if made is not None and moved(made, load_project(project)):
+            notes.append(
+                f"The project was aligned anew since the mesh of the run “{run}” was made: it lies elsewhere, or is of "
+                "another size. Run `fieldwork mesh` again."
+            )
+        elif trained:
             notes.append(f"The mesh is from an earlier training of the run “{run}”. Run `fieldwork mesh` again.")
     shown = read_made(photo_renders(project, renders) / RENDER_RECORD) if pictures else None
     if shown is not None and shown.settings.get("run") != run:

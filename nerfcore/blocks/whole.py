@@ -25,11 +25,11 @@ from ..mesh.surface import Surface, class_table, to_world
 from ..mesh.turntable import write_turntable
 from ..params import BlocksParams
 from ..progress import Reporter
-from ..project.fingerprints import digest, rounded, write_made
+from ..project.fingerprints import alignment, write_made
 from ..project.label_revision import map_revision
 from ..project.runs import MESH_RECORD, read_metrics, run_folder
 from ..project.schema import step
-from ..project.store import load_project, world_from_sfm
+from ..project.store import load_project
 from .join import joined, open_at_seams
 from .plan import RUN, Plan, block_folder
 from .surface import load_part
@@ -102,7 +102,7 @@ def write_whole(folder: Path, plan: Plan, params: BlocksParams, report: Reporter
     }
     if painted is not None:
         result["painted_by_photos"] = round(painted.seen, 4)
-    inputs = {"alignment": digest(rounded(world_from_sfm(load_project(folder))))}
+    inputs = {"alignment": alignment(load_project(folder))}
     write_made(target / MESH_RECORD, step("blocks", params.model_dump(mode="json"), result, inputs))
     return result
 

@@ -12,11 +12,12 @@ from ..mesh.features import features_of
 from ..mesh.files import write_surface
 from ..mesh.formats import USD
 from ..mesh.instances import read_instances
-from ..mesh.stored import load_class_map, load_surface, mesh_folder, mesh_label_revision
+from ..mesh.stored import load_class_map, load_surface, mesh_folder, mesh_label_revision, require_in_place
 from ..params import ExportParams
 from ..progress import Reporter
+from ..project.fingerprints import read_made
 from ..project.label_revision import map_revision
-from ..project.runs import holdout_of
+from ..project.runs import MESH_RECORD, holdout_of
 from ..project.schema import Project
 from ..project.store import load_project, record_step
 from ..render.baked import load_baked
@@ -42,8 +43,8 @@ def export(params: ExportParams, report: Reporter) -> dict[str, Any]:
         {"files": [paths], "to": format, "grids": names, of vdb, "label_revision": of the marks that classes are from, or
         None}
     Raises:
-        SettingError: the file has another ending, or the format has no words for a lens. ProjectError: there is no mesh, no
-        trained run or no pose. DiskError: a file cannot be written.
+        SettingError: the file has another ending, or the format has no words for a lens. ProjectError: there is no mesh, or
+        the project was aligned anew since it was made; no trained run or no pose. DiskError: a file cannot be written.
     """
     folder = Path(params.project).absolute()
     project = load_project(folder)
@@ -54,6 +55,9 @@ def export(params: ExportParams, report: Reporter) -> dict[str, Any]:
     revision = label_revision(folder, project, params)
     result: dict[str, Any] = {"to": params.to, "label_revision": revision}
     if params.to in OF_THE_MESH:
+        made = read_made(mesh_folder(folder, params.run) / MESH_RECORD)
+        if made is not None:
+            require_in_place(folder, made)
         for warning in stale(folder, params.run, pictures=False):
             report.warn(warning)
         files = _write_mesh(folder, project, params, out, revision, report)

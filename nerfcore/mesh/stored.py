@@ -13,10 +13,10 @@ from PIL import Image
 
 from ..errors import ProjectError
 from ..files import UNREADABLE_ARRAYS
-from ..project.fingerprints import digest, read_made, rounded
+from ..project.fingerprints import moved, read_made
 from ..project.runs import MESH_RECORD
 from ..project.schema import ProvenanceStep
-from ..project.store import load_project, world_from_sfm
+from ..project.store import load_project
 from .parts import Texture, texture_of
 from .surface import Surface
 
@@ -103,9 +103,14 @@ def mesh_record(project: Path, run: str) -> ProvenanceStep:
     made = read_made(mesh_folder(project, run) / MESH_RECORD)
     if made is None:
         raise ProjectError(f"The run “{run}” has no mesh, or an unfinished one.", "Run `fieldwork mesh` first.")
-    if made.inputs.get("alignment") != digest(rounded(world_from_sfm(load_project(project)))):
+    require_in_place(project, made)
+    return made
+
+
+def require_in_place(project: Path, made: ProvenanceStep) -> None:
+    """Raise ProjectError where the project was turned, moved or scaled since the mesh of this record was made."""
+    if moved(made, load_project(project)):
         raise ProjectError(
             "The project was aligned anew since its mesh was made: the mesh lies elsewhere, or is of another size.",
             "Run `fieldwork mesh` again.",
         )
-    return made

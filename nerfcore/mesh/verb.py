@@ -17,10 +17,10 @@ from ..geometry.similarity import similarity_scale
 from ..images.picture import to_bytes
 from ..params import MeshParams
 from ..progress import Reporter
-from ..project.fingerprints import Earlier, Fingerprint, compare, digest, read_made, rounded, write_made
+from ..project.fingerprints import Earlier, Fingerprint, alignment, compare, digest, read_made, rounded, write_made
 from ..project.runs import MESH_RECORD, checkpoint_id, state_id
 from ..project.schema import step
-from ..project.store import load_project, record_step, world_from_sfm
+from ..project.store import load_project, record_step
 from ..render.run import Trained, load_info, load_trained, refined_poses
 from ..verdict import mesh_verdict
 from .build import Built, build, largest_share, wanted_bounds
@@ -168,7 +168,7 @@ def mesh_inputs(params: MeshParams) -> Fingerprint:
     out = str(params.out.absolute()) if params.out else None
     return {
         "trained field": checkpoint_id(folder, params.run),
-        "alignment": digest(rounded(world_from_sfm(load_project(folder)))),
+        "alignment": alignment(load_project(folder)),
         "classes": class_inputs(scene),
         "settings": digest([settings, out, *rendering]),
         "region": digest(None if scene.bounds is None else rounded(scene.bounds)),

@@ -17,7 +17,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from ..files import file_hash, write_json
-from .schema import ProvenanceStep
+from .schema import Project, ProvenanceStep
 
 Fingerprint = dict[str, str]
 
@@ -67,6 +67,16 @@ def rounded(value: np.ndarray, digits: int = 6) -> list[Any]:
     size = float(np.abs(value).max(initial=0.0))
     step = 10.0 ** (np.floor(np.log10(size)) + 1 - digits) if size > 0 else 1.0
     return (np.round(np.asarray(value, np.float64) / step) + 0.0).tolist()
+
+
+def alignment(project: Project) -> str:
+    """A digest of where the project lies in the world, how it is turned and how large it is."""
+    return digest(rounded(np.array(project.frame.world_from_sfm, np.float64)))
+
+
+def moved(made: ProvenanceStep, project: Project) -> bool:
+    """Whether the project was turned, moved or scaled since this was made."""
+    return made.inputs.get("alignment") != alignment(project)
 
 
 def difference(old: Fingerprint, new: Fingerprint) -> str:

@@ -27,17 +27,17 @@ from ..progress import Reporter
 from ..project.fingerprints import (
     Earlier,
     Fingerprint,
+    alignment,
     compare,
     digest,
     files_digest,
     read_made,
-    rounded,
     write_made,
 )
 from ..project.label_revision import label_facts
 from ..project.runs import INSTANCES, MESH_RECORD, checkpoint_id
 from ..project.schema import step
-from ..project.store import load_project, world_from_sfm
+from ..project.store import load_project
 from . import parts
 from .baked import META, BakedField, load_baked, voxels_folder
 from .image import Frame, background_of, render_view
@@ -146,7 +146,7 @@ def render_inputs(params: RenderParams) -> Fingerprint:
     chosen = params.model_dump(mode="json", exclude={"project", "run", "out", "frame_range"})
     return {
         "trained field": checkpoint_id(folder, params.run),
-        "alignment": digest(rounded(world_from_sfm(load_project(folder)))),
+        "alignment": alignment(load_project(folder)),
         "classes": class_inputs(scene),
         "settings": digest([chosen, info.config.render.model_dump(mode="json")]),
         **({"baked field": files_digest([("meta", voxels_folder(folder, params.run) / META)])} if params.baked else {}),

@@ -22,6 +22,7 @@ from fieldwork.nerfcore.project.fingerprints import write_made
 from fieldwork.nerfcore.project.runs import RENDER_RECORD
 from fieldwork.nerfcore.project.schema import Project, step
 from fieldwork.nerfcore.project.store import load_project, save_project
+from fieldwork.tests.nerfcore.support.meshed import court
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from PIL import Image
@@ -240,3 +241,13 @@ answer([slot.image.filepath for slot in imported.cameras[0].data.background_imag
     (renders / "a.png").unlink()
     write_package(tmp_path, "main", taken, "p", Reporter())
     assert not list((folder / "renders").iterdir()), "what is gone from the project is gone from the package"
+
+
+def test_a_mesh_from_before_the_project_was_aligned_anew_is_told(tmp_path):
+    court(tmp_path)
+    assert stale(tmp_path, "main") == []
+    project = load_project(tmp_path)
+    frame = project.frame.model_copy(update={"world_from_sfm": np.diag([2.5, 2.5, 2.5, 1]).tolist()})
+    save_project(tmp_path, project.model_copy(update={"frame": frame}))
+    (told,) = stale(tmp_path, "main")
+    assert "aligned anew" in told

@@ -21,8 +21,10 @@ from fieldwork.nerfcore.geometry.contraction import grid_position
 from fieldwork.nerfcore.mesh.painted import MAPS
 from fieldwork.nerfcore.params import ExportParams, MeshParams, TrainParams
 from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.project.store import edit_project
 from fieldwork.nerfcore.verbs import run_verb
 from fieldwork.tests.nerfcore.support.ball import SMALL, ball_project
+from fieldwork.tests.nerfcore.support.meshed import court
 from onnx import TensorProto
 from onnx.reference import ReferenceEvaluator
 from onnxruntime import InferenceSession
@@ -260,3 +262,13 @@ def test_the_graph_computes_what_the_field_does(settings: dict, contracted: bool
     assert density == pytest.approx((geometry.density / 2.5).numpy(), rel=1e-3, abs=1e-6)
     assert color == pytest.approx(true_color.numpy(), abs=1e-4)
     assert classes == pytest.approx(true_classes.numpy(), abs=1e-4)
+
+
+def test_a_mesh_from_before_the_project_was_aligned_anew_is_refused(tmp_path: Path) -> None:
+    court(tmp_path / "p")
+    export(tmp_path / "p", "ply", out=tmp_path / "before.ply")
+    with edit_project(tmp_path / "p") as project:
+        project.frame.world_from_sfm = np.diag([2.5, 2.5, 2.5, 1]).tolist()
+    for kind in ("ply", "masks"):
+        with pytest.raises(ProjectError, match="aligned anew"):
+            export(tmp_path / "p", kind)

@@ -10,10 +10,10 @@ from fieldwork.nerfcore.config import RunConfig
 from fieldwork.nerfcore.mesh.instances import GAP, find_instances, write_instances
 from fieldwork.nerfcore.mesh.stored import COARSE, MESH, mesh_folder
 from fieldwork.nerfcore.mesh.surface import Surface, vertex_normals
-from fieldwork.nerfcore.project.fingerprints import digest, rounded, write_made
+from fieldwork.nerfcore.project.fingerprints import alignment, write_made
 from fieldwork.nerfcore.project.runs import INFO, MESH_RECORD, run_folder
 from fieldwork.nerfcore.project.schema import Project, SemanticClass, step
-from fieldwork.nerfcore.project.store import edit_project, load_project, save_project, world_from_sfm
+from fieldwork.nerfcore.project.store import edit_project, load_project, save_project
 from fieldwork.nerfcore.render.run import RunInfo
 
 CLASSES = [
@@ -61,7 +61,7 @@ def store_mesh(
     surface = Surface(vertices, faces, normals, grey if colors is None else colors, class_id, face_class, face_instance)
     np.savez(target / MESH, **vars(surface))
     np.savez(target / COARSE, vertices=coarse.vertices, faces=coarse.faces)
-    inputs = {"alignment": digest(rounded(world_from_sfm(project)))}
+    inputs = {"alignment": alignment(project)}
     write_made(target / MESH_RECORD, step("mesh", {}, {"voxel": voxel}, inputs))
 
 

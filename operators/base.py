@@ -13,9 +13,10 @@ from bpy.types import Context, Operator
 
 from ..addon import machine
 from ..addon.errors import EngineError
-from ..addon.jobs.job import Done, Job, Steps
+from ..addon.jobs.job import Done, Steps
 from ..addon.jobs.queue import queue
-from ..addon.project import edits, lists, recent, runs, snapshot
+from ..addon.project import edits, runs, snapshot
+from ..addon.project.lists import refresh_scenes
 from ..addon.properties import SETTINGS
 from ..addon.props import IntProperty, StringProperty
 from ..addon.text import t
@@ -241,18 +242,6 @@ def after_edits(steps: Steps | None) -> Steps | None:
             yield from steps
 
     return wait()
-
-
-def refresh_scenes(job: Job) -> None:
-    """Bring what the job changed in the project into the scenes that show it."""
-    for scene in bpy.data.scenes:
-        if job.project is not None and snapshot.folder_of(scene.fieldwork) == job.project:
-            if job.verb in ("new", "import", "reconstruct") and job.state == "done":
-                lists.other_project(scene.fieldwork)  # it may have been made anew
-                if not bpy.app.background:
-                    recent.remember(job.project)
-            else:
-                lists.refresh(scene.fieldwork)
 
 
 def scene_of(project: Path, name: str = "") -> bpy.types.Scene | None:

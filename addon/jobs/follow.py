@@ -16,7 +16,9 @@ def reattach(queue: Queue, project: Path) -> None:
     """Follow a job that another process runs on the project, and tell of one that died."""
     if queue.running and queue.running.project == project:
         return
-    from ...nerfcore.engine.status import list_jobs  # not at the top: enabling the extension must be quick
+    # Not at the top: enabling the extension must be quick, and the lists import jobs.
+    from ...nerfcore.engine.status import list_jobs
+    from ..project.lists import refresh_scenes
 
     queue.followed = None
     for status in reversed(list_jobs(project)):
@@ -24,6 +26,7 @@ def reattach(queue: Queue, project: Path) -> None:
             queue.followed = Job(
                 status.verb, status.params, status.id, project, state="running", followed=True,
                 started=time.monotonic() - max(0.0, time.time() - (status.started or time.time())),
+                on_done=refresh_scenes,
             )  # fmt: skip
             follow(queue)
             break

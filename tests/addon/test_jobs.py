@@ -20,11 +20,24 @@ from fieldwork.addon.jobs.follow import reattach  # noqa: E402
 from fieldwork.addon.jobs.job import CURVE_POINTS  # noqa: E402
 from fieldwork.addon.jobs.queue import Queue  # noqa: E402
 from fieldwork.addon.jobs.timer import tick  # noqa: E402
-from fieldwork.addon.project import classes, edits, snapshot  # noqa: E402
+from fieldwork.addon.project import (  # noqa: E402
+    classes,
+    edits,
+    lists,
+    snapshot,
+)
 from fieldwork.nerfcore.engine import status as st  # noqa: E402
 from fieldwork.tests.addon.support import make_project  # noqa: E402
 
 ENGINE = [sys.executable, str(Path(__file__).resolve().parents[1] / "counting_engine.py")]
+
+
+@pytest.fixture(autouse=True)
+def refreshed(monkeypatch):
+    """The jobs whose changes were brought into the scenes, which have no settings here."""
+    jobs = []
+    monkeypatch.setattr(lists, "refresh_scenes", jobs.append)
+    return jobs
 
 
 @pytest.fixture
@@ -134,7 +147,7 @@ def test_missing_engine_is_told(queue, project, monkeypatch):
         queue.run(count(queue, project))
 
 
-def test_reattach_follows_a_detached_job_to_its_end(queue, settings, project):
+def test_reattach_follows_a_detached_job_to_its_end(queue, settings, project, refreshed):
     job = count(queue, project, steps=150)
     queue.submit(job)
     tick_until(queue, lambda: job.fraction)
@@ -150,6 +163,7 @@ def test_reattach_follows_a_detached_job_to_its_end(queue, settings, project):
     tick_until(other, lambda: followed.state == "done")
     assert followed.result["steps"] == 150
     assert [step for step, _, _ in followed.curve] == list(range(0, 150, 10))
+    assert refreshed == [followed], "the lists show what it did"
 
 
 def test_followed_job_can_be_cancelled(queue, settings, project):

@@ -151,9 +151,9 @@ class Copy:
         for place in self.tracked:
             inside = [place] if place.is_file() else [path for path in place.rglob("*") if path.is_file()]
             for path in inside:
-                relative = path.relative_to(self.folder)
-                if "jobs" not in relative.parts and not path.name.startswith("."):
-                    found[relative.as_posix()] = path
+                # What the jobs of a project say is of this machine alone. Captures may lie in a folder of that name.
+                if "jobs" not in path.relative_to(place).parts and not path.name.startswith("."):
+                    found[path.relative_to(self.folder).as_posix()] = path
         return found
 
     def fetch(self, wanted: Callable[[str], bool] = lambda _: True, check: Callable[[], None] = lambda: None) -> int:

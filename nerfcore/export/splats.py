@@ -88,7 +88,8 @@ def write_splats(
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.write(_header(splats, label_revision))
         file.write(splats.tobytes())
-    beside = path.with_suffix(".glb")
+    # A file of this name without the word is rather the mesh.
+    beside = path.with_name(f"{path.stem.removesuffix('-splats')}-splats.glb")
     write_gltf_splats(beside, splats, label_revision)
     return [path, beside]
 

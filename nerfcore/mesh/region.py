@@ -70,7 +70,9 @@ def region_around(
         inside = ((points >= bounds[0]) & (points <= bounds[1])).all(1)
         if inside.sum() < FEWEST_HITS:
             raise TrainingError(
-                "The field has no surface in the region of interest.", "Train longer, or check the box."
+                "The photos show no surface in the region to look in.",
+                "Check the region of interest or `--region`: corners are in the aligned world, in its units. "
+                "`--region photos` looks at all that the photos show.",
             )
         points = points[inside]
         low, high = points.min(0), points.max(0)

@@ -59,6 +59,17 @@ def machine(root: Path, url: str) -> Copy:
     return Copy(Storage(url), root, "vase-1", [root / "vase"])
 
 
+def test_captures_may_lie_in_a_folder_called_jobs(tmp_path: Path) -> None:
+    place = tmp_path / "one/jobs/vase"
+    (place / "jobs").mkdir(parents=True)
+    (place / "jobs/engine.lock").touch()
+    (place / "project.json").write_text("{}")
+    copy = Copy(Storage((tmp_path / "store").as_uri()), tmp_path / "one", "vase-1", [place])
+    assert list(copy.storage.files("vase-1")) == []
+    assert copy.upload() == 1
+    assert list(copy.storage.files("vase-1")) == ["jobs/vase/project.json"]
+
+
 def test_what_one_machine_uploads_the_other_fetches(tmp_path, url):
     one, two = machine(tmp_path / "one", url), machine(tmp_path / "two", url)
     inner = tmp_path / "one/vase/runs"

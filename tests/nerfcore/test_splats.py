@@ -81,7 +81,7 @@ def test_splats_need_a_baked_field(ball: Path, tmp_path: Path) -> None:
         run_verb("export", ExportParams(project=project, to="splats"), Reporter())
 
 
-def test_splats_as_gltf_are_those_of_the_ply(exported: Path) -> None:
+def test_splats_as_gltf_are_those_of_the_ply(exported: Path, tmp_path: Path) -> None:
     """Read by other libraries: trimesh, and where there is node with it, the validator of Khronos."""
     import json
 
@@ -89,7 +89,9 @@ def test_splats_as_gltf_are_those_of_the_ply(exported: Path) -> None:
     from fieldwork.nerfcore.params import ExportParams
     from fieldwork.nerfcore.verbs import run_verb
 
-    ply, glb = run_verb("export", ExportParams(project=exported, to="splats"), Reporter())["files"]
+    out = tmp_path / "castle.ply"
+    ply, glb = run_verb("export", ExportParams(project=exported, to="splats", out=out), Reporter())["files"]
+    assert Path(glb).name == "castle-splats.glb", "castle.glb is rather its mesh"
     points = trimesh.load(ply).metadata["_ply_raw"]["vertex"]["data"]
     cloud = next(iter(trimesh.load(glb).geometry.values()))
     expected = np.stack([np.asarray(points[axis]).reshape(-1) for axis in "xzy"], 1) * [1, 1, -1]

@@ -1,7 +1,7 @@
 """What the menus of the scene's properties offer: identifier, name, tooltip."""
 
 PRESETS = [
-    ("draft", "Draft", "A first look in a minute or two"),
+    ("draft", "Draft", "A first look: a fifth of the steps, a smaller field"),
     ("standard", "Standard", "Good quality in reasonable time"),
     ("high", "High", "Best quality; takes several times longer"),
 ]
@@ -80,7 +80,7 @@ SPLITS = [
 ]
 PASSES = [
     ("rgb", "Color", "The photographed colors"),
-    ("depth", "Depth", "Distance along the ray in meters"),
+    ("depth", "Depth", "Distance along the camera's axis, in world units (meters once the scale is known)"),
     ("semantic", "Labels", "The class of each pixel"),
     ("confidence", "Confidence", "How certain the class is"),
     ("normal", "Normal", "Surface direction"),

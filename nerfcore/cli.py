@@ -1,6 +1,7 @@
 """The command line: one command a verb, made from the verb's parameter model.
 
-Exit codes: 0 done · 1 failed · 2 wrong usage · 3 done with warnings under --strict · 130 cancelled.
+Exit codes: 0 done · 1 failed · 2 wrong usage · 3 done, but with warnings or not judged good, under --strict ·
+130 cancelled.
 """
 
 from __future__ import annotations
@@ -103,13 +104,14 @@ class Points(click.ParamType):
 
 
 class Word(click.ParamType):
-    """A number or one of some words: the model of the parameters checks which."""
+    """A number or one of some words, or none: the model of the parameters checks which."""
 
-    def __init__(self, kinds: list[Any]) -> None:
-        self.name = "|".join(
+    def __init__(self, kinds: list[Any], none: bool) -> None:
+        names = [
             "|".join(get_args(k)) if get_origin(k) is Literal else click.types.convert_type(k).name.upper()
             for k in kinds
-        )
+        ]
+        self.name = "|".join([*names, "none"] if none else names)
 
     def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
         return self.name
@@ -133,7 +135,7 @@ def _plain(annotation: Any) -> Any:
     """The type without None, and without the checks that come with it."""
     if get_origin(annotation) in (Union, UnionType):
         kinds = [a for a in get_args(annotation) if a is not type(None)]
-        return _plain(kinds[0]) if len(kinds) == 1 else Word(kinds)
+        return _plain(kinds[0]) if len(kinds) == 1 else Word(kinds, type(None) in get_args(annotation))
     return _plain(get_args(annotation)[0]) if get_origin(annotation) is Annotated else annotation
 
 
@@ -168,7 +170,7 @@ def _option(name: str, info: FieldInfo) -> click.Option:
         kind = click.Choice([str(choice) for choice in get_args(kind)])
     elif kind is Path:
         kind = PATH
-    return click.Option(flags, type=kind, default=default, show_default=default is not None, **shared)
+    return click.Option(flags, type=kind, default=default, show_default=default not in (None, ""), **shared)
 
 
 def _command(name: str) -> click.Command:
@@ -182,7 +184,9 @@ def _command(name: str) -> click.Command:
     params += [
         click.Option(["--json", "as_json"], is_flag=True, help="print one JSON object on stdout and nothing else"),
         click.Option(["--quiet"], is_flag=True, help="no progress"),
-        click.Option(["--strict"], is_flag=True, help="exit with 3 when there were warnings"),
+        click.Option(
+            ["--strict"], is_flag=True, help="exit with 3 when there were warnings, or the result is not judged good"
+        ),
     ]
 
     def callback(as_json: bool, quiet: bool, strict: bool, **values: Any) -> int:

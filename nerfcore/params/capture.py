@@ -150,7 +150,7 @@ class ClassesParams(Params):
         default=None, description="all classes the project shall have; None: list them"
     )
     file: Path | None = Field(
-        default=None, description="classes.json with all classes the project shall have; none: list them"
+        default=None, description="classes.json with all classes the project shall have; without it they are listed"
     )
 
 

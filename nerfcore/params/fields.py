@@ -49,7 +49,9 @@ class RenderParams(Params):
     project: Path
     out: Path = Field(description="folder for the pictures")
     run: RunName = "main"
-    test: bool = Field(default=False, description="from the held-out photos")
+    test: bool = Field(
+        default=False, description="from the held-out photos; one of --test, --all, --camera and --orbit is needed"
+    )
     all: bool = Field(default=False, description="from every photo, also those of training")
     camera: Path | None = Field(
         default=None,

@@ -78,7 +78,7 @@ class LabelCarryParams(Params):
         default=None, description="project of an earlier epoch of the same object, which is labelled"
     )
     run: RunName = "main"
-    other_run: RunName = "main"
+    other_run: RunName = Field(default="main", description="run of the earlier epoch")
     points: Path | None = Field(
         default=None,
         description="table (.csv: name,x,y,z,other_x,other_y,other_z) of points in both worlds; default: by the surfaces",

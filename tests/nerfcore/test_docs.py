@@ -138,7 +138,11 @@ def test_help_names_the_words_that_an_option_takes() -> None:
     assert "default: rgb, depth, semantic" in shown["passes"][1]
     assert shown["frame_range"][0] == "--frame-range INTEGER INTEGER"
     (texture,) = (o for o in _command("mesh").params if o.name == "texture")
-    assert texture.get_help_record(click.Context(_command("mesh")))[0] == "--texture INTEGER|auto"
+    assert texture.get_help_record(click.Context(_command("mesh")))[0] == "--texture INTEGER|auto|none"
+    (query,) = (o for o in _command("relations").params if o.name == "query")
+    assert "default" not in query.get_help_record(click.Context(_command("relations")))[1]
+    (run,) = (o for o in _command("compare").params if o.name == "other_run")
+    assert "run of the earlier epoch" in run.get_help_record(click.Context(_command("compare")))[1]
 
 
 def test_experiments_are_dated_newest_first() -> None:

@@ -12,10 +12,12 @@ from ..addon.choices import MASK_MODES
 from ..addon.project import snapshot
 from ..addon.props import BoolProperty, CollectionProperty, EnumProperty, StringProperty
 from ..addon.text import t
+from ..nerfcore.images.suffixes import PHOTO_SUFFIXES, VIDEO_SUFFIXES
 from .base import ProjectOperator, mask_mode, need_photos, need_project_folder, scene_settings, set_if_empty
 
-PHOTOS = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".heic", ".heif", ".webp", ".exr", ".dng", ".bmp"}
-VIDEOS = {".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v"}
+READ = PHOTO_SUFFIXES | VIDEO_SUFFIXES
+# What Blender's own filters of pictures and movies do not show in a file browser.
+OTHERS = sorted(READ - bpy.path.extensions_image - bpy.path.extensions_movie)
 PHOTO_FOLDERS = ("photos", "images", "rgb")
 FORMATS = [
     ("auto", "Automatic", "Find out"),
@@ -35,7 +37,7 @@ FORMATS = [
 
 def project_for(source: Path) -> Path:
     """Where the project of a capture goes when the user names no place: beside it."""
-    if source.suffix.lower() in VIDEOS:
+    if source.suffix.lower() in VIDEO_SUFFIXES:
         return source.with_name(f"{source.stem}_fieldwork")
     whole = source.parent if source.name.lower() in PHOTO_FOLDERS else source
     return whole.with_name(f"{whole.name}_fieldwork")
@@ -43,7 +45,7 @@ def project_for(source: Path) -> Path:
 
 def photo_folder(source: Path) -> Path:
     """The folder of photos meant by a folder: one of its own named for photos where it has none itself."""
-    if not source.is_dir() or any(path.suffix.lower() in PHOTOS for path in source.iterdir()):
+    if not source.is_dir() or any(path.suffix.lower() in PHOTO_SUFFIXES for path in source.iterdir()):
         return source
     return next((source / name for name in PHOTO_FOLDERS if (source / name).is_dir()), source)
 
@@ -160,6 +162,7 @@ class FIELDWORK_OT_open(Operator):
     filter_folder: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
     filter_image: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
     filter_movie: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
+    filter_glob: StringProperty(default=";".join(f"*{suffix}" for suffix in OTHERS), options={"HIDDEN", "SKIP_SAVE"})
 
     def invoke(self, context: Context, event: bpy.types.Event) -> set[str]:
         # Dropped onto the viewport: the path is known already.
@@ -188,7 +191,7 @@ class FIELDWORK_OT_open(Operator):
             path = Path(bpy.path.abspath(self.directory))
         else:
             return None
-        return path if path.is_dir() or path.suffix.lower() in VIDEOS else path.parent
+        return path if path.is_dir() or path.suffix.lower() in VIDEO_SUFFIXES else path.parent
 
 
 def show_sidebar(context: Context) -> None:
@@ -216,7 +219,7 @@ class FIELDWORK_FH_capture(FileHandler):
     bl_idname = "FIELDWORK_FH_capture"
     bl_label = "Fieldwork Photos or Video"
     bl_import_operator = "fieldwork.open"
-    bl_file_extensions = ";".join(sorted(PHOTOS | VIDEOS))
+    bl_file_extensions = ";".join(sorted(READ))
 
     @classmethod
     def poll_drop(cls, context: Context) -> bool:

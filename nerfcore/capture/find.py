@@ -11,9 +11,9 @@ from pathlib import Path
 
 from ..errors import InputError
 from ..files import is_text, printable, require_readable
-from ..images.decode import PHOTO_SUFFIXES
-from ..images.names import VIDEO_SUFFIXES, beside_all, companion_stems, unique_names
+from ..images.names import beside_all, companion_stems, unique_names
 from ..images.soft_labels import find_confidence, find_probabilities
+from ..images.suffixes import PHOTO_SUFFIXES, VIDEO_SUFFIXES
 
 # Files that lie beside photos and are none.
 SIDECARS = {".json", ".txt", ".md", ".xmp", ".aae", ".csv", ".npy", ".npz", ".db", ".ini", ".xml", ".thm", ".log", ""}

@@ -12,7 +12,7 @@ from ..errors import InputError, ProjectError
 from ..files import file_hash
 from ..images.decode import float_exposure, is_linear
 from ..images.labels import Colors, drawn_as_stored
-from ..images.names import VIDEO_SUFFIXES
+from ..images.suffixes import VIDEO_SUFFIXES
 from ..params import NewParams
 from ..progress import Reporter, shortened
 from ..project.classes import make_classes, read_classes, unnamed_values

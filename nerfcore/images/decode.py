@@ -17,22 +17,13 @@ from ..errors import InputError
 from ..progress import log
 from .exif import photo_facts
 from .picture import Picture, associated, exposed, from_channels, from_image, resized, to_srgb8, without_unused_alpha
+from .suffixes import FLOAT_SUFFIXES, RAW_SUFFIXES, TIFF_SUFFIXES
 
 pillow_heif.register_heif_opener()
 # Stitched panoramas are larger than Pillow's decompression-bomb limit; ours is what a decode may take in memory.
 Image.MAX_IMAGE_PIXELS = 600_000_000
 
-RAW_SUFFIXES = {
-    ".3fr", ".arw", ".cr2", ".cr3", ".dcr", ".dng", ".erf", ".iiq", ".kdc", ".mef", ".mos", ".mrw", ".nef", ".nrw",
-    ".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw", ".x3f",
-}  # fmt: skip
-FLOAT_SUFFIXES = {".exr", ".hdr"}
-TIFF_SUFFIXES = {".tif", ".tiff"}
 FLOAT_KINDS = ("half", "float", "double")
-PHOTO_SUFFIXES = RAW_SUFFIXES | FLOAT_SUFFIXES | {
-    ".jpg", ".jpeg", ".jpe", ".png", ".tif", ".tiff", ".webp", ".bmp", ".heic", ".heif", ".hif", ".avif", ".ppm",
-    ".jp2", ".tga",
-}  # fmt: skip
 ROTATE = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,

@@ -9,8 +9,9 @@ import numpy as np
 from PIL import Image, UnidentifiedImageError
 
 from ..errors import InputError
-from .decode import TIFF_SUFFIXES, image_size, orientation_of, upright
+from .decode import image_size, orientation_of, upright
 from .soft_labels import PROBABILITY_SUFFIXES, read_probabilities
+from .suffixes import TIFF_SUFFIXES
 
 Colors = dict[int, tuple[int, int, int]]
 # Formats whose EXIF orientation is ours to apply: HEIF and raw decoders turn pictures themselves.

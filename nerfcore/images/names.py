@@ -12,7 +12,6 @@ from pathlib import Path
 from ..files import is_text
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".exr", ".bmp", ".ppm", ".heic", ".heif")
-VIDEO_SUFFIXES = {".mp4", ".mov", ".m4v", ".webm", ".mkv", ".avi", ".mts", ".m2ts", ".3gp", ".mpg", ".mpeg"}
 # Bytes of a photo's name in the project: file systems take 255, and "_confidence.png" and temporary endings come behind.
 LONGEST = 200
 

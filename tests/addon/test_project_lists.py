@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 
 import pytest
+from fieldwork.nerfcore.images.suffixes import PHOTO_SUFFIXES, VIDEO_SUFFIXES
 from fieldwork.tests.addon.support import ENGINE, SETUP, make_project
 
 
@@ -91,6 +92,36 @@ answer(seen)
     museum = tmp_path / "museum"
     assert facts["capture"] == [str(museum / "photos"), f"{museum}_fieldwork", str(museum / "labels")]
     assert facts["video"] == [str(tmp_path / "walk.mp4"), str(tmp_path / "walk_fieldwork"), ""]
+
+
+def test_whatever_the_engine_reads_is_shown_dropped_and_opened(bpy_script, tmp_path):
+    read = sorted(PHOTO_SUFFIXES | VIDEO_SUFFIXES)
+    for suffix in read:
+        (tmp_path / suffix[1:]).mkdir()
+        (tmp_path / suffix[1:] / f"a{suffix.upper()}").touch()
+        (tmp_path / suffix[1:] / "images").mkdir()  # not meant where there are photos beside it
+    facts = bpy_script(
+        SETUP
+        + """
+import fnmatch
+opened = []
+for suffix in read:
+    bpy.ops.fieldwork.open(directory=f"{folder}/{suffix[1:]}", files=[{"name": f"a{suffix.upper()}"}])
+    opened.append(settings.photos)
+dropped = bpy.types.FIELDWORK_FH_capture.bl_file_extensions.split(";")
+glob = bpy.ops.fieldwork.open.get_rna_type().properties["filter_glob"].default
+known = bpy.path.extensions_image | bpy.path.extensions_movie
+shown = [s for s in read if s in known or any(fnmatch.fnmatch(f"a{s}", one) for one in glob.split(";"))]
+answer({"opened": opened, "dropped": dropped, "shown": shown, "glob": len(glob)})
+""",
+        read=read,
+        folder=tmp_path,
+    )
+    folders = [tmp_path / suffix[1:] for suffix in read]
+    meant = [f if s in PHOTO_SUFFIXES else f / f"a{s.upper()}" for f, s in zip(folders, read)]
+    assert facts["opened"] == [str(path) for path in meant]
+    assert facts["dropped"] == facts["shown"] == read
+    assert facts["glob"] < 256  # Blender cuts what is longer
 
 
 def test_hidden_classes_vanish_from_the_mesh(bpy_script, tmp_path):

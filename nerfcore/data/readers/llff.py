@@ -16,7 +16,8 @@ from ...geometry.cameras import Camera
 from ...geometry.frames import upright
 from ...images.arrays import read_array
 from ...images.decode import image_size
-from ...images.names import VIDEO_SUFFIXES, labels_and_masks, list_images, unique_names
+from ...images.names import labels_and_masks, list_images, unique_names
+from ...images.suffixes import VIDEO_SUFFIXES
 from ..dataset import Dataset, DatasetView, require
 
 FILE = "poses_bounds.npy"

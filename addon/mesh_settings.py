@@ -23,7 +23,7 @@ class MeshSettings:
     )
     detail: FloatProperty(
         name="Detail",
-        description="Side of a cell in millimetres, instead of the resolution; needs a known scale. 0: the resolution",
+        description="Side of a cell in millimeters, instead of the resolution; needs a known scale. 0: the resolution",
         default=0.0,
         min=0.0,
         soft_max=100.0,

@@ -72,7 +72,7 @@ class RunOperator(ProjectOperator):
 
 @scene_settings(run="run", features="label_features")
 class FIELDWORK_OT_label_prepare(RunOperator):
-    """Prepare the run for labelling: the first marks do so too"""
+    """Prepare the run for labeling: the first marks do so too"""
 
     bl_idname = "fieldwork.label_prepare"
     bl_label = "Prepare"

@@ -35,7 +35,7 @@ SUFFIXES = {"history": ".csv", "coco": ".json", "cvat": ".xml", "label-studio": 
 
 
 class FIELDWORK_OT_label_import(ProjectOperator):
-    """Give the photos labels that another labelling tool wrote; what nobody assigned stays unlabelled"""
+    """Give the photos labels that another labeling tool wrote; what nobody assigned stays unlabeled"""
 
     bl_idname = "fieldwork.label_import"
     bl_label = "Import Labels"
@@ -72,7 +72,7 @@ class FIELDWORK_OT_label_import(ProjectOperator):
 
 @scene_settings(run="run")
 class FIELDWORK_OT_label_export(ProjectOperator):
-    """Write the labels of the photos for another labelling tool"""
+    """Write the labels of the photos for another labeling tool"""
 
     bl_idname = "fieldwork.label_export"
     bl_label = "Export Labels"

@@ -44,7 +44,7 @@ def need_source(context: Context) -> str | None:
     time_limit="time_limit", settings="settings", faces="faces", texture="texture",
 )  # fmt: skip
 class FIELDWORK_OT_reconstruct(VerbOperator):
-    """Take photos all the way to a labelled mesh: read, estimate poses, train, extract the mesh, write a .blend"""
+    """Take photos all the way to a labeled mesh: read, estimate poses, train, extract the mesh, write a .blend"""
 
     bl_idname = "fieldwork.reconstruct"
     bl_label = "Reconstruct"
@@ -138,7 +138,7 @@ class FIELDWORK_OT_bench(VerbOperator):
             ("evidence", "Evidence", "The published tables beside other methods, by a protocol"),
             ("gpu", "GPU", "What is asked of a graphics card"),
             ("surface", "Surfaces", "Textured meshes of simulated scenes beside their true surfaces"),
-            ("labels", "Labels", "Scenes labelled by a few strokes of a simulated annotator"),
+            ("labels", "Labels", "Scenes labeled by a few strokes of a simulated annotator"),
             ("measures", "Measures", "How often the true area lies in the interval that is given"),
             ("live", "Live View", "Baked fields: time, size, and what is lost"),
         ],

@@ -90,7 +90,7 @@ def label(context: Context) -> State:
         return State(False, "…")
     if known.computed is None:
         return State(False)
-    return State(True, t("{:.0%} labelled", 1 - known.void))
+    return State(True, t("{:.0%} labeled", 1 - known.void))
 
 
 def class_text(known: Facts, class_id: int) -> str:

@@ -39,7 +39,7 @@ def set_switch(root: bpy.types.Object) -> None:
     """Give a parent the slider, or one of before it knew confidence its present range."""
     root[SWITCH] = float(root.get(SWITCH, 0.0))
     root.id_properties_ui(SWITCH).update(
-        min=0.0, max=2.0, description="0: colours of the photos, 1: class colours, 2: confidence of the classes"
+        min=0.0, max=2.0, description="0: colors of the photos, 1: class colors, 2: confidence of the classes"
     )
 
 

@@ -42,7 +42,7 @@ answer(seen)
     assert line.startswith("stone: 1 mark, 50% of the surface, 7")
     assert conflict == "Mark 2 on a contradicts mark 1 on a."
     assert doubts == ["Mark 2 on a looks like stone: is it right?", "Mark 9 on ? looks like ?: is it right?"]
-    assert state == [True, "75% labelled"]
+    assert state == [True, "75% labeled"]
     assert more == "2 ✎  50%"
     assert nothing == ["Choose a class and draw over what belongs to it."]
     assert label_states.Facts(revision=3, computed=2).stale

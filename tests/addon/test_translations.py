@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,12 @@ FILES = [
     *sorted((ROOT / "operators").glob("*.py")),
     ROOT / "addon/preferences.py",
 ]
+# Spellings that Blender's interface, which is American, has otherwise.
+BRITISH = re.compile(
+    r"colour|metre|labell|modell|travell|cancelling|\bgrey|\bcentre|neighbour|behaviour|favour|licence|catalogue|analyse"
+    r"|(normal|optim|organ|recogn|visual|initial)is(e|ing|ation)",
+    re.IGNORECASE,
+)
 
 
 def literal(node: ast.expr) -> str:
@@ -70,6 +77,38 @@ answer({"lacking": lacking, "count": count})
     )
     assert facts["lacking"] == []
     assert facts["count"] > 90
+
+
+def test_words_are_spelled_as_blender_spells_them(bpy_script):
+    words = bpy_script(
+        """
+import fieldwork
+fieldwork.register()
+from fieldwork.addon import registration
+from fieldwork.addon.scene.look import SWITCH, set_switch
+words = []
+for module in registration._registered:
+    for cls in getattr(module, "CLASSES", ()):
+        words += [cls.bl_rna.name, cls.bl_rna.description]
+        if issubclass(cls, bpy.types.Operator):
+            words.append(cls.__doc__ or "")  # its tooltip
+        for prop in cls.bl_rna.properties:
+            words += [prop.name] if prop.name != prop.identifier else []
+            words.append(prop.description)
+            words += [text for item in getattr(prop, "enum_items", ()) for text in (item.name, item.description)]
+root = bpy.data.objects.new("root", None)
+set_switch(root)
+words.append(root.id_properties_ui(SWITCH).as_dict()["description"])
+answer(words)
+"""
+    )
+    for path in sorted(path for folder in ("addon", "operators", "panels") for path in (ROOT / folder).rglob("*.py")):
+        calls = [node for node in ast.walk(ast.parse(path.read_text("utf-8"))) if isinstance(node, ast.Call)]
+        texts = [argument for call in calls if getattr(call.func, "id", "") == "t" for argument in call.args]
+        parts = [part.value for text in texts for part in ast.walk(text) if isinstance(part, ast.Constant)]
+        words += [part for part in parts if isinstance(part, str)]
+    assert len(words) > 1000
+    assert [text for text in words if BRITISH.search(text)] == []
 
 
 def test_a_translation_is_shown_and_taken_back(bpy_script):

@@ -29,7 +29,7 @@ def settings_page() -> str:
         "# Settings of a run",
         "",
         "`fieldwork train PROJECT --preset NAME --set stage.name=value …`. Presets change only what is listed for them.",
-        "This page is made from `nerfcore/config.py`.",
+        "This page is made from `nerfcore/config.py` by `python tests/nerfcore/make_settings.py`.",
     ]
     for stage, info in RunConfig.model_fields.items():
         model = type(info.default)

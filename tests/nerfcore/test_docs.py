@@ -120,6 +120,13 @@ def test_every_package_is_on_the_map() -> None:
     assert sorted(packages - named) == []
 
 
+def test_every_environment_variable_is_explained() -> None:
+    files = [file for folder in ("nerfcore", "addon", "operators") for file in (ROOT / folder).rglob("*.py")]
+    read = {name for file in files for name in re.findall(r'"(FIELDWORK_[A-Z_]+)"', file.read_text("utf-8"))}
+    table = re.findall(r"^\| `(FIELDWORK_[A-Z_]+)` \|", prose(ROOT / "docs" / "cli.md"), flags=re.MULTILINE)
+    assert sorted(table) == sorted(read)
+
+
 def test_every_verb_is_explained() -> None:
     for page in (ROOT / "README.md", ROOT / "docs" / "cli.md"):
         named = code(page)

@@ -16,7 +16,7 @@ from ..labels.journal import Mark
 from ..labels.lookup import Labelling
 from ..labels.overlay import photo_labels
 from ..labels.preparation import Preparation
-from ..labels.propagation import appearance, propagated
+from ..labels.propagation import propagated
 from ..labels.seeds import Seeds, seeds_of
 from ..progress import Reporter
 from .annotator import LEAST_PIXELS, WIDTH, Stroke, correction, first_strokes
@@ -95,12 +95,6 @@ class Annotator:
         class_ids = [i for i in self.subject.class_ids if i in marked]
         sizes = {name: (ids.shape[1], ids.shape[0]) for name, ids in self.subject.truth.items()}
         return seeds_of(self.subject.ready, self.marks, class_ids, sizes), class_ids
-
-    def by_appearance(self) -> Labelling:
-        """Labels by what surfels look like alone, without the graph and without void."""
-        seeds, class_ids = self.seeds()
-        look, _ = appearance(self.subject.ready, seeds, len(class_ids))
-        return labelled(look, class_ids)
 
     def look(self, report: Reporter) -> Labelling:
         """Labels by all strokes so far."""

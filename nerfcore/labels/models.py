@@ -83,9 +83,6 @@ class Model:
     def has_input(self, name: str) -> bool:
         return any(port.name == name for port in self.inputs)
 
-    def has_output(self, name: str) -> bool:
-        return any(port.name == name for port in self.outputs)
-
     def bind(self, what: str, wanted: Sequence[Wanted], outputs: bool = False, also: Sequence[str] = ()) -> list[Port]:
         """The port of each wanted one: by name, else the only one left that fits by rank and channels.
 

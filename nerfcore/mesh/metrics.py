@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -26,9 +26,6 @@ class SurfaceScores:
     p95: float
     area_ratio: float
     normal_deg: float
-
-    def as_dict(self) -> dict[str, float]:
-        return {name: round(float(value), 5) for name, value in asdict(self).items()}
 
 
 def sample_surface(

@@ -117,10 +117,6 @@ class OccupancyGrid(nn.Module):
         """State (resolution³,) uint8 of every cell: `space.UNKNOWN`, `EMPTY` or `OCCUPIED`."""
         return cell_states(self.unknown, self.cells[:, 0] > 0)
 
-    def occupied_share(self) -> float:
-        """Share of the cells that are occupied."""
-        return float((self.cells[:, 0] > 0).float().mean())
-
     def positions(self, cells: torch.Tensor, generator: torch.Generator | None = None) -> torch.Tensor:
         """A random point (N, 3) in [0, 1]³ inside each of the cells (N,)."""
         n = self.config.resolution

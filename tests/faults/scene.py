@@ -14,7 +14,6 @@ from fieldwork.nerfcore.errors import FieldworkError
 from fieldwork.nerfcore.geometry.cameras import Camera, flip_camera_axes
 from fieldwork.nerfcore.mesh.stored import MESH, mesh_folder
 from fieldwork.nerfcore.project.lock import project_lock
-from fieldwork.nerfcore.project.runs import run_folder
 from fieldwork.nerfcore.project.store import POSES_FILE, load_points, load_poses, load_project
 from fieldwork.nerfcore.render.run import load_trained
 from fieldwork.tests.nerfcore.support.ball import SMALL, ball_project, camera_poses, draw
@@ -154,8 +153,3 @@ def held(project: Path) -> str:
             if time.monotonic() > deadline:
                 return f"the lock is still held: {error.message}"
         time.sleep(0.02)
-
-
-def half_written(project: Path) -> list[str]:
-    """Files that a write left behind which did not end."""
-    return [str(path.relative_to(project)) for path in run_folder(project, "main").parent.rglob(".*") if path.is_file()]

@@ -24,7 +24,6 @@ from .support.halves import write_halves
 __all__ = ["ball", "store"]
 
 LEFT, RIGHT = (H // 2 - 12, W // 2 - 12), (H // 2 - 12, W // 2 + 12)
-BELOW = (H // 2 + 12, W // 2)
 
 
 @pytest.fixture(scope="module")

@@ -166,7 +166,6 @@ def test_unseen_surface_without_a_field_takes_what_is_beside() -> None:
     made = textured([wall_photo(looking((0, 0, 0), (0, 0.01, 0.8)))])
     assert 0.05 < made.seen < 0.95
     assert made.unseen.max() == 255
-    assert made.image.min(initial=255) >= 0
     assert (made.image[made.unseen > 0].sum(1) > 0).all()
 
 

@@ -153,8 +153,6 @@ def fill_classes(obj: bpy.types.Object) -> None:
     own = obj.fieldwork
     folder = Path(absolute(own.project))
     values = (snapshot.project(folder) or {}).get("classes", [])
-    if [entry.id for entry in own.classes] == [value["id"] for value in values]:
-        return
     before = {entry.id: (entry.visible, entry.opacity, entry.tint, tuple(entry.color)) for entry in own.classes}
     own.classes.clear()
     for value in values:

@@ -1,0 +1,63 @@
+"""The classes of a field object: shown alone, and read again from the project."""
+
+from __future__ import annotations
+
+import json
+
+from fieldwork.tests.addon.support import SETUP, make_project
+
+FIELD = """
+field = bpy.data.objects.new("Field", None)
+scene.collection.objects.link(field)
+own = field.fieldwork
+own.is_field, own.project, own.run = True, project, "main"
+read = bpy.ops.fieldwork.refresh_field_classes
+read()
+def listed():
+    return [[entry.id, entry.name, entry.visible] for entry in own.classes]
+"""
+
+
+def test_one_class_is_shown_alone_and_then_all_are(bpy_script, tmp_path):
+    facts = bpy_script(
+        SETUP
+        + FIELD
+        + """
+def isolate(index):
+    bpy.ops.fieldwork.isolate_class(index=index)
+    return [entry.visible for entry in own.classes]
+seen = [isolate(1), isolate(1), isolate(0), isolate(1), isolate(1)]
+answer({"seen": seen, "none": attempt(lambda: bpy.ops.fieldwork.isolate_class(index=2)), "left": listed()})
+""",
+        project=make_project(tmp_path / "capture"),
+    )
+    assert facts["seen"] == [[False, True], [True, True], [True, False], [False, True], [True, True]]
+    assert "no such class" in facts["none"]
+    assert facts["left"] == [[1, "stone", True], [2, "gold", True]]
+
+
+def test_classes_are_read_again_and_keep_what_was_set(bpy_script, tmp_path):
+    project = make_project(tmp_path / "capture")
+    changed = json.loads((project / "project.json").read_text())["classes"]
+    changed[1]["name"] = "gilding"
+    facts = bpy_script(
+        SETUP
+        + FIELD
+        + """
+own.classes[1].visible, own.classes[1].opacity = False, 0.5
+path, seen = Path(project, "project.json"), []
+for classes in (changed, [changed[1], {**changed[0], "id": 7, "name": "wood"}]):
+    path.with_name("part").write_text(json.dumps({**json.loads(path.read_text()), "classes": classes}))
+    os.replace(path.with_name("part"), path)
+    read()
+    seen.append(listed())
+answer({"seen": seen, "opacity": own.classes[0].opacity})
+""",
+        project=project,
+        changed=changed,
+    )
+    assert facts["seen"] == [
+        [[1, "stone", True], [2, "gilding", False]],
+        [[2, "gilding", False], [7, "wood", True]],
+    ]
+    assert facts["opacity"] == 0.5

@@ -187,9 +187,11 @@ def test_the_suite_measures_and_writes_its_page(tmp_path: Path, monkeypatch: pyt
         rows["from a stroke to whole parts (s), 95 %"]["worst"]
         <= rows["from a stroke to all surfels (s), 95 %"]["worst"]
     )
-    for words in ("undo (s), 95 %", "labels of another photo (s), 95 %", "prepare (s)", "accept (s)"):
+    for words in ("undo (s), 95 %", "prepare (s)", "accept (s)"):
         assert rows[words]["worst"] > 0
         assert rows[words]["reached"] in ("yes", "no")
+    # Of photos as small as these it is rounded to 0.
+    assert rows["labels of another photo (s), 95 %"]["reached"] == "yes"
     assert rows["click, photo encoded, without the model (s), 95 %"]["worst"] < 5
     assert rows["accept: PSNR changed by (dB)"]["reached"] == "yes", "accepting changes no colour"
     assert rows["accept: mIoU lost against what was shown"]["worst"] < 0.3

@@ -29,7 +29,8 @@ FIELDS = {
     "FLOAT_COLOR": ("color", np.float32, 4),
     "BYTE_COLOR": ("color", np.float32, 4),
 }
-CORNERS = ".corner_vert"  # the one of Blender's own attributes, whose names begin with a dot, that is no passing state
+# Blender's own attributes begin with a dot; most are passing states, such as what is selected. These are not.
+LASTING = (".corner_vert", ".sculpt_mask", ".sculpt_face_set")
 DRAWN = ("Shown", "class_color")  # follow from others
 DIGITS = 6  # of numbers that Blender computes anew when a file is read
 
@@ -40,7 +41,7 @@ def mesh_fingerprint(held: Held) -> Steps:
     """The geometry of a mesh with its attributes, a step for each of them."""
     digest = hashlib.blake2b(digest_size=16)
     mesh = held()
-    names = [a.name for a in mesh.attributes if a.name not in DRAWN and (a.name[0] != "." or a.name == CORNERS)]
+    names = [a.name for a in mesh.attributes if a.name not in DRAWN and (a.name[0] != "." or a.name in LASTING)]
     digest.update(repr((len(mesh.vertices), len(mesh.polygons), mesh.shape_keys is not None)).encode())
     for name in sorted(names):
         attribute = held().attributes.get(name)
@@ -100,6 +101,17 @@ def mesh_edited(held: Held, owner: Owner) -> Steps:
     return (yield from mesh_fingerprint(held)) != held().get(WRITTEN)
 
 
+def surface_edited(item: bpy.types.Object, owner: Owner) -> Steps:
+    """Whether an object has another mesh than was written, or work that would go with its vertices."""
+    return hangs_on_vertices(item) or (yield from mesh_edited(Held(bpy.data.meshes, item.data), owner))
+
+
+def hangs_on_vertices(item: bpy.types.Object) -> bool:
+    """Whether an object has what another mesh could not keep: weights, or levels of sculpting."""
+    sculpted = any(modifier.type == "MULTIRES" and modifier.total_levels for modifier in item.modifiers)
+    return sculpted or len(item.vertex_groups) > 0
+
+
 def camera_edited(item: bpy.types.Object) -> bool:
     """Whether a camera was moved, has another lens or, if it is the animated one, other keys than were written."""
     fingerprint = keys_fingerprint if item.get(ROLE) == CAMERA_PATH else camera_fingerprint
@@ -114,7 +126,7 @@ def object_changed(item: bpy.types.Object) -> bool:
     if item.type == "CAMERA":
         own = camera_edited(item) or (item.animation_data is not None and item[ROLE] != CAMERA_PATH)
     else:
-        own = item.matrix_basis != Matrix.Identity(4) or item.animation_data is not None or len(item.vertex_groups) > 0
+        own = item.matrix_basis != Matrix.Identity(4) or item.animation_data is not None or hangs_on_vertices(item)
     return bool(own or item.constraints or modifiers or children)
 
 

@@ -12,7 +12,7 @@ import bpy
 from ..errors import SceneChanged
 from ..roles import ROLE, UUID, Owner
 from . import slices
-from .edited import Steps, mesh_edited, object_changed, release
+from .edited import Steps, object_changed, release, surface_edited
 from .slices import Held
 
 
@@ -92,7 +92,7 @@ class Owned:
         """The object of a role with this mesh, in place of the one an earlier import made, wherever that is used; beside
         one that the user edited. Returns it."""
         before = self.existing(role)
-        if before is not None and (yield from mesh_edited(Held(bpy.data.meshes, before.data), self.owner)):
+        if before is not None and (yield from surface_edited(before, self.owner)):
             self.leave(role)
         before = self.existing(role)
         item = self.object(role, name, held(), group)
@@ -109,7 +109,7 @@ class Owned:
             item = self.existing(role)
             changed = item is not None and object_changed(item)
             if item is not None and item.type == "MESH" and not changed:
-                changed = yield from mesh_edited(Held(bpy.data.meshes, item.data), self.owner)
+                changed = yield from surface_edited(item, self.owner)
             item = self.existing(role)
             if item is not None and changed:
                 self.leave(role)

@@ -1,0 +1,100 @@
+"""What the user made of a part of the capture in the scene is his from then on, and no update takes it away."""
+
+from __future__ import annotations
+
+from fieldwork.tests.addon.test_scene_bridge import IMPORT, package
+
+__all__ = ["package"]
+
+EDITS = {
+    "surface": "made.mesh.data.vertices[3].co.x += 0.1",
+    "being edited": "bpy.context.view_layer.objects.active = made.mesh; bpy.ops.object.mode_set(mode='EDIT')",
+    "cleaned": "import bmesh; b = bmesh.new(); b.from_mesh(made.mesh.data); bmesh.ops.delete(b, geom=b.faces[:9], "
+    "context='FACES'); b.to_mesh(made.mesh.data)",
+    "own material": "made.mesh.data.materials[1] = bpy.data.materials.new('Marble')",
+    "shape key": "made.mesh.shape_key_add(name='Basis')",
+    "weights": "made.mesh.vertex_groups.new(name='moss').add(list(range(20)), 0.5, 'REPLACE')",
+    "sculpted": "bpy.context.view_layer.objects.active = made.mesh; "
+    "levels = made.mesh.modifiers.new('Multires', 'MULTIRES'); bpy.ops.object.multires_subdivide(modifier='Multires')",
+    "mask": "made.mesh.data.attributes.new('.sculpt_mask', 'FLOAT', 'POINT').data[3].value = 1",
+    "face sets": "made.mesh.data.attributes.new('.sculpt_face_set', 'INT', 'FACE').data[3].value = 2",
+    "points": "made.points.data.vertices[3].co.x += 0.1",
+    "camera": "made.cameras[1].location.x += 1",
+    "lens": "made.cameras[1].data.lens += 1",
+    "keys": "made.animated.keyframe_insert('location', frame=77)",
+}
+CHANGED = {"points": "Sparse points", "camera": "view_001", "lens": "view_001", "keys": "Photographer"}
+
+
+def test_what_the_user_edited_stays_and_the_new_one_comes_beside_it(bpy_script, package):
+    facts = bpy_script(
+        """
+import fieldwork
+fieldwork.register()
+from fieldwork.addon.scene.package import read_package
+from fieldwork.addon.scene.build import import_package
+def names():
+    return {o.name for o in bpy.data.objects}
+def state(name):
+    item = bpy.data.objects[name]
+    keys = [k for k in item.keys() if k.startswith("fieldwork_role")]
+    vertices = [tuple(v.co) for v in item.data.vertices] if item.type == "MESH" else None
+    weights = [[(g.group, g.weight) for g in v.groups] for v in item.data.vertices] if item.type == "MESH" else None
+    levels = [m.total_levels for m in item.modifiers if m.type == "MULTIRES"]
+    animation = item.animation_data and item.animation_data.action.name
+    return [item.data.name, vertices, weights, levels, tuple(item.location), animation], keys
+seen = {}
+for title, edit in edits.items():
+    bpy.ops.wm.read_homefile(use_factory_startup=True)
+    update = lambda: import_package(bpy.context.scene, read_package(package))
+    made = update()
+    before = names()
+    name = changed.get(title, "Surface")
+    exec(edit)
+    was = state(name)[0]
+    again = update()
+    now, roles = state(name)
+    other = [o.name for o in bpy.data.objects if o.name not in before]
+    last = update()
+    seen[title] = {"same": now == was, "roles": roles, "new": other, "warnings": again.warnings,
+                   "again": [last.warnings, len(names()) - len(before)],
+                   "now": [o.name for o in (last.mesh, last.points, last.animated, last.cameras[1])]}
+answer(seen)
+""",
+        package=package,
+        edits=EDITS,
+        changed=CHANGED,
+    )
+    for title, seen in facts.items():
+        name = CHANGED.get(title, "Surface")
+        assert seen["same"], title
+        assert seen["roles"] == [], title
+        assert seen["new"] == [f"{name}.001"], title
+        assert name in seen["warnings"][0], title
+        assert seen["again"] == [[], 1], f"{title}: the one beside it is brought up to date"
+        assert f"{name}.001" in seen["now"], title
+
+
+def test_what_the_package_no_longer_has_is_deleted_only_where_nobody_changed_it(bpy_script, package):
+    facts = bpy_script(
+        IMPORT
+        + """
+made.mesh.data.vertices[3].co.x += 0.1
+lamp = bpy.data.objects["Light"]
+lamp.parent = made.cameras[0]
+value = json.loads(Path(package, "package.json").read_text())
+value["cameras"] = value["cameras"][2:]
+Path(package, "package.json").write_text(json.dumps(value))
+update("classes")
+first = sorted(before - names())
+bpy.data.objects["stone"].constraints.new("COPY_LOCATION")
+bpy.data.objects["gold"].location.x = 2
+update("none")
+answer([first, sorted(before - names()), sorted(names() - before), lamp.parent.name])
+""",
+        package=package,
+    )
+    assert facts[0] == ["view_001"]
+    assert facts[1] == ["view_001"]
+    assert facts[2] == ["Surface.001", "gold", "stone"]
+    assert facts[3] == "view_000"

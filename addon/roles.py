@@ -6,6 +6,7 @@ scenes of Fieldwork 0.1 have nothing else.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 ROLE, PROJECT, UUID = "fieldwork_role", "fieldwork_project", "fieldwork_uuid"
@@ -27,3 +28,12 @@ class Owner(NamedTuple):
         item[ROLE], item[PROJECT] = role, self.name
         if self.uuid:
             item[UUID] = self.uuid
+
+
+def by_role(objects: Iterable[Any], owner: Owner) -> dict[str, Any]:
+    """The objects of a project by their roles. Copies, which have the role as well, come after their original."""
+    found: dict[str, Any] = {}
+    for item in objects:
+        if ROLE in item and owner.owns(item):
+            found.setdefault(item[ROLE], item)
+    return found

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import bpy
 
-from ..roles import ROLE, Owner
+from ..roles import Owner, by_role
 from .slot import MARK, load_render, render_slot
 
 EVERY_FRAME = "every_frame"  # folder beside the pictures of an animation
@@ -59,12 +59,9 @@ def _places(scene: bpy.types.Scene, colored: list[Path], photos: bool, owner: Ow
     """Which cameras get which pictures, by their names."""
     if not photos:
         return [(scene.camera.name, colored[0])] if scene.camera else []
-    cameras = {
-        obj[ROLE].removeprefix("camera:"): obj.name
-        for obj in scene.objects
-        if obj.type == "CAMERA" and str(obj.get(ROLE)).startswith("camera:") and owner.owns(obj)
-    }
-    return [(cameras[path.stem], path) for path in colored if path.stem in cameras]
+    known = by_role(scene.objects, owner)
+    cameras = [(known.get(f"camera:{path.stem}"), path) for path in colored]
+    return [(camera.name, path) for camera, path in cameras if camera is not None]
 
 
 def frame_number(path: Path) -> int:

@@ -93,6 +93,7 @@ def import_steps(
     package, pieces = yield from _in_thread(read)
     owned = Owned(place(), Owner(package.name, package.uuid))
     _parent(owned, package)
+    owned.release_copies()
     size = display_size(package)
     roles: list[str] = []
     if cameras in {"many", "both"}:

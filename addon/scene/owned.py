@@ -10,9 +10,10 @@ from typing import Any
 import bpy
 
 from ..errors import SceneChanged
-from ..roles import ROLE, UUID, Owner
+from ..roles import ROLE, UUID, Owner, by_role
 from . import slices
 from .edited import Steps, object_changed, release, surface_edited
+from .frame import root_of
 from .slices import Held
 
 
@@ -40,9 +41,17 @@ class Owned:
         """The objects that are there by their roles."""
         if self._slice != slices.number():
             self._slice = slices.number()
-            objects = self.collection.all_objects
-            self._known = {item[ROLE]: item for item in objects if ROLE in item and self.owner.owns(item)}
+            self._known = by_role(self.collection.all_objects, self.owner)
+            root = root_of(self.scene, self.owner)  # wherever the user has put it
+            if root is not None:
+                self._known["root"] = root
         return self._known
+
+    def release_copies(self) -> None:
+        """Let the user have what he made as copies of the objects."""
+        for item in self.scene.objects:
+            if ROLE in item and self.owner.owns(item) and self.known.get(item[ROLE], item) != item:
+                release(item)
 
     def _collection(self, parent: bpy.types.Collection, name: str, role: str) -> bpy.types.Collection:
         for child in parent.children:

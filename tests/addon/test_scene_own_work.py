@@ -98,3 +98,80 @@ answer([first, sorted(before - names()), sorted(names() - before), lamp.parent.n
     assert facts[1] == ["view_001"]
     assert facts[2] == ["Surface.001", "gold", "stone"]
     assert facts[3] == "view_000"
+
+
+COPY = """
+import numpy as np
+from fieldwork.addon.scene.frame import root_of
+from fieldwork.addon.scene.owned import Owned
+from fieldwork.addon.roles import Owner
+def copy(item):
+    bpy.ops.object.select_all(action="DESELECT")
+    item.select_set(True)
+    bpy.context.view_layer.objects.active = item
+    bpy.ops.object.duplicate()
+    return bpy.context.object
+def raise_mesh():
+    arrays = dict(np.load(Path(package, "mesh.npz")))
+    arrays["vertices"] = arrays["vertices"] + np.float32(1)
+    np.savez(Path(package, "mesh.npz"), **arrays)
+def first_height(item):
+    return round(item.data.vertices[0].co.z, 3)
+"""
+
+
+def test_a_copy_of_the_surface_is_the_users_own(bpy_script, package, tmp_path):
+    facts = bpy_script(
+        IMPORT
+        + COPY
+        + """
+bpy.ops.wm.save_as_mainfile(filepath=folder + "/scene.blend")
+seen = {}
+for title in ("as it was", "edited"):
+    bpy.ops.wm.open_mainfile(filepath=folder + "/scene.blend")
+    own = copy(bpy.data.objects["Surface"])
+    if title == "edited":
+        own.data.vertices[3].co.x += 0.1
+    bpy.ops.wm.save_as_mainfile(filepath=folder + "/copied.blend")
+    bpy.ops.wm.open_mainfile(filepath=folder + "/copied.blend")
+    count = len(bpy.data.objects)
+    raise_mesh()
+    made = update()
+    own = bpy.data.objects["Surface.001"]
+    seen[title] = [made.mesh.name, first_height(made.mesh), first_height(own), "fieldwork_role" in own,
+                   len(bpy.data.objects) - count, made.warnings]
+answer(seen)
+""",
+        package=package,
+        folder=tmp_path,
+    )
+    assert facts["as it was"] == ["Surface", 1, 0, False, 0, []]
+    assert facts["edited"] == ["Surface", 2, 0, False, 0, []]
+
+
+def test_a_copy_of_a_camera_and_of_the_parent_is_the_users_own(bpy_script, package):
+    facts = bpy_script(
+        IMPORT
+        + COPY
+        + """
+camera, parent = copy(made.cameras[1]), copy(made.root)
+camera.location = (7, 7, 7)
+count = len(bpy.data.objects)
+made = update()
+scene.collection.objects.link(made.root)  # the user puts the parent elsewhere
+made.root.users_collection[0].objects.unlink(made.root)
+again = update()
+owner = Owner("capture")
+answer({"camera": [made.cameras[1].name, made.cameras[1].location[:], camera.name, camera.location[:]],
+        "parents": [made.root.name, again.root.name, root_of(scene, owner).name, Owned(scene, owner).root.name],
+        "marked": [o.name for o in (camera, parent) if "fieldwork_role" in o],
+        "new": len(bpy.data.objects) - count, "warnings": made.warnings + again.warnings})
+""",
+        package=package,
+    )
+    name, place, copy, at = facts["camera"]
+    assert (name, copy, at) == ("view_001", "view_001.001", [7, 7, 7])
+    assert abs(place[0] - 0.1) < 1e-6
+    assert facts["parents"] == ["Fieldwork · capture"] * 4
+    assert facts["marked"] == facts["warnings"] == []
+    assert facts["new"] == 0

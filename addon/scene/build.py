@@ -22,8 +22,10 @@ from ..roles import Owner
 from .cameras import SIZE, animated_camera, display_size, photo_camera, use_size_of
 from .edited import CAMERA_PATH, Steps
 from .frame import units_per_metre
-from .look import TEXTURE, set_switch, shader_group, viewport_group
-from .mesh_data import Part, parts
+from .look import set_switch, shader_group, viewport_group
+from .materials import find_material
+from .mesh_data import Part, parts, slot_classes
+from .own_look import TEXTURE, remove_unused_textures
 from .owned import Owned
 from .package import Package, read_package, sketch_package
 from .points import sparse_points
@@ -107,9 +109,13 @@ def import_steps(
         yield from sparse_points(owned, package)
     yield 0.8, "mesh"
     if pieces:
+        for entry in slot_classes(package):
+            find_material(owned.owner, entry["name"])  # those of a scene of Fieldwork 0.1 have no mark yet
+        yield from owned.leave_edited({part.role for part in pieces})
         texture = _texture(package)
         yield 0.8, "materials"  # the first picture of its kind takes Blender long: it gets ready to read such
         group = shader_group(owned.owner, "mesh", owned.root, texture and texture())
+        remove_unused_textures()
         trees = [Held(bpy.data.node_groups, tree) for tree in (group, viewport_group(owned.owner, owned.root))]
         for part in pieces:
             yield from surface(owned, package, part, lambda: (trees[0](), trees[1]()))

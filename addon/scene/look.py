@@ -13,6 +13,7 @@ import bpy
 
 from ..roles import Owner
 from .edited import WRITTEN, tree_fingerprint
+from .own_look import TEXTURE
 from .owned import find
 
 SWITCH = "show_labels"  # custom property of the parent empty: 0 photo colour, 1 class colour, 2 confidence
@@ -22,7 +23,6 @@ CONFIDENCE_ATTRIBUTE = "confidence"  # at the vertices
 SHOWN_ATTRIBUTE = "Shown"  # what Workbench draws, at the corners
 MODIFIER = "Fieldwork Viewport Colors"
 GROUP, VIEWPORT_GROUP = "Fieldwork Surface", "Fieldwork Viewport Colors"
-TEXTURE = "fieldwork_texture"  # marks the images that are textures of a surface
 FIRST_GROUP = "Fieldwork"  # what the shader group was called at first
 # From unsure to sure, linear: viridis at quarters (van der Walt and Smith, 2015), which is even to the eye and safe for
 # the colour-blind.

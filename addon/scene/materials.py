@@ -15,15 +15,19 @@ def srgb_to_linear(value: float) -> float:
     return value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4
 
 
+def find_material(owner: Owner, label: str) -> bpy.types.Material | None:
+    """The material of what is called `label`, marked as the project's; None when there is none yet."""
+    return find(bpy.data.materials, owner, f"material:{label}", f"{owner.name} · {label}")
+
+
 def make_material(owner: Owner, label: str, color: list[float], group: Any) -> bpy.types.Material:
     """The material of what is called `label`: `color` is sRGB in [0, 1]. One that the project has is given the colour
     anew."""
-    name, role = f"{owner.name} · {label}", f"material:{label}"
-    material = find(bpy.data.materials, owner, role, name)
+    material = find_material(owner, label)
     linear = (*(srgb_to_linear(channel) for channel in color), 1.0)
     if material is None:
-        material = bpy.data.materials.new(name)
-        owner.mark(material, role)
+        material = bpy.data.materials.new(f"{owner.name} · {label}")
+        owner.mark(material, f"material:{label}")
         material.use_nodes = True
         tree = material.node_tree
         tree.nodes.clear()

@@ -14,6 +14,7 @@ from ..roles import ROLE, UUID, Owner, by_role
 from . import slices
 from .edited import Steps, object_changed, release, surface_edited
 from .frame import root_of
+from .own_look import give_own_look
 from .slices import Held
 
 
@@ -50,8 +51,13 @@ class Owned:
     def release_copies(self) -> None:
         """Let the user have what he made as copies of the objects."""
         for item in self.scene.objects:
-            if ROLE in item and self.owner.owns(item) and self.known.get(item[ROLE], item) != item:
+            if ROLE not in item or not self.owner.owns(item):
+                continue
+            first = self.known.get(item[ROLE], item)
+            if first != item:
                 release(item)
+                if item.type == "MESH" and item.data != first.data:
+                    give_own_look(item.data, self.owner)
 
     def _collection(self, parent: bpy.types.Collection, name: str, role: str) -> bpy.types.Collection:
         for child in parent.children:
@@ -93,15 +99,33 @@ class Owned:
 
     def leave(self, role: str) -> None:
         """Let the user have the object of a role as it is; the next `object` is a new one."""
-        item = self.known.pop(role)
+        item = self.known.pop(role, None)
+        if item is None:
+            return
         release(item)
+        if item.type == "MESH":
+            give_own_look(item.data, self.owner)
         self.kept.append(item.name)
+
+    def leave_edited(self, roles: set[str]) -> Steps:
+        """Let the user have what he made of the surface, whose objects will have these roles, before the materials and
+        node groups it looks by are made anew."""
+        for role in [role for role in self.known if role not in self.used]:
+            item = self.existing(role)
+            if item is not None and item.type == "MESH" and (yield from self._changed(role, role in roles)):
+                self.leave(role)
+
+    def _changed(self, role: str, replaced: bool) -> Steps:
+        """Whether the user made something of an object that would go with it; `replaced`: with its mesh alone."""
+        item = self.existing(role)
+        if item is None or (not replaced and object_changed(item)):
+            return item is not None
+        return item.type == "MESH" and (yield from surface_edited(item, self.owner))
 
     def with_mesh(self, role: str, name: str, held: Held, group: str = "") -> Steps:
         """The object of a role with this mesh, in place of the one an earlier import made, wherever that is used; beside
         one that the user edited. Returns it."""
-        before = self.existing(role)
-        if before is not None and (yield from surface_edited(before, self.owner)):
+        if (yield from self._changed(role, replaced=True)):
             self.leave(role)
         before = self.existing(role)
         item = self.object(role, name, held(), group)
@@ -115,10 +139,7 @@ class Owned:
     def remove_unused(self) -> Steps:
         """Take away what the package no longer has; what the user changed stays, as his own."""
         for role in [role for role in self.known if role not in self.used]:
-            item = self.existing(role)
-            changed = item is not None and object_changed(item)
-            if item is not None and item.type == "MESH" and not changed:
-                changed = yield from surface_edited(item, self.owner)
+            changed = yield from self._changed(role, replaced=False)
             item = self.existing(role)
             if item is not None and changed:
                 self.leave(role)

@@ -9,6 +9,7 @@ points.npz          xyz (N, 3) float32 world, rgb (N, 3) uint8 sRGB
 lenses.json         which lens each photo was undistorted for
 mesh.npz            only when there is a mesh: vertices, faces, normals, colors, class_id, face_class, face_instance,
                     confidence of the vertices
+texture-….png       the texture of the mesh, named by its content; some of earlier meshes
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from PIL import Image
 from ..data.load import load_scene
 from ..data.scene import Scene, View
 from ..errors import InputError, ProjectError
-from ..files import UNREADABLE_ARRAYS, atomic_path, disk_errors, write_json
+from ..files import UNREADABLE_ARRAYS, atomic_path, disk_errors, file_hash, write_json
 from ..geometry.cameras import Camera, flip_camera_axes, pixel_centers, project, rays
 from ..images.encode import write_picture
 from ..images.picture import Picture, as_float, associated, to_srgb8
@@ -52,6 +53,7 @@ from ..project.store import is_project, load_project
 
 FORMAT, VERSION = "fieldwork-package", 1
 MESH_ARRAYS = ("vertices", "faces", "colors", "class_id", "face_class")
+OLD_TEXTURES = 3  # kept for scenes that show an earlier mesh
 
 
 def package_folder(project: Path, run: str) -> Path:
@@ -87,7 +89,7 @@ def write_package(
     source = project / "exports" / run
     made = read_made(source / MESH_RECORD)
     has_mesh = _copy_mesh(source / "mesh.npz", folder / "mesh.npz")
-    has_texture = has_mesh and _copy_texture(source / "texture.png", folder)
+    texture = _copy_texture(source / "texture.png", folder) if has_mesh else None
     write_json(
         folder / "package.json",
         {
@@ -101,7 +103,7 @@ def write_package(
             "classes": [{"id": c.id, "name": c.name, "color": list(c.color)} for c in scene.classes],
             "cameras": cameras,
             "mesh": has_mesh,
-            "texture": "texture.png" if has_texture else None,
+            "texture": texture,
             "instances": _beside(source / INSTANCES, []) if has_mesh else [],
             "relations": _relations(source) if has_mesh else [],
             "measures": _beside(source / MEASURES, {}) if has_mesh else {},
@@ -307,16 +309,20 @@ def _relations(source: Path) -> list[dict[str, Any]]:
     return graph.get("relations", []) if same else []
 
 
-def _copy_texture(source: Path, folder: Path) -> bool:
-    """Copy the texture of the packaged mesh; false when it has no UVs."""
+def _copy_texture(source: Path, folder: Path) -> str | None:
+    """Copy the texture of the packaged mesh; the copy's name, None when the mesh has no UVs."""
     with np.load(folder / "mesh.npz", allow_pickle=False) as data:
         wanted = "uv" in data and source.is_file()
     if not wanted:
-        (folder / "texture.png").unlink(missing_ok=True)
-        return False
-    with atomic_path(folder / "texture.png") as temporary:
-        shutil.copyfile(source, temporary)
-    return True
+        return None
+    target = folder / f"texture-{file_hash(source)[:8]}.png"
+    if not target.is_file():
+        with atomic_path(target) as temporary:
+            shutil.copyfile(source, temporary)
+    others = [path for path in folder.glob("texture*.png") if path != target]
+    for path in sorted(others, key=lambda path: path.stat().st_mtime)[:-OLD_TEXTURES]:
+        path.unlink()
+    return target.name
 
 
 def package(params: PackageParams, report: Reporter) -> dict[str, Any]:

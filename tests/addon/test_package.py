@@ -12,7 +12,14 @@ import pytest
 from fieldwork.addon.photograph import orbit
 from fieldwork.addon.photograph.pixels import read_exr, write_index_png
 from fieldwork.addon.scene.package import SENSOR_MM, PackageError, blender_camera, read_package
-from fieldwork.nerfcore.blender.package import photo_renders, stale, undistort, undistortion_grid, write_package
+from fieldwork.nerfcore.blender.package import (
+    MESH_ARRAYS,
+    photo_renders,
+    stale,
+    undistort,
+    undistortion_grid,
+    write_package,
+)
 from fieldwork.nerfcore.data.scene import ClassInfo, Scene, View
 from fieldwork.nerfcore.geometry.cameras import Camera, flip_camera_axes, pixel_centers, project, rays
 from fieldwork.nerfcore.geometry.points import Points
@@ -117,6 +124,28 @@ def test_a_package_says_of_which_project_it_is(tmp_path):
     save_project(tmp_path, Project())
     folder = write_package(tmp_path, "main", scene(tmp_path, lens), "Büste", Reporter())
     assert read_package(folder).uuid == load_project(tmp_path).uuid
+
+
+def test_textures_of_earlier_meshes_stay_in_the_package_for_a_while(tmp_path):
+    """Scenes that were not updated since show them."""
+    views = scene(tmp_path, Camera(width=60, height=40, fx=50, fy=50, cx=29, cy=22))
+    exports = tmp_path / "exports/main"
+    (exports / "package").mkdir(parents=True)
+    (exports / "package/texture.png").write_bytes(b"of the first version")
+    np.savez(exports / "mesh.npz", **{name: np.zeros((1, 3)) for name in (*MESH_ARRAYS, "uv")})
+    names = []
+    for number in (0, 1, 1, 2, 3):
+        Image.new("RGB", (4, 4), (number, 0, 0)).save(exports / "texture.png")
+        texture = read_package(write_package(tmp_path, "main", views, "p", Reporter())).texture
+        assert texture.read_bytes() == (exports / "texture.png").read_bytes()
+        os.utime(texture, (10**9 + number, 10**9 + number))
+        names.append(texture.name)
+        if number == 1:
+            assert (exports / "package/texture.png").read_bytes() == b"of the first version"
+    assert names[1] == names[2]
+    assert len(set(names)) == 4
+    kept = {path.name for path in (exports / "package").glob("texture*")}
+    assert kept == {*names[2:], "texture.png"}, "the oldest is gone"
 
 
 def test_renders_of_the_photos_that_are_of_another_run_are_told(tmp_path):

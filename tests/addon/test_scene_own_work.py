@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 from fieldwork.tests.addon.test_scene_bridge import IMPORT, package
 
 __all__ = ["package"]
@@ -175,3 +176,87 @@ answer({"camera": [made.cameras[1].name, made.cameras[1].location[:], camera.nam
     assert facts["parents"] == ["Fieldwork · capture"] * 4
     assert facts["marked"] == facts["warnings"] == []
     assert facts["new"] == 0
+
+
+TEXTURED = """
+def put_texture(color):
+    # As the engine does: textures have names of their own, and in time the old ones go.
+    for old in Path(package).glob("texture*"):
+        old.unlink()
+    name = "texture-{:02x}{:02x}{:02x}.png".format(*color)
+    image = bpy.data.images.new("new", 4, 4)
+    image.pixels = [c / 255 for c in (*color, 255)] * 16
+    image.filepath_raw, image.file_format = f"{package}/{name}", "PNG"
+    image.save()
+    bpy.data.images.remove(image)
+    value = json.loads(Path(package, "package.json").read_text())
+    Path(package, "package.json").write_text(json.dumps({**value, "texture": name}))
+def look(item):
+    # The colour of the texture, and whether the slider moves the materials.
+    material = item.data.materials[1]
+    group = next(n.node_tree for n in material.node_tree.nodes if n.type == "GROUP")
+    image = next(n.image for n in group.nodes if n.type == "TEX_IMAGE")
+    target = group.animation_data.drivers[0].driver.variables[0].targets[0]
+    return [[round(255 * c) for c in image.pixels[:3]], target.id.name + target.data_path]
+RED, GREEN, BLUE = (255, 0, 0), (0, 255, 0), (0, 0, 255)
+"""
+SLIDER = 'Fieldwork · capture["show_labels"]'
+
+
+@pytest.mark.parametrize("split", ["none", "classes"])
+def test_a_surface_that_was_edited_keeps_its_texture(split, bpy_script, package, tmp_path):
+    facts = bpy_script(
+        IMPORT
+        + COPY
+        + TEXTURED
+        + """
+put_texture(RED)
+made = update()
+own = copy(made.mesh)
+made.mesh.data.vertices[3].co.x += 0.1
+texture = bpy.data.images["texture-ff0000.png"]
+bpy.ops.wm.save_as_mainfile(filepath=folder + "/scene.blend")
+bpy.ops.wm.open_mainfile(filepath=folder + "/scene.blend")
+for color in (GREEN, BLUE):
+    # The engine writes the texture before Blender comes to it, and keeps the one before.
+    before = list(Path(package).glob("texture*"))
+    kept = [(path, path.read_bytes()) for path in before]
+    put_texture(color)
+    for path, content in kept:
+        path.write_bytes(content)
+    update(split)
+    for path in before:
+        path.unlink()
+bpy.ops.wm.save_as_mainfile(filepath=folder + "/scene.blend")
+bpy.ops.wm.open_mainfile(filepath=folder + "/scene.blend")
+new = next(o for o in bpy.data.objects if o.get("fieldwork_role") in ("mesh", "class:1"))
+answer([look(bpy.data.objects["Surface"]), look(bpy.data.objects["Surface.001"]), look(new),
+        sorted(i.name for i in bpy.data.images if i.name.startswith("texture"))])
+""",
+        package=package,
+        folder=tmp_path,
+        split=split,
+    )
+    edited, copied, new, images = facts
+    assert edited == copied == [[255, 0, 0], SLIDER]
+    assert new == [[0, 0, 255], SLIDER]
+    assert images == ["texture-0000ff.png", "texture-ff0000.png"], "nothing piles up"
+
+
+def test_a_texture_that_was_painted_on_stays(bpy_script, package):
+    facts = bpy_script(
+        IMPORT
+        + TEXTURED
+        + """
+put_texture(RED)
+update()
+image = bpy.data.images["texture-ff0000.png"]
+image.pixels[:4] = [0, 1, 1, 1]
+image.update()
+put_texture(BLUE)
+made = update()
+answer([look(made.mesh)[0], image.use_fake_user, [round(c) for c in image.pixels[:3]]])
+""",
+        package=package,
+    )
+    assert facts == [[0, 0, 255], True, [0, 1, 1]]

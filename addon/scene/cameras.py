@@ -11,6 +11,7 @@ from mathutils import Matrix
 
 from ..render.slot import is_of, load_image, load_render, render_slot
 from .edited import CAMERA_PATH, WRITTEN, Steps, camera_edited, camera_fingerprint, keys_fingerprint, write_once
+from .frame import units_per_metre
 from .owned import Owned
 from .package import SENSOR_MM, Package, blender_camera
 
@@ -68,7 +69,9 @@ def _camera(owned: Owned, role: str, name: str, size: float) -> bpy.types.Object
     data = found.data if found else bpy.data.cameras.new(name)
     write_once(data, "display_size", size)
     if found is None:
-        data.clip_start, data.clip_end = 0.01, 1000.0
+        # Unlike places and sizes these do not follow the scale of the parent.
+        metre = units_per_metre(owned.scene)
+        data.clip_start, data.clip_end = 0.01 * metre, 1000.0 * metre
     return owned.object(role, name, data)
 
 

@@ -78,10 +78,13 @@ for _ in range(2):
 bpy.context.view_layer.update()
 mesh = imported.mesh
 width = max((mesh.matrix_world @ v.co).x for v in mesh.data.vertices)
-answer({"width": width * metres, "scale": list(imported.root.scale)})
+camera = imported.cameras[0].data
+answer({"width": width * metres, "scale": list(imported.root.scale),
+        "clip": [camera.clip_start * metres, camera.clip_end * metres]})
 """,
         folder=make_package(tmp_path / "package", 20, cameras=3, points=50),
         metres=metres,
     )
     assert facts["width"] == pytest.approx(0.95, rel=1e-4)
     assert facts["scale"] == pytest.approx([1 / metres] * 3, rel=1e-4)
+    assert facts["clip"] == pytest.approx([0.01, 1000], rel=1e-4)

@@ -139,13 +139,14 @@ class FIELDWORK_OT_compare(ProjectOperator):
         other = self.path(context, "other")
         if other is None:
             raise ValueError(t("Choose the project of the earlier epoch."))
+        unit = context.scene.unit_settings.scale_length or 1.0
         return {
             "project": self.project_path(context),
             "other": other,
             "run": self.value(context, "run"),
             "other_run": self.value(context, "other_run"),
             "points": self.path(context, "points"),
-            "limit": self.value(context, "limit") or None,
+            "limit": self.value(context, "limit") * unit or None,
             "views": ordered(self.value(context, "views")),
             "scale": self.value(context, "scale") or None,
             "out": self.path(context, "out"),

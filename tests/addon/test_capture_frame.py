@@ -88,3 +88,23 @@ answer({"width": width * metres, "scale": list(imported.root.scale),
     assert facts["width"] == pytest.approx(0.95, rel=1e-4)
     assert facts["scale"] == pytest.approx([1 / metres] * 3, rel=1e-4)
     assert facts["clip"] == pytest.approx([0.01, 1000], rel=1e-4)
+
+
+def test_the_limit_of_a_comparison_is_in_the_units_of_the_scene(bpy_script, tmp_path):
+    facts = bpy_script(
+        SETUP
+        + """
+class Operator:
+    value = lambda self, context, name: getattr(settings, bpy.types.FIELDWORK_OT_compare.scene_names[name])
+    path = lambda self, context, name: project
+    project_path = lambda self, context: project
+scene.unit_settings.scale_length = 0.01
+seen = []
+for limit in (0.0, 25.0):
+    settings.compare_limit = limit
+    seen.append(bpy.types.FIELDWORK_OT_compare.parameters(Operator(), bpy.context)["limit"])
+answer(seen)
+""",
+        project=make_posed_project(tmp_path / "capture"),
+    )
+    assert facts == [None, pytest.approx(0.25)]

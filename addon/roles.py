@@ -30,10 +30,15 @@ class Owner(NamedTuple):
             item[UUID] = self.uuid
 
 
+def is_local(item: Any) -> bool:
+    """Whether a datablock is this file's to change: neither linked from another nor an override of what is."""
+    return item.library is None and item.override_library is None
+
+
 def by_role(objects: Iterable[Any], owner: Owner) -> dict[str, Any]:
-    """The objects of a project by their roles. Copies, which have the role as well, come after their original."""
+    """The file's own objects of a project by their roles. Copies, which have the role as well, come after their original."""
     found: dict[str, Any] = {}
     for item in objects:
-        if ROLE in item and owner.owns(item):
+        if ROLE in item and owner.owns(item) and is_local(item):
             found.setdefault(item[ROLE], item)
     return found

@@ -13,7 +13,7 @@ from ..addon.jobs.job import Done, Job, Steps
 from ..addon.jobs.queue import queue
 from ..addon.project import classes, snapshot
 from ..addon.props import EnumProperty, StringProperty
-from ..addon.roles import ROLE
+from ..addon.roles import by_role
 from ..addon.scene import viewing
 from ..addon.text import t
 from .base import ProjectOperator, absolute, need_poses, refresh_scenes, scene_of, scene_settings, set_if_empty
@@ -62,7 +62,7 @@ def update_scene(job: Job, scene: bpy.types.Scene, always: bool = False) -> None
     """After a job that changed what stands in the scene: update what an earlier import put there; nothing where none did,
     unless `always`."""
     owner = snapshot.owner(job.project)
-    roles = {str(item[ROLE]) for item in scene.objects if ROLE in item and owner.owns(item)}
+    roles = set(by_role(scene.objects, owner))
     if not roles and not always:
         return
     many, animated = any(role.startswith("camera:") for role in roles), "camera path" in roles

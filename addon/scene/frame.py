@@ -5,14 +5,16 @@ from __future__ import annotations
 import bpy
 from mathutils import Matrix
 
-from ..roles import ROLE, Owner
+from ..roles import ROLE, Owner, is_local
 
 
 def root_of(scene: bpy.types.Scene, owner: Owner | None) -> bpy.types.Object | None:
-    """The empty under which everything of a project hangs in a scene; None where nothing was imported."""
+    """The empty under which everything of a project hangs in a scene, rather one that is not linked from another file; None
+    where nothing was imported."""
     if owner is None:
         return None
-    return next((item for item in scene.objects if item.get(ROLE) == "root" and owner.owns(item)), None)
+    roots = [item for item in scene.objects if item.get(ROLE) == "root" and owner.owns(item)]
+    return next((root for root in roots if is_local(root)), roots[0] if roots else None)
 
 
 def scene_from_capture(scene: bpy.types.Scene, owner: Owner | None) -> Matrix:

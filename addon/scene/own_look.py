@@ -7,7 +7,7 @@ from pathlib import Path
 import bpy
 
 from ..render.slot import painted
-from ..roles import Owner
+from ..roles import Owner, is_local
 from .edited import release
 
 TEXTURE = "fieldwork_texture"  # marks the images that are textures of a surface
@@ -31,7 +31,7 @@ def give_own_look(mesh: bpy.types.Mesh, owner: Owner) -> None:
 
 def remove_unused_textures() -> None:
     """Take away the textures of earlier meshes that nothing shows any more; those that the user painted on stay."""
-    for image in [image for image in bpy.data.images if TEXTURE in image and image.users == 0]:
+    for image in [image for image in bpy.data.images if TEXTURE in image and image.users == 0 and is_local(image)]:
         if painted(image):
             image.use_fake_user = True
         else:

@@ -10,7 +10,7 @@ from typing import Any
 import bpy
 
 from ..errors import SceneChanged
-from ..roles import ROLE, UUID, Owner, by_role
+from ..roles import ROLE, UUID, Owner, by_role, is_local
 from . import slices
 from .edited import Steps, object_changed, release, surface_edited
 from .frame import root_of
@@ -44,14 +44,14 @@ class Owned:
             self._slice = slices.number()
             self._known = by_role(self.collection.all_objects, self.owner)
             root = root_of(self.scene, self.owner)  # wherever the user has put it
-            if root is not None:
+            if root is not None and is_local(root):
                 self._known["root"] = root
         return self._known
 
     def release_copies(self) -> None:
         """Let the user have what he made as copies of the objects."""
         for item in self.scene.objects:
-            if ROLE not in item or not self.owner.owns(item):
+            if ROLE not in item or not self.owner.owns(item) or not is_local(item):
                 continue
             first = self.known.get(item[ROLE], item)
             if first != item:
@@ -61,7 +61,7 @@ class Owned:
 
     def _collection(self, parent: bpy.types.Collection, name: str, role: str) -> bpy.types.Collection:
         for child in parent.children:
-            if child.get(ROLE) == role and self.owner.owns(child):
+            if child.get(ROLE) == role and self.owner.owns(child) and is_local(child):
                 self.owner.mark(child, role)  # one of before the project had a UUID
                 return child
         made = bpy.data.collections.new(name)
@@ -156,9 +156,9 @@ def find(items: Any, owner: Owner, role: str, name: str) -> Any:
 
     `name`: what it is called in scenes of Fieldwork 0.1, which know materials and groups by nothing else.
     """
-    found = next((item for item in items if item.get(ROLE) == role and owner.owns(item)), None)
+    found = next((item for item in items if item.get(ROLE) == role and owner.owns(item) and is_local(item)), None)
     if found is None:
-        old = items.get(name)
+        old = items.get((name, None))  # None: in no library
         found = old if old is not None and ROLE not in old and UUID not in old else None
     if found is not None:
         owner.mark(found, role)
@@ -169,5 +169,5 @@ def hand_over(old: Owner, new: Owner) -> None:
     """Let what was made for one project belong to another: the same one under another name or in another place."""
     for items in (bpy.data.objects, bpy.data.collections, bpy.data.materials, bpy.data.node_groups):
         for item in items:
-            if ROLE in item and old.owns(item):
+            if ROLE in item and old.owns(item) and is_local(item):
                 new.mark(item, item[ROLE])

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import bpy
 
-from ..roles import ROLE, Owner
+from ..roles import Owner, by_role
 from .frame import root_of, scene_from_capture
 from .owned import find
 
@@ -15,7 +15,7 @@ ROLE_OF_VOLUME = "volume"
 
 def show(scene: bpy.types.Scene, owner: Owner, path: Path) -> bpy.types.Object:
     """The volume of a project in a scene, read from this file: a new object, or the one of before with the new file."""
-    item = next((obj for obj in scene.objects if obj.get(ROLE) == ROLE_OF_VOLUME and owner.owns(obj)), None)
+    item = by_role(scene.objects, owner).get(ROLE_OF_VOLUME)
     if item is None or item.type != "VOLUME":
         item = bpy.data.objects.new(f"{owner.name} · volume", bpy.data.volumes.new(owner.name))
         owner.mark(item, ROLE_OF_VOLUME)

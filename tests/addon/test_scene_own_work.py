@@ -260,3 +260,50 @@ answer([look(made.mesh)[0], image.use_fake_user, [round(c) for c in image.pixels
         package=package,
     )
     assert facts == [[0, 0, 255], True, [0, 1, 1]]
+
+
+@pytest.mark.parametrize("override", [False, True])
+def test_what_is_linked_from_another_file_stays_and_the_new_comes_beside_it(override, bpy_script, package, tmp_path):
+    facts = bpy_script(
+        IMPORT
+        + COPY
+        + TEXTURED
+        + """
+put_texture(RED)
+update()
+bpy.ops.wm.save_as_mainfile(filepath=folder + "/library.blend", relative_remap=True)
+bpy.ops.wm.read_factory_settings(use_empty=True)
+with bpy.data.libraries.load(folder + "/library.blend", link=True) as (there, here):
+    here.collections = [name for name in there.collections if name.startswith("Fieldwork")]
+scene, linked = bpy.context.scene, here.collections[0]
+scene.collection.children.link(linked)
+if override:
+    linked.override_hierarchy_create(scene, bpy.context.view_layer, do_fully_editable=True)
+def theirs():
+    items = [o for o in scene.objects if (o.library or o.override_library) and o.animation_data is None]
+    return sorted((o.name, o.matrix_basis.translation[:]) for o in items)
+before, others = theirs(), set(scene.objects)
+raise_mesh()
+value = json.loads(Path(package, "package.json").read_text())
+value["cameras"].append({**value["cameras"][0], "name": "new"})
+Path(package, "package.json").write_text(json.dumps(value))
+seen = []
+for _ in range(2):
+    made = update()
+    seen.append([len(set(scene.objects) - others), theirs() == before, made.warnings])
+    bpy.ops.wm.save_as_mainfile(filepath=folder + "/scene.blend")
+    bpy.ops.wm.open_mainfile(filepath=folder + "/scene.blend")
+    scene = bpy.context.scene
+    others = {o for o in scene.objects if o.library or o.override_library}
+made = update()
+used = [i for i in (made.mesh, made.mesh.data, made.root, made.cameras[0].data, *made.mesh.data.materials) if i.library]
+answer([seen, first_height(made.mesh), look(made.mesh)[0], [i.name for i in used]])
+""",
+        package=package,
+        folder=tmp_path,
+        override=override,
+    )
+    seen, height, color, used = facts
+    everything = 1 + 5 + 1 + 1 + 1  # parent, cameras, the animated one, points, surface
+    assert seen == [[everything, True, []]] * 2
+    assert (height, color, used) == (1, [255, 0, 0], [])

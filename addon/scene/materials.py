@@ -9,25 +9,45 @@ import bpy
 from ..roles import ROLE, Owner
 from .owned import find
 
+PARTS = ("void", "points", "volume")  # that are no classes and have a material, see points.py and volume.py
+
 
 def srgb_to_linear(value: float) -> float:
     """One sRGB channel in [0, 1] as linear light (IEC 61966-2-1)."""
     return value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4
 
 
-def find_material(owner: Owner, label: str) -> bpy.types.Material | None:
-    """The material of what is called `label`, marked as the project's; None when there is none yet."""
-    return find(bpy.data.materials, owner, f"material:{label}", f"{owner.name} · {label}")
+def find_material(owner: Owner, label: str, is_class: bool = True) -> bpy.types.Material | None:
+    """The material of the class or, if it is none, of the part that is called `label`, marked as the project's; None when
+    there is none yet."""
+    name = f"{owner.name} · {label}"
+    found = find(bpy.data.materials, owner, _role(label, is_class), name)
+    if found is None and is_class and label not in PARTS:
+        found = find(bpy.data.materials, owner, _role(label, False), name)  # classes were marked like parts at first
+        if found is not None:
+            owner.mark(found, _role(label, is_class))
+    return found
 
 
-def make_material(owner: Owner, label: str, color: list[float], group: Any) -> bpy.types.Material:
-    """The material of what is called `label`: `color` is sRGB in [0, 1]. One that the project has is given the colour
-    anew."""
-    material = find_material(owner, label)
+def _role(label: str, is_class: bool) -> str:
+    return f"class material:{label}" if is_class else f"material:{label}"
+
+
+def label_of(material: bpy.types.Material) -> str:
+    """What a material is of; its name where that is not known."""
+    return str(material[ROLE]).partition(":")[2] if ROLE in material else material.name
+
+
+def make_material(
+    owner: Owner, label: str, color: list[float], group: Any, is_class: bool = True
+) -> bpy.types.Material:
+    """The material of a class or part (see `find_material`): `color` is sRGB in [0, 1]. One that the project has is given
+    the colour anew."""
+    material = find_material(owner, label, is_class)
     linear = (*(srgb_to_linear(channel) for channel in color), 1.0)
     if material is None:
         material = bpy.data.materials.new(f"{owner.name} · {label}")
-        owner.mark(material, f"material:{label}")
+        owner.mark(material, _role(label, is_class))
         material.use_nodes = True
         tree = material.node_tree
         tree.nodes.clear()

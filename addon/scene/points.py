@@ -29,7 +29,8 @@ def sparse_points(owned: Owned, package: Package) -> Steps:
     held()[WRITTEN] = fingerprint
     item = yield from owned.with_mesh("points", "Sparse points", held)
     centers = np.array([np.array(c["camera_to_world"])[:3, 3] for c in package.cameras]).reshape(-1, 3)
-    material = make_material(owned.owner, "points", [0.8, 0.8, 0.8], shader_group(owned.owner, "points", owned.root))
+    group = shader_group(owned.owner, "points", owned.root)
+    material = make_material(owned.owner, "points", [0.8, 0.8, 0.8], group, is_class=False)
     show_points(item, float(np.ptp(centers, axis=0).max(initial=0.0)) / 600 or 0.005, material)
     return item
 

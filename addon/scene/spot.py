@@ -8,10 +8,11 @@ from dataclasses import dataclass, field
 import bpy
 from mathutils import Vector
 
-from ..roles import PROJECT, ROLE, UUID, Owner
+from ..roles import PROJECT, UUID, Owner
 from .cameras import ASPECT, SIZE
 from .lens import pinhole
 from .look import CONFIDENCE_ATTRIBUTE
+from .materials import label_of
 from .surface import CLASS_ATTRIBUTE, INSTANCE_ATTRIBUTE, INSTANCE_NAMES
 from .visibility import is_surface
 
@@ -59,7 +60,7 @@ def spot_at(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph, origin: Vect
     return Spot(
         place,
         mesh.attributes[CLASS_ATTRIBUTE].data[face].value,
-        str(material.get(ROLE, material.name)).removeprefix("material:"),
+        label_of(material),
         str(item.get(INSTANCE_NAMES, {}).get(str(number), number)) if number else "",
         sum(sure) / len(sure),
         photos_of(scene, depsgraph, place, normal, Owner(str(item.get(PROJECT, "")), str(item.get(UUID, "")))),

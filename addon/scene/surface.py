@@ -45,7 +45,8 @@ def surface(owned: Owned, package: Package, part: Part, groups: Callable[[], tup
     held = Held(bpy.data.meshes, bpy.data.meshes.new(part.name))
     yield from fill_surface(held, part.data)
     for entry in slot_classes(package):
-        material = make_material(owned.owner, entry["name"], entry["color"], groups()[0])
+        is_class = entry["id"] != package.ignore_id
+        material = make_material(owned.owner, entry["name"], entry["color"], groups()[0], is_class)
         describe(material, measured_of(package, "classes", entry["id"]), package.measures)
         held().materials.append(material)
     fingerprint = yield from mesh_fingerprint(held)

@@ -154,3 +154,47 @@ def test_objects_are_named_and_sorted_by_class_and_say_what_was_measured(package
     assert {name: left for name, left in facts["left"].items() if left} == {"stone": facts["faces"]["stone"]}
     assert facts["again"] == ["Surface"]
     assert not {"gold", "stone"} & set(facts["after"]), "collections that nothing stands in are gone"
+
+
+@pytest.mark.parametrize("names", [("points", "void"), ("volume", "gold")])
+def test_classes_called_like_other_parts_have_materials_of_their_own(names, package, bpy_script):
+    value = json.loads((package / "package.json").read_text())
+    for entry, name in zip(value["classes"], names):
+        entry["name"] = name
+    (package / "package.json").write_text(json.dumps(value))
+    facts = bpy_script(
+        IMPORT
+        + """
+from fieldwork.addon.roles import Owner
+from fieldwork.addon.scene.materials import label_of
+from fieldwork.addon.scene.volume import volume_material
+balls = next(n for n in made.points.modifiers[0].node_group.nodes if n.type == "SET_MATERIAL")
+others = [balls.inputs["Material"].default_value, volume_material(Owner("capture"))]
+answer([[m.name for m in (*made.mesh.data.materials, *others)], [label_of(m) for m in made.mesh.data.materials]])
+""",
+        package=package,
+        split="none",
+    )
+    materials, labels = facts
+    assert len(set(materials)) == 5
+    assert labels == ["void", *names]
+
+
+def test_materials_that_are_marked_like_parts_stay_those_of_their_classes(package, bpy_script):
+    facts = bpy_script(
+        IMPORT
+        + """
+before = sorted(m.name for m in bpy.data.materials)
+for material in made.mesh.data.materials:
+    material["fieldwork_role"] = material["fieldwork_role"].replace("class material:", "material:")
+made = import_package(scene, read_package(package))
+answer([before, sorted(m.name for m in bpy.data.materials), made.warnings,
+        [m["fieldwork_role"] for m in made.mesh.data.materials]])
+""",
+        package=package,
+        split="none",
+    )
+    before, after, warnings, roles = facts
+    assert before == after
+    assert warnings == []
+    assert roles == ["material:void", "class material:stone", "class material:gold"]

@@ -110,7 +110,7 @@ def import_steps(
     yield 0.8, "mesh"
     if pieces:
         for entry in slot_classes(package):  # those of the first scenes have no mark yet
-            find_material(owned.owner, entry["name"], entry["id"] != package.ignore_id)
+            find_material(owned.owner, entry["name"], owned.root, entry["id"] != package.ignore_id)
         yield from owned.leave_edited({part.role for part in pieces})
         texture = _texture(package)
         yield 0.8, "materials"  # the first picture of its kind takes Blender long: it gets ready to read such

@@ -17,6 +17,7 @@ from .own_look import TEXTURE
 from .owned import find
 
 SWITCH = "show_labels"  # custom property of the parent empty: 0 photo colour, 1 class colour, 2 confidence
+SLIDER = f'["{SWITCH}"]'  # the way to it in drivers
 COLOR_ATTRIBUTE = "Color"  # of the photos, at the vertices
 CLASS_COLOR_ATTRIBUTE = "class_color"  # at the faces
 CONFIDENCE_ATTRIBUTE = "confidence"  # at the vertices
@@ -43,17 +44,35 @@ def set_switch(root: bpy.types.Object) -> None:
     )
 
 
+def slider_of(tree: bpy.types.NodeTree) -> bpy.types.Object | None:
+    """The parent whose slider a node group follows; None where it follows none, or one that was deleted."""
+    for curve in tree.animation_data.drivers if tree.animation_data else ():
+        for variable in curve.driver.variables:
+            if variable.targets[0].data_path == SLIDER:
+                return variable.targets[0].id
+    return None
+
+
+def may_follow(tree: bpy.types.NodeTree, root: bpy.types.Object | None) -> bool:
+    """Whether a node group may follow the slider of this parent: it does not follow that of another scene."""
+    present = slider_of(tree)
+    if present is None or present == root:
+        return True
+    return all(root is not None and scene in root.users_scene for scene in present.users_scene)
+
+
 def shader_group(
     owner: Owner, part: str, root: bpy.types.Object, texture: bpy.types.Image | None = None
 ) -> bpy.types.NodeTree:
     """The shader group shared by all classes of a part ("mesh" or "points"): class colour in, the colour to show out.
 
     The colour of the photos is that of `texture` by the mesh's UVs, or without one that of its colour attribute. One
-    that the project has already is built anew, unless the user changed its nodes.
+    that the project has already in the scene of `root` is built anew, unless the user changed its nodes.
     """
     ending = " · points" if part == "points" else ""
     role = f"colors:{part}"
-    tree = find(bpy.data.node_groups, owner, role, f"{FIRST_GROUP} · {owner.name}{ending}")
+    name = f"{FIRST_GROUP} · {owner.name}{ending}"
+    tree = find(bpy.data.node_groups, owner, role, name, lambda tree: may_follow(tree, root))
     if tree is not None and tree.name.startswith(f"{FIRST_GROUP} · "):
         tree.name = f"{GROUP} · {owner.name}{ending}"
     if tree is None:
@@ -84,7 +103,8 @@ def viewport_group(owner: Owner, root: bpy.types.Object) -> bpy.types.NodeTree:
     """The geometry-nodes group that fills the attribute which Workbench draws; built anew where the project has it,
     unless the user changed its nodes."""
     role = "colors:viewport"
-    tree = find(bpy.data.node_groups, owner, role, f"{VIEWPORT_GROUP} · {owner.name}")
+    name = f"{VIEWPORT_GROUP} · {owner.name}"
+    tree = find(bpy.data.node_groups, owner, role, name, lambda tree: may_follow(tree, root))
     if tree is None:
         tree = bpy.data.node_groups.new(f"{VIEWPORT_GROUP} · {owner.name}", "GeometryNodeTree")
         owner.mark(tree, role)
@@ -120,7 +140,7 @@ def _kept(tree: bpy.types.NodeTree, root: bpy.types.Object, texture: bpy.types.I
         return False
     for curve in tree.animation_data.drivers if tree.animation_data else ():
         for variable in curve.driver.variables:
-            if variable.targets[0].data_path == f'["{SWITCH}"]':
+            if variable.targets[0].data_path == SLIDER:
                 variable.targets[0].id = root
     for node in tree.nodes:
         if node.type == "TEX_IMAGE" and texture is not None and (node.image is None or TEXTURE in node.image):
@@ -176,7 +196,7 @@ def _slider(tree: bpy.types.NodeTree, root: bpy.types.Object) -> bpy.types.NodeS
     variable = driver.variables.new()
     variable.type = "SINGLE_PROP"
     variable.targets[0].id = root
-    variable.targets[0].data_path = f'["{SWITCH}"]'
+    variable.targets[0].data_path = SLIDER
     return node.outputs[0]
 
 

@@ -5,6 +5,7 @@ What the user changed since is left to him (edited.py), and what is new comes be
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import bpy
@@ -151,15 +152,16 @@ class Owned:
                 bpy.data.collections.remove(child)
 
 
-def find(items: Any, owner: Owner, role: str, name: str) -> Any:
-    """The material or node group of a role among those of the file; None when there is none.
+def find(items: Any, owner: Owner, role: str, name: str, fits: Callable[[Any], bool] = lambda item: True) -> Any:
+    """The material or node group of a role among those of the file that fit; None when there is none.
 
     `name`: what it is called in scenes of Fieldwork 0.1, which know materials and groups by nothing else.
     """
-    found = next((item for item in items if item.get(ROLE) == role and owner.owns(item) and is_local(item)), None)
+    own = (item for item in items if item.get(ROLE) == role and owner.owns(item) and is_local(item))
+    found = next((item for item in own if fits(item)), None)
     if found is None:
         old = items.get((name, None))  # None: in no library
-        found = old if old is not None and ROLE not in old and UUID not in old else None
+        found = old if old is not None and ROLE not in old and UUID not in old and fits(old) else None
     if found is not None:
         owner.mark(found, role)
     return found

@@ -198,3 +198,37 @@ answer([before, sorted(m.name for m in bpy.data.materials), made.warnings,
     assert before == after
     assert warnings == []
     assert roles == ["material:void", "class material:stone", "class material:gold"]
+
+
+def test_each_scene_of_a_project_has_its_own_slider(package, bpy_script):
+    facts = bpy_script(
+        IMPORT
+        + """
+def followed(item):
+    groups = [n.node_tree for m in item.data.materials for n in m.node_tree.nodes if n.type == "GROUP"]
+    groups += [m.node_group for m in item.modifiers if m.type == "NODES"]
+    return sorted({d.driver.variables[0].targets[0].id.name for g in groups for d in g.animation_data.drivers})
+def count():
+    return [len(getattr(bpy.data, kind)) for kind in ("materials", "node_groups")]
+first = [count(), followed(made.mesh)]
+bpy.ops.scene.new(type="NEW")
+other = import_package(bpy.context.scene, read_package(package))
+second = [count(), followed(other.mesh), followed(made.mesh)]
+again = [import_package(place, read_package(package)) for place in (scene, bpy.context.scene)]
+third = [count(), *(followed(item.mesh) for item in again)]
+roots = [made.root.name, other.root.name]
+bpy.data.objects.remove(other.root)  # a new parent takes its place
+last = import_package(bpy.context.scene, read_package(package))
+answer({"first": first, "second": second, "third": third, "last": [count(), followed(last.mesh) == [last.root.name]],
+        "roots": roots})
+""",
+        package=package,
+        split="none",
+    )
+    (one, mine), (two, others, unchanged) = facts["first"], facts["second"]
+    root, other = facts["roots"]
+    assert mine == unchanged == [root]
+    assert others == [other]
+    assert two == [2 * n for n in one]
+    assert facts["third"] == [two, [root], [other]], "nothing is there twice"
+    assert facts["last"] == [two, True]

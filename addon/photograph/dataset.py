@@ -105,23 +105,32 @@ def camera_lens(camera: bpy.types.Camera, width: int, height: int) -> Lens:
 def camera_shots(scene: bpy.types.Scene, views: int, size: list[int] | None) -> list[Shot]:
     """One shot per frame of the scene's camera, at most `views`, spread over the frame range.
 
-    Only the camera moves: what else is animated stays as it is at the current frame.
+    Timeline markers may change the camera. Nothing else moves: what is animated stays as it is at the current frame.
+
+    Raises:
+        SceneError: a frame has no perspective camera.
     """
-    camera = scene.camera
-    if camera is None or camera.data.type != "PERSP":
-        raise SceneError("The scene has no perspective camera: add one, or choose another path.")
     width, height = scene_size(scene, size)
     numbers = list(range(scene.frame_start, scene.frame_end + 1, scene.frame_step))
     chosen = sorted({numbers[round(i)] for i in np.linspace(0, len(numbers) - 1, min(views, len(numbers)))})
-    current, shots = scene.frame_current, []
-    for number in chosen:
-        scene.frame_set(number)
-        evaluated = camera.evaluated_get(bpy.context.evaluated_depsgraph_get())
-        location, rotation, _ = evaluated.matrix_world.decompose()  # a scaled parent must not scale the axes
-        pose = np.array(Matrix.LocRotScale(location, rotation, None))
-        shots.append(Shot(f"{number:04d}", pose, camera_lens(evaluated.data, width, height)))
-    scene.frame_set(current)
-    return shots
+    current, camera = scene.frame_current, scene.camera
+    try:
+        return [_camera_shot(scene, number, width, height) for number in chosen]
+    finally:
+        scene.frame_set(current)
+        scene.camera = camera
+
+
+def _camera_shot(scene: bpy.types.Scene, number: int, width: int, height: int) -> Shot:
+    """The shot of a frame; the scene is in that frame afterwards."""
+    scene.frame_set(number)
+    camera = scene.camera
+    if camera is None or camera.data.type != "PERSP":
+        raise SceneError(f"The scene has no perspective camera in frame {number}: add one, or choose another path.")
+    evaluated = camera.evaluated_get(bpy.context.evaluated_depsgraph_get())
+    location, rotation, _ = evaluated.matrix_world.decompose()  # a scaled parent must not scale the axes
+    pose = np.array(Matrix.LocRotScale(location, rotation, None))
+    return Shot(f"{number:04d}", pose, camera_lens(evaluated.data, width, height))
 
 
 def curve_poses(scene: bpy.types.Scene, name: str | None, views: int, center: np.ndarray) -> list[np.ndarray]:

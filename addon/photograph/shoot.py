@@ -125,6 +125,7 @@ def photograph(
         render.film_transparent = transparent
         render.use_persistent_data = True
         render.use_compositing = render.use_sequencer = False
+        render.use_stamp = render.use_multiview = False
         # One change of the camera per shot and two passes over the list would lose the finished shots of a
         # cancelled run, so both renders of a shot are made in turn.
         for index, shot in enumerate(shots):
@@ -235,10 +236,17 @@ def _camera(scene: bpy.types.Scene) -> Iterator[None]:
     data.clip_start, data.clip_end = 0.001, 1e6
     camera = bpy.data.objects.new(data.name, data)
     scene.collection.objects.link(camera)
-    before, scene.camera = scene.camera, camera
+    before = scene.camera
+    # Rendering makes the camera of a timeline marker the scene's, and so does changing a marker.
+    bound = [(marker, marker.camera) for marker in scene.timeline_markers]
+    for marker, _ in bound:
+        marker.camera = None
+    scene.camera = camera
     try:
         yield
     finally:
+        for marker, marked in bound:
+            marker.camera = marked
         scene.camera = before
         bpy.data.objects.remove(camera)
         bpy.data.cameras.remove(data)
@@ -272,6 +280,7 @@ def _settings_kept(scene: bpy.types.Scene) -> Iterator[None]:
     targets = [
         (scene.render, ("engine", "resolution_x", "resolution_y", "resolution_percentage", "use_persistent_data")),
         (scene.render, ("use_compositing", "use_sequencer", "use_file_extension", "filepath")),
+        (scene.render, ("use_stamp", "use_multiview")),
         (scene.render, ("pixel_aspect_x", "pixel_aspect_y", "use_border", "use_motion_blur", "film_transparent")),
         (scene.cycles, ("samples", "use_adaptive_sampling", "adaptive_threshold", "filter_width")),
         (scene.cycles, ("pixel_filter_type", "use_denoising", "denoiser")),

@@ -256,3 +256,49 @@ answer([shot.name for shot in camera_shots(scene, 100, None)])
 """
     )
     assert names == ["0002", "0007", "0012"]
+
+
+CUTS = """
+from fieldwork.addon.photograph.dataset import camera_shots, plan
+from fieldwork.addon.photograph.shoot import photograph
+bpy.ops.wm.open_mainfile(filepath=blend)
+scene = bpy.context.scene
+first = scene.camera
+second = bpy.data.objects.new("second", bpy.data.cameras.new("second"))
+second.location = 0, 0, 12
+scene.collection.objects.link(second)
+request = {"path": "hemisphere", "views": 3, "size": [32, 48], "center": None, "radius": None}
+shots = plan(scene, request)
+
+def depths(name):
+    photograph(scene, shots, Path(folder) / name, samples=1, labels="none")
+    import numpy as np
+    return np.stack([np.load(Path(folder) / name / f"{shot.name}.depth.npy") for shot in shots])
+
+plain = depths("plain")
+scene.render.use_stamp = scene.render.use_multiview = True
+for name, frame, camera in (("a", 1, first), ("b", 6, second)):
+    scene.timeline_markers.new(name, frame=frame).camera = camera
+scene.frame_set(1)
+marked = depths("marked")
+places = {shot.name: [round(float(v), 3) for v in shot.camera_to_world[:3, 3]] for shot in camera_shots(scene, 10, None)}
+answer({
+    "same": bool((plain == marked).all()), "seen": float((plain > 0).mean()), "places": places,
+    "after": [scene.frame_current, scene.camera.name, [m.camera.name for m in scene.timeline_markers]],
+    "first": first.name, "kept": [scene.render.use_stamp, scene.render.use_multiview],
+})
+"""
+
+
+def test_cameras_of_timeline_markers_are_followed_only_along_the_scene_s_camera(blend, tmp_path, bpy_script):
+    facts = bpy_script(CUTS, blend=blend, folder=tmp_path)
+    assert facts["same"], "photos along other paths do not look through the cameras of the markers"
+    assert facts["seen"] > 0.02
+    assert facts["places"]["0006"] == facts["places"]["0010"] == [0, 0, 12]
+    assert facts["places"]["0001"] != facts["places"]["0005"] != [0, 0, 12]
+    assert facts["after"] == [1, facts["first"], [facts["first"], "second"]]
+    assert facts["kept"] == [True, True]
+    plain, marked = (sorted((tmp_path / name).glob("*.png")) for name in ("plain", "marked"))
+    assert [p.name for p in plain] == [p.name for p in marked]
+    for one, other in zip(plain, marked):
+        np.testing.assert_array_equal(np.asarray(Image.open(one)), np.asarray(Image.open(other)))

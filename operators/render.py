@@ -67,7 +67,9 @@ def camera_at(scene: bpy.types.Scene, number: int, width: int, height: int, owne
     if number != current:
         scene.frame_set(number)
     try:
-        evaluated = scene.camera.evaluated_get(scene.view_layers[0].depsgraph)
+        layer = scene.view_layers[0]
+        layer.update()  # a layer that no window shows is behind, or has not been evaluated at all
+        evaluated = scene.camera.evaluated_get(layer.depsgraph)
         # A scaled parent must not scale the camera's axes.
         capture_from_scene = scene_from_capture(scene, owner).inverted_safe()
         location, rotation, _ = (capture_from_scene @ evaluated.matrix_world).decompose()

@@ -72,6 +72,30 @@ answer({"names": [f["file_path"] for f in frames], "x": [f["transform_matrix"][0
     assert (facts["size"], facts["now"]) == ([100, 50], [5, 5, 5])
 
 
+def test_camera_is_where_it_stands_whichever_view_layer_the_window_shows(bpy_script, tmp_path):
+    facts = bpy_script(
+        SETUP
+        + """
+from fieldwork.operators.render import camera_at
+def place():
+    scene = bpy.context.scene
+    return camera_at(scene, scene.frame_current, 64, 48, None)["transform_matrix"][0][3]
+other = scene.view_layers.new("Other")
+bpy.context.window_manager.windows[0].view_layer = other
+place()
+scene.camera.location.x = 12
+other.update()
+found = [place()]
+bpy.ops.wm.save_as_mainfile(filepath=file)
+bpy.ops.wm.open_mainfile(filepath=file)
+answer({"layer": bpy.context.view_layer.name, "places": [*found, place()]})
+""",
+        file=tmp_path / "layers.blend",
+    )
+    assert facts["layer"] == "Other"
+    assert facts["places"] == pytest.approx([12, 12])
+
+
 def test_renders_appear_behind_their_cameras_or_on_planes_once(bpy_script, tmp_path):
     facts = bpy_script(
         SETUP

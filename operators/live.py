@@ -133,7 +133,10 @@ class FIELDWORK_OT_refresh_field_classes(_OfField):
     bl_label = "Refresh Classes and Things"
 
     def execute(self, context: Context) -> set[str]:
-        fields.refresh(active_field(context))
+        obj = active_field(context)
+        if not fields.refresh(obj):
+            self.report({"ERROR"}, t("The project of the field cannot be read at {}.", fields.folder_of(obj.fieldwork)))
+            return {"CANCELLED"}
         return {"FINISHED"}
 
 

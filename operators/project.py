@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import bpy
 from bpy.types import Context, Event, Operator
 
 from ..addon.errors import EngineError
 from ..addon.jobs.queue import queue
+from ..addon.live import fields
 from ..addon.project import edits, lists, snapshot
 from ..addon.props import StringProperty
 from ..addon.roles import Owner
@@ -48,19 +52,20 @@ class FIELDWORK_OT_locate_project(Operator):
         old, uuid = snapshot.folder_of(settings), settings.project_uuid
         hand_over(Owner(old.name, uuid), snapshot.owner(folder))
         edits.move(old, folder)
-        move_images(old, folder)
+        move_files((bpy.data.images, bpy.data.volumes), old, folder)
+        fields.move(old, folder)
         for scene in bpy.data.scenes:
             if scene.fieldwork.project_uuid == uuid and snapshot.folder_of(scene.fieldwork) == old:
                 scene.fieldwork.project = str(folder)
         return {"FINISHED"}
 
 
-def move_images(old: Path, new: Path) -> None:
-    """Let images of the file that lie in a folder be read from another."""
-    for image in bpy.data.images:
-        path = Path(bpy.path.abspath(image.filepath, library=image.library)) if image.filepath else None
-        if path is not None and image.library is None and path.is_relative_to(old):
-            image.filepath = str(new / path.relative_to(old))
+def move_files(collections: Iterable[Any], old: Path, new: Path) -> None:
+    """Let what the file reads from a folder, such as its images, be read from another."""
+    for item in itertools.chain.from_iterable(collections):
+        path = Path(bpy.path.abspath(item.filepath)) if item.filepath and item.library is None else None
+        if path is not None and path.is_relative_to(old):
+            item.filepath = str(new / path.relative_to(old))
 
 
 def refusal(settings: bpy.types.PropertyGroup, folder: Path) -> str | None:

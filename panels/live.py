@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import bpy
 from bpy.types import Context, Panel, UILayout, UIList
 
@@ -12,6 +10,7 @@ from ..addon.live.engine import ENGINE
 from ..addon.live.settings import look_name
 from ..addon.live.training import trainings
 from ..addon.live.viewport import viewport
+from ..addon.project import snapshot
 from ..addon.text import t
 from ..operators.live import active_field
 from . import states
@@ -67,6 +66,7 @@ def draw_field(layout: UILayout, context: Context, obj) -> None:
     """What is set for a field of the scene, and why it is not to be seen, where it is not."""
     own = obj.fieldwork
     layout.prop(obj, "name", text="", icon="EMPTY_AXIS")
+    layout.prop(own, "project", text="")
     for reason in why_not_drawn(context, own):
         draw_wrapped(layout.box(), reason, text_width(context) - 4, icon="INFO")
     row = layout.row(align=True)
@@ -110,9 +110,12 @@ def why_not_drawn(context: Context, own) -> list[str]:
     reasons = []
     if hint.lacks_overlays(context.space_data):
         return [t("Show overlays to see the field: this version of Blender needs them.")]
-    if own.project and trainings.run_of(Path(fields.absolute(own.project))) == own.run:
+    folder = fields.folder_of(own)
+    if folder is not None and trainings.run_of(folder) == own.run:
         return [t("In training: shown as it converges, coarse where the view moves.")]
-    baked = voxels.baked(Path(fields.absolute(own.project)), own.run) if own.project else None
+    if folder is not None and not snapshot.has_project(folder):
+        return [t("There is no project in {}: choose the folder that holds its project.json.", folder)]
+    baked = voxels.baked(folder, own.run) if folder is not None else None
     if baked is None:
         reasons.append(t("Bake the field to see it here: the viewport draws baked fields."))
     elif viewport.error:
@@ -125,8 +128,8 @@ def why_not_drawn(context: Context, own) -> list[str]:
 def why_things_are_not_drawn(own) -> str:
     """A sentence that says why the viewport does not show edits of things; empty where it does, or there is nothing to edit in it.
     What is needed for that is asked for."""
-    project = Path(fields.absolute(own.project))
-    baked = None if bpy.app.background else voxels.baked(project, own.run)
+    project = fields.folder_of(own)
+    baked = None if project is None or bpy.app.background else voxels.baked(project, own.run)
     if baked is None:
         return ""
     known = thing_texels.answers.of(baked, project, own.run)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -82,11 +83,12 @@ def _rendered_item(part: Part, baked: bool, depsgraph: bpy.types.Depsgraph) -> d
 def item_of(obj: bpy.types.Object, baked: bool, depsgraph: bpy.types.Depsgraph | None = None) -> dict[str, Any]:
     """A field object as it is, or in a depsgraph, with all its things as they are. Raises SceneError: it has no project."""
     own = obj.fieldwork
-    if not own.project:
+    folder = folder_of(own)
+    if folder is None:
         raise SceneError(t("The field “{}” has no project folder.", obj.name))
     return {
         "name": obj.name,
-        "project": absolute(own.project),
+        "project": str(folder),
         "run": own.run,
         "baked": baked,
         **poses_of(obj, depsgraph),
@@ -132,9 +134,20 @@ def crop_matrix(crop: bpy.types.Object) -> Matrix:
     return crop.matrix_world @ Matrix.Scale(crop.empty_display_size, 4)
 
 
-def absolute(path: str) -> str:
-    """A folder of a field as an absolute path."""
-    return str(Path(bpy.path.abspath(path)).absolute())
+def folder_of(own: Any) -> Path | None:
+    """The project folder that a field object names, as an absolute path; None where it names none."""
+    if not own.project:
+        return None
+    # A linked object means a folder beside its own file, which Blender may call "//../other/file.blend".
+    return Path(os.path.abspath(bpy.path.abspath(own.project, library=own.id_data.original.library)))
+
+
+def move(old: Path, new: Path) -> None:
+    """Let the fields of a project in one folder be read from another."""
+    old = Path(os.path.abspath(old))
+    for obj in bpy.data.objects:
+        if obj.library is None and obj.fieldwork.is_field and folder_of(obj.fieldwork) == old:
+            obj.fieldwork.project = str(new)
 
 
 def rows(matrix: Matrix) -> list[list[float]]:
@@ -142,17 +155,21 @@ def rows(matrix: Matrix) -> list[list[float]]:
     return [list(row) for row in matrix]
 
 
-def refresh(obj: bpy.types.Object) -> None:
-    """Read classes and things of a field object anew; what the user set for them stays."""
-    fill_classes(obj)
-    things.fill(obj, Path(absolute(obj.fieldwork.project)))
+def refresh(obj: bpy.types.Object) -> bool:
+    """Read classes and things of a field object anew; what the user set for them stays. False: its project cannot be read, and
+    all stays as it is."""
+    folder = folder_of(obj.fieldwork)
+    project = snapshot.project(folder)
+    if folder is None or project is None:
+        return False
+    fill_classes(obj, project.get("classes", []))
+    things.fill(obj, folder)
+    return True
 
 
-def fill_classes(obj: bpy.types.Object) -> None:
+def fill_classes(obj: bpy.types.Object, values: list[dict[str, Any]]) -> None:
     """Let the classes of a field object be those of its project, with what the user set of them."""
     own = obj.fieldwork
-    folder = Path(absolute(own.project))
-    values = (snapshot.project(folder) or {}).get("classes", [])
     before = {entry.id: (entry.visible, entry.opacity, entry.tint, tuple(entry.color)) for entry in own.classes}
     own.classes.clear()
     for value in values:

@@ -128,7 +128,7 @@ class Viewport:
         # The farthest first: pixels at edges of nearer ones mix with what is behind.
         for part in sorted(shown, key=lambda one: (view3d.view_matrix @ one.object.matrix_world.translation).z):
             own = part.field.fieldwork
-            project = Path(fields.absolute(own.project)) if own.project else None
+            project = fields.folder_of(own)
             if project is None:
                 continue
             key = (region.as_pointer(), part.object.name_full)

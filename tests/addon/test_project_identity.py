@@ -188,6 +188,76 @@ answer(seen)
     shutil.rmtree(tmp_path / "elsewhere")
 
 
+FIELDS = """
+from fieldwork.addon.live import fields
+def add_field(scene, folder):
+    field = bpy.data.objects.new("Field", None)
+    scene.collection.objects.link(field)
+    field.fieldwork.is_field, field.fieldwork.project = True, folder
+    bpy.context.view_layer.objects.active = field
+    return field
+"""
+
+
+def test_fields_and_volumes_go_where_the_project_is_found(bpy_script, tmp_path):
+    project, other = make_posed_project(tmp_path / "capture"), make_project(tmp_path / "other")
+    facts = bpy_script(
+        SETUP
+        + FIELDS
+        + """
+import shutil
+settings.project = project
+field, others = add_field(scene, project), add_field(scene, other)
+bpy.context.view_layer.objects.active = field
+bpy.ops.fieldwork.refresh_field_classes()
+field.fieldwork.classes[0].visible = False
+volume = bpy.data.volumes.new("volume")
+volume.filepath = f"{project}/exports/main/field.vdb"
+shutil.move(project, moved)
+seen = {"away": attempt(bpy.ops.fieldwork.refresh_field_classes)}
+seen["kept"] = [entry.visible for entry in field.fieldwork.classes]
+seen["found"] = attempt(lambda: bpy.ops.fieldwork.locate_project(directory=moved))
+seen["read"] = attempt(bpy.ops.fieldwork.refresh_field_classes)
+answer({**seen, "fields": [field.fieldwork.project, others.fieldwork.project], "volume": volume.filepath})
+""",
+        project=project,
+        moved=tmp_path / "elsewhere",
+        other=other,
+    )
+    assert "cannot be read" in facts["away"]
+    assert str(project) in facts["away"]
+    assert facts["kept"] == [False, True]
+    assert facts["found"] == facts["read"] == ["FINISHED"]
+    assert facts["fields"] == [str(tmp_path / "elsewhere"), str(other)]
+    assert facts["volume"] == str(tmp_path / "elsewhere/exports/main/field.vdb")
+
+
+def test_a_linked_field_names_a_folder_beside_its_own_file(bpy_script, tmp_path):
+    project = make_project(tmp_path / "library/capture")
+    (tmp_path / "work").mkdir()
+    facts = bpy_script(
+        SETUP
+        + FIELDS
+        + """
+bpy.ops.wm.save_as_mainfile(filepath=f"{folder}/library/fields.blend")
+add_field(bpy.context.scene, "//capture")
+bpy.ops.wm.save_mainfile()
+bpy.ops.wm.read_factory_settings(use_empty=True)
+with bpy.data.libraries.load(f"{folder}/library/fields.blend", link=True) as (_, wanted):
+    wanted.objects = ["Field"]
+bpy.ops.wm.save_as_mainfile(filepath=f"{folder}/work/scene.blend")
+field = bpy.data.objects["Field"]
+bpy.context.scene.collection.objects.link(field)
+layer = bpy.context.view_layer
+layer.update()
+both = (field, field.evaluated_get(layer.depsgraph))
+answer([str(fields.folder_of(obj.fieldwork)) for obj in both] + [fields.item_of(field, False)["project"]])
+""",
+        folder=tmp_path,
+    )
+    assert facts == [str(project)] * 3
+
+
 def test_edits_without_a_window_wait_for_the_engine(bpy_script, tmp_path):
     """The engine itself writes; what it refuses is an error and stays until it is discarded."""
     project = make_posed_project(tmp_path / "capture")

@@ -168,11 +168,11 @@ bpy.context.view_layer.update()
 cut = passes(shoot())["Combined.A"]
 facts["crop"] = [float(cut[y, 27]) for y in (32, 48)]
 left.fieldwork.crop = None
-from fieldwork.addon.live.fields import fill_classes
-fill_classes(left)
+from fieldwork.addon.live.fields import refresh
+refresh(left)
 facts["classes"] = [[c.id, c.name] for c in left.fieldwork.classes]
 left.fieldwork.classes[0].visible = False
-fill_classes(left)
+refresh(left)
 facts["hidden"] = float(passes(shoot())["Combined.A"][:38].sum() / both["Combined.A"][:38, :60].sum())
 left.fieldwork.project = ""
 facts["no project"] = attempt(bpy.ops.render.render)

@@ -245,7 +245,7 @@ def _hash7(name: str) -> str:
 def _end_when_idle() -> float:
     minutes = machine.preferences().idle_minutes
     if minutes and _frames is not None and _frames.idle_seconds > 60 * minutes:
-        close_frames()
+        _frames.rest()
     return IDLE_PERIOD
 
 

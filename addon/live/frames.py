@@ -201,6 +201,10 @@ class FrameEngine:
             self._link = self._open_link()
         return self._link
 
+    def rest(self) -> None:
+        """End the engine until the next frame. Its folder stays: views of a training have files there."""
+        self._end(at_once=False)
+
     def close(self) -> None:
         """End the engine and remove its files. A frame that is being rendered is stopped."""
         self._end(at_once=False)

@@ -140,3 +140,26 @@ answer(facts)
     assert facts["before"] == [None, idle]
     assert facts["begun"] == watching < idle
     assert facts["quiet"] == idle
+
+
+def test_views_of_a_training_go_on_when_the_engine_of_frames_rests(bpy_script, tmp_path: Path) -> None:
+    facts = bpy_script(
+        """
+import time
+from types import SimpleNamespace
+import fieldwork
+fieldwork.register()
+from fieldwork.addon.live import engine
+from fieldwork.addon.live.training import trainings
+watch = trainings._new(Path(project), (8, 4))
+ended = []
+long_ago = time.monotonic() - 1e6
+engine.frames()._link = SimpleNamespace(last_used=long_ago, process=None, close=lambda timeout: ended.append(timeout))
+engine._end_when_idle()
+facts = {"ended": len(ended), "there": watch.file.path.exists(), "process": engine.frames().process}
+fieldwork.unregister()
+answer({**facts, "left": watch.file.path.parent.exists()})
+""",
+        project=tmp_path,
+    )
+    assert facts == {"ended": 1, "there": True, "process": None, "left": False}

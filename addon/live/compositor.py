@@ -14,7 +14,7 @@ import bpy
 from ..errors import SceneError
 from ..text import t
 from . import fields, shadows
-from .shared_scene import filter_width, share
+from .shared_scene import filter_width, scene_of, share
 
 FIELD_SCENE = "fieldwork_field_scene"  # on a scene: that of its fields
 NODE = "fieldwork_node"  # on nodes that are ours
@@ -38,8 +38,7 @@ def set_up(scene: bpy.types.Scene) -> bpy.types.Scene:
     needed, and the nodes of this one. Raises SceneError as `check`."""
     check(scene)
     caught = shadows.set_up(scene)
-    made = scene.get(FIELD_SCENE) or bpy.data.scenes.new(t("{} · Field", scene.name))
-    scene[FIELD_SCENE] = made
+    made = scene_of(scene, FIELD_SCENE, t("{} · Field", scene.name))
     share(scene, made)
     made.render.engine = ENGINE
     made.render.filter_size = filter_width(scene)

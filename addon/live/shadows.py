@@ -15,7 +15,7 @@ from ..roles import ROLE
 from ..scene.visibility import is_surface
 from ..text import t
 from .objects import SOLID
-from .shared_scene import filter_width, share
+from .shared_scene import filter_width, scene_of, share
 
 PASS = "Shadow Catcher"
 SHADOW_SCENE = "fieldwork_shadow_scene"  # on a scene: that of its shadows
@@ -67,9 +67,8 @@ def set_up(scene: bpy.types.Scene) -> bpy.types.Scene | None:
     _hold_out(scene.view_layers[0].layer_collection, not own)
     made = scene
     if not own:
-        made = scene.get(SHADOW_SCENE)
-        if made is None:
-            made = scene[SHADOW_SCENE] = bpy.data.scenes.new(t("{} · Shadows", scene.name))
+        made = scene_of(scene, SHADOW_SCENE, t("{} · Shadows", scene.name))
+        if made.render.engine != "CYCLES":  # a new one
             made.render.engine = "CYCLES"
             made.cycles.samples, made.cycles.use_denoising = SAMPLES, False
         share(scene, made)

@@ -13,23 +13,51 @@ SHARED = (
 )  # fmt: skip
 
 
+OWNER = "fieldwork_owner_scene"  # on a scene made here: the one that it was made for
+
+
+def scene_of(scene: bpy.types.Scene, key: str, name: str) -> bpy.types.Scene:
+    """The scene that another one names in its custom property `key`; made where there is none.
+
+    A copy of a scene names that of its original, and gets one of its own.
+    """
+    made = scene.get(key)
+    if made is None or made.get(OWNER) not in (None, scene):
+        made = scene[key] = bpy.data.scenes.new(name)
+    made[OWNER] = scene
+    return made
+
+
 def share(scene: bpy.types.Scene, made: bpy.types.Scene) -> None:
-    """Let a scene see what another one sees, with the same camera and frames, without a background or a compositor."""
-    made.camera, made.world = scene.camera, scene.world
+    """Let a scene see what another one sees, with the same cameras and frames, without a background or a compositor."""
+    _share_markers(scene, made)
+    made.camera, made.world = scene.camera, scene.world  # after the markers, which may change the camera
     made.frame_start, made.frame_end, made.frame_step = scene.frame_start, scene.frame_end, scene.frame_step
     made.unit_settings.scale_length = scene.unit_settings.scale_length
     for name in SHARED:
         setattr(made.render, name, getattr(scene.render, name))
     made.render.film_transparent = True
     made.render.use_compositing = False
-    for child in scene.collection.children:
-        if child.name not in made.collection.children:
-            made.collection.children.link(child)
-    for obj in scene.collection.objects:
-        if obj.name not in made.collection.objects:
-            made.collection.objects.link(obj)
+    _share_links(scene.collection.children, made.collection.children)
+    _share_links(scene.collection.objects, made.collection.objects)
     made.view_layers[0].update()  # the view layer of a new scene has no collections before
     _share_collections(scene.view_layers[0].layer_collection, made.view_layers[0].layer_collection)
+
+
+def _share_links(seen: Any, made: Any) -> None:
+    """Let a collection hold the objects, or the collections, that another one holds, and no others."""
+    wanted, there = set(seen), set(made)
+    for item in there - wanted:
+        made.unlink(item)
+    for item in wanted - there:
+        made.link(item)
+
+
+def _share_markers(scene: bpy.types.Scene, made: bpy.types.Scene) -> None:
+    """Let the timeline change cameras where that of another scene does."""
+    made.timeline_markers.clear()
+    for marker in scene.timeline_markers:
+        made.timeline_markers.new(marker.name, frame=marker.frame).camera = marker.camera
 
 
 def _share_collections(seen: Any, made: Any) -> None:

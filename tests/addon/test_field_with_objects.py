@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from fieldwork.tests.addon.rendered import ball
-from fieldwork.tests.addon.support import SETUP
+from fieldwork.tests.addon.support import SETUP, make_project
 
 __all__ = ["ball"]
 
@@ -131,6 +131,85 @@ answer(facts)
     assert facts["out"] == "BLUR"
     assert "itself" in facts["itself"]
     assert "camera" in facts["camera"]
+
+
+SCENES = (
+    SETUP
+    + """
+from fieldwork.addon.live import compositor, shadows
+settings.project = project
+cube = bpy.data.objects["Cube"]
+for collection in list(cube.users_collection):
+    collection.objects.unlink(cube)
+scene.collection.objects.link(cube)
+"""
+)
+
+
+def test_the_scene_of_the_field_follows_what_is_deleted_and_cuts_between_cameras(bpy_script, tmp_path):
+    facts = bpy_script(
+        SCENES
+        + """
+props = bpy.data.collections.new("Props")
+scene.collection.children.link(props)
+made = compositor.set_up(scene)
+seen = [cube.name in made.objects, props.name in made.collection.children]
+bpy.ops.object.select_all(action="DESELECT")
+cube.select_set(True)
+bpy.ops.object.delete()
+scene.collection.children.unlink(props)
+first, second = scene.camera, bpy.data.objects.new("Second", bpy.data.cameras.new("Second"))
+scene.collection.objects.link(second)
+for name, frame, camera in (("one", 1, first), ("two", 10, second)):
+    scene.timeline_markers.new(name, frame=frame).camera = camera
+scene.frame_set(12)
+for _ in range(2):
+    compositor.set_up(scene)
+cameras = []
+for frame in (1, 12):
+    made.frame_set(frame)
+    cameras.append(made.camera.name)
+answer({"before": seen, "after": ["Cube" in made.objects, "Props" in made.collection.children], "cameras": cameras,
+        "markers": len(made.timeline_markers), "same": set(made.objects) == set(scene.objects)})
+""",
+        project=make_project(tmp_path / "capture"),
+    )
+    assert facts["before"] == [True, True]
+    assert facts["after"] == [False, False]
+    assert facts["cameras"] == ["Camera", "Second"]
+    assert facts["markers"] == 2
+    assert facts["same"]
+
+
+def test_a_copy_of_the_scene_gets_scenes_of_its_own(bpy_script, tmp_path):
+    facts = bpy_script(
+        SCENES
+        + """
+cube["fieldwork_role"], cube.is_shadow_catcher = "mesh", True
+def names(scene):
+    return [scene[key].name for key in (compositor.FIELD_SCENE, shadows.SHADOW_SCENE)]
+made = compositor.set_up(scene)
+scene[shadows.SHADOW_SCENE].cycles.samples = 7
+bpy.ops.scene.new(type="FULL_COPY")
+copy = bpy.context.scene
+for each in (copy, scene, copy):
+    compositor.set_up(each)
+nodes = {
+    each.name: sorted(n.scene.name for n in compositor.tree_of(each)[0].nodes if n.type == "R_LAYERS")
+    for each in (scene, copy)
+}
+answer({"scenes": [names(scene), names(copy)], "cameras": [made.camera == scene.camera, made.camera == copy.camera],
+        "nodes": nodes, "samples": scene[shadows.SHADOW_SCENE].cycles.samples, "all": len(bpy.data.scenes)})
+""",
+        project=make_project(tmp_path / "capture"),
+    )
+    first, second = facts["scenes"]
+    assert first == ["Scene · Field", "Scene · Shadows"]
+    assert second == ["Scene.001 · Field", "Scene.001 · Shadows"]
+    assert facts["all"] == 6
+    assert facts["cameras"] == [True, False]
+    assert facts["samples"] == 7, "what the user set stays"
+    assert facts["nodes"] == {"Scene": sorted(["Scene", *first]), "Scene.001": sorted(["Scene.001", *second])}
 
 
 def test_surfaces_of_the_capture_do_not_hide_its_field(bpy_script, ball, tmp_path):

@@ -106,7 +106,7 @@ def poses_of(
     if copy is not None:
         placed = copy.evaluated_get(depsgraph) if depsgraph is not None else copy
         return {"scene_from_capture": rows(things.scene_from_capture(placed))}
-    found, crop = {"scene_from_capture": rows(obj.matrix_world)}, obj.fieldwork.crop
+    found, crop = {"scene_from_capture": rows(obj.matrix_world)}, crop_box(obj.fieldwork)
     if crop is not None:
         found["crop"] = rows(crop_matrix(crop.evaluated_get(depsgraph) if depsgraph is not None else crop))
     return found
@@ -127,6 +127,12 @@ def project_item(scene: bpy.types.Scene, baked: bool) -> dict[str, Any]:
         "scene_from_capture": rows(scene_from_capture(scene, snapshot.owner(folder))),
         "classes": {number: {"opacity": 0.0, "color": tuple(entry.color)} for number, entry in hidden.items()},
     }
+
+
+def crop_box(own: Any) -> bpy.types.Object | None:
+    """The box that a field object is cut to; None where it has none."""
+    # A deleted object lives on as long as something points to it.
+    return own.crop if own.crop is not None and own.crop.original.users_scene else None
 
 
 def crop_matrix(crop: bpy.types.Object) -> Matrix:

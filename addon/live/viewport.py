@@ -186,7 +186,8 @@ class Viewport:
                 self._tell_apart(asset, project, own.run)
             if asset.told is not None:
                 looks = voxels.thing_looks(looks, asset.told, edited)
-            crop = fields.crop_matrix(own.crop) if own.crop is not None else None
+            box = fields.crop_box(own)
+            crop = fields.crop_matrix(box) if box is not None else None
             return Shown(looks, voxels.rows(looks), field.matrix_world @ world_from_box, crop)
         self._tell_apart(asset, project, own.run)
         told, thing, place = asset.told, part.copy.fieldwork_copy.thing, things.scene_from_capture(part.copy)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 from fieldwork.tests.addon.rendered import START, ball
+from fieldwork.tests.addon.support import SETUP
 
 __all__ = ["ball"]
 
@@ -195,3 +196,27 @@ def test_field_objects_are_moved_cropped_hidden_and_coloured(bpy_script, ball, t
     assert facts["classes"] == [[1, "top"], [2, "bottom"]]
     assert facts["hidden"] < 0.4
     assert "no project folder" in facts["no project"]
+
+
+def test_a_crop_box_that_was_deleted_cuts_nothing(bpy_script):
+    facts = bpy_script(
+        SETUP
+        + """
+from fieldwork.addon.live import fields
+field = bpy.data.objects.new("Field", None)
+scene.collection.objects.link(field)
+field.fieldwork.is_field = True
+bpy.context.view_layer.objects.active = field
+bpy.ops.fieldwork.add_crop_box()
+def cropped():
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    seen = (field, None), (field.evaluated_get(depsgraph), depsgraph)
+    return ["crop" in fields.poses_of(*each) for each in seen]
+facts = {"there": cropped()}
+bpy.ops.object.select_all(action="DESELECT")
+field.fieldwork.crop.select_set(True)
+bpy.ops.object.delete()
+answer({**facts, "deleted": cropped(), "pointer": field.fieldwork.crop is not None})
+"""
+    )
+    assert facts == {"there": [True, True], "deleted": [False, False], "pointer": True}

@@ -25,6 +25,7 @@ class FIELDWORK_AP_preferences(AddonPreferences):
         name="Environment",
         description="Python of an existing environment that has the engine's packages; empty: the installed engine",
         subtype="FILE_PATH",
+        blend_relative=False,
     )
     device: EnumProperty(
         name="Device",
@@ -41,11 +42,13 @@ class FIELDWORK_AP_preferences(AddonPreferences):
         name="Base Python",
         description="Python 3.11 or newer that the engine's environment is made from; empty: Blender's own",
         subtype="FILE_PATH",
+        blend_relative=False,
     )
     wheels: StringProperty(
         name="Package Folder",
         description="Folder of package files (wheels) for a machine without network; empty: download",
         subtype="DIR_PATH",
+        blend_relative=False,
     )
     on_close: EnumProperty(
         name="When Blender Closes",

@@ -1,8 +1,10 @@
 """Blender's properties with the translation context of Fieldwork."""
 
+from collections.abc import Collection
 from functools import partial
+from typing import Any
 
-import bpy.props
+import bpy
 
 from .text import CONTEXT
 
@@ -12,7 +14,17 @@ FloatProperty = partial(bpy.props.FloatProperty, translation_context=CONTEXT)
 FloatVectorProperty = partial(bpy.props.FloatVectorProperty, translation_context=CONTEXT)
 IntProperty = partial(bpy.props.IntProperty, translation_context=CONTEXT)
 IntVectorProperty = partial(bpy.props.IntVectorProperty, translation_context=CONTEXT)
-StringProperty = partial(bpy.props.StringProperty, translation_context=CONTEXT)
 # These have no words of their own.
 CollectionProperty = bpy.props.CollectionProperty
 PointerProperty = bpy.props.PointerProperty
+
+PATHS = {"DIR_PATH", "FILE_PATH"}
+
+
+def StringProperty(
+    *, subtype: str = "NONE", options: Collection[str] = ("ANIMATABLE",), blend_relative: bool = True, **more: Any
+) -> Any:
+    """A text; a path may begin with "//", the folder of the open file, unless `blend_relative` is false."""
+    if subtype in PATHS and blend_relative and bpy.app.version >= (4, 5, 0):  # all paths may in older ones
+        options = {*options, "PATH_SUPPORTS_BLEND_RELATIVE"}
+    return bpy.props.StringProperty(subtype=subtype, options=set(options), translation_context=CONTEXT, **more)

@@ -100,3 +100,36 @@ def test_nothing_is_left_after_unregister():
     assert "train" in facts["between"]["operators"]
     assert facts["between"]["properties"]
     assert facts["after"] == facts["before"]
+
+
+def test_paths_may_begin_at_the_open_file_but_for_those_of_the_preferences():
+    facts = run(
+        """
+        import json, os, sys, warnings
+        import bpy
+        import fieldwork
+        fieldwork.register()
+        from fieldwork.addon import registration
+        classes = [cls for module in registration._registered for cls in getattr(module, "CLASSES", ())]
+        types = [cls.bl_rna for cls in classes]
+        types += [getattr(bpy.ops.fieldwork, name).get_rna_type() for name in dir(bpy.ops.fieldwork)]
+        relative, plain = [], []
+        for rna in types:
+            for prop in rna.properties:
+                if getattr(prop, "subtype", "") in ("DIR_PATH", "FILE_PATH"):
+                    # Before Blender 4.5 all may.
+                    may = getattr(prop, "is_path_supports_blend_relative", True)
+                    (relative if may else plain).append(f"{rna.identifier}.{prop.identifier}")
+        with warnings.catch_warnings(record=True) as warned:
+            warnings.simplefilter("always")
+            bpy.context.scene.fieldwork.photos = "//photos"
+        facts = {"relative": relative, "plain": plain, "warned": [str(each.message) for each in warned]}
+        print(json.dumps({**facts, "version": list(bpy.app.version)}))
+        sys.stdout.flush()
+        os._exit(0)
+        """
+    )
+    assert len(facts["relative"]) > 40
+    preferences = [f"FIELDWORK_AP_preferences.{name}" for name in ("engine_python", "base_python", "wheels")]
+    assert facts["plain"] == (preferences if facts["version"] >= [4, 5, 0] else [])
+    assert facts["warned"] == []

@@ -172,26 +172,44 @@ class FIELDWORK_OT_open(Operator):
         return {"RUNNING_MODAL"}
 
     def execute(self, context: Context) -> set[str]:
-        source = self.source()
-        if source is None or not source.exists():
-            self.report({"ERROR"}, t("There is nothing at {}.", source))
+        try:
+            source = source_of(self.chosen())
+        except ValueError as error:
+            self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         choose_source(context.scene, source)
         show_sidebar(context)
         return {"FINISHED"}
 
-    def source(self) -> Path | None:
-        """The folder or video meant: a photo stands for its folder, project.json for its project."""
+    def chosen(self) -> Path:
+        """The folder, or the first of the files. Raises ValueError with a sentence for the user: there is none."""
         names = [file.name for file in self.files if file.name]
+        path = self.filepath or self.directory
         if self.directory and names:
-            path = Path(bpy.path.abspath(self.directory), names[0])
-        elif self.filepath:
-            path = Path(bpy.path.abspath(self.filepath))
-        elif self.directory:
-            path = Path(bpy.path.abspath(self.directory))
-        else:
-            return None
-        return path if path.is_dir() or path.suffix.lower() in VIDEO_SUFFIXES else path.parent
+            return Path(bpy.path.abspath(self.directory), names[0])
+        if not path:
+            raise ValueError(t("Choose a folder of photos, a video, or an existing project."))
+        return Path(bpy.path.abspath(path))
+
+
+def source_of(chosen: Path) -> Path:
+    """The folder or video meant: a photo stands for its folder, project.json for its project.
+
+    Raises ValueError with a sentence for the user: it does not exist, or is JSON of another kind.
+    """
+    source = chosen if chosen.is_dir() or chosen.suffix.lower() in VIDEO_SUFFIXES else chosen.parent
+    if not source.exists():
+        raise ValueError(t("There is nothing at {}.", source))
+    is_json = source != chosen and chosen.suffix.lower() == ".json"
+    if is_json and (chosen.name.lower() != snapshot.PROJECT_FILE or snapshot.project(source) is None):
+        raise ValueError(
+            t(
+                "{} is no project of Fieldwork: choose a project.json, or a folder of photos. Photos with known cameras, "
+                "such as those of a transforms.json, are read by Import Posed Data Set.",
+                chosen,
+            )
+        )
+    return source
 
 
 def show_sidebar(context: Context) -> None:

@@ -124,6 +124,32 @@ answer({"opened": opened, "dropped": dropped, "shown": shown, "glob": len(glob)}
     assert facts["glob"] < 256  # Blender cuts what is longer
 
 
+def test_open_refuses_json_that_is_no_project(bpy_script, tmp_path):
+    project = make_project(tmp_path / "old")
+    for name in ("old/instances.json", "set/transforms.json", "set/project.json"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("[]")
+    facts = bpy_script(
+        SETUP
+        + """
+settings.project = project
+files = ("old/instances.json", "set/transforms.json", "set/project.json", "nowhere/a.jpg")
+said = [attempt(lambda: bpy.ops.fieldwork.open(filepath=f"{folder}/{file}")) for file in files]
+said.append(attempt(bpy.ops.fieldwork.open))
+answer({"said": said, "project": settings.project, "photos": settings.photos})
+""",
+        folder=tmp_path,
+        project=project,
+    )
+    *json_files, missing, nothing = facts["said"]
+    for name, said in zip(("instances.json", "transforms.json", "project.json"), json_files):
+        assert f"{name} is no project of Fieldwork" in said
+        assert "Import Posed Data Set" in said
+    assert f"nothing at {tmp_path / 'nowhere'}" in missing
+    assert "Choose a folder of photos" in nothing
+    assert (facts["project"], facts["photos"]) == (str(project), "")
+
+
 def test_hidden_classes_vanish_from_the_mesh(bpy_script, tmp_path):
     facts = bpy_script(
         SETUP

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import bpy
 from bpy.types import Context, Operator
 
-from ..addon import machine
+from ..addon import machine, paths
 from ..addon.errors import EngineError
 from ..addon.jobs.job import Done, Steps
 from ..addon.jobs.queue import queue
@@ -114,7 +114,7 @@ def same_verb_active(verb: str, context: Context) -> str | None:
 
 def absolute(path: str) -> str | None:
     """A path as the user gave it, absolute; None when it is empty."""
-    return str(Path(bpy.path.abspath(path)).absolute()) if path else None
+    return str(paths.absolute(path)) if path else None
 
 
 class VerbOperator(Operator):

@@ -8,6 +8,7 @@ from typing import Any
 import bpy
 from bpy.types import Context, FileHandler, Operator, OperatorFileListElement
 
+from ..addon import paths
 from ..addon.choices import MASK_MODES
 from ..addon.project import snapshot
 from ..addon.props import BoolProperty, CollectionProperty, EnumProperty, StringProperty
@@ -135,7 +136,7 @@ class FIELDWORK_OT_import_dataset(ProjectOperator):
     def parameters(self, context: Context) -> dict[str, Any]:
         if not self.directory:
             raise ValueError(t("Choose the folder of a data set first."))
-        source = Path(bpy.path.abspath(self.directory)).absolute()
+        source = paths.absolute(self.directory)
         # A scene that shows another capture gets a new project, not that capture's.
         given = self.properties.is_property_set("project") and bool(self.project)
         project = Path(self.project_path(context)) if given else project_for(source)
@@ -186,10 +187,10 @@ class FIELDWORK_OT_open(Operator):
         names = [file.name for file in self.files if file.name]
         path = self.filepath or self.directory
         if self.directory and names:
-            return Path(bpy.path.abspath(self.directory), names[0])
+            return paths.absolute(self.directory) / names[0]
         if not path:
             raise ValueError(t("Choose a folder of photos, a video, or an existing project."))
-        return Path(bpy.path.abspath(path))
+        return paths.absolute(path)
 
 
 def source_of(chosen: Path) -> Path:

@@ -10,6 +10,7 @@ from typing import Any
 import bpy
 from bpy.types import Context, Event
 
+from ..addon import paths
 from ..addon.jobs.job import Job
 from ..addon.jobs.queue import queue
 from ..addon.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, IntVectorProperty, StringProperty
@@ -104,7 +105,7 @@ class FIELDWORK_OT_dataset(VerbOperator):
     def parameters(self, context: Context) -> dict[str, Any]:
         if not self.out:
             raise ValueError(t("Choose a folder for the data set."))
-        out = Path(bpy.path.abspath(self.out)).absolute()
+        out = paths.absolute(self.out)
         if out.is_dir() and any(out.iterdir()):
             raise ValueError(t("{} is not empty: choose another folder.", out))
         # What is photographed is the scene as it is now, saved or not, in a Blender of its own: this one stays free.

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import bpy
 from bpy.types import Context, Operator
 
+from ..addon import paths
 from ..addon.errors import SceneError
 from ..addon.live import compositor, fields, shadows, things
 from ..addon.live.training import trainings
@@ -191,7 +191,7 @@ class FIELDWORK_OT_save_field_edits(_OfField):
 
         found = things.edits(active_field(context), context.view_layer.objects)
         try:
-            write_json(Path(bpy.path.abspath(self.filepath)), {"version": 1, "edits": found})
+            write_json(paths.absolute(self.filepath), {"version": 1, "edits": found})
         except FieldworkError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}

@@ -10,6 +10,7 @@ from typing import Any
 import bpy
 from bpy.types import Context, Event, Operator
 
+from ..addon import paths
 from ..addon.errors import EngineError
 from ..addon.jobs.queue import queue
 from ..addon.live import fields
@@ -42,7 +43,7 @@ class FIELDWORK_OT_locate_project(Operator):
 
     def execute(self, context: Context) -> set[str]:
         settings = context.scene.fieldwork
-        folder = Path(bpy.path.abspath(self.directory)).absolute()
+        folder = paths.absolute(self.directory)
         reason = refusal(settings, folder)
         if reason:
             self.report({"ERROR"}, reason)
@@ -63,7 +64,7 @@ class FIELDWORK_OT_locate_project(Operator):
 def move_files(collections: Iterable[Any], old: Path, new: Path) -> None:
     """Let what the file reads from a folder, such as its images, be read from another."""
     for item in itertools.chain.from_iterable(collections):
-        path = Path(bpy.path.abspath(item.filepath)) if item.filepath and item.library is None else None
+        path = paths.absolute(item.filepath) if item.filepath and item.library is None else None
         if path is not None and path.is_relative_to(old):
             item.filepath = str(new / path.relative_to(old))
 

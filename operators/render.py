@@ -10,6 +10,7 @@ from typing import Any
 import bpy
 from bpy.types import Context
 
+from ..addon import paths
 from ..addon.choices import PASSES
 from ..addon.errors import SceneError
 from ..addon.jobs.job import Done, Job, Steps
@@ -136,7 +137,7 @@ class FIELDWORK_OT_render(ProjectOperator):
     def parameters(self, context: Context) -> dict[str, Any]:
         project, run = self.project_path(context), self.value(context, "run")
         source, size = self.value(context, "source"), tuple(self.value(context, "size"))
-        folder = Path(bpy.path.abspath(self.out)) if self.out else Path(project) / "exports" / "renders" / source
+        folder = paths.absolute(self.out) if self.out else Path(project) / "exports" / "renders" / source
         passes = self.value(context, "passes")
         if not passes:
             raise ValueError(t("Choose at least one pass."))

@@ -8,6 +8,7 @@ from typing import Any
 import bpy
 from bpy.types import Context, Operator
 
+from ..addon import paths
 from ..addon.choices import SPLITS
 from ..addon.jobs.job import Done, Job, Steps
 from ..addon.jobs.queue import queue
@@ -118,7 +119,7 @@ class FIELDWORK_OT_show_image(Operator):
     filepath: StringProperty(name="File", description="The picture", subtype="FILE_PATH", options={"SKIP_SAVE"})
 
     def execute(self, context: Context) -> set[str]:
-        path = Path(bpy.path.abspath(self.filepath))
+        path = paths.absolute(self.filepath)
         if not path.is_file():
             self.report({"ERROR"}, t("There is nothing at {}.", path))
             return {"CANCELLED"}

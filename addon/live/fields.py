@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,6 +10,7 @@ import bpy
 from mathutils import Matrix
 
 from ..errors import SceneError
+from ..paths import absolute
 from ..project import snapshot
 from ..scene.frame import scene_from_capture
 from ..text import t
@@ -145,12 +145,11 @@ def folder_of(own: Any) -> Path | None:
     if not own.project:
         return None
     # A linked object means a folder beside its own file, which Blender may call "//../other/file.blend".
-    return Path(os.path.abspath(bpy.path.abspath(own.project, library=own.id_data.original.library)))
+    return absolute(own.project, own.id_data.original.library)
 
 
 def move(old: Path, new: Path) -> None:
     """Let the fields of a project in one folder be read from another."""
-    old = Path(os.path.abspath(old))
     for obj in bpy.data.objects:
         if obj.library is None and obj.fieldwork.is_field and folder_of(obj.fieldwork) == old:
             obj.fieldwork.project = str(new)

@@ -6,8 +6,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-import bpy
-
+from ..paths import absolute
 from .snapshot import cached_json
 
 STATUS_FILE, PAGE = "status.json", "index.html"
@@ -20,7 +19,7 @@ def folder_of(settings: Any) -> Path | None:
     """The folder of the campaign that a scene follows: LIST-campaign, also where the list itself was chosen."""
     if not settings.campaign:
         return None
-    path = Path(bpy.path.abspath(settings.campaign)).absolute()
+    path = absolute(settings.campaign)
     return path.with_name(f"{path.stem}-campaign") if path.suffix.lower() in (".csv", ".json") else path
 
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import bpy
 
 from ..jobs.job import Job
+from ..paths import absolute
 from ..roles import FOLDER, ROLE
 from . import classes, recent, snapshot
 
@@ -16,7 +16,7 @@ def adopt(scene: bpy.types.Scene) -> None:
     """Let a scene that knows no project have the one that its file was made of, if that is where the file says."""
     for root in scene.objects if not scene.fieldwork.project else ():
         if root.get(ROLE) == "root" and FOLDER in root:
-            folder = Path(bpy.path.abspath(root[FOLDER]))
+            folder = absolute(root[FOLDER])
             if snapshot.has_project(folder) and snapshot.owner(folder).owns(root):
                 scene.fieldwork.project = root[FOLDER]
                 return

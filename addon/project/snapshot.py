@@ -10,8 +10,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-import bpy
-
+from ..paths import absolute
 from ..roles import Owner
 from ..text import t
 
@@ -24,7 +23,7 @@ _cache: dict[Path, tuple[tuple[int, int, int], Any]] = {}
 
 def folder_of(settings: Any) -> Path | None:
     """The project folder of a scene as an absolute path, None when none is chosen."""
-    return Path(bpy.path.abspath(settings.project)).absolute() if settings.project else None
+    return absolute(settings.project) if settings.project else None
 
 
 def read_json(path: Path) -> Any:

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import bpy
 
+from ..paths import absolute
+
 MARK = "fieldwork_render"
 BYTES, MODIFIED = "fieldwork_bytes", "fieldwork_modified"  # of the file, as the image was read from it
 
@@ -40,7 +42,7 @@ def is_of(image: bpy.types.Image | None, path: Path) -> bool:
     """Whether an image was read from this file; its own path may be relative to the .blend."""
     if image is None or image.library is not None or not image.filepath:
         return False
-    return Path(bpy.path.abspath(image.filepath)) == path
+    return absolute(image.filepath) == absolute(str(path))
 
 
 def load_render(path: Path) -> bpy.types.Image:

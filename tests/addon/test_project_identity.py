@@ -303,3 +303,25 @@ answer(seen)
     assert facts["cleared"] is None
     assert facts["from file"] == [[1, "stone"], [7, "wood"]]
     assert "classes.jsonx" in facts["no file"]
+
+
+def test_a_project_above_the_open_file_is_known_by_its_own_name(bpy_script, tmp_path):
+    project = make_posed_project(tmp_path / "capture")
+    facts = bpy_script(
+        SETUP
+        + """
+from fieldwork.addon.project import snapshot
+from fieldwork.addon.render.slot import is_of
+picture = Path(project, "exports/main/a.png")
+picture.parent.mkdir(parents=True)
+made = bpy.data.images.new("a", 4, 4)
+made.filepath_raw, made.file_format = str(picture), "PNG"
+made.save()
+bpy.ops.wm.save_as_mainfile(filepath=str(picture.with_name("a.blend")))
+settings.project, made.filepath = "//../..", "//../main/a.png"
+answer([str(snapshot.folder_of(settings)), is_of(made, picture), len(settings.images)])
+""",
+        project=project,
+    )
+    assert facts[:2] == [str(project), True]
+    assert facts[2] > 0

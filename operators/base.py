@@ -15,8 +15,8 @@ from ..addon import machine, paths
 from ..addon.errors import EngineError
 from ..addon.jobs.job import Done, Steps
 from ..addon.jobs.queue import queue
+from ..addon.jobs.refresh import refresh_scenes
 from ..addon.project import edits, runs, snapshot
-from ..addon.project.lists import refresh_scenes
 from ..addon.properties import SETTINGS
 from ..addon.props import IntProperty, StringProperty
 from ..addon.text import t

@@ -6,6 +6,7 @@ import time
 from pathlib import Path
 
 from ..errors import EngineError
+from . import refresh
 from .job import Job
 from .queue import Queue
 
@@ -16,9 +17,7 @@ def reattach(queue: Queue, project: Path) -> None:
     """Follow a job that another process runs on the project, and tell of one that died."""
     if queue.running and queue.running.project == project:
         return
-    # Not at the top: enabling the extension must be quick, and the lists import jobs.
-    from ...nerfcore.engine.status import list_jobs
-    from ..project.lists import refresh_scenes
+    from ...nerfcore.engine.status import list_jobs  # not at the top: enabling the extension must be quick
 
     queue.followed = None
     for status in reversed(list_jobs(project)):
@@ -26,7 +25,7 @@ def reattach(queue: Queue, project: Path) -> None:
             queue.followed = Job(
                 status.verb, status.params, status.id, project, state="running", followed=True,
                 started=time.monotonic() - max(0.0, time.time() - (status.started or time.time())),
-                on_done=refresh_scenes,
+                on_done=refresh.refresh_scenes,
             )  # fmt: skip
             follow(queue)
             break

@@ -6,10 +6,9 @@ from typing import Any
 
 import bpy
 
-from ..jobs.job import Job
 from ..paths import absolute
 from ..roles import FOLDER, ROLE
-from . import classes, recent, snapshot
+from . import classes, snapshot
 
 
 def adopt(scene: bpy.types.Scene) -> None:
@@ -61,15 +60,3 @@ def other_project(settings: Any) -> None:
     """Another folder was chosen: what was known of the one before is no more."""
     settings.project_uuid = ""
     refresh(settings)
-
-
-def refresh_scenes(job: Job) -> None:
-    """Bring what a job changed in its project into the scenes that show it."""
-    for scene in bpy.data.scenes:
-        if job.project is not None and snapshot.folder_of(scene.fieldwork) == job.project:
-            if job.verb in ("new", "import", "reconstruct") and job.state == "done":
-                other_project(scene.fieldwork)  # it may have been made anew
-                if not bpy.app.background:
-                    recent.remember(job.project)
-            else:
-                refresh(scene.fieldwork)

@@ -15,7 +15,11 @@ bpy = pytest.importorskip("bpy")
 from fieldwork.addon import machine  # noqa: E402
 from fieldwork.addon.engine.link import Link  # noqa: E402
 from fieldwork.addon.errors import EngineError  # noqa: E402
-from fieldwork.addon.jobs import gate, timer  # noqa: E402
+from fieldwork.addon.jobs import (  # noqa: E402
+    gate,
+    refresh,
+    timer,
+)
 from fieldwork.addon.jobs.follow import reattach  # noqa: E402
 from fieldwork.addon.jobs.job import CURVE_POINTS  # noqa: E402
 from fieldwork.addon.jobs.queue import Queue  # noqa: E402
@@ -23,7 +27,6 @@ from fieldwork.addon.jobs.timer import tick  # noqa: E402
 from fieldwork.addon.project import (  # noqa: E402
     classes,
     edits,
-    lists,
     snapshot,
 )
 from fieldwork.nerfcore.engine import status as st  # noqa: E402
@@ -36,7 +39,7 @@ ENGINE = [sys.executable, str(Path(__file__).resolve().parents[1] / "counting_en
 def refreshed(monkeypatch):
     """The jobs whose changes were brought into the scenes, which have no settings here."""
     jobs = []
-    monkeypatch.setattr(lists, "refresh_scenes", jobs.append)
+    monkeypatch.setattr(refresh, "refresh_scenes", jobs.append)
     return jobs
 
 

@@ -15,7 +15,6 @@ import numpy as np
 from .. import __version__
 from ..data.load import load_scene
 from ..data.scene import Scene
-from ..measure.stored import read_measures
 from ..project.runs import INFO, holdout_of, read_metrics, run_folder
 from ..project.schema import Poses, Project
 from ..project.store import load_poses, load_project
@@ -45,18 +44,18 @@ def results_of(project: Project, run: str) -> dict[str, Any]:
     return found
 
 
-def sections(folder: Path, run: str, results: dict[str, Any]) -> list[Section]:
+def sections(folder: Path, run: str, results: dict[str, Any], measures: dict[str, Any] | None = None) -> list[Section]:
     """All tables of a report, those with something in them.
 
     Args:
-        results: of the verbs by name.
+        results: of the verbs by name. measures: of the mesh as `measure` left them, if there are any.
     Raises:
         ProjectError: the project has no poses, or a file of it is damaged.
     """
     project, poses, scene = load_project(folder), load_poses(folder), load_scene(folder, holdout_of(folder, run))
     details = _poses_details(folder)
     evaluation = read_metrics(run_folder(folder, run)).get("test") or {}
-    measures = read_measures(folder, run) or {}
+    measures = measures or {}
     made = [
         _judgement(results, evaluation),
         _summary(project, poses, results, evaluation),

@@ -9,13 +9,14 @@ from typing import Any
 
 from ..errors import SettingError
 from ..files import write_text
-from ..mesh.stored import mesh_folder
+from ..measure.stored import read_measures
 from ..params import ReportParams
 from ..progress import Reporter
 from ..project.runs import read_events, read_metrics, run_folder
 from ..project.store import load_project
 from ..render.pictures import ENDINGS
 from .documentation import JUDGEMENT, Section, results_of, sections
+from .reported_mesh import current_drawings, mesh_stands
 
 FORMATS = (".html", ".pdf")
 HEAD = ("Result", "Time")  # tables that stand beside each other at the top
@@ -68,20 +69,30 @@ def report(params: ReportParams, reporter: Reporter) -> dict[str, Any]:
     results = results_of(load_project(folder), params.run)
     results["evaluate"] = read_metrics(run_folder(folder, params.run)).get("test")
     reporter.stage("Writing the report")
-    titles = write_report(out, folder, params.run, folder / "exports" / params.run / "renders", results)
+    titles = write_report(out, folder, params.run, folder / "exports" / params.run / "renders", results, reporter)
     return {"file": str(out), "sections": titles}
 
 
-def write_report(path: Path, folder: Path, run: str, renders: Path, result: dict[str, Any]) -> list[str]:
+def write_report(
+    path: Path, folder: Path, run: str, renders: Path, result: dict[str, Any], reporter: Reporter
+) -> list[str]:
     """Write the report of the verbs' results with the pictures of the folder `renders`, and return the titles of its
-    tables. `result` may have "stages", the seconds of each verb.
+    tables. `result` may have "stages", the seconds of each verb. What is of a mesh that no longer holds is left out, with
+    a warning.
 
     Raises:
         SettingError: neither .html nor .pdf. ProjectError: there are no poses. DiskError: `path` cannot be written.
     """
     check_report(path)
     project = load_project(folder)
-    tables = sections(folder, run, result)
+    measures: dict[str, Any] = {}
+    drawn: list[Path] = []
+    if mesh_stands(folder, run, result, reporter):
+        measures = read_measures(folder, run) or {}
+        drawn = current_drawings(folder, project, run, reporter)
+    else:
+        result = {verb: value for verb, value in result.items() if verb != "mesh"}
+    tables = sections(folder, run, result, measures)
     stages = result.get("stages") or {}
     if stages:
         seconds = [[stage, f"{value} s"] for stage, value in stages.items()]
@@ -89,7 +100,7 @@ def write_report(path: Path, folder: Path, run: str, renders: Path, result: dict
         tables.insert(place, Section("Time", [], [*seconds, ["all", f"{sum(stages.values()):.1f} s"]]))
     evaluation = result.get("evaluate") or {}
     compared = [folder / name for name in evaluation.get("pictures", []) if (folder / name).is_file()]
-    drawn, rendered = sorted((mesh_folder(folder, run) / "drawings").glob("*.png")), sorted(renders.glob("*.png"))
+    rendered = sorted(renders.glob("*.png"))
     name = folder.resolve().name
     if path.suffix.lower() == ".pdf":
         captions = (("Drawing", drawn), ("Held-out photo and render", compared), ("Render", rendered))

@@ -250,7 +250,7 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
     if params.report is not None:
         report.stage("Writing the report")
         found = {**results_of(load_project(folder), params.run), "evaluate": result}
-        write_report(params.report, folder, params.run, folder / "exports" / params.run / "renders", found)
+        write_report(params.report, folder, params.run, folder / "exports" / params.run / "renders", found, report)
     return result
 
 

@@ -273,6 +273,7 @@ class Campaign:
                 [stage for stage, answer in made.items() if answer["reused"]],
                 {stage: answer["redone"] for stage, answer in made.items() if answer["redone"]},
                 {stage: answer["result"] for stage, answer in made.items()},
+                self.report,
             )
         except Exception as error:  # noqa: BLE001 - a report that cannot be written must not stop the other captures
             known = explained(error)

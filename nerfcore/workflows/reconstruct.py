@@ -152,7 +152,7 @@ def reconstruct(params: p.ReconstructParams, report: Reporter) -> dict[str, Any]
     if params.time_limit is not None:
         report.note(budget.estimate(params.time_limit))
     made = run_stages(params, stages_of(params), report)
-    return summed_up(params, made.seconds, made.reused, made.redone, made.results)
+    return summed_up(params, made.seconds, made.reused, made.redone, made.results, report)
 
 
 def summed_up(
@@ -161,6 +161,7 @@ def summed_up(
     reused: list[str],
     redone: dict[str, str],
     results: dict[str, Any],
+    report: Reporter,
 ) -> dict[str, Any]:
     """What `reconstruct` returns, of stages that were done; writes the report that was asked for."""
     result = {
@@ -172,7 +173,7 @@ def summed_up(
         **results,
     }
     if params.report is not None:
-        write_report(params.report, Path(params.out), "main", renders_folder(params), result)
+        write_report(params.report, Path(params.out), "main", renders_folder(params), result, report)
         result["report"] = str(params.report)
     return result
 

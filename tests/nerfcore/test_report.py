@@ -84,6 +84,40 @@ def test_another_person_finds_what_is_needed_to_repeat_it(project: Path) -> None
     assert "03.jpg" not in html
 
 
+def test_what_is_of_a_mesh_that_lies_elsewhere_is_left_out_with_a_warning(project: Path) -> None:
+    with edit_project(project) as edited:
+        edited.frame.world_from_sfm = (2 * np.eye(4)).tolist()
+    reporter = Reporter()
+    html = Path(report(ReportParams(project=project), reporter)["file"]).read_text("utf-8")
+    assert not [words for words in ("cells of", "1.571", "door", "data:image/png") if words in html]
+    assert "Photos used" in html
+    (warning,) = reporter.warnings
+    assert "leaves out mesh, measures and drawings" in warning
+    assert "aligned anew" in warning
+    assert "Run `fieldwork mesh` again." in warning
+
+
+def test_drawings_of_an_earlier_mesh_are_left_out_with_a_warning(project: Path) -> None:
+    drawn = {"files": [str(project / "exports/main/drawings/top.png")]}
+    with edit_project(project) as edited:
+        edited.record("plan", {"run": "main", "out": None}, drawn)
+        edited.record("mesh", {"run": "other"}, {})  # another run's
+    assert "<h2>Drawings" in Path(report(ReportParams(project=project), Reporter())["file"]).read_text("utf-8")
+    with edit_project(project) as edited:
+        mesh = next(step for step in edited.provenance if step.verb == "mesh")
+        edited.record("mesh", {"run": "main"}, mesh.result)
+    reporter = Reporter()
+    html = Path(report(ReportParams(project=project), reporter)["file"]).read_text("utf-8")
+    assert "<h2>Drawings" not in html
+    assert "1.571" in html
+    (warning,) = reporter.warnings
+    assert "earlier mesh: top.png. Run `fieldwork plan`" in warning
+    assert (project / "exports/main/drawings/top.png").is_file()
+    with edit_project(project) as edited:
+        edited.record("plan", {"run": "main", "out": None}, drawn)
+    assert "<h2>Drawings" in Path(report(ReportParams(project=project), Reporter())["file"]).read_text("utf-8")
+
+
 def test_the_pdf_has_the_same_tables(project: Path, tmp_path: Path) -> None:
     html = report(ReportParams(project=project), Reporter())
     pdf = report(ReportParams(project=project, out=tmp_path / "r.pdf"), Reporter())

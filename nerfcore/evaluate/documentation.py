@@ -165,7 +165,10 @@ def _distances(measures: dict[str, Any]) -> Section:
         for d in measures.get("distances", [])
     ]
     checks = [d["difference"] for d in measures.get("distances", []) if d["use"] == "check"]
+    checks = [difference for difference in checks if difference is not None]
     text = "Distances marked “check” were not used for scaling."
+    if unit != "m":
+        text += " The scale is not known: nothing is held against metres."
     if checks:
         text += f" Root mean square of their differences: {1000 * float(np.sqrt(np.mean(np.square(checks)))):.1f} mm."
     columns = ["distance", "use", f"measured ({unit})", "95 % interval", "known (m)", "difference"]

@@ -16,6 +16,7 @@ from ..project.store import world_from_sfm
 
 COLUMNS = ("name", "from", "to", "metres", "u_mm", "use")
 USES = ("scale", "check")
+METRES = "m"  # the unit of a project whose scale is known
 PLACED = 1.0  # voxels: standard uncertainty of a point that was picked on the surface, along the distance
 HINT = (
     "Write a table with the columns name,from,to,metres,u_mm,use: points as “x y z” or names of photos, use “scale” or "
@@ -110,9 +111,9 @@ def scale_of(project: Project, poses: Poses, distances: list[Distance], voxel: f
         if len(by) > 1:
             u *= max(1.0, float(np.sqrt((weight * (ratio - factor) ** 2).sum() / (len(by) - 1))))
     if percent is not None:
-        return Scale("m", percent / 100, "as given", factor)
+        return Scale(METRES, percent / 100, "as given", factor)
     if by:
-        return Scale("m", u, f"{len(by)} control distance{'s' if len(by) > 1 else ''}", factor)
+        return Scale(METRES, u, f"{len(by)} control distance{'s' if len(by) > 1 else ''}", factor)
     return _as_set(project, poses, voxel)
 
 
@@ -121,12 +122,12 @@ def _as_set(project: Project, poses: Poses, voxel: float) -> Scale:
     for step in reversed(project.provenance):
         if step.verb == "align" and step.settings.get("scale"):
             metres = float(step.settings["scale"][2])
-            return Scale("m", np.sqrt(2) * PLACED * voxel / metres, f"one distance of {metres:g} m")
+            return Scale(METRES, np.sqrt(2) * PLACED * voxel / metres, f"one distance of {metres:g} m")
         residual = (step.result.get("gps") or {}).get("residual_m") if step.verb == "align" else None
         if residual is not None:
             # Standard uncertainty of the slope of a straight line through positions.
             frame = world_from_sfm(project)
             centers = transform_points(frame, np.array([np.array(i.camera_to_world)[:3, 3] for i in poses.images]))
             spread = float(np.sqrt(((centers - centers.mean(0))[:, :2] ** 2).sum()))
-            return Scale("m", float(residual) / max(spread, 1e-9), "GPS positions of the photos")
-    return Scale("m", 0.0, "taken as exact: nothing says how sure it is")
+            return Scale(METRES, float(residual) / max(spread, 1e-9), "GPS positions of the photos")
+    return Scale(METRES, 0.0, "taken as exact: nothing says how sure it is")

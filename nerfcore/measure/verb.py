@@ -30,7 +30,7 @@ from ..render.run import load_info, refined_poses
 from .amounts import Amount, K, Labelled, area_amounts, summed, transferred, volume_amount
 from .placing import area_deviations_of_place, u_places
 from .resampling import Pieces, Votes, area_deviations
-from .scale import Distance, Scale, read_distances, scale_of, u_measured
+from .scale import METRES, Distance, Scale, read_distances, scale_of, u_measured
 
 
 @dataclass(frozen=True)
@@ -72,6 +72,11 @@ def measure(params: MeasureParams, report: Reporter) -> dict[str, Any]:
     target = mesh_folder(folder, params.run)
     distances = [] if params.distances is None else read_distances(params.distances, world_from_sfm(project), poses)
     scale = scale_of(project, poses, distances, voxel, params.scale_error)
+    if scale.unit != METRES and any(d.known is not None for d in distances):
+        report.warn(
+            "The scale is not known: distances in metres are held against nothing. Set the scale with "
+            "`fieldwork align --scale`, then run `fieldwork mesh` and `fieldwork measure` again."
+        )
     if abs(scale.factor - 1) > K * max(scale.u, 1e-6):
         report.warn(
             f"By the distances to scale by, lengths are {100 * (scale.factor - 1):+.2f} % off: set the scale with "
@@ -196,7 +201,9 @@ def entries(area: Amount, volume: Amount | None) -> dict[str, Any]:
 
 
 def distance_entry(distance: Distance, scale: Scale, voxel: float) -> dict[str, Any]:
-    """A distance as JSON: measured, with its 95 % interval, and beside what is known of it."""
+    """A distance as JSON: measured, with its 95 % interval, and beside what is known of it; the difference is None where
+    nothing is known, or the scale is not."""
+    compared = distance.known is not None and scale.unit == METRES
     length, spread = distance.length, K * u_measured(distance, scale, voxel)
     return {
         "name": distance.name,
@@ -205,5 +212,5 @@ def distance_entry(distance: Distance, scale: Scale, voxel: float) -> dict[str, 
         "low": max(0.0, length - spread),
         "high": length + spread,
         "known": distance.known,
-        "difference": None if distance.known is None else length - distance.known,
+        "difference": length - (distance.known or 0.0) if compared else None,
     }

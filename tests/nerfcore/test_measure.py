@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 import trimesh
 from fieldwork.nerfcore.errors import InputError, ProjectError
+from fieldwork.nerfcore.evaluate.documentation import sections
 from fieldwork.nerfcore.geometry.cameras import Camera
 from fieldwork.nerfcore.measure.closing import border_loops, closed
 from fieldwork.nerfcore.measure.placing import area_rates, border_lengths, u_places
 from fieldwork.nerfcore.measure.resampling import Votes
 from fieldwork.nerfcore.measure.scale import read_distances, scale_of
+from fieldwork.nerfcore.measure.stored import read_measures
 from fieldwork.nerfcore.measure.verb import Measured, Sized, amounts, measure
 from fieldwork.nerfcore.mesh.facelets import facelets
 from fieldwork.nerfcore.mesh.instances import find_instances
@@ -178,6 +180,23 @@ def test_the_verb_measures_a_mesh_with_the_label_maps_of_its_photos(project: Pat
     assert between["low"] < between["length"] < between["high"]
     # One distance, known to 2 mm and picked to a voxel at both ends.
     assert result["scale"]["u_percent"] == pytest.approx(100 * np.hypot(0.002, np.sqrt(2) * 0.03), rel=1e-3)
+
+
+def test_while_the_scale_is_not_known_nothing_is_held_against_metres(project: Path, tmp_path: Path) -> None:
+    table = tmp_path / "lengths.csv"
+    table.write_text("name,from,to,metres,use\nacross,-0.5 0 0,0.5 0 0,2.5,check\n")
+    with edit_project(project) as edited:
+        edited.frame.scale_known = False
+    report = Reporter()
+    (row,) = measure(MeasureParams(project=project, distances=table), report)["distances"]
+    assert (row["known"], row["difference"]) == (2.5, None)
+    assert [warning for warning in report.warnings if "scale is not known" in warning and "align --scale" in warning]
+    (written,) = [
+        table for table in sections(project, "main", {}, read_measures(project, "main")) if "Control" in table.title
+    ]
+    assert written.rows[0][-2:] == ["2.5000", ""]
+    assert "The scale is not known" in written.text
+    assert "mean square" not in written.text
 
 
 def test_a_mesh_that_lies_elsewhere_is_not_measured(project: Path) -> None:

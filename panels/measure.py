@@ -51,16 +51,24 @@ class FIELDWORK_PT_measure(StepPanel):
 
 
 def draw_measures(layout: UILayout, measures: dict[str, Any]) -> None:
-    """Area and volume of each class with half their intervals."""
-    metric = measures.get("unit") == "m"
+    """Area and volume of the whole surface and of each class with half their intervals."""
     box = layout.box().column(align=True)
-    for row in measures.get("classes", [])[:MOST_ROWS]:
+    for name, amounts in measured_rows(measures):
         line = box.split(factor=0.3)
-        line.label(text=row["name"], translate=False)
-        parts = [amount_text(row, name, power if metric else "") for name, power in (("area", "m²"), ("volume", "m³"))]
-        line.label(text="   ".join(part for part in parts if part), translate=False)
-    if not metric:
+        line.label(text=name, translate=False)
+        line.label(text=amounts, translate=False)
+    if measures.get("unit") != "m":
         box.label(text=t("In scene units: the scale is not known"))
+
+
+def measured_rows(measures: dict[str, Any]) -> list[tuple[str, str]]:
+    """The name of what was measured, and its sizes in words."""
+    units = (("area", "m²"), ("volume", "m³")) if measures.get("unit") == "m" else (("area", ""), ("volume", ""))
+    rows = [(t("Whole surface"), measures["whole"])] if "whole" in measures else []
+    rows += [(row["name"], row) for row in measures.get("classes", [])[:MOST_ROWS]]
+    return [
+        (name, "   ".join(filter(None, (amount_text(row, what, unit) for what, unit in units)))) for name, row in rows
+    ]
 
 
 def amount_text(row: dict[str, Any], name: str, unit: str) -> str:

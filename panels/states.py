@@ -116,6 +116,8 @@ def measure(context: Context) -> State:
     if not known:
         return State(False)
     count = len(known.get("classes", []))
+    if not count:
+        return State(True)  # the whole surface
     return State(True, t("{} classes", count) if count != 1 else t("1 class"))
 
 

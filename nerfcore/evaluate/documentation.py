@@ -59,6 +59,7 @@ def sections(folder: Path, run: str, results: dict[str, Any], measures: dict[str
     made = [
         _judgement(results, evaluation),
         _summary(project, poses, results, evaluation),
+        _measured([measures["whole"]] if "whole" in measures else [], measures, "Whole surface: area and volume"),
         _measured(measures.get("classes", []), measures, "Classes: areas and volumes"),
         _measured(measures.get("instances", []), measures, "Instances: areas and volumes"),
         _distances(measures),

@@ -12,7 +12,14 @@ from ..mesh.features import features_of
 from ..mesh.files import write_surface
 from ..mesh.formats import USD
 from ..mesh.instances import read_instances
-from ..mesh.stored import load_class_map, load_surface, mesh_folder, mesh_label_revision, require_in_place
+from ..mesh.stored import (
+    LABEL_FIRST,
+    load_class_map,
+    load_surface,
+    mesh_folder,
+    mesh_label_revision,
+    require_in_place,
+)
 from ..params import ExportParams
 from ..progress import Reporter
 from ..project.fingerprints import read_made
@@ -104,6 +111,9 @@ def _write_mesh(
     if scene is not None and params.to == "masks":
         from .class_masks import write_masks
 
+        if (surface.face_class == scene.ignore_id).all():
+            told = "all masks are empty" if scene.classes else "no masks are written"
+            report.warn(f"The mesh has no classes, so {told}. {LABEL_FIRST}")
         ids = load_class_map(folder, params.run) if texture is not None else None
         return write_masks(out, surface, ids, scene.views, scene.classes, report)
     instances = read_instances(mesh_folder(folder, params.run))

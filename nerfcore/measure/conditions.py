@@ -51,7 +51,8 @@ def chosen_classes(names: Sequence[str], known: dict[int, str], void: int) -> li
         return sorted(by_name.values())
     missing = [name for name in names if name not in by_name]
     if missing:
-        raise SettingError(f"There is no class “{missing[0]}”.", f"There are: {', '.join(by_name)}; or give {ALL}.")
+        there = f"There are: {', '.join(by_name)}; or give {ALL}." if by_name else "The project has no classes yet."
+        raise SettingError(f"There is no class “{missing[0]}”.", there)
     return [by_name[name] for name in names]
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from ..errors import SettingError
 from ..mesh.instances import Instance, read_instances
 from ..mesh.parts import Texture
-from ..mesh.stored import load_surface, mesh_folder, mesh_record
+from ..mesh.stored import LABEL_FIRST, load_surface, mesh_folder, mesh_record
 from ..mesh.surface import Surface
 from ..mesh.triangles import areas
 from ..params import PlanParams, SectionParams
@@ -97,6 +97,8 @@ def plan(params: PlanParams, report: Reporter) -> dict[str, Any]:
     subject = load_subject(folder, params.run)
     target = params.out or mesh_folder(folder, params.run) / "drawings"
     scales, files = {}, []
+    if params.conditions and not subject.class_ids():
+        report.warn(f"The mesh has no classes, so no conditions are mapped. {LABEL_FIRST}")
     mapped = chosen_classes(params.conditions, subject.names, subject.void)
     places = find_places(subject.surface, mapped, subject.instances, subject.instance_measures)
     legend = {c: (f"{subject.names[c]}  {subject.size_text(c)}", line_color(subject, c)) for c in mapped}

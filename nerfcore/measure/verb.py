@@ -32,6 +32,8 @@ from .placing import area_deviations_of_place, u_places
 from .resampling import Pieces, Votes, area_deviations
 from .scale import METRES, Distance, Scale, read_distances, scale_of, u_measured
 
+WHOLE = "whole surface"
+
 
 @dataclass(frozen=True)
 class Sized:
@@ -44,8 +46,10 @@ class Sized:
 
 @dataclass(frozen=True)
 class Measured:
-    """Amounts by class and by instance, in their order; None for the volume of what is open."""
+    """Amounts of the whole surface, by class and by instance, in their order; None for the volume of what is open."""
 
+    area: Amount
+    volume: Amount | None
     areas: list[Amount]
     volumes: list[Amount | None]
     instance_areas: list[Amount]
@@ -56,11 +60,11 @@ def measure(params: MeasureParams, report: Reporter) -> dict[str, Any]:
     """Measure the mesh of a run and write measures.json beside it.
 
     Returns:
-        {"unit": "m" or "scene units", "scale": {"u_percent", "source", "factor"}, "classes" and "instances":
-        [{"id", "name", "area", "area_low", "area_high", "volume", "volume_low", "volume_high"}], "distances": [{"name",
-        "use", "length", "low", "high", "known", "difference"}], "label_revision": of the marks that the mesh's classes are
-        from, or None, "file"}; lows and highs are the ends of 95 % intervals,
-        volumes None where a thing is open.
+        {"unit": "m" or "scene units", "scale": {"u_percent", "source", "factor"}, "whole": {"name", "area", "area_low",
+        "area_high", "volume", "volume_low", "volume_high"}, "classes" and "instances": [the same, with "id"], "distances":
+        [{"name", "use", "length", "low", "high", "known", "difference"}], "label_revision": of the marks that the mesh's
+        classes are from, or None, "file"}; lows and highs are the ends of 95 % intervals, volumes None where a thing is
+        open.
     Raises:
         ProjectError: there is no mesh, or the project was aligned anew since. InputError: the file of distances.
     """
@@ -94,6 +98,8 @@ def measure(params: MeasureParams, report: Reporter) -> dict[str, Any]:
     votes = gathered_votes(photos, pieces, list(known), report)
     if known and not len(votes.piece):
         report.warn("No photo has a label map: how sure the borders of classes are is not known and not counted.")
+    if not known:
+        report.note("The mesh has no classes: the whole surface is measured alone.")
     report.stage("Measuring")
     views, longest = [photo.view for photo in photos], info.image_size
     sized = Sized(voxel, partial(u_places, views, pieces.centers, longest=longest))
@@ -101,6 +107,7 @@ def measure(params: MeasureParams, report: Reporter) -> dict[str, Any]:
     result: dict[str, Any] = {
         "unit": scale.unit,
         "scale": {"u_percent": round(100 * scale.u, 4), "source": scale.source, "factor": round(scale.factor, 6)},
+        "whole": {"name": WHOLE, **entries(measured.area, measured.volume)},
         "classes": [
             {"id": c, "name": name, **entries(area, volume)}
             for (c, name), area, volume in zip(known.items(), measured.areas, measured.volumes)
@@ -138,7 +145,7 @@ def amounts(
     most_capped: float,
     report: Reporter,
 ) -> Measured:
-    """Areas and volumes of the classes and instances of a surface.
+    """Areas and volumes of a surface, of its classes and of its instances.
 
     Args:
         pieces: of the surface; coarse: the surface (vertices, faces) at cells of twice the size. votes: for `class_ids`. u_scale: relative uncertainty of lengths. most_capped: share of a closed
@@ -151,26 +158,27 @@ def amounts(
     labels = Pieces(pieces.centers, pieces.areas, of_class[pieces.parent], of_instance[pieces.parent])
     u_class, u_instance = area_deviations(labels, votes, len(instances))
     vertices = surface.vertices.astype(np.float64)
-    fine = [Labelled(vertices, surface.faces, label) for label in (of_class + 1, of_instance)]
-    rough = transferred(coarse, pieces.centers, [labels.label + 1, labels.instance], sized.voxel)
-    counts = len(class_ids) + 1, len(instances) + 1
-    places = [sized.u_places(label, n) for label, n in zip((labels.label + 1, labels.instance), counts)]
+    fine = [Labelled(vertices, surface.faces, label) for label in (np.ones_like(of_class), of_class + 1, of_instance)]
+    of_piece = [np.ones_like(labels.label), labels.label + 1, labels.instance]
+    rough = transferred(coarse, pieces.centers, of_piece, sized.voxel)
+    counts = 2, len(class_ids) + 1, len(instances) + 1
+    places = [sized.u_places(label, n) for label, n in zip(of_piece, counts)]
     moved = [area_deviations_of_place(f.vertices, f.faces, f.label, place) for f, place in zip(fine, places)]
-    by_class, by_instance = (
+    (area,), by_class, by_instance = (
         area_amounts(f.areas(n)[1:], r.areas(n)[1:], u, place[1:], u_scale)
-        for f, r, n, u, place in zip(fine, rough, counts, (u_class, u_instance), moved)
+        for f, r, n, u, place in zip(fine, rough, counts, (np.zeros(1), u_class, u_instance), moved)
     )
+
+    def volume(kind: int, number: int, area: Amount) -> Amount | None:
+        one, other = (part[kind].closed(number, most_capped) for part in (fine, rough))
+        return volume_amount(one, other, area.value, sized.voxel, places[kind][number], u_scale)
+
     volumes = []
     for number, instance in enumerate(instances):
         report.progress(number / len(instances), instance.name)
-        one, other = (part[1].closed(instance.id, most_capped) for part in (fine, rough))
-        volumes.append(
-            volume_amount(one, other, by_instance[number].value, sized.voxel, places[1][instance.id], u_scale)
-        )
-    together = [
-        summed([volume for volume, i in zip(volumes, instances) if i.class_id == class_id]) for class_id in class_ids
-    ]
-    return Measured(by_class, together, by_instance, volumes)
+        volumes.append(volume(2, instance.id, by_instance[number]))
+    together = [summed([v for v, i in zip(volumes, instances) if i.class_id == class_id]) for class_id in class_ids]
+    return Measured(area, volume(0, 1, area), by_class, together, by_instance, volumes)
 
 
 def gathered_votes(photos: list[Photo], pieces: Facelets, class_ids: list[int], report: Reporter) -> Votes:

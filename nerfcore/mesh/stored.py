@@ -24,6 +24,7 @@ MESH = "mesh.npz"
 COARSE = "mesh_coarse.npz"  # the same surface at cells of twice the size
 TEXTURE = "texture.png"
 CLASS_MAP = "class_id.png"
+LABEL_FIRST = "Label some photos, then run `fieldwork train` and `fieldwork mesh` again."  # for a mesh without classes
 
 
 def mesh_folder(project: Path, run: str) -> Path:

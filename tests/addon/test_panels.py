@@ -291,6 +291,17 @@ def test_sizes_are_said_with_as_many_digits_as_they_are_sure():
     assert amount_text(row, "volume", "m³") == ""
 
 
+def test_the_whole_surface_is_said_before_the_classes():
+    from fieldwork.panels.measure import measured_rows
+
+    half = {"area": 1.2384, "area_low": 1.21, "area_high": 1.27, "volume": None}
+    whole = {"name": "whole surface", "area": 140.2, "area_low": 120, "area_high": 160}
+    measures = {"unit": "m", "whole": whole | {"volume": 9, "volume_low": 8, "volume_high": 10}, "classes": []}
+    assert measured_rows(measures) == [("Whole surface", "140 ± 20 m²   9 ± 1 m³")]
+    measures = {"unit": "scene units", "classes": [{"name": "Gold", **half}]}
+    assert measured_rows(measures) == [("Gold", "1.24 ± 0.03")]
+
+
 def test_headers_say_the_state_of_each_step(bpy_script, tmp_path):
     facts = bpy_script(
         """
@@ -327,7 +338,8 @@ queue.finished = [rendered, written]
 full = look()
 queue.running = queue.make("train", {"project": project})
 queue.running.state, queue.running.fraction = "running", 0.34
-answer({"empty": empty, "full": full, "training": look()["train"], "locked": states.training(bpy.context)})
+write("exports/main/measures.json", {"whole": {"area": 1}, "classes": []})
+answer({"empty": empty, "full": full, "training": look()["train"], "no classes": look()["measure"], "locked": states.training(bpy.context)})
 """,
         project=tmp_path / "project",
     )
@@ -343,6 +355,7 @@ answer({"empty": empty, "full": full, "training": look()["train"], "locked": sta
         "export": [True, "museum.blend"],
     }
     assert facts["training"] == [False, "34%"]
+    assert facts["no classes"] == [True, ""]
     assert facts["locked"]
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from fieldwork.nerfcore.errors import ProjectError, SettingError
 from fieldwork.nerfcore.measure.conditions import widest, without_specks
 from fieldwork.nerfcore.measure.drawings import axis_names, framed, load_subject, plan, section
@@ -16,7 +17,9 @@ from fieldwork.nerfcore.measure.sheet import DPI, chosen_scale, nice_step
 from fieldwork.nerfcore.measure.views import Window, picture, plane, projection
 from fieldwork.nerfcore.params import PlanParams, SectionParams
 from fieldwork.nerfcore.progress import Reporter
-from fieldwork.tests.nerfcore.support.meshed import court
+from fieldwork.nerfcore.project.schema import Project
+from fieldwork.nerfcore.project.store import save_project
+from fieldwork.tests.nerfcore.support.meshed import court, store_mesh
 from PIL import Image
 
 
@@ -130,6 +133,20 @@ def test_conditions_are_hatched_numbered_and_listed(project: Path, tmp_path: Pat
     assert line[rows, int(x[1]) + 8 : int(x[3])].mean() < 0.05
     with pytest.raises(SettingError, match=r"no class “crack”.*floor, wall, plinth"):
         plan(PlanParams(project=project, conditions=["crack"], out=tmp_path), Reporter())
+
+
+def test_a_mesh_without_classes_has_no_conditions_and_says_so(tmp_path: Path) -> None:
+    bare = tmp_path / "bare"
+    save_project(bare, Project())
+    box = trimesh.creation.box()
+    store_mesh(bare, box, np.zeros(len(box.faces), int), box, 0.02)
+    report = Reporter()
+    plan(PlanParams(project=bare, views=["top"], conditions=["all"]), report)
+    (warning,) = report.warnings
+    assert "no classes, so no conditions are mapped" in warning
+    assert "fieldwork train" in warning
+    with pytest.raises(SettingError, match="The project has no classes yet"):
+        plan(PlanParams(project=bare, conditions=["crack"]), report)
 
 
 def test_specks_are_left_out_and_numbers_stand_inside() -> None:

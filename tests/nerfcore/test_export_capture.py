@@ -21,10 +21,11 @@ from fieldwork.nerfcore.geometry.cameras import Camera, pixel_centers, project, 
 from fieldwork.nerfcore.geometry.points import Points
 from fieldwork.nerfcore.params import ExportParams, ImportParams
 from fieldwork.nerfcore.progress import Cancelled, Reporter
-from fieldwork.nerfcore.project.store import load_poses
+from fieldwork.nerfcore.project.store import edit_project, load_poses
 from fieldwork.nerfcore.verbs import run_verb
 from fieldwork.tests.nerfcore.support import painted_box as box
 from fieldwork.tests.nerfcore.support.ball import ball_project
+from fieldwork.tests.nerfcore.support.meshed import store_mesh
 from PIL import Image
 
 SIZE = {"width": 320, "height": 200, "fx": 260.0, "fy": 250.0, "cx": 150.0, "cy": 110.0}
@@ -178,6 +179,20 @@ def test_masks_are_what_a_ray_meets_first(tmp_path: Path) -> None:
         assert (true == number).sum() > 100
     with Image.open(tmp_path / "masks" / "texture" / "gold.png") as image:
         np.testing.assert_array_equal(np.array(image), [[0, 255], [0, 0]])
+
+
+def test_masks_of_a_mesh_without_classes_are_warned_of(tmp_path: Path) -> None:
+    folder = ball_project(tmp_path / "ball", views=9)
+    ball = trimesh.creation.icosphere(1, 0.5)
+    store_mesh(folder, ball, np.zeros(len(ball.faces), int), ball, 0.03)
+    report = Reporter()
+    run_verb("export", ExportParams(project=folder, to="masks"), report)
+    assert any("no classes, so all masks are empty. Label some photos" in warning for warning in report.warnings)
+    with edit_project(folder) as edited:
+        edited.classes = []
+    report = Reporter()
+    assert run_verb("export", ExportParams(project=folder, to="masks"), report)["files"] == []
+    assert any("so no masks are written" in warning for warning in report.warnings)
 
 
 def test_masks_that_are_stopped_leave_those_that_were_there(tmp_path: Path) -> None:

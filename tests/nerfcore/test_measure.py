@@ -168,6 +168,8 @@ def test_the_verb_measures_a_mesh_with_the_label_maps_of_its_photos(project: Pat
     assert result["unit"] == "m"
     assert json.loads((mesh_folder(project, "main") / MEASURES).read_text())["classes"] == result["classes"]
     half, body = 2 * np.pi * RADIUS**2, 2 / 3 * np.pi * RADIUS**3
+    assert result["whole"]["area"] == pytest.approx(sum(row["area"] for row in result["classes"]))
+    assert result["whole"]["volume_low"] < 2 * body < result["whole"]["volume_high"]
     for row in [*result["classes"], *result["instances"]]:
         assert row["area_low"] < half < row["area_high"]
         assert row["volume_low"] < body < row["volume_high"]
@@ -180,6 +182,21 @@ def test_the_verb_measures_a_mesh_with_the_label_maps_of_its_photos(project: Pat
     assert between["low"] < between["length"] < between["high"]
     # One distance, known to 2 mm and picked to a voxel at both ends.
     assert result["scale"]["u_percent"] == pytest.approx(100 * np.hypot(0.002, np.sqrt(2) * 0.03), rel=1e-3)
+
+
+def test_a_mesh_without_classes_is_measured_as_a_whole(tmp_path: Path) -> None:
+    folder = ball_project(tmp_path / "ball", views=10, side=48)
+    ball, coarse = trimesh.creation.icosphere(4, RADIUS), trimesh.creation.icosphere(3, RADIUS)
+    store_mesh(folder, ball, np.zeros(len(ball.faces), int), coarse, voxel=0.03)
+    result = measure(MeasureParams(project=folder), Reporter())
+    assert (result["classes"], result["instances"]) == ([], [])
+    whole = result["whole"]
+    assert whole["name"] == "whole surface"
+    assert whole["area_low"] < 4 * np.pi * RADIUS**2 < whole["area_high"] < 1.5 * whole["area"]
+    assert whole["volume_low"] < 4 / 3 * np.pi * RADIUS**3 < whole["volume_high"] < 1.5 * whole["volume"]
+    made = sections(folder, "main", {}, read_measures(folder, "main"))
+    (written,) = [table for table in made if table.title == "Whole surface: area and volume"]
+    assert written.rows[0][0] == "whole surface"
 
 
 def test_while_the_scale_is_not_known_nothing_is_held_against_metres(project: Path, tmp_path: Path) -> None:

@@ -47,6 +47,7 @@ class Subject:
     instances: list[Instance]
     instance_measures: dict[int, dict[str, Any]]
     label_revision: int | None
+    voxel: float
 
     def class_ids(self) -> list[int]:
         """The classes that occur; void is none."""
@@ -68,7 +69,7 @@ def load_subject(folder: Path, run: str) -> Subject:
     """The mesh of a run as drawings need it. Raises ProjectError when there is none, or it lies elsewhere by now."""
     project: Project = load_project(folder)
     surface, texture = load_surface(folder, run)
-    measures = read_measures(folder, run) or {}
+    measures, made = read_measures(folder, run) or {}, mesh_record(folder, run).result
     return Subject(
         folder.absolute().name,
         surface,
@@ -80,7 +81,8 @@ def load_subject(folder: Path, run: str) -> Subject:
         project.ignore_id,
         read_instances(mesh_folder(folder, run)),
         {row["id"]: row for row in measures.get("instances", [])},
-        mesh_record(folder, run).result.get(LABEL_REVISION),
+        made.get(LABEL_REVISION),
+        float(made["voxel"]),
     )
 
 
@@ -100,7 +102,7 @@ def plan(params: PlanParams, report: Reporter) -> dict[str, Any]:
     if params.conditions and not subject.class_ids():
         report.warn(f"The mesh has no classes, so no conditions are mapped. {LABEL_FIRST}")
     mapped = chosen_classes(params.conditions, subject.names, subject.void)
-    places = find_places(subject.surface, mapped, subject.instances, subject.instance_measures)
+    places = find_places(subject.surface, mapped, subject.instances, subject.instance_measures, subject.voxel)
     legend = {c: (f"{subject.names[c]}  {subject.size_text(c)}", line_color(subject, c)) for c in mapped}
     for name in params.views:
         report.stage(f"Drawing: {name}")

@@ -14,7 +14,7 @@ from ..geometry.registration import Registered, by_points, by_surfaces
 from ..geometry.similarity import similarity_scale
 from ..kernels.closest import ClosestPoints
 from ..mesh.metrics import sample_surface
-from ..mesh.stored import mesh_folder, mesh_record
+from ..mesh.stored import mesh_folder
 from ..mesh.surface import Surface, to_world
 from ..mesh.triangles import areas, cross, unit
 from ..params import CompareParams
@@ -48,12 +48,11 @@ def compare(params: CompareParams, report: Reporter) -> dict[str, Any]:
     """
     folder, other = Path(params.project), Path(params.other)
     now, before = load_subject(folder, params.run), load_subject(other, params.other_run)
-    voxel = float(mesh_record(folder, params.run).result["voxel"])
     report.stage("Registering")
     registered = register(now, before, params.points, report)
     past = to_world(before.surface, registered.transform)
     report.stage("Measuring distances")
-    limit = params.limit or FAR * voxel
+    limit = params.limit or FAR * now.voxel
     distance = signed_distances(now.surface.vertices, past, report)
     distance[np.abs(distance) > limit] = np.nan
     if not np.isfinite(distance).any():

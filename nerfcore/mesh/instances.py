@@ -61,7 +61,7 @@ def find_instances(
     face_instance, found = np.zeros(len(faces), np.uint32), []
     for class_id in sorted(set(np.unique(face_class).tolist()) - {void}):
         own = np.flatnonzero(face_class == class_id)
-        part = _joined(vertices, faces[own], gap)
+        part = joined_parts(vertices, faces[own], gap)
         size = np.bincount(part, area[own])
         total = np.maximum(size, 1e-30)[:, None]
         center = np.stack([np.bincount(part, area[own] * middle[own, k]) for k in range(3)], 1) / total
@@ -147,7 +147,7 @@ def distance_if_alike(one: Piece, other: Piece) -> float | None:
     return apart if alike and apart <= 0.5 * min(area, other_area) ** 0.5 else None
 
 
-def _joined(vertices: np.ndarray, faces: np.ndarray, gap: float) -> np.ndarray:
+def joined_parts(vertices: np.ndarray, faces: np.ndarray, gap: float) -> np.ndarray:
     """Number (F,) of the part of each face (F, 3), where parts with borders nearer than `gap` to each other are one."""
     part = components(faces, len(vertices))
     count = int(part.max(initial=-1)) + 1

@@ -15,12 +15,21 @@ from fieldwork.nerfcore.measure.drawings import axis_names, framed, load_subject
 from fieldwork.nerfcore.measure.sections import profile
 from fieldwork.nerfcore.measure.sheet import DPI, chosen_scale, nice_step
 from fieldwork.nerfcore.measure.views import Window, picture, plane, projection
+from fieldwork.nerfcore.mesh.instances import read_instances
 from fieldwork.nerfcore.params import PlanParams, SectionParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.schema import Project
 from fieldwork.nerfcore.project.store import save_project
-from fieldwork.tests.nerfcore.support.meshed import court, store_mesh
+from fieldwork.tests.nerfcore.support.meshed import CLASSES, court, store_mesh
 from PIL import Image
+
+SMALL = [
+    (0.2, 1.6),
+    (2.5, 0.12),
+    (3.0, 0.1),
+    (3.4, 0.012),
+    (3.7, 0.011),
+]  # place along a wall and side of damages, metres
 
 
 @pytest.fixture(scope="module")
@@ -133,6 +142,32 @@ def test_conditions_are_hatched_numbered_and_listed(project: Path, tmp_path: Pat
     assert line[rows, int(x[1]) + 8 : int(x[3])].mean() < 0.05
     with pytest.raises(SettingError, match=r"no class “crack”.*floor, wall, plinth"):
         plan(PlanParams(project=project, conditions=["crack"], out=tmp_path), Reporter())
+
+
+def test_small_damages_have_numbers_and_specks_are_told_together(tmp_path: Path) -> None:
+    folder = tmp_path / "damaged"
+    save_project(folder, Project(classes=CLASSES))
+    wall = trimesh.creation.box(bounds=[[0, 0, 0], [4, 0.1, 3]])
+    small = [trimesh.creation.box(bounds=[[x, -0.1, 1], [x + side, -0.05, 1 + side]]) for x, side in SMALL]
+    parts = [wall, *small]
+    mesh = trimesh.util.concatenate(parts)
+    labels = np.repeat([1, *[3] * len(small)], [len(part.faces) for part in parts])
+    store_mesh(folder, mesh, labels, mesh, 0.05)
+    # One large damage and two that are less than 1 % of it; the last two are below four cells of 5 cm.
+    assert [instance.name for instance in read_instances(folder / "exports/main")] == ["floor.001", "plinth.001"]
+    wanted = PlanParams(project=folder, views=["front"], conditions=["plinth"], scale=40, out=tmp_path / "out")
+    plan(wanted, Reporter())
+    with open(tmp_path / "out/conditions.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    told = [(row["number"], row["instance"]) for row in rows]
+    assert told == [("1", "plinth.001"), ("2", ""), ("3", ""), ("", "others (2 places)")]
+    areas = [2 * side**2 + 4 * side * 0.05 for _, side in SMALL]
+    assert [float(row["area"]) for row in rows] == pytest.approx([*areas[:3], sum(areas[3:])], rel=1e-4)
+    assert float(rows[2]["x"]) == pytest.approx(3.05)
+    assert {row["class"] for row in rows} == {"plinth"}
+    svg = (tmp_path / "out/front_conditions.svg").read_text()
+    texts = re.findall(r"<!-- (.*?) -->", svg)
+    assert texts[texts.index("z (m)") + 1 :][:3] == ["1", "2", "3"]
 
 
 def test_a_mesh_without_classes_has_no_conditions_and_says_so(tmp_path: Path) -> None:

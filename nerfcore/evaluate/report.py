@@ -9,6 +9,7 @@ from typing import Any
 
 from ..errors import SettingError
 from ..files import write_text
+from ..measure.lettering import warn_of_missing
 from ..measure.stored import read_measures
 from ..params import ReportParams
 from ..progress import Reporter
@@ -107,6 +108,8 @@ def write_report(
         pictures = [(f"{what}: {file.stem}", file) for what, files in captions for file in files]
         from .report_pdf import write_pdf  # loads matplotlib
 
+        cells = (cell for table in tables for row in table.rows for cell in row)
+        warn_of_missing([name, *cells, *(caption for caption, _ in pictures)], reporter)
         write_pdf(path, name, tables, pictures)
         return [table.title for table in tables]
     scores = {Path(s["name"]).stem: s for s in evaluation.get("per_image", [])}

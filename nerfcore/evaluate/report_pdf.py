@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from ..files import atomic_path
+from ..measure.lettering import lettering
 from .documentation import Section
 
 WIDTH, HEIGHT = 210.0, 297.0  # mm
@@ -47,7 +48,7 @@ class _Pages:
             self._begin()
 
     def text(self, x: float, text: str, size: float = SIZE, weight: str = "normal") -> None:
-        self.figure.text(x / WIDTH, self.y / HEIGHT, text, fontsize=size, fontweight=weight, va="top", parse_math=False)
+        self.figure.text(x / WIDTH, self.y / HEIGHT, text, fontsize=size, fontweight=weight, va="top")
 
 
 def write_pdf(path: Path, title: str, sections: Sequence[Section], pictures: Sequence[tuple[str, Path]]) -> None:
@@ -56,7 +57,11 @@ def write_pdf(path: Path, title: str, sections: Sequence[Section], pictures: Seq
     Raises:
         DiskError: `path` cannot be written.
     """
-    with atomic_path(path) as temporary, PdfPages(temporary, metadata={"Title": title, "Creator": "Fieldwork"}) as file:
+    with (
+        lettering(),
+        atomic_path(path) as temporary,
+        PdfPages(temporary, metadata={"Title": title, "Creator": "Fieldwork"}) as file,
+    ):
         pages = _Pages(file)
         pages.text(MARGIN, title, 16, weight="bold")
         pages.y -= 9

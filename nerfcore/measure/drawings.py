@@ -20,6 +20,7 @@ from ..project.label_revision import LABEL_REVISION
 from ..project.schema import Project
 from ..project.store import load_project, record_step
 from .conditions import chosen_classes, condition_sheet, find_places, write_places
+from .lettering import warn_of_missing
 from .sections import profile, write_profile
 from .sheet import DPI, MM, Color, Entry, Sheet, chosen_scale, label_note, write_sheet
 from .stored import read_measures
@@ -64,6 +65,10 @@ class Subject:
             return f"{row['area']:.3g} ± {(row['area_high'] - row['area_low']) / 2:.1g} {unit}"
         return f"{self.area(class_id):.3g} {unit}"
 
+    def texts(self) -> list[str]:
+        """What drawings write that the user named."""
+        return [self.title, *self.names.values()]
+
 
 def load_subject(folder: Path, run: str) -> Subject:
     """The mesh of a run as drawings need it. Raises ProjectError when there is none, or it lies elsewhere by now."""
@@ -99,6 +104,7 @@ def plan(params: PlanParams, report: Reporter) -> dict[str, Any]:
     subject = load_subject(folder, params.run)
     target = params.out or mesh_folder(folder, params.run) / "drawings"
     scales, files = {}, []
+    warn_of_missing(subject.texts(), report)
     if params.conditions and not subject.class_ids():
         report.warn(f"The mesh has no classes, so no conditions are mapped. {LABEL_FIRST}")
     mapped = chosen_classes(params.conditions, subject.names, subject.void)
@@ -138,6 +144,7 @@ def section(params: SectionParams, report: Reporter) -> dict[str, Any]:
     """
     folder = Path(params.project)
     subject = load_subject(folder, params.run)
+    warn_of_missing(subject.texts(), report)
     view, at = plane(params.plane, params.turn)
     report.stage("Cutting")
     cut = profile(subject.surface, view, at)

@@ -22,6 +22,7 @@ from ..progress import Reporter
 from ..project.store import record_step
 from .amounts import K
 from .drawings import Subject, axis_names, framed, load_subject
+from .lettering import warn_of_missing
 from .sheet import Entry, Sheet, write_sheet
 from .views import picture, projection
 
@@ -63,6 +64,7 @@ def compare(params: CompareParams, report: Reporter) -> dict[str, Any]:
     target = params.out or mesh_folder(folder, params.run) / "compare"
     result = summary(now, before, registered, distance)
     report.stage("Drawing")
+    warn_of_missing([now.title], report)
     colors, legend = distance_colors(distance, result["unit"])
     files = [write_distances(target / "distance.ply", now.surface, distance, colors)]
     noise = f"noise ±{length(result['detectable'], result['unit'])} (95 %)"

@@ -13,6 +13,7 @@ import numpy as np
 
 from ..errors import SettingError
 from ..files import atomic_path
+from .lettering import lettering, wrapped
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
 MM = 1 / 25.4  # inches
 DPI = 200
 LEFT, RIGHT, TOP, BOTTOM = 18.0, 62.0, 14.0, 26.0  # margins in mm; the legend stands in the right one
+ROW, LINE = 6.0, 2.7  # mm from one entry of the legend to the next, and between lines of one
+LEGEND = 36  # characters of a line of the legend
 ROOM = 400.0, 280.0  # mm that a drawing may take where no scale is asked for: about A3 with its margins
 SMALLEST = 60.0  # mm, so that scale bar and title have room
 LARGEST = 2000.0  # mm
@@ -107,6 +110,11 @@ def nice_step(length: float, parts: int) -> float:
 
 def write_sheet(stem: Path, sheet: Sheet) -> list[Path]:
     """Write a sheet as STEM.png, STEM.svg and STEM.pdf, each in its true size. Raises DiskError."""
+    with lettering():
+        return _write(stem, sheet)
+
+
+def _write(stem: Path, sheet: Sheet) -> list[Path]:
     figure = _figure(sheet)
     paths = []
     for kind in FORMATS:
@@ -130,7 +138,7 @@ def _figure(sheet: Sheet) -> Figure:
     extent = sheet.high - sheet.low
     drawn = extent * 1000 / sheet.scale
     width, height = np.maximum(drawn, SMALLEST) + [LEFT + RIGHT, TOP + BOTTOM]
-    height = max(height, TOP + BOTTOM + 6.0 * (len(sheet.legend) + 2))
+    height = max(height, TOP + BOTTOM + 2 * ROW + sum(_tall(entry) for entry in sheet.legend))
     figure = Figure(figsize=(width * MM, height * MM))
     FigureCanvasAgg(figure)
     axes = figure.add_axes((LEFT / width, BOTTOM / height, drawn[0] / width, drawn[1] / height))
@@ -202,15 +210,20 @@ def _scale_bar(figure: Figure, sheet: Sheet, width: float, height: float) -> Non
         figure.text((LEFT + k * mm) / width, 8 / height, text, fontsize=6, ha="center")
 
 
+def _tall(entry: Entry) -> float:
+    """Height of an entry of the legend in mm."""
+    return ROW + LINE * (len(wrapped(entry.text, LEGEND)) - 1)
+
+
 def _legend(figure: Figure, sheet: Sheet, width: float, height: float) -> None:
     from matplotlib.patches import Rectangle
 
     left = (width - RIGHT + 4) / width
-    top = height - TOP
+    y = height - TOP - 3
     if sheet.heading:
-        figure.text(left, (top - 3) / height, sheet.heading, fontsize=7, weight="bold")
-    for number, entry in enumerate(sheet.legend, 1):
-        y = top - 3 - 6.0 * number
+        figure.text(left, y / height, sheet.heading, fontsize=7, weight="bold")
+    y -= ROW
+    for entry in sheet.legend:
         figure.patches.append(
             Rectangle(
                 (left, y / height), 4 / width, 3 / height, linewidth=0.3, hatch=2 * entry.hatch,
@@ -218,4 +231,6 @@ def _legend(figure: Figure, sheet: Sheet, width: float, height: float) -> None:
                 transform=figure.transFigure, figure=figure,
             )
         )  # fmt: skip
-        figure.text(left + 5.5 / width, (y + 0.4) / height, entry.text, fontsize=6.5)
+        for number, line in enumerate(wrapped(entry.text, LEGEND)):
+            figure.text(left + 5.5 / width, (y + 0.4 - number * LINE) / height, line, fontsize=6.5)
+        y -= _tall(entry)

@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import csv
 import re
+import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 from fieldwork.nerfcore.errors import ProjectError, SettingError
+from fieldwork.nerfcore.measure import lettering
 from fieldwork.nerfcore.measure.conditions import widest, without_specks
 from fieldwork.nerfcore.measure.drawings import axis_names, framed, load_subject, plan, section
 from fieldwork.nerfcore.measure.sections import profile
-from fieldwork.nerfcore.measure.sheet import DPI, chosen_scale, nice_step
+from fieldwork.nerfcore.measure.sheet import DPI, Entry, Sheet, _figure, chosen_scale, nice_step
 from fieldwork.nerfcore.measure.views import Window, picture, plane, projection
 from fieldwork.nerfcore.mesh.instances import read_instances
 from fieldwork.nerfcore.params import PlanParams, SectionParams
 from fieldwork.nerfcore.progress import Reporter
-from fieldwork.nerfcore.project.schema import Project
+from fieldwork.nerfcore.project.schema import Project, SemanticClass
 from fieldwork.nerfcore.project.store import save_project
 from fieldwork.tests.nerfcore.support.meshed import CLASSES, court, store_mesh
 from PIL import Image
@@ -168,6 +170,54 @@ def test_small_damages_have_numbers_and_specks_are_told_together(tmp_path: Path)
     svg = (tmp_path / "out/front_conditions.svg").read_text()
     texts = re.findall(r"<!-- (.*?) -->", svg)
     assert texts[texts.index("z (m)") + 1 :][:3] == ["1", "2", "3"]
+
+
+def named(folder: Path, *names: str) -> Path:
+    """A project with cubes beside each other, each of a class of its own."""
+    classes = [SemanticClass(id=n, name=name, color=(0.2, 0.5, 0.8)) for n, name in enumerate(names, 1)]
+    save_project(folder, Project(classes=classes))
+    boxes = [trimesh.creation.box(bounds=[[2 * k, 0, 0], [2 * k + 1, 1, 1]]) for k in range(len(names))]
+    mesh = trimesh.util.concatenate(boxes)
+    store_mesh(folder, mesh, np.repeat(np.arange(len(names)) + 1, 12), mesh, 0.02)
+    return folder
+
+
+def test_names_are_written_as_they_are_and_long_ones_on_several_lines(tmp_path: Path) -> None:
+    long = "biogenic crust of lichens and algae on the weathered northern parapet"
+    folder = named(tmp_path / "cost $5$ and $x^$", "$a^$ and $b$", r"\frac{$", long)
+    wanted = PlanParams(project=folder, views=["top"], conditions=["all"], scale=100, out=tmp_path / "out")
+    plan(wanted, Reporter())
+    for kind in ("classes", "conditions"):
+        texts = re.findall(r"<!-- (.*?) -->", (tmp_path / f"out/top_{kind}.svg").read_text("utf-8"))
+        assert any(text.startswith("cost $5$ and $x^$: top") for text in texts)
+        assert any(text.startswith("$a^$ and $b$  ") for text in texts)
+        assert any(text.startswith(r"\frac{$  ") for text in texts)
+        assert "biogenic crust of lichens and algae" in texts
+        assert any(text.startswith("on the weathered northern parapet") and len(text) <= 36 for text in texts)
+
+
+def test_a_long_legend_makes_the_sheet_higher() -> None:
+    window = {"low": np.zeros(2), "high": np.ones(2), "scale": 100, "metric": True, "axes": ("x", "y")}
+    picture = np.zeros((4, 4, 3), np.uint8)
+    entries = [Entry(f"{n} " + "long name " * 8, (0, 0, 0)) for n in range(12)]
+    figure = _figure(Sheet("t", image=picture, legend=entries, **window))
+    figure.canvas.draw()
+    bottoms = [text.get_window_extent().y0 for text in figure.texts]
+    assert min(bottoms) >= 0
+    assert len(figure.texts) > 2 * len(entries)
+    right = max(text.get_window_extent().x1 for text in figure.texts)
+    assert right <= figure.bbox.x1
+
+
+def test_characters_that_no_font_has_are_named_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lettering, "FONTS", ("DejaVu Sans",))
+    folder, report = named(tmp_path / "wall", "裂缝", "moss"), Reporter()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # matplotlib's own
+        plan(PlanParams(project=folder, views=["top", "front"], scale=100, out=tmp_path / "out"), report)
+    (warning,) = report.warnings
+    assert warning.startswith("No font has 缝 裂: drawn as boxes. Install a font")
+    assert lettering.wrapped("裂" * 30, 36) == ["裂" * 18, "裂" * 12]
 
 
 def test_a_mesh_without_classes_has_no_conditions_and_says_so(tmp_path: Path) -> None:

@@ -72,15 +72,13 @@ def measured_rows(measures: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def amount_text(row: dict[str, Any], name: str, unit: str) -> str:
-    """A value with half of its 95 % interval, to the digits that this leaves: “1.24 ± 0.03 m²”; empty without one."""
+    """A value with half of its 95 % interval, to the digits that this leaves: “1.238 ± 0.030 m²”; empty without one."""
+    from ..nerfcore.measure.wording import amount  # not at the top: enabling the extension must be quick
+
     value = row.get(name)
     if value is None:
         return ""
-    half = (row[f"{name}_high"] - row[f"{name}_low"]) / 2
-    digits = 0
-    while digits < 6 and half * 10**digits < 1:
-        digits += 1
-    return f"{value:.{digits}f} ± {half:.{digits}f} {unit}".rstrip()
+    return f"{amount(value, (row[f'{name}_high'] - row[f'{name}_low']) / 2)} {unit}".rstrip()
 
 
 CLASSES = [FIELDWORK_PT_measure]

@@ -15,6 +15,7 @@ import numpy as np
 from .. import __version__
 from ..data.load import load_scene
 from ..data.scene import Scene
+from ..measure.wording import interval, significant
 from ..project.runs import INFO, holdout_of, read_metrics, run_folder
 from ..project.schema import Poses, Project
 from ..project.store import load_poses, load_project
@@ -130,7 +131,7 @@ def _summary(project: Project, poses: Poses, results: dict[str, Any], evaluation
     if mesh:
         unit = "m" if project.frame.scale_known else "units"
         closed = "closed" if mesh["watertight"] else "open"
-        rows.append(["Mesh", f"{mesh['faces']} faces, {closed}, cells of {mesh['voxel']:.4g} {unit}"])
+        rows.append(["Mesh", f"{mesh['faces']} faces, {closed}, cells of {significant(mesh['voxel'], 4)} {unit}"])
     return Section("Result", [], rows)
 
 
@@ -142,13 +143,13 @@ def _measured(rows: list[dict[str, Any]], measures: dict[str, Any], title: str) 
     def cells(row: dict[str, Any], name: str) -> list[str]:
         if row[name] is None:
             return ["open", ""]
-        return [f"{row[name]:.4g}", f"{row[f'{name}_low']:.4g} … {row[f'{name}_high']:.4g}"]
+        return list(interval(row[name], row[f"{name}_low"], row[f"{name}_high"]))
 
     return Section(
         title,
         ["name", f"area ({area})", "95 % interval", f"volume ({volume})", "95 % interval"],
         [[row["name"], *cells(row, "area"), *cells(row, "volume")] for row in rows],
-        f"Relative standard uncertainty of the scale: {scale.get('u_percent', 0):.3g} % ({scale.get('source', '')}).",
+        f"Relative standard uncertainty of the scale: {significant(scale.get('u_percent', 0))} % ({scale.get('source', '')}).",
     )
 
 

@@ -25,11 +25,13 @@ from .sections import profile, write_profile
 from .sheet import DPI, MM, Color, Entry, Sheet, chosen_scale, label_note, write_sheet
 from .stored import read_measures
 from .views import Picture, Projection, Window, picture, plane, projection
+from .wording import amount, significant
 
 MARGIN = 0.02  # of the drawing's longer side, around it
 CLASS_SHARE = 0.6  # of a class's colour in a map of classes, over the grey picture
 PALE = 0.55  # share of white over what lies behind a section
 VOID = (0.35, 0.35, 0.35)
+NO_BREAK = "\u00a0"  # a space at which lines do not end
 
 
 @dataclass(frozen=True)
@@ -59,11 +61,13 @@ class Subject:
         return float(areas(self.surface.vertices.astype(np.float64), own).sum())
 
     def size_text(self, class_id: int) -> str:
-        """The area of a class, with half of its interval where it was measured."""
+        """The area of a class, with half of its interval where it was measured; no line ends within."""
         unit, row = "m²" if self.metric else "units²", self.measures.get(class_id)
-        if row is not None:
-            return f"{row['area']:.3g} ± {(row['area_high'] - row['area_low']) / 2:.1g} {unit}"
-        return f"{self.area(class_id):.3g} {unit}"
+        if row is None:
+            size = significant(self.area(class_id))
+        else:
+            size = amount(row["area"], (row["area_high"] - row["area_low"]) / 2)
+        return f"{size} {unit}".replace(" ", NO_BREAK)
 
     def texts(self) -> list[str]:
         """What drawings write that the user named."""
@@ -168,7 +172,7 @@ def section(params: SectionParams, report: Reporter) -> dict[str, Any]:
         pale,
         axis_names(view, params.turn),
         [
-            Entry(f"{subject.names.get(c, c)}  {length:.3g} {unit}", line_color(subject, c))
+            Entry(f"{subject.names.get(c, c)}  {significant(length)}{NO_BREAK}{unit}", line_color(subject, c))
             for c, length in lengths.items()
         ],
         "Length of the section",

@@ -25,6 +25,7 @@ from .drawings import Subject, axis_names, framed, load_subject
 from .lettering import warn_of_missing
 from .sheet import Entry, Sheet, write_sheet
 from .views import picture, projection
+from .wording import significant
 
 SAMPLES = 100_000  # points of a surface that distances are taken from
 FAR = 20.0  # voxels: what is farther from the other epoch has no counterpart there
@@ -182,7 +183,7 @@ def distance_colors(distance: np.ndarray, unit: str) -> tuple[np.ndarray, list[E
 
 def length(value: float, unit: str) -> str:
     """A length in words: millimetres where the unit is "m", else scene units."""
-    return f"{1000 * value:.3g} mm" if unit == "m" else f"{value:.3g} units"
+    return f"{significant(1000 * value)} mm" if unit == "m" else f"{significant(value)} units"
 
 
 def write_distances(path: Path, surface: Surface, distance: np.ndarray, colors: np.ndarray) -> Path:

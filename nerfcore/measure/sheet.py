@@ -14,6 +14,7 @@ import numpy as np
 from ..errors import SettingError
 from ..files import atomic_path
 from .lettering import lettering, wrapped
+from .wording import significant
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -155,6 +156,7 @@ def _figure(sheet: Sheet) -> Figure:
     step = nice_step(float(extent.max()), 10)
     for axis, low, high in ((axes.xaxis, box[0], box[1]), (axes.yaxis, box[2], box[3])):
         axis.set_ticks(np.arange(np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9) + 1) * step)
+    axes.ticklabel_format(style="plain", useOffset=False)
     axes.grid(color="0.35", linewidth=0.25, alpha=0.6)
     axes.tick_params(labelsize=6, length=2, width=0.4)
     unit = "m" if sheet.metric else "units"
@@ -162,9 +164,11 @@ def _figure(sheet: Sheet) -> Figure:
     axes.set_ylabel(f"{sheet.axes[1]} ({unit})", fontsize=6, labelpad=1)
     for spine in axes.spines.values():
         spine.set_linewidth(0.4)
-    stated = f"1:{sheet.scale:g}" if sheet.metric else "not to scale: the scale of the capture is not known"
+    stated = (
+        f"1:{significant(sheet.scale, 6)}" if sheet.metric else "not to scale: the scale of the capture is not known"
+    )
     figure.text(LEFT / width, 1 - 9 / height, sheet.title, fontsize=10, weight="bold")
-    stated = f"{stated} · grid {step:g} {unit}" + (f" · {sheet.note}" if sheet.note else "")
+    stated = f"{stated} · grid {significant(step)} {unit}" + (f" · {sheet.note}" if sheet.note else "")
     figure.text(LEFT / width, 3 / height, stated, fontsize=8)
     _scale_bar(figure, sheet, float(width), float(height))
     _legend(figure, sheet, float(width), float(height))
@@ -206,7 +210,7 @@ def _scale_bar(figure: Figure, sheet: Sheet, width: float, height: float) -> Non
             )
         )  # fmt: skip
     for k in (0, 2, 4):
-        text = f"{k * length:g}" + ((" m" if sheet.metric else " units") if k == 4 else "")
+        text = f"{significant(k * length)}" + ((" m" if sheet.metric else " units") if k == 4 else "")
         figure.text((LEFT + k * mm) / width, 8 / height, text, fontsize=6, ha="center")
 
 

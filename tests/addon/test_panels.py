@@ -286,7 +286,7 @@ def test_sizes_are_said_with_as_many_digits_as_they_are_sure():
     from fieldwork.panels.measure import amount_text
 
     row = {"area": 1.2384, "area_low": 1.21, "area_high": 1.27, "volume": None, "volume_low": None, "volume_high": None}
-    assert amount_text(row, "area", "m²") == "1.24 ± 0.03 m²"
+    assert amount_text(row, "area", "m²") == "1.238 ± 0.030 m²"
     assert amount_text(row | {"area": 140.2, "area_low": 120, "area_high": 160}, "area", "") == "140 ± 20"
     assert amount_text(row, "volume", "m³") == ""
 
@@ -297,9 +297,9 @@ def test_the_whole_surface_is_said_before_the_classes():
     half = {"area": 1.2384, "area_low": 1.21, "area_high": 1.27, "volume": None}
     whole = {"name": "whole surface", "area": 140.2, "area_low": 120, "area_high": 160}
     measures = {"unit": "m", "whole": whole | {"volume": 9, "volume_low": 8, "volume_high": 10}, "classes": []}
-    assert measured_rows(measures) == [("Whole surface", "140 ± 20 m²   9 ± 1 m³")]
+    assert measured_rows(measures) == [("Whole surface", "140 ± 20 m²   9.0 ± 1.0 m³")]
     measures = {"unit": "scene units", "classes": [{"name": "Gold", **half}]}
-    assert measured_rows(measures) == [("Gold", "1.24 ± 0.03")]
+    assert measured_rows(measures) == [("Gold", "1.238 ± 0.030")]
 
 
 def test_headers_say_the_state_of_each_step(bpy_script, tmp_path):

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 from fieldwork.nerfcore.errors import ProjectError, SettingError
+from fieldwork.nerfcore.files import write_json
 from fieldwork.nerfcore.measure import lettering
 from fieldwork.nerfcore.measure.conditions import widest, without_specks
 from fieldwork.nerfcore.measure.drawings import axis_names, framed, load_subject, plan, section
@@ -20,6 +21,7 @@ from fieldwork.nerfcore.measure.views import Window, picture, plane, projection
 from fieldwork.nerfcore.mesh.instances import read_instances
 from fieldwork.nerfcore.params import PlanParams, SectionParams
 from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.project.runs import MEASURES
 from fieldwork.nerfcore.project.schema import Project, SemanticClass
 from fieldwork.nerfcore.project.store import save_project
 from fieldwork.tests.nerfcore.support.meshed import CLASSES, court, store_mesh
@@ -194,6 +196,19 @@ def test_names_are_written_as_they_are_and_long_ones_on_several_lines(tmp_path: 
         assert any(text.startswith(r"\frac{$  ") for text in texts)
         assert "biogenic crust of lichens and algae" in texts
         assert any(text.startswith("on the weathered northern parapet") and len(text) <= 36 for text in texts)
+
+
+def test_large_areas_are_written_without_exponents(tmp_path: Path) -> None:
+    folder = named(tmp_path / "dam", "concrete")
+    row = {"id": 1, "name": "concrete", "area": 1234.5, "area_low": 1196.5, "area_high": 1272.5}
+    write_json(folder / "exports/main" / MEASURES, {"unit": "m", "classes": [row]})
+    assert load_subject(folder, "main").size_text(1).replace("\u00a0", " ") == "1234 ± 38 m²"
+    box = trimesh.creation.box(bounds=[[0, 0, 0], [3e5, 2e5, 10]])
+    big = tmp_path / "land"
+    save_project(big, Project(classes=CLASSES))
+    store_mesh(big, box, np.ones(12, int), box, 1000.0)
+    section(SectionParams(project=big, plane="z=5", scale=1e6, out=tmp_path / "out"), Reporter())
+    assert not re.findall(r"<!-- .*\de[+-]?\d.* -->", (tmp_path / "out/section_z_5.svg").read_text("utf-8"))
 
 
 def test_a_long_legend_makes_the_sheet_higher() -> None:

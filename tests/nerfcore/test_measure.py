@@ -18,6 +18,7 @@ from fieldwork.nerfcore.measure.resampling import Votes
 from fieldwork.nerfcore.measure.scale import read_distances, scale_of
 from fieldwork.nerfcore.measure.stored import read_measures
 from fieldwork.nerfcore.measure.verb import Measured, Sized, amounts, measure
+from fieldwork.nerfcore.measure.wording import amount, interval, significant
 from fieldwork.nerfcore.mesh.facelets import facelets
 from fieldwork.nerfcore.mesh.instances import find_instances
 from fieldwork.nerfcore.mesh.stored import COARSE, mesh_folder
@@ -214,6 +215,18 @@ def test_while_the_scale_is_not_known_nothing_is_held_against_metres(project: Pa
     assert written.rows[0][-2:] == ["2.5000", ""]
     assert "The scale is not known" in written.text
     assert "mean square" not in written.text
+
+
+def test_sizes_are_written_with_two_digits_of_their_uncertainty_and_no_exponent() -> None:
+    assert amount(1234.5, 38) == "1234 ± 38"
+    assert amount(123456.0, 4321) == "123500 ± 4300"
+    assert amount(1.2384, 0.0296) == "1.238 ± 0.030"
+    assert amount(0.00012345, 0.0000099) == "0.0001234 ± 0.0000099"
+    assert amount(1.0, 0.0996) == "1.00 ± 0.10"
+    assert amount(1234567.0, 0.0) == "1235000 ± 0"
+    assert interval(1234.5, 1000.0, 1469.0) == ("1230", "1000 … 1470")
+    assert interval(2e6, 1.9e6, 2.1e6) == ("2000000", "1900000 … 2100000")
+    assert [significant(x) for x in (1234.5, 10.0, 0.0000123, 0.0)] == ["1230", "10", "0.0000123", "0"]
 
 
 def test_a_mesh_that_lies_elsewhere_is_not_measured(project: Path) -> None:

@@ -66,7 +66,7 @@ def test_another_person_finds_what_is_needed_to_repeat_it(project: Path) -> None
     for words in (
         "Photos used 8",
         "320 faces, closed, cells of 0.03 m",
-        "1.571 1.5 … 1.64 open",
+        "1.571 1.500 … 1.640 open",
         "door check 2.0040 1.9900 … 2.0200 2.0000 +4.0 mm",
         "Root mean square of their differences: 4.0 mm",
         "uncertainty of the scale: 0.4 % (1 control distance)",

@@ -122,15 +122,15 @@ def plan(params: PlanParams, report: Reporter) -> dict[str, Any]:
         before = float(found[:, 2].max()) + window.pixel
         seen = picture(subject.surface, subject.texture, view, window, before, report)
         scales[name] = scale if subject.metric else None
-        title = f"{subject.title}: {name}"
+        title, stem = f"{subject.title}: {name}{turned(params.turn)}", f"{name}{suffix(params.turn)}"
         axes, note = axis_names(view, params.turn), label_note(subject.label_revision)
         sheet = Sheet(title, window.low, window.high, scale, subject.metric, seen.color, axes, note=note)
-        files += write_sheet(target / name, sheet)
+        files += write_sheet(target / stem, sheet)
         if subject.class_ids():
-            files += write_sheet(target / f"{name}_classes", class_sheet(sheet, subject, seen))
+            files += write_sheet(target / f"{stem}_classes", class_sheet(sheet, subject, seen))
         if mapped:
             conditions = condition_sheet(sheet, subject.surface, seen, places, legend)
-            files += write_sheet(target / f"{name}_conditions", conditions)
+            files += write_sheet(target / f"{stem}_conditions", conditions)
     if mapped:
         files.append(write_places(target / "conditions.csv", places, subject.names, subject.label_revision))
     result = {"scales": scales, "label_revision": subject.label_revision, "files": [str(path) for path in files]}
@@ -164,7 +164,7 @@ def section(params: SectionParams, report: Reporter) -> dict[str, Any]:
     lengths = cut.lengths()
     unit = "m" if subject.metric else "units"
     sheet = Sheet(
-        f"{subject.title}: section {params.plane}",
+        f"{subject.title}: section {params.plane}{turned(params.turn)}",
         window.low,
         window.high,
         scale,
@@ -181,7 +181,7 @@ def section(params: SectionParams, report: Reporter) -> dict[str, Any]:
         note=label_note(subject.label_revision),
     )
     target = params.out or mesh_folder(folder, params.run) / "drawings"
-    stem = "section_" + params.plane.replace(" ", "").replace("=", "_")
+    stem = "section_" + params.plane.replace(" ", "").replace("=", "_") + suffix(params.turn)
     files = write_sheet(target / stem, sheet)
     files.append(target / f"{stem}.csv")
     write_profile(files[-1], cut, subject.names, subject.label_revision)
@@ -194,6 +194,16 @@ def section(params: SectionParams, report: Reporter) -> dict[str, Any]:
     }
     record_step(folder, "section", params.model_dump(mode="json"), result)
     return result
+
+
+def turned(turn: float) -> str:
+    """What titles say of a turn by degrees about z."""
+    return f", turned {turn:g}°" if turn else ""
+
+
+def suffix(turn: float) -> str:
+    """What the names of files say of it, so that drawings of several turns stand beside each other."""
+    return f"_turn_{turn:g}" if turn else ""
 
 
 def framed(points: np.ndarray, scale: float | None, metric: bool) -> tuple[Window, float]:

@@ -269,6 +269,21 @@ def test_a_section_is_drawn_and_listed(project: Path, tmp_path: Path) -> None:
     assert all(float(row["z0"]) == 0.5 for row in rows)
 
 
+def test_drawings_of_several_turns_stand_beside_each_other(project: Path, tmp_path: Path) -> None:
+    for turn in (0, 30, -45.5):
+        settings = {"project": project, "turn": turn, "scale": 100, "out": tmp_path}
+        plan(PlanParams(views=["front"], conditions=["plinth"], **settings), Reporter())
+        section(SectionParams(plane="z=0.5", **settings), Reporter())
+    found = {path.name for path in tmp_path.iterdir()}
+    for stem in ("front", "front{}_classes", "front{}_conditions", "section_z_0.5"):
+        stem = stem if "{}" in stem else stem + "{}"
+        assert {f"{stem.format(turn)}.svg" for turn in ("", "_turn_30", "_turn_-45.5")} <= found
+    assert {"section_z_0.5.csv", "section_z_0.5_turn_30.csv"} <= found
+    assert "<!-- court: front, turned 30° -->" in (tmp_path / "front_turn_30.svg").read_text("utf-8")
+    assert "section z=0.5, turned 30° -->" in (tmp_path / "section_z_0.5_turn_30.svg").read_text("utf-8")
+    assert "turned" not in (tmp_path / "front.svg").read_text("utf-8")
+
+
 def test_impossible_sections_and_meshes_are_named(project: Path, tmp_path: Path) -> None:
     for text in ("z", "up=1", "z=high"):
         with pytest.raises(SettingError, match="no plane"):

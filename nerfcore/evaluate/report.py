@@ -7,13 +7,13 @@ import io
 from pathlib import Path
 from typing import Any
 
-from ..errors import SettingError
+from ..errors import ProjectError, SettingError
 from ..files import write_text
 from ..measure.lettering import warn_of_missing
 from ..measure.stored import read_measures
 from ..params import ReportParams
 from ..progress import Reporter
-from ..project.runs import read_events, read_metrics, run_folder
+from ..project.runs import known_runs, read_events, read_metrics, run_folder
 from ..project.store import load_project
 from ..render.pictures import ENDINGS
 from .documentation import JUDGEMENT, Section, results_of, sections
@@ -62,12 +62,15 @@ def report(params: ReportParams, reporter: Reporter) -> dict[str, Any]:
     Returns:
         {"file", "sections": titles of its tables}
     Raises:
-        SettingError: neither .html nor .pdf. ProjectError: there are no poses. DiskError.
+        SettingError: neither .html nor .pdf. ProjectError: there are no poses, or there is no such run. DiskError.
     """
     folder = Path(params.project)
+    project, known = load_project(folder), known_runs(folder)
+    if params.run not in (*known, ReportParams.model_fields["run"].default):  # without any, the photos are reported
+        raise ProjectError(f"{folder} has no run “{params.run}”.", f"Its runs: {', '.join(known) or 'none'}.")
     out = params.out or folder / "exports" / params.run / "report.html"
     check_report(out)
-    results = results_of(load_project(folder), params.run)
+    results = results_of(project, params.run)
     results["evaluate"] = read_metrics(run_folder(folder, params.run)).get("test")
     reporter.stage("Writing the report")
     titles = write_report(out, folder, params.run, folder / "exports" / params.run / "renders", results, reporter)

@@ -109,6 +109,7 @@ def plan(params: PlanParams, report: Reporter) -> dict[str, Any]:
     target = params.out or mesh_folder(folder, params.run) / "drawings"
     scales, files = {}, []
     warn_of_missing(subject.texts(), report)
+    warn_of_unused_scale(params.scale, subject, report)
     if params.conditions and not subject.class_ids():
         report.warn(f"The mesh has no classes, so no conditions are mapped. {LABEL_FIRST}")
     mapped = chosen_classes(params.conditions, subject.names, subject.void)
@@ -149,6 +150,7 @@ def section(params: SectionParams, report: Reporter) -> dict[str, Any]:
     folder = Path(params.project)
     subject = load_subject(folder, params.run)
     warn_of_missing(subject.texts(), report)
+    warn_of_unused_scale(params.scale, subject, report)
     view, at = plane(params.plane, params.turn)
     report.stage("Cutting")
     cut = profile(subject.surface, view, at)
@@ -194,6 +196,15 @@ def section(params: SectionParams, report: Reporter) -> dict[str, Any]:
     }
     record_step(folder, "section", params.model_dump(mode="json"), result)
     return result
+
+
+def warn_of_unused_scale(scale: float | None, subject: Subject, report: Reporter) -> None:
+    """Warn where a scale on paper was asked for and the capture has none."""
+    if scale is not None and not subject.metric:
+        report.warn(
+            f"The scale 1:{significant(scale, 6)} is not used: the scale of the capture is not known. Set it with "
+            "`fieldwork align --scale`, then run `fieldwork mesh` again."
+        )
 
 
 def turned(turn: float) -> str:

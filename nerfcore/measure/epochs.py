@@ -21,7 +21,7 @@ from ..params import CompareParams
 from ..progress import Reporter
 from ..project.store import record_step
 from .amounts import K
-from .drawings import Subject, axis_names, framed, load_subject
+from .drawings import Subject, axis_names, framed, load_subject, warn_of_unused_scale
 from .lettering import warn_of_missing
 from .sheet import Entry, Sheet, write_sheet
 from .views import picture, projection
@@ -66,6 +66,7 @@ def compare(params: CompareParams, report: Reporter) -> dict[str, Any]:
     result = summary(now, before, registered, distance)
     report.stage("Drawing")
     warn_of_missing([now.title], report)
+    warn_of_unused_scale(params.scale, now, report)
     colors, legend = distance_colors(distance, result["unit"])
     files = [write_distances(target / "distance.ply", now.surface, distance, colors)]
     noise = f"noise ±{length(result['detectable'], result['unit'])} (95 %)"

@@ -45,6 +45,13 @@ def _old_folder(project: Path, run: str) -> Path:
     return Path(project) / "runs" / OLD / run
 
 
+def known_runs(project: Path) -> list[str]:
+    """The names of the runs of a project: what was trained, and what has a mesh."""
+    trained = (path.name for path in run_folder(project, "").glob("[!.]*") if path.is_dir())
+    meshed = (path.parent.name for path in (Path(project) / "exports").glob(f"*/{MESH_RECORD}"))
+    return sorted({*trained, *meshed})
+
+
 def has_checkpoint(folder: Path) -> bool:
     return (folder / CHECKPOINT).is_file()
 

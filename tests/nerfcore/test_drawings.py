@@ -291,7 +291,13 @@ def test_impossible_sections_and_meshes_are_named(project: Path, tmp_path: Path)
     with pytest.raises(SettingError, match=r"misses the mesh\. It spans x 0\.00 to 4\.00"):
         section(SectionParams(project=project, plane="z=9"), Reporter())
     unknown = court(tmp_path / "unscaled", metric=False)
-    result = plan(PlanParams(project=unknown, views=["right"], scale=100), Reporter())
+    report = Reporter()
+    result = plan(PlanParams(project=unknown, views=["right"], scale=100), report)
+    section(SectionParams(project=unknown, plane="z=0.5", scale=100), report)
+    assert len(report.warnings) == 2
+    assert all("1:100 is not used: the scale of the capture is not known" in text for text in report.warnings)
+    plan(PlanParams(project=unknown, views=["right"]), report)
+    assert len(report.warnings) == 2
     assert result["scales"] == {"right": None}
     assert "scale of the capture is not known" in (Path(result["files"][0]).with_suffix(".svg")).read_text()
     (unknown / "exports" / "main" / "mesh.npz").unlink()

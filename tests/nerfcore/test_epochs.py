@@ -84,6 +84,13 @@ def test_changes_of_measured_areas_have_intervals(tmp_path: Path) -> None:
     assert [row["change_low"], row["change_high"]] == pytest.approx([1 - 0.3 * 2**0.5, 1 + 0.3 * 2**0.5])
 
 
+def test_a_scale_on_paper_needs_a_known_one(tmp_path: Path) -> None:
+    now, before = epoch(tmp_path / "now", np.eye(4), 0, metric=False), epoch(tmp_path / "before", np.eye(4), 1)
+    report = Reporter()
+    compare(CompareParams(project=now, other=before, views=[], scale=100), report)
+    assert any("1:100 is not used" in warning for warning in report.warnings)
+
+
 def test_an_epoch_of_unknown_size_is_brought_to_this_one() -> None:
     random = np.random.default_rng(0)
     mesh, other = thing(random)[0], thing(random)[0]

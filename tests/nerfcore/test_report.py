@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from fieldwork.nerfcore.errors import SettingError
+from fieldwork.nerfcore.errors import ProjectError, SettingError
 from fieldwork.nerfcore.evaluate.documentation import Section
 from fieldwork.nerfcore.evaluate.report import by_view, report
 from fieldwork.nerfcore.evaluate.report_pdf import write_pdf
@@ -142,6 +142,16 @@ def test_other_endings_are_refused_before_anything_is_done(project: Path, tmp_pa
     with pytest.raises(SettingError, match=r"\.html or \.pdf"):
         reconstruct(ReconstructParams(photos=tmp_path, out=tmp_path / "p", report=tmp_path / "r.doc"), Reporter())
     assert not (tmp_path / "p").exists()
+
+
+def test_runs_that_are_not_there_are_named(project: Path, tmp_path: Path) -> None:
+    run_folder(project, "fine").mkdir()
+    with pytest.raises(ProjectError, match=r"no run “mian”\. Its runs: fine, main\."):
+        report(ReportParams(project=project, run="mian"), Reporter())
+    assert not (project / "exports/mian").exists()
+    assert "Photographs" in report(ReportParams(project=project, run="fine"), Reporter())["sections"]
+    posed = ball_project(tmp_path / "posed", views=9)
+    assert "Photographs" in report(ReportParams(project=posed), Reporter())["sections"]
 
 
 def test_passes_of_a_view_stand_together() -> None:

@@ -103,7 +103,9 @@ def write_report(
         place = next((i + 1 for i, table in enumerate(tables) if table.title == "Result"), 0)
         tables.insert(place, Section("Time", [], [*seconds, ["all", f"{sum(stages.values()):.1f} s"]]))
     evaluation = result.get("evaluate") or {}
-    compared = [folder / name for name in evaluation.get("pictures", []) if (folder / name).is_file()]
+    judged = zip(evaluation.get("pictures", []), evaluation.get("per_image", []))  # in one order, see `evaluate`
+    scores = {folder / name: score for name, score in judged if (folder / name).is_file()}
+    compared = list(scores)
     rendered = sorted(renders.glob("*.png"))
     name = folder.resolve().name
     if path.suffix.lower() == ".pdf":
@@ -115,7 +117,6 @@ def write_report(
         warn_of_missing([name, *cells, *(caption for caption, _ in pictures)], reporter)
         write_pdf(path, name, tables, pictures)
         return [table.title for table in tables]
-    scores = {Path(s["name"]).stem: s for s in evaluation.get("per_image", [])}
     import jinja2
 
     html = (
@@ -128,8 +129,7 @@ def write_report(
             tables=[table for table in tables if table.title not in (*HEAD, JUDGEMENT)],
             areas=(result.get("mesh") or {}).get("classes") or {},
             evaluation=evaluation,
-            pictures=pictures_of(compared),
-            scores=scores,
+            pictures=[picture | {"score": score} for picture, score in zip(pictures_of(compared), scores.values())],
             drawings=pictures_of(drawn),
             renders=[pictures_of(view) for view in by_view(rendered)],
             curve=training_curve(run_folder(folder, run)),

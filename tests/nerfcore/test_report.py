@@ -84,6 +84,20 @@ def test_another_person_finds_what_is_needed_to_repeat_it(project: Path) -> None
     assert "03.jpg" not in html
 
 
+def test_held_out_photos_may_have_dots_in_their_names(project: Path) -> None:
+    names = ["IMG.01", "IMG.02", "gone.03"]
+    for name in names[:2]:
+        Image.new("RGB", (8, 6)).save(project / f"{name}.png")
+    scores = [{"name": name, "psnr": 20.0 + n, "ssim": 0.5 + n / 10} for n, name in enumerate(names)]
+    test = {"images": 3, "psnr": 21.0, "ssim": 0.6, "miou": None, "per_image": scores}
+    pictures = [f"{name}.png" for name in ("IMG.01", "gone.03", "IMG.02")]
+    test |= {"pictures": pictures, "per_image": [scores[0], scores[2], scores[1]]}
+    write_json(run_folder(project, "main") / METRICS, {"test": test})
+    html = Path(report(ReportParams(project=project), Reporter())["file"]).read_text("utf-8")
+    captions = re.findall(r"<figcaption>(IMG.*?)</figcaption>", html)
+    assert captions == ["IMG.01 — 20.00 dB, SSIM 0.500", "IMG.02 — 21.00 dB, SSIM 0.600"]
+
+
 def test_what_is_of_a_mesh_that_lies_elsewhere_is_left_out_with_a_warning(project: Path) -> None:
     with edit_project(project) as edited:
         edited.frame.world_from_sfm = (2 * np.eye(4)).tolist()

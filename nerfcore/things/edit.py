@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import numpy as np
 import scipy
 
 from ..errors import InputError, ProjectError
-from ..files import UNREADABLE_ARRAYS, atomic_path
+from ..files import UNREADABLE_ARRAYS, atomic_path, write_json
 from ..mesh.instances import Instance, joined, read_instances, write_instances
 from ..mesh.stored import MESH, mesh_folder, mesh_record
 from ..mesh.triangles import areas, components
@@ -20,6 +21,7 @@ from ..project.label_revision import LABEL_REVISION
 from ..project.runs import MEASURES
 from ..project.store import load_project, record_step
 
+PACKAGE = "package/package.json"  # beside the mesh, see blender/package.py
 LEAST_SHARE = 0.01  # of the area of what is split, below which a piece stays with the nearest other one
 
 
@@ -40,6 +42,8 @@ def instances(params: InstancesParams, report: Reporter) -> dict[str, Any]:
     after, changed = before, []
     if params.rename:
         after, changed = renamed(before, *params.rename)
+        for path in (target / MEASURES, target / PACKAGE):
+            _rename_in(path, params.rename[0], changed[0])
     elif params.merge or params.split:
         arrays = read_arrays(target / MESH)
         if "face_instance" not in arrays:
@@ -74,6 +78,20 @@ def renamed(known: list[Instance], old: str, new: str) -> tuple[list[Instance], 
     if any(other.name == new for other in known if other.id != one.id):
         raise InputError(f"There is an instance “{new}” already.", "Give another name.")
     return [replace(i, name=new) if i.id == one.id else i for i in known], [new]
+
+
+def _rename_in(path: Path, old: str, new: str) -> None:
+    """Give an instance its new name in measures or a package, where there are any. Raises ProjectError, DiskError."""
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+        for row in [*value.get("instances", []), *value.get("measures", {}).get("instances", [])]:
+            if row["name"] == old:
+                row["name"] = new
+    except FileNotFoundError:
+        return
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ProjectError(f"{path} is damaged: {error}.", "Delete it and make it again.") from error
+    write_json(path, value)
 
 
 def merged(

@@ -12,6 +12,7 @@ import pytest
 import trimesh
 from fieldwork.nerfcore.cli import main
 from fieldwork.nerfcore.errors import InputError, ProjectError
+from fieldwork.nerfcore.files import write_json
 from fieldwork.nerfcore.mesh.instances import (
     Instance,
     joined,
@@ -23,7 +24,7 @@ from fieldwork.nerfcore.mesh.instances import (
 from fieldwork.nerfcore.mesh.stored import MESH, mesh_folder
 from fieldwork.nerfcore.params import InstancesParams, RelationsParams
 from fieldwork.nerfcore.progress import Reporter
-from fieldwork.nerfcore.project.runs import SCENE_GRAPH
+from fieldwork.nerfcore.project.runs import MEASURES, SCENE_GRAPH
 from fieldwork.nerfcore.project.schema import Project, SemanticClass
 from fieldwork.nerfcore.project.store import save_project
 from fieldwork.nerfcore.things.edit import instances
@@ -159,6 +160,28 @@ def test_a_graph_is_kept_until_the_things_change(project: Path) -> None:
     assert "Ming" in again["found"]
     (mesh_folder(project, "main") / SCENE_GRAPH).write_text("{")
     assert not asked(project)["reused"], "a damaged graph is made anew"
+
+
+def test_a_new_name_stands_in_measures_and_package_too(project: Path) -> None:
+    target = mesh_folder(project, "main")
+    rows = {"instances": [{"id": i.id, "name": i.name, "area": i.area} for i in read_instances(target)]}
+    package = target / "package/package.json"
+    package.parent.mkdir()
+    write_json(target / MEASURES, {"unit": "m", **rows})
+    write_json(package, {**rows, "measures": rows, "cameras": []})
+    changed(project, rename=["vase.001", "Ming"])
+    names = [i.name for i in read_instances(target)]
+    assert "Ming" in names
+    measures, packed = (json.loads(path.read_text("utf-8")) for path in (target / MEASURES, package))
+    for found in (measures, packed, packed["measures"]):
+        assert [row["name"] for row in found["instances"]] == names
+    assert measures["instances"][0]["area"] == rows["instances"][0]["area"]
+    (target / MEASURES).write_text("{")
+    with pytest.raises(ProjectError, match=r"measures\.json is damaged"):
+        changed(project, rename=["Ming", "vase.001"])
+    assert "Ming" in [i.name for i in read_instances(target)]
+    (target / MEASURES).unlink()
+    package.unlink()
 
 
 def test_instances_are_joined_and_split(project: Path) -> None:

@@ -16,7 +16,7 @@ from ..kernels.closest import ClosestPoints
 from ..mesh.metrics import sample_surface
 from ..mesh.stored import mesh_folder
 from ..mesh.surface import Surface, to_world
-from ..mesh.triangles import areas, cross, unit
+from ..mesh.triangles import areas, components, cross, unit
 from ..params import CompareParams
 from ..progress import Reporter
 from ..project.store import record_step
@@ -30,6 +30,8 @@ from .wording import significant
 SAMPLES = 100_000  # points of a surface that distances are taken from
 FAR = 20.0  # voxels: what is farther from the other epoch has no counterpart there
 CHUNK = 20_000  # points at once
+LEAST_VOXELS = 0.1  # no change below this share of a cell is told from noise, however alike two meshes are
+LEAST_CELLS = 20.0  # area in cells below which a connected patch of moved surface is noise
 NOTHING = (0.6, 0.6, 0.6)  # colour of what has no counterpart
 STEPS = 9  # of the legend
 
@@ -42,7 +44,8 @@ def compare(params: CompareParams, report: Reporter) -> dict[str, Any]:
 
     Returns:
         {"unit", "transform": (4×4) world of this project from that of the other, "rms": of the registration, "detectable":
-        distance from which on a change is none of noise (95 %), "changed_area", "unmatched_area", "p05", "median", "p95"
+        distance from which on a change is none of noise (95 %), "changed_area": of connected patches that moved by more,
+        "unmatched_area", "p05", "median", "p95"
         of the distances, "classes": [{"name", "before", "after", "change", "change_low", "change_high"}], "label_revision" and
         "other_label_revision": of the marks that the classes of the two are from, or None, "files"}
     Raises:
@@ -108,11 +111,9 @@ def summary(now: Subject, before: Subject, registered: Registered, distance: np.
     than half of the surface leave alone."""
     found = distance[np.isfinite(distance)]
     noise = 1.4826 * float(np.median(np.abs(found - np.median(found))))
-    detectable = K * noise
-    vertices, faces = now.surface.vertices.astype(np.float64), now.surface.faces
-    area, each = areas(vertices, faces), distance[faces]
-    with np.errstate(invalid="ignore"):
-        moved = (np.abs(each) > detectable).all(1)
+    detectable = max(K * noise, registered.rms, LEAST_VOXELS * now.voxel)
+    area = areas(now.surface.vertices.astype(np.float64), now.surface.faces)
+    moved = moved_faces(now.surface.faces, area, distance, detectable, LEAST_CELLS * now.voxel**2)
     p05, middle, p95 = np.quantile(found, (0.05, 0.5, 0.95)).tolist()
     return {
         "unit": "m" if now.metric else "scene units",
@@ -120,7 +121,7 @@ def summary(now: Subject, before: Subject, registered: Registered, distance: np.
         "rms": registered.rms,
         "detectable": detectable,
         "changed_area": float(area[moved].sum()),
-        "unmatched_area": float(area[~np.isfinite(each).all(1)].sum()),
+        "unmatched_area": float(area[~np.isfinite(distance[now.surface.faces]).all(1)].sum()),
         "p05": p05,
         "median": middle,
         "p95": p95,
@@ -128,6 +129,24 @@ def summary(now: Subject, before: Subject, registered: Registered, distance: np.
         "label_revision": now.label_revision,
         "other_label_revision": before.label_revision,
     }
+
+
+def moved_faces(
+    faces: np.ndarray, area: np.ndarray, distance: np.ndarray, detectable: float, least: float
+) -> np.ndarray:
+    """The faces (F,) bool of which every vertex moved by more than `detectable`, all to one side, in connected patches of an
+    area of at least `least`: noise goes far here and there, but not as a patch.
+
+    Args:
+        area: (F,) of the faces (F, 3); distance: (V,) of the vertices, NaN where there is none.
+    """
+    moved, each = np.zeros(len(faces), bool), distance[faces]
+    for side in (each, -each):
+        with np.errstate(invalid="ignore"):
+            own = np.flatnonzero((side > detectable).all(1))
+        part = components(faces[own], len(distance))
+        moved[own] = (np.bincount(part, area[own]) >= least)[part]
+    return moved
 
 
 def class_changes(now: Subject, before: Subject, scale: float) -> list[dict[str, Any]]:

@@ -12,15 +12,16 @@ from fieldwork.nerfcore.errors import InputError, ProjectError
 from fieldwork.nerfcore.files import write_json
 from fieldwork.nerfcore.geometry.registration import by_points, by_surfaces
 from fieldwork.nerfcore.geometry.similarity import make_similarity, similarity_scale, transform_points
-from fieldwork.nerfcore.measure.epochs import compare, distance_colors
+from fieldwork.nerfcore.measure.epochs import compare, distance_colors, moved_faces
 from fieldwork.nerfcore.mesh.metrics import sample_surface
 from fieldwork.nerfcore.mesh.stored import mesh_folder
-from fieldwork.nerfcore.mesh.triangles import cross, unit
+from fieldwork.nerfcore.mesh.triangles import areas, cross, unit
 from fieldwork.nerfcore.params import CompareParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.runs import MEASURES
 from fieldwork.nerfcore.project.schema import Project
 from fieldwork.nerfcore.project.store import save_project
+from fieldwork.tests.nerfcore.support.flat import wall_mesh
 from fieldwork.tests.nerfcore.support.meshed import CLASSES, store_mesh
 from scipy.spatial.transform import Rotation
 
@@ -71,6 +72,34 @@ def test_two_epochs_are_registered_and_what_grew_is_found(tmp_path: Path) -> Non
     drawn = next(Path(file) for file in result["files"] if file.endswith("distance_top.svg"))
     assert f"noise ±{1000 * result['detectable']:.3g} mm (95 %)" in drawn.read_text(encoding="utf-8")
     assert json.loads((tmp_path / "out" / "compare.json").read_text())["rms"] == result["rms"]
+
+
+def test_a_mesh_compared_with_itself_has_not_changed(tmp_path: Path) -> None:
+    now = epoch(tmp_path / "now", np.eye(4), 0)
+    result = compare(CompareParams(project=now, other=now, views=[]), Reporter())
+    assert result["changed_area"] == 0
+    assert 0.001 <= result["detectable"] < 0.002  # a tenth of a cell, or what registering leaves
+    # Of two reconstructions of what did not change, next to nothing.
+    before = epoch(tmp_path / "before", np.eye(4), 1)
+    result = compare(CompareParams(project=now, other=before, views=[]), Reporter())
+    assert result["changed_area"] < 0.01 * 20
+
+
+def test_patches_that_moved_to_one_side_count() -> None:
+    vertices, faces, _ = wall_mesh(10, 0.5)  # 10 × 10 squares of 0.1, two triangles each
+    area = areas(vertices, faces)
+    distance = np.full(len(vertices), 0.001)
+    x, y, _ = vertices.T
+    distance[(x < -0.15) & (y < -0.15)] = -0.02
+    distance[np.hypot(x - 0.4, y - 0.4) < 0.11] = 0.02
+    distance[x > 0.45] = np.nan
+    moved = moved_faces(faces, area, distance, 0.01, 0.05)
+    assert area[moved].sum() == pytest.approx(0.3**2)
+    assert moved_faces(faces, area, distance, 0.01, 0.0).sum() > moved.sum()  # the small one too
+    assert not moved_faces(faces, area, distance, 0.01, 0.1).any()
+    # Two patches that moved to different sides are not one.
+    distance = np.where(x < 0.05, 0.02, -0.02)
+    assert area[moved_faces(faces, area, distance, 0.01, 0.45)].sum() == pytest.approx(0.5)
 
 
 def test_changes_of_measured_areas_have_intervals(tmp_path: Path) -> None:

@@ -154,7 +154,9 @@ def _measured(rows: list[dict[str, Any]], measures: dict[str, Any], title: str) 
 
 
 def _distances(measures: dict[str, Any]) -> Section:
-    unit = "m" if measures.get("unit") == "m" else "units"
+    metric, distances = measures.get("unit") == "m", measures.get("distances", [])
+    # Measures of earlier versions have differences between scene units and metres.
+    differences = [d["difference"] if metric else None for d in distances]
     rows = [
         [
             d["name"],
@@ -162,18 +164,24 @@ def _distances(measures: dict[str, Any]) -> Section:
             f"{d['length']:.4f}",
             f"{d['low']:.4f} … {d['high']:.4f}",
             "" if d["known"] is None else f"{d['known']:.4f}",
-            "" if d["difference"] is None else f"{1000 * d['difference']:+.1f} mm",
+            "" if difference is None else f"{1000 * difference:+.1f} mm",
         ]
-        for d in measures.get("distances", [])
+        for d, difference in zip(distances, differences)
     ]
-    checks = [d["difference"] for d in measures.get("distances", []) if d["use"] == "check"]
-    checks = [difference for difference in checks if difference is not None]
     text = "Distances marked “check” were not used for scaling."
-    if unit != "m":
+    if not metric:
         text += " The scale is not known: nothing is held against metres."
+    checks = [x for d, x in zip(distances, differences) if d["use"] == "check" and x is not None]
     if checks:
         text += f" Root mean square of their differences: {1000 * float(np.sqrt(np.mean(np.square(checks)))):.1f} mm."
-    columns = ["distance", "use", f"measured ({unit})", "95 % interval", "known (m)", "difference"]
+    columns = [
+        "distance",
+        "use",
+        f"measured ({'m' if metric else 'units'})",
+        "95 % interval",
+        "known (m)",
+        "difference",
+    ]
     return Section("Control distances", columns, rows, text)
 
 

@@ -215,6 +215,11 @@ def test_while_the_scale_is_not_known_nothing_is_held_against_metres(project: Pa
     assert written.rows[0][-2:] == ["2.5000", ""]
     assert "The scale is not known" in written.text
     assert "mean square" not in written.text
+    earlier = read_measures(project, "main") or {}
+    earlier["distances"][0]["difference"] = -1.5  # as earlier versions wrote it
+    (written,) = [table for table in sections(project, "main", {}, earlier) if "Control" in table.title]
+    assert written.rows[0][-1] == ""
+    assert "mean square" not in written.text
 
 
 def test_sizes_are_written_with_two_digits_of_their_uncertainty_and_no_exponent() -> None:

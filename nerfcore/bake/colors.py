@@ -95,11 +95,10 @@ def _colors(
 
 
 def _classes(probabilities: torch.Tensor) -> torch.Tensor:
-    """Most probable class, its probability, and second class (N, 3) uint8 of probabilities (N, K)."""
-    if probabilities.shape[1] == 1:
-        probabilities = torch.nn.functional.pad(probabilities, (0, 1))
-    value, number = probabilities.topk(2, 1)
-    return torch.stack([number[:, 0], stored_shares(value[:, 0]), number[:, 1]], 1).to(torch.uint8)
+    """Most probable class, its probability, and second class (N, 3) uint8 of probabilities (N, K); an only class is its own
+    second."""
+    value, number = probabilities.topk(min(2, probabilities.shape[1]), 1)
+    return torch.stack([number[:, 0], stored_shares(value[:, 0]), number[:, -1]], 1).to(torch.uint8)
 
 
 def stored_shares(probabilities: torch.Tensor) -> torch.Tensor:

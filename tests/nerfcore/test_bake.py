@@ -30,7 +30,7 @@ from fieldwork.nerfcore.data.camera_rays import CameraRays
 from fieldwork.nerfcore.errors import Cancelled, DiskError, ProjectError, SettingError
 from fieldwork.nerfcore.field.hybrid import Geometry
 from fieldwork.nerfcore.kernels.traversal import MarchSettings
-from fieldwork.nerfcore.kernels.voxel_field import VERTICES, cell_length
+from fieldwork.nerfcore.kernels.voxel_field import TEXELS, VERTICES, cell_length, texels_of
 from fieldwork.nerfcore.params import BakeParams, EvaluateParams, RenderParams, TrainParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.render import baked
@@ -97,6 +97,29 @@ def test_a_baked_ball_renders_to_its_closed_form() -> None:
     assert (found.label([3, 7])[solid] == 7).all()
     field = render_view(model, camera, pose, 1.0)
     assert np.abs(found.depth - field.depth)[solid].max() < 0.05
+
+
+class PlainBall(DirectedBall):
+    """The same with one class only."""
+
+    classes = 1
+
+    def logits(self, geometry: Geometry) -> torch.Tensor:
+        return torch.zeros(len(geometry.density), 1)
+
+
+def test_a_field_with_one_class_names_no_other() -> None:
+    model = ball_model(64)
+    model.field = PlainBall()  # type: ignore[assignment]
+    camera, pose = view()
+    baked_ball = bake_model(model, 16)
+    named = texels_of(baked_ball.field.vertices, TEXELS)[:, 1, ::2]
+    assert named.max() == 0, "load_baked refuses classes that are not there"
+    found = render_view(baked_ball, camera, pose, 1.0)
+    solid = found.opacity > 0.9
+    assert solid.sum() > 100
+    assert (found.label([7])[solid] == 7).all()
+    assert found.confidence()[solid] == pytest.approx(found.opacity[solid], abs=1e-3)
 
 
 def opaque_ball() -> Model:

@@ -71,11 +71,9 @@ def camera_at(scene: bpy.types.Scene, number: int, width: int, height: int, owne
         layer = scene.view_layers[0]
         layer.update()  # a layer that no window shows is behind, or has not been evaluated at all
         evaluated = scene.camera.evaluated_get(layer.depsgraph)
-        # A scaled parent must not scale the camera's axes.
+        # A scaled parent must not scale the camera's axes; what is mirrored stays so.
         capture_from_scene = scene_from_capture(scene, owner).inverted_safe()
-        location, rotation, _ = (capture_from_scene @ evaluated.matrix_world).decompose()
-        matrix = rotation.to_matrix().to_4x4()
-        matrix.translation = location
+        matrix = (capture_from_scene @ evaluated.matrix_world).normalized()
         aspect = scene.render.pixel_aspect_x, scene.render.pixel_aspect_y
         lens = intrinsics(evaluated.data, width, height, aspect)
     finally:

@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import bpy
-from mathutils import Matrix
 
 from ..errors import SceneError
 from ..scene.lens import pinhole
@@ -101,9 +100,8 @@ def _aperture(camera: bpy.types.Object) -> dict[str, Any] | None:
 
 
 def pose(camera: bpy.types.Object) -> list[list[float]]:
-    """Scene from camera, without the scale of the camera or its parents."""
-    location, rotation, _ = camera.matrix_world.decompose()
-    return [list(row) for row in Matrix.LocRotScale(location, rotation, None)]
+    """Scene from camera, without the scale of the camera or its parents; mirrored where the camera is, as Blender has it."""
+    return [list(row) for row in camera.matrix_world.normalized()]
 
 
 def shutter_times(render: Any, frame: float) -> list[float]:

@@ -12,7 +12,7 @@ from fieldwork.tests.addon.support import SETUP, make_project
 @pytest.mark.parametrize("fit", ["AUTO", "HORIZONTAL", "VERTICAL"])
 def test_scene_camera_as_pixels_agrees_with_blender(bpy_script, tmp_path, width, height, fit):
     """Blender's own projection of a point, and that through the exported intrinsics, meet, also where pixels are not
-    square."""
+    square, and where the camera is scaled or mirrored."""
     facts = bpy_script(
         SETUP
         + """
@@ -23,20 +23,20 @@ scene.render.resolution_x, scene.render.resolution_y = width, height
 camera = scene.camera
 camera.data.sensor_fit, camera.data.lens = fit, 41.0
 camera.data.shift_x, camera.data.shift_y = 0.11, -0.07
-camera.scale = (2, 2, 2)
-bpy.context.view_layer.update()
 file = Path(folder, "cameras.json")
 seen = []
-for aspect in ((1, 1), (2, 1), (1, 1.5)):
+for aspect, scale in (((1, 1), (2, 2, 2)), ((2, 1), (1, 2, 3)), ((1, 1.5), (1, 1, 1)), ((1, 1), (-1, 1, 1))):
     scene.render.pixel_aspect_x, scene.render.pixel_aspect_y = aspect
+    camera.scale = scale
+    bpy.context.view_layer.update()
     for _ in write_cameras(file, scene, False, (0, 0)):
         pass
     frame = json.loads(file.read_text())["frames"][0]
     for point in (Vector((0, 0, 0)), Vector((1, 0.5, -0.3)), Vector((-0.8, 0.2, 1.0))):
-        x, y, _ = world_to_camera_view(scene, camera, point)
+        x, y, depth = world_to_camera_view(scene, camera, point)
         p = Matrix(frame["transform_matrix"]).inverted() @ point
-        mine = [frame["cx"] + frame["fl_x"] * p.x / -p.z, frame["cy"] - frame["fl_y"] * p.y / -p.z]
-        seen.append([[x * width, (1 - y) * height], mine])
+        mine = [frame["cx"] + frame["fl_x"] * p.x / -p.z, frame["cy"] - frame["fl_y"] * p.y / -p.z, -p.z]
+        seen.append([[x * width, (1 - y) * height, depth], mine])
 answer(seen)
 """,
         width=width,

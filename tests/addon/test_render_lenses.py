@@ -28,6 +28,7 @@ cases = {
     "orthographic, shifted": dict(kind="ORTHO", shift=(0.1, 0.2), aspect=(1, 1.5)),
     "orthographic, vertical": dict(kind="ORTHO", fit="VERTICAL", size=(80, 120)),
     "scaled": dict(scale=(2, 3, 0.5)),
+    "mirrored": dict(scale=(-1, 1, 1)),
 }
 asked, frame, errors = engine.frames().render, None, {}
 def noted(*args):
@@ -62,7 +63,7 @@ answer(errors)
 def test_points_are_where_blender_projects_them(bpy_script, ball, tmp_path):
     """For each camera setting, the point that a pixel shows is projected by Blender into this pixel."""
     errors = bpy_script(PROJECTED, project=ball, folder=tmp_path)
-    assert len(errors) == 14
+    assert len(errors) == 15
     for name, (count, worst) in errors.items():
         assert count > 100, name
         assert worst < 0.5, name

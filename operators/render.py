@@ -45,8 +45,9 @@ def write_cameras(
     from ..nerfcore.files import write_json  # not at the top: enabling the extension must be quick
 
     place, render = Held(bpy.data.scenes, scene), scene.render
-    width = size[0] or round(render.resolution_x * render.resolution_percentage / 100)
-    height = size[1] or round(render.resolution_y * render.resolution_percentage / 100)
+    # As Blender: 33 % of 1920 pixels are 633, not 634.
+    width = size[0] or render.resolution_x * render.resolution_percentage // 100
+    height = size[1] or render.resolution_y * render.resolution_percentage // 100
     numbers = [scene.frame_current]
     if animated:
         numbers = list(range(scene.frame_start, scene.frame_end + 1, scene.frame_step))

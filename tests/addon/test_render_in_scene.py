@@ -48,6 +48,34 @@ answer(seen)
         assert mine == pytest.approx(blender, abs=0.01)
 
 
+def test_a_render_has_as_many_pixels_as_blenders_own(bpy_script, tmp_path):
+    """33 % of 1920 × 1080: Blender cuts off what is left over."""
+    facts = bpy_script(
+        SETUP
+        + """
+from fieldwork.operators.render import write_cameras
+seen = []
+class Asked(bpy.types.RenderEngine):
+    bl_idname = "ASKED"
+    bl_label = "Asked"
+    def render(self, depsgraph):
+        seen.append([self.resolution_x, self.resolution_y])
+bpy.utils.register_class(Asked)
+render = scene.render
+render.engine = "ASKED"
+render.resolution_x, render.resolution_y, render.resolution_percentage = 1920, 1080, 33
+bpy.ops.render.render()
+file = Path(folder, "cameras.json")
+for _ in write_cameras(file, scene, False, (0, 0)):
+    pass
+frame = json.loads(file.read_text())["frames"][0]
+answer({"blender": seen[0], "fieldwork": [frame["w"], frame["h"]]})
+""",
+        folder=tmp_path,
+    )
+    assert facts["fieldwork"] == facts["blender"] == [633, 356]
+
+
 def test_animation_gives_a_frame_each_and_leaves_the_scene_where_it_was(bpy_script, tmp_path):
     facts = bpy_script(
         SETUP

@@ -21,12 +21,14 @@ class Triangles(NamedTuple):
 
 
 def triangles(depsgraph: Any) -> Triangles:
-    """The triangles of all that is rendered, but for surfaces of captures, which are what the field shows itself."""
+    """The triangles of all that a camera sees, but for surfaces of captures, which are what the field shows itself."""
     vertices, faces, count = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.int32)], 0
     holdout = [np.zeros(0, bool)]
     for instance in depsgraph.object_instances:
         obj = instance.object
         if obj.type not in SOLID or not instance.show_self or obj.hide_render or ROLE in obj.original:
+            continue
+        if not _is_seen(instance):
             continue
         places, corners = mesh_of(obj)
         matrix = np.array(instance.matrix_world, np.float32)
@@ -50,6 +52,11 @@ def mesh_of(obj: Any) -> tuple[np.ndarray, np.ndarray]:
     mesh.loop_triangles.foreach_get("vertices", corners)
     obj.to_mesh_clear()
     return places.reshape(-1, 3), corners.reshape(-1, 3)
+
+
+def _is_seen(instance: Any) -> bool:
+    """Whether cameras see an instance of the depsgraph (Ray Visibility), rather than only its shadow or its reflection."""
+    return instance.object.visible_camera and (instance.parent is None or instance.parent.visible_camera)
 
 
 def is_holdout(instance: Any, view_layer: Any) -> bool:

@@ -250,6 +250,32 @@ answer(facts)
     assert facts["place"] == pytest.approx([1.1, 1.3, 2.5], abs=1e-5)
 
 
+def test_objects_that_no_camera_sees_do_not_hide_the_field(bpy_script, ball, tmp_path):
+    facts = bpy_script(
+        START
+        + """
+from fieldwork.addon.live.objects import triangles
+def count():
+    bpy.context.view_layer.update()
+    return len(triangles(bpy.context.evaluated_depsgraph_get()).faces)
+bpy.data.objects["before"].visible_camera = False
+facts = {"one less": count()}
+group = bpy.data.collections.new("group")
+group.objects.link(bpy.data.objects["through"])
+placed = bpy.data.objects.new("placed", None)
+placed.instance_type, placed.instance_collection = "COLLECTION", group
+scene.collection.objects.link(placed)
+facts["instance"] = count()
+placed.visible_camera = False
+facts["hidden instance"] = count()
+answer(facts)
+""",
+        project=ball,
+        folder=tmp_path,
+    )
+    assert facts == {"one less": 4, "instance": 6, "hidden instance": 4}
+
+
 def test_holdouts_cut_the_field(bpy_script, ball, tmp_path):
     """A holdout before the field leaves nothing of it, one within only what is before it; at edges, too, against 32 times the
     resolution. Its collection may be what makes it one, also in the field's scene."""

@@ -8,12 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 
 from ..data.box import Box, box_poses
 from ..data.load import class_inputs, load_scene, view_inputs
 from ..data.pixels import training_size
+from ..data.readers.transforms import frame_camera
 from ..data.scene import Scene, View
-from ..errors import InputError, SettingError
+from ..errors import InputError, SettingError, wrong_value
 from ..files import atomic_path, disk_errors, write_json
 from ..geometry.cameras import Camera, flip_camera_axes
 from ..geometry.frames import focus_point
@@ -48,7 +50,6 @@ from .sparse_rays import sparse_rays
 
 OF_CLASSES = ("semantic", "confidence")  # passes
 ORBIT_PIXELS = 800  # longest side of orbit frames unless a size is asked for
-# Not tuned:
 
 
 def render(params: RenderParams, report: Reporter, shown: Model | BakedField | None = None) -> dict[str, Any]:
@@ -190,35 +191,47 @@ def chosen_cameras(params: RenderParams, scene: Scene) -> list[tuple[str, Camera
 
 
 def read_cameras(path: Path) -> list[tuple[str, Camera, np.ndarray]]:
-    """Cameras of a transforms.json-like file in the world frame: OpenGL axes, intrinsics per file or per frame.
+    """Cameras of a transforms.json-like file in the world frame: OpenGL axes, lenses per file or per frame.
 
     Raises:
-        InputError: the file is missing, not JSON, or lacks a key.
+        InputError: the file is missing, not JSON, has no frames, or one of them has no lens or pose.
     """
+    needed = "It needs w, h, fl_x and frames with transform_matrix."
     try:
         data = json.loads(Path(path).read_text(encoding="utf-8"))
-        places, poses = [], []
-        for number, frame in enumerate(data["frames"]):
-            lens = {**data, **frame}
-            width, height = int(lens["w"]), int(lens["h"])
-            fx = lens.get("fl_x") or width / 2 / np.tan(lens["camera_angle_x"] / 2)
-            camera = Camera(
-                width=width,
-                height=height,
-                fx=fx,
-                fy=lens.get("fl_y", fx),
-                cx=lens.get("cx", width / 2),
-                cy=lens.get("cy", height / 2),
-            )
-            places.append(str(frame.get("file_path", f"{number:04d}")))
-            poses.append((camera, flip_camera_axes(np.array(frame["transform_matrix"], np.float64))))
-        return [(name, *posed) for name, posed in zip(frame_names(places), poses)]
+        frames = [{**data, **frame} for frame in data["frames"]]
+        posed = [_posed(frame) for frame in frames]
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}.", "Give a cameras file.") from error
-    except (json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
-        raise InputError(
-            f"{path} is not a cameras file: {error!r}.", "It needs w, h, fl_x and frames with transform_matrix."
-        ) from error
+    except KeyError as error:
+        raise InputError(f"{path} is not a cameras file: “{error.args[0]}” is missing.", needed) from error
+    except ValidationError as error:
+        raise InputError(f"{path} is not a cameras file: {wrong_value(error.errors()[0])}.", needed) from error
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{path} is not a cameras file: {error}.", needed) from error
+    except InputError as error:
+        raise InputError(f"{path}: {error.message}", error.hint) from error
+    if not posed:
+        raise InputError(f"{path} has no frames.", needed)
+    places = [str(frame.get("file_path", f"{number:04d}")) for number, frame in enumerate(frames)]
+    return [(name, *camera) for name, camera in zip(frame_names(places), posed)]
+
+
+def _posed(frame: dict[str, Any]) -> tuple[Camera, np.ndarray]:
+    """Lens and pose of a frame. Raises KeyError, TypeError, ValueError, InputError: it lacks one."""
+    given = {name: value for name, value in frame.items() if value is not None}
+    camera = frame_camera(given, int(given["w"]), int(given["h"]))
+    if not (np.isfinite([camera.fx, camera.fy, camera.cx, camera.cy]).all() and min(camera.fx, camera.fy) > 0):
+        raise ValueError(f"a focal length of {camera.fx:g} pixels cannot be")
+    pose = np.array(given["transform_matrix"], np.float64)
+    if pose.shape not in ((3, 4), (4, 4)) or not np.isfinite(pose).all():
+        raise ValueError("a “transform_matrix” is not 4 × 4 numbers")
+    u, size, vt = np.linalg.svd(pose[:3, :3])
+    if size[2] <= 1e-6 * size[0]:
+        raise ValueError("a “transform_matrix” scales to nothing")
+    found = np.eye(4)
+    found[:3, :3], found[:3, 3] = u @ vt, pose[:3, 3]  # directions have unit length, whatever the scale of the camera
+    return camera, flip_camera_axes(found)
 
 
 def orbit_cameras(scene: Scene, count: int) -> list[tuple[str, Camera, np.ndarray]]:

@@ -64,7 +64,10 @@ class Frame:
         return self.opacity * 0 if self.probabilities is None else self.probabilities.max(-1)
 
     def normal(self) -> np.ndarray:
-        """Surface normal (H, W, 3) in the normalised frame from neighbouring surface points; 0 where nothing is."""
+        """Surface normal (H, W, 3) in the normalised frame from neighbouring surface points; 0 where nothing is, and in a
+        picture of one row or column, whose points have no neighbours."""
+        if min(self.opacity.shape) < 2:
+            return np.zeros_like(self.position)
         dy, dx = np.gradient(self.position, axis=(0, 1))
         normal = np.cross(dx, dy)
         length = np.linalg.norm(normal, axis=-1, keepdims=True)

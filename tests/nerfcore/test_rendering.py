@@ -119,6 +119,14 @@ def test_depth_labels_and_normals_of_the_ball() -> None:
     assert frame.normal()[20, 24] @ toward > 0.97
 
 
+@pytest.mark.parametrize("size", [(1, 1), (1, 40), (48, 1)])
+def test_a_picture_may_have_one_row_or_column(size: tuple[int, int]) -> None:
+    camera, pose = view()
+    frame = render_view(ball_model(32), camera.reframed(*size), pose, 1.0)
+    assert frame.normal().shape == (size[1], size[0], 3)
+    assert not frame.normal().any()
+
+
 def test_an_empty_field_is_background() -> None:
     camera, pose = view()
     model = ball_model(8)

@@ -28,7 +28,7 @@ class Frame:
     """One rendered view, numpy, (H, W, …).
 
     picture: sRGB float32 with associated alpha, nothing behind it; background: the grey that `color` has behind it, or the
-    environment (3); opacity; depth: distance along the optical axis in normalised units,
+    environment (3); opacity; depth: distance along the optical axis, of a panorama along the ray, in normalised units,
     NaN where nothing is; probabilities (K) or None; position (3) expected surface point in the normalised frame;
     unknown: share of the ray's way, up to what it meets, that no training photo shows, or None where not asked for.
     Where nothing is for a share above 0 the field does not say that there is nothing.
@@ -123,7 +123,8 @@ def render_view(
         opacity = out.opacity * valid
         distance = torch.where(opacity > least, out.depth / out.opacity.clamp(min=least), torch.nan)
         color = torch.cat([out.color * valid[:, None], opacity[:, None]], 1)
-        found = [color, distance * (directions @ axis), origins + directions * distance[:, None]]
+        depth = distance if camera.model == "EQUIRECTANGULAR" else distance * (directions @ axis)
+        found = [color, depth, origins + directions * distance[:, None]]
         if states is not None:
             solid = torch.where(opacity > 0.5, distance, torch.nan)
             found.append(unknown_share(states, contracted, origins, directions, solid))

@@ -57,8 +57,8 @@ def render(params: RenderParams, report: Reporter, shown: Model | BakedField | N
 
     `shown` is rendered in the place of the run's field.
 
-    Depth PNGs are coloured for viewing, and NAME_depth.json says what the colours mean; the EXR holds the values: depth in world units along the optical axis, class
-    ids, confidence, world-space normals.
+    Depth PNGs are coloured for viewing, and NAME_depth.json says what the colours mean; the EXR holds the values: depth in world
+    units along the optical axis, of a panorama along the ray, class ids, confidence, world-space normals.
 
     Returns:
         {"frames": [paths], "ms_per_frame", "label_revision": of the marks that classes are from, or None}

@@ -119,6 +119,15 @@ def test_depth_labels_and_normals_of_the_ball() -> None:
     assert frame.normal()[20, 24] @ toward > 0.97
 
 
+def test_depths_of_a_panorama_are_distances() -> None:
+    """From the middle of the ball all is as far, also what is behind the camera."""
+    camera = Camera(model="EQUIRECTANGULAR", width=40, height=20, fx=20, fy=20, cx=20, cy=10)
+    frame = render_view(ball_model(96), camera, np.eye(4), 1.0)
+    assert frame.opacity.min() > 0.8
+    middle = (1 - math.exp(-DENSITY * RADIUS) * (1 + DENSITY * RADIUS)) / DENSITY / (1 - math.exp(-DENSITY * RADIUS))
+    assert frame.depth == pytest.approx(np.full((20, 40), middle), rel=0.2)  # a ray has 96 samples in coarse cells
+
+
 @pytest.mark.parametrize("size", [(1, 1), (1, 40), (48, 1)])
 def test_a_picture_may_have_one_row_or_column(size: tuple[int, int]) -> None:
     camera, pose = view()

@@ -268,6 +268,27 @@ def test_sparse_points_come_along(truth: tuple[list[DatasetView], Matches], tmp_
     assert np.allclose(scene.points.xyz, transform_points(frame, np.array([[1.5, 2.5, 3.5]])))
 
 
+def test_panoramas_of_metashape_are_imported(tmp_path: Path) -> None:
+    """Its spherical sensors have no calibration."""
+    folder = tmp_path / "set"
+    folder.mkdir()
+    cameras = ""
+    for number in range(3):
+        Image.new("RGB", (200, 100), (90, 80, 70)).save(folder / f"p{number}.png")
+        matrix = np.eye(4)
+        matrix[0, 3] = number
+        pose = " ".join(map(str, matrix.ravel()))
+        cameras += f'<camera id="{number}" sensor_id="0" label="p{number}"><transform>{pose}</transform></camera>'
+    (folder / "cameras.xml").write_text(
+        '<document version="1.5.0"><chunk label="Chunk 1"><sensors><sensor id="0" type="spherical">'
+        f'<resolution width="200" height="100"/></sensor></sensors><cameras>{cameras}</cameras></chunk></document>'
+    )
+    import_dataset(ImportParams(dataset=folder, project=tmp_path / "p"), Reporter())
+    camera = load_scene(tmp_path / "p").views[0].camera
+    assert (camera.model, camera.width, camera.height) == ("EQUIRECTANGULAR", 200, 100)
+    assert camera.undistorted().fx == 100, "an orbit sees 90° of it"
+
+
 def test_rotated_photo_keeps_the_pixels_its_pose_is_for(shared_data: Data, tmp_path: Path) -> None:
     folder = tmp_path / "set"
     folder.mkdir()

@@ -137,9 +137,8 @@ def _camera(sensor: ElementTree.Element, size: tuple[int, int], path: Path) -> C
     width, height = int(resolution.get("width", 0)), int(resolution.get("height", 0))
     kind = sensor.get("type", "frame")
     if kind == "spherical":
-        return Camera(
-            model="EQUIRECTANGULAR", width=size[0], height=size[1], fx=1, fy=1, cx=size[0] / 2, cy=size[1] / 2
-        )
+        (w, h), focal = size, size[0] / 2  # as in transforms.json: no ray depends on it
+        return Camera(model="EQUIRECTANGULAR", width=w, height=h, fx=focal, fy=focal, cx=w / 2, cy=h / 2)
     if calibration is None:
         raise InputError(f"{path}: a sensor has no calibration.", "Align the photos in Metashape and export again.")
     values = {child.tag: float(child.text) for child in calibration if child.text and child.tag != "resolution"}

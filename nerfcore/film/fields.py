@@ -18,7 +18,7 @@ from ..kernels.traversal import BEFORE_CUBE, PDF_UNIFORM
 from ..mesh.stored import MESH, mesh_folder
 from ..progress import Reporter
 from ..project.runs import INSTANCES, checkpoint_id
-from ..project.store import load_project
+from ..project.store import PROJECT_FILE, load_project
 from ..render.baked import META, BakedField, load_baked, voxels_folder
 from ..render.fused import ray_renderer
 from ..render.image import LEAST
@@ -126,7 +126,9 @@ class FieldStore:
     def field(self, item: FieldItem, report: Reporter) -> LoadedField:
         """The field of an item. Raises ProjectError."""
         folder = item.project
-        state = [checkpoint_id(folder, item.run), (folder / "project.json").stat().st_mtime_ns]
+        if not (folder / PROJECT_FILE).is_file():
+            load_project(folder)  # says what is not there
+        state = [checkpoint_id(folder, item.run), (folder / PROJECT_FILE).stat().st_mtime_ns]
         if item.baked:
             meta = voxels_folder(folder, item.run) / META
             beside = [mesh_folder(folder, item.run) / name for name in (MESH, INSTANCES)]

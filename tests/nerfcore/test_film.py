@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fieldwork.nerfcore.errors import ProjectError
 from fieldwork.nerfcore.film.cryptomatte import id_of
 from fieldwork.nerfcore.film.exposure import surface_normals
 from fieldwork.nerfcore.film.fields import FieldStore
@@ -133,6 +134,13 @@ def test_a_world_is_behind_all(ball: Path, store: FieldStore) -> None:
     found = take(ball, store, ["Combined"], world=(0.2, 0.4, 0.6))["Combined"]
     assert found[2, 2] == pytest.approx([0.2, 0.4, 0.6, 1.0], abs=0.01)
     assert found[..., 3] == pytest.approx(np.ones((H, W)), abs=1e-5)
+
+
+def test_a_project_that_was_moved_is_told(store: FieldStore, tmp_path: Path) -> None:
+    with pytest.raises(ProjectError, match="the folder is not there"):
+        take(tmp_path / "moved", store, ["Combined"])
+    with pytest.raises(ProjectError, match=r"no project\.json"):
+        take(tmp_path, store, ["Combined"])
 
 
 def test_normals_face_the_camera_and_stop_at_borders() -> None:

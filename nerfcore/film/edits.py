@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -18,6 +18,8 @@ from ..render import verb
 from ..render.baked import BakedField, BakedRays
 from .fields import FAR, LoadedField, PlacedField, light_left, load_field
 from .shot import ClassLook, FieldItem, Matrix
+
+Share = Annotated[float, Field(ge=0, le=1)]
 
 
 class Edit(BaseModel):
@@ -33,7 +35,7 @@ class Edit(BaseModel):
     class_name: str = Field(default="", alias="class")
     hide: bool = False
     opacity: float = Field(default=1.0, ge=0, le=1)
-    color: tuple[float, float, float] | None = None
+    color: tuple[Share, Share, Share] | None = None
     tint: float | None = Field(default=None, ge=0, le=1)
     move: Matrix | None = None
     copies: list[Matrix] = []
@@ -58,6 +60,8 @@ class Edit(BaseModel):
             raise ValueError("needs either “instance” or “class”")
         if self.class_name and (self.move is not None or self.copies):
             raise ValueError("only an instance can be moved or copied, not a class")
+        if self.instance and self.tint and self.color is None:
+            raise ValueError("the tint of an instance needs a “color”")
         return self
 
     def look(self, color: tuple[float, float, float]) -> ClassLook:

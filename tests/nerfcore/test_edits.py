@@ -154,6 +154,8 @@ def test_the_verb_edits_things_and_classes(things: Path, tmp_path: Path) -> None
         ('{"edits": [{"class": "top", "move": [[1]]}]}', "4 × 4|only an instance"),
         ('{"edits": [{"instance": "left", "copies": [[[0,0,0,0],[0,0,0,0],[0,0,0,0],[0,0,0,1]]]}]}', "nothing"),
         ('{"edits": [{"instance": "left", "colour": 1}]}', "colour"),
+        ('{"edits": [{"instance": "left", "color": [255, 128, 0]}]}', "color.*less than or equal to 1"),
+        ('{"edits": [{"instance": "left", "tint": 0.5}]}', "tint.*needs a “color”"),
         ('{"edits": [{"class": "sky", "hide": true}]}', "no class “sky”.*top, bottom"),
         ('{"edits": [{"instance": "cup", "hide": true}]}', "no thing “cup”"),
     ],

@@ -225,13 +225,16 @@ def world_color(world: bpy.types.World | None) -> tuple[float, float, float]:
     if world is None:
         return 0.0, 0.0, 0.0
     if world.node_tree is not None and world.use_nodes:
-        for node in world.node_tree.nodes:
-            if node.type == "BACKGROUND" and not node.mute:
-                color, strength = node.inputs[0], node.inputs[1]
-                if not color.is_linked and not strength.is_linked:
-                    red, green, blue = (channel * strength.default_value for channel in color.default_value[:3])
-                    return red, green, blue
-                return 0.0, 0.0, 0.0
+        output = world.node_tree.get_output_node("ALL")
+        links = output.inputs["Surface"].links if output is not None else ()
+        node = links[0].from_node if links else None
+        if node is None or node.type != "BACKGROUND" or node.mute:
+            return 0.0, 0.0, 0.0
+        color, strength = node.inputs["Color"], node.inputs["Strength"]
+        if color.is_linked or strength.is_linked:
+            return 0.0, 0.0, 0.0
+        red, green, blue = (channel * strength.default_value for channel in color.default_value[:3])
+        return red, green, blue
     red, green, blue = world.color
     return red, green, blue
 

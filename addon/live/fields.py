@@ -47,7 +47,16 @@ def parts(objects: Iterable[bpy.types.Object], is_shown: Callable[[bpy.types.Obj
 
 def rendered_parts(depsgraph: bpy.types.Depsgraph) -> list[Part]:
     """Those that a render shows."""
-    return parts(depsgraph.view_layer.objects, lambda obj: not obj.hide_render)
+    inside = in_rendered_collections(depsgraph.view_layer.layer_collection)
+    return parts(depsgraph.view_layer.objects, lambda obj: not obj.hide_render and obj.name_full in inside)
+
+
+def in_rendered_collections(layer: bpy.types.LayerCollection) -> set[str]:
+    """Full names of the objects in a collection of a view layer, or in one below it, that renders are not told to leave out."""
+    if layer.exclude or layer.collection.hide_render:
+        return set()
+    below = (in_rendered_collections(child) for child in layer.children)
+    return {obj.name_full for obj in layer.collection.objects}.union(*below)
 
 
 def rendered_items(depsgraph: bpy.types.Depsgraph) -> list[dict[str, Any]]:

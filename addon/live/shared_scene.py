@@ -61,11 +61,12 @@ def _share_markers(scene: bpy.types.Scene, made: bpy.types.Scene) -> None:
 
 
 def _share_collections(seen: Any, made: Any) -> None:
-    """Let the collections of a view layer be excluded, or holdouts, in another one where they are so in the first."""
+    """Let the collections of a view layer be excluded, holdouts or seen by light alone in another one where they are so in the
+    first."""
     for child in seen.children:
         other = made.children.get(child.name)
         if other is not None:
-            other.exclude, other.holdout = child.exclude, child.holdout
+            other.exclude, other.holdout, other.indirect_only = child.exclude, child.holdout, child.indirect_only
             _share_collections(child, other)
 
 

@@ -61,3 +61,55 @@ answer({"seen": seen, "opacity": own.classes[0].opacity})
         [[2, "gilding", False], [7, "wood", True]],
     ]
     assert facts["opacity"] == 0.5
+
+
+def test_fields_are_rendered_unless_their_collection_is_left_out(bpy_script, tmp_path):
+    seen = bpy_script(
+        SETUP
+        + FIELD
+        + """
+from fieldwork.addon.live.fields import rendered_parts
+outer, inner = bpy.data.collections.new("outer"), bpy.data.collections.new("inner")
+scene.collection.children.link(outer)
+outer.children.link(inner)
+scene.collection.objects.unlink(field)
+inner.objects.link(field)
+def count():
+    return len(rendered_parts(bpy.context.evaluated_depsgraph_get()))
+seen = [count()]
+outer.hide_render = True
+seen.append(count())
+outer.hide_render, inner.hide_render = False, True
+seen.append(count())
+inner.hide_render = False
+bpy.context.view_layer.layer_collection.children["outer"].exclude = True
+seen.append(count())
+scene.collection.objects.link(field)
+seen.append(count())
+answer(seen)
+""",
+        project=make_project(tmp_path / "capture"),
+    )
+    assert seen == [1, 0, 0, 0, 1]
+
+
+def test_the_background_is_that_of_the_node_at_the_worlds_output(bpy_script):
+    colors = bpy_script(
+        SETUP
+        + """
+from fieldwork.addon.live.engine import world_color
+world = bpy.data.worlds.new("sky")
+world.use_nodes = True
+nodes, links = world.node_tree.nodes, world.node_tree.links
+nodes.clear()
+unused, used = nodes.new("ShaderNodeBackground"), nodes.new("ShaderNodeBackground")
+output = nodes.new("ShaderNodeOutputWorld")
+unused.inputs[0].default_value, used.inputs[0].default_value = (1, 0, 0, 1), (0, 0.5, 0.25, 1)
+used.inputs[1].default_value = 2
+seen = [world_color(world)]
+links.new(used.outputs[0], output.inputs[0])
+seen.append(world_color(world))
+answer(seen)
+"""
+    )
+    assert colors == [[0, 0, 0], [0, 1, 0.5]]

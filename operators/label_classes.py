@@ -10,7 +10,7 @@ from bpy.types import Context, Operator
 
 from ..addon.errors import EngineError
 from ..addon.jobs.queue import queue
-from ..addon.labels import pending, session
+from ..addon.labels import journal, pending, session
 from ..addon.project import classes, lists, snapshot
 from ..addon.props import StringProperty
 from ..addon.text import t
@@ -85,8 +85,10 @@ class FIELDWORK_OT_class_add(ClassEdit):
     name: StringProperty(name="Name", description="Name of the class; empty: a number", options={"SKIP_SAVE"})
 
     def changed(self, settings: Any, known: list[dict[str, Any]]) -> list[dict[str, Any]]:
-        void = int((snapshot.project(snapshot.folder_of(settings)) or {}).get("ignore_id", 0))
-        taken = {value["id"] for value in known} | {void}
+        folder = snapshot.folder_of(settings)
+        void = int((snapshot.project(folder) or {}).get("ignore_id", 0))
+        # The marks of a class that was removed must not become those of the new one.
+        taken = {value["id"] for value in known} | {void} | journal.class_ids(folder)
         number = next(i for i in range(1, len(taken) + 2) if i not in taken)
         names = {value["name"] for value in known}
         name = self.name.strip() or t("Class {}", number)

@@ -44,6 +44,11 @@ def _parsed(lines: list[bytes]) -> list[dict[str, Any]]:
     return found
 
 
+def class_ids(folder: Path) -> set[int]:
+    """The ids of classes that marks name, also of classes that are gone and of marks that were undone."""
+    return {mark["class_id"] for mark in marks(folder) if mark.get("class_id") is not None}
+
+
 def shown(folder: Path) -> int:
     """The revision of the marks that the project shows; 0 has none."""
     newest = len(marks(folder))

@@ -7,6 +7,7 @@ marks/carried_DIGEST.npz   places (M, 3) in the frame of the poses, class_id (M,
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from ..progress import Reporter
 from ..project.fingerprints import array_digest
 from ..project.schema import SemanticClass
 from ..project.store import edit_project, load_project, world_from_sfm
-from .journal import FOLDER, Mark, append_mark, marks_at, read_marks, shown_revision
+from .journal import FOLDER, Mark, append_mark, marks_at, named_classes, read_marks, shown_revision
 from .preparation import Preparation, ensured
 from .revisions import computed
 
@@ -145,10 +146,11 @@ def classes_of(folder: Path, wanted: list[SemanticClass]) -> tuple[dict[int, int
     ids, added = {}, []
     with edit_project(folder) as project:
         known = {c.name: c.id for c in project.classes}
-        taken = {c.id for c in project.classes} | {project.ignore_id}
+        # The marks of a class that was removed must not become those of a new one.
+        taken = {c.id for c in project.classes} | {project.ignore_id} | named_classes(read_marks(folder))
         for one in wanted:
             if one.name not in known:
-                number = one.id if one.id not in taken else max(taken) + 1
+                number = one.id if one.id not in taken else next(i for i in count(1) if i not in taken)
                 project.classes.append(one.model_copy(update={"id": number}))
                 known[one.name] = number
                 taken.add(number)

@@ -188,6 +188,11 @@ def require_revision(revision: int, newest: int) -> None:
         raise InputError(f"There is no revision {revision} of the marks.", f"The newest is {newest}, 0 has no marks.")
 
 
+def named_classes(marks: list[Mark]) -> set[int]:
+    """The ids of the classes that marks name, whether the project still has them or not."""
+    return {mark.class_id for mark in marks if mark.class_id is not None}
+
+
 def marks_at(marks: list[Mark], revision: int) -> list[Mark]:
     """The marks of a revision, oldest first. Raises InputError where there is no such revision."""
     require_revision(revision, len(marks))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from fieldwork.nerfcore.labels.journal import append_mark
 from fieldwork.tests.addon.support import SETUP, make_posed_project
 from fieldwork.tests.addon.test_labels import project_with_labels
 
@@ -93,6 +94,23 @@ answer(seen)
     assert chosen == [1, "brush"]
     assert removed == [[1, "stone"], [3, "wood"], [4, "Class 4"], [5, "wood'"]]
     assert beyond == ["CANCELLED"]
+
+
+def test_a_new_class_does_not_take_over_the_marks_of_one_that_was_removed(bpy_script, tmp_path):
+    folder = make_posed_project(tmp_path / "p")
+    append_mark(folder, {"photo": "a", "shape": "line", "points": [(1, 1)], "class_id": 2})
+    added = bpy_script(
+        SETUP
+        + CLASSES
+        + """
+settings.class_index = 1
+bpy.ops.fieldwork.class_remove()
+bpy.ops.fieldwork.class_add(name="wood")
+answer([[entry.id, entry.name] for entry in settings.classes])
+""",
+        project=folder,
+    )
+    assert added == [[1, "stone"], [3, "wood"]]
 
 
 def test_edits_before_the_engine_answered_keep_the_added_class(bpy_script, tmp_path):

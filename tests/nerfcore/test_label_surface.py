@@ -11,8 +11,8 @@ from fieldwork.nerfcore.cli import main
 from fieldwork.nerfcore.errors import InputError, ProjectError
 from fieldwork.nerfcore.geometry.similarity import transform_points
 from fieldwork.nerfcore.labels.accept import accept
-from fieldwork.nerfcore.labels.carry import carry
-from fieldwork.nerfcore.labels.journal import read_marks
+from fieldwork.nerfcore.labels.carry import carry, classes_of
+from fieldwork.nerfcore.labels.journal import append_mark, read_marks
 from fieldwork.nerfcore.labels.preparation import Preparation, current
 from fieldwork.nerfcore.labels.propagate import propagate
 from fieldwork.nerfcore.labels.revisions import load
@@ -26,8 +26,9 @@ from fieldwork.nerfcore.params import (
     LabelStrokeParams,
 )
 from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.project.schema import SemanticClass
 from fieldwork.nerfcore.project.store import edit_project, load_project
-from fieldwork.tests.nerfcore.support.ball import RADIUS
+from fieldwork.tests.nerfcore.support.ball import RADIUS, ball_project
 from fieldwork.tests.nerfcore.test_labels import BOTTOM, TOP, ball, trained  # noqa: F401
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
@@ -184,6 +185,16 @@ def test_labels_of_an_earlier_epoch_are_carried_shown_as_such_and_confirmed(trai
     done = accept(LabelAcceptParams(project=now, seconds=1.0), Reporter())
     assert done["revision"] == 1
     assert sorted(done["classes"]) == sorted(c.name for c in load_project(before).classes)
+
+
+def test_carried_classes_get_ids_that_neither_classes_nor_marks_nor_void_have(tmp_path: Path) -> None:
+    folder = ball_project(tmp_path / "p", views=3)
+    append_mark(folder, {"photo": "00", "shape": "line", "points": [(1, 1)], "class_id": 3})
+    with edit_project(folder) as project:
+        project.ignore_id = 65535
+    grey = (0.5, 0.5, 0.5)
+    wanted = [SemanticClass(id=i, name=name, color=grey) for i, name in ((3, "brick"), (65535, "glass"), (7, "top"))]
+    assert classes_of(folder, wanted) == ({3: 4, 65535: 5, 7: TOP}, ["brick", "glass"])
 
 
 def test_epochs_that_do_not_fit_and_damaged_files_are_told(trained: Path, tmp_path: Path) -> None:  # noqa: F811

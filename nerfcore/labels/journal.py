@@ -16,7 +16,7 @@ from typing import Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from ..errors import InputError, ProjectError, wrong_value
+from ..errors import DiskError, InputError, ProjectError, wrong_value
 from ..files import disk_errors, write_json
 from ..project.schema import ImageName, OwnFile, now
 from ..project.store import locked
@@ -130,6 +130,8 @@ def append_mark(project: Path, values: dict[str, object]) -> Mark:
         marks = read_marks(project)
         sent = next((m for m in reversed(marks) if m.key and m.key == values.get("key")), None)
         if sent is not None:
+            if shown_revision(project, len(marks)) == sent.parent:  # killed between writing and showing it
+                _show(project, sent.revision)
             return sent
         mark = Mark.model_validate(
             {**values, "revision": len(marks) + 1, "parent": shown_revision(project, len(marks))}
@@ -137,13 +139,18 @@ def append_mark(project: Path, values: dict[str, object]) -> Mark:
         line = (mark.model_dump_json() + "\n").encode()
         with disk_errors(path):
             path.parent.mkdir(parents=True, exist_ok=True)
-            _append(path, line)
-        _show(project, mark.revision)
+            end = _append(path, line)
+            try:
+                _show(project, mark.revision)
+            except (DiskError, OSError):
+                os.truncate(path, end)
+                raise
     return mark
 
 
-def _append(path: Path, line: bytes) -> None:
-    """Append a line behind the whole lines of a file and fsync it; where that fails the file is as it was."""
+def _append(path: Path, line: bytes) -> int:
+    """Append a line behind the whole lines of a file and fsync it; where that fails the file is as it was. Returns where the
+    line begins."""
     with open(path, "ab+") as file:
         file.seek(0)
         end = _whole_lines(file.read())
@@ -155,6 +162,7 @@ def _append(path: Path, line: bytes) -> None:
         except OSError:
             os.truncate(path, end)
             raise
+    return end
 
 
 def shown_revision(project: Path, newest: int) -> int:

@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 from fieldwork.nerfcore.cli import main
 from fieldwork.nerfcore.errors import DiskError, InputError, ProjectError
+from fieldwork.nerfcore.labels import journal
 from fieldwork.nerfcore.labels.journal import FOLDER, JOURNAL, append_mark, marks_at, read_marks, show, shown_revision
 from fieldwork.nerfcore.labels.stroke import checkout, stroke
 from fieldwork.nerfcore.params import LabelCheckoutParams, LabelStrokeParams
@@ -152,6 +153,19 @@ def test_on_a_full_disk_nothing_is_appended(tmp_path: Path, monkeypatch: pytest.
     assert append_mark(tmp_path, LINE).revision == 2
 
 
+def test_a_mark_that_cannot_be_shown_is_not_appended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    append_mark(tmp_path, LINE)
+
+    def full(*_: object) -> None:
+        raise DiskError("No space left on the disk.")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(journal, "write_json", full)
+        with pytest.raises(DiskError, match="No space left"):
+            append_mark(tmp_path, LINE)
+    assert len(read_marks(tmp_path)) == 1
+
+
 @pytest.fixture
 def ball(tmp_path: Path) -> Path:
     return ball_project(tmp_path / "p", views=4)
@@ -234,6 +248,12 @@ def test_a_mark_that_is_sent_twice_is_one_mark(tmp_path: Path) -> None:
     other = append_mark(tmp_path, {**LINE, "key": "b"})
     assert append_mark(tmp_path, {**LINE, "key": "a"}) == first
     assert read_marks(tmp_path) == [first, other]
-    assert [append_mark(tmp_path, LINE).revision, append_mark(tmp_path, LINE).revision] == [3, 4], (
+    assert shown_revision(tmp_path, 2) == 2
+    # A process that was killed behind the journal has not shown it: whoever sends it again sees it, and marks grow from it.
+    third = append_mark(tmp_path, {**LINE, "key": "c"})
+    show(tmp_path, 2)
+    assert append_mark(tmp_path, {**LINE, "key": "c"}) == third
+    assert shown_revision(tmp_path, 3) == 3
+    assert [append_mark(tmp_path, LINE).revision, append_mark(tmp_path, LINE).revision] == [4, 5], (
         "without a key each is one"
     )

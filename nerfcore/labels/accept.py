@@ -91,6 +91,8 @@ def accept(params: LabelAcceptParams, report: Reporter) -> dict[str, Any]:
             if image.name in known:
                 image.label = f"{MAPS.format(labelling.revision)}/{image.name}.png"
                 image.confidence = f"{MAPS.format(labelling.revision)}/confidence/{image.name}.png"
+            elif image.label and is_accepted(image.label):  # held out now: the maps of before are removed
+                image.label = image.confidence = None
         edited.record("label accept", params.model_dump(mode="json"), result)
     for other in (folder / "labels").glob(MAPS.format("*").split("/")[1]):
         if other != maps:

@@ -39,7 +39,7 @@ from fieldwork.nerfcore.params import (
     TrainParams,
 )
 from fieldwork.nerfcore.progress import Reporter
-from fieldwork.nerfcore.project.runs import CHECKPOINT, checkpoint_id, geometry_id, run_folder
+from fieldwork.nerfcore.project.runs import CHECKPOINT, INFO, checkpoint_id, geometry_id, run_folder
 from fieldwork.nerfcore.project.store import edit_project, load_project
 from fieldwork.nerfcore.render.run import load_trained
 from fieldwork.nerfcore.render.verb import render
@@ -253,6 +253,24 @@ def test_accepted_labels_are_the_fields_and_renders_name_the_revision(ball: Path
     assert next(i for i in load_project(ball).images if i.name == own).label == f"labels/{own}.png"
     assert not (ball / MAPS.format(2)).exists()
     assert (ball / MAPS.format(3)).is_dir()
+
+
+def test_photos_that_another_run_holds_out_lose_the_maps_that_were_accepted_before(ball: Path) -> None:
+    two_strokes(ball)
+    spread(ball)
+    accept(LabelAcceptParams(project=ball, seconds=0.1), Reporter())
+    shutil.copytree(run_folder(ball, "main"), run_folder(ball, "other"))
+    config = run_folder(ball, "other") / INFO
+    config.write_text(json.dumps(json.loads(config.read_text()) | {"holdout": 3}))
+    mark(ball, points=[(20, 12)], shape="click", class_id=TOP)
+    spread(ball, run="other")
+    accept(LabelAcceptParams(project=ball, run="other", seconds=0.1), Reporter())
+    scene = load_scene(ball, 3)
+    train_names = {scene.views[i].name for i in scene.train}
+    for image in load_project(ball).images:
+        wanted = f"{MAPS.format(3)}/{image.name}.png" if image.name in train_names else None
+        assert image.label == wanted
+        assert (image.confidence is None) == (wanted is None)
 
 
 def test_a_stale_preparation_is_noticed_and_made_again(ball: Path) -> None:

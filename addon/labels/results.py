@@ -55,6 +55,12 @@ def computed(folder: Path, run: str, revision: int) -> bool:
     return _file(folder, run, revision) is not None
 
 
+def is_current(folder: Path, run: str, revision: int) -> bool:
+    """Whether the labels of a revision are there and the project still has all their classes."""
+    found = labelling(folder, run, revision)
+    return found is not None and set(found.class_ids.tolist()) <= class_ids(folder)
+
+
 def nearest_computed(folder: Path, run: str, revision: int) -> int | None:
     """The revision, or the youngest it was drawn on, whose labels are there; None where there is none."""
     found = (number for number in journal.ancestry(folder, revision) if computed(folder, run, number))
@@ -192,6 +198,11 @@ def overlay(
 def linear(srgb: np.ndarray) -> np.ndarray:
     """Linear light of sRGB values in [0, 1]."""
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
+def class_ids(folder: Path) -> set[int]:
+    """The ids of the project's classes."""
+    return {int(entry["id"]) for entry in (snapshot.project(folder) or {}).get("classes", [])}
 
 
 def void_of(folder: Path) -> int:

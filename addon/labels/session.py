@@ -21,7 +21,8 @@ IDLE_PERIOD = 0.5
 VERBS = ("label prepare", "label propagate")
 
 _live: set[Path] = set()  # projects that are being labelled in this Blender
-_tried: dict[tuple[Path, str], int] = {}  # the revision for which the last propagation of a run was asked
+# The revision, and the ids of the classes, for which the last propagation of a run was asked.
+_tried: dict[tuple[Path, str], tuple[int, set[int]]] = {}
 _undo: dict[Path, int] = {}  # how many steps to undo once all marks are steps
 
 
@@ -121,9 +122,10 @@ def _propagate(scene: bpy.types.Scene) -> None:
     from . import results  # not at the top: it needs numpy, and enabling the extension must be quick
 
     revision = journal.shown(folder)
-    if revision == 0 or _tried.get((folder, run)) == revision or results.computed(folder, run, revision):
+    wanted = revision, results.class_ids(folder)
+    if revision == 0 or _tried.get((folder, run)) == wanted or results.is_current(folder, run, revision):
         return
-    _tried[folder, run] = revision
+    _tried[folder, run] = wanted
     queue.submit(queue.make("label propagate", {"project": str(folder), "run": run, "revision": revision}))
 
 

@@ -11,6 +11,7 @@ from ..errors import ProjectError
 from ..files import atomic_path
 from ..project.fingerprints import digest
 from ..project.runs import run_folder
+from ..project.store import load_project
 from .journal import Mark, marks_at, read_marks, shown_revision
 from .lookup import FIRST, REVISIONS, Labelling, read_labelling
 from .preparation import Preparation, current
@@ -66,7 +67,7 @@ def computed(project: Path, run: str, revision: int | None) -> tuple[Preparation
     """The preparation of a run and the labels of a revision (None: the one that is shown), both of its present field.
 
     Raises:
-        ProjectError: the run was not prepared, or the revision not propagated, since it was trained.
+        ProjectError: the run was not prepared, or the revision not propagated, since it was trained; a class is gone.
         InputError: there is no such revision.
     """
     ready = current(project, run)
@@ -82,6 +83,11 @@ def computed(project: Path, run: str, revision: int | None) -> tuple[Preparation
     if found is None or found.made != made_of(ready, at, found.class_ids.tolist()):
         raise ProjectError(
             f"Revision {wanted} of the marks was not propagated over the present field of the run “{run}”.",
+            "Run `fieldwork label propagate`.",
+        )
+    if not set(found.class_ids.tolist()) <= {c.id for c in load_project(project).classes}:
+        raise ProjectError(
+            f"Revision {wanted} of the marks was propagated before a class of it was removed.",
             "Run `fieldwork label propagate`.",
         )
     return ready, found

@@ -184,6 +184,17 @@ def test_marks_beside_the_surface_and_of_lost_classes_are_told(ball: Path) -> No
     assert [c["name"] for c in told["classes"]] == ["top"]
 
 
+def test_labels_with_a_class_that_is_gone_are_not_accepted(ball: Path) -> None:
+    two_strokes(ball)
+    spread(ball)
+    with edit_project(ball) as project:
+        project.classes = project.classes[:1]
+    with pytest.raises(ProjectError, match="propagated before a class of it was removed"):
+        accept(LabelAcceptParams(project=ball, seconds=0.1), Reporter())
+    spread(ball)
+    assert accept(LabelAcceptParams(project=ball, seconds=0.1), Reporter())["classes"] == ["top"]
+
+
 def test_overlays_are_looked_up_and_photos_suggested(ball: Path, tmp_path: Path) -> None:
     two_strokes(ball)
     spread(ball)

@@ -24,6 +24,7 @@ _live: set[Path] = set()  # projects that are being labelled in this Blender
 # The revision, and the ids of the classes, for which the last propagation of a run was asked.
 _tried: dict[tuple[Path, str], tuple[int, set[int]]] = {}
 _undo: dict[Path, int] = {}  # how many steps to undo once all marks are steps
+_before: dict[str, int] = {}  # the revision that each scene had before the undo or redo under way
 
 
 def begin(settings: Any) -> None:
@@ -146,12 +147,19 @@ def _tick() -> float:
 
 
 @bpy.app.handlers.persistent
+def _undoing(*_: Any) -> None:
+    _before.update({scene.name: scene.fieldwork.label_revision for scene in bpy.data.scenes})
+
+
+@bpy.app.handlers.persistent
 def _undone(*_: Any) -> None:
-    """After an undo or redo the project shows the revision that the scene had then."""
+    """After an undo or redo of a mark the project shows the revision that the scene had then. That of anything else hides no
+    mark that was made elsewhere meanwhile."""
     try:
         for scene in bpy.data.scenes:
             folder, revision = snapshot.folder_of(scene.fieldwork), scene.fieldwork.label_revision
-            if folder in _live and revision >= 0 and revision != pending.shown(folder):
+            moved = revision >= 0 and revision != _before.get(scene.name)
+            if folder in _live and moved and revision != pending.shown(folder):
                 pending.check_out(folder, revision)
         hurry()
     except Exception as error:  # noqa: BLE001 - of errors in handlers only a terminal would hear
@@ -166,7 +174,13 @@ def _file_loaded(*_: Any) -> None:
             begin(scene.fieldwork)
 
 
-HANDLERS = (("undo_post", _undone), ("redo_post", _undone), ("load_post", _file_loaded))
+HANDLERS = (
+    ("undo_pre", _undoing),
+    ("redo_pre", _undoing),
+    ("undo_post", _undone),
+    ("redo_post", _undone),
+    ("load_post", _file_loaded),
+)
 
 
 def register() -> None:
@@ -188,3 +202,4 @@ def unregister() -> None:
     _live.clear()
     _tried.clear()
     _undo.clear()
+    _before.clear()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 from fieldwork.tests.addon.support import SETUP
-from fieldwork.tests.addon.test_labels import project_with_labels
+from fieldwork.tests.addon.test_labels import project_with_labels, project_without_marks
 
 pytest.importorskip("bpy")
 
@@ -32,3 +32,36 @@ answer([before, look(), look(), asked])
         project=project_with_labels(tmp_path / "p"),
     )
     assert asked == [0, 1, 1, [["label propagate", 2]]]
+
+
+def test_undo_of_something_else_hides_no_mark_that_was_made_elsewhere(bpy_script, tmp_path):
+    seen = bpy_script(
+        SETUP
+        + """
+from fieldwork.addon.jobs.queue import queue
+from fieldwork.addon.labels import journal, session
+from fieldwork.nerfcore.labels.journal import append_mark, show
+folder, line = Path(project), {"photo": "a", "shape": "line", "points": [[1, 1]], "width": 2.0, "class_id": 1}
+def engine(verb, params, on_done):
+    values = {name: value for name, value in params.items() if name not in ("project", "revision")}
+    revision = append_mark(folder, values).revision if verb == "label stroke" else params["revision"]
+    show(folder, revision)
+    on_done({"revision": revision}, None)
+queue.ask_and_wait = engine
+settings.project = project
+session.begin(settings)
+bpy.ops.ed.undo_push(message="begin")
+session.mark(folder, line)
+bpy.ops.ed.undo_push(message="Label")
+append_mark(folder, line)
+bpy.data.objects["Cube"].location.x = 3
+bpy.ops.ed.undo_push(message="Move")
+seen = []
+for step in (bpy.ops.ed.undo, bpy.ops.ed.redo, bpy.ops.ed.undo, bpy.ops.ed.undo):
+    step()
+    seen.append(journal.shown(folder))
+answer(seen)
+""",
+        project=project_without_marks(tmp_path / "p"),
+    )
+    assert seen == [2, 2, 2, 0]

@@ -62,13 +62,17 @@ def _draw() -> None:
         if texture is not None:
             _draw_texture(texture, region, 1.0)
     if settings.label_strokes:
-        marks = [*journal.marks_at(folder, pending.shown(folder)), *pending.marks_of(folder)]
-        for mark in marks:
-            if mark["photo"] == photo["name"] and not mark.get("erase"):
-                _draw_mark(mark, mark["points"], region, size, colors)
+        for mark in marks_on(folder, str(photo["name"])):
+            _draw_mark(mark, mark["points"], region, size, colors)
     if live is not None and live.photo == photo["name"]:
         _draw_mark(live.params, live.points, region, size, colors)
     gpu.state.blend_set("NONE")
+
+
+def marks_on(folder: Path, photo: str) -> list[dict[str, Any]]:
+    """The marks on a photo that are shown or on their way, but those that erase. One on the surface has no photo."""
+    marks = [*journal.marks_at(folder, pending.shown(folder)), *pending.marks_of(folder)]
+    return [mark for mark in marks if mark.get("photo") == photo and not mark.get("erase")]
 
 
 def _overlay(folder: Path, settings: Any, photo: str, colors: dict[int, tuple[float, float, float]]) -> Any:

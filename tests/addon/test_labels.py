@@ -15,7 +15,7 @@ from fieldwork.tests.addon.support import SETUP, make_posed_project
 
 pytest.importorskip("bpy")
 
-from fieldwork.addon.labels import journal, pending, results
+from fieldwork.addon.labels import draw, journal, pending, results
 
 LINE = {"photo": "a", "shape": "line", "points": [(1.0, 2.0), (3.0, 4.0)], "width": 2.0, "class_id": 1}
 DEAD = EngineError("died", "The engine stopped unexpectedly (signal 9).", "Run it again.")
@@ -154,6 +154,15 @@ def test_of_several_undone_steps_the_last_one_is_shown_at_once_and_after_the_mar
     pending.mark(tmp_path, {**LINE, "class_id": 7})
     pending.send(engine)
     assert journal.ancestry(tmp_path, 4) == [4, 1], "a mark grows from what is shown"
+
+
+def test_marks_on_a_photo_are_drawn_while_one_on_the_surface_is_on_its_way(tmp_path):
+    append_mark(tmp_path, LINE)
+    pending.mark(tmp_path, {"shape": "line", "places": [(0, 0, 0)], "width": 1.0, "class_id": 1})
+    pending.mark(tmp_path, {**LINE, "erase": True})
+    pending.mark(tmp_path, {**LINE, "class_id": 2})
+    assert [mark["class_id"] for mark in draw.marks_on(tmp_path, "a")] == [1, 2]
+    assert draw.marks_on(tmp_path, "b") == []
 
 
 def test_a_torn_or_foreign_journal_is_read_as_far_as_it_is_whole(tmp_path):

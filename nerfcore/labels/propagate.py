@@ -30,7 +30,7 @@ def propagate(params: LabelPropagateParams, report: Reporter) -> dict[str, Any]:
         {"revision", "marks", "surfels", "void": share of the surfels that no class explains, "carried": share that an earlier
         epoch says and nobody confirmed, "confidence": mean of the labelled ones, "classes": [{"id", "name", "surfels", "confidence"}], "conflicts": [{"revision", "other", "surfels"}],
         "doubtful": [{"revision", "looks_like": class id}] of marks that look more like those of another class,
-        "unused": revisions of marks that met no surface or whose class is gone, "self_check": share of the marks of each
+        "unused": revisions of marks that met no surface, or whose class, photo or its pose is gone, "self_check": share of the marks of each
         photo that those on the others guess, "parts_seconds": until the labels of whole
         parts were on disk, "seconds", "file"}
     Raises:

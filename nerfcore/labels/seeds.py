@@ -29,7 +29,7 @@ MOST_STEPS = 10_000  # of a brush between two places
 class Seeds:
     """Known surfels, ascending: surfel (S,), label (S,) class index or VOID, mark (S,) revision of the mark each is from;
     conflicts: [{"revision", "other", "surfels"}] of marks that say different things of the same place; unused: revisions
-    of marks that met no surface; photo (S,): number of the photo that each mark is on, all on the surface having one more.
+    of marks that met no surface, or whose photo or class is gone; photo (S,): number of the photo that each mark is on, all on the surface having one more.
     """
 
     surfel: np.ndarray
@@ -60,7 +60,7 @@ def seeds_of(
     Args:
         class_ids: id of each class index. sizes: width and height of the photos the marks were drawn on, by name.
     Raises:
-        InputError: a marked photo has no pose any more.
+        ProjectError: carried labels are missing or damaged.
     """
     index = {class_id: number for number, class_id in enumerate(class_ids)}
     label = np.full(len(ready.surfels), UNMARKED, np.int32)
@@ -76,7 +76,8 @@ def seeds_of(
             if carried is not None:
                 carried.confirmed[:] = True
             continue
-        if mark.class_id is not None and mark.class_id not in index:
+        gone = bool(mark.photo) and (mark.photo not in sizes or mark.photo not in ready.of_photo)
+        if gone or (mark.class_id is not None and mark.class_id not in index):
             unused.append(mark.revision)
             continue
         surfels = placed_surfels(ready, mark) if mark.places else marked_surfels(ready, mark, sizes[mark.photo])

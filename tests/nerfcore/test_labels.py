@@ -40,7 +40,7 @@ from fieldwork.nerfcore.params import (
 )
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.runs import CHECKPOINT, INFO, checkpoint_id, geometry_id, run_folder
-from fieldwork.nerfcore.project.store import edit_project, load_project
+from fieldwork.nerfcore.project.store import edit_project, load_points, load_poses, load_project, save_poses
 from fieldwork.nerfcore.render.run import load_trained
 from fieldwork.nerfcore.render.verb import render
 from fieldwork.nerfcore.train.verb import train
@@ -182,6 +182,22 @@ def test_marks_beside_the_surface_and_of_lost_classes_are_told(ball: Path) -> No
     told = spread(ball)
     assert told["unused"] == [2, beside]
     assert [c["name"] for c in told["classes"]] == ["top"]
+
+
+@pytest.mark.parametrize("what", ["pose", "photo"])
+def test_marks_on_a_photo_that_is_gone_are_told_and_the_others_count(ball: Path, what: str) -> None:
+    two_strokes(ball)
+    mark(ball, points=[(20, 20)], shape="click", class_id=TOP, photo="02")
+    if what == "photo":
+        with edit_project(ball) as project:
+            project.images = [image for image in project.images if image.name != "02"]
+    poses = load_poses(ball)
+    poses.images = [image for image in poses.images if image.name != "02"]
+    save_poses(ball, poses, load_points(ball))
+    told = spread(ball)
+    assert told["unused"] == [3]
+    assert [c["name"] for c in told["classes"]] == ["top", "bottom"]
+    assert accept(LabelAcceptParams(project=ball, seconds=0.1), Reporter())["revision"] == 3
 
 
 def test_labels_with_a_class_that_is_gone_are_not_accepted(ball: Path) -> None:

@@ -15,7 +15,7 @@ from ..geometry.similarity import transform_points
 from ..images.encode import write_picture
 from ..params import MeshParams
 from ..progress import Reporter
-from ..project.runs import MEASURES, MESH_RECORD
+from ..project.runs import MEASURES, MESH_RECORD, SCENE_GRAPH
 from .build import Built
 from .features import features_of
 from .instances import Instance, write_instances
@@ -88,7 +88,7 @@ def write_outputs(target: Path, made: Made, scene: Scene, params: MeshParams, re
         report.check()
         # From here on nothing stops it. What these say is no longer true, and what has no successor goes.
         written = {path.name for path in files if path.parent == here}
-        for path in [target / MESH_RECORD, target / MEASURES, *level_files(target)]:
+        for path in [target / MESH_RECORD, target / MEASURES, target / SCENE_GRAPH, *level_files(target)]:
             path.unlink(missing_ok=True)
         for name in {TEXTURE, *MAPS} - written:
             (target / name).unlink(missing_ok=True)

@@ -18,7 +18,7 @@ from ..mesh.triangles import areas, components
 from ..params import InstancesParams
 from ..progress import Reporter
 from ..project.label_revision import LABEL_REVISION
-from ..project.runs import MEASURES
+from ..project.runs import MEASURES, SCENE_GRAPH
 from ..project.store import load_project, record_step
 
 PACKAGE = "package/package.json"  # beside the mesh, see blender/package.py
@@ -51,7 +51,8 @@ def instances(params: InstancesParams, report: Reporter) -> dict[str, Any]:
         report.stage("Changing instances")
         done = merged(arrays, before, params.merge) if params.merge else split(arrays, before, params.split)
         face_instance, after, changed = done
-        (target / MEASURES).unlink(missing_ok=True)  # it measures others
+        for path in (target / MEASURES, target / SCENE_GRAPH):  # they are of others
+            path.unlink(missing_ok=True)
         if params.split:  # a name without faces does no harm, faces without a name would
             write_instances(target, after)
         write_arrays(target / MESH, {**arrays, "face_instance": face_instance})

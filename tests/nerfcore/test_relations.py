@@ -194,7 +194,9 @@ def test_instances_are_joined_and_split(project: Path) -> None:
         own = data["face_instance"] == now["book.001"].id
         assert set(data["face_class"][own].tolist()) == {IDS["book"]}
         assert np.isin(data["face_instance"], [i.id for i in now.values()]).all()
+    asked(project)
     made = changed(project, split="book.001")["changed"]
+    assert not (mesh_folder(project, "main") / SCENE_GRAPH).exists(), "the panel would list things without the new one"
     assert made == ["book.001.2"]
     apart = {i.name: i.area for i in read_instances(mesh_folder(project, "main"))}
     assert apart["book.001"] == pytest.approx(before["book.001"])

@@ -63,8 +63,11 @@ def mark(folder: Path, params: dict[str, Any], more: bool = False) -> Wish:
 
 
 def check_out(folder: Path, revision: int) -> None:
-    """Let a revision be shown once the marks before it are taken; an earlier such wish that nobody sent is forgotten."""
-    _wishes[:] = [w for w in _wishes if w.sent or w.folder != folder or w.verb != "label checkout"]
+    """Let a revision be shown once the marks before it are taken; such a wish just before it that nobody sent is forgotten.
+    One before a mark stays, for the mark was drawn on that revision."""
+    last = next((wish for wish in reversed(_wishes) if wish.folder == folder), None)
+    if last is not None and last.verb == "label checkout" and not last.sent:
+        _wishes.remove(last)
     _wishes.append(Wish(folder, "label checkout", {"revision": revision}))
 
 

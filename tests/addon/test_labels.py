@@ -156,6 +156,20 @@ def test_of_several_undone_steps_the_last_one_is_shown_at_once_and_after_the_mar
     assert journal.ancestry(tmp_path, 4) == [4, 1], "a mark grows from what is shown"
 
 
+def test_a_mark_that_waits_grows_from_the_revision_that_it_was_drawn_on(tmp_path):
+    engine = Engine(tmp_path)
+    for class_id in (1, 2):
+        pending.mark(tmp_path, {**LINE, "class_id": class_id})
+        pending.send(engine)
+    pending.check_out(tmp_path, 1)
+    pending.mark(tmp_path, {**LINE, "class_id": 7})
+    pending.check_out(tmp_path, 0)
+    for _ in range(3):
+        pending.send(engine)
+    assert journal.ancestry(tmp_path, 3) == [3, 1]
+    assert journal.shown(tmp_path) == 0
+
+
 def test_marks_on_a_photo_are_drawn_while_one_on_the_surface_is_on_its_way(tmp_path):
     append_mark(tmp_path, LINE)
     pending.mark(tmp_path, {"shape": "line", "places": [(0, 0, 0)], "width": 1.0, "class_id": 1})

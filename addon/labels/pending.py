@@ -129,6 +129,14 @@ def send(ask: Ask, at_once: bool = False) -> None:
             _answered(wish, None, error)
 
 
+def send_all(folder: Path, ask: Ask) -> None:
+    """Hand all wishes of a project to an engine that answers at once, those that failed before first, until one fails."""
+    for _ in [wish for wish in _wishes if wish.folder == folder]:
+        send(ask, at_once=True)
+        if folder in _errors:
+            return
+
+
 def clear() -> None:
     """Forget everything."""
     for found in (_wishes, _taken, _errors):

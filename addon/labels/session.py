@@ -44,6 +44,8 @@ def mark(folder: Path, params: dict[str, Any], more: bool = False) -> None:
     """
     _live.add(folder)
     pending.mark(folder, params, more)
+    if bpy.app.background:
+        pending.send_all(folder, queue.ask_and_wait)
     hurry()
     wrong = pending.error(folder)
     if bpy.app.background and wrong is not None:

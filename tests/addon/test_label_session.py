@@ -65,3 +65,33 @@ answer(seen)
         project=project_without_marks(tmp_path / "p"),
     )
     assert seen == [2, 2, 2, 0]
+
+
+def test_without_a_window_a_mark_is_on_disk_also_after_one_that_failed(bpy_script, tmp_path):
+    seen = bpy_script(
+        SETUP
+        + """
+from fieldwork.addon.errors import EngineError
+from fieldwork.addon.jobs.queue import queue
+from fieldwork.addon.labels import journal, session
+from fieldwork.nerfcore.labels.journal import append_mark
+folder, seen, dead = Path(project), [], [True, False, False, True]
+def engine(verb, params, on_done):
+    if dead.pop(0):
+        raise EngineError("died", "The engine stopped unexpectedly.")
+    values = {name: value for name, value in params.items() if name != "project"}
+    on_done({"revision": append_mark(folder, values).revision}, None)
+queue.ask_and_wait = engine
+settings.project = project
+for class_id in (1, 2, 1):
+    try:
+        session.mark(folder, {"photo": "a", "shape": "line", "points": [[1, 1]], "width": 2.0, "class_id": class_id})
+        told = ""
+    except EngineError as error:
+        told = error.kind
+    seen.append([told, [mark["class_id"] for mark in journal.marks(folder)]])
+answer(seen)
+""",
+        project=project_without_marks(tmp_path / "p"),
+    )
+    assert seen == [["died", []], ["", [1, 2]], ["died", [1, 2]]]

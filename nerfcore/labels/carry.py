@@ -55,7 +55,7 @@ def carry(params: LabelCarryParams, report: Reporter) -> dict[str, Any]:
         confirming, "classes": names that were new to the project}
     Raises:
         ProjectError: one of them has no trained run, or the earlier one no labels. InputError: the epochs do not fit, the
-        file of common points, nothing to confirm. TrainingError, DiskError, Cancelled.
+        file of common points, nothing to carry or to confirm. TrainingError, DiskError, Cancelled.
     """
     folder = Path(params.project)
     if params.other is None:
@@ -79,12 +79,15 @@ def carry(params: LabelCarryParams, report: Reporter) -> dict[str, Any]:
             "Give common points (--points), or align both projects.",
         )
     used = sorted(set(told.class_id[told.class_id >= 0].tolist()))
+    if not used:
+        raise InputError(
+            f"{other} shows no class where {folder} has surface that looks the same.",
+            "Mark more there, or label this one.",
+        )
     ids, added = classes_of(
         folder, [names.get(i) or SemanticClass(id=i, name=str(i), color=(0.5, 0.5, 0.5)) for i in used]
     )
-    mapped = np.array([ids[i] for i in used] or [0], np.int64)[
-        np.searchsorted(used, told.class_id).clip(0, max(len(used) - 1, 0))
-    ]
+    mapped = np.array([ids[i] for i in used], np.int64)[np.searchsorted(used, told.class_id).clip(0, len(used) - 1)]
     chosen = told.class_id >= 0
     sfm_from_world = np.linalg.inv(world_from_sfm(project))
     places = transform_points(sfm_from_world, now.world[0][chosen])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from fieldwork.nerfcore.labels.carry import carry, classes_of
 from fieldwork.nerfcore.labels.journal import append_mark, read_marks
 from fieldwork.nerfcore.labels.preparation import Preparation, current
 from fieldwork.nerfcore.labels.propagate import propagate
-from fieldwork.nerfcore.labels.revisions import load
+from fieldwork.nerfcore.labels.revisions import computed, load, save
 from fieldwork.nerfcore.labels.seeds import placed_surfels
 from fieldwork.nerfcore.labels.stroke import checkout, stroke
 from fieldwork.nerfcore.params import (
@@ -209,6 +210,12 @@ def test_epochs_that_do_not_fit_and_damaged_files_are_told(trained: Path, tmp_pa
     assert read_marks(now) == []
     with pytest.raises(ProjectError, match="not propagated"):
         carry(LabelCarryParams(project=before, other=now), Reporter())
+    _, shown = computed(before, "main", None)
+    save(before, "main", replace(shown, probability=np.zeros_like(shown.probability)))
+    with pytest.raises(InputError, match="shows no class where"):
+        carry(LabelCarryParams(project=now, other=before, points=points), Reporter())
+    assert read_marks(now) == []
+    save(before, "main", shown)
     carry(LabelCarryParams(project=now, other=before, points=points), Reporter())
     (now / read_marks(now)[0].file).write_bytes(b"")
     with pytest.raises(ProjectError, match=r"carried are not readable: .*carried_"):

@@ -137,6 +137,15 @@ def send_all(folder: Path, ask: Ask) -> None:
             return
 
 
+def send_rest(ask: Ask) -> None:
+    """Hand what the engine was not told yet to it, in order and without waiting for answers: Blender ends."""
+    for wish in [wish for wish in _wishes if not wish.sent]:
+        try:
+            ask(wish.verb, {"project": str(wish.folder), **wish.params}, _taker(wish))
+        except EngineError:
+            return  # there is no engine
+
+
 def clear() -> None:
     """Forget everything."""
     for found in (_wishes, _taken, _errors):

@@ -198,7 +198,7 @@ def unregister() -> None:
     for name, handler in HANDLERS:
         getattr(bpy.app.handlers, name).remove(handler)
     # What the engine has been told before its input ends it does.
-    pending.send(queue.ask, at_once=True)
+    pending.send_rest(queue.ask)
     pending.clear()
     ahead.clear()
     _live.clear()

@@ -88,6 +88,17 @@ def test_a_mark_that_the_engine_does_not_answer_is_sent_again_and_written_once(t
         assert [(taken.verb, taken.revision) for taken in pending.take()] == [("label stroke", 1), ("label stroke", 2)]
 
 
+def test_all_marks_that_wait_are_sent_when_blender_ends(tmp_path):
+    engine, late = Engine(tmp_path), []
+    for class_id in (1, 2, 3):
+        pending.mark(tmp_path, {**LINE, "class_id": class_id})
+    pending.send(lambda *request: late.append(request))
+    pending.send_rest(lambda *request: late.append(request))
+    for request in late:
+        engine(*request)
+    assert [mark["class_id"] for mark in journal.marks(tmp_path)] == [1, 2, 3]
+
+
 def test_pieces_of_a_stroke_are_told_from_marks_of_their_own(tmp_path):
     for more in (True, True, False, False):
         pending.mark(tmp_path, LINE, more)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,11 +33,12 @@ from .regions import (
 
 
 def read(path: Path) -> Source:
-    """The labels of a COCO file, instances or panoptic. Raises InputError."""
+    """The labels of a COCO file, instances or panoptic. Of what it calls stuff nothing is a single thing. Raises InputError."""
     value = read_json(path)
     try:
         names = {entry["id"]: str(entry["name"]) for entry in value["categories"]}
         colors = {str(e["name"]): tuple(e["color"]) for e in value["categories"] if len(e.get("color") or ()) == 3}
+        stuff = {str(entry["name"]) for entry in value["categories"] if entry.get("isthing", 1) == 0}
         images = {entry["id"]: entry for entry in value["images"]}
         of_image: dict[Any, list[dict[str, Any]]] = defaultdict(list)
         for annotation in value["annotations"]:
@@ -46,11 +48,13 @@ def read(path: Path) -> Source:
             f"{path} is no COCO file: {error!r} is missing.", "It has images, annotations, categories."
         ) from error
     source = Source(iter(()), {name: colors.get(name) for name in names.values()})
-    source.pictures = _pictures(path, images, of_image, names, source)
+    source.pictures = _pictures(path, images, of_image, names, stuff, source)
     return source
 
 
-def _pictures(path: Path, images: dict, of_image: dict, names: dict[Any, str], source: Source) -> Iterator[Picture]:
+def _pictures(
+    path: Path, images: dict, of_image: dict, names: dict[Any, str], stuff: set[str], source: Source
+) -> Iterator[Picture]:
     for number, entries in of_image.items():
         image = images.get(number)
         if image is None:
@@ -73,11 +77,12 @@ def _pictures(path: Path, images: dict, of_image: dict, names: dict[Any, str], s
             except (KeyError, TypeError, ValueError, IndexError) as error:
                 wrong = f"An annotation of {name} in {path} is damaged: {error}."
                 raise InputError(wrong, "Export the labels once more.") from error
-        yield Picture(name, width, height, _without_crowd_instances(regions, entries))
+        regions = _without_crowd_instances(regions, entries)
+        yield Picture(name, width, height, [replace(r, instance=0) if r.class_name in stuff else r for r in regions])
 
 
 def _without_crowd_instances(regions: list[Region], annotations: list[dict[str, Any]]) -> list[Region]:
-    """A crowd, and what COCO calls stuff, is no single thing."""
+    """A crowd is no single thing."""
     kinds = [bool(a.get("iscrowd")) for a in annotations if "segments_info" not in a and a.get("segmentation")]
     if len(kinds) != len(regions):
         return regions

@@ -13,7 +13,7 @@ from fieldwork.nerfcore.errors import DiskError, FieldworkError, InputError, Set
 from fieldwork.nerfcore.images.working import read_label
 from fieldwork.nerfcore.labels.exchange import export_labels, import_labels
 from fieldwork.nerfcore.labels.formats import coco, cvat, known, label_studio
-from fieldwork.nerfcore.labels.formats.regions import from_runs, hex_color, runs_of
+from fieldwork.nerfcore.labels.formats.regions import from_runs, hex_color, placed, runs_of
 from fieldwork.nerfcore.params import LabelExportParams, LabelImportParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.store import edit_project, load_project
@@ -105,6 +105,14 @@ def test_what_has_no_area_and_strange_pictures_are_told(tmp_path: Path) -> None:
     assert any("“box” have no area" in text for text in report.warnings)
     told, _ = bring(folder, write_cvat(tmp_path), replace=True)
     assert told["skipped"] == {"polyline": 1}
+
+
+def test_masks_that_stand_out_of_the_picture_are_cut_off() -> None:
+    for left, top in np.ndindex(16, 14):
+        whole = np.zeros((40, 40), bool)
+        whole[10 + top - 4 : 13 + top - 4, 10 + left - 4 : 14 + left - 4] = True
+        found = placed(np.ones((3, 4), bool), left - 4, top - 4, 8, 6)
+        np.testing.assert_array_equal(found, whole[10:16, 10:18])
 
 
 def test_photos_keep_labels_of_their_own_unless_they_shall_not(tmp_path: Path) -> None:

@@ -110,7 +110,7 @@ def placed(patch: np.ndarray, left: int, top: int, width: int, height: int) -> n
     """A patch (h, w) bool at its place in a picture (H, W); what stands out is cut off."""
     mask = np.zeros((height, width), bool)
     first_row, first_column = max(0, top), max(0, left)
-    part = patch[first_row - top : height - top, first_column - left : width - left]
+    part = patch[first_row - top : max(0, height - top), first_column - left : max(0, width - left)]
     mask[first_row : first_row + part.shape[0], first_column : first_column + part.shape[1]] = part
     return mask
 

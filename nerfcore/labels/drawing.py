@@ -12,13 +12,16 @@ def covered(shape: str, points: np.ndarray, width: float, columns: int, rows: in
     """Pixels (rows, columns) bool whose centres a mark covers.
 
     Args:
-        shape: "line" (a round brush along the points), "outline" (the area inside them), "click" (discs at them) or "part"
-            (the same).
+        shape: "line" (a round brush along the points), "outline" (the area inside them, their places where it is too thin
+            for the centre of a pixel), "click" (discs at them) or "part" (the same).
         points: (N, 2) x, y in pixels; width: diameter of the brush in pixels.
     """
     found = np.zeros((rows, columns), bool)
     if shape == "outline" and len(points) >= 3:
-        return skimage.draw.polygon2mask((rows, columns), points[:, ::-1] - 0.5)
+        inside = skimage.draw.polygon2mask((rows, columns), points[:, ::-1] - 0.5)
+        if inside.any():
+            return inside
+        shape, width = "click", THINNEST
     ends = zip(points, points) if shape in ("click", "part") or len(points) == 1 else zip(points[:-1], points[1:])
     radius = max(width, THINNEST) / 2
     for begin, end in ends:

@@ -168,6 +168,10 @@ def test_outlines_and_clicks() -> None:
     expected[3:7, 2:8] = True
     assert (square != expected).sum() <= 24  # the border itself may fall to either side
     assert square[4:6, 3:7].all()
+    thin = covered("outline", np.array([[2.0, 3.6], [8.0, 3.6], [8.0, 3.9], [2.0, 3.9]]), 1.0, 12, 10)
+    assert thin[3, [1, 2, 7, 8]].all(), "it lies between the centres of pixels: its corners count"
+    assert thin.sum() <= 8
+    assert not covered("outline", np.array([[-9.0, 3], [-5.0, 3], [-5.0, 7]]), 1.0, 12, 10).any()
     clicks = covered("click", np.array([[2.5, 2.5], [9.5, 7.5]]), 3.0, 12, 10)
     assert (clicks[2, 2], clicks[7, 9], clicks[5, 6]) == (True, True, False)
     assert not covered("click", np.array([[-9.0, 2.0]]), 3.0, 12, 10).any()

@@ -29,13 +29,16 @@ def answer(graph: Mapping[str, Any], question: str) -> list[str]:
     """
     things: Sequence[Mapping[str, Any]] = graph["things"]
     question = " ".join(question.split())
-    asked = QUESTION.match(question)
+    called = any(thing["name"].lower() == question.lower() for thing in things)  # “mug on shelf” may be a name
+    asked = None if called else QUESTION.match(question)
     if asked is None:
         chosen = {thing["id"] for thing in things} if question.lower() in ALL - {""} else named(things, question)
         return [thing["name"] for thing in things if thing["id"] in chosen]
     kind, goal = asked["kind"].lower(), named(things, asked["of"])
     found = related(graph["relations"], kind, goal)
-    what = re.sub(r"^(the|all|every)\s+|\s+(that|which)?\s*(is|are|stands?|lies)?$", "", asked["what"].strip().lower())
+    what = re.sub(
+        r"^((the|all|every)\s+)+|\s+(that|which)?\s*(is|are|stands?|lies)?$", "", asked["what"].strip().lower()
+    )
     if what not in ALL:
         found &= named(things, what)
     return [thing["name"] for thing in things if thing["id"] in found]
@@ -44,7 +47,8 @@ def answer(graph: Mapping[str, Any], question: str) -> list[str]:
 def named(things: Sequence[Mapping[str, Any]], name: str) -> set[int]:
     """Ids of the things of this name, or of a class of this name, whatever the case and an s at the end. Raises InputError."""
     wanted = name.strip().strip("“”\"'").lower()
-    for form in dict.fromkeys((wanted, wanted.removesuffix("s"))):
+    bare = re.sub(r"^((the|a|an|all|every)\s+)+", "", wanted)
+    for form in dict.fromkeys((wanted, bare, bare.removesuffix("s"))):
         found = {thing["id"] for thing in things if thing["name"].lower() == form}
         found = found or {t["id"] for t in things if form in (t["class"].lower(), t["class"].lower().split("/")[-1])}
         if found:

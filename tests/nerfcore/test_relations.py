@@ -138,6 +138,10 @@ def test_questions_mean_the_things_that_stand_so(project: Path) -> None:
     assert ask("what is part of the chair") == {"chair/leg.001"}
     assert ask("book") == {"book.001", "book.002"}
     assert ask("legs") == {"chair/leg.001"}
+    assert ask("all the books on the table") == {"book.001"}
+    assert ask("the table") == {"table.001"}
+    changed(project, rename=["vase.001", "vase on wall"])
+    assert ask("Vase on wall") == {"vase on wall"}, "a name of a thing, though it reads like a question"
     with pytest.raises(InputError, match="no thing and no class “lamp”") as told_:
         ask("everything on the lamp")
     assert "table" in told_.value.hint

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import bpy
@@ -122,8 +123,20 @@ def show_instances(job: Job) -> None:
     for entry in job.result["instances"]:
         if entry["id"] in own and entry["name"] in job.result["changed"]:
             own[entry["id"]].name = entry["name"]
+    if job.params.get("rename"):
+        rename_in_fields(job.project, str(job.params.get("run", "main")), *job.params["rename"])
     if own and (job.params.get("merge") or job.params.get("split")):
         job.warnings.append(t("Press Update Scene to see the things as they are now."))
+
+
+def rename_in_fields(project: Path, run: str, old: str, new: str) -> None:
+    """Let a thing that got another name keep its look and its copies in the field objects of the run."""
+    from ..addon.live import fields
+    from ..addon.live import things as of_fields
+
+    for field in fields.field_objects(bpy.data.objects):
+        if Path(fields.absolute(field.fieldwork.project)) == project.absolute() and field.fieldwork.run == run:
+            of_fields.rename(field, old, new.strip(), bpy.data.objects)
 
 
 class FIELDWORK_OT_select_thing(Operator):

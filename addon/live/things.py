@@ -30,6 +30,16 @@ def fill(obj: bpy.types.Object, project: Path) -> None:
             entry.visible, entry.opacity, entry.tint, entry.color = before[value["name"]]
 
 
+def rename(field: bpy.types.Object, old: str, new: str, objects: Iterable[bpy.types.Object]) -> None:
+    """A thing of a field has another name: what the user set of it, and its copies among the objects, stay its own."""
+    for copy in copies(field, objects):
+        if copy.fieldwork_copy.thing == old:
+            copy.fieldwork_copy.thing = new
+    entry = field.fieldwork.things.get(old)
+    if entry is not None:
+        entry.name = new
+
+
 def looks(obj: bpy.types.Object) -> dict[str, dict[str, Any]]:
     """How the things of a field that are edited look where they stand."""
     return {

@@ -188,3 +188,34 @@ answer({"told": told, "count": count, "same": bool(((own == 1) == chosen).all())
     assert facts["count"] == 1
     assert facts["same"]
     assert facts["some"] > 0
+
+
+def test_a_renamed_thing_keeps_its_look_and_copies_in_fields(bpy_script, tmp_path):
+    folder = with_graph(make_posed_project(tmp_path / "capture"))
+    facts = bpy_script(
+        SETUP
+        + """
+from fieldwork.addon.jobs.job import Job
+from fieldwork.addon.live import fields
+from fieldwork.addon.live import things
+from fieldwork.operators.things import show_instances
+def field_of(project):
+    field = bpy.data.objects.new("field", None)
+    scene.collection.objects.link(field)
+    own = field.fieldwork
+    own.is_field, own.project, own.run = True, str(project), "main"
+    for name in ("table.001", "vase.001"):
+        own.things.add().name = name
+    own.things["vase.001"].opacity = 0.25
+    return field, things.add_copy(field, own.things["vase.001"], "copy")
+(field, copy), (other, apart) = field_of(folder), field_of(Path(folder) / "other")
+job = Job("instances", {"project": folder, "run": "main", "rename": ["vase.001", " Ming"]}, id="x", project=Path(folder))
+job.state, job.result = "done", {"instances": [{"id": 3, "name": "Ming"}], "changed": ["Ming"]}
+show_instances(job)
+look = lambda field, copy: [[[e.name, e.opacity] for e in field.fieldwork.things], copy.fieldwork_copy.thing]
+answer([look(field, copy), look(other, apart)])
+""",
+        folder=folder,
+    )
+    assert facts[0] == [[["table.001", 1.0], ["Ming", 0.25]], "Ming"]
+    assert facts[1] == [[["table.001", 1.0], ["vase.001", 0.25]], "vase.001"]

@@ -73,7 +73,7 @@ def computed(project: Path, run: str, revision: int | None) -> tuple[Preparation
     ready = current(project, run)
     if ready is None:
         raise ProjectError(
-            f"The run “{run}” of {project} is not prepared for labelling since it was trained.",
+            f"The run “{run}” of {project} is not prepared for labelling since it was trained, aligned or got other poses.",
             "Run `fieldwork label propagate`, which prepares it too.",
         )
     marks = read_marks(project)

@@ -309,6 +309,11 @@ def test_a_stale_preparation_is_noticed_and_made_again(ball: Path) -> None:
     with pytest.raises(ProjectError, match="not prepared for labelling since it was trained"):
         overlay(LabelOverlayParams(project=ball, photo="01"), Reporter())
     assert spread(ball)["revision"] == 2
+    with edit_project(ball) as project:
+        project.frame.world_from_sfm[0][3] += 1.0
+    with pytest.raises(ProjectError, match="since it was trained, aligned"):
+        computed(ball, "main", None)
+    assert spread(ball)["revision"] == 2
     assert current(ball, "main") is not None
     assert right_share(ball) > 0.6
 

@@ -132,8 +132,8 @@ def placed_surfels(ready: Preparation, mark: Mark) -> np.ndarray:
     tree, normal = ready.tree, ready.world[1]
     corners = [places[:1]]
     for begin, end in pairwise(places) if mark.shape == "line" else ():
-        steps = int(np.ceil(float(np.linalg.norm(end - begin)) / max(radius / 2, 1e-9)))
-        corners.append(begin + (end - begin) * (np.arange(1, min(steps, MOST_STEPS) + 1) / max(steps, 1))[:, None])
+        steps = min(int(np.ceil(float(np.linalg.norm(end - begin)) / max(radius / 2, 1e-9))), MOST_STEPS)
+        corners.append(begin + (end - begin) * (np.arange(1, steps + 1) / max(steps, 1))[:, None])
     along = np.concatenate(corners) if mark.shape == "line" else places
     distance, nearest = (np.asarray(part) for part in tree.query(along))
     if mark.shape == "line":

@@ -99,6 +99,15 @@ def test_a_stroke_marks_nothing_where_it_is_off_the_surface(ball: Path) -> None:
     assert distance.min(1).max() < 0.2
 
 
+def test_a_stroke_of_a_thin_brush_reaches_its_end(ball: Path) -> None:  # noqa: F811
+    ready = prepared(ball)
+    ends = np.array([on_ball(0, 0.3), on_ball(60, 0.3)])
+    at_end = set(ready.tree.query(ends)[1].tolist())
+    place(ball, TOP, ends.tolist(), width=1e-5)
+    (mark,) = read_marks(ball)
+    assert at_end <= set(placed_surfels(ready, mark).tolist())
+
+
 def prepared_anew(folder: Path) -> Preparation:
     """The same surfels where the world lies otherwise."""
     return Preparation(folder / "runs/main/surfels")

@@ -232,12 +232,13 @@ def test_a_first_guess_has_the_classes_of_the_project(tmp_path: Path, project: P
     assert (label[:, WIDTH // 2 + 4 :] == 0).all(), "what is no class of the project stays unlabelled"
 
 
-def test_guesses_leave_labels_of_photos_alone(tmp_path: Path, project: Path) -> None:
+@pytest.mark.parametrize("own", ["labels/own.png", "labels/suggested_view.png"])
+def test_guesses_leave_labels_of_photos_alone(tmp_path: Path, project: Path, own: str) -> None:
     with edit_project(project) as edited:
-        edited.images[0].label = "labels/own.png"
+        edited.images[0].label = own
     told = guess(project, tiny.segformer(tmp_path / "m.onnx"), {"0": "top"})
     assert (told["photos"], told["kept"]) == (1, 1)
-    assert load_project(project).images[0].label == "labels/own.png"
+    assert load_project(project).images[0].label == own
 
 
 def test_wrong_mappings_and_models_are_told(tmp_path: Path, project: Path) -> None:

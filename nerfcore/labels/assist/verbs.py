@@ -98,7 +98,7 @@ def suggest(params: AssistSuggestParams, report: Reporter) -> dict[str, Any]:
     mapping = {number: ids[name] for number, name in read_mapping(params.mapping, list(ids)).items()}
     model = Semantic(load(params.model))
     photos = chosen(project, folder, params.photos)
-    own = [p for p in photos if p.label and not is_accepted(p.label) and not p.label.startswith(SUGGESTED)]
+    own = [p for p in photos if p.label and not is_accepted(p.label) and not p.label.startswith(f"{SUGGESTED}/")]
     report.stage("Guessing classes")
     taken: dict[str, float] = {}
     todo = [photo for photo in photos if photo not in own]

@@ -100,7 +100,7 @@ def test_exported_meshes_and_fields_name_it_in_their_files(labelled: Path, tmp_p
         assert data["label_revision"] == REVISION
     splats = written("splats", ".ply")
     assert f"comment label_revision {REVISION}" in header(splats)
-    assert gltf(splats.with_suffix(".glb"))["asset"]["extras"] == {"label_revision": REVISION}
+    assert gltf(splats.with_name(f"{splats.stem}-splats.glb"))["asset"]["extras"] == {"label_revision": REVISION}
     assert b"label_revision\x05\x00\x00\x00int32\x04\x00\x00\x00\x02\x00\x00\x00" in written("vdb", ".vdb").read_bytes()
     voxels = json.loads((labelled / "runs" / "main" / "voxels" / "meta.json").read_text())
     assert voxels["label_revision"] == REVISION

@@ -14,6 +14,7 @@ from ..files import is_text, printable, require_readable
 from ..images.names import beside_all, companion_stems, unique_names
 from ..images.soft_labels import find_confidence, find_probabilities
 from ..images.suffixes import PHOTO_SUFFIXES, VIDEO_SUFFIXES
+from ..project.store import PROJECT_FILE
 
 # Files that lie beside photos and are none.
 SIDECARS = {".json", ".txt", ".md", ".xmp", ".aae", ".csv", ".npy", ".npz", ".db", ".ini", ".xml", ".thm", ".log", ""}
@@ -33,6 +34,8 @@ class Source:
 def list_photos(folder: Path, exclude: Iterable[Path | None] = ()) -> tuple[list[Path], list[dict[str, str]], Path]:
     """Photos below `folder` (subfolders are cameras of one capture), files skipped with reasons, and the root.
 
+    Projects that lie in there are left out: their pictures are copies and renders.
+
     Raises:
         InputError: the folder is missing, unreadable or has no photos.
     """
@@ -50,6 +53,7 @@ def list_photos(folder: Path, exclude: Iterable[Path | None] = ()) -> tuple[list
     for place, folders, files in os.walk(root, onerror=problems.append):
         here = Path(place)
         inner = sorted(f for f in folders if not f.startswith(".") and (here / f).resolve() not in skip_folders)
+        inner = [name for name in inner if not os.path.isfile(here / name / PROJECT_FILE)]
         odd = {name: _odd_folder(here / name) for name in inner}
         folders[:] = [name for name in inner if not odd[name]]
         skipped += [{"file": printable(name), "reason": reason} for name, reason in odd.items() if reason]

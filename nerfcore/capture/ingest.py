@@ -26,6 +26,7 @@ from .select import reject_blurred, reject_duplicates
 from .working_copies import Settings, make_working_copies
 
 FRAMES_FOLDER = "frames"
+WORKING_FOLDERS = ("images", "labels", "masks", "confidence")  # of the project
 Classes = tuple[dict[int, str], int, Colors]  # names, void id, colours
 
 
@@ -85,15 +86,16 @@ def ingest_inputs(params: NewParams) -> Fingerprint:
     """What the working copies of a capture depend on, by the names, sizes and times of its files.
 
     Raises:
-        InputError: there are no photos.
+        InputError: there are no photos, or the project would write over them.
     """
     photos = Path(params.photos)
-    given = [params.labels, params.masks]
     paths, root = [photos], photos.parent
     if photos.suffix.lower() not in VIDEO_SUFFIXES or not photos.is_file():
-        paths, _, root = list_photos(photos, exclude=given)
+        paths, _, root = list_photos(photos, exclude=[params.labels, params.masks, params.project])
     labels = params.labels or subfolder(photos, "labels")
     masks = params.masks or subfolder(photos, "masks")
+    of_photos = None if photos.is_file() else root
+    _require_apart(Path(params.project), {"photos": of_photos, "labels": labels, "masks": masks})
     sources = find_sources(paths, root, labels, masks, set())
     if paths == [photos]:  # frames of a video are named later
         sources_of = {
@@ -119,7 +121,7 @@ def ingested(params: NewParams) -> Earlier:
     """The working copies that are there, if they are of the present files.
 
     Raises:
-        InputError: there are no photos. ProjectError: the folder holds another capture.
+        InputError: as `ingest_inputs`. ProjectError: the folder holds another capture.
     """
     previous = _previous_project(params)
     if previous is None:
@@ -128,6 +130,17 @@ def ingested(params: NewParams) -> Earlier:
     folder = Path(params.project)
     files = [folder / file for r in previous.images for file in (r.file, r.label, r.mask, r.confidence) if file]
     return compare(made, ingest_inputs(params), files)
+
+
+def _require_apart(project: Path, given: dict[str, Path | None]) -> None:
+    """Raise InputError where working copies would be written over the files that they are made of, or among them."""
+    own = [project, *(project / name for name in WORKING_FOLDERS)]
+    for what, folder in given.items():
+        if folder is not None and folder.resolve() in {place.resolve() for place in own}:
+            raise InputError(
+                f"The {what} in {folder} lie where the project {project} keeps its own files.",
+                f"Choose another folder for the project, such as {folder.resolve().name}_fieldwork beside it.",
+            )
 
 
 def _photos(params: NewParams, report: Reporter) -> tuple[list[Path], list[dict[str, str]], Path]:
@@ -139,7 +152,7 @@ def _photos(params: NewParams, report: Reporter) -> tuple[list[Path], list[dict[
         from .video import extract_frames  # the library takes its time to load
 
         return extract_frames(photos, root, params.frames, report), [], root
-    return list_photos(photos, exclude=[params.labels, params.masks])
+    return list_photos(photos, exclude=[params.labels, params.masks, params.project])
 
 
 def _settings(
@@ -190,7 +203,7 @@ def _same_place(before: Any, now: Path) -> bool:
 
 def _remove_halves(folder: Path) -> None:
     """Delete what a run that was killed had half written: hidden files in the folders of working copies."""
-    for name in ("images", "labels", "masks", "confidence"):
+    for name in WORKING_FOLDERS:
         for path in (folder / name).glob(".*"):
             path.unlink(missing_ok=True)
 

@@ -126,6 +126,34 @@ def test_empty_missing_and_useless_folders(tmp_path: Path) -> None:
     assert not (tmp_path / "p" / "project.json").exists()
 
 
+def test_projects_among_the_photos_are_left_out(tmp_path: Path) -> None:
+    photos = folder_of(tmp_path / "photos")
+    new(photos, tmp_path / "other")
+    shutil.copytree(tmp_path / "other", photos / "earlier")
+    (photos / "p" / "frames").mkdir(parents=True)  # left by a run that was stopped before it had a project.json
+    picture(9).save(photos / "p" / "frames" / "f0.png")
+    for _ in range(2):
+        assert new(photos, photos / "p")["images"] == 3
+        assert [record.name for record in load_project(photos / "p").images] == ["p0", "p1", "p2"]
+    assert ingest.ingested(NewParams(photos=photos, project=photos / "p")).result is not None
+
+
+@pytest.mark.parametrize("inner", ["", "images"])
+def test_photos_are_never_overwritten_by_working_copies(tmp_path: Path, inner: str) -> None:
+    photos = folder_of(tmp_path / "p" / inner)
+    before = {path: path.read_bytes() for path in photos.iterdir()}
+    with pytest.raises(InputError, match=r"The photos in .* lie where the project .* keeps its own files"):
+        new(photos, tmp_path / "p", max_size=64)
+    assert {path: path.read_bytes() for path in photos.iterdir()} == before
+
+
+def test_label_maps_are_never_overwritten_by_working_copies(tmp_path: Path) -> None:
+    photos = folder_of(tmp_path / "p" / "photos")
+    (tmp_path / "p" / "labels").mkdir()
+    with pytest.raises(InputError, match="The labels in"):
+        new(photos, tmp_path / "p", labels=tmp_path / "p" / "labels")
+
+
 def test_unreadable_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Tests may run as root, which reads everything: the refusal is simulated at os.scandir."""
     photos = folder_of(tmp_path / "photos")

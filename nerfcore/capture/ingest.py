@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -33,8 +34,8 @@ Classes = tuple[dict[int, str], int, Colors]  # names, void id, colours
 def new(params: NewParams, report: Reporter) -> dict[str, Any]:
     """Ingest a folder of photos, or a video, into a project.
 
-    Running it again over the same photos only does what is missing; with `add` it puts further photos into an
-    existing project.
+    Running it again over the same photos only does what is missing, and keeps photos and labels that were added since; with
+    `add` it puts further photos into an existing project.
 
     Returns:
         {"images": count, "rejected": [{"file", "reason"}], "labelled", "masked", "classes": [names]}
@@ -53,7 +54,7 @@ def new(params: NewParams, report: Reporter) -> dict[str, Any]:
     create_folder(folder)
     _remove_halves(folder)
     paths, skipped, root = _photos(params, report)
-    kept = [record for record in previous.images if record.file] if previous and params.add else []
+    kept = _kept(previous, params, root) if previous else []
     sources = find_sources(paths, root, labels_folder, masks_folder, {record.name for record in kept})
     settings = _settings(params, paths, sources, classes, report)
 
@@ -63,9 +64,13 @@ def new(params: NewParams, report: Reporter) -> dict[str, Any]:
     reject_duplicates(records, pictures, kept)
     if not params.keep_blurry:
         reject_blurred(records, folder)
-    records = kept + records
+    fresh, records = records, kept + records if params.add else records + kept
     _check_usable(records, photos, skipped)
-    cut_out = _masks_wanted(params, previous, records) and mask_objects(_without_mask(records), folder, report)
+    asked = records if params.add else fresh
+    cut_out = _masks_wanted(params, previous, asked) and mask_objects(_without_mask(records), folder, report)
+    if previous:
+        later = _keep_later_labels(fresh, previous.images, folder)
+        classes = _with_earlier_names(classes, previous, _present_ids(folder, kept + later, report))
     present = _present_ids(folder, records, report)
     result = _summary(records, skipped)
     _warn(records, result["rejected"], report)
@@ -195,6 +200,43 @@ def _previous_project(params: NewParams) -> Project | None:
             f"{folder} already holds another capture.", "Choose a new folder, or --add to put these photos into it."
         )
     return project
+
+
+def _kept(previous: Project, params: NewParams, root: Path) -> list[ImageRecord]:
+    """Photos that stay as they are: all where others are added, else those that were added from other folders."""
+    records = [record for record in previous.images if record.file]
+    if params.add:
+        return records
+    places = [Path(params.photos).resolve(), root.resolve()]
+    return [r for r in records if not any(Path(r.source).resolve().is_relative_to(place) for place in places)]
+
+
+def _keep_later_labels(records: list[ImageRecord], before: list[ImageRecord], folder: Path) -> list[ImageRecord]:
+    """Give unchanged photos without a label map the one that was imported or made since; which photos got one. Maps from the
+    labels folder go with that folder."""
+    labelled = {
+        (r.sha256, r.width, r.height): r
+        for r in before
+        if r.label and r.label != f"labels/{r.name}.png" and (folder / r.label).is_file()
+    }
+    given = []
+    for record in records:
+        earlier = labelled.get((record.sha256, record.width, record.height))
+        if record.label is None and record.status != "rejected" and earlier is not None:
+            for name in ("label", "instances", "confidence", "depth"):
+                setattr(record, name, getattr(earlier, name))
+            given.append(record)
+    return given
+
+
+def _with_earlier_names(classes: Classes, previous: Project, present: Iterable[int]) -> Classes:
+    """What the classes file says, with the names that classes of maps from elsewhere have already."""
+    names, ignore_id, colors = classes
+    if not names:
+        return classes  # then the project keeps its own
+    known = {c.id: c.name for c in previous.classes}
+    earlier = {i: known[i] for i in present if i in known and known[i] not in names.values()}
+    return {**earlier, **names}, ignore_id, colors
 
 
 def _same_place(before: Any, now: Path) -> bool:

@@ -323,3 +323,17 @@ def test_a_sharp_photo_of_a_plain_wall_is_no_blur(tmp_path: Path) -> None:
     rejected = new(photos, tmp_path / "p")["rejected"]
     assert [entry["file"] for entry in rejected] == ["shaky.png"]
     assert "--keep-blurry" in rejected[0]["reason"]
+
+
+def test_added_photos_stay_when_it_runs_again(tmp_path: Path) -> None:
+    photos, project = folder_of(tmp_path / "photos"), tmp_path / "p"
+    (tmp_path / "more").mkdir()
+    picture(30).save(tmp_path / "more" / "p0.jpg")
+    new(photos, project)
+    new(tmp_path / "more", project, add=True)
+    before = load_project(project).images
+    assert new(photos, project)["images"] == 4
+    assert load_project(project).images == before
+    (photos / "p2.jpg").unlink()  # what is missing in its own folder is gone
+    new(photos, project)
+    assert [record.name for record in load_project(project).images] == ["p0", "p1", "p0_b"]

@@ -11,7 +11,8 @@ from fieldwork.nerfcore.capture import ingest
 from fieldwork.nerfcore.errors import InputError
 from fieldwork.nerfcore.params import NewParams
 from fieldwork.nerfcore.progress import Reporter
-from fieldwork.nerfcore.project.store import load_project
+from fieldwork.nerfcore.project.schema import SemanticClass
+from fieldwork.nerfcore.project.store import edit_project, load_project
 from fieldwork.tests.nerfcore.support.photos import exif, folder_of, new, picture
 from PIL import Image
 
@@ -147,3 +148,30 @@ def test_masks(tmp_path: Path) -> None:
     assert project.mask_mode == "empty"
     with Image.open(tmp_path / "p" / "masks" / "p0.png") as image:
         assert np.array_equal(np.asarray(image), mask)
+
+
+def test_labels_that_came_later_stay_when_it_runs_again(tmp_path: Path) -> None:
+    """Labels of p0 are the capture's own, those of p1 and p2 were imported; then p2 is taken again."""
+    photos, folder, project = folder_of(tmp_path / "photos"), tmp_path / "labels", tmp_path / "p"
+    write_labels(folder, "index", "p0.png")
+    (folder / "classes.json").write_text(json.dumps(CLASSES))
+    new(photos, project, labels=folder)
+    (project / "labels" / "imported").mkdir()
+    with edit_project(project) as edited:
+        for record in edited.images[1:]:
+            record.label = record.instances = f"labels/imported/{record.name}.png"
+            record.depth = f"depth/{record.name}.exr"
+            Image.fromarray(np.full((200, 320), 9, np.uint8)).save(project / record.label)
+        edited.classes = [*edited.classes, SemanticClass(id=9, name="ivy", color=(0, 1, 0))]
+    before = load_project(project)
+    picture(99).save(photos / "p2.jpg", quality=95)
+    report = Reporter()
+    ingest.new(NewParams(photos=photos, project=project, labels=folder), report)
+    after = load_project(project)
+    assert after.images[:2] == before.images[:2]
+    assert (after.images[2].label, after.images[2].instances) == (None, None)
+    assert after.classes == before.classes
+    assert report.warnings == []
+    (folder / "p0.png").unlink()  # its own labels go with their folder
+    new(photos, project, labels=folder)
+    assert [record.label for record in load_project(project).images] == [None, "labels/imported/p1.png", None]

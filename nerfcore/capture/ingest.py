@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from ..params import NewParams
 from ..progress import Reporter, shortened
 from ..project.classes import make_classes, read_classes, unnamed_values
 from ..project.fingerprints import Earlier, Fingerprint, compare, digest, files_digest, stamps_digest
+from ..project.kept import keep_later_labels, with_earlier_names
 from ..project.schema import ImageRecord, Project
 from ..project.store import PROJECT_FILE, create_folder, edit_project, load_project
 from .backdrop import mask_objects
@@ -69,8 +69,10 @@ def new(params: NewParams, report: Reporter) -> dict[str, Any]:
     asked = records if params.add else fresh
     cut_out = _masks_wanted(params, previous, asked) and mask_objects(_without_mask(records), folder, report)
     if previous:
-        later = _keep_later_labels(fresh, previous.images, folder)
-        classes = _with_earlier_names(classes, previous, _present_ids(folder, kept + later, report))
+        later = keep_later_labels(fresh, previous.images, folder)
+        if classes[0]:  # else the project keeps its own
+            there = _present_ids(folder, kept + later, report)
+            classes = (with_earlier_names(classes[0], previous.classes, there), *classes[1:])
     present = _present_ids(folder, records, report)
     result = _summary(records, skipped)
     _warn(records, result["rejected"], report)
@@ -209,34 +211,6 @@ def _kept(previous: Project, params: NewParams, root: Path) -> list[ImageRecord]
         return records
     places = [Path(params.photos).resolve(), root.resolve()]
     return [r for r in records if not any(Path(r.source).resolve().is_relative_to(place) for place in places)]
-
-
-def _keep_later_labels(records: list[ImageRecord], before: list[ImageRecord], folder: Path) -> list[ImageRecord]:
-    """Give unchanged photos without a label map the one that was imported or made since; which photos got one. Maps from the
-    labels folder go with that folder."""
-    labelled = {
-        (r.sha256, r.width, r.height): r
-        for r in before
-        if r.label and r.label != f"labels/{r.name}.png" and (folder / r.label).is_file()
-    }
-    given = []
-    for record in records:
-        earlier = labelled.get((record.sha256, record.width, record.height))
-        if record.label is None and record.status != "rejected" and earlier is not None:
-            for name in ("label", "instances", "confidence", "depth"):
-                setattr(record, name, getattr(earlier, name))
-            given.append(record)
-    return given
-
-
-def _with_earlier_names(classes: Classes, previous: Project, present: Iterable[int]) -> Classes:
-    """What the classes file says, with the names that classes of maps from elsewhere have already."""
-    names, ignore_id, colors = classes
-    if not names:
-        return classes  # then the project keeps its own
-    known = {c.id: c.name for c in previous.classes}
-    earlier = {i: known[i] for i in present if i in known and known[i] not in names.values()}
-    return {**earlier, **names}, ignore_id, colors
 
 
 def _same_place(before: Any, now: Path) -> bool:

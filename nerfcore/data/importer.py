@@ -18,6 +18,7 @@ from ..images.labels import read_mask
 from ..params import ImportParams
 from ..progress import Reporter, shortened
 from ..project.classes import make_classes, unnamed_values
+from ..project.kept import earlier_poses, keep_later_labels, keep_world, with_earlier_classes
 from ..project.schema import Frame, ImageRecord, PosedImage, Poses, Project, SemanticClass
 from ..project.store import PROJECT_FILE, create_folder, edit_project, load_project, save_poses
 from .copying import copy_depth, copy_labels, copy_mask, copy_photo
@@ -34,15 +35,18 @@ FORMATS = (
 def import_dataset(params: ImportParams, report: Reporter) -> dict[str, Any]:
     """Copy a posed data set into a project.
 
+    Importing it again keeps what was decided since: labels of unchanged photos that it has none for, classes, and the
+    world as it was aligned.
+
     Returns:
-        {"format", "images", "labelled", "classes": [names]}
+        {"format", "images", "labelled", "classes": [names], "world_kept": whether that is one aligned by hand}
     Raises:
         InputError: the data set is of no known format or damaged.
         ProjectError: the project folder already holds another capture.
         DiskError: it cannot be written.
     """
     source, folder = Path(params.dataset), Path(params.project)
-    _require_free(folder, source)
+    previous = _previous_project(folder, source)
     report.stage("Reading the data set")
     dataset = read_dataset(source, params.format)
     for message in dataset.warnings:
@@ -59,27 +63,27 @@ def import_dataset(params: ImportParams, report: Reporter) -> dict[str, Any]:
             present.setdefault(value, []).append(view.label.name if view.label else view.name)
     _warn_of_maps(records, present, dataset, source, folder, report)
     classes = _classes(dataset, set(present))
-    cameras, images = _poses(dataset.views)
-    result = {
-        "format": dataset.format,
-        "images": len(records),
-        "labelled": sum(record.label is not None for record in records),
-        "classes": [c.name for c in classes],
-    }
     told = params.keep_backdrop or params.mask_mode == "ignore" or any(r.mask or r.label for r in records)
     cut_out = not told and mask_objects(records, folder, report)
     masks = [folder / record.mask for record in records if record.mask]
     mask_mode = "empty" if cut_out else chosen_mask_mode(params.mask_mode, masks, len(records), report)
-    save_poses(folder, Poses(source=dataset.format, cameras=cameras, images=images), dataset.points)
+    cameras, images = _poses(dataset.views)
+    poses, before = Poses(source=dataset.format, cameras=cameras, images=images), earlier_poses(folder)
     with edit_project(folder, Project()) as project:
+        if previous is not None:
+            keep_later_labels(records, project.images, folder)
+            classes = with_earlier_classes(classes, project.classes)
         project.images, project.classes, project.ignore_id = records, classes, dataset.ignore_id
-        project.frame = Frame(
-            world_from_sfm=dataset.world_from_sfm.tolist(),
-            up_confidence=dataset.up_confidence,
-            scale_known=dataset.scale_known,
-            bounds=None if dataset.bounds is None else dataset.bounds.tolist(),
-        )
-        project.mask_mode, project.provenance = mask_mode, []
+        project.mask_mode, frame = mask_mode, _frame(dataset)
+        project.frame, kept = (frame, False) if previous is None else keep_world(project, before, poses, frame, report)
+        save_poses(folder, poses, dataset.points)
+        result = {
+            "format": dataset.format,
+            "images": len(records),
+            "labelled": sum(record.label is not None for record in records),
+            "classes": [c.name for c in classes],
+            "world_kept": kept,
+        }
         project.record("import", params.model_dump(mode="json"), result)
     return result
 
@@ -132,13 +136,24 @@ def _reader(name: str) -> Any:
     return importlib.import_module(f".readers.{name}", __package__)
 
 
-def _require_free(folder: Path, source: Path) -> None:
-    """Importing again over the same data set is fine; over another capture it is not."""
+def _previous_project(folder: Path, source: Path) -> Project | None:
+    """The project that is there already. Importing again over the same data set is fine; over another capture it is not."""
     if not (folder / PROJECT_FILE).exists():
-        return
-    steps = load_project(folder).provenance
+        return None
+    project = load_project(folder)
+    steps = project.provenance
     if not steps or steps[0].verb != "import" or Path(str(steps[0].settings.get("dataset"))) != source:
         raise ProjectError(f"{folder} already holds another capture.", "Choose a new folder for the project.")
+    return project
+
+
+def _frame(dataset: Dataset) -> Frame:
+    return Frame(
+        world_from_sfm=dataset.world_from_sfm.tolist(),
+        up_confidence=dataset.up_confidence,
+        scale_known=dataset.scale_known,
+        bounds=None if dataset.bounds is None else dataset.bounds.tolist(),
+    )
 
 
 def _copy_view(view: DatasetView, folder: Path, dataset: Dataset) -> tuple[ImageRecord, set[int]]:

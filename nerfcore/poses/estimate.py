@@ -18,6 +18,7 @@ from ..geometry.points import Points
 from ..params import PosesParams
 from ..progress import Reporter, shortened
 from ..project.fingerprints import Earlier, Fingerprint, compare, digest, files_digest
+from ..project.kept import earlier_poses, keep_world
 from ..project.schema import Frame, ImageRecord, PosedImage, Poses, Project
 from ..project.store import POSES_FILE, edit_project, load_poses, load_project, save_poses
 from ..verdict import poses_verdict
@@ -39,10 +40,11 @@ def estimate_poses(params: PosesParams, report: Reporter) -> dict[str, Any]:
     """Estimate the poses of all usable photos of a project.
 
     A run that was stopped goes on with the features and matches it has. When photos were added to a project with
-    poses, only they are placed and everything else stays where it is, unless `restart`.
+    poses, only they are placed and everything else stays where it is, unless `restart`. A world that was aligned by hand
+    is kept in either case, if the cameras stand to each other as before.
 
     Returns:
-        {"registered", "total", "reprojection_px", "up_confidence", "images": [{"name", "status", "reason"}]}
+        {"registered", "total", "reprojection_px", "up_confidence", "world_kept", "images": [{"name", "status", "reason"}]}
     Raises:
         ProjectError, PosesError, DiskError, Cancelled.
     """
@@ -56,7 +58,7 @@ def estimate_poses(params: PosesParams, report: Reporter) -> dict[str, Any]:
             f"poses need at least {MIN_PHOTOS}.",
             "Add photos with `fieldwork new --add`; twenty to a hundred around the subject work well.",
         )
-    inputs = posing_inputs(folder, project, params)
+    inputs, before = posing_inputs(folder, project, params), earlier_poses(folder)
     job = pose_job(folder, project, params, report)
     result = run_worker(job, folder / WORK_FOLDER, report)
     # Classes and region may have been edited meanwhile.
@@ -65,13 +67,17 @@ def estimate_poses(params: PosesParams, report: Reporter) -> dict[str, Any]:
         poses, points, visibility = _poses(result, records)
         if not params.keep_exposure:
             poses = with_gains(folder, records, poses, points, visibility, report)
-        _update_project(project, records, poses, points, result, keep_frame=job["start"] is not None)
+        _set_statuses(records, result)
+        kept = job["start"] is not None  # the cameras that were there stayed
+        if not kept:
+            project.frame, kept = keep_world(project, before, poses, _upright_frame(project, poses, points), report)
         save_poses(folder, poses, points, visibility)
         answer = {
             "registered": len(poses.images),
             "total": len(records),
             "reprojection_px": result["reprojection_px"],
             "up_confidence": project.frame.up_confidence,
+            "world_kept": kept,
             "level": result["level"],
             "groups": result["groups"],
             "verdict": poses_verdict(len(poses.images), len(records)),
@@ -303,24 +309,18 @@ def _usable(project: Project) -> list[ImageRecord]:
     return [record for record in project.images if record.status != "rejected"]
 
 
-def _update_project(
-    project: Project,
-    records: list[ImageRecord],
-    poses: Poses,
-    points: Points,
-    result: dict[str, Any],
-    keep_frame: bool,
-) -> None:
-    """Write statuses, and unless earlier cameras were kept the world frame, into the project."""
+def _set_statuses(records: list[ImageRecord], result: dict[str, Any]) -> None:
     for record, image in zip(records, result["images"]):
         record.status = image["status"]
         record.reason = image["reason"]
-    if keep_frame:
-        return
+
+
+def _upright_frame(project: Project, poses: Poses, points: Points) -> Frame:
+    """The world as cameras, points and GPS positions suggest it."""
     matrices = [np.array(image.camera_to_world) for image in poses.images]
     world_from_sfm, confidence = upright(matrices, points.xyz)
     measured = gps_frame(world_from_sfm, project, poses)
-    project.frame = Frame(
+    return Frame(
         world_from_sfm=(world_from_sfm if measured is None else measured).tolist(),
         up_confidence=confidence,
         scale_known=measured is not None,

@@ -1,0 +1,172 @@
+"""What is kept of a project that is imported, or whose cameras are placed, once more."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from fieldwork.nerfcore.data.importer import import_dataset
+from fieldwork.nerfcore.data.load import load_scene
+from fieldwork.nerfcore.geometry.similarity import make_similarity, transform_pose
+from fieldwork.nerfcore.params import AlignParams, ImportParams, PosesParams
+from fieldwork.nerfcore.poses import estimate
+from fieldwork.nerfcore.poses.align import align
+from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.project.kept import motion_of
+from fieldwork.nerfcore.project.schema import PosedImage, Poses, SemanticClass
+from fieldwork.nerfcore.project.store import edit_project, load_poses, load_project
+from fieldwork.tests.nerfcore.support.ball import ball_project, camera_poses
+from fieldwork.tests.nerfcore.support.photos import picture
+from fieldwork.tests.nerfcore.support.writers import data_set
+from PIL import Image
+
+TURN = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
+MOTION = make_similarity(3.5, TURN, np.array([5.0, -6, 7]))
+
+
+def posed(matrices: list[np.ndarray]) -> Poses:
+    images = [PosedImage(name=f"{i:02d}", camera=0, camera_to_world=m.tolist()) for i, m in enumerate(matrices)]
+    return Poses(source="sfm", images=images)
+
+
+def line(bend: float = 0.0) -> list[np.ndarray]:
+    """Cameras in a line, which a walk along a wall makes."""
+    poses = [np.eye(4) for _ in range(6)]
+    for i, pose in enumerate(poses):
+        pose[:3, 3] = i, bend * i * i, 0
+    return poses
+
+
+@pytest.mark.parametrize("cameras", [camera_poses(8), line()], ids=["ring", "line"])
+@pytest.mark.parametrize("wrong", [0, 1])
+def test_the_motion_of_cameras_is_found(cameras: list[np.ndarray], wrong: int) -> None:
+    moved = [transform_pose(MOTION, pose) for pose in cameras]
+    for pose in moved[:wrong]:
+        pose[:3, 3] += 2
+    motion, _ = motion_of(posed(moved), posed(cameras))
+    assert motion is not None
+    assert np.allclose(motion @ MOTION, np.eye(4), atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("after", "why"),
+    [
+        (line()[:2], "only 2 photos"),
+        (line(bend=0.5), "in another way"),
+        ([np.diag([-1.0, -1, 1, 1]) @ np.eye(4)] * 6, "at one place"),
+    ],
+)
+def test_cameras_that_say_nothing_of_their_motion(after: list[np.ndarray], why: str) -> None:
+    motion, told = motion_of(posed(after), posed(line()))
+    assert motion is None
+    assert why in told
+
+
+def moved_worker(folder: Path, motion: np.ndarray, count: int = 8) -> Any:
+    """A pose process that finds the project's poses again, in another frame."""
+    known = load_poses(folder)
+
+    def work(job: dict[str, Any], work: Path, report: Reporter) -> dict[str, Any]:
+        none, xyz = np.zeros(0, np.int32), np.random.default_rng(0).normal(size=(30, 3))
+        np.savez(
+            work / "points.npz", xyz=xyz, rgb=np.zeros((30, 3), np.uint8), error=np.ones(30), view=none, point=none
+        )
+        images: list[dict[str, Any]] = []
+        for number, (image, before) in enumerate(zip(job["images"], known.images)):
+            pose = transform_pose(motion, np.array(before.camera_to_world)).tolist()
+            there = {"status": "ok", "reason": "", "camera": 0, "camera_to_world": pose}
+            away = {"status": "unregistered", "reason": "matches no other photo"}
+            images.append({"file": image["file"], **(there if number < count else away)})
+        return {
+            "cameras": [camera.model_dump(mode="json") for camera in known.cameras],
+            "images": images,
+            "links": [],
+            "groups": [count],
+            "reprojection_px": 0.5,
+            "contradicting_pairs": 0,
+            "level": "fast",
+            "points_file": str(work / "points.npz"),
+        }
+
+    return work
+
+
+def centres(folder: Path) -> np.ndarray:
+    return np.stack([view.camera_to_world[:3, 3] for view in load_scene(folder).views])
+
+
+def test_a_world_set_by_hand_survives_poses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    project = ball_project(tmp_path / "p", views=8, side=24)
+    align(AlignParams(project=project, up="x", scale=("00", "04", 9.0), crop="-1,-1,-1,2,2,2"), Reporter())
+    before, frame = centres(project), load_project(project).frame
+    for _ in range(2):  # what was kept is kept again
+        monkeypatch.setattr(estimate, "run_worker", moved_worker(project, MOTION))
+        report = Reporter()
+        assert estimate.estimate_poses(PosesParams(project=project, restart=True), report)["world_kept"]
+        assert report.warnings == []
+        assert np.allclose(centres(project), before)
+        after = load_project(project).frame
+        assert (after.scale_known, after.up_confidence, after.bounds) == (True, 1.0, frame.bounds)
+
+
+def test_a_world_that_cannot_be_kept_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    project = ball_project(tmp_path / "p", views=8, side=24)
+    align(AlignParams(project=project, scale=("00", "04", 9.0)), Reporter())
+    monkeypatch.setattr(estimate, "run_worker", moved_worker(project, MOTION, count=2))
+    report = Reporter()
+    assert not estimate.estimate_poses(PosesParams(project=project, restart=True), report)["world_kept"]
+    assert not load_project(project).frame.scale_known
+    assert "only 2 photos" in report.warnings[0]
+    assert "fieldwork align" in report.warnings[0]
+    again = Reporter()  # there is nothing left to lose
+    estimate.estimate_poses(PosesParams(project=project, restart=True), again)
+    assert not any("align" in text for text in again.warnings)
+
+
+def imported(dataset: Path, project: Path) -> list[str]:
+    report = Reporter()
+    import_dataset(ImportParams(dataset=dataset, project=project), report)
+    return report.warnings
+
+
+def test_importing_again_keeps_what_was_decided(tmp_path: Path) -> None:
+    dataset, project = data_set(tmp_path / "d", {"aabb_scale": 1}), tmp_path / "p"
+    imported(dataset, project)
+    align(AlignParams(project=project, up="y", scale=("f0", "f2", 9.0), crop="-1,-1,-1,2,2,2"), Reporter())
+    (project / "labels" / "imported").mkdir(parents=True)
+    with edit_project(project) as edited:
+        edited.classes = [SemanticClass(id=3, name="ivy", color=(0, 1, 0), priority=2.0)]
+        for record in edited.images:
+            record.label = f"labels/imported/{record.name}.png"
+            Image.new("L", (320, 200), 3).save(project / record.label)
+    before = load_project(project)
+    picture(50).save(dataset / "images" / "f2.png")
+    assert imported(dataset, project) == []
+    after = load_project(project)
+    assert after.frame == before.frame
+    assert after.classes == before.classes
+    assert after.images[:2] == before.images[:2]
+    assert after.images[2].label is None
+    assert [step.verb for step in after.provenance] == ["import", "align", "import"]
+    assert after.uuid == before.uuid
+
+
+def test_importing_again_with_other_poses_moves_the_world(tmp_path: Path) -> None:
+    dataset, project = data_set(tmp_path / "d", {"aabb_scale": 1}), tmp_path / "p"
+    imported(dataset, project)
+    align(AlignParams(project=project, scale=("f0", "f2", 9.0)), Reporter())
+    before = centres(project)
+    value = json.loads((dataset / "transforms.json").read_text())
+    for frame in value["frames"]:
+        frame["transform_matrix"] = transform_pose(MOTION, np.array(frame["transform_matrix"])).tolist()
+    (dataset / "transforms.json").write_text(json.dumps(value))
+    assert imported(dataset, project) == []
+    assert np.allclose(centres(project), before)
+    # Without an alignment by hand the world is that of the data set.
+    imported(dataset, tmp_path / "q")
+    (dataset / "transforms.json").write_text(json.dumps({**value, "up": [0, 1, 0]}))
+    imported(dataset, tmp_path / "q")
+    assert load_project(tmp_path / "q").frame.world_from_sfm[2][1] == pytest.approx(1)

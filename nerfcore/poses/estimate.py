@@ -227,31 +227,36 @@ def _forget_changed(work: Path, records: list[ImageRecord]) -> bool:
 
 
 def _prepare_masks(folder: Path, work: Path, records: list[ImageRecord], report: Reporter) -> Path | None:
-    """Masks under the names COLMAP looks for: those of the project, and the alpha of photos with transparency."""
+    """Masks under the names COLMAP looks for: those of the project, and the alpha of photos with transparency.
+
+    Once one photo has a mask all get one, others a white one: COLMAP finds no features in photos whose mask is missing.
+    """
     target = work / "masks"
-    found = False
+    masked = [record for record in records if record.mask or _has_alpha(folder / record.file)]
+    if not masked:
+        return None
     for record in records:
         report.check()
-        source = folder / record.mask if record.mask else None
-        if source is None and record.file.endswith(".png"):
-            with Image.open(folder / record.file) as image:
-                alpha = image.getchannel("A") if "A" in image.getbands() else None
-        elif source is not None:
-            alpha = None
-        else:
-            continue
-        if source is None and alpha is None:
-            continue
-        found = True
         path = target / f"{_database_name(record)}.png"
         if path.is_file():
             continue
         with atomic_path(path) as temporary:
-            if source is not None:
-                shutil.copyfile(source, temporary)
-            elif alpha is not None:
-                Image.fromarray(np.where(np.asarray(alpha) > 127, 255, 0).astype(np.uint8)).save(temporary)
-    return target if found else None
+            if record.mask:
+                shutil.copyfile(folder / record.mask, temporary)
+            elif record in masked:
+                with Image.open(folder / record.file) as image:
+                    alpha = np.asarray(image.getchannel("A"))
+                Image.fromarray(np.where(alpha > 127, 255, 0).astype(np.uint8)).save(temporary)
+            else:
+                Image.new("L", (record.width, record.height), 255).save(temporary)
+    return target
+
+
+def _has_alpha(photo: Path) -> bool:
+    if photo.suffix != ".png":
+        return False
+    with Image.open(photo) as image:
+        return "A" in image.getbands()
 
 
 def _database_name(record: ImageRecord) -> str:

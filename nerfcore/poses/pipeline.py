@@ -26,6 +26,7 @@ from .validate import MIN_MATCHES, MIN_POINTS, ImageCheck, pair_images
 MIN_FEATURES = 100
 MIN_COMMON = 40
 MIN_REGISTERED = 3  # photos of a model that is not given up
+UNREADABLE = "its file could not be read for features"
 LEVEL_FILE = "level.json"  # features of the model in poses/sparse
 
 
@@ -341,7 +342,7 @@ def _reasons(best: Attempt, names: list[str], registered: set[str]) -> dict[str,
             continue
         placed = {mate: n for mate, n in mates[name].items() if mate in registered}
         if name not in counts:
-            reasons[name] = "its file could not be read for features"
+            reasons[name] = UNREADABLE
         elif counts[name] < MIN_FEATURES:
             reasons[name] = f"only {counts[name]} features: blurred, dark, masked out or without texture"
         elif name in dropped:
@@ -371,7 +372,10 @@ def _why_nothing(best: Attempt, names: list[str]) -> str:
     reasons = list(_reasons(best, names, set()).values())
     few = sum("features: blurred" in reason for reason in reasons)
     alone = sum(reason == "matches no other photo" for reason in reasons)
-    if few > len(names) / 2:
+    unread = reasons.count(UNREADABLE)
+    if unread > len(names) / 2:
+        why = f"{unread} of them could not be read for features, or their masks"
+    elif few > len(names) / 2:
         why = f"{few} of them have too little texture"
     elif alone > len(names) / 2:
         why = f"{alone} of them match no other photo"

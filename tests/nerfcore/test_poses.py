@@ -452,3 +452,14 @@ def test_the_verb_says_groups_and_judges(tmp_path: Path, monkeypatch: pytest.Mon
     assert "5 of 8" in result["verdict"]["reasons"][0]
     assert "2 groups of 5 and 3" in report.warnings[0]
     assert "--group 1" in report.warnings[0]
+
+
+def test_files_that_could_not_be_read_are_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    import zlib  # noqa: F401
+
+    from fieldwork.nerfcore.poses import pipeline
+
+    names = ["a", "b", "c"]
+    monkeypatch.setattr(pipeline, "_reasons", lambda *_: dict.fromkeys(names, pipeline.UNREADABLE))
+    best = pipeline.Attempt(level=None, database=None, models=[], checks={}, links={}, dropped={})  # type: ignore[arg-type]
+    assert "3 of them could not be read" in pipeline._why_nothing(best, names)

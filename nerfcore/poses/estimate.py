@@ -133,7 +133,7 @@ def pose_job(folder: Path, project: Project, params: PosesParams, report: Report
     records, work = _usable(project), folder / WORK_FOLDER
     with disk_errors(work):
         work.mkdir(parents=True, exist_ok=True)
-        same = _forget_changed(work, records)
+        same = _forget_changed(folder, records)
         # Where a photo that has a pose is another one now, the poses around it are worth nothing.
         anew = params.restart or params.group or not same
         previous = None if anew else _extendable(folder, records)
@@ -188,17 +188,29 @@ def posed(params: PosesParams) -> Earlier:
     if not made.inputs:
         # Made by version 0.1: the photos whose features were found are on record.
         state = _state(folder / WORK_FOLDER)
-        same = state is not None and _photo_state(_usable(project)) == state
+        same = state is not None and _same_photos(state, _photo_state(folder, _usable(project)))
         return Earlier(made.result) if same else Earlier(reason="made by an earlier version from other photos")
     inputs = posing_inputs(folder, project, params)
     return compare(made, inputs | {"settings": made.inputs.get("settings", "")})
 
 
-def _photo_state(records: list[ImageRecord]) -> dict[str, list[Any]]:
+def _photo_state(folder: Path, records: list[ImageRecord]) -> dict[str, list[Any]]:
+    """What the features of each photo depend on."""
     return {
-        record.name: [record.file, record.sha256, record.width, record.height, record.camera_group, record.mask]
-        for record in records
+        r.name: [r.file, r.sha256, r.width, r.height, r.camera_group, r.mask]
+        + ([files_digest([(r.mask, folder / r.mask)])] if r.mask else [])
+        for r in records
     }
+
+
+def _same_photos(before: dict[str, list[Any]], now: dict[str, list[Any]]) -> bool:
+    """Whether these were the same photos, as far as an earlier version of the state says."""
+    return before.keys() == now.keys() and not _changed(before, now)
+
+
+def _changed(before: dict[str, list[Any]], now: dict[str, list[Any]]) -> bool:
+    """Whether a photo that was there before is another one now. Earlier versions say less of each."""
+    return any(now[name][: len(state)] != state for name, state in before.items() if name in now)
 
 
 def _state(work: Path) -> dict[str, list[Any]] | None:
@@ -207,18 +219,19 @@ def _state(work: Path) -> dict[str, list[Any]] | None:
         value = json.loads((work / STATE_FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    return value if isinstance(value, dict) else None
+    right = isinstance(value, dict) and all(isinstance(state, list) for state in value.values())
+    return value if right else None
 
 
-def _forget_changed(work: Path, records: list[ImageRecord]) -> bool:
+def _forget_changed(folder: Path, records: list[ImageRecord]) -> bool:
     """Throw away features of photos whose working copy or mask is another one than when they were found.
 
     Returns:
         whether none was.
     """
-    now, same = _photo_state(records), True
-    before = _state(work)
-    if before is not None and any(before.get(name, value) != value for name, value in now.items()):
+    work, same = folder / WORK_FOLDER, True
+    before, now = _state(work), _photo_state(folder, records)
+    if before is not None and _changed(before, now):
         shutil.rmtree(work)
         work.mkdir(parents=True)
         before, same = None, False

@@ -191,7 +191,7 @@ def test_a_project_of_before_keeps_its_poses(place: Path) -> None:
 
     records = load_project(place / "p").images
     (place / "p" / "poses" / "sfm").mkdir()
-    estimate._forget_changed(place / "p" / "poses" / "sfm", records)
+    estimate._forget_changed(place / "p", records)
     result = call(place)
     assert "poses" in result["reused"]
     assert "earlier version" in result["redone"]["new"]

@@ -126,8 +126,8 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def staged(folder: Path) -> Iterator[Path]:
-    """Yield an empty folder inside `folder`; when the block succeeds, the files that were written into it are moved to
-    `folder`, in the place of those of their names.
+    """Yield an empty folder inside `folder`; when the block succeeds, the files that were written into it, or into folders in
+    it, are moved to `folder`, in the place of those of their names.
 
     On any failure they are removed, and what stood in `folder` before is untouched.
 
@@ -143,8 +143,10 @@ def staged(folder: Path) -> Iterator[Path]:
         place = Path(tempfile.mkdtemp(prefix=".new-", dir=folder))
         try:
             yield place
-            for path in sorted(place.iterdir()):
-                replace(path, folder / path.name)
+            for path in sorted(path for path in place.rglob("*") if path.is_file()):
+                target = folder / path.relative_to(place)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                replace(path, target)
         except DiskError as error:  # the folder of a moment is of no use to the user
             error.message = error.message.replace(str(place), str(folder))
             raise

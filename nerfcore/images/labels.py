@@ -18,6 +18,10 @@ Colors = dict[int, tuple[int, int, int]]
 TAGGED_SUFFIXES = {".jpg", ".jpeg", ".jpe", ".png", ".webp", ".tif", ".tiff"}
 
 
+class UnknownColors(InputError):
+    """A label map has colours, and no class is known to have them."""
+
+
 def read_labels(path: Path, colors: Colors | None = None, ignore_id: int = 0) -> np.ndarray:
     """Class ids (H, W) uint16 of a label map.
 
@@ -72,7 +76,7 @@ def _from_colors(rgba: np.ndarray, colors: Colors | None, ignore_id: int, name: 
         # Some tools save ids as grey RGB; anything coloured needs a class file to be understood.
         if (rgb.max(-1) == rgb.min(-1)).all():
             return np.where(opaque, rgb[..., 0], ignore_id)
-        raise InputError(f"label map {name} is coloured; give --classes with a colour for each class")
+        raise UnknownColors(f"label map {name} is coloured; give --classes with a colour for each class")
     packed = rgb @ [65536, 256, 1]
     values = np.full(packed.shape, -1, np.int64)
     for class_id, (red, green, blue) in colors.items():
@@ -81,7 +85,7 @@ def _from_colors(rgba: np.ndarray, colors: Colors | None, ignore_id: int, name: 
     unknown = values < 0
     if unknown.any():
         example = f"#{int(packed[unknown][0]):06x}"
-        raise InputError(
+        raise UnknownColors(
             f"label map {name}: {100 * unknown.mean():.1f} % of its pixels have colours of no class (e.g. {example})"
         )
     return values

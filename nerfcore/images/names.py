@@ -23,9 +23,9 @@ def unique_names(paths: Sequence[Path], root: Path) -> list[str]:
     with. Long names are cut, with a digest of the whole behind.
     """
     names = [path.stem for path in paths]
-    if _alike(map(_joined, names)):
+    if _alike(map(joined, names)):
         names = ["/".join(_below(path, root).with_suffix("").parts) for path in paths]
-    names = [_joined(name) for name in names]
+    names = [joined(name) for name in names]
     if _alike(names):  # a.jpg beside a.png
         names = [f"{name}_{path.suffix[1:].lower()}" for name, path in zip(names, paths)]
     if _alike(names):
@@ -39,9 +39,9 @@ def frame_names(places: Sequence[str]) -> list[str]:
     bare = [
         place[: -len(Path(place).suffix)] if Path(place).suffix.lower() in IMAGE_SUFFIXES else place for place in places
     ]
-    names = [_joined(Path(place).name) for place in bare]
+    names = [joined(Path(place).name) for place in bare]
     if _alike(names):
-        names = [_joined("/".join(part for part in Path(place).parts if part.strip("./"))) for place in bare]
+        names = [joined("/".join(part for part in Path(place).parts if part.strip("./"))) for place in bare]
     if _alike(names):
         names = [f"{name}_{i}" for i, name in enumerate(names)]
     return names
@@ -59,7 +59,8 @@ def _alike(names: Iterable[str]) -> bool:
     return len(set(folded)) < len(folded)
 
 
-def _joined(name: str) -> str:
+def joined(name: str) -> str:
+    """A path as a name: "_" for separators, white space and what Windows has no files with; long ones cut."""
     plain = "_".join(re.sub(r'[\\/:*?"<>|\x00-\x1f]', "_", name.replace("/", "_")).split()) or "photo"
     if len(plain.encode()) <= LONGEST:
         return plain
@@ -154,4 +155,4 @@ def beside(folder: Path, stem: str, exact: bool = True) -> Path | None:
 
 def plain_name(image: Path) -> str:
     """The name of an image in sets whose stems are unique."""
-    return _joined(image.stem)
+    return joined(image.stem)

@@ -5,13 +5,14 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..errors import InputError, SettingError
-from ..files import atomic_path, disk_errors
+from ..files import atomic_path, disk_errors, staged
 from ..images.encode import write_picture
 from ..images.labels import fit_to_photo
 from ..images.working import nearest, read_label
@@ -26,6 +27,7 @@ from .formats import known
 from .formats.regions import LabelClass, Picture, Region, Source
 from .history import write_history
 from .journal import read_marks, shown_revision
+from .matching import Claims, Photos
 from .overlay import photo_labels
 from .revisions import computed
 
@@ -53,49 +55,78 @@ def import_labels(params: LabelImportParams, report: Reporter) -> dict[str, Any]
     source = known.read(path, kind, label_classes(project), project.ignore_id, params.class_name)
     report.stage("Reading labels")
     classes = Classes(project, source)
-    photos = {image.name: image for image in project.images if image.status != "rejected"}
-    taken: dict[str, tuple[str, str | None]] = {}
-    kept: list[str] = []
-    unknown: list[str] = []
-    instances = 0
-    for number, picture in enumerate(source.pictures):
-        report.progress(number / (number + 10), picture.name)
-        photo = photos.get(Path(picture.name).stem) or photos.get(picture.name)
-        if photo is None:
-            unknown.append(picture.name)
-        elif photo.label and not is_accepted(photo.label) and not params.replace:
-            kept.append(photo.name)
-        else:
-            ids, things = maps_of(picture, classes, project.ignore_id)
-            try:
-                taken[photo.name] = write_photo(folder, photo, ids, things)
-            except InputError as error:
-                report.warn(f"{error.message}: it keeps the labels it has.")
-                continue
-            instances += int(things.max(initial=0))
-    tell(report, kept, unknown, source)
-    if not taken and not kept:
-        raise InputError(
-            f"No picture in {path} is a photo of {folder}.",
-            "Pictures are matched by their names without suffix: compare the two.",
-        )
+    # Maps that photos have already stay as they are until all of the new ones are there.
+    with staged(folder / IMPORTED) as place:
+        brought = _bring(source, project, classes, place, params.replace, report)
+        tell(report, brought, source)
+        if not brought.maps and not brought.kept:
+            raise InputError(
+                f"No picture in {path} is a photo of {folder}.",
+                "Pictures are matched by their names without suffix: compare the two.",
+            )
     result = {
         "format": kind,
-        "photos": len(taken),
-        "kept": kept,
-        "unknown": unknown,
+        "photos": len(brought.maps),
+        "kept": brought.kept,
+        "unknown": brought.unknown,
         "classes": sorted(classes.used),
-        "instances": instances,
+        "instances": sum(brought.instances.values()),
         "skipped": dict(source.skipped),
     }
     with edit_project(folder) as edited:
         classes.add_to(edited)
         for image in edited.images:
-            if image.name in taken:
-                image.label, image.instances = taken[image.name]
+            if image.name in brought.maps:
+                image.label, image.instances = brought.maps[image.name]
                 image.confidence = None
         edited.record("label import", params.model_dump(mode="json"), result)
     return result
+
+
+@dataclass
+class Brought:
+    """What an import found. maps: places in the project of the label map and the instances by photo; instances: how many;
+    kept: photos that have labels of their own; unknown: pictures of no photo; doubtful: photos that several pictures may be
+    of, which got none; repeated: photos of several pictures, the last of which counts."""
+
+    maps: dict[str, tuple[str, str | None]] = field(default_factory=dict)
+    instances: dict[str, int] = field(default_factory=dict)
+    kept: list[str] = field(default_factory=list)
+    unknown: list[str] = field(default_factory=list)
+    doubtful: dict[str, list[str]] = field(default_factory=dict)
+    repeated: dict[str, list[str]] = field(default_factory=dict)
+
+
+def _bring(source: Source, project: Project, classes: Classes, place: Path, replace: bool, report: Reporter) -> Brought:
+    """Write the label maps of a file into the folder `place`."""
+    claims = Claims(Photos(image for image in project.images if image.status != "rejected"))
+    brought = Brought()
+    for number, picture in enumerate(source.pictures):
+        report.progress(number / (number + 10), picture.name)
+        photo = claims.photo_of(picture.name)
+        if photo is None:
+            brought.unknown.append(picture.name)
+        elif photo.label and not is_accepted(photo.label) and not replace:
+            if photo.name not in brought.kept:
+                brought.kept.append(photo.name)
+        else:
+            brought.maps.pop(photo.name, None)
+            ids, things = maps_of(picture, classes, project.ignore_id)
+            try:
+                brought.maps[photo.name] = write_photo(place, photo, ids, things)
+            except InputError as error:
+                report.warn(f"{error.message}: it keeps the labels it has.")
+                continue
+            brought.instances[photo.name] = int(things.max(initial=0))
+    brought.doubtful, brought.repeated = claims.doubtful(), claims.repeated()
+    for name in brought.doubtful:
+        brought.maps.pop(name, None)
+        brought.instances.pop(name, None)
+    for file in place.rglob("*.png"):
+        if file.stem not in brought.maps:
+            file.unlink()
+    brought.unknown += [picture for pictures in brought.doubtful.values() for picture in pictures]
+    return brought
 
 
 class Classes:
@@ -145,19 +176,20 @@ def maps_of(picture: Picture, classes: Classes, void: int) -> tuple[np.ndarray, 
     return ids, things
 
 
-def write_photo(folder: Path, photo: ImageRecord, ids: np.ndarray, things: np.ndarray) -> tuple[str, str | None]:
-    """Write the label map of a photo, and that of instances where there are any; their places in the project.
+def write_photo(place: Path, photo: ImageRecord, ids: np.ndarray, things: np.ndarray) -> tuple[str, str | None]:
+    """Write the label map of a photo into a folder, and that of instances where there are any; where they will be in the
+    project.
 
     Raises:
         InputError: they have another shape than the photo. DiskError.
     """
     size = (photo.width, photo.height)
-    place, other = f"{IMPORTED}/{photo.name}.png", f"{IMPORTED}/{INSTANCES}/{photo.name}.png"
-    _write(folder / place, fit_to_photo(ids, 1, size, size, f"the label map of {photo.name}"))
+    name, other = f"{photo.name}.png", f"{INSTANCES}/{photo.name}.png"
+    _write(place / name, fit_to_photo(ids, 1, size, size, f"the label map of {photo.name}"))
     if not things.any():
-        return place, None
-    _write(folder / other, fit_to_photo(things, 1, size, size, f"the instances of {photo.name}"))
-    return place, other
+        return f"{IMPORTED}/{name}", None
+    _write(place / other, fit_to_photo(things, 1, size, size, f"the instances of {photo.name}"))
+    return f"{IMPORTED}/{name}", f"{IMPORTED}/{other}"
 
 
 def _write(path: Path, values: np.ndarray) -> None:
@@ -165,17 +197,28 @@ def _write(path: Path, values: np.ndarray) -> None:
         write_picture(temporary, values.astype(np.uint8) if int(values.max(initial=0)) < 256 else values)
 
 
-def tell(report: Reporter, kept: list[str], unknown: list[str], source: Source) -> None:
+def tell(report: Reporter, brought: Brought, source: Source) -> None:
     """Warn of what was left out."""
+    for name, pictures in brought.doubtful.items():
+        report.warn(
+            f"{_listed(pictures)} may all be of the photo {name}: none was taken. Name them by their whole paths."
+        )
+    for name, pictures in brought.repeated.items():
+        report.warn(f"{_listed(pictures)} are all of the photo {name}: the last one counts.")
+    doubtful = {picture for pictures in brought.doubtful.values() for picture in pictures}
+    unknown = [picture for picture in brought.unknown if picture not in doubtful]
     for names, what in (
-        (kept, "photos have labels of their own and keep them (`replace` takes the new ones)"),
+        (brought.kept, "photos have labels of their own and keep them (`replace` takes the new ones)"),
         (unknown, "pictures are no photos of the project"),
     ):
         if names:
-            more = "" if len(names) <= MOST_TOLD else " …"
-            report.warn(f"{len(names)} {what}: {', '.join(names[:MOST_TOLD])}{more}.")
+            report.warn(f"{len(names)} {what}: {_listed(names)}.")
     for kind, count in source.skipped.items():
         report.warn(f"{count} annotations of the kind “{kind}” have no area and were left out.")
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(names[:MOST_TOLD]) + ("" if len(names) <= MOST_TOLD else " …")
 
 
 def export_labels(params: LabelExportParams, report: Reporter) -> dict[str, Any]:

@@ -11,13 +11,12 @@ import pytest
 from fieldwork.nerfcore.cli import main
 from fieldwork.nerfcore.errors import DiskError, FieldworkError, InputError, SettingError
 from fieldwork.nerfcore.images.working import read_label
-from fieldwork.nerfcore.labels.exchange import export_labels, import_labels
+from fieldwork.nerfcore.labels.exchange import export_labels
 from fieldwork.nerfcore.labels.formats import coco, cvat, known, label_studio
 from fieldwork.nerfcore.labels.formats.regions import from_runs, hex_color, placed, runs_of
-from fieldwork.nerfcore.params import LabelExportParams, LabelImportParams
+from fieldwork.nerfcore.params import LabelExportParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.store import edit_project, load_project
-from fieldwork.tests.nerfcore.support.ball import ball_project
 from fieldwork.tests.nerfcore.support.label_files import (
     BRUSH,
     COCO,
@@ -27,6 +26,9 @@ from fieldwork.tests.nerfcore.support.label_files import (
     RING,
     WIDTH,
     WRITTEN,
+    bring,
+    named_map,
+    project_of,
     write_coco,
     write_cvat,
 )
@@ -39,31 +41,6 @@ MASKS = st.integers(1, 12).flatmap(
         lambda h: st.lists(st.booleans(), min_size=w * h, max_size=w * h).map(lambda v: np.array(v).reshape(h, w))
     )
 )
-
-
-def project_of(folder: Path, names: list[str], size: tuple[int, int] = (WIDTH, HEIGHT)) -> Path:
-    """A project with photos of these names, without classes and labels."""
-    ball_project(folder, views=len(names), side=8)
-    with edit_project(folder) as project:
-        project.classes = []
-        for image, name in zip(project.images, names):
-            image.name, image.label, (image.width, image.height) = name, None, size
-            image.file = f"images/{name}.jpg"
-    return folder
-
-
-def bring(folder: Path, file: Path, **values: Any) -> tuple[dict[str, Any], Reporter]:
-    report = Reporter()
-    return import_labels(LabelImportParams.model_validate({"project": folder, "file": file, **values}), report), report
-
-
-def named_map(folder: Path, photo: str) -> np.ndarray:
-    """The label map of a photo with the names of the classes, "" for unlabelled."""
-    project = load_project(folder)
-    label = next(image.label for image in project.images if image.name == photo)
-    assert label is not None
-    names = {project.ignore_id: "", **{c.id: c.name for c in project.classes}}
-    return np.vectorize(names.__getitem__)(read_label(folder / label))
 
 
 def expect(**masks: np.ndarray) -> np.ndarray:

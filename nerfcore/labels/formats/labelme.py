@@ -45,7 +45,7 @@ def read(path: Path) -> Source:
 
 def _pictures(values: list[tuple[Path, dict[str, Any]]], source: Source) -> Iterator[Picture]:
     for file, value in values:
-        name = PureWindowsPath(str(value.get("imagePath") or file.name)).name
+        name = PureWindowsPath(str(value.get("imagePath") or file.name)).as_posix()
         width, height = checked_size(value.get("imageWidth"), value.get("imageHeight"), name)
         groups: dict[Any, int] = {}
         regions: list[Region] = []

@@ -11,7 +11,7 @@ from PIL import Image
 
 from ...errors import InputError
 from ...files import atomic_path, write_json
-from ...images.labels import read_labels, read_mask
+from ...images.labels import UnknownColors, read_labels, read_mask
 from ...project.classes import read_classes
 from .regions import Color, LabelClass, Picture, Region, Source, checked_size
 
@@ -52,9 +52,9 @@ def _maps(
         try:
             ids = read_labels(file, colors, void)
         except InputError as error:
-            raise InputError(
-                f"{file.parent}: {error.message}.", f"Name the classes in {TABLE} beside the maps."
-            ) from error
+            named = f"Name the classes with their colours in {TABLE} beside the maps."
+            hint = named if isinstance(error, UnknownColors) else "Write the label map once more, as PNG, or remove it."
+            raise InputError(f"{file.parent}: {error.message}.", hint) from error
         checked_size(ids.shape[1], ids.shape[0], file.name)
         regions = []
         for class_id in np.unique(ids).tolist():

@@ -1,4 +1,4 @@
-"""Files of labels as other tools write them: the same two areas of one picture in each."""
+"""Files of labels as other tools write them, the same two areas of one picture in each, and bringing them into projects."""
 
 from __future__ import annotations
 
@@ -8,9 +8,16 @@ import json
 import zipfile
 import zlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from fieldwork.nerfcore.images.working import read_label
+from fieldwork.nerfcore.labels.exchange import import_labels
 from fieldwork.nerfcore.labels.formats import label_studio
+from fieldwork.nerfcore.params import LabelImportParams
+from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.project.store import edit_project, load_project
+from fieldwork.tests.nerfcore.support.ball import ball_project
 from PIL import Image
 
 WIDTH, HEIGHT = 7, 5
@@ -289,3 +296,28 @@ WRITTEN = {
     "supervisely": write_supervisely,
     "colors": write_colors,
 }
+
+
+def project_of(folder: Path, names: list[str], size: tuple[int, int] = (WIDTH, HEIGHT)) -> Path:
+    """A project with photos of these names, without classes and labels."""
+    ball_project(folder, views=len(names), side=8)
+    with edit_project(folder) as project:
+        project.classes = []
+        for image, name in zip(project.images, names):
+            image.name, image.label, (image.width, image.height) = name, None, size
+            image.file = f"images/{name}.jpg"
+    return folder
+
+
+def bring(folder: Path, file: Path, **values: Any) -> tuple[dict[str, Any], Reporter]:
+    report = Reporter()
+    return import_labels(LabelImportParams.model_validate({"project": folder, "file": file, **values}), report), report
+
+
+def named_map(folder: Path, photo: str) -> np.ndarray:
+    """The label map of a photo with the names of the classes, "" for unlabelled."""
+    project = load_project(folder)
+    label = next(image.label for image in project.images if image.name == photo)
+    assert label is not None
+    names = {project.ignore_id: "", **{c.id: c.name for c in project.classes}}
+    return np.vectorize(names.__getitem__)(read_label(folder / label))

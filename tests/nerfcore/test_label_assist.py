@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from fieldwork.nerfcore.cli import main
-from fieldwork.nerfcore.errors import InputError
+from fieldwork.nerfcore.errors import Cancelled, InputError
 from fieldwork.nerfcore.images.working import read_label
 from fieldwork.nerfcore.labels import models as loaded
 from fieldwork.nerfcore.labels.assist.embeddings import FOLDER
@@ -208,11 +208,11 @@ def test_wrong_requests_are_refused(tmp_path: Path, project: Path) -> None:
         cut(project, encoder, decoder, points=[CLICK], photo="x")
 
 
-def guess(folder: Path, model: Path, mapping: Any, **values: Any) -> dict[str, Any]:
+def guess(folder: Path, model: Path, mapping: Any, report: Reporter | None = None, **values: Any) -> dict[str, Any]:
     path = folder.parent / "mapping.json"
     path.write_text(mapping if isinstance(mapping, str) else json.dumps(mapping))
     given = {"project": folder, "model": model, "mapping": path, **values}
-    return suggest(AssistSuggestParams.model_validate(given), Reporter())
+    return suggest(AssistSuggestParams.model_validate(given), report or Reporter())
 
 
 @pytest.mark.parametrize("side", [None, 64])
@@ -230,6 +230,22 @@ def test_a_first_guess_has_the_classes_of_the_project(tmp_path: Path, project: P
     guess(project, model, {"0": "top"})
     label = read_label(project / str(load_project(project).images[0].label))
     assert (label[:, WIDTH // 2 + 4 :] == 0).all(), "what is no class of the project stays unlabelled"
+
+
+def test_a_guess_that_is_cancelled_leaves_earlier_ones(tmp_path: Path, project: Path) -> None:
+    model = tiny.segformer(tmp_path / "m.onnx")
+    guess(project, model, {"0": "top"})
+    before = {path: path.read_bytes() for path in (project / "labels").rglob("*") if path.is_file()}
+
+    class Stops(Reporter):
+        def progress(self, fraction: float, message: str = "") -> None:
+            if fraction > 0:
+                self.cancel()
+                self.check()
+
+    with pytest.raises(Cancelled):
+        guess(project, model, {"0": "bottom"}, Stops())
+    assert {path: path.read_bytes() for path in (project / "labels").rglob("*") if path.is_file()} == before
 
 
 @pytest.mark.parametrize("own", ["labels/own.png", "labels/suggested_view.png"])

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import InputError
-from ...files import atomic_path
+from ...files import atomic_path, staged
 from ...images.encode import write_picture
 from ...params import AssistEmbedParams, AssistSegmentParams, AssistSuggestParams
 from ...progress import Reporter
@@ -102,14 +102,15 @@ def suggest(params: AssistSuggestParams, report: Reporter) -> dict[str, Any]:
     report.stage("Guessing classes")
     taken: dict[str, float] = {}
     todo = [photo for photo in photos if photo not in own]
-    for number, photo in enumerate(todo):
-        report.progress(number / len(todo), photo.name)
-        found = model.probabilities(photo_pixels(folder, photo))
-        size = (photo.width, photo.height)
-        labels, sure = guessed(found, mapping, size, params.least, project.ignore_id, params.mapping)
-        _write(folder / SUGGESTED / f"{photo.name}.png", labels if labels.max() > 255 else labels.astype(np.uint8))
-        _write(folder / SUGGESTED / "confidence" / f"{photo.name}.png", (sure * 255 + 0.5).astype(np.uint8))
-        taken[photo.name] = float((labels != project.ignore_id).mean())
+    with staged(folder / SUGGESTED) as place:  # earlier guesses stay until all of the new ones are there
+        for number, photo in enumerate(todo):
+            report.progress(number / len(todo), photo.name)
+            found = model.probabilities(photo_pixels(folder, photo))
+            size = (photo.width, photo.height)
+            labels, sure = guessed(found, mapping, size, params.least, project.ignore_id, params.mapping)
+            _write(place / f"{photo.name}.png", labels if labels.max() > 255 else labels.astype(np.uint8))
+            _write(place / "confidence" / f"{photo.name}.png", (sure * 255 + 0.5).astype(np.uint8))
+            taken[photo.name] = float((labels != project.ignore_id).mean())
     share = round(float(np.mean(list(taken.values()))), 4) if taken else 0.0
     result = {"photos": len(taken), "kept": len(own), "labelled": share}
     with edit_project(folder) as edited:

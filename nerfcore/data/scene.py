@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Collection
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -55,6 +56,11 @@ class Scene:
     bounds: np.ndarray | None = None
     mask_mode: str = "ignore"
     frame: str = "sfm"
+
+    def unseen_by(self, trained_on: Collection[str]) -> Scene:
+        """The scene whose held-out views are those that a run was not trained on, by the names of its photos: which ones are
+        held out changes where photos are added or left out later."""
+        return replace(self, test=[i for i in self.test if self.views[i].name not in trained_on])
 
     def transformed(self, similarity: np.ndarray, frame: str) -> Scene:
         """The same scene seen from another frame; `similarity` (4, 4) maps this frame to the new one."""

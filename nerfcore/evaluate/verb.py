@@ -34,7 +34,7 @@ from ..render.baked import META, BakedField, load_baked, voxels_folder
 from ..render.image import Frame, background_of, render_view
 from ..render.model import Model
 from ..render.pictures import colorize_depth, colorize_labels, side_by_side
-from ..render.run import Trained, load_info, load_trained, refined_poses
+from ..render.run import Trained, load_info, load_trained, refined_poses, without_seen
 from ..render.sparse_rays import sparse_rays
 from ..verdict import evaluate_verdict
 from .advice import advice
@@ -184,6 +184,9 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
             f"The run “{params.run}” has no held-out photos: all were trained on.",
             "Train another run with --holdout 8 to measure, or measure the training photos (--split train).",
         )
+    if params.split == "test":
+        scene = without_seen(scene, trained.info, report)
+        indices = scene.test
     # Views larger than the training images are compared at the training size.
     sizes = [training_size(scene.views[index].camera, trained.info.image_size) for index in indices]
     shown = load_baked(folder, params.run, trained.info) if params.baked else trained.model
@@ -278,7 +281,7 @@ def evaluation_inputs(params: EvaluateParams) -> Fingerprint:
     """What an evaluation depends on. Raises ProjectError."""
     folder = Path(params.project)
     info = load_info(folder, params.run)
-    scene = load_scene(folder, info.holdout)
+    scene = load_scene(folder, info.holdout).unseen_by(info.images)
     limit = [] if params.time_limit is None else ["limited"]  # to however many seconds
     return {
         "trained field": checkpoint_id(folder, params.run),

@@ -145,6 +145,7 @@ def judge(
     """What photos say of a surface: "shown", "solid_shown", "holes", "overlap_shown", "seen_by_few", "verdict" and "silhouette" of
     `mesh`."""
     report.stage("Comparing it with the photos")
+    scene = scene.unseen_by(trained.info.images)
     shown = shown_share(photos, built.vertices, built.faces, report.check)
     bounds = wanted_bounds(params, scene, box)
     found = coverage(trained.model, scene, box.box_from_world, built.vertices, built.faces, bounds, report.check)

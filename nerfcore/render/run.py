@@ -15,10 +15,12 @@ from safetensors import SafetensorError, safe_open
 
 from ..config import RunConfig
 from ..data.box import Box
-from ..errors import ProjectError
+from ..data.scene import Scene
+from ..errors import InputError, ProjectError
 from ..files import write_json
 from ..geometry.similarity import transform_pose
 from ..kernels.device import use_device
+from ..progress import Reporter, shortened
 from ..project.runs import CHECKPOINT, HOLDOUT, INFO, run_folder, settle, state_id
 from ..project.schema import Poses, Project
 from ..project.store import world_from_sfm
@@ -151,6 +153,27 @@ def _as_trained(value: Any) -> RunInfo:
         stage = getattr(info.config, str(detail["loc"][1]))
         vars(stage)[str(detail["loc"][2])] = detail["input"]  # not checked again
     return info
+
+
+def without_seen(scene: Scene, info: RunInfo, report: Reporter) -> Scene:
+    """The scene without held-out views that the run was trained on, of which a warning tells.
+
+    Raises:
+        InputError: it was trained on all of them.
+    """
+    unseen = scene.unseen_by(info.images)
+    seen = [scene.views[i].name for i in scene.test if i not in unseen.test]
+    if seen and not unseen.test:
+        raise InputError(
+            f"The run was trained on all {len(seen)} photos that are held out now, since photos were added or left out.",
+            "Train it again.",
+        )
+    if seen:
+        report.warn(
+            shortened(f"{len(seen)} photos that are held out now were trained on by this run and do not count", seen)
+            + " Train it again to hold them out."
+        )
+    return unseen
 
 
 def refined_poses(project: Path, run: str, info: RunInfo) -> dict[str, np.ndarray]:

@@ -45,7 +45,7 @@ from .baked import META, BakedField, load_baked, voxels_folder
 from .image import Frame, background_of, render_view
 from .model import Model
 from .pictures import ENDINGS, colorize_depth, colorize_labels, depth_range
-from .run import RunInfo, load_info, load_trained
+from .run import RunInfo, load_info, load_trained, without_seen
 from .sparse_rays import sparse_rays
 
 OF_CLASSES = ("semantic", "confidence")  # passes
@@ -69,6 +69,8 @@ def render(params: RenderParams, report: Reporter, shown: Model | BakedField | N
     folder, out = Path(params.project), Path(params.out)
     project, info = load_project(folder), load_info(folder, params.run)
     scene = load_scene(folder, info.holdout)
+    if params.test and scene.test:
+        scene = without_seen(scene, info, report)
     if params.baked and "unknown" in params.passes:
         raise SettingError("A baked field has no pass “unknown”.", "Leave it out of --passes, or leave out --baked.")
     shown = shown or _shown(params, info)

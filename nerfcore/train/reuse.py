@@ -97,4 +97,5 @@ def unfinished(params: TrainParams) -> bool:
 
 def held_out(project: Path, run: str) -> int:
     """How many photos a run holds out. Raises ProjectError when there is no such run."""
-    return len(load_scene(project, load_info(project, run).holdout).test)
+    info = load_info(project, run)
+    return len(load_scene(project, info.holdout).unseen_by(info.images).test)

@@ -10,14 +10,15 @@ from pathlib import Path
 import pytest
 from fieldwork.nerfcore.errors import Cancelled, DiskError, InputError, ProjectError
 from fieldwork.nerfcore.evaluate.verb import evaluate, evaluated
-from fieldwork.nerfcore.params import EvaluateParams, RegionParams, TrainParams
+from fieldwork.nerfcore.params import EvaluateParams, RegionParams, RenderParams, TrainParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project import runs
 from fieldwork.nerfcore.project.edit import region
 from fieldwork.nerfcore.project.runs import TrainingFolder, checkpoint_id, fresh_folder, run_folder, settle, swap_in
 from fieldwork.nerfcore.project.store import load_project, save_project
 from fieldwork.nerfcore.render.run import load_info, load_trained
-from fieldwork.nerfcore.train.reuse import finished, unfinished
+from fieldwork.nerfcore.render.verb import render
+from fieldwork.nerfcore.train.reuse import finished, held_out, unfinished
 from fieldwork.nerfcore.train.verb import train
 from fieldwork.tests.nerfcore.support.ball import SMALL, ball_project
 from pydantic import ValidationError
@@ -301,6 +302,35 @@ def test_holdout(project: Path) -> None:
     # Resuming keeps the split of the run.
     train(params(project, run="all", steps=14, resume=True), Reporter())
     assert load_info(project, "all").images == every
+
+
+def hold_out(project: Path, *names: str) -> None:
+    """Let the project hold out these photos, as photos that come or go may do."""
+    value = load_project(project)
+    for image in value.images:
+        image.split = "test" if image.name in names else "train"
+    save_project(project, value)
+
+
+def test_photos_that_were_trained_on_are_not_held_out(project: Path, tmp_path: Path) -> None:
+    hold_out(project, "00", "05")  # the run has held out 00 and 08
+    for verb, values in ((evaluate, EvaluateParams(project=project)), (render, picture_of(project, tmp_path))):
+        report = Reporter()
+        result = verb(values, report)
+        assert result.get("images", len({Path(frame).stem for frame in result.get("frames", [])})) == 1
+        (warning,) = [text for text in report.warnings if "trained on" in text]
+        assert "05" in warning
+        assert "00" not in warning
+    assert evaluated(EvaluateParams(project=project)).result is not None
+    hold_out(project, "05")
+    for verb, values in ((evaluate, EvaluateParams(project=project)), (render, picture_of(project, tmp_path))):
+        with pytest.raises(InputError, match="trained on all 1 photos"):
+            verb(values, Reporter())
+    assert held_out(project, "main") == 0
+
+
+def picture_of(project: Path, out: Path) -> RenderParams:
+    return RenderParams(project=project, out=out / "renders", test=True, passes=["rgb"], size=(8, 8))
 
 
 def test_hold_out_nothing_or_something(tmp_path: Path) -> None:

@@ -205,8 +205,12 @@ def write_section(page: Path, heading: str, text: str) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Atomically write `value` as indented JSON."""
-    write_text(path, json.dumps(value, indent=1, ensure_ascii=False) + "\n")
+    """Atomically write `value` as indented JSON.
+
+    Raises:
+        ValueError: a number is not finite: JSON has none such, and what stands there stays readable.
+    """
+    write_text(path, json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
 
 
 def file_hash(path: Path) -> str:

@@ -111,7 +111,11 @@ def keep_quiet_about_destructors() -> None:
 
 
 def print_json(value: dict[str, Any], stream: TextIO) -> None:
-    print(json.dumps(value, ensure_ascii=False), file=stream)
+    """One line of JSON, in which numbers that are not finite are null, as the engine answers."""
+    from pydantic_core import to_json  # not at the top: signals are caught before libraries load
+
+    finite = json.loads(to_json(value, inf_nan_mode="null"))
+    print(json.dumps(finite, ensure_ascii=False, allow_nan=False), file=stream)
 
 
 def write_log(error: BaseException, verb: str, project: Path | None) -> Path:

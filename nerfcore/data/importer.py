@@ -61,12 +61,16 @@ def import_dataset(params: ImportParams, report: Reporter) -> dict[str, Any]:
         records.append(record)
         for value in ids:
             present.setdefault(value, []).append(view.label.name if view.label else view.name)
-    _warn_of_maps(records, present, dataset, source, folder, report)
+    _warn_of_maps(present, dataset, source, report)
+    _reject_hidden(records, folder, report)
+    used = [record for record in records if record.status == "ok"]
+    if not used:
+        raise InputError(f"The masks of {source} leave nothing of any photo.", "White in a mask marks what counts.")
     classes = _classes(dataset, set(present))
     told = params.keep_backdrop or params.mask_mode == "ignore" or any(r.mask or r.label for r in records)
     cut_out = not told and mask_objects(records, folder, report)
-    masks = [folder / record.mask for record in records if record.mask]
-    mask_mode = "empty" if cut_out else chosen_mask_mode(params.mask_mode, masks, len(records), report)
+    masks = [folder / record.mask for record in used if record.mask]
+    mask_mode = "empty" if cut_out else chosen_mask_mode(params.mask_mode, masks, len(used), report)
     cameras, images = _poses(dataset.views)
     poses, before = Poses(source=dataset.format, cameras=cameras, images=images), earlier_poses(folder)
     with edit_project(folder, Project()) as project:
@@ -79,8 +83,8 @@ def import_dataset(params: ImportParams, report: Reporter) -> dict[str, Any]:
         save_poses(folder, poses, dataset.points)
         result = {
             "format": dataset.format,
-            "images": len(records),
-            "labelled": sum(record.label is not None for record in records),
+            "images": len(used),
+            "labelled": sum(record.label is not None for record in used),
             "classes": [c.name for c in classes],
             "world_kept": kept,
         }
@@ -189,22 +193,24 @@ def _copy_view(view: DatasetView, folder: Path, dataset: Dataset) -> tuple[Image
     return record, ids
 
 
-def _warn_of_maps(
-    records: list[ImageRecord],
-    present: dict[int, list[str]],
-    dataset: Dataset,
-    source: Path,
-    folder: Path,
-    report: Reporter,
-) -> None:
-    """Say which values of label maps have no name where others have one, and which masks leave nothing of a photo."""
+def _warn_of_maps(present: dict[int, list[str]], dataset: Dataset, source: Path, report: Reporter) -> None:
+    """Say which values of label maps have no name where others have one."""
     if dataset.class_names:
         named = source / "classes.json" if (source / "classes.json").is_file() else source
         for text in unnamed_values(present, dataset.class_names, dataset.ignore_id, named):
             report.warn(text)
-    black = [record.name for record in records if record.mask and not read_mask(folder / record.mask).any()]
-    if black:
-        report.warn(shortened("Masks that are black everywhere leave nothing of these photos", black))
+
+
+def _reject_hidden(records: list[ImageRecord], folder: Path, report: Reporter) -> None:
+    """Leave photos out of which masks leave nothing, and say so."""
+    hidden = [record for record in records if record.mask and not read_mask(folder / record.mask).any()]
+    for record in hidden:
+        record.status, record.reason = "rejected", "its mask is black everywhere: white marks what counts"
+    if hidden:
+        names = [record.name for record in hidden]
+        report.warn(
+            shortened("Masks that are black everywhere leave nothing of these photos, which are left out", names)
+        )
 
 
 def _relative(path: Path | None, folder: Path) -> str | None:

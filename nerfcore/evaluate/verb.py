@@ -25,7 +25,7 @@ from ..images.picture import cut_out, over, resized, to_bytes
 from ..images.working import MASK_UNKNOWN, nearest, read_image, read_label
 from ..kernels.runtime import compile_seconds
 from ..params import EvaluateParams
-from ..progress import Reporter
+from ..progress import Reporter, shortened
 from ..project.fingerprints import Earlier, Fingerprint, compare, digest, files_digest, read_made, write_made
 from ..project.runs import checkpoint_id, read_metrics, run_folder, state_id
 from ..project.schema import step
@@ -65,6 +65,7 @@ class Comparison:
     confusion: Confusion
     scores: list[dict[str, Any]] = field(default_factory=list)
     pictures: list[Path] = field(default_factory=list)
+    hidden: list[str] = field(default_factory=list)
     opacity: list[float] = field(default_factory=list)
     spread: list[float] = field(default_factory=list)  # 95th percentile of depth over the 5th
     seconds: float = 0.0
@@ -75,10 +76,13 @@ class Comparison:
         return background_of(self.trained.info)
 
     def add(self, view: View, size: tuple[int, int], check: Callable[[], None]) -> None:
-        """Compare one view at a size (width, height)."""
+        """Compare one view at a size (width, height); `hidden` notes those whose mask leaves nothing to compare."""
         background = self.background
         camera = view.camera.resized(*size)
         photo, keep, label = compared_with(view, self.scene, camera.width, camera.height, background)
+        if keep is not None and not keep.any():
+            self.hidden.append(view.name)
+            return
         pose, given = self._pose(view, camera, photo, keep, check)
         begin, compiled = time.perf_counter(), compile_seconds()
         frame = render_view(self.shown, camera, pose, background, check=check)
@@ -218,6 +222,10 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
         view = scene.views[indices[place]]
         report.progress(number / len(indices), view.name)
         compared.add(view, sizes[place], report.check)
+    if compared.hidden:
+        report.warn(shortened("Photos whose masks leave nothing of them were not compared", compared.hidden))
+    if not compared.scores:
+        raise InputError("The masks leave nothing of the photos to compare.", "White in a mask marks what counts.")
     environment = trained.model.environment is not None
     speed: dict[str, Any] = dict.fromkeys(SPEED_KEYS)
     if params.speed:

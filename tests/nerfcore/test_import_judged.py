@@ -11,6 +11,7 @@ import pytest
 from fieldwork.nerfcore.data.dataset import Y_UP
 from fieldwork.nerfcore.data.importer import import_dataset, read_dataset
 from fieldwork.nerfcore.data.lens_check import lens_problem
+from fieldwork.nerfcore.data.load import load_scene
 from fieldwork.nerfcore.errors import InputError
 from fieldwork.nerfcore.geometry.cameras import Camera
 from fieldwork.nerfcore.params import ImportParams
@@ -131,6 +132,18 @@ def test_labels_and_masks_of_data_sets_are_judged_too(tmp_path: Path) -> None:
     assert [c.name for c in load_project(tmp_path / "p").classes] == ["class 77"]
     assert any("77" in text and "f1.png" in text and "classes.json" in text for text in report.warnings)
     assert any("f1" in text and "black everywhere" in text for text in report.warnings)
+    statuses = {record.name: record.status for record in load_project(tmp_path / "p").images}
+    assert statuses == {"f0": "ok", "f1": "rejected", "f2": "ok"}
+    assert [view.name for view in load_scene(tmp_path / "p").views] == ["f0", "f2"]
+
+
+def test_a_set_whose_masks_leave_nothing_is_refused(tmp_path: Path) -> None:
+    folder = data_set(tmp_path / "d", {"aabb_scale": 1})
+    (folder / "masks").mkdir()
+    for i in range(3):
+        Image.new("L", (320, 200), 0).save(folder / "masks" / f"f{i}.png")
+    with pytest.raises(InputError, match="leave nothing of any photo"):
+        import_dataset(ImportParams(dataset=folder, project=tmp_path / "p"), Reporter())
 
 
 def test_what_black_in_masks_means_can_be_said_of_a_data_set(tmp_path: Path) -> None:

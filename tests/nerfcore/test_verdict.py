@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from fieldwork.nerfcore.cli import main
+from fieldwork.nerfcore.errors import InputError
 from fieldwork.nerfcore.evaluate.verb import evaluate
 from fieldwork.nerfcore.geometry.cameras import Camera
 from fieldwork.nerfcore.images.picture import Picture
@@ -18,7 +20,9 @@ from fieldwork.nerfcore.mesh.verb import mesh
 from fieldwork.nerfcore.mesh.visibility import PosedCamera
 from fieldwork.nerfcore.params import EvaluateParams, MeshParams, TrainParams
 from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.project.store import edit_project
 from fieldwork.nerfcore.render.image import Frame
+from fieldwork.nerfcore.streams import print_json
 from fieldwork.nerfcore.train.verb import train
 from fieldwork.nerfcore.verdict import (
     evaluate_verdict,
@@ -30,6 +34,7 @@ from fieldwork.nerfcore.verdict import (
 )
 from fieldwork.tests.nerfcore.support.ball import SMALL, ball_project
 from fieldwork.tests.nerfcore.support.reconstructed import triangle
+from PIL import Image
 
 
 def curve(*psnr: float) -> list[dict[str, float]]:
@@ -147,3 +152,33 @@ def test_what_is_judged_of_renders_is_measured(tmp_path: Path, monkeypatch: pyte
     result = evaluate(EvaluateParams(project=project), Reporter())
     assert result["opacity"] == pytest.approx(0.2, abs=1e-4)
     assert result["depth_spread"] == pytest.approx(2.9 / 1.1, rel=0.01)
+
+
+def test_photos_of_which_a_mask_leaves_nothing_are_not_compared(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    project = ball_project(tmp_path / "p")
+    train(TrainParams(project=project, preset="draft", steps=2, set=SMALL), Reporter())
+    hide(project, "08")
+    assert main(["evaluate", str(project), "--json"]) == 0
+    result = json.loads(capfd.readouterr().out, parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
+    assert result["images"] == 1
+    assert result["psnr"] > 0
+    assert any("08" in text for text in result["warnings"])
+    hide(project, "00")
+    with pytest.raises(InputError, match="leave nothing"):
+        evaluate(EvaluateParams(project=project), Reporter())
+
+
+def hide(project: Path, name: str) -> None:
+    """Give a photo a mask that is black everywhere."""
+    (project / "masks").mkdir(exist_ok=True)
+    with edit_project(project) as edited:
+        image = next(image for image in edited.images if image.name == name)
+        image.mask = f"masks/{name}.png"
+        Image.new("L", (image.width, image.height), 0).save(project / image.mask)
+
+
+def test_results_on_stdout_are_json(capfd: pytest.CaptureFixture[str]) -> None:
+    print_json({"a": [1.5, float("nan")], "ü": float("inf")}, sys.stdout)
+    assert capfd.readouterr().out == '{"a": [1.5, null], "ü": null}\n'

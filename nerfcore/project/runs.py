@@ -177,12 +177,30 @@ def holdout_of(project: Path, run: str) -> int:
 
 
 def read_events(folder: Path) -> list[dict[str, Any]]:
-    """The course of a training as its events tell it; a line that a kill cut off is left out."""
+    """The course of a training as its events tell it; a line that a kill or a full disk cut off is left out."""
     try:
-        text = (folder / EVENTS).read_text(encoding="utf-8")
+        lines = (folder / EVENTS).read_bytes().splitlines()
     except OSError:
         return []
-    return [json.loads(line) for line in text.splitlines() if line.endswith("}")]
+    events = []
+    for line in lines:
+        try:
+            event = json.loads(line)
+        except ValueError:
+            continue
+        if isinstance(event, dict):
+            events.append(event)
+    return events
+
+
+def cut_events(folder: Path) -> None:
+    """Take away the end of a line that was cut off, before more lines are appended. Raises DiskError."""
+    path = folder / EVENTS
+    with disk_errors(path):
+        if not path.is_file():
+            return
+        with open(path, "rb+") as file:
+            file.truncate(file.read().rfind(b"\n") + 1)
 
 
 def read_metrics(folder: Path) -> dict[str, Any]:

@@ -32,6 +32,7 @@ from ..project.runs import (
     INFO,
     METRICS,
     TrainingFolder,
+    cut_events,
     read_events,
 )
 from ..project.store import load_project, record_step
@@ -93,6 +94,7 @@ def train(params: TrainParams, report: Reporter) -> dict[str, Any]:
     if place is not None:
         info, scene = _resumable(place, params, report)
         saved = _saved(place, info, device)
+        cut_events(place.folder)
     else:
         info, scene = _planned(params, device)
         place = TrainingFolder.anew(project_folder, params.run)

@@ -269,6 +269,23 @@ def test_a_resumed_run_says_that_it_keeps_its_settings(project: Path) -> None:
     assert step.settings["preset"] == "draft"
 
 
+def test_a_run_whose_events_were_cut_off_is_finished(project: Path) -> None:
+    events = run_folder(project, "main") / runs.EVENTS
+    whole = events.read_bytes()
+    assert whole.count(b"\n") >= 1
+    events.write_bytes(whole + b'{"step": 12, "sec')
+    assert len(runs.read_events(events.parent)) == whole.count(b"\n")
+    assert train(params(project, steps=14, resume=True), Reporter())["steps"] == 14
+    assert events.read_bytes().startswith(whole)
+    assert all(json.loads(line)["step"] for line in events.read_text().splitlines())
+
+
+def test_lines_of_events_that_cannot_be_read_are_left_out(tmp_path: Path) -> None:
+    """As versions left them that appended to a line which was cut off."""
+    (tmp_path / runs.EVENTS).write_bytes(b'{"step": 1}\n{"step": 2, "se{"step": 3}\n\xff{}\n7\n{"step": 4}\n')
+    assert [event["step"] for event in runs.read_events(tmp_path)] == [1, 4]
+
+
 def test_runs_of_before_go_on(project: Path) -> None:
     """config.json and checkpoints without an origin, as version 0.1 wrote them."""
     path = run_folder(project, "main") / "config.json"

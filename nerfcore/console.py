@@ -1,4 +1,7 @@
-"""Progress and results on a terminal; plain lines where there is none."""
+"""Progress and results on a terminal; plain lines where there is none.
+
+Names and messages are shown as they are: square brackets in them are no markup of rich's.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
+from rich.text import Text
 
 from .progress import Reporter
 
@@ -23,7 +27,7 @@ class ConsoleReporter(Reporter):
     def __init__(self, quiet: bool) -> None:
         super().__init__()
         self.quiet = quiet
-        self.console = Console(stderr=True, highlight=False)
+        self.console = Console(stderr=True, highlight=False, markup=False, emoji=False)
         self.bar: Progress | None = None
         self.task: TaskID | None = None
         self.name, self.begin, self.told = "", time.monotonic(), 0.0
@@ -33,12 +37,12 @@ class ConsoleReporter(Reporter):
     def __enter__(self) -> ConsoleReporter:
         if not self.quiet and self.console.is_terminal:
             self.bar = Progress(
-                TextColumn("{task.description}"),
+                TextColumn("{task.description}", markup=False),
                 BarColumn(),
                 TextColumn("{task.percentage:>3.0f} %"),
                 TimeElapsedColumn(),
                 TimeRemainingColumn(),
-                TextColumn("{task.fields[message]}"),
+                TextColumn("{task.fields[message]}", markup=False),
                 console=self.console,
             )
             self.bar.start()
@@ -99,13 +103,13 @@ class ConsoleReporter(Reporter):
 
     def warn(self, message: str) -> None:
         self.warnings.append(message)
-        self.console.print(f"[yellow]Warning:[/yellow] {message}")
+        self.console.print(Text.assemble(("Warning:", "yellow"), f" {message}"))
 
     def table(self, verb: str, result: dict[str, Any], stream: TextIO) -> None:
         """Print a result as one table."""
         table = Table(title=f"fieldwork {verb}", show_header=False, title_justify="left")
         for name, value in flattened(result):
-            table.add_row(name, value)
+            table.add_row(Text(name), Text(value))
         Console(file=stream, highlight=False, width=None if stream.isatty() else 120).print(table)
 
 
@@ -115,14 +119,15 @@ def campaign_table(status: dict[str, Any]) -> Table:
     head = ", ".join(f"{counts[state]} {state}" for state in ("done", "failed", "running", "waiting"))
     left = "" if status["eta_s"] is None else f", about {time_text(status['eta_s'])} left"
     workers = "1 worker" if status["workers"] == 1 else f"{status['workers']} workers"
-    table = Table(title=f"{status['campaign']}: {head}, {workers}{left}", title_justify="left")
+    table = Table(title=Text(f"{status['campaign']}: {head}, {workers}{left}"), title_justify="left")
     for name in ("capture", "state", "stage", "done", "left"):
         table.add_column(name, justify="right" if name in ("done", "left") else "left")
     for row in status["captures"]:
         failed = row["state"] == "failed"
         share = "" if failed or row["state"] == "waiting" else f"{row['fraction']:.0%}"
         stage = row["error"] if failed else row["stage"]
-        table.add_row(row["name"], row["state"], stage, share, time_text(row["eta_s"]), style="red" if failed else "")
+        cells = (row["name"], row["state"], stage, share, time_text(row["eta_s"]))
+        table.add_row(*map(Text, cells), style="red" if failed else "")
     return table
 
 

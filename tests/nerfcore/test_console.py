@@ -1,0 +1,55 @@
+"""What the command line shows: names and messages as they are, whatever they hold."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import pytest
+from fieldwork.nerfcore import console
+from fieldwork.nerfcore.console import ConsoleReporter, campaign_table
+from rich.console import Console
+
+ODD = "photos [2024] [/x] :smile: [red]"
+
+
+@pytest.fixture(params=[False, True], ids=["plain", "terminal"])
+def shown(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> io.StringIO:
+    """What a reporter writes, without a terminal and with one."""
+    out = io.StringIO()
+
+    def made(**values: Any) -> Console:
+        values.pop("stderr")
+        return Console(file=out, force_terminal=request.param, width=200, color_system=None, **values)
+
+    monkeypatch.setattr(console, "Console", made)
+    monkeypatch.setattr(console, "PLAIN_EVERY", -1.0)
+    return out
+
+
+@pytest.mark.parametrize("call", ["stage", "progress", "note", "warn"])
+def test_text_in_brackets_is_shown(shown: io.StringIO, call: str) -> None:
+    with ConsoleReporter(quiet=False) as report:
+        if call == "progress":
+            report.stage("Reading")
+            report.progress(0.5, ODD)
+        else:
+            getattr(report, call)(ODD)
+    assert ODD in shown.getvalue()
+
+
+def test_results_in_brackets_are_shown() -> None:
+    out = io.StringIO()
+    ConsoleReporter(quiet=False).table("new", {"file": ODD, "per_class": {"[wood]": 1}}, out)
+    assert ODD in out.getvalue()
+    assert "per_class.[wood]" in out.getvalue()
+
+
+def test_captures_in_brackets_are_shown() -> None:
+    rows = [{"name": "[a]", "state": "failed", "stage": "", "error": ODD, "fraction": 0.0, "eta_s": None}]
+    counts = {"done": 0, "failed": 1, "running": 0, "waiting": 0}
+    status = {"campaign": "[list]", "counts": counts, "eta_s": None, "workers": 1, "captures": rows}
+    drawn = Console(width=200, record=True, file=io.StringIO())
+    drawn.print(campaign_table(status))
+    text = drawn.export_text()
+    assert all(part in text for part in ("[list]", "[a]", ODD))

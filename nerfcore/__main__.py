@@ -9,7 +9,7 @@ CANCELLED = 130  # exit code
 
 
 def main() -> None:
-    if sys.argv[1:2] == ["serve"]:
+    if sys.argv[1:] == ["serve"]:  # with options, the command line says what they mean
         from .engine.server import main as serve
 
         sys.exit(serve())

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import subprocess
+import sys
 from typing import Any
 
 import pytest
@@ -53,3 +55,14 @@ def test_captures_in_brackets_are_shown() -> None:
     drawn.print(campaign_table(status))
     text = drawn.export_text()
     assert all(part in text for part in ("[list]", "[a]", ODD))
+
+
+def test_the_engine_says_how_it_is_called() -> None:
+    """`serve` alone is the engine, which speaks JSON on its standard streams."""
+    command = [sys.executable, "-m", "fieldwork.nerfcore", "serve", "--help"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL, timeout=60)
+    assert done.returncode == 0
+    assert "Usage" in done.stdout
+    assert "JSON-RPC" in done.stdout
+    wrong = subprocess.run([*command[:-1], "--wrong"], capture_output=True, text=True, check=False, timeout=60)
+    assert wrong.returncode == 2

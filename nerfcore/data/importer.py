@@ -39,7 +39,7 @@ def import_dataset(params: ImportParams, report: Reporter) -> dict[str, Any]:
     world as it was aligned.
 
     Returns:
-        {"format", "images", "labelled", "classes": [names], "world_kept": whether that is one aligned by hand}
+        {"format", "images", "labelled", "classes": [names]}
     Raises:
         InputError: the data set is of no known format or damaged.
         ProjectError: the project folder already holds another capture.
@@ -86,9 +86,8 @@ def import_dataset(params: ImportParams, report: Reporter) -> dict[str, Any]:
             "images": len(used),
             "labelled": sum(record.label is not None for record in used),
             "classes": [c.name for c in classes],
-            "world_kept": kept,
         }
-        project.record("import", params.model_dump(mode="json"), result)
+        project.record("import", params.model_dump(mode="json"), result | {"world_kept": kept})
     return result
 
 

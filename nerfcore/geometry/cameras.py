@@ -9,7 +9,7 @@ Conventions, used everywhere in `nerfcore`:
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -179,6 +179,17 @@ def project(camera: Camera, points: np.ndarray) -> np.ndarray:
         if camera.model == "OPENCV" and any(camera.distortion):
             uv, _ = _opencv_distort(uv, camera.distortion)
     return uv * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+
+
+def pose_matrix(value: Any) -> np.ndarray | None:
+    """The pose (4, 4) that a file gives as 4×4 or 3×4 numbers; None where it gives something else."""
+    try:
+        matrix = np.array(value, np.float64)
+    except (TypeError, ValueError):
+        return None
+    if matrix.shape == (3, 4):
+        return np.vstack([matrix, [0, 0, 0, 1]])
+    return matrix if matrix.shape == (4, 4) else None
 
 
 def flip_camera_axes(camera_to_world: np.ndarray) -> np.ndarray:

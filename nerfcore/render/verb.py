@@ -17,7 +17,7 @@ from ..data.readers.transforms import frame_camera
 from ..data.scene import Scene, View
 from ..errors import InputError, SettingError, wrong_value
 from ..files import atomic_path, disk_errors, write_json
-from ..geometry.cameras import Camera, flip_camera_axes
+from ..geometry.cameras import Camera, flip_camera_axes, pose_matrix
 from ..geometry.frames import focus_point
 from ..geometry.orbit import orbit_angles
 from ..geometry.similarity import similarity_scale
@@ -215,7 +215,8 @@ def read_cameras(path: Path) -> list[tuple[str, Camera, np.ndarray]]:
         raise InputError(f"{path}: {error.message}", error.hint) from error
     if not posed:
         raise InputError(f"{path} has no frames.", needed)
-    places = [str(frame.get("file_path", f"{number:04d}")) for number, frame in enumerate(frames)]
+    # Tools on Windows write backslashes.
+    places = [str(frame.get("file_path", f"{number:04d}")).replace("\\", "/") for number, frame in enumerate(frames)]
     return [(name, *camera) for name, camera in zip(frame_names(places), posed)]
 
 
@@ -225,8 +226,8 @@ def _posed(frame: dict[str, Any]) -> tuple[Camera, np.ndarray]:
     camera = frame_camera(given, int(given["w"]), int(given["h"]))
     if not (np.isfinite([camera.fx, camera.fy, camera.cx, camera.cy]).all() and min(camera.fx, camera.fy) > 0):
         raise ValueError(f"a focal length of {camera.fx:g} pixels cannot be")
-    pose = np.array(given["transform_matrix"], np.float64)
-    if pose.shape not in ((3, 4), (4, 4)) or not np.isfinite(pose).all():
+    pose = pose_matrix(given["transform_matrix"])
+    if pose is None or not np.isfinite(pose).all():
         raise ValueError("a “transform_matrix” is not 4 × 4 numbers")
     u, size, vt = np.linalg.svd(pose[:3, :3])
     if size[2] <= 1e-6 * size[0]:

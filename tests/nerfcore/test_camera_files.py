@@ -1,4 +1,4 @@
-"""Files of cameras that renders are made from."""
+"""Files of cameras as other programs write them, to render from and of data sets."""
 
 from __future__ import annotations
 
@@ -8,9 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fieldwork.nerfcore.data.importer import read_dataset
 from fieldwork.nerfcore.errors import InputError
 from fieldwork.nerfcore.geometry.cameras import Camera, flip_camera_axes
 from fieldwork.nerfcore.render.verb import look_at, read_cameras
+from fieldwork.tests.nerfcore.support.writers import data_set
+from PIL import Image
 
 POSE = look_at(np.array([1.0, -2.0, 0.5]), np.zeros(3))
 FRAME = {"file_path": "a", "transform_matrix": flip_camera_axes(POSE).tolist()}
@@ -57,6 +60,9 @@ def test_poses_may_be_three_rows_and_scaled(tmp_path: Path) -> None:
         ({"frames": []}, "no frames"),
         ({"frames": [{}]}, "“transform_matrix” is missing"),
         ({"frames": [{"transform_matrix": [[1, 2], [3, 4]]}]}, "not 4 × 4 numbers"),
+        ({"frames": [FRAME, {"transform_matrix": np.eye(5).tolist()}]}, "not 4 × 4 numbers"),
+        ({"frames": [{"transform_matrix": [[1, 2, 3, 4], [5]]}]}, "not 4 × 4 numbers"),
+        ({"frames": [{"transform_matrix": "x"}]}, "not 4 × 4 numbers"),
         ({"frames": [{"transform_matrix": np.full((4, 4), np.nan).tolist()}]}, "not 4 × 4 numbers"),
         ({"frames": [{"transform_matrix": np.zeros((4, 4)).tolist()}]}, "scales to nothing"),
         ({"w": 0}, "“width”"),
@@ -70,3 +76,25 @@ def test_what_is_wrong_with_a_file_is_named(tmp_path: Path, changes: dict, messa
         read_cameras(written(tmp_path, **changes))
     assert "cameras.json" in caught.value.message
     assert "pydantic" not in caught.value.message
+
+
+def test_names_of_windows_are_names(tmp_path: Path) -> None:
+    frames = [{**FRAME, "file_path": path} for path in ("left\\0.png", "right\\0.png")]
+    assert [name for name, *_ in read_cameras(written(tmp_path, frames=frames))] == ["left_0", "right_0"]
+
+
+def test_paths_of_windows_are_found(tmp_path: Path) -> None:
+    folder = data_set(tmp_path / "d")
+    (folder / "given").mkdir()
+    for i in range(3):
+        Image.new("L", (320, 200), 255).save(folder / "given" / f"m{i}.png")
+    value = json.loads((folder / "transforms.json").read_text())
+    for i, frame in enumerate(value["frames"]):
+        frame["file_path"] = f".\\images\\f{i}.png"
+        frame["mask_path"] = f"given\\m{i}.png"
+    value |= {"train_filenames": ["images\\f0.png"], "test_filenames": ["images\\f1.png", ".\\images\\f2.png"]}
+    (folder / "transforms.json").write_text(json.dumps(value))
+    views = read_dataset(folder).views
+    assert [view.image for view in views] == [folder / "images" / f"f{i}.png" for i in range(3)]
+    assert [view.mask for view in views] == [folder / "given" / f"m{i}.png" for i in range(3)]
+    assert [view.split for view in views] == ["train", "test", "test"]

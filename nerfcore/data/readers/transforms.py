@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from ...errors import InputError, wrong_value
-from ...geometry.cameras import Camera, flip_camera_axes
+from ...geometry.cameras import Camera, flip_camera_axes, pose_matrix
 from ...geometry.points import Points
 from ...images.decode import image_size
 from ...images.names import find_image, labels_and_masks, unique_names
@@ -63,8 +63,8 @@ def read(folder: Path) -> Dataset:
         splits = _named_splits(head)
         for frame in head["frames"]:
             try:
-                image = find_image(folder / frame["file_path"])
-                frame_split = splits.get(Path(frame["file_path"]).as_posix(), split)
+                place = _place(frame["file_path"])
+                image, frame_split = find_image(folder / place), splits.get(place.as_posix(), split)
             except (KeyError, TypeError) as error:
                 raise InputError(f"{file} has a frame without file_path.", "Export the data set again.") from error
             if image is None:
@@ -115,8 +115,15 @@ def _named_splits(head: dict[str, Any]) -> dict[str, Split]:
     test = head.get("test_filenames") or head.get("val_filenames")
     if not test:
         return {}
-    splits: dict[str, Split] = {Path(name).as_posix(): "train" for name in head.get("train_filenames", [])}
-    return {**splits, **{Path(name).as_posix(): "test" for name in test}}
+    splits: dict[str, Split] = {_place(name).as_posix(): "train" for name in head.get("train_filenames", [])}
+    return {**splits, **{_place(name).as_posix(): "test" for name in test}}
+
+
+def _place(text: str) -> Path:
+    """A path as files give it, which on Windows has backslashes. Raises TypeError where it is none."""
+    if not isinstance(text, str):
+        raise TypeError(f"{text!r} is no path")
+    return Path(text.replace("\\", "/"))
 
 
 def _view(
@@ -128,13 +135,8 @@ def _view(
     companions: tuple[Path | None, Path | None],
 ) -> DatasetView:
     width, height = image_size(image)
-    try:
-        matrix = np.array(frame.get("transform_matrix"), np.float64)
-    except (TypeError, ValueError):
-        matrix = np.zeros(0)
-    if matrix.shape == (3, 4):
-        matrix = np.vstack([matrix, [0, 0, 0, 1]])
-    if matrix.shape != (4, 4):
+    matrix = pose_matrix(frame.get("transform_matrix"))
+    if matrix is None:
         raise InputError(f"The pose of {image.name} in {folder} is not a 4×4 matrix.", "Export the data set again.")
     label_path = frame.get("semantic_path") or frame.get("label_path")
     depth = _optional(folder, frame.get("depth_file_path") or frame.get("depth_path"))
@@ -176,7 +178,7 @@ def _depth_scale(frame: dict[str, Any], depth: Path | None) -> float:
 
 
 def _optional(folder: Path, value: Any) -> Path | None:
-    return find_image(folder / value) if isinstance(value, str) and value else None
+    return find_image(folder / _place(value)) if isinstance(value, str) and value else None
 
 
 def frame_camera(frame: dict[str, Any], width: int, height: int) -> Camera:
@@ -227,11 +229,11 @@ def frame_camera(frame: dict[str, Any], width: int, height: int) -> Camera:
 def _points(folder: Path, head: dict[str, Any]) -> Points:
     """nerfstudio's sparse point cloud, which lies in the frame of the poses."""
     name = head.get("ply_file_path")
-    if not isinstance(name, str) or not (folder / name).is_file():
+    if not isinstance(name, str) or not (folder / _place(name)).is_file():
         return Points.empty()
     import trimesh
 
-    cloud = trimesh.load(folder / name)
+    cloud = trimesh.load(folder / _place(name))
     xyz = np.asarray(getattr(cloud, "vertices", np.zeros((0, 3))), np.float64)
     colors = getattr(cloud, "colors", None)
     rgb = np.asarray(colors)[:, :3].astype(np.uint8) if colors is not None and len(colors) == len(xyz) else None

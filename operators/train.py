@@ -30,7 +30,7 @@ def parse_settings(text: str) -> dict[str, str]:
     for word in text.split():
         name, equals, value = word.partition("=")
         if not (name and equals and value):
-            raise ValueError(t("“{}” is not a setting: write name=value, e.g. loss.semantic=0.1.", word))
+            raise ValueError(t("“{}” is not a setting: write name=value, e.g. loss.semantic_weight=0.1.", word))
         pairs[name] = value
     return pairs
 

@@ -36,7 +36,8 @@ Preset = Annotated[
 Settings = Annotated[
     dict[str, str],
     Field(
-        default_factory=dict, description="a setting of training by its name, e.g. loss.semantic=0.1; may be repeated"
+        default_factory=dict,
+        description="a setting of training by its name, e.g. loss.semantic_weight=0.1; may be repeated",
     ),
 ]
 Split = Literal["none", "classes", "instances"]

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 from pydantic import ValidationError
 
+from ..config import make_config
 from ..errors import InputError, SettingError, wrong_value
 from ..params import ReconstructParams
 
@@ -46,12 +47,16 @@ def read_list(path: Path) -> list[Capture]:
         if isinstance(values.get("set"), str):
             values["set"] = dict(word.partition("=")[::2] for word in values["set"].split())
         try:
-            captures.append(Capture(ReconstructParams.model_validate(values), priority))
+            capture = Capture(ReconstructParams.model_validate(values), priority)
+            make_config(capture.params.preset, capture.params.set)
         except ValidationError as error:
             raise SettingError(
                 f"{path}, capture {number}: {wrong_value(error.errors()[0])}.",
                 "Columns are named like the options of `fieldwork reconstruct`.",
             ) from error
+        except SettingError as error:
+            raise SettingError(f"{path}, capture {number}: {error.message}", error.hint) from error
+        captures.append(capture)
     if not captures:
         raise InputError(f"{path} lists no captures.", "Write one row for each, with its folder under “photos”.")
     outs = Counter(str(capture.params.out) for capture in captures)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from .. import params as p
+from ..config import make_config
 from ..data.load import load_scene
 from ..data.readers import colmap, transforms
 from ..errors import ProjectError
@@ -147,6 +148,7 @@ def reconstruct(params: p.ReconstructParams, report: Reporter) -> dict[str, Any]
     Raises:
         any verb's error; the project is left so that the same command goes on.
     """
+    make_config(params.preset, params.set)  # says what is wrong with them before hours of work
     if params.report is not None:
         check_report(params.report)
     if params.time_limit is not None:

@@ -128,7 +128,10 @@ def test_training_settings_are_read_from_text():
     pytest.importorskip("bpy")
     from fieldwork.operators.train import parse_settings
 
-    assert parse_settings("loss.semantic=0.1  field.levels=6") == {"loss.semantic": "0.1", "field.levels": "6"}
+    assert parse_settings("loss.semantic_weight=0.1  field.levels=6") == {
+        "loss.semantic_weight": "0.1",
+        "field.levels": "6",
+    }
     assert parse_settings("") == {}
     with pytest.raises(ValueError, match="name=value"):
         parse_settings("field.levels=")

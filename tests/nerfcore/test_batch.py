@@ -99,7 +99,7 @@ def test_lists_of_both_kinds_say_the_same(tmp_path):
     table = tmp_path / "list.csv"
     table.write_text(
         "photos,out,preset,time_limit,set\n"
-        "a/images,,draft,30,loss.semantic=0.1 field.levels=6\n"
+        "a/images,,draft,30,loss.semantic_weight=0.1 field.levels=6\n"
         "walk.mp4,/elsewhere/walk,,,\n",
         encoding="utf-8-sig",
     )
@@ -111,7 +111,7 @@ def test_lists_of_both_kinds_say_the_same(tmp_path):
                     "photos": "a/images",
                     "preset": "draft",
                     "time_limit": 30,
-                    "set": {"loss.semantic": "0.1", "field.levels": "6"},
+                    "set": {"loss.semantic_weight": "0.1", "field.levels": "6"},
                 },
                 {"photos": "walk.mp4", "out": "/elsewhere/walk"},
             ]
@@ -133,6 +133,13 @@ def test_lists_of_both_kinds_say_the_same(tmp_path):
         ("a.csv", "photos\nx,y,z\n", InputError, "more cells"),
         ("a.csv", "photos,out\nx,p\ny,p\n", SettingError, "two captures with the project"),
         ("a.csv", "photos,preset\nx,best\n", SettingError, "preset"),
+        (
+            "a.csv",
+            "photos,set\nx,\ny,loss.semantic=0.1\n",
+            SettingError,
+            "capture 2: There is no setting “loss.semantic”",
+        ),
+        ("a.csv", "photos,set\nx,loss.semantic_weight=-1\n", SettingError, "capture 1: The setting"),
         ("a.csv", "photos,priority\nx,soon\n", SettingError, "capture 1: “priority”"),
         ("a.json", "{", InputError, "damaged"),
         ("a.json", '{"photos": "x"}', InputError, "no array"),

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 from fieldwork.nerfcore.capture.ingest import new
+from fieldwork.nerfcore.errors import SettingError
 from fieldwork.nerfcore.geometry.cameras import Camera
 from fieldwork.nerfcore.params import BlocksParams, MeshParams, NewParams, Params, ReconstructParams
 from fieldwork.nerfcore.progress import Reporter
@@ -50,6 +51,14 @@ def test_poses_that_are_there_are_offered(
     _, (warning,) = first_stage(monkeypatch, ReconstructParams(photos=photos if inside else root, out=tmp_path / "p"))
     assert kind in warning
     assert f"fieldwork import {root}" in warning
+
+
+def test_settings_are_checked_before_anything_is_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module.Pipeline, "do", lambda *_: pytest.fail("a stage began"))
+    values = {"photos": folder_of(tmp_path / "photos"), "out": tmp_path / "p", "set": {"loss.semantic": "0.1"}}
+    with pytest.raises(SettingError, match=r"loss\.semantic"):
+        module.reconstruct(ReconstructParams.model_validate(values), Reporter())
+    assert not (tmp_path / "p").exists()
 
 
 def test_nothing_is_said_of_photos_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,8 +6,10 @@ Presets (`presets/*.json`) hold only what differs from the defaults. `--set stag
 from __future__ import annotations
 
 import json
+from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, Literal
+from types import NoneType
+from typing import Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -16,6 +18,10 @@ from .errors import SettingError, wrong_value
 PRESETS = Path(__file__).parent / "presets"
 # Earlier names of settings, still understood in `--set`, in preset files and in stored runs.
 RENAMED = {"sampling.interest": "sampling.importance"}
+# How a setting's type and limits are called.
+TYPES: dict[Any, str] = {int: "a whole number", float: "a number", bool: "true or false", str: "text", NoneType: "null"}
+BOUNDS = {"ge": "at least", "gt": "more than", "le": "at most", "lt": "less than", "multiple_of": "a multiple of"}
+CLOSE = 0.75  # how like a name has to be to one that may have been meant, of 1; not tuned
 MANY = 1_000_000_000  # more steps or seconds than anybody waits for
 MOST_VERTICES = 2048  # along a side of the finest level that a run chooses by itself; not tuned
 
@@ -308,9 +314,7 @@ def make_config(preset: str, settings: dict[str, str] | None = None) -> RunConfi
         stage, _, key = RENAMED.get(name, name).partition(".")
         model = RunConfig.model_fields.get(stage)
         if model is None or key not in type(model.default).model_fields:
-            raise SettingError(
-                f"There is no setting “{name}”.", "`fieldwork train --help` and docs/settings.md list them."
-            )
+            raise SettingError(f"There is no setting “{name}”.", _hint_for(name))
         try:
             value = json.loads(text)
         except json.JSONDecodeError:
@@ -321,6 +325,29 @@ def make_config(preset: str, settings: dict[str, str] | None = None) -> RunConfi
     try:
         return RunConfig.model_validate(values)
     except ValidationError as error:
+        detail = error.errors()[0]
         raise SettingError(
-            f"The setting {wrong_value(error.errors()[0])}.", "docs/settings.md lists what it takes."
+            f"The setting {wrong_value(detail)}.", what_it_takes(*map(str, detail["loc"][:2]))
         ) from error
+
+
+def _hint_for(name: str) -> str:
+    """Which setting may have been meant by a name that is none."""
+    keys = {stage: list(type(info.default).model_fields) for stage, info in RunConfig.model_fields.items()}
+    known = [f"{stage}.{key}" for stage, names in keys.items() for key in names]
+    near = [full for full in known if full.partition(".")[2] == name] + get_close_matches(name, known, 3, CLOSE)
+    if near:
+        return f"Did you mean {' or '.join(dict.fromkeys(near))}?"
+    stage = name.partition(".")[0]
+    if stage in keys:
+        return f"Settings of {stage} are {', '.join(keys[stage])}."
+    return f"Settings are called stage.name, and stages are {', '.join(keys)}."
+
+
+def what_it_takes(stage: str, key: str) -> str:
+    """A sentence on the values of a setting."""
+    setting = type(RunConfig.model_fields[stage].default).model_fields[key]
+    kinds = [TYPES.get(kind, str(kind)) for kind in get_args(setting.annotation) or (setting.annotation,)]
+    bounds = [f"{BOUNDS[n]} {getattr(m, n):g}" for m in setting.metadata for n in BOUNDS if hasattr(m, n)]
+    values = ", ".join([" or ".join(kinds), *bounds])
+    return f"{stage}.{key} takes {values} (default: {json.dumps(setting.default)})."

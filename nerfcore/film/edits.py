@@ -95,7 +95,8 @@ def render(params: RenderParams, report: Reporter) -> dict[str, Any]:
 
 def read_edits(path: Path) -> list[Edit]:
     """The edits of a file. Raises InputError."""
-    advice = "docs/live.md says what a file of edits holds."
+    names = ", ".join(field.alias or name for name, field in Edit.model_fields.items())
+    advice = f'Write {{"version": 1, "edits": [{{"class": "wall", "hide": true}}]}}. An edit may have {names}.'
     try:
         return EditList.model_validate(json.loads(path.read_text(encoding="utf-8"))).edits
     except OSError as error:

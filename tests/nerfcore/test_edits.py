@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 from fieldwork.nerfcore.errors import FieldworkError, InputError, ProjectError, SettingError
 from fieldwork.nerfcore.film.cryptomatte import id_of
-from fieldwork.nerfcore.film.edits import render
+from fieldwork.nerfcore.film.edits import read_edits, render
 from fieldwork.nerfcore.film.fields import FieldStore
 from fieldwork.nerfcore.mesh.instances import Instance, write_instances
 from fieldwork.nerfcore.params import RenderParams
@@ -179,3 +180,15 @@ def test_other_edits_are_another_render(things: Path, tmp_path: Path) -> None:
     assert rendered(params).result is not None
     (tmp_path / "edits.json").write_text('{"edits": [{"instance": "right", "hide": true}]}')
     assert rendered(params).result is None
+
+
+def test_a_wrong_file_of_edits_says_what_one_holds(tmp_path: Path) -> None:
+    path = tmp_path / "edits.json"
+    path.write_text('{"edits": [{"class": "wall", "hidden": true}]}')
+    with pytest.raises(InputError, match=r"no setting “edits\.0\.hidden”") as caught:
+        read_edits(path)
+    assert "instance, class, hide, opacity, color, tint, move, copies" in caught.value.hint
+    (example,) = re.findall(r"Write (\{.*\})\. ", caught.value.hint)
+    path.write_text(example)
+    (edit,) = read_edits(path)
+    assert edit.hide

@@ -11,7 +11,7 @@ import torch
 from fieldwork.nerfcore import config as config_module
 from fieldwork.nerfcore.bench.suites import ABLATION
 from fieldwork.nerfcore.cli import main
-from fieldwork.nerfcore.config import ONLY_RENDERING, RunConfig, make_config
+from fieldwork.nerfcore.config import ONLY_RENDERING, RunConfig, make_config, what_it_takes
 from fieldwork.nerfcore.errors import SettingError
 from fieldwork.nerfcore.field.hybrid import HybridField
 from fieldwork.nerfcore.kernels.traversal import PDF_UNIFORM
@@ -23,6 +23,7 @@ from fieldwork.tests.nerfcore.support.settings import trainer_of
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
+ROOT = Path(__file__).resolve().parents[2]
 NAMES = [
     f"{stage}.{name}" for stage, info in RunConfig.model_fields.items() for name in type(info.default).model_fields
 ]
@@ -160,3 +161,48 @@ def test_time_is_a_number(tmp_path: Path) -> None:
 def test_true_is_no_number(name: str) -> None:
     with pytest.raises(SettingError, match=name):
         make_config("draft", {name: "true"})
+
+
+@pytest.mark.parametrize(
+    ("name", "hint"),
+    [
+        ("loss.semantic", "Did you mean loss.semantic_weight?"),
+        ("holdout_rate", "stages are scene, field, sampling, render, loss, train"),
+        ("image_size", "Did you mean scene.image_size?"),
+        ("samples", "sampling.samples or render.samples"),
+        ("field.colour_of_it", "Settings of field are"),
+        ("loss", "semantic_weight"),
+    ],
+)
+def test_names_of_no_setting_say_which_may_be_meant(name: str, hint: str) -> None:
+    with pytest.raises(SettingError, match=name) as caught:
+        make_config("draft", {name: "1"})
+    assert hint in caught.value.hint
+
+
+@pytest.mark.parametrize(
+    ("name", "hint"),
+    [
+        ("sampling.samples", "a whole number, at least 1, at most 512 (default: 16)"),
+        ("field.branch", "hybrid or explicit or implicit"),
+        ("field.finest", "a whole number or null, at least 2"),
+    ],
+)
+def test_impossible_values_say_what_is_possible(name: str, hint: str) -> None:
+    with pytest.raises(SettingError, match=name) as caught:
+        make_config("draft", {name: "-7"})
+    assert hint in caught.value.hint
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_setting_says_what_it_takes(name: str) -> None:
+    assert name in what_it_takes(*name.split("."))
+
+
+def test_the_examples_of_settings_are_settings() -> None:
+    sources = [(ROOT / path).read_text("utf-8") for path in ("nerfcore/params/base.py", "operators/train.py")]
+    examples = [example for text in sources for example in re.findall(r"e\.g\. ([a-z_]+\.\w+=[\w.]+\w)", text)]
+    assert len(examples) == 2
+    for example in examples:
+        name, _, value = example.partition("=")
+        make_config("draft", {name: value})

@@ -61,6 +61,7 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, size: int | Callable[[int], 
     area = float(np.linalg.norm(np.cross(*_sides(vertices, faces)), axis=1).sum()) / 2
     if not np.isfinite(area) or area <= 0:
         raise TrainingError("The mesh has no area to unwrap.", "Extract it again.")
+    vertices = _with_unit_faces(vertices, area / len(faces))
     chunks = spatial_chunks(vertices[faces].mean(1), CHUNK_FACES)
     cut_for = CUT_SIZE if callable(size) else size
     with tempfile.TemporaryDirectory(prefix="fieldwork-uv-") as name:
@@ -72,7 +73,7 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, size: int | Callable[[int], 
                     folder / f"in_{number}.npz",
                     vertices=vertices[used],
                     faces=corners.reshape(-1, 3),
-                    texels_per_unit=np.sqrt(COVERED * cut_for**2 / area),
+                    texels_per_unit=np.sqrt(COVERED * cut_for**2 / len(faces)),
                 )
         _work(folder, list(range(len(chunks))), report, 0.7, 0.0)
         order = np.concatenate(chunks)
@@ -107,6 +108,13 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, size: int | Callable[[int], 
 def _sides(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     a, b, c = (vertices[faces[:, k]].astype(np.float64) for k in range(3))
     return b - a, c - a
+
+
+def _with_unit_faces(vertices: np.ndarray, face_area: float) -> np.ndarray:
+    """Vertices (V, 3) about the origin and scaled, so that a mean face, of area `face_area`, has an area of 1: xatlas leaves out
+    faces below 1e-7, which in metres most faces of a small object are."""
+    middle = (vertices.min(0).astype(np.float64) + vertices.max(0)) / 2
+    return (vertices - middle) / np.sqrt(face_area)
 
 
 def spatial_chunks(centers: np.ndarray, most: int) -> list[np.ndarray]:

@@ -57,6 +57,16 @@ def test_chunks_make_one_map_without_overlap_and_of_one_scale(monkeypatch: pytes
     assert np.percentile(scale, 95) / np.percentile(scale, 5) < 2
 
 
+@pytest.mark.parametrize("radius", [1e-3, 1.0, 1e5])
+def test_every_face_has_a_place_whatever_the_unit(radius: float) -> None:
+    ball = trimesh.creation.icosphere(3)
+    made = uv.unwrap((ball.vertices * radius).astype(np.float32), ball.faces, 256, Reporter())
+    u, v = made.corners[:, 1] - made.corners[:, 0], made.corners[:, 2] - made.corners[:, 0]
+    share = np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]) / 2
+    assert share.min() > 0
+    assert 0.3 < share.sum() <= 1
+
+
 def test_faces_without_area_get_a_place() -> None:
     vertices, faces = box_mesh()
     made = uv.unwrap(vertices, np.concatenate([faces, [[0, 1, 1], [2, 2, 2]]]), 256, Reporter())

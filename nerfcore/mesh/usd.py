@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +23,7 @@ from .features import Feature, Features
 from .parts import Texture
 from .surface import Surface
 
+MATERIALS, CAMERAS = "Materials", "Cameras"  # what else lies beside the meshes
 APERTURE = 0.36  # of the cameras: 36 mm in tenths of a metre, USD's unit of lenses
 
 
@@ -95,7 +96,7 @@ def _write_stage(
         assert png is not None
         file.with_name(picture).write_bytes(png)
     materials = _materials(stage, root.GetPath(), features.rows, picture if texture is not None else None)
-    names = _Names()
+    names = _Names({root.GetPath().AppendChild(name) for name in (MATERIALS, CAMERAS)})
     for label, chosen in features.groups(split).items():
         check()
         prim = names.under(root.GetPath(), "Surface" if split == "none" else label)
@@ -182,7 +183,7 @@ def _materials(
     stage: Usd.Stage, root: Sdf.Path, rows: list[Feature], picture: str | None
 ) -> dict[int, UsdShade.Material]:
     """A matt material for each class: all show the texture, or the display colours."""
-    scope, names, made = UsdGeom.Scope.Define(stage, root.AppendChild("Materials")).GetPath(), _Names(), {}
+    scope, names, made = UsdGeom.Scope.Define(stage, root.AppendChild(MATERIALS)).GetPath(), _Names(), {}
     for row in rows:
         if row.class_id in made:
             continue
@@ -224,7 +225,7 @@ def _color_source(stage: Usd.Stage, path: Sdf.Path, picture: str | None) -> UsdS
 
 
 def _cameras(stage: Usd.Stage, root: Sdf.Path, views: Sequence[View]) -> None:
-    names, scope = _Names(), root.AppendChild("Cameras")
+    names, scope = _Names(), root.AppendChild(CAMERAS)
     for view in views:
         lens = view.camera.undistorted() if view.camera.model != "EQUIRECTANGULAR" else None
         if lens is None:
@@ -245,10 +246,10 @@ def _cameras(stage: Usd.Stage, root: Sdf.Path, views: Sequence[View]) -> None:
 
 
 class _Names:
-    """Names of prims: identifiers, each once."""
+    """Names of prims: identifiers, each once, and none of the `taken` paths."""
 
-    def __init__(self) -> None:
-        self.taken: set[Sdf.Path] = set()
+    def __init__(self, taken: Iterable[Sdf.Path] = ()) -> None:
+        self.taken = set(taken)
 
     def under(self, parent: Sdf.Path, name: str) -> Sdf.Path:
         path = parent.AppendChild(_identifier(name))

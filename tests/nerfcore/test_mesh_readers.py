@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import struct
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 import trimesh
 from fieldwork.nerfcore.geometry.cameras import project
 from fieldwork.nerfcore.geometry.similarity import transform_points
+from fieldwork.nerfcore.mesh.features import features_of
 from fieldwork.nerfcore.mesh.files import write_surface
 from fieldwork.tests.nerfcore.support import gltf_validator
 from fieldwork.tests.nerfcore.support import painted_box as box
@@ -135,6 +137,24 @@ def test_usd_says_class_and_instance_of_each_face(tmp_path: Path, split: str, en
     assert sorted(seen) == list(range(12))
 
 
+def test_classes_may_be_called_as_other_parts_of_a_usd(tmp_path: Path) -> None:
+    classes = [replace(c, name=name) for c, name in zip(box.CLASSES, ("Materials", "Cameras"))]
+    features = features_of(box.surface(), classes, 0)
+    path, *_ = write_surface(tmp_path / "a.usdc", box.surface(), features, "classes", box.texture(), [box.VIEW])
+    stage = Usd.Stage.Open(str(path))
+    faces = {
+        prim.GetDisplayName(): len(UsdGeom.Mesh(prim).GetFaceVertexCountsAttr().Get())
+        for prim in stage.Traverse()
+        if prim.IsA(UsdGeom.Mesh)
+    }
+    assert faces == {"void": 2, "Materials": 6, "Cameras": 4}
+    (camera,) = (prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Camera))
+    (materials, cameras) = (stage.GetPrimAtPath(f"/a/{name}") for name in ("Materials", "Cameras"))
+    assert materials.IsA(UsdGeom.Scope)
+    assert len(materials.GetChildren()) == 3
+    assert cameras.GetChildren() == [camera]
+
+
 def check_subsets(mesh: UsdGeom.Mesh, faces: np.ndarray) -> None:
     """The subsets of a mesh that has these faces of the box."""
     classes, instances = np.zeros(len(faces), int), np.zeros(len(faces), int)
@@ -215,10 +235,6 @@ def test_ply_says_class_and_instance_of_each_face(tmp_path: Path) -> None:
 
 def test_many_features_have_their_numbers_all_the_same(tmp_path: Path) -> None:
     """More rows than 16 bits can count."""
-    from dataclasses import replace
-
-    from fieldwork.nerfcore.mesh.features import features_of
-
     count = 65540
     one = box.surface()
     many = replace(

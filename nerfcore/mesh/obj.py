@@ -35,8 +35,7 @@ def write_obj(path: Path, part: Part, features: Features, png: bytes | None, che
     Raises:
         DiskError: a file cannot be written. What `check` raises, between bands of lines.
     """
-    # Several objects may lie in one folder, or be brought into one scene: all of their names are their own. White
-    # space ends a name for many readers.
+    # Several objects may lie in one folder, or be brought into one scene: all of their names are their own.
     name = _word(path.stem)
     order = np.argsort(part.face_feature, kind="stable")
     ordered = part.face_feature[order]
@@ -74,4 +73,5 @@ def _lines(file: TextIO, line: str, values: np.ndarray, check: Callable[[], None
 
 
 def _word(name: str) -> str:
-    return re.sub(r"\s+", "_", name)
+    """A name as one word: white space ends it, and a backslash at the end of a line joins the next one to it."""
+    return re.sub(r"[\s\\]+", "_", name)

@@ -226,6 +226,14 @@ def test_obj_groups_are_the_features(tmp_path: Path) -> None:
     assert len(trimesh.load(path, force="mesh", process=False).faces) == 12
 
 
+def test_a_backslash_in_a_name_takes_no_face_from_an_obj(tmp_path: Path) -> None:
+    classes = [replace(c, name=name) for c, name in zip(box.CLASSES, ("stone\\", "a \\ b"))]
+    path, *_ = write_surface(tmp_path / "a.obj", box.surface(), features_of(box.surface(), classes, 0), "none")
+    groups = [line for line in path.read_text("utf-8").splitlines() if line.startswith("g ")]
+    assert groups == ["g void", "g stone_", "g a_b.001", "g a_b.002"]
+    assert len(trimesh.load(path, force="mesh", process=False).faces) == 12
+
+
 def test_ply_says_class_and_instance_of_each_face(tmp_path: Path) -> None:
     (path,) = write(tmp_path / "a.ply")
     face = trimesh.load(path, process=False).metadata["_ply_raw"]["face"]["data"]

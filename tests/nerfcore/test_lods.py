@@ -44,6 +44,15 @@ def most_at_an_edge(faces: np.ndarray) -> int:
     return int(np.unique(edges, axis=0, return_counts=True)[1].max())
 
 
+@pytest.mark.parametrize("unit", [1e-3, 1e6])
+def test_levels_are_as_near_whatever_the_unit(unit: float) -> None:
+    full, place = ball(), np.array([3.0, -2.0, 1.0], np.float32)
+    other = replace(full, vertices=((full.vertices + place) * unit).astype(np.float32))
+    for plain, level in zip(make_levels(full, None, 2, Reporter()), make_levels(other, None, 2, Reporter())):
+        assert len(level.surface.faces) == pytest.approx(len(plain.surface.faces), rel=0.01)
+        assert level.deviation == pytest.approx(plain.deviation * unit, rel=0.1)
+
+
 def test_levels_keep_class_borders_and_stay_closed_and_near() -> None:
     full = ball()
     levels = make_levels(full, None, 2, Reporter())

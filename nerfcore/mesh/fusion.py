@@ -10,9 +10,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+import psutil
 import scipy
 import torch
 
+from ..errors import SettingError
 from ..kernels.depth_arrays import FREE, MapArrays
 from ..kernels.surface import fuse
 from ..progress import Reporter
@@ -31,6 +33,7 @@ CHUNK = 256  # bricks
 STEP = 1.3  # voxels by which distances of neighbouring corners differ at most on either side of one surface
 UNSTEADY = 0.15  # share of the crossings in a brick that step farther, from which on its views disagree
 WIDER = 4.0  # times the truncation with which such bricks are fused anew
+BYTES_PER_PLACE, BYTES_PER_BRICK = 8, 2 * 4 * BRICK**3  # of memory: a brick that may be there, and one that is
 
 
 @dataclass(frozen=True)
@@ -68,13 +71,17 @@ def fuse_maps(
             not all there are.
         part: first bricks (3,) and those after the last (3,), where only a part of the region's grid is wanted: what is
             there is the same, to the bit, as on the whole grid.
+    Raises:
+        SettingError: the grid does not fit into memory.
     """
     h = region.voxel
     origin, counts = grid_of(region)
+    check_memory(counts, BYTES_PER_PLACE * np.prod(counts, dtype=float))
     index = _mark(maps, origin, h, counts, report)
     if part is not None:
         index = _only(index, *part)
     bricks = np.stack(np.nonzero(index >= 0), 1)
+    check_memory(counts, BYTES_PER_BRICK * len(bricks))
     device = maps.depth.device
     axis = torch.arange(BRICK, device=device)
     inner = torch.cartesian_prod(axis, axis, axis)
@@ -98,6 +105,17 @@ def fuse_maps(
         wide = unsure & unsteady(distance, weight, h)
         fuse_bricks(np.flatnonzero(wide), WIDER, 0.8, 1.0)
     return Bricks(origin, h, index, distance, weight, wide)
+
+
+def check_memory(counts: np.ndarray, needed: float) -> None:
+    """Raise SettingError when a grid of so many bricks (3,), which needs so many bytes, does not fit into free memory."""
+    free = psutil.virtual_memory().available
+    if needed > free:
+        cells = "×".join(str(n * BRICK) for n in counts.tolist())
+        raise SettingError(
+            f"A grid of {cells} cells needs {needed / 1e9:.3g} GB of memory, and {free / 1e9:.3g} GB are free.",
+            "Ask for larger cells by `--detail` or `--resolution`, or look in a smaller `--region`.",
+        )
 
 
 def spread_of(maps: MapArrays) -> np.ndarray:

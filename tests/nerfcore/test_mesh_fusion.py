@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from fieldwork.nerfcore.data.scene import View
-from fieldwork.nerfcore.errors import Cancelled, TrainingError
+from fieldwork.nerfcore.errors import Cancelled, SettingError, TrainingError
 from fieldwork.nerfcore.geometry.cameras import Camera
 from fieldwork.nerfcore.kernels.depth_arrays import FREE, MapArrays
-from fieldwork.nerfcore.mesh import clean, depth_maps, metrics, triangles
+from fieldwork.nerfcore.mesh import clean, depth_maps, fusion, metrics, triangles
 from fieldwork.nerfcore.mesh.decimate import decimate
 from fieldwork.nerfcore.mesh.extract import extract, weld
 from fieldwork.nerfcore.mesh.fusion import BRICK, Bricks, fuse_maps, is_soft, mean_spread, spread_of, tolerances
@@ -49,6 +50,16 @@ def test_a_sphere_comes_back_as_a_closed_sphere(lens: str) -> None:
     outward = (triangles.cross(vertices, faces) * vertices[faces].mean(1)).sum(1)
     assert (outward > 0).all()
     assert triangles.areas(vertices, faces).sum() == pytest.approx(np.pi, rel=0.01)
+
+
+@pytest.mark.parametrize(("voxel", "free"), [(1e-7, 64 << 30), (0.01, 1 << 20)], ids=["of the grid", "of its bricks"])
+def test_no_memory_for_fine_cells_is_said_before_they_are_made(
+    monkeypatch: pytest.MonkeyPatch, voxel: float, free: int
+) -> None:
+    monkeypatch.setattr(fusion.psutil, "virtual_memory", lambda: SimpleNamespace(available=free))
+    with pytest.raises(SettingError, match=r"cells needs .* GB of memory") as caught:
+        surface_of(sphere(0.5), orbit(6, 1.8), 64, voxel=voxel)
+    assert "--detail" in (caught.value.hint or "")
 
 
 def test_a_plate_of_two_voxels_keeps_both_sides() -> None:

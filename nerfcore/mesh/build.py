@@ -93,6 +93,11 @@ def build(trained: Trained, project: Project, scene: Scene, params: MeshParams, 
 
 def no_surface(params: MeshParams) -> TrainingError:
     """What to say where there is none in the region."""
+    if params.detail is not None:
+        return TrainingError(
+            f"There is no surface in the region {params.region} in cells of {params.detail:g} mm.",
+            "Give a smaller `--detail`, or another `--region`.",
+        )
     if params.region in ("auto", "photos"):
         return TrainingError("The field has no surface in the region of interest.", "Train longer, or check the box.")
     return TrainingError(
@@ -147,7 +152,7 @@ def wanted_bounds(params: MeshParams, scene: Scene, box: Box) -> tuple[np.ndarra
     """Corners (3,) in the normalised frame of the region that was asked for; None: what the photos show.
 
     Raises:
-        SettingError: it is not six numbers, or empty.
+        SettingError: it is not six finite numbers, or empty.
     """
     if params.region == "photos":
         return None
@@ -162,6 +167,10 @@ def wanted_bounds(params: MeshParams, scene: Scene, box: Box) -> tuple[np.ndarra
             raise SettingError(
                 f"{params.region} is no region.", "Give auto, photos, or x0,y0,z0,x1,y1,z1 in the aligned world."
             ) from error
+        if not np.isfinite([low, high]).all():
+            raise SettingError(
+                f"The region {params.region} has no end.", "Give numbers, or photos for all that the photos show."
+            )
         if not (low < high).all():
             raise SettingError(f"The region {params.region} is empty.", "Give x0 < x1, y0 < y1, z0 < z1.")
     corners = np.stack(np.meshgrid(*zip(low, high), indexing="ij"), -1).reshape(-1, 3)

@@ -11,7 +11,7 @@ from fieldwork.nerfcore.data.scene import Scene
 from fieldwork.nerfcore.errors import SettingError
 from fieldwork.nerfcore.geometry.similarity import make_similarity
 from fieldwork.nerfcore.mesh.appearance import bilinear, blend
-from fieldwork.nerfcore.mesh.build import check_parts, wanted_bounds, wanted_voxel
+from fieldwork.nerfcore.mesh.build import check_parts, no_surface, wanted_bounds, wanted_voxel
 from fieldwork.nerfcore.params import MeshParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.schema import Project
@@ -34,10 +34,15 @@ def test_the_region_is_the_projects_or_what_is_given() -> None:
     np.testing.assert_allclose(found, [[0, 0, 0], [1, 1, 0.5]])
 
 
-@pytest.mark.parametrize("text", ["here", "1,2,3", "0,0,0,1,1,0", "0,0,0,1,1,nan"])
+@pytest.mark.parametrize("text", ["here", "1,2,3", "0,0,0,1,1,0", "0,0,0,1,1,nan", "0,0,0,inf,1,1"])
 def test_impossible_regions_are_named(text: str) -> None:
     with pytest.raises(SettingError, match="region"):
         wanted_bounds(MeshParams(project=HERE, region=text), scene(), BOX)
+
+
+def test_a_detail_larger_than_what_is_there_is_named() -> None:
+    assert "in cells of 50000 mm" in no_surface(MeshParams(project=HERE, detail=50_000)).message
+    assert "cells" not in no_surface(MeshParams(project=HERE)).message
 
 
 def test_a_detail_in_millimetres_needs_a_scale() -> None:

@@ -47,12 +47,12 @@ def to_world(surface: Surface, world_from_box: np.ndarray) -> Surface:
 
 
 def class_table(surface: Surface, names: dict[int, str]) -> dict[str, dict[str, float]]:
-    """Number of faces and area (world units²) of each class on the surface."""
+    """Number of faces and area (world units², to six digits, as a small thing has little of it) of each class on the surface."""
     area = areas(surface.vertices.astype(np.float64), surface.faces)
     return {
         names.get(int(c), str(c)): {
             "faces": int((surface.face_class == c).sum()),
-            "area": round(float(area[surface.face_class == c].sum()), 6),
+            "area": float(f"{area[surface.face_class == c].sum():.6g}"),
         }
         for c in np.unique(surface.face_class)
     }

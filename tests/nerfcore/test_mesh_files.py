@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from fieldwork.nerfcore.data.scene import ClassInfo
 from fieldwork.nerfcore.mesh.features import features_of
 from fieldwork.nerfcore.mesh.files import write_surface
 from fieldwork.nerfcore.mesh.parts import texture_of
-from fieldwork.nerfcore.mesh.surface import Surface
+from fieldwork.nerfcore.mesh.surface import Surface, class_table
 from PIL import Image
 from pxr import Usd, UsdGeom
 
@@ -133,3 +134,8 @@ def test_split_obj_keeps_the_textures_of_its_parts(tmp_path: Path) -> None:
         if path.suffix == ".png":
             with Image.open(path) as image:
                 assert image.getpixel((7, 7)) == (50, 50, 50)
+
+
+def test_areas_of_small_things_have_their_digits() -> None:
+    small = replace(square(), vertices=square().vertices * 0.0123)
+    assert class_table(small, {1: "a"})["a"] == {"faces": 1, "area": pytest.approx(0.0123**2 / 2, rel=1e-5)}

@@ -25,6 +25,7 @@ from .surface import Surface
 
 MATERIALS, CAMERAS = "Materials", "Cameras"  # what else lies beside the meshes
 APERTURE = 0.36  # of the cameras: 36 mm in tenths of a metre, USD's unit of lenses
+NEAR, FAR = 0.01, 1000.0  # what cameras show at least
 
 
 def write_usd(
@@ -103,7 +104,7 @@ def _write_stage(
         mesh = _mesh(stage, prim, surface, features, texture, chosen)
         mesh.GetPrim().SetDisplayName(label if split != "none" else "Surface")
         _label_faces(mesh, features, chosen, materials)
-    _cameras(stage, root.GetPath(), views)
+    _cameras(stage, root.GetPath(), views, surface.vertices)
     stage.GetRootLayer().Save()
 
 
@@ -224,8 +225,9 @@ def _color_source(stage: Usd.Stage, path: Sdf.Path, picture: str | None) -> UsdS
     return texture.CreateOutput("rgb", Sdf.ValueTypeNames.Float3)
 
 
-def _cameras(stage: Usd.Stage, root: Sdf.Path, views: Sequence[View]) -> None:
+def _cameras(stage: Usd.Stage, root: Sdf.Path, views: Sequence[View], vertices: np.ndarray) -> None:
     names, scope = _Names(), root.AppendChild(CAMERAS)
+    low, high = vertices.min(0), vertices.max(0)
     for view in views:
         lens = view.camera.undistorted() if view.camera.model != "EQUIRECTANGULAR" else None
         if lens is None:
@@ -239,7 +241,9 @@ def _cameras(stage: Usd.Stage, root: Sdf.Path, views: Sequence[View]) -> None:
         camera.CreateVerticalApertureAttr(height)
         camera.CreateHorizontalApertureOffsetAttr((0.5 - lens.cx / lens.width) * APERTURE)
         camera.CreateVerticalApertureOffsetAttr((lens.cy / lens.height - 0.5) * height)
-        camera.CreateClippingRangeAttr(Gf.Vec2f(0.01, 1000.0))
+        # All of the surface, however small or large the unit.
+        far = float(np.linalg.norm(np.maximum(view.camera_to_world[:3, 3] - low, high - view.camera_to_world[:3, 3])))
+        camera.CreateClippingRangeAttr(Gf.Vec2f(min(NEAR, far / 1000), max(FAR, 2 * far)))
         # USD's cameras look along −z with y up, and its matrices act on rows.
         pose = flip_camera_axes(view.camera_to_world)
         camera.AddTransformOp().Set(Gf.Matrix4d(*pose.T.reshape(-1).tolist()))

@@ -214,6 +214,23 @@ def test_usd_cameras_see_what_ours_see(tmp_path: Path) -> None:
     np.testing.assert_allclose(theirs, ours, atol=1e-3)
 
 
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e4])
+def test_usd_cameras_show_all_of_a_surface_whatever_the_unit(tmp_path: Path, unit: float) -> None:
+    pose = box.VIEW.camera_to_world.copy()
+    pose[:3, 3] *= unit
+    whole, view = (
+        replace(box.surface(), vertices=box.surface().vertices * unit),
+        replace(box.VIEW, camera_to_world=pose),
+    )
+    path, *_ = write_surface(tmp_path / "a.usdc", whole, box.features(), "none", views=[view])
+    stage = Usd.Stage.Open(str(path))
+    (camera,) = (UsdGeom.Camera(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.Camera))
+    near, far = camera.GetClippingRangeAttr().Get()
+    depth = transform_points(np.linalg.inv(pose), whole.vertices.astype(float))[:, 2]
+    assert near < depth.min()
+    assert depth.max() < far
+
+
 def test_obj_groups_are_the_features(tmp_path: Path) -> None:
     path, *_ = write(tmp_path / "a.obj")
     groups: dict[str, int] = {}

@@ -12,7 +12,7 @@ from pathlib import Path
 from ..files import is_text
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".exr", ".bmp", ".ppm", ".heic", ".heif")
-# Bytes of a photo's name in the project: file systems take 255, and "_confidence.png" and temporary endings come behind.
+# Bytes of a name of a file: file systems take 255, and "_confidence.png" and temporary endings come behind.
 LONGEST = 200
 
 
@@ -49,7 +49,7 @@ def frame_names(places: Sequence[str]) -> list[str]:
 
 def file_names(names: Sequence[str]) -> list[str]:
     """A file name, without ending, for each of some names of classes or things, which may hold what file names may not."""
-    plain = [re.sub(r"[^\w.-]+", "_", name).strip(".") or "_" for name in names]
+    plain = [_cut(re.sub(r"[^\w.-]+", "_", name).strip(".") or "_") for name in names]
     return [f"{name}_{i}" for i, name in enumerate(plain)] if _alike(plain) else plain
 
 
@@ -61,7 +61,11 @@ def _alike(names: Iterable[str]) -> bool:
 
 def joined(name: str) -> str:
     """A path as a name: "_" for separators, white space and what Windows has no files with; long ones cut."""
-    plain = "_".join(re.sub(r'[\\/:*?"<>|\x00-\x1f]', "_", name.replace("/", "_")).split()) or "photo"
+    return _cut("_".join(re.sub(r'[\\/:*?"<>|\x00-\x1f]', "_", name.replace("/", "_")).split()) or "photo")
+
+
+def _cut(plain: str) -> str:
+    """A name as long as file systems take it, with a digest of the whole behind where it is cut."""
     if len(plain.encode()) <= LONGEST:
         return plain
     return plain.encode()[: LONGEST - 9].decode(errors="ignore") + "~" + hashlib.sha256(plain.encode()).hexdigest()[:8]

@@ -251,6 +251,13 @@ def test_a_backslash_in_a_name_takes_no_face_from_an_obj(tmp_path: Path) -> None
     assert len(trimesh.load(path, force="mesh", process=False).faces) == 12
 
 
+def test_long_names_of_classes_are_cut_for_files(tmp_path: Path) -> None:
+    classes = [replace(c, name=300 * "long " + c.name) for c in box.CLASSES]
+    files = write_surface(tmp_path / "a.ply", box.surface(), features_of(box.surface(), classes, 0), "classes")
+    assert len(set(files)) == 3
+    assert sum(len(trimesh.load(path, process=False).faces) for path in files) == 12
+
+
 def test_ply_says_class_and_instance_of_each_face(tmp_path: Path) -> None:
     (path,) = write(tmp_path / "a.ply")
     face = trimesh.load(path, process=False).metadata["_ply_raw"]["face"]["data"]

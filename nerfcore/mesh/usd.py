@@ -57,8 +57,7 @@ def write_usd(
         with tempfile.TemporaryDirectory(prefix="fieldwork-usd-") as folder, atomic_path(path) as temporary:
             inside = Path(folder) / f"{_identifier(path.stem)}.usdc"
             _write_stage(inside, path.stem, surface, features, split, texture, png, picture, views, check)
-            if not UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(inside)), str(inside.with_suffix(".usdz"))):
-                raise DiskError(f"{path} cannot be written.", "Check the disk and the folder's permissions.")
+            _saved(lambda: UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(inside)), str(inside.with_suffix(".usdz"))))
             shutil.copyfile(inside.with_suffix(".usdz"), temporary)
         return [path]
     with tempfile.TemporaryDirectory(prefix="fieldwork-usd-") as folder, atomic_path(path) as temporary:
@@ -105,7 +104,18 @@ def _write_stage(
         mesh.GetPrim().SetDisplayName(label if split != "none" else "Surface")
         _label_faces(mesh, features, chosen, materials)
     _cameras(stage, root.GetPath(), views, surface.vertices)
-    stage.GetRootLayer().Save()
+    _saved(stage.GetRootLayer().Save)
+
+
+def _saved(save: Callable[[], bool]) -> None:
+    """Let the library write a temporary file. Raises DiskError where it cannot, of which it does not say why in words."""
+    try:
+        done = save()
+    except Tf.ErrorException:
+        done = False
+    if not done:
+        folder = tempfile.gettempdir()
+        raise DiskError(f"USD cannot be written to {folder}, where it is made.", "Free some space there.")
 
 
 def _mesh(

@@ -11,8 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from fieldwork.nerfcore.errors import DiskError
 from fieldwork.nerfcore.geometry.cameras import project
 from fieldwork.nerfcore.geometry.similarity import transform_points
+from fieldwork.nerfcore.mesh import usd
 from fieldwork.nerfcore.mesh.features import features_of
 from fieldwork.nerfcore.mesh.files import write_surface
 from fieldwork.tests.nerfcore.support import gltf_validator
@@ -212,6 +214,24 @@ def test_usd_cameras_see_what_ours_see(tmp_path: Path) -> None:
     clip = np.array([list(matrix.Transform(Gf.Vec3d(*point.tolist()))) for point in points])
     theirs = (clip[:, :2] * [1, -1] + 1) / 2 * [box.VIEW.camera.width, box.VIEW.camera.height]
     np.testing.assert_allclose(theirs, ours, atol=1e-3)
+
+
+@pytest.mark.parametrize("ending", ["usda", "usdc", "usdz"])
+def test_usd_that_finds_no_room_leaves_what_was_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ending: str
+) -> None:
+    (tmp_path / f"a.{ending}").write_text("before")
+    (tmp_path / "file").touch()
+
+    def without_folder(stage: Usd.Stage, *_: object) -> None:
+        layer = stage.GetRootLayer()
+        layer.identifier = str(tmp_path / "file" / Path(layer.identifier).name)
+
+    monkeypatch.setattr(usd, "_cameras", without_folder)
+    with pytest.raises(DiskError, match="USD cannot be written to"):
+        write(tmp_path / f"a.{ending}", textured=False)
+    assert {path.name for path in tmp_path.iterdir()} == {f"a.{ending}", "file"}
+    assert (tmp_path / f"a.{ending}").read_text() == "before"
 
 
 @pytest.mark.parametrize("unit", [1e-3, 1.0, 1e4])

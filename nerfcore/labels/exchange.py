@@ -126,6 +126,7 @@ def _bring(source: Source, project: Project, classes: Classes, place: Path, repl
         if file.stem not in brought.maps:
             file.unlink()
     brought.unknown += [picture for pictures in brought.doubtful.values() for picture in pictures]
+    brought.unknown += [picture for picture in claims.outdone() if picture not in brought.unknown]
     return brought
 
 

@@ -96,6 +96,13 @@ def test_pictures_that_may_be_of_one_photo_are_told(tmp_path: Path) -> None:
     assert "left/0.jpg, right/0.jpg may all be of the photo 0" in warning
 
 
+def test_pictures_that_another_one_outdoes_are_told(tmp_path: Path) -> None:
+    folder = placed(tmp_path / "p", ["0.jpg"])
+    told, _ = bring(folder, coco_of(tmp_path / "given.json", ["left/0.jpg", "0.jpg", "right/0.jpg"]))
+    assert labels_of(folder) == {"0": "0.jpg"}
+    assert sorted(told["unknown"]) == ["left/0.jpg", "right/0.jpg"]
+
+
 def test_an_import_that_fails_changes_no_label_map(tmp_path: Path) -> None:
     folder = project_of(tmp_path / "p", ["a", "b"])
     maps = tmp_path / "maps"

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 
-from ..images.decode import PHOTO_SUFFIXES
 from ..images.names import joined
+from ..images.suffixes import PHOTO_SUFFIXES
 from ..project.schema import ImageRecord
 
 

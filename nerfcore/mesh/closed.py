@@ -12,7 +12,7 @@ from ..progress import Reporter
 from .clean import FEWEST_VIEWS, drop_scraps, seen_by
 from .decimate import decimate_closed
 from .denoise import denoised
-from .extract import BLOCK, assemble, off_corners, weld
+from .extract import BLOCK, assemble, in_region, off_corners, weld
 from .fusion import BRICK, FREE_AT, TRUNCATION, Bricks, depth_gap
 from .triangles import areas, compact, components, cross, unit
 
@@ -42,7 +42,7 @@ def closed_surface(
 
 def extract_closed(bricks: Bricks, maps: MapArrays, report: Reporter) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (V, 3) of the normalised frame and triangles (F, 3) of the border between what views show to be free and
-    everything else, closed at the sides of the grid.
+    everything else, closed at the sides of the region.
 
     A corner has its fused distance where at least one view says something about it, and is inside where none does; where
     there are no bricks, the middle of eight corners a side speaks for all of them.
@@ -83,7 +83,7 @@ def _free(bricks: Bricks, maps: MapArrays, report: Reporter) -> np.ndarray:
 
 def _distances(bricks: Bricks, free: np.ndarray, corner: np.ndarray) -> np.ndarray:
     """Distances in voxels at the corners of up to 16³ bricks from `corner` on, and of those that close the gap to the block
-    before; outside around the whole grid."""
+    before; outside around the region."""
     shape = np.array(bricks.index.shape)
     low, high = np.maximum(corner - 1, 0), np.minimum(corner + BLOCK, shape)
     part = tuple(slice(a, b) for a, b in zip(low, high))
@@ -92,6 +92,7 @@ def _distances(bricks: Bricks, free: np.ndarray, corner: np.ndarray) -> np.ndarr
     fused = assemble(index, bricks.distance) / np.float32(bricks.voxel)
     there, clear = (a.repeat(BRICK, 0).repeat(BRICK, 1).repeat(BRICK, 2) for a in (index >= 0, free[part]))
     distance = np.where(there, np.where(known, fused, -1.0), np.where(clear, 1.0, -1.0)).astype(np.float32)
+    distance[~in_region(bricks, low * BRICK, distance.shape)] = 1.0
     # From the corner before the block's first to its last, which is where the next block begins.
     begin = corner * BRICK - 1
     end = np.where(corner + BLOCK < shape, (corner + BLOCK) * BRICK, shape * BRICK + 1)

@@ -16,7 +16,7 @@ _WHOLE = 1e-4
 def extract(bricks: Bricks, report: Reporter) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (V, 3) of the normalised frame and triangles (F, 3), normals outward, welded across all blocks.
 
-    Only cells whose eight corners are known are looked at: the surface ends at their border, open.
+    Only cells of the region whose eight corners are known are looked at: the surface ends at their border, open.
     """
     places, triangles, first = [], [], 0
     starts = [range(0, n, BLOCK) for n in bricks.index.shape]
@@ -45,6 +45,7 @@ def _block(bricks: Bricks, corner: np.ndarray) -> tuple[np.ndarray, np.ndarray] 
     whole = assemble(index, bricks.weight) > 0
     side = tuple(min(n, BLOCK * BRICK + 1) for n in distance.shape)
     distance, whole = distance[: side[0], : side[1], : side[2]], whole[: side[0], : side[1], : side[2]]
+    whole = whole & in_region(bricks, corner * BRICK, whole.shape)
     # scikit-image looks at the cell before a corner where the mask of that corner is set.
     for axis in range(3):
         before = np.roll(whole, 1, axis)
@@ -59,6 +60,13 @@ def _block(bricks: Bricks, corner: np.ndarray) -> tuple[np.ndarray, np.ndarray] 
     except (RuntimeError, ValueError):  # no cell is crossed
         return None
     return vertices.astype(np.float64) + corner * BRICK, faces.astype(np.int64)
+
+
+def in_region(bricks: Bricks, first: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Which corners of the grid, of a box of this shape from the corner `first` (3,) on, lie in the region: bool, as large as
+    the box."""
+    x, y, z = (np.arange(n) + begin < count for n, begin, count in zip(shape, first, bricks.corners))
+    return x[:, None, None] & y[:, None] & z
 
 
 def off_corners(distance: np.ndarray) -> np.ndarray:

@@ -40,7 +40,8 @@ BYTES_PER_PLACE, BYTES_PER_BRICK = 8, 2 * 4 * BRICK**3  # of memory: a brick tha
 class Bricks:
     """Distances on a sparse grid. index (X, Y, Z) int32: place of each brick, −1 where there is none; distance
     (B, 8, 8, 8) float32 in normalised units, negative inside, and weight, 0 where no view says anything, of the corners
-    origin + voxel · (8 · brick + (i, j, k)); wide (B,) bool: bricks fused with a wider truncation."""
+    origin + voxel · (8 · brick + (i, j, k)); wide (B,) bool: bricks fused with a wider truncation; corners (3,): how many
+    of the grid lie in the region, which the last bricks reach beyond."""
 
     origin: np.ndarray
     voxel: float
@@ -48,6 +49,7 @@ class Bricks:
     distance: np.ndarray
     weight: np.ndarray
     wide: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
+    corners: np.ndarray = field(default_factory=lambda: np.full(3, np.iinfo(np.int64).max))
 
     def __len__(self) -> int:
         return len(self.distance)
@@ -104,7 +106,7 @@ def fuse_maps(
         unsure = mean_spread(maps, origin, h, counts)[tuple(bricks.T)] > TRUNCATION * h
         wide = unsure & unsteady(distance, weight, h)
         fuse_bricks(np.flatnonzero(wide), WIDER, 0.8, 1.0)
-    return Bricks(origin, h, index, distance, weight, wide)
+    return Bricks(origin, h, index, distance, weight, wide, cells_of(region) + 1)
 
 
 def check_memory(counts: np.ndarray, needed: float) -> None:
@@ -167,9 +169,14 @@ def tolerances(bricks: Bricks, vertices: np.ndarray, faces: np.ndarray, toleranc
     return np.where((number >= 0) & bricks.wide[number], WIDER * tolerance, tolerance)
 
 
+def cells_of(region: Region) -> np.ndarray:
+    """How many cells (3,) a region has along its sides."""
+    return np.maximum(np.ceil((region.high - region.low) / region.voxel).astype(int), 1)
+
+
 def grid_of(region: Region) -> tuple[np.ndarray, np.ndarray]:
     """The first corner (3,) of a region's grid, and how many bricks (3,) it has."""
-    cells = np.maximum(np.ceil((region.high - region.low) / region.voxel).astype(int), 1)
+    cells = cells_of(region)
     return (region.low + region.high) / 2 - cells * region.voxel / 2, -(-(cells + 1) // BRICK)
 
 
@@ -207,7 +214,7 @@ def coarser(bricks: Bricks) -> Bricks:
         there = child >= 0
         for new, old in zip(made, (bricks.distance, bricks.weight)):
             new[(there, *block)] = old[child[there]][:, ::2, ::2, ::2]
-    return Bricks(bricks.origin, 2 * bricks.voxel, index, *made)
+    return Bricks(bricks.origin, 2 * bricks.voxel, index, *made, corners=(bricks.corners - 1) // 2 + 1)
 
 
 def _mark(maps: MapArrays, origin: np.ndarray, voxel: float, counts: np.ndarray, report: Reporter) -> np.ndarray:

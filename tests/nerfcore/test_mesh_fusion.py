@@ -13,9 +13,19 @@ from fieldwork.nerfcore.errors import Cancelled, SettingError, TrainingError
 from fieldwork.nerfcore.geometry.cameras import Camera
 from fieldwork.nerfcore.kernels.depth_arrays import FREE, MapArrays
 from fieldwork.nerfcore.mesh import clean, depth_maps, fusion, metrics, triangles
+from fieldwork.nerfcore.mesh.closed import extract_closed
 from fieldwork.nerfcore.mesh.decimate import decimate
 from fieldwork.nerfcore.mesh.extract import extract, weld
-from fieldwork.nerfcore.mesh.fusion import BRICK, Bricks, fuse_maps, is_soft, mean_spread, spread_of, tolerances
+from fieldwork.nerfcore.mesh.fusion import (
+    BRICK,
+    Bricks,
+    coarser,
+    fuse_maps,
+    is_soft,
+    mean_spread,
+    spread_of,
+    tolerances,
+)
 from fieldwork.nerfcore.mesh.region import Region, choose_region, on_sides
 from fieldwork.nerfcore.mesh.surface import is_watertight
 from fieldwork.nerfcore.progress import Reporter
@@ -362,3 +372,17 @@ def test_vertices_of_a_grid_beyond_32_bits_are_told_apart() -> None:
     joined, faces = weld(np.concatenate([place, place]), np.array([[0, 1, 2], [3, 4, 5]]))
     assert joined[faces].tolist() == [place.tolist()] * 2
     assert len(joined) == 3
+
+
+@pytest.mark.parametrize("cells", [64, 50, 45])
+def test_a_surface_ends_where_its_region_does_on_every_side(cells: int) -> None:
+    """Bricks of eight cells reach beyond the last side of a region."""
+    maps = depth_maps.confirmed_maps(*maps_of(sphere(0.5), orbit(24, 1.8)), CPU, Reporter())
+    region = choose_region(maps, (np.full(3, -0.2), np.full(3, 0.45)), cells)
+    bricks = fuse_maps(maps, region, Reporter())
+    open_, closed = extract(bricks, Reporter())[0], extract_closed(bricks, maps, Reporter())[0]
+    for vertices, beyond in ((open_, 0.5), (closed, 1.5)):
+        assert (vertices.min(0) >= region.low - beyond * region.voxel).all()
+        assert (vertices.max(0) <= region.high + beyond * region.voxel).all()
+    coarse = extract(coarser(bricks), Reporter())[0]
+    assert (coarse.max(0) <= region.high + region.voxel).all()

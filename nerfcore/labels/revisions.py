@@ -33,7 +33,7 @@ def save(project: Path, run: str, labelling: Labelling) -> Path:
     path = _written(path_of(project, run, labelling.revision), labelling)
     others = sorted((p for p in path.parent.glob("*.npz") if p.name != FIRST), key=lambda p: p.stat().st_mtime)
     for old in others[:-KEPT]:
-        old.unlink()
+        old.unlink(missing_ok=True)  # another engine may be at it, too
     return path
 
 

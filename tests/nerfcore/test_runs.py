@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from fieldwork.nerfcore.errors import Cancelled, DiskError, InputError, ProjectError
+from fieldwork.nerfcore.evaluate.documentation import sections
 from fieldwork.nerfcore.evaluate.verb import evaluate, evaluated
 from fieldwork.nerfcore.params import EvaluateParams, RegionParams, RenderParams, TrainParams
 from fieldwork.nerfcore.progress import Reporter
@@ -339,6 +340,8 @@ def test_photos_that_were_trained_on_are_not_held_out(project: Path, tmp_path: P
         assert "05" in warning
         assert "00" not in warning
     assert evaluated(EvaluateParams(project=project)).result is not None
+    (cameras,) = (section for section in sections(project, "main", {}) if section.title == "Cameras")
+    assert [row[0] for row in cameras.rows if "held out" in row] == ["00"]
     hold_out(project, "05")
     for verb, values in ((evaluate, EvaluateParams(project=project)), (render, picture_of(project, tmp_path))):
         with pytest.raises(InputError, match="trained on all 1 photos"):

@@ -173,7 +173,7 @@ class FieldworkRenderEngine(bpy.types.RenderEngine):
             "fields": fields.rendered_items(depsgraph),
             "passes": [each.name for each in asked],
             "levels": layer.pass_cryptomatte_depth + layer.pass_cryptomatte_depth % 2,
-            "world": None if render.film_transparent else world_color(scene.world),
+            "world": None if render.film_transparent else passes.rec709(world_color(scene.world), working_space()),
             "sky": not render.film_transparent,
         }
         if live.objects_hide:

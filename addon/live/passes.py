@@ -58,6 +58,17 @@ def working_space(linear: Any, space: str) -> Any:
     return np.concatenate([linear[..., :3] @ np.array(matrix, np.float32).T, linear[..., 3:]], -1)
 
 
+def rec709(color: tuple[float, float, float], space: str) -> tuple[float, float, float]:
+    """A color of a working space of the file, as Blender has the world's, as light of Rec.709 primaries."""
+    import numpy as np
+
+    matrix = _FROM_REC709.get(space)
+    if matrix is None:
+        return color
+    red, green, blue = np.linalg.solve(np.array(matrix), color).tolist()
+    return red, green, blue
+
+
 # Linear Rec.709 (D65) into others; ITU-R BT.2087, and for ACEScg with the Bradford adaptation to its white (ACES TB-2014-004).
 _FROM_REC709 = {
     "Linear Rec.2020": [[0.6274, 0.3293, 0.0433], [0.0691, 0.9195, 0.0114], [0.0164, 0.0880, 0.8956]],

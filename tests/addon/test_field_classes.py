@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+import pytest
 from fieldwork.tests.addon.support import SETUP, make_project
 
 FIELD = """
@@ -113,3 +114,18 @@ answer(seen)
 """
     )
     assert colors == [[0, 0, 0], [0, 1, 0.5]]
+
+
+def test_the_background_is_told_as_the_engine_counts_and_comes_back_as_blender_does(bpy_script):
+    there_and_back = bpy_script(
+        SETUP
+        + """
+import numpy as np
+from fieldwork.addon.live.passes import rec709, working_space
+color = (0.8, 0.1, 0.05)
+spaces = ("Linear Rec.709", "Linear Rec.2020", "ACEScg")
+answer([np.array(working_space(np.array([*rec709(color, space), 1.0]), space)).tolist() for space in spaces])
+"""
+    )
+    for found in there_and_back:
+        assert found == pytest.approx([0.8, 0.1, 0.05, 1], abs=1e-5)

@@ -64,7 +64,7 @@ def draw_measures(layout: UILayout, measures: dict[str, Any]) -> None:
 def measured_rows(measures: dict[str, Any]) -> list[tuple[str, str]]:
     """The name of what was measured, and its sizes in words."""
     units = (("area", "m²"), ("volume", "m³")) if measures.get("unit") == "m" else (("area", ""), ("volume", ""))
-    rows = [(t("Whole surface"), measures["whole"])] if "whole" in measures else []
+    rows = [(t("Whole"), measures["whole"])] if "whole" in measures else []
     rows += [(row["name"], row) for row in measures.get("classes", [])[:MOST_ROWS]]
     return [
         (name, "   ".join(filter(None, (amount_text(row, what, unit) for what, unit in units)))) for name, row in rows

@@ -297,7 +297,7 @@ def test_the_whole_surface_is_said_before_the_classes():
     half = {"area": 1.2384, "area_low": 1.21, "area_high": 1.27, "volume": None}
     whole = {"name": "whole surface", "area": 140.2, "area_low": 120, "area_high": 160}
     measures = {"unit": "m", "whole": whole | {"volume": 9, "volume_low": 8, "volume_high": 10}, "classes": []}
-    assert measured_rows(measures) == [("Whole surface", "140 ± 20 m²   9.0 ± 1.0 m³")]
+    assert measured_rows(measures) == [("Whole", "140 ± 20 m²   9.0 ± 1.0 m³")]
     measures = {"unit": "scene units", "classes": [{"name": "Gold", **half}]}
     assert measured_rows(measures) == [("Gold", "1.238 ± 0.030")]
 

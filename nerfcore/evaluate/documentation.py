@@ -16,10 +16,9 @@ from .. import __version__
 from ..data.load import load_scene
 from ..data.scene import Scene
 from ..measure.wording import interval, significant
-from ..project.runs import INFO, holdout_of, read_metrics, run_folder
+from ..project.runs import INFO, holdout_of, photos_of, read_metrics, run_folder
 from ..project.schema import Poses, Project
 from ..project.store import load_poses, load_project
-from ..render.run import load_info
 from ..verdict import worst
 
 LIBRARIES = ("torch", "numpy", "warp-lang", "pycolmap", "OpenImageIO", "scikit-image", "scipy", "trimesh", "xatlas")
@@ -55,8 +54,7 @@ def sections(folder: Path, run: str, results: dict[str, Any], measures: dict[str
         ProjectError: the project has no poses, or a file of it is damaged.
     """
     project, poses, scene = load_project(folder), load_poses(folder), load_scene(folder, holdout_of(folder, run))
-    if (run_folder(folder, run) / INFO).is_file():
-        scene = scene.unseen_by(load_info(folder, run).images)
+    scene = scene.unseen_by(photos_of(folder, run))
     details = _poses_details(folder)
     evaluation = read_metrics(run_folder(folder, run)).get("test") or {}
     measures = measures or {}

@@ -176,6 +176,15 @@ def holdout_of(project: Path, run: str) -> int:
     return value if isinstance(value, int) else HOLDOUT
 
 
+def photos_of(project: Path, run: str) -> list[str]:
+    """The names of the photos that a run was trained on; none where there is no such run."""
+    try:
+        value = json.loads((run_folder(project, run) / INFO).read_text(encoding="utf-8")).get("images", [])
+    except (OSError, ValueError, AttributeError):
+        return []
+    return value if isinstance(value, list) else []
+
+
 def read_events(folder: Path) -> list[dict[str, Any]]:
     """The course of a training as its events tell it; a line that a kill or a full disk cut off is left out."""
     try:

@@ -11,7 +11,7 @@ from .photos import Photo
 from .uv import COVERED, PADDING
 from .visibility import DepthBuffers, PosedCamera, observe
 
-TEXELS = 1.5  # along a pixel of the photo that shows a place largest, at least: more show nothing more
+TEXELS = 1.6  # along a pixel of the photo that shows a place largest, at least: more show nothing more
 SMALLEST, LARGEST = 512, 8192
 LOOK = 400  # pixels: longest side, of most photos, of the pictures in which it is looked up what each of them sees
 

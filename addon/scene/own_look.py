@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import bpy
 
+from ..paths import absolute
 from ..render.slot import painted
 from ..roles import Owner, is_local
 from .edited import release
@@ -50,5 +49,5 @@ def _own_group(tree: bpy.types.NodeTree) -> bpy.types.NodeTree:
 def _pack(image: bpy.types.Image) -> None:
     """Put a texture into the .blend: the package keeps those of earlier meshes only for a while."""
     packed = image.packed_file is not None or painted(image)
-    if not packed and Path(bpy.path.abspath(image.filepath)).is_file():
+    if not packed and absolute(image.filepath).is_file():
         image.pack()

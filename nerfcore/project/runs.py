@@ -169,20 +169,22 @@ def state_id(state: dict[str, Any] | None) -> str:
 
 def holdout_of(project: Path, run: str) -> int:
     """Every how manieth photo the run holds out; the usual number where there is no such run."""
-    try:
-        value = json.loads((run_folder(project, run) / INFO).read_text(encoding="utf-8")).get("holdout", HOLDOUT)
-    except (OSError, ValueError, AttributeError):
-        return HOLDOUT
+    value = _said_of(project, run, "holdout")
     return value if isinstance(value, int) else HOLDOUT
 
 
 def photos_of(project: Path, run: str) -> list[str]:
     """The names of the photos that a run was trained on; none where there is no such run."""
-    try:
-        value = json.loads((run_folder(project, run) / INFO).read_text(encoding="utf-8")).get("images", [])
-    except (OSError, ValueError, AttributeError):
-        return []
+    value = _said_of(project, run, "images")
     return value if isinstance(value, list) else []
+
+
+def _said_of(project: Path, run: str, key: str) -> Any:
+    """A value of the record of a run; None where there is no such run, or it does not say."""
+    try:
+        return json.loads((run_folder(project, run) / INFO).read_text(encoding="utf-8")).get(key)
+    except (OSError, ValueError, AttributeError):
+        return None
 
 
 def read_events(folder: Path) -> list[dict[str, Any]]:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from pathlib import PurePath
 from typing import Any, NamedTuple
 
 from pydantic import ValidationError
-from pydantic_core import to_json
+from pydantic_core import PydanticSerializationError, to_json
 
 from ..errors import Cancelled, UnexpectedError, explained, wrong_value
+from ..files import printable
 from ..params import Params
 from ..verbs import VERBS
 
@@ -47,7 +49,7 @@ def parse_request(line: bytes) -> Request:
     """
     try:
         value = json.loads(line)
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+    except ValueError as error:  # also of bytes that are no Unicode, and of integers with thousands of digits
         raise RpcError(PARSE_ERROR, f"This line is not JSON: {error}.") from error
     except RecursionError as error:
         raise RpcError(PARSE_ERROR, "This line is nested too deeply.") from error
@@ -79,12 +81,28 @@ def parse_params(verb: str, values: dict[str, Any]) -> Params:
 
 def encode(message: dict[str, Any]) -> bytes:
     """One line of JSON. Paths become strings, NumPy values plain ones, NaN and infinity null."""
-    return to_json({"jsonrpc": "2.0", **message}, inf_nan_mode="null", fallback=_plain) + b"\n"
+    return _json({"jsonrpc": "2.0", **message}) + b"\n"
 
 
 def plain(value: Any) -> Any:
     """The value as it looks after a trip through JSON."""
-    return json.loads(to_json(value, inf_nan_mode="null", fallback=_plain))
+    return json.loads(_json(value))
+
+
+def _json(value: Any) -> bytes:
+    try:
+        return to_json(value, inf_nan_mode="null", fallback=_plain)
+    except PydanticSerializationError:  # half a surrogate pair, which JSON can ask for and UTF-8 has not
+        return to_json(_unicode(value), inf_nan_mode="null", fallback=_plain)
+
+
+def _unicode(value: Any) -> Any:
+    """The value with “?” where its text is no Unicode."""
+    if isinstance(value, dict):
+        return {_unicode(key): _unicode(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_unicode(item) for item in value]
+    return printable(str(value)) if isinstance(value, (str, PurePath)) else value
 
 
 def _plain(value: Any) -> Any:

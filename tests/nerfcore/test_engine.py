@@ -171,6 +171,9 @@ def test_eta_is_about_right(start, project):
         (b'{"jsonrpc": "2.0", "id": {}, "method": "ping"}\n', -32600, "id"),
         (b'{"jsonrpc": "2.0", "id": 7, "method": "ping", "params": [1]}\n', -32602, "by name"),
         (b'{"jsonrpc": "2.0", "id": 7, "method": "fly"}\n', -32601, "fly"),
+        (b'{"jsonrpc": "2.0", "id": "\\udce9", "method": "fly"}\n', -32601, "fly"),
+        (b'{"jsonrpc": "2.0", "id": 7, "method": "fl\\udce9"}\n', -32601, "“fl?”"),
+        (b'{"jsonrpc": "2.0", "id": ' + b"9" * 5000 + b', "method": "ping"}\n', -32700, "digits"),
         (b'{"jsonrpc": "2.0", "id": 7, "method": "count", "params": {"stepz": 3}}\n', -32602, "stepz"),
         (
             b'{"jsonrpc": "2.0", "id": 7, "method": "poses", "params": {"project": "x", "preset": "q"}}\n',

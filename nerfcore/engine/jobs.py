@@ -98,7 +98,7 @@ class Job(Reporter):
 
     def event(self, kind: str, **data: Any) -> None:
         self._send(notification("event", job=self.status.id, kind=kind, **data))
-        if self.project and self.project.is_dir():
+        if self.project and os.path.isdir(self.project):
             line = encode({"kind": kind, "time": time.time(), **data})
             path = st.events_path(self.project, self.status.id)
             try:
@@ -139,15 +139,16 @@ class Job(Reporter):
 
     def heartbeat(self) -> None:
         """Called twice a second from the server's clock: write what changed, look for a cancel file."""
-        if self.project and st.cancel_path(self.project, self.status.id).exists():
+        if self.project and os.path.exists(st.cancel_path(self.project, self.status.id)):
             self.cancel()
         if self._changed or time.monotonic() - self._written > st.HEARTBEAT:
             self.write()
 
     def write(self) -> None:
         """Write the job file. The job goes on when that fails: its own writes will tell of a full disk."""
-        # The folder is there from the time the project is locked, and goes when nothing came of a new project.
-        if self.project is None or not (self.project / st.FOLDER).is_dir():
+        # The folder is there from the time the project is locked, and goes when nothing came of a new project. Of a path that
+        # the system refuses, os.path says that nothing is there; pathlib raises.
+        if self.project is None or not os.path.isdir(self.project / st.FOLDER):
             return
         with self._lock:
             self._changed, self._written = False, time.monotonic()

@@ -243,6 +243,18 @@ def test_cancel_file_stops_a_job_from_outside(start, project):
     assert not st.cancel_path(project, job).exists()
 
 
+def test_a_path_that_the_system_refuses_ends_its_own_job_only(start, project):
+    client = start()
+    request = client.send("count", project=project, steps=10_000, job="long")
+    client.until_progress()
+    refused = client.send("count", project=project.parent / ("x" * 300), job="refused")
+    time.sleep(1.2)  # the clock has looked at both
+    st.request_cancel(project, "long")
+    assert client.answer(request, timeout=5)["error"]["code"] == -32001
+    assert "the name is too long" in client.answer(refused)["error"]["message"]
+    assert client.answer(client.send("status"))["result"]["jobs"] == []
+
+
 def test_queued_jobs_wait_and_can_be_cancelled(start, project):
     client = start()
     first = client.send("count", project=project, steps=60, job="first")

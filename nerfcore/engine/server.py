@@ -43,8 +43,8 @@ GRACE = 10.0  # seconds a cancelled job has to come to an end before the process
 TICK = 0.5  # seconds between two looks of the clock thread
 
 
-class _Stop(Exception):
-    """Raised by a signal handler inside the reading loop."""
+class _Stop(BaseException):
+    """Raised by a signal handler inside the reading loop, where a request that is being answered must not catch it."""
 
 
 class Server:

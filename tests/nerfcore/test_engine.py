@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
 import os
 import queue
@@ -15,6 +16,7 @@ from pathlib import Path
 
 import pytest
 from fieldwork.nerfcore.engine import status as st
+from fieldwork.nerfcore.engine.server import Server, _Stop
 from fieldwork.nerfcore.project.schema import Project
 from fieldwork.nerfcore.project.store import save_project
 from PIL import Image
@@ -253,6 +255,17 @@ def test_a_path_that_the_system_refuses_ends_its_own_job_only(start, project):
     assert client.answer(request, timeout=5)["error"]["code"] == -32001
     assert "the name is too long" in client.answer(refused)["error"]["message"]
     assert client.answer(client.send("status"))["result"]["jobs"] == []
+
+
+def test_a_signal_is_heard_while_a_request_is_answered():
+    server = Server(io.BytesIO(b'{"jsonrpc": "2.0", "id": 1, "method": "ping"}\n'), io.BytesIO())
+
+    def ping(params):
+        raise _Stop
+
+    server._do_ping = ping
+    with pytest.raises(_Stop):
+        server._handle(b'{"jsonrpc": "2.0", "id": 1, "method": "ping"}\n')
 
 
 def test_queued_jobs_wait_and_can_be_cancelled(start, project):

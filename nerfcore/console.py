@@ -16,7 +16,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 from rich.table import Table
 from rich.text import Text
 
-from .progress import Reporter
+from .progress import Estimate, Reporter
 
 PLAIN_EVERY = 10.0  # seconds between plain progress lines
 
@@ -30,7 +30,7 @@ class ConsoleReporter(Reporter):
         self.console = Console(stderr=True, highlight=False, markup=False, emoji=False)
         self.bar: Progress | None = None
         self.task: TaskID | None = None
-        self.name, self.begin, self.told = "", time.monotonic(), 0.0
+        self.name, self.estimate, self.told = "", Estimate(), 0.0
         self.live: Live | None = None  # the table of a campaign
         self.begun = False  # whether the work has told of anything
 
@@ -63,7 +63,7 @@ class ConsoleReporter(Reporter):
     def stage(self, name: str) -> None:
         super().stage(name)
         self.begun = True
-        self.name, self.begin, self.told = name, time.monotonic(), time.monotonic()
+        self.name, self.estimate, self.told = name, Estimate(), time.monotonic()
         if self.bar is not None:
             if self.task is not None:
                 self.bar.update(self.task, completed=1.0, message="")
@@ -75,11 +75,13 @@ class ConsoleReporter(Reporter):
         super().progress(fraction, message)
         if self.bar is not None and self.task is not None:
             self.bar.update(self.task, completed=min(fraction, 1.0), message=message)
-        elif not self.quiet and self.live is None and time.monotonic() - self.told > PLAIN_EVERY:
-            self.told = time.monotonic()
-            elapsed = self.told - self.begin
-            left = f", about {elapsed / fraction - elapsed:.0f} s left" if fraction > 0.02 else ""
-            self.console.print(f"{self.name}: {fraction:.0%}{left}  {message}")
+        elif not self.quiet and self.live is None:
+            now = time.monotonic()
+            seconds = self.estimate.update(now, fraction)
+            if now - self.told > PLAIN_EVERY:
+                self.told = now
+                left = "" if seconds is None else f", about {seconds:.0f} s left"
+                self.console.print(f"{self.name}: {fraction:.0%}{left}  {message}")
 
     def event(self, kind: str, **data: Any) -> None:
         if kind != "campaign" or self.quiet or not self.console.is_terminal:

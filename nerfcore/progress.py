@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+from collections import deque
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
@@ -59,6 +60,30 @@ class Reporter:
     def check(self) -> None:
         if self._cancelled.is_set():
             raise Cancelled
+
+
+class Estimate:
+    """Remaining seconds of a stage from its recent speed.
+
+    The first fraction that is told of is where the counting begins: a training that goes on has done half of it long ago.
+    """
+
+    WINDOW = 30.0  # seconds of history: long enough to be calm, short enough to follow a change of speed
+
+    def __init__(self) -> None:
+        self.points: deque[tuple[float, float]] = deque()
+
+    def update(self, now: float, fraction: float) -> float | None:
+        """Seconds left at `fraction` of the stage, None while nothing can be said."""
+        if self.points and fraction < self.points[-1][1]:
+            self.points.clear()
+        self.points.append((now, fraction))
+        while len(self.points) > 2 and now - self.points[0][0] > self.WINDOW:
+            self.points.popleft()
+        f0, seconds = self.points[0][1], now - self.points[0][0]
+        if fraction <= f0 or seconds < 0.5:
+            return None
+        return (1.0 - fraction) * seconds / (fraction - f0)
 
 
 def go_on() -> None:

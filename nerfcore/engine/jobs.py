@@ -6,7 +6,6 @@ import logging
 import os
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from contextlib import AbstractContextManager, suppress
 from pathlib import Path
@@ -14,7 +13,7 @@ from typing import Any
 
 from ..errors import DiskError
 from ..params import Params
-from ..progress import Reporter
+from ..progress import Estimate, Reporter
 from ..project.lock import lockable, project_of
 from . import status as st
 from .protocol import encode, notification, plain
@@ -23,31 +22,6 @@ log = logging.getLogger("fieldwork.engine")
 
 Send = Callable[[dict[str, Any]], None]
 PROGRESS_PERIOD = 0.1  # seconds between two progress notifications
-
-
-class Estimate:
-    """Remaining seconds of a stage from its recent speed."""
-
-    WINDOW = 30.0  # seconds of history: long enough to be calm, short enough to follow a change of speed
-
-    def __init__(self) -> None:
-        self.points: deque[tuple[float, float]] = deque()
-
-    def reset(self, now: float) -> None:
-        self.points.clear()
-        self.points.append((now, 0.0))
-
-    def update(self, now: float, fraction: float) -> float | None:
-        """Seconds left at `fraction` of the stage, None while nothing can be said."""
-        if self.points and fraction < self.points[-1][1]:
-            self.points.clear()
-        self.points.append((now, fraction))
-        while len(self.points) > 2 and now - self.points[0][0] > self.WINDOW:
-            self.points.popleft()
-        f0, seconds = self.points[0][1], now - self.points[0][0]
-        if fraction <= f0 or seconds < 0.5:
-            return None
-        return (1.0 - fraction) * seconds / (fraction - f0)
 
 
 class Job(Reporter):
@@ -84,7 +58,7 @@ class Job(Reporter):
     def stage(self, name: str) -> None:
         self.check()
         with self._lock:
-            self._estimate.reset(time.monotonic())
+            self._estimate = Estimate()
             self._set(stage=name, fraction=0.0, message="", eta_s=None)
         self._notify(force=True)
 

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from fieldwork.nerfcore import console
 from fieldwork.nerfcore.console import ConsoleReporter, campaign_table
+from fieldwork.nerfcore.progress import Estimate
 from rich.console import Console
 
 ODD = "photos [2024] [/x] :smile: [red]"
@@ -38,6 +39,19 @@ def test_text_in_brackets_is_shown(shown: io.StringIO, call: str) -> None:
         else:
             getattr(report, call)(ODD)
     assert ODD in shown.getvalue()
+
+
+def test_time_left_of_work_that_goes_on_is_counted_from_where_it_began(shown: io.StringIO, monkeypatch) -> None:
+    estimate = Estimate()
+    assert estimate.update(0.0, 0.9) is None
+    assert estimate.update(1.0, 0.91) == pytest.approx(9.0)
+    clock = iter([100.0, 120.0, 130.0])
+    monkeypatch.setattr(console.time, "monotonic", lambda: next(clock))
+    report = ConsoleReporter(quiet=False)  # without its bar, which has an estimate of its own
+    report.stage("Training")
+    report.progress(0.9)
+    report.progress(0.91)
+    assert "91%, about 90 s left" in shown.getvalue()
 
 
 def test_results_in_brackets_are_shown() -> None:

@@ -28,6 +28,7 @@ from .place import (
     lock_hash,
     next_environment,
     python_in,
+    read_json,
 )
 from .tools import InstallCancelled, InstallError, Report, Runner
 
@@ -83,8 +84,13 @@ def _install(options: Options, report: Report, cancelled: threading.Event, lock:
         report(0.1, "Loading packages")
         run(_install_command(options, uv, lock, venv), "The packages could not be installed", packages=_count(lock))
         report(0.92, "Checking the engine")
-        result = _doctor(python_in(venv), folder)
-        _check_doctor(result, options)
+        try:
+            result = _doctor(python_in(venv), folder)
+            _check_doctor(result, options)
+        except InstallError:
+            # A package that a kill left half there, or the build for another device: the installers take both for installed.
+            (folder / STAGING).unlink(missing_ok=True)
+            raise
     text = {"lock": lock_hash(lock), "time": time.time(), "venv": venv.name, "doctor": result}
     temporary = folder / (COMPLETE + ".part")
     temporary.write_text(json.dumps(text, indent=1), encoding="utf-8")
@@ -97,17 +103,19 @@ def _install(options: Options, report: Report, cancelled: threading.Event, lock:
 
 
 def _make_environment(options: Options, venv: Path, uv: Path | None, run: Runner) -> None:
-    """An empty environment, or the one of an installation that broke off."""
+    """An empty environment, or the one of an installation with the same options that broke off."""
     note = options.folder / STAGING
-    if note.is_file() and python_in(venv).is_file():
+    made = {"venv": venv.name, "base": str(options.base), "device": options.device, "wheels": options.wheels}
+    if read_json(note) == made and python_in(venv).is_file():
         return
     run.report(0.08, "Making the environment")
+    note.unlink(missing_ok=True)
     shutil.rmtree(venv, ignore_errors=True)
     if venv.exists():
         raise InstallError(f"{venv} is in use. Close other Blenders, then press Repair again.")
-    note.write_text("{}", encoding="utf-8")
     how = [uv, "venv", "--no-config", "--python", options.base] if uv else [options.base, "-m", "venv"]
     run([*how, venv], "The environment cannot be made")
+    note.write_text(json.dumps(made), encoding="utf-8")
 
 
 def _check_disk(options: Options) -> None:

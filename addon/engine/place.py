@@ -2,7 +2,7 @@
 
 ENGINE/venv/, venv-2/  the environment, made from Blender's Python or a chosen one, which stays untouched. One of them is
                        installed; the next one is made in the other, and takes its place once the doctor is content
-ENGINE/staging.json    is there while one is made; one that broke off goes on
+ENGINE/staging.json    is there while packages come into one, and says from what it was made; one that broke off goes on
 ENGINE/tools/          the installer `uv`, where the machine has none
 ENGINE/cache/          downloads; an installation that broke off goes on from here
 ENGINE/complete.json   written last, when the doctor was content; names the environment that is installed
@@ -50,11 +50,16 @@ def find_python(chosen: str, engine_folder: Path, root: Path) -> Path | None:
 
 def installed(folder: Path) -> dict[str, Any] | None:
     """What is known of the installed engine; None when there is none, or only a part of one."""
+    value = read_json(folder / COMPLETE)
+    return value if isinstance(value, dict) and python_in(folder / _name(value)).is_file() else None
+
+
+def read_json(path: Path) -> Any:
+    """What stands in a file; None where there is none, or only a part of one."""
     try:
-        value = json.loads((folder / COMPLETE).read_text(encoding="utf-8"))
+        return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    return value if isinstance(value, dict) and python_in(folder / _name(value)).is_file() else None
 
 
 def environment(folder: Path) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import subprocess
 import sys
@@ -117,6 +118,52 @@ def test_broken_package_says_so_and_the_next_try_goes_on(options, lock, tmp_path
     go(options, lock)
     assert marker.exists(), "the environment was kept"
     assert place.installed(options.folder)
+
+
+@pytest.mark.parametrize("other", ["base", "device"])
+def test_a_next_try_with_other_options_has_an_environment_of_its_own(
+    options, lock, tmp_path, content_doctor, monkeypatch, other
+):
+    wheel = make_wheel(tmp_path / "wheels")
+    wheel.rename(wheel.with_suffix(".away"))
+    monkeypatch.setattr(module, "_check_disk", lambda options: None)
+    with pytest.raises(InstallError, match="Press Install again"):
+        go(options, lock)
+    marker = options.folder / "venv" / "marker"
+    marker.touch()
+    wheel.with_suffix(".away").rename(wheel)
+    base = tmp_path / "another python"
+    base.symlink_to(options.base)
+    content_doctor["device"] = "cuda"
+    go(dataclasses.replace(options, **({"base": base} if other == "base" else {"device": "cuda"})), lock)
+    assert not marker.exists()
+
+
+def test_a_next_try_goes_on_only_in_an_environment_that_was_made_whole(options, lock, tmp_path, content_doctor):
+    make_wheel(tmp_path / "wheels")
+    base = tmp_path / "python"
+    base.write_text(
+        f'#!/bin/sh\n[ "$1 $2" = "-m venv" ] && mkdir -p "$3/bin" && touch "$3/bin/python" && exit 1\n'
+        f'exec "{options.base}" "$@"\n'
+    )  # as a kill leaves it, without its packages
+    base.chmod(0o755)
+    with pytest.raises(InstallError, match="environment cannot be made"):
+        go(dataclasses.replace(options, base=base), lock)
+    base.write_text(f'#!/bin/sh\nexec "{options.base}" "$@"\n')
+    go(dataclasses.replace(options, base=base), lock)
+    assert place.installed(options.folder)
+
+
+def test_a_doctor_that_was_not_content_has_an_empty_environment_next_time(options, lock, tmp_path, content_doctor):
+    make_wheel(tmp_path / "wheels")
+    content_doctor.update(ok=False, problems=["tiny 1.0 does not load."])
+    with pytest.raises(InstallError, match="does not load"):
+        go(options, lock)
+    marker = options.folder / "venv" / "marker"
+    marker.touch()
+    content_doctor.update(ok=True)
+    go(options, lock)
+    assert not marker.exists()
 
 
 def test_engine_that_does_not_run_is_not_installed(options, lock, tmp_path):

@@ -160,7 +160,7 @@ def _find_uv(options: Options, run: Runner) -> Path | None:
     """The installer `uv`: the machine's, or one of our own; None where only pip will do."""
     found = shutil.which("uv")
     # An old one cannot choose among the builds of PyTorch.
-    if found and "--torch-backend" in run([found, "pip", "install", "--help"], "uv does not run"):
+    if found and "--torch-backend" in _help_of(found, run):
         return Path(found)
     tools = options.folder / "tools"
     name = "uv.exe" if sys.platform == "win32" else "uv"
@@ -175,6 +175,15 @@ def _find_uv(options: Options, run: Runner) -> Path | None:
         run.log.write(f"going on with pip: {error}\n")
         return None
     return own
+
+
+def _help_of(uv: str, run: Runner) -> str:
+    """What an `uv` says of its way to install; nothing where it does not run, as the stub of a version manager may not."""
+    try:
+        return run([uv, "pip", "install", "--help"], "uv does not run")
+    except InstallError as error:
+        run.log.write(f"going on without {uv}: {error}\n")
+        return ""
 
 
 def _check_device(device: str) -> None:

@@ -354,6 +354,17 @@ def test_an_old_uv_is_not_used(options, tmp_path, monkeypatch, words, own):
     assert uv == (None if own else found)
 
 
+def test_an_uv_that_does_not_run_is_not_used(options, tmp_path, monkeypatch):
+    found = tmp_path / "uv"
+    found.write_text("#!/bin/sh\necho 'No version is set for command uv'\nexit 126\n")
+    found.chmod(0o755)
+    monkeypatch.setattr(module.shutil, "which", lambda name: str(found))
+    with open(tmp_path / "log", "w+") as log:
+        assert module._find_uv(options, module.Runner(log, threading.Event(), lambda *_: None)) is None
+        log.seek(0)
+        assert "No version is set" in log.read()
+
+
 def test_state_of_a_half_installed_engine(options):
     options.folder.mkdir(parents=True)
     (options.folder / place.COMPLETE).write_text(json.dumps({"lock": "x"}))

@@ -213,6 +213,19 @@ def write_json(path: Path, value: Any) -> None:
     write_text(path, json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
 
 
+def json_lines(block: bytes) -> list[dict[str, Any]]:
+    """The objects in lines of JSON; a line that a kill or a full disk cut off is left out."""
+    found = []
+    for line in block.splitlines():
+        try:
+            value = json.loads(line)
+        except ValueError:
+            continue
+        if isinstance(value, dict):
+            found.append(value)
+    return found
+
+
 def file_hash(path: Path) -> str:
     """SHA-256 of a file, in hex."""
     with open(path, "rb") as file:

@@ -18,7 +18,7 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from ..files import write_text
+from ..files import json_lines, write_text
 
 FOLDER = "jobs"
 FINISHED = ("done", "failed", "cancelled")
@@ -116,7 +116,7 @@ def read_events(project: Path, job: str, offset: int = 0) -> tuple[list[dict[str
     except FileNotFoundError:
         return [], offset
     whole = block[: block.rfind(b"\n") + 1]
-    return [json.loads(line) for line in whole.splitlines()], offset + len(whole)
+    return json_lines(whole), offset + len(whole)
 
 
 def request_cancel(project: Path, job: str) -> None:

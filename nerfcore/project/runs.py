@@ -13,7 +13,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from ..files import disk_errors
+from ..files import disk_errors, json_lines
 from .fingerprints import digest
 
 CHECKPOINT = "field.safetensors"
@@ -190,18 +190,9 @@ def _said_of(project: Path, run: str, key: str) -> Any:
 def read_events(folder: Path) -> list[dict[str, Any]]:
     """The course of a training as its events tell it; a line that a kill or a full disk cut off is left out."""
     try:
-        lines = (folder / EVENTS).read_bytes().splitlines()
+        return json_lines((folder / EVENTS).read_bytes())
     except OSError:
         return []
-    events = []
-    for line in lines:
-        try:
-            event = json.loads(line)
-        except ValueError:
-            continue
-        if isinstance(event, dict):
-            events.append(event)
-    return events
 
 
 def cut_events(folder: Path) -> None:

@@ -386,6 +386,17 @@ def test_damaged_job_files_are_no_jobs(project):
     assert st.list_jobs(project) == []
 
 
+def test_events_that_a_full_disk_cut_off_are_left_out(project):
+    path = st.events_path(project, "x")
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(
+        b'{"kind": "train", "step": 1}\n{"kind": "tr{"kind": "train", "step": 3}\n\xff\n7\n{"step": 4}\n{"ste'
+    )
+    events, offset = st.read_events(project, "x")
+    assert [event["step"] for event in events] == [1, 4]
+    assert st.read_events(project, "x", offset) == ([], offset)
+
+
 def test_a_project_that_is_not_there_is_not_made(start, tmp_path):
     client = start()
     error = client.answer(client.send("poses", project=tmp_path / "nowhere"))["error"]

@@ -117,7 +117,7 @@ def _bring(source: Source, project: Project, classes: Classes, place: Path, repl
             except InputError as error:
                 report.warn(f"{error.message}: it keeps the labels it has.")
                 continue
-            brought.instances[photo.name] = int(things.max(initial=0))
+            brought.instances[photo.name] = int(np.count_nonzero(np.unique(things)))
     brought.doubtful, brought.repeated = claims.doubtful(), claims.repeated()
     for name in brought.doubtful:
         brought.maps.pop(name, None)

@@ -199,6 +199,33 @@ def test_labels_and_instances_come_back_as_they_went(tmp_path: Path, kind: str) 
             assert len({b for _, b in pairs}) == 3
 
 
+THING_FORMATS = ["coco", "coco-panoptic", "cvat", "label-studio", "labelme", "segments", "supervisely"]
+
+
+@pytest.mark.parametrize("kind", THING_FORMATS)
+@pytest.mark.parametrize("single", [True, False], ids=["one thing", "no thing"])
+def test_what_is_no_instance_comes_back_as_none(tmp_path: Path, kind: str, single: bool) -> None:
+    folder = project_of(tmp_path / "p", ["a"])
+    things = np.where(CORNER & single, 7, 0).astype(np.uint8)
+    with edit_project(folder) as project:
+        project.classes = [known_class(1, "stone"), known_class(2, "wood")]
+        project.images[0].label, project.images[0].instances = "labels/a.png", "labels/things.png"
+        ids = np.full((HEIGHT, WIDTH), 2, np.uint8)
+        ids[:, :3] = 1
+        Image.fromarray(ids).save(folder / "labels/a.png")
+        Image.fromarray(things).save(folder / "labels/things.png")
+    out = tmp_path / f"out{known.FILES.get(kind, '')}"
+    export(folder, out, kind)
+    other = project_of(tmp_path / "q", ["a"])
+    told, _ = bring(other, out / "panoptic.json" if kind == "coco-panoptic" else out)
+    assert told["instances"] == single
+    found = load_project(other).images[0].instances
+    assert (found is not None) == single
+    if found is not None:
+        np.testing.assert_array_equal(read_label(other / found) > 0, CORNER)
+    np.testing.assert_array_equal(named_map(other, "a"), expect(stone=ids == 1, wood=ids == 2))
+
+
 @given(MASKS)
 @settings(max_examples=60, deadline=None)
 def test_run_lengths_come_back(mask: np.ndarray) -> None:

@@ -14,6 +14,7 @@ from ...errors import InputError
 from ...files import atomic_path
 from ...project.label_revision import label_facts
 from .regions import (
+    STUFF,
     LabelClass,
     Picture,
     Region,
@@ -32,6 +33,13 @@ from .regions import (
 )
 
 INSIDE = "annotations.xml"  # of a zip
+_STUFF_ATTRIBUTE = (
+    ("name", STUFF),
+    ("mutable", "False"),
+    ("input_type", "checkbox"),
+    ("default_value", "false"),
+    ("values", "false"),
+)
 HINT = "Export the task from CVAT as “CVAT for images 1.1”."
 
 
@@ -74,8 +82,13 @@ def _pictures(path: Path, root: xml.Element, source: Source) -> Iterator[Picture
                 continue
             group = shape.get("group_id", "0")
             key = group if group != "0" else f"shape {len(regions)}"
-            regions.append(Region(shape.get("label", ""), mask, groups.setdefault(key, len(groups) + 1)))
+            instance = 0 if _is_stuff(shape) else groups.setdefault(key, len(groups) + 1)
+            regions.append(Region(shape.get("label", ""), mask, instance))
         yield Picture(name, width, height, regions)
+
+
+def _is_stuff(shape: xml.Element) -> bool:
+    return any(a.get("name") == STUFF and (a.text or "").strip().lower() == "true" for a in shape.iterfind("attribute"))
 
 
 def _mask(shape: xml.Element, width: int, height: int) -> np.ndarray | None:
@@ -105,7 +118,7 @@ def _mask(shape: xml.Element, width: int, height: int) -> np.ndarray | None:
 def write(
     pictures: Iterable[Picture], classes: list[LabelClass], out: Path, label_revision: int | None = None
 ) -> list[Path]:
-    """Write one XML file: every region a mask, regions of one instance in one group."""
+    """Write one XML file: every region a mask, regions of one instance in one group; an attribute says which are none."""
     root = xml.Element("annotations")
     xml.SubElement(root, "version").text = "1.1"
     meta = xml.SubElement(root, "meta")
@@ -116,6 +129,9 @@ def write(
         label = xml.SubElement(labels, "label")
         for tag, text in (("name", c.name), ("color", color_hex(c.color)), ("type", "mask")):
             xml.SubElement(label, tag).text = text
+        attribute = xml.SubElement(xml.SubElement(label, "attributes"), "attribute")
+        for tag, text in _STUFF_ATTRIBUTE:
+            xml.SubElement(attribute, tag).text = text
     for number, picture in numbered(pictures):
         size = {"width": str(picture.width), "height": str(picture.height)}
         image = xml.SubElement(root, "image", {"id": str(number - 1), "name": picture.name, **size})
@@ -133,7 +149,9 @@ def write(
                 "z_order": "0",
                 "group_id": str(region.instance),
             }
-            xml.SubElement(image, "mask", values)
+            mask = xml.SubElement(image, "mask", values)
+            if region.instance == 0:
+                xml.SubElement(mask, "attribute", {"name": STUFF}).text = "true"
     xml.indent(root)
     with atomic_path(out) as temporary:
         xml.ElementTree(root).write(temporary, "utf-8", xml_declaration=True)

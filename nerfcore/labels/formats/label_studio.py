@@ -14,6 +14,7 @@ from ...errors import InputError
 from ...files import write_json
 from ...project.label_revision import label_facts
 from .regions import (
+    STUFF,
     LabelClass,
     Picture,
     Region,
@@ -74,8 +75,15 @@ def _pictures(path: Path, tasks: list[dict[str, Any]], source: Source) -> Iterat
                 raise InputError(
                     f"A region of {name} in {path} is damaged: {error!r}.", "Export it once more."
                 ) from error
-            regions.append(Region(str(_labels(result)[0]), mask, len(regions) + 1))
+            instance = 0 if _is_stuff(result) else len(regions) + 1
+            regions.append(Region(str(_labels(result)[0]), mask, instance))
         yield Picture(name, width, height, regions)
+
+
+def _is_stuff(result: dict[str, Any]) -> bool:
+    meta = result.get("meta")
+    note = meta.get("text") if isinstance(meta, dict) else None
+    return STUFF in note if isinstance(note, list) else note == STUFF
 
 
 def picture_name(data: dict[str, Any], number: int) -> str:
@@ -154,7 +162,8 @@ def packed(flat: np.ndarray) -> list[int]:
 def write(
     pictures: Iterable[Picture], classes: list[LabelClass], out: Path, label_revision: int | None = None
 ) -> list[Path]:
-    """Write a JSON file to import: every region a brush stroke of the control “label” on “image”."""
+    """Write a JSON file to import: every region a brush stroke of the control “label” on “image”; its note says which
+    are no instance."""
     tasks = []
     for number, picture in numbered(pictures):
         results = []
@@ -171,6 +180,7 @@ def write(
                     "original_height": picture.height,
                     "image_rotation": 0,
                     "value": value,
+                    **({} if region.instance else {"meta": {"text": [STUFF]}}),
                 }
             )
         annotations = [{"id": number, "result": results}]

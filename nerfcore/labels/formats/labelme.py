@@ -13,6 +13,7 @@ from ...errors import InputError
 from ...files import write_json
 from ...project.label_revision import label_facts
 from .regions import (
+    STUFF,
     LabelClass,
     Picture,
     Region,
@@ -57,8 +58,10 @@ def _pictures(values: list[tuple[Path, dict[str, Any]]], source: Source) -> Iter
                     continue
                 group = shape.get("group_id")
                 key = ("shape", len(regions)) if group is None else (shape["label"], group)
-                regions.append(Region(str(shape["label"]), mask, groups.setdefault(key, len(groups) + 1)))
-            except (KeyError, TypeError, ValueError) as error:
+                stuff = (shape.get("flags") or {}).get(STUFF) is True
+                instance = 0 if stuff else groups.setdefault(key, len(groups) + 1)
+                regions.append(Region(str(shape["label"]), mask, instance))
+            except (KeyError, TypeError, ValueError, AttributeError) as error:
                 raise InputError(f"A shape in {file} is damaged: {error!r}.", "Save it again with LabelMe.") from error
         yield Picture(name, width, height, regions)
 
@@ -83,7 +86,7 @@ def _mask(shape: dict[str, Any], width: int, height: int, name: str) -> np.ndarr
 def write(
     pictures: Iterable[Picture], classes: list[LabelClass], out: Path, label_revision: int | None = None
 ) -> list[Path]:
-    """Write a folder with a JSON file for each picture: every region a mask, instances as groups."""
+    """Write a folder with a JSON file for each picture: every region a mask, instances as groups; a flag says which are none."""
     files = []
     for picture in pictures:
         shapes = []
@@ -97,7 +100,7 @@ def write(
                     "group_id": region.instance or None,
                     "description": "",
                     "shape_type": "mask",
-                    "flags": {},
+                    "flags": {} if region.instance else {STUFF: True},
                     "mask": base64.b64encode(data).decode("ascii"),
                 }
             )

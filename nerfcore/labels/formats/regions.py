@@ -19,6 +19,7 @@ from ...params import LARGEST_PICTURE
 
 Color = tuple[int, int, int]
 MOST_PIXELS = 2**29  # of a picture
+STUFF = "stuff"  # how files call areas that are no single thing, in tools for which else every area is one
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from ...errors import InputError
 from ...files import atomic_path, write_json
 from ...project.label_revision import label_facts
 from .regions import (
+    STUFF,
     LabelClass,
     Picture,
     Region,
@@ -82,10 +83,10 @@ def _pictures(
 def _bitmap(folder: Path, name: str, attributes: dict[str, Any], names: dict, things: dict) -> Picture:
     place = bitmap_place(folder, name, str((attributes.get("segmentation_bitmap") or {}).get("url", "")))
     numbers = numbers_of(picture_of(place, name))
-    regions = [
-        Region(names[entry["category_id"]], numbers == entry["id"], i if things[entry["category_id"]] else 0)
-        for i, entry in enumerate(attributes.get("annotations") or [], 1)
-    ]
+    regions = []
+    for i, entry in enumerate(attributes.get("annotations") or [], 1):
+        single = things[entry["category_id"]] and not (entry.get("attributes") or {}).get(STUFF)
+        regions.append(Region(names[entry["category_id"]], numbers == entry["id"], i if single else 0))
     return Picture(name, numbers.shape[1], numbers.shape[0], regions)
 
 
@@ -106,16 +107,18 @@ def bitmap_place(folder: Path, name: str, address: str) -> Path:
 def write(
     pictures: Iterable[Picture], classes: list[LabelClass], out: Path, label_revision: int | None = None
 ) -> list[Path]:
-    """Write a folder with a release file and a PNG of segment ids for each picture."""
+    """Write a folder with a release file and a PNG of segment ids for each picture. Categories without any instance say so;
+    of the others an attribute says which segments are none."""
     ids, samples, files = {c.name: c.id for c in classes}, [], [out / RELEASE]
+    things: set[str] = set()
     stuff: set[str] = set()
     for picture in pictures:
         numbers, annotations = np.zeros((picture.height, picture.width), np.int64), []
         for number, region in enumerate(picture.regions, 1):
             numbers[region.mask] = number
-            annotations.append({"id": number, "category_id": ids[region.class_name]})
-            if region.instance == 0:
-                stuff.add(region.class_name)
+            marked = {} if region.instance else {"attributes": {STUFF: True}}
+            annotations.append({"id": number, "category_id": ids[region.class_name], **marked})
+            (things if region.instance else stuff).add(region.class_name)
         files.append(out / f"{Path(picture.name).stem}_label_{LABELSET}.png")
         rgba = np.dstack([id_picture(numbers), np.full(numbers.shape, 255, np.uint8)])
         with atomic_path(files[-1]) as temporary:
@@ -129,7 +132,8 @@ def write(
         image = {"url": picture.name, "width": picture.width, "height": picture.height}
         samples.append({"name": picture.name, "attributes": {"image": image}, "labels": {LABELSET: label}})
     categories = [
-        {"id": c.id, "name": c.name, "color": list(c.color), "has_instances": c.name not in stuff} for c in classes
+        {"id": c.id, "name": c.name, "color": list(c.color), "has_instances": c.name not in stuff - things}
+        for c in classes
     ]
     attributes = {"format_version": "0.1", "categories": categories}
     dataset = {

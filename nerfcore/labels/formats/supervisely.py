@@ -14,6 +14,7 @@ from ...errors import InputError
 from ...files import write_json
 from ...project.label_revision import label_facts
 from .regions import (
+    STUFF,
     LabelClass,
     Picture,
     Region,
@@ -32,6 +33,7 @@ from .regions import (
 )
 
 META, DATASET = "meta.json", "photos"
+_STUFF_TAG = {"name": STUFF, "value_type": "none", "color": "#AAAAAA"}
 
 
 def read(path: Path) -> Source:
@@ -60,8 +62,10 @@ def _pictures(files: list[Path], source: Source) -> Iterator[Picture]:
                     source.skip(str(entry.get("geometryType")))
                     continue
                 key = entry.get("instance") or ("object", len(regions))
-                regions.append(Region(str(entry["classTitle"]), mask, keys.setdefault(key, len(keys) + 1)))
-        except (KeyError, TypeError, ValueError, zlib.error) as error:
+                stuff = any(tag.get("name") == STUFF for tag in entry.get("tags") or [])
+                instance = 0 if stuff else keys.setdefault(key, len(keys) + 1)
+                regions.append(Region(str(entry["classTitle"]), mask, instance))
+        except (KeyError, TypeError, ValueError, AttributeError, zlib.error) as error:
             raise InputError(f"{file} is damaged: {error!r}.", "Export the project once more.") from error
         yield Picture(name, width, height, regions)
 
@@ -88,10 +92,10 @@ def _mask(entry: dict[str, Any], width: int, height: int, name: str) -> np.ndarr
 def write(
     pictures: Iterable[Picture], classes: list[LabelClass], out: Path, label_revision: int | None = None
 ) -> list[Path]:
-    """Write a project folder without the photos: every region a bitmap."""
+    """Write a project folder without the photos: every region a bitmap; a tag says which are no instance."""
     entries = [{"title": c.name, "shape": "bitmap", "color": color_hex(c.color).upper()} for c in classes]
     files = [out / META]
-    write_json(files[0], {"classes": entries, "tags": [], "projectType": "images"})
+    write_json(files[0], {"classes": entries, "tags": [_STUFF_TAG], "projectType": "images"})
     for picture in pictures:
         objects = []
         for region in picture.regions:
@@ -99,7 +103,8 @@ def write(
             data = zlib.compress(png_bytes(region.mask[top:bottom, left:right].astype(np.uint8) * 255))
             instance = {"instance": f"{picture.name}-{region.instance}"} if region.instance else {}
             bitmap = {"data": base64.b64encode(data).decode("ascii"), "origin": [left, top]}
-            named = {"classTitle": region.class_name, "geometryType": "bitmap", "tags": [], "description": ""}
+            tags = [] if region.instance else [{"name": STUFF, "value": None}]
+            named = {"classTitle": region.class_name, "geometryType": "bitmap", "tags": tags, "description": ""}
             objects.append({**named, **instance, "bitmap": bitmap})
         size = {"height": picture.height, "width": picture.width}
         files.append(out / DATASET / "ann" / f"{picture.name}.json")

@@ -86,9 +86,10 @@ class FIELDWORK_OT_class_add(ClassEdit):
 
     def changed(self, settings: Any, known: list[dict[str, Any]]) -> list[dict[str, Any]]:
         folder = snapshot.folder_of(settings)
-        void = int((snapshot.project(folder) or {}).get("ignore_id", 0))
-        # The marks of a class that was removed must not become those of the new one.
-        taken = {value["id"] for value in known} | {void} | journal.class_ids(folder)
+        project = snapshot.project(folder) or {}
+        # What marks and label maps say of a class that was removed must not become that of the new one.
+        gone = {value["id"] for value in project.get("classes", [])} | set(project.get("former_class_ids", []))
+        taken = {value["id"] for value in known} | {int(project.get("ignore_id", 0))} | gone | journal.class_ids(folder)
         number = next(i for i in range(1, len(taken) + 2) if i not in taken)
         names = {value["name"] for value in known}
         name = self.name.strip() or t("Class {}", number)

@@ -23,7 +23,7 @@ from ..progress import Reporter
 from ..project.fingerprints import array_digest
 from ..project.schema import SemanticClass
 from ..project.store import edit_project, load_project, world_from_sfm
-from .journal import FOLDER, Mark, append_mark, marks_at, named_classes, read_marks, shown_revision
+from .journal import FOLDER, Mark, append_mark, marks_at, read_marks, shown_revision, taken_ids
 from .preparation import Preparation, ensured
 from .revisions import computed
 
@@ -149,8 +149,7 @@ def classes_of(folder: Path, wanted: list[SemanticClass]) -> tuple[dict[int, int
     ids, added = {}, []
     with edit_project(folder) as project:
         known = {c.name: c.id for c in project.classes}
-        # The marks of a class that was removed must not become those of a new one.
-        taken = {c.id for c in project.classes} | {project.ignore_id} | named_classes(read_marks(folder))
+        taken = taken_ids(folder, project)
         for one in wanted:
             if one.name not in known:
                 number = one.id if one.id not in taken else next(i for i in count(1) if i not in taken)

@@ -11,14 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError, SettingError
+from ..errors import InputError, ProjectError, SettingError
 from ..files import atomic_path, disk_errors, staged
 from ..images.encode import write_picture
 from ..images.labels import fit_to_photo
 from ..images.working import nearest, read_label
 from ..params import LabelExportParams, LabelImportParams
 from ..progress import Reporter
-from ..project.classes import class_color
+from ..project.classes import MOST_CLASSES, class_color
 from ..project.label_revision import map_revision
 from ..project.schema import ImageRecord, Project, SemanticClass
 from ..project.store import edit_project, load_project
@@ -26,7 +26,7 @@ from .accept import is_accepted
 from .formats import known
 from .formats.regions import LabelClass, Picture, Region, Source
 from .history import write_history
-from .journal import read_marks, shown_revision
+from .journal import read_marks, shown_revision, taken_ids
 from .matching import Claims, Photos
 from .overlay import photo_labels
 from .revisions import computed
@@ -46,15 +46,15 @@ def import_labels(params: LabelImportParams, report: Reporter) -> dict[str, Any]
         pictures that are no photo of the project, "classes": names that occur, "instances", "skipped": shapes without
         area by kind}
     Raises:
-        InputError: the file cannot be read, or none of its pictures is a photo of the project. ProjectError, DiskError,
-        Cancelled: the project is as before.
+        InputError: the file cannot be read, none of its pictures is a photo of the project, or it has too many classes.
+        ProjectError, DiskError, Cancelled: the project is as before.
     """
     folder, path = Path(params.project), Path(params.file)
     project = load_project(folder)
     kind = known.format_of(path) if params.format == "auto" else params.format
     source = known.read(path, kind, label_classes(project), project.ignore_id, params.class_name)
     report.stage("Reading labels")
-    classes = Classes(project, source)
+    classes = Classes(project, source, taken_ids(folder, project))
     # Maps that photos have already stay as they are until all of the new ones are there.
     with staged(folder / IMPORTED) as place:
         brought = _bring(source, project, classes, place, params.replace, report)
@@ -64,6 +64,7 @@ def import_labels(params: LabelImportParams, report: Reporter) -> dict[str, Any]
                 f"No picture in {path} is a photo of {folder}.",
                 "Pictures are matched by their names without suffix: compare the two.",
             )
+        classes.with_new(load_project(folder))  # while no map was changed yet
     result = {
         "format": kind,
         "photos": len(brought.maps),
@@ -74,7 +75,7 @@ def import_labels(params: LabelImportParams, report: Reporter) -> dict[str, Any]
         "skipped": dict(source.skipped),
     }
     with edit_project(folder) as edited:
-        classes.add_to(edited)
+        edited.classes = classes.with_new(edited)
         for image in edited.images:
             if image.name in brought.maps:
                 image.label, image.instances = brought.maps[image.name]
@@ -131,10 +132,11 @@ def _bring(source: Source, project: Project, classes: Classes, place: Path, repl
 
 
 class Classes:
-    """The ids that classes of a file get: of the project's where the name is there, else free ones."""
+    """The ids that classes of a file get: of the project's where the name is there, else others than those `taken`."""
 
-    def __init__(self, project: Project, source: Source) -> None:
+    def __init__(self, project: Project, source: Source, taken: set[int]) -> None:
         self.ids = {c.name: c.id for c in project.classes}
+        self._taken = set(taken)
         self.new: dict[str, SemanticClass] = {}
         self.used: set[str] = set()
         self._void, self._colors = project.ignore_id, source.classes
@@ -146,18 +148,31 @@ class Classes:
             return None
         self.used.add(name)
         if name not in self.ids:
-            number = next(i for i in range(1, 65536) if i != self._void and i not in self.ids.values())
+            number = next(i for i in range(1, 65536) if i not in self._taken)
             given = self._colors.get(name)
             color = (given[0] / 255, given[1] / 255, given[2] / 255) if given else class_color(number, self._void)
             self.ids[name] = number
+            self._taken.add(number)
             self.new[name] = SemanticClass(id=number, name=name, color=color)
         return self.ids[name]
 
-    def add_to(self, project: Project) -> None:
-        """Add the new ones to a project, unless somebody did so meanwhile."""
-        names = {c.name for c in project.classes}
-        added = [c for name, c in self.new.items() if name not in names]
-        project.classes = sorted([*project.classes, *added], key=lambda c: c.id)
+    def with_new(self, project: Project) -> list[SemanticClass]:
+        """The classes of a project with the new ones, by id.
+
+        Raises:
+            ProjectError: somebody gave their ids or names to others meanwhile. InputError: there would be too many.
+        """
+        known = {c.name: c.id for c in project.classes}
+        taken = {*known.values(), *project.former_class_ids}
+        if any(known[c.name] != c.id if c.name in known else c.id in taken for c in self.new.values()):
+            raise ProjectError("The classes were changed during the import.", "Import the labels once more.")
+        made = {c.id: c for c in [*self.new.values(), *project.classes]}
+        if len(made) > MOST_CLASSES:
+            raise InputError(
+                f"With those of the file there would be {len(made)} classes; a field tells at most {MOST_CLASSES} apart.",
+                "Merge classes in the file.",
+            )
+        return [made[i] for i in sorted(made)]
 
 
 def maps_of(picture: Picture, classes: Classes, void: int) -> tuple[np.ndarray, np.ndarray]:

@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from ..errors import DiskError, InputError, ProjectError, wrong_value
 from ..files import disk_errors, write_json
-from ..project.schema import ImageName, OwnFile, now
+from ..project.schema import ImageName, OwnFile, Project, now
 from ..project.store import locked
 
 FOLDER = "marks"
@@ -196,9 +196,11 @@ def require_revision(revision: int, newest: int) -> None:
         raise InputError(f"There is no revision {revision} of the marks.", f"The newest is {newest}, 0 has no marks.")
 
 
-def named_classes(marks: list[Mark]) -> set[int]:
-    """The ids of the classes that marks name, whether the project still has them or not."""
-    return {mark.class_id for mark in marks if mark.class_id is not None}
+def taken_ids(folder: Path, project: Project) -> set[int]:
+    """The ids that a new class must not get: those of classes, of void, and of classes that were removed, for what marks
+    and label maps say of them must not become that of the new one. Raises ProjectError."""
+    named = {mark.class_id for mark in read_marks(folder) if mark.class_id is not None}
+    return named | {c.id for c in project.classes} | {*project.former_class_ids, project.ignore_id}
 
 
 def marks_at(marks: list[Mark], revision: int) -> list[Mark]:

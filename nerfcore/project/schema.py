@@ -103,6 +103,7 @@ class Project(Model):
     created: str = Field(default_factory=lambda: now())
     images: list[ImageRecord] = []
     classes: list[SemanticClass] = []
+    former_class_ids: list[int] = []  # of classes that were removed: label maps and marks may still hold them
     ignore_id: int = 0
     mask_mode: Literal["ignore", "empty"] = "ignore"
     frame: Frame = Frame()

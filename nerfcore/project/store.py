@@ -86,7 +86,8 @@ def locked(path: Path, lock_file: Path) -> Iterator[None]:
 
 @contextmanager
 def edit_project(folder: Path, fresh: Project | None = None) -> Iterator[Project]:
-    """Read project.json, let the block change it, write it: no other edit comes between. Keep the block short.
+    """Read project.json, let the block change it, write it: no other edit comes between. Keep the block short. Ids of classes
+    that the block removes are noted, so that no new class gets them.
 
     Args:
         fresh: what to begin with where there is no project yet.
@@ -98,7 +99,9 @@ def edit_project(folder: Path, fresh: Project | None = None) -> Iterator[Project
         load_project(folder)  # says what is wrong before a lock file is made
     with locked(folder / PROJECT_FILE, folder / LOCK_FILE):
         project = load_project(folder) if fresh is None or is_project(folder) else fresh
+        before = {*project.former_class_ids, *(c.id for c in project.classes)}
         yield project
+        project.former_class_ids = sorted(before - {c.id for c in project.classes})
         save_project(folder, project)
 
 

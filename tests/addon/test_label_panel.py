@@ -113,6 +113,26 @@ answer([[entry.id, entry.name] for entry in settings.classes])
     assert added == [[1, "stone"], [3, "wood"]]
 
 
+def test_a_new_class_does_not_take_over_what_label_maps_say_of_one_that_was_removed(bpy_script, tmp_path):
+    added = bpy_script(
+        SETUP
+        + """
+from fieldwork.addon.jobs.queue import queue
+from fieldwork.nerfcore.params import ClassesParams
+from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.project.edit import classes
+queue.ask_and_wait = lambda _, params, on_done: on_done(classes(ClassesParams(**params), Reporter()), None)
+settings.project = project
+settings.class_index = 1
+bpy.ops.fieldwork.class_remove()
+bpy.ops.fieldwork.class_add(name="wood")
+answer([[entry.id, entry.name] for entry in settings.classes])
+""",
+        project=make_posed_project(tmp_path / "p"),
+    )
+    assert added == [[1, "stone"], [3, "wood"]]
+
+
 def test_edits_before_the_engine_answered_keep_the_added_class(bpy_script, tmp_path):
     lists = bpy_script(
         SETUP

@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 from fieldwork.nerfcore.cli import main
-from fieldwork.nerfcore.errors import DiskError, FieldworkError, InputError, SettingError
+from fieldwork.nerfcore.errors import DiskError, FieldworkError, InputError, ProjectError, SettingError
 from fieldwork.nerfcore.images.working import read_label
+from fieldwork.nerfcore.labels import exchange
 from fieldwork.nerfcore.labels.exchange import export_labels
 from fieldwork.nerfcore.labels.formats import coco, cvat, known, label_studio
 from fieldwork.nerfcore.labels.formats.regions import from_runs, hex_color, placed, runs_of
+from fieldwork.nerfcore.labels.journal import append_mark
 from fieldwork.nerfcore.params import LabelExportParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.store import edit_project, load_project
@@ -123,6 +125,44 @@ def test_known_classes_keep_their_ids_and_names_for_nothing_are_no_class(tmp_pat
     (tmp_path / "annotations.xml").write_text(CVAT.replace("stone", "background"))
     bring(folder, tmp_path / "annotations.xml", replace=True)
     assert [(c.id, c.name) for c in load_project(folder).classes] == [(2, "background"), (5, "wood")]
+
+
+def test_new_classes_get_no_id_that_marks_or_label_maps_may_hold(tmp_path: Path) -> None:
+    folder = project_of(tmp_path / "p", ["a"])
+    with edit_project(folder) as project:
+        project.classes = [known_class(1, "marked"), known_class(2, "drawn"), known_class(4, "clay")]
+    append_mark(folder, {"photo": "a", "shape": "line", "points": [(1, 1)], "class_id": 1})
+    with edit_project(folder) as project:
+        project.classes = project.classes[2:]
+    bring(folder, write_cvat(tmp_path))
+    assert [(c.id, c.name) for c in load_project(folder).classes] == [(3, "stone"), (4, "clay"), (5, "wood")]
+
+
+def test_classes_that_are_added_during_an_import_keep_their_ids(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = project_of(tmp_path / "p", ["a"])
+    whole = exchange.maps_of
+
+    def slow(*given: Any) -> Any:
+        with edit_project(folder) as project:  # meanwhile, in Blender
+            project.classes = [known_class(1, "gold")]
+        return whole(*given)
+
+    monkeypatch.setattr(exchange, "maps_of", slow)
+    with pytest.raises(ProjectError, match="changed during the import"):
+        bring(folder, write_cvat(tmp_path))
+    assert not list((folder / "labels/imported").rglob("*.png"))
+    assert [c.name for c in load_project(folder).classes] == ["gold"]
+
+
+def test_more_classes_than_a_field_tells_apart_are_refused(tmp_path: Path) -> None:
+    folder = project_of(tmp_path / "p", ["a"], (300, 4))
+    (tmp_path / "maps").mkdir()
+    Image.fromarray(np.arange(300, dtype=np.uint16)[None].repeat(4, 0)).save(tmp_path / "maps/a.png")
+    with pytest.raises(InputError, match="299 classes"):
+        bring(folder, tmp_path / "maps")
+    assert not load_project(folder).classes
 
 
 def known_class(number: int, name: str) -> Any:

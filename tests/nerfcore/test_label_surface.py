@@ -28,7 +28,7 @@ from fieldwork.nerfcore.params import (
 )
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.schema import SemanticClass
-from fieldwork.nerfcore.project.store import edit_project, load_project
+from fieldwork.nerfcore.project.store import edit_project, load_project, save_project
 from fieldwork.tests.nerfcore.support.ball import RADIUS, ball_project
 from fieldwork.tests.nerfcore.test_labels import BOTTOM, TOP, ball, trained  # noqa: F401
 from pydantic import ValidationError
@@ -147,7 +147,7 @@ def epochs(trained: Path, folder: Path) -> tuple[Path, Path, np.ndarray, Path]: 
     shutil.rmtree(now / "marks", ignore_errors=True)
     with edit_project(now) as project:
         project.frame.world_from_sfm = (turn @ np.array(project.frame.world_from_sfm)).tolist()
-        project.classes = []
+    save_project(now, project.model_copy(update={"classes": []}))
     rows = ["name,x,y,z,other_x,other_y,other_z"]
     for number, there in enumerate(np.array([[0.5, 0, 0], [0, 0.5, 0], [0, 0, 0.5], [-0.5, 0, 0]])):
         here = transform_points(turn, there[None])[0]
@@ -201,10 +201,13 @@ def test_carried_classes_get_ids_that_neither_classes_nor_marks_nor_void_have(tm
     folder = ball_project(tmp_path / "p", views=3)
     append_mark(folder, {"photo": "00", "shape": "line", "points": [(1, 1)], "class_id": 3})
     with edit_project(folder) as project:
-        project.ignore_id = 65535
+        project.ignore_id, kept = 65535, project.classes
+        project.classes = [*kept, SemanticClass(id=4, name="gone", color=(0, 0, 0))]
+    with edit_project(folder) as project:
+        project.classes = kept
     grey = (0.5, 0.5, 0.5)
     wanted = [SemanticClass(id=i, name=name, color=grey) for i, name in ((3, "brick"), (65535, "glass"), (7, "top"))]
-    assert classes_of(folder, wanted) == ({3: 4, 65535: 5, 7: TOP}, ["brick", "glass"])
+    assert classes_of(folder, wanted) == ({3: 5, 65535: 6, 7: TOP}, ["brick", "glass"])
 
 
 def test_epochs_that_do_not_fit_and_damaged_files_are_told(trained: Path, tmp_path: Path) -> None:  # noqa: F811

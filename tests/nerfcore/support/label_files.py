@@ -16,7 +16,7 @@ from fieldwork.nerfcore.labels.exchange import import_labels
 from fieldwork.nerfcore.labels.formats import label_studio
 from fieldwork.nerfcore.params import LabelImportParams
 from fieldwork.nerfcore.progress import Reporter
-from fieldwork.nerfcore.project.store import edit_project, load_project
+from fieldwork.nerfcore.project.store import load_project, save_project
 from fieldwork.tests.nerfcore.support.ball import ball_project
 from PIL import Image
 
@@ -301,11 +301,12 @@ WRITTEN = {
 def project_of(folder: Path, names: list[str], size: tuple[int, int] = (WIDTH, HEIGHT)) -> Path:
     """A project with photos of these names, without classes and labels."""
     ball_project(folder, views=len(names), side=8)
-    with edit_project(folder) as project:
-        project.classes = []
-        for image, name in zip(project.images, names):
-            image.name, image.label, (image.width, image.height) = name, None, size
-            image.file = f"images/{name}.jpg"
+    project = load_project(folder)
+    project.classes = []
+    for image, name in zip(project.images, names):
+        image.name, image.label, (image.width, image.height) = name, None, size
+        image.file = f"images/{name}.jpg"
+    save_project(folder, project)
     return folder
 
 

@@ -35,27 +35,35 @@ DARK, CONTRAST = 80, 2.0  # of 255: the brightest of the surroundings, and by ho
 RIM = 2  # pixels of the small picture around its outline that the whole picture decides about
 
 
-def mask_objects(records: Sequence[ImageRecord], folder: Path, report: Reporter) -> bool:
+def mask_objects(
+    records: Sequence[ImageRecord], folder: Path, report: Reporter, before: Sequence[ImageRecord] = ()
+) -> bool:
     """Write a mask for each of the photos (`record.mask`) if nearly all show an object before dark surroundings; whether
-    they do.
+    they do. Unchanged photos keep the mask that was made before.
 
     Args:
-        records: photos of a project in `folder`, without masks.
+        records: photos of a project in `folder`, without masks. before: photos that masks were made for before.
     Raises:
         InputError: a photo cannot be read. DiskError: a mask cannot be written. What `report` raises to stop.
     """
     if not all_before_dark([folder / record.file for record in records], report):
         return False
     report.stage("Cutting the object out")
+    there = {(r.sha256, r.width, r.height, r.mask) for r in before if r.mask and (folder / r.mask).is_file()}
+    made = 0
     for number, record in enumerate(records):
         report.progress(number / len(records), record.name)
-        mask = object_mask(read_picture(folder / record.file).pixels)
         record.mask = f"masks/{record.name}.png"
+        if (record.sha256, record.width, record.height, record.mask) in there:
+            continue
+        made += 1
+        mask = object_mask(read_picture(folder / record.file).pixels)
         with atomic_path(folder / record.mask) as path:
             Image.fromarray(mask).save(path, compress_level=2)
     report.note(
-        f"The photos show an object before dark surroundings: {len(records)} masks were made, and what is dark around it is "
-        "taken as empty space. Give masks of your own with --masks, or keep the surroundings with --keep-backdrop."
+        f"The photos show an object before dark surroundings: {made} masks were made"
+        + (f", {len(records) - made} are there already" if made < len(records) else "")
+        + ", and what is dark around it is taken as empty space. Give masks of your own with --masks, or keep the surroundings with --keep-backdrop."
     )
     return True
 

@@ -17,7 +17,7 @@ from ..params import NewParams
 from ..progress import Reporter, shortened
 from ..project.classes import make_classes, read_classes, unnamed_values
 from ..project.fingerprints import Earlier, Fingerprint, compare, digest, files_digest, stamps_digest
-from ..project.kept import keep_later_labels, with_earlier_names
+from ..project.kept import earlier_cut_outs, keep_later_labels, with_earlier_names
 from ..project.schema import ImageRecord, Project
 from ..project.store import PROJECT_FILE, create_folder, edit_project, load_project
 from .backdrop import mask_objects
@@ -67,7 +67,8 @@ def new(params: NewParams, report: Reporter) -> dict[str, Any]:
     fresh, records = records, kept + records if params.add else records + kept
     _check_usable(records, photos, skipped)
     asked = records if params.add else fresh
-    cut_out = _masks_wanted(params, previous, asked) and mask_objects(_without_mask(records), folder, report)
+    wanted, made = _masks_wanted(params, previous, asked), earlier_cut_outs(previous)
+    cut_out = wanted and mask_objects(_without_mask(records), folder, report, made)
     if previous:
         later = keep_later_labels(fresh, previous.images, folder)
         if classes[0]:  # else the project keeps its own
@@ -79,7 +80,7 @@ def new(params: NewParams, report: Reporter) -> dict[str, Any]:
     if classes_file and classes[0]:
         for text in unnamed_values(present, *classes[:2], classes_file):
             report.warn(text)
-    origin = {"video_sha256": file_hash(photos)} if photos.is_file() else {}
+    origin = {"cut_out": cut_out} | ({"video_sha256": file_hash(photos)} if photos.is_file() else {})
     mask_mode = "empty" if cut_out else _mask_mode(params, previous, folder, records, report)
     with edit_project(folder, Project()) as project:
         _put_in(project, records, set(present), classes, params, previous is not None)

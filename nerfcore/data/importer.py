@@ -18,7 +18,7 @@ from ..images.labels import read_mask
 from ..params import ImportParams
 from ..progress import Reporter, shortened
 from ..project.classes import make_classes, unnamed_values
-from ..project.kept import earlier_poses, keep_later_labels, keep_world, with_earlier_classes
+from ..project.kept import earlier_cut_outs, earlier_poses, keep_later_labels, keep_world, with_earlier_classes
 from ..project.schema import Frame, ImageRecord, PosedImage, Poses, Project, SemanticClass
 from ..project.store import PROJECT_FILE, create_folder, edit_project, load_project, save_poses
 from .copying import copy_depth, copy_labels, copy_mask, copy_photo
@@ -68,7 +68,7 @@ def import_dataset(params: ImportParams, report: Reporter) -> dict[str, Any]:
         raise InputError(f"The masks of {source} leave nothing of any photo.", "White in a mask marks what counts.")
     classes = _classes(dataset, set(present))
     told = params.keep_backdrop or params.mask_mode == "ignore" or any(r.mask or r.label for r in records)
-    cut_out = not told and mask_objects(records, folder, report)
+    cut_out = not told and mask_objects(records, folder, report, earlier_cut_outs(previous))
     masks = [folder / record.mask for record in used if record.mask]
     mask_mode = "empty" if cut_out else chosen_mask_mode(params.mask_mode, masks, len(used), report)
     cameras, images = _poses(dataset.views)
@@ -87,7 +87,7 @@ def import_dataset(params: ImportParams, report: Reporter) -> dict[str, Any]:
             "labelled": sum(record.label is not None for record in used),
             "classes": [c.name for c in classes],
         }
-        project.record("import", params.model_dump(mode="json"), result | {"world_kept": kept})
+        project.record("import", params.model_dump(mode="json"), result | {"world_kept": kept, "cut_out": cut_out})
     return result
 
 

@@ -1,4 +1,5 @@
-"""What is kept of a project whose photos are read, or whose cameras are placed, once more: labels, classes, the world."""
+"""What is kept of a project whose photos are read, or whose cameras are placed, once more: labels, masks, classes, the
+world."""
 
 from __future__ import annotations
 
@@ -39,6 +40,13 @@ def keep_later_labels(records: Sequence[ImageRecord], before: Sequence[ImageReco
             record.depth = record.depth or earlier.depth
             given.append(record)
     return given
+
+
+def earlier_cut_outs(project: Project | None) -> list[ImageRecord]:
+    """Photos whose masks Fieldwork made itself when it read them the last time; somebody may have edited these since."""
+    steps = reversed(project.provenance) if project else ()
+    read = next((s for s in steps if s.verb in ("new", "import") and not s.settings.get("add")), None)
+    return project.images if project and read and read.result.get("cut_out") else []
 
 
 def with_earlier_names(

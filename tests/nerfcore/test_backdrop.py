@@ -134,6 +134,32 @@ def test_new_cuts_the_object_out(tmp_path: Path) -> None:
     assert new(photos, tmp_path / "p")["masked"] == 10  # again, from the working copies that are there
 
 
+def test_masks_that_were_made_and_edited_are_kept(tmp_path: Path) -> None:
+    photos = photos_of(tmp_path / "photos", [velvet(seed)[0] for seed in range(10)])
+    masks = tmp_path / "p/masks"
+    new(photos, tmp_path / "p")
+    edited = np.zeros((HEIGHT, WIDTH), np.uint8)
+    edited[100:200, 100:200] = 255
+    for name in ("p00", "p01"):
+        Image.fromarray(edited).save(masks / f"{name}.png")
+    Image.fromarray(velvet(20)[0]).save(photos / "p01.png")  # another photo: another mask
+    Image.fromarray(velvet(21)[0]).save(photos / "p10.png")
+    report = Notes()
+    assert ingest.new(NewParams(photos=photos, project=tmp_path / "p"), report)["masked"] == 11
+    assert np.array_equal(read_mask(masks / "p00.png"), edited > 0)
+    assert not np.array_equal(read_mask(masks / "p01.png"), edited > 0)
+    assert any("2 masks were made, 9 are there already" in note for note in report.heard)
+    given = tmp_path / "given"
+    given.mkdir()
+    for number in range(11):
+        Image.fromarray(edited).save(given / f"p{number:02}.png")
+    new(photos, tmp_path / "p", masks=given)
+    new(photos, tmp_path / "p")
+    assert not np.array_equal(read_mask(masks / "p00.png"), edited > 0), (
+        "masks that were given are gone with their folder"
+    )
+
+
 def test_photos_that_are_added_are_as_the_others(tmp_path: Path) -> None:
     dark = photos_of(tmp_path / "dark", [velvet(seed)[0] for seed in range(4)])
     more = photos_of(tmp_path / "more", [velvet(seed)[0] for seed in range(4, 6)])

@@ -132,7 +132,10 @@ def lines(known: Facts) -> list[str]:
         told.append(t("Self-check: from the other photos {:.0%} of the marks are guessed.", known.told["self_check"]))
     unused = len(known.told.get("unused", []))
     if unused:
-        told.append(t("{} marks met no surface.", unused) if unused > 1 else t("1 mark met no surface."))
+        why = t("there is no surface under it, or its class or photo is gone")
+        told.append(
+            t("{} marks do not count: {}.", unused, why) if unused > 1 else t("1 mark does not count: {}.", why)
+        )
     if known.accepted is not None:
         told.append(t("The field has the classes of revision {}.", known.accepted))
     return told

@@ -37,7 +37,7 @@ answer(seen)
     assert "25% of the surface is void: nothing like it is marked." in lines
     assert "The last propagation took 1.5 s." in lines
     assert "Self-check: from the other photos 75% of the marks are guessed." in lines
-    assert "1 mark met no surface." in lines
+    assert "1 mark does not count: there is no surface under it, or its class or photo is gone." in lines
     assert "The field has the classes of revision 1." in lines
     assert row == "1 ✎  50%"
     assert line.startswith("stone: 1 mark, 50% of the surface, 7")

@@ -266,6 +266,35 @@ def test_what_is_no_instance_comes_back_as_none(tmp_path: Path, kind: str, singl
     np.testing.assert_array_equal(named_map(other, "a"), expect(stone=ids == 1, wood=ids == 2))
 
 
+@pytest.mark.parametrize("kind", [*THING_FORMATS, "png", "png-colors"])
+def test_photos_with_odd_names_are_found_again(tmp_path: Path, kind: str) -> None:
+    names = [
+        "20240101-front",
+        "deadbeef-x",
+        "IMG#1",
+        "50%25",
+        "a.b",
+        "a;b&c",
+        "[1]",
+        "mask",
+        "-x",
+        "a_label_ground-truth",
+    ]
+    folder, other = project_of(tmp_path / "p", names), project_of(tmp_path / "q", names)
+    with edit_project(folder) as project:
+        project.classes = [known_class(1, "stone")]
+        for number, image in enumerate(project.images):
+            image.label = f"labels/{image.name}.png"
+            ids = np.arange(HEIGHT * WIDTH).reshape(HEIGHT, WIDTH) == number
+            Image.fromarray(ids.astype(np.uint8)).save(folder / image.label)
+    out = tmp_path / f"out{known.FILES.get(kind, '')}"
+    export(folder, out, kind)
+    told, _ = bring(other, out / "panoptic.json" if kind == "coco-panoptic" else out)
+    assert told["unknown"] == []
+    for name in names:
+        np.testing.assert_array_equal(named_map(other, name), named_map(folder, name))
+
+
 @given(MASKS)
 @settings(max_examples=60, deadline=None)
 def test_run_lengths_come_back(mask: np.ndarray) -> None:
@@ -290,8 +319,11 @@ def test_run_lengths_are_those_of_the_tools() -> None:
 def test_names_of_label_studio_s_pictures() -> None:
     name = lambda address: label_studio.picture_name({"image": address}, 1)  # noqa: E731
     assert name("/data/upload/3/0a1b2c3d-IMG_1.jpg") == "IMG_1.jpg"
-    assert name("/data/local-files/?d=vase%2FIMG%201.jpg") == "IMG 1.jpg"
-    assert name("s3://bucket/vase/IMG_1.jpg?versionId=4") == "IMG_1.jpg"
+    assert name("/data/upload/3/0a1b2c3d-20240101-IMG_1.jpg") == "20240101-IMG_1.jpg"
+    assert name("/data/local-files/?d=vase%2FIMG%201.jpg") == "vase/IMG 1.jpg"
+    assert name("s3://bucket/vase/IMG_1.jpg?versionId=4") == "vase/IMG_1.jpg"
+    for plain in ("20240101-IMG_1.jpg", "IMG#1.jpg", "50%25.jpg", "a;b?.jpg", "cam0/1.jpg"):
+        assert name(plain) == plain
     assert hex_color("#0f8") == (0, 255, 136)
     assert hex_color("red") is None
 

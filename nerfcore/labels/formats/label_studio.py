@@ -87,13 +87,15 @@ def _is_stuff(result: dict[str, Any]) -> bool:
 
 
 def picture_name(data: dict[str, Any], number: int) -> str:
-    """The name of a task's picture, without what Label Studio put before it."""
+    """The place of a task's picture, of uploaded files the name without what Label Studio put before it."""
     texts = [data.get("image"), *data.values()]
     address = next((str(v) for v in texts if isinstance(v, str) and v), f"task {number}")
+    if "://" not in address and not address.startswith("/data/"):
+        return address  # as it was imported: the name of a file
     parsed = urlparse(address)
     # Files of local storage are named in the query: /data/local-files/?d=photos/a.jpg
-    place = parsed.query.partition("d=")[2] if "local-files" in parsed.path else parsed.path
-    return UPLOADED.sub("", unquote(place).replace("\\", "/").rsplit("/", 1)[-1])
+    place = unquote(parsed.query.partition("d=")[2] if "local-files" in parsed.path else parsed.path)
+    return UPLOADED.sub("", place.rsplit("/", 1)[-1]) if "/upload/" in parsed.path else place.lstrip("/")
 
 
 def _mask(result: dict[str, Any], width: int, height: int) -> np.ndarray:

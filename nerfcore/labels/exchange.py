@@ -139,7 +139,7 @@ class Classes:
         self._taken = set(taken)
         self.new: dict[str, SemanticClass] = {}
         self.used: set[str] = set()
-        self._void, self._colors = project.ignore_id, source.classes
+        self._void, self._colors, self._wanted = project.ignore_id, source.classes, source.ids
 
     def id_of(self, name: str) -> int | None:
         """The id of a class; None for what stands for no class."""
@@ -148,7 +148,9 @@ class Classes:
             return None
         self.used.add(name)
         if name not in self.ids:
-            number = next(i for i in range(1, 65536) if i not in self._taken)
+            number = self._wanted.get(name)
+            if number is None or number in self._taken:
+                number = next(i for i in range(1, 65536) if i not in self._taken)
             given = self._colors.get(name)
             color = (given[0] / 255, given[1] / 255, given[2] / 255) if given else class_color(number, self._void)
             self.ids[name] = number

@@ -156,6 +156,18 @@ def test_classes_that_are_added_during_an_import_keep_their_ids(
     assert [c.name for c in load_project(folder).classes] == ["gold"]
 
 
+def test_ids_of_label_maps_without_names_mean_the_same_in_every_import(tmp_path: Path) -> None:
+    folder = project_of(tmp_path / "p", ["a", "b"])
+    for name, values in {"a": (1, 5), "b": (2, 5)}.items():
+        (tmp_path / name).mkdir()
+        Image.fromarray(np.where(CORNER, *values).astype(np.uint8)).save(tmp_path / name / f"{name}.png")
+        bring(folder, tmp_path / name)
+        np.testing.assert_array_equal(
+            named_map(folder, name), np.where(CORNER, f"class {values[0]}", f"class {values[1]}")
+        )
+    assert [(c.id, c.name) for c in load_project(folder).classes] == [(i, f"class {i}") for i in (1, 2, 5)]
+
+
 def test_more_classes_than_a_field_tells_apart_are_refused(tmp_path: Path) -> None:
     folder = project_of(tmp_path / "p", ["a"], (300, 4))
     (tmp_path / "maps").mkdir()

@@ -41,6 +41,7 @@ def read_maps(path: Path, classes: list[LabelClass], void: int) -> Source:
         names, void, given = read_classes(table)
         colors = {**{i: color for i, color in colors.items() if i in names}, **given}
     source = Source(iter(()), {name: colors.get(i) for i, name in names.items()})
+    source.ids = {name: i for i, name in names.items()}
     source.pictures = _maps(pictures_in(path), names, colors, void, source)
     return source
 
@@ -59,7 +60,9 @@ def _maps(
         regions = []
         for class_id in np.unique(ids).tolist():
             if class_id != void:
-                regions.append(Region(names.get(class_id, f"class {class_id}"), ids == class_id))
+                name = names.get(class_id, f"class {class_id}")
+                source.ids.setdefault(name, class_id)
+                regions.append(Region(name, ids == class_id))
         yield Picture(file.name, ids.shape[1], ids.shape[0], regions)
 
 

@@ -53,11 +53,13 @@ class LabelClass:
 @dataclass
 class Source:
     """What a file holds. classes: names in their order, with colours where they have one; skipped: kinds of shapes that
-    have no area, and how many there were, complete once the pictures were read."""
+    have no area, and how many there were, complete once the pictures were read; ids: which id new classes get, if it is
+    free, where the pictures themselves hold ids."""
 
     pictures: Iterator[Picture]
     classes: dict[str, Color | None] = field(default_factory=dict)
     skipped: dict[str, int] = field(default_factory=dict)
+    ids: dict[str, int] = field(default_factory=dict)
 
     def skip(self, kind: str) -> None:
         self.skipped[kind] = self.skipped.get(kind, 0) + 1

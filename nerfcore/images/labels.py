@@ -60,6 +60,9 @@ def _from_palette(image: Image.Image, colors: Colors | None, ignore_id: int) -> 
     if not colors:
         return indices
     used = np.unique(indices)
+    own = {ignore_id: (0, 0, 0)} | colors
+    if all(i < len(palette) and tuple(palette[i].tolist()) == own.get(i) for i in used.tolist()):
+        return indices  # also where two classes have the same colour
     by_color = {(0, 0, 0): ignore_id} | {tuple(color): i for i, color in colors.items()}
     ids = [by_color.get(tuple(palette[i].tolist())) if i < len(palette) else None for i in used]
     if any(i is None for i in ids):
@@ -79,8 +82,15 @@ def _from_colors(rgba: np.ndarray, colors: Colors | None, ignore_id: int, name: 
         raise UnknownColors(f"label map {name} is coloured; give --classes with a colour for each class")
     packed = rgb @ [65536, 256, 1]
     values = np.full(packed.shape, -1, np.int64)
+    owner: dict[int, int] = {}
     for class_id, (red, green, blue) in colors.items():
-        values[packed == red * 65536 + green * 256 + blue] = class_id
+        color = red * 65536 + green * 256 + blue
+        its = packed == color
+        if owner.setdefault(color, class_id) != class_id and (its & opaque).any():
+            raise UnknownColors(
+                f"label map {name}: its colour #{color:06x} is that of the classes {owner[color]} and {class_id}"
+            )
+        values[its] = class_id
     values[~opaque | ((values < 0) & (packed == 0))] = ignore_id  # black means unlabelled unless a class has it
     unknown = values < 0
     if unknown.any():

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from fieldwork.nerfcore.capture import ingest
 from fieldwork.nerfcore.errors import InputError
+from fieldwork.nerfcore.images.labels import read_labels
 from fieldwork.nerfcore.params import NewParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.schema import SemanticClass
@@ -49,6 +50,20 @@ def write_labels(folder: Path, kind: str, name: str) -> None:
         for i, color in COLORS.items():
             rgb[values == i] = color
         Image.fromarray(rgb).save(folder / name)
+
+
+def test_classes_of_one_color(tmp_path: Path) -> None:
+    """A palette tells them apart by its indices; colours alone do not."""
+    red = {1: (255, 0, 0), 2: (255, 0, 0), 3: (0, 255, 0)}
+    picture = Image.fromarray(np.array([[0, 1, 2]], np.uint8), "P")
+    picture.putpalette([0, 0, 0, 255, 0, 0, 255, 0, 0])
+    picture.save(tmp_path / "palette.png")
+    picture.convert("RGB").save(tmp_path / "rgb.png")
+    assert read_labels(tmp_path / "palette.png", red).tolist() == [[0, 1, 2]]
+    with pytest.raises(InputError, match="#ff0000 is that of the classes 1 and 2"):
+        read_labels(tmp_path / "rgb.png", red)
+    Image.fromarray(np.array([[[0, 255, 0], [0, 0, 0]]], np.uint8)).save(tmp_path / "green.png")
+    assert read_labels(tmp_path / "green.png", red).tolist() == [[3, 0]]
 
 
 @pytest.mark.parametrize("kind", ["index", "index16", "palette", "palette colours", "rgb"])

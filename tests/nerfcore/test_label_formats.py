@@ -168,6 +168,18 @@ def test_ids_of_label_maps_without_names_mean_the_same_in_every_import(tmp_path:
     assert [(c.id, c.name) for c in load_project(folder).classes] == [(i, f"class {i}") for i in (1, 2, 5)]
 
 
+def test_colors_that_do_not_tell_classes_apart_are_refused(tmp_path: Path) -> None:
+    folder = project_of(tmp_path / "p", ["a"])
+    bring(folder, write_cvat(tmp_path))
+    for color, owner in (((1.0, 0.0, 0.2), "stone"), ((0.0, 0.0, 0.0), "void")):
+        with edit_project(folder) as project:
+            project.classes[0].color = color
+        with pytest.raises(SettingError, match=f"the colour of .*{owner}"):
+            export(folder, tmp_path / "out", "png-colors")
+        assert not (tmp_path / "out").exists()
+    export(folder, tmp_path / "ids", "png")
+
+
 def test_more_classes_than_a_field_tells_apart_are_refused(tmp_path: Path) -> None:
     folder = project_of(tmp_path / "p", ["a"], (300, 4))
     (tmp_path / "maps").mkdir()

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from ...errors import InputError
+from ...errors import InputError, SettingError
 from ...files import atomic_path, write_json
 from ...images.labels import UnknownColors, read_labels, read_mask
 from ...project.classes import read_classes
-from .regions import Color, LabelClass, Picture, Region, Source, checked_size
+from .regions import Color, LabelClass, Picture, Region, Source, checked_size, color_hex
 
 SUFFIXES = {".png", ".tif", ".tiff", ".bmp"}
 MASK = re.compile(r"[_.-]?mask$", re.IGNORECASE)  # behind the name of the photo
@@ -90,10 +90,28 @@ def map_of(picture: Picture, ids: dict[str, int], void: int) -> np.ndarray:
     return values.astype(np.uint8 if max([void, *ids.values()]) < 256 else np.uint16)
 
 
+def _require_apart(classes: list[LabelClass]) -> None:
+    """Raise SettingError where two classes have the same colour, or one that of void."""
+    owner = {(0, 0, 0): "void"}
+    for c in classes:
+        if c.color in owner:
+            raise SettingError(
+                f"“{c.name}” has the colour of {owner[c.color]}: {color_hex(c.color)}.",
+                "Give every class a colour of its own, or export ids (--format png).",
+            )
+        owner[c.color] = f"“{c.name}”"
+
+
 def write_maps(
     pictures: Iterable[Picture], classes: list[LabelClass], out: Path, void: int, colored: bool
 ) -> list[Path]:
-    """Write a folder of label maps of ids, or in the classes' colours on black, with classes.json."""
+    """Write a folder of label maps of ids, or in the classes' colours on black, with classes.json.
+
+    Raises:
+        SettingError: colours do not tell the classes apart.
+    """
+    if colored:
+        _require_apart(classes)
     table = {str(c.id): {"name": c.name, "color": list(c.color)} for c in classes}
     files = [out / TABLE]
     write_json(files[0], {"ignore_id": void, "classes": table})

@@ -14,7 +14,7 @@ from fieldwork.nerfcore.images.working import read_label
 from fieldwork.nerfcore.labels import exchange
 from fieldwork.nerfcore.labels.exchange import export_labels
 from fieldwork.nerfcore.labels.formats import coco, cvat, known, label_studio
-from fieldwork.nerfcore.labels.formats.regions import from_runs, hex_color, placed, runs_of
+from fieldwork.nerfcore.labels.formats.regions import from_runs, hex_color, id_picture, placed, runs_of
 from fieldwork.nerfcore.labels.journal import append_mark
 from fieldwork.nerfcore.params import LabelExportParams
 from fieldwork.nerfcore.progress import Reporter
@@ -350,6 +350,39 @@ def test_names_of_label_studio_s_pictures() -> None:
         assert name(plain) == plain
     assert hex_color("#0f8") == (0, 255, 136)
     assert hex_color("red") is None
+
+
+def test_pictures_of_one_name_in_several_folders_keep_apart(tmp_path: Path) -> None:
+    segments, samples = tmp_path / "segments", []
+    boxes = {"cam0": RING, "cam1": CORNER}
+    for number, (camera, mask) in enumerate(boxes.items(), 1):
+        (segments / camera).mkdir(parents=True)
+        rgba = np.dstack([id_picture(mask * number), np.full(mask.shape, 255, np.uint8)])
+        Image.fromarray(rgba).save(segments / camera / "1_label_mine.png")
+        attributes = {
+            "annotations": [{"id": number, "category_id": 1}],
+            "segmentation_bitmap": {"url": "https://x.org/0a"},
+        }
+        samples.append({"name": f"{camera}/1.jpg", "labels": {"mine": {"attributes": attributes}}})
+        annotated = tmp_path / "supervisely" / camera / "ann"
+        annotated.mkdir(parents=True)
+        points = {"exterior": [[0, number], [3, 5]], "interior": []}
+        objects = [{"classTitle": "clay", "geometryType": "rectangle", "points": points}]
+        value = {"size": {"width": WIDTH, "height": HEIGHT}, "objects": objects}
+        (annotated / "1.jpg.json").write_text(json.dumps(value))
+    dataset = {"samples": samples, "task_attributes": {"categories": [{"id": 1, "name": "clay"}]}}
+    (segments / "release.json").write_text(json.dumps({"dataset": dataset}))
+    (tmp_path / "supervisely/meta.json").write_text(json.dumps({"classes": [{"title": "clay"}]}))
+    folder = project_of(tmp_path / "p", ["cam0_1", "cam1_1"])
+    assert bring(folder, segments)[0]["photos"] == 2
+    for camera, mask in boxes.items():
+        np.testing.assert_array_equal(named_map(folder, f"{camera}_1"), expect(clay=mask))
+    (segments / "cam1/1_label_mine.png").unlink()
+    with pytest.raises(InputError, match=r"label picture of cam1/1\.jpg is not beside"):
+        bring(folder, segments, replace=True)
+    assert bring(folder, tmp_path / "supervisely", replace=True)[0]["photos"] == 2
+    for number, camera in enumerate(boxes, 1):
+        assert (named_map(folder, f"{camera}_1") == "clay").any(1).tolist() == [row >= number for row in range(HEIGHT)]
 
 
 BROKEN = {

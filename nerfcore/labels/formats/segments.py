@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 from urllib.parse import unquote, urlparse
 
@@ -57,13 +57,13 @@ def _pictures(
     for sample in samples:
         try:
             name, labels = str(sample["name"]), sample.get("labels") or {}
-            label = next((value for value in labels.values() if value), None)
-            if not label:
+            labelset = next((key for key, value in labels.items() if value), None)
+            if labelset is None:
                 continue
-            attributes = label["attributes"]
+            attributes = labels[labelset]["attributes"]
             annotations = attributes.get("annotations") or []
             if "segmentation_bitmap" in attributes:
-                yield _bitmap(folder, name, attributes, names, things)
+                yield _bitmap(folder, name, labelset, attributes, names, things)
                 continue
             image = attributes.get("image") or sample["attributes"]["image"]
             width, height = checked_size(image.get("width"), image.get("height"), name)
@@ -80,8 +80,9 @@ def _pictures(
             raise InputError(wrong, "Download the release file once more.") from error
 
 
-def _bitmap(folder: Path, name: str, attributes: dict[str, Any], names: dict, things: dict) -> Picture:
-    place = bitmap_place(folder, name, str((attributes.get("segmentation_bitmap") or {}).get("url", "")))
+def _bitmap(folder: Path, name: str, labelset: str, attributes: dict[str, Any], names: dict, things: dict) -> Picture:
+    address = str((attributes.get("segmentation_bitmap") or {}).get("url", ""))
+    place = bitmap_place(folder, name, address, labelset)
     numbers = numbers_of(picture_of(place, name))
     regions = []
     for i, entry in enumerate(attributes.get("annotations") or [], 1):
@@ -90,14 +91,22 @@ def _bitmap(folder: Path, name: str, attributes: dict[str, Any], names: dict, th
     return Picture(name, numbers.shape[1], numbers.shape[0], regions)
 
 
-def bitmap_place(folder: Path, name: str, address: str) -> Path:
-    """Where the bitmap of a sample lies. Nothing is downloaded. Raises InputError."""
-    stem = Path(name).stem
-    wanted = [unquote(urlparse(address).path).rsplit("/", 1)[-1], f"{stem}_label_{LABELSET}.png", f"{stem}.png"]
+def bitmap_place(folder: Path, name: str, address: str, labelset: str = LABELSET) -> Path:
+    """Where the bitmap of a sample lies. Nothing is downloaded. Raises InputError.
+
+    Args:
+        name, address, labelset: of the sample, of its bitmap as the release has it, and of its labels.
+    """
+    stem = name.removesuffix(PurePosixPath(name).suffix)
+    wanted = [unquote(urlparse(address).path).rsplit("/", 1)[-1]]
+    for one in (stem, PurePosixPath(stem).name):
+        wanted += [f"{one}_label_{labelset}.png", f"{one}.png"]
+    inner = [folder, folder / "labels", *sorted(place for place in folder.iterdir() if place.is_dir())]
     for file in dict.fromkeys(w for w in wanted if w.lower().endswith(".png")):
-        for place in (folder / file, folder / "labels" / file, *sorted(folder.glob(f"*/{file}"))):
-            if place.is_file():
-                return place
+        # A bare name in some other folder may be that of another sample.
+        for place in inner[:2] if "/" in name and "/" not in file else inner:
+            if (place / file).is_file():
+                return place / file
     raise InputError(
         f"The label picture of {name} is not beside the release file in {folder}.",
         f"Download it there as {wanted[1]} (the tool of Segments.ai does so: export_dataset).",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import zlib
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -50,8 +51,11 @@ def read(path: Path) -> Source:
 
 
 def _pictures(files: list[Path], source: Source) -> Iterator[Picture]:
+    many = Counter(file.name for file in files)  # data sets are folders, each of which may have a photo of one name
     for file in files:
         value, name = read_json(file), file.name.removesuffix(".json")
+        if many[file.name] > 1:
+            name = f"{file.parents[1].name}/{name}"
         try:
             width, height = checked_size(value["size"]["width"], value["size"]["height"], name)
             regions: list[Region] = []

@@ -11,7 +11,7 @@ from PIL import Image
 from ..errors import InputError
 from ..files import atomic_path
 from ..images.arrays import read_array
-from ..images.decode import read_photo
+from ..images.decode import UNDECODABLE, read_photo
 from ..images.labels import Colors, read_labels, read_mask
 from ..images.suffixes import FLOAT_SUFFIXES, RAW_SUFFIXES
 
@@ -35,7 +35,7 @@ def copy_photo(source: Path, folder: Path, name: str) -> Path:
             with Image.open(source) as image:
                 plain = image.mode in PLAIN_MODES and image.getexif().get(0x0112, 1) in (0, 1)
                 image.load()  # headers of truncated files are whole
-        except OSError as error:
+        except UNDECODABLE as error:
             raise InputError(f"The photo {source} cannot be used: {error}.", "Replace or remove it.") from error
         if plain:
             return copy_file(source, folder, name)

@@ -23,6 +23,18 @@ pillow_heif.register_heif_opener()
 # Stitched panoramas are larger than Pillow's decompression-bomb limit; ours is what a decode may take in memory.
 Image.MAX_IMAGE_PIXELS = 600_000_000
 
+# What decoders raise for damaged files; UnidentifiedImageError is an OSError.
+UNDECODABLE = (
+    OSError,
+    EOFError,
+    SyntaxError,
+    ValueError,
+    TypeError,
+    RuntimeError,
+    struct.error,
+    Image.DecompressionBombError,
+)
+
 FLOAT_KINDS = ("half", "float", "double")
 ROTATE = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
@@ -70,7 +82,7 @@ def image_size(path: Path) -> tuple[int, int]:
     try:
         with Image.open(path) as image:
             return _stored_size(image, orientation_of(image))
-    except (OSError, UnidentifiedImageError, ValueError) as error:
+    except UNDECODABLE as error:
         raise InputError(f"{path} is not a readable image: {error}.", "Replace or remove it.") from error
 
 
@@ -105,7 +117,9 @@ def read_photo(path: Path, max_size: int = 0, exposure: float = 1.0, turn: bool 
         raise InputError("the file is not an image, whatever its name says") from error
     except Image.DecompressionBombError as error:
         raise InputError(f"the image is too large: {error}") from error
-    except (OSError, SyntaxError, ValueError, EOFError) as error:
+    except MemoryError as error:
+        raise InputError("the image is larger than the memory") from error
+    except UNDECODABLE as error:
         text = str(error).lower()
         if "truncated" in text or "eof" in text or "broken data" in text or "premature" in text:
             raise InputError("the file is truncated: its end is missing") from error
@@ -133,7 +147,7 @@ def _read_pillow(path: Path, max_size: int, turn: bool) -> Photo:
             # The decoder itself halves the size as often as it can without falling below the working size.
             scale = max_size / max(stored_size)
             if scale < 0.5:
-                image.draft("RGB", (round(stored_size[0] * scale), round(stored_size[1] * scale)))
+                image.draft("RGB", (max(1, round(stored_size[0] * scale)), max(1, round(stored_size[1] * scale))))
         lossy = image.format in ("JPEG", "MPO", "HEIF", "WEBP", "AVIF")
         if _is_deep(image):
             decoded = Image.fromarray(to_srgb8(_read_oiio(path)[0]).pixels)

@@ -6,10 +6,10 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from ..errors import InputError
-from .decode import image_size, orientation_of, upright
+from .decode import UNDECODABLE, image_size, orientation_of, upright
 from .soft_labels import PROBABILITY_SUFFIXES, read_probabilities
 from .suffixes import TIFF_SUFFIXES
 
@@ -47,7 +47,7 @@ def read_labels(path: Path, colors: Colors | None = None, ignore_id: int = 0) ->
                 values = _from_colors(np.asarray(image.convert("RGBA")), colors, ignore_id, path.name)
             else:
                 raise InputError(f"label map {path.name} has the unusual mode {mode}; save as 8-bit PNG")
-    except (OSError, UnidentifiedImageError, SyntaxError, ValueError) as error:
+    except UNDECODABLE as error:
         raise InputError(f"label map {path.name} cannot be read: {error}") from error
     if values.min() < 0 or values.max() > 65535:
         raise InputError(f"label map {path.name} has ids outside 0…65535")
@@ -111,7 +111,7 @@ def read_mask(path: Path) -> np.ndarray:
         with Image.open(path) as image:
             channel = image.getchannel("A") if image.mode in ("RGBA", "LA") else image.convert("L")
             return np.asarray(channel) > 127
-    except (OSError, UnidentifiedImageError, SyntaxError, ValueError) as error:
+    except UNDECODABLE as error:
         raise InputError(f"mask {path.name} cannot be read: {error}") from error
 
 
@@ -154,7 +154,7 @@ def own_orientation(path: Path) -> int:
     try:
         with Image.open(path) as image:
             return orientation_of(image)
-    except (OSError, UnidentifiedImageError, SyntaxError, ValueError):
+    except UNDECODABLE:
         return 1  # it gets its own reason when it is read
 
 

@@ -8,10 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import OpenImageIO as oiio
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from ..errors import InputError
 from .arrays import read_array
+from .decode import UNDECODABLE
 from .names import beside
 
 PROBABILITY_SUFFIXES = (".npy", ".npz", ".exr")
@@ -70,6 +71,6 @@ def read_confidence(path: Path) -> np.ndarray:
         with Image.open(path) as image:
             wide = image.mode.startswith("I")
             values = np.asarray(image if wide else image.convert("L"))
-    except (OSError, UnidentifiedImageError, SyntaxError, ValueError) as error:
+    except UNDECODABLE as error:
         raise InputError(f"confidence map {path.name} cannot be read: {error}") from error
     return (values.astype(np.int64).clip(0, 65535) // 257).astype(np.uint8) if wide else values.astype(np.uint8)

@@ -59,6 +59,18 @@ def linked_folder(folder: Path) -> str:
     return "more"
 
 
+def damaged(folder: Path) -> str:
+    picture(7).save(folder / "b.avif")
+    whole = (folder / "b.avif").read_bytes()
+    (folder / "b.avif").write_bytes(whole.replace(b"av01", b"xx01"))
+    return "b.avif"
+
+
+def thin(folder: Path) -> str:
+    Image.new("RGB", (20_000, 3)).save(folder / "line.jpg")
+    return "line.jpg"
+
+
 ODD = {
     latin: "not UTF-8",
     latin_folder: "not UTF-8",
@@ -67,6 +79,8 @@ ODD = {
     directory: "a folder",
     pipe: "not a file",
     linked_folder: "a link to a folder",
+    damaged: "damaged",
+    thin: "a panorama",
 }
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import scipy
 import trimesh
+from PIL import Image
 from trimesh.exchange.ply import export_ply
 
 from ..data.scene import Scene, View
@@ -27,7 +28,7 @@ FISHEYE = ("k1", "k2", "k3", "k4")
 def write_transforms(out: Path, scene: Scene, metres: bool, label_revision: int | None = None) -> list[Path]:
     """A transforms.json as nerfstudio and Instant-NGP read it: camera-to-world with OpenGL axes, intrinsics of each frame
     in pixels, which photos are held out, and the revision of the marks that label maps are from, if they are from any; and the
-    sparse points beside it.
+    sparse points beside it. Where only some photos have masks the others get white ones beside it: nerfstudio wants all or none.
 
     Returns:
         the files written.
@@ -43,12 +44,15 @@ def write_transforms(out: Path, scene: Scene, metres: bool, label_revision: int 
         )
     frames = [_frame(view, out.parent) for view in scene.views]
     head: dict[str, Any] = {"camera_convention": "OpenGL axes, z up" + (", metres" if metres else "")}
+    models = {view.camera.model for view in scene.views}
+    head |= {"camera_model": models.pop()} if len(models) == 1 else {}  # nerfstudio looks for it nowhere else
     head |= label_facts(label_revision)
-    head |= {
-        f"{split}_filenames": [frames[i]["file_path"] for i in indices]
-        for split, indices in (("train", scene.train), ("test", scene.test))
-    }
-    files = [out]
+    if scene.test:  # nerfstudio validates on "val", and takes no file that names some splits and not that one
+        head |= {
+            f"{split}_filenames": [frames[i]["file_path"] for i in indices]
+            for split, indices in (("train", scene.train), ("val", scene.test), ("test", scene.test))
+        }
+    files = [out, *_white_masks(frames, out)]
     if len(scene.points.xyz):
         cloud = out.with_name(f"{out.stem}_points.ply")
         with atomic_path(cloud) as temporary:
@@ -73,9 +77,26 @@ def _frame(view: View, folder: Path) -> dict[str, Any]:
         frame["mask_path"] = _relative(view.mask, folder)
     if view.label is not None:
         frame["semantic_path"] = _relative(view.label, folder)
-    if camera.model != "EQUIRECTANGULAR":
-        frame |= {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
+    frame |= {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
+    if camera.model == "OPENCV_FISHEYE":
+        frame["is_fisheye"] = True  # in Instant-NGP's words
     return frame | dict(zip(FISHEYE if camera.model == "OPENCV_FISHEYE" else RADIAL, camera.distortion))
+
+
+def _white_masks(frames: list[dict[str, Any]], out: Path) -> list[Path]:
+    """Give frames without a mask a white one of their size, if others have one; the files written."""
+    if not any("mask_path" in frame for frame in frames):
+        return []
+    written: list[Path] = []
+    for frame in frames:
+        if "mask_path" not in frame:
+            path = out.with_name(f"{out.stem}_white_{frame['w']}x{frame['h']}.png")
+            frame["mask_path"] = path.name
+            if path not in written:
+                with atomic_path(path) as temporary:
+                    Image.new("L", (frame["w"], frame["h"]), 255).save(temporary)
+                written.append(path)
+    return written
 
 
 def _relative(path: Path, folder: Path) -> str:

@@ -106,6 +106,32 @@ def test_transforms_say_what_our_cameras_see(tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.asarray(cloud.colors)[:, :3], ours.points.rgb)
 
 
+@pytest.mark.parametrize("lens", ["fisheye", "panorama"])
+def test_nerfstudio_and_instant_ngp_find_what_they_look_for(tmp_path: Path, lens: str) -> None:
+    """Which keys those are: nerfstudio_dataparser.py and nerf_loader.cu."""
+    panorama = Camera(model="EQUIRECTANGULAR", width=320, height=160, fx=160, fy=160, cx=160, cy=80)
+    camera = {**LENSES, "panorama": panorama}[lens]
+    ours = scene(tmp_path / "p", camera, camera, camera)
+    mask = tmp_path / "p" / "mask.png"
+    Image.new("L", (camera.width, camera.height), 0).save(mask)
+    ours.views[0] = replace(ours.views[0], mask=mask)
+    out = tmp_path / "p" / "exports" / "transforms.json"
+    files = write_transforms(out, ours, metres=False)
+    tree = json.loads(out.read_text("utf-8"))
+    assert tree["camera_model"] == camera.model, "nerfstudio knows one model, that of the whole file"
+    assert tree["val_filenames"] == tree["test_filenames"] == ["../images/IMG_0.png"]
+    assert all({"fl_x", "fl_y", "cx", "cy", "w", "h"} <= set(frame) for frame in tree["frames"])
+    assert [frame.get("is_fisheye", False) for frame in tree["frames"]] == [lens == "fisheye"] * 3
+    masks = [out.parent / frame["mask_path"] for frame in tree["frames"]]
+    assert masks[0].resolve() == mask
+    assert masks[1] == masks[2] in files
+    with Image.open(masks[1]) as white:
+        assert white.size == (camera.width, camera.height)
+        assert white.getextrema() == (255, 255)
+    write_transforms(out, replace(ours, train=[0, 1, 2], test=[]), metres=False)
+    assert not any("filenames" in key for key in json.loads(out.read_text("utf-8"))), "it holds some out by itself"
+
+
 @pytest.mark.parametrize(("to", "read"), [("transforms", "transforms.json"), ("colmap", "colmap")])
 def test_a_capture_is_imported_as_it_was_exported(tmp_path: Path, to: str, read: str) -> None:
     folder = ball_project(tmp_path / "Kugel ü", views=6, points=30)

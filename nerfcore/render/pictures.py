@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 
 VOID_COLOR = (0.0, 0.0, 0.0)
@@ -14,6 +16,15 @@ ENDINGS = {
     "normal": "_normal",
     "unknown": "_unknown",
 }
+
+
+def pass_name(frame: str, kind: str, frames: Collection[str]) -> str:
+    """The name, without suffix, of the picture of a pass: no picture of another one of the frames has it, as the frame
+    `a_depth` would beside the depth of `a`. `frames`: their names by `casefold`."""
+    ending, plain = ENDINGS[kind], frame
+    while ending and ((plain + ending).casefold() in frames or (plain != frame and plain.casefold() in frames)):
+        plain += "_"
+    return plain + ending
 
 
 def colorize_depth(depth: np.ndarray, opacity: np.ndarray) -> np.ndarray:

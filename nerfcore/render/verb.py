@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +45,7 @@ from . import parts
 from .baked import META, BakedField, load_baked, voxels_folder
 from .image import Frame, background_of, render_view
 from .model import Model
-from .pictures import ENDINGS, colorize_depth, colorize_labels, depth_range
+from .pictures import colorize_depth, colorize_labels, depth_range, pass_name
 from .run import RunInfo, load_info, load_trained, without_seen
 from .sparse_rays import sparse_rays
 
@@ -98,6 +99,7 @@ def render(params: RenderParams, report: Reporter, shown: Model | BakedField | N
     with disk_errors(out):
         out.mkdir(parents=True, exist_ok=True)
     colors = {c.id: c.color for c in scene.classes}
+    names = {name.casefold() for name, _, _ in planned}
     frames, seconds = [path for made in kept.values() for path in made], 0.0
     report.stage("Rendering")
     for number, (name, camera, pose) in enumerate(todo):
@@ -113,7 +115,7 @@ def render(params: RenderParams, report: Reporter, shown: Model | BakedField | N
             unknown="unknown" in params.passes,
         )
         seconds += time.perf_counter() - begin
-        frames += write_frame(out, name, frame, params.passes, info, scene.ignore_id, colors, box)
+        frames += write_frame(out, name, frame, params.passes, info, scene.ignore_id, colors, box, names)
     result: dict[str, Any] = {"frames": [str(path) for path in sorted(frames)] if kept else [str(p) for p in frames]}
     result["ms_per_frame"] = round(seconds / max(len(todo), 1) * 1e3, 1)
     result["label_revision"] = info.label_revision
@@ -281,8 +283,10 @@ def write_frame(
     void: int,
     colors: dict[int, tuple[float, float, float]],
     box: Box,
+    names: Collection[str] = (),
 ) -> list[Path]:
     """Write NAME.png, NAME_depth.png, … and NAME.exr with all asked passes. Returns the paths of these pictures.
+    `names`: of all frames, which no picture of a pass takes (`pass_name`).
 
     The PNG shows the field on its background; the EXR has the field alone, linear and with associated alpha, to be put
     over anything, and beside it the environment, if the run has one; `label_revision` in its
@@ -312,7 +316,7 @@ def write_frame(
     }
     written, facts = [], label_facts(info.label_revision)
     for kind in passes:
-        path = out / f"{name}{ENDINGS[kind]}.png"
+        path = out / f"{pass_name(name, kind, names)}.png"
         with atomic_path(path) as temporary:
             write_picture(temporary, pictures[kind], facts=facts if kind in OF_CLASSES else None)
         written.append(path)

@@ -7,12 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fieldwork.nerfcore.data.load import load_scene
 from fieldwork.nerfcore.errors import SettingError
+from fieldwork.nerfcore.geometry.cameras import flip_camera_axes
 from fieldwork.nerfcore.params import ReconstructParams, RenderParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.lock import lockable, project_lock
 from fieldwork.nerfcore.render import verb as module
-from fieldwork.nerfcore.render.verb import render, rendered
+from fieldwork.nerfcore.render.pictures import pass_name
+from fieldwork.nerfcore.render.verb import chosen_cameras, render, rendered
 from fieldwork.nerfcore.workflows import stage_task
 from fieldwork.nerfcore.workflows.campaign import capture_tasks, frame_ranges, plan
 from fieldwork.nerfcore.workflows.captures import Capture
@@ -73,6 +76,40 @@ def test_a_picture_that_is_gone_and_other_settings_are_rendered_again(place, tmp
     drawn.clear()
     render(asked(place, tmp_path, size=(16, 16)), Reporter())
     assert len(drawn) == 5
+
+
+def test_frames_called_like_passes_of_others_keep_their_pictures(place, tmp_path):
+    cameras = cameras_of(place, tmp_path, ["a", "a_depth"])
+    result = render(asked(place, tmp_path / "out", orbit=None, size=None, camera=cameras), Reporter())
+    names = [Path(path).name for path in result["frames"]]
+    assert names == ["a.png", "a__depth.png", "a.exr", "a_depth.png", "a_depth_depth.png", "a_depth.exr"]
+    assert all(Path(path).is_file() for path in result["frames"])
+    read = pictures(tmp_path / "out")
+    assert not np.array_equal(read["a_depth.png"], read["a__depth.png"])
+    assert (tmp_path / "out" / "a__depth.json").is_file()
+
+
+def test_names_of_passes_are_no_others():
+    frames = {"a", "a_depth", "a_", "b"}
+    made = [pass_name(frame, kind, frames) for frame in sorted(frames) for kind in ("rgb", "depth")]
+    assert len(set(made)) == len(made)
+    assert pass_name("b", "depth", frames) == "b_depth"
+    assert pass_name("B", "rgb", {"b"}) == "B"
+    assert pass_name("A", "depth", {"a", "a_depth"}) == "A__depth", "on Windows and macOS capitals are the same"
+
+
+def cameras_of(place: Path, folder: Path, names: list[str]) -> Path:
+    """A file of cameras that see what the photos do."""
+    (_, camera, pose), *_ = chosen_cameras(asked(place, folder), load_scene(place / "p", 8))
+    frame = {
+        "w": 24,
+        "h": 16,
+        "fl_x": camera.fx / camera.width * 24,
+        "transform_matrix": flip_camera_axes(pose).tolist(),
+    }
+    path = folder / "cameras.json"
+    path.write_text(json.dumps({"frames": [{**frame, "file_path": name} for name in names]}))
+    return path
 
 
 def test_wrong_ranges_are_told(place, tmp_path):

@@ -13,7 +13,7 @@ from ..roles import Owner, by_role
 from .slot import MARK, load_render, render_slot
 
 EVERY_FRAME = "every_frame"  # folder beside the pictures of an animation
-OTHER_PASSES = ("_depth", "_labels", "_confidence", "_normal", "_unknown")  # file names of all but the color
+OTHER_PASSES = ("_depth", "_labels", "_confidence", "_normal", "_unknown")  # ends of names of all but the color
 
 
 def show_steps(
@@ -34,7 +34,7 @@ def show_steps(
     for number, path in enumerate(files):
         yield number / len(files), path.name
         load_render(path)
-    colored = [path for path in files if path.suffix == ".png" and not path.stem.endswith(OTHER_PASSES)]
+    colored = colored_files(files)
     if show_as == "none" or not colored:
         return []
     pairs = []
@@ -50,9 +50,20 @@ def show_steps(
         if len(shown) > 1:
             image.source = "SEQUENCE"
         put = background if show_as == "background" else plane
-        put(scene, camera, image, frame_number(shown[0]), len(shown))
+        put(scene, camera, image, frame_number(path), len(shown))
         pairs.append((camera, image))
     return pairs
+
+
+def colored_files(files: list[Path]) -> list[Path]:
+    """The pictures of colors among rendered files; each frame has an EXR of its own name."""
+    frames = {path.stem for path in files if path.suffix == ".exr"}
+    pictures = [path for path in files if path.suffix == ".png"]
+    if frames:
+        return [path for path in pictures if path.stem in frames]
+    stems = {path.stem for path in pictures}
+    passes = {stem + ending for stem in stems for ending in OTHER_PASSES}
+    return [path for path in pictures if path.stem not in passes]
 
 
 def _places(scene: bpy.types.Scene, colored: list[Path], photos: bool, owner: Owner) -> list[tuple[str, Path]]:
@@ -65,29 +76,31 @@ def _places(scene: bpy.types.Scene, colored: list[Path], photos: bool, owner: Ow
 
 
 def frame_number(path: Path) -> int:
-    """The number at the end of a picture's name, 1 where there is none."""
-    found = re.search(r"(\d+)$", path.stem)
-    return int(found[1]) if found else 1
+    """The number at the end of a picture's name, which may be negative; 1 where there is none."""
+    found = re.search(r"(?<=_)-\d+$|\d+$", path.stem)
+    return int(found[0]) if found else 1
 
 
 def every_frame(files: list[Path]) -> list[Path]:
     """The pictures of an animation with one for each frame.
 
-    Blender plays pictures by their numbers, and shows nothing where one is missing. Where only every so many frames
-    were rendered, a folder beside them gets a picture for each: the last one that was rendered.
+    Blender plays pictures by their numbers, which cannot be negative, and shows nothing where one is missing. Where only
+    every so many frames were rendered, or the animation begins before frame 0, a folder beside them gets a picture for
+    each, numbered from 1 on in the latter case: the last one that was rendered.
     """
     numbers = [frame_number(path) for path in files]
     steps = {after - before for before, after in zip(numbers, numbers[1:])}
-    step = min(steps, default=1)
-    if len(steps) != 1 or step <= 1:
+    step, negative = min(steps, default=1), len(files) > 1 and numbers[0] < 0
+    if len(steps) > 1 or step < 1 or (step == 1 and not negative):
         return files
+    before = numbers[0] - 1 if negative else 0
     folder = files[0].parent / EVERY_FRAME
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
     held = []
     for path, number in zip(files, numbers):
         for frame in range(number, number + step):
-            held.append(folder / f"frame_{frame:04}{path.suffix}")
+            held.append(folder / f"frame_{frame - before:04}{path.suffix}")
             shutil.copyfile(path, held[-1])
     return held
 
@@ -96,7 +109,7 @@ def background(
     scene: bpy.types.Scene, camera: bpy.types.Object, image: bpy.types.Image, first: int, frames: int
 ) -> None:
     """Put the image over the camera's view, in place of an earlier one; photos behind it stay. A sequence of so many
-    frames begins at the frame `first`."""
+    frames begins at the frame `first` of the scene."""
     slot = render_slot(camera.data)
     slot.image, slot.alpha, slot.display_depth, slot.frame_method = image, 1.0, "FRONT", "STRETCH"
     _play(slot.image_user, image, first, frames)
@@ -127,5 +140,5 @@ def plane(scene: bpy.types.Scene, camera: bpy.types.Object, image: bpy.types.Ima
 def _play(user: bpy.types.ImageUser, image: bpy.types.Image, first: int, frames: int) -> None:
     if image.source == "SEQUENCE":
         user.frame_start, user.frame_duration = first, frames
-        user.frame_offset = first - 1
+        user.frame_offset = frame_number(Path(image.filepath)) - 1
         user.use_auto_refresh = True

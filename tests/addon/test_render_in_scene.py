@@ -258,3 +258,40 @@ answer([slot.image_user.frame_duration, Path(slot.image.filepath).parent.name])
         folder=tmp_path,
     )
     assert facts == [6, "every_frame"]
+
+
+def test_an_animation_that_begins_before_frame_0_is_shown_in_its_frames(bpy_script, tmp_path):
+    facts = bpy_script(
+        SETUP
+        + """
+from fieldwork.addon.render import result
+from fieldwork.addon.roles import Owner
+files = []
+for number in (-2, -1, 0, 1):
+    image = bpy.data.images.new("frame", 8, 8)
+    files.append(Path(folder, f"frame_{number:04}.png"))
+    image.filepath_raw, image.file_format = str(files[-1]), "PNG"
+    image.save()
+    bpy.data.images.remove(image)
+for _ in result.show_steps(scene, files, "background", False, Owner("capture")):
+    pass
+(slot,) = scene.camera.data.background_images
+user = slot.image_user
+answer([user.frame_start, user.frame_duration, user.frame_offset, Path(slot.image.filepath).name])
+""",
+        folder=tmp_path,
+    )
+    assert facts == [-2, 4, 0, "frame_0001.png"]
+
+
+def test_photos_called_like_passes_are_colors_too(tmp_path):
+    pytest.importorskip("bpy")
+    from fieldwork.addon.render.result import colored_files
+
+    def files(*names):
+        return [tmp_path / name for name in names]
+
+    rendered = files("a.png", "a__depth.png", "a.exr", "a_depth.png", "a_depth_depth.png", "a_depth.exr")
+    assert colored_files(rendered) == files("a.png", "a_depth.png")
+    assert colored_files(files("a_depth.png", "a.exr")) == [], "of the depth alone"
+    assert colored_files(files("stairs_depth.png", "b.png")) == files("stairs_depth.png", "b.png"), "straightened ones"

@@ -309,3 +309,9 @@ def test_pictures_of_every_other_frame_are_held(tmp_path):
     assert [path.read_text() for path in held] == ["5"] * 3 + ["8"] * 3 + ["11"] * 3
     every_frame(files(5, 7))
     assert sorted(os.listdir(tmp_path / EVERY_FRAME)) == [f"frame_{n:04}.png" for n in (5, 6, 7, 8)]
+    early = files(-2, -1, 0, 1)
+    assert [frame_number(path) for path in early] == [-2, -1, 0, 1]
+    held = every_frame(early)
+    assert [frame_number(path) for path in held] == [1, 2, 3, 4], "Blender knows no negative numbers of pictures"
+    assert [path.read_text() for path in held] == ["-2", "-1", "0", "1"]
+    assert every_frame(files(-2)) == files(-2)

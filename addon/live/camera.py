@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import bpy
+from mathutils import Matrix
 
 from ..errors import SceneError
 from ..scene.lens import pinhole
@@ -21,12 +22,16 @@ PANORAMAS = {
 }
 
 
-def lens(camera: bpy.types.Object, width: int, height: int, aspect: Sequence[float]) -> dict[str, Any]:
-    """The lens of a camera for a frame of this size in pixels, without its poses.
+def lens(
+    camera: bpy.types.Object, width: int, height: int, aspect: Sequence[float], shift_x: float | None = None
+) -> dict[str, Any]:
+    """The lens of a camera for a frame of this size in pixels, without its poses; `shift_x`: that of an eye of stereo,
+    None: the camera's own.
 
     Raises SceneError: it is a panorama of a kind that the engine does not know.
     """
     data = camera.data
+    shift_x = data.shift_x if shift_x is None else shift_x
     found = {"width": width, "height": height, "clip": (data.clip_start, data.clip_end)}
     aperture = _aperture(camera)
     if aperture is not None:
@@ -34,11 +39,11 @@ def lens(camera: bpy.types.Object, width: int, height: int, aspect: Sequence[flo
     if data.type == "ORTHO":
         side, tall = _fitted(data, width, height, aspect)
         scale = side / data.ortho_scale
-        center = (width / 2 - data.shift_x * side, height / 2 + data.shift_y * side / tall)
+        center = (width / 2 - shift_x * side, height / 2 + data.shift_y * side / tall)
         return {**found, "kind": "orthographic", "scale": (scale, scale / tall), "center": center}
     if data.type == "PANO":
         return {**found, **_panorama(data, width, height)}
-    hole = pinhole(data, width, height, aspect)
+    hole = pinhole(data, width, height, aspect, shift_x)
     return {**found, "kind": "perspective", "scale": (hole.fx, hole.fy), "center": (hole.cx, hole.cy)}
 
 
@@ -99,9 +104,9 @@ def _aperture(camera: bpy.types.Object) -> dict[str, Any] | None:
     }
 
 
-def pose(camera: bpy.types.Object) -> list[list[float]]:
+def pose(world: Matrix) -> list[list[float]]:
     """Scene from camera, without the scale of the camera or its parents; mirrored where the camera is, as Blender has it."""
-    return [list(row) for row in camera.matrix_world.normalized()]
+    return [list(row) for row in world.normalized()]
 
 
 def shutter_times(render: Any, frame: float) -> list[float]:

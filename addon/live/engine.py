@@ -93,19 +93,26 @@ class FieldworkRenderEngine(bpy.types.RenderEngine):
         self.error_set(message)
 
     def _render(self, depsgraph: bpy.types.Depsgraph) -> None:
-        scene, layer = depsgraph.scene_eval, depsgraph.view_layer_eval
-        asked = passes.wanted(scene, layer)
+        layer = depsgraph.view_layer_eval
+        asked = passes.wanted(depsgraph.scene_eval, layer)
+        for each in asked[1:]:
+            self.add_pass(each.name, each.channels, each.letters, layer=layer.name)
+        # The two of stereo; else one, whose name is empty.
+        for view in [view.name for view in self.get_result().views]:
+            self.active_view_set(view)
+            self._render_view(depsgraph, asked, view)
+
+    def _render_view(self, depsgraph: bpy.types.Depsgraph, asked: list[passes.RenderPass], view: str) -> None:
+        layer = depsgraph.view_layer_eval
         self.update_stats("", t("Reading the scene"))
         shot = self._shot(depsgraph, asked)
         x0, y0, x1, y1 = shot["border"]
-        from .frames import Sizes
+        from .frames import Frame, Sizes
 
         sizes = Sizes(x1 - x0, y1 - y0, {each.name: each.channels for each in asked})
-        for each in asked[1:]:
-            self.add_pass(each.name, each.channels, each.letters, layer=layer.name)
         space = working_space()
 
-        result = self.begin_result(0, 0, sizes.width, sizes.height, layer=layer.name)
+        result = self.begin_result(0, 0, sizes.width, sizes.height, layer=layer.name, view=view)
 
         def show(colors: Any) -> None:
             self._put(result, {"Combined": colors}, space)
@@ -116,7 +123,10 @@ class FieldworkRenderEngine(bpy.types.RenderEngine):
             self.update_stats("", t(stage) if stage else "")
 
         try:
-            frame = frames().render(shot, sizes, self.test_break, tell, None if bpy.app.background else show)
+            if shot["fields"]:
+                frame = frames().render(shot, sizes, self.test_break, tell, None if bpy.app.background else show)
+            else:
+                frame = Frame(passes.empty(sizes, shot["world"]), {})
             self._put(result, frame.passes, space)
         except BaseException:
             self.end_result(result, cancel=True)
@@ -163,9 +173,11 @@ class FieldworkRenderEngine(bpy.types.RenderEngine):
         aspect = render.pixel_aspect_x, render.pixel_aspect_y
 
         def eye() -> bpy.types.Object:
-            return depsgraph.scene_eval.camera.evaluated_get(depsgraph)
+            return self.camera_override.evaluated_get(depsgraph)  # that of the view
 
-        lens = camera.lens(eye(), width, height, aspect)
+        if render.use_multiview and eye().data.type == "PANO" and eye().data.stereo.use_spherical_stereo:
+            raise SceneError(t("Fieldwork does not render spherical stereo: switch it off in “{}”.", eye().data.name))
+        lens = camera.lens(eye(), width, height, aspect, self.camera_shift_x(eye()))
         shot: dict[str, Any] = {
             "border": border(render, width, height),
             "samples": live.samples,
@@ -187,7 +199,7 @@ class FieldworkRenderEngine(bpy.types.RenderEngine):
 
         def poses() -> tuple[Any, ...]:
             placed = [fields.poses_of(part.field.evaluated_get(depsgraph), depsgraph, part.copy) for part in known]
-            return camera.pose(eye()), placed
+            return camera.pose(self.camera_model_matrix(eye())), placed
 
         seen, placed = zip(*camera.in_time(poses, times, self.frame_set, now))
         lens["poses"] = camera.moving(list(seen))

@@ -46,9 +46,13 @@ def parts(objects: Iterable[bpy.types.Object], is_shown: Callable[[bpy.types.Obj
 
 
 def rendered_parts(depsgraph: bpy.types.Depsgraph) -> list[Part]:
-    """Those that a render shows."""
+    """Those that a render shows in the frame of the depsgraph."""
     inside = in_rendered_collections(depsgraph.view_layer.layer_collection)
-    return parts(depsgraph.view_layer.objects, lambda obj: not obj.hide_render and obj.name_full in inside)
+
+    def is_shown(obj: bpy.types.Object) -> bool:
+        return obj.name_full in inside and not obj.evaluated_get(depsgraph).hide_render
+
+    return parts(depsgraph.view_layer.objects, is_shown)
 
 
 def in_rendered_collections(layer: bpy.types.LayerCollection) -> set[str]:
@@ -60,16 +64,18 @@ def in_rendered_collections(layer: bpy.types.LayerCollection) -> set[str]:
 
 
 def rendered_items(depsgraph: bpy.types.Depsgraph) -> list[dict[str, Any]]:
-    """What a render shows, as nerfcore/film/shot.py describes fields.
+    """What a render shows, as nerfcore/film/shot.py describes fields; nothing in frames in which fields are hidden that other
+    frames may show.
 
     Raises SceneError: there is no field to show, or things are edited of one that is not baked.
     """
     scene = depsgraph.scene_eval
     baked = scene.fieldwork_live.source == "baked"
     items = [_rendered_item(part, baked, depsgraph) for part in rendered_parts(depsgraph)]
-    if not field_objects(depsgraph.view_layer.objects):
+    known = field_objects(depsgraph.view_layer.objects)
+    if not known:
         items = [project_item(scene, baked)]
-    if not items:
+    if not items and not any(field.animation_data for field in known):
         raise SceneError(t("All fields of the scene are hidden in renders."))
     return items
 

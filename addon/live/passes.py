@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import bpy
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from .frames import Sizes
 
 
 class RenderPass(NamedTuple):
@@ -22,6 +27,7 @@ class RenderPass(NamedTuple):
 COMBINED = RenderPass("Combined", "RGBA", "COLOR")
 # Names of the passes that are light, in the scene's working space.
 LIGHT = ("Combined", "Class Color", "FieldFront", "FieldBehind")
+FAR = 1e10  # depth where nothing is
 CRYPTOMATTES = (("object", "CryptoObject"), ("material", "CryptoMaterial"), ("asset", "CryptoAsset"))
 
 
@@ -45,6 +51,18 @@ def wanted(scene: bpy.types.Scene, layer: bpy.types.ViewLayer) -> list[RenderPas
         if getattr(layer, f"use_pass_cryptomatte_{switch}"):
             count = (layer.pass_cryptomatte_depth + 1) // 2
             found += [RenderPass(f"{name}{number:02}", "RGBA", "COLOR") for number in range(count)]
+    return found
+
+
+def empty(sizes: Sizes, world: tuple[float, float, float] | None) -> dict[str, np.ndarray]:
+    """The passes of a frame in which no field is seen, of Rec.709 primaries. `world`: light behind it; None: it is transparent."""
+    import numpy as np
+
+    found = {name: np.zeros((sizes.height, sizes.width, count), np.float32) for name, count in sizes.channels.items()}
+    if world is not None:
+        found["Combined"][:] = (*world, 1.0)
+    if "Depth" in found:
+        found["Depth"][:] = FAR
     return found
 
 

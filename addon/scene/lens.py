@@ -17,8 +17,15 @@ class Pinhole(NamedTuple):
     cy: float
 
 
-def pinhole(camera: bpy.types.Camera, width: int, height: int, aspect: Sequence[float] = (1.0, 1.0)) -> Pinhole:
-    """A perspective camera at a picture size in pixels, which are as wide and as high as `aspect` says.
+def pinhole(
+    camera: bpy.types.Camera,
+    width: int,
+    height: int,
+    aspect: Sequence[float] = (1.0, 1.0),
+    shift_x: float | None = None,
+) -> Pinhole:
+    """A perspective camera at a picture size in pixels, which are as wide and as high as `aspect` says; `shift_x`: that of
+    an eye of stereo, None: the camera's own.
 
     Blender measures the angle and the shifts along the side that `sensor_fit` names, or along the longer one
     (BKE_camera_params_compute_viewplane).
@@ -32,4 +39,5 @@ def pinhole(camera: bpy.types.Camera, width: int, height: int, aspect: Sequence[
         sensor = camera.sensor_width if fit == "HORIZONTAL" else camera.sensor_height
     side = width if fit == "HORIZONTAL" else tall * height
     focal = camera.lens / sensor * side
-    return Pinhole(focal, focal / tall, width / 2 - camera.shift_x * side, height / 2 + camera.shift_y * side / tall)
+    shift_x = camera.shift_x if shift_x is None else shift_x
+    return Pinhole(focal, focal / tall, width / 2 - shift_x * side, height / 2 + camera.shift_y * side / tall)

@@ -215,3 +215,78 @@ def test_fields_that_move_are_blurred(bpy_script, ball, tmp_path):
     assert facts["moving"][1] == pytest.approx(59.5, abs=1.5)
     assert facts["later"][1] == pytest.approx(59.5 + 0.125 / 2 * 120 * 50 / 36, abs=2.5)
     assert facts["place"] == [1, pytest.approx(0, abs=1e-6)], "the scene is as it was"
+
+
+STEREO = (
+    START
+    + """
+render.use_multiview, image.views_format = True, "INDIVIDUAL"
+eyes = camera.data.stereo
+eyes.interocular_distance, eyes.convergence_distance, eyes.pivot = 0.3, 2.5, "CENTER"
+def seen(name):
+    found = passes(f"{folder}/{name}.exr")
+    rows, columns = np.nonzero(found["Combined.A"] > 0.9)
+    return {"middle": float(columns.mean()), "points": len(rows)}
+facts = {}
+for mode in ("OFFAXIS", "PARALLEL", "TOE"):
+    eyes.convergence_mode = mode
+    shoot(mode)
+    facts[mode] = [seen(f"{mode}_L"), seen(f"{mode}_R")]
+other = bpy.data.objects.new("Other_R", camera.data.copy())
+camera.name, other.matrix_world = "Other_L", camera.matrix_world @ Matrix.Translation((0.1, 0, 0))
+scene.collection.objects.link(other)
+render.views_format = "MULTIVIEW"
+shoot("cameras")
+facts["cameras"] = [seen("cameras_L"), seen("cameras_R")]
+camera.data.type = "PANO"
+own = camera.data if hasattr(camera.data, "panorama_type") else camera.data.cycles
+own.panorama_type, eyes.use_spherical_stereo = "EQUIRECTANGULAR", True
+facts["spherical"] = attempt(bpy.ops.render.render)
+answer(facts)
+"""
+)
+
+
+def test_stereo_has_a_picture_for_each_eye(bpy_script, ball, tmp_path):
+    facts = bpy_script(STEREO, project=ball, folder=tmp_path)
+    for name in ("OFFAXIS", "PARALLEL", "TOE", "cameras"):
+        left, right = facts[name]
+        assert min(left["points"], right["points"]) > 3000, name
+    # Of the outline of a ball of radius 0.5, which is farther out than its middle, in pixels.
+    focal, distance = 120 / 36 * 50, 1.934
+    apart = 0.3 * focal * distance / (distance**2 - 0.5**2)
+    for name, expected in (("PARALLEL", apart), ("cameras", apart / 3), ("OFFAXIS", apart - 0.3 * focal / 2.5)):
+        left, right = facts[name]
+        assert left["middle"] - right["middle"] == pytest.approx(expected, abs=1.5), name
+    assert "spherical stereo" in facts["spherical"]
+
+
+HIDDEN_IN_TIME = (
+    START
+    + """
+bpy.ops.fieldwork.add_field()
+field = bpy.context.object
+layer.use_pass_z = True
+for number, hidden in ((1, False), (2, True)):
+    field.hide_render = hidden
+    field.keyframe_insert("hide_render", frame=number)
+scene.frame_set(1)
+scene.frame_start, scene.frame_end = 1, 2
+shoot("frame_", animation=True)
+found = [passes(f"{folder}/frame_{number:04}.exr") for number in (1, 2)]
+render.film_transparent = False
+next(node for node in scene.world.node_tree.nodes if node.type == "BACKGROUND").inputs["Color"].default_value = (0.25, 0.5, 0.75, 1)
+scene.frame_set(2)
+world = passes(shoot("world"))
+answer({"alpha": [float(one["Combined.A"].max()) for one in found], "far": float(found[1]["Depth.Z"].min()),
+        "world": [float(world[f"Combined.{letter}"].min()) for letter in "RGBA"]})
+"""
+)
+
+
+def test_fields_are_hidden_in_the_frames_that_say_so(bpy_script, ball, tmp_path):
+    facts = bpy_script(HIDDEN_IN_TIME, project=ball, folder=tmp_path)
+    assert facts["alpha"][0] > 0.9
+    assert facts["alpha"][1] == 0.0
+    assert facts["far"] == pytest.approx(1e10)
+    assert facts["world"] == pytest.approx([0.25, 0.5, 0.75, 1.0])

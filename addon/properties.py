@@ -24,8 +24,10 @@ def _project_changed(self: "FieldworkScene", context: Context) -> None:
     """Another project folder was chosen."""
     from .jobs.follow import reattach
     from .jobs.queue import queue
-    from .project import lists, recent, snapshot
+    from .project import file_paths, lists, recent, snapshot
 
+    if file_paths.rewriting:
+        return
     lists.other_project(self)
     folder = snapshot.folder_of(self)
     if folder is not None and not bpy.app.background:

@@ -30,6 +30,7 @@ MODULES = (
     "addon.preferences",
     "addon.pictures.thumbnails",
     "addon.jobs.timer",
+    "addon.project.file_paths",
     "addon.scene.measured_line",
     "addon.labels.session",
     "addon.labels.draw",

@@ -12,6 +12,7 @@ from mathutils import Matrix
 from ..errors import SceneError
 from ..paths import absolute
 from ..project import snapshot
+from ..roles import is_local
 from ..scene.frame import scene_from_capture
 from ..text import t
 from . import things
@@ -159,14 +160,16 @@ def folder_of(own: Any) -> Path | None:
     """The project folder that a field object names, as an absolute path; None where it names none."""
     if not own.project:
         return None
-    # A linked object means a folder beside its own file, which Blender may call "//../other/file.blend".
-    return absolute(own.project, own.id_data.original.library)
+    # A linked object means a folder beside its own file, which Blender may call "//../other/file.blend"; so does an override.
+    obj = own.id_data.original
+    linked = obj.override_library.reference if obj.override_library is not None else obj
+    return absolute(own.project, linked.library)
 
 
 def move(old: Path, new: Path) -> None:
     """Let the fields of a project in one folder be read from another."""
     for obj in bpy.data.objects:
-        if obj.library is None and obj.fieldwork.is_field and folder_of(obj.fieldwork) == old:
+        if is_local(obj) and obj.fieldwork.is_field and folder_of(obj.fieldwork) == old:
             obj.fieldwork.project = str(new)
 
 

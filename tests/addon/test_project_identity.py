@@ -325,3 +325,89 @@ answer([str(snapshot.folder_of(settings)), is_of(made, picture), len(settings.im
     )
     assert facts[:2] == [str(project), True]
     assert facts[2] > 0
+
+
+def test_paths_beside_the_file_lead_where_they_led_when_it_is_saved_elsewhere(bpy_script, tmp_path):
+    project = make_project(tmp_path / "one/capture")
+    (tmp_path / "two/deep").mkdir(parents=True)
+    facts = bpy_script(
+        SETUP
+        + FIELDS
+        + """
+from fieldwork.addon.project import snapshot
+from fieldwork.addon.roles import FOLDER
+bpy.ops.wm.save_as_mainfile(filepath=f"{folder}/one/first.blend")
+settings.project, settings.photos, settings.export_path = "//capture", "//photos", f"{folder}/absolute.glb"
+add_field(scene, "//capture")
+root = bpy.data.objects.new("root", None)
+root[FOLDER] = "//capture"
+scene.collection.objects.link(root)
+uuid = settings.project_uuid
+def seen():
+    own, field = bpy.context.scene.fieldwork, bpy.data.objects["Field"]
+    return [own.project, own.photos, own.export_path, field.fieldwork.project, bpy.data.objects["root"][FOLDER],
+            str(snapshot.folder_of(own)), str(fields.folder_of(field.fieldwork)), own.project_uuid == uuid, len(own.images)]
+def save(name, **more):
+    bpy.ops.wm.save_as_mainfile(filepath=f"{folder}/{name}", **more)
+    return seen()
+facts = {"beside": save("one/second.blend"), "copy": save("two/copy.blend", copy=True), "deep": save("two/deep/third.blend")}
+try:
+    save("nowhere/fourth.blend")
+except RuntimeError:
+    facts["not saved"] = seen()
+for name in ("two/copy.blend", "two/deep/third.blend"):
+    bpy.ops.wm.open_mainfile(filepath=f"{folder}/{name}")
+    facts[f"opened {name}"] = seen()
+answer(facts)
+""",
+        folder=tmp_path,
+    )
+    there = [str(project), str(project), True, 2]
+    absolute = str(tmp_path / "absolute.glb")
+
+    def stored(way):
+        return [f"{way}/capture", f"{way}/photos", absolute, f"{way}/capture", f"{way}/capture", *there]
+
+    assert facts["beside"] == facts["copy"] == stored("/")
+    assert facts["deep"] == facts["not saved"] == facts["opened two/deep/third.blend"] == stored("//../../one")
+    assert facts["opened two/copy.blend"] == stored("//../one")
+
+
+def test_paths_of_what_is_appended_or_overridden_lead_where_they_led(bpy_script, tmp_path):
+    project = make_project(tmp_path / "library/capture")
+    (tmp_path / "work").mkdir()
+    facts = bpy_script(
+        SETUP
+        + FIELDS
+        + """
+bpy.ops.wm.save_as_mainfile(filepath=f"{folder}/library/fields.blend")
+settings.project = "//capture"
+add_field(scene, "//capture")
+scene.name = "Library"
+bpy.ops.wm.save_mainfile()
+bpy.ops.wm.read_homefile()
+bpy.ops.wm.save_as_mainfile(filepath=f"{folder}/work/scene.blend")
+def append(kind, name):
+    bpy.ops.wm.append(directory=f"{folder}/library/fields.blend/{kind}/", filename=name)
+append("Object", "Field")
+places = {"appended": str(fields.folder_of(bpy.data.objects["Field"].fieldwork))}
+bpy.data.objects.remove(bpy.data.objects["Field"])
+append("Scene", "Library")
+places["scene"] = bpy.data.scenes["Library"].fieldwork.project
+places["of the scene"] = bpy.data.objects["Field"].fieldwork.project
+bpy.data.objects.remove(bpy.data.objects["Field"])
+with bpy.data.libraries.load(f"{folder}/library/fields.blend", link=True) as (_, wanted):
+    wanted.objects = ["Field"]
+linked = wanted.objects[0]
+bpy.context.scene.collection.objects.link(linked)
+made = linked.override_create(remap_local_usages=True)
+places["overridden"] = [made.library is None, str(fields.folder_of(made.fieldwork)), made.fieldwork.project]
+answer([places, bpy.app.version >= (4, 3, 0)])
+""",
+        folder=tmp_path,
+    )
+    places, told = facts
+    assert places["overridden"] == [True, str(project), "//capture"]
+    if told:  # Blender 4.2 does not say what was appended
+        assert places["appended"] == str(project)
+        assert places["scene"] == places["of the scene"] == "//../library/capture"

@@ -26,12 +26,16 @@ from .base import ProjectOperator, absolute, need_held_out, need_run, refresh_sc
 from .scene import show_image
 
 
-def check_camera(scene: bpy.types.Scene) -> None:
-    """Raise ValueError when the scene has no camera to render from, or not a perspective one."""
-    if scene.camera is None:
-        raise ValueError(t("The scene has no active camera."))
-    if scene.camera.data.type != "PERSP":
-        raise ValueError(t("“{}” is not a perspective camera.", scene.camera.name))
+def camera_fault(scene: bpy.types.Scene) -> str | None:
+    """Why the scene cannot be rendered from its camera, as a sentence; None when it can."""
+    camera = scene.camera
+    if camera is None:
+        return t("The scene has no active camera.")
+    if camera.type != "CAMERA":
+        return t("“{}” is the active camera, but no camera.", camera.name)
+    if camera.data.type != "PERSP":
+        return t("“{}” is not a perspective camera.", camera.name)
+    return None
 
 
 def write_cameras(
@@ -61,14 +65,14 @@ def write_cameras(
 def camera_at(scene: bpy.types.Scene, number: int, width: int, height: int, owner: Owner | None) -> dict[str, Any]:
     """Pose and intrinsics of the scene's camera in a frame, as transforms.json has them; the scene stays in its frame.
 
-    Raises SceneError: the scene has no camera any more.
+    Raises SceneError: the scene has no camera any more, or in this frame not a perspective one.
     """
-    if scene.camera is None:
-        raise SceneError(t("The scene has no active camera."))
     current = scene.frame_current
     if number != current:
-        scene.frame_set(number)
+        scene.frame_set(number)  # markers may change the camera
     try:
+        if fault := camera_fault(scene):
+            raise SceneError(t("Frame {}: {}", number, fault))
         layer = scene.view_layers[0]
         layer.update()  # a layer that no window shows is behind, or has not been evaluated at all
         evaluated = scene.camera.evaluated_get(layer.depsgraph)
@@ -156,7 +160,8 @@ class FIELDWORK_OT_render(ProjectOperator):
             return {**params, "test" if source == "photos" else "all": True}
         if source == "orbit":
             return {**params, "orbit": self.value(context, "orbit")}
-        check_camera(context.scene)
+        if fault := camera_fault(context.scene):
+            raise ValueError(fault)
         return {**params, "camera": str(folder / CAMERAS), "size": None}
 
     def before(self, context: Context, params: dict[str, Any]) -> Steps | None:

@@ -37,6 +37,17 @@ def scene_error(what: str, error: Exception) -> EngineError:
     )
 
 
+def failure(what: str, error: Exception) -> EngineError:
+    """What a job failed of in Blender, for the panel: errors that are written for the user as they are, others after `what`."""
+    from ...nerfcore.errors import FieldworkError  # not at the top: enabling the extension must be quick
+
+    if isinstance(error, EngineError):
+        return error
+    if isinstance(error, FieldworkError):
+        return EngineError(error.code, error.message, error.hint)
+    return EngineError("scene", str(error)) if isinstance(error, SceneError) else scene_error(what, error)
+
+
 class Landing:
     """What jobs that have ended have to do in the scene."""
 
@@ -129,10 +140,8 @@ class Landing:
                 self._begin(job)
             else:
                 self._brought(job, scene_error(FAILED, error))
-        except SceneError as error:
-            self._brought(job, EngineError("scene", str(error)))
         except Exception as error:  # noqa: BLE001 - the job and its report tell it
-            self._brought(job, scene_error(FAILED, error))
+            self._brought(job, failure(FAILED, error))
 
     def _brought(self, job: Job, error: EngineError | None) -> None:
         if self.current and self.current[0] is job:

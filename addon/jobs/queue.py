@@ -24,12 +24,13 @@ from .. import machine
 from ..errors import EngineError
 from . import computer, gate, redraw
 from .job import Done, Job, Steps
-from .landing import SLICE, Landing, scene_error
+from .landing import SLICE, Landing, failure, scene_error
 
 if TYPE_CHECKING:
     from ..engine.install import Installer
     from ..engine.link import DONE, Link
 
+UNREAD = "The scene cannot be read"
 KEPT = 8  # finished jobs the panel remembers
 
 
@@ -125,14 +126,15 @@ class Queue:
         """Run a job and wait for it. Raises EngineError."""
         job.state, job.started = "running", time.monotonic()
         self.running = job
-        for _ in job.before or ():
-            pass
         try:
+            for _ in job.before or ():
+                pass
             result = self._engine().run_blocking(job.verb, {**job.params, "job": job.id}, job.take)
-        except EngineError as error:
-            self.finish(job, None, error)
+        except Exception as error:  # noqa: BLE001 - the job and its report tell it
+            told = failure(UNREAD, error)
+            self.finish(job, None, told)
             self.landing.settle()
-            raise
+            raise told from error
         self.finish(job, result, None)
         self.landing.settle()
         return result
@@ -235,7 +237,7 @@ class Queue:
             job.before, job.fraction, job.message = None, None, ""
         except Exception as error:  # noqa: BLE001 - the job and its report tell it
             self.waiting.remove(job)
-            self.finish(job, None, scene_error("The scene cannot be read", error))
+            self.finish(job, None, failure(UNREAD, error))
 
     def _start_next(self) -> None:
         if self.running is not None or not self.waiting or self.waiting[0].before is not None:

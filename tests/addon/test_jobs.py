@@ -14,7 +14,7 @@ bpy = pytest.importorskip("bpy")
 
 from fieldwork.addon import machine  # noqa: E402
 from fieldwork.addon.engine.link import Link  # noqa: E402
-from fieldwork.addon.errors import EngineError  # noqa: E402
+from fieldwork.addon.errors import EngineError, SceneError  # noqa: E402
 from fieldwork.addon.jobs import (  # noqa: E402
     gate,
     refresh,
@@ -30,6 +30,7 @@ from fieldwork.addon.project import (  # noqa: E402
     snapshot,
 )
 from fieldwork.nerfcore.engine import status as st  # noqa: E402
+from fieldwork.nerfcore.errors import DiskError  # noqa: E402
 from fieldwork.tests.addon.support import make_project  # noqa: E402
 
 ENGINE = [sys.executable, str(Path(__file__).resolve().parents[1] / "counting_engine.py")]
@@ -339,6 +340,26 @@ def test_what_a_job_needs_of_the_scene_is_done_in_slices_and_at_once(queue, proj
     queue.submit(third)
     tick_until(queue, lambda: third.state == "failed")
     assert "the scene is gone" in third.error.message
+
+
+def test_why_a_scene_cannot_be_read_is_told_as_it_is(queue, project):
+    def fails(error):
+        yield 0.0, ""
+        raise error
+
+    reasons = {
+        "The lens is dirty.": SceneError("The lens is dirty."),
+        "No room. Make some.": DiskError("No room.", "Make some."),
+    }
+    for text, error in reasons.items():
+        job = queue.make("count", {"project": str(project)}, before=fails(error))
+        queue.submit(job)
+        tick_until(queue, lambda job=job: job.state == "failed")
+        assert str(job.error) == text
+        blocking = queue.make("count", {"project": str(project)}, before=fails(error))
+        with pytest.raises(EngineError, match=text):
+            queue.run(blocking)
+        assert (blocking.state, queue.running) == ("failed", None)
 
 
 def test_what_fails_in_blender_reaches_the_panel_and_stops_nothing_else(queue, project, monkeypatch):

@@ -295,3 +295,46 @@ def test_photos_called_like_passes_are_colors_too(tmp_path):
     assert colored_files(rendered) == files("a.png", "a_depth.png")
     assert colored_files(files("a_depth.png", "a.exr")) == [], "of the depth alone"
     assert colored_files(files("stairs_depth.png", "b.png")) == files("stairs_depth.png", "b.png"), "straightened ones"
+
+
+def test_what_is_no_perspective_camera_is_told_in_any_frame(bpy_script, tmp_path):
+    facts = bpy_script(
+        SETUP
+        + """
+from fieldwork.addon.errors import SceneError
+from fieldwork.operators.render import camera_fault, write_cameras
+own, empty = scene.camera, bpy.data.objects.new("Empty", None)
+flat = bpy.data.objects.new("Flat", bpy.data.cameras.new("flat"))
+flat.data.type = "ORTHO"
+for obj in (empty, flat):
+    scene.collection.objects.link(obj)
+faults = []
+for scene.camera in (own, empty, flat, None):
+    faults.append(camera_fault(scene))
+for number, camera in ((1, own), (3, flat)):
+    scene.timeline_markers.new("cut", frame=number).camera = camera
+scene.frame_start, scene.frame_end = 1, 4
+scene.frame_set(1)
+try:
+    list(write_cameras(Path(folder, "cameras.json"), scene, True, (8, 8)))
+except SceneError as error:
+    faults.append(str(error))
+settings.project, settings.render_from, scene.camera = project, "camera", empty
+scene.timeline_markers.clear()
+scene.camera = empty
+faults.append(attempt(bpy.ops.fieldwork.render))
+answer([faults, scene.frame_current, Path(folder, "cameras.json").exists()])
+""",
+        folder=tmp_path,
+        project=make_project(tmp_path / "capture"),
+    )
+    own, empty, flat, none, animated, told = facts[0]
+    assert own is None
+    assert "no camera" in empty
+    assert "not a perspective" in flat
+    assert "no active camera" in none
+    assert "Frame 3" in animated
+    assert "not a perspective" in animated
+    assert "“Empty” is the active camera, but no camera." in told
+    assert "Traceback" not in told
+    assert facts[1:] == [1, False]

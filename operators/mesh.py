@@ -62,16 +62,22 @@ class FIELDWORK_OT_mesh(ProjectOperator):
             "resolution": self.value(context, "resolution") or None,
             "detail": self.value(context, "detail") or None,
             "region": self.value(context, "region"),
-            "turntable": self.path(context, "turntable"),
+            "turntable": self.also(context, "turntable"),
             "faces": self.value(context, "faces") or None,
             "lods": self.value(context, "lods"),
             "texture": None if (size := self.value(context, "texture")) == "0" else size,
             "watertight": self.value(context, "watertight"),
             "texture_kind": self.value(context, "texture_kind"),
-            "out": self.path(context, "out"),
+            "out": self.also(context, "out"),
             "split": self.value(context, "split"),
             "preview": self.preview,
         }
+
+    def also(self, context: Context, name: str) -> str | None:
+        """A path that the mesh is written to as well; the scene's are not for its preview."""
+        if self.preview and not self.properties.is_property_set(name):
+            return None
+        return self.path(context, name)
 
 
 def shows_mesh(scene: bpy.types.Scene, folder: Path) -> bool:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..data.load import load_scene
+from ..errors import SettingError
 from ..files import atomic_path
 from ..geometry.similarity import similarity_scale
 from ..images.picture import to_bytes
@@ -35,8 +36,15 @@ def preview(params: MeshParams, report: Reporter) -> dict[str, Any]:
     Returns:
         {"vertices", "faces", "voxel": in world units, "preview": its file}
     Raises:
-        TrainingError: the views agree on no surface, or there is none in the region. SettingError, ProjectError.
+        TrainingError: the views agree on no surface, or there is none in the region. SettingError: files of the mesh were
+        asked for, or an impossible region. ProjectError.
     """
+    for option in ("out", "turntable"):
+        if (path := getattr(params, option)) is not None:
+            raise SettingError(
+                f"A preview is written to {FILE} alone, and not to {path}.",
+                f"Leave `--{option}` or `--preview` away.",
+            )
     project, trained = load_project(params.project), load_trained(params.project, params.run)
     scene = load_scene(params.project, trained.info.holdout)
     box = trained.info.box(project)

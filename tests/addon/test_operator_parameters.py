@@ -32,6 +32,7 @@ ASKED: dict[str, dict[str, Any]] = {
     "render around": {"source": "orbit", "orbit": 8, "passes": {"rgb", "depth"}},
     "render cameras": {"camera": "c.json"},
     "mesh": {},
+    "mesh preview": {"preview": True},
     "mesh by all": {"detail": 2.0, "faces": 5000, "texture": "auto", "lods": 2, "split": "classes", "out": "m.glb"},
     "blend": {},
     "export": {"to": "glb"},
@@ -100,6 +101,7 @@ from fieldwork.addon.jobs.queue import queue
 from fieldwork.operators.base import VerbOperator
 os.chdir(folder)
 settings.project = folder + "/capture"
+settings.mesh_file, settings.turntable = folder + "/m.glb", folder + "/t"
 queue.run = lambda job: seen.append([job.verb, job.params])
 found = {}
 for case, arguments in asked.items():
@@ -129,3 +131,7 @@ def test_what_an_operator_queues_is_what_its_verb_takes(queued: dict[str, Any], 
     assert isinstance(queued[case], list), queued[case]
     verb, params = queued[case]
     VERBS[verb].params.model_validate(params)
+
+
+def test_a_preview_does_not_write_the_files_that_the_mesh_is_to_be_written_to(queued: dict[str, Any]) -> None:
+    assert queued["mesh"][1].keys() - queued["mesh preview"][1].keys() == {"out", "turntable"}

@@ -111,6 +111,14 @@ def test_an_empty_region_is_said_to_before_the_work(
         run_verb("mesh", MeshParams(project=untrained, region="1,0,0,0,1,1", preview=preview), Reporter())
 
 
+@pytest.mark.parametrize("option", ["out", "turntable"])
+def test_a_preview_that_shall_write_files_is_refused(untrained: Path, option: str) -> None:
+    params = MeshParams.model_validate({"project": untrained, "preview": True, option: untrained / "look.ply"})
+    with pytest.raises(SettingError, match=r"look\.ply") as caught:
+        run_verb("mesh", params, Reporter())
+    assert f"--{option}" in (caught.value.hint or "")
+
+
 def test_one_photo_is_no_surface(untrained: Path) -> None:
     trained = load_trained(untrained, "main")
     scene = load_scene(untrained, trained.info.holdout)

@@ -8,6 +8,10 @@ import warp as wp
 
 from .runtime import array, init, launch
 
+FARTHEST = wp.constant(
+    1.0e18
+)  # distance up to which triangles are looked for; its square is a number of single precision
+
 
 @wp.kernel(module="fieldwork_closest")
 def closest_kernel(
@@ -19,7 +23,7 @@ def closest_kernel(
     offset: int,
 ):
     i = wp.tid() + offset
-    query = wp.mesh_query_point_no_sign(mesh, points[i], 1.0e6)
+    query = wp.mesh_query_point_no_sign(mesh, points[i], FARTHEST)
     if query.result:
         face[i] = query.face
         corner[i] = wp.vec2(query.u, query.v)

@@ -9,6 +9,7 @@ import warp as wp
 from .runtime import array, init, launch
 
 MOST_LAYERS = wp.constant(64)  # triangles seen from behind that a ray passes at most
+FARTHEST = wp.constant(1.0e30)  # how far a ray goes, in any unit
 
 
 @wp.kernel(module="fieldwork_raycast")
@@ -27,7 +28,7 @@ def cast_kernel(
     done = int(0)
     for _ in range(MOST_LAYERS):
         if done == 0:
-            query = wp.mesh_query_ray(mesh, o, d, 1.0e6)
+            query = wp.mesh_query_ray(mesh, o, d, FARTHEST)
             if not query.result:
                 done = 1
             elif wp.dot(query.normal, d) < 0.0:

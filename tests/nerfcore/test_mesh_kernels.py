@@ -9,6 +9,7 @@ import pytest
 import torch
 from fieldwork.nerfcore.geometry.cameras import Camera, pixel_centers, rays
 from fieldwork.nerfcore.kernels import surface
+from fieldwork.nerfcore.kernels.closest import ClosestPoints
 from fieldwork.nerfcore.kernels.depth_arrays import FREE, MapArrays
 from fieldwork.nerfcore.kernels.packed_info import PackedInfo
 from fieldwork.nerfcore.kernels.patches import refine
@@ -252,6 +253,17 @@ def test_rays_meet_the_triangles_that_their_reference_says() -> None:
     assert (face == expected)[clear].mean() > 0.999
     hit = clear & (face == expected) & (expected >= 0)
     assert np.abs(corner[hit] - weights[hit]).max() < 1e-3
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1e3, 1e7])
+def test_rays_and_closest_points_reach_as_far_in_any_unit(unit: float) -> None:
+    square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]) * unit
+    faces, eye = np.array([[0, 1, 2], [0, 2, 3]]), np.array([[0.6, 0.3, 2.0]]) * unit
+    face, _ = FrontFaces(square, faces).cast(eye, np.array([[0.0, 0.0, -1.0]]))
+    assert face.tolist() == [0]
+    closest, _, distance = ClosestPoints(square, faces).find(eye)
+    assert closest.tolist() == [0]
+    assert distance[0] == pytest.approx(2 * unit)
 
 
 @pytest.mark.parametrize("device", WARP_DEVICES)

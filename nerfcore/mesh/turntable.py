@@ -20,6 +20,7 @@ from .parts import Texture
 from .stored import load_class_map, load_surface, mesh_folder
 from .surface import Surface
 from .surface_picture import TexturedMesh
+from .triangles import cross
 
 VIEWS, SIDE = 8, 640
 ELEVATION = np.radians(30)
@@ -41,8 +42,9 @@ def outwards(angle: np.ndarray) -> np.ndarray:
 def front_angles(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Angles (N,) about the z axis from which much of a mesh shows its front, and not the back of what stands before it."""
     angles = np.linspace(-np.pi, np.pi, DIRECTIONS, endpoint=False)
-    a, b, c = vertices[faces].transpose(1, 0, 2)
-    facing = np.maximum(np.cross(b - a, c - a) @ outwards(angles).T, 0).sum(0)
+    normals = cross(vertices, faces)
+    # One angle after the other: all at once would take a gigabyte for a million triangles.
+    facing = np.array([np.maximum(normals @ outward, 0).sum() for outward in outwards(angles)])
     return angles[facing >= LEAST_FRONT * facing.max()]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -68,3 +69,14 @@ def test_a_turntable_stays_before_what_has_a_front_alone(tmp_path: Path) -> None
     shares = [(view > 200).all(-1).mean() for view in views]
     assert min(shares) > 0.1
     assert len(np.unique(np.round(shares, 3))) >= 4
+
+
+def test_the_front_of_many_triangles_takes_little_memory() -> None:
+    ball = trimesh.creation.icosphere(6)
+    vertices, faces = np.asarray(ball.vertices, np.float32), np.asarray(ball.faces)
+    tracemalloc.start()
+    angles = front_angles(vertices, faces)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert len(angles) == 72
+    assert peak < 300 * len(faces)

@@ -19,6 +19,11 @@ from .visibility import PosedCamera, depth_buffer
 MOST_PHOTOS, ACROSS = 16, 48  # photos that are asked, evenly spread, and rays across each
 
 
+def spread(count: int) -> list[int]:
+    """Indices of at most `MOST_PHOTOS` of so many photos, evenly spread."""
+    return np.unique(np.linspace(0, count - 1, min(count, MOST_PHOTOS)).round().astype(int)).tolist()
+
+
 def cut_out(view: View, mask_mode: str) -> np.ndarray | None:
     """Which pixels (H, W) bool of a photo show the object that its mask or its transparency cuts out; None without."""
     width, height = view.camera.width, view.camera.height
@@ -41,10 +46,10 @@ def _unknown(view: View) -> np.ndarray:
 def silhouette(scene: Scene, vertices: np.ndarray, faces: np.ndarray, check: Callable[[], None]) -> float | None:
     """Intersection over union of what held-out photos cut out (of all photos where none is held out) and what a mesh,
     vertices (V, 3) and faces (F, 3) in the scene's frame, covers there; None where nothing is cut out."""
-    views = [scene.views[i] for i in scene.test or scene.train][:MOST_PHOTOS]
+    views = [scene.views[i] for i in scene.test or scene.train]
     pieces = small_pieces(vertices, faces)
     both = either = 0
-    for view in views:
+    for view in (views[i] for i in spread(len(views))):
         check()
         shown = cut_out(view, scene.mask_mode)
         if shown is None:
@@ -64,7 +69,7 @@ def shown_share(
         return 0.0
     mesh = FrontFaces(vertices, faces)
     hits = asked = 0
-    for index in np.unique(np.linspace(0, len(photos) - 1, min(len(photos), MOST_PHOTOS)).round().astype(int)):
+    for index in spread(len(photos)):
         check()
         camera, pose = photos[index].view.camera, photos[index].view.pose
         x = (np.arange(ACROSS) + 0.5) / ACROSS

@@ -51,6 +51,15 @@ def test_a_silhouette_is_held_against_what_is_cut_out(tmp_path: Path, masks: boo
     assert silhouette(scene, ball.vertices + 5, faces, nothing) == 0
 
 
+def test_a_silhouette_is_held_against_photos_from_all_sides(tmp_path: Path) -> None:
+    views = ball_views(tmp_path, True)
+    assert views[1].mask is not None
+    Image.fromarray(np.zeros((120, 120), np.uint8)).save(views[1].mask)
+    scene = Scene(views, [], [0] * 20 + [1] * 20, mask_mode="empty")  # the first half of an orbit, and the second one
+    ball = trimesh.creation.icosphere(4, RADIUS)
+    assert silhouette(scene, ball.vertices, np.asarray(ball.faces), nothing) == pytest.approx(0.5, abs=0.03)
+
+
 def test_photos_that_cut_nothing_out_say_nothing(tmp_path: Path) -> None:
     views = ball_views(tmp_path, True)
     ball = trimesh.creation.icosphere(2, RADIUS)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -31,7 +31,7 @@ from .extract import extract
 from .field_values import shade
 from .fusion import TRUNCATION, Bricks, coarser, fuse_maps, tolerances
 from .refine import refined_maps
-from .region import Region, choose_region, on_sides
+from .region import Region, choose_region, on_sides, sides_of
 from .surface import vertex_normals
 from .triangles import areas, compact, components
 
@@ -66,6 +66,7 @@ def build(trained: Trained, project: Project, scene: Scene, params: MeshParams, 
     bounds, voxel = wanted_bounds(params, scene, box), wanted_voxel(params, project, box)
     flats, store, maps = agreed_maps(trained, scene, box, report)
     region = choose_region(maps, bounds, params.resolution, voxel)
+    region = replace(region, sides=wanted_sides(params, scene, box))
     report.stage("Fusing")
     bricks = fuse_maps(maps, region, report)
     report.stage("Extracting the surface")
@@ -149,7 +150,28 @@ def open_surface(
 
 
 def wanted_bounds(params: MeshParams, scene: Scene, box: Box) -> tuple[np.ndarray, np.ndarray] | None:
-    """Corners (3,) in the normalised frame of the region that was asked for; None: what the photos show.
+    """Corners (3,) in the normalised frame of what holds the region that was asked for; None: what the photos show.
+
+    Raises:
+        SettingError: it is not six finite numbers, or empty.
+    """
+    wanted = wanted_region(params, scene)
+    if wanted is None:
+        return None
+    corners = np.stack(np.meshgrid(*zip(*wanted), indexing="ij"), -1).reshape(-1, 3)
+    moved = transform_points(box.box_from_world, corners)
+    return moved.min(0), moved.max(0)
+
+
+def wanted_sides(params: MeshParams, scene: Scene, box: Box) -> np.ndarray | None:
+    """The sides (6, 4) of the region that was asked for in the normalised frame, where it stands at an angle there, as the
+    project was turned since the field was trained; see `region.sides_of`. Raises SettingError."""
+    wanted = wanted_region(params, scene)
+    return None if wanted is None else sides_of(*wanted, box.world_from_box)
+
+
+def wanted_region(params: MeshParams, scene: Scene) -> tuple[np.ndarray, np.ndarray] | None:
+    """Corners (3,) in the world of the region that was asked for; None: what the photos show.
 
     Raises:
         SettingError: it is not six finite numbers, or empty.
@@ -173,9 +195,7 @@ def wanted_bounds(params: MeshParams, scene: Scene, box: Box) -> tuple[np.ndarra
             )
         if not (low < high).all():
             raise SettingError(f"The region {params.region} is empty.", "Give x0 < x1, y0 < y1, z0 < z1.")
-    corners = np.stack(np.meshgrid(*zip(low, high), indexing="ij"), -1).reshape(-1, 3)
-    moved = transform_points(box.box_from_world, corners)
-    return moved.min(0), moved.max(0)
+    return low, high
 
 
 def wanted_voxel(params: MeshParams, project: Project, box: Box) -> float | None:

@@ -12,7 +12,7 @@ from ..progress import Reporter
 from .clean import FEWEST_VIEWS, drop_scraps, seen_by
 from .decimate import decimate_closed
 from .denoise import denoised
-from .extract import BLOCK, assemble, in_region, off_corners, weld
+from .extract import BLOCK, assemble, in_region, off_corners, outside_of, weld
 from .fusion import BRICK, FREE_AT, TRUNCATION, Bricks, depth_gap
 from .triangles import areas, compact, components, cross, unit
 
@@ -93,6 +93,8 @@ def _distances(bricks: Bricks, free: np.ndarray, corner: np.ndarray) -> np.ndarr
     there, clear = (a.repeat(BRICK, 0).repeat(BRICK, 1).repeat(BRICK, 2) for a in (index >= 0, free[part]))
     distance = np.where(there, np.where(known, fused, -1.0), np.where(clear, 1.0, -1.0)).astype(np.float32)
     distance[~in_region(bricks, low * BRICK, distance.shape)] = 1.0
+    if bricks.sides is not None:
+        distance = np.maximum(distance, outside_of(bricks, low * BRICK, distance.shape).clip(-1, 1).astype(np.float32))
     # From the corner before the block's first to its last, which is where the next block begins.
     begin = corner * BRICK - 1
     end = np.where(corner + BLOCK < shape, (corner + BLOCK) * BRICK, shape * BRICK + 1)

@@ -23,6 +23,7 @@ from ..kernels.depth_arrays import FREE
 from ..kernels.raycast import FirstHits, FrontFaces
 from ..render.model import Model
 from .depth_maps import FlatView, flat_views, render_depth
+from .region import outside
 from .shown import cut_out
 
 MOST_PHOTOS, ACROSS = 12, 96  # photos that are asked, evenly spread, and pixels along their longest side
@@ -55,11 +56,13 @@ def coverage(
     faces: np.ndarray,
     bounds: tuple[np.ndarray, np.ndarray] | None,
     check: Callable[[], None],
+    sides: np.ndarray | None = None,
 ) -> Coverage:
     """How much of the held-out photos (of all where none is held out) a mesh in the normalised frame fills.
 
     Args:
-        bounds: corners (3,) of the region that was asked for: what lies beside it need not be there.
+        bounds, sides: corners (3,) of the region that was asked for and, where it stands at an angle, its sides: what lies beside
+            it need not be there.
     """
     chosen = [scene.views[i] for i in scene.test or scene.train]
     chosen = [chosen[i] for i in np.unique(np.linspace(0, len(chosen) - 1, MOST_PHOTOS).round().astype(int))]
@@ -77,7 +80,7 @@ def coverage(
     filled = missing = 0
     places, hits = [], []
     for flat, (hit, depth, shown) in zip(flats, seen):
-        near = flat.inside & (depth > 0) & (depth < min(FAR * middle, FREE)) & within_bounds(flat, depth, bounds)
+        near = flat.inside & (depth > 0) & (depth < min(FAR * middle, FREE)) & within_bounds(flat, depth, bounds, sides)
         solid = near & shown
         places.append(points_of(flat, depth)[solid.reshape(-1)])
         hits.append(hit[solid])
@@ -116,12 +119,18 @@ def shown_by(
     return count
 
 
-def within_bounds(flat: FlatView, depth: np.ndarray, bounds: tuple[np.ndarray, np.ndarray] | None) -> np.ndarray:
-    """Which pixels (H, W) bool of a flat view with depths (H, W) show what lies between two corners."""
+def within_bounds(
+    flat: FlatView, depth: np.ndarray, bounds: tuple[np.ndarray, np.ndarray] | None, sides: np.ndarray | None
+) -> np.ndarray:
+    """Which pixels (H, W) bool of a flat view with depths (H, W) show what lies between two corners, and within the sides of a
+    box at an angle."""
     if bounds is None:
         return np.ones(depth.shape, bool)
     points = points_of(flat, depth)
-    return ((points >= bounds[0]) & (points <= bounds[1])).all(1).reshape(depth.shape)
+    inside = ((points >= bounds[0]) & (points <= bounds[1])).all(1)
+    if sides is not None:
+        inside &= outside(sides, *points.T) <= 0
+    return inside.reshape(depth.shape)
 
 
 def points_of(flat: FlatView, depth: np.ndarray) -> np.ndarray:

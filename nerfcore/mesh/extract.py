@@ -7,6 +7,7 @@ import skimage
 
 from ..progress import Reporter
 from .fusion import BRICK, Bricks
+from .region import outside
 
 BLOCK = 16  # bricks along each side of what is extracted at once
 LEAST = 1e-3  # voxels that a crossing keeps from a corner: vertices of neighbouring cells then never coincide
@@ -66,7 +67,15 @@ def in_region(bricks: Bricks, first: np.ndarray, shape: tuple[int, ...]) -> np.n
     """Which corners of the grid, of a box of this shape from the corner `first` (3,) on, lie in the region: bool, as large as
     the box."""
     x, y, z = (np.arange(n) + begin < count for n, begin, count in zip(shape, first, bricks.corners))
-    return x[:, None, None] & y[:, None] & z
+    inside = x[:, None, None] & y[:, None] & z
+    return inside if bricks.sides is None else inside & (outside_of(bricks, first, shape) <= 0.5)
+
+
+def outside_of(bricks: Bricks, first: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """How far, in voxels, the same corners lie outside of the sides of a region that stands at an angle."""
+    assert bricks.sides is not None
+    x, y, z = (start + bricks.voxel * (np.arange(n) + begin) for n, begin, start in zip(shape, first, bricks.origin))
+    return outside(bricks.sides, x[:, None, None], y[:, None], z) / bricks.voxel
 
 
 def off_corners(distance: np.ndarray) -> np.ndarray:

@@ -41,7 +41,7 @@ class Bricks:
     """Distances on a sparse grid. index (X, Y, Z) int32: place of each brick, −1 where there is none; distance
     (B, 8, 8, 8) float32 in normalised units, negative inside, and weight, 0 where no view says anything, of the corners
     origin + voxel · (8 · brick + (i, j, k)); wide (B,) bool: bricks fused with a wider truncation; corners (3,): how many
-    of the grid lie in the region, which the last bricks reach beyond."""
+    of the grid lie in the region, which the last bricks reach beyond; sides: see `Region`."""
 
     origin: np.ndarray
     voxel: float
@@ -50,6 +50,7 @@ class Bricks:
     weight: np.ndarray
     wide: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
     corners: np.ndarray = field(default_factory=lambda: np.full(3, np.iinfo(np.int64).max))
+    sides: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.distance)
@@ -106,7 +107,7 @@ def fuse_maps(
         unsure = mean_spread(maps, origin, h, counts)[tuple(bricks.T)] > TRUNCATION * h
         wide = unsure & unsteady(distance, weight, h)
         fuse_bricks(np.flatnonzero(wide), WIDER, 0.8, 1.0)
-    return Bricks(origin, h, index, distance, weight, wide, cells_of(region) + 1)
+    return Bricks(origin, h, index, distance, weight, wide, cells_of(region) + 1, region.sides)
 
 
 def check_memory(counts: np.ndarray, needed: float) -> None:
@@ -214,7 +215,9 @@ def coarser(bricks: Bricks) -> Bricks:
         there = child >= 0
         for new, old in zip(made, (bricks.distance, bricks.weight)):
             new[(there, *block)] = old[child[there]][:, ::2, ::2, ::2]
-    return Bricks(bricks.origin, 2 * bricks.voxel, index, *made, corners=(bricks.corners - 1) // 2 + 1)
+    return Bricks(
+        bricks.origin, 2 * bricks.voxel, index, *made, corners=(bricks.corners - 1) // 2 + 1, sides=bricks.sides
+    )
 
 
 def _mark(maps: MapArrays, origin: np.ndarray, voxel: float, counts: np.ndarray, report: Reporter) -> np.ndarray:

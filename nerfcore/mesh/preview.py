@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from ..progress import Reporter
 from ..project.store import load_project
 from ..render.run import Trained, load_trained
 from . import depth_maps as dm
-from .build import no_surface, wanted_bounds
+from .build import no_surface, wanted_bounds, wanted_sides
 from .clean import drop_scraps
 from .extract import extract
 from .field_values import shade
@@ -55,6 +56,7 @@ def preview(params: MeshParams, report: Reporter) -> dict[str, Any]:
     maps = dm.confirmed_maps(flats, dm.depth_maps(trained.model, flats, report), trained.device, report)
     report.stage("A first look: surface")
     region = choose_region(maps, bounds, min(CELLS, params.resolution or CELLS))
+    region = replace(region, sides=wanted_sides(params, scene, box))
     vertices, faces = extract(fuse_maps(maps, region, report), report)
     vertices, faces = compact(vertices, drop_scraps(vertices, faces)) if len(faces) else (vertices, faces)
     if not len(faces):

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from ..errors import TrainingError
+from ..geometry.similarity import similarity_scale
 from ..kernels.depth_arrays import FREE, MapArrays
 from .depth_maps import hit_points
 
@@ -16,20 +17,41 @@ MARGIN = 0.02  # of the longest side
 INNER, REACH = (1.0, 99.0), 0.25  # percentiles of all hits; how far beyond them, as a share of their extent
 FEWEST_HITS = 200
 CELLS = (512, 1024)  # along the longest side, where nobody asks for a number: the fewest and the most
+ALONG = 1e-6  # sine of the angle between two axes up to which they are one
 ENOUGH = 1.5  # median footprints of a pixel that a voxel may have before there are more cells than the fewest
 
 
 @dataclass(frozen=True)
 class Region:
-    """A box of the normalised frame between two corners (3,), cut into cubes of side `voxel`."""
+    """A box of the normalised frame between two corners (3,), cut into cubes of side `voxel`; `sides`: of a box at an angle
+    in it, outside of which nothing is looked for, see `sides_of`."""
 
     low: np.ndarray
     high: np.ndarray
     voxel: float
+    sides: np.ndarray | None = None
 
     @property
     def size(self) -> float:
         return float((self.high - self.low).max())
+
+
+def sides_of(low: np.ndarray, high: np.ndarray, world_from_box: np.ndarray) -> np.ndarray | None:
+    """The six sides (6, 4) of the box between two corners (3,) of the world, as planes of the normalised frame: a·x + b·y + c·z +
+    d is the distance outwards. None where the box stands along the axes there."""
+    scale = similarity_scale(world_from_box)
+    rows = world_from_box[:3] / scale
+    if np.sort(np.abs(rows[:, :3]), axis=1)[:, 1].max() < ALONG:
+        return None
+    beyond_high = np.concatenate([rows[:, :3], rows[:, 3:] - high[:, None] / scale], 1)
+    beyond_low = np.concatenate([-rows[:, :3], low[:, None] / scale - rows[:, 3:]], 1)
+    return np.concatenate([beyond_high, beyond_low])
+
+
+def outside(sides: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """How far places, whose coordinates broadcast to each other, lie outside of a box with these sides (6, 4); negative
+    within."""
+    return np.stack([a * x + b * y + c * z + d for a, b, c, d in sides]).max(0)
 
 
 def all_hits(maps: MapArrays, most: int = 1 << 20) -> torch.Tensor:

@@ -23,7 +23,7 @@ from ..project.schema import step
 from ..project.store import load_project, record_step
 from ..render.run import Trained, load_info, load_trained, refined_poses
 from ..verdict import mesh_verdict
-from .build import Built, build, largest_share, wanted_bounds
+from .build import Built, build, largest_share, wanted_bounds, wanted_sides
 from .coverage import coverage
 from .field_values import shade
 from .formats import check_format
@@ -147,8 +147,8 @@ def judge(
     report.stage("Comparing it with the photos")
     scene = scene.unseen_by(trained.info.images)
     shown = shown_share(photos, built.vertices, built.faces, report.check)
-    bounds = wanted_bounds(params, scene, box)
-    found = coverage(trained.model, scene, box.box_from_world, built.vertices, built.faces, bounds, report.check)
+    bounds, sides = wanted_bounds(params, scene, box), wanted_sides(params, scene, box)
+    found = coverage(trained.model, scene, box.box_from_world, built.vertices, built.faces, bounds, report.check, sides)
     solid, overlapped = (None if share is None else round(share, 4) for share in (found.solid, found.overlapped))
     largest, _ = largest_share(built.vertices, built.faces)
     result: dict[str, Any] = {"shown": round(shown, 4), "solid_shown": solid, "holes": round(found.holes, 4)}

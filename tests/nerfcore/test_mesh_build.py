@@ -9,9 +9,10 @@ import pytest
 from fieldwork.nerfcore.data.box import Box
 from fieldwork.nerfcore.data.scene import Scene
 from fieldwork.nerfcore.errors import SettingError
-from fieldwork.nerfcore.geometry.similarity import make_similarity
+from fieldwork.nerfcore.geometry.similarity import make_similarity, transform_points
 from fieldwork.nerfcore.mesh.appearance import bilinear, blend
-from fieldwork.nerfcore.mesh.build import check_parts, no_surface, wanted_bounds, wanted_voxel
+from fieldwork.nerfcore.mesh.build import check_parts, no_surface, wanted_bounds, wanted_sides, wanted_voxel
+from fieldwork.nerfcore.mesh.region import outside
 from fieldwork.nerfcore.params import MeshParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.schema import Project
@@ -32,6 +33,21 @@ def test_the_region_is_the_projects_or_what_is_given() -> None:
     assert wanted_bounds(MeshParams(project=HERE, region="photos"), scene(inner), BOX) is None
     found = wanted_bounds(MeshParams(project=HERE, region="1,0,0,3,2,1"), scene(inner), BOX)
     np.testing.assert_allclose(found, [[0, 0, 0], [1, 1, 0.5]])
+
+
+def test_a_region_at_an_angle_to_the_field_has_sides() -> None:
+    turned = Box(
+        BOX.world_from_box @ make_similarity(1.0, np.array([[0.6, -0.8, 0], [0.8, 0.6, 0], [0, 0, 1]]), np.zeros(3)),
+        False,
+    )
+    params = MeshParams(project=HERE, region="1,0,0,3,2,1")
+    assert wanted_sides(params, scene(), BOX) is None
+    assert wanted_sides(MeshParams(project=HERE), scene(), turned) is None
+    sides = wanted_sides(params, scene(), turned)
+    assert sides is not None
+    world = np.array([[2.0, 1, 0.5], [3.5, 1, 0.5], [2, -0.25, 0.5], [2, 1, 1.75]])
+    off = outside(sides, *transform_points(turned.box_from_world, world).T)
+    np.testing.assert_allclose(off, [-0.25, 0.25, 0.125, 0.375])  # in units of the cube's frame
 
 
 @pytest.mark.parametrize("text", ["here", "1,2,3", "0,0,0,1,1,0", "0,0,0,1,1,nan", "0,0,0,inf,1,1"])

@@ -11,6 +11,7 @@ import torch
 from fieldwork.nerfcore.data.scene import View
 from fieldwork.nerfcore.errors import Cancelled, SettingError, TrainingError
 from fieldwork.nerfcore.geometry.cameras import Camera
+from fieldwork.nerfcore.geometry.similarity import make_similarity, transform_points
 from fieldwork.nerfcore.kernels.depth_arrays import FREE, MapArrays
 from fieldwork.nerfcore.mesh import clean, depth_maps, fusion, metrics, triangles
 from fieldwork.nerfcore.mesh.closed import extract_closed
@@ -26,10 +27,11 @@ from fieldwork.nerfcore.mesh.fusion import (
     spread_of,
     tolerances,
 )
-from fieldwork.nerfcore.mesh.region import Region, choose_region, on_sides
+from fieldwork.nerfcore.mesh.region import Region, choose_region, on_sides, sides_of
 from fieldwork.nerfcore.mesh.surface import is_watertight
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.tests.nerfcore.support.depth_views import CAMERA, Hit, box, look_at, maps_of, orbit, sphere
+from scipy.spatial.transform import Rotation
 
 CPU = torch.device("cpu")
 
@@ -386,3 +388,23 @@ def test_a_surface_ends_where_its_region_does_on_every_side(cells: int) -> None:
         assert (vertices.max(0) <= region.high + beyond * region.voxel).all()
     coarse = extract(coarser(bricks), Reporter())[0]
     assert (coarse.max(0) <= region.high + region.voxel).all()
+
+
+def test_a_surface_ends_where_its_region_does_at_any_angle() -> None:
+    """A box of the world, in which the field's cube stands at an angle: the project was turned since the training."""
+    maps = depth_maps.confirmed_maps(*maps_of(sphere(0.5), orbit(24, 1.8)), CPU, Reporter())
+    turn = make_similarity(2.0, Rotation.from_euler("zx", [40, 30], degrees=True).as_matrix(), np.array([1.0, 2, 3]))
+    low, high = np.array([0.6, 1.4, 2.5]), np.array([1.9, 2.9, 3.7])
+    sides = sides_of(low, high, turn)
+    region = replace(choose_region(maps, None, 64), sides=sides)
+    bricks = fuse_maps(maps, region, Reporter())
+    found = extract(bricks, Reporter())[0], extract(coarser(bricks), Reporter())[0]
+    for vertices, beyond in zip((*found, extract_closed(bricks, maps, Reporter())[0]), (0.6, 1.1, 0.1)):
+        world = transform_points(turn, vertices)
+        assert (world >= low - 2 * beyond * region.voxel).all()
+        assert (world <= high + 2 * beyond * region.voxel).all()
+        assert (world.min(0) < low + 4 * region.voxel).all()  # and not before
+        assert (world.max(0) > high - 4 * region.voxel).all()
+    assert (
+        sides_of(low, high, make_similarity(2.0, Rotation.from_euler("z", 90, degrees=True).as_matrix(), low)) is None
+    )

@@ -22,7 +22,7 @@ from ..project.store import load_project, record_step
 from .conditions import chosen_classes, condition_sheet, find_places, write_places
 from .lettering import warn_of_missing
 from .sections import profile, write_profile
-from .sheet import DPI, MM, Color, Entry, Sheet, chosen_scale, label_note, write_sheet
+from .sheet import DPI, MM, Color, Entry, Sheet, chosen_scale, label_note, ratio, write_sheet
 from .stored import read_measures
 from .views import Picture, Projection, Window, picture, plane, projection
 from .wording import amount, significant
@@ -202,7 +202,7 @@ def warn_of_unused_scale(scale: float | None, subject: Subject, report: Reporter
     """Warn where a scale on paper was asked for and the capture has none."""
     if scale is not None and not subject.metric:
         report.warn(
-            f"The scale 1:{significant(scale, 6)} is not used: the scale of the capture is not known. Set it with "
+            f"The scale {ratio(scale)} is not used: the scale of the capture is not known. Set it with "
             "`fieldwork align --scale`, then run `fieldwork mesh` again."
         )
 

@@ -28,7 +28,10 @@ LEGEND = 36  # characters of a line of the legend
 ROOM = 400.0, 280.0  # mm that a drawing may take where no scale is asked for: about A3 with its margins
 SMALLEST = 60.0  # mm, so that scale bar and title have room
 LARGEST = 2000.0  # mm
-SCALES = [n * 10**k for k in range(5) for n in (1, 2, 2.5, 5)]
+# N of 1 : N, from 1000000:1 to 1:10^12: of things in scene units sizes say nothing.
+SCALES = [1 / (n * 10**k) for k in reversed(range(6)) for n in (10, 5, 2.5, 2)] + [
+    n * 10**k for k in range(12) for n in (1, 2, 2.5, 5)
+]
 FORMATS = ("png", "svg", "pdf")
 Color = tuple[float, float, float]
 
@@ -98,8 +101,15 @@ def chosen_scale(size: np.ndarray, asked: float | None) -> float:
         return float(next((s for s in SCALES if (paper / s <= ROOM).all()), SCALES[-1]))
     if (paper / asked > LARGEST).any():
         width, height = paper / asked
-        raise SettingError(f"At 1:{asked:g} the drawing is {width:.0f} × {height:.0f} mm.", "Choose a smaller scale.")
+        raise SettingError(
+            f"At {ratio(asked)} the drawing is {width:.0f} × {height:.0f} mm.", "Choose a smaller scale."
+        )
     return asked
+
+
+def ratio(scale: float) -> str:
+    """A scale 1 : N in words: “1:50”, of what is drawn larger than it is “2:1”."""
+    return f"1:{significant(scale, 6)}" if scale >= 1 else f"{significant(1 / scale, 6)}:1"
 
 
 def nice_step(length: float, parts: int) -> float:
@@ -164,9 +174,7 @@ def _figure(sheet: Sheet) -> Figure:
     axes.set_ylabel(f"{sheet.axes[1]} ({unit})", fontsize=6, labelpad=1)
     for spine in axes.spines.values():
         spine.set_linewidth(0.4)
-    stated = (
-        f"1:{significant(sheet.scale, 6)}" if sheet.metric else "not to scale: the scale of the capture is not known"
-    )
+    stated = ratio(sheet.scale) if sheet.metric else "not to scale: the scale of the capture is not known"
     figure.text(LEFT / width, 1 - 9 / height, sheet.title, fontsize=10, weight="bold")
     stated = f"{stated} · grid {significant(step)} {unit}" + (f" · {sheet.note}" if sheet.note else "")
     figure.text(LEFT / width, 3 / height, stated, fontsize=8)

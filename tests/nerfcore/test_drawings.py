@@ -16,7 +16,7 @@ from fieldwork.nerfcore.measure import lettering
 from fieldwork.nerfcore.measure.conditions import widest, without_specks
 from fieldwork.nerfcore.measure.drawings import axis_names, framed, load_subject, plan, section
 from fieldwork.nerfcore.measure.sections import profile
-from fieldwork.nerfcore.measure.sheet import DPI, Entry, Sheet, _figure, chosen_scale, nice_step
+from fieldwork.nerfcore.measure.sheet import DPI, Entry, Sheet, _figure, chosen_scale, nice_step, ratio
 from fieldwork.nerfcore.measure.views import Window, picture, plane, projection
 from fieldwork.nerfcore.mesh.instances import read_instances
 from fieldwork.nerfcore.params import PlanParams, SectionParams
@@ -98,6 +98,11 @@ def test_scales_are_round_and_fit_the_paper() -> None:
     assert chosen_scale(np.array([4.0, 2.6]), None) == 10
     assert chosen_scale(np.array([4.2, 2.6]), None) == 20
     assert chosen_scale(np.array([40.0, 26]), 50) == 50
+    # A coin is drawn larger than it is, and a town in millimetres, of unknown scale, still fits.
+    assert ratio(chosen_scale(np.array([0.025, 0.025]), None)) == "10:1"
+    assert ratio(chosen_scale(np.array([0.2, 0.1]), None)) == "2:1"
+    assert (np.array([3e5, 2e5]) * 1000 / chosen_scale(np.array([3e5, 2e5]), None) <= (400, 280)).all()
+    assert [ratio(scale) for scale in (0.4, 1, 2.5, 1e6)] == ["2.5:1", "1:1", "1:2.5", "1:1000000"]
     with pytest.raises(SettingError, match="1:1 the drawing is 40000"):
         chosen_scale(np.array([40.0, 26]), 1)
     assert [nice_step(x, 10) for x in (1.0, 4.2, 37.0)] == [0.1, 0.5, 5.0]

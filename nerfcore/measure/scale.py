@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import InputError
+from ..errors import InputError, SettingError
 from ..geometry.similarity import transform_points
+from ..images.names import joined
 from ..poses.align import placed_point
 from ..project.schema import Poses, Project
 from ..project.store import world_from_sfm
@@ -61,17 +62,23 @@ def read_distances(path: Path, frame: np.ndarray, poses: Poses) -> list[Distance
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
             reader = csv.DictReader(file)
-            rows, columns = list(reader), reader.fieldnames or []
+            columns = reader.fieldnames or []
+            rows = [(reader.line_num, row) for row in reader]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"The distances {path} cannot be read: {error}.", HINT) from error
     if not {"name", "from", "to"} <= set(columns) <= set(COLUMNS):
         raise InputError(f"{path} has the columns {', '.join(columns) or 'none'}.", HINT)
-    return [_distance(path, number, row, frame, poses) for number, row in enumerate(rows, 2)]
+    return [_distance(path, number, row, frame, poses) for number, row in rows]
 
 
 def _distance(path: Path, line: int, row: dict[str, str], frame: np.ndarray, poses: Poses) -> Distance:
+    if None in row:
+        raise InputError(f"{path}, line {line}: it has more cells than there are columns.", HINT)
     given = {key: (row.get(key) or "").strip() for key in COLUMNS}
-    start, end = (placed_point(given[key].replace(" ", ","), frame, poses) for key in ("from", "to"))
+    try:
+        start, end = (_place(given[key], frame, poses) for key in ("from", "to"))
+    except SettingError as error:
+        raise InputError(f"{path}, line {line}: {error.message}", HINT) from error
     try:
         metres = float(given["metres"]) if given["metres"] else None
         unsure = float(given["u_mm"] or 0) / 1000
@@ -85,6 +92,13 @@ def _distance(path: Path, line: int, row: dict[str, str], frame: np.ndarray, pos
     if np.linalg.norm(end - start) < 1e-9:
         raise InputError(f"{path}, line {line}: both ends are the same place.", HINT)
     return Distance(given["name"], start, end, metres, unsure, use)
+
+
+def _place(text: str, frame: np.ndarray, poses: Poses) -> np.ndarray:
+    """A point (3,) of the world: “x y z”, with commas or without, or the name of a photo. Raises SettingError."""
+    name = joined(text)  # as photos are called here, whose files may have spaces in their names
+    known = any(image.name == name for image in poses.images)
+    return placed_point(name if known and text else ",".join(text.replace(",", " ").split()), frame, poses)
 
 
 def u_measured(distance: Distance, scale: Scale, voxel: float) -> float:

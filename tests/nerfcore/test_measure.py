@@ -27,7 +27,7 @@ from fieldwork.nerfcore.mesh.visibility import PosedCamera
 from fieldwork.nerfcore.params import MeasureParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.runs import MEASURES, MESH_RECORD
-from fieldwork.nerfcore.project.schema import Poses, Project
+from fieldwork.nerfcore.project.schema import PosedImage, Poses, Project
 from fieldwork.nerfcore.project.store import edit_project
 from fieldwork.tests.nerfcore.support.ball import RADIUS, ball_project
 from fieldwork.tests.nerfcore.support.flat import box_mesh, wall_mesh
@@ -254,6 +254,9 @@ def test_a_mesh_that_lies_elsewhere_is_not_measured(project: Path) -> None:
         ("name,from,to,metres,use\na,0 0 0,1 0 0,,scale\n", "metres ''"),
         ("name,from,to,metres\na,0 0 0,1 0 0,-1\n", "positive"),
         ("name,from,to\na,1 0 0,1 0 0\n", "same place"),
+        ("name,from,to\n\n\na,IMG_7,1 0 0\n", "line 4: No placed photo is called 'IMG_7'"),
+        ("name,from,to\na,0,0,0,1,0,0\n", "line 2: it has more cells than there are columns"),
+        ("name,from,to\na\n", "line 2: No placed photo is called ''"),
     ],
 )
 def test_faults_in_the_table_of_distances_are_named(tmp_path: Path, text: str, words: str) -> None:
@@ -261,6 +264,13 @@ def test_faults_in_the_table_of_distances_are_named(tmp_path: Path, text: str, w
     path.write_text(text)
     with pytest.raises(InputError, match=words):
         read_distances(path, np.eye(4), Poses())
+
+
+def test_places_in_the_table_of_distances_are_written_in_several_ways(tmp_path: Path) -> None:
+    path = tmp_path / "lengths.csv"
+    path.write_text('name,from,to\na,0  0 0,3 4 0\nb,"0, 0, 0","0,0,2"\nc,my first photo,0 0 7\n')
+    poses = Poses(images=[PosedImage(name="my_first_photo", camera=0, camera_to_world=np.eye(4).tolist())])
+    assert [distance.length for distance in read_distances(path, np.eye(4), poses)] == [5, 2, 7]
 
 
 def test_how_sure_the_scale_is(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from .. import __version__
 from ..data.load import load_scene
 from ..data.scene import Scene
-from ..measure.wording import interval, significant
+from ..measure.wording import decimals, interval, significant
 from ..project.runs import INFO, holdout_of, photos_of, read_metrics, run_folder
 from ..project.schema import Poses, Project
 from ..project.store import load_poses, load_project
@@ -150,7 +150,9 @@ def _measured(rows: list[dict[str, Any]], measures: dict[str, Any], title: str) 
         title,
         ["name", f"area ({area})", "95 % interval", f"volume ({volume})", "95 % interval"],
         [[row["name"], *cells(row, "area"), *cells(row, "volume")] for row in rows],
-        f"Relative standard uncertainty of the scale: {significant(scale.get('u_percent', 0))} % ({scale.get('source', '')}).",
+        f"Relative standard uncertainty of the scale: {significant(scale.get('u_percent', 0))} % ({scale.get('source', '')})."
+        if metric
+        else "The scale is not known: sizes are in scene units.",
     )
 
 
@@ -158,23 +160,26 @@ def _distances(measures: dict[str, Any]) -> Section:
     metric, distances = measures.get("unit") == "m", measures.get("distances", [])
     # Measures of earlier versions have differences between scene units and metres.
     differences = [d["difference"] if metric else None for d in distances]
+    # Tenths of a millimetre, and more where small things are measured more finely.
+    digits = [max(4, decimals((d["high"] - d["low"]) / 2)) for d in distances]
     rows = [
         [
             d["name"],
             d["use"] or "measured only",
-            f"{d['length']:.4f}",
-            f"{d['low']:.4f} … {d['high']:.4f}",
-            "" if d["known"] is None else f"{d['known']:.4f}",
-            "" if difference is None else f"{1000 * difference:+.1f} mm",
+            f"{d['length']:.{places}f}",
+            f"{d['low']:.{places}f} … {d['high']:.{places}f}",
+            "" if d["known"] is None else f"{d['known']:.{places}f}",
+            "" if difference is None else f"{1000 * difference:+.{places - 3}f} mm",
         ]
-        for d, difference in zip(distances, differences)
+        for d, difference, places in zip(distances, differences, digits)
     ]
     text = "Distances marked “check” were not used for scaling."
     if not metric:
         text += " The scale is not known: nothing is held against metres."
     checks = [x for d, x in zip(distances, differences) if d["use"] == "check" and x is not None]
     if checks:
-        text += f" Root mean square of their differences: {1000 * float(np.sqrt(np.mean(np.square(checks)))):.1f} mm."
+        spread = 1000 * float(np.sqrt(np.mean(np.square(checks))))
+        text += f" Root mean square of their differences: {spread:.{max(digits) - 3}f} mm."
     columns = [
         "distance",
         "use",

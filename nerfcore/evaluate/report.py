@@ -11,6 +11,7 @@ from ..errors import ProjectError, SettingError
 from ..files import write_text
 from ..measure.lettering import warn_of_missing
 from ..measure.stored import read_measures
+from ..measure.wording import significant
 from ..params import ReportParams
 from ..progress import Reporter
 from ..project.runs import known_runs, read_events, read_metrics, run_folder
@@ -128,6 +129,8 @@ def write_report(
             judgement=next((table for table in tables if table.title == JUDGEMENT), None),
             tables=[table for table in tables if table.title not in (*HEAD, JUDGEMENT)],
             areas=(result.get("mesh") or {}).get("classes") or {},
+            area_unit="m²" if project.frame.scale_known else "units²",
+            significant=significant,
             evaluation=evaluation,
             pictures=[picture | {"score": score} for picture, score in zip(pictures_of(compared), scores.values())],
             drawings=pictures_of(drawn),

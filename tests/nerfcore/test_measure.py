@@ -215,6 +215,8 @@ def test_while_the_scale_is_not_known_nothing_is_held_against_metres(project: Pa
     assert written.rows[0][-2:] == ["2.5000", ""]
     assert "The scale is not known" in written.text
     assert "mean square" not in written.text
+    sizes = [table for table in sections(project, "main", {}, read_measures(project, "main")) if "areas" in table.title]
+    assert {table.text for table in sizes} == {"The scale is not known: sizes are in scene units."}
     earlier = read_measures(project, "main") or {}
     earlier["distances"][0]["difference"] = -1.5  # as earlier versions wrote it
     (written,) = [table for table in sections(project, "main", {}, earlier) if "Control" in table.title]

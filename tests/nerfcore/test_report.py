@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -82,6 +83,22 @@ def test_another_person_finds_what_is_needed_to_repeat_it(project: Path) -> None
     assert "somebody" not in html
     assert html.count("data:image/png") == 1  # the drawing
     assert "03.jpg" not in html
+
+
+def test_sizes_of_small_things_keep_their_digits_and_have_units(project: Path) -> None:
+    path = project / "exports/main" / MEASURES
+    measures = json.loads(path.read_text())
+    pin = {"name": "pin", "use": "check", "length": 0.00204, "low": 0.00202, "high": 0.00206, "known": 0.002}
+    write_json(path, measures | {"distances": [pin | {"difference": 0.00004}]})
+    with edit_project(project) as edited:
+        mesh = next(step for step in edited.provenance if step.verb == "mesh").result
+        edited.record("mesh", {"run": "main"}, mesh | {"classes": {"top": {"faces": 160, "area": 0.00012345}}})
+    html = Path(report(ReportParams(project=project), Reporter())["file"]).read_text("utf-8")
+    assert '<td class="n">0.0001234</td>' in html
+    assert "area (m²)</th></tr>" in html
+    for cell in ("0.002040", "0.002020 … 0.002060", "+0.040 mm"):
+        assert f"<td>{cell}</td>" in html
+    assert "Root mean square of their differences: 0.040 mm" in html
 
 
 def test_held_out_photos_may_have_dots_in_their_names(project: Path) -> None:

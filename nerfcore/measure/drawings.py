@@ -66,7 +66,7 @@ class Subject:
         if row is None:
             size = significant(self.area(class_id))
         else:
-            size = amount(row["area"], (row["area_high"] - row["area_low"]) / 2)
+            size = amount(row["area"], row["area_high"] - row["area"])  # the lower end is never below 0
         return f"{size} {unit}".replace(" ", NO_BREAK)
 
     def texts(self) -> list[str]:

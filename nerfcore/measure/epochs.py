@@ -181,7 +181,7 @@ def _area(subject: Subject, class_id: int | None) -> Area:
     row = subject.measures.get(class_id)
     if row is None:
         return subject.area(class_id), None
-    return row["area"], (row["area_high"] - row["area_low"]) / (2 * K)
+    return row["area"], (row["area_high"] - row["area"]) / K  # the lower end is never below 0
 
 
 def distance_colors(distance: np.ndarray, unit: str) -> tuple[np.ndarray, list[Entry]]:

@@ -208,6 +208,9 @@ def test_large_areas_are_written_without_exponents(tmp_path: Path) -> None:
     row = {"id": 1, "name": "concrete", "area": 1234.5, "area_low": 1196.5, "area_high": 1272.5}
     write_json(folder / "exports/main" / MEASURES, {"unit": "m", "classes": [row]})
     assert load_subject(folder, "main").size_text(1).replace("\u00a0", " ") == "1234 ± 38 m²"
+    row |= {"area": 1.0, "area_low": 0.0, "area_high": 2.96}  # the interval ends at 0, the uncertainty does not
+    write_json(folder / "exports/main" / MEASURES, {"unit": "m", "classes": [row]})
+    assert load_subject(folder, "main").size_text(1).replace("\u00a0", " ") == "1.0 ± 2.0 m²"
     box = trimesh.creation.box(bounds=[[0, 0, 0], [3e5, 2e5, 10]])
     big = tmp_path / "land"
     save_project(big, Project(classes=CLASSES))

@@ -81,6 +81,8 @@ def measure(params: MeasureParams, report: Reporter) -> dict[str, Any]:
             "The scale is not known: distances in metres are held against nothing. Set the scale with "
             "`fieldwork align --scale`, then run `fieldwork mesh` and `fieldwork measure` again."
         )
+    if scale.unit != METRES and params.scale_error is not None:
+        report.warn("--scale-error is not used: the scale is not known, and sizes are in scene units.")
     if abs(scale.factor - 1) > K * max(scale.u, 1e-6):
         report.warn(
             f"By the distances to scale by, lengths are {100 * (scale.factor - 1):+.2f} % off: set the scale with "

@@ -206,7 +206,8 @@ def test_while_the_scale_is_not_known_nothing_is_held_against_metres(project: Pa
     with edit_project(project) as edited:
         edited.frame.scale_known = False
     report = Reporter()
-    (row,) = measure(MeasureParams(project=project, distances=table), report)["distances"]
+    (row,) = measure(MeasureParams(project=project, distances=table, scale_error=2), report)["distances"]
+    assert [warning for warning in report.warnings if "--scale-error is not used" in warning]
     assert (row["known"], row["difference"]) == (2.5, None)
     assert [warning for warning in report.warnings if "scale is not known" in warning and "align --scale" in warning]
     (written,) = [

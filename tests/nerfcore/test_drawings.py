@@ -232,6 +232,18 @@ def test_a_long_legend_makes_the_sheet_higher() -> None:
     assert right <= figure.bbox.x1
 
 
+def test_long_titles_and_notes_stay_on_the_sheet() -> None:
+    window = {"low": np.zeros(2), "high": np.full(2, 0.05), "scale": 1.0, "axes": ("x", "y")}
+    title, note = "weathered parapet of the northern front: section z=1.2, turned 30°", "noise ±0.0123 units (95 %)"
+    figure = _figure(Sheet(title, metric=False, image=np.zeros((4, 4, 3), np.uint8), note=note, **window))
+    figure.canvas.draw()
+    assert max(text.get_window_extent().x1 for text in figure.texts) <= figure.bbox.x1
+    shown = {text.get_text(): text for text in figure.texts}
+    assert title in shown
+    assert any(note in text for text in shown)
+    assert shown[title].get_fontsize() > 8
+
+
 def test_characters_that_no_font_has_are_named_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lettering, "FONTS", ("DejaVu Sans",))
     folder, report = named(tmp_path / "wall", "裂缝", "moss"), Reporter()

@@ -6,7 +6,6 @@ Exit codes: 0 done · 1 failed · 2 wrong usage · 3 done, but with warnings or 
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 import sys
@@ -292,7 +291,11 @@ def main(arguments: list[str] | None = None) -> int:
     open_standard_streams()
     keep_quiet_about_destructors()
     logging.basicConfig(level=logging.ERROR, format="%(message)s", stream=sys.stderr)
-    group = _Commands("fieldwork", help="Photos to a semantic radiance field, and the field into labelled meshes.")
+    group = _Commands(
+        "fieldwork",
+        help="Photos to a semantic radiance field, and the field into labelled meshes.",
+        context_settings={"help_option_names": ["-h", "--help"]},
+    )
     group.params.append(
         click.Option(
             ["--version"],
@@ -312,9 +315,14 @@ def main(arguments: list[str] | None = None) -> int:
     except click.ClickException as error:
         if "--json" in (sys.argv[1:] if arguments is None else arguments):
             failure = {"code": "usage", "message": error.format_message(), "hint": "fieldwork --help"}
-            print(json.dumps({"error": failure}, ensure_ascii=False))
+            with suppress(NoReader), stdout_for_results() as stdout:
+                print_json({"error": failure}, stdout)
+                stdout.flush()
         error.show()
         return error.exit_code
+    except OSError as error:  # of help that nobody takes; verbs tell of their own
+        click.echo(f"Nothing can be printed: {error.strerror} on standard output.", err=True)
+        return 1
     return code if isinstance(code, int) else 0
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import json
 import logging
 import os
@@ -34,7 +35,7 @@ class NoReader(FieldworkError):
 
 def open_standard_streams() -> None:
     """Lead closed standard streams to nothing; else the next file that is opened takes their number, and what native
-    libraries print goes into it."""
+    libraries print goes into it. Characters that the terminal's encoding lacks become escapes."""
     for number, name in ((0, "stdin"), (1, "stdout"), (2, "stderr")):
         try:
             os.fstat(number)
@@ -46,6 +47,8 @@ def open_standard_streams() -> None:
                 os.close(opened)
         if getattr(sys, name) is None:
             setattr(sys, name, os.fdopen(number, "r" if number == 0 else "w", encoding="utf-8", closefd=False))
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
 
 
 class _Results:

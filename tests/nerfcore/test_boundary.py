@@ -199,6 +199,40 @@ def test_results_that_nobody_takes(tmp_path: Path, redirection: str, words: str)
     assert "Traceback" not in told
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="POSIX shells")
+@pytest.mark.parametrize(
+    ("command", "code", "words"),
+    [
+        ("nosuch --json >/dev/full", 2, "No such command"),
+        ("nosuch --json | sleep 0", 2, "No such command"),
+        ("--help >/dev/full", 1, "No space left"),
+        ("train -h | sleep 0", 1, ""),
+    ],
+)
+def test_help_and_wrong_usage_that_nobody_takes(command: str, code: int, words: str) -> None:
+    command = f"{' '.join(COMMAND)} {command}; echo ${{PIPESTATUS[0]}} >&2"
+    done = subprocess.run(
+        ["bash", "-c", command], env=ENVIRONMENT, cwd=ROOT.parent, capture_output=True, timeout=60, check=False
+    )
+    told = done.stderr.decode()
+    assert words in told
+    assert told.rstrip().endswith(str(code))
+    assert "Traceback" not in told
+
+
+@pytest.mark.parametrize(("arguments", "code"), [("plan . --views nope --json", 2), ("section -h", 0)])
+def test_terminals_that_lack_characters(arguments: str, code: int) -> None:
+    environment = {**ENVIRONMENT, "PYTHONIOENCODING": "latin-1"}
+    command = [*COMMAND, *arguments.split()]
+    done = subprocess.run(command, env=environment, cwd=ROOT.parent, capture_output=True, timeout=60, check=False)
+    assert done.returncode == code
+    assert b"Traceback" not in done.stderr
+    if "--json" in arguments:
+        assert "“views.0”" in json.loads(done.stdout)["error"]["message"]
+    else:
+        assert b"\\u2026" in done.stdout
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="limits of POSIX")
 def test_files_may_only_be_small(tmp_path: Path) -> None:
     project = ball_project(tmp_path / "p")

@@ -10,7 +10,7 @@ import torch
 from ..config import MOST_VERTICES, RunConfig
 from ..data.box import Box, box_poses, choose_box, looks_inward
 from ..data.load import load_scene
-from ..data.pixels import PixelStore
+from ..data.pixels import VOID, PixelStore
 from ..data.scene import Scene
 from ..errors import SettingError, TrainingError
 from ..field.blend import RESOLUTION
@@ -68,7 +68,8 @@ def plan_run(
     """Decide what a run will be: its views, classes and box, and the settings that follow from the photos.
 
     Raises:
-        TrainingError: fewer than two posed training images. SettingError: an environment behind transparent photos.
+        TrainingError: fewer than two posed training images, or more classes than a field tells apart.
+        SettingError: an environment behind transparent photos.
     """
     project, scene = load_project(project_folder), load_scene(project_folder, holdout)
     train = training_views(scene, config)
@@ -95,6 +96,11 @@ def plan_run(
         across = pixels_across(scene, train, box, config.scene.image_size)
         config.field.finest = min(max(across, 2 * config.field.coarsest), MOST_VERTICES)
     class_ids = present_classes(scene, train) if config.loss.semantic_weight > 0 else []
+    if len(class_ids) > VOID:
+        raise TrainingError(
+            f"The labels of {project_folder} hold {len(class_ids)} classes; a field tells at most {VOID} apart.",
+            "Leave some out of the project's classes, or train without: --set loss.semantic_weight=0.",
+        )
     priority = {c.id: c.priority for c in scene.classes}
     info = RunInfo(
         preset=preset,

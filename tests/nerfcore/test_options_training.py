@@ -13,9 +13,12 @@ import torch
 from fieldwork.nerfcore.config import LossConfig, SceneConfig
 from fieldwork.nerfcore.data.box import choose_box
 from fieldwork.nerfcore.data.pixels import VOID
+from fieldwork.nerfcore.errors import TrainingError
 from fieldwork.nerfcore.geometry.similarity import similarity_scale
 from fieldwork.nerfcore.params import TrainParams
 from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.project.schema import SemanticClass
+from fieldwork.nerfcore.project.store import load_project, save_project
 from fieldwork.nerfcore.render.image import background_of
 from fieldwork.nerfcore.render.run import CPU_IMAGE_SIZE, GPU_IMAGE_SIZE, RunInfo
 from fieldwork.nerfcore.train import losses, verb
@@ -30,6 +33,7 @@ from fieldwork.tests.nerfcore.support.settings import config_of, trainer_of
 from fieldwork.tests.nerfcore.test_visibility import ball as points_on_a_ball
 from fieldwork.tests.nerfcore.test_visibility import half_ring
 from fieldwork.tests.nerfcore.test_visibility import scene as scene_of
+from PIL import Image
 
 
 @pytest.fixture(scope="module")
@@ -200,6 +204,22 @@ def test_without_semantics_there_are_no_classes(ball: Path) -> None:
     trainer = trainer_of(ball, **{"loss.semantic_weight": "0"})
     assert trainer.model.field.semantic_head is None
     assert planned(ball, **{"loss.semantic_weight": "0"}).class_ids == []
+
+
+def test_more_classes_than_labels_can_hold_are_refused(tmp_path: Path) -> None:
+    project = ball_project(tmp_path / "ball", views=3, side=32)
+    saved = load_project(project)
+    saved.classes = [SemanticClass(id=i, name=f"class {i}", color=(0.5, 0.5, 0.5)) for i in range(1, 257)]
+    save_project(project, saved)
+    every = 1 + np.arange(32 * 32).reshape(32, 32) % 256
+    for path in (project / "labels").iterdir():
+        Image.fromarray(every.astype(np.uint16)).save(path)
+    with pytest.raises(TrainingError, match="hold 256 classes; a field tells at most 255 apart"):
+        planned(project)
+    assert planned(project, **{"loss.semantic_weight": "0"}).class_ids == []
+    saved.classes.pop()
+    save_project(project, saved)
+    assert len(planned(project).class_ids) == 255
 
 
 @pytest.mark.setting("loss.sparsity_weight", "loss.sparsity", "loss.sparsity_scale")

@@ -156,8 +156,8 @@ def make_trainer(project_folder: Path, info: RunInfo, scene: Scene, device: torc
         )
     degrade(store, config)
     space = space_of(scene, trained, box, config, device)
-    seen, unknown = (_refined(cells, config.sampling.resolution).cpu() for cells in (space.views > 0, space.unknown))
-    model = new_model(info, device, seen, unknown)
+    shown, known = (_at_resolution(cells, config.sampling.resolution) for cells in (space.views > 0, ~space.unknown))
+    model = new_model(info, device, shown, ~known)
     model.occupancy.empty_distance.fill_(space.empty_distance)
     if model.field.blend is not None:
         model.field.blend.views.copy_((space.views / VIEWS_ENOUGH).clamp(max=1))
@@ -192,11 +192,12 @@ def space_of(scene: Scene, trained: list[int], box: Box, config: RunConfig, devi
     return known_space(cameras, poses, points, focus, RESOLUTION, box.contracted, config.sampling)
 
 
-def _refined(cells: torch.Tensor, resolution: int) -> torch.Tensor:
-    """A cubic grid of cells (N³,) at another resolution (resolution³,)."""
+def _at_resolution(cells: torch.Tensor, resolution: int) -> torch.Tensor:
+    """A cubic grid of cells (N³,) bool at another resolution (resolution³,), on the CPU: those that any of the cells reaches
+    into."""
     side = round(len(cells) ** (1 / 3))
-    index = (torch.arange(resolution, device=cells.device) * side) // resolution
-    return cells.view(side, side, side)[index][:, index][:, :, index].reshape(-1)
+    grid = cells.cpu().view(1, side, side, side).float()
+    return torch.nn.functional.adaptive_max_pool3d(grid, resolution).view(-1) > 0
 
 
 def degrade(store: PixelStore, config: RunConfig) -> None:

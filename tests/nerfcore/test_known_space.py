@@ -11,6 +11,7 @@ import pytest
 import torch
 from fieldwork.nerfcore.config import SamplingConfig
 from fieldwork.nerfcore.geometry.cameras import Camera
+from fieldwork.nerfcore.kernels.cells_torch import cell_index
 from fieldwork.nerfcore.params import RenderParams, TrainParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.schema import Poses
@@ -24,6 +25,7 @@ from fieldwork.nerfcore.sampling.visibility import cells_at
 from fieldwork.nerfcore.train.closed_picture import COLORS, write_closed_picture
 from fieldwork.nerfcore.verbs import run_verb
 from fieldwork.tests.nerfcore.support.ball import SMALL, ball_project
+from fieldwork.tests.nerfcore.support.settings import trainer_of
 from matplotlib.colors import to_rgb
 from scipy.ndimage import find_objects, label
 
@@ -193,6 +195,22 @@ def test_the_pass_of_unknown_space_is_in_the_exr(one_side: Path, tmp_path: Path)
     image = oiio.ImageBuf(next(path for path in result["frames"] if path.endswith(".exr")))
     assert "Unknown.V" in image.spec().channelnames
     assert any(path.endswith("_unknown.png") for path in result["frames"])
+
+
+@pytest.mark.parametrize("resolution", ["16", "48"])
+def test_a_cell_is_shown_where_photos_show_a_part_of_it(one_side: Path, resolution: str) -> None:
+    """Coarser grids than that of the photos' views close nothing that a photo shows."""
+    trainer = trainer_of(one_side, **{"sampling.resolution": resolution, "scene.contraction": "on"})
+    space, grid = trainer.space, trainer.model.occupancy
+    assert space is not None
+    axis = (torch.arange(space.resolution) + 0.5) / space.resolution
+    z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
+    centers = torch.stack([x, y, z], -1).view(-1, 3)
+    side = int(resolution)
+    cell = cell_index(centers, side)
+    assert grid.seen[cell[space.views > 0]].all()
+    assert not grid.unknown[cell[~space.unknown]].any()
+    assert 0 < int(grid.unknown.sum()) < side**3
 
 
 def test_training_shows_what_the_rules_closed(one_side: Path) -> None:

@@ -126,7 +126,8 @@ def _of_points(
 
 
 def _of_map(view: View, camera: Camera, scale: float, free: np.ndarray) -> Found:
-    """The same of evenly spread pixels of a view's depth map (distance along the optical axis, 0 unknown)."""
+    """The same of evenly spread pixels of a view's depth map (distance along the optical axis, of a panorama along the ray;
+    0 unknown)."""
     if view.depth is None:
         return np.zeros((0, 3)), np.zeros(0), np.zeros(0)
     depth = read_depth(view.depth)
@@ -136,9 +137,9 @@ def _of_map(view: View, camera: Camera, scale: float, free: np.ndarray) -> Found
     )
     z = depth[y * depth.shape[0] // camera.height, x * depth.shape[1] // camera.width] * scale
     direction, valid = rays(camera, np.stack([x, y], 1) + 0.5)
-    valid &= (z > 0) & np.isfinite(z) & free[y, x] & (direction[:, 2] > 1e-3)
-    direction = direction[valid]
-    return direction, z[valid] / direction[:, 2], np.ones(len(direction))
+    along = np.ones(len(z)) if camera.model == "EQUIRECTANGULAR" else direction[:, 2]
+    valid &= (z > 0) & np.isfinite(z) & free[y, x] & (along > 1e-3)
+    return direction[valid], z[valid] / along[valid], np.ones(valid.sum())
 
 
 def depth_scale(world_from_sfm: np.ndarray, box_from_world: np.ndarray) -> float:

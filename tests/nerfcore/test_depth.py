@@ -6,17 +6,20 @@ import math
 from pathlib import Path
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 import torch
 from fieldwork.nerfcore.config import make_config
 from fieldwork.nerfcore.data.box import box_poses
 from fieldwork.nerfcore.data.load import load_scene
+from fieldwork.nerfcore.data.scene import View
+from fieldwork.nerfcore.geometry.cameras import Camera
 from fieldwork.nerfcore.images.working import read_picture
 from fieldwork.nerfcore.params import TrainParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.render.image import render_view
 from fieldwork.nerfcore.render.run import load_trained
-from fieldwork.nerfcore.train.depth import DepthRays, depth_loss, point_trust
+from fieldwork.nerfcore.train.depth import DepthRays, _of_map, depth_loss, point_trust
 from fieldwork.nerfcore.train.prepare import make_trainer, plan_run
 from fieldwork.nerfcore.verbs import run_verb
 from fieldwork.tests.nerfcore.support.ball import RADIUS, SMALL, ball_project
@@ -49,6 +52,17 @@ def test_rays_of_depth_maps_end_on_the_surface(tmp_path: Path) -> None:
     assert len(known) > 7 * 100
     assert torch.allclose(ends.norm(dim=1), torch.full((len(ends),), RADIUS), atol=1e-3)
     assert bool((known.weight == 1).all())
+
+
+def test_depth_of_a_panorama_is_along_the_ray(tmp_path: Path) -> None:
+    camera = Camera(model="EQUIRECTANGULAR", width=32, height=16, fx=16, fy=16, cx=16, cy=8)
+    depth = tmp_path / "depth.exr"
+    oiio.ImageBuf(np.full((16, 32, 1), 2.0, np.float32)).write(str(depth))
+    view = View("all around", camera, np.eye(4), Path(), depth=depth)
+    direction, distance, weight = _of_map(view, camera, 0.5, np.ones((16, 32), bool))
+    assert len(direction) == len(weight) == 32 * 16
+    assert np.allclose(distance, 1.0)
+    assert (direction[:, 2] < 0).sum() == 32 * 16 // 2  # behind it as well
 
 
 def test_points_that_reproject_badly_are_trusted_less() -> None:

@@ -36,7 +36,7 @@ class Job(Reporter):
             verb=verb,
             params=params.model_dump(mode="json"),
             pid=os.getpid(),
-            pid_started=st.process_start(os.getpid()) or time.time(),
+            pid_started=st.process_start(os.getpid()) or 0.0,
             log=str(self.log_path) if self.project else "",
         )
         self.answered = False

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import os
+import socket
 import sys
 import time
 from dataclasses import asdict, dataclass, field, fields
@@ -23,12 +24,13 @@ from ..files import json_lines, write_text
 FOLDER = "jobs"
 FINISHED = ("done", "failed", "cancelled")
 HEARTBEAT = 5.0  # seconds between writes of a running job that has nothing new to say
-STALE = 30.0  # a job not written for so long is dead where the start time of a process cannot be read
+STALE = 30.0  # a job not written for so long is dead where its process, or when that started, cannot be seen
 
 
 @dataclass
 class JobStatus:
-    """`state`: queued, running, done, failed, cancelled; `read_job` adds died. Times are seconds since the epoch."""
+    """`state`: queued, running, done, failed, cancelled; `read_job` adds died. Times are seconds since the epoch, but for
+    `pid_started`: see `process_start`. `host`: the computer that runs it."""
 
     id: str
     verb: str
@@ -36,6 +38,7 @@ class JobStatus:
     state: str = "queued"
     pid: int = 0
     pid_started: float = 0.0
+    host: str = field(default_factory=socket.gethostname)
     stage: str = ""
     fraction: float | None = None
     message: str = ""
@@ -133,7 +136,10 @@ def prune_jobs(project: Path, keep: JobStatus) -> None:
 
 
 def engine_alive(status: JobStatus) -> bool:
-    """Whether the process that runs the job still lives (and its number was not given to another)."""
+    """Whether the process that runs the job still lives (and its number was not given to another); of another computer, which
+    shares the folder, whether it has given a sign of life."""
+    if status.host != socket.gethostname():
+        return abs(time.time() - status.updated) < STALE
     if status.pid <= 0 or not process_exists(status.pid):
         return False
     started = process_start(status.pid)
@@ -143,16 +149,16 @@ def engine_alive(status: JobStatus) -> bool:
 
 
 def process_start(pid: int) -> float | None:
-    """When a process started, in seconds since the epoch; None where that cannot be read."""
+    """When a process started, in seconds since the system did, which no clock that is set changes; None where that cannot be
+    read."""
     if sys.platform != "linux":
         return None
     try:
         # The name of the program stands in parentheses and may hold blanks.
         after_name = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2]
-        boot = next(line for line in Path("/proc/stat").read_text().splitlines() if line.startswith("btime"))
-    except (OSError, StopIteration):
+    except OSError:
         return None
-    return int(boot.split()[1]) + int(after_name.split()[19]) / os.sysconf("SC_CLK_TCK")
+    return int(after_name.split()[19]) / os.sysconf("SC_CLK_TCK")
 
 
 def process_exists(pid: int) -> bool:

@@ -7,6 +7,7 @@ import io
 import json
 import os
 import queue
+import re
 import signal
 import subprocess
 import sys
@@ -355,6 +356,30 @@ def test_a_reused_process_number_is_not_taken_for_the_engine(project):
         "x", "count", {}, state="running", pid=os.getpid(), pid_started=(st.process_start(os.getpid()) or 0) - 100
     )
     st.write_job(project, job)
+    assert only_job(project).state == "died"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_a_clock_that_is_set_does_not_end_a_job(project, monkeypatch):
+    job = st.JobStatus("x", "count", {}, state="running", pid=os.getpid(), pid_started=st.process_start(os.getpid()))
+    st.write_job(project, job)
+    read = Path.read_text
+
+    def set_forward(path, *args, **values):
+        """The kernel takes the time at which it started from the clock."""
+        text = read(path, *args, **values)
+        return re.sub(r"btime (\d+)", lambda m: f"btime {int(m[1]) + 3600}", text) if path.name == "stat" else text
+
+    monkeypatch.setattr(Path, "read_text", set_forward)
+    assert only_job(project).state == "running"
+
+
+def test_a_job_of_another_computer_lives_as_long_as_it_is_written(project):
+    job = st.JobStatus("x", "count", {}, state="running", pid=2**22 + 1, host="another")
+    st.write_job(project, job)
+    assert only_job(project).state == "running"
+    path = st.job_path(project, "x")
+    path.write_text(json.dumps(dataclasses.asdict(job) | {"updated": time.time() - 2 * st.STALE}))
     assert only_job(project).state == "died"
 
 

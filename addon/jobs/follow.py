@@ -14,27 +14,28 @@ PERIOD = 0.5  # seconds between two looks at the files
 
 
 def reattach(queue: Queue, project: Path) -> None:
-    """Follow a job that another process runs on the project, and tell of one that died."""
+    """Follow the job that another process runs on the project, or is about to; else tell of one that died."""
     if queue.running and queue.running.project == project:
         return
     from ...nerfcore.engine.status import list_jobs  # not at the top: enabling the extension must be quick
 
     queue.followed = None
-    for status in reversed(list_jobs(project)):
-        if status.state == "running":
-            queue.followed = Job(
-                status.verb, status.params, status.id, project, state="running", followed=True,
-                started=time.monotonic() - max(0.0, time.time() - (status.started or time.time())),
-                on_done=refresh.refresh_scenes,
-            )  # fmt: skip
-            follow(queue)
-            break
-        if status.state == "died" and all(job.id != status.id for job in queue.finished):
-            job = Job(status.verb, status.params, status.id, project, state="failed", stage=status.stage)
-            error = status.error or {}
-            job.error = EngineError("died", error.get("message", ""), error.get("hint", ""))
-            queue.remember(job)
-            break
+    jobs = list_jobs(project)
+    status = next((job for state in ("running", "queued") for job in jobs if job.state == state), None)
+    died = [job for job in jobs if job.state == "died" and all(told.id != job.id for told in queue.finished)]
+    if status is not None:
+        queue.followed = Job(
+            status.verb, status.params, status.id, project, state=status.state, followed=True,
+            started=time.monotonic() - max(0.0, time.time() - (status.started or time.time())),
+            on_done=refresh.refresh_scenes,
+        )  # fmt: skip
+        follow(queue)
+    elif died:
+        status = died[-1]
+        job = Job(status.verb, status.params, status.id, project, state="failed", stage=status.stage)
+        error = status.error or {}
+        job.error = EngineError("died", error.get("message", ""), error.get("hint", ""))
+        queue.remember(job)
     queue.redraw()
 
 
@@ -52,14 +53,23 @@ def follow(queue: Queue) -> None:
         job.take_event(event)
     job.seconds = time.monotonic() - (job.started or time.monotonic())
     if status is not None and not status.finished:
+        if (job.state, status.state) == ("queued", "running"):
+            job.state, job.started = "running", time.monotonic()
         job.stage, job.fraction = status.stage, status.fraction
         job.message, job.eta = status.message, status.eta_s
         return
     queue.followed = None
+    if status is None:
+        # The next job of its kind takes the place of one that has ended.
+        reattach(queue, job.project)
+        if queue.followed is not None:
+            refresh.refresh_scenes(job)
+            return
     if status is not None and status.state == "done":
         queue.finish(job, status.result, None)
+    else:
+        error = (status.error if status else None) or {"code": "died", "message": "The job is gone."}
+        kind = "cancelled" if status and status.state == "cancelled" else error.get("code", "died")
+        queue.finish(job, None, EngineError(kind, error.get("message", ""), error.get("hint", "")))
+    if status is not None and status.state != "died":
         reattach(queue, job.project)  # the next one of those that were left to the engine
-        return
-    error = (status.error if status else None) or {"code": "died", "message": "The job is gone."}
-    kind = "cancelled" if status and status.state == "cancelled" else error.get("code", "died")
-    queue.finish(job, None, EngineError(kind, error.get("message", ""), error.get("hint", "")))

@@ -20,7 +20,7 @@ from fieldwork.addon.jobs import (  # noqa: E402
     refresh,
     timer,
 )
-from fieldwork.addon.jobs.follow import reattach  # noqa: E402
+from fieldwork.addon.jobs.follow import follow, reattach  # noqa: E402
 from fieldwork.addon.jobs.job import CURVE_POINTS  # noqa: E402
 from fieldwork.addon.jobs.queue import Queue  # noqa: E402
 from fieldwork.addon.jobs.timer import tick  # noqa: E402
@@ -284,6 +284,36 @@ def test_what_waits_goes_on_without_blender_too(queue, project):
         time.sleep(0.1)
     last = st.read_job(st.job_path(project, waiting[-1].id))
     assert (last.state, last.result["steps"]) == ("done", 5)
+
+
+def test_jobs_that_follow_each_other_elsewhere_are_followed_to_the_last(queue, project, refreshed):
+    def write(name, state, **more):
+        job = st.JobStatus(name, "count", {}, state=state, pid=os.getpid(), **more)
+        st.write_job(project, job)
+
+    def look():
+        if queue.followed:
+            queue.followed.looked = 0.0
+        follow(queue)
+
+    write("a", "running", created=1.0)
+    write("b", "queued", created=2.0)
+    write("c", "queued", created=3.0)
+    reattach(queue, project)
+    assert queue.followed.id == "a"
+    write("a", "failed", created=1.0, error={"code": "input", "message": "No photos."})
+    look()
+    assert (queue.followed.id, queue.followed.state) == ("b", "queued")
+    write("b", "running", created=2.0)
+    look()
+    assert queue.followed.state == "running"
+    st.job_path(project, "b").unlink()  # it has ended, and the next one of its kind begins
+    look()
+    assert queue.followed.id == "c"
+    write("c", "done", created=3.0)
+    look()
+    assert queue.followed is None
+    assert [(job.id, job.state) for job in queue.finished] == [("a", "failed"), ("c", "done")]
 
 
 def test_messages_stay_until_read_or_made_good(queue, project, tmp_path):

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import DiskError, FieldworkError, SettingError
-from ..files import atomic_path, file_hash, leads_outside, write_json
+from ..files import atomic_path, file_hash, leads_outside, linked, write_json
 from ..project.fingerprints import digest
 from .link import INSTALL
 
@@ -79,6 +79,12 @@ class Storage:
     def _object(self, name: str) -> str:
         return f"{self.root}/objects/{name[:2]}/{name}"
 
+    def objects(self) -> set[str]:
+        """The names of all contents that are there."""
+        self.fs.invalidate_cache()
+        found = self._told("listing what is there", lambda: self.fs.find(f"{self.root}/objects"))
+        return {place.rpartition("/")[2] for place in found}
+
     def put_object(self, path: Path, name: str) -> None:
         """Upload the contents of a file, unless they are there."""
         target = self._object(name)
@@ -136,7 +142,7 @@ class Copy:
     def __init__(self, storage: Storage, folder: Path, capture: str, tracked: Iterable[Path]) -> None:
         self.storage, self.folder, self.capture = storage, folder, capture
         self.tracked = [path.absolute() for path in tracked]
-        self.state_file = folder / STATE / f"{capture}.json"
+        self.state_file = folder / STATE / digest(storage.url)[:12] / f"{capture}.json"
         self.lock = threading.Lock()
 
     def _state(self) -> dict[str, list[Any]]:
@@ -152,15 +158,44 @@ class Copy:
             inside = [place] if place.is_file() else [path for path in place.rglob("*") if path.is_file()]
             for path in inside:
                 # What the jobs of a project say is of this machine alone. Captures may lie in a folder of that name.
-                if "jobs" not in path.relative_to(place).parts and not path.name.startswith("."):
+                parts = path.relative_to(place).parts
+                half_written = path.name.startswith(".") or any(part.startswith(".new-") for part in parts)
+                if "jobs" not in parts and not half_written:
                     found[path.relative_to(self.folder).as_posix()] = path
         return found
 
-    def fetch(self, wanted: Callable[[str], bool] = lambda _: True, check: Callable[[], None] = lambda: None) -> int:
-        """Bring files here that are wanted and not the same; those that are gone from the storage go. How many came."""
+    def mend(self, objects: set[str]) -> None:
+        """Forget what the storage has lost, so that what there is of it here is uploaded again.
+
+        Args:
+            objects: what the storage has.
+        """
+        state = self._state()
+        if not state:
+            return
+        files = self.storage.files(self.capture)
+        lost = {name for name, entry in files.items() if entry[0] not in objects}
+        gone = {name for name, entry in state.items() if not files or name in lost or entry[0] not in objects}
+        if lost:
+            self.storage.set_files(self.capture, {name: entry for name, entry in files.items() if name not in lost})
+        if gone:
+            write_json(self.state_file, {name: entry for name, entry in state.items() if name not in gone})
+
+    def fetch(
+        self,
+        wanted: Callable[[str], bool] = lambda _: True,
+        check: Callable[[], None] = lambda: None,
+        keep_changes: bool = False,
+    ) -> int:
+        """Bring files here that are wanted and not the same; those that are gone from the storage go. How many came.
+
+        Args:
+            keep_changes: leave files that were changed here and not there.
+        """
         state, files, todo = self._state(), self.storage.files(self.capture), []
         for name, (sha, _, _) in files.items():
-            same = state.get(name) == [sha, *_stamp(self.folder / name)]
+            stamp, known = _stamp(self.folder / name), state.get(name, [""])
+            same = known[0] == sha and bool(stamp) if keep_changes else known == [sha, *stamp]
             if wanted(name) and not same:
                 todo.append(name)
         with ThreadPoolExecutor(THREADS) as pool:
@@ -168,10 +203,11 @@ class Copy:
                 check()
         for name in todo:
             state[name] = [files[name][0], *_stamp(self.folder / name)]
-        for name in [name for name in state if name not in files]:
+        # A storage without a list has lost it: that says nothing of the files here.
+        for name in [name for name in state if files and name not in files]:
             (self.folder / name).unlink(missing_ok=True)
-            del state[name]
-        write_json(self.state_file, state)
+        # What was taken away here before is missing here, and not to be taken away from the others.
+        write_json(self.state_file, {name: entry for name, entry in state.items() if (self.folder / name).is_file()})
         return len(todo)
 
     def _fetch_one(self, name: str, entry: list[Any], check: Callable[[], None]) -> None:
@@ -222,7 +258,7 @@ class Copy:
                     shutil.copyfile(path, source)
                 else:
                     # Such a file is replaced, never changed: a second name keeps its contents while they are read.
-                    os.link(path, source)
+                    linked(str(path), str(source))
                 sha = file_hash(source)
                 self.storage.put_object(source, sha)
                 return [sha, *stamp]

@@ -221,10 +221,12 @@ class Campaign:
         """
         storage = Storage(url)
         self.report.stage("Uploading files")
+        objects = storage.objects()
         for number, (params, _) in enumerate(todo):
             self.report.progress(number / len(todo), params.out.name)
             copy = Copy(storage, folder, capture_name(params, folder), tracked_paths(params))
             self.copies[str(params.out)] = copy
+            copy.mend(objects)
             if copy.changed():
                 copy.upload()
 
@@ -256,7 +258,7 @@ class Campaign:
         if copy is None:
             return
         try:
-            copy.fetch()
+            copy.fetch(keep_changes=True)
         except Exception as error:  # noqa: BLE001 - one capture's files must not stop the others
             known = explained(error)
             task.state = "failed"

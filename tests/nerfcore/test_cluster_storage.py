@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import time
@@ -149,6 +150,87 @@ def test_damaged_contents_and_paths_that_lead_outside_are_refused(tmp_path, url)
     storage.set_files("vase-1", {"../outside": ["0" * 64, 1, 1]})
     with pytest.raises(StorageError, match="outside of the campaign's folder"):
         two.fetch()
+
+
+def test_another_or_an_emptied_storage_takes_no_files_away(tmp_path, url):
+    """The list's folder holds the only copy of the photos."""
+    photo = tmp_path / "one/vase/photo.jpg"
+    photo.parent.mkdir(parents=True)
+    photo.write_bytes(b"photo")
+    machine(tmp_path / "one", url).upload()
+    other = machine(tmp_path / "one", (tmp_path / "another store").as_uri())
+    assert other.changed(), "it has nothing yet"
+    other.fetch()
+    assert photo.exists()
+    one = machine(tmp_path / "one", url)
+    one.storage.fs.rm(one.storage.root, recursive=True)
+    one.fetch()
+    assert photo.exists()
+
+
+@pytest.mark.parametrize("lost", ["everything", "contents"])
+def test_what_a_storage_has_lost_is_uploaded_again(tmp_path, url, lost):
+    one, two = machine(tmp_path / "one", url), machine(tmp_path / "two", url)
+    (tmp_path / "one/vase").mkdir()
+    (tmp_path / "one/vase/photo.jpg").write_bytes(b"photo")
+    one.upload()
+    two.fetch()
+    (tmp_path / "two/vase/field.bin").write_bytes(b"only the worker has it")
+    two.upload()
+    storage = one.storage
+    storage.fs.rm(storage.root if lost == "everything" else f"{storage.root}/objects", recursive=True)
+    one.mend(storage.objects())
+    assert one.changed()
+    one.upload()
+    shutil.rmtree(tmp_path / "two")
+    assert machine(tmp_path / "two", url).fetch() == 1
+    assert (tmp_path / "two/vase/photo.jpg").read_bytes() == b"photo"
+
+
+def test_files_that_a_worker_lost_stay_with_the_others(tmp_path, url):
+    """Its copies lie in a temporary folder, which systems tidy up."""
+    one, two = machine(tmp_path / "one", url), machine(tmp_path / "two", url)
+    (tmp_path / "one/vase").mkdir()
+    photo = tmp_path / "one/vase/photo.jpg"
+    photo.write_bytes(b"photo")
+    one.upload()
+    two.fetch()
+    (tmp_path / "two/vase/photo.jpg").unlink()
+    two.fetch(lambda name: not name.endswith(".jpg"))
+    (tmp_path / "two/vase/field.bin").write_bytes(b"trained")
+    two.upload()
+    one.fetch()
+    assert photo.exists()
+    assert (tmp_path / "one/vase/field.bin").exists()
+
+
+def test_what_was_changed_here_meanwhile_stays(tmp_path, url):
+    one, two = machine(tmp_path / "one", url), machine(tmp_path / "two", url)
+    (tmp_path / "one/vase").mkdir()
+    for name in ("label.png", "project.json"):
+        (tmp_path / "one/vase" / name).write_text("{}")
+    one.upload()
+    two.fetch()
+    (tmp_path / "two/vase/project.json").write_text('{"from": "two"}')
+    two.upload()
+    (tmp_path / "one/vase/label.png").write_text("edited while the campaign ran")
+    assert one.fetch(keep_changes=True) == 1
+    assert (tmp_path / "one/vase/label.png").read_text() == "edited while the campaign ran"
+    assert "two" in (tmp_path / "one/vase/project.json").read_text()
+    assert one.changed(), "it is uploaded the next time"
+
+
+def test_files_are_uploaded_from_a_disk_without_hard_links(tmp_path, monkeypatch):
+    def refused(*_, **__):
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(os, "link", refused)
+    one = machine(tmp_path / "one", (tmp_path / "store").as_uri())
+    (tmp_path / "one/vase/.new-x7").mkdir(parents=True)
+    (tmp_path / "one/vase/photo.jpg").write_bytes(b"photo")
+    (tmp_path / "one/vase/.new-x7/mesh.ply").write_bytes(b"half of a mesh")
+    one.upload()
+    assert set(one.storage.files("vase-1")) == {"vase/photo.jpg"}
 
 
 def test_a_storage_that_is_not_there_is_told(tmp_path, s3, monkeypatch):

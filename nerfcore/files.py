@@ -11,7 +11,7 @@ import sys
 import time
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -118,7 +118,8 @@ def atomic_path(path: Path) -> Iterator[Path]:
             yield temporary
             with open(temporary, "rb+") as written:  # Windows syncs only what is open for writing
                 os.fsync(written.fileno())
-            temporary.chmod(0o644)
+            with suppress(PermissionError):  # folders of a network or of Windows, whose files belong to another user
+                temporary.chmod(0o644)
             replace(temporary, path)
         finally:
             temporary.unlink(missing_ok=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import subprocess
@@ -91,6 +92,15 @@ def test_read_only_folder_is_named(small_disk: Path) -> None:
 def test_a_folder_that_takes_no_files_is_named() -> None:
     with pytest.raises(DiskError, match=r"/proc/sub/a\.glb cannot be written: /proc takes no files"):
         require_writable(Path("/proc/sub/a.glb"))
+
+
+def test_a_network_folder_that_gives_no_rights_takes_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(*_: object) -> None:
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(Path, "chmod", refused)
+    write_text(tmp_path / "a.txt", "there")
+    assert (tmp_path / "a.txt").read_text() == "there"
 
 
 def test_keeps_the_suffix_for_image_writers(tmp_path: Path) -> None:

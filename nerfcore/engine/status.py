@@ -15,6 +15,7 @@ import os
 import socket
 import sys
 import time
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -128,11 +129,12 @@ def request_cancel(project: Path, job: str) -> None:
 
 
 def prune_jobs(project: Path, keep: JobStatus) -> None:
-    """Remove older finished jobs of the same verb."""
+    """Remove older finished jobs of the same verb; what another program reads (Windows) is removed with the next job."""
     for job in list_jobs(project):
         if job.verb == keep.verb and job.id != keep.id and job.finished:
             for path in (job_path(project, job.id), events_path(project, job.id), cancel_path(project, job.id)):
-                path.unlink(missing_ok=True)
+                with suppress(OSError):
+                    path.unlink(missing_ok=True)
 
 
 def engine_alive(status: JobStatus) -> bool:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from fieldwork.nerfcore import files
+from fieldwork.nerfcore.engine import status as st
 from fieldwork.nerfcore.errors import DiskError
 from fieldwork.nerfcore.files import write_json, write_text
 from fieldwork.nerfcore.project.runs import fresh_folder, run_folder, swap_in
@@ -70,3 +71,13 @@ def test_a_run_whose_file_is_open_elsewhere_keeps_its_place(tmp_path: Path) -> N
     assert (run / "field.safetensors").read_text() == "old"
     swap_in(tmp_path, "main")
     assert (run / "field.safetensors").read_text() == "new"
+
+
+def test_a_job_begins_while_that_of_an_earlier_one_is_read(tmp_path: Path) -> None:
+    for name in ("old", "new"):
+        st.write_job(tmp_path, st.JobStatus(name, "train", {}, state="done" if name == "old" else "queued"))
+    new = st.JobStatus("new", "train", {}, state="running")
+    with open(st.job_path(tmp_path, "old")):
+        st.prune_jobs(tmp_path, new)
+    st.prune_jobs(tmp_path, new)
+    assert [path.name for path in (tmp_path / st.FOLDER).iterdir()] == ["new.json"]

@@ -81,7 +81,8 @@ def project_lock(project: Path | None, owner: str) -> Iterator[None]:
         nothing_came = came == {FOLDER} and not is_project(project)
         raise
     finally:
-        note.unlink(missing_ok=True)
+        with suppress(OSError):  # a disk that takes no changes any more: what went wrong says so
+            note.unlink(missing_ok=True)
         if nothing_came:
             # Windows keeps the lock file until it is let go of.
             shutil.rmtree(folder, ignore_errors=True)

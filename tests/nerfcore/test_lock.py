@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import signal
@@ -83,6 +84,21 @@ def test_a_killed_holder_lets_go(project: Path) -> None:
     with project_lock(project, "poses"):
         assert (project / "jobs" / "engine.lock.owner").read_text() == f"poses (process {os.getpid()})"
     assert not (project / "jobs" / "engine.lock.owner").exists()
+
+
+def test_a_disk_that_takes_no_changes_hides_nothing(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    remove = Path.unlink
+
+    def refused(path: Path, missing_ok: bool = False) -> None:
+        if path.name == "engine.lock.owner":
+            raise OSError(errno.EROFS, "Read-only file system", str(path))
+        remove(path, missing_ok)
+
+    monkeypatch.setattr(Path, "unlink", refused)
+    with pytest.raises(InputError, match="no photo"), project_lock(project, "poses"):
+        raise InputError("It is no photo.")
+    with project_lock(project, "poses"):
+        pass
 
 
 @pytest.mark.parametrize("photos", ["missing", "empty", "bad"])

@@ -15,6 +15,8 @@ from pathlib import Path
 from typing import IO, Any
 
 Report = Callable[[float, str], None]
+# The last of pip's attempts; uv's words for it.
+_UNREACHABLE = re.compile(r"Retry\(total=0|error sending request|dns error|client error \(Connect\)")
 
 
 class InstallError(Exception):
@@ -71,10 +73,8 @@ class Runner:
         if self.cancelled.is_set():
             raise InstallCancelled
         if status:
-            told = [line for line in lines if line]
-            reason = next((line for line in told if line.lower().startswith("error")), told[-1] if told else "")
             raise InstallError(
-                f"{failure}. {reason[:300].rstrip('.')}. Press Install again to go on; what was loaded is kept. "
+                f"{failure}. {_reason(lines)}. Press Install again to go on; what was loaded is kept. "
                 "If it fails again, see the log."
             )
         return "\n".join(lines)
@@ -84,6 +84,18 @@ class Runner:
             if self.cancelled.wait(0.2):
                 _kill_tree(process)
                 return
+
+
+def _reason(lines: list[str]) -> str:
+    """Why a tool failed, by what it said, without a full stop."""
+    if any(_UNREACHABLE.search(line) for line in lines):  # pip then says that there is no such package
+        return (
+            "The server of the packages cannot be reached: check the network; behind a proxy, set HTTPS_PROXY and start "
+            "Blender again"
+        )
+    told = [line for line in lines if line]
+    reason = next((line for line in told if line.lower().startswith("error")), told[-1] if told else "")
+    return reason[:300].rstrip(".")
 
 
 def _kill_tree(process: subprocess.Popen[str]) -> None:

@@ -120,6 +120,22 @@ def test_broken_package_says_so_and_the_next_try_goes_on(options, lock, tmp_path
     assert place.installed(options.folder)
 
 
+@pytest.mark.parametrize(
+    "said",
+    [
+        "WARNING: Retrying (Retry(total=0, connect=None)) after connection broken by 'NewConnectionError'\n"
+        "ERROR: Could not find a version that satisfies the requirement tiny==1.0 (from versions: none)",
+        "error: Request failed after 3 retries\n  Caused by: error sending request for url (https://pypi.org/simple/)",
+    ],
+    ids=["pip", "uv"],
+)
+def test_a_missing_network_is_told_as_such(tmp_path, said):
+    with open(tmp_path / "log", "w") as log:
+        run = tools.Runner(log, threading.Event(), lambda *_: None)
+        with pytest.raises(InstallError, match=r"cannot be reached: check the network.* HTTPS_PROXY"):
+            run([sys.executable, "-c", f"print({said!r}); exit(1)"], "The packages could not be installed")
+
+
 @pytest.mark.parametrize("other", ["base", "device"])
 def test_a_next_try_with_other_options_has_an_environment_of_its_own(
     options, lock, tmp_path, content_doctor, monkeypatch, other

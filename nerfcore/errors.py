@@ -7,6 +7,10 @@ import os
 from collections.abc import Mapping
 from typing import Any
 
+# What the system says of disks that were taken out and of network folders that are gone.
+GONE = (
+    errno.EIO, errno.ENXIO, errno.ENODEV, errno.ESTALE, errno.ENOTCONN, errno.EHOSTDOWN, errno.EHOSTUNREACH, errno.ETIMEDOUT,
+)  # fmt: skip
 LONGEST_VALUE = 60  # characters of a wrong value that are repeated to the user
 
 
@@ -115,6 +119,15 @@ def disk_refusal(error: OSError, path: object) -> FieldworkError | None:
         )
     if number in (errno.EEXIST, errno.ENOTDIR, errno.EISDIR):
         return DiskError(f"{path} cannot be written: a file is in its way, or a folder.", "Choose another name.")
+    if number in (errno.ENOLCK, errno.EOPNOTSUPP):
+        return DiskError(
+            f"{path} cannot be locked or written: {os.strerror(number)}.",
+            "Let the server of the folder allow locks, or choose a folder on another disk.",
+        )
+    if number in GONE:
+        return DiskError(
+            f"{path} cannot be reached: {os.strerror(number)}.", "Connect its disk or network again, then run it again."
+        )
     if number == errno.ENAMETOOLONG:
         return DiskError(f"{path} cannot be written: the name is too long.", "Choose a shorter one.")
     return None

@@ -86,6 +86,27 @@ def test_a_killed_holder_lets_go(project: Path) -> None:
     assert not (project / "jobs" / "engine.lock.owner").exists()
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="locks files in another way")
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP, errno.EIO, errno.ESTALE])
+def test_a_folder_without_locks_or_that_is_gone_is_named(project: Path, number: int) -> None:
+    code = (
+        "import fcntl, os, sys\n"
+        "def refused(*_): raise OSError(int(sys.argv[1]), os.strerror(int(sys.argv[1])))\n"
+        "fcntl.flock = refused\n"
+        "from nerfcore.cli import main\n"
+        "sys.exit(main(['poses', sys.argv[2], '--json']))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(number), str(project)],
+        capture_output=True,
+        check=False,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+    )
+    error = json.loads(done.stdout)["error"]
+    assert error["code"] == "disk"
+    assert str(project / "jobs") in error["message"]
+
+
 def test_a_disk_that_takes_no_changes_hides_nothing(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     remove = Path.unlink
 

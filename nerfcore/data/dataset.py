@@ -16,6 +16,7 @@ from ..geometry.points import Points
 # A world with y up, turned so that z is up.
 Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 
+OTHER_SHAPE = 0.02  # difference of proportions that rounding sizes does not explain
 FARTHEST = 1e12  # units of a data set's frame: a million times what geographic coordinates in metres reach
 
 
@@ -54,6 +55,23 @@ class Dataset:
     bounds: np.ndarray | None = None
     warnings: list[str] = field(default_factory=list)
     resources: tuple[object, ...] = ()  # temporary folders that live as long as this
+
+
+def lens_at_size(camera: Camera, size: tuple[int, int], image: Path) -> Camera:
+    """The lens of a photo that is `size` (width, height), smaller or larger than the pictures that the lens is given for.
+
+    Raises:
+        InputError: its proportions are others, so that it was turned or cut since.
+    """
+    if size == (camera.width, camera.height):
+        return camera
+    if abs(size[0] / size[1] * camera.height / camera.width - 1) > OTHER_SHAPE:
+        raise InputError(
+            f"{image} is {size[0]}×{size[1]} pixels, but its lens is that of {camera.width}×{camera.height}: it was turned or "
+            "cut after its pose was found.",
+            "Use the photos as they were then.",
+        )
+    return camera.resized(*size)
 
 
 def require(views: Iterable[DatasetView], source: Path, missing: Sequence[str] = ()) -> list[DatasetView]:

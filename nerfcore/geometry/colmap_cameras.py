@@ -12,6 +12,8 @@ MODELS = {
     0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8),
     5: ("OPENCV_FISHEYE", 8), 6: ("FULL_OPENCV", 12), 7: ("FOV", 5), 8: ("SIMPLE_RADIAL_FISHEYE", 4),
     9: ("RADIAL_FISHEYE", 5), 10: ("THIN_PRISM_FISHEYE", 12), 11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+    12: ("SIMPLE_DIVISION", 4), 13: ("DIVISION", 5), 14: ("SIMPLE_FISHEYE", 3), 15: ("FISHEYE", 4), 16: ("EUCM", 6),
+    17: ("EQUIRECTANGULAR", 2),
 }  # fmt: skip
 
 
@@ -23,10 +25,21 @@ def camera_from_colmap(model: str, width: int, height: int, params: Sequence[flo
     """
     p = [float(value) for value in params]
     match model:
-        case "SIMPLE_PINHOLE" | "SIMPLE_RADIAL" | "RADIAL" | "SIMPLE_RADIAL_FISHEYE" | "RADIAL_FISHEYE":
+        case "EQUIRECTANGULAR":
+            # As in transforms.json: no ray depends on the focal length.
+            focal, cx, cy = width / 2, width / 2, height / 2
+            return Camera(model="EQUIRECTANGULAR", width=width, height=height, fx=focal, fy=focal, cx=cx, cy=cy)
+        case (
+            "SIMPLE_PINHOLE"
+            | "SIMPLE_RADIAL"
+            | "RADIAL"
+            | "SIMPLE_FISHEYE"
+            | "SIMPLE_RADIAL_FISHEYE"
+            | "RADIAL_FISHEYE"
+        ):
             fx = fy = p[0]
             cx, cy, extra = p[1], p[2], p[3:]
-        case "PINHOLE" | "OPENCV" | "OPENCV_FISHEYE" | "FULL_OPENCV":
+        case "PINHOLE" | "FISHEYE" | "OPENCV" | "OPENCV_FISHEYE" | "FULL_OPENCV":
             fx, fy, cx, cy, extra = p[0], p[1], p[2], p[3], p[4:]
         case _:
             raise InputError(

@@ -94,6 +94,9 @@ def test_folded_lens_is_marked_invalid() -> None:
         ("OPENCV_FISHEYE", [300, 310, 161, 99, 0.05, -0.01, 0.002, -0.001]),
         ("SIMPLE_RADIAL_FISHEYE", [300, 161, 99, 0.05]),
         ("RADIAL_FISHEYE", [300, 161, 99, 0.05, -0.01]),
+        ("SIMPLE_FISHEYE", [300, 161, 99]),
+        ("FISHEYE", [300, 310, 161, 99]),
+        ("EQUIRECTANGULAR", [320, 200]),
     ],
 )
 def test_projects_like_colmap(model: str, params: list[float]) -> None:

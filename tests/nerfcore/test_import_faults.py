@@ -95,3 +95,20 @@ def test_photos_that_a_model_does_not_place_are_named(tmp_path: Path) -> None:
     (warning,) = read_dataset(tmp_path).warnings
     assert "1 photos have no pose" in warning
     assert "c.png" in warning
+
+
+@pytest.mark.parametrize("format", ["transforms", "colmap"])
+def test_a_photo_that_was_turned_after_its_pose_was_found(tmp_path: Path, format: str) -> None:
+    """Its lens, stretched to the other proportions, would be that of no camera. Smaller photos are fine."""
+    frame = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}
+    lens = {"w": 40, "h": 30, "fl_x": 40, "cx": 20, "cy": 15}
+    if format == "colmap":
+        (tmp_path / "cameras.txt").write_text("1 PINHOLE 40 30 40 40 20 15\n")
+        (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n\n")
+    else:
+        (tmp_path / "transforms.json").write_text(json.dumps({**lens, "frames": [frame]}))
+    Image.new("RGB", (20, 15)).save(tmp_path / "a.png")
+    assert read_dataset(tmp_path).views[0].camera.fx == 20
+    Image.new("RGB", (30, 40)).save(tmp_path / "a.png")
+    with pytest.raises(InputError, match=r"a\.png is 30×40 pixels, but its lens is that of 40×30: it was turned"):
+        read_dataset(tmp_path)

@@ -22,7 +22,7 @@ from ...geometry.points import Points
 from ...images.decode import image_size
 from ...images.names import find_image, labels_and_masks, list_images, unique_names
 from ...progress import shortened
-from ..dataset import Dataset, DatasetView, require
+from ..dataset import Dataset, DatasetView, lens_at_size, require
 
 PLACES = ("sparse/0", "sparse", "colmap/sparse/0", "dense/sparse", ".")
 
@@ -68,13 +68,11 @@ def read(folder: Path) -> Dataset:
     views = []
     companions = labels_and_masks(folder, [path for path, _ in found], names)
     for name, (path, image), (label, mask) in zip(names, found, companions):
-        camera = cameras[image.camera]
-        size = image_size(path)
         views.append(
             DatasetView(
                 name=name,
                 image=path,
-                camera=camera if size == (camera.width, camera.height) else camera.resized(*size),
+                camera=lens_at_size(cameras[image.camera], image_size(path), path),
                 camera_to_world=image.camera_to_world,
                 label=label,
                 mask=mask,

@@ -18,7 +18,7 @@ from ...images.arrays import read_array
 from ...images.decode import image_size
 from ...images.names import labels_and_masks, list_images, unique_names
 from ...images.suffixes import VIDEO_SUFFIXES
-from ..dataset import Dataset, DatasetView, require
+from ..dataset import Dataset, DatasetView, lens_at_size, require
 
 FILE = "poses_bounds.npy"
 
@@ -90,11 +90,10 @@ def _view(name: str, image: Path, matrix: np.ndarray, companions: tuple[Path | N
     pose[:3, 3] = center
     height, width, focal = matrix[:, 4]
     camera = Camera(width=round(width), height=round(height), fx=focal, fy=focal, cx=width / 2, cy=height / 2)
-    size = image_size(image)
     return DatasetView(
         name=name,
         image=image,
-        camera=camera if size == (camera.width, camera.height) else camera.resized(*size),
+        camera=lens_at_size(camera, image_size(image), image),
         camera_to_world=pose,
         label=companions[0],
         mask=companions[1],

@@ -15,17 +15,15 @@ from ...errors import InputError
 from ...geometry.cameras import Camera
 
 
-def camera_from_matrix(k: np.ndarray, size: tuple[int, int], full_size: tuple[int, int] | None = None) -> Camera:
+def camera_from_matrix(k: np.ndarray, size: tuple[int, int]) -> Camera:
     """Pinhole camera from a calibration matrix (3, 3) with pixel centres at integers.
 
     Args:
         k: calibration; a skew is dropped.
-        size: width, height of the image at hand.
-        full_size: those of the image that was calibrated, if different.
+        size: width, height of the image that was calibrated.
     """
-    width, height = full_size or size
-    camera = Camera(width=width, height=height, fx=k[0, 0], fy=k[1, 1], cx=k[0, 2] + 0.5, cy=k[1, 2] + 0.5)
-    return camera if (width, height) == size else camera.resized(*size)
+    width, height = size
+    return Camera(width=width, height=height, fx=k[0, 0], fy=k[1, 1], cx=k[0, 2] + 0.5, cy=k[1, 2] + 0.5)
 
 
 def pose_from_world_to_camera(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ from ...geometry.cameras import Camera
 from ...geometry.frames import upright
 from ...images.decode import image_size
 from ...images.names import find_image, labels_and_masks, unique_names
-from ..dataset import Dataset, DatasetView, require
+from ..dataset import Dataset, DatasetView, lens_at_size, require
 
 RADIAL = {"radial1": 1, "radial3": 3, "radialk1": 1, "radialk3": 3}
 
@@ -71,7 +71,7 @@ def read(folder: Path) -> Dataset:
         try:
             pose[:3, :3] = np.array([float(v) for v in transform["rotation"]]).reshape(3, 3)
             pose[:3, 3] = [float(v) for v in transform["center"]]
-            camera = _camera(intrinsic, image_size(image), path)
+            camera = _camera(intrinsic, image, path)
         except (KeyError, ValueError, TypeError) as error:
             raise InputError(f"{path} is damaged at {image.name}: {error!r}.", "Export the cameras again.") from error
         views.append(
@@ -90,7 +90,7 @@ def read(folder: Path) -> Dataset:
     return Dataset("meshroom", views, frame, confidence, warnings=warnings)
 
 
-def _camera(value: dict[str, Any], size: tuple[int, int], path: Path) -> Camera:
+def _camera(value: dict[str, Any], image: Path, path: Path) -> Camera:
     width, height = int(value["width"]), int(value["height"])
     if "pxFocalLength" in value:
         focal = value["pxFocalLength"]
@@ -118,4 +118,4 @@ def _camera(value: dict[str, Any], size: tuple[int, int], path: Path) -> Camera:
         camera = Camera(model="OPENCV_FISHEYE", distortion=(k1, k2, k3, k4), **placed)
     else:
         raise InputError(f"{path} uses the lens model {kind}.", "Undistort the photos in Meshroom and export again.")
-    return camera if size == (width, height) else camera.resized(*size)
+    return lens_at_size(camera, image_size(image), image)

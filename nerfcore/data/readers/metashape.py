@@ -19,7 +19,7 @@ from ...geometry.frames import rotation_to_z, upright
 from ...geometry.similarity import make_similarity
 from ...images.decode import image_size
 from ...images.names import find_image, labels_and_masks, unique_names
-from ..dataset import Dataset, DatasetView, require
+from ..dataset import Dataset, DatasetView, lens_at_size, require
 
 EARTH = 5_000_000.0  # metres from the centre of the earth beyond which coordinates are geocentric: its radius is 6.4 million
 
@@ -85,7 +85,7 @@ def read(folder: Path) -> Dataset:
         DatasetView(
             name=name,
             image=image,
-            camera=_camera(sensor, image_size(image), path),
+            camera=_camera(sensor, image, path),
             camera_to_world=pose,
             label=label_map,
             mask=mask,
@@ -127,7 +127,8 @@ def _local(chunk: np.ndarray, views: list[DatasetView]) -> np.ndarray:
     return to_local @ chunk
 
 
-def _camera(sensor: ElementTree.Element, size: tuple[int, int], path: Path) -> Camera:
+def _camera(sensor: ElementTree.Element, image: Path, path: Path) -> Camera:
+    size = image_size(image)
     calibration = next(
         (c for c in sensor.findall("calibration") if c.get("class") != "initial"), sensor.find("calibration")
     )
@@ -171,4 +172,4 @@ def _camera(sensor: ElementTree.Element, size: tuple[int, int], path: Path) -> C
         )
     else:
         raise InputError(f"{path} has the lens type {kind}.", "Undistort the photos in Metashape and export again.")
-    return camera if size == (width, height) else camera.resized(*size)
+    return lens_at_size(camera, size, image)

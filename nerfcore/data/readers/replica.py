@@ -18,7 +18,7 @@ from ...geometry.frames import axis_upright
 from ...images.decode import image_size
 from ...images.names import list_images, plain_name
 from ...project.classes import read_classes
-from ..dataset import Dataset, DatasetView, require
+from ..dataset import Dataset, DatasetView, lens_at_size, require
 from .matrices import read_numbers
 
 TRAJECTORIES = ("traj_w_c.txt", "traj.txt")
@@ -58,7 +58,7 @@ def read(folder: Path) -> Dataset:
             DatasetView(
                 name=plain_name(image),
                 image=image,
-                camera=own if size == (own.width, own.height) else own.resized(*size),
+                camera=lens_at_size(own, size, image),
                 camera_to_world=poses[number],
                 label=labels.get(number),
                 depth=depths.get(number),

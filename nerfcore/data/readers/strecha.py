@@ -10,7 +10,7 @@ from ...errors import InputError
 from ...geometry.frames import axis_upright
 from ...images.decode import image_size
 from ...images.names import beside, find_image, plain_name
-from ..dataset import Dataset, DatasetView, require
+from ..dataset import Dataset, DatasetView, lens_at_size, require
 from .matrices import camera_from_matrix, read_numbers
 
 
@@ -43,7 +43,7 @@ def read(folder: Path) -> Dataset:
             DatasetView(
                 name=plain_name(image),
                 image=image,
-                camera=camera_from_matrix(np.array(rows[:3]), image_size(image), full_size),
+                camera=lens_at_size(camera_from_matrix(np.array(rows[:3]), full_size), image_size(image), image),
                 camera_to_world=pose,
                 label=beside(folder / "labels", stem),
                 mask=beside(folder / "masks", stem, exact=False),

@@ -20,7 +20,7 @@ from ...geometry.points import Points
 from ...images.decode import image_size
 from ...images.names import find_image, labels_and_masks, unique_names
 from ...project.classes import read_classes
-from ..dataset import Dataset, DatasetView, require
+from ..dataset import Dataset, DatasetView, lens_at_size, require
 from ..up_axis import choose_up
 
 SPLIT_FILES = {"transforms_train.json": "train", "transforms_test.json": "test", "transforms_val.json": "val"}
@@ -145,7 +145,7 @@ def _view(
     return DatasetView(
         name=name,
         image=image,
-        camera=_lens(frame, width, height, name, folder),
+        camera=lens_at_size(_lens(frame, width, height, name, folder), (width, height), image),
         camera_to_world=flip_camera_axes(matrix),
         label=label,
         mask=mask,
@@ -182,7 +182,7 @@ def _optional(folder: Path, value: Any) -> Path | None:
 
 
 def frame_camera(frame: dict[str, Any], width: int, height: int) -> Camera:
-    """Intrinsics of a frame (its own keys over those of the file) for an image of width × height pixels.
+    """Intrinsics of a frame (its own keys over those of the file), at the size it gives, else for width × height pixels.
 
     Raises:
         InputError: neither a focal length nor a field of view is given, or the lens model is unknown.
@@ -223,7 +223,7 @@ def frame_camera(frame: dict[str, Any], width: int, height: int) -> Camera:
         )
     else:
         raise InputError(f"The lens model {model} is not supported.", "Undistort the images and export again.")
-    return camera if (w, h) == (width, height) else camera.resized(width, height)
+    return camera
 
 
 def _points(folder: Path, head: dict[str, Any]) -> Points:

@@ -56,7 +56,7 @@ def new(params: NewParams, report: Reporter) -> dict[str, Any]:
     paths, skipped, root = _photos(params, report)
     kept = _kept(previous, params, root) if previous else []
     sources = find_sources(paths, root, labels_folder, masks_folder, {record.name for record in kept})
-    settings = _settings(params, paths, sources, classes, report)
+    settings, exposed = _settings(params, previous, paths, sources, classes, report)
 
     report.stage("Reading photos")
     records, pictures = make_working_copies(sources, settings, report)
@@ -86,7 +86,7 @@ def new(params: NewParams, report: Reporter) -> dict[str, Any]:
         _put_in(project, records, set(present), classes, params, previous is not None)
         project.mask_mode = mask_mode
         result["classes"] = [c.name for c in project.classes]
-        project.record("new", params.model_dump(mode="json"), result | origin, inputs)
+        project.record("new", params.model_dump(mode="json"), result | origin | exposed, inputs)
     return result
 
 
@@ -164,18 +164,29 @@ def _photos(params: NewParams, report: Reporter) -> tuple[list[Path], list[dict[
 
 
 def _settings(
-    params: NewParams, paths: list[Path], sources: list[Source], classes: Classes, report: Reporter
-) -> Settings:
+    params: NewParams,
+    previous: Project | None,
+    paths: list[Path],
+    sources: list[Source],
+    classes: Classes,
+    report: Reporter,
+) -> tuple[Settings, dict[str, float]]:
+    """How working copies are made, and the exposure of scene-linear photos for the record, if there are any."""
     _, ignore_id, colors = classes
-    return Settings(
+    linear = [path for path in paths if is_linear(path)]
+    steps = previous.provenance if previous and params.add else []
+    before = next((step.result["exposure"] for step in reversed(steps) if "exposure" in step.result), None)
+    exposure = float_exposure(linear) if before is None else float(before)
+    settings = Settings(
         folder=Path(params.project),
         max_size=params.max_size,
-        exposure=float_exposure([path for path in paths if is_linear(path)]),
+        exposure=exposure,
         colors=colors or None,
         ignore_id=ignore_id,
         labels_as_stored=_drawn_as_stored([(s.path, s.label) for s in sources], "label maps", report),
         masks_as_stored=_drawn_as_stored([(s.path, s.mask) for s in sources], "masks", report),
     )
+    return settings, {"exposure": exposure} if linear else {}
 
 
 def _drawn_as_stored(pairs: list[tuple[Path, Path | None]], what: str, report: Reporter) -> bool:

@@ -175,6 +175,30 @@ def test_float_photos_share_one_exposure(tmp_path: Path) -> None:
     assert 100 < values.pop()[0] < 230
 
 
+def grey_exr(path: Path, light: float, seed: int) -> None:
+    """A textured picture of this radiance, with a wall of radiance 1 in it."""
+    linear = np.asarray(picture(seed)).astype(np.float32) / 255 * light
+    linear[-20:] = 1.0
+    buffer = oiio.ImageBuf(oiio.ImageSpec(320, 200, 3, oiio.HALF))
+    buffer.set_pixels(oiio.ROI(), linear)
+    assert buffer.write(str(path))
+
+
+def test_float_photos_that_are_added_share_the_exposure(tmp_path: Path) -> None:
+    """The added ones look towards a lamp: by themselves they would be made darker."""
+    for folder, light in (("photos", 6.0), ("more", 60.0)):
+        (tmp_path / folder).mkdir()
+        for i in range(3):
+            grey_exr(tmp_path / folder / f"{folder}{i}.exr", light, i)
+    new(tmp_path / "photos", tmp_path / "p")
+    new(tmp_path / "more", tmp_path / "p", add=True)
+    walls = set()
+    for path in (tmp_path / "p" / "images").iterdir():
+        with Image.open(path) as image:
+            walls.add(image.getpixel((160, 195)))
+    assert len(walls) == 1
+
+
 def test_truncation_is_found_in_every_format(tmp_path: Path) -> None:
     for suffix in ("jpg", "png", "webp", "tif"):
         buffer = io.BytesIO()

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import bisect
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
-from ..images.sharpness import focus, same_picture
+from ..images.sharpness import SAME, focus, same_picture
 from ..project.schema import ImageRecord
 
 # Not tuned.
@@ -24,16 +25,23 @@ def reject_duplicates(
     """Mark photos that repeat another one, byte for byte or saved again, as rejected (the later one of the two)."""
     first_with: dict[str, ImageRecord] = {record.sha256: record for record in earlier if record.sha256}
     kept: list[ImageRecord] = []
+    # Pictures whose mean brightness differs by more than those of twins may do need not be compared.
+    by_brightness: list[tuple[float, int]] = []
     for record in records:
         if record.status == "rejected":
             continue
+        picture = pictures.get(record.name)
+        mean = 0.0 if picture is None else float(picture.mean())
         twin = first_with.get(record.sha256)
         if twin is None:
-            twin = next((k for k in kept if _same(k, record, pictures)), None)
+            low, high = (bisect.bisect(by_brightness, (mean + side, -1)) for side in (-SAME, SAME))
+            near = sorted(number for _, number in by_brightness[low:high])
+            twin = next((kept[number] for number in near if _same(kept[number], record, pictures)), None)
         if twin is not None:
             record.status, record.reason = "rejected", f"the same picture as {Path(twin.source).name}"
         else:
             first_with[record.sha256] = record
+            bisect.insort(by_brightness, (mean, len(kept)))
             kept.append(record)
 
 

@@ -25,6 +25,7 @@ from ..project.schema import ImageRecord
 from .find import Source
 
 CACHE_FILE = "jobs/ingested.json"
+SAVE_EVERY, SAVE_SHARE = 3.0, 20.0  # seconds, and times what saving took: it is 8 kB a photo
 # Not tuned. Wider pictures are stitched ones; full spheres are exactly 2:1 and at least this wide.
 MAX_ASPECT, SPHERE_WIDTH = 3.0, 5000
 
@@ -55,7 +56,7 @@ def make_working_copies(
     cache = _load_cache(settings.folder)
     done: dict[str, tuple[ImageRecord, np.ndarray | None]] = {}
     workers = max(1, min(4, os.cpu_count() or 1))
-    saved = time.monotonic()
+    due = time.monotonic() + SAVE_EVERY
     try:
         with ThreadPoolExecutor(workers) as pool:
             queue: Iterator[Source] = iter(sources)
@@ -69,9 +70,10 @@ def make_working_copies(
                     source, record, picture = future.result()
                     done[source.name] = record, picture
                     cache[source.name] = _cache_entry(source, settings, record, picture)
-                if time.monotonic() - saved > 3:
+                if time.monotonic() > due:
+                    started = time.monotonic()
                     write_json(settings.folder / CACHE_FILE, cache)
-                    saved = time.monotonic()
+                    due = time.monotonic() + max(SAVE_EVERY, SAVE_SHARE * (time.monotonic() - started))
     finally:
         if done:
             write_json(settings.folder / CACHE_FILE, cache)

@@ -9,6 +9,7 @@ from PIL import Image
 # Not tuned.
 WORKING_SIZE = 1000  # pixels of the long side
 COARSER = 4
+SAME = 0.7  # grey levels by which thumbnails of the same picture differ at most in the mean
 NOTHING = 0.05  # grey levels squared: less than what rounding to 8 bits makes
 
 
@@ -58,4 +59,4 @@ def same_picture(a: np.ndarray, b: np.ndarray) -> bool:
     same place, moves edges. Pictures without structure are never called the same.
     """
     difference = np.abs(a - b)
-    return bool(difference.mean() < 0.7 and difference.max() < 6 and min(a.std(), b.std()) > 4.0)
+    return bool(difference.mean() < SAME and difference.max() < 6 and min(a.std(), b.std()) > 4.0)

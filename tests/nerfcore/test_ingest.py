@@ -13,12 +13,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fieldwork.nerfcore.capture import ingest, working_copies
+from fieldwork.nerfcore.capture import ingest, select, working_copies
 from fieldwork.nerfcore.capture.find import list_photos
 from fieldwork.nerfcore.errors import Cancelled, DiskError, InputError, ProjectError
 from fieldwork.nerfcore.images.decode import read_photo
 from fieldwork.nerfcore.params import NewParams
 from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.project.schema import ImageRecord
 from fieldwork.nerfcore.project.store import load_project
 from fieldwork.tests.nerfcore.support.photos import exif, folder_of, new, picture
 from PIL import Image, ImageFilter
@@ -337,3 +338,18 @@ def test_added_photos_stay_when_it_runs_again(tmp_path: Path) -> None:
     (photos / "p2.jpg").unlink()  # what is missing in its own folder is gone
     new(photos, project)
     assert [record.name for record in load_project(project).images] == ["p0", "p1", "p0_b"]
+
+
+def test_few_of_many_photos_are_compared(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Twins are found, the first one is kept, and not every photo is compared with every other one."""
+    random, count = np.random.default_rng(0), 400
+    pictures = {f"{i}": random.uniform(0, 40, (64, 64)).astype(np.float32) + 0.4 * i for i in range(count)}
+    pictures["399"], pictures["200"] = pictures["7"] + 0.4, pictures["7"] - 0.4
+    records = [ImageRecord(name=name, source=f"{name}.jpg", sha256=name, width=9, height=9) for name in pictures]
+    asked = []
+    same = select.same_picture
+    monkeypatch.setattr(select, "same_picture", lambda a, b: asked.append(1) or same(a, b))
+    select.reject_duplicates(records, pictures)
+    rejected = {record.name: record.reason for record in records if record.status == "rejected"}
+    assert rejected == {"200": "the same picture as 7.jpg", "399": "the same picture as 7.jpg"}
+    assert len(asked) < 10 * count

@@ -15,6 +15,7 @@ GROUND_TILT = 6.0  # degrees from level
 GROUND_SHARE = 0.1  # of the points near the subject
 SIDEWAYS = 0.9  # certainty about a plane of down axes, and about the side from which it is seen
 LEVEL_SHARE = 0.3  # of the cameras that such a group must have
+ASKED = 200  # cameras at most, of which any two may span the plane of the group
 
 
 def up_direction(camera_to_world: Sequence[np.ndarray]) -> tuple[np.ndarray, float]:
@@ -67,8 +68,9 @@ def _plane_normal(right: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, float]
 def _largest_level_group(right: np.ndarray, up: np.ndarray) -> np.ndarray:
     """Indices of the largest group of cameras that are level about one common up (within 5°)."""
     best = np.zeros(0, int)
-    for i in range(len(right)):
-        for j in range(i + 1, len(right)):
+    asked = np.linspace(0, len(right) - 1, min(ASKED, len(right))).round().astype(int)
+    for number, i in enumerate(asked):
+        for j in asked[number + 1 :]:
             axis = np.cross(right[i], right[j])
             length = np.linalg.norm(axis)
             if length < 0.3:

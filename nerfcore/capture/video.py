@@ -23,7 +23,7 @@ GREY_WIDTH = 640  # pixels, at which the sharpness of frames is compared; not tu
 def extract_frames(video: Path, folder: Path, count: int, report: Reporter) -> list[Path]:
     """Save the sharpest frame of each of `count` equal stretches of a video as PNG files in `folder`.
 
-    The rotation stored with the video (phones) is applied. A finished extraction of the same file is reused.
+    The rotation stored with the video (phones) is applied, and pixels that are not square are made so. A finished extraction of the same file is reused.
 
     Returns:
         the frame files, in time order: `<video name>_<frame number>.png`.
@@ -45,6 +45,7 @@ def extract_frames(video: Path, folder: Path, count: int, report: Reporter) -> l
             stream = container.streams.video[0]
             stream.thread_type = "AUTO"
             duration = _duration(container, stream)
+            aspect = float(stream.sample_aspect_ratio or 1)
             for number, seconds, frame in _frames(container, stream):
                 if number % 10 == 0:
                     report.progress(min(seconds / duration, 1.0), f"{len(chosen)} frames chosen")
@@ -55,7 +56,7 @@ def extract_frames(video: Path, folder: Path, count: int, report: Reporter) -> l
                 current = window
                 value = frame_sharpness(frame)
                 if best is None or value > best[0]:
-                    best = value, number, _upright(frame)
+                    best = value, number, _upright(frame, aspect)
     except av.FFmpegError as error:
         if len(chosen) < 4:
             raise InputError(
@@ -145,7 +146,10 @@ def frame_sharpness(frame: Any) -> float:
     return float(scipy.ndimage.laplace(grey.astype(np.float32)).var())
 
 
-def _upright(frame: Any) -> Image.Image:
+def _upright(frame: Any, aspect: float = 1.0) -> Image.Image:
+    """The frame as it is meant to be seen; `aspect`: width of its pixels by their height."""
     image = frame.to_image()
+    if abs(aspect - 1) > 0.01:
+        image = image.resize((max(1, round(image.width * aspect)), image.height), Image.Resampling.LANCZOS)
     turns = round(frame.rotation / 90) % 4  # counter-clockwise quarter turns that make it upright
     return image.rotate(90 * turns, expand=True) if turns else image

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
 from pathlib import Path
 
 import av
@@ -79,6 +80,24 @@ def test_stored_rotation_is_applied(tmp_path: Path, rotation: int) -> None:
         red, green, _ = image.convert("RGB").getpixel((20, 15))
     assert red > 200
     assert green < 60
+
+
+@pytest.mark.parametrize("rotation", [0, 90])
+def test_pixels_that_are_not_square_are_made_so(tmp_path: Path, rotation: int) -> None:
+    """Anamorphic video: 240 × 192 pixels that are a third wider than high, shown as 320 × 192."""
+    video = tmp_path / "a.mp4"
+    with av.open(str(video), "w") as container:
+        stream = container.add_stream("libx264", rate=24)
+        stream.width, stream.height, stream.pix_fmt = 240, 192, "yuv420p"
+        stream.codec_context.sample_aspect_ratio = Fraction(4, 3)
+        if rotation:
+            stream.set_display_rotation(rotation)
+        for i in range(12):
+            container.mux(stream.encode(av.VideoFrame.from_image(frame_picture(i).resize((240, 192)))))
+        container.mux(stream.encode())
+    for path in extract_frames(video, tmp_path / "frames", 4, Reporter()):
+        with Image.open(path) as image:
+            assert image.size == ((192, 320) if rotation else (320, 192))
 
 
 def test_verb_and_reuse(tmp_path: Path) -> None:

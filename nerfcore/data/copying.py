@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from pathlib import Path
 
@@ -40,10 +41,12 @@ def copy_photo(source: Path, folder: Path, name: str) -> Path:
         if plain:
             return copy_file(source, folder, name)
     target = folder / f"{name}.png"
-    if target.is_file() and target.stat().st_mtime >= source.stat().st_mtime:
+    taken = source.stat()
+    if target.is_file() and target.stat().st_mtime_ns == taken.st_mtime_ns:
         return target
     with atomic_path(target) as temporary:
         _decode(source, suffix).save(temporary, compress_level=2)
+        os.utime(temporary, ns=(taken.st_atime_ns, taken.st_mtime_ns))  # tells later which one it is a copy of
     return target
 
 
@@ -109,7 +112,8 @@ def copy_depth(source: Path, folder: Path, name: str, scale: float) -> Path:
         pixels = oiio.ImageBuf(str(source))
         if pixels.has_error:
             raise InputError(f"The depth map {source} cannot be read: {pixels.geterror()}.", "Replace or remove it.")
-        values = pixels.get_pixels(oiio.UINT16 if str(pixels.spec().format) in ("uint16", "uint8") else oiio.FLOAT)
+        whole = {"uint8": oiio.UINT8, "uint16": oiio.UINT16}  # as they are, not as parts of the largest value
+        values = pixels.get_pixels(whole.get(str(pixels.spec().format), oiio.FLOAT))
     values = np.squeeze(np.asarray(values))
     depth = (values[..., 0] if values.ndim == 3 else values).astype(np.float32) * np.float32(scale)
     depth = np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)

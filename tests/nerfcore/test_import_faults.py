@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import shutil
 import subprocess
 import sys
@@ -12,7 +13,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
+from fieldwork.nerfcore.data.copying import copy_depth
 from fieldwork.nerfcore.data.importer import FORMATS, import_dataset, read_dataset
 from fieldwork.nerfcore.data.load import load_scene
 from fieldwork.nerfcore.errors import InputError
@@ -111,4 +114,51 @@ def test_a_photo_that_was_turned_after_its_pose_was_found(tmp_path: Path, format
     assert read_dataset(tmp_path).views[0].camera.fx == 20
     Image.new("RGB", (30, 40)).save(tmp_path / "a.png")
     with pytest.raises(InputError, match=r"a\.png is 30×40 pixels, but its lens is that of 40×30: it was turned"):
+        read_dataset(tmp_path)
+
+
+def test_a_photo_that_was_exchanged_for_an_older_one(tmp_path: Path) -> None:
+    """Its time says nothing about which of the two the copy is of."""
+    source = tmp_path / "set" / "a.tif"
+    source.parent.mkdir()
+    frame = {"file_path": "a.tif", "transform_matrix": np.eye(4).tolist()}
+    (source.parent / "transforms.json").write_text(json.dumps({"fl_x": 80, "frames": [frame]}))
+    for color, seconds in (((200, 10, 10), 2000), ((10, 10, 200), 1000)):
+        Image.new("RGB", (80, 60), color).save(source)
+        os.utime(source, (seconds, seconds))
+        import_dataset(ImportParams(dataset=source.parent, project=tmp_path / "p"), Reporter())
+        with Image.open(load_scene(tmp_path / "p").views[0].image) as copy:
+            assert copy.getpixel((0, 0)) == color
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_depth_maps_of_whole_numbers(tmp_path: Path, kind: type) -> None:
+    Image.fromarray(np.full((30, 40), 150, kind)).save(tmp_path / "d.png")
+    path = copy_depth(tmp_path / "d.png", tmp_path, "a", 0.01)
+    assert oiio.ImageBuf(str(path)).get_pixels(oiio.FLOAT) == pytest.approx(1.5)
+
+
+def test_names_of_colmap_keep_their_spaces(tmp_path: Path) -> None:
+    (tmp_path / "images").mkdir()
+    Image.new("RGB", (40, 30)).save(tmp_path / "images" / "left  wall 1.png")
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 40 30 40 40 20 15\n")
+    (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 left  wall 1.png\n\n")
+    assert read_dataset(tmp_path).views[0].image.name == "left  wall 1.png"
+
+
+@pytest.mark.parametrize(("p1", "known"), [(1e-4, True), (0.01, False)])
+def test_fisheye_lenses_of_metashape_with_tangential_terms(tmp_path: Path, p1: float, known: bool) -> None:
+    """Ours have none: terms that move pixels are refused, others do not matter."""
+    Image.new("RGB", (40, 30)).save(tmp_path / "a.png")
+    pose = " ".join(map(str, np.eye(4).ravel()))
+    size = '<resolution width="40" height="30"/>'
+    (tmp_path / "cameras.xml").write_text(
+        f'<document version="1.5.0"><chunk><sensors><sensor id="0" type="fisheye">{size}<calibration type="fisheye">{size}'
+        f"<f>15</f><k1>0.01</k1><p1>{p1}</p1></calibration></sensor></sensors><cameras>"
+        f'<camera id="0" sensor_id="0" label="a"><transform>{pose}</transform></camera></cameras></chunk></document>'
+    )
+    if known:
+        assert read_dataset(tmp_path).views[0].camera.model == "OPENCV_FISHEYE"
+        return
+    with pytest.raises(InputError, match="fits p1 and p2 of a fisheye lens"):
         read_dataset(tmp_path)

@@ -138,10 +138,11 @@ def pose_from_quaternion(quaternion: Sequence[float], translation: Sequence[floa
     return pose
 
 
-def _rows(path: Path) -> Iterator[list[str]]:
+def _rows(path: Path, fields: int = -1) -> Iterator[list[str]]:
+    """The rows of a file, split into words; what comes behind the first `fields` words stays together."""
     for line in path.read_text(encoding="utf-8").splitlines():
         if not line.startswith("#"):
-            yield line.split()
+            yield line.split(maxsplit=fields)
 
 
 def _cameras_text(path: Path) -> dict[int, Camera]:
@@ -154,14 +155,14 @@ def _cameras_text(path: Path) -> dict[int, Camera]:
 
 def _images_text(path: Path) -> list[ColmapImage]:
     images = []
-    rows = list(_rows(path))
+    rows = list(_rows(path, 9))  # names may hold spaces
     # Every second line lists the image's points, and may be empty.
     for row in rows[::2]:
         if not row:
             continue
         numbers = [float(value) for value in row[1:8]]
         pose = pose_from_quaternion(numbers[:4], numbers[4:])
-        images.append(ColmapImage(" ".join(row[9:]), int(row[8]), pose))
+        images.append(ColmapImage(row[9].rstrip(), int(row[8]), pose))
     return images
 
 

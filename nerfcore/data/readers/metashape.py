@@ -156,6 +156,12 @@ def _camera(sensor: ElementTree.Element, image: Path, path: Path) -> Camera:
         "cy": height / 2 + values.get("cy", 0.0),
     }
     if kind == "fisheye":
+        moved = 3 * max(abs(p1), abs(p2)) * (width**2 + height**2) / 4 / f  # pixels, at the corners
+        if moved > 1.0:
+            raise InputError(
+                f"{path} fits p1 and p2 of a fisheye lens, which move its corners by up to {moved:.0f} pixels.",
+                "Align in Metashape without fitting them, or undistort the photos.",
+            )
         camera = Camera(model="OPENCV_FISHEYE", width=width, height=height, distortion=(k1, k2, k3, k4), **placed)
     elif kind == "frame":
         if k4 or any(values.get(name) for name in ("p3", "p4")):

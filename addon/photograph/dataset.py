@@ -28,6 +28,7 @@ def dataset(request: dict[str, Any], emit: Callable[..., None]) -> dict[str, Any
     emit(kind="stage", name="Opening the scene")
     bpy.ops.wm.open_mainfile(filepath=request["blend"], load_ui=False, use_scripts=False)
     scene = bpy.context.scene
+    show_what_renders()
     shots = plan(scene, request)
     metre = scene.unit_settings.scale_length or 1.0
     emit(kind="plan", views=len(shots), metre=metre)
@@ -128,9 +129,35 @@ def _camera_shot(scene: bpy.types.Scene, number: int, width: int, height: int) -
     if camera is None or camera.data.type != "PERSP":
         raise SceneError(f"The scene has no perspective camera in frame {number}: add one, or choose another path.")
     evaluated = camera.evaluated_get(bpy.context.evaluated_depsgraph_get())
-    location, rotation, _ = evaluated.matrix_world.decompose()  # a scaled parent must not scale the axes
-    pose = np.array(Matrix.LocRotScale(location, rotation, None))
-    return Shot(f"{number:04d}", pose, camera_lens(evaluated.data, width, height))
+    return Shot(f"{number:04d}", unscaled(np.array(evaluated.matrix_world)), camera_lens(evaluated.data, width, height))
+
+
+def unscaled(matrix: np.ndarray) -> np.ndarray:
+    """The pose (4, 4) of a camera whose axes a scaled parent has stretched, sheared or mirrored.
+
+    It looks where the camera looks, its up as far upwards as can be: a mirrored picture is that of no camera.
+    """
+    back = matrix[:3, 2] / np.linalg.norm(matrix[:3, 2])
+    up = matrix[:3, 1] - back * (back @ matrix[:3, 1])
+    up /= np.linalg.norm(up)
+    pose = np.eye(4)
+    pose[:3] = np.stack([np.cross(up, back), up, back, matrix[:3, 3]], 1)
+    return pose
+
+
+def show_what_renders() -> None:
+    """Hide in the viewport what renders hide, and show the rest: classes and extents are those of what it shows."""
+    for layer in bpy.context.scene.view_layers:
+        layers = [layer.layer_collection]
+        while layers:
+            part = layers.pop()
+            part.hide_viewport = False
+            layers += part.children
+        for item in layer.objects:
+            item.hide_set(False, view_layer=layer)
+    for item in [*bpy.data.objects, *bpy.data.collections]:
+        if item.library is None:
+            item.hide_viewport = item.hide_render
 
 
 def curve_poses(scene: bpy.types.Scene, name: str | None, views: int, center: np.ndarray) -> list[np.ndarray]:

@@ -302,3 +302,57 @@ def test_cameras_of_timeline_markers_are_followed_only_along_the_scene_s_camera(
     assert [p.name for p in plain] == [p.name for p in marked]
     for one, other in zip(plain, marked):
         np.testing.assert_array_equal(np.asarray(Image.open(one)), np.asarray(Image.open(other)))
+
+
+MIRRORED = """
+bpy.ops.wm.open_mainfile(filepath=blend)
+scene = bpy.context.scene
+scene.camera.parent.scale = eval(scale)
+scene.camera.data.shift_x = 0
+bpy.ops.wm.save_as_mainfile(filepath=path, copy=True)
+matrix = scene.camera.evaluated_get(bpy.context.evaluated_depsgraph_get()).matrix_world
+answer([list(row) for row in matrix])
+"""
+
+
+@pytest.mark.parametrize("scale", ["(-2, 2, 2)", "(-1, -1, -1)", "(1, 3, 0.5)"])
+def test_a_camera_under_a_mirrored_or_stretched_parent_looks_the_same_way(blend, tmp_path, bpy_script, scale):
+    matrix = np.array(bpy_script(MIRRORED, blend=blend, path=tmp_path / "m.blend", scale=scale))
+    take(tmp_path / "m.blend", tmp_path / "out", path="camera", views=1, labels="none", depth=False)
+    pose = np.array(json.loads((tmp_path / "out/transforms.json").read_text())["frames"][0]["transform_matrix"])
+    np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-5)
+    assert np.linalg.det(pose[:3, :3]) > 0
+    np.testing.assert_allclose(pose[:3, 3], matrix[:3, 3], atol=1e-5)
+    back, up = (matrix[:3, k] / np.linalg.norm(matrix[:3, k]) for k in (2, 1))
+    np.testing.assert_allclose(pose[:3, 2], back, atol=1e-5)
+    assert pose[:3, 1] @ up > 0.8
+
+
+HIDDEN = """
+bpy.ops.wm.open_mainfile(filepath=blend)
+scene = bpy.context.scene
+bpy.data.objects["cube"].hide_viewport = how == "monitor"
+bpy.data.objects["cube"].hide_set(how == "eye")
+scene.view_layers[0].layer_collection.children["things"].hide_viewport = how == "collection"
+bpy.ops.mesh.primitive_cube_add(size=1, location=(40, 0, 0))  # a helper that is not rendered
+helper = bpy.context.object
+helper.data.materials.append(bpy.data.materials.new("paint of helper"))
+group = bpy.data.collections.new("helpers")
+scene.collection.children.link(group)
+for old in helper.users_collection:
+    old.objects.unlink(helper)
+group.objects.link(helper)
+group.hide_render = True
+bpy.ops.wm.save_as_mainfile(filepath=path, copy=True)
+answer(1)
+"""
+
+
+@pytest.mark.parametrize("how", ["monitor", "eye", "collection"])
+def test_what_renders_counts_and_not_what_the_viewport_shows(blend, tmp_path, bpy_script, how):
+    bpy_script(HIDDEN, blend=blend, path=tmp_path / "hidden.blend", how=how)
+    result = take(tmp_path / "hidden.blend", tmp_path / "out", views=2)
+    assert result["classes"] == CLASSES["material"]
+    found = surfaces(tmp_path / "out")
+    assert set(found) == {0, 1, 2}
+    np.testing.assert_allclose(np.abs(found[1] - [0, 0, 0.5]).max(-1), 0.5, atol=2e-3)

@@ -27,6 +27,7 @@ MODULES = (
     "addon.live.thing_texels",
     "addon.live.scene_depth",
     "addon.live.viewport",
+    "addon.live.in_step",
     "addon.preferences",
     "addon.pictures.thumbnails",
     "addon.jobs.timer",

@@ -130,7 +130,7 @@ class Queue:
             for _ in job.before or ():
                 pass
             result = self._engine().run_blocking(job.verb, {**job.params, "job": job.id}, job.take)
-        except Exception as error:  # noqa: BLE001 - the job and its report tell it
+        except Exception as error:
             told = failure(UNREAD, error)
             self.finish(job, None, told)
             self.landing.settle()

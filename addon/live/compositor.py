@@ -14,7 +14,7 @@ import bpy
 from ..errors import SceneError
 from ..text import t
 from . import fields, shadows
-from .shared_scene import filter_width, scene_of, share
+from .shared_scene import filter_width, made_for, scene_of, share, share_settings
 
 FIELD_SCENE = "fieldwork_field_scene"  # on a scene: that of its fields
 NODE = "fieldwork_node"  # on nodes that are ours
@@ -52,6 +52,16 @@ def set_up(scene: bpy.types.Scene) -> bpy.types.Scene:
     scene.render.use_compositing = True
     _connect(scene, made, caught)
     return made
+
+
+def follow(scene: bpy.types.Scene) -> None:
+    """Let the scenes made for this one go on with its cameras, frames and size of picture, where these changed since."""
+    made, caught = made_for(scene, FIELD_SCENE), made_for(scene, shadows.SHADOW_SCENE)
+    for each in (made, caught):
+        if each is not None:
+            share_settings(scene, each)
+    if made is not None and made.render.filter_size != filter_width(scene):
+        made.render.filter_size = filter_width(scene)
 
 
 def tree_of(scene: bpy.types.Scene) -> tuple[Any, Any]:

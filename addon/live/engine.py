@@ -123,6 +123,10 @@ class FieldworkRenderEngine(bpy.types.RenderEngine):
             self.update_stats("", t(stage) if stage else "")
 
         try:
+            if (result.resolution_x, result.resolution_y) != (sizes.width, sizes.height):
+                raise SceneError(
+                    t("The border of this scene is not that of the render: press Composite with Objects again.")
+                )
             if shot["fields"]:
                 frame = frames().render(shot, sizes, self.test_break, tell, None if bpy.app.background else show)
             else:

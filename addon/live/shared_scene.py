@@ -9,8 +9,9 @@ import bpy
 SHARED = (
     "resolution_x", "resolution_y", "resolution_percentage", "pixel_aspect_x", "pixel_aspect_y", "use_border",
     "border_min_x", "border_max_x", "border_min_y", "border_max_y", "use_crop_to_border", "fps", "fps_base",
-    "use_motion_blur", "motion_blur_shutter", "motion_blur_position",
+    "use_motion_blur", "motion_blur_shutter", "motion_blur_position", "use_multiview", "views_format",
 )  # fmt: skip
+VIEW = ("use", "camera_suffix", "file_suffix")  # of a view of stereo
 
 
 OWNER = "fieldwork_owner_scene"  # on a scene made here: the one that it was made for
@@ -28,20 +29,40 @@ def scene_of(scene: bpy.types.Scene, key: str, name: str) -> bpy.types.Scene:
     return made
 
 
+def made_for(scene: bpy.types.Scene, key: str) -> bpy.types.Scene | None:
+    """The scene of this key that was made for a scene; None where there is none."""
+    made = scene.get(key)
+    return made if isinstance(made, bpy.types.Scene) and made.get(OWNER) == scene else None
+
+
 def share(scene: bpy.types.Scene, made: bpy.types.Scene) -> None:
     """Let a scene see what another one sees, with the same cameras and frames, without a background or a compositor."""
-    _share_markers(scene, made)
-    made.camera, made.world = scene.camera, scene.world  # after the markers, which may change the camera
-    made.frame_start, made.frame_end, made.frame_step = scene.frame_start, scene.frame_end, scene.frame_step
-    made.unit_settings.scale_length = scene.unit_settings.scale_length
-    for name in SHARED:
-        setattr(made.render, name, getattr(scene.render, name))
+    share_settings(scene, made)
     made.render.film_transparent = True
     made.render.use_compositing = False
     _share_links(scene.collection.children, made.collection.children)
     _share_links(scene.collection.objects, made.collection.objects)
     made.view_layers[0].update()  # the view layer of a new scene has no collections before
     _share_collections(scene.view_layers[0].layer_collection, made.view_layers[0].layer_collection)
+
+
+def share_settings(scene: bpy.types.Scene, made: bpy.types.Scene) -> None:
+    """Let a scene have the cameras, frames and size of picture of another one; what is so already is not touched."""
+    _share_markers(scene, made)
+    _copy(scene, made, "camera", "world", "frame_start", "frame_end", "frame_step")  # the camera after the markers
+    _copy(scene.unit_settings, made.unit_settings, "scale_length")
+    _copy(scene.render, made.render, *SHARED)
+    for view in made.render.views:
+        if view.name not in scene.render.views:
+            view.use = False
+    for view in scene.render.views:
+        _copy(view, made.render.views.get(view.name) or made.render.views.new(view.name), *VIEW)
+
+
+def _copy(seen: Any, made: Any, *names: str) -> None:
+    for name in names:
+        if getattr(made, name) != getattr(seen, name):
+            setattr(made, name, getattr(seen, name))
 
 
 def _share_links(seen: Any, made: Any) -> None:
@@ -55,9 +76,15 @@ def _share_links(seen: Any, made: Any) -> None:
 
 def _share_markers(scene: bpy.types.Scene, made: bpy.types.Scene) -> None:
     """Let the timeline change cameras where that of another scene does."""
+    if _markers(made) == _markers(scene):
+        return
     made.timeline_markers.clear()
     for marker in scene.timeline_markers:
         made.timeline_markers.new(marker.name, frame=marker.frame).camera = marker.camera
+
+
+def _markers(scene: bpy.types.Scene) -> list[tuple[Any, ...]]:
+    return [(marker.name, marker.frame, marker.camera) for marker in scene.timeline_markers]
 
 
 def _share_collections(seen: Any, made: Any) -> None:

@@ -181,6 +181,67 @@ answer({"before": seen, "after": ["Cube" in made.objects, "Props" in made.collec
     assert facts["same"]
 
 
+def test_the_scene_of_the_field_goes_on_with_cameras_and_size_of_the_picture(bpy_script, tmp_path):
+    facts = bpy_script(
+        SCENES
+        + """
+from fieldwork.addon.live import in_step, shared_scene
+cube["fieldwork_role"], cube.is_shadow_catcher, scene.render.engine = "mesh", True, "BLENDER_WORKBENCH"
+made = compositor.set_up(scene)
+caught = scene[shadows.SHADOW_SCENE]
+render, other = scene.render, bpy.data.objects.new("Other", scene.camera.data)
+scene.collection.objects.link(other)
+scene.camera, scene.frame_end = other, 77
+scene.timeline_markers.new("cut", frame=5).camera = other
+render.resolution_percentage, render.use_border, render.border_max_x, render.pixel_aspect_x = 25, True, 0.5, 2
+render.use_multiview, render.views_format = True, "MULTIVIEW"
+render.views.new("third").camera_suffix = "_T"
+render.views["left"].use = False
+in_step._rendering(scene)
+def settings_of(scene):
+    return [scene.camera.name, scene.frame_end, [m.camera.name for m in scene.timeline_markers],
+            *[round(getattr(scene.render, name), 4) if isinstance(getattr(scene.render, name), float)
+              else getattr(scene.render, name) for name in shared_scene.SHARED],
+            sorted([view.name, view.use, view.camera_suffix] for view in scene.render.views)]
+markers = made.timeline_markers[0].as_pointer()
+in_step._rendering(scene)
+answer([settings_of(each) == settings_of(scene) for each in (made, caught)]
+       + [made.timeline_markers[0].as_pointer() == markers])
+""",
+        project=make_project(tmp_path / "capture"),
+    )
+    assert facts == [True] * 3
+
+
+def test_composites_follow_the_border_and_the_camera(bpy_script, ball, tmp_path):
+    facts = bpy_script(
+        START
+        + """
+render.resolution_x, render.resolution_y, scene.cycles.samples = 72, 48, 1
+bpy.ops.fieldwork.setup_compositor()
+again = bpy.data.objects.new("Again", camera.data)
+again.location, again.rotation_euler = (0.3, -2, 0), camera.rotation_euler
+scene.collection.objects.link(again)
+scene.camera = again
+render.use_border = render.use_crop_to_border = True
+render.border_min_x, render.border_max_x, render.border_min_y, render.border_max_y = 0.25, 0.75, 0.25, 0.75
+followed = shoot("followed")
+bpy.ops.fieldwork.setup_compositor()
+pressed = shoot("pressed")
+bpy.app.handlers.render_init.clear()
+scene["fieldwork_field_scene"].render.use_border = False
+answer([list(followed.shape), float(followed[..., 3].mean()), bool(np.array_equal(followed, pressed)),
+        attempt(bpy.ops.render.render)])
+""",
+        project=ball,
+        folder=tmp_path,
+    )
+    assert facts[0] == [24, 36, 4]
+    assert facts[1] > 0.5
+    assert facts[2], "as if the button had been pressed again"
+    assert "press Composite with Objects again" in facts[3]
+
+
 def test_a_copy_of_the_scene_gets_scenes_of_its_own(bpy_script, tmp_path):
     facts = bpy_script(
         SCENES

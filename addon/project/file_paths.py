@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import bpy
 
 from ..paths import absolute
+from ..props import PATHS
 from ..roles import FOLDER, is_local
 
 COPIED = "copybuffer.blend"  # what Blender pastes from: it does not say in which folder that was copied
@@ -34,11 +35,8 @@ def relative_paths(items: Iterable[Any]) -> Iterator[Stored]:
         if not is_local(item):
             continue
         own = item.fieldwork
-        names = [
-            prop.identifier
-            for prop in own.bl_rna.properties
-            if getattr(prop, "subtype", "") in ("DIR_PATH", "FILE_PATH")
-        ]
+        texts = [prop for prop in own.bl_rna.properties if prop.type == "STRING"]
+        names = [prop.identifier for prop in texts if prop.subtype in PATHS]
         found = [Stored(getattr(own, name), partial(setattr, own, name)) for name in names]
         if isinstance(item.get(FOLDER), str):
             found.append(Stored(item[FOLDER], partial(operator.setitem, item, FOLDER)))

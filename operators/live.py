@@ -40,13 +40,17 @@ class _OfField(Operator):
     """An operator for the active field."""
 
     bl_options = {"REGISTER", "UNDO"}
+    changes = True  # the field
 
     @classmethod
     def poll(cls, context: Context) -> bool:
-        if active_field(context) is None:
-            cls.poll_message_set(t("Choose a field in the scene"))
-            return False
-        return True
+        obj = active_field(context)
+        reason = None if obj is not None else t("Choose a field in the scene")
+        if obj is not None and obj.library is not None and cls.changes:
+            reason = t("“{}” is linked from another file: make a library override of it first", obj.name)
+        if reason:
+            cls.poll_message_set(reason)
+        return reason is None
 
 
 class FIELDWORK_OT_add_field(Operator):
@@ -176,6 +180,7 @@ class FIELDWORK_OT_save_field_edits(_OfField):
     bl_idname = "fieldwork.save_field_edits"
     bl_label = "Save Field Edits…"
     bl_options = {"REGISTER"}
+    changes = False
 
     filepath: StringProperty(name="File", description="File to write", subtype="FILE_PATH", options={"SKIP_SAVE"})
     filter_glob: StringProperty(default="*.json", options={"HIDDEN"})

@@ -135,7 +135,7 @@ def rename_in_fields(project: Path, run: str, old: str, new: str) -> None:
     from ..addon.live import things as of_fields
 
     for field in fields.field_objects(bpy.data.objects):
-        if Path(fields.absolute(field.fieldwork.project)) == project.absolute() and field.fieldwork.run == run:
+        if fields.folder_of(field.fieldwork) == project and field.fieldwork.run == run:
             of_fields.rename(field, old, new.strip(), bpy.data.objects)
 
 

@@ -1,5 +1,7 @@
 """What scenes, objects and view layers remember of fields that Blender shows."""
 
+from typing import Any
+
 import bpy
 from bpy.types import Context, PropertyGroup
 
@@ -28,25 +30,29 @@ def _changed(self: PropertyGroup, context: Context) -> None:
         redraw_views()
 
 
+OVERRIDABLE = {"LIBRARY_OVERRIDABLE"}  # where the object is linked from another file
+SHOWN: dict[str, Any] = {"update": _changed, "override": OVERRIDABLE}
+
+
 class FieldworkFieldClass(PropertyGroup):
     """How a field in the scene shows one of its classes. `name` is that of the class."""
 
     id: IntProperty()
     color: FloatVectorProperty(
         name="Color", description="Color that the class is tinted with", subtype="COLOR_GAMMA", min=0.0, max=1.0,
-        update=_changed,
+        **SHOWN,
     )  # fmt: skip
     visible: BoolProperty(
         name="Visible", description="Show the class; what is behind it appears where it is hidden", default=True,
-        update=_changed,
+        **SHOWN,
     )  # fmt: skip
     opacity: FloatProperty(
         name="Opacity", description="How much of the class is seen", default=1.0, min=0.0, max=1.0, subtype="FACTOR",
-        update=_changed,
+        **SHOWN,
     )  # fmt: skip
     tint: FloatProperty(
         name="Tint", description="How much of its own color the class gets", default=0.0, min=0.0, max=1.0,
-        subtype="FACTOR", update=_changed,
+        subtype="FACTOR", **SHOWN,
     )  # fmt: skip
 
     @property
@@ -61,19 +67,19 @@ class FieldworkFieldThing(PropertyGroup):
     center: FloatVectorProperty(subtype="XYZ")  # in the capture's own frame
     color: FloatVectorProperty(
         name="Color", description="Color that the thing is tinted with", subtype="COLOR_GAMMA", min=0.0, max=1.0,
-        default=(1.0, 1.0, 1.0), update=_changed,
+        default=(1.0, 1.0, 1.0), **SHOWN,
     )  # fmt: skip
     visible: BoolProperty(
         name="Visible", description="Show the thing where it stands; its copies are objects of their own", default=True,
-        update=_changed,
+        **SHOWN,
     )  # fmt: skip
     opacity: FloatProperty(
         name="Opacity", description="How much of the thing and of its copies is seen", default=1.0, min=0.0, max=1.0,
-        subtype="FACTOR", update=_changed,
+        subtype="FACTOR", **SHOWN,
     )  # fmt: skip
     tint: FloatProperty(
         name="Tint", description="How much of its color the thing and its copies get", default=0.0, min=0.0, max=1.0,
-        subtype="FACTOR", update=_changed,
+        subtype="FACTOR", **SHOWN,
     )  # fmt: skip
 
     @property
@@ -107,18 +113,18 @@ class FieldworkField(PropertyGroup):
     project: StringProperty(
         name="Project", description="Project folder of the field", subtype="DIR_PATH", update=_changed
     )
-    run: StringProperty(name="Run", description="Training run that is shown", default="main", update=_changed)
+    run: StringProperty(name="Run", description="Training run that is shown", default="main", **SHOWN)
     look: FloatProperty(
         name="Look", description="What is shown: 0 the photos' colors, 1 the classes, 2 how certain they are",
-        default=0.0, min=0.0, max=2.0, update=_changed,
+        default=0.0, min=0.0, max=2.0, **SHOWN,
     )  # fmt: skip
     crop: PointerProperty(
         name="Crop Box", description="Empty whose cube cuts the field; none: all of it is shown",
-        type=bpy.types.Object, poll=_is_crop_box, update=_changed,
+        type=bpy.types.Object, poll=_is_crop_box, **SHOWN,
     )  # fmt: skip
-    classes: CollectionProperty(type=FieldworkFieldClass)
+    classes: CollectionProperty(type=FieldworkFieldClass, override=OVERRIDABLE)
     class_index: IntProperty(name="Class", description="Selected class")
-    things: CollectionProperty(type=FieldworkFieldThing)
+    things: CollectionProperty(type=FieldworkFieldThing, override=OVERRIDABLE)
     thing_index: IntProperty(name="Thing", description="Selected thing")
 
 
@@ -179,7 +185,7 @@ CLASSES = [FieldworkFieldClass, FieldworkFieldThing, FieldworkThingCopy, Fieldwo
 
 
 def register() -> None:
-    bpy.types.Object.fieldwork = PointerProperty(type=FieldworkField)
+    bpy.types.Object.fieldwork = PointerProperty(type=FieldworkField, override=OVERRIDABLE)
     bpy.types.Object.fieldwork_copy = PointerProperty(type=FieldworkThingCopy)
     bpy.types.ViewLayer.fieldwork = PointerProperty(type=FieldworkLayer)
     bpy.types.Scene.fieldwork_live = PointerProperty(type=FieldworkLive)

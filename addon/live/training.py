@@ -224,8 +224,9 @@ def _is_there(key: tuple[int, str]) -> bool:
             continue
         for area in window.screen.areas:
             if area.type == "VIEW_3D" and any(region.as_pointer() == key[0] for region in area.regions):
-                obj = window.scene.objects.get(key[1])
-                return obj is not None and obj.visible_get(view_layer=window.view_layer)
+                layer = window.view_layer
+                obj = next((obj for obj in layer.objects if obj.name_full == key[1]), None)  # also linked ones
+                return obj is not None and obj.visible_get(view_layer=layer)
     return False
 
 

@@ -411,3 +411,41 @@ answer([places, bpy.app.version >= (4, 3, 0)])
     if told:  # Blender 4.2 does not say what was appended
         assert places["appended"] == str(project)
         assert places["scene"] == places["of the scene"] == "//../library/capture"
+
+
+def test_an_overridden_field_keeps_how_it_is_shown(bpy_script, tmp_path):
+    facts = bpy_script(
+        SETUP
+        + FIELDS
+        + """
+bpy.ops.wm.save_as_mainfile(filepath=f"{folder}/library.blend")
+own = add_field(scene, project).fieldwork
+for name in ("stone", "gold"):
+    own.classes.add().name = name
+own.things.add().name = "cup"
+bpy.ops.wm.save_mainfile()
+bpy.ops.wm.read_homefile()
+with bpy.data.libraries.load(f"{folder}/library.blend", link=True) as (_, wanted):
+    wanted.objects = ["Field"]
+linked = wanted.objects[0]
+collection = bpy.context.scene.collection
+collection.objects.link(linked)
+bpy.context.view_layer.objects.active = linked
+told = attempt(lambda: bpy.ops.fieldwork.isolate_class(index=1))
+made = linked.override_create(remap_local_usages=True)
+box = bpy.data.objects.new("Box", None)
+collection.objects.link(box)
+own = made.fieldwork
+own.look, own.crop, own.classes[0].opacity, own.things[0].tint = 1.5, box, 0.25, 0.5
+bpy.context.view_layer.objects.active = made
+bpy.ops.fieldwork.isolate_class(index=1)
+bpy.ops.wm.save_as_mainfile(filepath=f"{folder}/user.blend")
+bpy.ops.wm.open_mainfile(filepath=f"{folder}/user.blend")
+own = next(obj for obj in bpy.data.objects if obj.override_library).fieldwork
+answer([told, own.look, own.crop.name, [[c.visible, c.opacity] for c in own.classes], own.things[0].tint])
+""",
+        folder=tmp_path,
+        project=make_project(tmp_path / "capture"),
+    )
+    assert "linked from another file" in facts[0]
+    assert facts[1:] == [1.5, "Box", [[False, 0.25], [True, 1.0]], 0.5]

@@ -163,3 +163,30 @@ answer({**facts, "left": watch.file.path.parent.exists()})
         project=tmp_path,
     )
     assert facts == {"ended": 1, "there": True, "process": None, "left": False}
+
+
+def test_a_linked_field_that_stands_still_goes_on_being_watched(bpy_script, tmp_path: Path) -> None:
+    facts = bpy_script(
+        """
+import fieldwork
+fieldwork.register()
+from fieldwork.addon.live.training import _is_there
+field = bpy.data.objects.new("Field", None)
+bpy.context.scene.collection.objects.link(field)
+field.fieldwork.is_field = True
+bpy.ops.wm.save_as_mainfile(filepath=file)
+bpy.ops.wm.read_homefile()
+with bpy.data.libraries.load(file, link=True) as (_, wanted):
+    wanted.objects = ["Field"]
+linked = wanted.objects[0]
+bpy.context.scene.collection.objects.link(linked)
+bpy.context.view_layer.update()
+(window,) = bpy.context.window_manager.windows
+region = next(area.regions[0].as_pointer() for area in window.screen.areas if area.type == "VIEW_3D")
+seen = [_is_there((region, linked.name_full))]
+linked.hide_set(True)
+answer(seen + [_is_there((region, linked.name_full)), _is_there((region, "Field"))])
+""",
+        file=tmp_path / "library.blend",
+    )
+    assert facts == [True, False, False]

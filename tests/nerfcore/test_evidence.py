@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from fieldwork.nerfcore.bench.baselines import instant_ngp
 from fieldwork.nerfcore.bench.baselines.hash_grid import hash_levels
-from fieldwork.nerfcore.bench.evidence import suite
+from fieldwork.nerfcore.bench.evidence import scores, suite
 from fieldwork.nerfcore.bench.evidence.page import MARK, folder_of, page_text, read_records, write_page
 from fieldwork.nerfcore.bench.evidence.perceptual import Perceptual
 from fieldwork.nerfcore.bench.evidence.protocol import (
@@ -26,11 +27,16 @@ from fieldwork.nerfcore.bench.evidence.protocol import (
 from fieldwork.nerfcore.bench.evidence.summary import over_seeds, published
 from fieldwork.nerfcore.bench.evidence.trial import run_trial
 from fieldwork.nerfcore.config import make_config
+from fieldwork.nerfcore.data.load import load_scene
+from fieldwork.nerfcore.data.scene import View
 from fieldwork.nerfcore.errors import InputError, SettingError
 from fieldwork.nerfcore.evaluate.metrics import BoundaryOverlap, boundary, calibration_error
+from fieldwork.nerfcore.files import write_json
+from fieldwork.nerfcore.images.picture import Picture
 from fieldwork.nerfcore.kernels.device import use_device
 from fieldwork.nerfcore.params import BenchParams
 from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.render.image import Frame
 from fieldwork.nerfcore.verbs import run_verb
 from fieldwork.tests.nerfcore.support.ball import SMALL, ball_project
 from PIL import Image
@@ -274,6 +280,42 @@ def test_the_baked_field_is_measured_like_the_others(tmp_path: Path) -> None:
     assert figures["psnr"] > 10
     assert figures["ms_network"] == figures["ms_frame"]
     assert not list((project / "runs").glob("*/*.safetensors"))
+
+
+def test_photos_of_which_masks_leave_nothing_do_not_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And figures that nothing was measured for are None, which JSON has a word for."""
+    project = ball_project(tmp_path / "ball", views=9, side=24)
+    scene = load_scene(project, 2)
+    grey = np.full((24, 24), 0.5, np.float32)
+    picture = Picture(np.stack([grey] * 4, -1), alpha="associated")
+    frame = Frame(picture, 1.0, grey, np.stack([grey] * 2, -1), np.stack([grey] * 3, -1))
+    trainee = SimpleNamespace(
+        scene=scene,
+        info=SimpleNamespace(class_ids=[1, 2], image_size=24),
+        device=use_device(),
+        box_from_world=np.eye(4),
+        background=1.0,
+        frame=lambda *_: frame,
+        sampling_share=lambda *_: 0.5,
+    )
+    hidden = {scene.views[scene.test[0]].name}
+    true = scores.compared_with
+
+    def compared(view: View, *rest: Any) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
+        photo, keep, label = true(view, *rest)
+        return (photo, np.zeros((24, 24), bool), label) if view.name in hidden else (photo, keep, label * 0)
+
+    monkeypatch.setattr(scores, "compared_with", compared)
+    _, trial = trials_of("quick")[0]
+    trial = trial.model_copy(update={"held_out": len(scene.test)})
+    figures = scores.scored(trial, trainee, project, tmp_path, None, Reporter())  # type: ignore[arg-type]
+    assert figures["images"] == len(scene.test) - 1
+    assert 0 < figures["psnr"] < 60
+    assert (figures["miou"], figures["ece"]) == (None, None)
+    write_json(tmp_path / "figures.json", figures)
+    hidden.update(view.name for view in scene.views)
+    with pytest.raises(InputError, match="masks leave nothing"):
+        scores.scored(trial, trainee, project, tmp_path, None, Reporter())  # type: ignore[arg-type]
 
 
 def test_a_page_that_somebody_wrote_is_left_alone(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from ...data.box import box_poses
 from ...data.pixels import training_size
 from ...data.scene import View
+from ...errors import InputError
 from ...evaluate.metrics import BoundaryOverlap, Confusion, calibration_error, psnr, ssim
 from ...evaluate.verb import compared_with, spread
 from ...files import atomic_path
@@ -32,12 +33,14 @@ SOLID = 0.5  # opacity from which a pixel has a depth
 def scored(
     trial: Trial, trainee: Trainee, project: Path, out: Path, perceptual: Perceptual | None, report: Reporter
 ) -> dict[str, Any]:
-    """Figures of a trained method; None is what was not measured.
+    """Figures of a trained method; None is what was not measured. Photos of which a mask leaves nothing do not count.
 
     Returns:
         {"psnr", "ssim", "lpips", "miou", "per_class_iou", "boundary_iou", "ece", "depth_error": median of |z − z'| / z,
-        "images", "ms_frame", "ms_frame_plain": without classes, "ms_sampling", "ms_network": of a frame of 800×800 by the
+        "images": how many were compared, "ms_frame", "ms_frame_plain": without classes, "ms_sampling", "ms_network": of a frame of 800×800 by the
         time of the frames here, "pictures"}
+    Raises:
+        InputError: the masks leave nothing of the photos.
     """
     scene, info, device = trainee.scene, trainee.info, trainee.device
     chosen = [scene.test[place] for place in sorted(spread(len(scene.test))[: trial.held_out])]
@@ -53,6 +56,8 @@ def scored(
         camera = view.camera.resized(*training_size(view.camera, info.image_size))
         photo, keep, label = compared_with(view, scene, camera.width, camera.height, trainee.background)
         report.progress(number / len(chosen), view.name)
+        if keep is not None and not keep.any():
+            continue
         begin = timer()
         frame = trainee.frame(camera, pose, True, report.check)
         synchronize(device)
@@ -65,12 +70,14 @@ def scored(
             confusion.add(label, predicted)
             outlines.add(label, predicted)
             known = np.isin(label, info.class_ids)
-            sure.append(frame.confidence()[known])
-            right.append((predicted == label)[known])
+            if known.any():
+                sure.append(frame.confidence()[known])
+                right.append((predicted == label)[known])
         depth_errors += _depth_errors(view, frame, scale)
-        if number == 0:
+        if not pictures:
             pictures = _write_pictures(out, trial, image, photo)
-    assert frame is not None
+    if frame is None:
+        raise InputError("The masks leave nothing of the photos to compare.", "White in a mask marks what counts.")
     camera = scene.views[chosen[-1]].camera
     camera = camera.resized(*training_size(camera, info.image_size))
     each = seconds / rays * FRAME**2 * 1e3  # milliseconds of a frame
@@ -91,7 +98,7 @@ def scored(
         "boundary_iou": _rounded(outlines.mean()) if sure else None,
         "ece": _rounded(calibration_error(np.concatenate(sure), np.concatenate(right))) if sure else None,
         "depth_error": _rounded(float(np.median(np.concatenate(depth_errors)))) if depth_errors else None,
-        "images": len(chosen),
+        "images": len(images),
         "ms_frame": float(f"{each:.4g}"),
         "ms_frame_plain": float(f"{plain:.4g}"),
         "ms_sampling": float(f"{each * share:.4g}"),

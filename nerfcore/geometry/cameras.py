@@ -35,6 +35,11 @@ class Camera(BaseModel):
     cy: float
     distortion: tuple[float, ...] = ()
 
+    @property
+    def focal(self) -> float:
+        """Pixels along a radian in the middle of the image; of a panorama everywhere, whose `fx` formats mean differently."""
+        return self.width / (2 * np.pi) if self.model == "EQUIRECTANGULAR" else self.fx
+
     def resized(self, width: int, height: int) -> Camera:
         """The same lens on an image resampled to width × height."""
         sx, sy = width / self.width, height / self.height

@@ -57,8 +57,7 @@ class PosedCamera:
 
     def footprint(self, depth: np.ndarray) -> np.ndarray:
         """Width of a pixel at a depth (N,), in units of the mesh."""
-        focal = self.camera.width / (2 * np.pi) if self.camera.model == "EQUIRECTANGULAR" else self.camera.fx
-        return depth / focal
+        return depth / self.camera.focal
 
     def pixels(self, local: np.ndarray) -> np.ndarray:
         """Pixel coordinates (N, 2) of points (N, 3) in camera axes; NaN where the lens does not see."""

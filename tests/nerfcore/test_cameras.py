@@ -72,6 +72,15 @@ def test_equirectangular_round_trip_and_axes() -> None:
     assert np.allclose(directions, [[0, 0, 1], [1, 0, 0], [0, -1, 0]], atol=1e-12)
 
 
+@pytest.mark.parametrize("model", ["PINHOLE", "OPENCV_FISHEYE", "EQUIRECTANGULAR"])
+def test_the_focal_length_is_the_pixels_along_a_radian(model: str) -> None:
+    """Also of panoramas, in which no ray depends on `fx`."""
+    distortion = (0.0,) * 4 if model == "OPENCV_FISHEYE" else ()
+    camera = Camera(model=model, width=400, height=200, fx=200, fy=200, cx=200, cy=100, distortion=distortion)  # type: ignore[arg-type]
+    ahead, beside = project(camera, np.array([[0, 0, 1.0], [1e-4, 0, 1]]))
+    assert (beside - ahead)[0] / 1e-4 == pytest.approx(camera.focal, rel=1e-3)
+
+
 def test_folded_lens_is_marked_invalid() -> None:
     """A strong barrel folds the image over: pixels outside what it can map must be flagged, not invented."""
     camera = Camera(model="OPENCV", fx=100, fy=100, cx=160, cy=100, distortion=(-0.3, 0.0, 0.0, 0.0), **sizes)

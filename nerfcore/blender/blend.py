@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from ..data.load import class_inputs, load_scene, view_inputs
-from ..errors import SettingError
 from ..files import atomic_path
 from ..params import BlendParams
 from ..progress import Reporter
@@ -17,7 +16,7 @@ from ..project.runs import INSTANCES, MEASURES, holdout_of
 from ..project.schema import ProvenanceStep
 from ..project.store import load_poses, load_project, record_step
 from .package import photo_renders, stale, write_package
-from .process import write_in_blender
+from .process import check_blend, write_in_blender
 
 STAMP = "stamp"  # of the file as it was written, in the record of the step
 
@@ -37,8 +36,7 @@ def blend(params: BlendParams, report: Reporter) -> dict[str, Any]:
     """
     started = time.monotonic()
     out = params.out.absolute()
-    if out.suffix != ".blend":
-        raise SettingError(f"{out} is no Blender file.", "Name a file that ends in .blend.")
+    check_blend(out)
     folder = params.project.absolute()
     scene = load_scene(folder, holdout_of(folder, params.run))
     inputs = blend_inputs(params)

@@ -19,7 +19,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
 
-from ..errors import BlenderError
+from ..errors import BlenderError, SettingError
 from ..files import atomic_path
 from ..progress import Reporter
 
@@ -93,6 +93,12 @@ def run_in_blender(
             for stream in (child.stdin, child.stdout, child.stderr):
                 if stream is not None:
                     stream.close()
+
+
+def check_blend(path: Path) -> None:
+    """Raise SettingError unless a file's ending is .blend."""
+    if path.suffix != ".blend":
+        raise SettingError(f"{path} is no Blender file.", "Name a file that ends in .blend.")
 
 
 def write_in_blender(package: Path, out: Path, project: Path, split: str, report: Reporter) -> dict[str, Any]:

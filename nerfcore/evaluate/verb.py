@@ -18,7 +18,7 @@ from ..data.photo import photo_of
 from ..data.pixels import training_size
 from ..data.scene import Scene, View
 from ..errors import InputError, SettingError
-from ..files import atomic_path, write_json
+from ..files import atomic_path, require_writable, write_json
 from ..geometry.cameras import Camera
 from ..images.encode import write_picture
 from ..images.picture import cut_out, over, resized, to_bytes
@@ -179,6 +179,7 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
         raise SettingError("--speed measures the field itself.", "Leave out --baked, or look at its `rps`.")
     if params.report is not None:
         check_report(params.report)
+        require_writable(params.report)
     folder = Path(params.project)
     project, trained = load_project(folder), load_trained(folder, params.run)
     scene = load_scene(folder, trained.info.holdout)

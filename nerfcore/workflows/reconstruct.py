@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from .. import params as p
+from ..blender.process import check_blend
 from ..config import make_config
 from ..data.load import load_scene
 from ..data.readers import colmap, transforms
 from ..errors import ProjectError
 from ..evaluate.report import check_report, write_report
+from ..files import require_writable
 from ..progress import Reporter
 from ..project.fingerprints import Earlier
 from ..project.runs import holdout_of, read_metrics, run_folder
@@ -148,13 +150,24 @@ def reconstruct(params: p.ReconstructParams, report: Reporter) -> dict[str, Any]
     Raises:
         any verb's error; the project is left so that the same command goes on.
     """
-    make_config(params.preset, params.set)  # says what is wrong with them before hours of work
-    if params.report is not None:
-        check_report(params.report)
+    check_asked(params)
     if params.time_limit is not None:
         report.note(budget.estimate(params.time_limit))
     made = run_stages(params, stages_of(params), report)
     return summed_up(params, made.seconds, made.reused, made.redone, made.results, report)
+
+
+def check_asked(params: p.ReconstructParams) -> None:
+    """Say what is wrong with settings and with files to write before hours of work. Raises SettingError, DiskError."""
+    make_config(params.preset, params.set)
+    if params.report is not None:
+        check_report(params.report)
+        require_writable(params.report)
+    if params.blend is not None:
+        check_blend(params.blend)
+        require_writable(params.blend)
+    if params.renders is not None:
+        require_writable(params.renders / "view.png")
 
 
 def summed_up(

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 from fieldwork.nerfcore.capture.ingest import new
-from fieldwork.nerfcore.errors import SettingError
+from fieldwork.nerfcore.errors import DiskError, SettingError
 from fieldwork.nerfcore.geometry.cameras import Camera
 from fieldwork.nerfcore.params import BlocksParams, MeshParams, NewParams, Params, ReconstructParams
 from fieldwork.nerfcore.progress import Reporter
@@ -57,6 +57,28 @@ def test_settings_are_checked_before_anything_is_done(tmp_path: Path, monkeypatc
     monkeypatch.setattr(module.Pipeline, "do", lambda *_: pytest.fail("a stage began"))
     values = {"photos": folder_of(tmp_path / "photos"), "out": tmp_path / "p", "set": {"loss.semantic": "0.1"}}
     with pytest.raises(SettingError, match=r"loss\.semantic"):
+        module.reconstruct(ReconstructParams.model_validate(values), Reporter())
+    assert not (tmp_path / "p").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "file", "words"),
+    [
+        ("blend", "scene.obj", "no Blender file"),
+        ("blend", "taken/scene.blend", "a file is in its way"),
+        ("report", "taken/report.html", "a file is in its way"),
+        ("report", "p.html", "a file is in its way"),
+        ("renders", "taken", "a file is in its way"),
+    ],
+)
+def test_files_to_write_are_checked_before_anything_is_done(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, file: str, words: str
+) -> None:
+    monkeypatch.setattr(module.Pipeline, "do", lambda *_: pytest.fail("a stage began"))
+    (tmp_path / "taken").write_text("")
+    (tmp_path / "p.html").mkdir()
+    values = {"photos": folder_of(tmp_path / "photos"), "out": tmp_path / "p", name: tmp_path / file}
+    with pytest.raises((SettingError, DiskError), match=words):
         module.reconstruct(ReconstructParams.model_validate(values), Reporter())
     assert not (tmp_path / "p").exists()
 

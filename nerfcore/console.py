@@ -67,6 +67,8 @@ class ConsoleReporter(Reporter):
         if self.bar is not None:
             if self.task is not None:
                 self.bar.update(self.task, completed=1.0, message="")
+            for earlier in self.bar.task_ids[: max(0, len(self.bar.task_ids) + 2 - self.console.height)]:
+                self.bar.remove_task(earlier)  # of what is higher than the terminal rich leaves out the end
             self.task = self.bar.add_task(name, total=1.0, message="")
         elif not self.quiet:
             self.console.print(f"{name} …")
@@ -142,7 +144,8 @@ def time_text(seconds: float | None) -> str:
 
 
 def flattened(value: dict[str, Any], prefix: str = "") -> list[tuple[str, str]]:
-    """(name, text) rows of a result: nested objects get dotted names, long lists their length."""
+    """(name, text) rows of a result: nested objects get dotted names, sentences a line each, other long lists their
+    length."""
     rows: list[tuple[str, str]] = []
     for key, item in value.items():
         name = f"{prefix}{key}"
@@ -151,7 +154,9 @@ def flattened(value: dict[str, Any], prefix: str = "") -> list[tuple[str, str]]:
         elif isinstance(item, list):
             named = [i.get("name") if isinstance(i, dict) else i for i in item]
             short = ", ".join(map(str, named)) if all(not isinstance(i, dict) and i is not None for i in named) else ""
-            rows.append((name, short if short and len(short) < 90 else f"{len(item)} items"))
+            counted = f"{len(item)} item{'' if len(item) == 1 else 's'}"
+            told = item and all(isinstance(i, str) and i.endswith(".") for i in item)
+            rows.append((name, "\n".join(item) if told else short if short and len(short) < 90 else counted))
         else:
             rows.append((name, "not measured" if item is None else str(item)))
     return rows

@@ -54,11 +54,40 @@ def test_time_left_of_work_that_goes_on_is_counted_from_where_it_began(shown: io
     assert "91%, about 90 s left" in shown.getvalue()
 
 
+def test_the_present_stage_is_shown_in_a_low_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    out = io.StringIO()
+
+    def made(**values: Any) -> Console:
+        values.pop("stderr")
+        return Console(file=out, force_terminal=True, width=80, height=8, **values)
+
+    monkeypatch.setattr(console, "Console", made)
+    with ConsoleReporter(quiet=False) as report:
+        for number in range(20):
+            report.stage(f"stage {number}")
+            out.truncate(0)
+            assert report.bar is not None
+            report.bar.refresh()
+            assert f"stage {number}" in out.getvalue()
+
+
 def test_results_in_brackets_are_shown() -> None:
     out = io.StringIO()
     ConsoleReporter(quiet=False).table("new", {"file": ODD, "per_class": {"[wood]": 1}}, out)
     assert ODD in out.getvalue()
     assert "per_class.[wood]" in out.getvalue()
+
+
+def test_sentences_of_a_result_are_shown_in_full() -> None:
+    """What `doctor` finds wrong is no use as a number."""
+    problems = [f"{library} is not installed. Repair the engine in the preferences." for library in ("torch", "warp")]
+    out = io.StringIO()
+    ConsoleReporter(quiet=False).table(
+        "doctor", {"problems": problems, "files": ["/a" * 60], "poses": [[1.0] * 9]}, out
+    )
+    text = out.getvalue()
+    assert all(problem in text for problem in problems)
+    assert text.count("1 item ") == 1
 
 
 def test_captures_in_brackets_are_shown() -> None:

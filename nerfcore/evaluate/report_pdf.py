@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from ..files import atomic_path
-from ..measure.lettering import lettering
+from ..measure.lettering import fitted, lettering, width_of, wrapped
 from .documentation import Section
 
 WIDTH, HEIGHT = 210.0, 297.0  # mm
@@ -47,6 +47,11 @@ class _Pages:
             self.end()
             self._begin()
 
+    def heading(self, text: str, size: float, weight: str = "normal") -> None:
+        """A line across the page, in smaller letters where it is longer."""
+        place = MARGIN / WIDTH, self.y / HEIGHT
+        fitted(self.figure, place, text, size, 1 - MARGIN / WIDTH, weight=weight, va="top")
+
     def text(self, x: float, text: str, size: float = SIZE, weight: str = "normal") -> None:
         self.figure.text(x / WIDTH, self.y / HEIGHT, text, fontsize=size, fontweight=weight, va="top")
 
@@ -63,7 +68,7 @@ def write_pdf(path: Path, title: str, sections: Sequence[Section], pictures: Seq
         PdfPages(temporary, metadata={"Title": title, "Creator": "Fieldwork"}) as file,
     ):
         pages = _Pages(file)
-        pages.text(MARGIN, title, 16, weight="bold")
+        pages.heading(title, 16, weight="bold")
         pages.y -= 9
         pages.text(MARGIN, f"Written {datetime.now(UTC):%Y-%m-%d %H:%M} UTC", 8)
         pages.y -= 8
@@ -84,7 +89,7 @@ def _table(pages: _Pages, section: Section) -> None:
     lines = [section.columns, *section.rows] if section.columns else section.rows
     places, characters = _places(lines)
     for number, row in enumerate(lines):
-        broken = [textwrap.wrap(cell, wide) or [""] for cell, wide in zip(row, characters)]
+        broken = [wrapped(cell, wide) for cell, wide in zip(row, characters)]
         pages.need(LINE * max(map(len, broken)))
         for line in range(max(map(len, broken))):
             for x, cell in zip(places, broken):
@@ -99,7 +104,7 @@ def _table(pages: _Pages, section: Section) -> None:
 def _places(lines: Sequence[Sequence[str]]) -> tuple[list[float], list[int]]:
     """Where the columns of a table begin in mm, and how many characters have room in each."""
     glyph = SIZE * GLYPH * POINT
-    wide = [min(WIDEST, max(len(row[k]) for row in lines)) for k in range(len(lines[0]))]
+    wide = [min(WIDEST, max(width_of(row[k]) for row in lines)) for k in range(len(lines[0]))]
     places = [MARGIN]
     for characters in wide[:-1]:
         places.append(places[-1] + (characters + 2) * glyph)
@@ -113,7 +118,7 @@ def _picture(pages: _Pages, caption: str, path: Path) -> None:
     tall = min(wide * pixels.shape[0] / pixels.shape[1], HEIGHT - 2 * MARGIN - 8)
     wide = tall * pixels.shape[1] / pixels.shape[0]
     pages.need(tall + 8)
-    pages.text(MARGIN, caption, 8)
+    pages.heading(caption, 8)
     pages.y -= 4 + tall
     axes = pages.figure.add_axes((MARGIN / WIDTH, pages.y / HEIGHT, wide / WIDTH, tall / HEIGHT))
     axes.imshow(pixels, interpolation="none", aspect="auto")

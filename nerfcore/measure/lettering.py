@@ -7,8 +7,12 @@ import unicodedata
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
 
 from ..progress import Reporter
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 # Matplotlib's own font, then those of systems that have what it lacks; only installed ones are asked.
 FONTS = (
@@ -60,7 +64,21 @@ def warn_of_missing(texts: Iterable[str], report: Reporter) -> None:
         )
 
 
+def fitted(
+    figure: Figure, place: tuple[float, float], text: str, size: float, right: float = 1.0, **style: Any
+) -> None:
+    """A line of text that begins at a place of a figure (shares of it), in smaller letters where it would go beyond
+    `right`."""
+    line = figure.text(*place, text, fontsize=size, **style)
+    room, wide = (right - place[0]) * figure.bbox.width, line.get_window_extent().width
+    line.set_fontsize(size * min(1.0, 0.98 * room / max(wide, 1e-9)))
+
+
+def width_of(text: str) -> int:
+    """How many characters wide a text is: those of Chinese and Japanese count as two."""
+    return len(text) + sum(unicodedata.east_asian_width(char) in "WF" for char in text)
+
+
 def wrapped(text: str, characters: int) -> list[str]:
     """The lines of a text that may be so many characters wide; those of Chinese and Japanese are as wide as two."""
-    wide = sum(unicodedata.east_asian_width(char) in "WF" for char in text)
-    return textwrap.wrap(text, max(1, characters * len(text) // max(1, len(text) + wide))) or [""]
+    return textwrap.wrap(text, max(1, characters * len(text) // max(1, width_of(text)))) or [""]

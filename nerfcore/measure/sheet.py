@@ -13,7 +13,7 @@ import numpy as np
 
 from ..errors import SettingError
 from ..files import atomic_path
-from .lettering import lettering, wrapped
+from .lettering import fitted, lettering, wrapped
 from .wording import significant
 
 if TYPE_CHECKING:
@@ -175,19 +175,12 @@ def _figure(sheet: Sheet) -> Figure:
     for spine in axes.spines.values():
         spine.set_linewidth(0.4)
     stated = ratio(sheet.scale) if sheet.metric else "not to scale: the scale of the capture is not known"
-    _line(figure, LEFT / width, 1 - 9 / height, sheet.title, 10, "bold")
+    fitted(figure, (LEFT / width, 1 - 9 / height), sheet.title, 10, weight="bold")
     stated = f"{stated} · grid {significant(step)} {unit}" + (f" · {sheet.note}" if sheet.note else "")
-    _line(figure, LEFT / width, 3 / height, stated, 8)
+    fitted(figure, (LEFT / width, 3 / height), stated, 8)
     _scale_bar(figure, sheet, float(width), float(height))
     _legend(figure, sheet, float(width), float(height))
     return figure
-
-
-def _line(figure: Figure, x: float, y: float, text: str, size: float, weight: str = "normal") -> None:
-    """A line of text at a share of the sheet, in smaller letters where it would run out of it."""
-    line = figure.text(x, y, text, fontsize=size, weight=weight)
-    room, wide = (1 - x) * figure.bbox.width, line.get_window_extent().width
-    line.set_fontsize(size * min(1.0, 0.98 * room / max(wide, 1e-9)))
 
 
 def _hatched(axes: Axes, zone: Zone, sheet: Sheet) -> None:

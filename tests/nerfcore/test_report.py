@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 from fieldwork.nerfcore.errors import ProjectError, SettingError
+from fieldwork.nerfcore.evaluate import report_pdf
 from fieldwork.nerfcore.evaluate.documentation import Section
 from fieldwork.nerfcore.evaluate.report import by_view, report
 from fieldwork.nerfcore.evaluate.report_pdf import write_pdf
@@ -165,6 +166,19 @@ def test_long_tables_go_on_on_the_next_page_and_pictures_keep_their_shape(tmp_pa
         tmp_path / "r.pdf", "Übersicht", [Section("Many", ["n", "text"], rows)], [("tall", tmp_path / "tall.png")]
     )
     assert len(re.findall(rb"/Type /Page\b", (tmp_path / "r.pdf").read_bytes())) == 4
+
+
+def test_wide_letters_and_long_titles_stay_in_their_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn = []
+    monkeypatch.setattr(report_pdf._Pages, "end", lambda pages: drawn.append(pages.figure))
+    title = "survey of the weathered northern parapet " * 4
+    write_pdf(tmp_path / "r.pdf", title, [Section("Many", ["name", "area"], [["裂缝" * 12, "1.0"]])], [])
+    (figure,) = drawn
+    shown = {text.get_text(): text for text in figure.texts}
+    assert shown[title].get_window_extent().x1 <= figure.bbox.x1
+    # Letters of that script are as wide as high; columns lie two characters apart.
+    wide = max(len(text) for text in shown if text.startswith("裂缝")) * report_pdf.SIZE / 72 * 25.4
+    assert report_pdf.MARGIN + wide < shown["area"].get_position()[0] * report_pdf.WIDTH
 
 
 def test_other_endings_are_refused_before_anything_is_done(project: Path, tmp_path: Path) -> None:

@@ -93,7 +93,7 @@ def _judgement(results: dict[str, Any], evaluation: dict[str, Any]) -> Section:
     rows = [["in short", level], *(["because", reason] for reason in whole["reasons"])]
     told = evaluation.get("advice") or []
     rows += [["next", text] for text in told]
-    if not told and evaluation:
+    if not told and evaluation and whole["level"] == "good":  # else the reasons say what to do
         rows.append(["next", "Nothing: more photos would change little."])
     return Section(JUDGEMENT, [], rows, "By poses, training, held-out photos and mesh, as far as these were made.")
 

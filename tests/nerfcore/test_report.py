@@ -11,7 +11,7 @@ import pytest
 import trimesh
 from fieldwork.nerfcore.errors import ProjectError, SettingError
 from fieldwork.nerfcore.evaluate import report_pdf
-from fieldwork.nerfcore.evaluate.documentation import Section
+from fieldwork.nerfcore.evaluate.documentation import Section, _judgement
 from fieldwork.nerfcore.evaluate.report import by_view, report
 from fieldwork.nerfcore.evaluate.report_pdf import write_pdf
 from fieldwork.nerfcore.files import write_json
@@ -84,6 +84,13 @@ def test_another_person_finds_what_is_needed_to_repeat_it(project: Path) -> None
     assert "somebody" not in html
     assert html.count("data:image/png") == 1  # the drawing
     assert "03.jpg" not in html
+
+
+@pytest.mark.parametrize("level", ["good", "weak"])
+def test_nothing_is_left_to_do_only_where_all_is_good(level: str) -> None:
+    verdict = {"level": level, "reasons": [] if level == "good" else ["train longer."]}
+    made = _judgement({"train": {"verdict": verdict}}, {"verdict": {"level": "good", "reasons": []}, "advice": []})
+    assert (["next", "Nothing: more photos would change little."] in made.rows) == (level == "good")
 
 
 def test_sizes_of_small_things_keep_their_digits_and_have_units(project: Path) -> None:

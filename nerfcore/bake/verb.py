@@ -76,7 +76,8 @@ def bake(params: BakeParams, report: Reporter) -> dict[str, Any]:
     cameras = [view.camera.resized(*training_size(view.camera, trained.info.image_size)) for view in asked]
     poses = trained_poses(folder, params.run, trained, asked, box_from_world)
     rays = sparser_rays(cameras, poses, trained.device)
-    blocks = visible_blocks(trained, rays, [1 / camera.focal for camera in cameras], params.memory * 1e6, report.check)
+    pixels = [1 / camera.pixels_per_radian for camera in cameras]
+    blocks = visible_blocks(trained, rays, pixels, params.memory * 1e6, report.check)
     if len(blocks) == 0:
         report.warn("The photos show nothing of the field: what was baked is empty. Train longer.")
     report.stage("Reading colours")

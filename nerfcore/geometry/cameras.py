@@ -36,8 +36,8 @@ class Camera(BaseModel):
     distortion: tuple[float, ...] = ()
 
     @property
-    def focal(self) -> float:
-        """Pixels along a radian in the middle of the image; of a panorama everywhere, whose `fx` formats mean differently."""
+    def pixels_per_radian(self) -> float:
+        """Pixels that an angle spans in the middle of the picture."""
         return self.width / (2 * np.pi) if self.model == "EQUIRECTANGULAR" else self.fx
 
     def resized(self, width: int, height: int) -> Camera:

@@ -109,7 +109,7 @@ def flat_views(views: list[View], box_from_world: np.ndarray, longest: int) -> l
 def cube_faces(camera: Camera) -> list[tuple[Camera, np.ndarray]]:
     """Six square pinholes of 90° with the resolution of a wide camera's middle, and their rotations (3, 3) into its
     axes."""
-    side = max(16, round(2 * camera.focal))
+    side = max(16, round(2 * camera.pixels_per_radian))
     face = Camera(width=side, height=side, fx=side / 2, fy=side / 2, cx=side / 2, cy=side / 2)
     ahead = [(0, 0, 1), (1, 0, 0), (0, 0, -1), (-1, 0, 0), (0, 1, 0), (0, -1, 0)]
     turns = []

@@ -57,7 +57,7 @@ class PosedCamera:
 
     def footprint(self, depth: np.ndarray) -> np.ndarray:
         """Width of a pixel at a depth (N,), in units of the mesh."""
-        return depth / self.camera.focal
+        return depth / self.camera.pixels_per_radian
 
     def pixels(self, local: np.ndarray) -> np.ndarray:
         """Pixel coordinates (N, 2) of points (N, 3) in camera axes; NaN where the lens does not see."""

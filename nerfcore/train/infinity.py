@@ -30,7 +30,8 @@ def share_at_infinity(scene: Scene) -> float:
     chosen = np.unique(np.linspace(0, len(scene.train) - 1, MOST_PHOTOS).round().astype(int))
     views = [scene.views[scene.train[i]] for i in chosen]
     seen = [_colored_directions(view) for view in views]
-    focal = np.median([v.camera.fx * min(1.0, SIDE / max(v.camera.width, v.camera.height)) for v in views])
+    scales = [min(1.0, SIDE / max(view.camera.width, view.camera.height)) for view in views]
+    focal = np.median([view.camera.pixels_per_radian * scale for view, scale in zip(views, scales)])
     directions, colors = (np.concatenate(part) for part in zip(*seen))
     photo = np.repeat(np.arange(len(seen)), [len(part) for part, _ in seen])
     usable = np.isfinite(directions).all(1)
@@ -65,7 +66,9 @@ def _between_points(view: View, points: np.ndarray) -> np.ndarray:
     local = (points - view.camera_to_world[:3, 3]) @ view.camera_to_world[:3, :3]
     with np.errstate(invalid="ignore"):
         pixel = project(camera, local)
-        inside = (local[:, 2] > 0) & ((pixel >= 0) & (pixel < [camera.width, camera.height])).all(1)
+        inside = ((pixel >= 0) & (pixel < [camera.width, camera.height])).all(1)
+    if camera.model != "EQUIRECTANGULAR":
+        inside &= local[:, 2] > 0
     centers = pixel_centers(camera.width, camera.height).reshape(-1, 2)
     if inside.sum() < FEWEST:
         return np.zeros(len(centers), bool)

@@ -58,7 +58,7 @@ def pixels_across(scene: Scene, views: list[int], box: Box, image_size: int) -> 
     for index, pose in zip(views, box_poses([scene.views[i] for i in views], box.box_from_world)):
         camera = scene.views[index].camera
         scale = min(1.0, image_size / max(camera.width, camera.height))
-        footprints.append(max(float(np.linalg.norm(pose[:3, 3])), 0.5) / (camera.fx * scale))
+        footprints.append(max(float(np.linalg.norm(pose[:3, 3])), 0.5) / (camera.pixels_per_radian * scale))
     return round((4.0 if box.contracted else 2.0) / float(np.median(footprints)))
 
 

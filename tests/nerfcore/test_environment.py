@@ -14,8 +14,10 @@ import torch
 from fieldwork.nerfcore.config import RunConfig, make_config
 from fieldwork.nerfcore.data.box import box_poses
 from fieldwork.nerfcore.data.load import load_scene
+from fieldwork.nerfcore.data.scene import View
 from fieldwork.nerfcore.errors import ProjectError, SettingError
 from fieldwork.nerfcore.field.environment import NAMED, Environment
+from fieldwork.nerfcore.geometry.cameras import Camera
 from fieldwork.nerfcore.geometry.contraction import grid_position, horizon, thinning
 from fieldwork.nerfcore.geometry.points import Points
 from fieldwork.nerfcore.images.picture import linear_to_srgb
@@ -33,7 +35,7 @@ from fieldwork.nerfcore.render.run import Trained, load_trained
 from fieldwork.nerfcore.render.verb import look_at
 from fieldwork.nerfcore.train.background import INFINITE
 from fieldwork.nerfcore.train.composite_loss import composite_loss
-from fieldwork.nerfcore.train.infinity import share_at_infinity
+from fieldwork.nerfcore.train.infinity import _between_points, share_at_infinity
 from fieldwork.nerfcore.train.prepare import make_trainer, plan_run
 from fieldwork.nerfcore.verbs import run_verb
 from fieldwork.tests.nerfcore.support.ball import SMALL, ball_project, draw
@@ -142,6 +144,14 @@ def test_what_lies_between_points_is_not_at_infinity(tmp_path: Path) -> None:
     assert share_at_infinity(replace(scene, points=points(30))) == 0
     in_a_line = replace(points(1), xyz=np.linspace([-1, 0, 0], [1, 0, 0], 2000))
     assert share_at_infinity(replace(scene, points=in_a_line)) == alone
+
+
+def test_points_behind_a_panorama_have_things_between_them() -> None:
+    panorama_ = Camera(model="EQUIRECTANGULAR", width=64, height=32, fx=32, fy=32, cx=32, cy=16)
+    band = np.array([[np.sin(a), h, np.cos(a)] for a in np.linspace(-3.1, 3.1, 60) for h in (-0.5, 0.5)])
+    between = _between_points(View("all around", panorama_, np.eye(4), Path()), band).reshape(32, 64)
+    assert between[16].all()  # the horizon, also at both ends of the picture
+    assert not between[[0, -1]].any()
 
 
 def test_the_sky_is_learned_and_the_field_stays_empty_before_it(seen: Seen) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,10 @@ import pytest
 import torch
 from fieldwork.nerfcore.config import LossConfig, SceneConfig
 from fieldwork.nerfcore.data.box import choose_box
+from fieldwork.nerfcore.data.load import load_scene
 from fieldwork.nerfcore.data.pixels import VOID
 from fieldwork.nerfcore.errors import TrainingError
+from fieldwork.nerfcore.geometry.cameras import Camera
 from fieldwork.nerfcore.geometry.similarity import similarity_scale
 from fieldwork.nerfcore.params import TrainParams
 from fieldwork.nerfcore.progress import Reporter
@@ -24,7 +27,7 @@ from fieldwork.nerfcore.render.run import CPU_IMAGE_SIZE, GPU_IMAGE_SIZE, RunInf
 from fieldwork.nerfcore.train import losses, verb
 from fieldwork.nerfcore.train import trainer as trainer_module
 from fieldwork.nerfcore.train.composite_loss import composite_loss
-from fieldwork.nerfcore.train.prepare import plan_run
+from fieldwork.nerfcore.train.prepare import pixels_across, plan_run
 from fieldwork.nerfcore.train.schedule import bias_correction
 from fieldwork.nerfcore.train.trainer import Trainer
 from fieldwork.nerfcore.verbs import run_verb
@@ -46,6 +49,16 @@ def planned(project: Path, device: str = "cpu", **settings: str) -> RunInfo:
 
 
 # scene
+
+
+def test_the_finest_level_has_a_vertex_for_each_pixel_of_a_panorama(ball: Path) -> None:
+    scene, box = load_scene(ball), choose_box(load_scene(ball), SceneConfig(), True)
+    lens = scene.views[0].camera
+    width = round(2 * math.pi * lens.fx)  # as many pixels for an angle as the photos have
+    around = Camera(model="EQUIRECTANGULAR", width=width, height=width // 2, fx=width / 2, fy=width / 2, cx=0, cy=0)
+    panoramas = replace(scene, views=[replace(view, camera=around) for view in scene.views])
+    across = [pixels_across(s, scene.train, box, 4096) for s in (scene, panoramas)]
+    assert across[1] == pytest.approx(across[0], rel=0.01)
 
 
 @pytest.mark.setting("scene.contraction")

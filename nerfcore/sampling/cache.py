@@ -30,12 +30,15 @@ class CoarseCache:
         self.hit: torch.Tensor | None = None
 
     def _pixels(self, tiles: torch.Tensor, dx: torch.Tensor, dy: torch.Tensor) -> torch.Tensor:
-        """Flat pixel indices at offset (dx, dy) in [0, TILE) of tiles; clamped to the image."""
+        """Flat pixel indices at offset (dx, dy) in [0, TILE) of tiles; those that would reach beyond the image lie at its
+        edge, so that none of their pixels comes more often."""
         image = torch.bucketize(tiles, self.first[1:], right=True)
         local = tiles - self.first[image]
-        x = (local % self.columns[image] * TILE + dx).minimum(self.width[image] - 1)
-        y = (torch.div(local, self.columns[image], rounding_mode="floor") * TILE + dy).minimum(self.height[image] - 1)
-        return self.store.first[image] + y * self.width[image] + x
+        row, column = torch.div(local, self.columns[image], rounding_mode="floor"), local % self.columns[image]
+        width, height = self.width[image], self.height[image]
+        x = (column * TILE).minimum(width - TILE).clamp(min=0) + dx % width
+        y = (row * TILE).minimum(height - TILE).clamp(min=0) + dy % height
+        return self.store.first[image] + y * width + x
 
     @torch.no_grad()
     def rebuild(self, model) -> None:

@@ -184,6 +184,24 @@ def test_a_share_of_the_rays_comes_from_everywhere(ball: Path) -> None:
         assert elsewhere == pytest.approx(free * (1 - 1 / len(trainer.store.views)), abs=0.03)
 
 
+def test_no_pixel_of_a_hit_tile_is_drawn_more_often_because_the_image_ends(tmp_path: Path) -> None:
+    project = ball_project(tmp_path / "ball", views=4, side=37)  # two tiles and five pixels
+    trainer = trainer_of(project)
+    trainer.cache.hit = torch.arange(int(trainer.cache.first[-1]))
+    drawn = trainer.cache.draw(200 * len(trainer.store), 0.0, trainer.generator)
+    counts = torch.bincount(drawn, minlength=len(trainer.store)) / 200
+    assert counts.min() > 0.3
+    assert counts.max() < 6  # where four tiles lie on each other at a corner
+
+
+def test_photos_smaller_than_a_tile_are_drawn_evenly(tmp_path: Path) -> None:
+    trainer = trainer_of(ball_project(tmp_path / "ball", views=4, side=12))
+    trainer.cache.hit = torch.arange(int(trainer.cache.first[-1]))
+    drawn = trainer.cache.draw(500 * len(trainer.store), 0.0, trainer.generator)
+    counts = torch.bincount(drawn, minlength=len(trainer.store)) / 500
+    assert counts.max() < 2.5
+
+
 def near_another_class(label: torch.Tensor, y: int, x: int) -> bool:
     """The definition of an outline, looked up pixel by pixel."""
     around = label[max(y - DISTANCE, 0) : y + DISTANCE + 1, max(x - DISTANCE, 0) : x + DISTANCE + 1]

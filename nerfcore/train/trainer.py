@@ -84,6 +84,8 @@ class Trainer:
 
     def _refresh_cache(self) -> None:
         s = self.config.sampling
+        if self.store.usable is not None:
+            return  # it draws from the usable pixels alone, wherever they are
         if s.coarse_cache and self.steps >= s.warmup and (self.steps - s.warmup) % s.cache_every == 0:
             self.cache.rebuild(self.model)
 

@@ -134,6 +134,11 @@ def test_the_grid_and_the_cache_are_updated_when_told(ball: Path, monkeypatch: p
         trainer.step(0.1)
     assert len(rebuilds) == 3
     assert trainer.cache.hit is None
+    trainer = trainer_of(ball, **settings)
+    trainer.store.usable = torch.arange(1, len(trainer.store))  # a mask leaves a pixel out
+    for _ in range(9):
+        trainer.step(0.1)
+    assert len(rebuilds) == 3  # rays are drawn from the usable pixels, whatever they meet
 
 
 @pytest.mark.setting("sampling.decay", "sampling.threshold")

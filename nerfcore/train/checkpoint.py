@@ -25,7 +25,7 @@ def trainer_tensors(trainer: Trainer) -> dict[str, torch.Tensor]:
             tensors[f"optimizer.{index}.{name}"] = value
     tensors["generator"] = trainer.generator.get_state()
     if trainer.guard.scaling:
-        tensors["loss_scale"] = trainer.guard.scale
+        tensors["loss_scale"], tensors["loss_scale_steps"] = trainer.guard.scale, trainer.guard.good_steps
     if trainer.cache.hit is not None:
         tensors["cache.hit"] = trainer.cache.hit
     if trainer.poses is not None:
@@ -79,5 +79,6 @@ def restore(trainer: Trainer, tensors: dict[str, torch.Tensor], state: dict[str,
         trainer.poses.restore({n.removeprefix("poses."): t for n, t in tensors.items() if n.startswith("poses.")})
     trainer.generator.set_state(tensors["generator"].cpu())
     trainer.guard.scale = tensors.get("loss_scale", trainer.guard.scale)
+    trainer.guard.good_steps = tensors.get("loss_scale_steps", trainer.guard.good_steps)
     trainer.cache.hit = tensors.get("cache.hit")
     trainer.steps, trainer.rays = state["steps"], state["rays"]

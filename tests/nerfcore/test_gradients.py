@@ -9,6 +9,7 @@ import pytest
 import torch
 from fieldwork.nerfcore.errors import TrainingError
 from fieldwork.nerfcore.kernels.device import Kernels, using_kernels
+from fieldwork.nerfcore.train.checkpoint import restore, trainer_tensors
 from fieldwork.nerfcore.train.gradients import FIRST_SCALE, GROWTH_STEPS, GradientGuard
 from fieldwork.nerfcore.train.trainer import Trainer
 from fieldwork.tests.nerfcore.support.ball import ball_project
@@ -37,6 +38,17 @@ def test_the_scale_halves_after_an_overflow_and_grows_again() -> None:
     other.finite = other.inspected([torch.tensor([math.nan])])
     other.update()
     assert float(other.scale) == 1.0
+
+
+def test_the_scale_of_a_resumed_training_grows_when_it_would_have(ball: Path) -> None:
+    trainer, resumed = (trainer_of(ball, **{"field.precision": "float16"}) for _ in range(2))
+    for _ in range(GROWTH_STEPS - 1):
+        trainer.guard.update()
+    kept = {name: value.clone() for name, value in trainer_tensors(trainer).items()}
+    restore(resumed, kept, {"steps": GROWTH_STEPS - 1, "rays": trainer.rays})
+    for each in (trainer, resumed):
+        each.guard.update()
+        assert float(each.guard.scale) == 2 * FIRST_SCALE
 
 
 @pytest.mark.parametrize("kernels", ["warp", "torch"])

@@ -210,7 +210,8 @@ def degrade(store: PixelStore, config: RunConfig) -> None:
         store.rgba[:, :3] = noisy.to(torch.uint8).to(store.home)
     if t.labelled_share < 1:
         count = len(store.views)
-        keep = torch.randperm(count, generator=generator)[: max(1, round(count * t.labelled_share))].tolist()
+        kept = max(1, round(count * t.labelled_share)) if t.labelled_share > 0 else 0
+        keep = torch.randperm(count, generator=generator)[:kept].tolist()
         for index in set(range(count)) - set(keep):
             store.label[int(store.first[index]) : int(store.first[index + 1])] = 255
     if t.label_noise > 0:

@@ -360,6 +360,7 @@ def test_a_seed_repeats_a_run_and_another_one_does_not(ball: Path) -> None:
 def test_photos_and_labels_are_spoiled_as_much_as_asked(ball: Path) -> None:
     clean = trainer_of(ball).store
     labelled = clean.label != VOID
+    assert bool((trainer_of(ball, **{"train.labelled_share": "0"}).store.label == VOID).all())
     half = trainer_of(ball, **{"train.labelled_share": "0.5"}).store
     with_labels = [bool((half.label[a:b] != VOID).any()) for a, b in zip(half.first[:-1], half.first[1:])]
     assert sum(with_labels) == round(0.5 * len(clean.views))

@@ -105,7 +105,13 @@ def train(params: TrainParams, report: Reporter) -> dict[str, Any]:
     _picture_closed(place.folder / CLOSED_PICTURE, trainer, scene, info.box(load_project(project_folder)))
     state = {"seconds": 0.0, "progress": 0.0, "psnr": None, "largest_batch": None}
     if saved is not None:
-        restore(trainer, *saved)
+        try:
+            restore(trainer, *saved)
+        except (RuntimeError, KeyError) as error:
+            raise ProjectError(
+                f"{place.folder / CHECKPOINT} holds a field of another shape than {INFO} beside it describes.",
+                "Train the run anew, without --resume.",
+            ) from error
         state.update({key: saved[1].get(key) for key in state})
         trainer.largest_batch = state["largest_batch"]
         del saved

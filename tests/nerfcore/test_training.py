@@ -307,6 +307,22 @@ def test_a_damaged_checkpoint_is_named(tiny_project: Path) -> None:
         run_verb("evaluate", EvaluateParams(project=tiny_project, run="damaged"), Reporter())
 
 
+@pytest.mark.parametrize(
+    ("stage", "name", "value"),
+    [("field", "levels", 4), ("sampling", "resolution", 16), ("train", "refine_poses", True)],
+)
+def test_a_training_whose_settings_were_edited_cannot_go_on(
+    tiny_project: Path, stage: str, name: str, value: object
+) -> None:
+    train(tiny_project, "edited", 5)
+    path = tiny_project / "runs" / "edited" / "config.json"
+    info = json.loads(path.read_text())
+    info["config"][stage][name] = value
+    path.write_text(json.dumps(info))
+    with pytest.raises(ProjectError, match=r"field\.safetensors holds a field of another shape than config\.json"):
+        train(tiny_project, "edited", 10, resume=True)
+
+
 def test_a_missing_run_is_named(tiny_project: Path) -> None:
     with pytest.raises(ProjectError, match="no run “nothing”"):
         run_verb("evaluate", EvaluateParams(project=tiny_project, run="nothing"), Reporter())

@@ -85,8 +85,9 @@ def plan_run(
             "Leave it at “auto”.",
         )
     background = choose_background(scene, transparent)
-    # In front of one colour all around there is nothing but that colour.
-    box = choose_box(scene, config.scene, transparent or background in LEVEL)
+    # In front of one colour all around there is nothing but that colour, unless somebody says what else.
+    asked = config.scene.background
+    box = choose_box(scene, config.scene, transparent or (background in LEVEL and asked in ("auto", *LEVEL)))
     config = config.model_copy(deep=True)
     if config.scene.image_size is None:
         config.scene.image_size = CPU_IMAGE_SIZE if device.type == "cpu" else GPU_IMAGE_SIZE

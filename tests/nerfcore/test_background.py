@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fieldwork.nerfcore.config import RunConfig
+from fieldwork.nerfcore.config import RunConfig, make_config
 from fieldwork.nerfcore.data.box import box_poses
 from fieldwork.nerfcore.data.load import load_scene
 from fieldwork.nerfcore.geometry.similarity import similarity_scale
@@ -71,6 +71,15 @@ def test_the_cube_holds_all_there_is_in_front_of_one_colour(tmp_path: Path, valu
     assert info.contracted == (value is None)
     side = 2 * similarity_scale(np.asarray(info.sfm_from_box))
     assert side > 2 * RADIUS  # the ball fits in
+
+
+@pytest.mark.parametrize(("asked", "contracted"), [("black", False), ("environment", True), ("random", True)])
+def test_space_does_not_end_where_something_is_said_to_be_behind_black(
+    tmp_path: Path, asked: str, contracted: bool
+) -> None:
+    project = on_background(ball_project(tmp_path / "p"), 0)
+    config = make_config("draft", {"scene.background": asked})
+    assert plan_run(project, "draft", config, torch.device("cpu"))[0].contracted == contracted
 
 
 def test_photos_that_are_mostly_black_do_not_turn_the_field_black(

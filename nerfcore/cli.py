@@ -240,7 +240,7 @@ def run_command(name: str, values: dict[str, Any], as_json: bool, quiet: bool, s
                 report.table(name, result, stdout)
             stdout.flush()
         except (Cancelled, KeyboardInterrupt):
-            return _cancelled(as_json, stdout)
+            return _cancelled(getattr(params, "resume", True), as_json, stdout)
         except Exception as error:  # noqa: BLE001 - the boundary: whatever happened becomes a sentence
             return _failed(error, name, project_of(params), as_json, stdout)
         judged = result.get("verdict", GOOD)
@@ -249,8 +249,9 @@ def run_command(name: str, values: dict[str, Any], as_json: bool, quiet: bool, s
         return 3 if strict and (report.warnings or judged["level"] != "good") else 0
 
 
-def _cancelled(as_json: bool, stdout: TextIO) -> int:
-    hint = "Run the same command again to go on."
+def _cancelled(goes_on: bool, as_json: bool, stdout: TextIO) -> int:
+    """Tell how to go on: by the command as it was, if that `goes_on` by itself."""
+    hint = f"Run the same command again {'' if goes_on else 'with --resume '}to go on."
     click.echo(f"Cancelled. {hint}", err=True)
     if as_json:
         with suppress(NoReader):  # whoever cancels may be gone

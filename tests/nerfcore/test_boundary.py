@@ -84,7 +84,22 @@ def test_a_cancelled_command_prints_one_object_too(
     assert cli.main(["evaluate", str(project), "--json"]) == 130
     out, err = capfd.readouterr()
     assert json.loads(out)["error"]["code"] == "cancelled"
-    assert "go on" in err
+    assert "Run the same command again to go on." in err
+
+
+def test_a_cancelled_training_names_what_makes_it_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    def cancelled(*_: object) -> None:
+        raise Cancelled
+
+    project = ball_project(tmp_path / "p")
+    monkeypatch.setattr(cli, "run_verb", cancelled)
+    for options, words in (([], "again with --resume to go on"), (["--resume"], "again to go on")):
+        assert cli.main(["train", str(project), "--json", *options]) == 130
+        out, err = capfd.readouterr()
+        assert words in json.loads(out)["error"]["hint"]
+        assert words in err
 
 
 def test_a_failure_without_a_project_is_logged_too(

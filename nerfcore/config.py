@@ -148,7 +148,10 @@ class SamplingConfig(Stage):
     close_between_cameras: bool = Field(
         default=True, description="cells on the way between cameras around something, and right before it, stay empty"
     )
-    coarse_cache: bool = Field(default=True, description="choose training rays by which image tiles met the field")
+    coarse_cache: bool = Field(
+        default=True,
+        description="choose training rays by which image tiles met the field; not where masks or lenses leave pixels out",
+    )
     cache_every: int = Field(default=1000, ge=1, le=MANY, description="steps between updates of the coarse cache")
     outline_rays: float = Field(
         default=0.2, ge=0, le=1, description="share of rays drawn where classes meet in the labels"

@@ -2,7 +2,7 @@
 
 Positions are in the *normalised* frame, whose unit cube [−1, 1]³ is the region of interest. `contracted` maps all of
 space into the grid (Barron et al., "Mip-NeRF 360", 2022, eq. 10, with the infinity norm); otherwise the grid covers
-just the cube. A ray is marched in bins of about half a grid cell; bins in empty cells are skipped.
+just the cube. A ray is marched in bins of about a grid cell; bins in empty cells are skipped.
 
 Bin weights (`mode`):
   PDF_DEFAULT  T·α·(1 + β·importance) + ε      transmittance-weighted, ε keeps every occupied bin alive
@@ -35,7 +35,7 @@ class MarchSettings:
     """How rays are marched. `step` is the bin length inside the cube; `near`, `far` clip the ray (normalised units).
 
     `empty_distance`: where space is contracted, rays from outside of the cube start as far away as this, but before they reach
-    the cube. `per_bin`: samples for each occupied bin of a ray, at most the number asked for and at least `LEAST`; all
+    the cube. `per_bin`: samples for each occupied bin of a ray, at most the number asked for and at least `march.FEWEST_SAMPLES`; all
     rays get the number asked for when it is 0.
     """
 

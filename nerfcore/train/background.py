@@ -8,6 +8,7 @@ import numpy as np
 
 from ..data.box import looks_inward
 from ..data.scene import Scene
+from ..geometry.cameras import Camera, pixel_centers, rays
 from ..images.working import read_picture
 from .infinity import share_at_infinity
 
@@ -44,16 +45,23 @@ def choose_background(scene: Scene, transparent: bool) -> Background:
 def _plain_surroundings(scene: Scene) -> Background | None:
     """Black or white, where nearly all photos have borders of that."""
     chosen = np.unique(np.linspace(0, len(scene.train) - 1, MOST_PHOTOS).round().astype(int))
-    shares = [edge_shares(read_picture(scene.views[scene.train[i]].image).pixels[..., :3]) for i in chosen]
+    views = [scene.views[scene.train[i]] for i in chosen]
+    shares = [edge_shares(read_picture(view.image).pixels[..., :3], view.camera) for view in views]
     black, white = np.median(shares, axis=0)
     return "black" if black > SHARE else "white" if white > SHARE else None
 
 
-def edge_shares(photo: np.ndarray) -> tuple[float, float]:
-    """Which shares of the strip along the borders of a photo (H, W, 3) uint8 are black, and white."""
+def edge_shares(photo: np.ndarray, camera: Camera) -> tuple[float, float]:
+    """Which shares of the strip along the borders of a photo (H, W, 3) uint8 are black, and white; what a fisheye does not
+    see, which is black around its circle, says nothing."""
     height, width = photo.shape[:2]
     strip = np.ones((height, width), bool)
     y, x = max(1, round(EDGE * height)), max(1, round(EDGE * width))
     strip[y : height - y, x : width - x] = False
     pixels = photo[strip]
+    if camera.model == "OPENCV_FISHEYE":
+        places = pixel_centers(width, height)[strip]
+        pixels = pixels[rays(camera.resized(width, height), places)[1]]
+    if not len(pixels):
+        return 0.0, 0.0
     return float((pixels.max(1) < BLACK).mean()), float((pixels.min(1) >= WHITE).mean())

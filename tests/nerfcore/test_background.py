@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import torch
 from fieldwork.nerfcore.config import RunConfig, make_config
 from fieldwork.nerfcore.data.box import box_poses
 from fieldwork.nerfcore.data.load import load_scene
+from fieldwork.nerfcore.geometry.cameras import Camera, pixel_centers, rays
 from fieldwork.nerfcore.geometry.similarity import similarity_scale
 from fieldwork.nerfcore.params import ImportParams, TrainParams
 from fieldwork.nerfcore.progress import Reporter
@@ -47,6 +49,21 @@ def on_background(project: Path, value: int | None) -> Path:
 def test_black_and_white_surroundings_are_recognised(tmp_path: Path, value: int | None, chosen: str) -> None:
     project = on_background(ball_project(tmp_path / "p", views=48), value)
     assert choose_background(load_scene(project), transparent=False) == chosen
+
+
+def test_what_is_black_around_the_circle_of_a_fisheye_are_no_surroundings(tmp_path: Path) -> None:
+    scene = load_scene(on_background(ball_project(tmp_path / "p"), None))
+    # Sees 209°, which fill a circle as wide as the picture.
+    fisheye = Camera(
+        model="OPENCV_FISHEYE", width=40, height=40, fx=16.4, fy=16.4, cx=20, cy=20, distortion=(-0.1, 0.0, 0.0, 0.0)
+    )
+    sees = rays(fisheye, pixel_centers(40, 40).reshape(-1, 2))[1].reshape(40, 40)
+    for view in scene.views:
+        photo = np.asarray(Image.open(view.image)) * sees[..., None]
+        Image.fromarray(photo.astype(np.uint8)).save(view.image)
+    through = replace(scene, views=[replace(view, camera=fisheye) for view in scene.views])
+    assert choose_background(scene, transparent=False) == "black"
+    assert choose_background(through, transparent=False) == "random"
 
 
 def test_only_around_objects_without_alpha_and_masks(tmp_path: Path) -> None:
@@ -96,10 +113,11 @@ def test_photos_that_are_mostly_black_do_not_turn_the_field_black(
 def test_edges_only() -> None:
     photo = np.full((50, 100, 3), 120, np.uint8)
     photo[4:-4, 4:-4] = 0
-    assert edge_shares(photo) == (0, 0)
+    camera = Camera(width=100, height=50, fx=80, fy=80, cx=50, cy=25)
+    assert edge_shares(photo, camera) == (0, 0)
     photo[:2] = 0
     photo[-2:] = 255
-    black, white = edge_shares(photo)
+    black, white = edge_shares(photo, camera)
     assert black == white == pytest.approx(200 / (50 * 100 - 46 * 92))
 
 

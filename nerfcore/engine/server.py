@@ -142,7 +142,7 @@ class Server:
     def _do_status(self, params: dict[str, Any]) -> dict[str, Any]:
         memory = psutil.Process().memory_info().rss / 2**20
         with self._jobs_lock:
-            jobs = [vars(job.status) | {"detached": job.detached} for job in self._jobs.values()]
+            jobs = [vars(j.status) | {"detached": j.detached} for j in self._jobs.values() if not j.status.finished]
         return {**self._do_ping({}), "memory_mb": round(memory), "gpu_memory_mb": gpu_memory_mb(), "jobs": jobs}
 
     def _do_cancel(self, params: dict[str, Any]) -> dict[str, Any]:
@@ -173,8 +173,13 @@ class Server:
             return [self._jobs[name]]
 
     def _cancel(self, job: Job) -> None:
-        job.cancel()
+        """Let a running job come to its end; one that waits has none to come to, and is answered at once."""
+        with self._jobs_lock:
+            job.cancel()
+            waits = job.status.state == "queued"
         self._cancelled_at.setdefault(job.status.id, time.monotonic())
+        if waits:
+            self._fail(job, Cancelled())
 
     # Writing
 
@@ -214,7 +219,9 @@ class Server:
         try:
             job.check()
             with project_lock(job.lockable, job.verb):
-                job.begin()
+                with self._jobs_lock:
+                    job.check()  # from here on a cancel finds it running
+                    job.begin()
                 with _logged(job):
                     _loaded(job)
                     self._answer(job, "done", result=run_verb(job.verb, job.params, job))
@@ -250,9 +257,11 @@ class Server:
         while True:
             time.sleep(TICK)
             with self._jobs_lock:
-                jobs = list(self._jobs.values())
+                jobs = [job for job in self._jobs.values() if not job.status.finished]
             for job in jobs:
                 job.heartbeat()
+                if job.cancelled and job.status.state == "queued":
+                    self._cancel(job)
                 if job.cancelled and job.status.state == "running":
                     since = self._cancelled_at.setdefault(job.status.id, time.monotonic())
                     if time.monotonic() - since > GRACE:

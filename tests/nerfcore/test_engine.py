@@ -275,9 +275,27 @@ def test_queued_jobs_wait_and_can_be_cancelled(start, project):
     second = client.send("count", project=project, steps=5, job="second")
     third = client.send("count", project=project, steps=1, job="third")
     client.send("cancel", job="second")
-    assert client.answer(first)["result"]["steps"] == 60
     assert client.answer(second)["error"]["code"] == -32001
+    assert client.answer(first)["result"]["steps"] == 60
     assert client.answer(third)["result"]["steps"] == 1
+
+
+@pytest.mark.parametrize("how", ["request", "file"])
+def test_a_job_that_waits_is_cancelled_at_once(start, project, how):
+    client = start()
+    first = client.send("count", project=project, steps=100_000, job="first")
+    second = client.send("count", project=project, steps=5, job="second")
+    client.until_progress()
+    if how == "request":
+        client.send("cancel", job="second")
+    else:
+        st.request_cancel(project, "second")
+    assert client.answer(second, timeout=5)["error"]["code"] == -32001
+    assert {job.id: job.state for job in st.list_jobs(project)} == {"first": "running", "second": "cancelled"}
+    assert [job["id"] for job in client.answer(client.send("status"))["result"]["jobs"]] == ["first"]
+    client.send("cancel", job="first")
+    assert client.answer(first)["error"]["code"] == -32001
+    assert client.answer(client.send("count", project=project, steps=1))["result"]["steps"] == 1
 
 
 def test_a_deaf_job_is_ended_with_its_process(start, project):

@@ -23,8 +23,11 @@ def main(arguments: list[str]) -> int:
         return 1
     # Ctrl-C reaches both processes: the engine's ends its work in order, and this one must wait for it.
     process = subprocess.Popen([str(python), "-s", "-m", "nerfcore", *arguments], env=engine_environment())
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # What ends Blender, as a farm does, must end the engine too.
+    handlers = {signal.SIGINT: signal.SIG_IGN, signal.SIGTERM: lambda *_: process.terminate()}
+    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
     try:
         return process.wait()
     finally:
-        signal.signal(signal.SIGINT, before if before is not None else signal.SIG_DFL)
+        for number, handler in before.items():
+            signal.signal(number, handler if handler is not None else signal.SIG_DFL)

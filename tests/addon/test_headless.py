@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -56,3 +57,22 @@ def test_the_batch_example_makes_blend_files_and_names_what_failed(tmp_path, bpy
     )
     assert facts[0] >= 18
     assert facts[1] == 1.0
+
+
+TERMINATED = """
+import signal, threading
+from fieldwork.addon import cli
+cli.machine.engine_python = lambda: ENGINE_PYTHON
+started, popen = [], cli.subprocess.Popen
+def start(command, **options):
+    started.append(popen([ENGINE_PYTHON, "-c", "import time; time.sleep(60)"]))
+    threading.Timer(0.5, os.kill, [os.getpid(), signal.SIGTERM]).start()
+    return started[0]
+cli.subprocess.Popen = start
+answer([cli.main(["train", "project"]), started[0].poll()])
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="has no such signal")
+def test_what_ends_blender_ends_the_engine_it_waits_for(bpy_script):
+    assert bpy_script(TERMINATED) == [-signal.SIGTERM, -signal.SIGTERM]

@@ -150,6 +150,9 @@ class _Named(Reporter):
     def watching(self, training: Any) -> AbstractContextManager[Callable[[], None]]:
         return self.outer.watching(training)
 
+    def note(self, message: str) -> None:
+        self.outer.note(f"{self.name}: {message}")
+
     def warn(self, message: str) -> None:
         self.warnings.append(message)
         self.outer.warn(f"{self.name}: {message}")

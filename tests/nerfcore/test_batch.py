@@ -95,6 +95,22 @@ def test_cancelled_batch_keeps_what_is_done(tmp_path, reconstructed):
     assert batch(BatchParams(list=path), Reporter())["skipped"] == 1
 
 
+def test_notes_are_told_with_their_capture(tmp_path, monkeypatch):
+    class Listener(Reporter):
+        told: list[str] = []
+
+        def note(self, message: str) -> None:
+            self.told.append(message)
+
+    def work(params, report):
+        report.note("3 of 9 photos are compared: the time is used up.")
+        return {"stages": {}}
+
+    monkeypatch.setattr(module, "reconstruct", work)
+    batch(BatchParams(list=write_list(tmp_path, "vase")), Listener())
+    assert Listener.told == ["vase_fieldwork (1 of 1): 3 of 9 photos are compared: the time is used up."]
+
+
 def test_lists_of_both_kinds_say_the_same(tmp_path):
     table = tmp_path / "list.csv"
     table.write_text(

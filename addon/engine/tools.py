@@ -113,6 +113,7 @@ def _environment(log: IO[str]) -> dict[str, str]:
     env = {k: v for k, v in os.environ.items() if k not in ("PYTHONHOME", "PYTHONPATH", "VIRTUAL_ENV")}
     env["PYTHONNOUSERSITE"] = "1"
     env["PIP_DISABLE_PIP_VERSION_CHECK"] = "1"
+    env["PIP_USER"] = "0"  # where it is a user's habit, an environment refuses it
     env["UV_CACHE_DIR"] = str(Path(log.name).with_name("cache"))
     env["UV_PYTHON_DOWNLOADS"] = "never"
     env["UV_HTTP_TIMEOUT"] = "120"

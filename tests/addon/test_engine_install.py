@@ -120,6 +120,17 @@ def test_broken_package_says_so_and_the_next_try_goes_on(options, lock, tmp_path
     assert place.installed(options.folder)
 
 
+def test_habits_of_the_user_do_not_keep_packages_out_of_the_environment(
+    options, lock, tmp_path, content_doctor, monkeypatch
+):
+    make_wheel(tmp_path / "wheels")
+    settings = tmp_path / "pip.conf"
+    settings.write_text("[install]\nuser = true\n")
+    monkeypatch.setenv("PIP_CONFIG_FILE", str(settings))
+    go(options, lock)
+    assert place.installed(options.folder)
+
+
 @pytest.mark.parametrize(
     "said",
     [

@@ -60,7 +60,7 @@ class Storage:
             return work()
         except FileNotFoundError as error:
             raise StorageError(f"{self.url} lacks a file while {doing}: {error}.", "Run the campaign again.") from error
-        except OSError as error:
+        except Exception as error:  # clients of storages have errors of their own, for want of credentials for instance
             raise StorageError(
                 f"{self.url} cannot be reached while {doing}: {error}.",
                 "Check the address, the network and the rights.",

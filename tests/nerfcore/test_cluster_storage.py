@@ -240,6 +240,20 @@ def test_a_storage_that_is_not_there_is_told(tmp_path, s3, monkeypatch):
         Storage("s3://no-such-bucket/x").set_files("a", {})
 
 
+def test_missing_credentials_are_told(tmp_path, s3, monkeypatch):
+    import s3fs
+
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.delenv(name)
+    for name in ("AWS_SHARED_CREDENTIALS_FILE", "AWS_CONFIG_FILE"):
+        monkeypatch.setenv(name, str(tmp_path / "none"))
+    monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")
+    s3fs.S3FileSystem.clear_instance_cache()
+    with pytest.raises(StorageError, match=r"cannot be reached while .*credentials"):
+        Storage(s3).files("vase-1")
+    s3fs.S3FileSystem.clear_instance_cache()
+
+
 def test_checkpoints_are_saved_while_a_stage_runs(tmp_path, url):
     one, two = machine(tmp_path / "one", url), machine(tmp_path / "two", url)
     (tmp_path / "one/vase").mkdir()

@@ -20,6 +20,8 @@ from .errors import DiskError, InputError, disk_refusal
 
 WINDOWS = sys.platform == "win32"
 READERS_TAKE = 5.0  # seconds at most that a file which is to be replaced may stay open in another program
+STAGED = ".fieldwork-new-"  # how folders begin in which files wait for their place
+LEFT_AFTER = 86400.0  # seconds after which nobody works on such a folder any more
 LONGEST_NAME = 64  # characters of a name that the user gives, of a run for instance
 # Windows keeps these for devices, whatever comes behind a dot.
 _DEVICES = {"con", "prn", "aux", "nul", *(f"{kind}{i}" for kind in ("com", "lpt") for i in "0123456789¹²³")}
@@ -141,7 +143,11 @@ def staged(folder: Path) -> Iterator[Path]:
     folder = Path(folder)
     with disk_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        place = Path(tempfile.mkdtemp(prefix=".new-", dir=folder))
+        for left in folder.glob(f"{STAGED}*"):  # by a process that was killed
+            with suppress(OSError):
+                if time.time() - left.stat().st_mtime > LEFT_AFTER:
+                    shutil.rmtree(left)
+        place = Path(tempfile.mkdtemp(prefix=STAGED, dir=folder))
         try:
             yield place
             for path in sorted(path for path in place.rglob("*") if path.is_file()):

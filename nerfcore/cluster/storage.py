@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import DiskError, FieldworkError, SettingError
-from ..files import atomic_path, file_hash, leads_outside, linked, write_json
+from ..files import STAGED, atomic_path, file_hash, leads_outside, linked, write_json
 from ..project.fingerprints import digest
 from .link import INSTALL
 
@@ -159,7 +159,7 @@ class Copy:
             for path in inside:
                 # What the jobs of a project say is of this machine alone. Captures may lie in a folder of that name.
                 parts = path.relative_to(place).parts
-                half_written = path.name.startswith(".") or any(part.startswith(".new-") for part in parts)
+                half_written = path.name.startswith(".") or any(part.startswith(STAGED) for part in parts)
                 if "jobs" not in parts and not half_written:
                     found[path.relative_to(self.folder).as_posix()] = path
         return found

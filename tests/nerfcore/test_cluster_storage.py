@@ -226,9 +226,9 @@ def test_files_are_uploaded_from_a_disk_without_hard_links(tmp_path, monkeypatch
 
     monkeypatch.setattr(os, "link", refused)
     one = machine(tmp_path / "one", (tmp_path / "store").as_uri())
-    (tmp_path / "one/vase/.new-x7").mkdir(parents=True)
+    (tmp_path / "one/vase/.fieldwork-new-x7").mkdir(parents=True)
     (tmp_path / "one/vase/photo.jpg").write_bytes(b"photo")
-    (tmp_path / "one/vase/.new-x7/mesh.ply").write_bytes(b"half of a mesh")
+    (tmp_path / "one/vase/.fieldwork-new-x7/mesh.ply").write_bytes(b"half of a mesh")
     one.upload()
     assert set(one.storage.files("vase-1")) == {"vase/photo.jpg"}
 

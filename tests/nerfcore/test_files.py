@@ -6,12 +6,14 @@ import errno
 import json
 import os
 import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from fieldwork.nerfcore import files
 from fieldwork.nerfcore.errors import DiskError
-from fieldwork.nerfcore.files import atomic_path, require_writable, write_json, write_section, write_text
+from fieldwork.nerfcore.files import atomic_path, require_writable, staged, write_json, write_section, write_text
 
 pytestmark = pytest.mark.usefixtures("each_file_system")
 
@@ -101,6 +103,22 @@ def test_a_network_folder_that_gives_no_rights_takes_files(tmp_path: Path, monke
     monkeypatch.setattr(Path, "chmod", refused)
     write_text(tmp_path / "a.txt", "there")
     assert (tmp_path / "a.txt").read_text() == "there"
+
+
+def test_what_killed_processes_left_goes_a_day_later(tmp_path: Path) -> None:
+    code = (
+        "import os, signal, sys; from pathlib import Path; from nerfcore.files import staged\n"
+        "with staged(Path(sys.argv[1])) as place:\n"
+        "    (place / 'mesh.ply').write_text('half'); os.kill(os.getpid(), signal.SIGKILL)"
+    )
+    environment = os.environ | {"PYTHONPATH": str(Path(files.__file__).parents[1])}
+    for _ in range(2):
+        subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=False, env=environment)
+    old, new = sorted(tmp_path.iterdir())
+    os.utime(old, (1.0, 1.0))
+    with staged(tmp_path) as place:
+        (place / "mesh.ply").write_text("whole")
+    assert sorted(path.name for path in tmp_path.iterdir()) == [new.name, "mesh.ply"]
 
 
 def test_keeps_the_suffix_for_image_writers(tmp_path: Path) -> None:

@@ -161,14 +161,23 @@ def staged(folder: Path) -> Iterator[Path]:
             shutil.rmtree(place, ignore_errors=True)
 
 
-def linked(source: str, target: str) -> str:
-    """A file at two places, as one where the file system can; for `copy_function` of `shutil.copytree`."""
+def copied(source: str | Path, target: str | Path) -> str | Path:
+    """Copy a file with its time, but not with its rights: copies of what may only be read can be written."""
     import shutil
 
+    shutil.copyfile(source, target)
+    stat = os.stat(source)
+    with suppress(PermissionError):  # see `atomic_path`
+        os.utime(target, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+    return target
+
+
+def linked(source: str, target: str) -> str:
+    """A file at two places, as one where the file system can; for `copy_function` of `shutil.copytree`."""
     try:
         os.link(source, target)
     except OSError:
-        shutil.copy2(source, target)
+        copied(source, target)
     return target
 
 

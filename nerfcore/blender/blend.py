@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import shutil
 import time
 from pathlib import Path
 from typing import Any
 
 from ..data.load import class_inputs, load_scene, view_inputs
-from ..files import atomic_path
+from ..files import atomic_path, copied
 from ..params import BlendParams
 from ..progress import Reporter
 from ..project.fingerprints import Earlier, Fingerprint, array_digest, compare, digest, files_digest, stamps_digest
@@ -96,5 +95,5 @@ def keep_changed(folder: Path, out: Path) -> Path | None:
         return None
     kept = out.with_name(f"{out.name}1")
     with atomic_path(kept) as temporary:
-        shutil.copy2(out, temporary)
+        copied(out, temporary)
     return kept

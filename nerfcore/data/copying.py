@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import os
-import shutil
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
 from ..errors import InputError
-from ..files import atomic_path
+from ..files import atomic_path, copied
 from ..images.arrays import read_array
 from ..images.decode import UNDECODABLE, read_photo
 from ..images.labels import Colors, read_labels, read_mask
@@ -65,7 +64,7 @@ def copy_file(source: Path, folder: Path, name: str) -> Path:
     if target.is_file() and (target.stat().st_size, target.stat().st_mtime) == (stat.st_size, stat.st_mtime):
         return target
     with atomic_path(target) as temporary:
-        shutil.copy2(source, temporary)
+        copied(source, temporary)
     return target
 
 

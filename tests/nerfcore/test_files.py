@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -103,6 +104,26 @@ def test_a_network_folder_that_gives_no_rights_takes_files(tmp_path: Path, monke
     monkeypatch.setattr(Path, "chmod", refused)
     write_text(tmp_path / "a.txt", "there")
     assert (tmp_path / "a.txt").read_text() == "there"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="has no such users")
+def test_photos_that_may_only_be_read_are_imported() -> None:
+    """As they come from the cards of some cameras. The owner of the system may write everything: somebody else tries it."""
+    code = (
+        "import os, random, shutil, sys, tempfile; from pathlib import Path; from nerfcore.data.copying import copy_file\n"
+        "if os.geteuid() == 0: os.seteuid(65534)\n"
+        "copy_file(Path(sys.argv[1]), Path(sys.argv[2]), 'a')"
+    )
+    environment = os.environ | {"PYTHONPATH": str(Path(files.__file__).parents[1])}
+    with tempfile.TemporaryDirectory(dir="/tmp") as folder:
+        os.chmod(folder, 0o777)
+        source = Path(folder, "photo.jpg")
+        source.write_bytes(b"a photo")
+        source.chmod(0o444)
+        subprocess.run([sys.executable, "-c", code, source, folder], check=True, env=environment)
+        copy = Path(folder, "a.jpg")
+        assert copy.read_bytes() == b"a photo"
+        assert copy.stat().st_mtime_ns == source.stat().st_mtime_ns
 
 
 def test_what_killed_processes_left_goes_a_day_later(tmp_path: Path) -> None:

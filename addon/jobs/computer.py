@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from typing import Any
 
 from .. import machine
@@ -26,10 +27,13 @@ def known() -> dict[str, Any]:
 
 
 def remember(found: dict[str, Any]) -> None:
-    """Keep what the doctor found."""
-    from ...nerfcore.files import write_json  # not at the top: enabling the extension must be quick
+    """Keep what the doctor found, where the disk takes it; he can be asked again."""
+    # Not at the top: enabling the extension must be quick.
+    from ...nerfcore.errors import DiskError
+    from ...nerfcore.files import write_json
 
-    write_json(machine.user_folder() / FILE, found)
+    with suppress(DiskError):
+        write_json(machine.user_folder() / FILE, found)
 
 
 def title(facts: dict[str, Any]) -> str:

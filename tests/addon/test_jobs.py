@@ -16,6 +16,7 @@ from fieldwork.addon import machine  # noqa: E402
 from fieldwork.addon.engine.link import Link  # noqa: E402
 from fieldwork.addon.errors import EngineError, SceneError  # noqa: E402
 from fieldwork.addon.jobs import (  # noqa: E402
+    computer,
     gate,
     refresh,
     timer,
@@ -223,6 +224,15 @@ def test_an_edit_of_the_last_moment_is_taken_after_blender_is_gone(queue, tmp_pa
     queue.stop_engine()
     process.wait(timeout=60)
     assert snapshot.project(project)["classes"][0]["priority"] == 4.0
+
+
+def test_what_the_doctor_found_needs_no_room_on_the_disk(settings, tmp_path):
+    computer.remember({"device": "cpu"})
+    assert computer.known() == {"device": "cpu"}
+    (tmp_path / "user" / computer.FILE).unlink()
+    (tmp_path / "user").rmdir()
+    (tmp_path / "user").touch()  # no file can be written in it
+    computer.remember({"device": "cpu"})
 
 
 def test_idle_engine_is_released(queue, settings, project):

@@ -42,6 +42,7 @@ class Job(Reporter):
         self.answered = False
         self._send, self._estimate = send, Estimate()
         self._lock = threading.RLock()
+        self._told: set[str] = set()
         self._changed, self._sent, self._written = True, 0.0, 0.0
 
     @property
@@ -80,7 +81,7 @@ class Job(Reporter):
                 with open(path, "ab") as file:
                     file.write(line)
             except OSError as error:
-                log.warning("The events of the job cannot be written to %s: %s", path, error)
+                self._tell_once("The events of the job cannot be written to %s: %s", path, error)
 
     def watching(self, training: Any) -> AbstractContextManager[Callable[[], None]]:
         from ..film.training_view import watched  # loads torch, as the training has done
@@ -129,7 +130,12 @@ class Job(Reporter):
             try:
                 st.write_job(self.project, self.status)
             except (DiskError, OSError) as error:
-                log.warning("The state of the job cannot be written: %s", error)
+                self._tell_once("The state of the job cannot be written: %s", error)
+
+    def _tell_once(self, text: str, *values: Any) -> None:
+        """Warn of what happens again several times a second as long as a disk is full."""
+        log.log(logging.DEBUG if text in self._told else logging.WARNING, text, *values)
+        self._told.add(text)
 
     def _set(self, **values: Any) -> None:
         for name, value in values.items():

@@ -17,7 +17,10 @@ from pathlib import Path
 
 import pytest
 from fieldwork.nerfcore.engine import status as st
+from fieldwork.nerfcore.engine.jobs import Job
 from fieldwork.nerfcore.engine.server import Server, _Stop
+from fieldwork.nerfcore.errors import DiskError
+from fieldwork.nerfcore.params import RegionParams
 from fieldwork.nerfcore.project.schema import Project
 from fieldwork.nerfcore.project.store import save_project
 from PIL import Image
@@ -438,6 +441,22 @@ def test_events_that_a_full_disk_cut_off_are_left_out(project):
     events, offset = st.read_events(project, "x")
     assert [event["step"] for event in events] == [1, 4]
     assert st.read_events(project, "x", offset) == ([], offset)
+
+
+def test_a_full_disk_is_told_once_by_a_job(project, caplog, monkeypatch):
+    job = Job("x", "region", RegionParams(project=project), 1, lambda message: None, False)
+    (project / st.FOLDER).mkdir()
+    st.events_path(project, "x").mkdir()  # what cannot be written
+
+    def full(*_):
+        raise DiskError("No space left on the disk.")
+
+    monkeypatch.setattr(st, "write_job", full)
+    for step in range(3):
+        job.event("train", step=step)
+        job.heartbeat()
+        job.progress(step / 3)
+    assert len([record for record in caplog.records if record.levelname == "WARNING"]) == 2
 
 
 def test_a_project_that_is_not_there_is_not_made(start, tmp_path):

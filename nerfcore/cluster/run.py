@@ -235,8 +235,14 @@ class Runner:
         self.report.warn("The cluster's head is gone; the campaign waits for it.")
         for task in self.tasks.running:
             self.tasks.put_back(task)
-        self.nodes = self.link.open_again(self.report.check)["nodes"]
+        self.nodes = []
+        self.nodes = self.link.open_again(self._wait)["nodes"]
         self.report.note("The cluster is back.")
+
+    def _wait(self) -> None:
+        """While nothing can be done: those who watch are told that the campaign lives."""
+        self.report.check()
+        self._look(force=False)
 
     def _give_up_silent(self) -> None:
         now = time.monotonic()

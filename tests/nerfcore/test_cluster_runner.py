@@ -136,6 +136,26 @@ def test_a_worker_out_of_reach_is_not_waited_for(tmp_path, monkeypatch):
     assert (runner.tasks.all["a0"].state, runner.tasks.all["a0"].losses) == ("done", 1)
 
 
+def test_those_who_watch_hear_of_a_campaign_that_waits_for_its_head(tmp_path, monkeypatch):
+    """Who hears nothing for a minute takes it to have stopped."""
+
+    class Away(FakeLink):
+        def open_again(self, check: Any) -> dict[str, Any]:
+            for _ in range(3):
+                runner.watched = 0.0  # seconds later
+                check()
+            return super().open(check)
+
+    line = Away(good)
+    line.waiting.append(None)
+    seen: list[int] = []
+    watch = lambda progress: seen.append(len(progress.nodes))  # noqa: E731
+    runner = Runner(chain("a", 1), line, Options(tmp_path), Reporter(), lambda _: None, watch)
+    runner.run()
+    assert seen.count(0) == 3
+    assert seen[-1] == 1
+
+
 def test_a_cancel_reaches_the_workers(tmp_path):
     report, line = Reporter(), FakeLink(good)
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 
 from ..errors import InputError, ProjectError, SettingError
 from ..files import atomic_path, disk_errors, staged
@@ -189,8 +190,8 @@ def maps_of(picture: Picture, classes: Classes, void: int) -> tuple[np.ndarray, 
         class_id = classes.id_of(region.class_name)
         if region.instance > MOST_INSTANCES:
             raise InputError(f"{picture.name} has more than {MOST_INSTANCES} instances.", "Merge some of them.")
-        ids[region.mask] = void if class_id is None else class_id
-        things[region.mask] = 0 if class_id is None else region.instance
+        region.paint(ids, void if class_id is None else class_id)
+        region.paint(things, 0 if class_id is None else region.instance)
     return ids, things
 
 
@@ -324,10 +325,13 @@ def _picture(image: ImageRecord, ids: np.ndarray, things: np.ndarray | None, nam
     """The regions of a photo: one for each instance, and one for the rest of each class."""
     regions = []
     pairs = ids.astype(np.int64) * (MOST_INSTANCES + 1) + (0 if things is None else things)
-    for pair in np.unique(pairs).tolist():
-        class_id, thing = divmod(pair, MOST_INSTANCES + 1)
+    found, number = np.unique(pairs, return_inverse=True)
+    number = number.reshape(pairs.shape)
+    for i, (rows, columns) in enumerate(scipy.ndimage.find_objects(number + 1)):
+        class_id, thing = divmod(int(found[i]), MOST_INSTANCES + 1)
         if class_id in names:
-            regions.append(Region(names[class_id], pairs == pair, thing))
+            patch = number[rows, columns] == i
+            regions.append(Region(names[class_id], patch, columns.start, rows.start, thing))
     return Picture(Path(image.file).name, ids.shape[1], ids.shape[0], regions)
 
 

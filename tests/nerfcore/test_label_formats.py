@@ -8,13 +8,22 @@ from typing import Any
 
 import numpy as np
 import pytest
+import skimage
 from fieldwork.nerfcore.cli import main
 from fieldwork.nerfcore.errors import DiskError, FieldworkError, InputError, ProjectError, SettingError
 from fieldwork.nerfcore.images.working import read_label
 from fieldwork.nerfcore.labels import exchange
 from fieldwork.nerfcore.labels.exchange import export_labels
 from fieldwork.nerfcore.labels.formats import coco, cvat, known, label_studio
-from fieldwork.nerfcore.labels.formats.regions import from_runs, hex_color, id_picture, placed, runs_of
+from fieldwork.nerfcore.labels.formats.regions import (
+    from_runs,
+    hex_color,
+    id_picture,
+    placed,
+    polygon_mask,
+    region_of,
+    runs_of,
+)
 from fieldwork.nerfcore.labels.journal import append_mark
 from fieldwork.nerfcore.params import LabelExportParams
 from fieldwork.nerfcore.progress import Reporter
@@ -92,6 +101,23 @@ def test_masks_that_stand_out_of_the_picture_are_cut_off() -> None:
         whole[10 + top - 4 : 13 + top - 4, 10 + left - 4 : 14 + left - 4] = True
         found = placed(np.ones((3, 4), bool), left - 4, top - 4, 8, 6)
         np.testing.assert_array_equal(found, whole[10:16, 10:18])
+
+
+def test_regions_are_kept_as_the_patches_that_enclose_them() -> None:
+    random = np.random.default_rng(1)
+    for _ in range(200):
+        corners = random.integers(-40, 100, (random.integers(3, 7), 2)) / 2
+        whole = skimage.draw.polygon2mask((60, 70), corners[:, ::-1] + 20 - 0.5)[20:38, 20:44]
+        mask = polygon_mask(corners.tolist(), 24, 18)
+        np.testing.assert_array_equal(mask, whole)
+        region = region_of("wood", mask, 3)
+        np.testing.assert_array_equal(region.mask(24, 18), mask)
+        painted = np.zeros((18, 24), np.uint16)
+        region.paint(painted, 7)
+        np.testing.assert_array_equal(painted, 7 * mask)
+    small = np.zeros((3000, 4000), bool)
+    small[7:9, 30] = True
+    assert region_of("wood", small).patch.nbytes == 2, "hundreds of things on a large photo take no memory"
 
 
 def test_photos_keep_labels_of_their_own_unless_they_shall_not(tmp_path: Path) -> None:

@@ -19,7 +19,6 @@ from .regions import (
     Picture,
     Region,
     Source,
-    bounds,
     checked_size,
     from_runs,
     id_picture,
@@ -28,6 +27,7 @@ from .regions import (
     picture_of,
     polygon_mask,
     read_json,
+    region_of,
     runs_of,
 )
 
@@ -73,7 +73,7 @@ def _pictures(
                 if mask is None:
                     source.skip("box")
                 else:
-                    regions.append(Region(names[annotation["category_id"]], mask, len(regions) + 1))
+                    regions.append(region_of(names[annotation["category_id"]], mask, len(regions) + 1))
             except (KeyError, TypeError, ValueError, IndexError) as error:
                 wrong = f"An annotation of {name} in {path} is damaged: {error}."
                 raise InputError(wrong, "Export the labels once more.") from error
@@ -86,7 +86,7 @@ def _without_crowd_instances(regions: list[Region], annotations: list[dict[str, 
     kinds = [bool(a.get("iscrowd")) for a in annotations if "segments_info" not in a and a.get("segmentation")]
     if len(kinds) != len(regions):
         return regions
-    return [Region(r.class_name, r.mask, 0 if crowd else r.instance) for r, crowd in zip(regions, kinds)]
+    return [replace(r, instance=0 if crowd else r.instance) for r, crowd in zip(regions, kinds)]
 
 
 def _mask(segmentation: Any, width: int, height: int) -> np.ndarray | None:
@@ -119,7 +119,7 @@ def _segments(path: Path, annotation: dict[str, Any], names: dict[Any, str], sha
         raise ValueError(f"{file} is {numbers.shape[1]}×{numbers.shape[0]}, the picture {shape[1]}×{shape[0]}")
     things = {segment["id"]: not segment.get("iscrowd") for segment in annotation["segments_info"]}
     return [
-        Region(names[s["category_id"]], numbers == s["id"], i if things[s["id"]] else 0)
+        region_of(names[s["category_id"]], numbers == s["id"], i if things[s["id"]] else 0)
         for i, s in enumerate(annotation["segments_info"], 1)
     ]
 
@@ -163,15 +163,15 @@ def write(
     for number, picture in numbered(pictures):
         images.append({"id": number, "file_name": picture.name, "width": picture.width, "height": picture.height})
         for region in picture.regions:
-            left, top, right, bottom = bounds(region.mask)
-            counts = packed(runs_of(region.mask.T))
+            left, top, right, bottom = region.bounds
+            counts = packed(runs_of(region.mask(picture.width, picture.height).T))
             annotations.append(
                 {
                     "id": len(annotations) + 1,
                     "image_id": number,
                     "category_id": ids[region.class_name],
                     "segmentation": {"size": [picture.height, picture.width], "counts": counts},
-                    "area": int(region.mask.sum()),
+                    "area": int(region.patch.sum()),
                     "bbox": [left, top, right - left, bottom - top],
                     "iscrowd": int(region.instance == 0),
                 }
@@ -194,13 +194,13 @@ def write_panoptic(
     for number, picture in numbered(pictures):
         numbers, segments = np.zeros((picture.height, picture.width), np.int64), []
         for segment, region in enumerate(picture.regions, 1):
-            numbers[region.mask] = segment
-            left, top, right, bottom = bounds(region.mask)
+            region.paint(numbers, segment)
+            left, top, right, bottom = region.bounds
             segments.append(
                 {
                     "id": segment,
                     "category_id": ids[region.class_name],
-                    "area": int(region.mask.sum()),
+                    "area": int(region.patch.sum()),
                     "bbox": [left, top, right - left, bottom - top],
                     "iscrowd": int(region.instance == 0),
                 }

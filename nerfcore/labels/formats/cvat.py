@@ -19,7 +19,6 @@ from .regions import (
     Picture,
     Region,
     Source,
-    bounds,
     box_mask,
     checked_size,
     color_hex,
@@ -29,6 +28,7 @@ from .regions import (
     numbered,
     placed,
     polygon_mask,
+    region_of,
     runs_of,
 )
 
@@ -83,7 +83,7 @@ def _pictures(path: Path, root: xml.Element, source: Source) -> Iterator[Picture
             group = shape.get("group_id", "0")
             key = group if group != "0" else f"shape {len(regions)}"
             instance = 0 if _is_stuff(shape) else groups.setdefault(key, len(groups) + 1)
-            regions.append(Region(shape.get("label", ""), mask, instance))
+            regions.append(region_of(shape.get("label", ""), mask, instance))
         yield Picture(name, width, height, regions)
 
 
@@ -136,12 +136,12 @@ def write(
         size = {"width": str(picture.width), "height": str(picture.height)}
         image = xml.SubElement(root, "image", {"id": str(number - 1), "name": picture.name, **size})
         for region in picture.regions:
-            left, top, right, bottom = bounds(region.mask)
+            left, top, right, bottom = region.bounds
             values = {
                 "label": region.class_name,
                 "source": "file",
                 "occluded": "0",
-                "rle": ", ".join(str(run) for run in runs_of(region.mask[top:bottom, left:right])),
+                "rle": ", ".join(str(run) for run in runs_of(region.patch)),
                 "left": str(left),
                 "top": str(top),
                 "width": str(right - left),

@@ -17,13 +17,13 @@ from .regions import (
     STUFF,
     LabelClass,
     Picture,
-    Region,
     Source,
     checked_size,
     ellipse_mask,
     numbered,
     polygon_mask,
     read_json,
+    region_of,
 )
 
 KINDS = ("brushlabels", "polygonlabels", "rectanglelabels", "ellipselabels")
@@ -76,7 +76,7 @@ def _pictures(path: Path, tasks: list[dict[str, Any]], source: Source) -> Iterat
                     f"A region of {name} in {path} is damaged: {error!r}.", "Export it once more."
                 ) from error
             instance = 0 if _is_stuff(result) else len(regions) + 1
-            regions.append(Region(str(_labels(result)[0]), mask, instance))
+            regions.append(region_of(str(_labels(result)[0]), mask, instance))
         yield Picture(name, width, height, regions)
 
 
@@ -170,7 +170,7 @@ def write(
     for number, picture in numbered(pictures):
         results = []
         for index, region in enumerate(picture.regions):
-            flat = np.repeat(region.mask.reshape(-1).astype(np.uint8) * 255, CHANNELS)
+            flat = np.repeat(region.mask(picture.width, picture.height).reshape(-1).astype(np.uint8) * 255, CHANNELS)
             value = {"format": "rle", "rle": packed(flat), "brushlabels": [region.class_name]}
             results.append(
                 {

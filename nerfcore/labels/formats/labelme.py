@@ -18,7 +18,6 @@ from .regions import (
     Picture,
     Region,
     Source,
-    bounds,
     box_mask,
     checked_size,
     ellipse_mask,
@@ -28,6 +27,7 @@ from .regions import (
     png_bytes,
     polygon_mask,
     read_json,
+    region_of,
 )
 
 
@@ -60,7 +60,7 @@ def _pictures(values: list[tuple[Path, dict[str, Any]]], source: Source) -> Iter
                 key = ("shape", len(regions)) if group is None else (shape["label"], group)
                 stuff = (shape.get("flags") or {}).get(STUFF) is True
                 instance = 0 if stuff else groups.setdefault(key, len(groups) + 1)
-                regions.append(Region(str(shape["label"]), mask, instance))
+                regions.append(region_of(str(shape["label"]), mask, instance))
             except (KeyError, TypeError, ValueError, AttributeError) as error:
                 raise InputError(f"A shape in {file} is damaged: {error!r}.", "Save it again with LabelMe.") from error
         yield Picture(name, width, height, regions)
@@ -91,8 +91,8 @@ def write(
     for picture in pictures:
         shapes = []
         for region in picture.regions:
-            left, top, right, bottom = bounds(region.mask)
-            data = png_bytes(region.mask[top:bottom, left:right].astype(np.uint8) * 255)
+            left, top, right, bottom = region.bounds
+            data = png_bytes(region.patch.astype(np.uint8) * 255)
             shapes.append(
                 {
                     "label": region.class_name,

@@ -13,7 +13,7 @@ from ...errors import InputError, SettingError
 from ...files import atomic_path, write_json
 from ...images.labels import UnknownColors, read_labels, read_mask
 from ...project.classes import read_classes
-from .regions import Color, LabelClass, Picture, Region, Source, checked_size, color_hex
+from .regions import Color, LabelClass, Picture, Source, checked_size, color_hex, region_of
 
 SUFFIXES = {".png", ".tif", ".tiff", ".bmp"}
 MASK = re.compile(r"[_.-]?mask$", re.IGNORECASE)  # behind the name of the photo
@@ -62,7 +62,7 @@ def _maps(
             if class_id != void:
                 name = names.get(class_id, f"class {class_id}")
                 source.ids.setdefault(name, class_id)
-                regions.append(Region(name, ids == class_id))
+                regions.append(region_of(name, ids == class_id))
         yield Picture(file.name, ids.shape[1], ids.shape[0], regions)
 
 
@@ -78,7 +78,7 @@ def _masks(files: list[Path], class_name: str) -> Iterator[Picture]:
         mask = read_mask(file)
         checked_size(mask.shape[1], mask.shape[0], file.name)
         yield Picture(
-            f"{MASK.sub('', file.stem)}{file.suffix}", mask.shape[1], mask.shape[0], [Region(class_name, mask)]
+            f"{MASK.sub('', file.stem)}{file.suffix}", mask.shape[1], mask.shape[0], [region_of(class_name, mask)]
         )
 
 
@@ -86,7 +86,7 @@ def map_of(picture: Picture, ids: dict[str, int], void: int) -> np.ndarray:
     """The label map (H, W) of a picture: 8 bits where all ids fit, else 16."""
     values = np.full((picture.height, picture.width), void, np.int64)
     for region in picture.regions:
-        values[region.mask] = ids[region.class_name]
+        region.paint(values, ids[region.class_name])
     return values.astype(np.uint8 if max([void, *ids.values()]) < 256 else np.uint16)
 
 
@@ -133,7 +133,7 @@ def write_masks(pictures: Iterable[Picture], class_name: str, out: Path) -> list
         mask = np.zeros((picture.height, picture.width), np.uint8)
         for region in picture.regions:
             if region.class_name == class_name:
-                mask[region.mask] = 255
+                region.paint(mask, 255)
         files.append(out / f"{Path(picture.name).stem}_mask.png")
         with atomic_path(files[-1]) as temporary:
             Image.fromarray(mask).save(temporary, "PNG")

@@ -24,11 +24,38 @@ STUFF = "stuff"  # how files call areas that are no single thing, in tools for w
 
 @dataclass(frozen=True)
 class Region:
-    """An area of a picture. mask: (H, W) bool; instance: number of the thing in this picture, 0 for none."""
+    """An area of a picture, as the patch (h, w) bool that encloses it, at the column `left` and row `top`; instance: number
+    of the thing in this picture, 0 for none."""
 
     class_name: str
-    mask: np.ndarray
+    patch: np.ndarray
+    left: int
+    top: int
     instance: int = 0
+
+    @property
+    def bounds(self) -> tuple[int, int, int, int]:
+        """Left, top, right, bottom (exclusive)."""
+        return self.left, self.top, self.left + self.patch.shape[1], self.top + self.patch.shape[0]
+
+    def paint(self, values: np.ndarray, value: int) -> None:
+        """Set what is in the area to a value, in an array (H, W) of the whole picture."""
+        left, top, right, bottom = self.bounds
+        values[top:bottom, left:right][self.patch] = value
+
+    def mask(self, width: int, height: int) -> np.ndarray:
+        """The area in a mask (H, W) bool of the whole picture."""
+        return placed(self.patch, self.left, self.top, width, height)
+
+
+def region_of(class_name: str, mask: np.ndarray, instance: int = 0) -> Region:
+    """The region that a mask (H, W) bool of a whole picture shows."""
+    rows = np.flatnonzero(mask.any(1))
+    if not len(rows):
+        return Region(class_name, np.zeros((0, 0), bool), 0, 0, instance)
+    top, inside = int(rows[0]), mask[rows[0] : rows[-1] + 1]
+    columns = np.flatnonzero(inside.any(0))
+    return Region(class_name, inside[:, columns[0] : columns[-1] + 1].copy(), int(columns[0]), top, instance)
 
 
 @dataclass(frozen=True)
@@ -91,7 +118,10 @@ def polygon_mask(points: Sequence[float] | Sequence[Sequence[float]], width: int
     corners = np.asarray(points, np.float64).reshape(-1, 2)
     if len(corners) < 3 or not np.isfinite(corners).all():
         return np.zeros((height, width), bool)
-    return skimage.draw.polygon2mask((height, width), corners[:, ::-1] - 0.5)
+    low, high = np.clip([np.floor(corners.min(0)), np.ceil(corners.max(0))], 0, [width, height]).astype(int)
+    (left, top), (columns, rows) = low.tolist(), (high - low).tolist()
+    patch = skimage.draw.polygon2mask((rows, columns), (corners - low)[:, ::-1] - 0.5)
+    return placed(patch, left, top, width, height)
 
 
 def box_mask(left: float, top: float, right: float, bottom: float, width: int, height: int) -> np.ndarray:
@@ -116,12 +146,6 @@ def placed(patch: np.ndarray, left: int, top: int, width: int, height: int) -> n
     part = patch[first_row - top : max(0, height - top), first_column - left : max(0, width - left)]
     mask[first_row : first_row + part.shape[0], first_column : first_column + part.shape[1]] = part
     return mask
-
-
-def bounds(mask: np.ndarray) -> tuple[int, int, int, int]:
-    """Left, top, right, bottom (exclusive) of what is set in a mask that is not empty."""
-    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
 
 
 def runs_of(values: np.ndarray) -> list[int]:

@@ -17,7 +17,6 @@ from .regions import (
     STUFF,
     LabelClass,
     Picture,
-    Region,
     Source,
     checked_size,
     id_picture,
@@ -25,6 +24,7 @@ from .regions import (
     picture_of,
     polygon_mask,
     read_json,
+    region_of,
 )
 
 RELEASE, LABELSET = "release.json", "ground-truth"
@@ -71,7 +71,7 @@ def _pictures(
             for entry in annotations:
                 if entry.get("type") == "polygon":
                     mask = polygon_mask(entry["points"], width, height)
-                    regions.append(Region(names[entry["category_id"]], mask, len(regions) + 1))
+                    regions.append(region_of(names[entry["category_id"]], mask, len(regions) + 1))
                 else:
                     source.skip(str(entry.get("type")))
             yield Picture(name, width, height, regions)
@@ -87,7 +87,7 @@ def _bitmap(folder: Path, name: str, labelset: str, attributes: dict[str, Any], 
     regions = []
     for i, entry in enumerate(attributes.get("annotations") or [], 1):
         single = things[entry["category_id"]] and not (entry.get("attributes") or {}).get(STUFF)
-        regions.append(Region(names[entry["category_id"]], numbers == entry["id"], i if single else 0))
+        regions.append(region_of(names[entry["category_id"]], numbers == entry["id"], i if single else 0))
     return Picture(name, numbers.shape[1], numbers.shape[0], regions)
 
 
@@ -124,7 +124,7 @@ def write(
     for picture in pictures:
         numbers, annotations = np.zeros((picture.height, picture.width), np.int64), []
         for number, region in enumerate(picture.regions, 1):
-            numbers[region.mask] = number
+            region.paint(numbers, number)
             marked = {} if region.instance else {"attributes": {STUFF: True}}
             annotations.append({"id": number, "category_id": ids[region.class_name], **marked})
             (things if region.instance else stuff).add(region.class_name)

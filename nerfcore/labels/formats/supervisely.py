@@ -20,7 +20,6 @@ from .regions import (
     Picture,
     Region,
     Source,
-    bounds,
     box_mask,
     checked_size,
     color_hex,
@@ -31,6 +30,7 @@ from .regions import (
     png_bytes,
     polygon_mask,
     read_json,
+    region_of,
 )
 
 META, DATASET = "meta.json", "photos"
@@ -68,7 +68,7 @@ def _pictures(files: list[Path], source: Source) -> Iterator[Picture]:
                 key = entry.get("instance") or ("object", len(regions))
                 stuff = any(tag.get("name") == STUFF for tag in entry.get("tags") or [])
                 instance = 0 if stuff else keys.setdefault(key, len(keys) + 1)
-                regions.append(Region(str(entry["classTitle"]), mask, instance))
+                regions.append(region_of(str(entry["classTitle"]), mask, instance))
         except (KeyError, TypeError, ValueError, AttributeError, zlib.error) as error:
             raise InputError(f"{file} is damaged: {error!r}.", "Export the project once more.") from error
         yield Picture(name, width, height, regions)
@@ -103,10 +103,9 @@ def write(
     for picture in pictures:
         objects = []
         for region in picture.regions:
-            left, top, right, bottom = bounds(region.mask)
-            data = zlib.compress(png_bytes(region.mask[top:bottom, left:right].astype(np.uint8) * 255))
+            data = zlib.compress(png_bytes(region.patch.astype(np.uint8) * 255))
             instance = {"instance": f"{picture.name}-{region.instance}"} if region.instance else {}
-            bitmap = {"data": base64.b64encode(data).decode("ascii"), "origin": [left, top]}
+            bitmap = {"data": base64.b64encode(data).decode("ascii"), "origin": [region.left, region.top]}
             tags = [] if region.instance else [{"name": STUFF, "value": None}]
             named = {"classTitle": region.class_name, "geometryType": "bitmap", "tags": tags, "description": ""}
             objects.append({**named, **instance, "bitmap": bitmap})

@@ -27,13 +27,14 @@ def read_labels(path: Path, colors: Colors | None = None, ignore_id: int = 0) ->
 
     Grey PNGs (8 or 16 bits) and palette PNGs hold the ids themselves; a palette whose colours are those of the
     classes, and RGB pictures, are looked up in `colors` (id → RGB). Transparent pixels become `ignore_id`. Of
-    probability maps the most probable class is taken.
+    probability maps the most probable class is taken, `ignore_id` where none has any.
 
     Raises:
         InputError: it is no image, lossily compressed, or has colours that no class has. One clause, fit as a reason.
     """
     if path.suffix.lower() in PROBABILITY_SUFFIXES:
-        return read_probabilities(path).argmax(2).astype(np.uint16)
+        shares = read_probabilities(path)
+        return np.where(shares.max(2) > 0, shares.argmax(2), ignore_id).astype(np.uint16)
     try:
         with Image.open(path) as image:
             if image.format in ("JPEG", "MPO", "HEIF"):

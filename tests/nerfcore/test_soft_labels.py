@@ -11,6 +11,7 @@ from fieldwork.nerfcore.config import make_config
 from fieldwork.nerfcore.data.load import load_scene
 from fieldwork.nerfcore.data.pixels import VOID, PixelStore
 from fieldwork.nerfcore.errors import InputError
+from fieldwork.nerfcore.images.labels import read_labels
 from fieldwork.nerfcore.images.soft_labels import read_confidence, read_probabilities
 from fieldwork.nerfcore.params import EvaluateParams, TrainParams
 from fieldwork.nerfcore.progress import Reporter
@@ -50,6 +51,15 @@ def test_probability_maps_and_confidence_maps_become_labels_with_confidence(tmp_
         assert (label[:, 160:] == 2).all()
         assert np.unique(sure).tolist() == [153, 230]
     assert np.unique(np.asarray(Image.open(tmp_path / "project" / (records["p3"].confidence or "")))).tolist() == [51]
+
+
+def test_pixels_without_any_probability_are_void(tmp_path: Path) -> None:
+    values = probabilities()
+    values[:100] = 0
+    np.save(tmp_path / "p.npy", values)
+    ids = read_labels(tmp_path / "p.npy", ignore_id=255)
+    assert (ids[:100] == 255).all()
+    assert np.unique(ids[100:]).tolist() == [1, 2]
 
 
 @pytest.mark.parametrize(

@@ -63,7 +63,7 @@ def _draw() -> None:
             _draw_texture(texture, region, 1.0)
     if settings.label_strokes:
         for mark in marks_on(folder, str(photo["name"])):
-            _draw_mark(mark, mark["points"], region, size, colors)
+            _draw_mark(mark, mark["points"], region, tuple(mark.get("size") or size), colors)
     if live is not None and live.photo == photo["name"]:
         _draw_mark(live.params, live.points, region, size, colors)
     gpu.state.blend_set("NONE")

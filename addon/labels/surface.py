@@ -77,8 +77,8 @@ def parameters(scene: bpy.types.Scene, owner: Owner, places: Iterable[Vector], w
 
 def marks(folder: Path) -> list[tuple[dict[str, Any], list[Vector]]]:
     """The marks on the surface that are shown, each with its places in the aligned world."""
-    rows = snapshot.frame(folder).get("world_from_sfm")
-    world = Matrix(rows) if rows else Matrix()
+    frame, none = snapshot.frame(folder), Matrix()
+    world = Matrix(frame.get("world_from_sfm", none)) @ Matrix(frame.get("marks_from_sfm", none)).inverted()
     stored = [
         (m, [world @ Vector(p) for p in m["places"]])
         for m in journal.marks_at(folder, pending.shown(folder))

@@ -1,6 +1,6 @@
 """The verb `label carry`: the labels of one epoch of an object, carried to the next capture of it.
 
-marks/carried_DIGEST.npz   places (M, 3) in the frame of the poses, class_id (M,) and sure (M,) of each, and `reach`: how far
+marks/carried_DIGEST.npz   places (M, 3) in the frame of marks on the surface, class_id (M,) and sure (M,) of each, and `reach`: how far
                            from one a surfel may be to be told of it; the journal names the file
 """
 
@@ -22,7 +22,7 @@ from ..params import LabelCarryParams
 from ..progress import Reporter
 from ..project.fingerprints import array_digest
 from ..project.schema import SemanticClass
-from ..project.store import edit_project, load_project, world_from_sfm
+from ..project.store import edit_project, load_project, world_from_marks
 from .journal import FOLDER, Mark, append_mark, marks_at, read_marks, shown_revision, taken_ids
 from .preparation import Preparation, ensured
 from .revisions import computed
@@ -89,9 +89,11 @@ def carry(params: LabelCarryParams, report: Reporter) -> dict[str, Any]:
     )
     mapped = np.array([ids[i] for i in used], np.int64)[np.searchsorted(used, told.class_id).clip(0, len(used) - 1)]
     chosen = told.class_id >= 0
-    sfm_from_world = np.linalg.inv(world_from_sfm(project))
-    places = transform_points(sfm_from_world, now.world[0][chosen])
-    file = write_carried(folder, places, mapped[chosen], told.sure[chosen], spacing * similarity_scale(sfm_from_world))
+    marks_from_world = np.linalg.inv(world_from_marks(project))
+    places = transform_points(marks_from_world, now.world[0][chosen])
+    file = write_carried(
+        folder, places, mapped[chosen], told.sure[chosen], spacing * similarity_scale(marks_from_world)
+    )
     mark = append_mark(folder, {"shape": "carried", "file": file, "author": params.author})
     return {
         "revision": mark.revision,

@@ -31,10 +31,10 @@ DRAWN = ("line", "outline", "click", "part")
 
 
 class Mark(BaseModel):
-    """One mark: on a photo points in pixels of its working copy, and the brush's width in the same; on the surface places
-    in the frame of the poses (which no alignment changes), and the width in its units. class_id: None for void and for what
-    erases. level: how large the parts are that
-    a mark of shape "part" takes. key: which mark it is to whoever sent it.
+    """One mark: on a photo points in pixels of its working copy, and the brush's width in the same; size: width and height of
+    that copy, for the photo may be read anew at another size (marks of earlier versions have none). On the surface places
+    in the frame of the first poses (which neither alignment nor later poses change), and the width in its units. class_id: None for void and for what
+    erases. level: how large the parts are that a mark of shape "part" takes. key: which mark it is to whoever sent it.
 
     With shape "carried" the labels of an earlier epoch in `file` (see carry.py), with "confirmed" the word of the author
     that what was carried before is right.
@@ -48,6 +48,7 @@ class Mark(BaseModel):
     author: str = ""
     key: str = ""
     photo: ImageName = ""
+    size: tuple[int, int] | None = None
     shape: Shape
     points: list[tuple[float, float]] = []
     places: list[tuple[float, float, float]] = []

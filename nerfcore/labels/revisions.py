@@ -21,7 +21,8 @@ KEPT = 32  # results; the oldest go first
 
 def made_of(ready: Preparation, marks: list[Mark], class_ids: list[int]) -> str:
     """Digest of what labels are made from."""
-    return digest([ready.inputs, [mark.model_dump(mode="json") for mark in marks], class_ids])
+    said = [mark.model_dump(mode="json", exclude=None if mark.size else {"size"}) for mark in marks]
+    return digest([ready.inputs, said, class_ids])
 
 
 def path_of(project: Path, run: str, revision: int) -> Path:

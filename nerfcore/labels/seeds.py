@@ -13,7 +13,7 @@ import scipy
 from ..errors import ProjectError
 from ..files import UNREADABLE_ARRAYS
 from ..geometry.similarity import similarity_scale, transform_points
-from ..project.store import load_project, world_from_sfm
+from ..project.store import load_project, world_from_marks
 from .drawing import covered
 from .journal import Mark
 from .lookup import LEVELS
@@ -58,7 +58,7 @@ def seeds_of(
     what lies behind.
 
     Args:
-        class_ids: id of each class index. sizes: width and height of the photos the marks were drawn on, by name.
+        class_ids: id of each class index. sizes: width and height of the photos, by name.
     Raises:
         ProjectError: carried labels are missing or damaged.
     """
@@ -80,7 +80,10 @@ def seeds_of(
         if gone or (mark.class_id is not None and mark.class_id not in index):
             unused.append(mark.revision)
             continue
-        surfels = placed_surfels(ready, mark) if mark.places else marked_surfels(ready, mark, sizes[mark.photo])
+        if mark.places:
+            surfels = placed_surfels(ready, mark)
+        else:
+            surfels = marked_surfels(ready, mark, mark.size or sizes[mark.photo])
         if not len(surfels):
             unused.append(mark.revision)
         elif mark.erase:
@@ -110,7 +113,7 @@ def one_hot(label: np.ndarray, classes: int) -> np.ndarray:
 
 
 def marked_surfels(ready: Preparation, mark: Mark, size: tuple[int, int]) -> np.ndarray:
-    """The surfels (S,) that a mark on a photo of this width and height covers, each once; with shape "part" all those of
+    """The surfels (S,) that a mark on a photo covers which had this width and height then, each once; with shape "part" all those of
     the parts that are covered (see parts.py)."""
     surfel, edge = ready.map_of(mark.photo)
     rows, columns = surfel.shape
@@ -126,9 +129,9 @@ def placed_surfels(ready: Preparation, mark: Mark) -> np.ndarray:
     """The surfels (S,) that a mark on the surface covers, each once: those no farther from it than half of its width that
     face as the nearest one does, so that a brush on one side of a sheet leaves the other side alone. Between two places the
     brush marks nothing where it is off the surface: over a gap, or from a near thing to what is behind it."""
-    world_from_sfm_ = world_from_sfm(load_project(ready.folder.parents[2]))
-    places = transform_points(world_from_sfm_, np.array(mark.places, np.float64))
-    radius = mark.width / 2 * similarity_scale(world_from_sfm_)
+    to_world = world_from_marks(load_project(ready.folder.parents[2]))
+    places = transform_points(to_world, np.array(mark.places, np.float64))
+    radius = mark.width / 2 * similarity_scale(to_world)
     tree, normal = ready.tree, ready.world[1]
     corners = [places[:1]]
     for begin, end in pairwise(places) if mark.shape == "line" else ():
@@ -170,8 +173,8 @@ def carried_labels(ready: Preparation, path: Path, class_ids: Sequence[int]) -> 
             f"The labels that were carried are not readable: {path} ({error}).",
             "Show the revision before them (`fieldwork label checkout`), and carry them again.",
         ) from error
-    sfm_from_world = np.linalg.inv(world_from_sfm(load_project(ready.folder.parents[2])))
-    distance, nearest = scipy.spatial.KDTree(places).query(transform_points(sfm_from_world, ready.world[0]))
+    marks_from_world = np.linalg.inv(world_from_marks(load_project(ready.folder.parents[2])))
+    distance, nearest = scipy.spatial.KDTree(places).query(transform_points(marks_from_world, ready.world[0]))
     index = np.full(max([*class_ids, int(told.max(initial=0))]) + 1, UNMARKED, np.int32)
     index[list(class_ids)] = np.arange(len(class_ids))
     label = np.where(np.asarray(distance) <= reach, index[told[nearest]], UNMARKED).astype(np.int32)

@@ -12,7 +12,7 @@ from ..geometry.similarity import similarity_scale, transform_points
 from ..params import LabelCheckoutParams, LabelStrokeParams
 from ..progress import Reporter
 from ..project.schema import Project
-from ..project.store import load_poses, load_project, world_from_sfm
+from ..project.store import load_poses, load_project, world_from_marks
 from .drawing import covered
 from .journal import append_mark, marks_at, read_marks, show, shown_revision
 
@@ -34,7 +34,7 @@ def stroke(params: LabelStrokeParams, report: Reporter) -> dict[str, Any]:
         include={"photo", "shape", "points", "width", "level", "class_id", "erase", "author", "key"}
     )
     if params.places:
-        return _appended(folder, {**values, **on_surface(params, world_from_sfm(project))})
+        return _appended(folder, {**values, **on_surface(params, world_from_marks(project))})
     require_photo(project, folder, params.photo)
     size = next((i.width, i.height) for i in project.images if i.name == params.photo)
     points = np.array(params.points, np.float64)
@@ -43,16 +43,16 @@ def stroke(params: LabelStrokeParams, report: Reporter) -> dict[str, Any]:
             f"The mark lies outside the photo “{params.photo}”, which is {size[0]}×{size[1]}.",
             "Give pixels of the photo, its top-left corner being 0,0.",
         )
-    return _appended(folder, values)
+    return _appended(folder, {**values, "size": size})
 
 
-def on_surface(params: LabelStrokeParams, world_from_sfm: np.ndarray) -> dict[str, Any]:
-    """Places and width of a mark on the surface in the frame of the poses."""
+def on_surface(params: LabelStrokeParams, world_from_marks: np.ndarray) -> dict[str, Any]:
+    """Places and width of a mark on the surface in the frame of such marks."""
     places = np.array(params.places, np.float64)
-    sfm_from_world = np.linalg.inv(world_from_sfm)
+    marks_from_world = np.linalg.inv(world_from_marks)
     return {
-        "places": transform_points(sfm_from_world, places).tolist(),
-        "width": params.width * similarity_scale(sfm_from_world),
+        "places": transform_points(marks_from_world, places).tolist(),
+        "width": params.width * similarity_scale(marks_from_world),
     }
 
 

@@ -78,18 +78,21 @@ def keep_world(
     """The frame for cameras that were placed anew, and whether it is the one that was set by hand.
 
     That one is moved with the cameras, so that the coordinates of the world stay what they were. Where nothing was set, or
-    the cameras do not say how they moved, it is `fresh`; the latter is told.
+    the cameras do not say how they moved, it is `fresh`; the latter is told. Marks on the surface go with the cameras.
     """
+    motion, why = motion_of(after, before) if before is not None else (None, "the earlier poses cannot be read")
+    marks = np.array(project.frame.marks_from_sfm) @ (np.eye(4) if motion is None else motion)
+    fresh = fresh.model_copy(update={"marks_from_sfm": marks.tolist()})
     if not set_by_hand(project, fresh):
         return fresh, False
-    motion, why = motion_of(after, before) if before is not None else (None, "the earlier poses cannot be read")
     if motion is None:
         report.warn(
             f"Up direction, scale and region were reset, because {why}. Set them again with `fieldwork align` and "
             "`fieldwork region`."
         )
         return fresh, False
-    return project.frame.model_copy(update={"world_from_sfm": (world_from_sfm(project) @ motion).tolist()}), True
+    moved = {"world_from_sfm": (world_from_sfm(project) @ motion).tolist(), "marks_from_sfm": marks.tolist()}
+    return project.frame.model_copy(update=moved), True
 
 
 def set_by_hand(project: Project, fresh: Frame) -> bool:

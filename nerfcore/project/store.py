@@ -182,6 +182,11 @@ def world_from_sfm(project: Project) -> np.ndarray:
     return np.array(project.frame.world_from_sfm, np.float64)
 
 
+def world_from_marks(project: Project) -> np.ndarray:
+    """Similarity (4, 4) to the Blender world from the frame in which marks on the surface and carried labels stand."""
+    return world_from_sfm(project) @ np.linalg.inv(np.array(project.frame.marks_from_sfm, np.float64))
+
+
 def create_folder(folder: Path) -> None:
     """Make the project folder. Raises DiskError when that is not allowed."""
     with disk_errors(folder):

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from fieldwork.nerfcore.data.importer import import_dataset
 from fieldwork.nerfcore.data.load import load_scene
-from fieldwork.nerfcore.geometry.similarity import make_similarity, transform_pose
+from fieldwork.nerfcore.geometry.similarity import make_similarity, transform_points, transform_pose
 from fieldwork.nerfcore.params import AlignParams, ImportParams, PosesParams
 from fieldwork.nerfcore.poses import estimate
 from fieldwork.nerfcore.poses.align import align
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.kept import motion_of
 from fieldwork.nerfcore.project.schema import PosedImage, Poses, SemanticClass
-from fieldwork.nerfcore.project.store import edit_project, load_poses, load_project
+from fieldwork.nerfcore.project.store import edit_project, load_poses, load_project, world_from_marks
 from fieldwork.tests.nerfcore.support.ball import ball_project, camera_poses
 from fieldwork.tests.nerfcore.support.photos import picture
 from fieldwork.tests.nerfcore.support.writers import data_set
@@ -110,6 +110,20 @@ def test_a_world_set_by_hand_survives_poses(tmp_path: Path, monkeypatch: pytest.
         assert np.allclose(centres(project), before)
         after = load_project(project).frame
         assert (after.scale_known, after.up_confidence, after.bounds) == (True, 1.0, frame.bounds)
+
+
+@pytest.mark.parametrize("by_hand", [True, False])
+def test_marks_on_the_surface_go_with_the_cameras(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, by_hand: bool
+) -> None:
+    project = ball_project(tmp_path / "p", views=8, side=24)
+    if by_hand:
+        align(AlignParams(project=project, up="x"), Reporter())
+    marks = transform_points(np.linalg.inv(world_from_marks(load_project(project))), centres(project))
+    for _ in range(2):
+        monkeypatch.setattr(estimate, "run_worker", moved_worker(project, MOTION))
+        estimate.estimate_poses(PosesParams(project=project, restart=True), Reporter())
+        assert np.allclose(transform_points(world_from_marks(load_project(project)), marks), centres(project))
 
 
 def test_a_world_that_cannot_be_kept_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,11 +17,13 @@ from fieldwork.nerfcore.data.load import load_scene
 from fieldwork.nerfcore.errors import Cancelled, DiskError, InputError, ProjectError
 from fieldwork.nerfcore.images.working import nearest, read_label
 from fieldwork.nerfcore.labels.accept import MAPS, accept
+from fieldwork.nerfcore.labels.journal import read_marks
 from fieldwork.nerfcore.labels.next_photo import next_photo
 from fieldwork.nerfcore.labels.overlay import overlay, photo_labels
 from fieldwork.nerfcore.labels.preparation import FOLDER, Preparation, current, prepare
 from fieldwork.nerfcore.labels.propagate import propagate
 from fieldwork.nerfcore.labels.revisions import computed, load
+from fieldwork.nerfcore.labels.seeds import seeds_of
 from fieldwork.nerfcore.labels.stroke import checkout, stroke
 from fieldwork.nerfcore.measure.verb import measure
 from fieldwork.nerfcore.mesh.verb import mesh
@@ -172,6 +174,14 @@ def test_contradicting_strokes_are_listed_and_the_later_one_counts(ball: Path) -
     ready, labelling = computed(ball, "main", None)
     ids, _ = photo_labels(ready, labelling, "01", 0)
     assert nearest(ids, SIDE, SIDE)[14, 20] == BOTTOM
+
+
+def test_a_mark_keeps_its_place_when_its_photo_is_read_at_another_size(ball: Path) -> None:
+    mark(ball, points=[(14.0, 14.0), (26.0, 14.0)], class_id=TOP)
+    ready = Preparation(ball / "runs/main/surfels")
+    surfels = [seeds_of(ready, read_marks(ball), [TOP], {"01": (n * SIDE, n * SIDE)}).surfel for n in (1, 2)]
+    assert len(surfels[0])
+    np.testing.assert_array_equal(*surfels)
 
 
 def test_marks_beside_the_surface_and_of_lost_classes_are_told(ball: Path) -> None:

@@ -72,7 +72,8 @@ def segment(params: AssistSegmentParams, report: Reporter) -> dict[str, Any]:
     revision = None
     if params.class_id is not None or params.void:
         mark = params.model_dump(include={"photo", "class_id", "author", "key"})
-        revision = append_mark(folder, {**mark, "shape": "outline", "points": outline, "width": 1.0}).revision
+        drawn = {"shape": "outline", "points": outline, "width": 1.0, "size": (photo.width, photo.height)}
+        revision = append_mark(folder, {**mark, **drawn}).revision
     return {
         "outline": outline,
         "pixels": int(mask.sum()),

@@ -51,8 +51,11 @@ def _names(parts: list[str]) -> list[str]:
     if not suffix:
         return [joined(place)]
     stem = joined(place.removesuffix(suffix))
-    with_suffix = [f"{stem}_{suffix[1:].lower()}"]
-    return [stem, *with_suffix] if suffix.lower() in PHOTO_SUFFIXES else [joined(place), stem, *with_suffix]
+    names = [stem, f"{stem}_{suffix[1:].lower()}"]
+    own = PurePosixPath(stem).suffix  # masks may be called a.jpg.png
+    if own.lower() in PHOTO_SUFFIXES:
+        names += [stem.removesuffix(own), f"{stem.removesuffix(own)}_{own[1:].lower()}"]
+    return names if suffix.lower() in PHOTO_SUFFIXES else [joined(place), *names]
 
 
 class Claims:

@@ -411,7 +411,47 @@ def test_pictures_of_one_name_in_several_folders_keep_apart(tmp_path: Path) -> N
         assert (named_map(folder, f"{camera}_1") == "clay").any(1).tolist() == [row >= number for row in range(HEIGHT)]
 
 
+@pytest.mark.parametrize("kind", ["labelme", "png", "masks"])
+def test_folders_of_several_cameras_are_read(tmp_path: Path, kind: str) -> None:
+    boxes = {"cam0": (2, 2), "cam1": (4, 3)}
+    for camera, (right, bottom) in boxes.items():
+        (tmp_path / "given" / camera).mkdir(parents=True)
+        shape = {"label": "stone", "points": [[0, 0], [right, bottom]], "shape_type": "rectangle"}
+        value = {"shapes": [shape], "imagePath": "1.jpg", "imageWidth": WIDTH, "imageHeight": HEIGHT}
+        mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+        mask[:bottom, :right] = 255 if kind == "masks" else 1
+        if kind == "labelme":
+            (tmp_path / "given" / camera / "1.json").write_text(json.dumps(value))
+        else:
+            Image.fromarray(mask).save(tmp_path / "given" / camera / ("1_mask.png" if kind == "masks" else "1.png"))
+    folder = project_of(tmp_path / "p", ["cam0_1", "cam1_1"])
+    told, _ = bring(folder, tmp_path / "given", class_name="stone", format="masks" if kind == "masks" else "auto")
+    assert told["photos"] == 2
+    for camera, (right, bottom) in boxes.items():
+        found = named_map(folder, f"{camera}_1")
+        assert (found != "").sum() == right * bottom
+        assert (found[:bottom, :right] == ("class 1" if kind == "png" else "stone")).all()
+
+
+def test_masks_named_with_the_whole_name_of_the_photo(tmp_path: Path) -> None:
+    folder = project_of(tmp_path / "p", ["a", "b_jpg"])
+    (tmp_path / "masks").mkdir()
+    for name in ("a.jpg.png", "b.jpg.png"):
+        Image.fromarray(CORNER).save(tmp_path / "masks" / name)
+    assert bring(folder, tmp_path / "masks", format="masks")[0]["photos"] == 2
+
+
 BROKEN = {
+    "order.xml": CVAT.replace('z_order="1"', 'z_order="1.5"').encode(),
+    "no shapes.json": b'{"shapes": null}',
+    "circle.json": json.dumps(
+        {
+            "shapes": [{"label": "x", "points": [[1, 1]], "shape_type": "circle"}],
+            "imagePath": "a.jpg",
+            "imageWidth": 7,
+            "imageHeight": 5,
+        }
+    ).encode(),
     "no json.json": b"{",
     "other.json": b'{"a": 1}',
     "broken.xml": b"<annotations><image",
@@ -485,6 +525,9 @@ def test_folders_and_files_that_are_wrong_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="has labels"):
         export(folder, tmp_path / "x.json", "coco")
     bring(folder, write_cvat(tmp_path))
+    export(folder, tmp_path / "panoptic", "coco-panoptic")
+    with pytest.raises(InputError, match="of no format"):  # its pictures are no label maps
+        bring(folder, tmp_path / "panoptic", replace=True)
     with pytest.raises(SettingError, match=r"end in \.xml"):
         export(folder, tmp_path / "x.json", "cvat")
     with pytest.raises(SettingError, match="no class"):

@@ -69,7 +69,10 @@ def _pictures(path: Path, root: xml.Element, source: Source) -> Iterator[Picture
     for image in root.iterfind("image"):
         name = image.get("name", "")
         width, height = checked_size(image.get("width"), image.get("height"), name)
-        shapes = sorted(image, key=lambda shape: int(shape.get("z_order", 0)))
+        try:
+            shapes = sorted(image, key=lambda shape: int(shape.get("z_order", 0)))
+        except ValueError as error:
+            raise InputError(f"A z_order of {name} in {path} is no whole number: {error}.", HINT) from error
         groups: dict[str, int] = {}
         regions: list[Region] = []
         for shape in shapes:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ...errors import InputError
 from . import coco, cvat, label_studio, labelme, masks, segments, supervisely
-from .regions import LabelClass, Picture, Source, read_json
+from .regions import LabelClass, Picture, Source, files_in, read_json
 
 READERS = {
     "coco": coco.read,
@@ -37,11 +37,13 @@ def format_of(path: Path) -> str:
     if path.is_dir():
         if (path / supervisely.META).is_file():
             return "supervisely"
-        files = sorted(path.glob("*.json"))
+        files = files_in(path, {".json"})
         found = next((kind for file in files if (kind := _kind_of_json(read_json(file))) is not None), None)
         if found in ("labelme", "segments"):
             return found
-        if any(file.suffix.lower() in masks.SUFFIXES for file in path.iterdir()):
+        pictures = files_in(path, masks.SUFFIXES)
+        # Below a file of another format they are its own.
+        if pictures and (found is None or pictures[0].parent == path):
             return "png"
     elif path.suffix.lower() == ".xml" or zipfile.is_zipfile(path):
         return "cvat"

@@ -21,6 +21,7 @@ from .regions import (
     box_mask,
     checked_size,
     ellipse_mask,
+    files_in,
     from_base64,
     mask_of_png,
     placed,
@@ -33,20 +34,24 @@ from .regions import (
 
 def read(path: Path) -> Source:
     """The labels of a folder of JSON files, or of one. Raises InputError."""
-    files = sorted(path.glob("*.json")) if path.is_dir() else [path]
+    files = files_in(path, {".json"}) if path.is_dir() else [path]
     values = [(file, read_json(file)) for file in files]
-    values = [(file, value) for file, value in values if isinstance(value, dict) and "shapes" in value]
+    values = [
+        (file, value) for file, value in values if isinstance(value, dict) and isinstance(value.get("shapes"), list)
+    ]
     if not values:
         raise InputError(f"{path} holds no JSON file of LabelMe.", "Give the folder in which LabelMe saved.")
     names = [str(s.get("label", "")) for _, value in values for s in value["shapes"] if isinstance(s, dict)]
     source = Source(iter(()), dict.fromkeys(names))
-    source.pictures = _pictures(values, source)
+    source.pictures = _pictures(path, values, source)
     return source
 
 
-def _pictures(values: list[tuple[Path, dict[str, Any]]], source: Source) -> Iterator[Picture]:
+def _pictures(path: Path, values: list[tuple[Path, dict[str, Any]]], source: Source) -> Iterator[Picture]:
     for file, value in values:
         name = PureWindowsPath(str(value.get("imagePath") or file.name)).as_posix()
+        if path.is_dir() and file.parent != path:
+            name = f"{file.parent.relative_to(path).as_posix()}/{name}"
         width, height = checked_size(value.get("imageWidth"), value.get("imageHeight"), name)
         groups: dict[Any, int] = {}
         regions: list[Region] = []
@@ -61,7 +66,7 @@ def _pictures(values: list[tuple[Path, dict[str, Any]]], source: Source) -> Iter
                 stuff = (shape.get("flags") or {}).get(STUFF) is True
                 instance = 0 if stuff else groups.setdefault(key, len(groups) + 1)
                 regions.append(region_of(str(shape["label"]), mask, instance))
-            except (KeyError, TypeError, ValueError, AttributeError) as error:
+            except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
                 raise InputError(f"A shape in {file} is damaged: {error!r}.", "Save it again with LabelMe.") from error
         yield Picture(name, width, height, regions)
 

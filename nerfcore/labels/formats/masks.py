@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from PIL import Image
@@ -13,7 +13,7 @@ from ...errors import InputError, SettingError
 from ...files import atomic_path, write_json
 from ...images.labels import UnknownColors, read_labels, read_mask
 from ...project.classes import read_classes
-from .regions import Color, LabelClass, Picture, Source, checked_size, color_hex, region_of
+from .regions import Color, LabelClass, Picture, Source, checked_size, color_hex, files_in, region_of
 
 SUFFIXES = {".png", ".tif", ".tiff", ".bmp"}
 MASK = re.compile(r"[_.-]?mask$", re.IGNORECASE)  # behind the name of the photo
@@ -22,8 +22,8 @@ TABLE = "classes.json"
 
 def pictures_in(path: Path, more: frozenset[str] = frozenset()) -> list[Path]:
     """The pictures in a folder, or one. Raises InputError where there are none."""
-    files = sorted(path.iterdir()) if path.is_dir() else [path]
-    found = [file for file in files if file.suffix.lower() in SUFFIXES | more and file.is_file()]
+    suffixes = SUFFIXES | more
+    found = files_in(path, suffixes) if path.is_dir() else [path] if path.suffix.lower() in suffixes else []
     if not found:
         raise InputError(f"There is no label picture at {path}.", "Give a folder of PNG files named like the photos.")
     return found
@@ -42,14 +42,12 @@ def read_maps(path: Path, classes: list[LabelClass], void: int) -> Source:
         colors = {**{i: color for i, color in colors.items() if i in names}, **given}
     source = Source(iter(()), {name: colors.get(i) for i, name in names.items()})
     source.ids = {name: i for i, name in names.items()}
-    source.pictures = _maps(pictures_in(path), names, colors, void, source)
+    source.pictures = _maps(path, names, colors, void, source)
     return source
 
 
-def _maps(
-    files: list[Path], names: dict[int, str], colors: dict[int, Color], void: int, source: Source
-) -> Iterator[Picture]:
-    for file in files:
+def _maps(path: Path, names: dict[int, str], colors: dict[int, Color], void: int, source: Source) -> Iterator[Picture]:
+    for file in pictures_in(path):
         try:
             ids = read_labels(file, colors, void)
         except InputError as error:
@@ -63,23 +61,28 @@ def _maps(
                 name = names.get(class_id, f"class {class_id}")
                 source.ids.setdefault(name, class_id)
                 regions.append(region_of(name, ids == class_id))
-        yield Picture(file.name, ids.shape[1], ids.shape[0], regions)
+        yield Picture(_place(file, path), ids.shape[1], ids.shape[0], regions)
+
+
+def _place(file: Path, path: Path) -> str:
+    """Where a picture lies in the folder that was given; its name where it was given itself."""
+    return file.relative_to(path).as_posix() if path.is_dir() else file.name
 
 
 def read_masks(path: Path, class_name: str) -> Source:
     """Black and white masks: what is white is of one class, black is unlabelled. Raises InputError."""
     source = Source(iter(()), {class_name: None})
-    source.pictures = _masks(pictures_in(path, frozenset({".jpg", ".jpeg"})), class_name)
+    source.pictures = _masks(path, pictures_in(path, frozenset({".jpg", ".jpeg"})), class_name)
     return source
 
 
-def _masks(files: list[Path], class_name: str) -> Iterator[Picture]:
+def _masks(path: Path, files: list[Path], class_name: str) -> Iterator[Picture]:
     for file in files:
         mask = read_mask(file)
         checked_size(mask.shape[1], mask.shape[0], file.name)
-        yield Picture(
-            f"{MASK.sub('', file.stem)}{file.suffix}", mask.shape[1], mask.shape[0], [region_of(class_name, mask)]
-        )
+        place = PurePosixPath(_place(file, path))
+        name = place.with_name(f"{MASK.sub('', place.stem)}{place.suffix}").as_posix()
+        yield Picture(name, mask.shape[1], mask.shape[0], [region_of(class_name, mask)])
 
 
 def map_of(picture: Picture, ids: dict[str, int], void: int) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -90,6 +90,16 @@ class Source:
 
     def skip(self, kind: str) -> None:
         self.skipped[kind] = self.skipped.get(kind, 0) + 1
+
+
+def files_in(folder: Path, suffixes: Collection[str]) -> list[Path]:
+    """Files of these suffixes in a folder; where there are none, those in the folders in it, as cameras of one capture have
+    their own."""
+    for place in (folder.glob("*"), folder.rglob("*")):
+        found = sorted(file for file in place if file.suffix.lower() in suffixes and file.is_file())
+        if found:
+            return found
+    return []
 
 
 def read_json(path: Path) -> Any:

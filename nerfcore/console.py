@@ -19,6 +19,8 @@ from rich.text import Text
 from .progress import Estimate, Reporter
 
 PLAIN_EVERY = 10.0  # seconds between plain progress lines
+# Results that are no figures: without a value there is none of it.
+NO_FIGURES = {"revision", "label_revision", "other_label_revision", "parent", "texture", "file"}
 
 
 class ConsoleReporter(Reporter):
@@ -158,5 +160,6 @@ def flattened(value: dict[str, Any], prefix: str = "") -> list[tuple[str, str]]:
             told = item and all(isinstance(i, str) and i.endswith(".") for i in item)
             rows.append((name, "\n".join(item) if told else short if short and len(short) < 90 else counted))
         else:
-            rows.append((name, "not measured" if item is None else str(item)))
+            nothing = "none" if key in NO_FIGURES else "not measured"
+            rows.append((name, nothing if item is None else str(item)))
     return rows

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 from fieldwork.nerfcore import console
-from fieldwork.nerfcore.console import ConsoleReporter, campaign_table
+from fieldwork.nerfcore.console import ConsoleReporter, campaign_table, flattened
 from fieldwork.nerfcore.progress import Estimate
 from rich.console import Console
 
@@ -98,6 +98,11 @@ def test_captures_in_brackets_are_shown() -> None:
     drawn.print(campaign_table(status))
     text = drawn.export_text()
     assert all(part in text for part in ("[list]", "[a]", ODD))
+
+
+def test_what_there_is_none_of_was_not_to_be_measured() -> None:
+    result = {"psnr": None, "texture": None, "label_revision": None}
+    assert flattened(result) == [("psnr", "not measured"), ("texture", "none"), ("label_revision", "none")]
 
 
 def test_the_engine_says_how_it_is_called() -> None:

@@ -25,6 +25,7 @@ from ..verdict import poses_verdict
 from .align import gps_frame
 from .exposure import exposure_gains
 from .process import run_worker
+from .zoom import lens_groups
 
 WORK_FOLDER = "poses/sfm"
 SPARSE_FOLDER = "poses/sparse"
@@ -295,12 +296,12 @@ def _job(
         "images": [
             {
                 "file": _database_name(record),
-                "group": record.camera_group or f"{record.width}x{record.height}",
+                "group": group,
                 "width": record.width,
                 "height": record.height,
                 "focal_px": record.focal_px,
             }
-            for record in records
+            for record, group in zip(records, lens_groups(records))
         ],
     }
 

@@ -26,6 +26,11 @@ def training_size(camera: Camera, longest: int) -> tuple[int, int]:
     return max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
 
 
+def _flat(values: np.ndarray) -> torch.Tensor:
+    """Values of all pixels of a picture, one after the other."""
+    return torch.from_numpy(np.ascontiguousarray(values)).reshape(-1)
+
+
 def home_of(size: int, budget: float, device: torch.device) -> torch.device:
     """Where photos of `size` bytes stay: on the device if they are within the budget, else with the host."""
     return device if size <= budget else torch.device("cpu")
@@ -96,45 +101,42 @@ class PixelStore:
         lookup = np.full(65536, VOID, np.uint8)
         for index, class_id in enumerate(class_ids):
             lookup[class_id] = index
-        cameras, colours, labels, usable, confidences, unknown = [], [], [], [], [], []
-        for number, view in enumerate(self.views):
+        self.cameras = [view.camera.resized(*training_size(view.camera, longest)) for view in self.views]
+        first = np.cumsum([0, *(camera.width * camera.height for camera in self.cameras)])
+        total = int(first[-1])
+        has_confidence = any(view.confidence is not None for view in self.views)
+        cut = scene.mask_mode == "empty" and any(view.mask is not None for view in self.views)
+        rgba, labels = torch.empty(total, 4, dtype=torch.uint8), torch.empty(total, dtype=torch.uint8)
+        confidences = torch.empty(total if has_confidence else 0, dtype=torch.uint8)
+        keep, left_open = torch.ones(total, dtype=torch.bool), torch.zeros(total if cut else 0, dtype=torch.bool)
+        for number, (view, camera) in enumerate(zip(self.views, self.cameras)):
             report.progress(number / len(self.views), view.name)
-            width, height = training_size(view.camera, longest)
+            width, height, pixels = camera.width, camera.height, slice(int(first[number]), int(first[number + 1]))
             photo = resized(photo_of(view), width, height)
-            label = np.full((height, width), VOID, np.uint8)
-            if view.label is not None:
-                label = lookup[nearest(read_label(view.label), width, height)]
-            confidence = np.full((height, width), 255, np.uint8)
+            label = VOID if view.label is None else _flat(lookup[nearest(read_label(view.label), width, height)])
+            labels[pixels] = label
             if view.confidence is not None:
-                confidence = nearest(read_image(view.confidence)[..., 0], width, height)
-            confidences.append(torch.from_numpy(np.ascontiguousarray(confidence)).reshape(-1))
-            keep, open_ = np.ones((height, width), bool), np.zeros((height, width), bool)
+                confidences[pixels] = _flat(nearest(read_image(view.confidence)[..., 0], width, height))
+            elif has_confidence:
+                confidences[pixels] = 255
             if view.mask is not None:
                 mask = nearest(read_image(view.mask)[..., 0], width, height)
                 inside = mask > 127
-                if scene.mask_mode == "empty":
-                    photo, open_ = cut_out(photo, inside), mask == MASK_UNKNOWN
+                if cut:
+                    photo = cut_out(photo, inside)
+                    left_open[pixels] = _flat(mask == MASK_UNKNOWN)
                 else:
-                    keep = inside
-            cameras.append(view.camera.resized(width, height))
-            colours.append(torch.from_numpy(np.ascontiguousarray(with_alpha(photo).pixels)).reshape(-1, 4))
-            labels.append(torch.from_numpy(label).reshape(-1))
-            usable.append(torch.from_numpy(keep).reshape(-1))
-            unknown.append(torch.from_numpy(open_).reshape(-1))
-        self.cameras = cameras
-        keep = torch.cat(usable)
-        has_confidence = any(view.confidence is not None for view in self.views)
-        left_open = torch.cat(unknown)
+                    keep[pixels] = _flat(inside)
+            rgba[pixels] = _flat(with_alpha(photo).pixels).reshape(-1, 4)
         size = len(keep) * (5 + has_confidence + bool(left_open.any()) + (0 if bool(keep.all()) else 8))
         self.home = home_of(size, budget, device)
         left = budget - size if size <= budget else budget
-        self.rgba = self._keep(torch.cat(colours))
-        self.label = self._keep(torch.cat(labels))
-        self.confidence = self._keep(torch.cat(confidences)) if has_confidence else None
+        self.rgba = self._keep(rgba)
+        self.label = self._keep(labels)
+        self.confidence = self._keep(confidences) if has_confidence else None
         self.unknown = self._keep(left_open) if bool(left_open.any()) else None
-        sizes = torch.tensor([c.width * c.height for c in cameras])
-        self.first = torch.cat([torch.zeros(1, dtype=torch.long), sizes.cumsum(0)]).to(device)
-        self.rays = CameraRays(cameras, box_poses(self.views, box_from_world), device, left)
+        self.first = torch.from_numpy(first.astype(np.int64)).to(device)
+        self.rays = CameraRays(self.cameras, box_poses(self.views, box_from_world), device, left)
         for number in range(len(self.rays.distinct)):
             report.check()
             sees = ~self.rays.lens_directions(number)[:, 0].isnan().cpu()

@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -144,3 +146,34 @@ def test_the_setting_is_the_budget(masked: Path, monkeypatch: pytest.MonkeyPatch
     for step in range(3):
         trainer.step(step / 3)
     assert math.isfinite(trainer.take_measured().psnr)
+
+
+READ = """
+import resource, sys
+from pathlib import Path
+import numpy as np, torch
+from fieldwork.nerfcore.data.pixels import PixelStore
+from fieldwork.nerfcore.data.scene import Scene, View
+from fieldwork.nerfcore.geometry.cameras import Camera
+from fieldwork.nerfcore.progress import Reporter
+camera = Camera(width=800, height=600, fx=700, fy=700, cx=400, cy=300)
+views = [View(str(i), camera, np.eye(4), Path(sys.argv[1])) for i in range(80)]
+def peak():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+def read(some):
+    indices = list(range(len(some)))
+    return PixelStore(Scene(some, indices, []), indices, [], np.eye(4), 800, torch.device("cpu"), Reporter())
+read(views[:2])
+before = peak()
+store = read(views)
+print((peak() - before) / (store.rgba.nbytes + store.label.nbytes))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the unit of ru_maxrss is that of Linux")
+def test_photos_are_read_into_the_memory_where_they_stay(tmp_path: Path) -> None:
+    Image.new("RGB", (800, 600), (90, 120, 200)).save(tmp_path / "a.jpg")
+    done = subprocess.run(
+        [sys.executable, "-c", READ, str(tmp_path / "a.jpg")], capture_output=True, text=True, check=True
+    )
+    assert float(done.stdout) < 1.5, "times what is kept"

@@ -19,8 +19,8 @@ LONGEST = 200
 def unique_names(paths: Sequence[Path], root: Path) -> list[str]:
     """A name for each image: its stem, or its path below `root` with "_" for separators when stems repeat.
 
-    White space becomes "_", at which COLMAP's lists of names are split, and so do characters that Windows has no files
-    with. Long names are cut, with a digest of the whole behind.
+    White space becomes "_", at which COLMAP's lists of names are split, and so do a "#" in front, which makes comments of
+    their lines, and characters that Windows has no files with. Long names are cut, with a digest of the whole behind.
     """
     names = [path.stem for path in paths]
     if _alike(map(joined, names)):
@@ -60,8 +60,9 @@ def _alike(names: Iterable[str]) -> bool:
 
 
 def joined(name: str) -> str:
-    """A path as a name: "_" for separators, white space and what Windows has no files with; long ones cut."""
-    return _cut("_".join(re.sub(r'[\\/:*?"<>|\x00-\x1f]', "_", name.replace("/", "_")).split()) or "photo")
+    """A path as a name: "_" for separators, white space, a "#" in front and what Windows has no files with; long ones cut."""
+    plain = "_".join(re.sub(r'[\\/:*?"<>|\x00-\x1f]', "_", name.replace("/", "_")).split())
+    return _cut(re.sub("^#", "_", plain) or "photo")
 
 
 def _cut(plain: str) -> str:

@@ -105,6 +105,13 @@ def test_names_of_photos_differ_by_more_than_capitals(tmp_path: Path) -> None:
     assert frame_names(["left/A", "right/a"]) == ["left_A", "right_a"]
 
 
+def test_names_of_photos_are_no_comments(tmp_path: Path) -> None:
+    """COLMAP leaves out lines of a list of pairs that begin with "#"."""
+    names = unique_names([tmp_path / name for name in ("#1 left.jpg", "#2.jpg", "_2.jpg", "a#3.jpg")], tmp_path)
+    assert not any(name.startswith("#") for name in names)
+    assert len({name.casefold() for name in names}) == 4
+
+
 def test_json_of_a_wrong_name(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     assert main(["train", str(tmp_path), "--run", "..", "--json"]) == 2
     error = json.loads(capfd.readouterr().out)["error"]

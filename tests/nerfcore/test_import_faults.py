@@ -162,3 +162,27 @@ def test_fisheye_lenses_of_metashape_with_tangential_terms(tmp_path: Path, p1: f
         return
     with pytest.raises(InputError, match="fits p1 and p2 of a fisheye lens"):
         read_dataset(tmp_path)
+
+
+@pytest.mark.parametrize(("version", "fy"), [(["1", "2", "4"], 96.0), (["1", "2", "5"], 150.0)])
+def test_upright_photos_of_meshroom(tmp_path: Path, version: list[str], fy: float) -> None:
+    """Its sensors are as wide as their photos, also where those are higher; what its ratio is of has changed."""
+    Image.new("RGB", (60, 90)).save(tmp_path / "a.png")
+    lens = {
+        "intrinsicId": "1",
+        "width": "60",
+        "height": "90",
+        "sensorWidth": "24",
+        "focalLength": "48",
+        "type": "pinhole",
+    }
+    pose = {"rotation": [str(v) for v in np.eye(3).ravel()], "center": ["0", "0", "0"]}
+    value = {
+        "version": version,
+        "views": [{"viewId": "1", "poseId": "1", "intrinsicId": "1", "path": "/gone/a.png"}],
+        "intrinsics": [lens | {"pixelRatio": "1.25", "principalPoint": ["0", "0"]}],
+        "poses": [{"poseId": "1", "pose": {"transform": pose}}],
+    }
+    (tmp_path / "cameras.sfm").write_text(json.dumps(value))
+    camera = read_dataset(tmp_path).views[0].camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (120, fy, 30, 45)

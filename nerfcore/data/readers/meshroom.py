@@ -1,8 +1,9 @@
 """Meshroom (AliceVision): `cameras.sfm`, `sfm.json` or any `*.sfm` in JSON.
 
 Rotations are stored column by column as world-to-camera matrices, OpenCV axes; centres in the world. The focal length
-is in millimetres of a sensor whose width goes with the image's longer side; the principal point is an offset from the
-middle in pixels (in old files: absolute).
+is in millimetres of a sensor as wide as the image; "pixelRatio" is the focal length in pixels along y by
+that along x, before version 1.2.5 the other way round. The principal point is an offset from the middle in pixels (in old files:
+absolute). Source: AliceVision, sfmDataIO/jsonIO.cpp.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from ...images.decode import image_size
 from ...images.names import find_image, labels_and_masks, unique_names
 from ..dataset import Dataset, DatasetView, lens_at_size, require
 
+RATIO_OF_PIXELS = [1, 2, 5]  # the version from which "pixelRatio" is that of pixels
 RADIAL = {"radial1": 1, "radial3": 3, "radialk1": 1, "radialk3": 3}
 
 
@@ -45,6 +47,7 @@ def read(folder: Path) -> Dataset:
     folder = path.parent
     try:
         value = json.loads(path.read_text(encoding="utf-8"))
+        version = [int(part) for part in value.get("version", RATIO_OF_PIXELS)]
         intrinsics = {entry["intrinsicId"]: entry for entry in value["intrinsics"]}
         poses = {entry["poseId"]: entry["pose"]["transform"] for entry in value.get("poses", [])}
         entries = [
@@ -71,7 +74,7 @@ def read(folder: Path) -> Dataset:
         try:
             pose[:3, :3] = np.array([float(v) for v in transform["rotation"]]).reshape(3, 3)
             pose[:3, 3] = [float(v) for v in transform["center"]]
-            camera = _camera(intrinsic, image, path)
+            camera = _camera(intrinsic, version, image, path)
         except (KeyError, ValueError, TypeError) as error:
             raise InputError(f"{path} is damaged at {image.name}: {error!r}.", "Export the cameras again.") from error
         views.append(
@@ -90,14 +93,15 @@ def read(folder: Path) -> Dataset:
     return Dataset("meshroom", views, frame, confidence, warnings=warnings)
 
 
-def _camera(value: dict[str, Any], image: Path, path: Path) -> Camera:
+def _camera(value: dict[str, Any], version: list[int], image: Path, path: Path) -> Camera:
     width, height = int(value["width"]), int(value["height"])
     if "pxFocalLength" in value:
         focal = value["pxFocalLength"]
         fx, fy = (float(f) for f in focal) if isinstance(focal, list) else (float(focal), float(focal))
     else:
-        fx = fy = float(value["focalLength"]) / float(value["sensorWidth"]) * max(width, height)
-        fy *= float(value.get("pixelRatio", 1.0))
+        fx = float(value["focalLength"]) / float(value["sensorWidth"]) * width
+        ratio = float(value.get("pixelRatio", 1.0))
+        fy = fx * ratio if version >= RATIO_OF_PIXELS else fx / ratio
     cx, cy = (float(v) for v in value.get("principalPoint", (0, 0)))
     if abs(cx) < 0.25 * width and abs(cy) < 0.25 * height:
         cx, cy = cx + width / 2, cy + height / 2

@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 
 from ..capture.backdrop import mask_objects
 from ..capture.mask_mode import chosen_mask_mode
-from ..errors import InputError, ProjectError
+from ..errors import InputError, ProjectError, wrong_value
 from ..files import file_hash, require_readable
 from ..geometry.cameras import Camera
 from ..images.labels import read_mask
@@ -103,15 +104,23 @@ def read_dataset(source: Path, format: str = "auto") -> Dataset:
     if format != "auto":
         if format not in FORMATS:
             raise InputError(f"The format {format} cannot be read.", f"Choose one of {', '.join(FORMATS)}.")
-        return _checked(_reader(format).read(source), source)
+        return _checked(_read(format, source), source)
     for name in FORMATS:
-        reader = _reader(name)
-        if reader.matches(source):
-            return _checked(reader.read(source), source)
+        if _reader(name).matches(source):
+            return _checked(_read(name, source), source)
     raise InputError(
         f"{source} is no posed data set that Fieldwork knows.",
         f"Known are {', '.join(FORMATS)}. Photos without poses go through `fieldwork new`.",
     )
+
+
+def _read(name: str, source: Path) -> Dataset:
+    """Read a data set of this format. Raises InputError, also where its files hold what no reader looks for."""
+    try:
+        return _reader(name).read(source)
+    except (ValueError, TypeError, LookupError, ArithmeticError) as error:
+        reason = wrong_value(error.errors()[0]) if isinstance(error, ValidationError) else repr(error)
+        raise InputError(f"{source} is a damaged data set ({name}): {reason}.", "Export the data set again.") from error
 
 
 def _checked(dataset: Dataset, source: Path) -> Dataset:

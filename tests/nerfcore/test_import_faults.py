@@ -186,3 +186,23 @@ def test_upright_photos_of_meshroom(tmp_path: Path, version: list[str], fy: floa
     (tmp_path / "cameras.sfm").write_text(json.dumps(value))
     camera = read_dataset(tmp_path).views[0].camera
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (120, fy, 30, 45)
+
+
+XMP = """<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description xcr:PrincipalPointU="{u}" xcr:AspectRatio="1"
+xcr:FocalLength35mm="35"><xcr:Rotation>1 0 0 0 1 0 0 0 1</xcr:Rotation><xcr:Position>0 0 0</xcr:Position>
+</rdf:Description></x:xmpmeta>"""
+SENSOR = """<document><chunk><sensors><sensor id="0" type="frame"><resolution width="{u}" height="30"/>
+<calibration><f>40</f></calibration></sensor></sensors><cameras><camera id="0" sensor_id="0" label="a">
+<transform>1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1</transform></camera></cameras></chunk></document>"""
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "good", "bad"), [("a.xmp", XMP, "0", "0.1.2"), ("cameras.xml", SENSOR, "40", "0")]
+)
+def test_numbers_that_are_none(tmp_path: Path, file: str, text: str, good: str, bad: str) -> None:
+    Image.new("RGB", (40, 30)).save(tmp_path / "a.png")
+    (tmp_path / file).write_text(text.format(u=good))
+    assert read_dataset(tmp_path).views[0].camera.cx == 20
+    (tmp_path / file).write_text(text.format(u=bad))
+    with pytest.raises(InputError, match="is a damaged data set"):
+        read_dataset(tmp_path)

@@ -103,15 +103,20 @@ def _from_colors(rgba: np.ndarray, colors: Colors | None, ignore_id: int, name: 
 
 
 def read_mask(path: Path) -> np.ndarray:
-    """Foreground mask (H, W) bool: alpha where the file has one, else brightness above one half.
+    """Foreground mask (H, W) bool: alpha where the file has one, else brightness above one half. Grey files whose alpha is full
+    everywhere have none.
 
     Raises:
         InputError: it is no image. One clause, fit as a reason.
     """
     try:
         with Image.open(path) as image:
-            channel = image.getchannel("A") if image.mode in ("RGBA", "LA") else image.convert("L")
-            return np.asarray(channel) > 127
+            if image.mode not in ("RGBA", "LA"):
+                return np.asarray(image.convert("L")) > 127
+            pixels = np.asarray(image.convert("RGBA"))
+            # Many programs save black and white with an alpha channel that says nothing.
+            drawn = pixels[..., 3].min() == 255 and bool((pixels[..., :3] == pixels[..., :1]).all())
+            return pixels[..., 0 if drawn else 3] > 127
     except UNDECODABLE as error:
         raise InputError(f"mask {path.name} cannot be read: {error}") from error
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from fieldwork.nerfcore.capture import ingest
 from fieldwork.nerfcore.errors import InputError
-from fieldwork.nerfcore.images.labels import read_labels
+from fieldwork.nerfcore.images.labels import read_labels, read_mask
 from fieldwork.nerfcore.params import NewParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.schema import SemanticClass
@@ -163,6 +163,23 @@ def test_masks(tmp_path: Path) -> None:
     assert project.mask_mode == "empty"
     with Image.open(tmp_path / "p" / "masks" / "p0.png") as image:
         assert np.array_equal(np.asarray(image), mask)
+
+
+@pytest.mark.parametrize("mode", ["L", "RGB", "RGBA", "LA", "cut out"])
+def test_masks_drawn_in_black_and_white_or_by_alpha(tmp_path: Path, mode: str) -> None:
+    """Painting programs add an alpha channel that is full everywhere."""
+    inside = np.zeros((20, 30), np.uint8)
+    inside[5:15] = 255
+    image = Image.fromarray(inside).convert("RGBA" if mode == "cut out" else mode)
+    if mode == "cut out":
+        image.putalpha(Image.fromarray(inside))
+    image.save(tmp_path / "m.png")
+    assert np.array_equal(read_mask(tmp_path / "m.png"), inside > 0)
+
+
+def test_a_cut_out_photo_that_fills_the_picture(tmp_path: Path) -> None:
+    Image.new("RGBA", (30, 20), (10, 20, 30, 255)).save(tmp_path / "m.png")
+    assert read_mask(tmp_path / "m.png").all()
 
 
 def test_labels_that_came_later_stay_when_it_runs_again(tmp_path: Path) -> None:

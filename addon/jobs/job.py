@@ -56,6 +56,7 @@ TITLES = {
     "doctor": "Checking the Engine",
     "classes": "Reading Classes",
     "timer": "Watching",
+    "frame": "Rendering with Objects",
 }
 
 

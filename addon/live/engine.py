@@ -17,6 +17,7 @@ from .. import machine
 from ..errors import EngineError, SceneError
 from ..text import t
 from . import camera, fields, passes
+from .shared_scene import OWNER
 
 if TYPE_CHECKING:
     from .frames import Frame, FrameEngine
@@ -34,6 +35,8 @@ def _open_link() -> Any:
     return Link(python, machine.engine_log().with_name(f"frames-{machine.engine_log().stem}.log"))
 
 
+# Why fields are missing in composites: of scenes that are rendered for another one Blender tells the terminal alone.
+untold: list[str] = []
 _frames: FrameEngine | None = None
 _making = threading.Lock()
 
@@ -82,15 +85,15 @@ class FieldworkRenderEngine(bpy.types.RenderEngine):
     def render(self, depsgraph: bpy.types.Depsgraph) -> None:
         try:
             self._render(depsgraph)
-        except SceneError as error:
-            self._fail(str(error))
-        except EngineError as error:
-            if error.kind != "cancelled":
-                self._fail(str(error))
+        except (SceneError, EngineError) as error:
+            if getattr(error, "kind", "") != "cancelled":
+                self._fail(str(error), depsgraph.scene)
 
-    def _fail(self, message: str) -> None:
+    def _fail(self, message: str, scene: bpy.types.Scene) -> None:
         self.report({"ERROR"}, message)
         self.error_set(message)
+        if OWNER in scene:
+            untold.append(message)
 
     def _render(self, depsgraph: bpy.types.Depsgraph) -> None:
         layer = depsgraph.view_layer_eval

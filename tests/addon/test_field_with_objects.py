@@ -230,8 +230,12 @@ bpy.ops.fieldwork.setup_compositor()
 pressed = shoot("pressed")
 bpy.app.handlers.render_init.clear()
 scene["fieldwork_field_scene"].render.use_border = False
-answer([list(followed.shape), float(followed[..., 3].mean()), bool(np.array_equal(followed, pressed)),
-        attempt(bpy.ops.render.render)])
+bpy.ops.render.render()
+from fieldwork.addon.jobs.queue import queue
+from fieldwork.addon.live import engine, in_step
+told = list(engine.untold)
+in_step._taken()
+answer([list(followed.shape), float(followed[..., 3].mean()), bool(np.array_equal(followed, pressed)), told, str(queue.outcome.error), engine.untold])
 """,
         project=ball,
         folder=tmp_path,
@@ -239,7 +243,10 @@ answer([list(followed.shape), float(followed[..., 3].mean()), bool(np.array_equa
     assert facts[0] == [24, 36, 4]
     assert facts[1] > 0.5
     assert facts[2], "as if the button had been pressed again"
-    assert "press Composite with Objects again" in facts[3]
+    (told,) = facts[3]
+    assert "press Composite with Objects again" in told
+    assert told in facts[4], "the panel tells it"
+    assert facts[5] == []
 
 
 def test_a_copy_of_the_scene_gets_scenes_of_its_own(bpy_script, tmp_path):

@@ -65,18 +65,20 @@ def in_rendered_collections(layer: bpy.types.LayerCollection) -> set[str]:
 
 
 def rendered_items(depsgraph: bpy.types.Depsgraph) -> list[dict[str, Any]]:
-    """What a render shows, as nerfcore/film/shot.py describes fields; nothing in frames in which fields are hidden that other
-    frames may show.
+    """What a render of a view layer shows, as nerfcore/film/shot.py describes fields; nothing where other frames or view
+    layers show the scene's fields.
 
     Raises SceneError: there is no field to show, or things are edited of one that is not baked.
     """
-    scene = depsgraph.scene_eval
-    baked = scene.fieldwork_live.source == "baked"
-    items = [_rendered_item(part, baked, depsgraph) for part in rendered_parts(depsgraph)]
-    known = field_objects(depsgraph.view_layer.objects)
+    scene, layer = depsgraph.scene, depsgraph.view_layer
+    baked = depsgraph.scene_eval.fieldwork_live.source == "baked"
+    known = field_objects(scene.objects)
     if not known:
-        items = [project_item(scene, baked)]
-    if not items and not any(field.animation_data for field in known):
+        return [project_item(depsgraph.scene_eval, baked)]
+    items = [_rendered_item(part, baked, depsgraph) for part in rendered_parts(depsgraph)]
+    others = [other for other in scene.view_layers if other.use and other != layer]
+    elsewhere = any(field in set(other.objects) for other in others for field in known)
+    if not items and not elsewhere and not any(field.animation_data for field in known):
         raise SceneError(t("All fields of the scene are hidden in renders."))
     return items
 

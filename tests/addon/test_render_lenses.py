@@ -278,15 +278,39 @@ render.film_transparent = False
 next(node for node in scene.world.node_tree.nodes if node.type == "BACKGROUND").inputs["Color"].default_value = (0.25, 0.5, 0.75, 1)
 scene.frame_set(2)
 world = passes(shoot("world"))
-answer({"alpha": [float(one["Combined.A"].max()) for one in found], "far": float(found[1]["Depth.Z"].min()),
+field.animation_data_clear()
+field.hide_render = False
+held = bpy.data.collections.new("Held")
+scene.collection.children.link(held)
+for collection in list(field.users_collection):
+    collection.objects.unlink(field)
+held.objects.link(field)
+other = scene.view_layers.new("Other")
+other.layer_collection.children["Held"].exclude = True
+render.film_transparent = True
+def alphas():  # of each view layer
+    source, number, seen = oiio.ImageInput.open(shoot("layers")), 0, {}
+    while source.seek_subimage(number, 0):
+        spec, number = source.spec(), number + 1
+        pixels = source.read_image(number - 1, 0, 0, spec.nchannels, "float")
+        seen |= {name: float(pixels[..., place].max()) for place, name in enumerate(spec.channelnames) if name.endswith("Combined.A")}
+    return [seen["ViewLayer.Combined.A"], seen["Other.Combined.A"]]
+import OpenImageIO as oiio
+layers = alphas()
+layer.layer_collection.children["Held"].exclude = True
+nowhere = attempt(bpy.ops.render.render)
+answer({"layers": layers, "nowhere": nowhere, "alpha": [float(one["Combined.A"].max()) for one in found], "far": float(found[1]["Depth.Z"].min()),
         "world": [float(world[f"Combined.{letter}"].min()) for letter in "RGBA"]})
 """
 )
 
 
-def test_fields_are_hidden_in_the_frames_that_say_so(bpy_script, ball, tmp_path):
+def test_fields_are_hidden_in_the_frames_and_view_layers_that_say_so(bpy_script, ball, tmp_path):
     facts = bpy_script(HIDDEN_IN_TIME, project=ball, folder=tmp_path)
     assert facts["alpha"][0] > 0.9
     assert facts["alpha"][1] == 0.0
     assert facts["far"] == pytest.approx(1e10)
     assert facts["world"] == pytest.approx([0.25, 0.5, 0.75, 1.0])
+    assert facts["layers"][0] > 0.9
+    assert facts["layers"][1] == 0.0, "not the project's field in the place of the one that is excluded"
+    assert "hidden in renders" in facts["nowhere"]

@@ -13,6 +13,7 @@ from ..addon.live import compositor, fields, shadows, things
 from ..addon.live.training import trainings
 from ..addon.project import snapshot
 from ..addon.props import BoolProperty, IntProperty, StringProperty
+from ..addon.roles import is_local
 from ..addon.scene.frame import root_of, scene_from_capture
 from ..addon.text import t
 from .base import need_run
@@ -75,7 +76,8 @@ class FIELDWORK_OT_add_field(Operator):
         folder = snapshot.folder_of(settings)
         obj = bpy.data.objects.new(f"{folder.name} · {settings.run}", None)
         obj.empty_display_type, obj.empty_display_size = "PLAIN_AXES", 0.25
-        context.collection.objects.link(obj)
+        collection = context.collection if is_local(context.collection) else scene.collection
+        collection.objects.link(obj)
         owner = snapshot.owner(folder)
         root = root_of(scene, owner)
         if root is not None:
@@ -102,8 +104,7 @@ class FIELDWORK_OT_add_crop_box(_OfField):
         obj = active_field(context)
         box = bpy.data.objects.new(t("Crop of {}", obj.name), None)
         box.empty_display_type, box.empty_display_size = "CUBE", 1.0
-        for collection in obj.users_collection:
-            collection.objects.link(box)
+        things.put_beside(obj, box)
         box.parent = obj
         obj.fieldwork.crop = box
         return {"FINISHED"}

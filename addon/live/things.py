@@ -10,6 +10,7 @@ import bpy
 from mathutils import Matrix
 
 from ..project import snapshot
+from ..roles import is_local
 
 
 def known(project: Path, run: str) -> list[dict[str, Any]]:
@@ -72,12 +73,18 @@ def scene_from_capture(copy: bpy.types.Object) -> Matrix:
     return copy.matrix_world @ Matrix.Translation(-copy.fieldwork_copy.center)
 
 
+def put_beside(field: bpy.types.Object, made: bpy.types.Object) -> None:
+    """Put a new object into the collections of a field, or into the scene where these are another file's."""
+    own = [collection for collection in field.users_collection if is_local(collection)]
+    for collection in own or [bpy.context.scene.collection]:
+        collection.objects.link(made)
+
+
 def add_copy(field: bpy.types.Object, entry: Any, name: str) -> bpy.types.Object:
     """A copy of a thing of a field, where the thing itself stands."""
     obj = bpy.data.objects.new(name, None)
     obj.empty_display_type, obj.empty_display_size = "ARROWS", 0.25
-    for collection in field.users_collection:
-        collection.objects.link(obj)
+    put_beside(field, obj)
     obj.parent = field
     obj.location = entry.center
     own = obj.fieldwork_copy

@@ -449,3 +449,44 @@ answer([told, own.look, own.crop.name, [[c.visible, c.opacity] for c in own.clas
     )
     assert "linked from another file" in facts[0]
     assert facts[1:] == [1.5, "Box", [[False, 0.25], [True, 1.0]], 0.5]
+
+
+def test_fields_crop_boxes_and_copies_come_into_the_scene_where_the_collection_is_linked(bpy_script, tmp_path):
+    project = make_posed_project(tmp_path / "capture")
+    (project / "runs/main").mkdir(parents=True)
+    (project / "runs/main/field.safetensors").touch()
+    facts = bpy_script(
+        SETUP
+        + FIELDS
+        + """
+bpy.ops.wm.save_as_mainfile(filepath=f"{folder}/library.blend")
+held = bpy.data.collections.new("Held")
+scene.collection.children.link(held)
+field = add_field(scene, project)
+held.objects.link(field)
+scene.collection.objects.unlink(field)
+field.fieldwork.things.add().name = "cup"
+bpy.ops.wm.save_mainfile()
+bpy.ops.wm.read_homefile()
+with bpy.data.libraries.load(f"{folder}/library.blend", link=True) as (_, wanted):
+    wanted.collections = ["Held"]
+scene, layer = bpy.context.scene, bpy.context.view_layer
+linked = wanted.collections[0]
+scene.collection.children.link(linked)
+layer.active_layer_collection = layer.layer_collection.children["Held"]
+scene.fieldwork.project = project
+added = bpy.ops.fieldwork.add_field()
+names = [obj.name for obj in scene.collection.objects if obj.fieldwork.is_field]
+for name in names:
+    bpy.data.objects.remove(bpy.data.objects[name])
+linked.override_hierarchy_create(scene, layer)
+made = next(obj for obj in scene.objects if obj.override_library and obj.fieldwork.is_field)
+layer.objects.active = made
+box, copy = bpy.ops.fieldwork.add_crop_box(), bpy.ops.fieldwork.place_thing(thing="cup")
+answer([sorted(added), len(names), made.fieldwork.crop.name in scene.collection.objects,
+        [obj.fieldwork_copy.thing for obj in scene.collection.objects if obj.fieldwork_copy.thing]])
+""",
+        folder=tmp_path,
+        project=project,
+    )
+    assert facts == [["FINISHED"], 1, True, ["cup"]]

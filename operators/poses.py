@@ -10,6 +10,7 @@ from bpy.types import Context
 from mathutils import Vector
 
 from ..addon.jobs.job import Done, Job
+from ..addon.live.shared_scene import OWNER
 from ..addon.project import snapshot
 from ..addon.props import BoolProperty, StringProperty
 from ..addon.scene.frame import scene_from_capture
@@ -111,7 +112,8 @@ def aligned(job: Job) -> None:
         if snapshot.folder_of(settings) == job.project:
             settings.up = "auto"
             settings.point_a = settings.point_b = (0.0, 0.0, 0.0)
-            update_scene(job, scene)
+            if OWNER not in scene:  # one that renders fields or shadows shows what stands in another one
+                update_scene(job, scene)
 
 
 CLASSES = [FIELDWORK_OT_poses, FIELDWORK_OT_align]

@@ -213,6 +213,30 @@ answer([settings_of(each) == settings_of(scene) for each in (made, caught)]
     assert facts == [True] * 3
 
 
+def test_what_is_aligned_comes_once_into_scenes_that_show_the_same(bpy_script, tmp_path):
+    facts = bpy_script(
+        SCENES
+        + """
+from fieldwork.addon.jobs.queue import queue
+from fieldwork.addon.project import snapshot
+from fieldwork.operators.poses import aligned
+held = bpy.data.collections.new("Capture")
+scene.collection.children.link(held)
+root = bpy.data.objects.new("root", None)
+snapshot.owner(Path(project)).mark(root, "root")
+held.objects.link(root)
+made, asked = compositor.set_up(scene), []
+queue.follow_up = lambda job: asked.append(job.verb)
+job = queue.make("align", {"project": project})
+job.state, made.fieldwork.up = "done", "y"
+aligned(job)
+answer([root.name in made.objects, asked, made.fieldwork.up])
+""",
+        project=make_project(tmp_path / "capture"),
+    )
+    assert facts == [True, ["package"], "auto"]
+
+
 def test_composites_follow_the_border_and_the_camera(bpy_script, ball, tmp_path):
     facts = bpy_script(
         START

@@ -54,13 +54,20 @@ def _draw(menu: Any, lines: list[str]) -> None:
         menu.layout.label(text=line, translate=False)
 
 
-def _tick() -> float:
+def _look() -> None:
     if engine.untold and not bpy.app.is_job_running("RENDER"):
         _show(_taken())
     composited = [scene for scene in bpy.data.scenes if compositor.FIELD_SCENE in scene and is_local(scene)]
     if composited and gate.closed() is None:
         for scene in composited:
             compositor.follow(scene)
+
+
+def _tick() -> float:
+    try:
+        _look()
+    except Exception as error:  # noqa: BLE001 - a timer that raises is dropped by Blender
+        queue.tell(error)
     return PERIOD
 
 

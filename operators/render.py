@@ -154,6 +154,8 @@ class FIELDWORK_OT_render(ProjectOperator):
             "edits": absolute(self.edits) if self.edits else None,
             "frame_range": list(self.frame_range) if min(self.frame_range) >= 0 else None,
         }
+        if any(size) and not all(size) and (self.camera or source not in ("camera", "animation")):
+            raise ValueError(t("Give both width and height under Size, or 0 for both."))
         if self.camera:
             return {**params, "camera": absolute(self.camera)}
         if source in ("photos", "all"):

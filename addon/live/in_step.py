@@ -21,7 +21,7 @@ from ..text import t
 from . import compositor, engine
 
 PERIOD = 0.25  # seconds between two looks
-WIDTH = 80  # characters of a line of the message
+WIDTH = 60  # characters of a line of the message
 
 
 @bpy.app.handlers.persistent

@@ -338,3 +338,30 @@ answer([faults, scene.frame_current, Path(folder, "cameras.json").exists()])
     assert "“Empty” is the active camera, but no camera." in told
     assert "Traceback" not in told
     assert facts[1:] == [1, False]
+
+
+def test_a_size_of_one_side_is_not_ignored(bpy_script, tmp_path):
+    facts = bpy_script(
+        SETUP
+        + """
+from fieldwork.operators.render import FIELDWORK_OT_render
+settings.project = project
+class Asked:
+    out, camera, baked, edits, frame_range = "", "", False, "", (-1, -1)
+    source, size = "orbit", (80, 0)
+    def value(self, context, name):
+        return {"run": "main", "source": self.source, "size": self.size, "orbit": 4, "passes": {"rgb"}}[name]
+    project_path = lambda self, context: project
+def sized(source, size, camera=""):
+    Asked.source, Asked.size, Asked.camera = source, size, camera
+    try:
+        return FIELDWORK_OT_render.parameters(Asked(), bpy.context)["size"]
+    except ValueError as error:
+        return str(error)
+answer([sized("orbit", (80, 0)), sized("photos", (0, 60)), sized("camera", (80, 0), "file.json"), sized("orbit", (80, 60)),
+        sized("orbit", (0, 0)), sized("camera", (80, 0))])
+""",
+        project=make_project(tmp_path / "capture"),
+    )
+    assert all("both width and height" in told for told in facts[:3])
+    assert facts[3:] == [[80, 60], None, None], "the scene's camera has a height of its own"

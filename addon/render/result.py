@@ -6,6 +6,7 @@ import re
 import shutil
 from collections.abc import Generator
 from pathlib import Path
+from typing import Any
 
 import bpy
 
@@ -30,7 +31,7 @@ def show_steps(
     Returns:
         the cameras that got an image, with it.
     """
-    name = scene.name if scene is not None else ""
+    uid = scene.session_uid if scene is not None else 0
     for number, path in enumerate(files):
         yield number / len(files), path.name
         load_render(path)
@@ -38,11 +39,12 @@ def show_steps(
     if show_as == "none" or not colored:
         return []
     pairs = []
-    for camera_name, path in _places(bpy.data.scenes[name], colored, photos, owner):
-        yield 1.0, camera_name
+    scene = _of_session(bpy.data.scenes, uid)
+    for camera_uid, path in _places(scene, colored, photos, owner) if scene is not None else ():
+        yield 1.0, path.name
         # Looked up again in each step: between two the user may do anything.
-        scene = bpy.data.scenes.get(name)
-        camera = scene.objects.get(camera_name) if scene is not None else None
+        scene = _of_session(bpy.data.scenes, uid)
+        camera = _of_session(scene.objects, camera_uid) if scene is not None else None
         if camera is None:
             continue
         shown = [path] if photos else every_frame(colored)
@@ -66,13 +68,18 @@ def colored_files(files: list[Path]) -> list[Path]:
     return [path for path in pictures if path.stem not in passes]
 
 
-def _places(scene: bpy.types.Scene, colored: list[Path], photos: bool, owner: Owner) -> list[tuple[str, Path]]:
-    """Which cameras get which pictures, by their names."""
+def _of_session(items: Any, uid: int) -> Any:
+    """The scene or object of this number, whatever it is called by now; None where it is gone."""
+    return next((item for item in items if item.session_uid == uid), None)
+
+
+def _places(scene: bpy.types.Scene, colored: list[Path], photos: bool, owner: Owner) -> list[tuple[int, Path]]:
+    """Which cameras get which pictures, by their numbers in the session."""
     if not photos:
-        return [(scene.camera.name, colored[0])] if scene.camera else []
+        return [(scene.camera.session_uid, colored[0])] if scene.camera else []
     known = by_role(scene.objects, owner)
     cameras = [(known.get(f"camera:{path.stem}"), path) for path in colored]
-    return [(camera.name, path) for camera, path in cameras if camera is not None]
+    return [(camera.session_uid, path) for camera, path in cameras if camera is not None]
 
 
 def frame_number(path: Path) -> int:

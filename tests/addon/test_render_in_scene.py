@@ -365,3 +365,41 @@ answer([sized("orbit", (80, 0)), sized("photos", (0, 60)), sized("camera", (80, 
     )
     assert all("both width and height" in told for told in facts[:3])
     assert facts[3:] == [[80, 60], None, None], "the scene's camera has a height of its own"
+
+
+def test_renders_find_their_cameras_when_things_are_renamed_or_gone_meanwhile(bpy_script, tmp_path):
+    facts = bpy_script(
+        SETUP
+        + """
+from fieldwork.addon.render import result
+from fieldwork.addon.roles import Owner
+files, owner = [], Owner("capture")
+for name in ("a", "b"):
+    image = bpy.data.images.new(name, 8, 8)
+    image.filepath_raw, image.file_format = f"{folder}/{name}.png", "PNG"
+    image.save()
+    files.append(Path(folder, f"{name}.png"))
+    camera = bpy.data.objects.new(name, bpy.data.cameras.new(name))
+    owner.mark(camera, f"camera:{name}")
+    scene.collection.objects.link(camera)
+def play(meanwhile):
+    steps = result.show_steps(scene, files, "background", True, owner)
+    pairs, count = None, 0
+    while pairs is None:
+        try:
+            next(steps)
+            count += 1
+            meanwhile.get(count, lambda: None)()
+        except StopIteration as end:
+            pairs = end.value
+    return [[camera.name, image.name] for camera, image in pairs]
+def rename(item, name):
+    item.name = name
+renamed = play({1: lambda: rename(scene, "Other"), 3: lambda: rename(bpy.data.objects["a"], "first")})
+other = bpy.data.scenes.new("Left")
+gone = play({1: lambda: bpy.data.scenes.remove(scene)})
+answer([renamed, gone])
+""",
+        folder=tmp_path,
+    )
+    assert facts == [[["first", "a"], ["b", "b"]], []]

@@ -149,6 +149,13 @@ class FIELDWORK_OT_select_thing(Operator):
     number: IntProperty(name="Number", description="Number of the thing", options={"SKIP_SAVE"})
     below: BoolProperty(name="All of It", description="Also what it holds", options={"SKIP_SAVE"})
 
+    @classmethod
+    def poll(cls, context: Context) -> bool:
+        if context.mode != "OBJECT":
+            cls.poll_message_set(t("Things are selected in Object Mode"))
+            return False
+        return True
+
     def invoke(self, context: Context, event: bpy.types.Event) -> set[str]:
         self.below = self.below or event.shift
         return self.execute(context)

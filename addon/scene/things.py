@@ -59,7 +59,9 @@ def _select_faces(owner: Owner, numbers: list[int]) -> int:
         corner_edge, corner_vertex = (np.empty(len(item.data.loops), np.int32) for _ in range(2))
         item.data.loops.foreach_get("edge_index", corner_edge)
         item.data.loops.foreach_get("vertex_index", corner_vertex)
-        corners = np.repeat(chosen, 3)
+        count = np.empty(len(item.data.polygons), np.int32)  # the user may have made quads of the triangles
+        item.data.polygons.foreach_get("loop_total", count)
+        corners = np.repeat(chosen, count)
         edges[corner_edge[corners]] = True
         vertices[corner_vertex[corners]] = True
         for values, part in ((chosen, item.data.polygons), (edges, item.data.edges), (vertices, item.data.vertices)):

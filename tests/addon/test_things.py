@@ -219,3 +219,37 @@ answer([look(field, copy), look(other, apart)])
     )
     assert facts[0] == [[["table.001", 1.0], ["Ming", 0.25]], "Ming"]
     assert facts[1] == [[["table.001", 1.0], ["vase.001", 0.25]], "vase.001"]
+
+
+def test_things_are_selected_on_a_surface_with_quads_and_not_while_it_is_edited(bpy_script, tmp_path):
+    facts = bpy_script(
+        SETUP
+        + """
+from fieldwork.addon.project import snapshot
+from fieldwork.addon.scene import things
+settings.project = folder
+owner = snapshot.owner(Path(folder))
+mesh = bpy.data.meshes.new("Surface")
+mesh.from_pydata([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (2, 0, 0)], [], [(0, 1, 2, 3), (1, 4, 2)])
+mesh.attributes.new("instance_id", "INT", "FACE").data.foreach_set("value", [1, 2])
+item = bpy.data.objects.new("Surface", mesh)
+owner.mark(item, "mesh")
+scene.collection.objects.link(item)
+bpy.context.view_layer.objects.active = item
+for mode in ("EDIT", "OBJECT"):  # where the user makes quads
+    bpy.ops.object.mode_set(mode=mode)
+seen = []
+for number in (1, 2):
+    seen += [things.select(owner, [number]), [p.select for p in mesh.polygons], [v.select for v in mesh.vertices]]
+bpy.ops.object.mode_set(mode="EDIT")
+told = attempt(lambda: bpy.ops.fieldwork.select_thing(number=1))
+bpy.ops.object.mode_set(mode="OBJECT")
+answer([seen, told, attempt(lambda: bpy.ops.fieldwork.select_thing(number=1))])
+""",
+        folder=make_posed_project(tmp_path / "capture"),
+    )
+    quad, triangle = facts[0][:3], facts[0][3:]
+    assert quad == [1, [True, False], [True, True, True, True, False]]
+    assert triangle == [1, [False, True], [False, True, True, False, True]]
+    assert "Object Mode" in facts[1]
+    assert facts[2] == ["FINISHED"]

@@ -47,15 +47,14 @@ def to_world(surface: Surface, world_from_box: np.ndarray) -> Surface:
 
 
 def class_table(surface: Surface, names: dict[int, str]) -> dict[str, dict[str, float]]:
-    """Number of faces and area (world units², to six digits, as a small thing has little of it) of each class on the surface."""
+    """Number of faces and area (world units², to six digits, as a small thing has little of it) of each class on the surface;
+    void and a class that is called so are one."""
     area = areas(surface.vertices.astype(np.float64), surface.faces)
-    return {
-        names.get(int(c), str(c)): {
-            "faces": int((surface.face_class == c).sum()),
-            "area": float(f"{area[surface.face_class == c].sum():.6g}"),
-        }
-        for c in np.unique(surface.face_class)
-    }
+    ids: dict[str, list[int]] = {}
+    for number in np.unique(surface.face_class).tolist():
+        ids.setdefault(names.get(number, str(number)), []).append(number)
+    own = {name: np.isin(surface.face_class, some) for name, some in ids.items()}
+    return {name: {"faces": int(mask.sum()), "area": float(f"{area[mask].sum():.6g}")} for name, mask in own.items()}
 
 
 def is_watertight(faces: np.ndarray) -> bool:

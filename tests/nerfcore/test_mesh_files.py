@@ -136,6 +136,11 @@ def test_split_obj_keeps_the_textures_of_its_parts(tmp_path: Path) -> None:
                 assert image.getpixel((7, 7)) == (50, 50, 50)
 
 
+def test_areas_of_void_and_of_a_class_of_its_name_are_added() -> None:
+    found = class_table(square(), {1: "void", 2: "void"})
+    assert found == {"void": {"faces": 2, "area": pytest.approx(1)}}
+
+
 def test_areas_of_small_things_have_their_digits() -> None:
     small = replace(square(), vertices=square().vertices * 0.0123)
     assert class_table(small, {1: "a"})["a"] == {"faces": 1, "area": pytest.approx(0.0123**2 / 2, rel=1e-5)}

@@ -206,6 +206,16 @@ class HybridField(nn.Module):
                 return self._host_field().render(points, deltas, packed_info, math.inf, False)[0].clamp_(min=0)
             return self.density(points)
 
+    def density_until(
+        self, least: float, points: torch.Tensor, deltas: torch.Tensor, packed_info: PackedInfo
+    ) -> torch.Tensor:
+        """What `density` says, to the bit, of packed samples as in `density_along`. On the CPU what lies behind where a ray's
+        transmittance is below `least` is not read and has 0."""
+        if not self.on_host(points.device):
+            return self.density(points)
+        density, _, out, _, _ = self._host_field().render(points, deltas, packed_info, -1.0, False, least)
+        return torch.where(density < 0, 0.0, self._density_of(out, points))
+
     def color(self, geometry: Geometry, directions: torch.Tensor, codes: torch.Tensor | None = None) -> torch.Tensor:
         """Colour (N, 3) in [0, 1]; `directions` (N, 16) spherical harmonics, `codes` (N, A) appearance."""
         parts = [geometry.features, directions.to(self.dtype)]

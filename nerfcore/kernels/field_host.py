@@ -320,17 +320,23 @@ class HostField:
         return found.out, found.explicit, found.implicit
 
     def render(
-        self, points: torch.Tensor, deltas: torch.Tensor, packed_info: PackedInfo, cull: float, keep: bool
+        self,
+        points: torch.Tensor,
+        deltas: torch.Tensor,
+        packed_info: PackedInfo,
+        cull: float,
+        keep: bool,
+        least: float = EARLY_STOP,
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor | None, torch.Tensor | None]:
-        """Of packed samples at points (N, 3) of lengths deltas (N,): density (N,), −1 where the ray is opaque before, and
-        rendering weight (N,); and where that is above `cull` what the density head says (N, outputs) and, to `keep`,
+        """Of packed samples at points (N, 3) of lengths deltas (N,): density (N,), −1 where the ray's transmittance is
+        below `least` before, and rendering weight (N,); and where that is above `cull` what the density head says (N, outputs) and, to `keep`,
         features of the explicit and the implicit branch (N, F)."""
         found = self._room(points, keep, keep)
         density, weights = torch.empty(len(points)), torch.empty(len(points))
         rays = RayArrays()
         rays.starts, rays.counts = array(packed_info.starts), array(packed_info.counts)
         rays.deltas, rays.density, rays.weights = array(deltas), array(density), array(weights)
-        rays.cull, rays.least = cull, EARLY_STOP
+        rays.cull, rays.least = cull, least
         groups = -(-len(packed_info.counts) // RAYS)
         launch(render_kernel, groups, [self.arrays, rays, found.arrays], points.device)
         return density, weights, found.out, found.explicit, found.implicit

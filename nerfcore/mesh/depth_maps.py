@@ -33,6 +33,7 @@ FIELD_SHARE, FIELD_SIDE = 0.5, 160  # of a map's side on a CPU, and pixels at le
 MOST_VIEWS = 96
 OPAQUE, EMPTY = 0.5, 0.1  # opacities: something is there, nothing is there
 CERTAIN = 20.0  # footprints of a pixel: spread of a depth up to which its slope can be relied on
+ENOUGH = 0.24  # transmittance of a ray of which nothing more is asked: its spread is known, and that it hits something
 STEEPEST = np.cos(np.radians(80))
 EDGE, EDGE_PIXELS = 0.03, 5.5  # share, or footprints of a pixel, by which the depth of neighbours differs at an outline
 NEIGHBOURS = 48  # views asked to confirm a depth: what lies at a picture's rim is seen by views that share little else
@@ -194,7 +195,7 @@ def render_depth(model: Model, view: FlatView, check: Callable[[], None]) -> Dep
         check()
         origins, directions = through(torch.zeros_like(pixel), pixel)
         s = sample(origins, directions, grid.cells, grid.skip_distance, grid.settings, count)
-        density = model.field.density(s.points)
+        density = model.field.density_until(ENOUGH, s.points, s.deltas, s.packed_info)
         near, middle, far, opacity = depth_quantiles(density, s.deltas, s.t, s.packed_info)
         along = directions @ axis
         # A ray that stays more transparent than 1/4 has its spread up to its end unknown: three times the half.

@@ -152,6 +152,22 @@ def test_the_density_along_rays_is_read_until_they_are_opaque() -> None:
         torch.testing.assert_close(field.density_along(points, deltas, rays), every, rtol=1e-4, atol=1e-6)
 
 
+@torch.no_grad()
+def test_the_density_along_rays_is_that_of_single_points_to_the_bit_until_enough_is_known() -> None:
+    torch.manual_seed(4)
+    field = HybridField(FieldConfig(precision="float32", levels=3, finest=64, octaves=4, density_shift=0.0), 0)
+    starts, counts = torch.tensor([0, 50], dtype=torch.int32), torch.tensor([50, 30], dtype=torch.int32)
+    points, deltas = points_of(80), torch.full((80,), 0.5)
+    rays = PackedInfo(starts, counts, torch.repeat_interleave(torch.arange(2, dtype=torch.int32), counts.long()))
+    found, every = field.density_until(0.3, points, deltas, rays), field.density(points)
+    for some in (slice(0, 50), slice(50, 80)):
+        passed = torch.cumsum(every[some] * 0.5, 0)
+        before = torch.cat([torch.ones(1), torch.exp(-passed)])[:-1]
+        assert torch.equal(found[some], torch.where(before < 0.3, 0.0, every[some]))
+    with using_kernels("torch"):
+        torch.testing.assert_close(field.density_until(0.3, points, deltas, rays), every, rtol=1e-4, atol=1e-6)
+
+
 @pytest.mark.parametrize("contracted", [False, True])
 @pytest.mark.parametrize("mode", [PDF_DEFAULT, PDF_UNIFORM, PDF_LITERAL])
 def test_sixteen_rays_at_a_time_meet_what_one_does(

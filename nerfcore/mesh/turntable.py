@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..files import atomic_path, staged
+from ..files import atomic_path, require_writable, staged
 from ..geometry.cameras import Camera, pixel_centers, rays
 from ..geometry.orbit import orbit_angles
 from ..images.encode import write_picture
@@ -78,9 +78,10 @@ def turntable(params: TurntableParams, report: Reporter) -> dict[str, Any]:
     """
     folder = Path(params.project)
     project = load_project(folder)
+    target = params.out or mesh_folder(folder, params.run) / "turntable"
+    require_writable(target / "color_0.png")
     report.stage("Reading the mesh")
     surface, texture = load_surface(folder, params.run)
-    target = params.out or mesh_folder(folder, params.run) / "turntable"
     report.stage("Looking at it")
     class_map = None if texture is None else load_class_map(folder, params.run)
     colors = {c.id: c.color for c in project.classes}

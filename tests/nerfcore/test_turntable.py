@@ -8,10 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from fieldwork.nerfcore.errors import DiskError
 from fieldwork.nerfcore.mesh.parts import texture_of
 from fieldwork.nerfcore.mesh.surface import Surface
 from fieldwork.nerfcore.mesh.turntable import front_angles, write_turntable
+from fieldwork.nerfcore.params import TurntableParams
 from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.verbs import run_verb
+from fieldwork.tests.nerfcore.support.ball import ball_project
 from PIL import Image
 
 
@@ -69,6 +73,13 @@ def test_a_turntable_stays_before_what_has_a_front_alone(tmp_path: Path) -> None
     shares = [(view > 200).all(-1).mean() for view in views]
     assert min(shares) > 0.1
     assert len(np.unique(np.round(shares, 3))) >= 4
+
+
+def test_a_folder_that_cannot_be_is_said_before_the_work(tmp_path: Path) -> None:
+    project = ball_project(tmp_path / "ball")
+    (tmp_path / "file").touch()
+    with pytest.raises(DiskError, match="in its way"):  # and not that there is no mesh yet
+        run_verb("turntable", TurntableParams(project=project, out=tmp_path / "file"), Reporter())
 
 
 def test_the_front_of_many_triangles_takes_little_memory() -> None:

@@ -22,7 +22,7 @@ from ..render.run import Trained
 from ..verdict import LITTLE_IN_ONE
 from . import depth_maps as dm
 from .appearance import Photos
-from .clean import clean
+from .clean import clean, drop_scraps
 from .closed import closed_surface, unseen_faces
 from .cut_outs import left_out
 from .decimate import decimate
@@ -79,7 +79,7 @@ def build(trained: Trained, project: Project, scene: Scene, params: MeshParams, 
         if scene.mask_mode == "empty":
             world = transform_points(box.world_from_box, vertices)
             outside = left_out(world, faces, [scene.views[i] for i in scene.train], report)
-            vertices, faces = compact(vertices, faces[~outside])
+            vertices, faces = compact(vertices, drop_scraps(vertices, faces[~outside]))
     if not len(faces):
         raise no_surface(params)
     check_parts(vertices, faces, report)
@@ -146,7 +146,8 @@ def open_surface(
         report.stage("Simplifying")
         vertices, faces = decimate(vertices, faces, most, report)
     vertices = denoised(vertices, faces, maps.depth.device, report)
-    return compact(vertices, faces[~on_sides(vertices, faces, region, region.voxel / 2)])
+    faces = faces[~on_sides(vertices, faces, region, region.voxel / 2)]
+    return compact(vertices, drop_scraps(vertices, faces))  # simplifying tears thin ones off
 
 
 def wanted_bounds(params: MeshParams, scene: Scene, box: Box) -> tuple[np.ndarray, np.ndarray] | None:

@@ -5,12 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 import trimesh
 from fieldwork.nerfcore.kernels.depth_arrays import FREE
-from fieldwork.nerfcore.mesh import depth_maps
+from fieldwork.nerfcore.mesh import build, depth_maps
 from fieldwork.nerfcore.mesh.clean import FEWEST_VIEWS, seen_by, shown
-from fieldwork.nerfcore.mesh.triangles import border_edges, cross, mean_around, unit
+from fieldwork.nerfcore.mesh.fusion import fuse_maps
+from fieldwork.nerfcore.mesh.region import choose_region
+from fieldwork.nerfcore.mesh.triangles import border_edges, components, cross, mean_around, unit
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.tests.nerfcore.support.depth_views import box, maps_of, orbit, sphere
 
@@ -71,3 +74,20 @@ def test_values_of_triangles_spread_over_their_neighbours() -> None:
     assert calm.std() < 0.2 * noise.std()
     assert abs(calm.mean() - noise.mean()) < 0.05
     np.testing.assert_allclose(mean_around(faces, np.ones(len(faces)), len(mesh.vertices), 3), 1)
+
+
+def test_what_simplifying_tears_off_does_not_hang_in_the_air(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A few triangles without a border, where there was a thin strand."""
+    maps = depth_maps.confirmed_maps(*maps_of(sphere(0.5), orbit(24, 1.8)), torch.device("cpu"), Reporter())
+    region = choose_region(maps, None, 48)
+    lump = trimesh.creation.icosphere(0, 0.5 * region.voxel)
+
+    def torn(vertices: np.ndarray, faces: np.ndarray, target: int, report: Reporter) -> tuple[np.ndarray, np.ndarray]:
+        return np.concatenate([vertices, lump.vertices]), np.concatenate([faces, lump.faces + len(vertices)])
+
+    monkeypatch.setattr(build, "decimate", torn)
+    bricks = fuse_maps(maps, region, Reporter())
+    vertices, faces = build.open_surface(bricks, maps, 4 * region.voxel, region, 1000, Reporter())
+    assert len(faces) > 1000
+    assert components(faces, len(vertices)).max() == 0
+    assert len(np.unique(faces)) == len(vertices)

@@ -79,7 +79,7 @@ def _fisheye(uv: torch.Tensor, k: torch.Tensor) -> torch.Tensor:
 
 
 def _distort(u: torch.Tensor, v: torch.Tensor, k: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    """Distorted coordinates and their derivatives x_u, x_v = y_u, y_v; see `geometry.cameras._opencv_distort`."""
+    """Distorted coordinates and their derivatives x_u, x_v = y_u, y_v; see `geometry.cameras._opencv_slopes`."""
     k1, k2, p1, p2, k3, k4, k5, k6 = k.unbind(1)
     r2 = u * u + v * v
     top, bottom = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 1 + r2 * (k4 + r2 * (k5 + r2 * k6))

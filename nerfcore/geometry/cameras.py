@@ -79,8 +79,8 @@ def pixel_centers(width: int, height: int) -> np.ndarray:
     return np.stack([x, y], -1)
 
 
-def _opencv_distort(uv: np.ndarray, k: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Distorted normalised coordinates (N, 2) and their Jacobian (N, 2, 2).
+def _opencv_distort(uv: np.ndarray, k: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Distorted normalised coordinates (N, 2); and r², the radial factor and its denominator (N,).
 
     `k` is (k1, k2, p1, p2[, k3[, k4, k5, k6]]), the radial factor (1 + k1 r² + k2 r⁴ + k3 r⁶) / (1 + k4 r² + k5 r⁴ +
     k6 r⁶). Source: OpenCV calib3d; COLMAP's OPENCV and FULL_OPENCV.
@@ -90,11 +90,19 @@ def _opencv_distort(uv: np.ndarray, k: tuple[float, ...]) -> tuple[np.ndarray, n
     r2 = u * u + v * v
     top, bottom = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
     radial = top / bottom
-    # Twice the derivative of the radial factor by r².
-    slope = 2 * (k1 + r2 * (2 * k2 + 3 * k3 * r2) - radial * (k4 + r2 * (2 * k5 + 3 * k6 * r2))) / bottom
     out = np.stack(
         [u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u), v * radial + p1 * (r2 + 2 * v * v) + 2 * p2 * u * v], -1
     )
+    return out, r2, radial, bottom
+
+
+def _opencv_slopes(uv: np.ndarray, k: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Distorted normalised coordinates (N, 2), see `_opencv_distort`, and their Jacobian (N, 2, 2)."""
+    k1, k2, p1, p2, k3, k4, k5, k6 = (*k, *(0.0,) * (8 - len(k)))
+    out, r2, radial, bottom = _opencv_distort(uv, k)
+    u, v = uv[:, 0], uv[:, 1]
+    # Twice the derivative of the radial factor by r².
+    slope = 2 * (k1 + r2 * (2 * k2 + 3 * k3 * r2) - radial * (k4 + r2 * (2 * k5 + 3 * k6 * r2))) / bottom
     jacobian = np.empty((len(uv), 2, 2))
     jacobian[:, 0, 0] = radial + u * u * slope + 2 * p1 * v + 6 * p2 * u
     jacobian[:, 0, 1] = u * v * slope + 2 * p1 * u + 2 * p2 * v
@@ -107,7 +115,7 @@ def _opencv_undistort(target: np.ndarray, k: tuple[float, ...], steps: int = 25)
     """Newton inverse of `_opencv_distort`: (N, 2) undistorted coordinates and a convergence mask (N,)."""
     uv = target.copy()
     for _ in range(steps):
-        value, jacobian = _opencv_distort(uv, k)
+        value, jacobian = _opencv_slopes(uv, k)
         determinant = jacobian[:, 0, 0] * jacobian[:, 1, 1] - jacobian[:, 0, 1] * jacobian[:, 1, 0]
         determinant = np.where(np.abs(determinant) < 1e-9, 1e-9, determinant)
         error = value - target
@@ -116,7 +124,7 @@ def _opencv_undistort(target: np.ndarray, k: tuple[float, ...], steps: int = 25)
         # A step longer than half the image plane means the lens polynomial has folded over: keep it damped.
         length = np.maximum(np.hypot(step_u, step_v) / 0.5, 1.0)
         uv = uv - np.stack([step_u / length, step_v / length], -1)
-    value, jacobian = _opencv_distort(uv, k)
+    value, jacobian = _opencv_slopes(uv, k)
     determinant = jacobian[:, 0, 0] * jacobian[:, 1, 1] - jacobian[:, 0, 1] * jacobian[:, 1, 0]
     return uv, (np.abs(value - target).max(-1) < 1e-9) & (determinant > 0)
 
@@ -182,7 +190,7 @@ def project(camera: Camera, points: np.ndarray) -> np.ndarray:
     else:
         uv = np.stack([x, y], -1) / np.where(z > 0, z, np.nan)[:, None]
         if camera.model == "OPENCV" and any(camera.distortion):
-            uv, _ = _opencv_distort(uv, camera.distortion)
+            uv = _opencv_distort(uv, camera.distortion)[0]
     return uv * [camera.fx, camera.fy] + [camera.cx, camera.cy]
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -159,21 +158,19 @@ def paint_all(
     jobs = jobs.of(np.diff(texels.first)[jobs.face] > 0)
     order = np.argsort(jobs.view, kind="stable")
     numbers, begins = np.unique(jobs.view[order], return_index=True)
-    lock = threading.Lock()
 
-    def work(item: tuple[int, np.ndarray]) -> None:
+    def work(item: tuple[int, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         report.check()
         number, rows = item
         mine = jobs.of(rows)
         buffer = buffers[number] if careful[mine.face].any() else None
-        texel, value, seen = paint(photos[number], mine, buffers.pieces, texels, careful, buffer)
-        with lock:
-            total[texel] += value
-            painted[texel[seen]] = True
+        return paint(photos[number], mine, buffers.pieces, texels, careful, buffer)
 
     items = list(zip(numbers.tolist(), np.split(order, begins[1:]))) if len(numbers) else []
-    for _ in in_parallel(work, items, report, "photos"):
-        continue
+    # One photo after the other, in whatever order they are done: sums then do not differ from run to run.
+    for _, (texel, value, seen) in in_parallel(work, items, report, "photos"):
+        total[texel] += value
+        painted[texel[seen]] = True
     color = np.zeros((len(texels), 3), np.uint8)
     for begin in range(0, len(texels), BAND):
         some = begin + np.flatnonzero(painted[begin : begin + BAND])

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
 from fieldwork.nerfcore.errors import Cancelled, SettingError
+from fieldwork.nerfcore.kernels import runtime
+from fieldwork.nerfcore.mesh import painting, visibility
 from fieldwork.nerfcore.mesh import photo_texture as module
 from fieldwork.nerfcore.mesh.facelets import facelets
-from fieldwork.nerfcore.mesh.painting import crossings, texels_of
+from fieldwork.nerfcore.mesh.painting import Jobs, crossings, texels_of
 from fieldwork.nerfcore.mesh.photo_texture import PhotoTexture, one_of_each_square, photo_texture, prepare
 from fieldwork.nerfcore.mesh.photos import Photo, sharpened
 from fieldwork.nerfcore.mesh.surface_picture import surface_picture
@@ -244,3 +248,27 @@ def test_texels_of_a_square_share_one_of_them(step: int) -> None:
     assert len(chosen) == len(np.unique(own, axis=1).T)
     if step == 1:
         assert (place[chosen][shared] == place).all()
+
+
+def test_photos_are_mixed_in_the_same_order_whichever_is_done_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The colours are so large that single precision gives another sum in another order."""
+    vertices, faces = np.eye(3), np.array([[0, 1, 2]])
+    pieces = facelets(vertices, faces, np.array([[[0.0, 0], [1, 0], [0, 1]]]))
+    texels = texels_of(pieces, 8, (0, 0, 8, 8))
+    ones = np.ones((3, 3), np.float32)
+    jobs = Jobs(np.zeros(3, int), np.arange(3), ones, np.ones((3, 3, 3), np.float32), np.zeros(3, bool))
+    light, delay = {0: 1e8, 1: 1.0, 2: -1e8}, {0: 0.0, 1: 0.2, 2: 0.1}
+
+    def paint(number: int, *_: object) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        time.sleep(delay[number])
+        value = np.full((len(texels), 4), light[number], np.float32)
+        value[:, 3] = 1
+        return np.arange(len(texels)), value, np.ones(len(texels), bool)
+
+    monkeypatch.setattr(painting, "paint", paint)
+    for place in (visibility, runtime):
+        monkeypatch.setattr(place, "worker_count", lambda: 3)
+    buffers = visibility.DepthBuffers([], pieces)
+    color, painted = painting.paint_all([0, 1, 2], buffers, texels, jobs, np.zeros(1, bool), Reporter())  # type: ignore[arg-type]
+    assert painted.all()
+    assert (color == 0).all()

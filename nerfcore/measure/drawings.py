@@ -126,12 +126,12 @@ def plan(params: PlanParams, report: Reporter) -> dict[str, Any]:
         title, stem = f"{subject.title}: {name}{turned(params.turn)}", f"{name}{suffix(params.turn)}"
         axes, note = axis_names(view, params.turn), label_note(subject.label_revision)
         sheet = Sheet(title, window.low, window.high, scale, subject.metric, seen.color, axes, note=note)
-        files += write_sheet(target / stem, sheet)
+        files += write_sheet(target / stem, sheet, report.check)
         if subject.class_ids():
-            files += write_sheet(target / f"{stem}_classes", class_sheet(sheet, subject, seen))
+            files += write_sheet(target / f"{stem}_classes", class_sheet(sheet, subject, seen), report.check)
         if mapped:
             conditions = condition_sheet(sheet, subject.surface, seen, places, legend)
-            files += write_sheet(target / f"{stem}_conditions", conditions)
+            files += write_sheet(target / f"{stem}_conditions", conditions, report.check)
     if mapped:
         files.append(write_places(target / "conditions.csv", places, subject.names, subject.label_revision))
     result = {"scales": scales, "label_revision": subject.label_revision, "files": [str(path) for path in files]}
@@ -184,7 +184,7 @@ def section(params: SectionParams, report: Reporter) -> dict[str, Any]:
     )
     target = params.out or mesh_folder(folder, params.run) / "drawings"
     stem = "section_" + params.plane.replace(" ", "").replace("=", "_") + suffix(params.turn)
-    files = write_sheet(target / stem, sheet)
+    files = write_sheet(target / stem, sheet, report.check)
     files.append(target / f"{stem}.csv")
     write_profile(files[-1], cut, subject.names, subject.label_revision)
     named = {subject.names.get(c, str(c)): length for c, length in lengths.items()}

@@ -254,5 +254,5 @@ def draw_distances(
             "Distance from the earlier surface",
             note=note,
         )
-        files += write_sheet(folder / f"distance_{name}", sheet)
+        files += write_sheet(folder / f"distance_{name}", sheet, report.check)
     return files

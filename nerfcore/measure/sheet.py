@@ -5,6 +5,7 @@ Matplotlib takes long to load: only what draws loads it.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,6 +14,7 @@ import numpy as np
 
 from ..errors import SettingError
 from ..files import atomic_path
+from ..progress import go_on
 from .lettering import fitted, lettering, wrapped
 from .wording import significant
 
@@ -119,16 +121,19 @@ def nice_step(length: float, parts: int) -> float:
     return float(next(n * power for n in (1, 2, 5, 10) if n * power >= raw * 0.999))
 
 
-def write_sheet(stem: Path, sheet: Sheet) -> list[Path]:
-    """Write a sheet as STEM.png, STEM.svg and STEM.pdf, each in its true size. Raises DiskError."""
+def write_sheet(stem: Path, sheet: Sheet, check: Callable[[], None] = go_on) -> list[Path]:
+    """Write a sheet as STEM.png, STEM.svg and STEM.pdf, each in its true size; `check` is called before each of these, which
+    take a second. Raises DiskError."""
     with lettering():
-        return _write(stem, sheet)
+        return _write(stem, sheet, check)
 
 
-def _write(stem: Path, sheet: Sheet) -> list[Path]:
+def _write(stem: Path, sheet: Sheet, check: Callable[[], None]) -> list[Path]:
+    check()
     figure = _figure(sheet)
     paths = []
     for kind in FORMATS:
+        check()
         path = stem.with_name(f"{stem.name}.{kind}")
         with atomic_path(path) as temporary:
             told = {"Title": sheet.title} | (

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from fieldwork.nerfcore.errors import ProjectError, SettingError
+from fieldwork.nerfcore.errors import Cancelled, ProjectError, SettingError
 from fieldwork.nerfcore.files import write_json
 from fieldwork.nerfcore.measure import lettering
 from fieldwork.nerfcore.measure.conditions import widest, without_specks
 from fieldwork.nerfcore.measure.drawings import axis_names, framed, load_subject, plan, section
 from fieldwork.nerfcore.measure.sections import profile
-from fieldwork.nerfcore.measure.sheet import DPI, Entry, Sheet, _figure, chosen_scale, nice_step, ratio
+from fieldwork.nerfcore.measure.sheet import DPI, Entry, Sheet, _figure, chosen_scale, nice_step, ratio, write_sheet
 from fieldwork.nerfcore.measure.views import Window, picture, plane, projection
 from fieldwork.nerfcore.mesh.instances import read_instances
 from fieldwork.nerfcore.params import PlanParams, SectionParams
@@ -242,6 +242,20 @@ def test_long_titles_and_notes_stay_on_the_sheet() -> None:
     assert title in shown
     assert any(note in text for text in shown)
     assert shown[title].get_fontsize() > 8
+
+
+def test_a_cancel_does_not_wait_for_all_files_of_a_sheet(tmp_path: Path) -> None:
+    window = {"low": np.zeros(2), "high": np.full(2, 0.05), "scale": 1.0, "metric": True, "axes": ("x", "y")}
+    report = Reporter()
+
+    def check() -> None:
+        if (tmp_path / "top.png").is_file():
+            report.cancel()
+        report.check()
+
+    with pytest.raises(Cancelled):
+        write_sheet(tmp_path / "top", Sheet("t", image=np.zeros((4, 4, 3), np.uint8), **window), check)
+    assert [path.name for path in tmp_path.iterdir()] == ["top.png"]
 
 
 def test_characters_that_no_font_has_are_named_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -211,6 +211,14 @@ class _Commands(click.Group):
             return _group(cmd_name)
         return _command(cmd_name) if cmd_name in VERBS else None
 
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        known = self.list_commands(ctx)
+        if args[0] not in known and not args[0].startswith("-"):
+            raise click.exceptions.NoSuchCommand(args[0], possibilities=known, ctx=ctx)  # says what was meant
+        return super().resolve_command(ctx, args)
+
 
 def _serve() -> int:
     from .engine.server import main as serve

@@ -235,6 +235,12 @@ def test_help_and_wrong_usage_that_nobody_takes(command: str, code: int, words: 
     assert "Traceback" not in told
 
 
+@pytest.mark.parametrize(("verb", "meant"), [("trian", "train"), ("label strok", "stroke")])
+def test_verbs_that_are_misspelt_say_what_was_meant(capsys: pytest.CaptureFixture[str], verb: str, meant: str) -> None:
+    assert cli.main([*verb.split(), "p"]) == 2
+    assert f"Did you mean '{meant}'" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(("arguments", "code"), [("plan . --views nope --json", 2), ("section -h", 0)])
 def test_terminals_that_lack_characters(arguments: str, code: int) -> None:
     environment = {**ENVIRONMENT, "PYTHONIOENCODING": "latin-1"}

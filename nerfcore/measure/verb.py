@@ -159,20 +159,27 @@ def amounts(
         of_instance = surface.face_instance.astype(np.int64)
     labels = Pieces(pieces.centers, pieces.areas, of_class[pieces.parent], of_instance[pieces.parent])
     u_class, u_instance = area_deviations(labels, votes, len(instances))
+    report.check()
     vertices = surface.vertices.astype(np.float64)
     fine = [Labelled(vertices, surface.faces, label) for label in (np.ones_like(of_class), of_class + 1, of_instance)]
     of_piece = [np.ones_like(labels.label), labels.label + 1, labels.instance]
     rough = transferred(coarse, pieces.centers, of_piece, sized.voxel)
+    report.check()
     counts = 2, len(class_ids) + 1, len(instances) + 1
     places = [sized.u_places(label, n) for label, n in zip(of_piece, counts)]
+    report.check()
     moved = [area_deviations_of_place(f.vertices, f.faces, f.label, place) for f, place in zip(fine, places)]
+    report.check()
     (area,), by_class, by_instance = (
         area_amounts(f.areas(n)[1:], r.areas(n)[1:], u, place[1:], u_scale)
         for f, r, n, u, place in zip(fine, rough, counts, (np.zeros(1), u_class, u_instance), moved)
     )
 
     def volume(kind: int, number: int, area: Amount) -> Amount | None:
-        one, other = (part[kind].closed(number, most_capped) for part in (fine, rough))
+        one = fine[kind].closed(number, most_capped)
+        report.check()
+        other = rough[kind].closed(number, most_capped)
+        report.check()
         return volume_amount(one, other, area.value, sized.voxel, places[kind][number], u_scale)
 
     volumes = []

@@ -5,13 +5,15 @@ from __future__ import annotations
 import csv
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
-from fieldwork.nerfcore.errors import InputError, ProjectError
+from fieldwork.nerfcore.errors import Cancelled, InputError, ProjectError
 from fieldwork.nerfcore.evaluate.documentation import sections
 from fieldwork.nerfcore.geometry.cameras import Camera
+from fieldwork.nerfcore.measure import verb
 from fieldwork.nerfcore.measure.closing import border_loops, closed
 from fieldwork.nerfcore.measure.placing import area_rates, border_lengths, u_places
 from fieldwork.nerfcore.measure.resampling import Votes
@@ -183,6 +185,23 @@ def test_the_verb_measures_a_mesh_with_the_label_maps_of_its_photos(project: Pat
     assert between["low"] < between["length"] < between["high"]
     # One distance, known to 2 mm and picked to a voxel at both ends.
     assert result["scale"]["u_percent"] == pytest.approx(100 * np.hypot(0.002, np.sqrt(2) * 0.03), rel=1e-3)
+
+
+@pytest.mark.parametrize("step", ["area_deviations", "transferred", "area_deviations_of_place", "volume_amount"])
+def test_a_cancel_does_not_wait_for_what_comes_after(project: Path, monkeypatch: pytest.MonkeyPatch, step: str) -> None:
+    report, done = Reporter(), []
+    true = getattr(verb, step)
+
+    def last(*args: Any) -> Any:
+        done.append(step)
+        report.cancel()
+        return true(*args)
+
+    monkeypatch.setattr(verb, step, last)
+    with pytest.raises(Cancelled):
+        measure(MeasureParams(project=project), report)
+    assert len(done) == (3 if step == "area_deviations_of_place" else 1)
+    assert not (mesh_folder(project, "main") / MEASURES).exists()
 
 
 def test_a_mesh_without_classes_is_measured_as_a_whole(tmp_path: Path) -> None:

@@ -30,6 +30,7 @@ LEGEND = 36  # characters of a line of the legend
 ROOM = 400.0, 280.0  # mm that a drawing may take where no scale is asked for: about A3 with its margins
 SMALLEST = 60.0  # mm, so that scale bar and title have room
 LARGEST = 2000.0  # mm
+GRID = 10.0  # mm between lines of the grid at least, so that the coordinates beside it have room
 # N of 1 : N, from 1000000:1 to 1:10^12: of things in scene units sizes say nothing.
 SCALES = [1 / (n * 10**k) for k in reversed(range(6)) for n in (10, 5, 2.5, 2)] + [
     n * 10**k for k in range(12) for n in (1, 2, 2.5, 5)
@@ -114,8 +115,8 @@ def ratio(scale: float) -> str:
     return f"1:{significant(scale, 6)}" if scale >= 1 else f"{significant(1 / scale, 6)}:1"
 
 
-def nice_step(length: float, parts: int) -> float:
-    """A round number (1, 2 or 5 times a power of ten) that goes into a length about so many times."""
+def nice_step(length: float, parts: float) -> float:
+    """A round number (1, 2 or 5 times a power of ten) that goes into a length about so many times, or less often."""
     raw = max(length, 1e-9) / parts
     power = 10.0 ** np.floor(np.log10(raw))
     return float(next(n * power for n in (1, 2, 5, 10) if n * power >= raw * 0.999))
@@ -168,7 +169,7 @@ def _figure(sheet: Sheet) -> Figure:
         edge = {"boxstyle": "circle,pad=0.15", "facecolor": "white", "edgecolor": "black", "linewidth": 0.4}
         axes.text(mark.x, mark.y, mark.text, fontsize=5.5, ha="center", va="center", bbox=edge)
     axes.set(xlim=box[:2], ylim=box[2:])
-    step = nice_step(float(extent.max()), 10)
+    step = nice_step(float(extent.max()), min(10.0, float(drawn.max()) / GRID))
     for axis, low, high in ((axes.xaxis, box[0], box[1]), (axes.yaxis, box[2], box[3])):
         axis.set_ticks(np.arange(np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9) + 1) * step)
     axes.ticklabel_format(style="plain", useOffset=False)

@@ -244,6 +244,16 @@ def test_long_titles_and_notes_stay_on_the_sheet() -> None:
     assert shown[title].get_fontsize() > 8
 
 
+@pytest.mark.parametrize("scale", [20.0, 100.0, 1000.0])
+def test_coordinates_beside_a_small_drawing_do_not_overlap(scale: float) -> None:
+    window = {"low": np.array([4500.0, 5400.0]), "high": np.array([4504.2, 5402.0]), "metric": True, "axes": ("x", "y")}
+    figure = _figure(Sheet("t", image=np.zeros((4, 4, 3), np.uint8), scale=scale, **window))
+    figure.canvas.draw()
+    (axes,) = figure.axes
+    ends = [label.get_window_extent() for label in axes.get_xticklabels()]
+    assert all(left.x1 < right.x0 for left, right in zip(ends, ends[1:]))
+
+
 def test_a_cancel_does_not_wait_for_all_files_of_a_sheet(tmp_path: Path) -> None:
     window = {"low": np.zeros(2), "high": np.full(2, 0.05), "scale": 1.0, "metric": True, "axes": ("x", "y")}
     report = Reporter()

@@ -19,8 +19,6 @@ from rich.text import Text
 from .progress import Estimate, Reporter
 
 PLAIN_EVERY = 10.0  # seconds between plain progress lines
-# Results that are no figures: without a value there is none of it.
-NO_FIGURES = {"revision", "label_revision", "other_label_revision", "parent", "texture", "file"}
 
 
 class ConsoleReporter(Reporter):
@@ -30,6 +28,8 @@ class ConsoleReporter(Reporter):
         super().__init__()
         self.quiet = quiet
         self.console = Console(stderr=True, highlight=False, markup=False, emoji=False)
+        # Where lines cannot be drawn anew (TERM=dumb) rich would show the bar when all is over.
+        self.drawn = self.console.is_terminal and not self.console.is_dumb_terminal
         self.bar: Progress | None = None
         self.task: TaskID | None = None
         self.name, self.estimate, self.told = "", Estimate(), 0.0
@@ -37,7 +37,7 @@ class ConsoleReporter(Reporter):
         self.begun = False  # whether the work has told of anything
 
     def __enter__(self) -> ConsoleReporter:
-        if not self.quiet and self.console.is_terminal:
+        if not self.quiet and self.drawn:
             self.bar = Progress(
                 TextColumn("{task.description}", markup=False),
                 BarColumn(),
@@ -88,7 +88,7 @@ class ConsoleReporter(Reporter):
                 self.console.print(f"{self.name}: {fraction:.0%}{left}  {message}")
 
     def event(self, kind: str, **data: Any) -> None:
-        if kind != "campaign" or self.quiet or not self.console.is_terminal:
+        if kind != "campaign" or self.quiet or not self.drawn:
             return
         if self.live is None:
             if self.bar is not None:
@@ -160,6 +160,5 @@ def flattened(value: dict[str, Any], prefix: str = "") -> list[tuple[str, str]]:
             told = item and all(isinstance(i, str) and i.endswith(".") for i in item)
             rows.append((name, "\n".join(item) if told else short if short and len(short) < 90 else counted))
         else:
-            nothing = "none" if key in NO_FIGURES else "not measured"
-            rows.append((name, nothing if item is None else str(item)))
+            rows.append((name, "–" if item is None else str(item)))
     return rows

@@ -71,11 +71,29 @@ def test_the_present_stage_is_shown_in_a_low_terminal(monkeypatch: pytest.Monkey
             assert f"stage {number}" in out.getvalue()
 
 
+def test_terminals_that_draw_nothing_anew_get_plain_lines(monkeypatch: pytest.MonkeyPatch) -> None:
+    out = io.StringIO()
+
+    def made(**values: Any) -> Console:
+        values.pop("stderr")
+        return Console(file=out, force_terminal=True, width=80, _environ={"TERM": "dumb"}, **values)
+
+    monkeypatch.setattr(console, "Console", made)
+    with ConsoleReporter(quiet=False) as report:
+        report.stage("Reading")
+        assert out.getvalue() == "Reading …\n"
+
+
 def test_results_in_brackets_are_shown() -> None:
     out = io.StringIO()
     ConsoleReporter(quiet=False).table("new", {"file": ODD, "per_class": {"[wood]": 1}}, out)
     assert ODD in out.getvalue()
     assert "per_class.[wood]" in out.getvalue()
+
+
+def test_what_is_not_known_is_not_said_to_be_unmeasured() -> None:
+    """A revision of labels, or a Blender, is nothing that is measured."""
+    assert flattened({"label_revision": None, "classes": {"a": None}}) == [("label_revision", "–"), ("classes.a", "–")]
 
 
 def test_sentences_of_a_result_are_shown_in_full() -> None:
@@ -98,11 +116,6 @@ def test_captures_in_brackets_are_shown() -> None:
     drawn.print(campaign_table(status))
     text = drawn.export_text()
     assert all(part in text for part in ("[list]", "[a]", ODD))
-
-
-def test_what_there_is_none_of_was_not_to_be_measured() -> None:
-    result = {"psnr": None, "texture": None, "label_revision": None}
-    assert flattened(result) == [("psnr", "not measured"), ("texture", "none"), ("label_revision", "none")]
 
 
 def test_the_engine_says_how_it_is_called() -> None:

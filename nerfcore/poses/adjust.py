@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import copy
+from collections.abc import Container
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ MAX_POINT_ERROR = 4.0  # pixels; COLMAP's filter_max_reproj_error
 ROUNDS = 2  # not tuned: the loss follows the residuals, which follow the loss
 CAUCHY = 2.385  # of the noise: as good as least squares to 95 % if all matches were right (Holland and Welsch, 1977)
 RAYLEIGH = 1.1774  # √(2 ln 2): median length of a vector whose two parts have unit variance
+EXPLAINED = 0.005  # of the cost of the residuals; docs/experiments.md, “Square pixels”
 TOLERANCE = 1e-6  # relative change of the cost; pycolmap's default, 0, takes five times as long for the same lens
 
 
@@ -49,8 +51,10 @@ def _used(model: Any) -> list[Any]:
 def adjust(model: Any, keep_cameras: bool) -> Any:
     """Final bundle adjustment of a model; the adjusted model is returned.
 
-    A lens that took at least fifteen photos is given all of OPENCV's parameters, and its principal point is refined
-    where there is no other lens; not so where its view is narrow, or where the outcome is like no real lens.
+    A lens that took at least fifteen photos is given two terms of radial distortion, and its principal point is refined
+    where there is no other lens; not so where its view is narrow, or where the outcome is like no real lens. It is given
+    all of OPENCV's parameters, a focal length for each axis and tangential distortion, where these explain what is left:
+    cameras have square pixels, and photos taken upright alone hardly tell a stretched picture from another scene.
 
     Wrong matches that survived verification are too few to bend poses, but they do pull at the principal point, which
     some captures hardly determine. So the loss is Cauchy's, with the scale that the residuals ask for.
@@ -58,30 +62,48 @@ def adjust(model: Any, keep_cameras: bool) -> Any:
     if keep_cameras:
         return model
     if not has_long_lens(model):
-        freed = copy.deepcopy(model)
-        bundle_adjust(freed, full=True)
-        if not has_odd_lens(freed):
-            return freed
+        radial = copy.deepcopy(model)
+        free_lenses(radial, "RADIAL")
+        bundle_adjust(radial, full=True)
+        general = copy.deepcopy(radial)
+        if free_lenses(general, "OPENCV"):
+            bundle_adjust(general, full=True)
+            if not has_odd_lens(general) and explained(radial, general) > EXPLAINED:
+                return general
+        if not has_odd_lens(radial):
+            return radial
     bundle_adjust(model, full=False)
     return model
+
+
+def free_lenses(model: Any, name: str) -> bool:
+    """Give lenses that took many photos the parameters of another COLMAP model, RADIAL or OPENCV, beginning with those they
+    have; whether there was one that had fewer."""
+    taken = collections.Counter(model.image(i).camera_id for i in model.reg_image_ids())
+    before = {"RADIAL": ("SIMPLE_RADIAL",), "OPENCV": ("SIMPLE_RADIAL", "RADIAL")}[name]
+    changed = False
+    for camera_id, count in taken.items():
+        camera = model.camera(camera_id)
+        if count < FULL_MODEL_FROM or camera.model_name not in before:
+            continue
+        focal, cx, cy, *k = camera.params
+        k1, k2 = [*k, 0.0][:2]
+        camera.model = getattr(pycolmap.CameraModelId, name)
+        camera.params = [focal, cx, cy, k1, k2] if name == "RADIAL" else [focal, focal, cx, cy, k1, k2, 0.0, 0.0]
+        changed = True
+    return changed
 
 
 def bundle_adjust(model: Any, full: bool) -> None:
     """Bundle adjustment in place, with Cauchy's loss; points that miss by more than four pixels are taken out.
 
-    `full` gives lenses of many photos all of OPENCV's parameters, and refines a principal point that can be seen.
+    `full` refines a principal point that can be seen.
     """
-    taken = collections.Counter(model.image(i).camera_id for i in model.reg_image_ids())
-    for camera_id, count in taken.items():
-        camera = model.camera(camera_id)
-        if full and count >= FULL_MODEL_FROM and camera.model_name == "SIMPLE_RADIAL":
-            focal, cx, cy, k = camera.params
-            camera.model = pycolmap.CameraModelId.OPENCV
-            camera.params = [focal, focal, cx, cy, k, 0.0, 0.0, 0.0]
+    used = len({model.image(i).camera_id for i in model.reg_image_ids()})
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
     # Through a long lens a shifted principal point looks like a turned camera.
-    options.refine_principal_point = full and len(taken) == 1 and model.num_reg_images() >= PRINCIPAL_POINT_FROM
+    options.refine_principal_point = full and used == 1 and model.num_reg_images() >= PRINCIPAL_POINT_FROM
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.solver_options.function_tolerance = TOLERANCE
     for _ in range(ROUNDS):
@@ -92,21 +114,35 @@ def bundle_adjust(model: Any, full: bool) -> None:
         model.delete_point3D(point_id)
 
 
+def explained(model: Any, other: Any) -> float:
+    """The share of the cost of a model's residuals, by Cauchy's loss, that another one of the same photos does without; of
+    the points that both have."""
+    points = set(model.points3D) & set(other.points3D)
+    scale = max(CAUCHY * noise(model), 1e-3)
+    cost, rest = (float(np.log1p((residuals(m, points) / scale) ** 2).sum()) for m in (model, other))
+    return 1 - rest / cost if cost > 0 else 0.0
+
+
 def noise(model: Any) -> float:
     """Standard deviation, in pixels and along one axis, of the features about their projected points.
 
     From the median of the residuals, which wrong matches do not touch; 0 without points.
     """
-    lengths = []
+    lengths = residuals(model, model.points3D)
+    return float(np.median(lengths)) / RAYLEIGH if len(lengths) else 0.0
+
+
+def residuals(model: Any, points: Container[int]) -> np.ndarray:
+    """Distances (N,) in pixels of the features of some points from where these are projected; finite ones only."""
+    lengths = [np.zeros(0)]
     for i in model.reg_image_ids():
         image = model.image(i)
-        seen = image.get_observation_points2D()
+        seen = [point for point in image.get_observation_points2D() if point.point3D_id in points]
         if not seen:
             continue
         pose = image.cam_from_world().matrix()
         local = np.stack([model.point3D(point.point3D_id).xyz for point in seen]) @ pose[:, :3].T + pose[:, 3]
         found = np.asarray(image.camera.img_from_cam(local))
         lengths.append(np.linalg.norm(found - np.stack([point.xy for point in seen]), axis=1))
-    lengths = np.concatenate(lengths) if lengths else np.zeros(0)
-    lengths = lengths[np.isfinite(lengths)]
-    return float(np.median(lengths)) / RAYLEIGH if len(lengths) else 0.0
+    distances = np.concatenate(lengths)
+    return distances[np.isfinite(distances)]

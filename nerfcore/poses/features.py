@@ -17,7 +17,7 @@ import pycolmap
 from .presets import Level
 
 # Not tuned, but for the last two: docs/experiments.md, “What the pose stage was made of”.
-FULL_MODEL_FROM = 15  # photos of one camera at which its lens is given all of OPENCV's parameters in the end
+FULL_MODEL_FROM = 15  # photos of one camera at which its lens has more than one term of distortion
 LONG_LENS = 1.5  # focal length in long sides from which a lens counts as long (view narrower than 37°)
 FOCAL_GUESS = 0.85  # of the long side, where EXIF says nothing: 31 mm in terms of 35 mm film
 RETRIEVAL_FEATURES = 256  # of a photo; fewer where photos are many, which are all compared
@@ -117,12 +117,12 @@ def start_camera(group: list[dict[str, Any]], full: bool = False) -> tuple[str, 
     known = [image["focal_px"] for image in group if image["focal_px"]]
     focal = float(np.median(known)) if known else FOCAL_GUESS * max(width, height)
     if full:
-        return "OPENCV", [focal, focal, width / 2, height / 2, 0.0, 0.0, 0.0, 0.0]
+        return "RADIAL", [focal, width / 2, height / 2, 0.0, 0.0]
     return "SIMPLE_RADIAL", [focal, width / 2, height / 2, 0.0]
 
 
 def wants_full_model(group: list[dict[str, Any]]) -> bool:
-    """Whether a lens may have all parameters from the start: many photos, and no narrow view.
+    """Whether a lens may have two terms of distortion from the start: many photos, and no narrow view.
 
     On narrow views of few points (an object shot with a long lens) the extra parameters run away.
     """

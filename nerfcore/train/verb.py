@@ -58,7 +58,7 @@ from .prepare import make_trainer, plan_run
 from .results import Measured
 from .schedule import largest_batch
 from .trainer import Trainer
-from .voxel_init import save_features
+from .voxel_init import save_features, why_without_effect
 
 CLOSED_PICTURE = "closed.png"
 # Not tuned: the next two.
@@ -116,6 +116,9 @@ def train(params: TrainParams, report: Reporter) -> dict[str, Any]:
         trainer.largest_batch = state["largest_batch"]
         del saved
     limit = training_length(params.steps, params.time_limit, info.config)["steps"]
+    useless = why_without_effect(info.config.field, trainer.model.field.grid, limit)
+    if useless is not None:
+        report.warn(f"field.voxel_init has no effect: {useless}.")
     report.stage("Training")
     loop = _Loop(trainer, info, place, state, limit, params.time_limit, report)
     shown = Unfinished(project_folder, params.run, info, scene, trainer.model)

@@ -20,6 +20,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import nn
 
+from ..config import FieldConfig
 from ..data.camera_rays import CameraRays
 from ..data.pixels import PixelStore, training_size
 from ..errors import InputError
@@ -99,6 +100,18 @@ def save_features(path: Path, network: PixelFeatures) -> None:
 def dense_levels(grid: VertexGrid) -> list[tuple[int, int]]:
     """Resolution and first row of the levels in which every vertex has a row of its own."""
     return [(resolution, first) for resolution, first, rows in grid.levels if rows == resolution**3]
+
+
+def why_without_effect(config: FieldConfig, grid: VertexGrid | None, steps: int | None) -> str | None:
+    """Why `field.voxel_init` does nothing in a training of so many steps (None: as many as its time allows); None where it
+    is not asked for or does something."""
+    if config.voxel_init == "none":
+        return None
+    if grid is None or not dense_levels(grid):
+        return "no level of the grid has a row for each vertex"
+    if steps is not None and steps <= config.voxel_init_step:
+        return f"training ends after {steps} steps, before step {config.voxel_init_step} (field.voxel_init_step)"
+    return None
 
 
 def vertex_positions(resolution: int, contracted: bool, device: torch.device) -> torch.Tensor:

@@ -167,6 +167,23 @@ def test_a_run_that_stops_before_its_initialisation_catches_up_on_it(ball: Path,
     assert [name for name in whole if not torch.equal(whole[name], parts[name])] == []
 
 
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"field__voxel_init_step": "4"}, "ends after 4 steps, before step 4"),
+        ({"field__branch": "implicit"}, "no level of the grid"),
+        ({"field__coarsest": "40", "field__table_log2": "10"}, "no level of the grid"),
+        ({"field__voxel_init_step": "3"}, None),
+    ],
+)
+def test_an_initialisation_without_effect_is_told(ball: Path, settings: dict[str, str], words: str | None) -> None:
+    report = Reporter()
+    train(ball, "useless", 4, report=report, **{"field__voxel_init": "rgb_stats", **settings})
+    told = [warning for warning in report.warnings if "voxel_init has no effect" in warning]
+    assert len(told) == (words is not None)
+    assert words is None or words in told[0]
+
+
 @pytest.mark.setting("field.voxel_init_weights")
 def test_weights_of_one_run_serve_another_and_missing_ones_are_named(ball: Path) -> None:
     train(ball, "first", 14, field__voxel_init="cnn")

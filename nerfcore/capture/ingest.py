@@ -17,7 +17,7 @@ from ..params import NewParams
 from ..progress import Reporter, shortened
 from ..project.classes import make_classes, read_classes, unnamed_values
 from ..project.fingerprints import Earlier, Fingerprint, compare, digest, files_digest, stamps_digest
-from ..project.kept import earlier_cut_outs, keep_later_labels, with_earlier_names
+from ..project.kept import earlier_cut_outs, keep_later_labels, resized_labels, with_earlier_names
 from ..project.schema import ImageRecord, Project
 from ..project.store import PROJECT_FILE, create_folder, edit_project, load_project
 from .backdrop import mask_objects
@@ -71,6 +71,12 @@ def new(params: NewParams, report: Reporter) -> dict[str, Any]:
     cut_out = wanted and mask_objects(_without_mask(records), folder, report, made)
     if previous:
         later = keep_later_labels(fresh, previous.images, folder)
+        resized = resized_labels(fresh, previous.images)
+        if resized:
+            text = (
+                "Labels that photos got later do not fit their new size and were left out; import or accept them again"
+            )
+            report.warn(shortened(text, resized))
         if classes[0]:  # else the project keeps its own
             there = _present_ids(folder, kept + later, report)
             classes = (with_earlier_names(classes[0], previous.classes, there), *classes[1:])

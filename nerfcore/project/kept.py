@@ -42,6 +42,14 @@ def keep_later_labels(records: Sequence[ImageRecord], before: Sequence[ImageReco
     return given
 
 
+def resized_labels(records: Sequence[ImageRecord], before: Sequence[ImageRecord]) -> list[str]:
+    """Names of photos without a label map whose later one is of the same photo at another size, and so was not kept."""
+    sizes = {r.sha256: (r.width, r.height) for r in before if r.label and r.label != f"labels/{r.name}.png"}
+    return [
+        r.name for r in records if r.label is None and sizes.get(r.sha256, (r.width, r.height)) != (r.width, r.height)
+    ]
+
+
 def earlier_cut_outs(project: Project | None) -> list[ImageRecord]:
     """Photos whose masks Fieldwork made itself when it read them the last time; somebody may have edited these since."""
     steps = reversed(project.provenance) if project else ()

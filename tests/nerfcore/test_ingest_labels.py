@@ -207,3 +207,7 @@ def test_labels_that_came_later_stay_when_it_runs_again(tmp_path: Path) -> None:
     (folder / "p0.png").unlink()  # its own labels go with their folder
     new(photos, project, labels=folder)
     assert [record.label for record in load_project(project).images] == [None, "labels/imported/p1.png", None]
+    again = Reporter()
+    ingest.new(NewParams(photos=photos, project=project, max_size=200), again)
+    assert not any(record.label for record in load_project(project).images)
+    assert any("do not fit their new size" in text and "p1" in text for text in again.warnings)

@@ -32,7 +32,8 @@ class Stored(NamedTuple):
 def relative_paths(items: Iterable[Any]) -> Iterator[Stored]:
     """The paths that begin with "//" of those of some scenes and objects that are this file's."""
     for item in items:
-        if not is_local(item):
+        # Of other objects than empties nothing is asked: that alone would make properties of theirs.
+        if not is_local(item) or (isinstance(item, bpy.types.Object) and item.type != "EMPTY"):
             continue
         own = item.fieldwork
         texts = [prop for prop in own.bl_rna.properties if prop.type == "STRING"]

@@ -8,7 +8,7 @@ import torch
 from ..kernels.depth_arrays import MapArrays
 from ..kernels.surface import sight, slopes
 from ..progress import Reporter
-from .triangles import areas, border_edges, compact, components, cross, mean_around, unit
+from .triangles import areas, border_edges, compact, components, cross, mean_around, summed_around, unit
 
 FEWEST_VIEWS = 2
 TURNED = np.radians(35)  # by which a face may be steeper or flatter than what a view shows there
@@ -16,6 +16,7 @@ MOSTLY = 4  # rings of faces of which most must be seen: single ones are missed 
 AROUND = 6  # rings of faces over which views are averaged: single faces have noisy normals
 SCRAP = 1e-3  # of the area
 LONGEST_LOOP = 30  # edges of a hole that is filled
+SHEET = 0.5  # cosine, at least, of the angle between a sheet and what its border goes around
 CHUNK = 1 << 16
 
 
@@ -83,11 +84,13 @@ def fill_holes(
     vertices: np.ndarray, faces: np.ndarray, longest: int = LONGEST_LOOP
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Close border loops of at most `longest` edges by fans around their middle: vertices, triangles, and which of
-    these are new. Vertices where several loops meet are left alone."""
+    these are new. Vertices where several loops meet are left alone, and so are the borders of small sheets, which would get
+    a back."""
     border = border_edges(faces)
     starts, amount = np.unique(border[:, 0], return_counts=True)
     simple = set(starts[amount == 1].tolist())
     after = {int(a): int(b) for a, b in border if int(a) in simple}
+    around = summed_around(faces, cross(vertices, faces), len(vertices))
     middles, fans, visited = [], [], set()
     for start in after:
         if start in visited:
@@ -97,7 +100,7 @@ def fill_holes(
             visited.add(here)
             loop.append(here)
             here = after[here]
-        if here != start or not 3 <= len(loop) <= longest:
+        if here != start or not 3 <= len(loop) <= longest or _bounds_sheet(vertices[loop], around[loop]):
             continue
         if len(loop) == 3:
             fans.append(np.array([loop[::-1]]))
@@ -112,3 +115,12 @@ def fill_holes(
     if middles:
         vertices = np.concatenate([vertices, np.array(middles)])
     return vertices, np.concatenate([faces, added]), np.arange(len(faces) + len(added)) >= len(faces)
+
+
+def _bounds_sheet(loop: np.ndarray, normals: np.ndarray) -> bool:
+    """Whether a loop (N, 3) of a border, whose triangles lie to its left and have these normals (N, 3), goes around a sheet, and
+    not around a hole."""
+    place = loop - loop.mean(0)
+    area = np.cross(place, np.roll(place, -1, axis=0)).sum(0)
+    within = np.linalg.norm(area) * np.linalg.norm(normals, axis=1).sum()
+    return bool(area @ normals.sum(0) > SHEET * within)

@@ -30,6 +30,12 @@ def mean_around(faces: np.ndarray, values: np.ndarray, count: int, rings: int) -
     return values
 
 
+def summed_around(faces: np.ndarray, vectors: np.ndarray, count: int) -> np.ndarray:
+    """Sum (count, 3) for each vertex of the vectors (F, 3) of its triangles."""
+    corner = faces.reshape(-1)
+    return np.stack([np.bincount(corner, np.repeat(axis, 3), count) for axis in vectors.T], 1)
+
+
 def components(faces: np.ndarray, count: int) -> np.ndarray:
     """Number (F,) of the connected part of each triangle; triangles that share a vertex are connected."""
     rows = np.concatenate([faces[:, 0], faces[:, 1]])

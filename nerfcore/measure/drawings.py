@@ -25,7 +25,7 @@ from .sections import profile, write_profile
 from .sheet import DPI, MM, Color, Entry, Sheet, chosen_scale, label_note, ratio, write_sheet
 from .stored import read_measures
 from .views import Picture, Projection, Window, picture, plane, projection
-from .wording import amount, significant
+from .wording import amount, decimals, significant
 
 MARGIN = 0.02  # of the drawing's longer side, around it
 CLASS_SHARE = 0.6  # of a class's colour in a map of classes, over the grey picture
@@ -155,9 +155,7 @@ def section(params: SectionParams, report: Reporter) -> dict[str, Any]:
     report.stage("Cutting")
     cut = profile(subject.surface, view, at)
     if not len(cut.segments):
-        low, high = subject.surface.vertices.min(0), subject.surface.vertices.max(0)
-        spans = ", ".join(f"{axis} {a:.2f} to {b:.2f}" for axis, a, b in zip("xyz", low, high))
-        raise SettingError(f"The plane {params.plane} misses the mesh.", f"It spans {spans}.")
+        raise SettingError(f"The plane {params.plane} misses the mesh.", spans(subject.surface.vertices, params.turn))
     found = view(subject.surface.vertices)
     window, scale = framed(found[:, :2], params.scale, subject.metric)
     report.stage("Drawing")
@@ -196,6 +194,15 @@ def section(params: SectionParams, report: Reporter) -> dict[str, Any]:
     }
     record_step(folder, "section", params.model_dump(mode="json"), result)
     return result
+
+
+def spans(vertices: np.ndarray, turn: float) -> str:
+    """From where to where vertices (V, 3) lie along the axes that planes are named by, which are turned about z."""
+    along = projection("top", turn)(vertices)
+    places = max(2, decimals(float(np.ptp(along, axis=0).max())) + 1)
+    low, high = along.min(0).round(places) + 0.0, along.max(0).round(places) + 0.0  # − 0 is 0
+    text = ", ".join(f"{axis} {a:.{places}f} to {b:.{places}f}" for axis, a, b in zip("xyz", low, high))
+    return f"It spans {text}{turned(turn)}."
 
 
 def warn_of_unused_scale(scale: float | None, subject: Subject, report: Reporter) -> None:

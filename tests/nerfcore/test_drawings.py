@@ -313,6 +313,20 @@ def test_a_section_is_drawn_and_listed(project: Path, tmp_path: Path) -> None:
     assert all(float(row["z0"]) == 0.5 for row in rows)
 
 
+def test_planes_that_miss_a_turned_or_small_mesh_say_where_it_is(project: Path, tmp_path: Path) -> None:
+    with pytest.raises(SettingError) as told:
+        section(SectionParams(project=project, plane="y=3", turn=90), Reporter())
+    assert told.value.hint == "It spans x 0.00 to 3.10, y -4.00 to 0.00, z -0.10 to 2.50, turned 90°."
+    view, at = plane("y=-3.9", 90)  # as the sentence says
+    assert len(profile(load_subject(project, "main").surface, view, at).segments)
+    small = tmp_path / "pin"
+    save_project(small, Project(classes=CLASSES))
+    box = trimesh.creation.box(bounds=[[0, 0, 0], [0.002, 0.001, 0.0015]])
+    store_mesh(small, box, np.ones(12, int), box, 1e-5)
+    with pytest.raises(SettingError, match=r"y 0\.00000 to 0\.00100, z 0\.00000 to 0\.00150"):
+        section(SectionParams(project=small, plane="z=1"), Reporter())
+
+
 def test_drawings_of_several_turns_stand_beside_each_other(project: Path, tmp_path: Path) -> None:
     for turn in (0, 30, -45.5):
         settings = {"project": project, "turn": turn, "scale": 100, "out": tmp_path}

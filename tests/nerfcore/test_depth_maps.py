@@ -302,7 +302,7 @@ def test_rays_say_what_they_meet_that_nothing_is_there_or_nothing() -> None:
         priorities=torch.ones(1),
         render_grid=lambda: present_grid(grid, 0.0),
         config=SimpleNamespace(render=SimpleNamespace(samples=256)),
-        field=SimpleNamespace(density=slab),
+        field=SimpleNamespace(density_until=lambda _, points, *packed: slab(points)),
     )
     view = depth_maps.FlatView(camera, pose, 0, np.array([[True, True, True, False]]))
     found = depth_maps.render_depth(model, view, lambda: None).depth[0]  # type: ignore[arg-type]

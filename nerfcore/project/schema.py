@@ -76,9 +76,7 @@ class Frame(Model):
     """How the SfM frame lies in the world: z up, metres once `scale_known`."""
 
     world_from_sfm: list[list[float]] = IDENTITY
-    marks_from_sfm: list[list[float]] = (
-        IDENTITY  # marks on the surface: in the frame of the first poses; later ones have others
-    )
+    marks_from_sfm: list[list[float]] = IDENTITY  # marks on the surface stay in the frame of the first poses
     up_confidence: float | None = None
     scale_known: bool = False
     bounds: list[list[float]] | None = None  # region of interest in the world: [min, max]

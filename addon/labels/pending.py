@@ -11,7 +11,7 @@ import uuid
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from ..errors import EngineError
 from . import journal
@@ -38,8 +38,7 @@ class Wish:
     more: bool = False
 
 
-@dataclass(frozen=True)
-class Taken:
+class Taken(NamedTuple):
     """A wish that the engine has fulfilled, and the revision that is shown by it; more: as of the wish."""
 
     folder: Path

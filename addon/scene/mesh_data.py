@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,8 +12,7 @@ from .package import Package
 VOID_COLOR = [0.15, 0.15, 0.15]
 
 
-@dataclass(frozen=True)
-class MeshData:
+class MeshData(NamedTuple):
     """One mesh of V vertices, E edges and F triangles.
 
     `vertices` (V, 3) float32; `edges` (E, 2) vertex indices; `corners`, `corner_edges` (3F,) vertex and edge of each

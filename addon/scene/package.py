@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -46,8 +46,7 @@ class Package:
     label_revision: int | None = None
 
 
-@dataclass(frozen=True)
-class BlenderCamera:
+class BlenderCamera(NamedTuple):
     """Settings of a Blender camera with horizontal sensor fit that equal a pinhole in pixels.
 
     The pixel aspect belongs to the scene's render settings: `aspect` is (x, y), 1 and 1 for square pixels.

@@ -1,7 +1,5 @@
 """Preferences of the extension: where the engine is, and how it behaves."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 import bpy
@@ -86,7 +84,7 @@ def draw_preferences(preferences: FIELDWORK_AP_preferences, layout: UILayout) ->
     layout.prop(preferences, "idle_minutes")
 
 
-def draw_engine(layout: UILayout, installer: Installer | None) -> None:
+def draw_engine(layout: UILayout, installer: "Installer | None") -> None:
     """State of the installed engine, and the one button that changes it."""
     folder = engine_folder()
     known = place.installed(folder)

@@ -1,12 +1,14 @@
-"""What the operators of the verbs have in common: settings in, a job out."""
+"""What the operators of the verbs have in common: settings in, a job out.
 
-from __future__ import annotations
+Modules with properties of operators do without `from __future__ import annotations`: enabling the extension must be quick,
+and Blender would compile the text of each annotation, of base classes for each operator anew.
+"""
 
 import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import bpy
 from bpy.types import Context, Operator
@@ -120,9 +122,10 @@ def absolute(path: str) -> str | None:
 class VerbOperator(Operator):
     """An operator that runs a verb in the engine: queued in a window, blocking without one."""
 
-    verb: ClassVar[str]
-    needs: ClassVar[tuple[Callable[[Context], str | None], ...]] = ()
-    scene_names: ClassVar[dict[str, str]] = {}
+    # Annotations of these would be evaluated for each operator.
+    verb = ""
+    needs = ()  # functions that take the context and say what is missing, None where nothing is
+    scene_names = {}
 
     @classmethod
     def poll(cls, context: Context) -> bool:

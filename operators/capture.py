@@ -1,7 +1,5 @@
 """Capture: photos, a video or a posed data set become a project."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Dataset from Scene: photographs of what is open in Blender, with labels, depth and poses."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from pathlib import Path

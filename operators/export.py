@@ -1,7 +1,5 @@
 """Export: the capture as a .blend of its own, and in the formats of other programs."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Running jobs and the engine: cancel, report, stop, check."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import bpy

@@ -1,7 +1,5 @@
 """Label: the verbs that prepare, propagate, carry and accept; photos that are marked."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 from typing import Any

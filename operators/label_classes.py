@@ -1,7 +1,5 @@
 """Label: adding and removing classes, at once and by the engine."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Labels from and for other labelling tools."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Models that the user brings help with marking: clicks and boxes cut things out, a first guess of classes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

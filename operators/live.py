@@ -1,7 +1,5 @@
 """Fields in the scene: adding one, cropping it, its classes and things, and the compositor that puts it among objects."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import bpy

@@ -1,7 +1,5 @@
 """More than one machine does at once: many captures, and one large capture in blocks."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import bpy

@@ -1,7 +1,5 @@
 """Mesh: the labelled surface of the field."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Clicks in the viewport: one end of a known distance, or what is known of a place of the surface."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING, Any
 
 from bpy.types import Area, Context, Event, Operator, UILayout
@@ -124,13 +122,13 @@ class FIELDWORK_OT_pick_surface(ViewportPick):
         return True
 
 
-def spot_text(spot: Spot) -> str:
+def spot_text(spot: "Spot") -> str:
     """One line of what is known of a place."""
     name = f"{spot.class_name}, {spot.instance}" if spot.instance else spot.class_name
     return t("{}: {:.0%} sure, shown by {} photos", name, spot.confidence, len(spot.photos))
 
 
-def draw_spot(layout: UILayout, spot: Spot) -> None:
+def draw_spot(layout: UILayout, spot: "Spot") -> None:
     layout.label(text=spot_text(spot), translate=False)
     for shown in spot.photos[:MOST_PHOTOS]:
         name = shown.camera.name

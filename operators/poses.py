@@ -1,7 +1,5 @@
 """Poses: where each photo was taken, which way is up, how large things are."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

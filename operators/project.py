@@ -1,7 +1,5 @@
 """The project of the scene: finding one that was moved, and edits that wait for the engine."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Whole jobs in one step, made for scripts: photos to a .blend, simulated photos, benchmarks."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

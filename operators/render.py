@@ -1,7 +1,5 @@
 """Render: images of the field from the scene's camera, its animation, or the photo cameras."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Into the scene: cameras, points, mesh and materials of the capture under one parent, updated in place."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Things: the instances on the mesh, how they stand to each other, and selecting them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Train: the field of the capture, in one or several runs."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from bl_operators.presets import AddPresetBase

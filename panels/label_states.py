@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from bpy.types import Context
 
@@ -15,18 +14,17 @@ from ..addon.text import t
 from .states import State, project_folder
 
 
-@dataclass(frozen=True)
-class Facts:
+class Facts(NamedTuple):
     """revision: that is shown. computed: whose labels are shown, None for none. strokes: number of marks by class id.
     shares: by class id. told: what the propagation said. working: what the engine does for it, empty for nothing."""
 
     revision: int = 0
     newest: int = 0
     computed: int | None = None
-    strokes: dict[int | None, int] = field(default_factory=dict)
-    shares: dict[int, Any] = field(default_factory=dict)
+    strokes: dict[int | None, int] = {}
+    shares: dict[int, Any] = {}
     void: float = 0.0
-    told: dict[str, Any] = field(default_factory=dict)
+    told: dict[str, Any] = {}
     working: str = ""
     accepted: int | None = None
 

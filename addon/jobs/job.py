@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -60,34 +59,41 @@ TITLES = {
 }
 
 
-@dataclass
 class Job:
     """One piece of work. `state`: queued, running, cancelling, done, failed, cancelled."""
 
-    verb: str
-    params: dict[str, Any]
-    id: str
-    project: Path | None = None
-    on_done: Done | None = None
-    before: Steps | None = None  # work in Blender before the job can start
-    state: str = "queued"
-    stage: str = ""
-    fraction: float | None = None
-    message: str = ""
-    eta: float | None = None
-    started: float | None = None
-    seconds: float = 0.0
-    result: dict[str, Any] | None = None
-    error: EngineError | None = None
-    warnings: list[str] = field(default_factory=list)
-    curve: list[tuple[int, float, float]] = field(default_factory=list)  # step, loss, PSNR in dB
-    latest: dict[str, Any] = field(default_factory=dict)  # last "train" event
-    preview: str = ""  # picture of a held-out photo
-    preview_count: int = 0
-    dismissed: bool = False  # its message was put away
-    followed: bool = False  # runs in an engine that another Blender started
-    events_read: int = 0
-    looked: float = 0.0  # when its files were read last, by the monotonic clock
+    def __init__(
+        self,
+        verb: str,
+        params: dict[str, Any],
+        id: str,
+        project: Path | None = None,
+        on_done: Done | None = None,
+        before: Steps | None = None,
+        state: str = "queued",
+        stage: str = "",
+        started: float | None = None,
+        result: dict[str, Any] | None = None,
+        error: EngineError | None = None,
+        followed: bool = False,
+    ) -> None:
+        self.verb, self.params, self.id, self.project = verb, params, id, project
+        self.on_done = on_done
+        self.before = before  # work in Blender before the job can start
+        self.state, self.stage, self.message = state, stage, ""
+        self.fraction: float | None = None
+        self.eta: float | None = None
+        self.started, self.seconds = started, 0.0  # when, by the monotonic clock; how long it runs
+        self.result, self.error = result, error
+        self.warnings: list[str] = []
+        self.curve: list[tuple[int, float, float]] = []  # step, loss, PSNR in dB
+        self.latest: dict[str, Any] = {}  # last "train" event
+        self.preview = ""  # picture of a held-out photo
+        self.preview_count = 0
+        self.dismissed = False  # its message was put away
+        self.followed = followed  # runs in an engine that another Blender started
+        self.events_read = 0
+        self.looked = 0.0  # when its files were read last, by the monotonic clock
 
     @property
     def title(self) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -19,15 +18,14 @@ RIM_WIDTH = 1.5  # pixels of the screen
 CIRCLE = 24  # corners
 
 
-@dataclass
 class Live:
     """The stroke under the mouse: on which photo, parameters of `label stroke` but for its points, points in pixels;
     a stroke on the surface has no photo, and pieces of places in the scene (see trail.py)."""
 
-    photo: str
-    params: dict[str, Any]
-    points: list[tuple[float, float]] = field(default_factory=list)
-    pieces: list[list[Any]] = field(default_factory=list)
+    def __init__(self, photo: str, params: dict[str, Any], pieces: list[list[Any]] | None = None) -> None:
+        self.photo, self.params = photo, params
+        self.points: list[tuple[float, float]] = []
+        self.pieces = pieces if pieces is not None else []
 
 
 live: Live | None = None

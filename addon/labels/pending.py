@@ -6,10 +6,9 @@ the same key, so that it is neither lost nor made twice. Kept outside the scene:
 
 from __future__ import annotations
 
+import os
 import time
-import uuid
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,18 +23,15 @@ Answer = Callable[[dict[str, Any] | None, EngineError | None], None]
 Ask = Callable[[str, dict[str, Any], Answer], object]  # verb, parameters, what takes the answer; raises EngineError
 
 
-@dataclass
 class Wish:
     """What the engine is to do with the marks of a project: `label stroke` or `label checkout`. more: the mark after it is of
     the same step of undo."""
 
-    folder: Path
-    verb: str
-    params: dict[str, Any]
-    key: str = field(default_factory=lambda: uuid.uuid4().hex)
-    sent: bool = False
-    due: float = 0.0  # when to send (again), by the monotonic clock
-    more: bool = False
+    def __init__(self, folder: Path, verb: str, params: dict[str, Any], more: bool = False) -> None:
+        self.folder, self.verb, self.params, self.more = folder, verb, params, more
+        self.key = os.urandom(16).hex()
+        self.sent = False
+        self.due = 0.0  # when to send (again), by the monotonic clock
 
 
 class Taken(NamedTuple):
@@ -54,7 +50,7 @@ _errors: dict[Path, EngineError] = {}
 
 def mark(folder: Path, params: dict[str, Any], more: bool = False) -> Wish:
     """Let a mark (parameters of `label stroke`, but for the project) wait for `send`."""
-    wish = Wish(folder, "label stroke", params, more=more)
+    wish = Wish(folder, "label stroke", params, more)
     wish.params = {**params, "key": wish.key}
     _errors.pop(folder, None)
     _wishes.append(wish)

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +25,6 @@ Params = Callable[[Path, dict[Any, Any]], dict[str, Any]]
 Ask = Callable[[str, dict[str, Any], Answer], object]  # verb, parameters, what takes the answer; raises EngineError
 
 
-@dataclass
 class Edit:
     """The newest edit of one kind of one project.
 
@@ -34,13 +32,11 @@ class Edit:
     parameters of them.
     """
 
-    folder: Path
-    verb: str
-    values: dict[Any, Any]
-    params: Params
-    sent: dict[Any, Any] | None = None  # the values that the engine has and did not answer yet
-    due: float = 0.0  # when to send (again), by the monotonic clock
-    error: EngineError | None = None
+    def __init__(self, folder: Path, verb: str, values: dict[Any, Any], params: Params) -> None:
+        self.folder, self.verb, self.values, self.params = folder, verb, values, params
+        self.sent: dict[Any, Any] | None = None  # the values that the engine has and did not answer yet
+        self.due = 0.0  # when to send (again), by the monotonic clock
+        self.error: EngineError | None = None
 
 
 _pending: dict[tuple[Path, str], Edit] = {}

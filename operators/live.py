@@ -7,7 +7,7 @@ from bpy.types import Context, Operator
 
 from ..addon import paths
 from ..addon.errors import SceneError
-from ..addon.live import compositor, fields, shadows, things
+from ..addon.live import fields, things
 from ..addon.live.training import trainings
 from ..addon.project import snapshot
 from ..addon.props import BoolProperty, IntProperty, StringProperty
@@ -210,6 +210,8 @@ class FIELDWORK_OT_setup_compositor(Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     def execute(self, context: Context) -> set[str]:
+        from ..addon.live import compositor  # not at the top: enabling the extension must be quick
+
         try:
             made: Any = compositor.set_up(context.scene)
         except SceneError as error:
@@ -228,6 +230,8 @@ class FIELDWORK_OT_catch_shadows(Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     def execute(self, context: Context) -> set[str]:
+        from ..addon.live import compositor, shadows
+
         scene = context.scene
         if not shadows.surfaces(scene):
             self.report({"ERROR"}, t("The scene has no surface of a capture: extract the mesh, or press Update Scene."))

@@ -14,9 +14,8 @@ import bpy
 from ..errors import SceneError
 from ..text import t
 from . import fields, shadows
-from .shared_scene import filter_width, made_for, scene_of, share, share_settings
+from .shared_scene import FIELD_SCENE, filter_width, made_for, scene_of, share, share_settings
 
-FIELD_SCENE = "fieldwork_field_scene"  # on a scene: that of its fields
 NODE = "fieldwork_node"  # on nodes that are ours
 ENGINE = "FIELDWORK"
 

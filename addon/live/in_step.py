@@ -18,7 +18,8 @@ from ..jobs.job import Job
 from ..jobs.queue import queue
 from ..roles import is_local
 from ..text import t
-from . import compositor, engine
+from . import engine
+from .shared_scene import FIELD_SCENE
 
 PERIOD = 0.25  # seconds between two looks
 WIDTH = 60  # characters of a line of the message
@@ -26,6 +27,8 @@ WIDTH = 60  # characters of a line of the message
 
 @bpy.app.handlers.persistent
 def _rendering(scene: bpy.types.Scene, *_: Any) -> None:
+    from . import compositor  # not at the top: enabling the extension must be quick
+
     compositor.follow(scene)
 
 
@@ -57,8 +60,10 @@ def _draw(menu: Any, lines: list[str]) -> None:
 def _look() -> None:
     if engine.untold and not bpy.app.is_job_running("RENDER"):
         _show(_taken())
-    composited = [scene for scene in bpy.data.scenes if compositor.FIELD_SCENE in scene and is_local(scene)]
+    composited = [scene for scene in bpy.data.scenes if FIELD_SCENE in scene and is_local(scene)]
     if composited and gate.closed() is None:
+        from . import compositor
+
         for scene in composited:
             compositor.follow(scene)
 

@@ -14,6 +14,7 @@ SHARED = (
 VIEW = ("use", "camera_suffix", "file_suffix")  # of a view of stereo
 
 
+FIELD_SCENE = "fieldwork_field_scene"  # on a scene: that of its fields
 OWNER = "fieldwork_owner_scene"  # on a scene made here: the one that it was made for
 
 

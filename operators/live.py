@@ -8,7 +8,6 @@ from bpy.types import Context, Operator
 from ..addon import paths
 from ..addon.errors import SceneError
 from ..addon.live import fields, things
-from ..addon.live.training import trainings
 from ..addon.project import snapshot
 from ..addon.props import BoolProperty, IntProperty, StringProperty
 from ..addon.roles import is_local
@@ -30,8 +29,11 @@ def need_field(context: Context) -> str | None:
     """Why there is no field to add; one in training is one."""
     settings = context.scene.fieldwork
     folder = snapshot.folder_of(settings)
-    if folder is not None and trainings.run_of(folder) == settings.run:
-        return None
+    if folder is not None:
+        from ..addon.live.training import trainings  # not at the top: enabling the extension must be quick
+
+        if trainings.run_of(folder) == settings.run:
+            return None
     return need_run(context)
 
 

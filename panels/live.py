@@ -5,11 +5,9 @@ from __future__ import annotations
 import bpy
 from bpy.types import Context, Panel, UILayout, UIList
 
-from ..addon.live import fields, hint, thing_texels, voxels
+from ..addon.live import fields, hint
 from ..addon.live.engine import ENGINE
 from ..addon.live.settings import look_name
-from ..addon.live.training import trainings
-from ..addon.live.viewport import viewport
 from ..addon.project import snapshot
 from ..addon.text import t
 from ..operators.live import active_field
@@ -107,6 +105,10 @@ def draw_things(layout: UILayout, context: Context, own) -> None:
 
 def why_not_drawn(context: Context, own) -> list[str]:
     """Sentences that say why the viewport does not show the field."""
+    from ..addon.live import voxels  # not at the top: enabling the extension must be quick
+    from ..addon.live.training import trainings
+    from ..addon.live.viewport import viewport
+
     reasons = []
     if hint.lacks_overlays(context.space_data):
         return [t("Show overlays to see the field: this version of Blender needs them.")]
@@ -128,6 +130,8 @@ def why_not_drawn(context: Context, own) -> list[str]:
 def why_things_are_not_drawn(own) -> str:
     """A sentence that says why the viewport does not show edits of things; empty where it does, or there is nothing to edit in it.
     What is needed for that is asked for."""
+    from ..addon.live import thing_texels, voxels
+
     project = fields.folder_of(own)
     baked = None if project is None or bpy.app.background else voxels.baked(project, own.run)
     if baked is None:

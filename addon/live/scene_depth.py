@@ -62,6 +62,7 @@ class SceneDepth:
 
     def texture(self, context: Any, region: Any, view3d: Any) -> Any:
         """Depth in [0, 1] (red, as large as the region) of what the view's objects cover, 1 where there are none."""
+        _listen()
         size = region.width, region.height
         target = self._targets.get(region.as_pointer())
         if target is None or target.size != size:
@@ -171,14 +172,15 @@ HANDLERS = (
 )
 
 
-def register() -> None:
-    if not bpy.app.background:
+def _listen() -> None:
+    """Hear of changes of the scene from now on."""
+    if _updated not in bpy.app.handlers.depsgraph_update_post:
         for name, handler in HANDLERS:
             getattr(bpy.app.handlers, name).append(handler)
 
 
 def unregister() -> None:
-    if not bpy.app.background:
-        for name, handler in HANDLERS:
+    for name, handler in HANDLERS:
+        if handler in getattr(bpy.app.handlers, name):
             getattr(bpy.app.handlers, name).remove(handler)
     scene_depth.__init__()

@@ -110,6 +110,8 @@ class Trainings:
         """The run that a project trains at the moment."""
         from ...nerfcore.project import live
 
+        if not bpy.app.background and not bpy.app.timers.is_registered(tick):
+            bpy.app.timers.register(tick, first_interval=IDLE, persistent=True)
         looked, run = self._runs.get(project, (0.0, None))
         if time.monotonic() - looked > IDLE:
             run = live.training_run(project)
@@ -239,11 +241,6 @@ def tick() -> float:
     if changed:
         redraw_views()  # views that begin to look at a training do so while they are drawn, after this
     return WATCHING if changed or trainings.views else IDLE
-
-
-def register() -> None:
-    if not bpy.app.background:
-        bpy.app.timers.register(tick, first_interval=IDLE, persistent=True)
 
 
 def unregister() -> None:

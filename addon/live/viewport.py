@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import bpy
 from mathutils import Matrix
 
-from . import fields, hint, thing_texels, things, voxels
+from . import fields, thing_texels, things, voxels
 from .assets import Asset, texture
 from .redraw import redraw_views
 from .scene_depth import lacks_depth, scene_depth
@@ -101,17 +101,12 @@ class Viewport:
         self._waited = 0.0  # seconds of this redraw in which the card did what was asked of it before
         self._looks: dict[str, list[voxels.Look]] = {}  # of the classes of fields, in this redraw
 
-    def draw(self, context: bpy.types.Context) -> None:
+    def draw(self, context: bpy.types.Context, shown: list[fields.Part]) -> None:
         """Draw the fields of a view; what goes wrong is told in the panel, not in each redraw."""
-        scene, region, view3d = context.scene, context.region, context.region_data
-        if not scene.fieldwork_live.viewport or view3d is None:
-            return
-        layer, space = context.view_layer, context.space_data
-        shown = fields.parts(layer.objects, lambda obj: obj.visible_get(view_layer=layer, viewport=space))
-        if not shown or self.error or hint.lacks_overlays(space):
+        if self.error:
             return
         try:
-            self._draw(context, region, view3d, shown)
+            self._draw(context, context.region, context.region_data, shown)
         except Exception as error:  # noqa: BLE001 - a handler that raises in each redraw would fill the terminal
             self.error = f"{type(error).__name__}: {error}"
 
@@ -339,11 +334,6 @@ def _uniforms(
 
 
 viewport = Viewport()
-_handle: Any = None
-
-
-def _draw() -> None:
-    viewport.draw(bpy.context)
 
 
 def _redraw_soon() -> None:
@@ -351,17 +341,7 @@ def _redraw_soon() -> None:
         bpy.app.timers.register(redraw_views, first_interval=0.01)
 
 
-def register() -> None:
-    global _handle
-    if not bpy.app.background:
-        _handle = bpy.types.SpaceView3D.draw_handler_add(_draw, (), "WINDOW", "POST_VIEW")
-
-
 def unregister() -> None:
-    global _handle
-    if _handle is not None:
-        bpy.types.SpaceView3D.draw_handler_remove(_handle, "WINDOW")
-        _handle = None
     if bpy.app.timers.is_registered(redraw_views):
         bpy.app.timers.unregister(redraw_views)
     viewport.__init__()

@@ -102,6 +102,35 @@ def test_nothing_is_left_after_unregister():
     assert facts["after"] == facts["before"]
 
 
+def test_what_loads_with_the_first_field_that_is_seen_ends_as_well():
+    facts = run(
+        """
+        import json, os, sys
+        import bpy
+        import fieldwork
+        fieldwork.register()
+        loaded = [name for name in sys.modules if name.startswith("fieldwork.addon.live.")]
+        from fieldwork.addon.live import scene_depth, training, views
+        handlers = bpy.app.handlers.depsgraph_update_post
+        before = len(handlers)
+        for _ in range(2):
+            scene_depth._listen()
+        bpy.app.timers.register(training.tick)
+        between = len(handlers)
+        fieldwork.unregister()
+        facts = {"loaded": [name.rpartition(".")[2] for name in loaded], "later": views.LATER}
+        facts["listening"] = [between - before, scene_depth._updated in handlers]
+        facts["looking"] = bpy.app.timers.is_registered(training.tick)
+        print(json.dumps(facts))
+        sys.stdout.flush()
+        os._exit(0)
+        """
+    )
+    assert not set(facts["loaded"]) & {*facts["later"], "compositor"}
+    assert facts["listening"] == [1, False]
+    assert not facts["looking"]
+
+
 def test_paths_may_begin_at_the_open_file_but_for_those_of_the_preferences():
     facts = run(
         """

@@ -53,7 +53,7 @@ class Screen:
         return next(region for region in self.area.regions if region.type == "UI")
 
     def module(self, name: str):
-        return sys.modules[f"{PACKAGE}.{name}"]
+        return importlib.import_module(f"{PACKAGE}.{name}")
 
     @property
     def queue(self):

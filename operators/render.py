@@ -17,7 +17,6 @@ from ..addon.project import snapshot
 from ..addon.props import BoolProperty, IntVectorProperty, StringProperty
 from ..addon.roles import Owner
 from ..addon.scene.frame import scene_from_capture
-from ..addon.scene.lens import pinhole
 from ..addon.scene.slices import Held
 from ..addon.text import t
 from .base import ProjectOperator, absolute, need_held_out, need_run, refresh_scenes, scene_of, scene_settings
@@ -87,6 +86,8 @@ def camera_at(scene: bpy.types.Scene, number: int, width: int, height: int, owne
 
 def intrinsics(camera: bpy.types.Camera, width: int, height: int, aspect: Sequence[float]) -> dict[str, float]:
     """Pinhole intrinsics of a Blender camera as transforms.json has them; `aspect`: width and height of a pixel."""
+    from ..addon.scene.lens import pinhole  # not at the top: enabling the extension must be quick
+
     fx, fy, cx, cy = pinhole(camera, width, height, aspect)
     angle = 2 * math.atan(width / 2 / fx)
     return {"w": width, "h": height, "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "camera_angle_x": angle}

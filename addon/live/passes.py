@@ -92,3 +92,22 @@ _FROM_REC709 = {
     "Linear Rec.2020": [[0.6274, 0.3293, 0.0433], [0.0691, 0.9195, 0.0114], [0.0164, 0.0880, 0.8956]],
     "ACEScg": [[0.61309740, 0.33952315, 0.04737945], [0.07019372, 0.91635388, 0.01345240], [0.02061559, 0.10956977, 0.86981463]],
 }  # fmt: skip
+
+
+def world_color(world: bpy.types.World | None) -> tuple[float, float, float]:
+    """The colour of a world that has one, linear: that of its background node where nothing is linked to it."""
+    if world is None:
+        return 0.0, 0.0, 0.0
+    if world.node_tree is not None and world.use_nodes:
+        output = world.node_tree.get_output_node("ALL")
+        links = output.inputs["Surface"].links if output is not None else ()
+        node = links[0].from_node if links else None
+        if node is None or node.type != "BACKGROUND" or node.mute:
+            return 0.0, 0.0, 0.0
+        color, strength = node.inputs["Color"], node.inputs["Strength"]
+        if color.is_linked or strength.is_linked:
+            return 0.0, 0.0, 0.0
+        red, green, blue = (channel * strength.default_value for channel in color.default_value[:3])
+        return red, green, blue
+    red, green, blue = world.color
+    return red, green, blue

@@ -98,7 +98,7 @@ def test_the_background_is_that_of_the_node_at_the_worlds_output(bpy_script):
     colors = bpy_script(
         SETUP
         + """
-from fieldwork.addon.live.engine import world_color
+from fieldwork.addon.live.passes import world_color
 world = bpy.data.worlds.new("sky")
 world.use_nodes = True
 nodes, links = world.node_tree.nodes, world.node_tree.links

@@ -255,6 +255,13 @@ class TrainConfig(Stage):
         le=1,
         description="learning rate of the cameras, in radians and halves of the box; falls to 1 %",
     )
+    environment_start: float = Field(
+        default=0.3,
+        ge=0,
+        le=1,
+        description="share of training before an environment is behind all pixels where few cameras look in the same "
+        "direction; until then only behind those whose colour others see there too: surfaces form first",
+    )
     pose_start: float = Field(default=0.05, ge=0, lt=1, description="share of training before cameras move")
     checkpoint_every: float = Field(default=30.0, gt=0, le=MANY, description="seconds between checkpoints")
     preview_every: float = Field(default=15.0, gt=0, le=MANY, description="seconds between preview pictures")

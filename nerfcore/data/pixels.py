@@ -44,7 +44,7 @@ class Batch:
     alpha); label (R,) int64 class index or VOID; image (R,) int64 index into the store; pixel (R,) int64 its place;
     confidence (R,) float32 in [0, 1], how sure the label is; weight (R,) float32, how much of a pixel drawn as often as
     any other the ray stands for; unknown (R,) bool, where a mask does not know whether something is there, alpha being 0;
-    None: nowhere.
+    None: nowhere; sky (R,) bool, where the environment may be what the pixel shows; None: everywhere.
     """
 
     origins: torch.Tensor
@@ -57,6 +57,7 @@ class Batch:
     confidence: torch.Tensor
     weight: torch.Tensor
     unknown: torch.Tensor | None = None
+    sky: torch.Tensor | None = None
 
     def part(self, rays: slice) -> Batch:
         """Some of the rays."""

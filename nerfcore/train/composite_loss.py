@@ -28,8 +28,8 @@ def composite_loss(
     share: tuple[float, float | torch.Tensor] = (1.0, 1.0),
     squared: bool = False,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """The loss of R rays in front of `background` (R, 3), or of the environment where the model has one, and their mean
-    squared colour error; both scalars.
+    """The loss of R rays in front of `background` (R, 3), or of the environment where the model has one and it may be what
+    they show, and their mean squared colour error; both scalars.
 
     Args:
         progress: of the schedule, in [0, 1]; some terms begin later.
@@ -41,7 +41,10 @@ def composite_loss(
     rays, labels = share
     alpha, behind, environment = batch.alpha[:, None], 1 - rendered.opacity, rendered.environment
     if environment is not None:
-        background, behind = environment.color, environment.weight
+        behind = environment.weight
+        background = (
+            environment.color if batch.sky is None else torch.where(batch.sky[:, None], environment.color, background)
+        )
     target = batch.rgb * alpha + background.detach() * (1 - alpha)
     predicted = rendered.color + background * behind[:, None]
     total = rays * config.rgb_weight * color_loss(predicted, target, config, squared)
@@ -50,18 +53,23 @@ def composite_loss(
         opacity = torch.lerp(rendered.opacity.detach(), rendered.opacity, model.label_pull)
         probabilities = at_given_opacity(rendered.probabilities, opacity)
         if environment is not None and environment.probabilities is not None:
-            probabilities = probabilities + environment.probabilities * environment.weight.detach()[:, None]
+            weight = environment.weight.detach() if batch.sky is None else environment.weight.detach() * batch.sky
+            probabilities = probabilities + environment.probabilities * weight[:, None]
         price = semantic_loss(probabilities, batch.label, counted, batch.confidence)
         total = total + labels * config.semantic_weight * price
         if config.entropy_ratio > 0 and config.regularization > 0 and progress >= config.entropy_start:
             weight = config.regularization * config.entropy_ratio * config.semantic_weight
             total = total + labels * weight * entropy_loss(probabilities, counted)
     if config.regularization > 0:
-        total = total + rays * config.regularization * _regularizers(rendered, progress, config, model.contracted)
+        total = total + rays * config.regularization * _regularizers(
+            batch, rendered, progress, config, model.contracted
+        )
     return total, rays * ((predicted.detach() - target) ** 2 * batch.weight[:, None]).mean()
 
 
-def _regularizers(rendered: Rendered, progress: float, config: LossConfig, contracted: bool) -> torch.Tensor:
+def _regularizers(
+    batch: Batch, rendered: Rendered, progress: float, config: LossConfig, contracted: bool
+) -> torch.Tensor:
     samples = rendered.samples
     total = rendered.opacity.sum() * 0
     if config.distortion_weight > 0 and progress >= config.distortion_start:
@@ -72,5 +80,6 @@ def _regularizers(rendered: Rendered, progress: float, config: LossConfig, contr
     if config.opacity_weight > 0:
         total = total + config.opacity_weight * opacity_entropy(rendered.opacity)
     if config.environment_weight > 0 and rendered.environment is not None:
-        total = total + config.environment_weight * rendered.opacity.mean()
+        priced = rendered.opacity if batch.sky is None else rendered.opacity * batch.sky
+        total = total + config.environment_weight * priced.mean()
     return total

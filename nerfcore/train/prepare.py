@@ -26,6 +26,7 @@ from ..render.run import CPU_IMAGE_SIZE, GPU_IMAGE_SIZE, RunInfo, new_model
 from ..sampling.known_space import KnownSpace, known_space
 from .background import LEVEL, choose_background
 from .depth import depth_scale, find_depths
+from .sky_masks import sky_masks
 from .trainer import Trainer
 
 VIEWS_ENOUGH = 8  # cells seen by this many cameras count fully as evidence; not tuned
@@ -164,6 +165,8 @@ def make_trainer(project_folder: Path, info: RunInfo, scene: Scene, device: torc
         model.field.blend.views.copy_((space.views / VIEWS_ENOUGH).clamp(max=1))
     trainer = Trainer(model, store, config, LEVEL.get(config.scene.background), report.check)
     trainer.space = space
+    if model.environment is not None:
+        trainer.sky = sky_masks(scene, store.views, store.cameras, device)
     if config.loss.depth_weight > 0:
         scale = depth_scale(world_from_sfm(project), box.box_from_world)
         visibility = load_visibility(project_folder)

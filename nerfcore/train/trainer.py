@@ -27,6 +27,7 @@ from .pose_refinement import PoseRefinement, level_weights
 from .replay import CudaRecording, Replay, asked_mode
 from .results import Learned, Measured, ShardResult
 from .schedule import bias_correction, padded_capacity, rate_factor, sample_budget
+from .sky_masks import SkyMasks
 from .voxel_init import PixelFeatures, initialise
 
 BETAS = (0.9, 0.99)
@@ -68,6 +69,7 @@ class Trainer:
         self.cache = CoarseCache(store)
         self.poses = PoseRefinement(store.rays, config.train) if config.train.refine_poses else None
         self.depths: DepthRays | None = None
+        self.sky: SkyMasks | None = None  # where the environment may be before the rest gets it too
         self.space: KnownSpace | None = None  # what the photos show, if that was asked
         self.check = check
         semantic = config.loss.semantic_weight > 0 and config.sampling.outline_rays > 0
@@ -141,6 +143,8 @@ class Trainer:
             # Rays of known length, which are rendered as well, come after those of the batch.
             behind = [r.environment.weight for r in rendered if r.environment is not None]
             weight = torch.cat(behind)[: len(batch.label)]
+            if batch.sky is not None:
+                weight = weight * batch.sky
             model.environment.observe(weight, batch.label != VOID, model.labelled)
         if model.field.blend is not None and self.steps % config.sampling.update_every == 0:
             model.field.blend.update(
@@ -171,6 +175,7 @@ class Trainer:
             (self.rays, self._capacity(progress, 1), *model.fixed_shares()),
             (model.warming_up, None if blend is None else blend.warming_up),
             (self.steps < c.loss.rgb_warmup, progress >= c.loss.entropy_start, progress >= c.loss.distortion_start),
+            progress >= c.train.environment_start,
             (None if hit is None else (hit.data_ptr(), len(hit)), model.occupancy.march_settings()),
             0 if self.depths is None else len(self.depths),
         )
@@ -190,6 +195,8 @@ class Trainer:
         """Gradients of the composite loss of rays drawn here, summed in the order of the shards; only the grid's, and the
         random numbers, are changed."""
         batch = self.draw() if moving is None else moving.move(self.draw())
+        if self.sky is not None and progress < self.config.train.environment_start:
+            batch = replace(batch, sky=self.sky.at(batch.image, batch.pixel))
         tasks = self._shard_tasks(batch, progress)
         if self.config.loss.regularization * self.config.loss.sparsity_weight > 0:
             tasks.append(self._sparsity_task())

@@ -35,7 +35,7 @@ from fieldwork.nerfcore.render.run import Trained, load_trained
 from fieldwork.nerfcore.render.verb import look_at
 from fieldwork.nerfcore.train.background import INFINITE
 from fieldwork.nerfcore.train.composite_loss import composite_loss
-from fieldwork.nerfcore.train.infinity import _between_points, share_at_infinity
+from fieldwork.nerfcore.train.infinity import between_points, share_at_infinity
 from fieldwork.nerfcore.train.prepare import make_trainer, plan_run
 from fieldwork.nerfcore.verbs import run_verb
 from fieldwork.tests.nerfcore.support.ball import SMALL, ball_project, draw
@@ -130,7 +130,7 @@ def test_what_has_a_place_is_not_at_infinity(tmp_path: Path) -> None:
     assert share_at_infinity(load_scene(project)) < INFINITE
 
 
-def test_what_lies_between_points_is_not_at_infinity(tmp_path: Path) -> None:
+def test_what_liesbetween_points_is_not_at_infinity(tmp_path: Path) -> None:
     """A plain floor has the same colour from everywhere, like a sky, but points of its joints around it."""
     scene = load_scene(under_the_sky(tmp_path / "p"))
     alone = share_at_infinity(replace(scene, points=Points.empty()))
@@ -149,7 +149,7 @@ def test_what_lies_between_points_is_not_at_infinity(tmp_path: Path) -> None:
 def test_points_behind_a_panorama_have_things_between_them() -> None:
     panorama_ = Camera(model="EQUIRECTANGULAR", width=64, height=32, fx=32, fy=32, cx=32, cy=16)
     band = np.array([[np.sin(a), h, np.cos(a)] for a in np.linspace(-3.1, 3.1, 60) for h in (-0.5, 0.5)])
-    between = _between_points(View("all around", panorama_, np.eye(4), Path()), band).reshape(32, 64)
+    between = between_points(View("all around", panorama_, np.eye(4), Path()), band).reshape(32, 64)
     assert between[16].all()  # the horizon, also at both ends of the picture
     assert not between[[0, -1]].any()
 

@@ -1,0 +1,133 @@
+"""Which pixels of the training photos may show the sky: those whose colour other cameras see in the same direction.
+
+An environment, a colour for each direction, explains whatever few cameras see there: a capture of 20 photos from inside
+of a court lost its ground and its walls to it. While its surfaces form it is therefore behind these pixels only.
+Measured: docs/experiments.md, “An environment that waits”.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+import torch
+
+from ..data.photo import photo_of
+from ..data.pixels import training_size
+from ..data.scene import Scene, View
+from ..geometry.cameras import Camera, pixel_centers, project, rays
+from ..images.picture import resized
+from .infinity import SIDE, between_points
+
+FEW = 4  # other cameras that look in the direction of a pixel, at the median: with fewer the environment waits
+OTHERS = 40  # photos at most that a photo is compared with
+ALIKE = 4.0  # of 255: what one colour in one direction may differ by, beyond what it differs by between neighbours
+UNEVEN = 40.0  # of 255: difference of neighbours from which on nearly every colour would be alike
+AGREE = 0.2  # of the cameras that look there, and one at least: things hide the sky from many
+MAJORITY = 5  # pixels: side of the neighbourhood that decides
+CLOSE = 0.2  # of a photo's width: points no farther from each other have something between them, not sky
+
+
+@dataclass(frozen=True)
+class SkyMasks:
+    """Small masks of the views of a `PixelStore`: values (N,) bool of all of them; of each view (V,) int64 the first of
+    its values, the width and the height of its mask, and those of its photo."""
+
+    values: torch.Tensor
+    first: torch.Tensor
+    size: tuple[torch.Tensor, torch.Tensor]
+    photo: tuple[torch.Tensor, torch.Tensor]
+
+    def at(self, image: torch.Tensor, pixel: torch.Tensor) -> torch.Tensor:
+        """Which pixels (R,) int64 of the photos `image` (R,) int64 may show the sky, (R,) bool."""
+        width = self.photo[0][image]
+        row, column = torch.div(pixel, width, rounding_mode="floor"), pixel % width
+        small = self.size[0][image]
+        row = torch.div(row * self.size[1][image], self.photo[1][image], rounding_mode="floor")
+        column = torch.div(column * small, width, rounding_mode="floor")
+        return self.values[self.first[image] + row * small + column]
+
+
+def sky_masks(scene: Scene, views: list[View], cameras: list[Camera], device: torch.device) -> SkyMasks | None:
+    """The masks of training `views`, whose pictures have the sizes of `cameras`; None where so many cameras look in each
+    direction that colours of directions explain nothing but what is far away."""
+    small = [Small.of(view) for view in views]
+    others = np.unique(np.linspace(0, len(views) - 1, OTHERS).round().astype(int))
+    compared = [[small[j] for j in others if j != i] for i in range(len(views))]
+    counted = [_looking_and_alike(photo, rest) for photo, rest in zip(small, compared)]
+    shares = [looking / max(len(rest), 1) for (looking, _), rest in zip(counted, compared)]
+    if np.median(np.concatenate(shares)) * (len(views) - 1) >= FEW:
+        return None
+    found = [_sky_of(photo, *counts, scene.points.xyz) for photo, counts in zip(small, counted)]
+
+    def column(numbers: list[int]) -> torch.Tensor:
+        return torch.tensor(numbers, device=device)
+
+    first = np.cumsum([0, *(mask.size for mask in found)])[:-1]
+    return SkyMasks(
+        torch.from_numpy(np.concatenate([mask.ravel() for mask in found])).to(device),
+        column(first.tolist()),
+        (column([mask.shape[1] for mask in found]), column([mask.shape[0] for mask in found])),
+        (column([camera.width for camera in cameras]), column([camera.height for camera in cameras])),
+    )
+
+
+@dataclass(frozen=True)
+class Small:
+    """A small version of a photo: colors (H, W, 3) float32, the least and the largest of neighbours (H, W, 3), and
+    directions (H · W, 3) in the world, NaN where the lens does not see."""
+
+    view: View
+    camera: Camera
+    colors: np.ndarray
+    least: np.ndarray
+    largest: np.ndarray
+    directions: np.ndarray
+
+    @classmethod
+    def of(cls, view: View) -> Small:
+        camera = view.camera.resized(*training_size(view.camera, SIDE))
+        colors = resized(photo_of(view), camera.width, camera.height).pixels[..., :3].astype(np.float32)
+        directions, sees = rays(camera, pixel_centers(camera.width, camera.height).reshape(-1, 2))
+        directions = np.where(sees[:, None], directions @ view.camera_to_world[:3, :3].T, np.nan)
+        least, largest = (f(colors, (3, 3, 1)) for f in (scipy.ndimage.minimum_filter, scipy.ndimage.maximum_filter))
+        return cls(view, camera, colors, least, largest, directions)
+
+
+def _looking_and_alike(photo: Small, others: list[Small]) -> tuple[np.ndarray, np.ndarray]:
+    """How many others look in the direction of each pixel of a small photo, and how many see its colour there, (H · W,)."""
+    colors = photo.colors.reshape(-1, 3)
+    looking, alike = np.zeros(len(colors), int), np.zeros(len(colors), int)
+    for other in others:
+        index, pixel = _seen_by(other, photo.directions)
+        least, largest = (values.reshape(-1, 3)[pixel] for values in (other.least, other.largest))
+        color = colors[index]
+        apart = np.maximum(least - color, color - largest).max(1)
+        looking[index] += 1
+        alike[index] += (apart < ALIKE) & ((largest - least).max(1) < UNEVEN)
+    return looking, alike
+
+
+def _sky_of(photo: Small, looking: np.ndarray, alike: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Which pixels (H, W) bool of a small photo may show the sky."""
+    # Where nobody else looks nothing speaks against it.
+    agree = (looking == 0) | (alike >= np.maximum(1, AGREE * looking))
+    agree &= ~between_points(photo.view, points, CLOSE)
+    agree = agree.reshape(photo.camera.height, photo.camera.width)
+    return scipy.ndimage.uniform_filter(agree.astype(np.float32), MAJORITY) > 0.5
+
+
+def _seen_by(other: Small, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which of the directions (N, 3) a camera sees, as indices (M,), and in which of its pixels (M,)."""
+    camera = other.camera
+    local = directions @ other.view.camera_to_world[:3, :3]
+    ahead = np.isfinite(local).all(1)
+    if camera.model not in ("EQUIRECTANGULAR", "OPENCV_FISHEYE"):
+        ahead &= local[:, 2] > 0
+    index = ahead.nonzero()[0]
+    with np.errstate(invalid="ignore"):
+        place = project(camera, local[index])
+        inside = ((place >= 0) & (place < [camera.width, camera.height])).all(1)
+    column, row = place[inside].astype(int).T
+    return index[inside], row * camera.width + column

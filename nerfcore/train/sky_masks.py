@@ -52,14 +52,19 @@ class SkyMasks:
 def sky_masks(scene: Scene, views: list[View], cameras: list[Camera], device: torch.device) -> SkyMasks | None:
     """The masks of training `views`, whose pictures have the sizes of `cameras`; None where so many cameras look in each
     direction that colours of directions explain nothing but what is far away."""
-    small = [Small.of(view) for view in views]
-    others = np.unique(np.linspace(0, len(views) - 1, OTHERS).round().astype(int))
-    compared = [[small[j] for j in others if j != i] for i in range(len(views))]
-    counted = [_looking_and_alike(photo, rest) for photo, rest in zip(small, compared)]
-    shares = [looking / max(len(rest), 1) for (looking, _), rest in zip(counted, compared)]
-    if np.median(np.concatenate(shares)) * (len(views) - 1) >= FEW:
+    chosen = np.unique(np.linspace(0, len(views) - 1, OTHERS).round().astype(int)).tolist()
+    compared = {i: Small.of(views[i]) for i in chosen}
+
+    def counts(i: int, photo: Small) -> tuple[np.ndarray, np.ndarray]:
+        return _looking_and_alike(photo, [other for j, other in compared.items() if j != i])
+
+    looking = np.concatenate([counts(i, photo)[0] for i, photo in compared.items()])
+    if np.median(looking) / max(len(chosen) - 1, 1) * (len(views) - 1) >= FEW:
         return None
-    found = [_sky_of(photo, *counts, scene.points.xyz) for photo, counts in zip(small, counted)]
+    found = []
+    for i, view in enumerate(views):
+        photo = compared.get(i) or Small.of(view)
+        found.append(_sky_of(photo, *counts(i, photo), scene.points.xyz))
 
     def column(numbers: list[int]) -> torch.Tensor:
         return torch.tensor(numbers, device=device)

@@ -24,6 +24,7 @@ from .errors import Cancelled, explained, wrong_value
 from .project.lock import lockable, project_lock, project_of
 from .streams import (
     NoReader,
+    give_up_stdout,
     interruptible,
     keep_quiet_about_destructors,
     open_standard_streams,
@@ -331,6 +332,7 @@ def main(arguments: list[str] | None = None) -> int:
         return error.exit_code
     except OSError as error:  # of help that nobody takes; verbs tell of their own
         click.echo(f"Nothing can be printed: {error.strerror} on standard output.", err=True)
+        give_up_stdout()
         return 1
     return code if isinstance(code, int) else 0
 

@@ -51,6 +51,14 @@ def open_standard_streams() -> None:
         sys.stdout.reconfigure(errors="backslashreplace")
 
 
+def give_up_stdout() -> None:
+    """Lead standard output to nothing: what it did not take would be tried again as Python exits, which changes the exit
+    code (Python's documentation of SIGPIPE)."""
+    nothing = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nothing, 1)
+    os.close(nothing)
+
+
 class _Results:
     """Standard output as results go to it: what is written arrives, or `NoReader` is raised."""
 

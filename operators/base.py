@@ -33,8 +33,8 @@ def scene_settings(**names: str) -> Callable[[type], type]:
     """
 
     def decorate(cls: type) -> type:
-        own = dict(cls.__dict__.get("__annotations__", {}))
-        cls.__annotations__ = own | {name: SETTINGS[scene] for name, scene in names.items()}
+        # Not of the class's __dict__: Python 3.14 keeps there only what makes them.
+        cls.__annotations__ = cls.__annotations__ | {name: SETTINGS[scene] for name, scene in names.items()}
         cls.scene_names = names
         return cls
 

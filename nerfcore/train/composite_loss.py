@@ -53,8 +53,9 @@ def composite_loss(
         opacity = torch.lerp(rendered.opacity.detach(), rendered.opacity, model.label_pull)
         probabilities = at_given_opacity(rendered.probabilities, opacity)
         if environment is not None and environment.probabilities is not None:
-            weight = environment.weight.detach() if batch.sky is None else environment.weight.detach() * batch.sky
-            probabilities = probabilities + environment.probabilities * weight[:, None]
+            left = environment.weight.detach()
+            left = left if batch.sky is None else left * batch.sky
+            probabilities = probabilities + environment.probabilities * left[:, None]
         price = semantic_loss(probabilities, batch.label, counted, batch.confidence)
         total = total + labels * config.semantic_weight * price
         if config.entropy_ratio > 0 and config.regularization > 0 and progress >= config.entropy_start:

@@ -29,7 +29,7 @@ def share_at_infinity(scene: Scene) -> float:
     """
     chosen = np.unique(np.linspace(0, len(scene.train) - 1, MOST_PHOTOS).round().astype(int))
     views = [scene.views[scene.train[i]] for i in chosen]
-    seen = [_colored_directions(view) for view in views]
+    seen = [colored_directions(view) for view in views]
     scales = [min(1.0, SIDE / max(view.camera.width, view.camera.height)) for view in views]
     focal = np.median([view.camera.pixels_per_radian * scale for view, scale in zip(views, scales)])
     directions, colors = (np.concatenate(part) for part in zip(*seen))
@@ -49,7 +49,7 @@ def share_at_infinity(scene: Scene) -> float:
     return float(far.mean()) if (far & between).sum() <= BETWEEN * far.sum() else 0.0
 
 
-def _colored_directions(view: View) -> tuple[np.ndarray, np.ndarray]:
+def colored_directions(view: View) -> tuple[np.ndarray, np.ndarray]:
     """Unit directions (N, 3) in the world of a small version of a photo, NaN where the lens does not see, and its colours
     (N, 3) in [0, 255]."""
     camera = view.camera.resized(*training_size(view.camera, SIDE))

@@ -7,18 +7,17 @@ Measured: docs/experiments.md, “An environment that waits”.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import scipy
 import torch
 
-from ..data.photo import photo_of
 from ..data.pixels import training_size
 from ..data.scene import Scene, View
-from ..geometry.cameras import Camera, pixel_centers, project, rays
-from ..images.picture import resized
-from .infinity import SIDE, between_points
+from ..geometry.cameras import Camera, project
+from .infinity import SIDE, between_points, colored_directions
 
 FEW = 4  # other cameras that look in the direction of a pixel, at the median: with fewer the environment waits
 OTHERS = 40  # photos at most that a photo is compared with
@@ -49,22 +48,34 @@ class SkyMasks:
         return self.values[self.first[image] + row * small + column]
 
 
-def sky_masks(scene: Scene, views: list[View], cameras: list[Camera], device: torch.device) -> SkyMasks | None:
+def sky_masks(
+    scene: Scene,
+    views: list[View],
+    cameras: list[Camera],
+    device: torch.device,
+    check: Callable[[], None] = lambda: None,
+) -> SkyMasks | None:
     """The masks of training `views`, whose pictures have the sizes of `cameras`; None where so many cameras look in each
-    direction that colours of directions explain nothing but what is far away."""
+    direction that colours of directions explain nothing but what is far away. `check` is called for each photo and may
+    raise to stop."""
     chosen = np.unique(np.linspace(0, len(views) - 1, OTHERS).round().astype(int)).tolist()
-    compared = {i: Small.of(views[i]) for i in chosen}
+    compared: dict[int, Small] = {}
+    for i in chosen:
+        check()
+        compared[i] = Small.of(views[i])
 
     def counts(i: int, photo: Small) -> tuple[np.ndarray, np.ndarray]:
+        check()
         return _looking_and_alike(photo, [other for j, other in compared.items() if j != i])
 
-    looking = np.concatenate([counts(i, photo)[0] for i, photo in compared.items()])
+    counted = {i: counts(i, photo) for i, photo in compared.items()}
+    looking = np.concatenate([looking for looking, _ in counted.values()])
     if np.median(looking) / max(len(chosen) - 1, 1) * (len(views) - 1) >= FEW:
         return None
     found = []
     for i, view in enumerate(views):
         photo = compared.get(i) or Small.of(view)
-        found.append(_sky_of(photo, *counts(i, photo), scene.points.xyz))
+        found.append(_sky_of(photo, *(counted.get(i) or counts(i, photo)), scene.points.xyz))
 
     def column(numbers: list[int]) -> torch.Tensor:
         return torch.tensor(numbers, device=device)
@@ -80,34 +91,31 @@ def sky_masks(scene: Scene, views: list[View], cameras: list[Camera], device: to
 
 @dataclass(frozen=True)
 class Small:
-    """A small version of a photo: colors (H, W, 3) float32, the least and the largest of neighbours (H, W, 3), and
-    directions (H · W, 3) in the world, NaN where the lens does not see."""
+    """A small version of a photo, of H · W pixels: directions in the world, NaN where the lens does not see, colors in
+    [0, 255], and the least and the largest of neighbours, each (H · W, 3)."""
 
     view: View
     camera: Camera
+    directions: np.ndarray
     colors: np.ndarray
     least: np.ndarray
     largest: np.ndarray
-    directions: np.ndarray
 
     @classmethod
     def of(cls, view: View) -> Small:
         camera = view.camera.resized(*training_size(view.camera, SIDE))
-        colors = resized(photo_of(view), camera.width, camera.height).pixels[..., :3].astype(np.float32)
-        directions, sees = rays(camera, pixel_centers(camera.width, camera.height).reshape(-1, 2))
-        directions = np.where(sees[:, None], directions @ view.camera_to_world[:3, :3].T, np.nan)
-        least, largest = (f(colors, (3, 3, 1)) for f in (scipy.ndimage.minimum_filter, scipy.ndimage.maximum_filter))
-        return cls(view, camera, colors, least, largest, directions)
+        directions, colors = colored_directions(view)
+        picture = colors.reshape(camera.height, camera.width, 3)
+        least, largest = (f(picture, (3, 3, 1)) for f in (scipy.ndimage.minimum_filter, scipy.ndimage.maximum_filter))
+        return cls(view, camera, directions, colors, least.reshape(-1, 3), largest.reshape(-1, 3))
 
 
 def _looking_and_alike(photo: Small, others: list[Small]) -> tuple[np.ndarray, np.ndarray]:
     """How many others look in the direction of each pixel of a small photo, and how many see its colour there, (H · W,)."""
-    colors = photo.colors.reshape(-1, 3)
-    looking, alike = np.zeros(len(colors), int), np.zeros(len(colors), int)
+    looking, alike = np.zeros(len(photo.colors), int), np.zeros(len(photo.colors), int)
     for other in others:
         index, pixel = _seen_by(other, photo.directions)
-        least, largest = (values.reshape(-1, 3)[pixel] for values in (other.least, other.largest))
-        color = colors[index]
+        color, least, largest = photo.colors[index], other.least[pixel], other.largest[pixel]
         apart = np.maximum(least - color, color - largest).max(1)
         looking[index] += 1
         alike[index] += (apart < ALIKE) & ((largest - least).max(1) < UNEVEN)

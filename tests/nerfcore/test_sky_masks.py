@@ -12,6 +12,7 @@ from fieldwork.nerfcore.config import make_config
 from fieldwork.nerfcore.data.load import load_scene
 from fieldwork.nerfcore.data.pixels import PixelStore
 from fieldwork.nerfcore.data.scene import Scene
+from fieldwork.nerfcore.errors import Cancelled
 from fieldwork.nerfcore.geometry.points import Points
 from fieldwork.nerfcore.kernels.device import use_device
 from fieldwork.nerfcore.progress import Reporter
@@ -148,3 +149,17 @@ def test_later_it_is_behind_all_pixels(court: Path) -> None:
     assert torch.equal(early.sky, trainer.sky.at(early.image, early.pixel))
     assert late.sky is None
     assert trainer_of(court, scene__background="random").sky is None
+    assert trainer_of(court, train__environment_start="0").sky is None
+
+
+def test_masks_are_cancelled_between_photos(court: Path) -> None:
+    scene, calls = load_scene(court), []
+
+    def check() -> None:
+        calls.append(1)
+        if len(calls) == 3:
+            raise Cancelled
+
+    with pytest.raises(Cancelled):
+        sky_masks(scene, scene.views, [view.camera for view in scene.views], CPU, check)
+    assert len(calls) == 3

@@ -51,14 +51,14 @@ class CameraRays:
 
     def camera_directions(self, image: torch.Tensor, pixel: torch.Tensor) -> torch.Tensor:
         """Unit directions (N, 3) in camera axes of pixels y · width + x; NaN where the lens cannot be inverted."""
-        centers = _centers(pixel, self.width[image])
-        fx, fy, cx, cy = self.lens[image].unbind(1)
+        centers = _centers(pixel, self._of(self.width, image))
+        fx, fy, cx, cy = self._of(self.lens, image).unbind(1)
         x, y = centers.unbind(1)
         directions = torch.stack([(x - cx) / fx, (y - cy) / fy, torch.ones_like(x)], 1)
         directions = directions / directions.norm(dim=1, keepdim=True)
         if self.lenses is None:
             return directions
-        number = self.number[image]
+        number = self._of(self.number, image)
         lens = number.clamp(min=0)
         if self.table is None:
             others = self.lenses.directions(lens, centers)
@@ -68,8 +68,16 @@ class CameraRays:
 
     def __call__(self, image: torch.Tensor, pixel: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Origins and unit directions (N, 3), normalised frame."""
-        directions = torch.einsum("nij,nj->ni", self.rotation[image], self.camera_directions(image, pixel))
-        return self.center[image].contiguous(), directions.contiguous()
+        directions = self.camera_directions(image, pixel)
+        if len(self.cameras) == 1:
+            turned = directions @ self.rotation[0].T
+        else:
+            turned = torch.einsum("nij,nj->ni", self.rotation[image], directions)
+        return self._of(self.center, image).contiguous(), turned.contiguous()
+
+    def _of(self, table: torch.Tensor, image: torch.Tensor) -> torch.Tensor:
+        """Rows (N, …) of the cameras (K, …) of `image` (N,), none of which is looked up where there is one camera."""
+        return table.expand(len(image), *table.shape[1:]) if len(self.cameras) == 1 else table[image]
 
 
 def _centers(pixel: torch.Tensor, width: torch.Tensor | int) -> torch.Tensor:

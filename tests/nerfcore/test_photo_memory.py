@@ -54,6 +54,21 @@ def test_lenses_are_inverted_as_by_the_camera(name: str) -> None:
     assert np.abs(found[valid].numpy() - expected[valid]).max() < 1e-6
 
 
+@pytest.mark.parametrize("name", CAMERAS)
+def test_a_camera_alone_has_the_rays_it_has_among_others(name: str) -> None:
+    cameras = [CAMERAS["fisheye"], CAMERAS[name], CAMERAS["pinhole"]]
+    poses = np.stack([np.eye(4)] * 3)
+    poses[:, :3, :3] = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3, 3)))[0]
+    poses[:, :3, 3] = np.arange(9).reshape(3, 3)
+    pixel = torch.arange(cameras[1].width * cameras[1].height)
+    origins, directions = CameraRays(cameras[1:2], poses[1:2], CPU)(torch.zeros_like(pixel), pixel)
+    expected = CameraRays(cameras, poses, CPU)(torch.ones_like(pixel), pixel)
+    assert torch.equal(origins, expected[0])
+    assert torch.allclose(directions, expected[1], rtol=0, atol=1e-6, equal_nan=True)
+    assert origins.is_contiguous()
+    assert directions.is_contiguous()
+
+
 def test_directions_are_the_same_from_a_table_and_for_each_batch() -> None:
     cameras = list(CAMERAS.values()) * 2
     poses = np.tile(np.eye(4), (len(cameras), 1, 1))

@@ -221,8 +221,12 @@ def _work(folder: Path, numbers: list, report: Reporter, share: float, before: f
         with open(words, "wb") as log:
             processes += [_worker(folder, own, log) for own in shares]
             alive = [_Pulse(process) for process in processes]
+        done = [0] * workers  # of each share, which is worked off in its order
         while any(process.poll() is None for process in processes):
-            report.progress(before + share * sum(map(there, numbers)) / len(numbers))
+            for index, own in enumerate(shares):
+                while done[index] < len(own) and there(own[done[index]]):
+                    done[index] += 1
+            report.progress(before + share * sum(done) / len(numbers))
             if any(process.poll() for process in processes):
                 break
             for index, pulse in enumerate(alive):

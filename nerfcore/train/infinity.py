@@ -1,5 +1,5 @@
 """Whether photos show something infinitely far away, as the sky: it has the same colour in the same direction from everywhere,
-and no points of the reconstruction around it."""
+no points of the reconstruction around it, and is above the horizon."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from ..images.picture import resized
 MOST_PHOTOS, SIDE = 40, 120  # that are looked at, and their longest side in pixels
 ALIKE = 4.0  # standard deviation of colours, of 255
 BETWEEN = 0.5  # share of what looks infinitely far that may lie between points: plain floors and walls do, sky mostly does not
+HIGHER = 3.0  # times as often directions above the horizon must look infinitely far as those below it
 # Not tuned: the next two.
 CELL, CELL_PIXELS = 1.0, 3.0  # degrees, and pixels at least, in which directions count as the same
 CAMERAS = 3  # that must look there
@@ -25,7 +26,8 @@ FEWEST = 20  # points in a photo, from which on they have a hull
 def share_at_infinity(scene: Scene) -> float:
     """Share of the training photos' pixels that lie infinitely far away: at least `CAMERAS` cameras look that way, and what
     all of them see there has one colour. Walls with a texture have several; plain ones have light that changes along them.
-    Where that is too little, points tell: a plain floor lies between points of its joints and of what stands on it.
+    Where that is too little, points tell: a plain floor lies between points of its joints and of what stands on it. And the
+    horizon: white walls are alike below it as well. The world's z axis is up.
     """
     chosen = np.unique(np.linspace(0, len(scene.train) - 1, MOST_PHOTOS).round().astype(int))
     views = [scene.views[scene.train[i]] for i in chosen]
@@ -44,9 +46,19 @@ def share_at_infinity(scene: Scene) -> float:
     for channel in colors.T:
         mean = np.bincount(cell, channel) / pixels
         variance += np.bincount(cell, (channel - mean[cell]) ** 2) / pixels / 3
-    far = ((cameras >= CAMERAS) & (variance < ALIKE**2))[cell]
+    looked = (cameras >= CAMERAS)[cell]
+    far = looked & (variance < ALIKE**2)[cell]
     between = np.concatenate([between_points(view, scene.points.xyz) for view in views])[usable]
-    return float(far.mean()) if (far & between).sum() <= BETWEEN * far.sum() else 0.0
+    if (far & between).sum() > BETWEEN * far.sum():
+        return 0.0
+    above, below = (far[looked & half].sum() / max(int((looked & half).sum()), 1) for half in _halves(directions))
+    return float(far.mean()) if above >= HIGHER * below else 0.0
+
+
+def _halves(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which directions (N, 3) point above the horizon, and which do not."""
+    above = directions[:, 2] > 0
+    return above, ~above
 
 
 def colored_directions(view: View) -> tuple[np.ndarray, np.ndarray]:

@@ -13,6 +13,7 @@ from fieldwork.tests.nerfcore.support.ball import ball_project, camera_poses
 from PIL import Image
 
 VIEWS = 48
+FLOOR = -2.0  # height of the floor
 
 
 def sky(directions: np.ndarray) -> np.ndarray:
@@ -29,14 +30,25 @@ def looking(camera: Camera, pose: np.ndarray) -> np.ndarray:
     return d / np.linalg.norm(d, axis=-1, keepdims=True)
 
 
-def under_the_sky(folder: Path, named: bool = False) -> Path:
-    """The ball's capture with opaque photos, in which the sky is behind it; a class of its own where it is `named`."""
+def floor(directions: np.ndarray, center: np.ndarray) -> np.ndarray:
+    """Colours (…, 3) of a floor with waves far below, as a camera at `center` (3,) sees it in directions (…, 3)."""
+    place = center[:2] + directions[..., :2] * ((FLOOR - center[2]) / np.minimum(directions[..., 2:], -1e-6))
+    return np.repeat(0.5 + 0.3 * np.sin(4 * place[..., :1]) * np.sin(4 * place[..., 1:]), 3, -1)
+
+
+def under_the_sky(folder: Path, named: bool = False, above_a_floor: bool = False) -> Path:
+    """The ball's capture with opaque photos, in which the sky is behind it, on all sides or above the horizon alone; a class
+    of its own where it is `named`."""
     project = ball_project(folder, views=VIEWS)
     camera = load_scene(project).views[0].camera
     for i, pose in enumerate(camera_poses(VIEWS)):
         path = project / "images" / f"{i:02d}.png"
         rgba = np.asarray(Image.open(path))
-        behind = (sky(looking(camera, pose)) * 255 + 0.5).astype(np.uint8)
+        directions = looking(camera, pose)
+        colors = sky(directions)
+        if above_a_floor:
+            colors = np.where(directions[..., 2:] < 0, floor(directions, pose[:3, 3]), colors)
+        behind = (colors * 255 + 0.5).astype(np.uint8)
         Image.fromarray(np.where(rgba[..., 3:] > 0, rgba[..., :3], behind)).save(path)
         if named:
             labels = project / "labels" / path.name

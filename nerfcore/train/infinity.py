@@ -16,7 +16,7 @@ from ..images.picture import resized
 MOST_PHOTOS, SIDE = 40, 120  # that are looked at, and their longest side in pixels
 ALIKE = 4.0  # standard deviation of colours, of 255
 BETWEEN = 0.5  # share of what looks infinitely far that may lie between points: plain floors and walls do, sky mostly does not
-HIGHER = 3.0  # times as often directions above the horizon must look infinitely far as those below it
+HIGHER = 3.0  # times as often directions above the horizon must look infinitely far as below: “White walls below the horizon”
 # Not tuned: the next two.
 CELL, CELL_PIXELS = 1.0, 3.0  # degrees, and pixels at least, in which directions count as the same
 CAMERAS = 3  # that must look there
@@ -51,14 +51,9 @@ def share_at_infinity(scene: Scene) -> float:
     between = np.concatenate([between_points(view, scene.points.xyz) for view in views])[usable]
     if (far & between).sum() > BETWEEN * far.sum():
         return 0.0
-    above, below = (far[looked & half].sum() / max(int((looked & half).sum()), 1) for half in _halves(directions))
+    up = directions[:, 2] > 0
+    above, below = (far[half].sum() / max(int(looked[half].sum()), 1) for half in (up, ~up))
     return float(far.mean()) if above >= HIGHER * below else 0.0
-
-
-def _halves(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which directions (N, 3) point above the horizon, and which do not."""
-    above = directions[:, 2] > 0
-    return above, ~above
 
 
 def colored_directions(view: View) -> tuple[np.ndarray, np.ndarray]:

@@ -1,11 +1,12 @@
 """Whether photos show something infinitely far away, as the sky: it has the same colour in the same direction from everywhere,
-no points of the reconstruction around it, and is above the horizon."""
+no points of the reconstruction around it, and in captures from inside it is above the horizon."""
 
 from __future__ import annotations
 
 import numpy as np
 import scipy
 
+from ..data.box import looks_inward
 from ..data.photo import photo_of
 from ..data.pixels import training_size
 from ..data.scene import Scene, View
@@ -26,8 +27,8 @@ FEWEST = 20  # points in a photo, from which on they have a hull
 def share_at_infinity(scene: Scene) -> float:
     """Share of the training photos' pixels that lie infinitely far away: at least `CAMERAS` cameras look that way, and what
     all of them see there has one colour. Walls with a texture have several; plain ones have light that changes along them.
-    Where that is too little, points tell: a plain floor lies between points of its joints and of what stands on it. And the
-    horizon: white walls are alike below it as well. The world's z axis is up.
+    Where that is too little, points tell: a plain floor lies between points of its joints and of what stands on it. So does the
+    horizon where cameras look around: white walls of a room are alike below it as well. The world's z axis is up.
     """
     chosen = np.unique(np.linspace(0, len(scene.train) - 1, MOST_PHOTOS).round().astype(int))
     views = [scene.views[scene.train[i]] for i in chosen]
@@ -53,7 +54,9 @@ def share_at_infinity(scene: Scene) -> float:
         return 0.0
     up = directions[:, 2] > 0
     above, below = (far[half].sum() / max(int(looked[half].sum()), 1) for half in (up, ~up))
-    return float(far.mean()) if above >= HIGHER * below else 0.0
+    if above < HIGHER * below and not looks_inward(scene.views):
+        return 0.0
+    return float(far.mean())
 
 
 def colored_directions(view: View) -> tuple[np.ndarray, np.ndarray]:

@@ -45,7 +45,6 @@ from hypothesis import strategies as st
 from PIL import Image
 
 STEPS = 500
-BEHIND = {"scene.background": "environment"}
 CLEARED = {"loss.environment_weight": "0.01"}  # so few steps need a higher price
 
 
@@ -62,7 +61,7 @@ class Seen:
 
 def trained_under_the_sky(folder: Path, named: bool = False, **settings: str) -> Seen:
     project = under_the_sky(folder, named)
-    values = {**SMALL, **BEHIND, **CLEARED, **{name.replace("__", "."): value for name, value in settings.items()}}
+    values = {**SMALL, **CLEARED, **{name.replace("__", "."): value for name, value in settings.items()}}
     run_verb("train", TrainParams(project=project, preset="draft", steps=STEPS, set=values), Reporter())
     trained = load_trained(project, "main")
     scene = load_scene(project)
@@ -104,7 +103,7 @@ def test_rays_end_at_the_horizon_wherever_they_begin() -> None:
 
 
 def test_captures_under_the_sky_have_an_environment(tmp_path: Path) -> None:
-    project = under_the_sky(tmp_path / "p", above_a_floor=True)
+    project = under_the_sky(tmp_path / "p")
     info, scene = plan_run(project, "draft", RunConfig(), torch.device("cpu"))
     assert info.config.scene.background == "environment"
     assert info.contracted
@@ -122,7 +121,7 @@ def test_transparent_photos_say_nothing_of_what_is_behind_them(tmp_path: Path) -
 
 def test_what_has_a_place_is_not_at_infinity(tmp_path: Path) -> None:
     """The same colours before each camera, whichever way it looks; and a photo alone, or two."""
-    project = under_the_sky(tmp_path / "p", above_a_floor=True)
+    project = under_the_sky(tmp_path / "p")
     scene = load_scene(project)
     assert share_at_infinity(replace(scene, train=scene.train[:2])) == 0
     first = Image.open(project / "images" / "00.png")
@@ -131,16 +130,16 @@ def test_what_has_a_place_is_not_at_infinity(tmp_path: Path) -> None:
     assert share_at_infinity(load_scene(project)) < INFINITE
 
 
-def test_what_is_alike_below_the_horizon_too_is_not_at_infinity(tmp_path: Path) -> None:
-    """White walls of a room look as a sky does, but on all sides."""
-    under, around = (load_scene(under_the_sky(tmp_path / str(kept), above_a_floor=kept)) for kept in (True, False))
-    assert share_at_infinity(under) > INFINITE
-    assert share_at_infinity(around) == 0
+def test_walls_of_a_room_are_alike_below_the_horizon_too(tmp_path: Path) -> None:
+    """Cameras that look around: white walls look as a sky does, but on all sides."""
+    outside, room = (load_scene(under_the_sky(tmp_path / str(k), outward=True, above_a_floor=k)) for k in (True, False))
+    assert share_at_infinity(outside) > INFINITE
+    assert share_at_infinity(room) == 0
 
 
 def test_what_lies_between_points_is_not_at_infinity(tmp_path: Path) -> None:
     """A plain floor has the same colour from everywhere, like a sky, but points of its joints around it."""
-    scene = load_scene(under_the_sky(tmp_path / "p", above_a_floor=True))
+    scene = load_scene(under_the_sky(tmp_path / "p"))
     alone = share_at_infinity(replace(scene, points=Points.empty()))
     directions = np.random.default_rng(0).normal(size=(2000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -221,7 +220,7 @@ def test_the_verdict_knows_that_the_rest_is_sky(seen: Seen) -> None:
 def test_only_rays_that_were_rendered_teach_the_environment(tmp_path: Path) -> None:
     """With too small a capacity rays that meet the ball are left out; they do not show the sky."""
     project = under_the_sky(tmp_path / "p")
-    config = make_config("draft", {**SMALL, **BEHIND})
+    config = make_config("draft", SMALL)
     info, scene = plan_run(project, "draft", config, use_device())
     trainer = make_trainer(project, info, scene, use_device(), Reporter())
     model = trainer.model

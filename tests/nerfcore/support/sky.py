@@ -36,12 +36,13 @@ def floor(directions: np.ndarray, center: np.ndarray) -> np.ndarray:
     return np.repeat(0.5 + 0.3 * np.sin(4 * place[..., :1]) * np.sin(4 * place[..., 1:]), 3, -1)
 
 
-def under_the_sky(folder: Path, named: bool = False, above_a_floor: bool = False) -> Path:
+def under_the_sky(folder: Path, named: bool = False, outward: bool = False, above_a_floor: bool = False) -> Path:
     """The ball's capture with opaque photos, in which the sky is behind it, on all sides or above the horizon alone; a class
-    of its own where it is `named`."""
-    project = ball_project(folder, views=VIEWS)
+    of its own where it is `named`. `outward`: the cameras turn their backs to the ball, which no photo shows."""
+    poses = [pose @ np.diag([-1.0, 1, -1, 1]) if outward else pose for pose in camera_poses(VIEWS)]
+    project = ball_project(folder, views=VIEWS, given=poses)
     camera = load_scene(project).views[0].camera
-    for i, pose in enumerate(camera_poses(VIEWS)):
+    for i, pose in enumerate(poses):
         path = project / "images" / f"{i:02d}.png"
         rgba = np.asarray(Image.open(path))
         directions = looking(camera, pose)
@@ -49,7 +50,8 @@ def under_the_sky(folder: Path, named: bool = False, above_a_floor: bool = False
         if above_a_floor:
             colors = np.where(directions[..., 2:] < 0, floor(directions, pose[:3, 3]), colors)
         behind = (colors * 255 + 0.5).astype(np.uint8)
-        Image.fromarray(np.where(rgba[..., 3:] > 0, rgba[..., :3], behind)).save(path)
+        ball = (rgba[..., 3:] > 0) & (not outward)
+        Image.fromarray(np.where(ball, rgba[..., :3], behind)).save(path)
         if named:
             labels = project / "labels" / path.name
             label = np.asarray(Image.open(labels))

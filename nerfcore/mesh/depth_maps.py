@@ -26,7 +26,7 @@ from ..progress import Reporter
 from ..render.model import Model
 from ..render.sparse_rays import sparse_rays
 
-CPU_SIDE, GPU_SIDE = 640, 1600  # longest side of a map
+SIDE = 640  # longest side of a map; larger ones lose surface: docs/experiments.md, “How large depth maps are on a GPU”
 CPU_PIXELS, GPU_PIXELS = 8e6, 2e8  # of all maps together
 CPU_RAYS, GPU_RAYS = 8192, 1 << 18  # a tile; the CPU's fits a core's cache
 FIELD_SHARE, FIELD_SIDE = 0.5, 160  # of a map's side on a CPU, and pixels at least: a field is soft, photos refine it
@@ -89,10 +89,10 @@ def spread_views(views: list[View], most: int) -> list[View]:
 
 def map_size(views: list[View], device: torch.device) -> int:
     """Longest side of the depth maps, so that all together stay affordable."""
-    side, most = (CPU_SIDE, CPU_PIXELS) if device.type == "cpu" else (GPU_SIDE, GPU_PIXELS)
-    sizes = [training_size(view.camera, side) for view in views]
+    most = CPU_PIXELS if device.type == "cpu" else GPU_PIXELS
+    sizes = [training_size(view.camera, SIDE) for view in views]
     total = sum(width * height for width, height in sizes)
-    return max(64, int(side * min(1.0, (most / total) ** 0.5)))
+    return max(64, int(SIDE * min(1.0, (most / total) ** 0.5)))
 
 
 def flat_views(views: list[View], box_from_world: np.ndarray, longest: int) -> list[FlatView]:

@@ -201,9 +201,9 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
     views = [scene.views[index] for index in indices]
     if not params.baked or refined:  # poses are fitted to the field
         cameras = [view.camera.resized(*size) for view, size in zip(views, sizes)]
-        pixels = math.inf if refined else sum(camera.width * camera.height for camera in cameras)
+        # However few they are: what a field is worth does not depend on how many photos are compared.
         rays = sparse_rays(cameras, box_poses(views, box_from_world), trained.device)
-        trained.model.refine(pixels, report.check, rays)
+        trained.model.refine(math.inf, report.check, rays)
     compared = Comparison(
         trained,
         shown,

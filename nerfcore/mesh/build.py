@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from ..data.box import Box
+from ..data.box import Box, looks_inward
 from ..data.pixels import PixelStore
 from ..data.scene import Scene, View
 from ..errors import SettingError, TrainingError
@@ -127,7 +127,8 @@ def agreed_maps(
     rendered = dm.depth_maps(trained.model, flats, report)
     report.stage("Comparing photos")
     store = read_photos(trained, scene, views, box, report)
-    maps, agreed = refined_maps(flats, rendered, store, trained.device, report)
+    outward = not looks_inward(scene.views)
+    maps, agreed = refined_maps(flats, rendered, store, trained.device, report, outward=outward)
     check_agreement(agreed, report)
     return flats, store, maps
 

@@ -32,6 +32,7 @@ from .depth_maps import (
 from .planes import with_planes
 from .scene_planes import known_points, on_scene_planes, scene_planes
 from .sky import FAR, backdrop, confirmed_share, farthest, labels_tell, named_things, nothing
+from .walls import any_plain, on_walls, picture_of, plain_places, walls
 
 VIEWS = 5  # neighbours whose photos are compared
 LEAST, GAIN = 0.6, 0.05  # correlation that is believed, and by how much it must exceed that of the field's depth
@@ -79,17 +80,26 @@ def label_picture(view: FlatView, store: PixelStore) -> np.ndarray | None:
 
 
 def refined_maps(
-    views: list[FlatView], maps: list[DepthMap], store: PixelStore, device: torch.device, report: Reporter
+    views: list[FlatView],
+    maps: list[DepthMap],
+    store: PixelStore,
+    device: torch.device,
+    report: Reporter,
+    *,
+    outward: bool = False,
 ) -> tuple[MapArrays, float]:
     """Confirmed maps (see `depth_maps.confirmed_maps`) whose depths photos have moved, and the share of their depths that
     views do confirm. Where views do not confirm a moved depth, the field's is asked again, the plane through what is
     known around (planes.py), or that of a wall or floor that goes on from elsewhere (scene_planes.py); where label maps say that
     it is this floor, one view suffices. Where they do not confirm that either, but roughly the field's own depth, moved as the
     known ones around were (completion.py), it is taken, as far away as photos confirm depths. What label maps say is nothing,
-    and backdrops without the name of a thing (sky.py), have an unknown depth.
+    and backdrops without the name of a thing (sky.py), have an unknown depth. `outward`: cameras look around, so that what is plain
+    is mostly a wall (walls.py) and not the thing that they surround.
     """
     arrays = map_arrays(views, maps, device)
-    grey = torch.from_numpy(np.concatenate([g.reshape(-1) for g in grey_pictures(views, store, report)]))
+    greys = grey_pictures(views, store, report)
+    plain = [plain_places(grey) for grey in greys]
+    grey = torch.from_numpy(np.concatenate([g.reshape(-1) for g in greys]))
     grey = grey.to(arrays.depth.device)
     around = neighbours(views, maps)
     moved = []
@@ -102,7 +112,7 @@ def refined_maps(
     # What one other view has moved to the same place as well may be wrong, and planes are put through what is known here.
     believed = confirmed_maps(views, moved, device, report, around, few_suffice=False)
     kept = hits(believed, maps)
-    sure = [there & (new.depth != old.depth) for there, old, new in zip(kept, maps, moved)]
+    sure = [there & (new.depth != old.depth) & ~even for there, old, new, even in zip(kept, maps, moved, plain)]
     labels = [label_picture(view, store) for view in views]
     left_out = [None if label is None else label == VOID for label in labels]
     told = labels_tell(sure, left_out)
@@ -122,12 +132,18 @@ def refined_maps(
         spread = np.where(safe, np.minimum(old.spread, SURE * depth / view.camera.fx), old.spread)
         fields.append(trusted_field(old, depth, safe, empty))
         known.append(replace(old, depth=depth, spread=spread.astype(np.float32)))
-    planes = scene_planes(known_points(views, known, kept, labels), report)
+    planes = scene_planes(known_points(views, known, [a & ~b for a, b in zip(kept, plain)], labels), report)
+    pictures = [picture_of(*parts) for parts in zip(views, known, sure, plain)]
+    made = (
+        walls(known_points(views, known, [a & b for a, b in zip(kept, sure)], labels), report)
+        if any_plain(pictures)
+        else []
+    )
     mixed, named = [], []
-    for view, map_, safe, label in zip(views, known, sure, labels):
+    for number, (view, map_, safe, label) in enumerate(zip(views, known, sure, labels)):
         report.check()
         on_planes, by_class = on_scene_planes(view, map_, safe, with_planes(view, map_, safe), planes, label)
-        mixed.append(on_planes)
+        mixed.append(on_walls(pictures, number, around[number], made, on_planes, label))
         named.append(by_class)
     final = confirmed_maps(views, mixed, device, report, around, one_suffices=named)
     carried = [moved_as_around(*parts) for parts in zip(views, fields, depths(final, maps))]

@@ -134,9 +134,9 @@ def scene_planes(known: Known, report: Reporter) -> list[ScenePlane]:
         if best is None or area[best].sum() < least:
             break
         point, normal = _fit(sharp, area, best)
-        plane = _reaching(known, np.flatnonzero(_near(known, point, normal, WIDTHS[-1])), point, normal)
+        plane = _reaching(known, np.flatnonzero(near_plane(known, point, normal, WIDTHS[-1])), point, normal)
         found.append(replace(plane, height=_heights(everything, plane)))
-        left &= ~_near(sharp, point, normal, BESIDE)
+        left &= ~near_plane(sharp, point, normal, BESIDE)
     return found
 
 
@@ -145,12 +145,12 @@ def _largest(known: Known, area: np.ndarray, left: np.ndarray, rng: np.random.Ge
     rows, best = np.flatnonzero(left), None
     tried = []
     for start in rng.choice(rows, min(TRIES, len(rows)), replace=False, p=area[rows] / area[rows].sum()):
-        on = left & _near(known, known.points[start], known.normals[start], WIDTHS[0])
+        on = left & near_plane(known, known.points[start], known.normals[start], WIDTHS[0])
         tried.append((area[on].sum(), start))
     for _, start in sorted(tried, reverse=True)[:KEPT]:
         point, normal = known.points[start], known.normals[start]
         for width in WIDTHS:
-            on = np.flatnonzero(left & _near(known, point, normal, width))
+            on = np.flatnonzero(left & near_plane(known, point, normal, width))
             if len(on) < FEWEST:
                 break
             point, normal = _fit(known, area, on)
@@ -159,7 +159,7 @@ def _largest(known: Known, area: np.ndarray, left: np.ndarray, rng: np.random.Ge
     return best
 
 
-def _near(known: Known, point: np.ndarray, normal: np.ndarray, width: float) -> np.ndarray:
+def near_plane(known: Known, point: np.ndarray, normal: np.ndarray, width: float) -> np.ndarray:
     """Which points lie within `width` times their error of a plane and face as it does."""
     off = np.abs((known.points - point) @ normal)
     return (off < width * known.error) & (known.normals @ normal > TILTED)
@@ -206,7 +206,7 @@ def _heights(known: Known, plane: ScenePlane) -> np.ndarray:
     """Mean height (X, Y) above a plane of what is known beside it, around each of its cells, weighted as in `_fit` but for
     cells that hold much, as a paving that photos know well beside a meadow: none counts more than one whose height is known
     to `UNEVEN` footprints. Cells far from all that is known have the height of the nearest."""
-    near = np.flatnonzero(_near(known, plane.point, plane.normal, BESIDE))
+    near = np.flatnonzero(near_plane(known, plane.point, plane.normal, BESIDE))
     away = known.points[near] - plane.point
     place = np.floor((away @ plane.axes.T - plane.low) / plane.cell)
     inside = ((place >= 0) & (place < plane.reached.shape)).all(1)

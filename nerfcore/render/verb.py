@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Collection
 from pathlib import Path
@@ -93,9 +94,8 @@ def render(params: RenderParams, report: Reporter, shown: Model | BakedField | N
     todo = [camera for camera in cameras if camera[0] not in kept]
     report.stage("Preparing")
     if isinstance(shown, Model) and todo:
-        pixels = sum(camera.width * camera.height for _, camera, _ in planned)
         poses = box_poses([View(name, camera, pose, Path()) for name, camera, pose in planned], box.box_from_world)
-        shown.refine(pixels, report.check, sparse_rays([camera for _, camera, _ in planned], poses, shown.device))
+        shown.refine(math.inf, report.check, sparse_rays([camera for _, camera, _ in planned], poses, shown.device))
     with disk_errors(out):
         out.mkdir(parents=True, exist_ok=True)
     colors = {c.id: c.color for c in scene.classes}

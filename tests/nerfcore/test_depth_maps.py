@@ -141,7 +141,7 @@ def test_where_planes_contradict_each_other_the_field_is_believed_as_far_as_phot
 ) -> None:
     """Plain walls: planes of neighbouring views do not meet, and photos confirm what is nearer than `reach`, or nothing."""
     flats, maps = room
-    size = flats[0].camera.width * flats[0].camera.height
+    pattern = np.random.default_rng(0).random((flats[0].camera.height, flats[0].camera.width)).astype(np.float32)
 
     def moved(grey, facing, arrays, number, near, least, gain):
         depth = torch.from_numpy(maps[number].depth.reshape(-1))
@@ -155,7 +155,7 @@ def test_where_planes_contradict_each_other_the_field_is_believed_as_far_as_phot
     monkeypatch.setattr(refine, "refine", moved)
     monkeypatch.setattr(refine, "with_planes", apart)
     monkeypatch.setattr(refine, "scene_planes", lambda known, report: [])
-    monkeypatch.setattr(refine, "grey_pictures", lambda views, store, report: [np.zeros(size, np.float32)] * len(flats))
+    monkeypatch.setattr(refine, "grey_pictures", lambda views, store, report: [pattern] * len(flats))
     monkeypatch.setattr(refine, "label_picture", lambda view, store: None)
     field = depth_maps.map_arrays(flats, maps, CPU).depth
     final, _ = refined_maps(flats, maps, SimpleNamespace(), CPU, Reporter())  # type: ignore[arg-type]

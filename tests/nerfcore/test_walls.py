@@ -149,6 +149,4 @@ def test_a_plain_ball_stays_before_the_wall() -> None:
 def test_without_plain_places_nothing_moves() -> None:
     made, _ = pictures(papered=True)
     assert not any_plain(made)
-    assert (
-        on_walls(made, 2, [1, 3], walls(known(made), Reporter()), made[2].field).depth == made[2].field.depth
-    ).all()
+    assert (on_walls(made, 2, [1, 3], walls(known(made), Reporter()), made[2].field).depth == made[2].field.depth).all()

@@ -1,7 +1,9 @@
 """Whether photos show something infinitely far away, as the sky: it has the same colour in the same direction from everywhere,
-no points of the reconstruction around it, and in captures from inside it is above the horizon."""
+no points of the reconstruction around it, and in captures from inside it is above the horizon and has no other name."""
 
 from __future__ import annotations
+
+import re
 
 import numpy as np
 import scipy
@@ -12,6 +14,7 @@ from ..data.pixels import training_size
 from ..data.scene import Scene, View
 from ..geometry.cameras import pixel_centers, project, rays
 from ..images.picture import resized
+from ..images.working import nearest, read_label
 
 # Measured: docs/experiments.md, “Is there a sky?”.
 MOST_PHOTOS, SIDE = 40, 120  # that are looked at, and their longest side in pixels
@@ -22,13 +25,21 @@ HIGHER = 3.0  # times as often directions above the horizon must look infinitely
 CELL, CELL_PIXELS = 1.0, 3.0  # degrees, and pixels at least, in which directions count as the same
 CAMERAS = 3  # that must look there
 FEWEST = 20  # points in a photo, from which on they have a hull
+# Words in names of classes that may be infinitely far away, in the languages of Blender's users, and of what is no thing.
+WORDS = """
+sky skies cloud clouds himmel wolke wolken ciel nuage nuages cielo nube nubes nuvola nuvole céu nuvem nuvens hemel lucht niebo
+chmury небо облака gökyüzü trời 天空 天 空 雲 云 하늘 background backdrop hintergrund fond fondo sfondo fundo tło фон 背景 배경
+void nothing none unknown unlabeled unlabelled other misc outside exterior
+"""
+SKY = frozenset(WORDS.split())
 
 
 def share_at_infinity(scene: Scene) -> float:
     """Share of the training photos' pixels that lie infinitely far away: at least `CAMERAS` cameras look that way, and what
     all of them see there has one colour. Walls with a texture have several; plain ones have light that changes along them.
-    Where that is too little, points tell: a plain floor lies between points of its joints and of what stands on it. So does the
-    horizon where cameras look around: white walls of a room are alike below it as well. The world's z axis is up.
+    Where that is too little, points tell: a plain floor lies between points of its joints and of what stands on it. Where cameras
+    look around, so do names, as a ceiling's is none of a sky, and the horizon: white walls of a room are alike below it as well.
+    The world's z axis is up.
     """
     chosen = np.unique(np.linspace(0, len(scene.train) - 1, MOST_PHOTOS).round().astype(int))
     views = [scene.views[scene.train[i]] for i in chosen]
@@ -49,12 +60,15 @@ def share_at_infinity(scene: Scene) -> float:
         variance += np.bincount(cell, (channel - mean[cell]) ** 2) / pixels / 3
     looked = (cameras >= CAMERAS)[cell]
     far = looked & (variance < ALIKE**2)[cell]
+    around = not looks_inward(scene.views)
+    if around:
+        far &= ~np.concatenate([named_things(view, scene) for view in views])[usable]
     between = np.concatenate([between_points(view, scene.points.xyz) for view in views])[usable]
     if (far & between).sum() > BETWEEN * far.sum():
         return 0.0
     up = directions[:, 2] > 0
     above, below = (far[half].sum() / max(int(looked[half].sum()), 1) for half in (up, ~up))
-    if above < HIGHER * below and not looks_inward(scene.views):
+    if around and above < HIGHER * below:
         return 0.0
     return float(far.mean())
 
@@ -67,6 +81,16 @@ def colored_directions(view: View) -> tuple[np.ndarray, np.ndarray]:
     directions, _ = rays(camera, pixel_centers(camera.width, camera.height).reshape(-1, 2))
     directions = directions @ view.camera_to_world[:3, :3].T
     return directions / np.linalg.norm(directions, axis=1, keepdims=True), small.astype(np.float64)
+
+
+def named_things(view: View, scene: Scene) -> np.ndarray:
+    """Which pixels (N,) bool of a small version of a photo its label map gives a class that is no sky by its name."""
+    camera = view.camera.resized(*training_size(view.camera, SIDE))
+    if view.label is None:
+        return np.zeros(camera.width * camera.height, bool)
+    named = [kind for kind in scene.classes if kind.id != scene.ignore_id]
+    things = [kind.id for kind in named if not SKY & set(re.findall(r"\w+", kind.name.casefold()))]
+    return np.isin(nearest(read_label(view.label), camera.width, camera.height), things).reshape(-1)
 
 
 def between_points(view: View, points: np.ndarray, longest: float = np.inf) -> np.ndarray:

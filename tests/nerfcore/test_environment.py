@@ -59,7 +59,7 @@ class Seen:
     sky: np.ndarray
 
 
-def trained_under_the_sky(folder: Path, named: bool = False, **settings: str) -> Seen:
+def trained_under_the_sky(folder: Path, named: str | None = None, **settings: str) -> Seen:
     project = under_the_sky(folder, named)
     values = {**SMALL, **CLEARED, **{name.replace("__", "."): value for name, value in settings.items()}}
     run_verb("train", TrainParams(project=project, preset="draft", steps=STEPS, set=values), Reporter())
@@ -130,6 +130,12 @@ def test_what_has_a_place_is_not_at_infinity(tmp_path: Path) -> None:
     assert share_at_infinity(load_scene(project)) < INFINITE
 
 
+@pytest.mark.parametrize(("name", "far"), [("Night sky", True), ("Himmel", True), ("天空", True), ("Ceiling", False)])
+def test_what_has_the_name_of_a_thing_is_no_sky_where_cameras_look_around(tmp_path: Path, name: str, far: bool) -> None:
+    scene = load_scene(under_the_sky(tmp_path / "p", name, outward=True, above_a_floor=True))
+    assert (share_at_infinity(scene) > INFINITE) is far
+
+
 def test_walls_of_a_room_are_alike_below_the_horizon_too(tmp_path: Path) -> None:
     """Cameras that look around: white walls look as a sky does, but on all sides."""
     outside, room = (load_scene(under_the_sky(tmp_path / str(k), outward=True, above_a_floor=k)) for k in (True, False))
@@ -187,7 +193,7 @@ def test_an_environment_without_labels_is_void(seen: Seen) -> None:
 
 
 def test_an_environment_with_labels_has_its_class(tmp_path: Path) -> None:
-    found = trained_under_the_sky(tmp_path / "p", named=True)
+    found = trained_under_the_sky(tmp_path / "p", named="sky")
     label = found.frame.label(found.trained.info.class_ids)
     assert (label[~found.ball] == 3).mean() > 0.9
     assert (label[found.ball] == 3).mean() < 0.1

@@ -36,7 +36,7 @@ def floor(directions: np.ndarray, center: np.ndarray) -> np.ndarray:
     return np.repeat(0.5 + 0.3 * np.sin(4 * place[..., :1]) * np.sin(4 * place[..., 1:]), 3, -1)
 
 
-def under_the_sky(folder: Path, named: bool = False, outward: bool = False, above_a_floor: bool = False) -> Path:
+def under_the_sky(folder: Path, named: str | None = None, outward: bool = False, above_a_floor: bool = False) -> Path:
     """The ball's capture with opaque photos, in which the sky is behind it, on all sides or above the horizon alone; a class
     of its own where it is `named`. `outward`: the cameras turn their backs to the ball, which no photo shows."""
     poses = [pose @ np.diag([-1.0, 1, -1, 1]) if outward else pose for pose in camera_poses(VIEWS)]
@@ -58,6 +58,6 @@ def under_the_sky(folder: Path, named: bool = False, outward: bool = False, abov
             Image.fromarray(np.where(label == 0, 3, label).astype(np.uint8)).save(labels)
     if named:
         saved = load_project(project)
-        saved.classes.append(SemanticClass(id=3, name="sky", color=(0.3, 0.5, 0.9)))
+        saved.classes.append(SemanticClass(id=3, name=named, color=(0.3, 0.5, 0.9)))
         save_project(project, saved)
     return project

@@ -140,11 +140,12 @@ def refined_maps(
         else []
     )
     mixed, named = [], []
-    for number, (view, map_, safe, label) in enumerate(zip(views, known, sure, labels)):
+    for view, map_, safe, label in zip(views, known, sure, labels):
         report.check()
         on_planes, by_class = on_scene_planes(view, map_, safe, with_planes(view, map_, safe), planes, label)
-        mixed.append(on_walls(pictures, number, around[number], made, on_planes, label))
+        mixed.append(on_planes)
         named.append(by_class)
+    mixed = on_walls(pictures, around, made, mixed, labels, report)
     final = confirmed_maps(views, mixed, device, report, around, one_suffices=named)
     carried = [moved_as_around(*parts) for parts in zip(views, fields, depths(final, maps))]
     filling = confirmed_maps(views, carried, device, report, around, agree=FIELD_AGREES, round_trip=FIELD_RETURNS)

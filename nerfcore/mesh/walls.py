@@ -32,10 +32,12 @@ WITHIN = (0.1, 99.9)  # percentiles of offsets that are looked at
 PLAIN = 0.02  # share of what pictures show, from which on walls are looked for
 REGION = 0.002  # share of a picture that a plain region must have
 RIM = 6  # pixels around a region in which what is known tells of it
+ROUNDS = 2  # a third changes nothing
 HELD, FEWEST = 0.08, 30  # share of what is known there that the region's plane must hold, and pixels
 OFF = 0.3  # share by which the field's depth of a plain place may be wrong
 ASKED, EVERY = 5, 4  # other views that are asked whether a region is plain, and at every how many-th pixel
 DENIED = 0.5  # share of what they see of a region that may not be plain there
+AGREED, SAME = 0.5, 0.005  # share of a region that others must have on the same wall, and of its depth
 HIDES = 0.03  # share of a depth by which what hides a place is nearer
 
 
@@ -148,37 +150,59 @@ def _from_edges(known: Known, made: list[Wall], axes: list[np.ndarray]) -> list[
 
 def on_walls(
     pictures: list[Picture],
+    around: Sequence[Sequence[int]],
+    made: list[Wall],
+    maps: list[DepthMap],
+    labels: Sequence[np.ndarray | None],
+    report: Reporter,
+) -> list[DepthMap]:
+    """Depth maps whose plain regions lie on walls: of those that may hold a region, on the one closest to the field. In a second
+    round those also hold it on which other pictures have what it shows.
+
+    Args:
+        around: of each picture, numbers of others that show much the same.
+        maps: what becomes of their depths otherwise; labels: class (H, W) uint8 of each pixel.
+    """
+    if not made:
+        return maps
+    found: list[DepthMap] = []
+    for _ in range(ROUNDS):
+        before, found = found, []
+        for number, (map_, label) in enumerate(zip(maps, labels)):
+            report.check()
+            found.append(_on_walls(pictures, number, around[number], made, map_, label, before))
+    return found
+
+
+def _on_walls(
+    pictures: list[Picture],
     number: int,
     around: Sequence[int],
     made: list[Wall],
     map_: DepthMap,
-    label: np.ndarray | None = None,
+    label: np.ndarray | None,
+    found: list[DepthMap],
 ) -> DepthMap:
-    """A depth map whose plain regions lie on walls: of those that may hold a region, on the one closest to the field.
-
-    Args:
-        number: of the map's picture; around: numbers of pictures that show much the same.
-        map_: what becomes of its depths otherwise; label: class (H, W) uint8 of its pixels.
-    """
-    if not made:
-        return map_
+    """One of the maps; found: all of them after the first round."""
     own = pictures[number]
     ray = pixel_directions(own.view.camera) @ own.view.pose[:3, :3].T
-    others = [pictures[other] for other in around[:ASKED]]
+    others = [(pictures[other], found[other] if found else None) for other in around[:ASKED]]
     depths = [wall.depth(own.view, ray) for wall in made]
     depth, best = map_.depth.copy(), np.full(map_.depth.shape, OFF)
     for part, region, grown in _regions(own, label):
         field, near = own.field.depth[part], best[part]
         ring = scipy.ndimage.binary_dilation(region, iterations=RIM) & own.sure[part]
         for there in (all_[part] for all_ in depths):
-            held = ring & (np.abs(there - field) < WIDTHS[0] / own.view.camera.fx * there)
-            if held.sum() < max(FEWEST, HELD * ring.sum()):
+            on = ring & (np.abs(there - field) < WIDTHS[0] / own.view.camera.fx * there)
+            held = on.sum() >= max(FEWEST, HELD * ring.sum())
+            if not held and not found:
                 continue
             off = np.abs(there - field) / np.where(grown, field, 1)
             taken = grown & (there > 0) & (off < near)
             sample = np.flatnonzero(region & taken)[::EVERY]
             points = own.view.pose[:3, 3] + ray[part].reshape(-1, 3)[sample] * there.reshape(-1, 1)[sample]
-            if not _denied(points, others):
+            same, shows = _asked(points, others)
+            if shows <= DENIED and (held or same > AGREED):
                 depth[part][taken], near[taken] = there[taken], off[taken]
     moved = best < OFF
     spread = np.where(moved, FITTED_PIXELS / own.view.camera.fx * depth, map_.spread)
@@ -201,17 +225,20 @@ def _regions(own: Picture, label: np.ndarray | None) -> Iterator[tuple[tuple[sli
                 yield (rows, columns), region, grown
 
 
-def _denied(points: np.ndarray, others: list[Picture]) -> bool:
-    """Whether other pictures show something at points (N, 3), and nothing in front of them."""
-    asked, shown_there = 0, 0
-    for other in others:
+def _asked(points: np.ndarray, others: list[tuple[Picture, DepthMap | None]]) -> tuple[float, float]:
+    """Of what other pictures see of points (N, 3), the share that they have there after the first round; and of what nothing
+    nearer hides from them, the share where they show something."""
+    asked, same, visible, shows = 0, 0, 0, 0
+    for other, found in others:
         camera, pose = other.view.camera, other.view.pose
         local = (points - pose[:3, 3]) @ pose[:3, :3]
         local = local[local[:, 2] > 0]
         column, row = np.floor(local[:, :2] / local[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]).T
         inside = (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
-        place = row[inside].astype(int), column[inside].astype(int)
-        nearer = other.field.hit[place] & (other.field.depth[place] < (1 - HIDES) * local[inside, 2])
-        asked += int((~nearer).sum())
-        shown_there += int((~other.even[place] & ~nearer).sum())
-    return shown_there > DENIED * asked
+        place, depth = (row[inside].astype(int), column[inside].astype(int)), local[inside, 2]
+        open_ = ~(other.field.hit[place] & (other.field.depth[place] < (1 - HIDES) * depth))
+        asked, visible = asked + len(depth), visible + int(open_.sum())
+        shows += int((~other.even[place] & open_).sum())
+        if found is not None:
+            same += int((np.abs(found.depth[place] - depth) < SAME * depth).sum())
+    return same / max(asked, 1), shows / max(visible, 1)

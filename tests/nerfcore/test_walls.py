@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from fieldwork.nerfcore.errors import Cancelled
 from fieldwork.nerfcore.geometry.cameras import Camera
 from fieldwork.nerfcore.mesh.depth_maps import DepthMap, FlatView, cosines, pixel_directions
 from fieldwork.nerfcore.mesh.scene_planes import Known, known_points
-from fieldwork.nerfcore.mesh.walls import Picture, any_plain, on_walls, picture_of, plain_places, walls
+from fieldwork.nerfcore.mesh.walls import Picture, Wall, any_plain, on_walls, picture_of, plain_places, walls
 from fieldwork.nerfcore.progress import Reporter
 
 LENS = Camera(width=400, height=300, fx=275.0, fy=275.0, cx=200.0, cy=150.0)
@@ -72,6 +75,12 @@ def known(made: list[Picture]) -> Known:
     return known_points([p.view for p in made], [p.field for p in made], [p.sure for p in made])
 
 
+def moved_of(made: list[Picture], found: list[Wall], asked: bool = True) -> DepthMap:
+    """What becomes of the middle view; asked: the other views are."""
+    around = [[other for other in range(len(made)) if asked and other != number] for number in range(len(made))]
+    return on_walls(made, around, found, [p.field for p in made], [None] * len(made), Reporter())[2]
+
+
 def test_an_even_slope_is_plain_and_a_pattern_is_not() -> None:
     y, x = np.mgrid[:60, :80]
     slope = np.round((0.4 + 0.0011 * x - 0.0007 * y) * 255) / 255
@@ -125,8 +134,7 @@ def test_edges_alone_show_a_wall() -> None:
 def test_a_plain_wall_lies_on_its_plane_though_the_field_bulges() -> None:
     made, truths = pictures()
     found = walls(known(made), Reporter())
-    around = [1, 3, 0, 4]
-    moved = on_walls(made, 2, around, found, made[2].field)
+    moved = moved_of(made, found)
     plain = made[2].plain
     before, after = (np.abs(d / truths[2] - 1)[plain] for d in (made[2].field.depth, moved.depth))
     assert (before > 0.05).mean() > 0.3
@@ -138,15 +146,39 @@ def test_a_plain_ball_stays_before_the_wall() -> None:
     """The floor and the wall around it hold all that is known beside it, but other views show their pattern there."""
     made, truths = pictures(ball=True, papered=True)
     found = walls(known(made), Reporter())
-    around = [1, 3, 0, 4]
-    moved = on_walls(made, 2, around, found, made[2].field)
+    moved = moved_of(made, found)
     assert (made[2].plain & (truths[2] < room(VIEWS[2], papered=True)[1] - 0.05)).sum() > 300
     assert (moved.depth == made[2].field.depth).all()
     # Without other views to ask nothing tells the ball from a part of them.
-    assert (on_walls(made, 2, [], found, made[2].field).depth != made[2].field.depth).any()
+    assert (moved_of(made, found, asked=False).depth != made[2].field.depth).any()
 
 
 def test_without_plain_places_nothing_moves() -> None:
     made, _ = pictures(papered=True)
     assert not any_plain(made)
-    assert (on_walls(made, 2, [1, 3], walls(known(made), Reporter()), made[2].field).depth == made[2].field.depth).all()
+    assert (moved_of(made, walls(known(made), Reporter())).depth == made[2].field.depth).all()
+
+
+def test_a_region_whose_rim_tells_nothing_lies_where_other_pictures_have_it() -> None:
+    made, truths = pictures()
+    found = walls(known(made), Reporter())
+    made[2] = replace(made[2], sure=np.zeros_like(made[2].sure))
+    plain = made[2].plain
+    after = np.abs(moved_of(made, found).depth / truths[2] - 1)[plain]
+    assert (after < 0.01).mean() > 0.7
+    assert (moved_of(made, found, asked=False).depth == made[2].field.depth).all()
+
+
+def test_cancelling_is_heard() -> None:
+    made, _ = pictures()
+    report = Reporter()
+    report.cancel()
+    with pytest.raises(Cancelled):
+        on_walls(
+            made,
+            [[]] * 5,
+            [Wall(np.array([0.0, 1.5, 0]), np.array([0.0, -1, 0]))],
+            [p.field for p in made],
+            [None] * 5,
+            report,
+        )

@@ -170,6 +170,21 @@ def test_where_planes_contradict_each_other_the_field_is_believed_as_far_as_phot
         assert int(known(final).sum()) > 1000  # what photos confirm
 
 
+@pytest.mark.parametrize("outward", [False, True])
+def test_walls_are_looked_for_where_cameras_look_around(
+    room: Room, outward: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Photos that show nothing at all: plain everywhere."""
+    flats, maps = room
+    asked = []
+    plain = np.full(maps[0].depth.shape, 0.8, np.float32)
+    monkeypatch.setattr(refine, "walls", lambda known, report: asked.append(known) or [])
+    monkeypatch.setattr(refine, "grey_pictures", lambda views, store, report: [plain] * len(flats))
+    monkeypatch.setattr(refine, "label_picture", lambda view, store: None)
+    refined_maps(flats, maps, SimpleNamespace(), CPU, Reporter(), outward=outward)  # type: ignore[arg-type]
+    assert len(asked) == outward
+
+
 def test_photos_move_soft_depths_onto_the_surface() -> None:
     """A painted sphere whose field lies 1.5 % too deep here and too near there: the photos say where it is."""
     poses = orbit(24, 1.8)

@@ -48,7 +48,7 @@ class SceneConfig(Stage):
         description="what is behind the field; environment: sky and whatever is too far away to have a place, learned as "
         "colours of directions; auto: black or white where an object is photographed in front of that, environment "
         "where photos show the same colours in the same directions from everywhere, mostly not between points and, in captures "
-        "from inside, above the horizon, else random",
+        "from inside, above the horizon and with no other name than a sky, else random",
     )
     margin: float = Field(default=1.05, gt=0, le=100, description="size of the box relative to what must fit in")
     photo_memory: float | None = Field(

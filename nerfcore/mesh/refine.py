@@ -32,7 +32,7 @@ from .depth_maps import (
 from .planes import with_planes
 from .scene_planes import known_points, on_scene_planes, scene_planes
 from .sky import FAR, backdrop, confirmed_share, farthest, labels_tell, named_things, nothing
-from .walls import Wall, any_plain, on_walls, picture_of, plain_places, walls
+from .walls import any_plain, on_walls, picture_of, plain_places, walls
 
 VIEWS = 5  # neighbours whose photos are compared
 LEAST, GAIN = 0.6, 0.05  # correlation that is believed, and by how much it must exceed that of the field's depth
@@ -133,17 +133,16 @@ def refined_maps(
         fields.append(trusted_field(old, depth, safe, empty))
         known.append(replace(old, depth=depth, spread=spread.astype(np.float32)))
     planes = scene_planes(known_points(views, known, [a & ~b for a, b in zip(kept, plain)], labels), report)
-    pictures = [picture_of(*parts) for parts in zip(views, known, sure, plain)]
-    made: list[Wall] = []
-    if outward and any_plain(pictures):
-        made = walls(known_points(views, known, [a & b for a, b in zip(kept, sure)], labels), report)
     mixed, named = [], []
     for view, map_, safe, label in zip(views, known, sure, labels):
         report.check()
         on_planes, by_class = on_scene_planes(view, map_, safe, with_planes(view, map_, safe), planes, label)
         mixed.append(on_planes)
         named.append(by_class)
-    mixed = on_walls(pictures, around, made, mixed, labels, report)
+    if outward:
+        pictures = [picture_of(*parts) for parts in zip(views, known, sure, plain)]
+        made = walls(known_points(views, known, sure, labels), report) if any_plain(pictures) else []
+        mixed = on_walls(pictures, around, made, mixed, labels, report)
     final = confirmed_maps(views, mixed, device, report, around, one_suffices=named)
     carried = [moved_as_around(*parts) for parts in zip(views, fields, depths(final, maps))]
     filling = confirmed_maps(views, carried, device, report, around, agree=FIELD_AGREES, round_trip=FIELD_RETURNS)

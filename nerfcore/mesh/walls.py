@@ -22,9 +22,8 @@ from .depth_maps import DepthMap, FlatView, cosines, pixel_directions
 from .scene_planes import FITTED_PIXELS, STEEPEST, WIDTHS, Known, near_plane, scene_planes
 
 REACH = 4  # pixels that a window reaches from its middle, as patches that are compared do (kernels/patches.py)
-SHOWS = (
-    0.6 / 255
-)  # standard deviation of grey, less its slope, of a window that shows something: rounding makes 0.3 to 0.5
+# Standard deviation of grey, less its slope, from which a window shows something: rounding makes 0.3 to 0.5.
+SHOWS = 0.6 / 255
 RIGHT = np.radians(6)  # by which a plane may be turned to stand at right angles to others
 STAYS = 0.7  # share of a plane's points that must lie on it when it is turned
 BIN, LOCAL, PEAK, EDGES = 3.0, 21, 3.0, 0.003  # an offset's bin in footprints; bins around it; times these, and of all

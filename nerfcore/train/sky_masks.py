@@ -1,31 +1,39 @@
-"""Which pixels of the training photos may show the sky: those whose colour other cameras see in the same direction.
+"""Which pixels of the training photos may show the sky: those with no texture that other cameras miss in their direction.
 
-An environment, a colour for each direction, explains whatever few cameras see there: a capture of 20 photos from inside
-of a court lost its ground and its walls to it. While its surfaces form it is therefore behind these pixels only.
-Measured: docs/experiments.md, “An environment that waits”.
+An environment, a colour for each direction, explains what is far away, but also meadows and plain walls, whose colours differ
+little: captures lost their ground to it. While surfaces form it is therefore behind these pixels only. What is infinitely far
+looks the same in the same direction from everywhere; what is near moves against it from camera to camera.
+Measured: docs/experiments.md, “Meadows that became a sky”.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import scipy
 import torch
+from scipy.ndimage import map_coordinates, uniform_filter
 
+from ..data.photo import photo_of
 from ..data.pixels import training_size
-from ..data.scene import Scene, View
-from ..geometry.cameras import Camera, project
-from .infinity import SIDE, between_points, colored_directions
+from ..data.scene import View
+from ..geometry.cameras import Camera, pixel_centers, project, rays
+from ..images.picture import resized
+from .infinity import SIDE
 
-FEW = 4  # other cameras that look in the direction of a pixel, at the median: with fewer the environment waits
-OTHERS = 40  # photos at most that a photo is compared with
-ALIKE = 4.0  # of 255: what one colour in one direction may differ by, beyond what it differs by between neighbours
-UNEVEN = 40.0  # of 255: difference of neighbours from which on nearly every colour would be alike
-AGREE = 0.2  # of the cameras that look there, and one at least: things hide the sky from many
+PATCH = 5  # pixels: side of the patches that are compared
+TEXTURE = 1.0  # of 255: standard deviation, less an even slope, from which a patch has a texture
+SAME = 0.8  # correlation from which patches of two photos are the same
 MAJORITY = 5  # pixels: side of the neighbourhood that decides
-CLOSE = 0.2  # of a photo's width: points no farther from each other have something between them, not sky
+RIM = 3  # pixels beside what is near, whose patches show it too
+# Not tuned: the next four.
+CAMERAS = 6  # the nearest that look there: they see the sky beside the same things
+APART = 0.1  # of the typical distance of cameras from their middle, at least: what is near must have moved
+PROBES = 144  # places of a photo by which it is told who looks where it does
+LOOKING = 0.3  # of these must be seen
 
 
 @dataclass(frozen=True)
@@ -49,33 +57,25 @@ class SkyMasks:
 
 
 def sky_masks(
-    scene: Scene,
     views: list[View],
     cameras: list[Camera],
     device: torch.device,
     check: Callable[[], None] = lambda: None,
-) -> SkyMasks | None:
-    """The masks of training `views`, whose pictures have the sizes of `cameras`; None where so many cameras look in each
-    direction that colours of directions explain nothing but what is far away. `check` is called for each photo and may
+) -> SkyMasks:
+    """The masks of training `views`, whose pictures have the sizes of `cameras`. `check` is called for each photo and may
     raise to stop."""
-    chosen = np.unique(np.linspace(0, len(views) - 1, OTHERS).round().astype(int)).tolist()
-    compared: dict[int, Small] = {}
-    for i in chosen:
+    photos = []
+    for view in views:
         check()
-        compared[i] = Small.of(views[i])
-
-    def counts(i: int, photo: Small) -> tuple[np.ndarray, np.ndarray]:
-        check()
-        return _looking_and_alike(photo, [other for j, other in compared.items() if j != i])
-
-    counted = {i: counts(i, photo) for i, photo in compared.items()}
-    looking = np.concatenate([looking for looking, _ in counted.values()])
-    if np.median(looking) / max(len(chosen) - 1, 1) * (len(views) - 1) >= FEW:
-        return None
+        photos.append(Small.of(view))
+    centers = np.stack([view.camera_to_world[:3, 3] for view in views])
+    apart = APART * np.median(np.linalg.norm(centers - np.median(centers, 0), axis=1))
     found = []
-    for i, view in enumerate(views):
-        photo = compared.get(i) or Small.of(view)
-        found.append(_sky_of(photo, *(counted.get(i) or counts(i, photo)), scene.points.xyz))
+    for i, photo in enumerate(photos):
+        check()
+        away = np.linalg.norm(centers - centers[i], axis=1)
+        nearest = [photos[j] for j in np.argsort(away, kind="stable") if away[j] > apart]
+        found.append(_sky_of(photo, nearest))
 
     def column(numbers: list[int]) -> torch.Tensor:
         return torch.tensor(numbers, device=device)
@@ -91,56 +91,71 @@ def sky_masks(
 
 @dataclass(frozen=True)
 class Small:
-    """A small version of a photo, of H · W pixels: directions in the world, NaN where the lens does not see, colors in
-    [0, 255], and the least and the largest of neighbours, each (H · W, 3)."""
+    """A small version of a photo: its view, its camera and its grey values (H, W) in [0, 255]."""
 
     view: View
     camera: Camera
-    directions: np.ndarray
-    colors: np.ndarray
-    least: np.ndarray
-    largest: np.ndarray
+    grey: np.ndarray
 
     @classmethod
     def of(cls, view: View) -> Small:
         camera = view.camera.resized(*training_size(view.camera, SIDE))
-        directions, colors = colored_directions(view)
-        picture = colors.reshape(camera.height, camera.width, 3)
-        least, largest = (f(picture, (3, 3, 1)) for f in (scipy.ndimage.minimum_filter, scipy.ndimage.maximum_filter))
-        return cls(view, camera, directions, colors, least.reshape(-1, 3), largest.reshape(-1, 3))
+        small = resized(photo_of(view), camera.width, camera.height).pixels[..., :3]
+        return cls(view, camera, small.mean(2, dtype=np.float32))
+
+    def directions(self) -> np.ndarray:
+        """Of its pixels (H · W, 3) in the world, NaN where the lens does not see."""
+        local, _ = rays(self.camera, pixel_centers(self.camera.width, self.camera.height).reshape(-1, 2))
+        return local @ self.view.camera_to_world[:3, :3].T
+
+    def places(self, directions: np.ndarray) -> np.ndarray:
+        """Where directions (N, 3) of the world are in its picture (N, 2), NaN where they are not."""
+        local = directions @ self.view.camera_to_world[:3, :3]
+        ahead = np.isfinite(local).all(1)
+        if self.camera.model not in ("EQUIRECTANGULAR", "OPENCV_FISHEYE"):
+            ahead &= local[:, 2] > 0
+        with np.errstate(invalid="ignore"):
+            place = project(self.camera, np.where(ahead[:, None], local, [0, 0, 1]))
+            ahead &= ((place >= 0) & (place < [self.camera.width, self.camera.height])).all(1)
+        return np.where(ahead[:, None], place, np.nan)
 
 
-def _looking_and_alike(photo: Small, others: list[Small]) -> tuple[np.ndarray, np.ndarray]:
-    """How many others look in the direction of each pixel of a small photo, and how many see its colour there, (H · W,)."""
-    looking, alike = np.zeros(len(photo.colors), int), np.zeros(len(photo.colors), int)
-    for other in others:
-        index, pixel = _seen_by(other, photo.directions)
-        color, least, largest = photo.colors[index], other.least[pixel], other.largest[pixel]
-        apart = np.maximum(least - color, color - largest).max(1)
-        looking[index] += 1
-        alike[index] += (apart < ALIKE) & ((largest - least).max(1) < UNEVEN)
-    return looking, alike
+def _sky_of(photo: Small, nearest: list[Small]) -> np.ndarray:
+    """Which pixels (H, W) bool of a small photo may show the sky, by the nearest of others that look where it does."""
+    grey = photo.grey
+    directions = photo.directions()
+    probes = directions[np.linspace(0, len(directions) - 1, PROBES).astype(int)]
+    mean, deviation = _moments(grey)
+    compared, same = np.zeros(grey.shape, bool), np.zeros(grey.shape, bool)
+    looking = (other for other in nearest if np.isfinite(other.places(probes)).all(1).mean() >= LOOKING)
+    for other in itertools.islice(looking, CAMERAS):
+        place = other.places(directions).reshape(*grey.shape, 2)
+        seen = scipy.ndimage.minimum_filter(np.isfinite(place).all(2), PATCH)
+        at = np.nan_to_num(place[..., ::-1] - 0.5).transpose(2, 0, 1)
+        there = map_coordinates(other.grey, at, order=1, mode="nearest")
+        others, scattered = _moments(there)
+        covariance = uniform_filter(grey * there, PATCH) - mean * others
+        compared |= seen
+        same |= seen & (covariance > SAME * deviation * scattered)
+    near = compared & ~same & (_texture(grey, deviation) > TEXTURE)
+    near = uniform_filter(near.astype(np.float32), MAJORITY) > 0.5
+    return scipy.ndimage.maximum_filter(~near, 2 * RIM + 1)
 
 
-def _sky_of(photo: Small, looking: np.ndarray, alike: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Which pixels (H, W) bool of a small photo may show the sky."""
-    # Where nobody else looks nothing speaks against it.
-    agree = (looking == 0) | (alike >= np.maximum(1, AGREE * looking))
-    agree &= ~between_points(photo.view, points, CLOSE)
-    agree = agree.reshape(photo.camera.height, photo.camera.width)
-    return scipy.ndimage.uniform_filter(agree.astype(np.float32), MAJORITY) > 0.5
+def _moments(grey: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and standard deviation of each patch (H, W)."""
+    mean = uniform_filter(grey, PATCH)
+    return mean, np.sqrt(np.maximum(uniform_filter(grey * grey, PATCH) - mean * mean, 0))
 
 
-def _seen_by(other: Small, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which of the directions (N, 3) a camera sees, as indices (M,), and in which of its pixels (M,)."""
-    camera = other.camera
-    local = directions @ other.view.camera_to_world[:3, :3]
-    ahead = np.isfinite(local).all(1)
-    if camera.model not in ("EQUIRECTANGULAR", "OPENCV_FISHEYE"):
-        ahead &= local[:, 2] > 0
-    index = ahead.nonzero()[0]
-    with np.errstate(invalid="ignore"):
-        place = project(camera, local[index])
-        inside = ((place >= 0) & (place < [camera.width, camera.height])).all(1)
-    column, row = place[inside].astype(int).T
-    return index[inside], row * camera.width + column
+def _texture(grey: np.ndarray, deviation: np.ndarray) -> np.ndarray:
+    """Standard deviation of each patch less that of the slope that fits it best (H, W)."""
+    step = np.arange(PATCH) - PATCH // 2
+    spread = (step**2).mean()
+    slopes = [
+        scipy.ndimage.uniform_filter1d(
+            scipy.ndimage.correlate1d(grey, step / (PATCH * spread), axis=axis), PATCH, axis=1 - axis
+        )
+        for axis in (0, 1)
+    ]
+    return np.sqrt(np.maximum(deviation**2 - spread * (slopes[0] ** 2 + slopes[1] ** 2), 0))

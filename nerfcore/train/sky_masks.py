@@ -9,7 +9,7 @@ Measured: docs/experiments.md, “Meadows that became a sky”.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,7 +26,8 @@ from .infinity import SIDE
 
 PATCH = 5  # pixels: side of the patches that are compared
 TEXTURE = 1.0  # of 255: standard deviation, less an even slope, from which a patch has a texture
-SAME = 0.8  # correlation from which patches of two photos are the same
+SAME = 0.9  # correlation from which patches of two photos are the same
+STILL = 1  # pixel by which the same patch may be elsewhere: poses err, and what moves by so little is as good as infinitely far
 MAJORITY = 5  # pixels: side of the neighbourhood that decides
 RIM = 3  # pixels beside what is near, whose patches show it too
 # Not tuned: the next four.
@@ -133,13 +134,22 @@ def _sky_of(photo: Small, nearest: list[Small]) -> np.ndarray:
         seen = scipy.ndimage.minimum_filter(np.isfinite(place).all(2), PATCH)
         at = np.nan_to_num(place[..., ::-1] - 0.5).transpose(2, 0, 1)
         there = map_coordinates(other.grey, at, order=1, mode="nearest")
-        others, scattered = _moments(there)
-        covariance = uniform_filter(grey * there, PATCH) - mean * others
         compared |= seen
-        same |= seen & (covariance > SAME * deviation * scattered)
+        for moved in _moved(there):
+            others, scattered = _moments(moved)
+            covariance = uniform_filter(grey * moved, PATCH) - mean * others
+            same |= seen & (covariance > SAME * deviation * scattered)
     near = compared & ~same & (_texture(grey, deviation) > TEXTURE)
     near = uniform_filter(near.astype(np.float32), MAJORITY) > 0.5
     return scipy.ndimage.maximum_filter(~near, 2 * RIM + 1)
+
+
+def _moved(grey: np.ndarray) -> Iterator[np.ndarray]:
+    """A picture (H, W) moved by up to `STILL` pixels each way."""
+    height, width = grey.shape
+    wider = np.pad(grey, STILL, mode="edge")
+    for row, column in itertools.product(range(2 * STILL + 1), repeat=2):
+        yield wider[row : row + height, column : column + width]
 
 
 def _moments(grey: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

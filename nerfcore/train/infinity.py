@@ -63,7 +63,7 @@ def share_at_infinity(scene: Scene) -> float:
     around = not looks_inward(scene.views)
     if around:
         far &= ~np.concatenate([named_things(view, scene) for view in views])[usable]
-    between = np.concatenate([_between_points(view, scene.points.xyz) for view in views])[usable]
+    between = np.concatenate([between_points(view, scene.points.xyz) for view in views])[usable]
     if (far & between).sum() > BETWEEN * far.sum():
         return 0.0
     up = directions[:, 2] > 0
@@ -93,9 +93,9 @@ def named_things(view: View, scene: Scene) -> np.ndarray:
     return np.isin(nearest(read_label(view.label), camera.width, camera.height), things).reshape(-1)
 
 
-def _between_points(view: View, points: np.ndarray) -> np.ndarray:
+def between_points(view: View, points: np.ndarray, longest: float = np.inf) -> np.ndarray:
     """Which pixels (N,) bool of a small version of a photo lie in the convex hull of those of the points (P, 3) that are in
-    its picture."""
+    its picture; `longest`: only between points that are no farther from each other, as a share of its width."""
     camera = view.camera.resized(*training_size(view.camera, SIDE))
     local = (points - view.camera_to_world[:3, 3]) @ view.camera_to_world[:3, :3]
     with np.errstate(invalid="ignore"):
@@ -106,5 +106,9 @@ def _between_points(view: View, points: np.ndarray) -> np.ndarray:
     centers = pixel_centers(camera.width, camera.height).reshape(-1, 2)
     if inside.sum() < FEWEST:
         return np.zeros(len(centers), bool)
-    hull = scipy.spatial.Delaunay(pixel[inside], qhull_options="QJ")  # they may lie in a line
-    return hull.find_simplex(centers) >= 0
+    seen = pixel[inside]
+    triangles = scipy.spatial.Delaunay(seen, qhull_options="QJ")  # they may lie in a line
+    corners = seen[triangles.simplices]
+    edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(1)
+    triangle = triangles.find_simplex(centers)
+    return (triangle >= 0) & (edges[triangle] <= longest * camera.width)

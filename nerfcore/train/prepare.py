@@ -166,7 +166,7 @@ def make_trainer(project_folder: Path, info: RunInfo, scene: Scene, device: torc
     trainer = Trainer(model, store, config, LEVEL.get(config.scene.background), report.check)
     trainer.space = space
     if model.environment is not None and config.train.environment_start > 0:
-        trainer.sky = sky_masks(store.views, store.cameras, device, report.check)
+        trainer.sky = sky_masks(store.views, store.cameras, scene.points.xyz, device, report.check)
     if config.loss.depth_weight > 0:
         scale = depth_scale(world_from_sfm(project), box.box_from_world)
         visibility = load_visibility(project_folder)

@@ -22,7 +22,7 @@ from ..data.pixels import training_size
 from ..data.scene import View
 from ..geometry.cameras import Camera, pixel_centers, project, rays
 from ..images.picture import resized
-from .infinity import SIDE
+from .infinity import SIDE, between_points
 
 PATCH = 5  # pixels: side of the patches that are compared
 TEXTURE = 1.0  # of 255: standard deviation, less an even slope, from which a patch has a texture
@@ -30,6 +30,7 @@ SAME = 0.9  # correlation from which patches of two photos are the same
 STILL = 1  # pixel by which the same patch may be elsewhere: poses err, and what moves by so little is as good as infinitely far
 MAJORITY = 5  # pixels: side of the neighbourhood that decides
 RIM = 3  # pixels beside what is near, whose patches show it too
+CLOSE = 0.2  # of a photo's width: points no farther from each other have something between them, not sky
 # Not tuned: the next four.
 CAMERAS = 6  # the nearest that look there: they see the sky beside the same things
 APART = 0.1  # of the typical distance of cameras from their middle, at least: what is near must have moved
@@ -60,10 +61,11 @@ class SkyMasks:
 def sky_masks(
     views: list[View],
     cameras: list[Camera],
+    points: np.ndarray,
     device: torch.device,
     check: Callable[[], None] = lambda: None,
 ) -> SkyMasks:
-    """The masks of training `views`, whose pictures have the sizes of `cameras`. `check` is called for each photo and may
+    """The masks of training `views`, whose pictures have the sizes of `cameras`; points (P, 3): of the poses. `check` is called for each photo and may
     raise to stop."""
     photos = []
     for view in views:
@@ -76,7 +78,7 @@ def sky_masks(
         check()
         away = np.linalg.norm(centers - centers[i], axis=1)
         nearest = [photos[j] for j in np.argsort(away, kind="stable") if away[j] > apart]
-        found.append(_sky_of(photo, nearest))
+        found.append(_sky_of(photo, nearest) & ~_between(photo, points))
 
     def column(numbers: list[int]) -> torch.Tensor:
         return torch.tensor(numbers, device=device)
@@ -142,6 +144,11 @@ def _sky_of(photo: Small, nearest: list[Small]) -> np.ndarray:
     near = compared & ~same & (_texture(grey, deviation) > TEXTURE)
     near = uniform_filter(near.astype(np.float32), MAJORITY) > 0.5
     return scipy.ndimage.maximum_filter(~near, 2 * RIM + 1)
+
+
+def _between(photo: Small, points: np.ndarray) -> np.ndarray:
+    """Which pixels (H, W) bool of a small photo lie between points (P, 3) close to each other."""
+    return between_points(photo.view, points, CLOSE).reshape(photo.grey.shape)
 
 
 def _moved(grey: np.ndarray) -> Iterator[np.ndarray]:

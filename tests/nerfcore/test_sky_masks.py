@@ -13,9 +13,11 @@ from fieldwork.nerfcore.data.load import load_scene
 from fieldwork.nerfcore.data.pixels import PixelStore
 from fieldwork.nerfcore.data.scene import Scene
 from fieldwork.nerfcore.errors import Cancelled
+from fieldwork.nerfcore.geometry.points import Points
 from fieldwork.nerfcore.kernels.device import use_device
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.train.composite_loss import composite_loss
+from fieldwork.nerfcore.train.infinity import between_points
 from fieldwork.nerfcore.train.prepare import make_trainer, plan_run
 from fieldwork.nerfcore.train.sky_masks import sky_masks
 from fieldwork.nerfcore.train.trainer import Trainer
@@ -30,7 +32,7 @@ def masks_of(scene: Scene, longest: int = 10_000) -> list[np.ndarray]:
     """The masks of all views of a scene, each at the size of the store's photo."""
     views = list(range(len(scene.views)))
     store = PixelStore(scene, views, [], np.eye(4), longest, CPU, Reporter())
-    masks = sky_masks(store.views, store.cameras, CPU)
+    masks = sky_masks(store.views, store.cameras, scene.points.xyz, CPU)
     found = []
     for i, camera in enumerate(store.cameras):
         pixel = torch.arange(camera.width * camera.height)
@@ -78,6 +80,33 @@ def test_masks_are_read_at_the_size_of_the_photos_trained_on(tmp_path: Path) -> 
     for large, small in zip(masks_of(scene), masks_of(scene, longest=48)):
         assert small.shape == (48, 48)
         assert (large[::2, ::2] == small).all()
+
+
+def test_what_lies_between_close_points_is_not_sky(tmp_path: Path) -> None:
+    scene = load_scene(under_the_sky(tmp_path / "p"))
+    alone = np.mean(masks_of(replace(scene, points=Points.empty())))
+    directions = np.random.default_rng(0).normal(size=(20_000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    around = Points(30 * directions, np.zeros((20_000, 3), np.uint8), np.zeros(20_000))
+    assert alone > 0.2
+    assert np.mean(masks_of(replace(scene, points=around))) < 0.05
+
+
+def test_points_far_apart_have_nothing_between_them(tmp_path: Path) -> None:
+    """Towers have sky between them."""
+    view = load_scene(under_the_sky(tmp_path / "p")).views[0]
+    side = view.camera.width
+    generator = np.random.default_rng(0)
+    column = np.concatenate([generator.uniform(2, 6, 50), generator.uniform(side - 6, side - 2, 50)])
+    pixel = np.stack([column, generator.uniform(2, side - 2, 100)], 1)
+    local = np.concatenate([(pixel - [view.camera.cx, view.camera.cy]) / view.camera.fx, np.ones((100, 1))], 1)
+    points = local @ view.camera_to_world[:3, :3].T + view.camera_to_world[:3, 3]
+    whole = between_points(view, points).reshape(side, side)
+    near = between_points(view, points, 0.2).reshape(side, side)
+    middle = slice(side // 2 - 4, side // 2 + 4)
+    assert whole[middle, middle].all()
+    assert not near[middle, middle].any()
+    assert near[middle, 3:5].any()
 
 
 def trainer_of(project: Path, **settings: str) -> Trainer:
@@ -144,5 +173,5 @@ def test_masks_are_cancelled_between_photos(court: Path) -> None:
             raise Cancelled
 
     with pytest.raises(Cancelled):
-        sky_masks(scene.views, [view.camera for view in scene.views], CPU, check)
+        sky_masks(scene.views, [view.camera for view in scene.views], scene.points.xyz, CPU, check)
     assert len(calls) == 3

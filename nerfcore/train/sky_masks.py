@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 import torch
-from scipy.ndimage import map_coordinates, uniform_filter
 
 from ..data.photo import photo_of
 from ..data.pixels import training_size
@@ -135,14 +134,14 @@ def _sky_of(photo: Small, nearest: list[Small]) -> np.ndarray:
         place = other.places(directions).reshape(*grey.shape, 2)
         seen = scipy.ndimage.minimum_filter(np.isfinite(place).all(2), PATCH)
         at = np.nan_to_num(place[..., ::-1] - 0.5).transpose(2, 0, 1)
-        there = map_coordinates(other.grey, at, order=1, mode="nearest")
+        there = scipy.ndimage.map_coordinates(other.grey, at, order=1, mode="nearest")
         compared |= seen
         for moved in _moved(there):
             others, scattered = _moments(moved)
-            covariance = uniform_filter(grey * moved, PATCH) - mean * others
+            covariance = scipy.ndimage.uniform_filter(grey * moved, PATCH) - mean * others
             same |= seen & (covariance > SAME * deviation * scattered)
     near = compared & ~same & (_texture(grey, deviation) > TEXTURE)
-    near = uniform_filter(near.astype(np.float32), MAJORITY) > 0.5
+    near = scipy.ndimage.uniform_filter(near.astype(np.float32), MAJORITY) > 0.5
     return scipy.ndimage.maximum_filter(~near, 2 * RIM + 1)
 
 
@@ -161,8 +160,8 @@ def _moved(grey: np.ndarray) -> Iterator[np.ndarray]:
 
 def _moments(grey: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mean and standard deviation of each patch (H, W)."""
-    mean = uniform_filter(grey, PATCH)
-    return mean, np.sqrt(np.maximum(uniform_filter(grey * grey, PATCH) - mean * mean, 0))
+    mean = scipy.ndimage.uniform_filter(grey, PATCH)
+    return mean, np.sqrt(np.maximum(scipy.ndimage.uniform_filter(grey * grey, PATCH) - mean * mean, 0))
 
 
 def _texture(grey: np.ndarray, deviation: np.ndarray) -> np.ndarray:

@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
+from ..images.texture import left_of_slopes
 from ..progress import Reporter
 from .depth_maps import DepthMap, FlatView, cosines, pixel_directions
 from .scene_planes import FITTED_PIXELS, STEEPEST, WIDTHS, Known, near_plane, scene_planes
@@ -74,14 +75,7 @@ def picture_of(view: FlatView, field: DepthMap, sure: np.ndarray, plain: np.ndar
 
 def plain_places(grey: np.ndarray) -> np.ndarray:
     """Where (H, W) bool a picture (H, W) in [0, 1] shows nothing but an even slope of grey."""
-    grey, size = grey.astype(np.float64), 2 * REACH + 1
-    mean = scipy.ndimage.uniform_filter(grey, size)
-    left = scipy.ndimage.uniform_filter(grey * grey, size) - mean * mean
-    steps = np.arange(-REACH, REACH + 1)
-    for axis in (0, 1):
-        product = scipy.ndimage.correlate1d(grey, steps / size, axis=axis)
-        left -= scipy.ndimage.uniform_filter1d(product, size, axis=1 - axis) ** 2 / (steps**2).mean()
-    return left < SHOWS**2
+    return left_of_slopes(grey, 2 * REACH + 1) < SHOWS**2
 
 
 def any_plain(pictures: list[Picture]) -> bool:

@@ -21,6 +21,7 @@ from ..data.pixels import training_size
 from ..data.scene import View
 from ..geometry.cameras import Camera, pixel_centers, project, rays
 from ..images.picture import resized
+from ..images.texture import left_of_slopes
 from .infinity import SIDE, between_points
 
 PATCH = 5  # pixels: side of the patches that are compared
@@ -64,8 +65,8 @@ def sky_masks(
     device: torch.device,
     check: Callable[[], None] = lambda: None,
 ) -> SkyMasks:
-    """The masks of training `views`, whose pictures have the sizes of `cameras`; points (P, 3): of the poses. `check` is called for each photo and may
-    raise to stop."""
+    """The masks of training `views`, whose pictures have the sizes of `cameras`; points (P, 3): of the poses. `check` is
+    called for each photo and may raise to stop."""
     photos = []
     for view in views:
         check()
@@ -77,7 +78,8 @@ def sky_masks(
         check()
         away = np.linalg.norm(centers - centers[i], axis=1)
         nearest = [photos[j] for j in np.argsort(away, kind="stable") if away[j] > apart]
-        found.append(_sky_of(photo, nearest) & ~_between(photo, points))
+        between = between_points(photo.view, points, CLOSE).reshape(photo.grey.shape)
+        found.append(_sky_of(photo, nearest) & ~between)
 
     def column(numbers: list[int]) -> torch.Tensor:
         return torch.tensor(numbers, device=device)
@@ -140,14 +142,9 @@ def _sky_of(photo: Small, nearest: list[Small]) -> np.ndarray:
             others, scattered = _moments(moved)
             covariance = scipy.ndimage.uniform_filter(grey * moved, PATCH) - mean * others
             same |= seen & (covariance > SAME * deviation * scattered)
-    near = compared & ~same & (_texture(grey, deviation) > TEXTURE)
+    near = compared & ~same & (left_of_slopes(grey, PATCH) > TEXTURE**2)
     near = scipy.ndimage.uniform_filter(near.astype(np.float32), MAJORITY) > 0.5
     return scipy.ndimage.maximum_filter(~near, 2 * RIM + 1)
-
-
-def _between(photo: Small, points: np.ndarray) -> np.ndarray:
-    """Which pixels (H, W) bool of a small photo lie between points (P, 3) close to each other."""
-    return between_points(photo.view, points, CLOSE).reshape(photo.grey.shape)
 
 
 def _moved(grey: np.ndarray) -> Iterator[np.ndarray]:
@@ -162,16 +159,3 @@ def _moments(grey: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mean and standard deviation of each patch (H, W)."""
     mean = scipy.ndimage.uniform_filter(grey, PATCH)
     return mean, np.sqrt(np.maximum(scipy.ndimage.uniform_filter(grey * grey, PATCH) - mean * mean, 0))
-
-
-def _texture(grey: np.ndarray, deviation: np.ndarray) -> np.ndarray:
-    """Standard deviation of each patch less that of the slope that fits it best (H, W)."""
-    step = np.arange(PATCH) - PATCH // 2
-    spread = (step**2).mean()
-    slopes = [
-        scipy.ndimage.uniform_filter1d(
-            scipy.ndimage.correlate1d(grey, step / (PATCH * spread), axis=axis), PATCH, axis=1 - axis
-        )
-        for axis in (0, 1)
-    ]
-    return np.sqrt(np.maximum(deviation**2 - spread * (slopes[0] ** 2 + slopes[1] ** 2), 0))

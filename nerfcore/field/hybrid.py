@@ -225,6 +225,12 @@ class HybridField(nn.Module):
             parts.append(codes.to(self.dtype))
         return torch.sigmoid(self.color_head(torch.cat(parts, 1), self.dtype).float())
 
+    @torch.no_grad()
+    def hold_directions(self) -> None:
+        """Colours become the same from everywhere: weights that read directions are zero, but for the harmonic of degree 0."""
+        first = 1 + self.config.geometry_features
+        self.color_head.weights[0][:, first + 1 : first + DIRECTION_FEATURES] = 0
+
     def _mean_code(self) -> torch.Tensor:
         """The appearance code (A,) of pictures."""
         if self.appearance is None:

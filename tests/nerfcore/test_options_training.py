@@ -16,6 +16,7 @@ from fieldwork.nerfcore.data.box import choose_box
 from fieldwork.nerfcore.data.load import load_scene
 from fieldwork.nerfcore.data.pixels import VOID
 from fieldwork.nerfcore.errors import TrainingError
+from fieldwork.nerfcore.field.encoding import spherical_harmonics
 from fieldwork.nerfcore.geometry.cameras import Camera
 from fieldwork.nerfcore.geometry.similarity import similarity_scale
 from fieldwork.nerfcore.params import TrainParams
@@ -296,6 +297,28 @@ def test_first_steps_are_as_long_as_the_rates(ball: Path) -> None:
     assert bias_correction(1) == pytest.approx(1.0)
     assert moved[0] == pytest.approx(0.02 * 0.5**2, rel=0.02)
     assert moved[1] == pytest.approx(0.003 * 0.5**2, rel=0.02)
+
+
+@pytest.mark.setting("train.directions_start")
+def test_colours_depend_on_directions_later(ball: Path) -> None:
+    ways = torch.nn.functional.normalize(torch.randn(64, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+
+    @torch.no_grad()
+    def spread(trainer: Trainer) -> float:
+        """The largest difference of the colours that a point has in many directions."""
+        field = trainer.model.field
+        color = field.color(field.geometry(torch.full((64, 3), 0.5)), spherical_harmonics(ways))
+        return float((color.amax(0) - color.amin(0)).max())
+
+    trainer = trainer_of(ball, **{"train.directions_start": "0.5"})
+    assert spread(trainer) == 0
+    for progress in (0.0, 0.2, 0.49):
+        trainer.step(progress)
+    assert spread(trainer) == 0
+    for progress in (0.5, 0.6):
+        trainer.step(progress)
+    assert spread(trainer) > 1e-3
+    assert spread(trainer_of(ball, **{"train.directions_start": "0"})) > 1e-3
 
 
 @pytest.mark.setting("train.pose_rate")

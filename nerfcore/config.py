@@ -263,13 +263,6 @@ class TrainConfig(Stage):
         description="share of training before an environment is behind all pixels; until then it is not behind those whose "
         "texture no camera nearby sees in the same direction: surfaces form first",
     )
-    directions_start: float = Field(
-        default=0.1,
-        ge=0,
-        le=1,
-        description="share of training before colours depend on the direction from which they are seen: until then only a "
-        "surface at its place has one colour in all photos",
-    )
     pose_start: float = Field(default=0.05, ge=0, lt=1, description="share of training before cameras move")
     checkpoint_every: float = Field(default=30.0, gt=0, le=MANY, description="seconds between checkpoints")
     preview_every: float = Field(default=15.0, gt=0, le=MANY, description="seconds between preview pictures")

@@ -226,8 +226,8 @@ class HybridField(nn.Module):
         return torch.sigmoid(self.color_head(torch.cat(parts, 1), self.dtype).float())
 
     @torch.no_grad()
-    def hold_directions(self) -> None:
-        """Colours become the same from everywhere: weights that read directions are zero, but for the harmonic of degree 0."""
+    def forget_directions(self) -> None:
+        """Make colours the same from everywhere: weights of all harmonics but the constant one become zero."""
         first = 1 + self.config.geometry_features
         self.color_head.weights[0][:, first + 1 : first + DIRECTION_FEATURES] = 0
 

@@ -61,8 +61,8 @@ class Trainer:
         self.optimizer = torch.optim.Adam(
             model.parameters(), config.train.network_rate, betas=BETAS, eps=1e-15, fused=self.backend.fused_optimizer
         )
-        if config.train.directions_start > 0:
-            model.field.hold_directions()
+        # docs/experiments.md, “Colours that begin without directions”
+        model.field.forget_directions()
         self.guard = GradientGuard(model.field.dtype, self.device)
         self.generator = torch.Generator(self.device).manual_seed(config.train.seed)
         self.steps = 0
@@ -138,8 +138,6 @@ class Trainer:
             group["lr"] = config.train.network_rate * factor
         self.guard.step(self.optimizer)
         self.guard.update()
-        if progress < config.train.directions_start:
-            model.field.hold_directions()
         if model.field.grid is not None:
             model.field.grid.step(config.train.grid_rate * factor * bias_correction(self.steps, *BETAS), BETAS)
         rendered = learned.rendered

@@ -24,6 +24,7 @@ from ..project.schema import Frame, ImageRecord, PosedImage, Poses, Project, Sem
 from ..project.store import PROJECT_FILE, create_folder, edit_project, load_project, save_poses
 from .copying import copy_depth, copy_labels, copy_mask, copy_photo
 from .dataset import Dataset, DatasetView
+from .hull import trim_masks
 from .lens_check import lens_problem
 
 # In the order in which "auto" asks them: the more specific layouts first.
@@ -89,6 +90,8 @@ def import_dataset(params: ImportParams, report: Reporter) -> dict[str, Any]:
             "classes": [c.name for c in classes],
         }
         project.record("import", params.model_dump(mode="json"), result | {"world_kept": kept, "cut_out": cut_out})
+    if cut_out:
+        trim_masks(folder, report)
     return result
 
 

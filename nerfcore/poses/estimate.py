@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from ..data.hull import trim_masks
 from ..errors import PosesError
 from ..files import atomic_path, disk_errors, write_json
 from ..geometry.cameras import Camera
@@ -18,7 +19,7 @@ from ..geometry.points import Points
 from ..params import PosesParams
 from ..progress import Reporter, shortened
 from ..project.fingerprints import Earlier, Fingerprint, compare, digest, files_digest
-from ..project.kept import earlier_poses, keep_world
+from ..project.kept import earlier_cut_outs, earlier_poses, keep_world
 from ..project.schema import Frame, ImageRecord, PosedImage, Poses, Project
 from ..project.store import POSES_FILE, edit_project, load_poses, load_project, save_poses
 from ..verdict import poses_verdict
@@ -73,6 +74,10 @@ def estimate_poses(params: PosesParams, report: Reporter) -> dict[str, Any]:
         if not kept:
             project.frame, kept = keep_world(project, before, poses, _upright_frame(project, poses, points), report)
         save_poses(folder, poses, points, visibility)
+        if earlier_cut_outs(project) and trim_masks(folder, report):
+            # Found with the masks as they were; that they are others now is no reason to find them again.
+            inputs = posing_inputs(folder, project, params)
+            write_json(folder / WORK_FOLDER / STATE_FILE, _photo_state(folder, records))
         answer = {
             "registered": len(poses.images),
             "total": len(records),

@@ -26,6 +26,7 @@ from .clean import clean, drop_scraps
 from .closed import closed_surface, unseen_faces
 from .cut_outs import left_out
 from .decimate import decimate
+from .denied import denied
 from .denoise import denoised
 from .extract import extract
 from .field_values import shade
@@ -76,18 +77,19 @@ def build(trained: Trained, project: Project, scene: Scene, params: MeshParams, 
         vertices, faces = closed_surface(bricks, maps, tolerance, params.faces, report)
     else:
         vertices, faces = open_surface(bricks, maps, tolerance, region, params.faces, report)
+        world, photos = transform_points(box.world_from_box, vertices), [scene.views[i] for i in scene.train]
+        faces = faces[~denied(world, faces, photos, report)]
         if scene.mask_mode == "empty":
-            world = transform_points(box.world_from_box, vertices)
-            outside = left_out(world, faces, [scene.views[i] for i in scene.train], report)
-            vertices, faces = compact(vertices, drop_scraps(vertices, faces[~outside]))
+            faces = drop_scraps(vertices, faces[~left_out(world, faces, photos, report)])
+        vertices, faces = compact(vertices, faces)
     if not len(faces):
         raise no_surface(params)
     check_parts(vertices, faces, report)
     report.stage("Reading colours")
     vertices, faces = vertices.astype(np.float32), faces.astype(np.int32)
     normals = vertex_normals(vertices, faces)
-    photos = Photos(store, maps, np.array([flat.photo for flat in flats]), tolerance)
-    colors = vertex_colors(trained.model, region, photos, vertices, normals, report)
+    painted = Photos(store, maps, np.array([flat.photo for flat in flats]), tolerance)
+    colors = vertex_colors(trained.model, region, painted, vertices, normals, report)
     unseen = unseen_faces(vertices, faces, maps, tolerance, report) if params.watertight else None
     return Built(vertices, faces, normals, colors, region, coarse, unseen)
 

@@ -1,0 +1,96 @@
+"""Parts of a surface that photos deny are told from true ones, plain ones and those that few photos show."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy
+from fieldwork.nerfcore.data.scene import View
+from fieldwork.nerfcore.geometry.cameras import Camera, pixel_centers, rays
+from fieldwork.nerfcore.mesh.denied import denied, disagree
+from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.render.verb import look_at
+from PIL import Image
+
+CAMERA = Camera(width=240, height=180, fx=200, fy=200, cx=120, cy=90)
+EYES = [np.array([x, y, 5.0]) for x in (-1.5, -0.5, 0.5, 1.5) for y in (-0.6, 0.6)]
+PLATE = np.array([-1.2, 0.0, 1.0])  # middle of a true part before the wall
+SCRAP = np.array([1.0, 0.0, 1.0])  # of one that is not there
+HALF = 0.4
+
+
+def texture(seed: int, fine: float) -> np.ndarray:
+    noise = scipy.ndimage.gaussian_filter(np.random.default_rng(seed).normal(size=(400, 400)), fine, mode="wrap")
+    return 128 + 40 * noise / noise.std()
+
+
+def sampled(picture: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """A texture over [−5, 5]² at places (N,)."""
+    return scipy.ndimage.map_coordinates(picture, [(y + 5) * 40, (x + 5) * 40], order=1, mode="wrap")
+
+
+def photos(folder: Path, plain: bool) -> list[View]:
+    """A wall at z = 0 and a plate before it, both with a texture, the wall without one where it is `plain`."""
+    wall, plate = texture(0, 3.0), texture(1, 3.0)
+    views = []
+    for number, eye in enumerate(EYES):
+        pose = look_at(eye, np.array([0.0, 0.0, 0.5]), np.array([0.0, 1.0, 0.0]))
+        local, _ = rays(CAMERA, pixel_centers(CAMERA.width, CAMERA.height).reshape(-1, 2))
+        ways = local @ pose[:3, :3].T
+        near, far = (eye + ways * ((z - eye[2]) / ways[:, 2])[:, None] for z in (PLATE[2], 0.0))
+        inside = (np.abs(near[:, :2] - PLATE[:2]) < HALF).all(1)
+        behind = np.full(len(far), 128.0) if plain else sampled(wall, *far[:, :2].T)
+        grey = np.where(inside, sampled(plate, *near[:, :2].T), behind)
+        grey += np.random.default_rng(number).normal(size=len(grey))
+        pixels = np.clip(grey, 0, 255).astype(np.uint8).reshape(CAMERA.height, CAMERA.width)
+        Image.fromarray(np.repeat(pixels[..., None], 3, 2)).save(folder / f"{number}.png")
+        views.append(View(str(number), CAMERA, pose, folder / f"{number}.png"))
+    return views
+
+
+def square(middle: np.ndarray, half: float, cells: int) -> tuple[np.ndarray, np.ndarray]:
+    side = np.linspace(-half, half, cells + 1)
+    vertices = np.stack([*np.meshgrid(side, side), np.zeros((cells + 1, cells + 1))], -1).reshape(-1, 3) + middle
+    a = (np.arange(cells)[:, None] * (cells + 1) + np.arange(cells)).ravel()
+    b, c, d = a + 1, a + cells + 1, a + cells + 2
+    return vertices, np.concatenate([np.stack([a, b, c], 1), np.stack([b, d, c], 1)])
+
+
+@pytest.fixture
+def surface() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Wall, plate and scrap: vertices, faces, and of which of the three each face is."""
+    parts = [square(np.zeros(3), 3.0, 60), square(PLATE, HALF, 12), square(SCRAP, HALF, 12)]
+    starts = np.cumsum([0, *(len(v) for v, _ in parts)])
+    faces = np.concatenate([f + start for (_, f), start in zip(parts, starts)])
+    return np.concatenate([v for v, _ in parts]), faces, np.repeat(np.arange(3), [len(f) for _, f in parts])
+
+
+def test_only_the_part_that_is_not_there_is_denied(
+    tmp_path: Path, surface: tuple[np.ndarray, np.ndarray, np.ndarray]
+) -> None:
+    vertices, faces, part = surface
+    views = photos(tmp_path, plain=False)
+    assert np.array_equal(denied(vertices, faces, views, Reporter()), part == 2)
+    assert not denied(vertices, faces, views[:2], Reporter()).any(), "two photos are one pair"
+    assert not denied(vertices, faces[part == 2], views, Reporter()).any(), "the largest part stays"
+    assert len(denied(vertices, faces[:0], views, Reporter())) == 0
+
+
+def test_photos_say_nothing_of_what_is_plain(
+    tmp_path: Path, surface: tuple[np.ndarray, np.ndarray, np.ndarray]
+) -> None:
+    vertices, faces, _ = surface
+    assert not denied(vertices, faces, photos(tmp_path, plain=True), Reporter()).any()
+
+
+def test_photos_of_another_exposure_agree() -> None:
+    rng = np.random.default_rng(0)
+    shown = rng.uniform(40, 120, 300)
+    assert not disagree(np.stack([shown, 1.8 * shown + 20, 0.5 * shown]))
+    assert disagree(rng.uniform(40, 120, (3, 300)))
+    hidden = rng.uniform(40, 120, (3, 300))
+    hidden[:, ::2] = np.nan
+    hidden[1, 60:] = np.nan
+    assert not disagree(hidden), "two pairs share too few places"

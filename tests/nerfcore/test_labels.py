@@ -80,12 +80,12 @@ def mark(folder: Path, **values: Any) -> int:
 
 
 def two_strokes(folder: Path, photo: str = "01") -> None:
-    """One to and fro over the upper half of a photo, one over the lower."""
+    """One to and fro over the upper half of a photo, one over the lower, well away from where they meet."""
     ids = truth(folder)[photo]
     for class_id in (TOP, BOTTOM):
         rows, columns = np.nonzero(ids == class_id)
         points = []
-        for number, row in enumerate(np.percentile(rows, [15, 50, 85]).astype(int).tolist()):
+        for number, row in enumerate(np.percentile(rows, [20, 50, 80]).astype(int).tolist()):
             inside = columns[rows == row]
             ends = [(float(inside.min()) + 3, row + 0.5), (float(inside.max()) - 3, row + 0.5)]
             points += ends[:: -1 if number % 2 else 1]

@@ -46,55 +46,54 @@ def trim_masks(folder: Path, report: Reporter) -> int:
     report.stage("Comparing the masks")
     shown: list[Shown] = []
     for number, view in enumerate(scene.views):
-        report.progress(number / len(scene.views), view.name)
-        found = Shown.of(view)
-        if found is not None:
-            shown.append(found)
+        report.progress(number / len(scene.views) / 2, view.name)
+        if view.mask is not None:
+            shown.append(Shown.of(view, read_image(view.mask)[..., 0]))
     if len(shown) < FEWEST:
         return 0
     box = choose_box(scene, SceneConfig(), empty_around=True)
     side = (np.arange(CELLS) + 0.5) / CELLS * 2 - 1
     cells = np.stack(np.meshgrid(side, side, side, indexing="ij"), -1).reshape(-1, 3)
     hull = hull_of(shown, transform_points(box.world_from_box, cells), report)
-    size = similarity_scale(box.world_from_box) * 2 / CELLS
     changed = 0
-    for one in shown:
-        report.check()
-        beside = (one.made == 255) & ~one.covered(hull, size)
-        if not 0 < np.count_nonzero(beside) <= (1 - LEAST) * np.count_nonzero(one.made == 255):
-            continue
-        trimmed = np.where(beside, MASK_UNKNOWN, one.made).astype(np.uint8)
-        if not np.array_equal(trimmed, one.kept):
-            changed += 1
-            assert one.view.mask is not None
-            with atomic_path(one.view.mask) as path:
-                Image.fromarray(trimmed).save(path, compress_level=2)
+    for number, one in enumerate(shown if len(hull) else []):
+        report.progress((1 + number / len(shown)) / 2, one.view.name)
+        changed += _trim(one, hull, similarity_scale(box.world_from_box) * 2 / CELLS)
     if changed:
         report.note(f"What {changed} masks show beside the object, and most others do not, was left open in them.")
     return changed
 
 
+def _trim(one: Shown, hull: np.ndarray, size: float) -> bool:
+    """Leave open what a mask shows beside the cells (N, 3) of the hull, of that size; whether it was changed."""
+    assert one.view.mask is not None
+    kept, made = read_image(one.view.mask)[..., 0], object_mask(read_picture(one.view.image).pixels[..., :3])
+    if kept.shape != made.shape or not ((kept == made) | ((kept == MASK_UNKNOWN) & (made == 255))).all():
+        return False  # somebody's own, or edited
+    covered = nearest(one.covered(hull, size), made.shape[1], made.shape[0])
+    beside = (made == 255) & ~covered
+    if np.count_nonzero(beside) > (1 - LEAST) * np.count_nonzero(made == 255):
+        return False
+    trimmed = np.where(beside, MASK_UNKNOWN, made).astype(np.uint8)
+    if np.array_equal(trimmed, kept):
+        return False
+    with atomic_path(one.view.mask) as path:
+        Image.fromarray(trimmed).save(path, compress_level=2)
+    return True
+
+
 @dataclass(frozen=True)
 class Shown:
-    """A photo and its mask: as Fieldwork makes it and as it is in the project, (H, W) uint8; and which pixels of a small
-    picture (h, w) it says may show the object, with `SLACK`."""
+    """A photo, and which pixels of a small picture (h, w) bool its mask says may show the object, with `SLACK`."""
 
     view: View
-    made: np.ndarray
-    kept: np.ndarray
     small: np.ndarray
 
     @classmethod
-    def of(cls, view: View) -> Shown | None:
-        """None where the mask is another one than Fieldwork makes."""
-        if view.mask is None:
-            return None
-        kept, made = read_image(view.mask)[..., 0], object_mask(read_picture(view.image).pixels[..., :3])
-        if kept.shape != made.shape or not ((kept == made) | ((kept == MASK_UNKNOWN) & (made == 255))).all():
-            return None
+    def of(cls, view: View, mask: np.ndarray) -> Shown:
         scale = min(1.0, SIDE / max(view.camera.width, view.camera.height))
         width, height = (max(1, round(side * scale)) for side in (view.camera.width, view.camera.height))
-        return cls(view, made, kept, scipy.ndimage.maximum_filter(nearest(made, width, height) > 0, 2 * SLACK + 1))
+        return cls(view, scipy.ndimage.maximum_filter(nearest(mask, width, height) > 0, 2 * SLACK + 1))
 
     def pixels(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Column and row (N, 2) int of points (N, 3) of the world in the small picture, and which of them it shows (N,)."""
@@ -106,7 +105,7 @@ class Shown:
         return np.where(seen[:, None], place, 0).astype(int), seen
 
     def covered(self, hull: np.ndarray, size: float) -> np.ndarray:
-        """Which pixels (H, W) bool of the whole mask cells (N, 3) of the hull, of that size, are before, with `SLACK`."""
+        """Which pixels (h, w) bool of the small picture show cells (N, 3) of the hull, of that size, with `SLACK`."""
         pixel, seen = self.pixels(hull)
         picture = np.zeros(self.small.shape, bool)
         picture[pixel[seen, 1], pixel[seen, 0]] = True
@@ -114,15 +113,14 @@ class Shown:
         camera = self.view.camera.resized(self.small.shape[1], self.small.shape[0])
         cell = size * camera.pixels_per_radian / max(float(np.median(away)), 1e-9)
         reach = SLACK + int(np.ceil(min(cell, max(picture.shape))))
-        wide = scipy.ndimage.maximum_filter(picture, 2 * reach + 1)
-        return nearest(wide, self.made.shape[1], self.made.shape[0])
+        return scipy.ndimage.maximum_filter(picture, 2 * reach + 1)
 
 
 def hull_of(shown: list[Shown], cells: np.ndarray, report: Reporter) -> np.ndarray:
     """Those of the cells' centres (N, 3) that are in most masks of the photos that see them, (M, 3)."""
     inside, seeing = np.zeros(len(cells), np.int32), np.zeros(len(cells), np.int32)
-    for number, one in enumerate(shown):
-        report.progress(number / len(shown), one.view.name)
+    for one in shown:
+        report.check()
         pixel, seen = one.pixels(cells)
         seeing += seen
         inside += seen & one.small[pixel[:, 1], pixel[:, 0]]

@@ -50,8 +50,7 @@ def denied(vertices: np.ndarray, faces: np.ndarray, views: Sequence[View], repor
     chosen = []
     for one in others:
         own = np.flatnonzero(part == one)
-        share = area[own] / max(area[own].sum(), 1e-30)
-        chosen.append(rng.choice(own, SAMPLES, p=share) if share.sum() > 0.5 else own[:1].repeat(SAMPLES))
+        chosen.append(rng.choice(own, SAMPLES, p=area[own] / area[own].sum()))
     picked = np.concatenate(chosen)
     grey = _grey_values(vertices, faces, picked, views, report).reshape(len(views), len(others), SAMPLES)
     bad = [one for number, one in enumerate(others) if disagree(grey[:, number])]
@@ -82,7 +81,7 @@ def _grey_values(
     middles = vertices[faces].mean(1, dtype=np.float64)
     middle, normals = middles[picked], unit(cross(vertices, faces[picked]))
     front = FrontFaces(vertices, faces)
-    seen, places = np.zeros((len(views), len(picked)), bool), []
+    seen = np.zeros((len(views), len(picked)), bool)
     for number, view in enumerate(views):
         report.check()
         pose = view.camera_to_world
@@ -101,13 +100,12 @@ def _grey_values(
             apart = np.linalg.norm(middles[met] - middle[rows], axis=1)
             rows = rows[(met >= 0) & (apart < NEAR * away[rows])]
         seen[number, rows] = True
-        places.append(place)
     asked = seen.reshape(len(views), -1, SAMPLES)
     for part in range(asked.shape[1]):
         enough = np.flatnonzero(asked[:, part].sum(1) >= COMMON)
         kept = enough[np.unique(np.linspace(0, len(enough) - 1, MOST_PHOTOS).astype(int))] if len(enough) else enough
         asked[np.setdiff1d(np.arange(len(views)), kept), part] = False
-    grey = np.full(seen.shape, np.nan)
+    grey = np.full(seen.shape, np.nan, np.float32)
     for number, view in enumerate(views):
         report.check()
         rows = np.flatnonzero(seen[number])
@@ -115,7 +113,8 @@ def _grey_values(
             continue
         width, height = training_size(view.camera, SIDE)
         picture = resized(photo_of(view), width, height).pixels[..., :3].mean(2, dtype=np.float32)
-        place = places[number][rows] * [width / view.camera.width, height / view.camera.height] - 0.5
+        place = project(view.camera, (middle[rows] - view.camera_to_world[:3, 3]) @ view.camera_to_world[:3, :3])
+        place = place * [width / view.camera.width, height / view.camera.height] - 0.5
         smooth = scipy.ndimage.gaussian_filter(picture, 1.0)
         grey[number, rows] = scipy.ndimage.map_coordinates(smooth, place[:, ::-1].T, order=1, mode="nearest")
     return grey

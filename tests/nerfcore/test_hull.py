@@ -106,6 +106,16 @@ def test_a_photo_with_a_wrong_pose_keeps_its_mask(project: Path) -> None:
     assert np.array_equal(masks(project)[7], before[7])
 
 
+def test_without_a_hull_masks_stay(project: Path) -> None:
+    put(made(project)[CLOTH], project / f"masks/{CLOTH:02}.png")
+    poses, back = load_poses(project), np.diag([-1.0, 1.0, -1.0, 1.0])  # all look away from the ball
+    images = [
+        i.model_copy(update={"camera_to_world": (np.array(i.camera_to_world) @ back).tolist()}) for i in poses.images
+    ]
+    save_poses(project, poses.model_copy(update={"images": images}), Points.empty())
+    assert trim_masks(project, Reporter()) == 0
+
+
 def test_poses_trim_masks_and_are_not_estimated_again_for_it(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     trimmed = masks(project)
     put(made(project)[CLOTH], project / f"masks/{CLOTH:02}.png")

@@ -91,6 +91,7 @@ class Shown:
 
     @classmethod
     def of(cls, view: View, mask: np.ndarray) -> Shown:
+        # As `pixels.training_size` has it, which comes with torch.
         scale = min(1.0, SIDE / max(view.camera.width, view.camera.height))
         width, height = (max(1, round(side * scale)) for side in (view.camera.width, view.camera.height))
         return cls(view, scipy.ndimage.maximum_filter(nearest(mask, width, height) > 0, 2 * SLACK + 1))

@@ -27,12 +27,13 @@ from .mask_mode import NEARLY_ALL, cuts_out
 SIDE = 384  # longer side of the pictures in which outlines are looked for, in pixels
 AROUND = 15  # pixels of it that brightness on both sides of an outline is averaged over, and that parts may lie apart
 DIMMEST = 0.7  # of Otsu's threshold, which parts dark sides of an object from it
-EDGE = 0.25  # where an outline runs, from the brightness outside of it to that inside
+EDGE = 0.25  # from the brightness outside of an outline to that inside: what is brighter belongs to the object
 FAINT = 0.6  # of the first threshold: what is darker is never taken for the object's shaded side
 SPECK = 0.02  # of the largest part's area, below which a part is left out
 OPENING = 0.005  # of the object's area, from which a dark place within it may be an opening
 DARK, CONTRAST = 80, 2.0  # of 255: the brightest of the surroundings, and by how much the object outshines them
 RIM = 2  # pixels of the small picture around its outline that the whole picture decides about
+HALF, BESIDE = 0.5, 4  # where an edge runs there: halfway between the brightness of so many pixels beyond the rim
 
 
 def mask_objects(
@@ -101,14 +102,16 @@ def object_mask(picture: np.ndarray) -> np.ndarray:
     in large dark places within it, 0 around it."""
     shown = _small(picture)
     mask, threshold = _outlined(shown)
-    size = picture.shape[1], picture.shape[0]
-    middle = _enlarged(scipy.ndimage.binary_erosion(mask, iterations=RIM, border_value=1), size)
-    reach = _enlarged(scipy.ndimage.binary_dilation(mask, iterations=RIM), size)
-    bright = scipy.ndimage.gaussian_filter(picture.max(2).astype(np.float32), 1.0)
-    least = np.asarray(Image.fromarray(threshold).resize(size, Image.Resampling.BILINEAR))
-    made = np.where(middle | (reach & (bright > least)), 255, 0).astype(np.uint8)
     openings = _openings(mask & (shown <= threshold), OPENING * np.count_nonzero(mask))
-    made[_enlarged(openings, size) & (bright <= least)] = MASK_UNKNOWN
+    solid, size = mask & ~openings, (picture.shape[1], picture.shape[0])
+    core = scipy.ndimage.binary_erosion(solid, iterations=RIM, border_value=1)
+    reach = scipy.ndimage.binary_dilation(solid, iterations=RIM)
+    halfway = Image.fromarray(_halfway(shown, core, ~reach, threshold))
+    bright = scipy.ndimage.gaussian_filter(picture.max(2).astype(np.float32), 1.0)
+    lit = bright > np.asarray(halfway.resize(size, Image.Resampling.BILINEAR))
+    made = np.where(_enlarged(core, size) | (_enlarged(reach, size) & lit), 255, 0).astype(np.uint8)
+    around = scipy.ndimage.binary_dilation(openings, iterations=RIM) & mask
+    made[_enlarged(around, size) & (made == 0)] = MASK_UNKNOWN
     return made
 
 
@@ -134,6 +137,18 @@ def _outlined(bright: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     threshold = np.clip(outside + EDGE * (inside - outside), FAINT * otsu, otsu).astype(np.float32)
     beside = (within > 0.02) & (within < 0.98)
     return _parts(np.where(beside, bright > threshold, first)), threshold
+
+
+def _halfway(bright: np.ndarray, inside: np.ndarray, outside: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
+    """Brightness (h, w) float32 halfway between that inside and outside (h, w) bool near each place; `otherwise` where
+    one of them is not near."""
+    levels = []
+    for part in (inside, outside):
+        share = scipy.ndimage.gaussian_filter(part.astype(np.float32), BESIDE)
+        level = scipy.ndimage.gaussian_filter(bright * part, BESIDE) / np.maximum(share, 1e-3)
+        levels.append(np.where(share > 0.01, level, np.nan))
+    middle = levels[1] + HALF * (levels[0] - levels[1])
+    return np.where(np.isnan(middle), otherwise, middle).astype(np.float32)
 
 
 def _parts(bright: np.ndarray) -> np.ndarray:

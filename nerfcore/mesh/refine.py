@@ -37,7 +37,7 @@ from .walls import any_plain, on_walls, picture_of, plain_places, walls
 VIEWS = 5  # neighbours whose photos are compared
 LEAST, GAIN = 0.6, 0.05  # correlation that is believed, and by how much it must exceed that of the field's depth
 FIELD_AGREES, FIELD_RETURNS = 0.05, 6.0  # share and pixels to which views must confirm depths of the field in holes
-SMOOTH = 5  # pixels over which normals are averaged
+SMOOTH = (5, 21)  # pixels over which normals are averaged: what is curved needs few, what the field has in steps many
 SURE = 2.0  # pixels: the spread of a depth that photos confirm
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 
@@ -105,9 +105,8 @@ def refined_maps(
     moved = []
     for number, (view, map_) in enumerate(zip(views, maps)):
         report.progress(number / len(views))
-        facing = torch.from_numpy(smooth_normals(view.camera, map_.depth, SMOOTH).reshape(-1, 3)).to(grey.device)
         near = torch.tensor(around[number][:VIEWS], dtype=torch.int32, device=grey.device)
-        depth, _ = refine(grey, facing, arrays, number, near, LEAST, GAIN)
+        depth = where_photos_agree(grey, view, map_, arrays, number, near)
         moved.append(_with_depth(view, map_, depth.cpu().numpy().reshape(map_.depth.shape)))
     # What one other view has moved to the same place as well may be wrong, and planes are put through what is known here.
     believed = confirmed_maps(views, moved, device, report, around, few_suffice=False)
@@ -150,6 +149,19 @@ def refined_maps(
     final = replace(final, certain=relied_on(views, maps, sure).to(final.depth.device))
     asked = sum(int(map_.hit.sum()) for map_ in mixed)
     return final, sum(int(part.sum()) for part in hits(final, mixed)) / max(asked, 1)
+
+
+def where_photos_agree(
+    grey: torch.Tensor, view: FlatView, map_: DepthMap, arrays: MapArrays, number: int, near: torch.Tensor
+) -> torch.Tensor:
+    """Depths (H·W,) of the map `number` moved to where its photo agrees best with those of the maps `near` (K,) int32, by
+    patches turned as normals say that are averaged over few pixels, or over many."""
+    tried = []
+    for size in SMOOTH:
+        facing = torch.from_numpy(smooth_normals(view.camera, map_.depth, size).reshape(-1, 3)).to(grey.device)
+        tried.append(refine(grey, facing, arrays, number, near, LEAST, GAIN))
+    found, agreement = (torch.stack(part) for part in zip(*tried))
+    return found.gather(0, agreement.argmax(0, keepdim=True))[0]
 
 
 def relied_on(views: list[FlatView], fields: list[DepthMap], sure: list[np.ndarray]) -> torch.Tensor:

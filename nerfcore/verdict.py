@@ -24,6 +24,8 @@ HOLES = 0.02  # share of what the mesh fills in pictures that is holes
 LITTLE_IN_ONE = 0.5  # share of the area that the largest part has
 FEW_LABELS_RIGHT = 0.3  # mIoU
 PLACED, HALF = 0.9, 0.5  # share of the photos with a pose
+# Of pairs of photos; docs/experiments.md, “Photos whose matches contradict their poses”: 0.10 to 0.22 of a nave, at most 0.006 of others.
+CONTRADICTING = 0.05
 
 Verdict = dict[str, Any]  # {"level": one of LEVELS, "reasons": [sentences]}
 
@@ -34,13 +36,31 @@ def verdict(findings: Sequence[tuple[str, str]]) -> Verdict:
     return {"level": ordered[0][0] if ordered else "good", "reasons": [text for _, text in ordered]}
 
 
-def poses_verdict(registered: int, total: int) -> Verdict:
-    """Of `poses`: how many of the photos have one."""
+def poses_verdict(registered: int, total: int, matching: Sequence[tuple[str, int, int]] = ()) -> Verdict:
+    """Of `poses`: how many of the photos have one, and whether what matches agrees with them.
+
+    Args:
+        matching: of each photo with a pose its name, the number of photos that it matches, and of those whose matches
+            contradict the poses of both.
+    """
+    findings = []
     share = registered / max(total, 1)
-    if share >= PLACED:
-        return verdict([])
-    text = f"Only {registered} of {total} photos have a pose: add photos between those that do not overlap."
-    return verdict([("failed" if share < HALF else "weak", text)])
+    if share < PLACED:
+        text = f"Only {registered} of {total} photos have a pose: add photos between those that do not overlap."
+        findings.append(("failed" if share < HALF else "weak", text))
+    pairs, wrong = sum(mates for _, mates, _ in matching) // 2, sum(bad for *_, bad in matching) // 2
+    if wrong > CONTRADICTING * pairs:
+        worst = sorted((photo for photo in matching if photo[2]), key=lambda photo: -photo[2] / photo[1])[:4]
+        findings.append(
+            (
+                "weak",
+                f"{wrong} of {pairs} pairs of photos match but contradict their poses, most of them pairs of "
+                f"{', '.join(name for name, *_ in worst)}: parts that look alike were taken for the same, so that photos "
+                "stand where others do. Add photos between those, so that neighbours overlap by two thirds, or put "
+                "something beside one of the alike parts.",
+            )
+        )
+    return verdict(findings)
 
 
 def train_verdict(result: Mapping[str, Any], curve: Sequence[Mapping[str, float]], warmup: int, steps: int) -> Verdict:

@@ -57,8 +57,8 @@ def run(job: dict[str, Any], tell: Any) -> dict[str, Any]:
     extend, or null), images [{file, group, width, height, focal_px}]; only (features or match: just these) and part.
 
     Returns:
-        {cameras, images [{file, status, reason, camera, camera_to_world, agreement, points, error_px, mates}], links,
-        groups, reprojection_px, contradicting_pairs, level, points_file}; points_file has xyz, rgb, error, view and point.
+        {cameras, images [{file, status, reason, camera, camera_to_world, agreement, points, error_px, mates,
+        contradicting}], links, groups, reprojection_px, contradicting_pairs, level, points_file}; points_file has xyz, rgb, error, view and point.
     Raises:
         PosesError: no two photos could be placed; the message says why.
     """
@@ -284,6 +284,7 @@ def _result(best: Attempt, names: list[str], points_file: Path) -> dict[str, Any
                 "points": check.points if check else image.num_points3D,
                 "error_px": check.error_px if check else 0.0,
                 "mates": check.mates if check else 0,
+                "contradicting": check.contradicting if check else 0,
             }
         )
     _write_points(model, views, points_file)

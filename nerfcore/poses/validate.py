@@ -24,13 +24,15 @@ class ImageCheck:
     """What speaks for the pose of one image.
 
     `agreement`: share of its verified matches within 4 px of the epipolar lines (None without matches to judge by);
-    `points`: 3D points it sees; `error_px`: their mean reprojection error; `mates`: registered images it matches.
+    `points`: 3D points it sees; `error_px`: their mean reprojection error; `mates`: registered images it matches;
+    `contradicting`: those of them of which most matches are farther than that from the lines.
     """
 
     agreement: float | None
     points: int
     error_px: float
     mates: int
+    contradicting: int
 
     @property
     def bad(self) -> bool:
@@ -47,6 +49,7 @@ def check_images(reconstruction: Any, path: Path) -> tuple[dict[int, ImageCheck]
     good = dict.fromkeys(registered, 0.0)
     total = dict.fromkeys(registered, 0.0)
     mates = dict.fromkeys(registered, 0)
+    contradicting = dict.fromkeys(registered, 0)
     links: dict[tuple[int, int], int] = {}
     for a, b, share, count in pair_agreements(reconstruction, path):
         links[a, b] = count
@@ -54,6 +57,7 @@ def check_images(reconstruction: Any, path: Path) -> tuple[dict[int, ImageCheck]
             good[image] += share * count
             total[image] += count
             mates[image] += 1
+            contradicting[image] += share < GOOD_AGREEMENT
     checks = {}
     for i in registered:
         observed = [point.point3D_id for point in reconstruction.image(i).get_observation_points2D()]
@@ -63,6 +67,7 @@ def check_images(reconstruction: Any, path: Path) -> tuple[dict[int, ImageCheck]
             points=len(observed),
             error_px=float(np.mean(errors)) if errors else 0.0,
             mates=mates[i],
+            contradicting=contradicting[i],
         )
     return checks, links
 

@@ -78,6 +78,7 @@ def moved_worker(folder: Path, motion: np.ndarray, count: int = 8) -> Any:
         for number, (image, before) in enumerate(zip(job["images"], known.images)):
             pose = transform_pose(motion, np.array(before.camera_to_world)).tolist()
             there = {"status": "ok", "reason": "", "camera": 0, "camera_to_world": pose}
+            there |= {"mates": 7, "contradicting": 0}
             away = {"status": "unregistered", "reason": "matches no other photo"}
             images.append({"file": image["file"], **(there if number < count else away)})
         return {

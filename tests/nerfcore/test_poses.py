@@ -209,6 +209,7 @@ def test_a_wrong_pose_is_found_and_repaired(fountain: Path, tmp_path: Path) -> N
     model = pycolmap.Reconstruction(str(fountain / "poses" / "sparse"))
     right, _ = check_images(model, tmp_path / "f.db")
     assert min(check.agreement for check in right.values()) > 0.9
+    assert not any(check.contradicting for check in right.values())
     victim = sorted(model.reg_image_ids())[5]
     frame = model.image(victim).frame
     shift = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.0, 0.15, 0.05])), np.array([0.3, 0.0, 0.2]))
@@ -216,6 +217,8 @@ def test_a_wrong_pose_is_found_and_repaired(fountain: Path, tmp_path: Path) -> N
     wrong, _ = check_images(model, tmp_path / "f.db")
     assert wrong[victim].agreement < 0.4
     assert [i for i, check in wrong.items() if check.bad] == [victim]
+    assert wrong[victim].contradicting > wrong[victim].mates / 2
+    assert sum(check.contradicting for check in wrong.values()) == 2 * wrong[victim].contradicting
     names = sorted(image.name for image in model.images.values())
     images = fountain / "images"
     model, checks, _, dropped = mapping.repair(model, tmp_path / "f.db", images, tmp_path, False, names, Quiet())
@@ -430,6 +433,7 @@ def test_the_verb_says_groups_and_judges(tmp_path: Path, monkeypatch: pytest.Mon
         images = []
         for number, (image, posed) in enumerate(zip(job["images"], known.images)):
             there = {"status": "ok", "reason": "", "camera": 0, "camera_to_world": posed.camera_to_world}
+            there |= {"mates": 4, "contradicting": 2 if number in (1, 3) else 1}
             away = {"status": "unregistered", "reason": "belongs to a separate group of 3 photos"}
             images.append({"file": image["file"], **(there if number < 5 else away)})
         cameras = [camera.model_dump(mode="json") for camera in known.cameras]
@@ -449,7 +453,10 @@ def test_the_verb_says_groups_and_judges(tmp_path: Path, monkeypatch: pytest.Mon
     result = estimate.estimate_poses(PosesParams(project=project), report)
     assert (result["registered"], result["groups"]) == (5, [5, 3])
     assert result["verdict"]["level"] == "weak"
-    assert "5 of 8" in result["verdict"]["reasons"][0]
+    few, alike = result["verdict"]["reasons"]
+    assert "5 of 8" in few
+    first, second = known.images[1].name, known.images[3].name
+    assert f"3 of 10 pairs of photos match but contradict their poses, most of them pairs of {first}, {second}" in alike
     assert "2 groups of 5 and 3" in report.warnings[0]
     assert "--group 1" in report.warnings[0]
 

@@ -95,6 +95,20 @@ def test_meshes_and_poses() -> None:
     assert "49 of 60" in poses_verdict(49, 60)["reasons"][0]
 
 
+def test_photos_that_contradict_each_other() -> None:
+    """Of two groups of ten, each of which agrees with itself, photos of one match three of the other wrongly."""
+    good = [(f"good{i}", 9, 0) for i in range(20)]
+    assert poses_verdict(20, 20, good)["level"] == "good"
+    one = [("odd", 10, 1), ("even", 9, 1), *good]
+    assert poses_verdict(22, 22, one)["level"] == "good"
+    alike = [(f"alike{i}", 12, 3) for i in range(18)]
+    found = poses_verdict(20, 20, [("worst", 12, 9), *alike, ("fine", 9, 0)])
+    assert found["level"] == "weak"
+    (reason,) = found["reasons"]
+    assert reason.startswith("31 of 118 pairs")
+    assert "pairs of worst, alike0, alike1, alike2: parts that look alike" in reason
+
+
 @pytest.mark.parametrize(("side", "share"), [(1.0, 0.25), (2.0, 1.0), (0.0, 0.0)])
 def test_the_share_of_a_photo_that_shows_a_mesh(side: float, share: float) -> None:
     """A square before a camera whose view is 2 × 2 at its distance."""

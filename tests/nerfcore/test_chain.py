@@ -129,6 +129,7 @@ def test_video_around_a_can(shared_data: Callable[[str], Path], tmp_path: Path) 
     assert result["registered"] >= 79
     report = json.loads((project / "poses" / "report.json").read_text())
     assert report["contradicting_pairs"] > 100
+    assert result["verdict"]["level"] == "good"
     assert min(image["agreement"] for image in report["images"] if image["status"] == "ok") > 0.8
     centres = np.stack([view.camera_to_world[:3, 3] for view in load_scene(project).views])
     assert np.ptp(np.unwrap(np.arctan2(centres[:, 1], centres[:, 0]))) > np.radians(500)

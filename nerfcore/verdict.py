@@ -24,7 +24,8 @@ HOLES = 0.02  # share of what the mesh fills in pictures that is holes
 LITTLE_IN_ONE = 0.5  # share of the area that the largest part has
 FEW_LABELS_RIGHT = 0.3  # mIoU
 PLACED, HALF = 0.9, 0.5  # share of the photos with a pose
-# Of pairs of photos; docs/experiments.md, “Photos whose matches contradict their poses”: 0.06 of a folded can, 0.10 and more of a nave, at most 0.006 of others.
+# Share of pairs of photos: 0.06 of a folded can, 0.10 and more of a nave, at most 0.006 of others.
+# docs/experiments.md, “Photos whose matches contradict their poses”
 CONTRADICTING = 0.03
 
 Verdict = dict[str, Any]  # {"level": one of LEVELS, "reasons": [sentences]}

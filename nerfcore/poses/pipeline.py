@@ -58,7 +58,8 @@ def run(job: dict[str, Any], tell: Any) -> dict[str, Any]:
 
     Returns:
         {cameras, images [{file, status, reason, camera, camera_to_world, agreement, points, error_px, mates,
-        contradicting}], links, groups, reprojection_px, contradicting_pairs, level, points_file}; points_file has xyz, rgb, error, view and point.
+        contradicting}], links, groups, reprojection_px, contradicting_pairs, level, points_file}; points_file has xyz,
+        rgb, error, view and point.
     Raises:
         PosesError: no two photos could be placed; the message says why.
     """

@@ -24,7 +24,7 @@ HOLES = 0.02  # share of what the mesh fills in pictures that is holes
 LITTLE_IN_ONE = 0.5  # share of the area that the largest part has
 FEW_LABELS_RIGHT = 0.3  # mIoU
 PLACED, HALF = 0.9, 0.5  # share of the photos with a pose
-# Share of pairs of photos: 0.06 of a folded can, 0.10 and more of a nave, at most 0.006 of others.
+# Share of pairs of photos: 0.06 of a folded can, 0.18 and more of a nave, at most 0.006 of others.
 # docs/experiments.md, “Photos whose matches contradict their poses”
 CONTRADICTING = 0.03
 
@@ -51,12 +51,12 @@ def poses_verdict(registered: int, total: int, matching: Sequence[tuple[str, int
         findings.append(("failed" if share < HALF else "weak", text))
     pairs, wrong = sum(mates for _, mates, _ in matching) // 2, sum(bad for *_, bad in matching) // 2
     if wrong > CONTRADICTING * pairs:
-        worst = sorted((photo for photo in matching if photo[2]), key=lambda photo: -photo[2] / photo[1])[:4]
+        most = sorted((photo for photo in matching if photo[2]), key=lambda photo: -photo[2])[:4]
         findings.append(
             (
                 "weak",
-                f"{wrong} of {pairs} pairs of photos match but contradict their poses, most of them pairs of "
-                f"{', '.join(name for name, *_ in worst)}: parts that look alike were taken for the same, so that photos "
+                f"{wrong} of {pairs} pairs of photos match but contradict their poses, most often those of "
+                f"{', '.join(name for name, *_ in most)}: parts that look alike were taken for the same, so that photos "
                 "stand where others do. Add photos between those, so that neighbours overlap by two thirds, or put "
                 "something beside one of the alike parts.",
             )

@@ -78,8 +78,11 @@ def estimate_poses(params: PosesParams, report: Reporter) -> dict[str, Any]:
             # Found with the masks as they were; that they are others now is no reason to find them again.
             inputs = posing_inputs(folder, project, params)
             write_json(folder / WORK_FOLDER / STATE_FILE, _photo_state(folder, records))
-        placed = [(record, image) for record, image in zip(records, result["images"]) if image["status"] == "ok"]
-        matching = [(record.name, image["mates"], image["contradicting"]) for record, image in placed]
+        matching = [
+            (record.name, image["mates"], image["contradicting"])
+            for record, image in zip(records, result["images"])
+            if image["status"] == "ok"
+        ]
         answer = {
             "registered": len(poses.images),
             "total": len(records),

@@ -456,7 +456,7 @@ def test_the_verb_says_groups_and_judges(tmp_path: Path, monkeypatch: pytest.Mon
     few, alike = result["verdict"]["reasons"]
     assert "5 of 8" in few
     first, second = known.images[1].name, known.images[3].name
-    assert f"3 of 10 pairs of photos match but contradict their poses, most of them pairs of {first}, {second}" in alike
+    assert f"3 of 10 pairs of photos match but contradict their poses, most often those of {first}, {second}" in alike
     assert "2 groups of 5 and 3" in report.warnings[0]
     assert "--group 1" in report.warnings[0]
 

@@ -24,9 +24,9 @@ HOLES = 0.02  # share of what the mesh fills in pictures that is holes
 LITTLE_IN_ONE = 0.5  # share of the area that the largest part has
 FEW_LABELS_RIGHT = 0.3  # mIoU
 PLACED, HALF = 0.9, 0.5  # share of the photos with a pose
-# Share of pairs of photos: 0.06 of a folded can, 0.18 and more of a nave, at most 0.006 of others.
-# docs/experiments.md, “Photos whose matches contradict their poses”
-CONTRADICTING = 0.03
+# Share of pairs of photos, and two of them at least: 0.02 of a folded can, 0.009 to 0.03 of naves, 0 of others.
+# docs/experiments.md, “Which pairs contradict poses”
+CONTRADICTING = 0.005
 
 Verdict = dict[str, Any]  # {"level": one of LEVELS, "reasons": [sentences]}
 
@@ -50,7 +50,7 @@ def poses_verdict(registered: int, total: int, matching: Sequence[tuple[str, int
         text = f"Only {registered} of {total} photos have a pose: add photos between those that do not overlap."
         findings.append(("failed" if share < HALF else "weak", text))
     pairs, wrong = sum(mates for _, mates, _ in matching) // 2, sum(bad for *_, bad in matching) // 2
-    if wrong > CONTRADICTING * pairs:
+    if wrong > max(1, CONTRADICTING * pairs):
         most = sorted((photo for photo in matching if photo[2]), key=lambda photo: -photo[2])[:4]
         findings.append(
             (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,9 @@ MIN_POINTS = 20  # that a photo sees
 MIN_MATCHES = 15  # of a pair, from which it counts, and
 TOLERANCE_PX = 4.0  # by which a match may miss: both as in COLMAP's two-view geometry
 MATCHES_PER_PAIR = 300  # that are looked at, for the sake of time
+# Of the matches of the best pair of a photo: what a pair must have to contradict poses. Measured: docs/experiments.md,
+# “Which pairs contradict poses”
+STRONG = 0.3
 
 
 @dataclass
@@ -25,7 +29,7 @@ class ImageCheck:
 
     `agreement`: share of its verified matches within 4 px of the epipolar lines (None without matches to judge by);
     `points`: 3D points it sees; `error_px`: their mean reprojection error; `mates`: registered images it matches;
-    `contradicting`: those of them of which most matches are farther than that from the lines.
+    `contradicting`: those of them with which it has many matches, most of them farther than that from the lines.
     """
 
     agreement: float | None
@@ -51,13 +55,15 @@ def check_images(reconstruction: Any, path: Path) -> tuple[dict[int, ImageCheck]
     mates = dict.fromkeys(registered, 0)
     contradicting = dict.fromkeys(registered, 0)
     links: dict[tuple[int, int], int] = {}
-    for a, b, share, count in pair_agreements(reconstruction, path):
+    pairs = list(pair_agreements(reconstruction, path))
+    for image in itertools.chain(*contradicting_pairs(pairs)):
+        contradicting[image] += 1
+    for a, b, share, count in pairs:
         links[a, b] = count
         for image in (a, b):
             good[image] += share * count
             total[image] += count
             mates[image] += 1
-            contradicting[image] += share < GOOD_AGREEMENT
     checks = {}
     for i in registered:
         observed = [point.point3D_id for point in reconstruction.image(i).get_observation_points2D()]
@@ -94,6 +100,17 @@ def pair_agreements(reconstruction: Any, path: Path) -> Iterator[tuple[int, int,
             picked = matches
         distance = sampson_distance(poses[a], poses[b], normalised[a][picked[:, 0]], normalised[b][picked[:, 1]])
         yield a, b, float((distance * (focal[a] + focal[b]) / 2 <= TOLERANCE_PX).mean()), len(matches)
+
+
+def contradicting_pairs(pairs: list[tuple[int, int, float, int]]) -> list[tuple[int, int]]:
+    """Those of the verified pairs (`pair_agreements`) that contradict their poses: photos that match as if they stood side
+    by side, and stand and look elsewhere. A few matches of things that are alike, two roofs, say nothing."""
+    most: dict[int, int] = {}
+    for a, b, _, count in pairs:
+        most[a], most[b] = max(most.get(a, 0), count), max(most.get(b, 0), count)
+    return [
+        (a, b) for a, b, share, count in pairs if share < GOOD_AGREEMENT and count >= STRONG * min(most[a], most[b])
+    ]
 
 
 def pair_images(pair_id: int) -> tuple[int, int]:

@@ -96,11 +96,18 @@ def test_meshes_and_poses() -> None:
 
 
 def test_photos_that_contradict_each_other() -> None:
-    """Of two groups of ten, each of which agrees with itself, photos of one match three of the other wrongly."""
+    """Of two groups of ten, each of which agrees with itself, photos of one match three of the other wrongly; a single
+    pair may be an accident, two of many as well."""
     good = [(f"good{i}", 9, 0) for i in range(20)]
     assert poses_verdict(20, 20, good)["level"] == "good"
     one = [("odd", 10, 1), ("even", 9, 1), *good]
     assert poses_verdict(22, 22, one)["level"] == "good"
+    few = [("odd", 10, 1), ("even", 9, 1)]
+    assert poses_verdict(22, 22, few)["level"] == "good"
+    two = [("odd", 10, 2), ("even", 9, 2)]
+    assert poses_verdict(22, 22, [*two, *good])["level"] == "weak"
+    many = [(f"good{i}", 20, 0) for i in range(60)]
+    assert poses_verdict(62, 62, [*two, *many])["level"] == "good"
     alike = [(f"alike{i}", 12, 3) for i in range(18)]
     found = poses_verdict(20, 20, [("fine", 9, 0), ("few", 1, 1), *alike[:17], ("worst", 12, 9), ("other", 14, 2)])
     assert found["level"] == "weak"

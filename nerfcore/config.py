@@ -260,8 +260,8 @@ class TrainConfig(Stage):
         default=0.3,
         ge=0,
         le=1,
-        description="share of training before an environment is behind all pixels; until then it is not behind those whose "
-        "texture no camera nearby sees in the same direction: surfaces form first",
+        description="share of training before an environment that takes what is near is behind all pixels; until then it is not "
+        "behind those whose texture no camera nearby sees in the same direction: surfaces form first",
     )
     pose_start: float = Field(default=0.05, ge=0, lt=1, description="share of training before cameras move")
     checkpoint_every: float = Field(default=30.0, gt=0, le=MANY, description="seconds between checkpoints")

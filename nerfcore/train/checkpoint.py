@@ -23,6 +23,8 @@ def trainer_tensors(trainer: Trainer) -> dict[str, torch.Tensor]:
     for index, parameter in enumerate(trainer.model.parameters()):
         for name, value in trainer.optimizer.state.get(parameter, {}).items():
             tensors[f"optimizer.{index}.{name}"] = value
+    if trainer.sky is not None:
+        tensors["sky_share"] = trainer.sky.share
     tensors["generator"] = trainer.generator.get_state()
     if trainer.guard.scaling:
         tensors["loss_scale"], tensors["loss_scale_steps"] = trainer.guard.scale, trainer.guard.good_steps
@@ -77,6 +79,8 @@ def restore(trainer: Trainer, tensors: dict[str, torch.Tensor], state: dict[str,
             trainer.optimizer.state[parameter] = saved
     if trainer.poses is not None:
         trainer.poses.restore({n.removeprefix("poses."): t for n, t in tensors.items() if n.startswith("poses.")})
+    if trainer.sky is not None and "sky_share" in tensors:
+        trainer.sky.share.copy_(tensors["sky_share"])
     trainer.generator.set_state(tensors["generator"].cpu())
     trainer.guard.scale = tensors.get("loss_scale", trainer.guard.scale)
     trainer.guard.good_steps = tensors.get("loss_scale_steps", trainer.guard.good_steps)

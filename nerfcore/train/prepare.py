@@ -27,6 +27,7 @@ from ..sampling.known_space import KnownSpace, known_space
 from .background import LEVEL, choose_background
 from .depth import depth_scale, find_depths
 from .sky_masks import sky_masks
+from .sky_stage import SkyStage
 from .trainer import Trainer
 
 VIEWS_ENOUGH = 8  # cells seen by this many cameras count fully as evidence; not tuned
@@ -166,7 +167,8 @@ def make_trainer(project_folder: Path, info: RunInfo, scene: Scene, device: torc
     trainer = Trainer(model, store, config, LEVEL.get(config.scene.background), report.check)
     trainer.space = space
     if model.environment is not None and config.train.environment_start > 0:
-        trainer.sky = sky_masks(store.views, store.cameras, scene.points.xyz, device, report.check)
+        masks = sky_masks(store.views, store.cameras, scene.points.xyz, device, report.check)
+        trainer.sky = SkyStage(masks, config.train.environment_start)
     if config.loss.depth_weight > 0:
         scale = depth_scale(world_from_sfm(project), box.box_from_world)
         visibility = load_visibility(project_folder)

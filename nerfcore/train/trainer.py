@@ -27,7 +27,7 @@ from .pose_refinement import PoseRefinement, level_weights
 from .replay import CudaRecording, Replay, asked_mode
 from .results import Learned, Measured, ShardResult
 from .schedule import bias_correction, padded_capacity, rate_factor, sample_budget
-from .sky_masks import SkyMasks
+from .sky_stage import SkyStage
 from .voxel_init import PixelFeatures, initialise
 
 BETAS = (0.9, 0.99)
@@ -71,7 +71,7 @@ class Trainer:
         self.cache = CoarseCache(store)
         self.poses = PoseRefinement(store.rays, config.train) if config.train.refine_poses else None
         self.depths: DepthRays | None = None
-        self.sky: SkyMasks | None = None  # where the environment may be before the rest gets it too
+        self.sky: SkyStage | None = None  # when the environment may be behind the sky alone
         self.space: KnownSpace | None = None  # what the photos show, if that was asked
         self.check = check
         semantic = config.loss.semantic_weight > 0 and config.sampling.outline_rays > 0
@@ -145,6 +145,8 @@ class Trainer:
             # Rays of known length, which are rendered as well, come after those of the batch.
             behind = [r.environment.weight for r in rendered if r.environment is not None]
             weight = torch.cat(behind)[: len(batch.label)]
+            if self.sky is not None:
+                self.sky.observe(batch, weight.detach(), self.steps - 1, progress)
             if batch.sky is not None:
                 weight = weight * batch.sky
             model.environment.observe(weight, batch.label != VOID, model.labelled)
@@ -177,7 +179,7 @@ class Trainer:
             (self.rays, self._capacity(progress, 1), *model.fixed_shares()),
             (model.warming_up, None if blend is None else blend.warming_up),
             (self.steps < c.loss.rgb_warmup, progress >= c.loss.entropy_start, progress >= c.loss.distortion_start),
-            progress >= c.train.environment_start,
+            self.sky is not None and self.sky.masked(self.steps, progress),
             (None if hit is None else (hit.data_ptr(), len(hit)), model.occupancy.march_settings()),
             0 if self.depths is None else len(self.depths),
         )
@@ -197,8 +199,8 @@ class Trainer:
         """Gradients of the composite loss of rays drawn here, summed in the order of the shards; only the grid's, and the
         random numbers, are changed."""
         batch = self.draw() if moving is None else moving.move(self.draw())
-        if self.sky is not None and progress < self.config.train.environment_start:
-            batch = replace(batch, sky=self.sky.at(batch.image, batch.pixel))
+        if self.sky is not None:
+            batch = self.sky.limited(batch, self.steps, progress)
         tasks = self._shard_tasks(batch, progress)
         if self.config.loss.regularization * self.config.loss.sparsity_weight > 0:
             tasks.append(self._sparsity_task())

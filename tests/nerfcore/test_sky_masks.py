@@ -155,18 +155,6 @@ def test_opacity_has_a_price_before_the_sky_alone(court: Path) -> None:
     assert prices[1] - prices[0] == pytest.approx(float(rendered.opacity[half].sum().detach()) / 256, rel=1e-3)
 
 
-@pytest.mark.setting("train.environment_start")
-def test_later_it_is_behind_all_pixels(court: Path) -> None:
-    trainer = trainer_of(court, train__environment_start="0.5")
-    assert trainer.sky is not None
-    early, late = (trainer._learn(progress).batch for progress in (0.49, 0.5))
-    assert early.sky is not None
-    assert torch.equal(early.sky, trainer.sky.at(early.image, early.pixel))
-    assert late.sky is None
-    assert trainer_of(court, scene__background="random").sky is None
-    assert trainer_of(court, train__environment_start="0").sky is None
-
-
 def test_masks_are_cancelled_between_photos(court: Path) -> None:
     scene, calls = load_scene(court), []
 

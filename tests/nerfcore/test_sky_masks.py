@@ -9,23 +9,18 @@ import numpy as np
 import pytest
 import scipy
 import torch
-from fieldwork.nerfcore.config import make_config
 from fieldwork.nerfcore.data.load import load_scene
 from fieldwork.nerfcore.data.pixels import PixelStore
 from fieldwork.nerfcore.data.scene import Scene
 from fieldwork.nerfcore.errors import Cancelled
 from fieldwork.nerfcore.geometry.points import Points
-from fieldwork.nerfcore.kernels.device import use_device
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.train import sky_masks as module
 from fieldwork.nerfcore.train.composite_loss import composite_loss
 from fieldwork.nerfcore.train.infinity import between_points
-from fieldwork.nerfcore.train.prepare import make_trainer, plan_run
 from fieldwork.nerfcore.train.sky_masks import sky_masks
-from fieldwork.nerfcore.train.trainer import Trainer
-from fieldwork.tests.nerfcore.support.ball import SMALL
 from fieldwork.tests.nerfcore.support.bowl import bowl_project, distances, stone
-from fieldwork.tests.nerfcore.support.sky import under_the_sky
+from fieldwork.tests.nerfcore.support.sky import environment_trainer, under_the_sky
 
 CPU = torch.device("cpu")
 
@@ -112,19 +107,13 @@ def test_points_far_apart_have_nothing_between_them(tmp_path: Path) -> None:
     assert near[middle, 3:5].any()
 
 
-def trainer_of(project: Path, **settings: str) -> Trainer:
-    values = {**SMALL, "scene.background": "environment", **{k.replace("__", "."): v for k, v in settings.items()}}
-    info, scene = plan_run(project, "draft", make_config("draft", values), use_device())
-    return make_trainer(project, info, scene, use_device(), Reporter())
-
-
 @pytest.fixture(scope="module")
 def court(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return bowl_project(tmp_path_factory.mktemp("court") / "p")
 
 
 def test_the_environment_is_behind_the_sky_alone(court: Path) -> None:
-    trainer = trainer_of(court)
+    trainer = environment_trainer(court)
     batch = trainer.store.batch(torch.arange(256))
     rendered = trainer.model.render(batch.origins, batch.directions, 12)
     assert rendered.environment is not None
@@ -143,7 +132,7 @@ def test_the_environment_is_behind_the_sky_alone(court: Path) -> None:
 
 
 def test_opacity_has_a_price_before_the_sky_alone(court: Path) -> None:
-    trainer = trainer_of(court)
+    trainer = environment_trainer(court)
     batch = trainer.store.batch(torch.arange(256))
     rendered = trainer.model.render(batch.origins, batch.directions, 12)
     half = torch.arange(256) < 128

@@ -6,25 +6,14 @@ from pathlib import Path
 
 import pytest
 import torch
-from fieldwork.nerfcore.config import make_config
 from fieldwork.nerfcore.data.pixels import Batch
-from fieldwork.nerfcore.kernels.device import use_device
-from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.render.run import read_checkpoint
 from fieldwork.nerfcore.train.checkpoint import restore, save_checkpoint
-from fieldwork.nerfcore.train.prepare import make_trainer, plan_run
 from fieldwork.nerfcore.train.sky_stage import PART, STEPS, TAKEN, SkyStage
-from fieldwork.nerfcore.train.trainer import Trainer
-from fieldwork.tests.nerfcore.support.ball import SMALL
 from fieldwork.tests.nerfcore.support.bowl import bowl_project, stone
+from fieldwork.tests.nerfcore.support.sky import environment_trainer
 
 UNTIL = 0.3
-
-
-def trainer_of(project: Path, **settings: str) -> Trainer:
-    values = {**SMALL, "scene.background": "environment", **{k.replace("__", "."): v for k, v in settings.items()}}
-    info, scene = plan_run(project, "draft", make_config("draft", values), use_device())
-    return make_trainer(project, info, scene, use_device(), Reporter())
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +24,7 @@ def court(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def stage(court: Path) -> tuple[SkyStage, Batch, torch.Tensor]:
     """A stage, a batch that shows the court and its sky, and which of its rays are near."""
-    trainer = trainer_of(court)
+    trainer = environment_trainer(court)
     assert trainer.sky is not None
     batch = trainer.store.batch(torch.arange(0, len(trainer.store), 7))
     near = ~trainer.sky.masks.at(batch.image, batch.pixel)
@@ -80,31 +69,31 @@ def test_rays_of_nothing_near_tell_nothing(stage: tuple[SkyStage, Batch, torch.T
 
 @pytest.mark.setting("train.environment_start")
 def test_training_is_masked_until_the_stage_ends(court: Path) -> None:
-    trainer = trainer_of(court, train__environment_start="0.5")
+    trainer = environment_trainer(court, train__environment_start="0.5")
     assert trainer.sky is not None
     trainer.steps = STEPS
     early, late = (trainer._learn(progress).batch for progress in (0.49, 0.5))
     assert early.sky is not None
     assert torch.equal(early.sky, trainer.sky.masks.at(early.image, early.pixel))
     assert late.sky is None
-    assert trainer_of(court, scene__background="random").sky is None
-    assert trainer_of(court, train__environment_start="0").sky is None
+    assert environment_trainer(court, scene__background="random").sky is None
+    assert environment_trainer(court, train__environment_start="0").sky is None
 
 
 def test_what_was_seen_is_kept_with_the_training(court: Path, tmp_path: Path) -> None:
-    trainer = trainer_of(court)
+    trainer = environment_trainer(court)
     assert trainer.sky is not None
     for _ in range(3):
         trainer.step(0.001)
     assert 0 < float(trainer.sky.share) < 1
     save_checkpoint(tmp_path / "c", trainer, {})
     tensors, state = read_checkpoint(tmp_path / "c", torch.device("cpu"))
-    again = trainer_of(court)
+    again = environment_trainer(court)
     restore(again, tensors, state)
     assert again.sky is not None
     assert torch.equal(again.sky.share, trainer.sky.share)
     del tensors["sky_share"]  # as in older files, whose training was masked
-    older = trainer_of(court)
+    older = environment_trainer(court)
     restore(older, tensors, state)
     assert older.sky is not None
     assert older.sky.masked(STEPS, 0.1)

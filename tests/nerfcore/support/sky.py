@@ -5,11 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from fieldwork.nerfcore.config import make_config
 from fieldwork.nerfcore.data.load import load_scene
 from fieldwork.nerfcore.geometry.cameras import Camera, pixel_centers
+from fieldwork.nerfcore.kernels.device import use_device
+from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.schema import SemanticClass
 from fieldwork.nerfcore.project.store import load_project, save_project
-from fieldwork.tests.nerfcore.support.ball import ball_project, camera_poses
+from fieldwork.nerfcore.train.prepare import make_trainer, plan_run
+from fieldwork.nerfcore.train.trainer import Trainer
+from fieldwork.tests.nerfcore.support.ball import SMALL, ball_project, camera_poses
 from PIL import Image
 
 VIEWS = 48
@@ -61,3 +66,10 @@ def under_the_sky(folder: Path, named: str | None = None, outward: bool = False,
         saved.classes.append(SemanticClass(id=3, name=named, color=(0.3, 0.5, 0.9)))
         save_project(project, saved)
     return project
+
+
+def environment_trainer(project: Path, **settings: str) -> Trainer:
+    """The trainer of a small field with an environment; `settings`: by name, `__` for a dot."""
+    values = {**SMALL, "scene.background": "environment", **{k.replace("__", "."): v for k, v in settings.items()}}
+    info, scene = plan_run(project, "draft", make_config("draft", values), use_device())
+    return make_trainer(project, info, scene, use_device(), Reporter())

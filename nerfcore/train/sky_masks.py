@@ -1,8 +1,8 @@
 """Which pixels of the training photos may show the sky: those with no texture that other cameras miss in their direction.
 
 An environment, a colour for each direction, explains what is far away, but also meadows and plain walls, whose colours differ
-little: captures lost their ground to it. While surfaces form it is therefore behind these pixels only. What is infinitely far
-looks the same in the same direction from everywhere; what is near moves against it from camera to camera.
+little: captures lost their ground to it. Where it does that (`sky_stage.py`), it is behind these pixels only while surfaces form. What
+is infinitely far looks the same in the same direction from everywhere; what is near moves against it from camera to camera.
 Measured: docs/experiments.md, “Meadows that became a sky”.
 """
 

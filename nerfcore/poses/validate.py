@@ -18,8 +18,8 @@ MIN_POINTS = 20  # that a photo sees
 MIN_MATCHES = 15  # of a pair, from which it counts, and
 TOLERANCE_PX = 4.0  # by which a match may miss: both as in COLMAP's two-view geometry
 MATCHES_PER_PAIR = 300  # that are looked at, for the sake of time
-# Of the matches of the best pair of a photo: what a pair must have to contradict poses. Measured: docs/experiments.md,
-# “Which pairs contradict poses”
+# Of the matches of the best pair of a photo that agrees with its pose: what a pair must have to contradict it.
+# Measured: docs/experiments.md, “Which pairs contradict poses”
 STRONG = 0.3
 
 
@@ -105,9 +105,10 @@ def pair_agreements(reconstruction: Any, path: Path) -> Iterator[tuple[int, int,
 def contradicting_pairs(pairs: list[tuple[int, int, float, int]]) -> list[tuple[int, int]]:
     """Those of the verified pairs (`pair_agreements`) that contradict their poses: photos that match as if they stood side
     by side, and stand and look elsewhere. A few matches of things that are alike, two roofs, say nothing."""
-    most: dict[int, int] = {}
-    for a, b, _, count in pairs:
-        most[a], most[b] = max(most.get(a, 0), count), max(most.get(b, 0), count)
+    most = {image: 0 for a, b, *_ in pairs for image in (a, b)}
+    for a, b, share, count in pairs:
+        if share >= GOOD_AGREEMENT:
+            most[a], most[b] = max(most[a], count), max(most[b], count)
     return [
         (a, b) for a, b, share, count in pairs if share < GOOD_AGREEMENT and count >= STRONG * min(most[a], most[b])
     ]

@@ -24,7 +24,7 @@ HOLES = 0.02  # share of what the mesh fills in pictures that is holes
 LITTLE_IN_ONE = 0.5  # share of the area that the largest part has
 FEW_LABELS_RIGHT = 0.3  # mIoU
 PLACED, HALF = 0.9, 0.5  # share of the photos with a pose
-# Share of pairs of photos, and two of them at least: 0.02 of a folded can, 0.009 to 0.03 of naves, 0 of others.
+# Share of pairs of photos, and two of them at least: 0.016 and more of a folded can, 0.013 and more of a nave, 0 of others.
 # docs/experiments.md, “Which pairs contradict poses”
 CONTRADICTING = 0.005
 

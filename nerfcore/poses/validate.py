@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,8 +19,9 @@ MIN_POINTS = 20  # that a photo sees
 MIN_MATCHES = 15  # of a pair, from which it counts, and
 TOLERANCE_PX = 4.0  # by which a match may miss: both as in COLMAP's two-view geometry
 MATCHES_PER_PAIR = 300  # that are looked at, for the sake of time
-# Of the matches of the best pair of a photo that agrees with its pose: what a pair must have to contradict it.
-# Measured: docs/experiments.md, “Which pairs contradict poses”
+# Of the matches that the best agreeing pairs of its two photos have, as geometric mean: what a pair must have to
+# contradict their poses.
+# Measured: docs/experiments.md, “Pairs that contradict poses, beside the best of both photos”
 STRONG = 0.3
 
 
@@ -110,7 +112,9 @@ def contradicting_pairs(pairs: list[tuple[int, int, float, int]]) -> list[tuple[
         if share >= GOOD_AGREEMENT:
             most[a], most[b] = max(most[a], count), max(most[b], count)
     return [
-        (a, b) for a, b, share, count in pairs if share < GOOD_AGREEMENT and count >= STRONG * min(most[a], most[b])
+        (a, b)
+        for a, b, share, count in pairs
+        if share < GOOD_AGREEMENT and count >= STRONG * math.sqrt(most[a] * most[b])
     ]
 
 

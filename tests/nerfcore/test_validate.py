@@ -29,6 +29,10 @@ def test_few_matches_are_many_for_a_photo_that_has_no_more() -> None:
     assert contradicting_pairs([*WALK, (10, 11, 0.9, 40), (2, 11, 0.0, 30)]) == [(2, 11)]
 
 
+def test_a_photo_with_few_matches_does_not_make_alike_parts_of_another_one_count() -> None:
+    assert contradicting_pairs([*WALK, (10, 11, 0.9, 70), (2, 11, 0.0, 33)]) == []
+
+
 def test_all_pairs_of_a_photo_that_agrees_with_none_contradict_it() -> None:
     wrong = [(99, 2, 0.1, 150), (99, 3, 0.2, 30), (99, 8, 0.0, 15)]
     assert contradicting_pairs([*WALK, *wrong]) == [(99, 2), (99, 3), (99, 8)]

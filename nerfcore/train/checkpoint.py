@@ -42,7 +42,10 @@ def save_checkpoint(path: Path, trainer: Trainer, state: dict[str, Any]) -> None
         DiskError: the disk is full or the folder is not writable; an older checkpoint stays as it was.
     """
     tensors = {name: value.detach().cpu().contiguous() for name, value in trainer_tensors(trainer).items()}
-    write_checkpoint(path, tensors, {**state, "steps": trainer.steps, "rays": trainer.rays})
+    numbers = {"steps": trainer.steps, "rays": trainer.rays}
+    if trainer.sky is not None:
+        numbers["sky_masks"] = trainer.sky.needed
+    write_checkpoint(path, tensors, {**state, **numbers})
 
 
 def write_checkpoint(path: Path, tensors: dict[str, torch.Tensor], state: dict[str, Any]) -> None:
@@ -79,8 +82,9 @@ def restore(trainer: Trainer, tensors: dict[str, torch.Tensor], state: dict[str,
             trainer.optimizer.state[parameter] = saved
     if trainer.poses is not None:
         trainer.poses.restore({n.removeprefix("poses."): t for n, t in tensors.items() if n.startswith("poses.")})
-    if trainer.sky is not None and "sky_share" in tensors:
-        trainer.sky.share.copy_(tensors["sky_share"])
+    if trainer.sky is not None:
+        trainer.sky.share.copy_(tensors.get("sky_share", trainer.sky.share))
+        trainer.sky.needed = state.get("sky_masks", True)  # older trainings had them from the first step on
     trainer.generator.set_state(tensors["generator"].cpu())
     trainer.guard.scale = tensors.get("loss_scale", trainer.guard.scale)
     trainer.guard.good_steps = tensors.get("loss_scale_steps", trainer.guard.good_steps)

@@ -14,6 +14,22 @@ from ..sampling.known_space import KnownSpace
 VIEWS = {"from above": (0, 1), "from the side": (0, 2)}  # axes of the box across and up
 COLORS = ("tab:orange", "tab:purple", "tab:blue")
 MOST_POINTS = 20000
+NAME = "closed.png"
+
+
+def closed_picture(run: Path) -> str | None:
+    """Where a run's folder shows what rules closed before training; None where they closed nothing."""
+    path = run / NAME
+    return str(path) if path.is_file() else None
+
+
+def picture_closed(run: Path, space: KnownSpace | None, centers: torch.Tensor, points: torch.Tensor) -> None:
+    """Show in a run's folder which cells rules closed before training; a picture of an older one goes. See
+    `write_closed_picture`."""
+    path = run / NAME
+    path.unlink(missing_ok=True)
+    if space is not None:
+        write_closed_picture(path, space, centers, points)
 
 
 def write_closed_picture(path: Path, space: KnownSpace, centers: torch.Tensor, points: torch.Tensor) -> bool:

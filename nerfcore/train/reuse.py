@@ -15,8 +15,9 @@ from ..project.runs import CHECKPOINT, TrainingFolder, has_checkpoint, read_metr
 from ..project.schema import step
 from ..project.store import load_project, record_step
 from ..render.run import RunInfo, load_info, read_info, save_info
+from .closed_picture import closed_picture
 from .inputs import wanted_inputs
-from .verb import closed_picture, train
+from .verb import train
 
 
 def finished(params: TrainParams) -> Earlier:

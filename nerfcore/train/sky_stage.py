@@ -2,7 +2,8 @@
 
 The masks (`sky_masks.py`) have a price: what they call near must end on a surface from the first step on, and what few photos
 see past an edge then becomes a scrap at that edge. The ground of most captures becomes a surface without them. So training
-begins without, and how much of what is near the environment then has decides.
+begins without, and how much of what is near the environment then has decides; where that is much, training begins anew, with
+masks from its first step on.
 Measured: docs/experiments.md, “Masks of the sky only where the environment takes the ground”.
 """
 
@@ -24,37 +25,34 @@ RATE = 0.05  # at which the share follows that of a step; not tuned
 class SkyStage:
     """The part of a training, from its begin to `until` in [0, 1] of the schedule, in which `masks` may be needed.
 
-    `share`: of the pixels near, what the environment had in the steps watched; a scalar, 1 in the beginning: where there is
-    too little time to tell, masks are needed.
+    `needed`: whether they are, None until that is decided; without them till then. `share`: of the pixels near, what the
+    environment had in the steps watched; a scalar, 1 in the beginning.
     """
 
     def __init__(self, masks: SkyMasks, until: float) -> None:
         self.masks, self.until = masks, until
+        self.needed: bool | None = None
         self.share = torch.ones((), device=masks.values.device)
-        self._needed: bool | None = None
 
-    def masked(self, steps: int, progress: float) -> bool:
-        """Whether the environment is behind the sky alone in a step, `steps` after the first one; reads from the device
-        once."""
-        if progress >= self.until or self._watched(steps, progress):
-            return False
-        if self._needed is None:
-            self._needed = bool(self.share > TAKEN)
-        return self._needed
+    def masked(self, progress: float) -> bool:
+        """Whether the environment is behind the sky alone in a step."""
+        return bool(self.needed) and progress < self.until
 
-    def limited(self, batch: Batch, steps: int, progress: float) -> Batch:
+    def limited(self, batch: Batch, progress: float) -> Batch:
         """The batch of a step; where it is masked, with the pixels that may show the sky."""
-        if not self.masked(steps, progress):
+        if not self.masked(progress):
             return batch
         return replace(batch, sky=self.masks.at(batch.image, batch.pixel))
 
     @torch.no_grad()
-    def observe(self, batch: Batch, weight: torch.Tensor, steps: int, progress: float) -> None:
-        """Take in the environment's weight (R,) in the rays of a step."""
-        if self._watched(steps, progress):
+    def observe(self, batch: Batch, weight: torch.Tensor) -> None:
+        """Take in the environment's weight (R,) in the rays of a step, until it is decided."""
+        if self.needed is None:
             near = ~self.masks.at(batch.image, batch.pixel)
             share = (weight * near).sum() / near.sum().clamp(min=1)
             self.share += torch.where(near.any(), RATE * (share - self.share), 0.0)
 
-    def _watched(self, steps: int, progress: float) -> bool:
-        return steps < STEPS and progress < PART * self.until
+    def decide(self, steps: int, progress: float) -> None:
+        """Decide, where `steps` of training or `progress` are enough for it; reads from the device once."""
+        if self.needed is None and (steps >= STEPS or progress >= PART * self.until):
+            self.needed = bool(self.share > TAKEN)

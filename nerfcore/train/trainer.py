@@ -146,7 +146,7 @@ class Trainer:
             behind = [r.environment.weight for r in rendered if r.environment is not None]
             weight = torch.cat(behind)[: len(batch.label)]
             if self.sky is not None:
-                self.sky.observe(batch, weight.detach(), self.steps - 1, progress)
+                self.sky.observe(batch, weight.detach())
             if batch.sky is not None:
                 weight = weight * batch.sky
             model.environment.observe(weight, batch.label != VOID, model.labelled)
@@ -179,7 +179,7 @@ class Trainer:
             (self.rays, self._capacity(progress, 1), *model.fixed_shares()),
             (model.warming_up, None if blend is None else blend.warming_up),
             (self.steps < c.loss.rgb_warmup, progress >= c.loss.entropy_start, progress >= c.loss.distortion_start),
-            self.sky is not None and self.sky.masked(self.steps, progress),
+            self.sky is not None and self.sky.masked(progress),
             (None if hit is None else (hit.data_ptr(), len(hit)), model.occupancy.march_settings()),
             0 if self.depths is None else len(self.depths),
         )
@@ -200,7 +200,7 @@ class Trainer:
         random numbers, are changed."""
         batch = self.draw() if moving is None else moving.move(self.draw())
         if self.sky is not None:
-            batch = self.sky.limited(batch, self.steps, progress)
+            batch = self.sky.limited(batch, progress)
         tasks = self._shard_tasks(batch, progress)
         if self.config.loss.regularization * self.config.loss.sparsity_weight > 0:
             tasks.append(self._sparsity_task())

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from ..config import make_config, with_rendering_of
-from ..data.box import Box, box_poses
+from ..data.box import box_poses
 from ..data.load import load_scene
 from ..data.pixels import training_size
 from ..data.scene import Scene
@@ -50,8 +50,9 @@ from ..render.run import (
 )
 from ..render.unfinished import Unfinished
 from ..verdict import train_verdict
+from .begin import Begin
 from .checkpoint import restore, save_checkpoint
-from .closed_picture import write_closed_picture
+from .closed_picture import closed_picture, picture_closed
 from .inputs import data_inputs, training_inputs, training_length
 from .pose_refinement import write_poses
 from .prepare import make_trainer, plan_run
@@ -60,7 +61,6 @@ from .schedule import largest_batch
 from .trainer import Trainer
 from .voxel_init import save_features, why_without_effect
 
-CLOSED_PICTURE = "closed.png"
 # Not tuned: the next two.
 MOST_DROPPED = 0.01  # share of the rays that may be left out without a word
 MEASURED_STEPS = (16, 48)  # the steps between these say how fast the machine is
@@ -102,7 +102,9 @@ def train(params: TrainParams, report: Reporter) -> dict[str, Any]:
     for half_written in place.folder.glob(".*.safetensors"):  # by a process that was killed
         half_written.unlink()
     trainer = make_trainer(project_folder, info, scene, device, report)
-    _picture_closed(place.folder / CLOSED_PICTURE, trainer, scene, info.box(load_project(project_folder)))
+    points = transform_points(info.box(load_project(project_folder)).box_from_world, scene.points.xyz)
+    picture_closed(place.folder, trainer.space, trainer.store.rays.center, torch.from_numpy(points).float())
+    begin = Begin(trainer) if trainer.sky is not None else None
     state = {"seconds": 0.0, "progress": 0.0, "psnr": None, "largest_batch": None}
     if saved is not None:
         try:
@@ -121,6 +123,9 @@ def train(params: TrainParams, report: Reporter) -> dict[str, Any]:
         report.warn(f"field.voxel_init has no effect: {useless}.")
     report.stage("Training")
     loop = _Loop(trainer, info, place, state, limit, params.time_limit, report)
+    if trainer.sky is not None and trainer.sky.needed is None:
+        loop.begin = begin
+    del begin
     shown = Unfinished(project_folder, params.run, info, scene, trainer.model)
     try:
         with report.watching(shown) as show:
@@ -134,8 +139,8 @@ def train(params: TrainParams, report: Reporter) -> dict[str, Any]:
     config = info.config
     curve = read_events(place.folder)
     result["verdict"] = train_verdict(result, curve, config.sampling.warmup, config.train.steps)
-    if trainer.poses is not None:
-        result["pose_shift"] = trainer.poses.shift(info.box(load_project(project_folder)).world_from_box)
+    if loop.trainer.poses is not None:
+        result["pose_shift"] = loop.trainer.poses.shift(info.box(load_project(project_folder)).world_from_box)
     write_json(place.folder / METRICS, {"train": result})
     # What was done: a resumed run keeps the settings it began with.
     done = {"preset": info.preset, "holdout": info.holdout, "config": info.config.model_dump(mode="json")}
@@ -202,20 +207,6 @@ def _resumable(place: TrainingFolder, params: TrainParams, report: Reporter) -> 
     return info, load_scene(place.project, info.holdout)
 
 
-def closed_picture(run: Path) -> str | None:
-    """Where a run's folder shows what rules closed before training; None where they closed nothing."""
-    path = run / CLOSED_PICTURE
-    return str(path) if path.is_file() else None
-
-
-def _picture_closed(path: Path, trainer: Trainer, scene: Scene, box: Box) -> None:
-    """Show which cells rules closed before training."""
-    path.unlink(missing_ok=True)
-    if trainer.space is not None:
-        points = torch.from_numpy(transform_points(box.box_from_world, scene.points.xyz)).float()
-        write_closed_picture(path, trainer.space, trainer.store.rays.center, points)
-
-
 class _Loop:
     """Steps until the limit; events twice a second, previews and checkpoints as configured."""
 
@@ -232,6 +223,7 @@ class _Loop:
         self.trainer, self.info, self.place, self.state = trainer, info, place, state
         self.step_limit, self.time_limit, self.report = steps, seconds, report
         self.clock = _Clock(state["seconds"])
+        self.begin: Begin | None = None  # while training may have to begin anew
         self.warned: set[str] = set()
         self.measured_from: float | None = None  # seconds at the first of `MEASURED_STEPS`
 
@@ -253,6 +245,7 @@ class _Loop:
                 if self.trainer.steps in MEASURED_STEPS and self.state["largest_batch"] is None:
                     self._fit_into_time()
                 self.trainer.step(progress)
+                self._ask_for_masks(progress)
                 show()
                 self.state.update(progress=progress, seconds=self.clock.seconds())
                 now = time.perf_counter()
@@ -272,6 +265,20 @@ class _Loop:
                 self.report.check()
             self.state["progress"] = 1.0
             self._write_event(1.0, max(time.perf_counter() - last_event, 1e-3))
+
+    def _ask_for_masks(self, progress: float) -> None:
+        """Begin anew, with masks of the sky, where these turn out to be needed."""
+        begin, sky = self.begin, self.trainer.sky
+        if begin is None or sky is None:
+            return
+        sky.decide(self.trainer.steps, progress)
+        if sky.needed is None:
+            return
+        self.begin = None
+        if sky.needed:
+            self.report.note("What is near looks like a sky so far: training begins anew, with masks of the sky.")
+            self.trainer = begin.anew(self.trainer)
+            (self.place.folder / EVENTS).unlink(missing_ok=True)
 
     def _fit_into_time(self) -> None:
         """Let a short training have enough steps, by how long its first ones take."""

@@ -4,7 +4,7 @@ The masks (`sky_masks.py`) have a price: what they call near must end on a surfa
 see past an edge then becomes a scrap at that edge. The ground of most captures becomes a surface without them. So training
 begins without, and how much of what is near the environment then has decides; where that is much, training begins anew, with
 masks from its first step on.
-Measured: docs/experiments.md, “Masks of the sky only where the environment takes the ground”.
+Measured: docs/experiments.md, “Masks of the sky only where the environment takes the ground”, “Training that begins anew with masks”.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """Parts of a surface that photos deny: what lies on them looks otherwise in each photo.
 
 What cameras see far away, a meadow at the horizon, comes out near them in some fields, as scraps in the air that every
-view of the field shows. Photos tell: their grey values on a true part go up and down together from place to place.
-Measured: docs/experiments.md, “Scraps that photos deny”.
+view of the field shows. Photos tell: their grey values on a true part go up and down together from place to place. What
+is lighter towards one side says little, as much of the world is lighter towards the horizon.
+Measured: docs/experiments.md, “Scraps that photos deny”, “Plain scraps”.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ from ..progress import Reporter
 from .triangles import areas, components, cross, unit
 
 SAMPLES = 300  # places on a part, drawn by area
-AGREE = 0.3  # correlation of two photos' grey values there, below which they disagree
-PLAIN = 5.0  # of 255: standard deviation of grey values on a part up to which photos tell nothing
+AGREE = 0.18  # correlation of two photos' grey values there, less an even slope, below which they disagree
+PLAIN = 1.0  # of 255: standard deviation of grey values on a part up to which photos tell nothing: noise
 # Not tuned.
 MOST_PHOTOS = 12  # that are asked about a part, evenly spread over those that see it
 COMMON = 60  # places that two photos must both see
@@ -53,24 +54,31 @@ def denied(vertices: np.ndarray, faces: np.ndarray, views: Sequence[View], repor
         chosen.append(rng.choice(own, SAMPLES, p=area[own] / area[own].sum()))
     picked = np.concatenate(chosen)
     grey = _grey_values(vertices, faces, picked, views, report).reshape(len(views), len(others), SAMPLES)
-    bad = [one for number, one in enumerate(others) if disagree(grey[:, number])]
+    places = vertices[faces[picked]].mean(1, dtype=np.float64).reshape(len(others), SAMPLES, 3)
+    bad = [one for number, one in enumerate(others) if disagree(grey[:, number], places[number])]
     return np.isin(part, bad)
 
 
-def disagree(grey: np.ndarray) -> bool:
-    """Whether photos disagree on a part whose places have these grey values (N, S) in [0, 255] in them, NaN where a photo
-    does not show a place. Not where too few photos share places, or these are plain."""
+def disagree(grey: np.ndarray, places: np.ndarray) -> bool:
+    """Whether photos disagree on a part whose places (S, 3) have these grey values (N, S) in [0, 255] in them, NaN where a
+    photo does not show a place. Not where too few photos share places, or these are plain."""
     agreement, spread = [], []
     for i, first in enumerate(grey):
         for second in grey[:i]:
             both = np.isfinite(first) & np.isfinite(second)
             if both.sum() < COMMON:
                 continue
-            a, b = first[both] - first[both].mean(), second[both] - second[both].mean()
-            size = np.sqrt((a * a).mean()), np.sqrt((b * b).mean())
-            spread.append(min(size))
-            agreement.append((a * b).mean() / max(size[0] * size[1], 1e-9))
+            pair = np.stack([first[both], second[both]], 1).astype(np.float64)
+            spread.append(pair.std(0).min())
+            a, b = _uneven(pair, places[both]).T
+            agreement.append((a * b).sum() / max(np.linalg.norm(a) * np.linalg.norm(b), 1e-9))
     return len(agreement) >= PAIRS and bool(np.median(spread) > PLAIN and np.median(agreement) < AGREE)
+
+
+def _uneven(values: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Values (S, K) at places (S, 3) less their mean and what grows evenly along some direction."""
+    even = np.concatenate([places - places.mean(0), np.ones((len(places), 1))], 1)
+    return values - even @ np.linalg.lstsq(even, values, rcond=None)[0]
 
 
 def _grey_values(

@@ -31,8 +31,9 @@ def sampled(picture: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return scipy.ndimage.map_coordinates(picture, [(y + 5) * 40, (x + 5) * 40], order=1, mode="wrap")
 
 
-def photos(folder: Path, plain: bool) -> list[View]:
-    """A wall at z = 0 and a plate before it, both with a texture, the wall without one where it is `plain`."""
+def photos(folder: Path, plain: bool, contrast: float = 1.0) -> list[View]:
+    """A wall at z = 0 and a plate before it, both with a texture, the wall without one where it is `plain`; with less
+    `contrast` both are lighter towards one side instead."""
     wall, plate = texture(0, 3.0), texture(1, 3.0)
     views = []
     for number, eye in enumerate(EYES):
@@ -43,6 +44,7 @@ def photos(folder: Path, plain: bool) -> list[View]:
         inside = (np.abs(near[:, :2] - PLATE[:2]) < HALF).all(1)
         behind = np.full(len(far), 128.0) if plain else sampled(wall, *far[:, :2].T)
         grey = np.where(inside, sampled(plate, *near[:, :2].T), behind)
+        grey = 128 + contrast * (grey - 128) + (1 - contrast) * 10 * far[:, 0]
         grey += np.random.default_rng(number).normal(size=len(grey))
         pixels = np.clip(grey, 0, 255).astype(np.uint8).reshape(CAMERA.height, CAMERA.width)
         Image.fromarray(np.repeat(pixels[..., None], 3, 2)).save(folder / f"{number}.png")
@@ -85,12 +87,28 @@ def test_photos_say_nothing_of_what_is_plain(
     assert not denied(vertices, faces, photos(tmp_path, plain=True), Reporter()).any()
 
 
+def test_photos_tell_little_detail_from_none(
+    tmp_path: Path, surface: tuple[np.ndarray, np.ndarray, np.ndarray]
+) -> None:
+    """On a wall and a plate of a few grey values, which shine towards one side."""
+    vertices, faces, part = surface
+    assert np.array_equal(denied(vertices, faces, photos(tmp_path, plain=False, contrast=0.1), Reporter()), part == 2)
+
+
 def test_photos_of_another_exposure_agree() -> None:
     rng = np.random.default_rng(0)
-    shown = rng.uniform(40, 120, 300)
-    assert not disagree(np.stack([shown, 1.8 * shown + 20, 0.5 * shown]))
-    assert disagree(rng.uniform(40, 120, (3, 300)))
+    shown, places = rng.uniform(40, 120, 300), rng.normal(size=(300, 3))
+    assert not disagree(np.stack([shown, 1.8 * shown + 20, 0.5 * shown]), places)
+    assert disagree(rng.uniform(40, 120, (3, 300)), places)
     hidden = rng.uniform(40, 120, (3, 300))
     hidden[:, ::2] = np.nan
     hidden[1, 60:] = np.nan
-    assert not disagree(hidden), "two pairs share too few places"
+    assert not disagree(hidden, places), "two pairs share too few places"
+
+
+def test_what_is_lighter_towards_one_side_is_no_agreement() -> None:
+    rng = np.random.default_rng(0)
+    places = rng.normal(size=(300, 3))
+    slope = 100 + places @ [30.0, 10.0, 0.0]
+    assert disagree(slope + rng.uniform(-10, 10, (3, 300)), places)
+    assert not disagree(slope + rng.uniform(-10, 10, 300) + rng.uniform(-5, 5, (3, 300)), places)

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import torch
 from fieldwork.nerfcore.data.pixels import Batch
+from fieldwork.nerfcore.errors import Cancelled
 from fieldwork.nerfcore.params import TrainParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.runs import read_events
@@ -173,3 +174,31 @@ def test_train_begins_anew_where_masks_are_needed(court: Path, taken: float, mon
     first = 4  # steps until a third of the first 0.3
     assert masked == [False] * first + [True] * 9 + [False] * 21 if taken else [False] * 30
     assert len(report.notes) == (1 if taken else 0)
+
+
+def test_training_stopped_before_it_was_decided_begins_anew_where_it_goes_on(
+    court: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    report, masked = Notes(), []
+
+    def told(sky: SkyStage, batch: Batch, weight: torch.Tensor) -> None:
+        sky.share.fill_(1.0)
+        masked.append(batch.sky is not None)
+        if len(masked) == 2:
+            report.cancel()
+
+    monkeypatch.setattr(SkyStage, "observe", told)
+    params = TrainParams(
+        project=court, preset="draft", steps=30, set={**SMALL, "scene.background": "environment"}, run="stopped"
+    )
+    with pytest.raises(Cancelled):
+        train(params, report)
+    report = Notes()
+    result = train(params.model_copy(update={"resume": True}), report)
+    assert masked == [False] * 4 + [True] * 9 + [False] * 21
+    assert len(report.notes) == 1
+    assert result["steps"] == 30
+    again = Notes()
+    train(params.model_copy(update={"resume": True, "steps": 40}), again)
+    assert len(masked) == 34 + 10
+    assert not again.notes

@@ -42,7 +42,7 @@ def save_checkpoint(path: Path, trainer: Trainer, state: dict[str, Any]) -> None
         DiskError: the disk is full or the folder is not writable; an older checkpoint stays as it was.
     """
     tensors = {name: value.detach().cpu().contiguous() for name, value in trainer_tensors(trainer).items()}
-    numbers = {"steps": trainer.steps, "rays": trainer.rays}
+    numbers: dict[str, Any] = {"steps": trainer.steps, "rays": trainer.rays}
     if trainer.sky is not None:
         numbers["sky_masks"] = trainer.sky.needed
     write_checkpoint(path, tensors, {**state, **numbers})

@@ -278,7 +278,7 @@ class _Loop:
         if sky.needed:
             self.report.note("What is near looks like a sky so far: training begins anew, with masks of the sky.")
             self.trainer = begin.anew(self.trainer)
-            (self.place.folder / EVENTS).unlink(missing_ok=True)
+            (self.place.folder / EVENTS).write_bytes(b"")
 
     def _fit_into_time(self) -> None:
         """Let a short training have enough steps, by how long its first ones take."""

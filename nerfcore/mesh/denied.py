@@ -53,8 +53,9 @@ def denied(vertices: np.ndarray, faces: np.ndarray, views: Sequence[View], repor
         own = np.flatnonzero(part == one)
         chosen.append(rng.choice(own, SAMPLES, p=area[own] / area[own].sum()))
     picked = np.concatenate(chosen)
-    grey = _grey_values(vertices, faces, picked, views, report).reshape(len(views), len(others), SAMPLES)
-    places = vertices[faces[picked]].mean(1, dtype=np.float64).reshape(len(others), SAMPLES, 3)
+    middles = vertices[faces].mean(1, dtype=np.float64)
+    grey = _grey_values(vertices, faces, middles, picked, views, report).reshape(len(views), len(others), SAMPLES)
+    places = middles[picked].reshape(len(others), SAMPLES, 3)
     bad = [one for number, one in enumerate(others) if disagree(grey[:, number], places[number])]
     return np.isin(part, bad)
 
@@ -82,11 +83,15 @@ def _uneven(values: np.ndarray, places: np.ndarray) -> np.ndarray:
 
 
 def _grey_values(
-    vertices: np.ndarray, faces: np.ndarray, picked: np.ndarray, views: Sequence[View], report: Reporter
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    middles: np.ndarray,
+    picked: np.ndarray,
+    views: Sequence[View],
+    report: Reporter,
 ) -> np.ndarray:
-    """Grey values (N, P) in [0, 255] of the middles of triangles `picked` (P,), `SAMPLES` of each part, in the photos; NaN
+    """Grey values (N, P) in [0, 255] of the `middles` (F, 3) of triangles `picked` (P,), `SAMPLES` of each part, in the photos; NaN
     where a photo does not show it, or is not asked."""
-    middles = vertices[faces].mean(1, dtype=np.float64)
     middle, normals = middles[picked], unit(cross(vertices, faces[picked]))
     front = FrontFaces(vertices, faces)
     seen = np.zeros((len(views), len(picked)), bool)

@@ -2,7 +2,7 @@
 
 The masks (`sky_masks.py`) have a price: what they call near must end on a surface from the first step on, and what few photos
 see past an edge then becomes a scrap at that edge. The ground of most captures becomes a surface without them. So training
-begins without, and how much of what is near the environment then has decides; where that is much, training begins anew, with
+begins without, and how much of what is near the environment then has decides; where that is much, training starts over, with
 masks from its first step on.
 Measured: docs/experiments.md, “Masks of the sky only where the environment takes the ground”, “Training that begins anew with masks”.
 """
@@ -52,7 +52,13 @@ class SkyStage:
             share = (weight * near).sum() / near.sum().clamp(min=1)
             self.share += torch.where(near.any(), RATE * (share - self.share), 0.0)
 
-    def decide(self, steps: int, progress: float) -> None:
-        """Decide, where `steps` of training or `progress` are enough for it; reads from the device once."""
-        if self.needed is None and (steps >= STEPS or progress >= PART * self.until):
-            self.needed = bool(self.share > TAKEN)
+    def decide(self, steps: int, progress: float) -> bool:
+        """Decide, where `steps` of training or `progress` are enough for it; reads from the device once.
+
+        Returns:
+            whether masks have turned out to be needed just now, so that training must start over.
+        """
+        if self.needed is not None or (steps < STEPS and progress < PART * self.until):
+            return False
+        self.needed = bool(self.share > TAKEN)
+        return self.needed

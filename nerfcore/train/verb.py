@@ -50,9 +50,9 @@ from ..render.run import (
 )
 from ..render.unfinished import Unfinished
 from ..verdict import train_verdict
-from .begin import Begin
 from .checkpoint import restore, save_checkpoint
 from .closed_picture import closed_picture, picture_closed
+from .initial_state import InitialState
 from .inputs import data_inputs, training_inputs, training_length
 from .pose_refinement import write_poses
 from .prepare import make_trainer, plan_run
@@ -104,7 +104,7 @@ def train(params: TrainParams, report: Reporter) -> dict[str, Any]:
     trainer = make_trainer(project_folder, info, scene, device, report)
     points = transform_points(info.box(load_project(project_folder)).box_from_world, scene.points.xyz)
     picture_closed(place.folder, trainer.space, trainer.store.rays.center, torch.from_numpy(points).float())
-    begin = Begin(trainer) if trainer.sky is not None else None
+    initial = InitialState(trainer) if trainer.sky is not None else None
     state = {"seconds": 0.0, "progress": 0.0, "psnr": None, "largest_batch": None}
     if saved is not None:
         try:
@@ -122,10 +122,8 @@ def train(params: TrainParams, report: Reporter) -> dict[str, Any]:
     if useless is not None:
         report.warn(f"field.voxel_init has no effect: {useless}.")
     report.stage("Training")
-    loop = _Loop(trainer, info, place, state, limit, params.time_limit, report)
-    if trainer.sky is not None and trainer.sky.needed is None:
-        loop.begin = begin
-    del begin
+    loop = _Loop(trainer, initial, info, place, state, limit, params.time_limit, report)
+    del initial
     shown = Unfinished(project_folder, params.run, info, scene, trainer.model)
     try:
         with report.watching(shown) as show:
@@ -213,6 +211,7 @@ class _Loop:
     def __init__(
         self,
         trainer: Trainer,
+        initial: InitialState | None,
         info: RunInfo,
         place: TrainingFolder,
         state: dict[str, Any],
@@ -223,7 +222,7 @@ class _Loop:
         self.trainer, self.info, self.place, self.state = trainer, info, place, state
         self.step_limit, self.time_limit, self.report = steps, seconds, report
         self.clock = _Clock(state["seconds"])
-        self.begin: Begin | None = None  # while training may have to begin anew
+        self.initial = initial  # while training may have to start over
         self.warned: set[str] = set()
         self.measured_from: float | None = None  # seconds at the first of `MEASURED_STEPS`
 
@@ -245,7 +244,7 @@ class _Loop:
                 if self.trainer.steps in MEASURED_STEPS and self.state["largest_batch"] is None:
                     self._fit_into_time()
                 self.trainer.step(progress)
-                self._ask_for_masks(progress)
+                self._start_over_if_needed(progress)
                 show()
                 self.state.update(progress=progress, seconds=self.clock.seconds())
                 now = time.perf_counter()
@@ -266,19 +265,17 @@ class _Loop:
             self.state["progress"] = 1.0
             self._write_event(1.0, max(time.perf_counter() - last_event, 1e-3))
 
-    def _ask_for_masks(self, progress: float) -> None:
-        """Begin anew, with masks of the sky, where these turn out to be needed."""
-        begin, sky = self.begin, self.trainer.sky
-        if begin is None or sky is None:
+    def _start_over_if_needed(self, progress: float) -> None:
+        """Start over, with masks of the sky, where these have turned out to be needed."""
+        sky, initial = self.trainer.sky, self.initial
+        if sky is None or initial is None:
             return
-        sky.decide(self.trainer.steps, progress)
-        if sky.needed is None:
-            return
-        self.begin = None
-        if sky.needed:
-            self.report.note("What is near looks like a sky so far: training begins anew, with masks of the sky.")
-            self.trainer = begin.anew(self.trainer)
+        if sky.decide(self.trainer.steps, progress):
+            self.report.note("Much of what is near passes for sky so far: training starts over, with masks of the sky.")
+            self.trainer = initial.restarted(self.trainer)
             (self.place.folder / EVENTS).write_bytes(b"")
+        if sky.needed is not None:
+            self.initial = None
 
     def _fit_into_time(self) -> None:
         """Let a short training have enough steps, by how long its first ones take."""

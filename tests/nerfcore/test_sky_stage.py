@@ -13,8 +13,8 @@ from fieldwork.nerfcore.params import TrainParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.runs import read_events
 from fieldwork.nerfcore.render.run import read_checkpoint
-from fieldwork.nerfcore.train.begin import Begin
 from fieldwork.nerfcore.train.checkpoint import restore, save_checkpoint, trainer_tensors
+from fieldwork.nerfcore.train.initial_state import InitialState
 from fieldwork.nerfcore.train.sky_stage import PART, STEPS, TAKEN, SkyStage
 from fieldwork.nerfcore.train.trainer import Trainer
 from fieldwork.nerfcore.train.verb import train
@@ -128,10 +128,10 @@ def test_what_was_seen_and_decided_is_kept_with_the_training(court: Path, tmp_pa
 def test_training_that_begins_anew_is_as_if_it_had_never_begun(court: Path) -> None:
     """To the last bit, although the grids, optimisers and random numbers went on for some steps."""
     fresh, used = (environment_trainer(court, train__refine_poses="true", train__pose_start="0") for _ in range(2))
-    begin = Begin(used)
+    initial = InitialState(used)
     for step in range(20):
         used.step(step / 200)
-    again = begin.anew(used)
+    again = initial.restarted(used)
     for trainer in (fresh, again):
         assert trainer.sky is not None
         trainer.sky.needed = True

@@ -1,4 +1,4 @@
-"""The state in which a training begins, for those that find out that they must begin anew."""
+"""The state in which a training begins, for those that find out that they must start over."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from ..render.model import Model
 from .trainer import Trainer
 
 
-class Begin:
-    """A copy, in the host's memory, of all that the first step of a trainer depends on; make it before that step."""
+class InitialState:
+    """A copy, in the host's memory, of all that the first step of a trainer depends on; made before that step."""
 
     def __init__(self, trainer: Trainer) -> None:
         self.values = {name: value.to("cpu", copy=True) for name, value in _values(trainer.model)}
         self.generator = trainer.generator.get_state()
 
-    def anew(self, trainer: Trainer) -> Trainer:
-        """A trainer of the same model, which is put back into its first state; the one that was used before must not be
-        used again. What it found out about the sky stays known."""
+    def restarted(self, trainer: Trainer) -> Trainer:
+        """A trainer of the same model, which is put back into this state; the one given must not be used again. What it
+        found out about the sky stays known."""
         model = trainer.model
         again = Trainer(model, trainer.store, trainer.config, trainer.background, trainer.check)
         again.space, again.depths, again.sky = trainer.space, trainer.depths, trainer.sky

@@ -65,6 +65,17 @@ class MeshSettings:
         name="Watertight",
         description="Close the surface: what no photo shows counts as inside, and its faces are marked as unseen",
     )
+    close_gaps: FloatProperty(
+        name="Close Gaps",
+        description="Width, in percent of the longest side of the region, up to which holes, cracks and frayed borders "
+        "are closed by a guess; its faces are marked as unseen",
+        default=0.0,
+        min=0.0,
+        max=20.0,
+        soft_max=10.0,
+        precision=1,
+        subtype="PERCENTAGE",
+    )
     texture: EnumProperty(
         name="Texture",
         description="Size of the texture in pixels",

@@ -25,6 +25,7 @@ from .scene import SPLIT_ROLES, show_colors, update_scene
     texture="texture",
     texture_kind="texture_kind",
     watertight="watertight",
+    close_gaps="close_gaps",
     out="mesh_file",
     split="split",
 )
@@ -65,6 +66,7 @@ class FIELDWORK_OT_mesh(ProjectOperator):
             "lods": self.value(context, "lods"),
             "texture": None if (size := self.value(context, "texture")) == "0" else size,
             "watertight": self.value(context, "watertight"),
+            "close_gaps": self.value(context, "close_gaps"),
             "texture_kind": self.value(context, "texture_kind"),
             "out": self.also(context, "out"),
             "split": self.value(context, "split"),

@@ -27,6 +27,8 @@ class FIELDWORK_PT_mesh(StepPanel):
         column.prop(settings, "mesh_region")
         for name in ("resolution", "detail", "watertight"):
             column.prop(settings, name)
+        if not settings.watertight:
+            column.prop(settings, "close_gaps")
         row = column.row(align=True, heading=t("Faces"))
         row.prop(settings, "all_faces", toggle=True)
         if not settings.all_faces:

@@ -18,7 +18,8 @@ class MeshData(NamedTuple):
     `vertices` (V, 3) float32; `edges` (E, 2) vertex indices; `corners`, `corner_edges` (3F,) vertex and edge of each
     corner, the edge leading to the next corner; `colors` (V, 4), `face_colors` (F, 4) float32 sRGB of the photos and of the
     classes; `vertex_class` (V,), `face_class` (F,) class ids; `face_instance` (F,), 0 for none; `confidence` (V,) float32 of
-    the classes; `material` (F,) slot; `uv` (3F, 2) float32 or None. Indices and ids are int32.
+    the classes; `material` (F,) slot; `uv` (3F, 2) float32 or None; `unseen` (F,) bool of faces that close what no photo
+    shows, or None. Indices and ids are int32.
     """
 
     vertices: np.ndarray
@@ -33,6 +34,7 @@ class MeshData(NamedTuple):
     confidence: np.ndarray
     material: np.ndarray
     uv: np.ndarray | None
+    unseen: np.ndarray | None
 
 
 @dataclass(frozen=True)
@@ -101,7 +103,9 @@ def measured_of(package: Package, kind: str, number: int) -> dict[str, Any]:
 def part_of(arrays: dict[str, np.ndarray], chosen: np.ndarray) -> dict[str, np.ndarray]:
     """The arrays of a mesh (see `Package.mesh`) for a mask (F,) of its faces, with the vertices these use."""
     used, corners = np.unique(arrays["faces"][chosen], return_inverse=True)
-    per_face = {name: arrays[name][chosen] for name in ("face_class", "face_instance", "uv") if name in arrays}
+    per_face = {
+        name: arrays[name][chosen] for name in ("face_class", "face_instance", "uv", "unseen") if name in arrays
+    }
     per_vertex = {
         name: arrays[name][used] for name in ("vertices", "colors", "class_id", "confidence") if name in arrays
     }
@@ -116,6 +120,7 @@ def mesh_data(arrays: dict[str, np.ndarray], slots: dict[int, int], colors: np.n
         "class": arrays["face_class"].astype(np.int32),
         "instance": np.asarray(arrays.get("face_instance", np.zeros(len(faces)))).astype(np.int32),
         "uv": arrays.get("uv"),
+        "unseen": arrays.get("unseen"),
     }
     # A triangle with two equal corners has no area, and Blender has no edge for it.
     whole = (faces != np.roll(faces, 1, axis=1)).all(1)
@@ -141,6 +146,7 @@ def mesh_data(arrays: dict[str, np.ndarray], slots: dict[int, int], colors: np.n
         confidence=np.ascontiguousarray(arrays.get("confidence", np.zeros(count)), np.float32),
         material=material,
         uv=np.ascontiguousarray(uv, np.float32).reshape(-1, 2) if uv is not None else None,
+        unseen=per_face["unseen"],
     )
 
 

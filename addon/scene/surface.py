@@ -29,6 +29,7 @@ from .slices import Held
 
 CLASS_ATTRIBUTE, VERTEX_CLASS_ATTRIBUTE = "class_id", "vertex_class_id"
 INSTANCE_ATTRIBUTE = "instance_id"
+UNSEEN_ATTRIBUTE = "unseen"  # faces that close gaps, or a watertight surface
 RELATIONS = "relations"  # custom property of the objects of instances
 INSTANCE_NAMES = "instances"  # custom property of the objects: names by the numbers of the attribute
 LABEL_REVISION = "label_revision"  # custom property of the objects: of the marks that classes are from
@@ -118,6 +119,10 @@ def fill_surface(held: Held, data: MeshData) -> Steps:
         mesh.attributes.new(name, "INT", domain)
         set_values(mesh, name, "value", values)
     yield STEP
+    if data.unseen is not None:
+        held().attributes.new(UNSEEN_ATTRIBUTE, "BOOLEAN", "FACE")
+        set_values(held(), UNSEEN_ATTRIBUTE, "value", data.unseen)
+        yield STEP
     mesh = held()
     mesh.attributes.new(CONFIDENCE_ATTRIBUTE, "FLOAT", "POINT")
     set_values(mesh, CONFIDENCE_ATTRIBUTE, "value", data.confidence)

@@ -8,7 +8,7 @@ images/             the photos without lens distortion, in the size of their cam
 points.npz          xyz (N, 3) float32 world, rgb (N, 3) uint8 sRGB
 lenses.json         which lens each photo was undistorted for
 mesh.npz            only when there is a mesh: vertices, faces, normals, colors, class_id, face_class, face_instance,
-                    confidence of the vertices
+                    confidence of the vertices, unseen where there are such faces
 texture-….png       the texture of the mesh, named by its content; some of earlier meshes
 """
 

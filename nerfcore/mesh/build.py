@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 
 from ..data.box import Box, looks_inward
 from ..data.pixels import PixelStore
@@ -22,7 +23,7 @@ from ..render.run import Trained
 from ..verdict import LITTLE_IN_ONE
 from . import depth_maps as dm
 from .appearance import Photos
-from .clean import clean, drop_scraps
+from .clean import clean, not_scraps
 from .closed import closed_surface, unseen_faces
 from .cut_outs import left_out
 from .decimate import decimate
@@ -31,6 +32,7 @@ from .denoise import denoised
 from .extract import extract
 from .field_values import shade
 from .fusion import TRUNCATION, Bricks, coarser, fuse_maps, tolerances
+from .gaps import close_gaps
 from .refine import refined_maps
 from .region import Region, choose_region, on_sides, sides_of
 from .surface import vertex_normals
@@ -45,7 +47,7 @@ class Built:
     """A surface in the normalised frame, and the region in which it was looked for: vertices (V, 3) float32, faces (F, 3)
     int32, normals (V, 3) unit, outward, colors (V, 3) uint8 sRGB; coarse: vertices (V', 3) and faces (F', 3) of the same
     surface at voxels of twice the size, not cleaned; unseen (F,) bool: triangles that close a surface which was asked to
-    be watertight."""
+    be watertight, or its gaps."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -73,15 +75,19 @@ def build(trained: Trained, project: Project, scene: Scene, params: MeshParams, 
     report.stage("Extracting the surface")
     coarse, tolerance = extract(coarser(bricks), report), TRUNCATION * region.voxel
     coarse = denoised(*coarse, maps.depth.device, report), coarse[1]
+    unseen = None
     if params.watertight:
         vertices, faces = closed_surface(bricks, maps, tolerance, params.faces, report)
     else:
-        vertices, faces = open_surface(bricks, maps, tolerance, region, params.faces, report)
+        gaps = params.close_gaps / 100 * region.size
+        vertices, faces, guessed = open_surface(bricks, maps, tolerance, region, params.faces, gaps, report)
         world, photos = transform_points(box.world_from_box, vertices), [scene.views[i] for i in scene.train]
-        faces = faces[~denied(world, faces, photos, report)]
+        kept = ~denied(world, faces, photos, report)
         if scene.mask_mode == "empty":
-            faces = drop_scraps(vertices, faces[~left_out(world, faces, photos, report)])
-        vertices, faces = compact(vertices, faces)
+            kept[kept] = ~left_out(world, faces[kept], photos, report)
+            kept[kept] = not_scraps(vertices, faces[kept])
+        vertices, faces = compact(vertices, faces[kept])
+        unseen = guessed[kept] if gaps else None
     if not len(faces):
         raise no_surface(params)
     check_parts(vertices, faces, report)
@@ -90,7 +96,8 @@ def build(trained: Trained, project: Project, scene: Scene, params: MeshParams, 
     normals = vertex_normals(vertices, faces)
     painted = Photos(store, maps, np.array([flat.photo for flat in flats]), tolerance)
     colors = vertex_colors(trained.model, region, painted, vertices, normals, report)
-    unseen = unseen_faces(vertices, faces, maps, tolerance, report) if params.watertight else None
+    if params.watertight:
+        unseen = unseen_faces(vertices, faces, maps, tolerance, report)
     return Built(vertices, faces, normals, colors, region, coarse, unseen)
 
 
@@ -136,21 +143,35 @@ def agreed_maps(
 
 
 def open_surface(
-    bricks: Bricks, maps: MapArrays, tolerance: float, region: Region, most: int | None, report: Reporter
-) -> tuple[np.ndarray, np.ndarray]:
-    """What two views see of the fused surface, in about `most` triangles where a number is given; open where nothing is
-    known, and where the region cuts it."""
+    bricks: Bricks,
+    maps: MapArrays,
+    tolerance: float,
+    region: Region,
+    most: int | None,
+    gaps: float,
+    report: Reporter,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What two views see of the fused surface, in about `most` triangles where a number is given, and which of these (F,) bool
+    are a guess; open where nothing is known, but for gaps up to a width of `gaps`, and where the region cuts it."""
     vertices, faces = extract(bricks, report)
     if not len(faces):
-        return vertices, faces
+        return vertices, faces, np.zeros(0, bool)
     report.stage("Cleaning the surface")
-    vertices, faces, _ = clean(vertices, faces, maps, tolerances(bricks, vertices, faces, tolerance), report)
+    near = tolerances(bricks, vertices, faces, tolerance)
+    vertices, faces, guessed = clean(vertices, faces, maps, near, report)
+    if gaps:
+        report.stage("Closing gaps")
+        vertices, faces, guessed = close_gaps(bricks, vertices, faces[~guessed], gaps, maps, report)
+    before = vertices[faces].mean(1)
     if most is not None and len(faces) > most:
         report.stage("Simplifying")
         vertices, faces = decimate(vertices, faces, most, report)
     vertices = denoised(vertices, faces, maps.depth.device, report)
     faces = faces[~on_sides(vertices, faces, region, region.voxel / 2)]
-    return compact(vertices, drop_scraps(vertices, faces))  # simplifying tears thin ones off
+    faces = faces[not_scraps(vertices, faces)]  # simplifying tears thin ones off
+    vertices, faces = compact(vertices, faces)
+    _, nearest = cKDTree(before).query(vertices[faces].mean(1))
+    return vertices, faces, guessed[nearest]
 
 
 def wanted_bounds(params: MeshParams, scene: Scene, box: Box) -> tuple[np.ndarray, np.ndarray] | None:

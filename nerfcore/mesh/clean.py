@@ -75,9 +75,16 @@ def slopes_around(
 
 def drop_scraps(vertices: np.ndarray, faces: np.ndarray, share: float = SCRAP) -> np.ndarray:
     """The triangles (F, 3) of connected parts that have at least `share` of the area."""
+    return faces[not_scraps(vertices, faces, share)]
+
+
+def not_scraps(vertices: np.ndarray, faces: np.ndarray, share: float = SCRAP) -> np.ndarray:
+    """Which triangles (F,) bool are of connected parts that have at least `share` of the area."""
+    if not len(faces):
+        return np.zeros(0, bool)
     part = components(faces, len(vertices))
     area = np.bincount(part, areas(vertices, faces))
-    return faces[area[part] >= share * area.sum()] if len(faces) else faces
+    return area[part] >= share * area.sum()
 
 
 def fill_holes(

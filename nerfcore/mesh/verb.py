@@ -37,6 +37,7 @@ from .photos import Photo
 from .preview import preview
 from .shown import shown_share, silhouette
 from .surface import Surface, class_table, is_watertight, to_world
+from .triangles import areas
 from .turntable import look_around
 
 
@@ -52,6 +53,8 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
         "overlap_shown" and "seen_by_few": see `coverage.Coverage` (solid, holes, overlapped, few); "verdict";
         "silhouette" of a capture with masks: see `shown.silhouette`;
         for a preview see `preview.preview`;
+        of a closed surface "unseen", the share of its area that closes gaps, or that fewer than two photos see of a
+        watertight one;
         with a texture of photos "painted_by_photos", the share of its texels that a photo shows
     Raises:
         SettingError: unknown format, impossible region, or no memory for the texture. ProjectError, TrainingError, DiskError.
@@ -113,6 +116,9 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
         "files": [str(path) for path in files],
         **judged,
     }
+    if built.unseen is not None:
+        area = areas(built.vertices, built.faces)
+        result["unseen"] = round(float(area[built.unseen].sum() / area.sum()), 4)
     if painted.seen is not None:
         result["painted_by_photos"] = round(painted.seen, 4)
     settings = params.model_dump(mode="json")

@@ -42,6 +42,13 @@ class MeshParams(Params):
     watertight: bool = Field(
         default=False, description="close the surface: what no photo shows counts as inside, and its faces are marked"
     )
+    close_gaps: float = Field(
+        default=0.0,
+        ge=0,
+        le=20,
+        description="width, in percent of the longest side of the region, up to which holes, cracks and frayed borders are "
+        "closed by a guess, whose faces are marked; 0: none",
+    )
     texture_kind: Literal["photo", "field"] = Field(
         default="photo", description="what the texture shows: the photos, or the field's colours"
     )

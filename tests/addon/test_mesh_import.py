@@ -7,7 +7,7 @@ import os
 
 import numpy as np
 import pytest
-from fieldwork.addon.scene.mesh_data import edges_of, mesh_data
+from fieldwork.addon.scene.mesh_data import edges_of, mesh_data, part_of
 
 LIMIT = 0.1  # seconds that nothing may hold the window up for
 
@@ -71,6 +71,17 @@ def test_triangles_without_area_are_left_out():
     assert len(data.material) == len(arrays["faces"]) - 1
     assert len(data.corners) == len(data.corner_edges) == 3 * len(data.material)
     assert set(data.material.tolist()) == {0, 1}, "an unknown class gets the first slot"
+
+
+def test_faces_that_close_gaps_stay_marked_where_others_go():
+    arrays = sheet(3)
+    assert mesh_data(arrays, {0: 0}, np.eye(1, 4, dtype=np.float32)).unseen is None
+    arrays["unseen"] = np.arange(len(arrays["faces"])) % 3 == 0
+    arrays["faces"][3] = [4, 4, 5]
+    data = mesh_data(arrays, {0: 0}, np.eye(1, 4, dtype=np.float32))
+    assert data.unseen is not None
+    assert data.unseen.tolist() == np.delete(arrays["unseen"], 3).tolist()
+    assert part_of(arrays, np.arange(len(arrays["faces"])) < 4)["unseen"].tolist() == [True, False, False, True]
 
 
 SETUP = """

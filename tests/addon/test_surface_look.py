@@ -29,6 +29,7 @@ def package(tmp_path):
     arrays["face_class"] = np.where(middle[:, 0] < 0.44, 1, 2).astype(np.uint16)
     arrays["face_instance"] = ((arrays["face_class"] == 2) & (middle[:, 1] > 0.44)).astype(np.uint32)
     arrays["colors"] = np.full((len(arrays["vertices"]), 3), (200, 100, 50), np.uint8)
+    arrays["unseen"] = arrays["face_class"] == 1
     arrays["confidence"] = np.where(arrays["vertices"][:, 1] > 0.5, 1.0, 0.0).astype(np.float32)
     np.savez(folder / "mesh.npz", **arrays)
     value = json.loads((folder / "package.json").read_text())
@@ -127,6 +128,7 @@ answer({
     "materials": {m.name: describe(m) for m in next(iter(meshes.values())).data.materials},
     "faces": {name: len(m.data.polygons) for name, m in meshes.items()},
     "instances": {name: sorted({v.value for v in m.data.attributes["instance_id"].data}) for name, m in meshes.items()},
+    "unseen": {name: [v.value for v in m.data.attributes["unseen"].data] for name, m in meshes.items()},
     "left": {name: len(m.evaluated_get(depsgraph).data.polygons) for name, m in meshes.items()},
     "revisions": sorted({m["label_revision"] for m in meshes.values()}),
     "again": sorted(m.name for m in import_package(scene, read_package(package), split="none").meshes),
@@ -151,6 +153,9 @@ def test_objects_are_named_and_sorted_by_class_and_say_what_was_measured(package
         assert facts["instances"] == {"gold": [0], "gold.001": [1], "stone": [0]}
     assert facts["revisions"] == [7]
     assert sum(facts["faces"].values()) == 128
+    assert {name: set(unseen) for name, unseen in facts["unseen"].items()} == {
+        name: {name == "stone"} for name in facts["names"]
+    }
     assert {name: left for name, left in facts["left"].items() if left} == {"stone": facts["faces"]["stone"]}
     assert facts["again"] == ["Surface"]
     assert not {"gold", "stone"} & set(facts["after"]), "collections that nothing stands in are gone"

@@ -29,7 +29,7 @@ from PIL import Image
 ROOT = Path(__file__).resolve().parents[2]
 PROMPT = 2.0  # seconds of a processor from the cancel to the end
 DEADLINE = 120.0  # seconds on the clock for anything, on a machine with other work
-TINY = {"resolution": 40, "texture": 128, "faces": 2000, "lods": 1}
+TINY = {"resolution": 40, "texture": 128, "faces": 2000, "lods": 1, "close_gaps": 5.0}
 
 
 class Stops(Reporter):

@@ -87,7 +87,7 @@ def test_what_simplifying_tears_off_does_not_hang_in_the_air(monkeypatch: pytest
 
     monkeypatch.setattr(build, "decimate", torn)
     bricks = fuse_maps(maps, region, Reporter())
-    vertices, faces = build.open_surface(bricks, maps, 4 * region.voxel, region, 1000, Reporter())
+    vertices, faces, _ = build.open_surface(bricks, maps, 4 * region.voxel, region, 1000, 0.0, Reporter())
     assert len(faces) > 1000
     assert components(faces, len(vertices)).max() == 0
     assert len(np.unique(faces)) == len(vertices)

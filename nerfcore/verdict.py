@@ -20,6 +20,7 @@ FLAT = 1.02  # 95th percentile of depth over the 5th
 MISSED, PARTLY = 0.02, 0.1  # share of the photos' pixels that show the mesh
 SOLID, HALF_GONE = 0.9, 0.5  # share of the pixels that show something near with detail which hit the mesh
 MANY_FEW = 0.5  # of what is missing that fewer than three photos may show, before photos are asked for first
+MANY_GUESSED = 0.1  # share of the area that closes gaps by a guess, from which on the user is told
 HOLES = 0.02  # share of what the mesh fills in pictures that is holes
 LITTLE_IN_ONE = 0.5  # share of the area that the largest part has
 FEW_LABELS_RIGHT = 0.3  # mIoU
@@ -143,15 +144,18 @@ def mesh_verdict(
     largest: float = 1.0,
     overlapped: float | None = None,
     few: float = 0.0,
+    guessed: float | None = 0.0,
 ) -> Verdict:
     """Of `mesh`.
 
     Args:
         hit: share of the photos' pixels that show it. solid, holes, overlapped, few: shares as `mesh.coverage.Coverage` has
             them.
-        largest: share of the area that its largest connected part has.
+        largest: share of the area that its largest connected part has. guessed: share of it that closes gaps; None: nobody
+            asked for that.
     """
     found = []
+    hint = "" if guessed is not None else " Small gaps can be closed by a guess (“close gaps”)."
     if hit < MISSED or (solid is None and hit < PARTLY):
         text = (
             f"The mesh fills {hit:.1%} of the photos: the rest of what they show is missing. Train longer, or enlarge the "
@@ -166,9 +170,14 @@ def mesh_verdict(
             text += f", and {few:.0%} is in fewer than three photos: take more photos of that, and train longer."
         else:
             text += ". Train longer, add photos of what is missing, or enlarge the region."
-        found.append(("failed" if solid < HALF_GONE else "weak", text))
+        found.append(("failed" if solid < HALF_GONE else "weak", text + hint))
     if holes > HOLES:
-        found.append(("weak", f"The mesh has holes: {holes:.0%} of it in the photos. Train longer, or add photos."))
+        text = f"The mesh has holes: {holes:.0%} of it in the photos. Train longer, or add photos."
+        found.append(("weak", text + hint))
+    if guessed is not None and guessed > MANY_GUESSED:
+        found.append(
+            ("weak", f"Of the mesh's area, {guessed:.0%} closes gaps by a guess: train longer, or add photos of that.")
+        )
     if largest < LITTLE_IN_ONE:
         text = (
             f"The mesh is in pieces, the largest with {largest:.0%} of the area: more photos or training may join them."

@@ -22,6 +22,8 @@ class FIELDWORK_PT_mesh(StepPanel):
         if result:
             closed = t("{:,} triangles, closed") if result.get("watertight") else t("{:,} triangles, open")
             layout.label(text=closed.format(result.get("faces", 0)))
+            if result.get("unseen"):
+                layout.label(text=t("{:.1%} of its area is a guess").format(result["unseen"]))
             draw_verdict(layout, context, result)
         column = columns(layout)
         column.prop(settings, "mesh_region")

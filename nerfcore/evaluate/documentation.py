@@ -132,7 +132,10 @@ def _summary(project: Project, poses: Poses, results: dict[str, Any], evaluation
     if mesh:
         unit = "m" if project.frame.scale_known else "units"
         closed = "closed" if mesh["watertight"] else "open"
-        rows.append(["Mesh", f"{mesh['faces']} faces, {closed}, cells of {significant(mesh['voxel'], 4)} {unit}"])
+        guess = f", {100 * mesh['unseen']:.1f} % of the area a guess" if mesh.get("unseen") else ""
+        rows.append(
+            ["Mesh", f"{mesh['faces']} faces, {closed}, cells of {significant(mesh['voxel'], 4)} {unit}{guess}"]
+        )
     return Section("Result", [], rows)
 
 

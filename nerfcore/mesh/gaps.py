@@ -3,7 +3,7 @@
 A surface that photos show ends where they do not agree: in holes, cracks and ragged borders. Between its ends, distances
 that are harmonic continue it smoothly. Of that continuation stays what a closing leaves: places from which a disc of the
 asked width cannot be laid onto the continuation without touching what photos show, so that straight borders remain
-where they are. What views look through is an opening and stays one.
+where they are. What views look through is an opening and stays one: it may close by less of a width.
 Source: the volumetric filling of Davis, Marschner, Garr and Levoy, “Filling holes in complex surfaces using volumetric
 diffusion”, 2002, with the steady state of the diffusion, and closing as in mathematical morphology.
 """
@@ -58,12 +58,18 @@ def close_gaps(
     shape = np.array(bricks.index.shape) * BRICK
     cells = np.unique(_number(_cells(bricks, vertices, faces), shape))
     ends = (vertices[np.unique(border_edges(faces))] - bricks.origin) / bricks.voxel
+    if not len(ends):
+        return vertices, faces, np.zeros(len(faces), bool)
     found = continued(bricks, _place(cells, shape), ends, width / 2 / bricks.voxel, report)
     vertices, faces = extract(_as_bricks(bricks, found), report)
     guessed = ~np.isin(_number(_cells(bricks, vertices, faces), shape), cells)
-    kept = closing(vertices, faces, guessed, width / 2, report)
-    faces, guessed = faces[kept], guessed[kept]
-    kept = ~openings(vertices, faces, guessed, bricks, maps, report)
+    kept, reach, through = ~guessed, width / 2, None
+    while through is None or reach > bricks.voxel:
+        found = guessed & closing(vertices, faces, guessed, reach, report)
+        if through is None:  # what closes by less is part of it
+            through = looked_through(vertices, faces, found, bricks, maps, report)
+        kept |= found & ~openings(vertices, faces, found, through)
+        reach /= 2
     vertices, faces, filled = fill_holes(vertices, faces[kept])
     guessed = np.concatenate([guessed[kept], filled[kept.sum() :]])
     vertices, faces = compact(vertices, faces)
@@ -139,11 +145,11 @@ def closing(vertices: np.ndarray, faces: np.ndarray, guessed: np.ndarray, reach:
     return kept
 
 
-def openings(
-    vertices: np.ndarray, faces: np.ndarray, guessed: np.ndarray, bricks: Bricks, maps: MapArrays, report: Reporter
+def looked_through(
+    vertices: np.ndarray, faces: np.ndarray, asked: np.ndarray, bricks: Bricks, maps: MapArrays, report: Reporter
 ) -> np.ndarray:
-    """Which guessed triangles (F,) bool are an opening: views look through them, or through enough of the part they are of."""
-    rows, device, h = np.flatnonzero(guessed), maps.depth.device, bricks.voxel
+    """Which triangles (F,) bool, of those asked about, lie in space that views show to be free."""
+    rows, device, h = np.flatnonzero(asked), maps.depth.device, bricks.voxel
     through = np.zeros(len(faces))
     for begin in range(0, len(rows), CHUNK):
         report.check()
@@ -151,13 +157,19 @@ def openings(
         middle = torch.from_numpy(vertices[faces[some]].mean(1)).float().to(device)
         distance, weight = fuse(middle, maps, h, TRUNCATION * h, FREE_AT * h, depth_gap(maps))
         through[some] = ((weight > 0) & (distance > THROUGH * h)).cpu().numpy()
+    return asked & (mean_around(faces, through, len(vertices), MOSTLY) > 0.5)
+
+
+def openings(vertices: np.ndarray, faces: np.ndarray, guessed: np.ndarray, through: np.ndarray) -> np.ndarray:
+    """Which guessed triangles (F,) bool are an opening: views look through them (`through`), or through enough of the connected
+    part they are of."""
+    rows = np.flatnonzero(guessed)
     if not len(rows):
         return guessed
-    through = mean_around(faces, through, len(vertices), MOSTLY)[rows] > 0.5
     part, area = components(faces[rows], len(vertices)), areas(vertices, faces[rows])
-    share = np.bincount(part, area * through) / np.maximum(np.bincount(part, area), 1e-30)
+    share = np.bincount(part, area * through[rows]) / np.maximum(np.bincount(part, area), 1e-30)
     opening = np.zeros(len(faces), bool)
-    opening[rows] = through | (share >= OPENING)[part]
+    opening[rows] = through[rows] | (share >= OPENING)[part]
     return opening
 
 

@@ -20,12 +20,17 @@ from .parts import Texture
 from .stored import load_class_map, load_surface, mesh_folder
 from .surface import Surface
 from .surface_picture import TexturedMesh
-from .triangles import cross
+from .triangles import areas, cross
 
 VIEWS, SIDE = 8, 640
 ELEVATION = np.radians(30)
 DIRECTIONS, LEAST_FRONT = 72, 0.4  # angles that are asked, and share of the most front seen from any, for a view
 LENS = 1.4  # focal length over the picture's side
+FAR_OFF, MUCH = (
+    0.01,
+    0.75,
+)  # share of the area beyond either end of an axis, left out of sight where the rest has less than MUCH of the size
+ROOM = 0.1  # of the size of that rest, around it
 MARGIN = 0.03  # of the picture's side, left free around the mesh
 BACKGROUND = 70
 UNKNOWN = (0.15, 0.15, 0.15)  # of a class without a colour
@@ -48,12 +53,32 @@ def front_angles(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return angles[facing >= LEAST_FRONT * facing.max()]
 
 
+def framed(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """The vertices (N, 3) that pictures of a mesh are to show: all, or, where a little of it is far off and would make the rest
+    small, those of the rest."""
+    area = np.bincount(faces.reshape(-1), np.repeat(areas(vertices, faces), 3), len(vertices))
+    low, high = (np.array([_quantile(axis, area, share) for axis in vertices.T]) for share in (FAR_OFF, 1 - FAR_OFF))
+    size, whole = (high - low).max(), (vertices.max(0) - vertices.min(0)).max()
+    if size >= MUCH * whole:
+        return vertices
+    return vertices[((vertices >= low - ROOM * size) & (vertices <= high + ROOM * size)).all(1)]
+
+
+def _quantile(values: np.ndarray, weights: np.ndarray, share: float) -> float:
+    """The value (N,) below which this share of the weights (N,) lies."""
+    order = np.argsort(values)
+    return float(
+        values[order][np.searchsorted(np.cumsum(weights[order]), share * weights.sum()).clip(max=len(values) - 1)]
+    )
+
+
 def turntable_poses(vertices: np.ndarray, faces: np.ndarray, count: int) -> list[np.ndarray]:
     """Camera-to-world poses (4, 4) in a ring around a mesh with z up, or on an arc before one that has a front alone, as
-    near as all of it is in every picture."""
+    near as all of it (`framed`) is in every picture."""
+    angles, vertices = front_angles(vertices, faces), framed(vertices, faces)
     middle = (vertices.min(0) + vertices.max(0)) / 2
     turns, distance = [], 0.0
-    for angle in orbit_angles(front_angles(vertices, faces), count):
+    for angle in orbit_angles(angles, count):
         outward = outwards(angle)
         right = np.array([-np.sin(angle), np.cos(angle), 0])
         turn = np.stack([right, np.cross(-outward, right), -outward], 1)

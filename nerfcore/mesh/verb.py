@@ -116,9 +116,6 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
         "files": [str(path) for path in files],
         **judged,
     }
-    if built.unseen is not None:
-        area = areas(built.vertices, built.faces)
-        result["unseen"] = round(float(area[built.unseen].sum() / area.sum()), 4)
     if painted.seen is not None:
         result["painted_by_photos"] = round(painted.seen, 4)
     settings = params.model_dump(mode="json")
@@ -148,8 +145,8 @@ def judge(
     params: MeshParams,
     report: Reporter,
 ) -> dict[str, Any]:
-    """What photos say of a surface: "shown", "solid_shown", "holes", "overlap_shown", "seen_by_few", "verdict" and "silhouette" of
-    `mesh`."""
+    """What photos say of a surface: "shown", "solid_shown", "holes", "overlap_shown", "seen_by_few", "unseen", "verdict" and
+    "silhouette" of `mesh`."""
     report.stage("Comparing it with the photos")
     scene = scene.unseen_by(trained.info.images)
     shown = shown_share(photos, built.vertices, built.faces, report.check)
@@ -159,9 +156,19 @@ def judge(
     largest, _ = largest_share(built.vertices, built.faces)
     result: dict[str, Any] = {"shown": round(shown, 4), "solid_shown": solid, "holes": round(found.holes, 4)}
     result |= {"overlap_shown": overlapped, "seen_by_few": round(found.few, 4)}
-    result["verdict"] = mesh_verdict(shown, found.solid, found.holes, largest, found.overlapped, found.few)
+    guessed = guess_share(built) if params.close_gaps or params.watertight else None
+    asked = 0.0 if params.watertight else guessed
+    result["verdict"] = mesh_verdict(shown, found.solid, found.holes, largest, found.overlapped, found.few, asked)
+    if guessed is not None:
+        result["unseen"] = round(guessed, 4)
     outlines = silhouette(scene, surface.vertices, surface.faces, report.check)
     return result if outlines is None else {**result, "silhouette": round(outlines, 4)}
+
+
+def guess_share(built: Built) -> float:
+    """Share of the area of a surface that is marked as unseen."""
+    area = areas(built.vertices, built.faces)
+    return 0.0 if built.unseen is None else float(area[built.unseen].sum() / area.sum())
 
 
 def mesh_inputs(params: MeshParams) -> Fingerprint:
@@ -170,7 +177,9 @@ def mesh_inputs(params: MeshParams) -> Fingerprint:
     info = load_info(folder, params.run)
     scene = load_scene(folder, info.holdout)
     settings = params.model_dump(mode="json", exclude={"project", "run", "out", "preview"})
-    # Surfaces come from rendered depth maps. Defaults are left out, as in records that knew no others.
+    # Defaults are left out, as in records that knew no others. Surfaces come from rendered depth maps.
+    if not settings["close_gaps"]:
+        del settings["close_gaps"]
     rendering = [changed] if (changed := info.config.render.model_dump(mode="json", exclude_defaults=True)) else []
     out = str(params.out.absolute()) if params.out else None
     return {

@@ -47,7 +47,7 @@ class MeshParams(Params):
         ge=0,
         le=20,
         description="width, in percent of the longest side of the region, up to which holes, cracks and frayed borders are "
-        "closed by a guess, whose faces are marked; 0: none",
+        "closed by a guess, whose faces are marked; 0: none. Not needed with watertight",
     )
     texture_kind: Literal["photo", "field"] = Field(
         default="photo", description="what the texture shows: the photos, or the field's colours"

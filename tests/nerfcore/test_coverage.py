@@ -148,6 +148,16 @@ def test_what_fewer_than_three_photos_show_is_told_apart(room: tuple[Path, Scene
     assert "train longer" in both
 
 
+def test_a_guess_is_offered_for_what_is_missing_and_told_where_it_is_much() -> None:
+    for missing in ((0.3, 0.7), (0.3, 1.0, 0.1)):
+        assert "close gaps" not in mesh_verdict(*missing)["reasons"][0]
+        assert "close gaps" in mesh_verdict(*missing, guessed=None)["reasons"][0]
+    assert mesh_verdict(0.3, 1.0, guessed=None)["level"] == mesh_verdict(0.3, 1.0, guessed=0.09)["level"] == "good"
+    much = mesh_verdict(0.3, 1.0, guessed=0.31)
+    assert much["level"] == "weak"
+    assert "31%" in much["reasons"][0]
+
+
 def test_scraps_are_told_whatever_they_cover() -> None:
     assert mesh_verdict(0.5, 0.97, 0.0, 0.3)["level"] == "weak"
     assert "pieces" in mesh_verdict(0.5, 0.97, 0.0, 0.3)["reasons"][0]

@@ -10,7 +10,7 @@ from fieldwork.nerfcore.kernels.depth_arrays import MapArrays
 from fieldwork.nerfcore.mesh import build, depth_maps
 from fieldwork.nerfcore.mesh.extract import extract
 from fieldwork.nerfcore.mesh.fusion import Bricks, fuse_maps
-from fieldwork.nerfcore.mesh.gaps import Corners, close_gaps, harmonic, openings
+from fieldwork.nerfcore.mesh.gaps import Corners, close_gaps, harmonic, looked_through, openings
 from fieldwork.nerfcore.mesh.region import Region, choose_region
 from fieldwork.nerfcore.mesh.triangles import areas, border_edges, compact, components, cross, unit
 from fieldwork.nerfcore.progress import Reporter
@@ -41,7 +41,9 @@ def torn(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 def unveiled(monkeypatch: pytest.MonkeyPatch) -> None:
     """As if no view looked anywhere: the views of the ball's far side look past what is torn off."""
-    monkeypatch.setattr("fieldwork.nerfcore.mesh.gaps.openings", lambda vertices, faces, *_: np.zeros(len(faces), bool))
+    monkeypatch.setattr(
+        "fieldwork.nerfcore.mesh.gaps.looked_through", lambda vertices, faces, *_: np.zeros(len(faces), bool)
+    )
 
 
 @pytest.mark.parametrize("width", [0.35, 0.7])  # on the grid itself, and sought on coarser ones first
@@ -88,19 +90,39 @@ def test_views_look_through_an_opening(ball) -> None:
     places, own = compact(vertices, faces[lid])
     hung = places + [0, 0, 8 * region.voxel]
     both, triangles = np.concatenate([places, hung]), np.concatenate([own, own + len(places)])
-    found = openings(both, triangles, np.ones(len(triangles), bool), bricks, maps, Reporter())
+    found = looked_through(both, triangles, np.ones(len(triangles), bool), bricks, maps, Reporter())
     assert not found[: len(own)].any()
     assert found[len(own) :].all()
-    assert not openings(both, triangles, np.zeros(len(triangles), bool), bricks, maps, Reporter()).any()
+    assert not looked_through(both, triangles, np.zeros(len(triangles), bool), bricks, maps, Reporter()).any()
     # A part that bulges into the air is cut there; where most of it does, nothing of it stays.
-    away = np.linalg.norm(places[:, :2], axis=1)
+    away, every = np.linalg.norm(places[:, :2], axis=1), np.ones(len(own), bool)
     for radius, whole in ((0.06, False), (0.28, True)):
         bulge = 8 * region.voxel * np.cos(np.pi / 2 * np.minimum(away / radius, 1))
         bent = places + bulge[:, None] * [0, 0, 1]
-        gone = openings(bent, own, np.ones(len(own), bool), bricks, maps, Reporter())
+        through = looked_through(bent, own, every, bricks, maps, Reporter())
+        gone = openings(bent, own, every, through)
         assert gone.all() == whole
         assert gone[away[own].max(1) < radius / 3].all()
         assert whole or not gone[away[own].min(1) > radius + 3 * region.voxel].any()
+
+
+def test_a_part_that_is_an_opening_closes_by_less(ball, monkeypatch) -> None:
+    """The hole at the side is looked through, the waves are not, but a width that closes both joins them to one part."""
+    bricks, maps, region, vertices, faces = ball
+    kept = torn(vertices, faces)
+
+    def in_the_hole(vertices: np.ndarray, faces: np.ndarray, asked: np.ndarray, *_: object) -> np.ndarray:
+        return asked & (np.linalg.norm(vertices[faces].mean(1) - SIDE, axis=1) < HOLE - 3 * region.voxel)
+
+    monkeypatch.setattr("fieldwork.nerfcore.mesh.gaps.looked_through", in_the_hole)
+    made = []
+    for width in (0.12, 0.7):
+        closed, triangles, guessed = close_gaps(bricks, vertices, faces[kept], width, maps, Reporter())
+        middle, area = closed[triangles].mean(1), areas(closed, triangles)
+        away = np.linalg.norm(middle - SIDE, axis=1)
+        made.append(area[guessed & (away > HOLE + 2 * region.voxel)].sum())
+        assert area[guessed & (away < HOLE - 3 * region.voxel) & (away > ISLAND + 2 * region.voxel)].sum() < 0.01
+    assert made[1] > 0.95 * made[0] > 0.05
 
 
 def test_harmonic_values_are_means_of_their_neighbours() -> None:

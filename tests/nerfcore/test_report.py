@@ -37,7 +37,13 @@ def project(tmp_path: Path) -> Path:
         for image in edited.images:
             image.sha256, image.source = image.name.rjust(64, "a"), f"/home/somebody/{image.name}.jpg"
         edited.images[3].status, edited.images[3].reason = "rejected", "it is blurred <very>"
-        mesh = {"faces": 320, "watertight": True, "voxel": 0.03, "classes": {"top": {"faces": 160, "area": 1.57}}}
+        mesh = {
+            "faces": 320,
+            "watertight": True,
+            "voxel": 0.03,
+            "unseen": 0.031,
+            "classes": {"top": {"faces": 160, "area": 1.57}},
+        }
         edited.record("mesh", {"run": "main"}, mesh)
         edited.record("mesh", {"run": "other"}, mesh | {"faces": 7})
         edited.record("align", {"project": "/home/somebody/ball", "up": "z"}, {})
@@ -67,7 +73,7 @@ def test_another_person_finds_what_is_needed_to_repeat_it(project: Path) -> None
     text = re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", re.sub(r'src="data:[^"]*"', "", html)))
     for words in (
         "Photos used 8",
-        "320 faces, closed, cells of 0.03 m",
+        "320 faces, closed, cells of 0.03 m, 3.1 % of the area a guess",
         "1.571 1.500 … 1.640 open",
         "door check 2.0040 1.9900 … 2.0200 2.0000 +4.0 mm",
         "Root mean square of their differences: 4.0 mm",

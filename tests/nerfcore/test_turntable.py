@@ -11,7 +11,7 @@ import trimesh
 from fieldwork.nerfcore.errors import DiskError
 from fieldwork.nerfcore.mesh.parts import texture_of
 from fieldwork.nerfcore.mesh.surface import Surface
-from fieldwork.nerfcore.mesh.turntable import front_angles, write_turntable
+from fieldwork.nerfcore.mesh.turntable import framed, front_angles, write_turntable
 from fieldwork.nerfcore.params import TurntableParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.verbs import run_verb
@@ -73,6 +73,20 @@ def test_a_turntable_stays_before_what_has_a_front_alone(tmp_path: Path) -> None
     shares = [(view > 200).all(-1).mean() for view in views]
     assert min(shares) > 0.1
     assert len(np.unique(np.round(shares, 3))) >= 4
+
+
+def test_a_little_that_is_far_off_does_not_make_the_rest_small() -> None:
+    ball, far = trimesh.creation.icosphere(3, 1.0), trimesh.creation.icosphere(1, 0.05)
+    far.apply_translation([5.0, 0, 0])
+    both = trimesh.util.concatenate([ball, far])
+    vertices = np.asarray(both.vertices)
+    shown = framed(vertices, np.asarray(both.faces))
+    np.testing.assert_allclose([shown.min(0), shown.max(0)], [[-1] * 3, [1] * 3], atol=1e-3)
+    # What is no small part, or not far off, is in sight, and so is all of a few large triangles.
+    large = trimesh.util.concatenate([ball, trimesh.creation.icosphere(2, 0.3).apply_translation([5.0, 0, 0])])
+    near = trimesh.util.concatenate([ball, far.copy().apply_translation([-3.8, 0, 0])])
+    for mesh in (large, near, ball, trimesh.creation.box((3.0, 2.0, 0.1))):
+        assert len(framed(np.asarray(mesh.vertices), np.asarray(mesh.faces))) == len(mesh.vertices)
 
 
 def test_a_folder_that_cannot_be_is_said_before_the_work(tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ from .extract import extract
 from .fusion import BRICK, FREE_AT, TRUNCATION, Bricks, depth_gap
 from .triangles import areas, border_edges, compact, components, mean_around
 
-MOST_REACH = 10  # voxels, on the grid on which distances are first sought
+MOST_REACH = 10  # voxels, about, that a guess reaches at first, and on the grid on which it is first sought
 ROUNDS, GOOD = 400, 1e-3  # of conjugate gradients: at most, and the residual that is enough
 THROUGH = 1.5  # voxels that a view must look past a place, to deny it
 MOSTLY = 3  # rings of faces of which most must be looked through
@@ -47,7 +47,7 @@ class Corners:
 def close_gaps(
     bricks: Bricks, vertices: np.ndarray, faces: np.ndarray, width: float, maps: MapArrays, report: Reporter
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Close holes and bays of a surface up to a width.
+    """Close holes and bays of a surface up to a width: narrow ones first, then those between what is there by then.
 
     Args:
         bricks: distances the surface was extracted from. vertices (V, 3) of the normalised frame, faces (F, 3): what of it
@@ -56,24 +56,45 @@ def close_gaps(
         vertices, faces, and which of these (F,) bool are guessed.
     """
     shape = np.array(bricks.index.shape) * BRICK
-    cells = np.unique(_number(_cells(bricks, vertices, faces), shape))
-    ends = (vertices[np.unique(border_edges(faces))] - bricks.origin) / bricks.voxel
-    if not len(ends):
-        return vertices, faces, np.zeros(len(faces), bool)
-    found = continued(bricks, _place(cells, shape), ends, width / 2 / bricks.voxel, report)
-    vertices, faces = extract(_as_bricks(bricks, found), report)
-    guessed = ~np.isin(_number(_cells(bricks, vertices, faces), shape), cells)
-    kept, reach, through = ~guessed, width / 2, None
+    seen = np.unique(_number(_cells(bricks, vertices, faces), shape))
+    reach = width / 2 / bricks.voxel
+    for wider in range(-_halvings(reach), 1):
+        ends = np.unique(border_edges(faces))
+        if not len(ends):
+            break
+        cells = np.unique(_number(_cells(bricks, vertices, faces), shape))
+        places = (vertices[ends] - bricks.origin) / bricks.voxel
+        found = continued(bricks, _place(cells, shape), places, reach * 2.0**wider, report)
+        vertices, faces = extract(_as_bricks(bricks, found), report)
+        guessed = ~np.isin(_number(_cells(bricks, vertices, faces), shape), cells)
+        kept = ~guessed | closed(vertices, faces, guessed, reach * 2.0**wider * bricks.voxel, bricks, maps, report)
+        vertices, faces = compact(vertices, faces[kept])
+        bricks = _with_guess(bricks, found, _cells(bricks, vertices, faces[guessed[kept]]))
+    vertices, all_faces, filled = fill_holes(vertices, faces)
+    guessed = filled | ~np.isin(_number(_cells(bricks, vertices, all_faces), shape), seen)
+    vertices, faces = compact(vertices, all_faces)
+    return vertices, faces, guessed
+
+
+def closed(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    guessed: np.ndarray,
+    reach: float,
+    bricks: Bricks,
+    maps: MapArrays,
+    report: Reporter,
+) -> np.ndarray:
+    """Which guessed triangles (F,) bool close a gap that is none of the openings; those of a part that is one may close by
+    less."""
+    kept, through = np.zeros(len(faces), bool), None
     while through is None or reach > bricks.voxel:
         found = guessed & closing(vertices, faces, guessed, reach, report)
         if through is None:  # what closes by less is part of it
             through = looked_through(vertices, faces, found, bricks, maps, report)
         kept |= found & ~openings(vertices, faces, found, through)
         reach /= 2
-    vertices, faces, filled = fill_holes(vertices, faces[kept])
-    guessed = np.concatenate([guessed[kept], filled[kept.sum() :]])
-    vertices, faces = compact(vertices, faces)
-    return vertices, faces, guessed
+    return kept
 
 
 def continued(bricks: Bricks, cells: np.ndarray, ends: np.ndarray, reach: float, report: Reporter) -> Corners:
@@ -81,8 +102,7 @@ def continued(bricks: Bricks, cells: np.ndarray, ends: np.ndarray, reach: float,
     (E, 3), in voxels from the grid's origin. Where they reach far they are sought on a coarser grid first, and on each
     finer one around the level that the coarser one has."""
     guess: Corners | None = None
-    level = max(0, int(np.ceil(np.log2(max(reach, 1) / MOST_REACH))))
-    for step in [2**k for k in range(level, -1, -1)]:
+    for step in [2**k for k in range(_halvings(reach), -1, -1)]:
         known = _around(bricks, cells, step)
         if guess is None:
             unknown = np.setdiff1d(_near(ends / step, reach / step, known.shape), known.number, assume_unique=True)
@@ -97,6 +117,11 @@ def continued(bricks: Bricks, cells: np.ndarray, ends: np.ndarray, reach: float,
         guess = _joined(fixed, Corners(known.shape, unknown, value, np.ones(len(unknown), bool)))
     assert guess is not None
     return guess
+
+
+def _halvings(reach: float) -> int:
+    """How often a reach in voxels is halved until it is about the most that is sought on one grid."""
+    return max(0, round(np.log2(max(reach, 1) / MOST_REACH)))
 
 
 def harmonic(unknown: np.ndarray, known: Corners, start: np.ndarray | None, report: Reporter) -> np.ndarray:
@@ -288,6 +313,25 @@ def _as_bricks(bricks: Bricks, corners: Corners) -> Bricks:
     distance, weight = (np.zeros((int(there.sum()), BRICK, BRICK, BRICK), np.float32) for _ in range(2))
     slot = (index[brick], *(place % BRICK).T)
     distance[slot], weight[slot] = corners.value * bricks.voxel, 1.0
+    return replace(bricks, index=index, distance=distance, weight=weight, wide=np.zeros(len(distance), bool))
+
+
+def _with_guess(bricks: Bricks, corners: Corners, cells: np.ndarray) -> Bricks:
+    """The grid with the guessed ones of these corners, around cells (C, 3), known from now on."""
+    wanted = _corners_at(cells, _box(0, 1), corners.shape)
+    at, found = _find(corners.number, wanted)
+    at = at[found & corners.guessed[at]]
+    place = _place(corners.number[at], corners.shape)
+    brick, index = tuple((place // BRICK).T), bricks.index.copy()
+    added = np.zeros(index.shape, bool)
+    added[brick] = True
+    added &= index < 0
+    more = int(added.sum())
+    index[added] = np.arange(len(bricks), len(bricks) + more, dtype=np.int32)
+    empty = np.zeros((more, BRICK, BRICK, BRICK), np.float32)
+    distance, weight = (np.concatenate([values, empty]) for values in (bricks.distance, bricks.weight))
+    slot = (index[brick], *(place % BRICK).T)
+    distance[slot], weight[slot] = corners.value[at] * bricks.voxel, 1.0
     return replace(bricks, index=index, distance=distance, weight=weight, wide=np.zeros(len(distance), bool))
 
 

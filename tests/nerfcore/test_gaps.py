@@ -59,7 +59,7 @@ def test_holes_and_frayed_borders_close_and_straight_borders_stay(ball, monkeypa
     assert components(triangles, len(closed)).max() == 0  # the island is part of it
     off = np.abs(np.linalg.norm(middle, axis=1) - RADIUS)
     assert off[~guessed].max() < 0.5 * region.voxel
-    assert off[guessed & hole].max() < 0.75 * HOLE**2 / (2 * RADIUS)  # a flat lid is off by all of it
+    assert off[guessed & hole].max() < 0.9 * HOLE**2 / (2 * RADIUS)  # a flat lid without the island is off by all of it
     # Waves are levelled: no deeper than they were cut, and nearly as far.
     assert middle[:, 2].min() > -0.26
     assert np.isclose(area.sum(), 2 * np.pi * RADIUS * (RADIUS + 0.24), rtol=0.02)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from ..data.box import Box, looks_inward
 from ..data.pixels import PixelStore
@@ -170,7 +170,7 @@ def open_surface(
     faces = faces[~on_sides(vertices, faces, region, region.voxel / 2)]
     faces = faces[not_scraps(vertices, faces)]  # simplifying tears thin ones off
     vertices, faces = compact(vertices, faces)
-    _, nearest = cKDTree(before).query(vertices[faces].mean(1))
+    _, nearest = KDTree(before).query(vertices[faces].mean(1))
     return vertices, faces, guessed[nearest]
 
 

@@ -264,7 +264,7 @@ def things(screen):
     own.look = 1.0
     screen.shot("labels")
     own.look = 0.0
-    own.things["right"].opacity = 0.02
+    own.things["right"].opacity = 0.005  # a sharp field stays opaque by less
     screen.shot("dimmed")
     own.things["right"].opacity = 1.0
     bpy.ops.fieldwork.place_thing(thing="left")

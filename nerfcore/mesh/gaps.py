@@ -103,13 +103,14 @@ def continued(bricks: Bricks, cells: np.ndarray, ends: np.ndarray, reach: float,
     finer one around the level that the coarser one has."""
     guess: Corners | None = None
     for step in [2**k for k in range(_halvings(reach), -1, -1)]:
+        report.check()
         known = _around(bricks, cells, step)
         if guess is None:
             unknown = np.setdiff1d(_near(ends / step, reach / step, known.shape), known.number, assume_unique=True)
             fixed, start = known, None
         else:
             unknown = np.setdiff1d(_band(guess, known.shape), known.number, assume_unique=True)
-            start = _finer(guess, _place(unknown, known.shape))
+            start = _finer(guess, _place(unknown, known.shape), report)
             rim = _on_rim(unknown, known)
             fixed = _joined(known, Corners(known.shape, unknown[rim], start[rim], np.ones(int(rim.sum()), bool)))
             unknown, start = unknown[~rim], start[~rim]
@@ -129,6 +130,7 @@ def harmonic(unknown: np.ndarray, known: Corners, start: np.ndarray | None, repo
     ones. By conjugate gradients from `start`."""
     rows, columns, right, degree = [], [], np.zeros(len(unknown)), np.zeros(len(unknown))
     for wanted, inside in _neighbours(unknown, known.shape):
+        report.check()
         at, found = _find(unknown, wanted)
         free = np.flatnonzero(inside & found)
         rows.append(free)
@@ -274,10 +276,11 @@ def _band(coarse: Corners, shape: np.ndarray) -> np.ndarray:
     return _corners_at(2 * _place(around_it, coarse.shape), _box(0, 1), shape)
 
 
-def _finer(coarse: Corners, place: np.ndarray) -> np.ndarray:
+def _finer(coarse: Corners, place: np.ndarray, report: Reporter) -> np.ndarray:
     """Values (N,) at corners (N, 3) of a grid twice as fine: those of the corners around, weighted by nearness."""
     total, amount = np.zeros(len(place)), np.zeros(len(place))
     for step in _box(0, 1):
+        report.check()
         corner = place // 2 + step
         weight = np.where(place % 2 == 1, 0.5, 1.0 - step).prod(1)
         at, found = _find(coarse.number, _number(corner, coarse.shape))

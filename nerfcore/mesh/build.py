@@ -152,7 +152,7 @@ def open_surface(
     report: Reporter,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What two views see of the fused surface, in about `most` triangles where a number is given, and which of these (F,) bool
-    are a guess; open where nothing is known, but for gaps up to a width of `gaps`, and where the region cuts it."""
+    close gaps by a guess; open where nothing is known, but for gaps up to a width of `gaps`, and where the region cuts it."""
     vertices, faces = extract(bricks, report)
     if not len(faces):
         return vertices, faces, np.zeros(0, bool)
@@ -170,6 +170,8 @@ def open_surface(
     faces = faces[~on_sides(vertices, faces, region, region.voxel / 2)]
     faces = faces[not_scraps(vertices, faces)]  # simplifying tears thin ones off
     vertices, faces = compact(vertices, faces)
+    if not gaps:
+        return vertices, faces, np.zeros(len(faces), bool)
     _, nearest = KDTree(before).query(vertices[faces].mean(1))
     return vertices, faces, guessed[nearest]
 

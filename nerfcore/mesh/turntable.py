@@ -26,11 +26,9 @@ VIEWS, SIDE = 8, 640
 ELEVATION = np.radians(30)
 DIRECTIONS, LEAST_FRONT = 72, 0.4  # angles that are asked, and share of the most front seen from any, for a view
 LENS = 1.4  # focal length over the picture's side
-FAR_OFF, MUCH = (
-    0.01,
-    0.75,
-)  # share of the area beyond either end of an axis, left out of sight where the rest has less than MUCH of the size
-ROOM = 0.1  # of the size of that rest, around it
+FAR_OFF = 0.01  # share of the area at either end of an axis that may be out of sight,
+MUCH = 0.75  # where what is between has less than this share of the size,
+ROOM = 0.1  # and so much of its own size in sight around it
 MARGIN = 0.03  # of the picture's side, left free around the mesh
 BACKGROUND = 70
 UNKNOWN = (0.15, 0.15, 0.15)  # of a class without a colour

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 import torch
-from scipy.spatial import KDTree
 
 from ..data.box import Box, looks_inward
 from ..data.pixels import PixelStore
@@ -172,7 +172,7 @@ def open_surface(
     vertices, faces = compact(vertices, faces)
     if not gaps:
         return vertices, faces, np.zeros(len(faces), bool)
-    _, nearest = KDTree(before).query(vertices[faces].mean(1))
+    _, nearest = scipy.spatial.KDTree(before).query(vertices[faces].mean(1))
     return vertices, faces, guessed[nearest]
 
 

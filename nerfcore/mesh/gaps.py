@@ -56,20 +56,20 @@ def close_gaps(
         vertices, faces, and which of these (F,) bool are guessed.
     """
     shape = np.array(bricks.index.shape) * BRICK
-    seen = np.unique(_number(_cells(bricks, vertices, faces), shape))
+    seen = cells = np.unique(_number(_cells(bricks, vertices, faces), shape))
     reach = width / 2 / bricks.voxel
     for wider in range(-_halvings(reach), 1):
         ends = np.unique(border_edges(faces))
         if not len(ends):
             break
-        cells = np.unique(_number(_cells(bricks, vertices, faces), shape))
         places = (vertices[ends] - bricks.origin) / bricks.voxel
         found = continued(bricks, _place(cells, shape), places, reach * 2.0**wider, report)
-        vertices, faces = extract(_as_bricks(bricks, found), report)
+        vertices, faces = extract(_alone(bricks, found), report)
         guessed = ~np.isin(_number(_cells(bricks, vertices, faces), shape), cells)
         kept = ~guessed | closed(vertices, faces, guessed, reach * 2.0**wider * bricks.voxel, bricks, maps, report)
         vertices, faces = compact(vertices, faces[kept])
-        bricks = _with_guess(bricks, found, _cells(bricks, vertices, faces[guessed[kept]]))
+        cells = np.unique(_number(_cells(bricks, vertices, faces), shape))
+        bricks = _with(bricks, _guessed_at(found, _cells(bricks, vertices, faces[guessed[kept]])))
     vertices, all_faces, filled = fill_holes(vertices, faces)
     guessed = filled | ~np.isin(_number(_cells(bricks, vertices, all_faces), shape), seen)
     vertices, faces = compact(vertices, all_faces)
@@ -305,26 +305,22 @@ def _joined(first: Corners, second: Corners) -> Corners:
     return Corners(first.shape, number[order], value[order], guessed[order])
 
 
-def _as_bricks(bricks: Bricks, corners: Corners) -> Bricks:
+def _alone(bricks: Bricks, corners: Corners) -> Bricks:
     """The same grid with these corners alone."""
-    place = _place(corners.number, corners.shape)
-    brick = tuple((place // BRICK).T)
-    index = np.full(bricks.index.shape, -1, np.int32)
-    index[brick] = 0
-    there = index >= 0
-    index[there] = np.arange(int(there.sum()), dtype=np.int32)
-    distance, weight = (np.zeros((int(there.sum()), BRICK, BRICK, BRICK), np.float32) for _ in range(2))
-    slot = (index[brick], *(place % BRICK).T)
-    distance[slot], weight[slot] = corners.value * bricks.voxel, 1.0
-    return replace(bricks, index=index, distance=distance, weight=weight, wide=np.zeros(len(distance), bool))
+    none = np.zeros((0, BRICK, BRICK, BRICK), np.float32)
+    return _with(replace(bricks, index=np.full_like(bricks.index, -1), distance=none, weight=none), corners)
 
 
-def _with_guess(bricks: Bricks, corners: Corners, cells: np.ndarray) -> Bricks:
-    """The grid with the guessed ones of these corners, around cells (C, 3), known from now on."""
-    wanted = _corners_at(cells, _box(0, 1), corners.shape)
-    at, found = _find(corners.number, wanted)
+def _guessed_at(corners: Corners, cells: np.ndarray) -> Corners:
+    """The guessed ones of corners, around cells (C, 3)."""
+    at, found = _find(corners.number, _corners_at(cells, _box(0, 1), corners.shape))
     at = at[found & corners.guessed[at]]
-    place = _place(corners.number[at], corners.shape)
+    return Corners(corners.shape, corners.number[at], corners.value[at], corners.guessed[at])
+
+
+def _with(bricks: Bricks, corners: Corners) -> Bricks:
+    """The grid with these corners known."""
+    place = _place(corners.number, corners.shape)
     brick, index = tuple((place // BRICK).T), bricks.index.copy()
     added = np.zeros(index.shape, bool)
     added[brick] = True
@@ -334,7 +330,7 @@ def _with_guess(bricks: Bricks, corners: Corners, cells: np.ndarray) -> Bricks:
     empty = np.zeros((more, BRICK, BRICK, BRICK), np.float32)
     distance, weight = (np.concatenate([values, empty]) for values in (bricks.distance, bricks.weight))
     slot = (index[brick], *(place % BRICK).T)
-    distance[slot], weight[slot] = corners.value[at] * bricks.voxel, 1.0
+    distance[slot], weight[slot] = corners.value * bricks.voxel, 1.0
     return replace(bricks, index=index, distance=distance, weight=weight, wide=np.zeros(len(distance), bool))
 
 

@@ -51,15 +51,16 @@ def test_parts_are_shown_while_surfels_are_computed(ball: Path) -> None:  # noqa
     assert ready is not None
     parts = np.asarray(ready.parts[:, 0])
     label, later = first.label(0), shown.label(0)
-    clear = np.zeros(len(parts), bool)  # a part over the border of two classes has half of its surfels in each
+    most = later.copy()
     for number in range(parts.max() + 1):
         own = parts == number
         assert len(np.unique(label[own])) == 1
-        of_class = np.bincount(later[own])
-        clear[own] = of_class.max() > 0.55 * own.sum()
-        later[own] = of_class.argmax()
-    assert clear.mean() > 0.5
-    assert (label == later)[clear].mean() > 0.75, "a part has the class that most of its surfels get"
+        most[own] = np.bincount(later[own]).argmax()
+    # A part over the border of the halves has surfels of both: which class it gets matters as far as one has more of them.
+    # Eight seeds, two of them also with AVX2, lose 0 to 0.042; all parts of one class would lose 0.18 to 0.35.
+    lost = (most == later).mean() - (label == later).mean()
+    assert lost < 0.08, "a part has the class that most of its surfels get"
+    assert (label == later).mean() > 0.55
 
 
 def test_parts_of_another_revision_are_not_shown(ball: Path) -> None:  # noqa: F811

@@ -62,6 +62,20 @@ class Reporter:
             raise Cancelled
 
 
+class Stretch(Reporter):
+    """A stretch of the progress of a stage that another reporter hears of: from `begin`, `share` of it."""
+
+    def __init__(self, report: Reporter, begin: float, share: float) -> None:
+        super().__init__()
+        self.report, self.begin, self.share = report, begin, share
+
+    def progress(self, fraction: float, message: str = "") -> None:
+        self.report.progress(self.begin + self.share * fraction, message)
+
+    def check(self) -> None:
+        self.report.check()
+
+
 class Estimate:
     """Remaining seconds of a stage from its recent speed.
 

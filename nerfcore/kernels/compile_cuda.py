@@ -35,6 +35,7 @@ from . import (
     triangles,
     voxel_fit,
     voxel_march,
+    warping,
 )
 from .fused import lanes_of
 from .fused_kernel import class_kernel, color_kernel, density_kernel
@@ -52,6 +53,7 @@ SOURCES = (
     cells,
     surface,
     patches,
+    warping,
     depth_normals,
     raycast,
     closest,

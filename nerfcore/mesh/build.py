@@ -33,6 +33,7 @@ from .extract import extract
 from .field_values import shade
 from .fusion import TRUNCATION, Bricks, coarser, fuse_maps, tolerances
 from .gaps import close_gaps
+from .photometric import Pictures, moved_by_photos, pictures_of
 from .refine import refined_maps
 from .region import Region, choose_region, on_sides, sides_of
 from .surface import vertex_normals
@@ -75,12 +76,13 @@ def build(trained: Trained, project: Project, scene: Scene, params: MeshParams, 
     report.stage("Extracting the surface")
     coarse, tolerance = extract(coarser(bricks), report), TRUNCATION * region.voxel
     coarse = denoised(*coarse, maps.depth.device, report), coarse[1]
-    unseen = None
+    unseen, pictures = None, pictures_of(flats, store, maps, report)
     if params.watertight:
         vertices, faces = closed_surface(bricks, maps, tolerance, params.faces, report)
+        vertices = fitted(vertices, faces, pictures, report)
     else:
         gaps = params.close_gaps / 100 * region.size
-        vertices, faces, guessed = open_surface(bricks, maps, tolerance, region, params.faces, gaps, report)
+        vertices, faces, guessed = open_surface(bricks, maps, tolerance, region, params.faces, gaps, report, pictures)
         world, photos = transform_points(box.world_from_box, vertices), [scene.views[i] for i in scene.train]
         kept = ~denied(world, faces, photos, report)
         if scene.mask_mode == "empty":
@@ -150,9 +152,11 @@ def open_surface(
     most: int | None,
     gaps: float,
     report: Reporter,
+    pictures: Pictures | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What two views see of the fused surface, in about `most` triangles where a number is given, and which of these (F,) bool
-    close gaps by a guess; open where nothing is known, but for gaps up to a width of `gaps`, and where the region cuts it."""
+    close gaps by a guess; open where nothing is known, but for gaps up to a width of `gaps`, and where the region cuts it.
+    `pictures`: the photos that it is fitted to."""
     vertices, faces = extract(bricks, report)
     if not len(faces):
         return vertices, faces, np.zeros(0, bool)
@@ -167,6 +171,8 @@ def open_surface(
         report.stage("Simplifying")
         vertices, faces = decimate(vertices, faces, most, report)
     vertices = denoised(vertices, faces, maps.depth.device, report)
+    if pictures is not None:
+        vertices = fitted(vertices, faces, pictures, report)
     faces = faces[~on_sides(vertices, faces, region, region.voxel / 2)]
     faces = faces[not_scraps(vertices, faces)]  # simplifying tears thin ones off
     vertices, faces = compact(vertices, faces)
@@ -174,6 +180,13 @@ def open_surface(
         return vertices, faces, np.zeros(len(faces), bool)
     _, nearest = scipy.spatial.KDTree(before).query(vertices[faces].mean(1))
     return vertices, faces, guessed[nearest]
+
+
+def fitted(vertices: np.ndarray, faces: np.ndarray, pictures: Pictures, report: Reporter) -> np.ndarray:
+    """Vertices (V, 3) of triangles (F, 3) moved to where the photos agree best, without the noise that this leaves."""
+    report.stage("Fitting to the photos")
+    moved = moved_by_photos(vertices, faces, pictures, report)
+    return denoised(moved, faces, pictures.maps.depth.device, report)
 
 
 def wanted_bounds(params: MeshParams, scene: Scene, box: Box) -> tuple[np.ndarray, np.ndarray] | None:

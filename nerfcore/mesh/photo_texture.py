@@ -17,7 +17,7 @@ import scipy
 import torch
 
 from ..errors import SettingError
-from ..progress import Reporter, go_on
+from ..progress import Reporter, Stretch, go_on
 from .facelets import Facelets, facelets
 from .painting import Jobs, Texels, crossings, joined, paint_all, texels_of
 from .photos import Photo
@@ -160,21 +160,21 @@ def _texture(
     tiles = [(x, y) for y in range(0, size, TILE) for x in range(0, size, TILE)]
     unpainted: list[Texels] = []
     for number, (left, top) in enumerate(tiles):
-        part = _Part(report, number / len(tiles), 1 / len(tiles))
+        part = Stretch(report, number / len(tiles), 1 / len(tiles))
         width = min(TILE, size - left)
         texels = texels_of(prepared.pieces, size, (left, top, width, min(TILE, size - top)))
         row, column = np.divmod(texels.place, width)
         texels = replace(texels, place=(row + top) * size + column + left)
         canvas.source[texels.place] = UNSEEN
         for jobs in rounds[:1]:
-            texels = canvas.paint(prepared, texels, jobs, careful, _Part(part, 0, 0.7))
+            texels = canvas.paint(prepared, texels, jobs, careful, Stretch(part, 0, 0.7))
         # Photos are read once for the further rounds of many tiles, of which little is left.
         if unpainted and sum(map(len, unpainted)) + len(texels) > TILE**2:
-            _finish(canvas, prepared, joined(unpainted), rounds[1:], fill, _Part(part, 0.7, 0.3))
+            _finish(canvas, prepared, joined(unpainted), rounds[1:], fill, Stretch(part, 0.7, 0.3))
             unpainted = []
         unpainted.append(texels)
     _finish(
-        canvas, prepared, joined(unpainted), rounds[1:], fill, _Part(report, 1 - 0.3 / len(tiles), 0.3 / len(tiles))
+        canvas, prepared, joined(unpainted), rounds[1:], fill, Stretch(report, 1 - 0.3 / len(tiles), 0.3 / len(tiles))
     )
     image, source = canvas.image.reshape(size, size, 3), canvas.source.reshape(size, size)
     report.stage("Spreading borders")
@@ -203,7 +203,7 @@ def _finish(
     """Paint what the chosen photos did not: from the next best ones, then by `fill`."""
     pieces = prepared.pieces
     for number, jobs in enumerate(rounds):
-        part = _Part(report, number / len(rounds), 1 / len(rounds))
+        part = Stretch(report, number / len(rounds), 1 / len(rounds))
         texels = canvas.paint(prepared, texels, jobs, np.ones(len(pieces), bool), part)
     if fill is None or not len(texels):
         return
@@ -216,20 +216,6 @@ def _finish(
         some = chosen[begin : begin + FILLED]
         colors[begin : begin + FILLED] = fill(texels.points(pieces, owner[some], some), pieces.normals[owner[some]])
     canvas.image[texels.place] = colors[shared]
-
-
-class _Part(Reporter):
-    """A stretch of another reporter's progress."""
-
-    def __init__(self, report: Reporter, begin: float, share: float) -> None:
-        super().__init__()
-        self.report, self.begin, self.share = report, begin, share
-
-    def progress(self, fraction: float, message: str = "") -> None:
-        self.report.progress(self.begin + self.share * fraction, message)
-
-    def check(self) -> None:
-        self.report.check()
 
 
 def _whole_around(pieces: Facelets, seen: Observations, column: np.ndarray) -> np.ndarray:

@@ -1,0 +1,207 @@
+"""A surface moved to where the photos that it shows agree best with each other.
+
+Depth maps compare photos by small flat patches, and fusing them is a mean: edges become round, and grooves fill. Here the
+surface itself says which pixels of two photos show the same place; each vertex moves along its normal until what they show
+is alike (Vu, Labatut, Pons and Keriven, "High accuracy and visibility-consistent dense multiview stereo", 2012), by steps of
+Gauss and Newton, held by a thin plate where photos say little.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy
+import torch
+
+from ..data.pixels import PixelStore
+from ..kernels.depth_arrays import MapArrays
+from ..kernels.triangles import nearest_triangle
+from ..kernels.warping import NOT_SEEN, photo_forces
+from ..progress import Reporter, Stretch
+from .depth_maps import DepthMap, FlatView, neighbours, pixel_directions
+from .refine import grey_pictures, photo_pixels
+from .surface import vertex_normals
+from .triangles import border_edges, cross, unit
+from .visibility import in_parallel
+
+ROUNDS = 5
+PARTNERS = 4  # photos that each is compared with
+FARTHEST = 0.5  # footprints of a pixel that a vertex moves at most in a round
+PLATE = 10.0  # how stiff the plate is, in units of how firmly photos hold half of the vertices
+WEAK = 1e-3  # of that firmness: holds what no photo shows where it is
+SMOOTH = 0.5  # pixels over which slopes of a photo are taken
+DRAWING = 0.2  # of the time of a round
+STEEPEST = 0.17  # cosine under which a photo says nothing of a surface that it shows
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """What is compared: flat views of the photos; `grey` (P, 3) value and slopes along x and y, as `photo_forces` takes them;
+    `maps`: their cameras, whose depths are not used."""
+
+    views: list[FlatView]
+    grey: torch.Tensor
+    maps: MapArrays
+
+
+def pictures_of(views: list[FlatView], store: PixelStore, maps: MapArrays, report: Reporter) -> Pictures:
+    """Flat views with what their photos show, without what a mask or transparency takes away."""
+    known = store.rgba[:, 3].cpu().numpy() > 127
+    if store.usable is not None:
+        used = np.zeros(len(known), bool)
+        used[store.usable.cpu().numpy()] = True
+        known &= used
+    parts = []
+    for view, grey in zip(views, grey_pictures(views, store, report)):
+        photo, first = store.cameras[view.photo], int(store.first[view.photo])
+        x, y = np.nan_to_num(photo_pixels(view, store)).clip(0, [photo.width - 1, photo.height - 1]).astype(int).T
+        shown = view.inside & known[first + y * photo.width + x].reshape(grey.shape)
+        down, right = (
+            np.gradient(scipy.ndimage.gaussian_filter(grey, SMOOTH)) if min(grey.shape) > 1 else (grey * 0,) * 2
+        )
+        parts.append(np.stack([np.where(shown, grey, NOT_SEEN), right, down], -1).reshape(-1, 3))
+    return Pictures(views, torch.from_numpy(np.concatenate(parts).astype(np.float32)).to(maps.depth.device), maps)
+
+
+def moved_by_photos(vertices: np.ndarray, faces: np.ndarray, pictures: Pictures, report: Reporter) -> np.ndarray:
+    """Vertices (V, 3) float64 of triangles (F, 3), in the frame of the pictures, moved to where photos agree best. Those of open
+    borders stay where they are, and so do those of triangles that would be turned over."""
+    before = place = np.asarray(vertices, np.float64)
+    plate, fixed = bending(faces, len(place)), np.unique(border_edges(faces))
+    edge = float(np.median(np.linalg.norm(place[faces[:, 0]] - place[faces[:, 1]], axis=1)))
+    total, near = np.zeros(len(place)), []
+    for number in range(ROUNDS):
+        now = Stretch(report, number / ROUNDS, 1 / ROUNDS)
+        drawn = _drawn(place, faces, pictures, Stretch(now, 0, DRAWING))
+        near = near or neighbours(pictures.views, [picture.as_map() for picture in drawn], PARTNERS)
+        pixel = _footprint(pictures.views, drawn)
+        normals = vertex_normals(place, faces)
+        force, firm = _forces(place, faces, normals, pictures, drawn, near, Stretch(now, DRAWING, 1 - DRAWING))
+        if not firm.any():
+            return place
+        usual = float(np.median(firm[firm > 0]))
+        # Triangles smaller than a pixel have noise that none of them shows.
+        stiff = PLATE * usual * max(pixel / edge, 1) ** 4
+        step = _solved(plate, force - stiff * (plate @ total), firm + WEAK * usual, stiff, report)
+        step = step.clip(-FARTHEST * pixel, FARTHEST * pixel)
+        step[fixed] = 0
+        place, total = place + step[:, None] * normals, total + step
+    turned = (cross(before, faces) * cross(place, faces)).sum(1) < 0
+    place[faces[turned]] = before[faces[turned]]
+    return place
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """What a picture shows of a surface: triangle (H, W), −1 for none, and its depth (H, W), 0 there."""
+
+    face: np.ndarray
+    depth: np.ndarray
+
+    def as_map(self) -> DepthMap:
+        return DepthMap(self.depth, np.zeros_like(self.depth), np.ones_like(self.depth))
+
+    def nearest(self) -> np.ndarray:
+        """The least depth (H, W) of a pixel and its eight neighbours."""
+        return scipy.ndimage.minimum_filter(np.where(self.face >= 0, self.depth, np.inf), 3, mode="nearest")
+
+
+def _drawn(place: np.ndarray, faces: np.ndarray, pictures: Pictures, report: Reporter) -> list[Drawn]:
+    def draw(view: FlatView) -> Drawn:
+        camera = view.camera
+        local = (place - view.pose[:3, 3]) @ view.pose[:3, :3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            pixels = local[:, :2] / local[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+        size, device = (camera.width, camera.height), pictures.grey.device
+        face, depth = nearest_triangle(pixels, local[:, 2], faces, *size, device)
+        return Drawn(face, np.where(face >= 0, depth, 0).astype(np.float32))
+
+    return [drawn for _, drawn in in_parallel(draw, pictures.views, report, "photos")]
+
+
+def _footprint(views: list[FlatView], drawn: list[Drawn]) -> float:
+    """Median width of a pixel on the surface; 0 where no picture shows it."""
+    widths = np.concatenate([d.depth[d.face >= 0] / view.camera.fx for view, d in zip(views, drawn)])
+    return float(np.median(widths)) if len(widths) else 0.0
+
+
+def _forces(
+    place: np.ndarray,
+    faces: np.ndarray,
+    normals: np.ndarray,
+    pictures: Pictures,
+    drawn: list[Drawn],
+    near: list[list[int]],
+    report: Reporter,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The force (V,) of all photos on each vertex along its normal, and how firmly (V,) they hold it."""
+    device = pictures.grey.device
+
+    def flat(parts: list[np.ndarray]) -> torch.Tensor:
+        return torch.from_numpy(np.concatenate([part.reshape(-1) for part in parts]).astype(np.float32)).to(device)
+
+    maps = replace(pictures.maps, depth=flat([d.depth for d in drawn]))
+    nearest, facing = flat([d.nearest() for d in drawn]), unit(cross(place, faces))
+
+    def of_view(number: int) -> tuple[np.ndarray, np.ndarray]:
+        view, face = pictures.views[number], drawn[number].face
+        if not near[number] or not (face >= 0).any():
+            return np.zeros(len(place)), np.zeros(len(place))
+        normal = facing[face.reshape(-1)]
+        told = photo_forces(
+            pictures.grey,
+            torch.from_numpy(normal.astype(np.float32)).to(device),
+            nearest,
+            maps,
+            number,
+            torch.tensor(near[number], dtype=torch.int32, device=device),
+        )
+        told = told.cpu().numpy().astype(np.float64)
+        some = np.flatnonzero(told[:, 1] > 0)
+        ray = pixel_directions(view.camera).reshape(-1, 3)[some].astype(np.float64) @ view.pose[:3, :3].T
+        normal, corner = normal[some], faces[face.reshape(-1)[some]]
+        cosine = -(ray * normal).sum(1) / np.linalg.norm(ray, axis=1)
+        point = view.pose[:3, 3] + drawn[number].depth.reshape(-1)[some, None] * ray
+        share = barycentric(place[corner], point) * (normals[corner] * normal[:, None]).sum(2)
+        told = told[some, :2] * np.where(cosine > STEEPEST, cosine, 0)[:, None]
+        pull, hold = share * told[:, :1], np.abs(share) * told[:, 1:]
+        at = corner.reshape(-1)
+        return np.bincount(at, pull.reshape(-1), len(place)), np.bincount(at, hold.reshape(-1), len(place))
+
+    force, firm = np.zeros(len(place)), np.zeros(len(place))
+    for _, (pull, hold) in in_parallel(of_view, range(len(drawn)), report, "photos"):
+        force += pull
+        firm += hold
+    return force, firm
+
+
+def barycentric(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Weights (N, 3), none below 0, of the corners (N, 3, 3) of triangles at points (N, 3) in their planes."""
+    one, two, off = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], points - corners[:, 0]
+    normal = np.cross(one, two)
+    scale = np.maximum((normal**2).sum(1), 1e-30)
+    third = (np.cross(one, off) * normal).sum(1) / scale
+    second = (np.cross(off, two) * normal).sum(1) / scale
+    weights = np.stack([1 - second - third, second, third], 1).clip(0, 1)
+    return weights / weights.sum(1, keepdims=True)
+
+
+def bending(faces: np.ndarray, count: int) -> scipy.sparse.csr_matrix:
+    """The energy (count, count) of a thin plate: squares of how far each value is from the mean of its neighbours."""
+    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    beside = scipy.sparse.coo_matrix((np.ones(len(ends)), ends.T), (count, count)).tocsr()
+    beside = ((beside + beside.T) > 0).astype(float)
+    amount = np.maximum(np.asarray(beside.sum(1))[:, 0], 1)
+    apart = scipy.sparse.identity(count) - scipy.sparse.diags(1 / amount) @ beside
+    return (apart.T @ apart).tocsr()
+
+
+def _solved(
+    plate: scipy.sparse.csr_matrix, force: np.ndarray, firm: np.ndarray, stiff: float, report: Reporter
+) -> np.ndarray:
+    """Shifts (V,) at which forces, what photos hold, and the plate are in balance."""
+    matrix = (scipy.sparse.diags(firm) + stiff * plate).tocsr()
+    own = scipy.sparse.diags(1 / matrix.diagonal())
+    step, _ = scipy.sparse.linalg.cg(matrix, force, rtol=1e-3, maxiter=200, M=own, callback=lambda _: report.check())
+    return step

@@ -26,10 +26,12 @@ from .triangles import border_edges, cross, unit
 from .visibility import in_parallel
 
 ROUNDS = 5
+WIDTH, APART = 5, 0.03  # pixels of what is thin, and share of its depth by which what is behind it is farther
 PARTNERS = 4  # photos that each is compared with
 FARTHEST = 0.5  # footprints of a pixel that a vertex moves at most in a round
 PLATE = 10.0  # how stiff the plate is, in units of how firmly photos hold half of the vertices
 WEAK = 1e-3  # of that firmness: holds what no photo shows where it is
+TURNS = 5  # times that vertices of triangles which would turn over move as those around them
 SMOOTH = 0.5  # pixels over which slopes of a photo are taken
 DRAWING = 0.2  # of the time of a round
 STEEPEST = 0.17  # cosine under which a photo says nothing of a surface that it shows
@@ -66,9 +68,12 @@ def pictures_of(views: list[FlatView], store: PixelStore, maps: MapArrays, repor
 
 def moved_by_photos(vertices: np.ndarray, faces: np.ndarray, pictures: Pictures, report: Reporter) -> np.ndarray:
     """Vertices (V, 3) float64 of triangles (F, 3), in the frame of the pictures, moved to where photos agree best. Those of open
-    borders stay where they are, and so do those of triangles that would be turned over."""
+    borders stay where they are, and no triangle is turned over."""
     before = place = np.asarray(vertices, np.float64)
-    plate, fixed = bending(faces, len(place)), np.unique(border_edges(faces))
+    if not len(faces):
+        return place
+    around, fixed = means_around(faces, len(place)), np.unique(border_edges(faces))
+    plate = bending(around)
     edge = float(np.median(np.linalg.norm(place[faces[:, 0]] - place[faces[:, 1]], axis=1)))
     total, near = np.zeros(len(place)), []
     for number in range(ROUNDS):
@@ -87,24 +92,34 @@ def moved_by_photos(vertices: np.ndarray, faces: np.ndarray, pictures: Pictures,
         step = step.clip(-FARTHEST * pixel, FARTHEST * pixel)
         step[fixed] = 0
         place, total = place + step[:, None] * normals, total + step
-    turned = (cross(before, faces) * cross(place, faces)).sum(1) < 0
-    place[faces[turned]] = before[faces[turned]]
-    return place
+    return before + not_turned(before, place - before, faces, around)
+
+
+def not_turned(before: np.ndarray, step: np.ndarray, faces: np.ndarray, around: scipy.sparse.csr_matrix) -> np.ndarray:
+    """Steps (V, 3) from `before` (V, 3) that turn no triangle over: there vertices move as those around them do, or else not
+    at all."""
+    step, normals, left = step.copy(), cross(before, faces), TURNS
+    while True:
+        turned = (normals * cross(before + step, faces)).sum(1) < 0
+        if not turned.any():
+            return step
+        some, left = np.unique(faces[turned]), left - 1
+        step[some] = around[some] @ step if left >= 0 else 0
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """What a picture shows of a surface: triangle (H, W), −1 for none, and its depth (H, W), 0 there."""
+    """What a picture shows of a surface: triangle (H, W), −1 for none, and its depth (H, W), 0 there; `nearest` (H, W), the
+    least depth of a pixel and its eight neighbours; `thin` (H, W): what is of a thing less than `WIDTH` pixels wide, whose
+    pixels mix it with what is behind."""
 
     face: np.ndarray
     depth: np.ndarray
+    nearest: np.ndarray
+    thin: np.ndarray
 
     def as_map(self) -> DepthMap:
         return DepthMap(self.depth, np.zeros_like(self.depth), np.ones_like(self.depth))
-
-    def nearest(self) -> np.ndarray:
-        """The least depth (H, W) of a pixel and its eight neighbours."""
-        return scipy.ndimage.minimum_filter(np.where(self.face >= 0, self.depth, np.inf), 3, mode="nearest")
 
 
 def _drawn(place: np.ndarray, faces: np.ndarray, pictures: Pictures, report: Reporter) -> list[Drawn]:
@@ -115,9 +130,11 @@ def _drawn(place: np.ndarray, faces: np.ndarray, pictures: Pictures, report: Rep
             pixels = local[:, :2] / local[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
         size, device = (camera.width, camera.height), pictures.grey.device
         face, depth = nearest_triangle(pixels, local[:, 2], faces, *size, device)
-        return Drawn(face, np.where(face >= 0, depth, 0).astype(np.float32))
+        nearest = scipy.ndimage.minimum_filter(depth, 3, mode="nearest")
+        behind = scipy.ndimage.grey_closing(depth, WIDTH, mode="nearest")
+        return Drawn(face, np.where(face >= 0, depth, 0).astype(np.float32), nearest, behind > (1 + APART) * depth)
 
-    return [drawn for _, drawn in in_parallel(draw, pictures.views, report, "photos")]
+    return [drawn for _, drawn in in_parallel(draw, pictures.views, report, "photos", pictures.grey.device)]
 
 
 def _footprint(views: list[FlatView], drawn: list[Drawn]) -> float:
@@ -141,8 +158,8 @@ def _forces(
     def flat(parts: list[np.ndarray]) -> torch.Tensor:
         return torch.from_numpy(np.concatenate([part.reshape(-1) for part in parts]).astype(np.float32)).to(device)
 
-    maps = replace(pictures.maps, depth=flat([d.depth for d in drawn]))
-    nearest, facing = flat([d.nearest() for d in drawn]), unit(cross(place, faces))
+    maps = replace(pictures.maps, depth=flat([np.where(d.thin, 0, d.depth) for d in drawn]))
+    nearest, facing = flat([d.nearest for d in drawn]), unit(cross(place, faces))
 
     def of_view(number: int) -> tuple[np.ndarray, np.ndarray]:
         view, face = pictures.views[number], drawn[number].face
@@ -170,7 +187,7 @@ def _forces(
         return np.bincount(at, pull.reshape(-1), len(place)), np.bincount(at, hold.reshape(-1), len(place))
 
     force, firm = np.zeros(len(place)), np.zeros(len(place))
-    for _, (pull, hold) in in_parallel(of_view, range(len(drawn)), report, "photos"):
+    for _, (pull, hold) in in_parallel(of_view, range(len(drawn)), report, "photos", device):
         force += pull
         firm += hold
     return force, firm
@@ -187,13 +204,18 @@ def barycentric(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
     return weights / weights.sum(1, keepdims=True)
 
 
-def bending(faces: np.ndarray, count: int) -> scipy.sparse.csr_matrix:
-    """The energy (count, count) of a thin plate: squares of how far each value is from the mean of its neighbours."""
+def means_around(faces: np.ndarray, count: int) -> scipy.sparse.csr_matrix:
+    """The matrix (count, count) that takes values of vertices to the means of their neighbours'."""
     ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     beside = scipy.sparse.coo_matrix((np.ones(len(ends)), ends.T), (count, count)).tocsr()
     beside = ((beside + beside.T) > 0).astype(float)
     amount = np.maximum(np.asarray(beside.sum(1))[:, 0], 1)
-    apart = scipy.sparse.identity(count) - scipy.sparse.diags(1 / amount) @ beside
+    return (scipy.sparse.diags(1 / amount) @ beside).tocsr()
+
+
+def bending(around: scipy.sparse.csr_matrix) -> scipy.sparse.csr_matrix:
+    """The energy (V, V) of a thin plate: squares of how far each value is from the mean of its neighbours."""
+    apart = scipy.sparse.identity(around.shape[0]) - around
     return (apart.T @ apart).tocsr()
 
 

@@ -184,13 +184,14 @@ def with_flat_views(seen: Observations, buffers: DepthBuffers, report: Reporter)
     return Observations(*(np.where(unseen[:, None], new, old) for new, old in pairs))
 
 
-def in_parallel(work, items: Sequence, report: Reporter, noun: str) -> Iterator[tuple]:
-    """(number, work(item)) of every item, as many at once as there are threads; progress after each round."""
+def in_parallel(work, items: Sequence, report: Reporter, noun: str, device: torch.device = CPU) -> Iterator[tuple]:
+    """(number, work(item)) of every item, which computes on a device, as many at once as there are threads for it; progress
+    after each round."""
     step = max(worker_count(), 1)
     for begin in range(0, len(items), step):
         report.progress(begin / len(items), f"{begin} of {len(items)} {noun}")
         part = items[begin : begin + step]
-        yield from enumerate(run_parallel([lambda item=item: work(item) for item in part], CPU), begin)
+        yield from enumerate(run_parallel([lambda item=item: work(item) for item in part], device), begin)
 
 
 def _seen_by(

@@ -14,7 +14,15 @@ from fieldwork.nerfcore.kernels.depth_arrays import FREE
 from fieldwork.nerfcore.kernels.warping import NOT_SEEN, photo_forces
 from fieldwork.nerfcore.mesh import photometric
 from fieldwork.nerfcore.mesh.depth_maps import DepthMap, FlatView, map_arrays
-from fieldwork.nerfcore.mesh.photometric import Pictures, barycentric, bending, moved_by_photos, pictures_of
+from fieldwork.nerfcore.mesh.photometric import (
+    Pictures,
+    barycentric,
+    bending,
+    means_around,
+    moved_by_photos,
+    not_turned,
+    pictures_of,
+)
 from fieldwork.nerfcore.mesh.triangles import border_edges, cross
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.tests.nerfcore.support import warping_reference
@@ -148,16 +156,36 @@ def test_open_borders_stay(pictures: Pictures) -> None:
     assert off(moved[inner]) < 0.3 * off(vertices[inner])
 
 
-def test_triangles_that_would_turn_over_stay(pictures: Pictures, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_triangle_turns_over() -> None:
+    """One vertex that would pass its neighbours moves as they do; where all steps are wild, some stay where they are."""
     vertices, faces = ball(RADIUS)
-    random = np.random.default_rng(0)
-    monkeypatch.setattr(photometric, "_solved", lambda _, force, *__: random.normal(0, 0.1, len(force)))
-    monkeypatch.setattr(photometric, "FARTHEST", 10.0)
-    moved = moved_by_photos(vertices, faces, pictures, Reporter())
-    still = (moved == vertices).all(1)
-    assert still.any()
-    turned = (cross(vertices, faces) * cross(moved, faces)).sum(1) < 0
-    assert still[faces[turned]].any(1).all(), "what is left of them are neighbours of what went back"
+    around = means_around(faces, len(vertices))
+    small = 0.01 * vertices
+    wild = small.copy()
+    wild[7] = 0.3 * np.roll(vertices[7], 1)
+    np.testing.assert_allclose(not_turned(vertices, wild, faces, around), small, atol=0.03)
+    np.testing.assert_array_equal(not_turned(vertices, small, faces, around), small)
+    random = np.random.default_rng(0).normal(0, 0.1, vertices.shape)
+    found = not_turned(vertices, random, faces, around)
+    assert (cross(vertices, faces) * cross(vertices + found, faces)).sum(1).min() >= 0
+    assert (found == 0).all(1).any()
+
+
+def test_what_is_thin_says_nothing_of_itself(pictures: Pictures) -> None:
+    """A wire before a wall: photos mix the two in each of its pixels."""
+    wall, wire = trimesh.creation.box((3, 0.1, 3)), trimesh.creation.cylinder(0.02, 2)
+    wire.apply_translation((0, -0.5, 0))
+    vertices = np.concatenate([wall.vertices, wire.vertices])
+    faces = np.concatenate([wall.faces, wire.faces + len(wall.vertices)])
+    pose = np.array([[1.0, 0, 0, 0], [0, 0, 1, -2], [0, -1, 0, 0], [0, 0, 0, 1]])
+    view = replace(pictures.views[0], pose=pose)
+    drawn = photometric._drawn(vertices, faces, replace(pictures, views=[view]), Reporter())[0]
+    on_wire = drawn.face >= len(wall.faces)
+    assert on_wire.sum() > 20
+    assert drawn.thin[on_wire].all()
+    assert not drawn.thin[~on_wire].any()
+    moved = moved_by_photos(np.zeros((0, 3)), np.zeros((0, 3), int), pictures, Reporter())
+    assert moved.shape == (0, 3)
 
 
 def test_it_can_be_stopped_at_any_time(pictures: Pictures) -> None:
@@ -204,7 +232,7 @@ def test_a_plate_bends_no_plane() -> None:
     place = np.stack(np.meshgrid(np.arange(8.0), np.arange(8.0)), -1).reshape(-1, 2)
     at = np.arange(64).reshape(8, 8)
     a, b, c, d = at[:-1, :-1].ravel(), at[:-1, 1:].ravel(), at[1:, :-1].ravel(), at[1:, 1:].ravel()
-    plate = bending(np.concatenate([np.stack([a, b, c], 1), np.stack([d, c, b], 1)]), 64)
+    plate = bending(means_around(np.concatenate([np.stack([a, b, c], 1), np.stack([d, c, b], 1)]), 64))
     plane = place @ [0.3, -0.7] + 2
     inner = ((place > 1) & (place < 6)).all(1)
     np.testing.assert_allclose((plate @ plane)[inner], 0, atol=1e-12)

@@ -156,7 +156,7 @@ def test_open_borders_stay(pictures: Pictures) -> None:
     assert off(moved[inner]) < 0.3 * off(vertices[inner])
 
 
-def test_no_triangle_turns_over() -> None:
+def test_no_triangle_turns_over(monkeypatch: pytest.MonkeyPatch) -> None:
     """One vertex that would pass its neighbours moves as they do; where all steps are wild, some stay where they are."""
     vertices, faces = ball(RADIUS)
     around = means_around(faces, len(vertices))
@@ -166,9 +166,13 @@ def test_no_triangle_turns_over() -> None:
     np.testing.assert_allclose(not_turned(vertices, wild, faces, around), small, atol=0.03)
     np.testing.assert_array_equal(not_turned(vertices, small, faces, around), small)
     random = np.random.default_rng(0).normal(0, 0.1, vertices.shape)
-    found = not_turned(vertices, random, faces, around)
-    assert (cross(vertices, faces) * cross(vertices + found, faces)).sum(1).min() >= 0
-    assert (found == 0).all(1).any()
+    for turns in (photometric.TURNS, 0):
+        monkeypatch.setattr(photometric, "TURNS", turns)
+        found = not_turned(vertices, random, faces, around)
+        assert (cross(vertices, faces) * cross(vertices + found, faces)).sum(1).min() >= 0
+    still = (found == 0).all(1)
+    assert still.any()
+    np.testing.assert_array_equal(found[~still], random[~still])
 
 
 def test_what_is_thin_says_nothing_of_itself(pictures: Pictures) -> None:

@@ -20,10 +20,8 @@ SLACK, SLACK_SLOPE = wp.constant(2.0), wp.constant(3.0)  # footprints by which s
 FLATTEST = wp.constant(0.2)  # cosine under which another photo sees too little of a surface
 GRAZING = wp.constant(0.1)  # cosine at which slopes are capped
 NOISE = wp.constant(1.0e-4)  # of the variance of grey values in a window
-ALIKE, SURE = (
-    wp.constant(0.3),
-    wp.constant(0.7),
-)  # correlation from which windows count, and from which they count fully
+ALIKE = wp.constant(0.3)  # correlation from which windows count, and
+SURE = wp.constant(0.7)  # from which they count fully
 HALF = wp.constant(0.5)  # of a window that both photos must show
 NOT_SEEN = wp.constant(-1.0)  # grey value of what a photo does not show
 

@@ -16,14 +16,13 @@ import torch
 
 from ..data.pixels import PixelStore
 from ..kernels.depth_arrays import MapArrays
-from ..kernels.triangles import nearest_triangle
 from ..kernels.warping import NOT_SEEN, photo_forces
 from ..progress import Reporter, Stretch
 from .depth_maps import DepthMap, FlatView, neighbours, pixel_directions
 from .refine import grey_pictures, photo_pixels
 from .surface import vertex_normals
 from .triangles import border_edges, cross, unit
-from .visibility import in_parallel
+from .visibility import DepthBuffer, PosedCamera, depth_buffer, in_parallel
 
 ROUNDS = 5
 WIDTH, APART = 5, 0.03  # pixels of what is thin, and share of its depth by which what is behind it is farther
@@ -79,12 +78,12 @@ def moved_by_photos(vertices: np.ndarray, faces: np.ndarray, pictures: Pictures,
     for number in range(ROUNDS):
         now = Stretch(report, number / ROUNDS, 1 / ROUNDS)
         drawn = _drawn(place, faces, pictures, Stretch(now, 0, DRAWING))
-        near = near or neighbours(pictures.views, [picture.as_map() for picture in drawn], PARTNERS)
-        pixel = _footprint(pictures.views, drawn)
+        near = near or neighbours(pictures.views, [as_map(picture) for picture in drawn], PARTNERS)
+        pixel = _footprint(drawn)
         normals = vertex_normals(place, faces)
         force, firm = _forces(place, faces, normals, pictures, drawn, near, Stretch(now, DRAWING, 1 - DRAWING))
         if not firm.any():
-            return place
+            break
         usual = float(np.median(firm[firm > 0]))
         # Triangles smaller than a pixel have noise that none of them shows.
         stiff = PLATE * usual * max(pixel / edge, 1) ** 4
@@ -107,39 +106,33 @@ def not_turned(before: np.ndarray, step: np.ndarray, faces: np.ndarray, around: 
         step[some] = around[some] @ step if left >= 0 else 0
 
 
-@dataclass(frozen=True)
-class Drawn:
-    """What a picture shows of a surface: triangle (H, W), −1 for none, and its depth (H, W), 0 there; `nearest` (H, W), the
-    least depth of a pixel and its eight neighbours; `thin` (H, W): what is of a thing less than `WIDTH` pixels wide, whose
-    pixels mix it with what is behind."""
+def _drawn(place: np.ndarray, faces: np.ndarray, pictures: Pictures, report: Reporter) -> list[DepthBuffer]:
+    def draw(view: FlatView) -> DepthBuffer:
+        return depth_buffer(PosedCamera(view.camera, view.pose), place, faces, device)
 
-    face: np.ndarray
-    depth: np.ndarray
-    nearest: np.ndarray
-    thin: np.ndarray
-
-    def as_map(self) -> DepthMap:
-        return DepthMap(self.depth, np.zeros_like(self.depth), np.ones_like(self.depth))
+    device = pictures.grey.device
+    return [drawn for _, drawn in in_parallel(draw, pictures.views, report, "photos", device)]
 
 
-def _drawn(place: np.ndarray, faces: np.ndarray, pictures: Pictures, report: Reporter) -> list[Drawn]:
-    def draw(view: FlatView) -> Drawn:
-        camera = view.camera
-        local = (place - view.pose[:3, 3]) @ view.pose[:3, :3]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            pixels = local[:, :2] / local[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
-        size, device = (camera.width, camera.height), pictures.grey.device
-        face, depth = nearest_triangle(pixels, local[:, 2], faces, *size, device)
-        nearest = scipy.ndimage.minimum_filter(depth, 3, mode="nearest")
-        behind = scipy.ndimage.grey_closing(depth, WIDTH, mode="nearest")
-        return Drawn(face, np.where(face >= 0, depth, 0).astype(np.float32), nearest, behind > (1 + APART) * depth)
-
-    return [drawn for _, drawn in in_parallel(draw, pictures.views, report, "photos", pictures.grey.device)]
+def depths_of(drawn: DepthBuffer) -> np.ndarray:
+    """Depth (H, W) of what a picture shows of the surface, 0 where it shows none."""
+    return np.where(drawn.face >= 0, drawn.depth, 0).astype(np.float32)
 
 
-def _footprint(views: list[FlatView], drawn: list[Drawn]) -> float:
+def as_map(drawn: DepthBuffer) -> DepthMap:
+    """The depth map of a surface that is known exactly."""
+    depth = depths_of(drawn)
+    return DepthMap(depth, np.zeros_like(depth), np.ones_like(depth))
+
+
+def thin(drawn: DepthBuffer) -> np.ndarray:
+    """Which pixels (H, W) show a thing less than `WIDTH` pixels wide, and so mix it with what is behind."""
+    return scipy.ndimage.grey_closing(drawn.depth, WIDTH, mode="nearest") > (1 + APART) * drawn.depth
+
+
+def _footprint(drawn: list[DepthBuffer]) -> float:
     """Median width of a pixel on the surface; 0 where no picture shows it."""
-    widths = np.concatenate([d.depth[d.face >= 0] / view.camera.fx for view, d in zip(views, drawn)])
+    widths = np.concatenate([d.view.footprint(d.depth[d.face >= 0]) for d in drawn])
     return float(np.median(widths)) if len(widths) else 0.0
 
 
@@ -148,7 +141,7 @@ def _forces(
     faces: np.ndarray,
     normals: np.ndarray,
     pictures: Pictures,
-    drawn: list[Drawn],
+    drawn: list[DepthBuffer],
     near: list[list[int]],
     report: Reporter,
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -158,7 +151,7 @@ def _forces(
     def flat(parts: list[np.ndarray]) -> torch.Tensor:
         return torch.from_numpy(np.concatenate([part.reshape(-1) for part in parts]).astype(np.float32)).to(device)
 
-    maps = replace(pictures.maps, depth=flat([np.where(d.thin, 0, d.depth) for d in drawn]))
+    maps = replace(pictures.maps, depth=flat([np.where(thin(d), 0, depths_of(d)) for d in drawn]))
     nearest, facing = flat([d.nearest for d in drawn]), unit(cross(place, faces))
 
     def of_view(number: int) -> tuple[np.ndarray, np.ndarray]:
@@ -194,7 +187,8 @@ def _forces(
 
 
 def barycentric(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Weights (N, 3), none below 0, of the corners (N, 3, 3) of triangles at points (N, 3) in their planes."""
+    """Weights (N, 3), none below 0, of the corners (N, 3, 3) of triangles at points (N, 3) in their planes, also
+    of triangles without an area."""
     one, two, off = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], points - corners[:, 0]
     normal = np.cross(one, two)
     scale = np.maximum((normal**2).sum(1), 1e-30)

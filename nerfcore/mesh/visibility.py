@@ -107,8 +107,8 @@ class DepthBuffer:
         return inside & (self.nearest[y, x] > depth - slack)
 
 
-def depth_buffer(view: PosedCamera, vertices: np.ndarray, faces: np.ndarray) -> DepthBuffer:
-    """The mesh (V, 3), (F, 3) as a camera sees it, at one depth a pixel.
+def depth_buffer(view: PosedCamera, vertices: np.ndarray, faces: np.ndarray, device: torch.device = CPU) -> DepthBuffer:
+    """The mesh (V, 3), (F, 3) as a camera sees it, at one depth a pixel, drawn on `device`.
 
     Triangles are drawn with straight edges between their projected corners, so with a distorting lens they should be
     small. Those that reach behind the camera, or around a panorama's edge, are left out.
@@ -116,7 +116,7 @@ def depth_buffer(view: PosedCamera, vertices: np.ndarray, faces: np.ndarray) -> 
     local = view.local(vertices)
     size = view.camera.width, view.camera.height
     widest = size[0] / 2 if view.camera.model == "EQUIRECTANGULAR" else 1e9
-    face, nearest = nearest_triangle(view.pixels(local), view.depth(local), faces, *size, CPU, widest)
+    face, nearest = nearest_triangle(view.pixels(local), view.depth(local), faces, *size, device, widest)
     return DepthBuffer(view, face, nearest, scipy.ndimage.minimum_filter(nearest, 3, mode="nearest"))
 
 

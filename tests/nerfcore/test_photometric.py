@@ -22,6 +22,7 @@ from fieldwork.nerfcore.mesh.photometric import (
     moved_by_photos,
     not_turned,
     pictures_of,
+    thin,
 )
 from fieldwork.nerfcore.mesh.triangles import border_edges, cross
 from fieldwork.nerfcore.progress import Reporter
@@ -186,8 +187,8 @@ def test_what_is_thin_says_nothing_of_itself(pictures: Pictures) -> None:
     drawn = photometric._drawn(vertices, faces, replace(pictures, views=[view]), Reporter())[0]
     on_wire = drawn.face >= len(wall.faces)
     assert on_wire.sum() > 20
-    assert drawn.thin[on_wire].all()
-    assert not drawn.thin[~on_wire].any()
+    assert thin(drawn)[on_wire].all()
+    assert not thin(drawn)[~on_wire].any()
     moved = moved_by_photos(np.zeros((0, 3)), np.zeros((0, 3), int), pictures, Reporter())
     assert moved.shape == (0, 3)
 

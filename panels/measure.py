@@ -67,8 +67,15 @@ def measured_rows(measures: dict[str, Any]) -> list[tuple[str, str]]:
     rows = [(t("Whole"), measures["whole"])] if "whole" in measures else []
     rows += [(row["name"], row) for row in measures.get("classes", [])[:MOST_ROWS]]
     return [
-        (name, "   ".join(filter(None, (amount_text(row, what, unit) for what, unit in units)))) for name, row in rows
+        (name, "   ".join(filter(None, [*(amount_text(row, *unit) for unit in units), guess_text(row)])))
+        for name, row in rows
     ]
+
+
+def guess_text(row: dict[str, Any]) -> str:
+    """What of an area is a guess; empty where nothing is, and of measures of earlier versions."""
+    guessed = row.get("area_guessed", 0.0)
+    return t("{:.0%} a guess", guessed / row["area"]) if guessed else ""
 
 
 def amount_text(row: dict[str, Any], name: str, unit: str) -> str:

@@ -13,7 +13,7 @@ from .cameras import ASPECT, SIZE
 from .lens import pinhole
 from .look import CONFIDENCE_ATTRIBUTE
 from .materials import label_of
-from .surface import CLASS_ATTRIBUTE, INSTANCE_ATTRIBUTE, INSTANCE_NAMES
+from .surface import CLASS_ATTRIBUTE, INSTANCE_ATTRIBUTE, INSTANCE_NAMES, UNSEEN_ATTRIBUTE
 from .visibility import is_surface
 
 MOST_HITS = 32  # things before the surface, such as sparse points, that a ray goes through at most
@@ -33,13 +33,14 @@ class Shown:
 @dataclass(frozen=True)
 class Spot:
     """A place of the surface in the scene. `confidence` of its class in [0, 1]; `instance` is empty where it belongs to
-    none; `photos`, the sharpest first."""
+    none; `guessed`: it closes a gap, or a surface that was to be watertight; `photos`, the sharpest first."""
 
     place: Vector
     class_id: int
     class_name: str
     instance: str
     confidence: float
+    guessed: bool = False
     photos: list[Shown] = field(default_factory=list)
 
 
@@ -63,6 +64,7 @@ def spot_at(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph, origin: Vect
         label_of(material),
         str(item.get(INSTANCE_NAMES, {}).get(str(number), number)) if number else "",
         sum(sure) / len(sure),
+        UNSEEN_ATTRIBUTE in mesh.attributes and mesh.attributes[UNSEEN_ATTRIBUTE].data[face].value,
         photos_of(scene, depsgraph, place, normal, Owner(str(item.get(PROJECT, "")), str(item.get(UUID, "")))),
     )
 

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from ..data.load import load_scene
+from ..data.pixels import PixelStore
 from ..data.scene import Scene
 from ..errors import ProjectError, TrainingError
 from ..files import UNREADABLE_ARRAYS, atomic_path
@@ -22,7 +23,7 @@ from ..geometry.similarity import similarity_scale, transform_points
 from ..kernels.depth_arrays import MapArrays
 from ..kernels.device import use_device
 from ..mesh.appearance import Photos
-from ..mesh.build import Built, agreed_maps, read_photos, vertex_colors
+from ..mesh.build import Built, agreed_maps, fitted, read_photos, vertex_colors
 from ..mesh.clean import shown
 from ..mesh.decimate import decimate_patches
 from ..mesh.denoise import denoised
@@ -30,6 +31,7 @@ from ..mesh.depth_maps import MOST_VIEWS, flat_views, map_size, spread_views
 from ..mesh.extract import extract
 from ..mesh.fusion import BRICK, NEAR, TRUNCATION, WIDER, fuse_maps, grid_of, is_soft, tolerances
 from ..mesh.painted import training_photos
+from ..mesh.photometric import Pictures, pictures_of, without_unknown
 from ..mesh.region import Region, region_around
 from ..mesh.surface import Surface, to_world, vertex_normals
 from ..mesh.triangles import compact
@@ -108,11 +110,18 @@ def make_part(
         target = round(faces * len(triangles) / inside.sum())
         vertices, triangles, inside = decimate_patches(vertices, triangles, inside.astype(np.int64), target, report)
         inside = inside.astype(bool)
-    vertices = denoised(vertices, triangles, device, report, away_from(seams, vertices, FADE * region.voxel))
+    free = away_from(seams, vertices, FADE * region.voxel)
+    vertices = denoised(vertices, triangles, device, report, free)
     box = trained.info.box(project)
     box_from_common = box.box_from_world @ plan.world_from_common
-    own_maps = moved(read[block.name], box_from_common)
-    made = _painted(trained, own, scene, own_maps, vertices, triangles, region, box_from_common, report)
+    views = spread_views([scene.views[i] for i in scene.train], MOST_VIEWS)
+    flats = flat_views(views, box.box_from_world, map_size(views, trained.device))
+    store = read_photos(trained, scene, views, box, report)
+    pictures = pictures_of(flats, store, moved(read[block.name], box_from_common), report)
+    points = transform_points(box_from_common, vertices)
+    step = fitted(points, triangles, without_unknown(pictures), report, free) - points
+    vertices = vertices + step / similarity_scale(box_from_common)
+    made = _painted(trained, own, scene, store, pictures, vertices, triangles, region, box_from_common, report)
     part = Part(_inner(to_world(made, np.linalg.inv(box_from_common)), vertices, inside), seams, region.voxel)
     save_part(run_folder(own, RUN) / PART, part)
     counts = {"vertices": len(part.surface.vertices), "faces": len(part.surface.faces)}
@@ -225,7 +234,8 @@ def _painted(
     trained: Trained,
     folder: Path,
     scene: Scene,
-    maps: MapArrays,
+    store: PixelStore,
+    pictures: Pictures,
     vertices: np.ndarray,
     faces: np.ndarray,
     region: Region,
@@ -239,10 +249,7 @@ def _painted(
     own = Region(*_corners(box_from_common, (region.low, region.high)), region.voxel * scale)
     points, faces = transform_points(box_from_common, vertices).astype(np.float32), faces.astype(np.int32)
     normals = vertex_normals(points, faces)
-    views = spread_views([scene.views[i] for i in scene.train], MOST_VIEWS)
-    flats = flat_views(views, box.box_from_world, map_size(views, trained.device))
-    store = read_photos(trained, scene, views, box, report)
-    photos = Photos(store, maps, np.array([flat.photo for flat in flats]), TRUNCATION * own.voxel)
+    photos = Photos(store, pictures.maps, np.array([flat.photo for flat in pictures.views]), TRUNCATION * own.voxel)
     colors = vertex_colors(trained.model, own, photos, points, normals, report)
     built = Built(points, faces, normals, colors, own, (points[:0], faces[:0]))
     posed = training_photos(scene, box.box_from_world, refined_poses(folder, RUN, trained.info))

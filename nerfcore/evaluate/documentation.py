@@ -149,10 +149,18 @@ def _measured(rows: list[dict[str, Any]], measures: dict[str, Any], title: str) 
             return ["open", ""]
         return list(interval(row[name], row[f"{name}_low"], row[f"{name}_high"]))
 
+    # Measures of earlier versions do not say what is a guess.
+    guesses = [row.get("area_guessed", 0.0) / max(row["area"], 1e-30) for row in rows]
+    columns = ["name", f"area ({area})", "95 % interval", f"volume ({volume})", "95 % interval"]
+    told = [[row["name"], *cells(row, "area"), *cells(row, "volume")] for row in rows]
+    if any(guesses):
+        columns.insert(3, "of it a guess")
+        for line, guess in zip(told, guesses):
+            line.insert(3, f"{100 * guess:.1f} %")
     return Section(
         title,
-        ["name", f"area ({area})", "95 % interval", f"volume ({volume})", "95 % interval"],
-        [[row["name"], *cells(row, "area"), *cells(row, "volume")] for row in rows],
+        columns,
+        told,
         f"Relative standard uncertainty of the scale: {significant(scale.get('u_percent', 0))} % ({scale.get('source', '')})."
         if metric
         else "The scale is not known: sizes are in scene units.",

@@ -18,7 +18,7 @@ from ..mesh.facelets import Facelets, facelets
 from ..mesh.instances import Instance, read_instances
 from ..mesh.painted import LONGEST, training_photos
 from ..mesh.photos import Photo
-from ..mesh.stored import load_coarse, load_surface, mesh_folder, mesh_record
+from ..mesh.stored import load_coarse, load_guessed, load_surface, mesh_folder, mesh_record
 from ..mesh.surface import Surface
 from ..mesh.surface_labels import index_of, view_votes
 from ..mesh.visibility import DepthBuffers, in_parallel, observe
@@ -46,7 +46,8 @@ class Sized:
 
 @dataclass(frozen=True)
 class Measured:
-    """Amounts of the whole surface, by class and by instance, in their order; None for the volume of what is open."""
+    """Amounts of the whole surface, by class and by instance, in their order; None for the volume of what is open. `guesses`:
+    what of the whole area, of each class's and of each instance's is a guess."""
 
     area: Amount
     volume: Amount | None
@@ -54,6 +55,7 @@ class Measured:
     volumes: list[Amount | None]
     instance_areas: list[Amount]
     instance_volumes: list[Amount | None]
+    guesses: tuple[float, list[float], list[float]]
 
 
 def measure(params: MeasureParams, report: Reporter) -> dict[str, Any]:
@@ -61,16 +63,17 @@ def measure(params: MeasureParams, report: Reporter) -> dict[str, Any]:
 
     Returns:
         {"unit": "m" or "scene units", "scale": {"u_percent", "source", "factor"}, "whole": {"name", "area", "area_low",
-        "area_high", "volume", "volume_low", "volume_high"}, "classes" and "instances": [the same, with "id"], "distances":
+        "area_high", "area_guessed", "volume", "volume_low", "volume_high"}, "classes" and "instances": [the same, with "id"], "distances":
         [{"name", "use", "length", "low", "high", "known", "difference"}], "label_revision": of the marks that the mesh's
         classes are from, or None, "file"}; lows and highs are the ends of 95 % intervals, volumes None where a thing is
-        open.
+        open; "area_guessed" is what of the area closes gaps, or a surface that was to be watertight.
     Raises:
         ProjectError: there is no mesh, or the project was aligned anew since. InputError: the file of distances.
     """
     folder = Path(params.project)
     project, poses = load_project(folder), load_poses(folder)
     surface, _ = load_surface(folder, params.run)
+    guessed = load_guessed(folder, params.run)
     made = mesh_record(folder, params.run).result
     voxel = float(made["voxel"])
     target = mesh_folder(folder, params.run)
@@ -105,18 +108,21 @@ def measure(params: MeasureParams, report: Reporter) -> dict[str, Any]:
     report.stage("Measuring")
     views, longest = [photo.view for photo in photos], info.image_size
     sized = Sized(voxel, partial(u_places, views, pieces.centers, longest=longest))
-    measured = amounts(surface, pieces, coarse, sized, list(known), instances, votes, scale.u, params.caps, report)
+    measured = amounts(
+        surface, pieces, coarse, sized, list(known), instances, votes, guessed, scale.u, params.caps, report
+    )
+    of_whole, of_classes, of_instances = measured.guesses
     result: dict[str, Any] = {
         "unit": scale.unit,
         "scale": {"u_percent": round(100 * scale.u, 4), "source": scale.source, "factor": round(scale.factor, 6)},
-        "whole": {"name": WHOLE, **entries(measured.area, measured.volume)},
+        "whole": {"name": WHOLE, **entries(measured.area, measured.volume, of_whole)},
         "classes": [
-            {"id": c, "name": name, **entries(area, volume)}
-            for (c, name), area, volume in zip(known.items(), measured.areas, measured.volumes)
+            {"id": c, "name": name, **entries(*sizes)}
+            for (c, name), *sizes in zip(known.items(), measured.areas, measured.volumes, of_classes)
         ],
         "instances": [
-            {"id": i.id, "name": i.name, "class_id": i.class_id, **entries(area, volume)}
-            for i, area, volume in zip(instances, measured.instance_areas, measured.instance_volumes)
+            {"id": i.id, "name": i.name, "class_id": i.class_id, **entries(*sizes)}
+            for i, *sizes in zip(instances, measured.instance_areas, measured.instance_volumes, of_instances)
         ],
         "distances": [distance_entry(d, scale, voxel) for d in distances],
         "label_revision": made.get("label_revision"),
@@ -143,6 +149,7 @@ def amounts(
     class_ids: list[int],
     instances: list[Instance],
     votes: Votes,
+    guessed: np.ndarray | None,
     u_scale: float,
     most_capped: float,
     report: Reporter,
@@ -150,8 +157,8 @@ def amounts(
     """Areas and volumes of a surface, of its classes and of its instances.
 
     Args:
-        pieces: of the surface; coarse: the surface (vertices, faces) at cells of twice the size. votes: for `class_ids`. u_scale: relative uncertainty of lengths. most_capped: share of a closed
-            part's area that caps may have.
+        pieces: of the surface; coarse: the surface (vertices, faces) at cells of twice the size. votes: for `class_ids`. guessed (F,) bool: triangles that no photo shows. u_scale: relative uncertainty of lengths.
+            most_capped: share of a closed part's area that caps may have.
     """
     of_class = index_of(class_ids)[np.minimum(surface.face_class, max(class_ids, default=0) + 1)]
     of_instance = np.zeros(len(surface.faces), np.int64)
@@ -187,7 +194,12 @@ def amounts(
         report.progress(number / len(instances), instance.name)
         volumes.append(volume(2, instance.id, by_instance[number]))
     together = [summed([v for v, i in zip(volumes, instances) if i.class_id == class_id]) for class_id in class_ids]
-    return Measured(area, volume(0, 1, area), by_class, together, by_instance, volumes)
+    guess = np.zeros(len(surface.faces), bool) if guessed is None else guessed
+    (whole,), of_classes, of_instances = (
+        Labelled(vertices, f.faces[guess], f.label[guess]).areas(n)[1:].tolist() for f, n in zip(fine, counts)
+    )
+    guesses = whole, of_classes, of_instances
+    return Measured(area, volume(0, 1, area), by_class, together, by_instance, volumes, guesses)
 
 
 def gathered_votes(photos: list[Photo], pieces: Facelets, class_ids: list[int], report: Reporter) -> Votes:
@@ -206,14 +218,14 @@ def gathered_votes(photos: list[Photo], pieces: Facelets, class_ids: list[int], 
     return Votes(len(labelled), photo, np.concatenate([f for _, f, _ in found]), np.concatenate([v for *_, v in found]))
 
 
-def entries(area: Amount, volume: Amount | None) -> dict[str, Any]:
-    """An area and a volume as JSON, with what their uncertainties are made of."""
+def entries(area: Amount, volume: Amount | None, guessed: float) -> dict[str, Any]:
+    """An area, of which `guessed` is a guess, and a volume as JSON, with what their uncertainties are made of."""
     row: dict[str, Any] = {}
     for name, amount in (("area", area), ("volume", volume)):
         low, high = (None, None) if amount is None else amount.interval
         row |= {name: None if amount is None else amount.value, f"{name}_low": low, f"{name}_high": high}
     parts = {"scale": area.u_scale, "photos": area.u_photos, "geometry": area.u_geometry, "place": area.u_place}
-    row["area_u"] = parts
+    row |= {"area_guessed": guessed, "area_u": parts}
     return row
 
 

@@ -182,11 +182,14 @@ def open_surface(
     return vertices, faces, guessed[nearest]
 
 
-def fitted(vertices: np.ndarray, faces: np.ndarray, pictures: Pictures, report: Reporter) -> np.ndarray:
-    """Vertices (V, 3) of triangles (F, 3) moved to where the photos agree best, without the noise that this leaves."""
+def fitted(
+    vertices: np.ndarray, faces: np.ndarray, pictures: Pictures, report: Reporter, free: np.ndarray | None = None
+) -> np.ndarray:
+    """Vertices (V, 3) of triangles (F, 3) moved to where the photos agree best, without the noise that this leaves. Each moves by
+    the share `free` (V,) of the way, 1 where nothing is given."""
     report.stage("Fitting to the photos")
-    moved = moved_by_photos(vertices, faces, pictures, report)
-    return denoised(moved, faces, pictures.maps.depth.device, report)
+    moved = moved_by_photos(vertices, faces, pictures, report, free)
+    return denoised(moved, faces, pictures.maps.depth.device, report, free)
 
 
 def wanted_bounds(params: MeshParams, scene: Scene, box: Box) -> tuple[np.ndarray, np.ndarray] | None:

@@ -15,7 +15,7 @@ import scipy
 import torch
 
 from ..data.pixels import PixelStore
-from ..kernels.depth_arrays import MapArrays
+from ..kernels.depth_arrays import FREE, MapArrays
 from ..kernels.warping import NOT_SEEN, photo_forces
 from ..progress import Reporter, Stretch
 from .depth_maps import DepthMap, FlatView, neighbours, pixel_directions
@@ -65,13 +65,24 @@ def pictures_of(views: list[FlatView], store: PixelStore, maps: MapArrays, repor
     return Pictures(views, torch.from_numpy(np.concatenate(parts).astype(np.float32)).to(maps.depth.device), maps)
 
 
-def moved_by_photos(vertices: np.ndarray, faces: np.ndarray, pictures: Pictures, report: Reporter) -> np.ndarray:
+def without_unknown(pictures: Pictures) -> Pictures:
+    """The pictures without pixels of which the maps do not know the depth, where something may stand in front of the surface."""
+    known = (pictures.maps.depth > 0) & (pictures.maps.depth < FREE)
+    grey = torch.where(known[:, None], pictures.grey, torch.tensor([NOT_SEEN, 0.0, 0.0], device=known.device))
+    return replace(pictures, grey=grey)
+
+
+def moved_by_photos(
+    vertices: np.ndarray, faces: np.ndarray, pictures: Pictures, report: Reporter, free: np.ndarray | None = None
+) -> np.ndarray:
     """Vertices (V, 3) float64 of triangles (F, 3), in the frame of the pictures, moved to where photos agree best. Those of open
-    borders stay where they are, and no triangle is turned over."""
+    borders stay where they are, others move by the share `free` (V,) of each step, 1 where nothing is given, and no triangle
+    is turned over."""
     before = place = np.asarray(vertices, np.float64)
     if not len(faces):
         return place
-    around, fixed = means_around(faces, len(place)), np.unique(border_edges(faces))
+    around, free = means_around(faces, len(place)), np.ones(len(place)) if free is None else free.copy()
+    free[border_edges(faces)] = 0
     plate = bending(around)
     edge = float(np.median(np.linalg.norm(place[faces[:, 0]] - place[faces[:, 1]], axis=1)))
     total, near = np.zeros(len(place)), []
@@ -88,22 +99,23 @@ def moved_by_photos(vertices: np.ndarray, faces: np.ndarray, pictures: Pictures,
         # Triangles smaller than a pixel have noise that none of them shows.
         stiff = PLATE * usual * max(pixel / edge, 1) ** 4
         step = _solved(plate, force - stiff * (plate @ total), firm + WEAK * usual, stiff, report)
-        step = step.clip(-FARTHEST * pixel, FARTHEST * pixel)
-        step[fixed] = 0
+        step = free * step.clip(-FARTHEST * pixel, FARTHEST * pixel)
         place, total = place + step[:, None] * normals, total + step
-    return before + not_turned(before, place - before, faces, around)
+    return before + not_turned(before, place - before, faces, around, free)
 
 
-def not_turned(before: np.ndarray, step: np.ndarray, faces: np.ndarray, around: scipy.sparse.csr_matrix) -> np.ndarray:
-    """Steps (V, 3) from `before` (V, 3) that turn no triangle over: there vertices move as those around them do, or else not
-    at all."""
+def not_turned(
+    before: np.ndarray, step: np.ndarray, faces: np.ndarray, around: scipy.sparse.csr_matrix, free: np.ndarray
+) -> np.ndarray:
+    """Steps (V, 3) from `before` (V, 3) that turn no triangle over: there vertices move as those around them do, by the share
+    `free` (V,), or else not at all."""
     step, normals, left = step.copy(), cross(before, faces), TURNS
     while True:
         turned = (normals * cross(before + step, faces)).sum(1) < 0
         if not turned.any():
             return step
         some, left = np.unique(faces[turned]), left - 1
-        step[some] = around[some] @ step if left >= 0 else 0
+        step[some] = free[some, None] * (around[some] @ step) if left >= 0 else 0
 
 
 def _drawn(place: np.ndarray, faces: np.ndarray, pictures: Pictures, report: Reporter) -> list[DepthBuffer]:

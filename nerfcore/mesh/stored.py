@@ -48,6 +48,16 @@ def load_surface(project: Path, run: str) -> tuple[Surface, Texture | None]:
     return surface, texture_of(surface.faces, uv, _picture(picture, "RGB"))
 
 
+def load_guessed(project: Path, run: str) -> np.ndarray | None:
+    """Which triangles (F,) bool of a run's mesh close gaps, or a surface that was to be watertight; None where none do.
+
+    Raises:
+        ProjectError: there is no mesh, or its file is damaged.
+    """
+    with _reading(mesh_folder(project, run) / MESH, f"The run “{run}” has no mesh yet.") as data:
+        return data.get("unseen", None)
+
+
 def load_class_map(project: Path, run: str) -> np.ndarray | None:
     """The class (S, S) of each texel of the texture of a run's mesh; None where `mesh` made none.
 

@@ -300,6 +300,8 @@ def test_the_whole_surface_is_said_before_the_classes():
     assert measured_rows(measures) == [("Whole", "140 ± 20 m²   9.0 ± 1.0 m³")]
     measures = {"unit": "scene units", "classes": [{"name": "Gold", **half}]}
     assert measured_rows(measures) == [("Gold", "1.238 ± 0.030")]
+    measures = {"unit": "scene units", "classes": [{"name": "Gold", **half, "area_guessed": half["area"] / 4}]}
+    assert measured_rows(measures) == [("Gold", "1.238 ± 0.030   25% a guess")]
 
 
 def test_headers_say_the_state_of_each_step(bpy_script, tmp_path):

@@ -60,6 +60,7 @@ def test_a_place_says_what_it_is_and_which_photos_show_it(bpy_script, tmp_path, 
     flap = np.array([[0.84, 0.6, 1], [0.86, 0.6, 1], [0.85, 0.8, 1]], np.float32)
     arrays["face_class"] = np.append(np.where(middle[:, 0] < 0.44, 1, 2), 1)
     arrays["face_instance"] = np.append(np.where(middle[:, 0] < 0.44, 0, 7), 0)
+    arrays["unseen"] = np.append(middle[:, 0] < 0.44, False)
     arrays["faces"] = np.vstack([arrays["faces"], np.arange(3) + len(arrays["vertices"])])
     arrays["vertices"] = np.vstack([arrays["vertices"], flap])
     arrays["uv"] = np.vstack([arrays["uv"], np.zeros((1, 3, 2), np.float32)])
@@ -87,6 +88,7 @@ def test_a_place_says_what_it_is_and_which_photos_show_it(bpy_script, tmp_path, 
     assert gold["sharpness"] == pytest.approx([40 / 1.5, 40 / 4], rel=1e-4)
     assert gold["text"] == "gold, gold.001: 75% sure, shown by 2 photos"
     assert facts["stone"]["class"] == [1, "stone"]
+    assert facts["stone"]["text"] == "stone: 75% sure, a guess where photos do not agree"
     assert facts["stone"]["instance"] == ""
     assert facts["behind"]["photos"] == ["below"]
     assert facts["beside"] is None

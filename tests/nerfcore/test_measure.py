@@ -84,7 +84,7 @@ def simulated(seed: int, pixel: float) -> Measured:
     face_instance, instances = find_instances(vertices, faces, face_class, {}, 0, 0.2)
     surface = Surface(vertices, faces, vertices, vertices, face_class[:0], face_class, face_instance)
     sized = Sized(1 / ROUND, lambda _, count: np.full(count, pixel / np.sqrt(3)))
-    return amounts(surface, pieces, coarse, sized, [1, 2], instances, votes, U_SCALE, 0.9, Reporter())
+    return amounts(surface, pieces, coarse, sized, [1, 2], instances, votes, None, U_SCALE, 0.9, Reporter())
 
 
 @pytest.mark.parametrize(("pixel", "widest"), [(0.0, 0.25), (0.06, 0.4)])
@@ -185,6 +185,23 @@ def test_the_verb_measures_a_mesh_with_the_label_maps_of_its_photos(project: Pat
     assert between["low"] < between["length"] < between["high"]
     # One distance, known to 2 mm and picked to a voxel at both ends.
     assert result["scale"]["u_percent"] == pytest.approx(100 * np.hypot(0.002, np.sqrt(2) * 0.03), rel=1e-3)
+
+
+def test_what_of_an_area_is_a_guess_is_told(project: Path) -> None:
+    before = measure(MeasureParams(project=project), Reporter())
+    assert {row["area_guessed"] for row in [before["whole"], *before["classes"], *before["instances"]]} == {0}
+    path = mesh_folder(project, "main") / "mesh.npz"
+    with np.load(path) as data:
+        arrays = dict(data)
+    height = arrays["vertices"][arrays["faces"]].mean(1)[:, 2]
+    np.savez(path, **arrays, unseen=height > RADIUS / 2)
+    after = measure(MeasureParams(project=project), Reporter())
+    cap = np.pi * RADIUS**2  # of the sphere above half of its radius
+    top, bottom = after["classes"]
+    for row in (after["whole"], top, after["instances"][0]):
+        assert row["area_guessed"] == pytest.approx(cap, rel=0.05)
+    assert bottom["area_guessed"] == after["instances"][1]["area_guessed"] == 0
+    assert top["area"] == before["classes"][0]["area"]
 
 
 @pytest.mark.parametrize("step", ["area_deviations", "transferred", "area_deviations_of_place", "volume_amount"])

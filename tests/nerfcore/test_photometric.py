@@ -23,6 +23,7 @@ from fieldwork.nerfcore.mesh.photometric import (
     not_turned,
     pictures_of,
     thin,
+    without_unknown,
 )
 from fieldwork.nerfcore.mesh.triangles import border_edges, cross
 from fieldwork.nerfcore.progress import Reporter
@@ -157,23 +158,48 @@ def test_open_borders_stay(pictures: Pictures) -> None:
     assert off(moved[inner]) < 0.3 * off(vertices[inner])
 
 
+def test_vertices_move_as_far_as_they_are_free(pictures: Pictures) -> None:
+    vertices, faces = ball(0.97 * RADIUS)
+    height = vertices[:, 2] / RADIUS
+    free = np.clip(2 * height, 0, 1)
+    moved = moved_by_photos(vertices, faces, pictures, Reporter(), free)
+    np.testing.assert_array_equal(moved[free == 0], vertices[free == 0])
+    assert off(moved[free == 1]) < 0.15 * off(vertices[free == 1])
+    steps = np.linalg.norm(moved - vertices, axis=1)
+    assert 0 < np.median(steps[(free > 0) & (free < 0.1)]) < 0.5 * np.median(steps[free == 1])
+
+
+def test_pixels_of_unknown_depth_say_nothing(scene, pictures: Pictures) -> None:
+    """As in a block of a large capture, whose maps do not show what other blocks have in front of it."""
+    depth = torch.where(torch.arange(len(pictures.maps.depth)) % 3 == 0, 0, pictures.maps.depth)
+    partly = without_unknown(replace(pictures, maps=replace(pictures.maps, depth=depth)))
+    known = (depth > 0) & (depth < FREE)
+    assert known.any()
+    torch.testing.assert_close(partly.grey[known], pictures.grey[known])
+    assert (partly.grey[~known, 0] == NOT_SEEN).all()
+
+
 def test_no_triangle_turns_over(monkeypatch: pytest.MonkeyPatch) -> None:
     """One vertex that would pass its neighbours moves as they do; where all steps are wild, some stay where they are."""
     vertices, faces = ball(RADIUS)
-    around = means_around(faces, len(vertices))
+    around, free = means_around(faces, len(vertices)), np.ones(len(vertices))
     small = 0.01 * vertices
     wild = small.copy()
     wild[7] = 0.3 * np.roll(vertices[7], 1)
-    np.testing.assert_allclose(not_turned(vertices, wild, faces, around), small, atol=0.03)
-    np.testing.assert_array_equal(not_turned(vertices, small, faces, around), small)
+    np.testing.assert_allclose(not_turned(vertices, wild, faces, around, free), small, atol=0.03)
+    np.testing.assert_array_equal(not_turned(vertices, small, faces, around, free), small)
     random = np.random.default_rng(0).normal(0, 0.1, vertices.shape)
     for turns in (photometric.TURNS, 0):
         monkeypatch.setattr(photometric, "TURNS", turns)
-        found = not_turned(vertices, random, faces, around)
+        found = not_turned(vertices, random, faces, around, free)
         assert (cross(vertices, faces) * cross(vertices + found, faces)).sum(1).min() >= 0
     still = (found == 0).all(1)
     assert still.any()
     np.testing.assert_array_equal(found[~still], random[~still])
+    free[7] = 0
+    monkeypatch.setattr(photometric, "TURNS", 5)
+    held = not_turned(vertices, free[:, None] * random, faces, around, free)
+    np.testing.assert_array_equal(held[7], 0)
 
 
 def test_what_is_thin_says_nothing_of_itself(pictures: Pictures) -> None:

@@ -115,6 +115,21 @@ def test_sizes_of_small_things_keep_their_digits_and_have_units(project: Path) -
     assert "Root mean square of their differences: 0.040 mm" in html
 
 
+def test_what_of_an_area_is_a_guess_has_a_column(project: Path) -> None:
+    path = project / "exports/main" / MEASURES
+    measures = json.loads(path.read_text())
+    assert "of it a guess" not in Path(report(ReportParams(project=project), Reporter())["file"]).read_text("utf-8")
+    top, bottom = (
+        {"name": name, **AMOUNTS, "area_guessed": guess} for name, guess in (("top", 0.1571), ("bottom", 0.0))
+    )
+    write_json(path, measures | {"classes": [top, bottom]})
+    html = Path(report(ReportParams(project=project), Reporter())["file"]).read_text("utf-8")
+    text = re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", re.sub(r'src="data:[^"]*"', "", html)))
+    assert "95 % interval of it a guess volume" in text
+    assert "1.571 1.500 … 1.640 10.0 % open" in text
+    assert "1.571 1.500 … 1.640 0.0 % open" in text
+
+
 def test_held_out_photos_may_have_dots_in_their_names(project: Path) -> None:
     names = ["IMG.01", "IMG.02", "gone.03"]
     for name in names[:2]:

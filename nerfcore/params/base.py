@@ -72,6 +72,21 @@ FaceCount = Annotated[  # None: all there are
 ]
 
 
+CloseGaps = Annotated[
+    float,
+    Field(
+        ge=0,
+        le=20,
+        description="width, in percent of the longest side of the region, up to which holes, cracks and frayed borders are "
+        "closed by a guess, whose faces are marked; 0: none. Not needed with watertight",
+    ),
+]
+Watertight = Annotated[
+    bool,
+    Field(description="close the surface: what no photo shows counts as inside, and its faces are marked"),
+]
+
+
 def _texture_size(size: object) -> object:
     if size == "auto":
         return size

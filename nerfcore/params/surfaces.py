@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from .base import FaceCount, Params, RunName, Split, TextureSize
+from .base import CloseGaps, FaceCount, Params, RunName, Split, TextureSize, Watertight
 
 
 class MeshParams(Params):
@@ -39,16 +39,8 @@ class MeshParams(Params):
         default=None,
         description="texture size in pixels, or auto: what the photos' pixels need; none: vertex colours only",
     )
-    watertight: bool = Field(
-        default=False, description="close the surface: what no photo shows counts as inside, and its faces are marked"
-    )
-    close_gaps: float = Field(
-        default=0.0,
-        ge=0,
-        le=20,
-        description="width, in percent of the longest side of the region, up to which holes, cracks and frayed borders are "
-        "closed by a guess, whose faces are marked; 0: none. Not needed with watertight",
-    )
+    watertight: Watertight = False
+    close_gaps: CloseGaps = 0.0
     texture_kind: Literal["photo", "field"] = Field(
         default="photo", description="what the texture shows: the photos, or the field's colours"
     )

@@ -16,12 +16,14 @@ from .base import (
     MANY,
     MASK_MODE,
     MASKS,
+    CloseGaps,
     FaceCount,
     Holdout,
     Params,
     Preset,
     Settings,
     TextureSize,
+    Watertight,
 )
 
 
@@ -49,6 +51,8 @@ class ReconstructParams(Params):
         default="auto",
         description="size of the mesh's texture in pixels; auto: what the photos' pixels need; none: vertex colours only",
     )
+    watertight: Watertight = False
+    close_gaps: CloseGaps = 0.0
     report: Path | None = Field(default=None, description="report to write, .html or .pdf")
     renders: Path | None = Field(default=None, description="folder for renders of new views")
     render_count: int = Field(

@@ -100,7 +100,14 @@ def stage_params(params: p.ReconstructParams, verb: str, spent: float = 0.0) -> 
             )
             return training.model_copy(update={"resume": unfinished(training)})
         case "mesh":
-            return p.MeshParams(project=project, run=run, faces=params.faces, texture=params.texture)
+            return p.MeshParams(
+                project=project,
+                run=run,
+                faces=params.faces,
+                texture=params.texture,
+                watertight=params.watertight,
+                close_gaps=params.close_gaps,
+            )
         case "evaluate":
             from ..train.reuse import held_out
 

@@ -114,6 +114,15 @@ def test_the_mesh_is_of_a_size_one_can_use(
     assert (seen["mesh"].faces, seen["mesh"].texture) == made
 
 
+def test_the_mesh_is_closed_as_asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for number, asked in enumerate(({"close_gaps": 5.0}, {"watertight": True}, {})):
+        seen, _ = all_stages(monkeypatch, tmp_path / str(number), {}, **asked)
+        for name, usual in (("close_gaps", 0.0), ("watertight", False)):
+            assert getattr(seen["mesh"], name) == asked.get(name, usual)
+    with pytest.raises(ValidationError, match="close_gaps"):
+        ReconstructParams(photos=tmp_path, out=tmp_path / "p", close_gaps=21)
+
+
 def test_a_texture_has_a_size_or_as_many_texels_as_the_photos_need(tmp_path: Path) -> None:
     for given, taken in (("auto", "auto"), ("512", 512), (16384, 16384), (None, None)):
         assert MeshParams.model_validate({"project": tmp_path, "texture": given}).texture == taken

@@ -1,8 +1,8 @@
 """Photos compared through a surface: what one photo shows of it, and what another shows of the same places.
 
-A surface is given by its depth in each picture. Two kernels: the first reads another photo wherever the surface says that a
-pixel's place is seen there, and how this value would change if the surface moved; the second compares small windows of the
-two, and sums up what that says of each pixel's place.
+A surface is given by its depth in each picture. Three kernels: the first reads another photo wherever the surface says that a
+pixel's place is seen there, and how this value would change if the surface moved; the second sums up the two along rows of
+small windows; the third adds the rows of each window, compares the two in it, and sums up what that says of each pixel's place.
 """
 
 from __future__ import annotations
@@ -108,12 +108,42 @@ def warp_kernel(
 
 
 @wp.kernel(module="fieldwork_warping")
-def compare_kernel(
+def rows_kernel(
     grey: wp.array(dtype=wp.vec3),
     maps: Maps,
     view: int,
     warped: wp.array(dtype=wp.vec2, ndim=2),
     bell: wp.array(dtype=float),
+    sums: wp.array(dtype=wp.vec3, ndim=3),
+    offset: int,
+):
+    i = wp.tid() + offset
+    width = maps.size[view, 0]
+    column = i % width
+    first = maps.first[view] + i - column
+    for k in range(warped.shape[0]):
+        means = wp.vec3(0.0, 0.0, 0.0)
+        squares = wp.vec3(0.0, 0.0, 0.0)
+        for x in range(wp.max(column - RADIUS, 0), wp.min(column + RADIUS + 1, width)):
+            theirs = warped[k, i - column + x][0]
+            if theirs >= 0.0:
+                w = bell[x - column + RADIUS]
+                mine = grey[first + x][0]
+                means += w * wp.vec3(1.0, mine, theirs)
+                squares += w * wp.vec3(mine * mine, theirs * theirs, mine * theirs)
+        sums[k, i, 0] = means
+        sums[k, i, 1] = squares
+
+
+@wp.kernel(module="fieldwork_warping")
+def compare_kernel(
+    grey: wp.array(dtype=wp.vec3),
+    maps: Maps,
+    view: int,
+    warped: wp.array(dtype=wp.vec2, ndim=2),
+    sums: wp.array(dtype=wp.vec3, ndim=3),
+    bell: wp.array(dtype=float),
+    whole: float,
     out: wp.array(dtype=wp.vec3),
     offset: int,
 ):
@@ -122,44 +152,27 @@ def compare_kernel(
     height = maps.size[view, 1]
     column = i % width
     row = i / width
-    first = maps.first[view]
     total = wp.vec3(0.0, 0.0, 0.0)
     for k in range(warped.shape[0]):
         own = warped[k, i]
         if own[0] >= 0.0:
-            all_weights = float(0.0)
-            weights = float(0.0)
-            a = float(0.0)
-            b = float(0.0)
-            aa = float(0.0)
-            bb = float(0.0)
-            ab = float(0.0)
-            for dy in range(-RADIUS, RADIUS + 1):
-                for dx in range(-RADIUS, RADIUS + 1):
-                    w = bell[dx + RADIUS] * bell[dy + RADIUS]
-                    all_weights += w
-                    x = column + dx
-                    y = row + dy
-                    if x >= 0 and y >= 0 and x < width and y < height:
-                        theirs = warped[k, y * width + x][0]
-                        if theirs >= 0.0:
-                            mine = grey[first + y * width + x][0]
-                            weights += w
-                            a += w * mine
-                            b += w * theirs
-                            aa += w * mine * mine
-                            bb += w * theirs * theirs
-                            ab += w * mine * theirs
-            a /= weights
-            b /= weights
-            va = wp.max(aa / weights - a * a, 0.0) + NOISE
-            vb = wp.max(bb / weights - b * b, 0.0) + NOISE
-            alike = (ab / weights - a * b) / wp.sqrt(va * vb)
-            if alike > ALIKE and weights > HALF * all_weights:
-                off = (grey[first + i][0] - a) / wp.sqrt(va) - (own[0] - b) / wp.sqrt(vb)
+            means = wp.vec3(0.0, 0.0, 0.0)
+            squares = wp.vec3(0.0, 0.0, 0.0)
+            for y in range(wp.max(row - RADIUS, 0), wp.min(row + RADIUS + 1, height)):
+                w = bell[y - row + RADIUS]
+                means += w * sums[k, y * width + column, 0]
+                squares += w * sums[k, y * width + column, 1]
+            weights = means[0]
+            a = means[1] / weights
+            b = means[2] / weights
+            va = wp.max(squares[0] / weights - a * a, 0.0) + NOISE
+            vb = wp.max(squares[1] / weights - b * b, 0.0) + NOISE
+            alike = (squares[2] / weights - a * b) / wp.sqrt(va * vb)
+            if alike > ALIKE and weights > HALF * whole:
+                off = (grey[maps.first[view] + i][0] - a) / wp.sqrt(va) - (own[0] - b) / wp.sqrt(vb)
                 slope = own[1] / wp.sqrt(vb)
-                w = wp.min((alike - ALIKE) / (SURE - ALIKE), 1.0) / (1.0 + off * off)
-                total += w * wp.vec3(slope * off, slope * slope, off * off)
+                sure = wp.min((alike - ALIKE) / (SURE - ALIKE), 1.0) / (1.0 + off * off)
+                total += sure * wp.vec3(slope * off, slope * slope, off * off)
     out[i] = total
 
 
@@ -189,7 +202,10 @@ def photo_forces(
     struct = map_struct(maps)
     inputs = [array(grey, wp.vec3), array(facing, wp.vec3), array(nearest), struct, array(near), view]
     launch(warp_kernel, count, [*inputs, array(warped, wp.vec2)], device)
-    bell = array(torch.exp(-(torch.arange(-RADIUS, RADIUS + 1.0, device=device) ** 2) / (2 * SIGMA**2)))
-    compared = [array(grey, wp.vec3), struct, view, array(warped, wp.vec2), bell, array(out, wp.vec3)]
-    launch(compare_kernel, count, compared, device)
+    bell = torch.exp(-(torch.arange(-RADIUS, RADIUS + 1.0, device=device) ** 2) / (2 * SIGMA**2))
+    sums = torch.empty(len(near), count, 2, 3, device=device)
+    shown = [array(grey, wp.vec3), struct, view, array(warped, wp.vec2)]
+    launch(rows_kernel, count, [*shown, array(bell), array(sums, wp.vec3)], device)
+    whole = float(bell.sum()) ** 2
+    launch(compare_kernel, count, [*shown, array(sums, wp.vec3), array(bell), whole, array(out, wp.vec3)], device)
     return out

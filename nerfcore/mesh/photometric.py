@@ -165,15 +165,17 @@ def _forces(
 
     maps = replace(pictures.maps, depth=flat([np.where(thin(d), 0, depths_of(d)) for d in drawn]))
     nearest, facing = flat([d.nearest for d in drawn]), unit(cross(place, faces))
+    slopes, offsets = barycentric_slopes(place[faces])
+    along = np.einsum("fij,fj->fi", normals[faces], facing)  # of steps of the corners, along the normal of the triangle
 
     def of_view(number: int) -> tuple[np.ndarray, np.ndarray]:
         view, face = pictures.views[number], drawn[number].face
         if not near[number] or not (face >= 0).any():
             return np.zeros(len(place)), np.zeros(len(place))
-        normal = facing[face.reshape(-1)]
+        face = face.reshape(-1)
         told = photo_forces(
             pictures.grey,
-            torch.from_numpy(normal.astype(np.float32)).to(device),
+            torch.from_numpy(facing[face].astype(np.float32)).to(device),
             nearest,
             maps,
             number,
@@ -182,13 +184,14 @@ def _forces(
         told = told.cpu().numpy().astype(np.float64)
         some = np.flatnonzero(told[:, 1] > 0)
         ray = pixel_directions(view.camera).reshape(-1, 3)[some].astype(np.float64) @ view.pose[:3, :3].T
-        normal, corner = normal[some], faces[face.reshape(-1)[some]]
-        cosine = -(ray * normal).sum(1) / np.linalg.norm(ray, axis=1)
+        face = face[some]
+        cosine = -np.einsum("ni,ni->n", ray, facing[face]) / np.linalg.norm(ray, axis=1)
         point = view.pose[:3, 3] + drawn[number].depth.reshape(-1)[some, None] * ray
-        share = barycentric(place[corner], point) * (normals[corner] * normal[:, None]).sum(2)
+        weights = (np.einsum("nij,nj->ni", slopes[face], point) + offsets[face]).clip(0, 1)
+        share = weights / weights.sum(1, keepdims=True) * along[face]
         told = told[some, :2] * np.where(cosine > STEEPEST, cosine, 0)[:, None]
         pull, hold = share * told[:, :1], np.abs(share) * told[:, 1:]
-        at = corner.reshape(-1)
+        at = faces[face].reshape(-1)
         return np.bincount(at, pull.reshape(-1), len(place)), np.bincount(at, hold.reshape(-1), len(place))
 
     force, firm = np.zeros(len(place)), np.zeros(len(place))
@@ -198,16 +201,15 @@ def _forces(
     return force, firm
 
 
-def barycentric(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Weights (N, 3), none below 0, of the corners (N, 3, 3) of triangles at points (N, 3) in their planes, also
-    of triangles without an area."""
-    one, two, off = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], points - corners[:, 0]
+def barycentric_slopes(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How weights of corners (F, 3, 3) of triangles depend on a place in their planes: slopes (F, 3, 3) and what they are at
+    the origin (F, 3); weights are slopes @ place + that. Of triangles without an area the first corner has all weight."""
+    first, one, two = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normal = np.cross(one, two)
-    scale = np.maximum((normal**2).sum(1), 1e-30)
-    third = (np.cross(one, off) * normal).sum(1) / scale
-    second = (np.cross(off, two) * normal).sum(1) / scale
-    weights = np.stack([1 - second - third, second, third], 1).clip(0, 1)
-    return weights / weights.sum(1, keepdims=True)
+    scale = np.maximum((normal**2).sum(1, keepdims=True), 1e-30)
+    second, third = np.cross(two, normal) / scale, np.cross(normal, one) / scale
+    slopes = np.stack([-second - third, second, third], 1)
+    return slopes, np.array([1.0, 0, 0]) - np.einsum("fij,fj->fi", slopes, first)
 
 
 def means_around(faces: np.ndarray, count: int) -> scipy.sparse.csr_matrix:

@@ -16,7 +16,7 @@ from fieldwork.nerfcore.mesh import photometric
 from fieldwork.nerfcore.mesh.depth_maps import DepthMap, FlatView, map_arrays
 from fieldwork.nerfcore.mesh.photometric import (
     Pictures,
-    barycentric,
+    barycentric_slopes,
     bending,
     means_around,
     moved_by_photos,
@@ -254,9 +254,11 @@ def test_weights_of_corners() -> None:
     random = np.random.default_rng(1)
     corners, weights = random.normal(size=(50, 3, 3)), random.dirichlet(np.ones(3), 50)
     points = np.einsum("nk,nkc->nc", weights, corners)
-    np.testing.assert_allclose(barycentric(corners, points), weights, atol=1e-9)
-    outside = corners[:, 0] + 2 * (corners[:, 0] - corners[:, 1:].mean(1))
-    np.testing.assert_allclose(barycentric(corners, outside), np.tile([1.0, 0, 0], (50, 1)), atol=1e-9)
+    slopes, offsets = barycentric_slopes(corners)
+    np.testing.assert_allclose(np.einsum("nij,nj->ni", slopes, points) + offsets, weights, atol=1e-9)
+    corners[:, 2] = corners[:, 1]  # without an area
+    slopes, offsets = barycentric_slopes(corners)
+    np.testing.assert_allclose(np.einsum("nij,nj->ni", slopes, points) + offsets, np.tile([1.0, 0, 0], (50, 1)))
 
 
 def test_a_plate_bends_no_plane() -> None:

@@ -33,7 +33,7 @@ from ..mesh.fusion import BRICK, NEAR, TRUNCATION, WIDER, fuse_maps, grid_of, is
 from ..mesh.painted import training_photos
 from ..mesh.photometric import Pictures, pictures_of, without_unknown
 from ..mesh.region import Region, region_around
-from ..mesh.surface import Surface, to_world, vertex_normals
+from ..mesh.surface import Surface, to_world, vertex_normals, with_faces
 from ..mesh.triangles import compact
 from ..mesh.verb import paint
 from ..params import MeshParams
@@ -122,7 +122,9 @@ def make_part(
     step = fitted(points, triangles, without_unknown(pictures), report, free) - points
     vertices = vertices + step / similarity_scale(box_from_common)
     made = _painted(trained, own, scene, store, pictures, vertices, triangles, region, box_from_common, report)
-    part = Part(_inner(to_world(made, np.linalg.inv(box_from_common)), vertices, inside), seams, region.voxel)
+    # At a seam, vertices of neighbours are the same to the bit; those of `made` went to the box and back.
+    exact = replace(to_world(made, np.linalg.inv(box_from_common)), vertices=vertices.astype(np.float32))
+    part = Part(with_faces(exact, inside), seams, region.voxel)
     save_part(run_folder(own, RUN) / PART, part)
     counts = {"vertices": len(part.surface.vertices), "faces": len(part.surface.faces)}
     return {**counts, "maps": len(maps), "of": sum(map(len, heard)), "read": list(read)}
@@ -256,19 +258,6 @@ def _painted(
     params = MeshParams(project=folder, run=RUN)
     classes = paint(trained, built, posed, params, scene.ignore_id, report).classes
     return Surface(points, faces, normals, colors, classes.class_id, classes.face_class)
-
-
-def _inner(surface: Surface, vertices: np.ndarray, inside: np.ndarray) -> Surface:
-    """The triangles (F,) `inside` of a surface, its vertices (V, 3) at their exact place."""
-    used, index = np.unique(surface.faces[inside], return_inverse=True)
-    return Surface(
-        vertices[used].astype(np.float32),
-        index.reshape(-1, 3).astype(np.int32),
-        surface.normals[used],
-        surface.colors[used],
-        surface.class_id[used],
-        surface.face_class[inside],
-    )
 
 
 def _corners(matrix: np.ndarray, box: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

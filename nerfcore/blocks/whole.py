@@ -10,10 +10,12 @@ import numpy as np
 
 from ..data.load import load_scene
 from ..data.scene import Scene
+from ..errors import TrainingError
 from ..files import atomic_path, staged
-from ..geometry.similarity import similarity_scale
+from ..geometry.similarity import similarity_scale, transform_points
 from ..images.encode import write_picture
 from ..kernels.closest import ClosestPoints
+from ..mesh.build import not_refuted
 from ..mesh.features import features_of
 from ..mesh.instances import GAP, find_instances, write_instances
 from ..mesh.lods import level_files, make_levels, write_level
@@ -21,7 +23,7 @@ from ..mesh.painted import training_photos, unwrapped
 from ..mesh.parts import texture_of
 from ..mesh.photo_texture import photo_texture, prepare
 from ..mesh.stored import MESH, TEXTURE
-from ..mesh.surface import Surface, class_table, to_world
+from ..mesh.surface import Surface, class_table, to_world, with_faces
 from ..mesh.turntable import write_turntable
 from ..params import BlocksParams
 from ..progress import Reporter
@@ -54,6 +56,10 @@ def write_whole(folder: Path, plan: Plan, params: BlocksParams, report: Reporter
     parts = [load_part(folder, block) for block in plan.blocks]
     common = joined(parts)
     scene, voxel = load_scene(folder, params.holdout), parts[0].voxel * similarity_scale(plan.world_from_common)
+    kept = not_refuted(transform_points(plan.world_from_common, common.vertices), common.faces, scene, report)
+    if not kept.any():
+        raise TrainingError("The masks leave out all of the surface.", "Check the masks of the project.")
+    common = with_faces(common, kept)
     surface = to_world(common, plan.world_from_common)
     names = {scene.ignore_id: "void"} | {c.id: c.name for c in scene.classes}
     numbers, instances = find_instances(

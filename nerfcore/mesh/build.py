@@ -83,11 +83,7 @@ def build(trained: Trained, project: Project, scene: Scene, params: MeshParams, 
     else:
         gaps = params.close_gaps / 100 * region.size
         vertices, faces, guessed = open_surface(bricks, maps, tolerance, region, params.faces, gaps, report, pictures)
-        world, photos = transform_points(box.world_from_box, vertices), [scene.views[i] for i in scene.train]
-        kept = ~denied(world, faces, photos, report)
-        if scene.mask_mode == "empty":
-            kept[kept] = ~left_out(world, faces[kept], photos, report)
-            kept[kept] = not_scraps(vertices, faces[kept])
+        kept = not_refuted(transform_points(box.world_from_box, vertices), faces, scene, report)
         vertices, faces = compact(vertices, faces[kept])
         unseen = guessed[kept] if gaps else None
     if not len(faces):
@@ -101,6 +97,17 @@ def build(trained: Trained, project: Project, scene: Scene, params: MeshParams, 
     if params.watertight:
         unseen = unseen_faces(vertices, faces, maps, tolerance, report)
     return Built(vertices, faces, normals, colors, region, coarse, unseen)
+
+
+def not_refuted(vertices: np.ndarray, faces: np.ndarray, scene: Scene, report: Reporter) -> np.ndarray:
+    """Which triangles (F,) bool stay, of a surface with vertices (V, 3) in the world: not parts on which photos disagree, nor
+    what masks leave out. Raises InputError: a photo or a mask cannot be read."""
+    photos = [scene.views[i] for i in scene.train]
+    kept = ~denied(vertices, faces, photos, report)
+    if scene.mask_mode == "empty":
+        kept[kept] = ~left_out(vertices, faces[kept], photos, report)
+        kept[kept] = not_scraps(vertices, faces[kept])
+    return kept
 
 
 def no_surface(params: MeshParams) -> TrainingError:

@@ -46,6 +46,20 @@ def to_world(surface: Surface, world_from_box: np.ndarray) -> Surface:
     )
 
 
+def with_faces(surface: Surface, kept: np.ndarray) -> Surface:
+    """The triangles (F,) `kept` of a surface, without vertices that none of them has."""
+    used, index = np.unique(surface.faces[kept], return_inverse=True)
+    return Surface(
+        surface.vertices[used],
+        index.reshape(-1, 3).astype(np.int32),
+        surface.normals[used],
+        surface.colors[used],
+        surface.class_id[used],
+        surface.face_class[kept],
+        None if surface.face_instance is None else surface.face_instance[kept],
+    )
+
+
 def class_table(surface: Surface, names: dict[int, str]) -> dict[str, dict[str, float]]:
     """Number of faces and area (world units², to six digits, as a small thing has little of it) of each class on the surface;
     void and a class that is called so are one."""

@@ -35,7 +35,7 @@ from fieldwork.nerfcore.mesh.extract import extract
 from fieldwork.nerfcore.mesh.fusion import fuse_maps, tolerances
 from fieldwork.nerfcore.mesh.instances import GAP, find_instances
 from fieldwork.nerfcore.mesh.region import all_hits
-from fieldwork.nerfcore.mesh.surface import Surface, is_watertight, vertex_normals
+from fieldwork.nerfcore.mesh.surface import Surface, is_watertight, vertex_normals, with_faces
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.schema import Frame, ImageRecord, PosedImage, Poses, Project, SemanticClass
 from fieldwork.nerfcore.project.store import load_points, load_project, load_visibility, save_poses, save_project
@@ -320,6 +320,17 @@ def test_a_block_is_a_project_of_its_own(tmp_path: Path) -> None:
     (tmp_path / "blocks/plan.json").write_text("{}")
     with pytest.raises(ProjectError, match="damaged"):
         load_plan(tmp_path)
+
+
+def test_a_surface_keeps_what_its_triangles_have() -> None:
+    vertices = np.arange(15.0).reshape(5, 3) / 10
+    surface = replace(classed(vertices, np.array([[0, 1, 2], [1, 2, 4], [2, 3, 4]])), face_instance=np.array([5, 6, 7]))
+    kept = with_faces(surface, np.array([False, True, False]))
+    for name in ("vertices", "normals", "colors", "class_id"):
+        np.testing.assert_array_equal(getattr(kept, name), getattr(surface, name)[[1, 2, 4]])
+    np.testing.assert_array_equal(kept.faces, [[0, 1, 2]])
+    assert (kept.face_class[0], kept.face_instance) == (surface.face_class[1], [6])
+    assert with_faces(replace(surface, face_instance=None), np.ones(3, bool)).face_instance is None
 
 
 def test_a_part_that_is_missing_or_damaged_is_told(tmp_path: Path) -> None:

@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 import torch
 from fieldwork.nerfcore.blender.blend import blend
+from fieldwork.nerfcore.blocks import whole
 from fieldwork.nerfcore.blocks.join import joined, open_at_seams
 from fieldwork.nerfcore.blocks.maps import joined_maps, load_maps
 from fieldwork.nerfcore.blocks.plan import MAPS, SIGHTS, Plan, block_folder, cut
 from fieldwork.nerfcore.blocks.sights import load_sights
 from fieldwork.nerfcore.blocks.surface import Part, load_part, shared_region
 from fieldwork.nerfcore.data.load import load_scene
-from fieldwork.nerfcore.errors import SettingError
+from fieldwork.nerfcore.errors import SettingError, TrainingError
 from fieldwork.nerfcore.mesh.clean import shown
 from fieldwork.nerfcore.mesh.extract import extract
 from fieldwork.nerfcore.mesh.fusion import fuse_maps
@@ -86,10 +87,10 @@ def test_two_trained_blocks_make_the_surface_of_their_maps_in_one_piece(made: tu
     # The parts, each computed by itself, are the surface of all maps in one piece: the same triangles, the same holes.
     plan = cut(load_scene(project, 0), 2)
     parts = [load_part(project, block) for block in plan.blocks]
-    whole = in_one_piece(project, plan)
-    assert len(joined(parts).faces) == len(whole.faces)
-    assert len(border_edges(joined(parts).faces)) == len(border_edges(whole.faces))
-    assert result["open_at_seams"] == open_at_seams(whole, parts)
+    one = in_one_piece(project, plan)
+    assert len(joined(parts).faces) == len(one.faces)
+    assert len(border_edges(joined(parts).faces)) == len(border_edges(one.faces))
+    assert result["open_at_seams"] == open_at_seams(one, parts)
     names = [instance.name for instance in read_instances(project / "exports/blocks")]
     assert {name.split(".")[0] for name in names} <= {"top", "bottom"}
     assert (project / "whole.glb").stat().st_size > 1000
@@ -139,6 +140,23 @@ def test_the_whole_has_a_texture_levels_of_detail_and_opens_in_blender(
     pytest.importorskip("bpy", reason="there is no Blender to open it in")
     file = blend(BlendParams(project=project, out=project / "whole.blend", run="blocks"), Reporter())
     assert (file["mesh"], file["cameras"]) == (found["faces"], 14)
+
+
+@pytest.mark.slow
+def test_what_photos_and_masks_refute_is_left_out_of_the_whole(
+    made: tuple[Path, dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    project = Path(shutil.copytree(made[0], tmp_path / "ball"))
+    monkeypatch.setattr(whole, "not_refuted", lambda vertices, faces, *_: vertices[faces].mean(1)[:, 2] > 0)
+    result = blocks(asked(project), Reporter())
+    surface, _ = load_surface(project, "blocks")
+    assert 0.3 < result["faces"] / made[1]["faces"] < 0.7
+    assert (surface.vertices[surface.faces].mean(1)[:, 2] > -1e-4).all(), "asked about in the world"
+    assert set(np.unique(surface.faces)) == set(range(len(surface.vertices)))
+    monkeypatch.setattr(whole, "not_refuted", lambda vertices, faces, *_: np.zeros(len(faces), bool))
+    with pytest.raises(TrainingError, match="masks leave out all"):
+        blocks(asked(project), Reporter())
+    assert len(load_surface(project, "blocks")[0].faces) == result["faces"], "what was there stays"
 
 
 @pytest.mark.slow

@@ -117,12 +117,14 @@ def measure(params: MeasureParams, report: Reporter) -> dict[str, Any]:
         "scale": {"u_percent": round(100 * scale.u, 4), "source": scale.source, "factor": round(scale.factor, 6)},
         "whole": {"name": WHOLE, **entries(measured.area, measured.volume, of_whole)},
         "classes": [
-            {"id": c, "name": name, **entries(*sizes)}
-            for (c, name), *sizes in zip(known.items(), measured.areas, measured.volumes, of_classes)
+            {"id": c, "name": name, **entries(area, volume, guess)}
+            for (c, name), area, volume, guess in zip(known.items(), measured.areas, measured.volumes, of_classes)
         ],
         "instances": [
-            {"id": i.id, "name": i.name, "class_id": i.class_id, **entries(*sizes)}
-            for i, *sizes in zip(instances, measured.instance_areas, measured.instance_volumes, of_instances)
+            {"id": i.id, "name": i.name, "class_id": i.class_id, **entries(area, volume, guess)}
+            for i, area, volume, guess in zip(
+                instances, measured.instance_areas, measured.instance_volumes, of_instances
+            )
         ],
         "distances": [distance_entry(d, scale, voxel) for d in distances],
         "label_revision": made.get("label_revision"),

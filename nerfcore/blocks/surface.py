@@ -13,10 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from ..data.load import load_scene
 from ..data.pixels import PixelStore
-from ..data.scene import Scene
+from ..data.scene import Scene, View
 from ..errors import ProjectError, TrainingError
 from ..files import UNREADABLE_ARRAYS, atomic_path
 from ..geometry.similarity import similarity_scale, transform_points
@@ -27,7 +28,7 @@ from ..mesh.build import Built, agreed_maps, fitted, read_photos, vertex_colors
 from ..mesh.clean import shown
 from ..mesh.decimate import decimate_patches
 from ..mesh.denoise import denoised
-from ..mesh.depth_maps import MOST_VIEWS, flat_views, map_size, spread_views
+from ..mesh.depth_maps import MOST_VIEWS, FlatView, flat_views, map_size, spread_views
 from ..mesh.extract import extract
 from ..mesh.fusion import BRICK, NEAR, TRUNCATION, WIDER, fuse_maps, grid_of, is_soft, tolerances
 from ..mesh.painted import training_photos
@@ -115,7 +116,7 @@ def make_part(
     box = trained.info.box(project)
     box_from_common = box.box_from_world @ plan.world_from_common
     views = spread_views([scene.views[i] for i in scene.train], MOST_VIEWS)
-    flats = flat_views(views, box.box_from_world, map_size(views, trained.device))
+    flats = pictures_shown(read[block.name], views, box.box_from_world, block.name)
     store = read_photos(trained, scene, views, box, report)
     pictures = pictures_of(flats, store, moved(read[block.name], box_from_common), report)
     points = transform_points(box_from_common, vertices)
@@ -128,6 +129,19 @@ def make_part(
     save_part(run_folder(own, RUN) / PART, part)
     counts = {"vertices": len(part.surface.vertices), "faces": len(part.surface.faces)}
     return {**counts, "maps": len(maps), "of": sum(map(len, heard)), "read": list(read)}
+
+
+def pictures_shown(maps: MapArrays, views: Sequence[View], box_from_world: np.ndarray, name: str) -> list[FlatView]:
+    """The pictures that a block's depth maps are of: a GPU makes larger ones than a CPU, and blocks of a cluster are not
+    meshed where their maps were made. Raises ProjectError: the maps are not of these photos."""
+    for kind in ("cpu", "cuda"):
+        flats = flat_views(list(views), box_from_world, map_size(list(views), torch.device(kind)))
+        if [[flat.camera.width, flat.camera.height] for flat in flats] == maps.size.tolist():
+            return flats
+    raise ProjectError(
+        f"The depth maps of block {name} are not of the size of its photos.",
+        f"Remove its file {MAPS} and run `fieldwork blocks` again.",
+    )
 
 
 def away_from(seams: np.ndarray, vertices: np.ndarray, distance: float) -> np.ndarray:

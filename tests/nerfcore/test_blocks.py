@@ -20,6 +20,7 @@ from fieldwork.nerfcore.blocks.surface import (
     limit_of,
     load_part,
     part_box,
+    pictures_shown,
     save_part,
     shared_region,
 )
@@ -247,6 +248,22 @@ def walk(photos: int = 12, points: bool = True) -> Scene:
     seen = Points(wall, np.zeros((len(wall), 3), np.uint8), np.ones(len(wall))) if points else Points.empty()
     bounds = None if points else np.array([[-6.0, -0.5, 0], [6, 0.5, 2]])
     return Scene(views, list(range(photos)), [], points=seen, bounds=bounds)
+
+
+def test_a_block_s_pictures_are_those_of_its_maps_whatever_made_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    views = walk(4).views
+    monkeypatch.setattr(depth_maps, "CPU_PIXELS", 4 * 72 * 48)
+    monkeypatch.setattr(depth_maps, "SIDE", 120)
+    big = [replace(view, camera=CAMERA.resized(120, 80)) for view in views]
+    for kind, side in (("cuda", 120), ("cpu", 72)):
+        assert depth_maps.map_size(big, torch.device(kind)) == side
+        flats = depth_maps.flat_views(big, np.eye(4), depth_maps.map_size(big, torch.device(kind)))
+        empty = [np.zeros((f.camera.height, f.camera.width), np.float32) for f in flats]
+        maps = depth_maps.map_arrays(flats, [depth_maps.DepthMap(e, e, e) for e in empty], CPU)
+        found = pictures_shown(maps, big, np.eye(4), "1")
+        assert [f.camera for f in found] == [f.camera for f in flats]
+    with pytest.raises(ProjectError, match="block 7 are not of the size"):
+        pictures_shown(maps, big[:3], np.eye(4), "7")
 
 
 @pytest.mark.parametrize("points", [True, False])

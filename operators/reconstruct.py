@@ -40,6 +40,7 @@ def need_source(context: Context) -> str | None:
     photos="photos", labels="labels", masks="masks", classes="class_file", mask_mode="mask_mode",
     keep_backdrop="keep_backdrop", keep_exposure="keep_exposure", preset="preset",
     time_limit="time_limit", settings="settings", faces="faces", texture="texture",
+    watertight="watertight", close_gaps="close_gaps",
 )  # fmt: skip
 class FIELDWORK_OT_reconstruct(VerbOperator):
     """Take photos all the way to a labeled mesh: read, estimate poses, train, extract the mesh, write a .blend"""
@@ -98,6 +99,8 @@ class FIELDWORK_OT_reconstruct(VerbOperator):
             "set": parse_settings(self.value(context, "settings")),
             "faces": self.value(context, "faces"),
             "texture": self.value(context, "texture"),
+            "watertight": self.value(context, "watertight"),
+            "close_gaps": self.value(context, "close_gaps"),
             "blend": absolute(self.blend),
             "report": absolute(self.report_file),
             "renders": absolute(self.renders),

@@ -256,6 +256,27 @@ answer({"seen": seen, "reasons": reasons})
     assert facts["reasons"]["all photos"] is None
 
 
+def test_a_reconstruction_closes_its_mesh_as_the_mesh_panel_says(bpy_script, tmp_path):
+    seen = bpy_script(
+        SETUP
+        + """
+from fieldwork.addon.jobs.queue import queue
+seen = []
+queue.run = lambda job: seen.append([job.params["close_gaps"], job.params["watertight"]])
+settings.project = folder
+bpy.ops.fieldwork.reconstruct(photos=folder)
+settings.close_gaps = 5
+bpy.ops.fieldwork.reconstruct(photos=folder)
+bpy.ops.fieldwork.reconstruct(photos=folder, close_gaps=2, watertight=True)
+settings.watertight = True
+bpy.ops.fieldwork.reconstruct(photos=folder)
+answer(seen)
+""",
+        folder=tmp_path,
+    )
+    assert seen == [[0, False], [5, False], [2, True], [5, True]]
+
+
 def test_a_training_that_is_to_take_the_place_of_another_can_be_resumed(tmp_path):
     from fieldwork.addon.project import runs
 

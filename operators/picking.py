@@ -126,7 +126,7 @@ def spot_text(spot: "Spot") -> str:
     """One line of what is known of a place."""
     name = f"{spot.class_name}, {spot.instance}" if spot.instance else spot.class_name
     if spot.guessed:
-        return t("{}: {:.0%} sure, a guess where photos do not agree", name, spot.confidence)
+        return t("{}: {:.0%} sure, its surface a guess", name, spot.confidence)
     return t("{}: {:.0%} sure, shown by {} photos", name, spot.confidence, len(spot.photos))
 
 

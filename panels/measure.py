@@ -12,6 +12,7 @@ from .base import StepPanel, columns, open_folder
 from .states import project_folder
 
 MOST_ROWS = 12  # of what was measured
+LEAST_GUESS = 5e-4  # share of an area that is told
 
 
 class FIELDWORK_PT_measure(StepPanel):
@@ -73,9 +74,9 @@ def measured_rows(measures: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def guess_text(row: dict[str, Any]) -> str:
-    """What of an area is a guess; empty where nothing is, and of measures of earlier versions."""
-    guessed = row.get("area_guessed", 0.0)
-    return t("{:.0%} a guess", guessed / row["area"]) if guessed else ""
+    """What of an area is a guess; empty where next to nothing is, and of measures of earlier versions."""
+    share = row.get("area_guessed", 0.0) / max(row["area"], 1e-30)
+    return t("{:.1%} a guess", share) if share >= LEAST_GUESS else ""
 
 
 def amount_text(row: dict[str, Any], name: str, unit: str) -> str:

@@ -116,7 +116,7 @@ def make_part(
     box = trained.info.box(project)
     box_from_common = box.box_from_world @ plan.world_from_common
     views = spread_views([scene.views[i] for i in scene.train], MOST_VIEWS)
-    flats = pictures_shown(read[block.name], views, box.box_from_world, block.name)
+    flats = pictures_shown(read[block.name], views, box.box_from_world, run_folder(own, RUN) / MAPS)
     store = read_photos(trained, scene, views, box, report)
     pictures = pictures_of(flats, store, moved(read[block.name], box_from_common), report)
     points = transform_points(box_from_common, vertices)
@@ -131,16 +131,15 @@ def make_part(
     return {**counts, "maps": len(maps), "of": sum(map(len, heard)), "read": list(read)}
 
 
-def pictures_shown(maps: MapArrays, views: Sequence[View], box_from_world: np.ndarray, name: str) -> list[FlatView]:
-    """The pictures that a block's depth maps are of: a GPU makes larger ones than a CPU, and blocks of a cluster are not
+def pictures_shown(maps: MapArrays, views: list[View], box_from_world: np.ndarray, path: Path) -> list[FlatView]:
+    """The pictures that a block's depth maps, read from `path`, are of: a GPU makes larger ones than a CPU, and blocks of a cluster are not
     meshed where their maps were made. Raises ProjectError: the maps are not of these photos."""
     for kind in ("cpu", "cuda"):
-        flats = flat_views(list(views), box_from_world, map_size(list(views), torch.device(kind)))
+        flats = flat_views(views, box_from_world, map_size(views, torch.device(kind)))
         if [[flat.camera.width, flat.camera.height] for flat in flats] == maps.size.tolist():
             return flats
     raise ProjectError(
-        f"The depth maps of block {name} are not of the size of its photos.",
-        f"Remove its file {MAPS} and run `fieldwork blocks` again.",
+        f"{path} holds depth maps of another size than the photos have.", "Remove it and run `fieldwork blocks` again."
     )
 
 

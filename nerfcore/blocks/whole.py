@@ -55,6 +55,7 @@ def write_whole(folder: Path, plan: Plan, params: BlocksParams, report: Reporter
     report.stage("Joining the blocks")
     parts = [load_part(folder, block) for block in plan.blocks]
     common = joined(parts)
+    open_edges = open_at_seams(common, parts)
     scene, voxel = load_scene(folder, params.holdout), parts[0].voxel * similarity_scale(plan.world_from_common)
     kept = not_refuted(transform_points(plan.world_from_common, common.vertices), common.faces, scene, report)
     if not kept.any():
@@ -98,7 +99,7 @@ def write_whole(folder: Path, plan: Plan, params: BlocksParams, report: Reporter
         "blocks": [_row(folder, plan, number, len(part.surface.faces)) for number, part in enumerate(parts)],
         "vertices": len(surface.vertices),
         "faces": len(surface.faces),
-        "open_at_seams": open_at_seams(common, parts),
+        "open_at_seams": open_edges,
         "voxel": voxel,
         "classes": class_table(surface, names),
         "instances": len(instances),

@@ -159,7 +159,7 @@ def amounts(
     """Areas and volumes of a surface, of its classes and of its instances.
 
     Args:
-        pieces: of the surface; coarse: the surface (vertices, faces) at cells of twice the size. votes: for `class_ids`. guessed (F,) bool: triangles that no photo shows. u_scale: relative uncertainty of lengths.
+        pieces: of the surface; coarse: the surface (vertices, faces) at cells of twice the size. votes: for `class_ids`. guessed (F,) bool: triangles that are a guess; None: none is. u_scale: relative uncertainty of lengths.
             most_capped: share of a closed part's area that caps may have.
     """
     of_class = index_of(class_ids)[np.minimum(surface.face_class, max(class_ids, default=0) + 1)]

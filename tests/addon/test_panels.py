@@ -301,7 +301,9 @@ def test_the_whole_surface_is_said_before_the_classes():
     measures = {"unit": "scene units", "classes": [{"name": "Gold", **half}]}
     assert measured_rows(measures) == [("Gold", "1.238 ± 0.030")]
     measures = {"unit": "scene units", "classes": [{"name": "Gold", **half, "area_guessed": half["area"] / 4}]}
-    assert measured_rows(measures) == [("Gold", "1.238 ± 0.030   25% a guess")]
+    assert measured_rows(measures) == [("Gold", "1.238 ± 0.030   25.0% a guess")]
+    measures["classes"][0]["area_guessed"] = 1e-4
+    assert measured_rows(measures) == [("Gold", "1.238 ± 0.030")]
 
 
 def test_headers_say_the_state_of_each_step(bpy_script, tmp_path):

@@ -88,7 +88,7 @@ def test_a_place_says_what_it_is_and_which_photos_show_it(bpy_script, tmp_path, 
     assert gold["sharpness"] == pytest.approx([40 / 1.5, 40 / 4], rel=1e-4)
     assert gold["text"] == "gold, gold.001: 75% sure, shown by 2 photos"
     assert facts["stone"]["class"] == [1, "stone"]
-    assert facts["stone"]["text"] == "stone: 75% sure, a guess where photos do not agree"
+    assert facts["stone"]["text"] == "stone: 75% sure, its surface a guess"
     assert facts["stone"]["instance"] == ""
     assert facts["behind"]["photos"] == ["below"]
     assert facts["beside"] is None

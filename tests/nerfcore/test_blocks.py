@@ -260,10 +260,10 @@ def test_a_block_s_pictures_are_those_of_its_maps_whatever_made_them(monkeypatch
         flats = depth_maps.flat_views(big, np.eye(4), depth_maps.map_size(big, torch.device(kind)))
         empty = [np.zeros((f.camera.height, f.camera.width), np.float32) for f in flats]
         maps = depth_maps.map_arrays(flats, [depth_maps.DepthMap(e, e, e) for e in empty], CPU)
-        found = pictures_shown(maps, big, np.eye(4), "1")
+        found = pictures_shown(maps, big, np.eye(4), Path("maps.npz"))
         assert [f.camera for f in found] == [f.camera for f in flats]
-    with pytest.raises(ProjectError, match="block 7 are not of the size"):
-        pictures_shown(maps, big[:3], np.eye(4), "7")
+    with pytest.raises(ProjectError, match=r"maps\.npz holds depth maps of another size"):
+        pictures_shown(maps, big[:3], np.eye(4), Path("7/maps.npz"))
 
 
 @pytest.mark.parametrize("points", [True, False])

@@ -11,61 +11,69 @@ import torch
 import warp as wp
 
 from .depth_arrays import MapArrays
-from .patch_sums import Patch, Window, patch_sums, patch_sums_host
-from .projection import FARTHEST, NEAREST, Maps, map_struct, pixel_ray, project
+from .patch_sums import Patch, Window, corner, patch_sums, patch_sums_host
+from .projection import FARTHEST, NEAREST, Maps, map_struct, pixel_ray
 from .runtime import array, init, launch
 
+BESIDE = wp.constant(2.0)  # pixels from one value of a patch to the next
+SETTLED = wp.constant(0.9)  # correlation of a depth better than those beside it, from which farther ones are not tried
 REACH = wp.constant(4)  # a patch has 5 × 5 pixels, two apart: it reaches four pixels from its middle
 FLAT = wp.constant(2.0e-5)  # variance of grey values in [0, 1] below which a patch shows nothing
+EVEN = wp.constant(1.0e-6)  # variance up to which a window of another view says nothing
 STEEPEST = wp.constant(1.0e-2)  # of the normal along the ray: a surface seen more along is not compared
 WIDEST = wp.constant(24.0)  # pixels a patch may reach in another view
-MIDDLE = wp.constant(6)  # of 13 depths, every second of which is tried, and both beside the best of these
+MIDDLE = wp.constant(6)  # of 13 depths
 UNSEEN = wp.constant(-2.0)  # correlation with a view that does not show the patch
 
 _tries = wp.types.vector(length=13, dtype=float)
+_seven = wp.types.vector(length=7, dtype=float)
+_best = wp.types.matrix(shape=(7, 3), dtype=float)
 
 
 @wp.struct
 class RefineParams:
-    """See `refine`; host: 1 where the CPU's compiler sums up patches."""
+    """See `refine`. turn and shift lead from the view's camera axes to pixels of its neighbours, in homogeneous coordinates.
+    host: 1 where the CPU's compiler sums up patches."""
 
     view: int
     neighbours: wp.array(dtype=int)
+    turn: wp.array(dtype=wp.mat33)
+    shift: wp.array(dtype=wp.vec3)
     least: float
     gain: float
     host: int
 
 
 @wp.struct
-class Pixel:
-    """A pixel with the normal of its surface, in camera axes; along: of the normal on the ray, negative towards the
-    camera."""
+class Spot:
+    """Where a pixel's ray meets a plane at depth 1, and how this place moves with the pixel: from one value of its patch to
+    the next one right and below. In camera axes, or as homogeneous pixel coordinates of another view."""
 
-    x: float
-    y: float
-    lens: wp.vec4
-    normal: wp.vec3
-    along: float
+    place: wp.vec3
+    right: wp.vec3
+    below: wp.vec3
 
 
 @wp.struct
 class Other:
-    """Another view: its lens, and how points get there from the axes of the first one."""
+    """Another view: a pixel's spot in it, where it has depth z, is `spot.place` times z, and the shift."""
 
-    view: int
-    lens: wp.vec4
-    turn: wp.mat33
+    first: int
+    width: int
+    height: int
+    spot: Spot
     shift: wp.vec3
 
 
 @wp.func
-def read_patch(grey: wp.array(dtype=float), maps: Maps, view: int, column: int, row: int):
+def read_patch(quads: wp.array(dtype=wp.uint64), maps: Maps, view: int, column: int, row: int):
     """The patch around a pixel of a view."""
     patch = Patch()
     mean = float(0.0)
     square = float(0.0)
     for k in range(25):
-        g = grey[maps.first[view] + (row + (k / 5 - 2) * 2) * maps.size[view, 0] + column + (k % 5 - 2) * 2]
+        place = (row + (k / 5 - 2) * 2) * maps.size[view, 0] + column + (k % 5 - 2) * 2
+        g = corner(quads[maps.first[view] + place], 0)
         patch.values[k] = g
         mean += g
         square += g * g
@@ -76,36 +84,41 @@ def read_patch(grey: wp.array(dtype=float), maps: Maps, view: int, column: int, 
 
 
 @wp.func
-def other_view(maps: Maps, view: int, v: int):
+def spot_of(lens: wp.vec4, x: float, y: float, normal: wp.vec3):
+    """A pixel's spot on the plane with this normal, and the normal's part along the ray."""
+    r = pixel_ray(lens, x, y)
+    along = wp.dot(normal, r)
+    spot = Spot()
+    spot.place = r
+    spot.right = wp.vec3(BESIDE / lens[0], 0.0, 0.0) - r * (BESIDE / lens[0] * normal[0] / along)
+    spot.below = wp.vec3(0.0, BESIDE / lens[1], 0.0) - r * (BESIDE / lens[1] * normal[1] / along)
+    return spot, along
+
+
+@wp.func
+def other_view(maps: Maps, params: RefineParams, m: int, spot: Spot):
+    view = params.neighbours[m]
     other = Other()
-    other.view = v
-    other.lens = maps.lens[v]
-    other.turn = maps.rotation[v] * wp.transpose(maps.rotation[view])
-    other.shift = maps.translation[v] - other.turn * maps.translation[view]
+    other.first = maps.first[view]
+    other.width = maps.size[view, 0]
+    other.height = maps.size[view, 1]
+    other.spot.place = params.turn[m] * spot.place
+    other.spot.right = params.turn[m] * spot.right
+    other.spot.below = params.turn[m] * spot.below
+    other.shift = params.shift[m]
     return other
 
 
 @wp.func
-def flow(pixel: Pixel, other: Other, right: float, down: float, z: float):
-    """Where what lies `right` and `down` of a pixel appears in another view, on the plane through the pixel at depth z;
-    the third number is its depth there."""
-    r = pixel_ray(pixel.lens, pixel.x + right, pixel.y + down)
-    q = other.turn * (r * (z * pixel.along / wp.min(wp.dot(pixel.normal, r), -1e-3))) + other.shift
-    place = project(other.lens, wp.vec3(q[0], q[1], wp.max(q[2], 1e-6)))
-    return wp.vec3(place[0], place[1], q[2])
-
-
-@wp.func
-def pixels_per_depth(maps: Maps, params: RefineParams, pixel: Pixel, z: float):
-    """How many pixels a step in depth moves the point in other views, in the mean; 0 where that is not known."""
+def pixels_per_depth(params: RefineParams, place: wp.vec3, z: float):
+    """How many pixels a step in depth moves the place of a spot in other views, in the mean; 0 where that is not known."""
     rate = float(0.0)
     valid = float(0.0)
     for m in range(params.neighbours.shape[0]):
-        other = other_view(maps, params.view, params.neighbours[m])
-        a = flow(pixel, other, 0.0, 0.0, z)
-        b = flow(pixel, other, 0.0, 0.0, z * 1.01)
-        if a[2] > NEAREST:
-            rate += wp.sqrt((a[0] - b[0]) * (a[0] - b[0]) + (a[1] - b[1]) * (a[1] - b[1])) / (0.01 * z)
+        way = params.turn[m] * place
+        q = way * z + params.shift[m]
+        if q[2] > NEAREST:
+            rate += wp.length(wp.vec2(way[0] * q[2] - way[2] * q[0], way[1] * q[2] - way[2] * q[1])) / (q[2] * q[2])
             valid += 1.0
     mean = float(0.0)
     if valid >= 1.0 and rate >= 1e-6:
@@ -114,75 +127,38 @@ def pixels_per_depth(maps: Maps, params: RefineParams, pixel: Pixel, z: float):
 
 
 @wp.func
-def correlation(grey: wp.array(dtype=float), maps: Maps, patch: Patch, pixel: Pixel, other: Other, z: float, host: int):
-    """Normalised cross-correlation of a patch with another view, were the pixel's depth z; `UNSEEN` where the patch
-    leaves the picture or is stretched too far."""
-    middle = flow(pixel, other, 0.0, 0.0, z)
-    right = flow(pixel, other, 4.0, 0.0, z)
-    below = flow(pixel, other, 0.0, 4.0, z)
-    ax = (right[0] - middle[0]) * 0.5
-    ay = (right[1] - middle[1]) * 0.5
-    bx = (below[0] - middle[0]) * 0.5
-    by = (below[1] - middle[1]) * 0.5
-    reach_x = 2.0 * (wp.abs(ax) + wp.abs(bx)) + 1.0
-    reach_y = 2.0 * (wp.abs(ay) + wp.abs(by)) + 1.0
-    width = maps.size[other.view, 0]
-    height = maps.size[other.view, 1]
-    inside = middle[2] > NEAREST and middle[0] > reach_x and middle[1] > reach_y
-    inside = inside and middle[0] < float(width) - reach_x and middle[1] < float(height) - reach_y
-    result = float(UNSEEN)
-    if inside and reach_x < WIDEST and reach_y < WIDEST:
-        w = Window()
-        w.first = maps.first[other.view]
-        w.width = width
-        w.x = middle[0] - 0.5
-        w.y = middle[1] - 0.5
-        w.ax = ax
-        w.ay = ay
-        w.bx = bx
-        w.by = by
-        sums = wp.vec3()
-        if host == 1:
-            sums = patch_sums_host(grey, w, patch)
-        else:
-            sums = patch_sums(grey, w, patch)
-        mean = sums[0] / 25.0
-        variance = sums[1] / 25.0 - mean * mean
-        result = (sums[2] / 25.0 - mean * patch.mean) / wp.sqrt(wp.max(variance * patch.variance, 1e-14))
-    return result
+def window_at(other: Other, z: float):
+    """Where a patch lies in another view, were the pixel's depth z, and whether it does: not where it leaves the picture
+    or is stretched too far."""
+    q = other.spot.place * z + other.shift
+    nearness = 1.0 / wp.max(q[2], 1e-6)
+    x = q[0] * nearness
+    y = q[1] * nearness
+    w = Window()
+    w.first = other.first
+    w.width = other.width
+    w.x = x - 0.5
+    w.y = y - 0.5
+    w.ax = (other.spot.right[0] - x * other.spot.right[2]) * z * nearness
+    w.ay = (other.spot.right[1] - y * other.spot.right[2]) * z * nearness
+    w.bx = (other.spot.below[0] - x * other.spot.below[2]) * z * nearness
+    w.by = (other.spot.below[1] - y * other.spot.below[2]) * z * nearness
+    reach_x = 2.0 * (wp.abs(w.ax) + wp.abs(w.bx)) + 1.0
+    reach_y = 2.0 * (wp.abs(w.ay) + wp.abs(w.by)) + 1.0
+    inside = z > NEAREST and q[2] > NEAREST and x > reach_x and y > reach_y
+    inside = inside and x < float(other.width) - reach_x and y < float(other.height) - reach_y
+    return w, inside and reach_x < WIDEST and reach_y < WIDEST
 
 
 @wp.func
-def photo_agreement(
-    grey: wp.array(dtype=float), maps: Maps, params: RefineParams, patch: Patch, pixel: Pixel, z: float
-):
-    """Mean correlation of the three views that agree best, were the pixel's depth z, or of the fewer whose pictures show the
-    place; −1 where none does."""
-    first = float(-1.0)
-    second = float(-1.0)
-    third = float(-1.0)
-    if z > NEAREST:
-        for m in range(params.neighbours.shape[0]):
-            other = other_view(maps, params.view, params.neighbours[m])
-            c = correlation(grey, maps, patch, pixel, other, z, params.host)
-            if c > first:
-                third = second
-                second = first
-                first = c
-            elif c > second:
-                third = second
-                second = c
-            elif c > third:
-                third = c
-    total = first
-    shown = float(1.0)
-    if second > -1.0:
-        total += second
-        shown += 1.0
-    if third > -1.0:
-        total += third
-        shown += 1.0
-    return total / shown
+def correlation(sums: wp.vec3, patch: Patch):
+    """Normalised cross-correlation of a patch and the window that has these sums, see `patch_sums`."""
+    mean = sums[0] / 25.0
+    variance = sums[1] / 25.0 - mean * mean
+    agreed = float(0.0)
+    if variance > EVEN:  # below it this is rounding
+        agreed = (sums[2] / 25.0 - mean * patch.mean) / wp.sqrt(variance * patch.variance)
+    return agreed
 
 
 @wp.func
@@ -205,9 +181,53 @@ def best_try(tries: _tries, least: float, gain: float):
     return best, peak
 
 
+@wp.func
+def photo_agreement(
+    quads: wp.array(dtype=wp.uint64), maps: Maps, params: RefineParams, patch: Patch, spot: Spot,
+    z: float, step: float, count: int,
+):  # fmt: skip
+    """Mean correlation of the three views that agree best, or of the fewer whose pictures show the place, −1 where none
+    does, at `count` depths, at most seven, of which z is the first."""
+    best = _best()
+    for n in range(7):
+        for rank in range(3):
+            best[n, rank] = -1.0
+    for m in range(params.neighbours.shape[0]):
+        other = other_view(maps, params, m, spot)
+        for n in range(count):
+            w, inside = window_at(other, z + float(n) * step)
+            c = float(UNSEEN)
+            if inside:
+                sums = wp.vec3()
+                if params.host == 1:
+                    sums = patch_sums_host(quads, w, patch)
+                else:
+                    sums = patch_sums(quads, w, patch)
+                c = correlation(sums, patch)
+            if c > best[n, 0]:
+                best[n, 2] = best[n, 1]
+                best[n, 1] = best[n, 0]
+                best[n, 0] = c
+            elif c > best[n, 1]:
+                best[n, 2] = best[n, 1]
+                best[n, 1] = c
+            elif c > best[n, 2]:
+                best[n, 2] = c
+    agreement = _seven()
+    for n in range(7):
+        total = best[n, 0]
+        shown = float(1.0)
+        for rank in range(1, 3):
+            if best[n, rank] > -1.0:
+                total += best[n, rank]
+                shown += 1.0
+        agreement[n] = total / shown
+    return agreement
+
+
 @wp.kernel(module="fieldwork_patches")
 def refine_kernel(
-    grey: wp.array(dtype=float),
+    quads: wp.array(dtype=wp.uint64),
     normals: wp.array(dtype=wp.vec3),
     maps: Maps,
     params: RefineParams,
@@ -227,56 +247,82 @@ def refine_kernel(
     border = column < REACH or row < REACH or column >= width - REACH or row >= height - REACH
     if z <= 0.0 or z > FARTHEST or border:
         return
-    patch = read_patch(grey, maps, view, column, row)
+    patch = read_patch(quads, maps, view, column, row)
     if patch.variance < FLAT:
         return
-    pixel = Pixel()
-    pixel.x = float(column) + 0.5
-    pixel.y = float(row) + 0.5
-    pixel.lens = maps.lens[view]
-    pixel.normal = normals[i]
-    pixel.along = wp.dot(pixel.normal, pixel_ray(pixel.lens, pixel.x, pixel.y))
-    if pixel.along > -STEEPEST:
+    spot, along = spot_of(maps.lens[view], float(column) + 0.5, float(row) + 0.5, normals[i])
+    if along > -STEEPEST:
         return
-    rate = pixels_per_depth(maps, params, pixel, z)
+    rate = pixels_per_depth(params, spot.place, z)
     if rate <= 0.0:
         return
     step = wp.clamp(maps.spread[maps.first[view] + i] / 3.0, 0.4 / rate, 1.2 / rate)
     tries = _tries()
     for t in range(13):
         tries[t] = -1.0
-    coarse = int(MIDDLE)
-    for n in range(9):
-        t = 2 * n
-        if n >= 7:
-            t = coarse + 2 * (n - 7) - 1
-        if t >= 0 and t <= 12:
-            tries[t] = photo_agreement(grey, maps, params, patch, pixel, z + float(t - MIDDLE) * step)
-            if n < 7 and tries[t] > tries[coarse]:
-                coarse = t
+    rounds = int(4)  # not a constant: Warp would write the loop out
+    best = int(MIDDLE)
+    for n in range(rounds):
+        first = int(4)
+        count = int(3)
+        if n == 1:
+            first = 0
+            count = 2
+        elif n == 2:
+            first = 10
+            count = 2
+        elif n == 3:
+            first = best - 1
+            count = 2
+        settled = best == MIDDLE and tries[MIDDLE] >= SETTLED
+        if n == 0 or n == 3 or not settled:
+            found = photo_agreement(
+                quads, maps, params, patch, spot, z + float(first - MIDDLE) * step, 2.0 * step, count
+            )
+            for k in range(3):
+                t = first + 2 * k
+                if k < count and t >= 0 and t <= 12:
+                    tries[t] = found[k]
+                    if tries[t] > tries[best]:
+                        best = t
     best, peak = best_try(tries, params.least, params.gain)
     score[i] = tries[best]
     out[i] = z + peak * step
 
 
 def refine(
-    grey: torch.Tensor, normals: torch.Tensor, maps: MapArrays, view: int, neighbours: torch.Tensor,
+    quads: torch.Tensor, normals: torch.Tensor, maps: MapArrays, view: int, neighbours: torch.Tensor,
     least: float, gain: float, host: bool | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor]:  # fmt: skip
     """Depths (H·W,) of one map moved to where its photo agrees best with those of the maps `neighbours` (K,) int32, and
     how well (H·W,) they agree there, −1 where that is not known.
 
-    grey (P,) in [0, 1]: the photos as the maps see them; normals (H·W, 3) in camera axes, towards the camera. Of thirteen
-    depths around each pixel's, about half its spread apart but 0.4 to 1.2 pixels, every second and both beside the best of
-    these are rated by the mean correlation of the three best views. The best one counts if it reaches `least`, exceeds the present one's by `gain` and is not the
-    outermost; a parabola places it between its neighbours. `host`: by the code for CPUs; None: where the maps are on one.
+    quads (P, 4): the photos as the maps see them, see `patch_sums.quads`; normals (H·W, 3) in camera axes, towards the
+    camera. Thirteen depths around each pixel's, about half its spread apart but 0.4 to 1.2 pixels, are rated by the mean
+    correlation of the three best views: the middle one and the second beside it on each side; every second farther away,
+    unless the middle one is the best and reaches `SETTLED`; and both beside the best. The best one counts if it reaches
+    `least`, exceeds the present one's by `gain` and is not the outermost; a parabola places it between its neighbours.
+    `host`: by the code for CPUs; None: where the maps are on one.
     """
     init()
     count = int(maps.size[view].prod())
-    out, score = torch.empty(count, device=grey.device), torch.empty(count, device=grey.device)
+    out, score = torch.empty(count, device=quads.device), torch.empty(count, device=quads.device)
+    lens = maps.lens[neighbours]
+    pixels = torch.zeros(len(lens), 3, 3, device=lens.device)
+    pixels[:, 0, 0], pixels[:, 1, 1], pixels[:, 0, 2], pixels[:, 1, 2], pixels[:, 2, 2] = *lens.T, 1.0
+    turn = pixels @ maps.rotation[neighbours] @ maps.rotation[view].T
+    shift = (pixels @ maps.translation[neighbours, :, None])[..., 0] - turn @ maps.translation[view]
     params = RefineParams()
     params.view, params.neighbours, params.least, params.gain = view, array(neighbours), least, gain
-    params.host = int(grey.device.type == "cpu") if host is None else int(host)
-    inputs = [array(grey), array(normals.contiguous(), wp.vec3), map_struct(maps), params, array(out), array(score)]
-    launch(refine_kernel, count, inputs, grey.device)
+    params.turn, params.shift = array(turn, wp.mat33), array(shift, wp.vec3)
+    params.host = int(quads.device.type == "cpu") if host is None else int(host)
+    inputs = [
+        array(quads.view(torch.int64).reshape(-1), wp.uint64),
+        array(normals.contiguous(), wp.vec3),
+        map_struct(maps),
+        params,
+        array(out),
+        array(score),
+    ]
+    launch(refine_kernel, count, inputs, quads.device)
     return out, score

@@ -227,10 +227,9 @@ def normals(camera: Camera, depth: np.ndarray) -> np.ndarray:
     return depth_normals(torch.from_numpy(depth), lens, max(EDGE, EDGE_PIXELS / camera.fx)).numpy()
 
 
-def smooth_normals(camera: Camera, depth: np.ndarray, size: int) -> np.ndarray:
-    """Normals (H, W, 3) as `normals` gives them, averaged over windows of `size` pixels; 0 where there is none."""
-    found = normals(camera, depth)
-    mean = np.stack([scipy.ndimage.uniform_filter(found[..., k], size) for k in range(3)], -1)
+def averaged(normals: np.ndarray, size: int) -> np.ndarray:
+    """Normals (H, W, 3), averaged over windows of `size` pixels; 0 where there is none."""
+    mean = np.stack([scipy.ndimage.uniform_filter(normals[..., k], size) for k in range(3)], -1)
     length = np.linalg.norm(mean, axis=-1, keepdims=True)
     return np.where(length > 0.1, mean / np.maximum(length, 1e-9), 0).astype(np.float32)
 

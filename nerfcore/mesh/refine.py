@@ -16,18 +16,20 @@ import torch
 from ..data.pixels import VOID, PixelStore
 from ..geometry.cameras import pixel_centers, project, rays
 from ..kernels.depth_arrays import FREE, MapArrays
+from ..kernels.patch_sums import quads
 from ..kernels.patches import refine
 from ..progress import Reporter
 from .completion import moved_as_around
 from .depth_maps import (
     DepthMap,
     FlatView,
+    averaged,
     certain_slopes,
     confirmed_maps,
     cosines,
     map_arrays,
     neighbours,
-    smooth_normals,
+    normals,
 )
 from .planes import with_planes
 from .scene_planes import known_points, on_scene_planes, scene_planes
@@ -99,14 +101,13 @@ def refined_maps(
     arrays = map_arrays(views, maps, device)
     greys = grey_pictures(views, store, report)
     plain = [plain_places(grey) for grey in greys]
-    grey = torch.from_numpy(np.concatenate([g.reshape(-1) for g in greys]))
-    grey = grey.to(arrays.depth.device)
+    photos = torch.cat([quads(torch.from_numpy(grey)) for grey in greys]).to(arrays.depth.device)
     around = neighbours(views, maps)
     moved = []
     for number, (view, map_) in enumerate(zip(views, maps)):
         report.progress(number / len(views))
-        near = torch.tensor(around[number][:VIEWS], dtype=torch.int32, device=grey.device)
-        depth = where_photos_agree(grey, view, map_, arrays, number, near)
+        near = torch.tensor(around[number][:VIEWS], dtype=torch.int32, device=photos.device)
+        depth = where_photos_agree(photos, view, map_, arrays, number, near)
         moved.append(_with_depth(view, map_, depth.cpu().numpy().reshape(map_.depth.shape)))
     # What one other view has moved to the same place as well may be wrong, and planes are put through what is known here.
     believed = confirmed_maps(views, moved, device, report, around, few_suffice=False)
@@ -152,14 +153,14 @@ def refined_maps(
 
 
 def where_photos_agree(
-    grey: torch.Tensor, view: FlatView, map_: DepthMap, arrays: MapArrays, number: int, near: torch.Tensor
+    photos: torch.Tensor, view: FlatView, map_: DepthMap, arrays: MapArrays, number: int, near: torch.Tensor
 ) -> torch.Tensor:
     """Depths (H·W,) of the map `number` moved to where its photo agrees best with those of the maps `near` (K,) int32, by
     patches turned as normals say that are averaged over few pixels, or over many."""
-    tried = []
+    tried, faced = [], normals(view.camera, map_.depth)
     for size in SMOOTH:
-        facing = torch.from_numpy(smooth_normals(view.camera, map_.depth, size).reshape(-1, 3)).to(grey.device)
-        tried.append(refine(grey, facing, arrays, number, near, LEAST, GAIN))
+        facing = torch.from_numpy(averaged(faced, size).reshape(-1, 3)).to(photos.device)
+        tried.append(refine(photos, facing, arrays, number, near, LEAST, GAIN))
     found, agreement = (torch.stack(part) for part in zip(*tried))
     return found.gather(0, agreement.argmax(0, keepdim=True))[0]
 

@@ -21,7 +21,7 @@ import scipy
 
 from ..data.pixels import VOID
 from ..progress import Reporter
-from .depth_maps import DepthMap, FlatView, cosines, pixel_directions, smooth_normals
+from .depth_maps import DepthMap, FlatView, averaged, cosines, normals, pixel_directions
 
 POINTS = 400_000  # that heights are of, and
 LOOKED_AT = 40_000  # among which planes are looked for
@@ -105,7 +105,7 @@ def known_points(
     parts = []
     for view, map_, there, label in zip(views, maps, confirmed, labels or [None] * len(views)):
         rows, columns = (part[::step] for part in np.nonzero(there & map_.hit))
-        normal = smooth_normals(view.camera, map_.depth, SMOOTH)[rows, columns]
+        normal = averaged(normals(view.camera, map_.depth), SMOOTH)[rows, columns]
         facing = (normal != 0).any(1)
         rows, columns, normal = rows[facing], columns[facing], normal[facing]
         depth = map_.depth[rows, columns]

@@ -12,6 +12,7 @@ from fieldwork.nerfcore.kernels import surface
 from fieldwork.nerfcore.kernels.closest import ClosestPoints
 from fieldwork.nerfcore.kernels.depth_arrays import FREE, MapArrays
 from fieldwork.nerfcore.kernels.packed_info import PackedInfo
+from fieldwork.nerfcore.kernels.patch_sums import quads
 from fieldwork.nerfcore.kernels.patches import refine
 from fieldwork.nerfcore.kernels.raycast import FrontFaces
 from fieldwork.nerfcore.kernels.triangles import nearest_triangle
@@ -200,6 +201,12 @@ def painted() -> tuple[MapArrays, np.ndarray, np.ndarray]:
     return arrays, np.concatenate(grey), normals(flats[0].camera, maps[0].depth).reshape(-1, 3).astype(np.float32)
 
 
+def quads_of(grey: np.ndarray, maps: MapArrays) -> torch.Tensor:
+    """Photos (P,) of maps of one size as `refine` takes them."""
+    width, height = maps.size[0].tolist()
+    return torch.cat([quads(torch.from_numpy(photo)) for photo in grey.reshape(-1, height, width)])
+
+
 @pytest.mark.parametrize("host", [False, True])
 @pytest.mark.parametrize("device", WARP_DEVICES)
 def test_photos_move_depths_as_their_reference_says(
@@ -211,7 +218,7 @@ def test_photos_move_depths_as_their_reference_says(
     others, least, gain = [3, 8, 5, 16, 21], 0.6, 0.05
     near = torch.tensor(others, dtype=torch.int32, device=device)
     facing = torch.from_numpy(normal).to(device)
-    depth, score = refine(torch.from_numpy(grey).to(device), facing, on(device, maps), 0, near, least, gain, host)
+    depth, score = refine(quads_of(grey, maps).to(device), facing, on(device, maps), 0, near, least, gain, host)
     views = patches_reference.Views(maps, grey)
     pixels = [(row, column) for row in range(0, SMALL.height, 3) for column in range(0, SMALL.width, 4)]
     expected = np.array(

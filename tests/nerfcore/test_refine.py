@@ -10,6 +10,7 @@ import torch
 from fieldwork.nerfcore.data.pixels import VOID
 from fieldwork.nerfcore.geometry.cameras import pixel_centers, rays
 from fieldwork.nerfcore.kernels.depth_arrays import FREE, MapArrays
+from fieldwork.nerfcore.kernels.patch_sums import quads
 from fieldwork.nerfcore.mesh import depth_maps, refine
 from fieldwork.nerfcore.mesh.refine import refined_maps
 from fieldwork.nerfcore.progress import Reporter
@@ -100,7 +101,7 @@ def test_steps_of_the_field_on_flat_ground_do_not_tilt_what_photos_compare(monke
 
     arrays = depth_maps.map_arrays(flats, stepped, CPU)
     greys = refine.grey_pictures(flats, painted_photos(flats, true), Reporter())  # type: ignore[arg-type]
-    grey = torch.from_numpy(np.concatenate([g.reshape(-1) for g in greys]))
+    photos = torch.cat([quads(torch.from_numpy(grey)) for grey in greys])
 
     def error(sizes: tuple[int, ...]) -> float:
         """Of the depths of two photos from among the others, median."""
@@ -108,7 +109,7 @@ def test_steps_of_the_field_on_flat_ground_do_not_tilt_what_photos_compare(monke
         off = []
         for number in (3, 4):
             near = torch.tensor([k for k in range(1, 7) if k != number], dtype=torch.int32)
-            depth = refine.where_photos_agree(grey, flats[number], stepped[number], arrays, number, near)
+            depth = refine.where_photos_agree(photos, flats[number], stepped[number], arrays, number, near)
             truth = true[number].depth.reshape(-1)
             off.append(np.abs(depth.numpy() - truth)[truth < 4])
         return float(np.median(np.concatenate(off)))

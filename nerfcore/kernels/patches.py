@@ -26,8 +26,7 @@ MIDDLE = wp.constant(6)  # of 13 depths
 UNSEEN = wp.constant(-2.0)  # correlation with a view that does not show the patch
 
 _tries = wp.types.vector(length=13, dtype=float)
-_seven = wp.types.vector(length=7, dtype=float)
-_best = wp.types.matrix(shape=(7, 3), dtype=float)
+_best = wp.types.matrix(shape=(3, 3), dtype=float)
 
 
 @wp.struct
@@ -187,9 +186,9 @@ def photo_agreement(
     z: float, step: float, count: int,
 ):  # fmt: skip
     """Mean correlation of the three views that agree best, or of the fewer whose pictures show the place, −1 where none
-    does, at `count` depths, at most seven, of which z is the first."""
+    does, at `count` depths, at most three, of which z is the first."""
     best = _best()
-    for n in range(7):
+    for n in range(3):
         for rank in range(3):
             best[n, rank] = -1.0
     for m in range(params.neighbours.shape[0]):
@@ -213,8 +212,8 @@ def photo_agreement(
                 best[n, 1] = c
             elif c > best[n, 2]:
                 best[n, 2] = c
-    agreement = _seven()
-    for n in range(7):
+    agreement = wp.vec3()
+    for n in range(3):
         total = best[n, 0]
         shown = float(1.0)
         for rank in range(1, 3):

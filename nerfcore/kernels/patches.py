@@ -12,27 +12,26 @@ import warp as wp
 
 from .depth_arrays import MapArrays
 from .patch_sums import Patch, Window, corner, patch_sums, patch_sums_host
-from .projection import FARTHEST, NEAREST, Maps, map_struct, pixel_ray
+from .projection import FARTHEST, NEAREST, Maps, map_struct, pixel_ray, project
 from .runtime import array, init, launch
 
-BESIDE = wp.constant(2.0)  # pixels from one value of a patch to the next
-SETTLED = wp.constant(0.9)  # correlation of a depth better than those beside it, from which farther ones are not tried
 REACH = wp.constant(4)  # a patch has 5 × 5 pixels, two apart: it reaches four pixels from its middle
 FLAT = wp.constant(2.0e-5)  # variance of grey values in [0, 1] below which a patch shows nothing
 EVEN = wp.constant(1.0e-6)  # variance up to which a window of another view says nothing
 STEEPEST = wp.constant(1.0e-2)  # of the normal along the ray: a surface seen more along is not compared
 WIDEST = wp.constant(24.0)  # pixels a patch may reach in another view
-MIDDLE = wp.constant(6)  # of 13 depths
+MIDDLE = wp.constant(6)  # of 13 depths, every second of which is tried, and both beside the best of these
 UNSEEN = wp.constant(-2.0)  # correlation with a view that does not show the patch
 
 _tries = wp.types.vector(length=13, dtype=float)
-_best = wp.types.matrix(shape=(3, 3), dtype=float)
+_seven = wp.types.vector(length=7, dtype=float)
+_best = wp.types.matrix(shape=(7, 3), dtype=float)
 
 
 @wp.struct
 class RefineParams:
-    """See `refine`. turn and shift lead from the view's camera axes to pixels of its neighbours, in homogeneous coordinates.
-    host: 1 where the CPU's compiler sums up patches."""
+    """See `refine`; turn and shift lead from the view's camera axes into those of its neighbours; host: 1 where the CPU's
+    compiler sums up patches."""
 
     view: int
     neighbours: wp.array(dtype=int)
@@ -44,23 +43,27 @@ class RefineParams:
 
 
 @wp.struct
-class Spot:
-    """Where a pixel's ray meets a plane at depth 1, and how this place moves with the pixel: from one value of its patch to
-    the next one right and below. In camera axes, or as homogeneous pixel coordinates of another view."""
+class Pixel:
+    """Three places of a patch in camera axes, on the plane through its pixel at depth 1: the pixel itself, and what lies
+    four pixels right of it and below."""
 
-    place: wp.vec3
+    middle: wp.vec3
     right: wp.vec3
     below: wp.vec3
 
 
 @wp.struct
 class Other:
-    """Another view: a pixel's spot in it, where it has depth z, is `spot.place` times z, and the shift."""
+    """The same three places in the camera axes of another view, for depth 1 and without the way between the cameras,
+    `shift`: at depth z a place is there z times as much, and the shift."""
 
     first: int
     width: int
     height: int
-    spot: Spot
+    lens: wp.vec4
+    middle: wp.vec3
+    right: wp.vec3
+    below: wp.vec3
     shift: wp.vec3
 
 
@@ -83,41 +86,48 @@ def read_patch(quads: wp.array(dtype=wp.uint64), maps: Maps, view: int, column: 
 
 
 @wp.func
-def spot_of(lens: wp.vec4, x: float, y: float, normal: wp.vec3):
-    """A pixel's spot on the plane with this normal, and the normal's part along the ray."""
+def on_plane(lens: wp.vec4, x: float, y: float, normal: wp.vec3, along: float):
+    """Where the ray of a pixel meets the plane with this normal and the distance `along` from the camera."""
     r = pixel_ray(lens, x, y)
-    along = wp.dot(normal, r)
-    spot = Spot()
-    spot.place = r
-    spot.right = wp.vec3(BESIDE / lens[0], 0.0, 0.0) - r * (BESIDE / lens[0] * normal[0] / along)
-    spot.below = wp.vec3(0.0, BESIDE / lens[1], 0.0) - r * (BESIDE / lens[1] * normal[1] / along)
-    return spot, along
+    return r * (along / wp.min(wp.dot(normal, r), -1e-3))
 
 
 @wp.func
-def other_view(maps: Maps, params: RefineParams, m: int, spot: Spot):
-    view = params.neighbours[m]
+def other_view(maps: Maps, params: RefineParams, m: int, pixel: Pixel):
+    turn = params.turn[m]
     other = Other()
+    view = params.neighbours[m]
     other.first = maps.first[view]
     other.width = maps.size[view, 0]
     other.height = maps.size[view, 1]
-    other.spot.place = params.turn[m] * spot.place
-    other.spot.right = params.turn[m] * spot.right
-    other.spot.below = params.turn[m] * spot.below
+    other.lens = maps.lens[view]
+    other.middle = turn * pixel.middle
+    other.right = turn * pixel.right
+    other.below = turn * pixel.below
     other.shift = params.shift[m]
     return other
 
 
 @wp.func
-def pixels_per_depth(params: RefineParams, place: wp.vec3, z: float):
-    """How many pixels a step in depth moves the place of a spot in other views, in the mean; 0 where that is not known."""
+def place_at(lens: wp.vec4, way: wp.vec3, shift: wp.vec3, z: float):
+    """Pixel coordinates of a place (see `Other`), and its depth."""
+    q = way * z + shift
+    place = project(lens, wp.vec3(q[0], q[1], wp.max(q[2], 1e-6)))
+    return wp.vec3(place[0], place[1], q[2])
+
+
+@wp.func
+def pixels_per_depth(maps: Maps, params: RefineParams, pixel: Pixel, z: float):
+    """How many pixels a step in depth moves the point in other views, in the mean; 0 where that is not known."""
     rate = float(0.0)
     valid = float(0.0)
     for m in range(params.neighbours.shape[0]):
-        way = params.turn[m] * place
-        q = way * z + params.shift[m]
-        if q[2] > NEAREST:
-            rate += wp.length(wp.vec2(way[0] * q[2] - way[2] * q[0], way[1] * q[2] - way[2] * q[1])) / (q[2] * q[2])
+        lens = maps.lens[params.neighbours[m]]
+        way = params.turn[m] * pixel.middle
+        a = place_at(lens, way, params.shift[m], z)
+        b = place_at(lens, way, params.shift[m], z * 1.01)
+        if a[2] > NEAREST:
+            rate += wp.sqrt((a[0] - b[0]) * (a[0] - b[0]) + (a[1] - b[1]) * (a[1] - b[1])) / (0.01 * z)
             valid += 1.0
     mean = float(0.0)
     if valid >= 1.0 and rate >= 1e-6:
@@ -126,38 +136,42 @@ def pixels_per_depth(params: RefineParams, place: wp.vec3, z: float):
 
 
 @wp.func
-def window_at(other: Other, z: float):
-    """Where a patch lies in another view, were the pixel's depth z, and whether it does: not where it leaves the picture
-    or is stretched too far."""
-    q = other.spot.place * z + other.shift
-    nearness = 1.0 / wp.max(q[2], 1e-6)
-    x = q[0] * nearness
-    y = q[1] * nearness
-    w = Window()
-    w.first = other.first
-    w.width = other.width
-    w.x = x - 0.5
-    w.y = y - 0.5
-    w.ax = (other.spot.right[0] - x * other.spot.right[2]) * z * nearness
-    w.ay = (other.spot.right[1] - y * other.spot.right[2]) * z * nearness
-    w.bx = (other.spot.below[0] - x * other.spot.below[2]) * z * nearness
-    w.by = (other.spot.below[1] - y * other.spot.below[2]) * z * nearness
-    reach_x = 2.0 * (wp.abs(w.ax) + wp.abs(w.bx)) + 1.0
-    reach_y = 2.0 * (wp.abs(w.ay) + wp.abs(w.by)) + 1.0
-    inside = z > NEAREST and q[2] > NEAREST and x > reach_x and y > reach_y
-    inside = inside and x < float(other.width) - reach_x and y < float(other.height) - reach_y
-    return w, inside and reach_x < WIDEST and reach_y < WIDEST
-
-
-@wp.func
-def correlation(sums: wp.vec3, patch: Patch):
-    """Normalised cross-correlation of a patch and the window that has these sums, see `patch_sums`."""
-    mean = sums[0] / 25.0
-    variance = sums[1] / 25.0 - mean * mean
-    agreed = float(0.0)
-    if variance > EVEN:  # below it this is rounding
-        agreed = (sums[2] / 25.0 - mean * patch.mean) / wp.sqrt(variance * patch.variance)
-    return agreed
+def correlation(quads: wp.array(dtype=wp.uint64), patch: Patch, other: Other, z: float, host: int):
+    """Normalised cross-correlation of a patch with another view, were the pixel's depth z; `UNSEEN` where the patch
+    leaves the picture or is stretched too far."""
+    middle = place_at(other.lens, other.middle, other.shift, z)
+    right = place_at(other.lens, other.right, other.shift, z)
+    below = place_at(other.lens, other.below, other.shift, z)
+    ax = (right[0] - middle[0]) * 0.5
+    ay = (right[1] - middle[1]) * 0.5
+    bx = (below[0] - middle[0]) * 0.5
+    by = (below[1] - middle[1]) * 0.5
+    reach_x = 2.0 * (wp.abs(ax) + wp.abs(bx)) + 1.0
+    reach_y = 2.0 * (wp.abs(ay) + wp.abs(by)) + 1.0
+    inside = z > NEAREST and middle[2] > NEAREST and middle[0] > reach_x and middle[1] > reach_y
+    inside = inside and middle[0] < float(other.width) - reach_x and middle[1] < float(other.height) - reach_y
+    result = float(UNSEEN)
+    if inside and reach_x < WIDEST and reach_y < WIDEST:
+        w = Window()
+        w.first = other.first
+        w.width = other.width
+        w.x = middle[0] - 0.5
+        w.y = middle[1] - 0.5
+        w.ax = ax
+        w.ay = ay
+        w.bx = bx
+        w.by = by
+        sums = wp.vec3()
+        if host == 1:
+            sums = patch_sums_host(quads, w, patch)
+        else:
+            sums = patch_sums(quads, w, patch)
+        mean = sums[0] / 25.0
+        variance = sums[1] / 25.0 - mean * mean
+        result = float(0.0)
+        if variance > EVEN:  # below it this is rounding
+            result = (sums[2] / 25.0 - mean * patch.mean) / wp.sqrt(variance * patch.variance)
+    return result
 
 
 @wp.func
@@ -182,27 +196,19 @@ def best_try(tries: _tries, least: float, gain: float):
 
 @wp.func
 def photo_agreement(
-    quads: wp.array(dtype=wp.uint64), maps: Maps, params: RefineParams, patch: Patch, spot: Spot,
+    quads: wp.array(dtype=wp.uint64), maps: Maps, params: RefineParams, patch: Patch, pixel: Pixel,
     z: float, step: float, count: int,
 ):  # fmt: skip
     """Mean correlation of the three views that agree best, or of the fewer whose pictures show the place, −1 where none
-    does, at `count` depths, at most three, of which z is the first."""
+    does, at `count` depths, at most seven, of which z is the first."""
     best = _best()
-    for n in range(3):
+    for n in range(7):
         for rank in range(3):
             best[n, rank] = -1.0
     for m in range(params.neighbours.shape[0]):
-        other = other_view(maps, params, m, spot)
+        other = other_view(maps, params, m, pixel)
         for n in range(count):
-            w, inside = window_at(other, z + float(n) * step)
-            c = float(UNSEEN)
-            if inside:
-                sums = wp.vec3()
-                if params.host == 1:
-                    sums = patch_sums_host(quads, w, patch)
-                else:
-                    sums = patch_sums(quads, w, patch)
-                c = correlation(sums, patch)
+            c = correlation(quads, patch, other, z + float(n) * step, params.host)
             if c > best[n, 0]:
                 best[n, 2] = best[n, 1]
                 best[n, 1] = best[n, 0]
@@ -212,8 +218,8 @@ def photo_agreement(
                 best[n, 1] = c
             elif c > best[n, 2]:
                 best[n, 2] = c
-    agreement = wp.vec3()
-    for n in range(3):
+    agreement = _seven()
+    for n in range(7):
         total = best[n, 0]
         shown = float(1.0)
         for rank in range(1, 3):
@@ -249,41 +255,36 @@ def refine_kernel(
     patch = read_patch(quads, maps, view, column, row)
     if patch.variance < FLAT:
         return
-    spot, along = spot_of(maps.lens[view], float(column) + 0.5, float(row) + 0.5, normals[i])
+    lens = maps.lens[view]
+    x = float(column) + 0.5
+    y = float(row) + 0.5
+    normal = normals[i]
+    along = wp.dot(normal, pixel_ray(lens, x, y))
     if along > -STEEPEST:
         return
-    rate = pixels_per_depth(params, spot.place, z)
+    pixel = Pixel()
+    pixel.middle = on_plane(lens, x, y, normal, along)
+    pixel.right = on_plane(lens, x + 4.0, y, normal, along)
+    pixel.below = on_plane(lens, x, y + 4.0, normal, along)
+    rate = pixels_per_depth(maps, params, pixel, z)
     if rate <= 0.0:
         return
     step = wp.clamp(maps.spread[maps.first[view] + i] / 3.0, 0.4 / rate, 1.2 / rate)
     tries = _tries()
     for t in range(13):
         tries[t] = -1.0
-    rounds = int(4)  # not a constant: Warp would write the loop out
-    best = int(MIDDLE)
-    for n in range(rounds):
-        first = int(4)
-        count = int(3)
-        if n == 1:
-            first = 0
-            count = 2
-        elif n == 2:
-            first = 10
-            count = 2
-        elif n == 3:
-            first = best - 1
-            count = 2
-        settled = best == MIDDLE and tries[MIDDLE] >= SETTLED
-        if n == 0 or n == 3 or not settled:
-            found = photo_agreement(
-                quads, maps, params, patch, spot, z + float(first - MIDDLE) * step, 2.0 * step, count
-            )
-            for k in range(3):
-                t = first + 2 * k
-                if k < count and t >= 0 and t <= 12:
-                    tries[t] = found[k]
-                    if tries[t] > tries[best]:
-                        best = t
+    coarse = photo_agreement(quads, maps, params, patch, pixel, z - float(MIDDLE) * step, 2.0 * step, 7)
+    top = int(0)
+    for n in range(7):
+        tries[2 * n] = coarse[n]
+        if coarse[n] > coarse[top]:
+            top = n
+    first = 2 * top - 1
+    beside = photo_agreement(quads, maps, params, patch, pixel, z + float(first - MIDDLE) * step, 2.0 * step, 2)
+    if first >= 0:
+        tries[first] = beside[0]
+    if first <= 10:
+        tries[first + 2] = beside[1]
     best, peak = best_try(tries, params.least, params.gain)
     score[i] = tries[best]
     out[i] = z + peak * step
@@ -297,20 +298,15 @@ def refine(
     how well (H·W,) they agree there, −1 where that is not known.
 
     quads (P, 4): the photos as the maps see them, see `patch_sums.quads`; normals (H·W, 3) in camera axes, towards the
-    camera. Thirteen depths around each pixel's, about half its spread apart but 0.4 to 1.2 pixels, are rated by the mean
-    correlation of the three best views: the middle one and the second beside it on each side; every second farther away,
-    unless the middle one is the best and reaches `SETTLED`; and both beside the best. The best one counts if it reaches
-    `least`, exceeds the present one's by `gain` and is not the outermost; a parabola places it between its neighbours.
-    `host`: by the code for CPUs; None: where the maps are on one.
+    camera. Of thirteen depths around each pixel's, about half its spread apart but 0.4 to 1.2 pixels, every second and both beside the best of
+    these are rated by the mean correlation of the three best views. The best one counts if it reaches `least`, exceeds the present one's by `gain` and is not the
+    outermost; a parabola places it between its neighbours. `host`: by the code for CPUs; None: where the maps are on one.
     """
     init()
     count = int(maps.size[view].prod())
     out, score = torch.empty(count, device=quads.device), torch.empty(count, device=quads.device)
-    lens = maps.lens[neighbours]
-    pixels = torch.zeros(len(lens), 3, 3, device=lens.device)
-    pixels[:, 0, 0], pixels[:, 1, 1], pixels[:, 0, 2], pixels[:, 1, 2], pixels[:, 2, 2] = *lens.T, 1.0
-    turn = pixels @ maps.rotation[neighbours] @ maps.rotation[view].T
-    shift = (pixels @ maps.translation[neighbours, :, None])[..., 0] - turn @ maps.translation[view]
+    turn = maps.rotation[neighbours] @ maps.rotation[view].T
+    shift = maps.translation[neighbours] - turn @ maps.translation[view]
     params = RefineParams()
     params.view, params.neighbours, params.least, params.gain = view, array(neighbours), least, gain
     params.turn, params.shift = array(turn, wp.mat33), array(shift, wp.vec3)

@@ -8,8 +8,6 @@ from scipy.ndimage import map_coordinates
 
 GRID = np.stack(np.meshgrid(np.arange(-2, 3), np.arange(-2, 3)), -1).reshape(25, 2)  # x fastest
 FLATTEST = 2e-5
-STEP = 1e-4  # pixels, of the differences that give the affine map
-SETTLED = 0.9
 
 
 class Views:
@@ -43,9 +41,9 @@ class Views:
     def correlation(self, view: int, other: int, pixel: np.ndarray, normal: np.ndarray, z: float) -> float:
         """Pearson's correlation of the patch around a pixel with where it lies in another view; −1 where it does not."""
         middle, right, below = self.seen(
-            view, other, pixel, normal, z, pixel + STEP * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+            view, other, pixel, normal, z, pixel + np.array([[0.0, 0.0], [4.0, 0.0], [0.0, 4.0]])
         )
-        a, b = (right - middle)[:2] / STEP * 2, (below - middle)[:2] / STEP * 2
+        a, b = (right - middle)[:2] / 2, (below - middle)[:2] / 2
         reach = 2 * (np.abs(a) + np.abs(b)) + 1
         height, width = self.grey[other].shape
         if middle[2] <= 1e-4 or (middle[:2] <= reach).any() or (middle[:2] >= [width, height] - reach).any():
@@ -91,9 +89,7 @@ def refined(
             showing = sorted((c for c in agreed if c > -1), reverse=True)
             found[number] = np.mean(showing[:3]) if showing else -1
 
-    rate_tries([4, 6, 8])
-    if not (found[6] >= SETTLED and found[6] == found.max()):
-        rate_tries([0, 2, 10, 12])
+    rate_tries([*range(0, 13, 2)])
     coarse = int(np.argmax(found))
     rate_tries([number for number in (coarse - 1, coarse + 1) if 0 <= number <= 12])
     # The middle one where several are equal.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 import scipy
 from fieldwork.nerfcore.data.scene import View
 from fieldwork.nerfcore.geometry.cameras import Camera, pixel_centers, rays
-from fieldwork.nerfcore.mesh.denied import denied, disagree
+from fieldwork.nerfcore.mesh.denied import AGREE, agreement, denied
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.render.verb import look_at
 from PIL import Image
@@ -98,17 +99,36 @@ def test_photos_tell_little_detail_from_none(
 def test_photos_of_another_exposure_agree() -> None:
     rng = np.random.default_rng(0)
     shown, places = rng.uniform(40, 120, 300), rng.normal(size=(300, 3))
-    assert not disagree(np.stack([shown, 1.8 * shown + 20, 0.5 * shown]), places)
-    assert disagree(rng.uniform(40, 120, (3, 300)), places)
+    assert agreement(np.stack([shown, 1.8 * shown + 20, 0.5 * shown]), places) > 0.99
+    assert agreement(rng.uniform(40, 120, (3, 300)), places) < AGREE
     hidden = rng.uniform(40, 120, (3, 300))
     hidden[:, ::2] = np.nan
     hidden[1, 60:] = np.nan
-    assert not disagree(hidden, places), "two pairs share too few places"
+    assert np.isnan(agreement(hidden, places)), "two pairs share too few places"
 
 
 def test_what_is_lighter_towards_one_side_is_no_agreement() -> None:
     rng = np.random.default_rng(0)
     places = rng.normal(size=(300, 3))
     slope = 100 + places @ [30.0, 10.0, 0.0]
-    assert disagree(slope + rng.uniform(-10, 10, (3, 300)), places)
-    assert not disagree(slope + rng.uniform(-10, 10, 300) + rng.uniform(-5, 5, (3, 300)), places)
+    assert agreement(slope + rng.uniform(-10, 10, (3, 300)), places) < AGREE
+    assert agreement(slope + rng.uniform(-10, 10, 300) + rng.uniform(-5, 5, (3, 300)), places) > AGREE
+
+
+def test_a_piece_of_the_largest_part_that_is_not_there_is_denied(tmp_path: Path) -> None:
+    """One surface: the wall, and a half of it that lies too near, as wide as several pieces."""
+    vertices, faces = square(np.zeros(3), 3.0, 120)
+    raised = np.clip((vertices[:, 0] - 0.5) / 0.1, 0, 1)
+    vertices[:, 2] = 0.8 * raised
+    views = photos(tmp_path, plain=False)
+    bad = denied(vertices, faces, views, Reporter())
+    middle = vertices[faces].mean(1)
+    shown = (np.abs(middle[:, :2] - PLATE[:2]) > 1.2 * HALF).any(1) & (np.abs(middle[:, :2]) < [2.4, 1.8]).all(1)
+    wrong, right = (middle[:, 0] > 1.6) & shown, (middle[:, 0] < -0.1) & shown
+    assert bad[wrong].mean() > 0.9
+    assert bad[right].mean() < 0.02
+    # Where photos disagree on most of it, as with wrong poses, single pieces are not blamed.
+    moved = [replace(view, camera_to_world=look_at(eye + [0.3, 0.2, 0.0], np.array([0.4, 0.3, 0.5]), np.array([0.0, 1.0, 0.0])))
+             for view, eye in zip(views, np.roll(EYES, 3, axis=0))]  # fmt: skip
+    assert not denied(vertices, faces, moved, Reporter()).any()
+    assert not denied(vertices, faces, photos(tmp_path, plain=True), Reporter())[right].any()

@@ -154,25 +154,31 @@ def _on_triangles(corners: np.ndarray) -> np.ndarray:
 
 def agreement(grey: np.ndarray, places: np.ndarray) -> float:
     """Median correlation of two photos on a part whose places (S, 3) have these grey values (N, S) in [0, 255] in them, NaN
-    where a photo does not show a place. NaN where too few photos share places, or these are plain."""
-    found, spread = [], []
-    for i, first in enumerate(grey):
-        for second in grey[:i]:
-            both = np.isfinite(first) & np.isfinite(second)
-            if both.sum() < COMMON * len(places):
-                continue
-            pair = np.stack([first[both], second[both]], 1).astype(np.float64)
-            spread.append(pair.std(0).min())
-            a, b = _uneven(pair, places[both]).T
-            found.append((a * b).sum() / max(np.linalg.norm(a) * np.linalg.norm(b), 1e-9))
-    told = len(found) >= PAIRS and np.median(spread) > PLAIN
-    return float(np.median(found)) if told else np.nan
-
-
-def _uneven(values: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Values (S, K) at places (S, 3) less their mean and what grows evenly along some direction."""
-    even = np.concatenate([places - places.mean(0), np.ones((len(places), 1))], 1)
-    return values - even @ np.linalg.lstsq(even, values, rcond=None)[0]
+    where a photo does not show a place; of what is left of them when an even slope is taken off. NaN where too few photos share
+    places, or these are plain."""
+    grey = grey[np.isfinite(grey).sum(1) >= COMMON * len(places)].astype(np.float64)
+    shown = np.isfinite(grey)
+    first, second = np.triu_indices(len(grey), 1)
+    both = shown[first] & shown[second]
+    enough = both.sum(1) >= COMMON * len(places)
+    if enough.sum() < PAIRS:
+        return np.nan
+    first, second, both = first[enough], second[enough], both[enough]
+    away = places - places.mean(0)
+    even = np.concatenate([away / max(np.abs(away).max(), 1e-12), np.ones((len(places), 1))], 1)
+    squares = (both @ (even[:, :, None] * even[:, None]).reshape(-1, 16)).reshape(-1, 4, 4)
+    inverse = np.linalg.pinv(squares, 1e-6, hermitian=True)  # of places in a plane there are many slopes
+    left, spread = [], []
+    for number in (first, second):
+        values = np.where(both, grey[number], 0)
+        values = np.where(both, values - (values.sum(1) / both.sum(1))[:, None], 0)
+        spread.append(np.sqrt((values**2).sum(1) / both.sum(1)))
+        slope = np.einsum("pij,pj->pi", inverse, values @ even)
+        left.append(np.where(both, values - slope @ even.T, 0))
+    if np.median(np.minimum(*spread)) <= PLAIN:
+        return np.nan
+    lengths = np.linalg.norm(left[0], axis=1) * np.linalg.norm(left[1], axis=1)
+    return float(np.median((left[0] * left[1]).sum(1) / np.maximum(lengths, 1e-9)))
 
 
 def _grey_values(

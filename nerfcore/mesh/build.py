@@ -41,6 +41,7 @@ from .triangles import areas, compact, components
 
 FEW_STEPS = 300  # of training, below which a field is a sketch
 LITTLE_AGREEMENT = 0.3  # share below which the user is told
+MUCH_DENIED = 0.05  # share of the area on which photos disagree, from which on the user is told
 
 
 @dataclass(frozen=True)
@@ -104,6 +105,13 @@ def not_refuted(vertices: np.ndarray, faces: np.ndarray, scene: Scene, report: R
     what masks leave out. Raises InputError: a photo or a mask cannot be read."""
     photos = [scene.views[i] for i in scene.train]
     kept = ~denied(vertices, faces, photos, report)
+    area = areas(vertices, faces)
+    share = area[~kept].sum() / max(area.sum(), 1e-30)
+    if share > MUCH_DENIED:
+        report.warn(
+            f"The photos disagree on {100 * share:.0f} % of the surface that the field shows, so that part is left out. "
+            "Photos from nearer or from a steeper angle would tell where it is."
+        )
     if scene.mask_mode == "empty":
         kept[kept] = ~left_out(vertices, faces[kept], photos, report)
         kept[kept] = not_scraps(vertices, faces[kept])

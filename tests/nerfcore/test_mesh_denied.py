@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy
-from fieldwork.nerfcore.data.scene import View
+from fieldwork.nerfcore.data.scene import Scene, View
 from fieldwork.nerfcore.geometry.cameras import Camera, pixel_centers, rays
+from fieldwork.nerfcore.mesh.build import not_refuted
 from fieldwork.nerfcore.mesh.denied import AGREE, agreement, denied
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.render.verb import look_at
@@ -132,3 +133,14 @@ def test_a_piece_of_the_largest_part_that_is_not_there_is_denied(tmp_path: Path)
              for view, eye in zip(views, np.roll(EYES, 3, axis=0))]  # fmt: skip
     assert not denied(vertices, faces, moved, Reporter()).any()
     assert not denied(vertices, faces, photos(tmp_path, plain=True), Reporter())[right].any()
+
+
+def test_how_much_photos_deny_is_told(tmp_path: Path, surface: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
+    vertices, faces, part = surface
+    views, report = photos(tmp_path, plain=False), Reporter()
+    scene = Scene(views, list(range(len(views))), [])
+    assert np.array_equal(not_refuted(vertices, faces, scene, report), part != 2)
+    assert report.warnings == [], "2 % of the area"
+    near = part > 0
+    assert np.array_equal(not_refuted(vertices, faces[near], scene, report), part[near] != 2)
+    assert "disagree on 50 % of the surface" in report.warnings[0]

@@ -31,6 +31,7 @@ from .depth_maps import (
     neighbours,
     normals,
 )
+from .plane_starts import from_planes
 from .planes import with_planes
 from .scene_planes import known_points, on_scene_planes, scene_planes
 from .sky import FAR, backdrop, confirmed_share, farthest, labels_tell, named_things, nothing
@@ -103,16 +104,25 @@ def refined_maps(
     plain = [plain_places(grey) for grey in greys]
     photos = torch.cat([quads(torch.from_numpy(grey)) for grey in greys]).to(arrays.depth.device)
     around = neighbours(views, maps)
-    moved = []
+    near = [torch.tensor(others[:VIEWS], dtype=torch.int32, device=photos.device) for others in around]
+    moved, agreed = [], []
     for number, (view, map_) in enumerate(zip(views, maps)):
         report.progress(number / len(views))
-        near = torch.tensor(around[number][:VIEWS], dtype=torch.int32, device=photos.device)
-        depth = where_photos_agree(photos, view, map_, arrays, number, near)
+        depth, score = where_photos_agree(photos, view, map_, arrays, number, near[number])
         moved.append(_with_depth(view, map_, depth.cpu().numpy().reshape(map_.depth.shape)))
-    # What one other view has moved to the same place as well may be wrong, and planes are put through what is known here.
-    believed = confirmed_maps(views, moved, device, report, around, few_suffice=False)
-    kept = hits(believed, maps)
-    sure = [there & (new.depth != old.depth) & ~even for there, old, new, even in zip(kept, maps, moved, plain)]
+        agreed.append(score.cpu().numpy().reshape(map_.depth.shape))
+
+    def confirmed_moves() -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """Which depths (H, W) bool views confirm, and which of these photos have moved."""
+        # What one other view has moved to the same place as well may be wrong, and planes are put through what is known here.
+        kept = hits(confirmed_maps(views, moved, device, report, around, few_suffice=False), maps)
+        return kept, [a & (new.depth != old.depth) & ~even for a, old, new, even in zip(kept, maps, moved, plain)]
+
+    kept, sure = confirmed_moves()
+    sharp = [with_spread(*parts) for parts in zip(views, maps, moved, sure)]
+    planes = scene_planes(known_points(views, sharp, sure), report)
+    moved = from_planes(photos, views, moved, agreed, sure, arrays, near, planes, report)
+    kept, sure = confirmed_moves()
     labels = [label_picture(view, store) for view in views]
     left_out = [None if label is None else label == VOID for label in labels]
     told = labels_tell(sure, left_out)
@@ -129,9 +139,8 @@ def refined_maps(
         if label is not None:
             behind &= label == VOID
         depth = np.where(behind, 0, depth)
-        spread = np.where(safe, np.minimum(old.spread, SURE * depth / view.camera.fx), old.spread)
         fields.append(trusted_field(old, depth, safe, empty))
-        known.append(replace(old, depth=depth, spread=spread.astype(np.float32)))
+        known.append(with_spread(view, old, replace(old, depth=depth), safe))
     planes = scene_planes(known_points(views, known, [a & ~b for a, b in zip(kept, plain)], labels), report)
     mixed, named = [], []
     for view, map_, safe, label in zip(views, known, sure, labels):
@@ -152,17 +161,24 @@ def refined_maps(
     return final, sum(int(part.sum()) for part in hits(final, mixed)) / max(asked, 1)
 
 
+def with_spread(view: FlatView, field: DepthMap, map_: DepthMap, sure: np.ndarray) -> DepthMap:
+    """A map with the spreads of the field's depths, but where photos confirm them, `sure` (H, W) bool."""
+    sharp = np.minimum(field.spread, SURE * map_.depth / view.camera.fx)
+    return replace(map_, spread=np.where(sure, sharp, field.spread).astype(np.float32))
+
+
 def where_photos_agree(
     photos: torch.Tensor, view: FlatView, map_: DepthMap, arrays: MapArrays, number: int, near: torch.Tensor
-) -> torch.Tensor:
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Depths (H·W,) of the map `number` moved to where its photo agrees best with those of the maps `near` (K,) int32, by
-    patches turned as normals say that are averaged over few pixels, or over many."""
+    patches turned as normals say that are averaged over few pixels, or over many; and how well (H·W,) they agree there."""
     tried, faced = [], normals(view.camera, map_.depth)
     for size in SMOOTH:
         facing = torch.from_numpy(averaged(faced, size).reshape(-1, 3)).to(photos.device)
         tried.append(refine(photos, facing, arrays, number, near, LEAST, GAIN))
     found, agreement = (torch.stack(part) for part in zip(*tried))
-    return found.gather(0, agreement.argmax(0, keepdim=True))[0]
+    best, which = agreement.max(0, keepdim=True)
+    return found.gather(0, which)[0], best[0]
 
 
 def relied_on(views: list[FlatView], fields: list[DepthMap], sure: list[np.ndarray]) -> torch.Tensor:

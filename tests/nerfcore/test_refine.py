@@ -109,7 +109,7 @@ def test_steps_of_the_field_on_flat_ground_do_not_tilt_what_photos_compare(monke
         off = []
         for number in (3, 4):
             near = torch.tensor([k for k in range(1, 7) if k != number], dtype=torch.int32)
-            depth = refine.where_photos_agree(photos, flats[number], stepped[number], arrays, number, near)
+            depth, _ = refine.where_photos_agree(photos, flats[number], stepped[number], arrays, number, near)
             truth = true[number].depth.reshape(-1)
             off.append(np.abs(depth.numpy() - truth)[truth < 4])
         return float(np.median(np.concatenate(off)))

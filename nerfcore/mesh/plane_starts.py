@@ -19,7 +19,7 @@ from ..progress import Reporter
 from .depth_maps import DepthMap, FlatView, cosines, pixel_directions
 from .scene_planes import STEEPEST, ScenePlane
 
-PLANES = 3  # of the scene, the largest, from which depths are tried
+PLANES = 8  # of the scene, the largest, from which depths are tried
 LEAST, GAIN = (
     0.6,
     0.1,

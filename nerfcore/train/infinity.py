@@ -23,8 +23,7 @@ BETWEEN = 0.5  # share of what looks infinitely far that may lie between points:
 HIGHER = 3.0  # times as often directions above the horizon must look infinitely far as below: “White walls below the horizon”
 # Not tuned: the next two.
 CELL, CELL_PIXELS = 1.0, 3.0  # degrees, and pixels at least, in which directions count as the same
-CAMERAS, UNNAMED_CAMERAS = 3, 2  # that must look there; at what label maps leave without a name
-MOST_UNNAMED = 0.5  # share of the pixels: label maps that leave more are strokes, and say nothing of the rest
+CAMERAS = 3  # that must look there
 FEWEST = 20  # points in a photo, from which on they have a hull
 # Words in names of classes that may be infinitely far away, in the languages of Blender's users, and of what is no thing.
 WORDS = """
@@ -40,8 +39,6 @@ def share_at_infinity(scene: Scene) -> float:
     all of them see there has one colour. Walls with a texture have several; plain ones have light that changes along them.
     Where that is too little, points tell: a plain floor lies between points of its joints and of what stands on it. Where cameras
     look around, so do names, as a ceiling's is none of a sky, and the horizon: white walls of a room are alike below it as well.
-    Where label maps name most of what photos show, the same is asked of the rest alone, of which `UNNAMED_CAMERAS` say enough:
-    where a sky is seen in few photos and beside things, all cameras together never see one colour. The larger share counts.
     The world's z axis is up.
     """
     chosen = np.unique(np.linspace(0, len(scene.train) - 1, MOST_PHOTOS).round().astype(int))
@@ -51,34 +48,9 @@ def share_at_infinity(scene: Scene) -> float:
     focal = np.median([view.camera.pixels_per_radian * scale for view, scale in zip(views, scales)])
     directions, colors = (np.concatenate(part) for part in zip(*seen))
     photo = np.repeat(np.arange(len(seen)), [len(part) for part, _ in seen])
-    named = np.concatenate([named_things(view, scene) for view in views])
-    between = np.concatenate([between_points(view, scene.points.xyz) for view in views])
     usable = np.isfinite(directions).all(1)
-    around, side = not looks_inward(scene.views), max(np.radians(CELL), CELL_PIXELS / focal)
-
-    def share(some: np.ndarray, least: int) -> float:
-        """Of the pixels `some` (N,) bool those that are infinitely far, by at least as many cameras, over all usable ones."""
-        looked, far = same_from_everywhere(directions[some], colors[some], photo[some], side, least)
-        if around:
-            far &= ~named[some]
-        if (far & between[some]).sum() > BETWEEN * far.sum():
-            return 0.0
-        up = directions[some, 2] > 0
-        above, below = (far[half].sum() / max(int(looked[half].sum()), 1) for half in (up, ~up))
-        if around and above < HIGHER * below:
-            return 0.0
-        return float(far.sum() / usable.sum())
-
-    unnamed = usable & ~named
-    mostly_named = 0 < unnamed.sum() < MOST_UNNAMED * usable.sum()
-    return max(share(usable, CAMERAS), share(unnamed, UNNAMED_CAMERAS) if mostly_named else 0.0)
-
-
-def same_from_everywhere(
-    directions: np.ndarray, colors: np.ndarray, photo: np.ndarray, side: float, least: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Which pixels (N,) bool look where at least as many photos do, in cells of `side` radians, and which of these show what
-    has one colour in all of them. directions, colors (N, 3), the latter in [0, 255]; photo (N,) its number."""
+    directions, colors, photo = directions[usable], colors[usable], photo[usable]
+    side = max(np.radians(CELL), CELL_PIXELS / focal)
     _, cell = np.unique(np.floor(directions / side).astype(int), axis=0, return_inverse=True)
     pixels = np.bincount(cell)
     cameras = np.bincount(np.unique(np.stack([cell, photo], 1), axis=0)[:, 0])
@@ -86,8 +58,19 @@ def same_from_everywhere(
     for channel in colors.T:
         mean = np.bincount(cell, channel) / pixels
         variance += np.bincount(cell, (channel - mean[cell]) ** 2) / pixels / 3
-    looked = (cameras >= least)[cell]
-    return looked, looked & (variance < ALIKE**2)[cell]
+    looked = (cameras >= CAMERAS)[cell]
+    far = looked & (variance < ALIKE**2)[cell]
+    around = not looks_inward(scene.views)
+    if around:
+        far &= ~np.concatenate([named_things(view, scene) for view in views])[usable]
+    between = np.concatenate([between_points(view, scene.points.xyz) for view in views])[usable]
+    if (far & between).sum() > BETWEEN * far.sum():
+        return 0.0
+    up = directions[:, 2] > 0
+    above, below = (far[half].sum() / max(int(looked[half].sum()), 1) for half in (up, ~up))
+    if around and above < HIGHER * below:
+        return 0.0
+    return float(far.mean())
 
 
 def _colored_directions(view: View) -> tuple[np.ndarray, np.ndarray]:

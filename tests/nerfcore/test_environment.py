@@ -130,27 +130,6 @@ def test_what_has_a_place_is_not_at_infinity(tmp_path: Path) -> None:
     assert share_at_infinity(load_scene(project)) < INFINITE
 
 
-def test_a_sky_in_few_photos_is_told_by_what_label_maps_leave_without_a_name(tmp_path: Path) -> None:
-    """Every second photo shows things that have a name and many colours where the others see past the ball."""
-    project = under_the_sky(tmp_path / "p")
-    noise = np.random.default_rng(0).integers(0, 255, (64, 64, 3), np.uint8)
-    for number, path in enumerate(sorted((project / "images").iterdir())):
-        if number % 2:
-            size = Image.open(path).size
-            Image.fromarray(noise).resize(size).save(path)
-            Image.new("L", size, 1).save(project / "labels" / path.name)
-    scene = load_scene(project)
-    assert share_at_infinity(scene) > INFINITE
-    without = replace(scene, views=[replace(view, label=None) for view in scene.views])
-    assert share_at_infinity(without) < INFINITE
-    # Strokes name little: what they leave is not known.
-    for path in (project / "labels").iterdir():
-        label = np.array(Image.open(path))
-        label[2:] = 0
-        Image.fromarray(label).save(path)
-    assert share_at_infinity(load_scene(project)) < INFINITE
-
-
 @pytest.mark.parametrize(("name", "far"), [("Night sky", True), ("Himmel", True), ("天空", True), ("Ceiling", False)])
 def test_what_has_the_name_of_a_thing_is_no_sky_where_cameras_look_around(tmp_path: Path, name: str, far: bool) -> None:
     scene = load_scene(under_the_sky(tmp_path / "p", name, outward=True, above_a_floor=True))

@@ -91,8 +91,9 @@ def refined_maps(
     *,
     outward: bool = False,
 ) -> tuple[MapArrays, float]:
-    """Confirmed maps (see `depth_maps.confirmed_maps`) whose depths photos have moved, and the share of their depths that
-    views do confirm. Where views do not confirm a moved depth, the field's is asked again, the plane through what is
+    """Confirmed maps (see `depth_maps.confirmed_maps`) whose depths photos have moved, from the field's or from a plane of the
+    scene (plane_starts.py), and the share of their depths that views do confirm. Where views do not confirm a moved depth, the
+    field's is asked again, the plane through what is
     known around (planes.py), or that of a wall or floor that goes on from elsewhere (scene_planes.py); where label maps say that
     it is this floor, one view suffices. Where they do not confirm that either, but roughly the field's own depth, moved as the
     known ones around were (completion.py), it is taken, as far away as photos confirm depths. What label maps say is nothing,

@@ -52,7 +52,8 @@ def from_planes(
         report.progress(number / len(views))
         begin = int(arrays.first[number])
         some = slice(begin, begin + map_.depth.size)
-        depth, best, asked = map_.depth.copy(), np.maximum(score + GAIN, LEAST), map_.hit & ~safe
+        depth, best = map_.depth.copy(), np.maximum(score + GAIN, LEAST)
+        asked = map_.hit & ~safe & (best < 1)  # nothing agrees better than that
         for plane in planes[:PLANES] if asked.any() else []:
             start = depth_of(view, plane)
             near = asked & (start > map_.depth / OFF) & (start < map_.depth * OFF)

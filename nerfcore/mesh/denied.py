@@ -71,6 +71,8 @@ def _denied_pieces(vertices: np.ndarray, faces: np.ndarray, views: Sequence[View
     """Which triangles (F,) bool lie in pieces on which photos disagree, and hardly agree on those beside; none where photos
     agree on less than most pieces: then they or their poses say nothing of single ones."""
     size = PIECE * _pixel_size(vertices[faces].mean(1), views)
+    if size <= 0:  # no photo shows any of it
+        return np.zeros(len(faces), bool)
     piece = pieces(vertices, faces, size)
     while piece.max() >= MOST_PIECES:
         size *= 1.5
@@ -110,6 +112,7 @@ def _pixel_size(points: np.ndarray, views: Sequence[View]) -> float:
         with np.errstate(all="ignore"):
             place = project(view.camera, local)
             inside = ((place >= 0) & (place < [view.camera.width, view.camera.height])).all(1)
+        inside &= (local[:, 2] > 0) | (view.camera.model == "EQUIRECTANGULAR")
         shrunk = training_size(view.camera, PIECE_SIDE)[0] / view.camera.width
         sizes.append(np.linalg.norm(local[inside], axis=1) / (view.camera.pixels_per_radian * shrunk))
     found = np.concatenate(sizes)

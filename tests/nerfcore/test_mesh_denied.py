@@ -80,6 +80,7 @@ def test_only_the_part_that_is_not_there_is_denied(
     assert not denied(vertices, faces, views[:2], Reporter()).any(), "two photos are one pair"
     assert not denied(vertices, faces[part == 2], views, Reporter()).any(), "the largest part stays"
     assert len(denied(vertices, faces[:0], views, Reporter())) == 0
+    assert not denied(vertices + [0, 0, 50], faces, views, Reporter()).any(), "it lies behind all cameras"
 
 
 def test_photos_say_nothing_of_what_is_plain(

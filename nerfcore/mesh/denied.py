@@ -74,7 +74,8 @@ def _denied_pieces(vertices: np.ndarray, faces: np.ndarray, views: Sequence[View
     if size <= 0:  # no photo shows any of it
         return np.zeros(len(faces), bool)
     piece = pieces(vertices, faces, size)
-    while piece.max() >= MOST_PIECES:
+    extent = float(np.ptp(vertices[faces].reshape(-1, 3), axis=0).max())
+    while piece.max() >= MOST_PIECES and size < extent:  # wider ones join no parts
         size *= 1.5
         piece = pieces(vertices, faces, size)
     agreed = agreements(vertices, faces, piece, np.arange(piece.max() + 1), PIECE_SAMPLES, views, report)

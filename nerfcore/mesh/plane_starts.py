@@ -20,10 +20,8 @@ from .depth_maps import DepthMap, FlatView, cosines, pixel_directions
 from .scene_planes import STEEPEST, ScenePlane
 
 PLANES = 8  # of the scene, the largest, from which depths are tried
-LEAST, GAIN = (
-    0.6,
-    0.1,
-)  # correlation that is believed, and by how much it must exceed that of the depth beside the field's
+LEAST = 0.6  # correlation that is believed
+GAIN = 0.1  # by which it must exceed that of the depth near the field's
 # Not tuned.
 OFF = 2.0  # times as far or as near as the field's depth a plane may be
 STEP_GAIN = 0.05  # see `patches.refine`: by how much a depth must be better than the plane's to leave it

@@ -93,9 +93,8 @@ def refined_maps(
 ) -> tuple[MapArrays, float]:
     """Confirmed maps (see `depth_maps.confirmed_maps`) whose depths photos have moved, from the field's or from a plane of the
     scene (plane_starts.py), and the share of their depths that views do confirm. Where views do not confirm a moved depth, the
-    field's is asked again, the plane through what is
-    known around (planes.py), or that of a wall or floor that goes on from elsewhere (scene_planes.py); where label maps say that
-    it is this floor, one view suffices. Where they do not confirm that either, but roughly the field's own depth, moved as the
+    field's is asked again, the plane through what is known around (planes.py), or that of a wall or floor that goes on from
+    elsewhere (scene_planes.py); where label maps say that it is this floor, one view suffices. Where they do not confirm that either, but roughly the field's own depth, moved as the
     known ones around were (completion.py), it is taken, as far away as photos confirm depths. What label maps say is nothing,
     and backdrops without the name of a thing (sky.py), have an unknown depth. `outward`: cameras look around, so that what is plain
     is mostly a wall (walls.py) and not the thing that they surround.
@@ -113,17 +112,17 @@ def refined_maps(
         moved.append(_with_depth(view, map_, depth.cpu().numpy().reshape(map_.depth.shape)))
         agreed.append(score.cpu().numpy().reshape(map_.depth.shape))
 
-    def confirmed_moves() -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """Which depths (H, W) bool views confirm, and which of these photos have moved."""
+    def confirmed_moves(moved: list[DepthMap]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """Which depths (H, W) bool of moved maps views confirm, and which of these photos have moved."""
         # What one other view has moved to the same place as well may be wrong, and planes are put through what is known here.
         kept = hits(confirmed_maps(views, moved, device, report, around, few_suffice=False), maps)
         return kept, [a & (new.depth != old.depth) & ~even for a, old, new, even in zip(kept, maps, moved, plain)]
 
-    kept, sure = confirmed_moves()
+    _, sure = confirmed_moves(moved)
     sharp = [with_spread(*parts) for parts in zip(views, maps, moved, sure)]
     planes = scene_planes(known_points(views, sharp, sure), report)
     moved = from_planes(photos, views, moved, agreed, sure, arrays, near, planes, report)
-    kept, sure = confirmed_moves()
+    kept, sure = confirmed_moves(moved)
     labels = [label_picture(view, store) for view in views]
     left_out = [None if label is None else label == VOID for label in labels]
     told = labels_tell(sure, left_out)

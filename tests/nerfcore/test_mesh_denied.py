@@ -83,6 +83,14 @@ def test_only_the_part_that_is_not_there_is_denied(
     assert not denied(vertices + [0, 0, 50], faces, views, Reporter()).any(), "it lies behind all cameras"
 
 
+def test_a_surface_of_more_parts_than_pieces_is_judged_too(
+    tmp_path: Path, surface: tuple[np.ndarray, np.ndarray, np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    vertices, faces, part = surface
+    monkeypatch.setattr("fieldwork.nerfcore.mesh.denied.MOST_PIECES", 1)
+    assert np.array_equal(denied(vertices, faces, photos(tmp_path, plain=False), Reporter()), part == 2)
+
+
 def test_photos_say_nothing_of_what_is_plain(
     tmp_path: Path, surface: tuple[np.ndarray, np.ndarray, np.ndarray]
 ) -> None:

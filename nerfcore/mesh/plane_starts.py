@@ -36,17 +36,20 @@ def from_planes(
     arrays: MapArrays,
     around: list[torch.Tensor],
     planes: list[ScenePlane],
+    labels: list[np.ndarray | None],
     report: Reporter,
 ) -> list[DepthMap]:
     """The maps with other depths where photos agree better near a plane of the scene.
 
     Args:
         photos: see `patch_sums.quads`. moved: maps whose depths photos have moved, and how well they agree there, `agreed`
-            (H, W) of each. sure: where (H, W) bool they stay. around: the maps (K,) int32 that each is compared with.
+            (H, W) of each. sure: where (H, W) bool they stay. around: the maps (K,) int32 that each is compared with. labels:
+            class (H, W) uint8 of each pixel, None for maps without: what label maps name lies only on planes on which some of its
+            class is known, as what stands before a wall may look like it.
     """
     own = replace(arrays, depth=torch.zeros_like(arrays.depth), spread=torch.zeros_like(arrays.spread))
     made = []
-    for number, (view, map_, score, safe) in enumerate(zip(views, moved, agreed, sure)):
+    for number, (view, map_, score, safe, label) in enumerate(zip(views, moved, agreed, sure, labels)):
         report.progress(number / len(views))
         begin = int(arrays.first[number])
         some = slice(begin, begin + map_.depth.size)
@@ -55,6 +58,10 @@ def from_planes(
         for plane in planes[:PLANES] if asked.any() else []:
             start = depth_of(view, plane)
             near = asked & (start > map_.depth / OFF) & (start < map_.depth * OFF)
+            if label is not None:
+                near &= plane.partly[label]
+            if not near.any():
+                continue
             start = torch.from_numpy(np.where(near, start, 0).astype(np.float32).reshape(-1))
             own.depth[some], own.spread[some] = start.to(own.depth.device), start.to(own.depth.device)
             facing = (view.pose[:3, :3].T @ plane.normal).astype(np.float32)

@@ -120,10 +120,10 @@ def refined_maps(
 
     _, sure = confirmed_moves(moved)
     sharp = [with_spread(*parts) for parts in zip(views, maps, moved, sure)]
-    planes = scene_planes(known_points(views, sharp, sure), report)
-    moved = from_planes(photos, views, moved, agreed, sure, arrays, near, planes, report)
-    kept, sure = confirmed_moves(moved)
     labels = [label_picture(view, store) for view in views]
+    planes = scene_planes(known_points(views, sharp, sure, labels), report)
+    moved = from_planes(photos, views, moved, agreed, sure, arrays, near, planes, labels, report)
+    kept, sure = confirmed_moves(moved)
     left_out = [None if label is None else label == VOID for label in labels]
     told = labels_tell(sure, left_out)
     confirmed, usual = confirmed_share([map_.hit for map_ in maps], sure, labels)

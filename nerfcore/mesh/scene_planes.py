@@ -43,6 +43,7 @@ AGREES, SPREADS, OFF = (
     0.1,
 )  # share by which depths may be off a plane: at least, spreads of the field, at most
 FLAT_CLASS = 0.75  # share of what is known of a class that lies on one plane, from which on all of it does
+PARTLY = 0.1  # share of what is known of a class that lies on a plane, from which on it may go on there
 LABELLED_OFF = 0.5  # share by which the field's depth may be off the plane of its class
 BEHIND = 0.01  # share of what is known that may lie behind such a plane: a floor bounds a scene, a table top does not
 SMOOTHED = 12.0  # cells over which heights above a plane are averaged
@@ -68,7 +69,7 @@ class Known:
 class ScenePlane:
     """Part of a plane: a point of it (3,), its unit normal (3,) towards the cameras, two axes (2, 3) in it, and which cells
     (X, Y) bool it reaches into, of size `cell` from `low` (2,) on along the axes; height (X, Y) of what is known above the
-    plane, and which classes (256,) bool lie on it wholly."""
+    plane, and which classes (256,) bool lie on it wholly, and which in part, VOID too."""
 
     point: np.ndarray
     normal: np.ndarray
@@ -78,6 +79,7 @@ class ScenePlane:
     reached: np.ndarray
     height: np.ndarray
     classes: np.ndarray
+    partly: np.ndarray
 
     def holds(self, points: np.ndarray) -> np.ndarray:
         """Whether points (N, 3) of the plane lie in what is reached."""
@@ -187,8 +189,8 @@ def _reaching(known: Known, on: np.ndarray, point: np.ndarray, normal: np.ndarra
     there = np.zeros(index.max(0) + rim + 1, bool)
     there[tuple(index.T)] = True
     reached = np.asarray(scipy.ndimage.distance_transform_edt(~there)) <= REACH
-    classes = _flat_classes(known, point, normal)
-    return ScenePlane(point, normal, axes, low, cell, reached, np.zeros(there.shape), classes)
+    classes, partly = _flat_classes(known, point, normal), _partly(known, on)
+    return ScenePlane(point, normal, axes, low, cell, reached, np.zeros(there.shape), classes, partly)
 
 
 def _flat_classes(known: Known, point: np.ndarray, normal: np.ndarray) -> np.ndarray:
@@ -200,6 +202,15 @@ def _flat_classes(known: Known, point: np.ndarray, normal: np.ndarray) -> np.nda
     flat = own >= FLAT_CLASS * np.maximum(np.bincount(known.kind, area, 256), FEWEST * np.median(area))
     flat[VOID] = False
     return flat
+
+
+def _partly(known: Known, on: np.ndarray) -> np.ndarray:
+    """Which classes (256,) bool have a good part of their known area among the points `on` of a plane; VOID may have."""
+    area = known.footprint**2
+    found = np.bincount(known.kind[on], area[on], 256)
+    partly = (found > 0) & (found >= PARTLY * np.bincount(known.kind, area, 256))
+    partly[VOID] = True
+    return partly
 
 
 def _heights(known: Known, plane: ScenePlane) -> np.ndarray:

@@ -14,6 +14,7 @@ from fieldwork.tests.nerfcore.support.depth_views import box, look_at, maps_of
 from fieldwork.tests.nerfcore.test_refine import painted_photos
 
 CPU = torch.device("cpu")
+GRASS, POND = 3, 7
 
 
 @pytest.fixture(scope="module")
@@ -23,8 +24,13 @@ def ground() -> tuple[list[depth_maps.FlatView], list[depth_maps.DepthMap]]:
     return maps_of(box(np.array([-9, -9, -1.0]), np.array([9, 9, 0.0])), poses)
 
 
-def floor_of(flats: list[depth_maps.FlatView], true: list[depth_maps.DepthMap], near: list[np.ndarray]) -> ScenePlane:
-    planes = scene_planes(known_points(flats, true, near), Reporter())
+def floor_of(
+    flats: list[depth_maps.FlatView],
+    true: list[depth_maps.DepthMap],
+    near: list[np.ndarray],
+    labels: list[np.ndarray | None] | None = None,
+) -> ScenePlane:
+    planes = scene_planes(known_points(flats, true, near, labels), Reporter())
     assert len(planes) == 1
     return planes[0]
 
@@ -42,11 +48,12 @@ def test_a_plane_is_as_deep_as_views_see_it(
     assert (found[up] == 0).all(), "above the horizon"
 
 
-@pytest.mark.parametrize("painted", [True, False])
+@pytest.mark.parametrize(("painted", "far_class"), [(True, None), (True, GRASS), (True, POND), (False, None)])
 def test_photos_find_far_ground_from_the_plane_of_near_ground(
-    ground: tuple[list[depth_maps.FlatView], list[depth_maps.DepthMap]], painted: bool
+    ground: tuple[list[depth_maps.FlatView], list[depth_maps.DepthMap]], painted: bool, far_class: int | None
 ) -> None:
-    """The field has what is farther than 2.3 too near by a fifth. Where nothing is painted, photos say nothing of it."""
+    """The field has what is farther than 2.3 too near by a fifth. Where nothing is painted, photos say nothing of it, and
+    where label maps name it, it lies on planes of this class alone: near ground is grass."""
     flats, true = ground
     sure = [map_.hit & (map_.depth < 2.3) for map_ in true]
     wrong = []
@@ -64,14 +71,15 @@ def test_photos_find_far_ground_from_the_plane_of_near_ground(
         depth_maps.DepthMap(depth.numpy().reshape(map_.depth.shape), map_.spread, map_.cosine)
         for (depth, _), map_ in zip(moved, wrong)
     ]
-    planes = [floor_of(flats, true, sure)]
-    found = from_planes(photos, flats, depths, agreed, sure, arrays, around, planes, Reporter())
+    labels = [None if far_class is None else np.where(s, GRASS, far_class).astype(np.uint8) for s in sure]
+    planes = [floor_of(flats, true, sure, labels)]
+    found = from_planes(photos, flats, depths, agreed, sure, arrays, around, planes, labels, Reporter())
     off = [np.abs(map_.depth / np.where(t.hit, t.depth, 1) - 1) for map_, t in zip(found, true)]
     far = [t.hit & ~safe & (t.depth < 3.2) for t, safe in zip(true, sure)]
     right = np.mean(np.concatenate([o[f] < 0.01 for o, f in zip(off, far)]))
     before = [np.abs(map_.depth / np.where(t.hit, t.depth, 1) - 1) for map_, t in zip(depths, true)]
     assert np.mean(np.concatenate([o[f] < 0.01 for o, f in zip(before, far)])) < 0.1
-    if painted:
+    if painted and far_class != POND:
         assert right > 0.5  # the pattern is finer than pixels far away
     else:
         assert all(np.array_equal(a.depth, b.depth) for a, b in zip(found, depths))

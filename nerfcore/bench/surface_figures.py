@@ -32,6 +32,7 @@ FAR = 2.5  # of the median depth of the photos: what is farther is a background
 MOST_CAPPED = 0.25  # share of a body's area that may stand on something
 HIDDEN = 0.5  # footprints of a pixel that something lies in front of what it hides
 NEAR_CORNER = 0.7  # of the way from a piece's middle to a corner
+CUT = 4.0  # pixels: longest edge of pieces that are seen in part, where classes are asked
 STEEPEST = 0.1  # cosine under which a camera is not said to see a place
 MARGIN = 2.0  # radii of a piece by which it may lie beside a picture that shows some of it
 ACROSS = 50  # pieces across what the photos show, from which points of the truth are taken
@@ -107,10 +108,25 @@ class Sight:
     def class_near(self, points: np.ndarray) -> np.ndarray:
         """True class (N,) of what is closest to points (N, 3), of all that enough cameras see: where one thing lies on
         another, the faces between them are nobody's."""
-        pieces = self.pieces
-        seen = np.flatnonzero(self.visible(pieces.centers, pieces.normals))
-        closest = ClosestPoints(pieces.vertices, pieces.faces[seen]).find(points)[0]
-        return self.truth.face_class[pieces.parent[seen[closest]]]
+        shown, classes = self._shown
+        return classes[shown.find(points)[0]]
+
+    @cached_property
+    def _shown(self) -> tuple[ClosestPoints, np.ndarray]:
+        """What enough cameras see, and its class (S,) by triangle. What they see a part of, as of a ground on which a wall
+        stands, is cut into smaller pieces."""
+        pieces, limit = self.pieces, CUT * self.pixel
+        ends = pieces.vertices[pieces.faces]
+        longest = np.linalg.norm(ends - np.roll(ends, 1, axis=1), axis=2).max(1)
+        seen = np.array([self.visible(place, pieces.normals) for place in _places(pieces)])
+        in_part = seen.any(0) & ~seen.all(0) & (longest > limit)
+        whole = np.flatnonzero(seen[0] & ~in_part)
+        cut = facelets(pieces.vertices, pieces.faces[in_part], limit=limit)
+        kept = np.flatnonzero(self.visible(cut.centers, cut.normals))
+        parent = np.concatenate([pieces.parent[whole], pieces.parent[in_part][cut.parent[kept]]])
+        # `facelets` keeps the vertices it is given in front of its own.
+        faces = np.concatenate([pieces.faces[whole], cut.faces[kept]])
+        return ClosestPoints(cut.vertices, faces), self.truth.face_class[parent]
 
     def visible_near(self, points: np.ndarray) -> np.ndarray:
         """Whether enough cameras see what is closest to points (N, 3), of all that any camera sees: what no camera sees,
@@ -123,10 +139,8 @@ class Sight:
     @cached_property
     def _looked_at(self) -> np.ndarray:
         """The pieces (L,) of which a camera sees the middle, or a place near a corner."""
-        pieces = self.pieces
-        corners = pieces.vertices[pieces.faces]
-        places = [pieces.centers, *(corners[:, k] * NEAR_CORNER + pieces.centers * (1 - NEAR_CORNER) for k in range(3))]
-        return np.flatnonzero(np.any([self.cameras_at(place, pieces.normals) > 0 for place in places], axis=0))
+        looks = [self.cameras_at(place, self.pieces.normals) > 0 for place in _places(self.pieces)]
+        return np.flatnonzero(np.any(looks, axis=0))
 
     def visible(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """Whether enough cameras see points (N, 3) of the truth with normals (N, 3): (N,)."""
@@ -155,6 +169,12 @@ class Sight:
             slack = HIDDEN * camera.footprint(depth[rows]) / distance[rows]
             seen[rows] += ~((face >= 0) & (reached > 0) & (reached < 1 - slack))
         return seen
+
+
+def _places(pieces: Facelets) -> list[np.ndarray]:
+    """The middles (P, 3) of pieces, and a place of each near each of its corners."""
+    corners = pieces.vertices[pieces.faces]
+    return [pieces.centers, *(corners[:, k] * NEAR_CORNER + pieces.centers * (1 - NEAR_CORNER) for k in range(3))]
 
 
 def posed(views: Sequence[View]) -> list[PosedCamera]:

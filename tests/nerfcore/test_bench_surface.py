@@ -157,6 +157,22 @@ def test_classes_are_those_of_what_can_be_seen() -> None:
     assert sight.class_near(inside).tolist() == [1, 1, 2]
 
 
+def test_a_ground_in_large_pieces_is_itself_up_to_what_stands_on_it() -> None:
+    """The middle of a large piece of the ground may lie under the box, where no camera sees it."""
+    import trimesh
+
+    box = trimesh.creation.box((0.4, 0.4, 0.2)).subdivide_to_size(0.1).apply_translation((0, 0, 0.1))
+    plate = trimesh.creation.box((60, 60, 0.2)).apply_translation((0.3, 0.3, -0.1))
+    whole = trimesh.util.concatenate([plate, box])
+    kinds = np.repeat([2, 1], [len(plate.faces), len(box.faces)])
+    sight = Sight(Truth(np.asarray(whole.vertices), np.asarray(whole.faces), kinds), scene_around().views)
+    x, y = np.meshgrid(np.linspace(-0.4, 0.4, 81), np.linspace(-0.4, 0.4, 81))
+    beside = np.maximum(np.abs(x), np.abs(y)) > 0.2 + 3 * sight.pixel
+    ground = np.stack([x[beside], y[beside], np.zeros(beside.sum())], 1)
+    assert (sight.class_near(ground) == 2).all()
+    assert (sight.class_near(np.stack([x, y, np.full(x.shape, 0.2)], -1)[~beside]) == 1).all()
+
+
 def test_a_ground_that_few_cameras_see_is_none_of_what_stands_on_it() -> None:
     """Two cameras look from the other side of the box; one sees what they do not, of the plate beside it."""
     import trimesh

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 import scipy
 
-from ..mesh.clean import SCRAP, fill_holes
+from ..mesh.clean import SCRAP
+from ..mesh.holes import SHORT_LOOP, fill_holes
 from ..mesh.surface import Surface, vertex_normals
 from ..mesh.triangles import areas, border_edges, components
 from .surface import Part
@@ -80,20 +81,13 @@ def _filled(
 ) -> Surface:
     """The surface with its small holes filled, and without vertices that no triangle has."""
     before = len(vertices)
-    vertices, all_faces, new = fill_holes(vertices, faces)
-    rims = all_faces[new]
-    face_class = np.concatenate([face_class, class_id[rims.min(1)]]) if len(rims) else face_class
-    if len(vertices) > before:  # the middles of filled holes: as their rims
-        total, amount = np.zeros((len(vertices), 3)), np.zeros(len(vertices))
-        some = np.zeros(len(vertices), class_id.dtype)
-        for center, rim in ((rims[:, 2], rims[:, 0]), (rims[:, 2], rims[:, 1])):
-            is_new = center >= before
-            np.add.at(total, center[is_new], colors[rim[is_new]])
-            np.add.at(amount, center[is_new], 1.0)
-            some[center[is_new]] = class_id[rim[is_new]]
-        added = slice(before, None)
-        colors = np.concatenate([colors, (total[added] / np.maximum(amount[added], 1)[:, None] + 0.5).astype(np.uint8)])
-        class_id = np.concatenate([class_id, some[added]])
+    vertices, all_faces, new = fill_holes(vertices, faces, SHORT_LOOP)
+    if len(vertices) > before:  # as the closest of their rims
+        rim = np.unique(all_faces[new])
+        rim = rim[rim < before]
+        nearest = rim[scipy.spatial.KDTree(vertices[rim]).query(vertices[before:])[1]]
+        colors, class_id = np.append(colors, colors[nearest], 0), np.append(class_id, class_id[nearest])
+    face_class = np.append(face_class, class_id[all_faces[new].min(1)])
     used, index = np.unique(all_faces, return_inverse=True)
     vertices, index = vertices[used], index.reshape(-1, 3)
     return Surface(

@@ -32,7 +32,7 @@ from .denoise import denoised
 from .extract import extract
 from .field_values import shade
 from .fusion import TRUNCATION, Bricks, coarser, fuse_maps, tolerances
-from .gaps import close_gaps
+from .gaps import close_gaps, open_places
 from .photometric import Pictures, moved_by_photos, pictures_of
 from .refine import refined_maps
 from .region import Region, choose_region, on_sides, sides_of
@@ -49,7 +49,7 @@ class Built:
     """A surface in the normalised frame, and the region in which it was looked for: vertices (V, 3) float32, faces (F, 3)
     int32, normals (V, 3) unit, outward, colors (V, 3) uint8 sRGB; coarse: vertices (V', 3) and faces (F', 3) of the same
     surface at voxels of twice the size, not cleaned; unseen (F,) bool: triangles that close a surface which was asked to
-    be watertight, or its gaps."""
+    be watertight, its gaps, or small holes; None without any."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -86,7 +86,7 @@ def build(trained: Trained, project: Project, scene: Scene, params: MeshParams, 
         vertices, faces, guessed = open_surface(bricks, maps, tolerance, region, params.faces, gaps, report, pictures)
         kept = not_refuted(transform_points(box.world_from_box, vertices), faces, scene, report)
         vertices, faces = compact(vertices, faces[kept])
-        unseen = guessed[kept] if gaps else None
+        unseen = guessed[kept] if guessed.any() else None
     if not len(faces):
         raise no_surface(params)
     check_parts(vertices, faces, report)
@@ -170,7 +170,8 @@ def open_surface(
     pictures: Pictures | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What two views see of the fused surface, in about `most` triangles where a number is given, and which of these (F,) bool
-    close gaps by a guess; open where nothing is known, but for gaps up to a width of `gaps`, and where the region cuts it.
+    close small holes, or gaps, by a guess; else open where nothing is known, but for gaps up to a width of `gaps`, and where the
+    region cuts it.
     `pictures`: the photos that it is fitted to."""
     vertices, faces = extract(bricks, report)
     if not len(faces):
@@ -178,6 +179,8 @@ def open_surface(
     report.stage("Cleaning the surface")
     near = tolerances(bricks, vertices, faces, tolerance)
     vertices, faces, guessed = clean(vertices, faces, maps, near, report)
+    kept = ~open_places(vertices, faces, guessed, bricks, maps, report)
+    (vertices, faces), guessed = compact(vertices, faces[kept]), guessed[kept]
     if gaps:
         report.stage("Closing gaps")
         vertices, faces, guessed = close_gaps(bricks, vertices, faces[~guessed], gaps, maps, report)
@@ -191,7 +194,7 @@ def open_surface(
     faces = faces[~on_sides(vertices, faces, region, region.voxel / 2)]
     faces = faces[not_scraps(vertices, faces)]  # simplifying tears thin ones off
     vertices, faces = compact(vertices, faces)
-    if not gaps:
+    if not guessed.any():
         return vertices, faces, np.zeros(len(faces), bool)
     _, nearest = scipy.spatial.KDTree(before).query(vertices[faces].mean(1))
     return vertices, faces, guessed[nearest]

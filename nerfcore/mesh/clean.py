@@ -8,15 +8,14 @@ import torch
 from ..kernels.depth_arrays import MapArrays
 from ..kernels.surface import sight, slopes
 from ..progress import Reporter
-from .triangles import areas, border_edges, compact, components, cross, mean_around, summed_around, unit
+from .holes import fill_holes
+from .triangles import areas, compact, components, cross, mean_around, unit
 
 FEWEST_VIEWS = 2
 TURNED = np.radians(35)  # by which a face may be steeper or flatter than what a view shows there
 MOSTLY = 4  # rings of faces of which most must be seen: single ones are missed by noise, and each would be a hole
 AROUND = 6  # rings of faces over which views are averaged: single faces have noisy normals
 SCRAP = 1e-3  # of the area
-LONGEST_LOOP = 30  # edges of a hole that is filled
-SHEET = 0.5  # cosine, at least, of the angle between a sheet and what its border goes around
 CHUNK = 1 << 16
 
 
@@ -34,7 +33,7 @@ def clean(
     vertices: np.ndarray, faces: np.ndarray, maps: MapArrays, tolerance: float | np.ndarray, report: Reporter
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Vertices, triangles, and which triangles (F,) bool fill a hole: without faces that views do not show (`shown`) and
-    parts below a thousandth of the area; holes of at most 30 edges filled. `tolerance`: of all faces, or (F,) of each."""
+    parts below a thousandth of the area; small holes filled (holes.py). `tolerance`: of all faces, or (F,) of each."""
     faces = drop_scraps(vertices, faces[shown(vertices, faces, maps, tolerance, report)])
     report.check()
     vertices, faces, filled = fill_holes(vertices, faces)
@@ -85,49 +84,3 @@ def not_scraps(vertices: np.ndarray, faces: np.ndarray, share: float = SCRAP) ->
     part = components(faces, len(vertices))
     area = np.bincount(part, areas(vertices, faces))
     return area[part] >= share * area.sum()
-
-
-def fill_holes(
-    vertices: np.ndarray, faces: np.ndarray, longest: int = LONGEST_LOOP
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Close border loops of at most `longest` edges by fans around their middle: vertices, triangles, and which of
-    these are new. Vertices where several loops meet are left alone, and so are the borders of small sheets, which would get
-    a back."""
-    border = border_edges(faces)
-    starts, amount = np.unique(border[:, 0], return_counts=True)
-    simple = set(starts[amount == 1].tolist())
-    after = {int(a): int(b) for a, b in border if int(a) in simple}
-    around = summed_around(faces, cross(vertices, faces), len(vertices))
-    middles, fans, visited = [], [], set()
-    for start in after:
-        if start in visited:
-            continue
-        loop, here = [], start
-        while here in after and here not in visited:
-            visited.add(here)
-            loop.append(here)
-            here = after[here]
-        if here != start or not 3 <= len(loop) <= longest or _bounds_sheet(vertices[loop], around[loop]):
-            continue
-        if len(loop) == 3:
-            fans.append(np.array([loop[::-1]]))
-            continue
-        center = len(vertices) + len(middles)
-        middles.append(vertices[loop].mean(0))
-        ring = np.array(loop)
-        fans.append(np.stack([np.roll(ring, -1), ring, np.full(len(ring), center)], 1))
-    if not fans:
-        return vertices, faces, np.zeros(len(faces), bool)
-    added = np.concatenate(fans)
-    if middles:
-        vertices = np.concatenate([vertices, np.array(middles)])
-    return vertices, np.concatenate([faces, added]), np.arange(len(faces) + len(added)) >= len(faces)
-
-
-def _bounds_sheet(loop: np.ndarray, normals: np.ndarray) -> bool:
-    """Whether a loop (N, 3) of a border, whose triangles lie to its left and have these normals (N, 3), goes around a sheet, and
-    not around a hole."""
-    place = loop - loop.mean(0)
-    area = np.cross(place, np.roll(place, -1, axis=0)).sum(0)
-    within = np.linalg.norm(area) * np.linalg.norm(normals, axis=1).sum()
-    return bool(area @ normals.sum(0) > SHEET * within)

@@ -19,9 +19,9 @@ import torch
 from ..kernels.depth_arrays import MapArrays
 from ..kernels.surface import fuse
 from ..progress import Reporter
-from .clean import fill_holes
 from .extract import extract
 from .fusion import BRICK, FREE_AT, TRUNCATION, Bricks, depth_gap
+from .holes import fill_holes
 from .triangles import areas, border_edges, compact, components, mean_around
 
 MOST_REACH = 10  # voxels, about, that a guess reaches at first, and on the grid on which it is first sought
@@ -70,10 +70,10 @@ def close_gaps(
         vertices, faces = compact(vertices, faces[kept])
         cells = np.unique(_number(_cells(bricks, vertices, faces), shape))
         bricks = _with(bricks, _guessed_at(found, _cells(bricks, vertices, faces[guessed[kept]])))
-    vertices, all_faces, filled = fill_holes(vertices, faces)
-    guessed = filled | ~np.isin(_number(_cells(bricks, vertices, all_faces), shape), seen)
-    vertices, faces = compact(vertices, all_faces)
-    return vertices, faces, guessed
+    vertices, faces, filled = fill_holes(vertices, faces)
+    filled = filled[kept := ~open_places(vertices, faces, filled, bricks, maps, report)]
+    vertices, faces = compact(vertices, faces[kept])
+    return vertices, faces, filled | ~np.isin(_number(_cells(bricks, vertices, faces), shape), seen)
 
 
 def closed(
@@ -185,6 +185,13 @@ def looked_through(
         distance, weight = fuse(middle, maps, h, TRUNCATION * h, FREE_AT * h, depth_gap(maps))
         through[some] = ((weight > 0) & (distance > THROUGH * h)).cpu().numpy()
     return asked & (mean_around(faces, through, len(vertices), MOSTLY) > 0.5)
+
+
+def open_places(
+    vertices: np.ndarray, faces: np.ndarray, guessed: np.ndarray, bricks: Bricks, maps: MapArrays, report: Reporter
+) -> np.ndarray:
+    """Which guessed triangles (F,) bool close what views look through."""
+    return openings(vertices, faces, guessed, looked_through(vertices, faces, guessed, bricks, maps, report))
 
 
 def openings(vertices: np.ndarray, faces: np.ndarray, guessed: np.ndarray, through: np.ndarray) -> np.ndarray:

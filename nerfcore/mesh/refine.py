@@ -121,10 +121,13 @@ def refined_maps(
     _, sure = confirmed_moves(moved)
     sharp = [with_spread(*parts) for parts in zip(views, maps, moved, sure)]
     labels = [label_picture(view, store) for view in views]
-    planes = scene_planes(known_points(views, sharp, sure, labels), report)
-    moved = from_planes(photos, views, moved, agreed, sure, arrays, near, planes, labels, report)
-    kept, sure = confirmed_moves(moved)
     left_out = [None if label is None else label == VOID for label in labels]
+    things = [None] * len(views)
+    if labels_tell(sure, left_out):
+        things = named_things(labels, *confirmed_share([map_.hit for map_ in maps], sure, labels))
+    planes = scene_planes(known_points(views, sharp, sure, things), report)
+    moved = from_planes(photos, views, moved, agreed, sure, arrays, near, planes, things, report)
+    kept, sure = confirmed_moves(moved)
     told = labels_tell(sure, left_out)
     confirmed, usual = confirmed_share([map_.hit for map_ in maps], sure, labels)
     labels = named_things(labels, confirmed, usual)

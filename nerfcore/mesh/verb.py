@@ -53,8 +53,8 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
         "overlap_shown" and "seen_by_few": see `coverage.Coverage` (solid, holes, overlapped, few); "verdict";
         "silhouette" of a capture with masks: see `shown.silhouette`;
         for a preview see `preview.preview`;
-        of a closed surface "unseen", the share of its area that closes gaps, or that fewer than two photos see of a
-        watertight one;
+        "unseen": the share of its area that closes small holes or gaps, or that fewer than two photos see of a watertight
+        one;
         with a texture of photos "painted_by_photos", the share of its texels that a photo shows
     Raises:
         SettingError: unknown format, impossible region, or no memory for the texture. ProjectError, TrainingError, DiskError.
@@ -156,11 +156,10 @@ def judge(
     largest, _ = largest_share(built.vertices, built.faces)
     result: dict[str, Any] = {"shown": round(shown, 4), "solid_shown": solid, "holes": round(found.holes, 4)}
     result |= {"overlap_shown": overlapped, "seen_by_few": round(found.few, 4)}
-    guessed = guess_share(built) if params.close_gaps or params.watertight else None
-    asked = 0.0 if params.watertight else guessed
+    guessed = guess_share(built)
+    asked = 0.0 if params.watertight else guessed if params.close_gaps else None
     result["verdict"] = mesh_verdict(shown, found.solid, found.holes, largest, found.overlapped, found.few, asked)
-    if guessed is not None:
-        result["unseen"] = round(guessed, 4)
+    result["unseen"] = round(guessed, 4)
     outlines = silhouette(scene, surface.vertices, surface.faces, report.check)
     return result if outlines is None else {**result, "silhouette": round(outlines, 4)}
 

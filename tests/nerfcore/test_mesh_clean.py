@@ -10,7 +10,7 @@ import torch
 import trimesh
 from fieldwork.nerfcore.kernels.depth_arrays import FREE
 from fieldwork.nerfcore.mesh import build, depth_maps
-from fieldwork.nerfcore.mesh.clean import FEWEST_VIEWS, fill_holes, seen_by, shown
+from fieldwork.nerfcore.mesh.clean import FEWEST_VIEWS, seen_by, shown
 from fieldwork.nerfcore.mesh.fusion import fuse_maps
 from fieldwork.nerfcore.mesh.region import choose_region
 from fieldwork.nerfcore.mesh.triangles import border_edges, components, cross, mean_around, unit
@@ -91,18 +91,3 @@ def test_what_simplifying_tears_off_does_not_hang_in_the_air(monkeypatch: pytest
     assert len(faces) > 1000
     assert components(faces, len(vertices)).max() == 0
     assert len(np.unique(faces)) == len(vertices)
-
-
-def test_small_sheets_get_no_back() -> None:
-    vertices, faces = grid(np.array([0.3, 0.1, 0.2]), np.array([0.0, 0.4, 0.1]), 6)
-    _, after, filled = fill_holes(vertices, faces)
-    assert len(after) == len(faces)
-    assert not filled.any()
-    hole = np.delete(faces, 14, axis=0)  # in its middle
-    vertices, after, filled = fill_holes(vertices, hole)
-    assert filled.sum() == 1
-    assert (unit(cross(vertices, after)) @ unit(cross(vertices, after))[0] > 0.99).all()
-    tube = trimesh.creation.cylinder(1.0, 3.0, sections=12)
-    open_ = tube.faces[np.abs(tube.face_normals[:, 2]) < 0.5]
-    _, after, filled = fill_holes(np.asarray(tube.vertices), np.asarray(open_))
-    assert filled.sum() == 24

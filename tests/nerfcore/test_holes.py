@@ -1,0 +1,100 @@
+"""Small holes of a surface, filled."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+from fieldwork.nerfcore.mesh.holes import LONGEST_LOOP, SHORT_LOOP, border_loops, fill_holes
+from fieldwork.nerfcore.mesh.surface import is_watertight
+from fieldwork.nerfcore.mesh.triangles import areas, border_edges, cross, unit
+from fieldwork.tests.nerfcore.test_mesh_clean import grid
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+FLAT = grid(np.array([1.0, 0, 0]), np.array([0, 1.0, 0]), 24)
+
+
+def ball(detail: int = 5) -> tuple[np.ndarray, np.ndarray]:
+    made = trimesh.creation.icosphere(detail)
+    return np.asarray(made.vertices), np.asarray(made.faces)
+
+
+def sound(vertices: np.ndarray, faces: np.ndarray) -> bool:
+    """Whether no edge has more than one triangle on a side, and none is turned over or has no area."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    return len(np.unique(edges, axis=0)) == len(edges) and bool((areas(vertices, faces) > 0).all())
+
+
+def test_small_sheets_get_no_back() -> None:
+    vertices, faces = grid(np.array([0.3, 0.1, 0.2]), np.array([0.0, 0.4, 0.1]), 6)
+    _, after, filled = fill_holes(vertices, faces)
+    assert len(after) == len(faces)
+    assert not filled.any()
+    hole = np.delete(faces, 14, axis=0)  # in its middle
+    vertices, after, filled = fill_holes(vertices, hole)
+    assert filled.sum() == 1
+    assert (unit(cross(vertices, after)) @ unit(cross(vertices, after))[0] > 0.99).all()
+    tube = trimesh.creation.cylinder(1.0, 3.0, sections=12)
+    open_ = tube.faces[np.abs(tube.face_normals[:, 2]) < 0.5]
+    vertices, after, filled = fill_holes(np.asarray(tube.vertices), np.asarray(open_))
+    assert is_watertight(after)
+    assert areas(vertices, after[filled]).sum() == pytest.approx(2 * 12 / 2 * np.sin(np.pi / 6)), "both ends"
+
+
+@pytest.mark.parametrize("wide", [0.04, 0.1, 0.2])
+def test_a_hole_in_a_ball_is_filled_by_a_membrane(wide: float) -> None:
+    vertices, faces = ball()
+    gone = np.linalg.norm(vertices[faces].mean(1) - [1, 0, 0], axis=1) < wide
+    after, filled, new = fill_holes(vertices, faces[~gone])
+    assert is_watertight(filled)
+    assert sound(after, filled)
+    np.testing.assert_array_equal(after[: len(vertices)], vertices)
+    assert ((cross(after, filled) * after[filled].mean(1)).sum(1) > 0).all(), "outward"
+    depth = 1 - np.linalg.norm(after[filled[new]].mean(1), axis=1)
+    assert depth.max() < 1.1 * wide**2 / 2 + 0.001, "a membrane lies as deep as its rim"
+    longest = np.linalg.norm(np.diff(after[filled[new][:, [0, 1, 2, 0]]], axis=1), axis=2).max()
+    rim = np.linalg.norm(np.diff(after[border_edges(faces[~gone])], axis=1), axis=2).max()
+    assert longest < 1.6 * rim
+
+
+def test_longer_loops_stay() -> None:
+    vertices, faces = ball()
+    gone = np.linalg.norm(vertices[faces].mean(1) - [1, 0, 0], axis=1) < 0.5
+    (loop,) = border_loops(faces[~gone])
+    assert len(loop) > LONGEST_LOOP
+    after, filled, new = fill_holes(vertices, faces[~gone])
+    assert not new.any()
+    assert len(after) == len(vertices)
+    assert is_watertight(fill_holes(vertices, faces[~gone], len(loop))[1])
+
+
+def test_holes_that_meet_in_a_corner_are_two() -> None:
+    vertices, faces = FLAT
+    middle = vertices[faces].mean(1)[:, :2] * 24
+    one, other = ((np.abs(middle - place) < 2).all(1) for place in ((8, 8), (12, 12)))
+    kept = faces[~one & ~other]
+    loops = [loop for loop in border_loops(kept) if len(loop) < 90]
+    assert sorted(map(len, loops)) == [16, 16]
+    assert len(np.intersect1d(*loops)) == 1
+    after, filled, _ = fill_holes(vertices, kept)
+    assert sound(after, filled)
+    assert areas(after, filled).sum() == pytest.approx(1)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(0.05, 0.5))
+def test_ragged_holes_in_a_plane_are_filled_flat(seed: int, share: float) -> None:
+    """Whatever triangles are missing in the middle of a plane: what is filled lies in it and covers nothing twice."""
+    vertices, faces = FLAT
+    middle = vertices[faces].mean(1)[:, :2]
+    random = np.random.default_rng(seed)
+    gone = (np.abs(middle - 0.5) < 0.3).all(1) & (random.random(len(faces)) < share)
+    after, filled, new = fill_holes(vertices, faces[~gone])
+    assert len(filled) - len(faces[~gone]) == new.sum()
+    assert np.abs(after[filled[new], 2]).max(initial=0) < 1e-9
+    up = cross(after, filled[new])[:, 2]
+    simple = {len(loop) for loop in border_loops(faces[~gone])} <= set(range(3, SHORT_LOOP)) | {96}
+    if simple:
+        assert (up > -1e-12).mean() > 0.9
+    assert up.sum() / 2 <= areas(vertices, faces[gone]).sum() + 1e-9

@@ -63,7 +63,7 @@ def test_longer_loops_stay() -> None:
     gone = np.linalg.norm(vertices[faces].mean(1) - [1, 0, 0], axis=1) < 0.5
     (loop,) = border_loops(faces[~gone])
     assert len(loop) > LONGEST_LOOP
-    after, filled, new = fill_holes(vertices, faces[~gone])
+    after, _, new = fill_holes(vertices, faces[~gone])
     assert not new.any()
     assert len(after) == len(vertices)
     assert is_watertight(fill_holes(vertices, faces[~gone], len(loop))[1])

@@ -9,6 +9,7 @@ from fieldwork.tests.faults.campaign import AREAS, attempted
 from fieldwork.tests.faults.scene import Scene
 
 SEED = 7
+LONG = ("limits", "clocks")
 
 
 @pytest.fixture(scope="module")
@@ -18,7 +19,10 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
     made.engine.kill()
 
 
-@pytest.mark.parametrize("name", [name for name, area in AREAS.items() if area.few])
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.slow] if name in LONG else []) for name, area in AREAS.items() if area.few],
+)
 def test_faults_are_told_and_nothing_is_lost(scene: Scene, name: str) -> None:
     area = AREAS[name]
     cases = (area.quick or area.cases)(scene, area.few, SEED)

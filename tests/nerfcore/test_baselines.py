@@ -295,7 +295,13 @@ def small_networks(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(module, "FIRST_RATE", 3e-3)
 
 
-@pytest.mark.parametrize("name", BASELINES)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[] if name in ("instant-ngp", "semantic-nerf") else [pytest.mark.slow])
+        for name in BASELINES
+    ],
+)
 def test_methods_learn_a_small_scene(name: str, store: PixelStore, small_networks: None) -> None:
     method = make_baseline(name, SETUP, 0)
     before, after = learned(method, store, 50 if isinstance(method, InstantNGP) else 160)

@@ -297,6 +297,7 @@ def test_the_environment_is_named_as_often_as_other_pixels(share: float, named: 
     assert (float(environment.labelled) > NAMED) == named
 
 
+@pytest.mark.slow
 def test_baked_fields_have_the_environment_too(seen: Seen, tmp_path: Path) -> None:
     run_verb("bake", BakeParams(project=seen.project, memory=20), Reporter())
     baked = load_baked(seen.project, "main", seen.trained.info)

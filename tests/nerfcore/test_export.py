@@ -222,10 +222,10 @@ WORLD = np.array([[2.4, -0.7, 0.0, 1.0], [0.7, 2.4, 0.0, 2.0], [0.0, 0.0, 2.5, 3
     [
         ({}, False),
         ({}, True),
-        ({"branch": "explicit"}, False),
-        ({"branch": "implicit"}, True),
+        pytest.param({"branch": "explicit"}, False, marks=pytest.mark.slow),
+        pytest.param({"branch": "implicit"}, True, marks=pytest.mark.slow),
         ({"fusion": "concat", "appearance": 8}, True),
-        ({"blend_by": "density"}, False),
+        pytest.param({"blend_by": "density"}, False, marks=pytest.mark.slow),
     ],
     ids=str,
 )

@@ -272,6 +272,7 @@ def test_pure_rotation_has_no_depth(shared_data: Data, tmp_path: Path) -> None:
         poses(project)
 
 
+@pytest.mark.slow
 def test_two_unrelated_scenes(shared_data: Data, tmp_path: Path) -> None:
     """The larger scene is placed; every photo of the other says that it belongs to another group or matches none."""
     (tmp_path / "photos").mkdir()

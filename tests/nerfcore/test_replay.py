@@ -73,7 +73,10 @@ def addresses(trainer: Trainer) -> dict[str, int]:
     "settings",
     [
         {},
-        {"loss.depth_weight": "0.1", "loss.distortion_weight": "0.01", "loss.distortion_start": "0.5"},
+        pytest.param(
+            {"loss.depth_weight": "0.1", "loss.distortion_weight": "0.01", "loss.distortion_start": "0.5"},
+            marks=pytest.mark.slow,
+        ),
         {"field.appearance": "2", "field.precision": "float16", "loss.rgb_warmup": "30"},
     ],
     ids=lambda s: " ".join(s) or "default",

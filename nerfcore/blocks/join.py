@@ -8,13 +8,14 @@ import numpy as np
 import scipy
 
 from ..mesh.clean import SCRAP
-from ..mesh.holes import SHORT_LOOP, fill_holes
+from ..mesh.holes import fill_holes
 from ..mesh.surface import Surface, vertex_normals
 from ..mesh.triangles import areas, border_edges, components
 from .surface import Part
 
 SAME = 1e-3  # voxels that vertices of two blocks at a seam differ by at most
 ON_SEAM = 1e-2  # voxels
+LONGEST_LOOP = 30  # edges of a hole that is filled
 
 
 def joined(parts: Sequence[Part]) -> Surface:
@@ -81,7 +82,7 @@ def _filled(
 ) -> Surface:
     """The surface with its small holes filled, and without vertices that no triangle has."""
     before = len(vertices)
-    vertices, all_faces, new = fill_holes(vertices, faces, SHORT_LOOP)
+    vertices, all_faces, new = fill_holes(vertices, faces, LONGEST_LOOP)
     if len(vertices) > before:  # as the closest of their rims
         rim = np.unique(all_faces[new])
         rim = rim[rim < before]

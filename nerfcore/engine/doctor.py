@@ -35,7 +35,6 @@ LIBRARIES = [
     ("pillow-heif", "pillow_heif", "pillow_heif"),
     ("scikit-image", "skimage", "scikit_image"),
     ("trimesh", "trimesh", "trimesh"),
-    ("mapbox-earcut", "mapbox_earcut", "mapbox_earcut"),
     ("xatlas", "xatlas", "xatlas"),
     ("safetensors", "safetensors", "safetensors"),
     ("rawpy", "rawpy", "rawpy"),

@@ -1,22 +1,22 @@
 """Small holes of a surface, filled.
 
 Where views disagree at single places, as on the top of a step that all cameras see at a flat angle, a surface is full of
-small holes. A loop of the border is flattened and cut into triangles, from its middle where that sees all of it, these into such that are
-hardly longer than the loop's edges, and above the plane they lie as a membrane does: in a hole of twenty voxels a ball's curvature is hardly seen.
+small holes. A loop of the border is cut into triangles from its middle, where that sees all of it, else such that they have the
+least area, these into such that are hardly longer than the loop's edges, and what lies inside is drawn tight like a membrane: in a
+hole of twenty voxels a ball's curvature is hardly seen.
+Source: the triangles of least area of Barequet and Sharir, “Filling gaps in the boundary of a polyhedron”, 1995.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-import mapbox_earcut
 import numpy as np
 
 from .facelets import facelets
 from .triangles import border_edges, cross, summed_around
 
 LONGEST_LOOP = 64  # edges of a hole that is filled
-SHORT_LOOP = 30  # edges of one that is filled whatever its shape
 SHEET = 0.5  # cosine, at least, of the angle between a sheet and what its border goes around
 LONGER = 1.5  # times as long as the longest edge of the loops an edge inside of them may be
 FLAT = 0.01  # share by which triangles of a flattened loop may hold more or less than it does
@@ -26,8 +26,7 @@ def fill_holes(
     vertices: np.ndarray, faces: np.ndarray, longest: int = LONGEST_LOOP
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Close border loops of at most `longest` edges: vertices, new ones at the end, triangles, and which of these (F,) bool
-    are new. The borders of small sheets, which would get a back, are left alone, and so are long loops that cross themselves seen
-    from where they are widest."""
+    are new. The borders of small sheets, which would get a back, are left alone."""
     around, known = summed_around(faces, cross(vertices, faces), len(vertices)), _edge_numbers(faces, len(vertices))
     places, patches, count = [vertices], [faces], len(vertices)
     for loop in border_loops(faces):
@@ -37,10 +36,8 @@ def fill_holes(
         flat, normal = _flattened(vertices[ring])
         patch = _fan(len(ring))
         if not _covers(flat, np.append(flat, [flat.mean(0)], 0), patch):
-            cut = _cut(flat)
-            if cut is not None and not _any_in(_inner_edges(ring[cut], len(vertices)), known):
-                patch = cut
-            elif len(ring) > SHORT_LOOP:
+            patch = _smallest(vertices[ring], _known_between(ring, known, len(vertices)))
+            if patch is None:
                 continue
         inside, patch = _membrane(vertices[ring], patch, normal)
         patches.append(np.append(ring, count + np.arange(len(inside)))[patch])
@@ -116,13 +113,31 @@ def _flattened(ring: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return place @ np.stack([first, np.cross(normal, first)], 1), normal
 
 
-def _cut(flat: np.ndarray) -> np.ndarray | None:
-    """Triangles (N − 2, 3) of a polygon (N, 2), None where it crosses itself or a corner lies in none of them."""
-    found = mapbox_earcut.triangulate_float64(flat, np.array([len(flat)], np.uint32)).reshape(-1, 3).astype(int)
-    a, b, c = flat[found].transpose(1, 0, 2)
-    turned = (b - a)[:, 0] * (c - a)[:, 1] < (b - a)[:, 1] * (c - a)[:, 0]
-    found[turned] = found[turned][:, [0, 2, 1]]
-    return found if len(found) == len(flat) - 2 and _covers(flat, flat, found) else None
+def _smallest(ring: np.ndarray, taken: np.ndarray) -> np.ndarray | None:
+    """Triangles (N − 2, 3) of the least area between the corners of a loop (N, 3); no edge lies between corners (N, N) bool that
+    have one elsewhere. None where there are no such triangles."""
+    count = len(ring)
+    cost, middle = np.zeros((count, count)), np.zeros((count, count), int)
+    for wide in range(2, count):
+        first = np.arange(count - wide)
+        last, between = first + wide, first[:, None] + np.arange(1, wide)
+        sides = ring[between] - ring[first, None], (ring[last] - ring[first])[:, None]
+        total = np.linalg.norm(np.cross(*sides), axis=2) / 2
+        total += cost[first[:, None], between] + cost[between, last[:, None]]
+        best = total.argmin(1)
+        forbidden = taken[first, last] & (wide < count - 1)
+        cost[first, last] = np.where(forbidden, np.inf, total[first, best])
+        middle[first, last] = between[first, best]
+    if not np.isfinite(cost[0, -1]):
+        return None
+    made, left = [], [(0, count - 1)]
+    while left:
+        first, last = left.pop()
+        if last - first > 1:
+            k = int(middle[first, last])
+            made.append((first, k, last))
+            left += [(first, k), (k, last)]
+    return np.array(made)
 
 
 def _fan(count: int) -> np.ndarray:
@@ -148,17 +163,12 @@ def _edge_numbers(faces: np.ndarray, count: int) -> np.ndarray:
     return np.unique(ends[:, 0] * count + ends[:, 1])
 
 
-def _inner_edges(patch: np.ndarray, count: int) -> np.ndarray:
-    """Numbers (E,) of the edges that lie between two triangles of a patch."""
-    ends = np.sort(np.stack([patch, patch[:, [1, 2, 0]]], -1).reshape(-1, 2), 1).astype(np.int64)
-    number, times = np.unique(ends[:, 0] * count + ends[:, 1], return_counts=True)
-    return number[times > 1]
-
-
-def _any_in(values: np.ndarray, known: np.ndarray) -> bool:
-    """Whether any of the values (N,) is among sorted ones (K,)."""
-    place = np.minimum(np.searchsorted(known, values), len(known) - 1)
-    return bool((known[place] == values).any())
+def _known_between(ring: np.ndarray, known: np.ndarray, count: int) -> np.ndarray:
+    """Whether there is an edge (N, N) between corners (N,) of a loop, or they are the same; `known`: sorted numbers of edges."""
+    low, high = np.minimum(ring[:, None], ring), np.maximum(ring[:, None], ring)
+    number = low.astype(np.int64) * count + high
+    place = np.minimum(np.searchsorted(known, number), len(known) - 1)
+    return (known[place] == number) | (low == high)
 
 
 def _membrane(ring: np.ndarray, patch: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -3,7 +3,7 @@
 Where views disagree at single places, as on the top of a step that all cameras see at a flat angle, a surface is full of
 small holes. A loop of the border is cut into triangles from its middle, where that sees all of it, else such that they have the
 least area, these into such that are hardly longer than the loop's edges, and what lies inside is drawn tight like a membrane: in a
-hole of twenty voxels a ball's curvature is hardly seen.
+hole of thirty voxels a ball's curvature is hardly seen.
 Source: the triangles of least area of Barequet and Sharir, “Filling gaps in the boundary of a polyhedron”, 1995.
 """
 
@@ -16,7 +16,7 @@ import numpy as np
 from .facelets import facelets
 from .triangles import border_edges, cross, summed_around
 
-LONGEST_LOOP = 64  # edges of a hole that is filled
+LONGEST_LOOP = 100  # edges of a hole that is filled
 SHEET = 0.5  # cosine, at least, of the angle between a sheet and what its border goes around
 LONGER = 1.5  # times as long as the longest edge of the loops an edge inside of them may be
 FLAT = 0.01  # share by which triangles of a flattened loop may hold more or less than it does

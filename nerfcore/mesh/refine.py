@@ -122,7 +122,7 @@ def refined_maps(
     sharp = [with_spread(*parts) for parts in zip(views, maps, moved, sure)]
     labels = [label_picture(view, store) for view in views]
     left_out = [None if label is None else label == VOID for label in labels]
-    things = [None] * len(views)
+    things: list[np.ndarray | None] = [None] * len(views)
     if labels_tell(sure, left_out):
         things = named_things(labels, *confirmed_share([map_.hit for map_ in maps], sure, labels))
     planes = scene_planes(known_points(views, sharp, sure, things), report)

@@ -10,6 +10,7 @@ from fieldwork.nerfcore.kernels.depth_arrays import MapArrays
 from fieldwork.nerfcore.mesh import build, depth_maps
 from fieldwork.nerfcore.mesh.extract import extract
 from fieldwork.nerfcore.mesh.fusion import Bricks, fuse_maps
+from fieldwork.nerfcore.mesh.build import open_surface
 from fieldwork.nerfcore.mesh.gaps import Corners, close_gaps, harmonic, looked_through, openings
 from fieldwork.nerfcore.mesh.region import Region, choose_region
 from fieldwork.nerfcore.mesh.triangles import areas, border_edges, compact, components, cross, unit
@@ -193,3 +194,38 @@ def test_nothing_to_close_changes_nothing(ball) -> None:
     assert not guessed.any()
     assert len(triangles) == len(faces)
     assert areas(closed, triangles).sum() == pytest.approx(areas(vertices, faces).sum())
+
+
+@pytest.mark.parametrize("known", [True, False], ids=["a window", "unknown"])
+def test_small_holes_are_filled_but_what_views_look_through_stays_open(known: bool) -> None:
+    """A board with a window before a wall, from in front; or with a place of which no view knows anything."""
+    board, wall, wide = 0.3, -0.2, 0.09
+
+    def hit(origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            to_board, to_wall = -origin[2] / direction[:, 2], (wall - origin[2]) / direction[:, 2]
+        place = np.abs(origin + direction * np.nan_to_num(to_board)[:, None])[:, :2].max(1)
+        there = (to_board > 0) & (place < board) & (place > wide / 2)
+        return np.where(there, to_board, np.where(to_wall > 0, to_wall, np.inf))
+
+    poses = [pose for pose in orbit(40, 1.2, (0.8, 0.9, 0.97)) if pose[2, 3] > 0]
+    flats, shown = maps_of(hit, poses)
+    if not known:
+        for flat, map_ in zip(flats, shown):
+            ray = depth_maps.pixel_directions(flat.camera) @ flat.pose[:3, :3].T
+            place = flat.pose[:3, 3] - ray * (flat.pose[2, 3] / ray[..., 2])[..., None]
+            map_.depth[np.abs(place[..., :2]).max(-1) <= wide / 2] = 0
+    maps = depth_maps.map_arrays(flats, shown, torch.device("cpu"))
+    region = choose_region(maps, (np.array([-0.35, -0.35, -0.25]), np.array([0.35, 0.35, 0.1])), 96)
+    bricks = fuse_maps(maps, region, Reporter())
+    vertices, faces, guessed = open_surface(bricks, maps, 4 * region.voxel, region, None, 0.0, Reporter())
+    middle, area = vertices[faces].mean(1), areas(vertices, faces)
+    before = middle[:, 2] > wall / 2
+    inside = before & (np.abs(middle[:, :2]).max(1) < wide / 2)
+    assert area[before & ~inside].sum() == pytest.approx(4 * board**2 - wide**2, rel=0.15)
+    if known:
+        assert not (before & (np.abs(middle[:, :2]).max(1) < wide / 4)).any()
+    else:
+        assert area[inside].sum() == pytest.approx(wide**2, rel=0.2)
+        assert guessed[before & (np.abs(middle[:, :2]).max(1) < wide / 4)].all()
+        assert np.abs(middle[inside, 2]).max() < region.voxel

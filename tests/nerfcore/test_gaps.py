@@ -8,9 +8,9 @@ import torch
 from fieldwork.nerfcore.errors import Cancelled
 from fieldwork.nerfcore.kernels.depth_arrays import MapArrays
 from fieldwork.nerfcore.mesh import build, depth_maps
+from fieldwork.nerfcore.mesh.build import open_surface
 from fieldwork.nerfcore.mesh.extract import extract
 from fieldwork.nerfcore.mesh.fusion import Bricks, fuse_maps
-from fieldwork.nerfcore.mesh.build import open_surface
 from fieldwork.nerfcore.mesh.gaps import Corners, close_gaps, harmonic, looked_through, openings
 from fieldwork.nerfcore.mesh.region import Region, choose_region
 from fieldwork.nerfcore.mesh.triangles import areas, border_edges, compact, components, cross, unit

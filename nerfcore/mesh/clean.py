@@ -36,7 +36,7 @@ def clean(
     parts below a thousandth of the area; small holes filled (holes.py). `tolerance`: of all faces, or (F,) of each."""
     faces = drop_scraps(vertices, faces[shown(vertices, faces, maps, tolerance, report)])
     report.check()
-    vertices, faces, filled = fill_holes(vertices, faces)
+    vertices, faces, filled = fill_holes(vertices, faces, check=report.check)
     vertices, faces = compact(vertices, faces)
     return vertices, faces, filled
 

@@ -70,7 +70,7 @@ def close_gaps(
         vertices, faces = compact(vertices, faces[kept])
         cells = np.unique(_number(_cells(bricks, vertices, faces), shape))
         bricks = _with(bricks, _guessed_at(found, _cells(bricks, vertices, faces[guessed[kept]])))
-    vertices, faces, filled = fill_holes(vertices, faces)
+    vertices, faces, filled = fill_holes(vertices, faces, check=report.check)
     filled = filled[kept := ~open_places(vertices, faces, filled, bricks, maps, report)]
     vertices, faces = compact(vertices, faces[kept])
     return vertices, faces, filled | ~np.isin(_number(_cells(bricks, vertices, faces), shape), seen)

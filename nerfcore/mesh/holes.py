@@ -9,7 +9,7 @@ Source: the triangles of least area of Barequet and Sharir, “Filling gaps in t
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
@@ -23,13 +23,14 @@ FLAT = 0.01  # share by which triangles of a flattened loop may hold more or les
 
 
 def fill_holes(
-    vertices: np.ndarray, faces: np.ndarray, longest: int = LONGEST_LOOP
+    vertices: np.ndarray, faces: np.ndarray, longest: int = LONGEST_LOOP, check: Callable[[], None] = lambda: None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Close border loops of at most `longest` edges: vertices, new ones at the end, triangles, and which of these (F,) bool
-    are new. The borders of small sheets, which would get a back, are left alone."""
+    are new. The borders of small sheets, which would get a back, are left alone. Raises what `check` raises to stop."""
     around, known = summed_around(faces, cross(vertices, faces), len(vertices)), _edge_numbers(faces, len(vertices))
     places, patches, count = [vertices], [faces], len(vertices)
     for loop in border_loops(faces):
+        check()
         if not 3 <= len(loop) <= longest or _bounds_sheet(vertices[loop], around[loop]):
             continue
         ring = loop[::-1]  # the other way around, as triangles beside each other have their common edge

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
+from fieldwork.nerfcore.errors import Cancelled
 from fieldwork.nerfcore.mesh.holes import LONGEST_LOOP, border_loops, fill_holes
 from fieldwork.nerfcore.mesh.surface import is_watertight
 from fieldwork.nerfcore.mesh.triangles import areas, border_edges, cross, unit
@@ -111,3 +112,15 @@ def test_a_loop_that_crosses_itself_from_everywhere_is_filled() -> None:
     after, filled, new = fill_holes(vertices, kept, len(loop))
     assert is_watertight(filled)
     assert 0 < areas(after, filled[new]).sum() < 4 * np.pi
+
+
+def test_filling_stops_when_told() -> None:
+    vertices, faces = ball()
+    middle = vertices[faces].mean(1)
+    gone = (np.linalg.norm(middle - [1, 0, 0], axis=1) < 0.1) | (np.linalg.norm(middle - [0, 1, 0], axis=1) < 0.1)
+
+    def stop() -> None:
+        raise Cancelled
+
+    with pytest.raises(Cancelled):
+        fill_holes(vertices, faces[~gone], check=stop)

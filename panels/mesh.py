@@ -22,7 +22,7 @@ class FIELDWORK_PT_mesh(StepPanel):
         if result:
             closed = t("{:,} triangles, closed") if result.get("watertight") else t("{:,} triangles, open")
             layout.label(text=closed.format(result.get("faces", 0)))
-            if result.get("unseen", 0) >= 0.0005:
+            if result.get("unseen", 0) >= 0.0005:  # what would not be shown as 0.0%
                 layout.label(text=t("{:.1%} of its area is a guess").format(result["unseen"]))
             draw_verdict(layout, context, result)
         column = columns(layout)

@@ -22,7 +22,7 @@ from ..mesh.metrics import Distances, distances, sample_surface
 from ..mesh.painted import Painted
 from ..mesh.surface import Surface
 from ..mesh.surface_picture import surface_picture
-from ..mesh.triangles import areas, components, cross, unit
+from ..mesh.triangles import areas, components, cross, edge_ends, unit
 from ..mesh.visibility import DepthBuffer, PosedCamera, depth_buffer, within
 from .surface_outlines import outline_texels, true_outline
 
@@ -341,7 +341,7 @@ def seam_ratio(faces: np.ndarray, painted: Painted) -> float | None:
     if painted.uv is None or painted.image is None or not len(painted.uv.seams):
         return None
     corners, size = painted.uv.corners.astype(np.float64), painted.image.shape[0]
-    ends = np.sort(np.stack([faces, faces[:, [1, 2, 0]]], -1).reshape(-1, 2), 1)
+    ends = edge_ends(faces)
     middle = ((corners + corners[:, [1, 2, 0]]) / 2).reshape(-1, 2)
     inward = np.repeat(corners.mean(1), 3, 0) - middle
     place = middle + inward * np.minimum(1.5 / size / np.maximum(np.linalg.norm(inward, axis=1), 1e-12), 1)[:, None]

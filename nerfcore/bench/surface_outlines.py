@@ -8,7 +8,7 @@ from scipy.spatial import KDTree
 from ..mesh.facelets import facelets
 from ..mesh.painted import Painted
 from ..mesh.painting import texels_of
-from ..mesh.triangles import cross, unit
+from ..mesh.triangles import cross, edge_ends, unit
 
 TILE = 2048  # texels a side that are looked at at once
 SPACING = 0.25  # texels between points of a true outline
@@ -38,7 +38,7 @@ def outline_texels(
 def true_outline(vertices: np.ndarray, faces: np.ndarray, face_class: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Ends (E, 2, 3) of the edges of a mesh whose two triangles have different classes, and the normals (E, 3) of one of
     these."""
-    ends = np.sort(np.stack([faces, faces[:, [1, 2, 0]]], -1).reshape(-1, 2), 1).astype(np.int64)
+    ends = edge_ends(faces).astype(np.int64)
     key, kind = ends[:, 0] * len(vertices) + ends[:, 1], np.repeat(face_class, 3)
     order = np.argsort(key, kind="stable")
     pair = key[order[1:]] == key[order[:-1]]

@@ -7,6 +7,8 @@ from functools import cached_property
 
 import numpy as np
 
+from .triangles import edge_ends
+
 PIECES = 60  # for depth buffers, along the longest side of a mesh
 
 
@@ -51,7 +53,7 @@ def facelets(
     uv = np.zeros((len(faces), 3, 0)) if corners is None else np.asarray(corners, np.float64)
     parent = np.arange(len(faces))
     while True:
-        ends = np.sort(np.stack([faces, faces[:, [1, 2, 0]]], -1).reshape(-1, 2), 1)
+        ends = edge_ends(faces)
         _, first, which = np.unique(
             ends[:, 0].astype(np.int64) * len(vertices) + ends[:, 1], return_index=True, return_inverse=True
         )

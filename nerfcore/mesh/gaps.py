@@ -71,9 +71,9 @@ def close_gaps(
         cells = np.unique(_number(_cells(bricks, vertices, faces), shape))
         bricks = _with(bricks, _guessed_at(found, _cells(bricks, vertices, faces[guessed[kept]])))
     vertices, faces, filled = fill_holes(vertices, faces, check=report.check)
-    filled = filled[kept := ~open_places(vertices, faces, filled, bricks, maps, report)]
+    kept = ~open_places(vertices, faces, filled, bricks, maps, report)
     vertices, faces = compact(vertices, faces[kept])
-    return vertices, faces, filled | ~np.isin(_number(_cells(bricks, vertices, faces), shape), seen)
+    return vertices, faces, filled[kept] | ~np.isin(_number(_cells(bricks, vertices, faces), shape), seen)
 
 
 def closed(

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from .facelets import facelets
-from .triangles import border_edges, cross, summed_around
+from .triangles import border_edges, cross, edge_ends, summed_around
 
 LONGEST_LOOP = 100  # edges of a hole that is filled
 SHEET = 0.5  # cosine, at least, of the angle between a sheet and what its border goes around
@@ -27,11 +27,15 @@ def fill_holes(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Close border loops of at most `longest` edges: vertices, new ones at the end, triangles, and which of these (F,) bool
     are new. The borders of small sheets, which would get a back, are left alone. Raises what `check` raises to stop."""
-    around, known = summed_around(faces, cross(vertices, faces), len(vertices)), _edge_numbers(faces, len(vertices))
+    loops = [loop for loop in border_loops(faces) if 3 <= len(loop) <= longest]
+    around, known = (
+        summed_around(faces, cross(vertices, faces), len(vertices)),
+        _edges_between(faces, loops, len(vertices)),
+    )
     places, patches, count = [vertices], [faces], len(vertices)
-    for loop in border_loops(faces):
+    for loop in loops:
         check()
-        if not 3 <= len(loop) <= longest or _bounds_sheet(vertices[loop], around[loop]):
+        if _bounds_sheet(vertices[loop], around[loop]):
             continue
         ring = loop[::-1]  # the other way around, as triangles beside each other have their common edge
         flat, normal = _flattened(vertices[ring])
@@ -158,9 +162,12 @@ def _covers(ring: np.ndarray, corners: np.ndarray, patch: np.ndarray) -> bool:
     return bool(double.min() >= 0 and abs(double.sum() - whole) <= FLAT * abs(whole))
 
 
-def _edge_numbers(faces: np.ndarray, count: int) -> np.ndarray:
-    """A number (E,) for each edge of triangles with `count` vertices, the same in either direction."""
-    ends = np.sort(np.stack([faces, faces[:, [1, 2, 0]]], -1).reshape(-1, 2), 1).astype(np.int64)
+def _edges_between(faces: np.ndarray, loops: list[np.ndarray], count: int) -> np.ndarray:
+    """Sorted numbers (E,) of the edges of triangles, with `count` vertices, both ends of which lie on loops."""
+    rim = np.zeros(count, bool)
+    for loop in loops:
+        rim[loop] = True
+    ends = edge_ends(faces[rim[faces].sum(1) > 1]).astype(np.int64)
     return np.unique(ends[:, 0] * count + ends[:, 1])
 
 
@@ -180,7 +187,7 @@ def _membrane(ring: np.ndarray, patch: np.ndarray, normal: np.ndarray) -> tuple[
     fine = facelets(np.append(ring, [ring.mean(0)], 0), patch, limit=LONGER * float(longest))
     used, triangles = np.unique(np.append(np.arange(count), fine.faces), return_inverse=True)
     place, triangles = fine.vertices[used], triangles[count:].reshape(-1, 3)
-    ends = np.unique(np.sort(np.stack([triangles, triangles[:, [1, 2, 0]]], -1).reshape(-1, 2), 1), axis=0)
+    ends = np.unique(edge_ends(triangles), axis=0)
     pull = np.zeros((len(place), len(place)))
     near = 1 / np.maximum(np.linalg.norm(place[ends[:, 0]] - place[ends[:, 1]], axis=1), 1e-12 * longest)
     pull[ends[:, 0], ends[:, 1]] = pull[ends[:, 1], ends[:, 0]] = -near

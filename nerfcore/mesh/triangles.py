@@ -52,6 +52,11 @@ def compact(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
     return vertices[used], index.reshape(-1, 3)
 
 
+def edge_ends(faces: np.ndarray) -> np.ndarray:
+    """Vertices (3F, 2) at the ends of triangles' edges, from corner k to k + 1, the smaller number first."""
+    return np.sort(np.stack([faces, faces[:, [1, 2, 0]]], -1).reshape(-1, 2), 1)
+
+
 def border_edges(faces: np.ndarray) -> np.ndarray:
     """Directed edges (E, 2) that have a triangle on one side only."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)

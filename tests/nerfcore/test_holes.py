@@ -22,7 +22,7 @@ def ball(detail: int = 5) -> tuple[np.ndarray, np.ndarray]:
 
 
 def sound(vertices: np.ndarray, faces: np.ndarray) -> bool:
-    """Whether no edge has more than one triangle on a side, and none is turned over or has no area."""
+    """Whether no edge has more than one triangle on a side, and each has an area."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     return len(np.unique(edges, axis=0)) == len(edges) and bool((areas(vertices, faces) > 0).all())
 

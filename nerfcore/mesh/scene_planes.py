@@ -31,6 +31,7 @@ SHARP = 3.0  # footprints of a pixel by which a point may be wrong: what a soft 
 SOFT = 0.5  # share of its spread by which a depth may be wrong, but at least a footprint of a pixel
 TRIES, KEPT = 400, 48  # points whose tangent plane is tried, and the best of them that are fitted
 WIDTHS = (3.0, 2.0, 1.5, 1.5)  # errors around a plane in which points are its own, from fit to fit
+AT_ONCE = 16  # of these planes, compared with all points
 BESIDE = 4.0  # errors from a plane that was found, within which no other plane takes points
 TILTED = np.cos(np.radians(25))  # between the normal of a point and that of its plane
 SMOOTH = 9  # pixels over which normals are averaged: a plain wall's depths are noisy
@@ -145,19 +146,32 @@ def scene_planes(known: Known, report: Reporter) -> list[ScenePlane]:
 def _largest(known: Known, area: np.ndarray, left: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
     """The points, of those that are left, on the largest plane that was met; None where there is none."""
     rows, best = np.flatnonzero(left), None
-    tried = []
-    for start in rng.choice(rows, min(TRIES, len(rows)), replace=False, p=area[rows] / area[rows].sum()):
-        on = left & near_plane(known, known.points[start], known.normals[start], WIDTHS[0])
-        tried.append((area[on].sum(), start))
-    for _, start in sorted(tried, reverse=True)[:KEPT]:
+    known, area = Known(*(values[rows] for values in vars(known).values())), area[rows]
+    starts = rng.choice(len(rows), min(TRIES, len(rows)), replace=False, p=area / area.sum())
+    held = _area_near(known, area, starts)
+    for start in starts[np.argsort(-held, kind="stable")[:KEPT]]:
         point, normal = known.points[start], known.normals[start]
         for width in WIDTHS:
-            on = np.flatnonzero(left & near_plane(known, point, normal, width))
+            on = np.flatnonzero(near_plane(known, point, normal, width))
             if len(on) < FEWEST:
                 break
             point, normal = _fit(known, area, on)
         if len(on) >= FEWEST and (best is None or area[on].sum() > area[best].sum()):
             best = on
+    return None if best is None else rows[best]
+
+
+def _area_near(known: Known, area: np.ndarray, starts: np.ndarray) -> np.ndarray:
+    """The area (S,) of the points near the tangent plane of each of some points, by number (S,); in single precision."""
+    points, normals, limit = (
+        values.astype(np.float32) for values in (known.points, known.normals, WIDTHS[0] * known.error)
+    )
+    found = []
+    for part in np.array_split(starts, -(-len(starts) // AT_ONCE)):
+        off = points @ normals[part].T - np.einsum("ij,ij->i", points[part], normals[part])
+        near = (np.abs(off, out=off) < limit[:, None]) & (normals @ normals[part].T > TILTED)
+        found.append(area.astype(np.float32) @ near)
+    return np.concatenate(found)
     return best
 
 
@@ -169,10 +183,10 @@ def near_plane(known: Known, point: np.ndarray, normal: np.ndarray, width: float
 
 def _fit(known: Known, area: np.ndarray, on: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A point and the normal of the plane through points, by least squares weighted with their area over their error."""
-    weight = area[on] / known.error[on] ** 2
-    middle = np.average(known.points[on], axis=0, weights=weight)
-    around = (known.points[on] - middle) * np.sqrt(weight)[:, None]
-    normal = np.linalg.svd(around, full_matrices=False)[2][2]
+    weight, points = area[on] / known.error[on] ** 2, known.points[on]
+    middle = weight @ points / weight.sum()
+    around = points - middle
+    normal = np.linalg.eigh((around * weight[:, None]).T @ around)[1][:, 0]
     return middle, normal * np.sign(normal @ known.normals[on].mean(0) or 1.0)
 
 

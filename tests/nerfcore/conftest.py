@@ -10,9 +10,10 @@ import pytest
 from fieldwork.tests.nerfcore.support.backends import device
 from fieldwork.tests.nerfcore.support.captures import ingest, poses
 from fieldwork.tests.nerfcore.support.reconstructed import place, reconstructed
+from fieldwork.tests.nerfcore.support.unlabelled import unlabelled
 from fieldwork.tests.nerfcore.support.windows_files import each_file_system
 
-__all__ = ["device", "each_file_system", "fountain", "place", "reconstructed"]
+__all__ = ["device", "each_file_system", "fountain", "place", "reconstructed", "unlabelled"]
 
 Data = Callable[[str], Path]
 

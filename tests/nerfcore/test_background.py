@@ -99,6 +99,7 @@ def test_space_does_not_end_where_something_is_said_to_be_behind_black(
     assert plan_run(project, "draft", config, torch.device("cpu"))[0].contracted == contracted
 
 
+@pytest.mark.slow
 def test_photos_that_are_mostly_black_do_not_turn_the_field_black(
     shared_data: Callable[[str], Path], tmp_path: Path
 ) -> None:

@@ -153,6 +153,7 @@ def test_rows_say_whether_what_is_asked_is_reached() -> None:
     assert row("a", [None], 0.5)["reached"] is None
 
 
+@pytest.mark.slow
 def test_the_suite_measures_and_writes_its_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(label_times, "LabelAcceptParams", partial(LabelAcceptParams, seconds=2))
     ball = ball_project(tmp_path / "ball", views=12)

@@ -342,7 +342,10 @@ def test_drawings_of_several_turns_stand_beside_each_other(project: Path, tmp_pa
     assert "turned" not in (tmp_path / "front.svg").read_text("utf-8")
 
 
-def test_impossible_sections_and_meshes_are_named(project: Path, tmp_path: Path) -> None:
+def test_impossible_sections_and_meshes_are_named(
+    project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fieldwork.nerfcore.measure.drawings.DPI", 40)  # what is drawn is not looked at
     for text in ("z", "up=1", "z=high"):
         with pytest.raises(SettingError, match="no plane"):
             section(SectionParams(project=project, plane=text), Reporter())

@@ -192,6 +192,7 @@ def test_an_environment_without_labels_is_void(seen: Seen) -> None:
     assert (label[seen.ball] > 0).mean() > 0.9
 
 
+@pytest.mark.slow
 def test_an_environment_with_labels_has_its_class(tmp_path: Path) -> None:
     found = trained_under_the_sky(tmp_path / "p", named="sky")
     label = found.frame.label(found.trained.info.class_ids)

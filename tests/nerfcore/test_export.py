@@ -224,7 +224,7 @@ WORLD = np.array([[2.4, -0.7, 0.0, 1.0], [0.7, 2.4, 0.0, 2.0], [0.0, 0.0, 2.5, 3
         ({}, True),
         pytest.param({"branch": "explicit"}, False, marks=pytest.mark.slow),
         pytest.param({"branch": "implicit"}, True, marks=pytest.mark.slow),
-        ({"fusion": "concat", "appearance": 8}, True),
+        pytest.param({"fusion": "concat", "appearance": 8}, True, marks=pytest.mark.slow),
         pytest.param({"blend_by": "density"}, False, marks=pytest.mark.slow),
     ],
     ids=str,

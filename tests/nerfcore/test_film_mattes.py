@@ -103,7 +103,7 @@ def over(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     ("y", "holdout"),
     [
         pytest.param(-1.0, False, marks=pytest.mark.slow),
-        (-0.1, False),
+        pytest.param(-0.1, False, marks=pytest.mark.slow),
         pytest.param(1.0, False, marks=pytest.mark.slow),
         (-0.1, True),
     ],

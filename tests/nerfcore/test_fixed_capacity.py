@@ -168,6 +168,7 @@ def test_an_ordinary_step_asks_the_device_for_nothing(
     assert all(bool(torch.isfinite(p).all()) for p in trainer.model.parameters())
 
 
+@pytest.mark.slow
 def test_training_with_a_fixed_capacity_learns_as_well(ball: Path) -> None:
     errors = {}
     for fixed in (False, True):

@@ -104,6 +104,7 @@ def test_gradients_of_cameras_are_those_of_the_loss_itself(ball: Path) -> None:
     assert sizes["float16"] == pytest.approx(sizes["float32"], rel=0.3)
 
 
+@pytest.mark.slow
 def test_training_in_half_precision_learns_as_well(ball: Path) -> None:
     errors = {}
     for precision in ("float32", "float16"):

@@ -17,7 +17,7 @@ from fieldwork.nerfcore.params import LabelPrepareParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.runs import run_folder
 from fieldwork.tests.nerfcore.support import onnx_models as tiny
-from fieldwork.tests.nerfcore.test_labels import ball, trained, two_strokes  # noqa: F401
+from fieldwork.tests.nerfcore.test_labels import ball, two_strokes  # noqa: F401
 from fieldwork.tests.nerfcore.test_labels import spread as propagated
 
 

@@ -14,7 +14,7 @@ from fieldwork.nerfcore.labels.revisions import path_of
 from fieldwork.nerfcore.params import LabelPropagateParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.runs import run_folder
-from fieldwork.tests.nerfcore.test_labels import ball, mark, trained, truth, two_strokes  # noqa: F401
+from fieldwork.tests.nerfcore.test_labels import ball, mark, truth, two_strokes  # noqa: F401
 
 
 def first_of(folder: Path, revision: int) -> Labelling | None:

@@ -24,7 +24,7 @@ from fieldwork.nerfcore.labels.head import (
 )
 from fieldwork.nerfcore.params import EvaluateParams, LabelAcceptParams
 from fieldwork.nerfcore.progress import Reporter
-from fieldwork.tests.nerfcore.test_labels import ball, spread, trained, two_strokes  # noqa: F401
+from fieldwork.tests.nerfcore.test_labels import ball, spread, two_strokes  # noqa: F401
 
 
 @pytest.mark.parametrize("seconds", [0.001, 1e6])

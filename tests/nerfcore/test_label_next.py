@@ -15,7 +15,7 @@ from fieldwork.nerfcore.labels.preparation import current
 from fieldwork.nerfcore.labels.stroke import stroke
 from fieldwork.nerfcore.params import LabelNextParams, LabelStrokeParams
 from fieldwork.nerfcore.progress import Reporter
-from fieldwork.tests.nerfcore.test_labels import ball, trained, truth  # noqa: F401
+from fieldwork.tests.nerfcore.test_labels import ball, truth  # noqa: F401
 
 
 def scene(shows: dict[str, list[int]]) -> Any:

@@ -22,7 +22,8 @@ from fieldwork.nerfcore.labels.surfels import Surfels, nearest_neighbours
 from fieldwork.nerfcore.params import LabelPartsParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.runs import run_folder
-from fieldwork.tests.nerfcore.test_labels import SIDE, TOP, ball, mark, trained, truth  # noqa: F401
+from fieldwork.tests.nerfcore.support.unlabelled import SIDE
+from fieldwork.tests.nerfcore.test_labels import TOP, ball, mark, truth  # noqa: F401
 
 
 def plane(columns: int = 60, rows: int = 40) -> tuple[Surfels, np.ndarray]:

@@ -48,7 +48,7 @@ from fieldwork.nerfcore.things.graph import relate
 from fieldwork.nerfcore.train.verb import train
 from fieldwork.tests.nerfcore.support.ball import SMALL
 from fieldwork.tests.nerfcore.support.film import taken
-from fieldwork.tests.nerfcore.test_labels import spread, trained, two_strokes  # noqa: F401
+from fieldwork.tests.nerfcore.test_labels import spread, two_strokes  # noqa: F401
 from PIL import Image
 from pxr import Usd
 
@@ -56,9 +56,9 @@ REVISION = 2
 
 
 @pytest.fixture(scope="module")
-def labelled(trained: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:  # noqa: F811
+def labelled(unlabelled: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:  # noqa: F811
     """The ball with the classes of two strokes, its mesh, and its field baked."""
-    folder = Path(shutil.copytree(trained, tmp_path_factory.mktemp("labelled") / "p"))
+    folder = Path(shutil.copytree(unlabelled, tmp_path_factory.mktemp("labelled") / "p"))
     two_strokes(folder)
     spread(folder)
     accept(LabelAcceptParams(project=folder, seconds=1), Reporter())
@@ -117,7 +117,8 @@ def test_renders_and_frames_name_it(labelled: Path, tmp_path: Path) -> None:
     assert taken(labelled, FieldStore(), ["Combined"]).label_revisions == {"Ball": REVISION}
 
 
-def test_drawings_and_tables_name_it(labelled: Path, tmp_path: Path) -> None:
+def test_drawings_and_tables_name_it(labelled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fieldwork.nerfcore.measure.drawings.DPI", 40)  # what is drawn is not looked at
     wanted = PlanParams(project=labelled, views=["front"], conditions=["top"], out=tmp_path / "plan")
     assert plan(wanted, Reporter())["label_revision"] == REVISION
     for name in ("front", "front_classes", "front_conditions"):
@@ -166,8 +167,8 @@ def test_a_training_with_accepted_labels_names_their_revision(labelled: Path, tm
     assert ["labels", f"label maps of revision {REVISION} of the marks"] in [list(row) for row in settings.rows]
 
 
-def test_what_has_no_marks_names_none(trained: Path, tmp_path: Path) -> None:  # noqa: F811
-    folder = Path(shutil.copytree(trained, tmp_path / "p"))
+def test_what_has_no_marks_names_none(unlabelled: Path, tmp_path: Path) -> None:  # noqa: F811
+    folder = Path(shutil.copytree(unlabelled, tmp_path / "p"))
     mesh(MeshParams(project=folder, resolution=32), Reporter())
     told = export(ExportParams(project=folder, to="ply", out=tmp_path / "a.ply"), Reporter())
     assert told["label_revision"] is None

@@ -30,7 +30,7 @@ from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.schema import SemanticClass
 from fieldwork.nerfcore.project.store import edit_project, load_project, save_project
 from fieldwork.tests.nerfcore.support.ball import RADIUS, ball_project
-from fieldwork.tests.nerfcore.test_labels import BOTTOM, TOP, ball, trained  # noqa: F401
+from fieldwork.tests.nerfcore.test_labels import BOTTOM, TOP, ball  # noqa: F401
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
@@ -134,10 +134,10 @@ def test_what_is_wrong_with_a_mark_on_the_surface_is_told(ball: Path) -> None:  
         place(ball, TOP, [[0.0, float("inf"), 0.0]])
 
 
-def epochs(trained: Path, folder: Path) -> tuple[Path, Path, np.ndarray, Path]:  # noqa: F811
+def epochs(unlabelled: Path, folder: Path) -> tuple[Path, Path, np.ndarray, Path]:  # noqa: F811
     """An epoch with labels, a later one without any whose world lies otherwise, the way from one to the other, and common
     points."""
-    before, now = (Path(shutil.copytree(trained, folder / name)) for name in ("before", "now"))
+    before, now = (Path(shutil.copytree(unlabelled, folder / name)) for name in ("before", "now"))
     place(before, TOP, ring(0.5))
     place(before, BOTTOM, ring(-0.5))
     assert right(before) > 0.97
@@ -156,8 +156,8 @@ def epochs(trained: Path, folder: Path) -> tuple[Path, Path, np.ndarray, Path]: 
     return before, now, turn, folder / "points.csv"
 
 
-def test_labels_of_an_earlier_epoch_are_carried_shown_as_such_and_confirmed(trained: Path, tmp_path: Path) -> None:  # noqa: F811
-    before, now, turn, points = epochs(trained, tmp_path)
+def test_labels_of_an_earlier_epoch_are_carried_shown_as_such_and_confirmed(unlabelled: Path, tmp_path: Path) -> None:  # noqa: F811
+    before, now, turn, points = epochs(unlabelled, tmp_path)
     result = carry(LabelCarryParams(project=now, other=before, points=points, author="Ada"), Reporter())
     assert result["carried"] > 0.9
     assert result["unmatched"] < 0.05
@@ -210,8 +210,8 @@ def test_carried_classes_get_ids_that_neither_classes_nor_marks_nor_void_have(tm
     assert classes_of(folder, wanted) == ({3: 5, 65535: 6, 7: TOP}, ["brick", "glass"])
 
 
-def test_epochs_that_do_not_fit_and_damaged_files_are_told(trained: Path, tmp_path: Path) -> None:  # noqa: F811
-    before, now, _, points = epochs(trained, tmp_path)
+def test_epochs_that_do_not_fit_and_damaged_files_are_told(unlabelled: Path, tmp_path: Path) -> None:  # noqa: F811
+    before, now, _, points = epochs(unlabelled, tmp_path)
     far = tmp_path / "far.csv"
     far.write_text(points.read_text().replace("\n0,", "\n0,9"))
     text = ["name,x,y,z,other_x,other_y,other_z"]

@@ -47,9 +47,9 @@ from fieldwork.nerfcore.render.run import load_trained
 from fieldwork.nerfcore.render.verb import render
 from fieldwork.nerfcore.train.verb import train
 from fieldwork.tests.nerfcore.support.ball import SMALL, ball_project
+from fieldwork.tests.nerfcore.support.unlabelled import SIDE
 from PIL import Image
 
-SIDE = 40
 TOP, BOTTOM = 1, 2
 
 
@@ -57,21 +57,9 @@ def truth(folder: Path) -> dict[str, np.ndarray]:
     return {view.name: read_label(folder / "labels" / f"{view.name}.png") for view in load_scene(folder).views}
 
 
-@pytest.fixture(scope="session")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The ball without label maps, trained and prepared; tests copy it."""
-    folder = ball_project(tmp_path_factory.mktemp("ball") / "p", views=12, side=SIDE)
-    with edit_project(folder) as project:
-        for image in project.images:
-            image.label = None
-    train(TrainParams(project=folder, preset="draft", steps=250, set=SMALL), Reporter())
-    prepare(LabelPrepareParams(project=folder, surfels=3000), Reporter())
-    return folder
-
-
 @pytest.fixture
-def ball(trained: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(trained, tmp_path / "p"))
+def ball(unlabelled: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(unlabelled, tmp_path / "p"))
 
 
 def mark(folder: Path, **values: Any) -> int:
@@ -112,9 +100,9 @@ def right_share(folder: Path, revision: int | None = None) -> float:
     return right / total
 
 
-def test_surfels_lie_on_the_ball_and_photos_show_them(trained: Path) -> None:
-    ready = Preparation(run_folder(trained, "main") / FOLDER)
-    box = load_trained(trained, "main").info.box(load_project(trained))
+def test_surfels_lie_on_the_ball_and_photos_show_them(unlabelled: Path) -> None:
+    ready = Preparation(run_folder(unlabelled, "main") / FOLDER)
+    box = load_trained(unlabelled, "main").info.box(load_project(unlabelled))
     normalised = ready.surfels.position.astype(np.float64) * 2 - 1  # the grid of a field that is not contracted
     world = normalised @ box.world_from_box[:3, :3].T + box.world_from_box[:3, 3]
     distance = np.linalg.norm(world, axis=1)
@@ -123,7 +111,7 @@ def test_surfels_lie_on_the_ball_and_photos_show_them(trained: Path) -> None:
     assert np.median(outward) > 0.9
     np.testing.assert_allclose(ready.surfels.height, world[:, 2], atol=1e-4)
     assert len(ready.surfels) <= 3000
-    for name, ids in truth(trained).items():
+    for name, ids in truth(unlabelled).items():
         shown = nearest(ready.map_of(name)[0], SIDE, SIDE) >= 0
         assert (shown == (ids > 0)).mean() > 0.9
 

@@ -260,6 +260,7 @@ def turned(photo: Image.Image, yaw: float, focal: float) -> Image.Image:
     return photo.transform(photo.size, Image.Transform.PERSPECTIVE, (h / h[2, 2]).ravel()[:8], Image.Resampling.BICUBIC)
 
 
+@pytest.mark.slow
 def test_pure_rotation_has_no_depth(shared_data: Data, tmp_path: Path) -> None:
     """A camera that only turns: plenty of matches, and no parallax."""
     (tmp_path / "photos").mkdir()

@@ -27,7 +27,9 @@ def verified_pairs(project: Path) -> int:
         return connection.execute("SELECT COUNT(*) FROM two_view_geometries").fetchone()[0]
 
 
-@pytest.mark.parametrize("stage", ["Finding features", "Matching features", "Placing cameras"])
+@pytest.mark.parametrize(
+    "stage", [pytest.param("Finding features", marks=pytest.mark.slow), "Matching features", "Placing cameras"]
+)
 def test_cancel_is_prompt_and_work_is_kept(unposed_fountain: Path, tmp_path: Path, stage: str) -> None:
     project = Path(shutil.copytree(unposed_fountain, tmp_path / "p"))
 
@@ -55,7 +57,14 @@ def test_cancel_is_prompt_and_work_is_kept(unposed_fountain: Path, tmp_path: Pat
 
 
 @pytest.mark.parametrize(
-    "stage", ["Finding features", "Matching features", "Placing cameras", "Checking poses", "Final adjustment"]
+    "stage",
+    [
+        pytest.param("Finding features", marks=pytest.mark.slow),
+        "Matching features",
+        "Placing cameras",
+        pytest.param("Checking poses", marks=pytest.mark.slow),
+        pytest.param("Final adjustment", marks=pytest.mark.slow),
+    ],
 )
 def test_killed_in_each_stage_then_run_again(
     unposed_fountain: Path, tmp_path: Path, stage: str, monkeypatch: pytest.MonkeyPatch

@@ -44,6 +44,7 @@ def train(project: Path, kernels: Kernels, steps: int, **settings: str) -> Train
         return trainer
 
 
+@pytest.mark.slow
 def test_the_torch_backend_trains_as_well_as_warp(ball: Path) -> None:
     found = {}
     for kernels in ("warp", "torch"):

@@ -18,9 +18,9 @@ ON_SEAM = 1e-2  # voxels
 LONGEST_LOOP = 30  # edges of a hole that is filled
 
 
-def joined(parts: Sequence[Part]) -> Surface:
-    """One surface of the parts of all blocks, which share a frame. A vertex at a seam takes its class from the faces
-    around it, of both sides, by their area."""
+def joined(parts: Sequence[Part]) -> tuple[Surface, np.ndarray]:
+    """One surface of the parts of all blocks, which share a frame, and which triangles (F,) bool of it fill small holes. A vertex
+    at a seam takes its class from the faces around it, of both sides, by their area."""
     surfaces = [part.surface for part in parts]
     counts = np.cumsum([0, *[len(s.vertices) for s in surfaces]])
     faces = np.concatenate([s.faces.astype(np.int64) + before for s, before in zip(surfaces, counts)])
@@ -79,8 +79,8 @@ def _by_area(vertices: np.ndarray, faces: np.ndarray, face_class: np.ndarray) ->
 
 def _filled(
     vertices: np.ndarray, faces: np.ndarray, colors: np.ndarray, class_id: np.ndarray, face_class: np.ndarray
-) -> Surface:
-    """The surface with its small holes filled, and without vertices that no triangle has."""
+) -> tuple[Surface, np.ndarray]:
+    """The surface with its small holes filled, without vertices that no triangle has, and which triangles (F,) bool are new."""
     before = len(vertices)
     vertices, all_faces, new = fill_holes(vertices, faces, LONGEST_LOOP)
     if len(vertices) > before:  # as the closest of their rims
@@ -91,7 +91,7 @@ def _filled(
     face_class = np.append(face_class, class_id[all_faces[new].min(1)])
     used, index = np.unique(all_faces, return_inverse=True)
     vertices, index = vertices[used], index.reshape(-1, 3)
-    return Surface(
+    surface = Surface(
         vertices.astype(np.float32),
         index.astype(np.int32),
         vertex_normals(vertices, index).astype(np.float32),
@@ -99,3 +99,4 @@ def _filled(
         class_id[used],
         face_class,
     )
+    return surface, new

@@ -24,6 +24,7 @@ from ..mesh.parts import texture_of
 from ..mesh.photo_texture import photo_texture, prepare
 from ..mesh.stored import MESH, TEXTURE
 from ..mesh.surface import Surface, class_table, to_world, with_faces
+from ..mesh.triangles import area_share
 from ..mesh.turntable import write_turntable
 from ..params import BlocksParams
 from ..progress import Reporter
@@ -46,7 +47,7 @@ def write_whole(folder: Path, plan: Plan, params: BlocksParams, report: Reporter
 
     Returns:
         {"blocks": [{"name", "photos", "psnr_train", "faces"}], "vertices", "faces", "open_at_seams": edges, "voxel",
-        "classes", "instances", "label_revision": of the marks that label maps are from, or None, "lods": [{"faces", "deviation"}], "files"}; with a texture "painted_by_photos"
+        "unseen": the share of its area that fills small holes, "classes", "instances", "label_revision": of the marks that label maps are from, or None, "lods": [{"faces", "deviation"}], "files"}; with a texture "painted_by_photos"
     Raises:
         ProjectError, SettingError, TrainingError, DiskError, Cancelled.
     """
@@ -54,13 +55,13 @@ def write_whole(folder: Path, plan: Plan, params: BlocksParams, report: Reporter
 
     report.stage("Joining the blocks")
     parts = [load_part(folder, block) for block in plan.blocks]
-    common = joined(parts)
+    common, filled = joined(parts)
     open_edges = open_at_seams(common, parts)
     scene, voxel = load_scene(folder, params.holdout), parts[0].voxel * similarity_scale(plan.world_from_common)
     kept = not_refuted(transform_points(plan.world_from_common, common.vertices), common.faces, scene, report)
     if not kept.any():
         raise TrainingError("The masks leave out all of the surface.", "Check the masks of the project.")
-    common = with_faces(common, kept)
+    common, filled = with_faces(common, kept), filled[kept]
     surface = to_world(common, plan.world_from_common)
     names = {scene.ignore_id: "void"} | {c.id: c.name for c in scene.classes}
     numbers, instances = find_instances(
@@ -75,7 +76,7 @@ def write_whole(folder: Path, plan: Plan, params: BlocksParams, report: Reporter
     revision = map_revision(load_project(folder))
     features = features_of(surface, scene.classes, scene.ignore_id, instances, revision)
     with staged(target) as here:
-        written = _write_arrays(here, surface, painted) + [write_instances(here, instances)]
+        written = _write_arrays(here, surface, filled, painted) + [write_instances(here, instances)]
         written += write_surface(here / "mesh.ply", surface, features, "none", check=report.check)
         for number, level in enumerate(levels, 1):
             written += write_level(here, number, level, report.check)
@@ -101,6 +102,7 @@ def write_whole(folder: Path, plan: Plan, params: BlocksParams, report: Reporter
         "faces": len(surface.faces),
         "open_at_seams": open_edges,
         "voxel": voxel,
+        "unseen": round(area_share(surface.vertices, surface.faces, filled), 4),
         "classes": class_table(surface, names),
         "instances": len(instances),
         "label_revision": revision,
@@ -147,9 +149,9 @@ def paint(surface: Surface, plan: Plan, scene: Scene, size: int | Literal["auto"
     return Paint(uv.corners, made.image, made.unseen, made.seen)
 
 
-def _write_arrays(folder: Path, surface: Surface, painted: Paint | None) -> list[Path]:
-    """mesh.npz, and the texture if there is one."""
-    arrays = vars(surface) if painted is None else {**vars(surface), "uv": painted.uv}
+def _write_arrays(folder: Path, surface: Surface, filled: np.ndarray, painted: Paint | None) -> list[Path]:
+    """mesh.npz, with the triangles (F,) that fill small holes as unseen, and the texture if there is one."""
+    arrays = {**vars(surface), "unseen": filled} | ({} if painted is None else {"uv": painted.uv})
     with atomic_path(folder / MESH) as temporary, open(temporary, "wb") as file:
         np.savez(file, **arrays)
     written = [folder / MESH]

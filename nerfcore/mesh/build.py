@@ -37,7 +37,7 @@ from .photometric import Pictures, moved_by_photos, pictures_of
 from .refine import refined_maps
 from .region import Region, choose_region, on_sides, sides_of
 from .surface import vertex_normals
-from .triangles import areas, compact, components
+from .triangles import area_share, areas, compact, components
 
 FEW_STEPS = 300  # of training, below which a field is a sketch
 LITTLE_AGREEMENT = 0.3  # share below which the user is told
@@ -105,8 +105,7 @@ def not_refuted(vertices: np.ndarray, faces: np.ndarray, scene: Scene, report: R
     what masks leave out. Raises InputError: a photo or a mask cannot be read."""
     photos = [scene.views[i] for i in scene.train]
     kept = ~denied(vertices, faces, photos, report)
-    area = areas(vertices, faces)
-    share = area[~kept].sum() / max(area.sum(), 1e-30)
+    share = area_share(vertices, faces, ~kept)
     if share > MUCH_DENIED:
         report.warn(
             f"The photos disagree on {100 * share:.0f} % of the surface that the field shows, so that part is left out. "

@@ -74,12 +74,14 @@ def paint_surface(
     field_color: Fill,
     field_classes: ClassField | None,
     report: Reporter,
+    continued: bool = False,
 ) -> Painted:
     """Texture and classes of a mesh in the frame of the photos.
 
     Args:
         vertices (V, 3), faces (F, 3), colors (V, 3) uint8 sRGB. size: of the texture; "auto" for what the photos need, None for none.
         kind: what the texture shows. void: id of what nothing says anything about.
+        continued: whether what no photo sees has the classes around it; see `class_evidence`.
         field_color, field_classes: points (N, 3) and normals (N, 3) → colours (N, 3) uint8, probabilities (N, C).
     Raises:
         SettingError: no memory for the texture. TrainingError: the mesh cannot be unwrapped.
@@ -97,7 +99,7 @@ def paint_surface(
     pieces = made.pieces
     contrast = colors[faces].mean(1)[pieces.parent] / 255
     seen = with_flat_views(made.seen, made.buffers, report)
-    evidence = class_evidence(photos, pieces, seen, class_ids, field_classes, contrast, report)
+    evidence = class_evidence(photos, pieces, seen, class_ids, field_classes, contrast, report, continued)
     classes = surface_classes(len(vertices), faces, pieces, evidence, class_ids, void)
     if uv is None:
         return Painted(classes)

@@ -3,7 +3,8 @@
 The probability of a class at a place is the mean over the views that show it labelled, weighted by how frontal and near
 they are: P(c) = Σ w·p(c) / Σ w, where p is the confidence of a label map for its class. What label maps leave unlabelled
 is void, unless they leave most of the surface so: then they are samples, which do not say what is nothing. Where photos
-see the surface and no label map says what it is, the field's probabilities stand in; what no photo sees is void.
+see the surface and no label map says what it is, the field's probabilities stand in. What no photo sees is void on a closed
+surface; of an open one it is bits and filled holes, which have the classes around them.
 Neighbours across smooth, evenly coloured places share what they know a little, and only then the most probable class is
 taken.
 """
@@ -74,6 +75,7 @@ def class_evidence(
     field: ClassField | None,
     colors: np.ndarray | None,
     report: Reporter,
+    continued: bool = False,
 ) -> Evidence:
     """Evidence for each facelet.
 
@@ -81,6 +83,8 @@ def class_evidence(
         class_ids: id of each class; other ids in label maps say nothing.
         field: points (N, 3) and normals (N, 3) → (N, C) probabilities; None where there is no field.
         colors: (F, 3) sRGB in [0, 1] for the contrast between neighbours; None: shape alone decides.
+        continued: whether what no photo sees has the classes around it, as bits that close holes of an open surface or
+            lie at its rims, or is void.
     """
     votes = np.zeros((len(pieces), len(class_ids)), np.float32)
     total, looked = np.zeros(len(pieces), np.float32), np.zeros(len(pieces), np.float32)
@@ -103,7 +107,10 @@ def class_evidence(
             report.check()
             if len(part):
                 own[part] = field(pieces.centers[part], pieces.normals[part])
-    return Evidence(_shared(pieces, own, colors, blank), own, bool(sparse))
+    mass = _shared(pieces, own, colors, blank)
+    if continued:
+        mass = _continued(pieces, mass, (seen.view < 0).all(1), blank)
+    return Evidence(mass, own, bool(sparse))
 
 
 def view_votes(
@@ -182,6 +189,25 @@ def _shared(pieces: Facelets, own: np.ndarray, colors: np.ndarray | None, blank:
             total += weight[:, edge, None] * mass[there[:, edge]]
             amount += weight[:, edge]
         mass = np.where(blank[:, None], 0, total / amount[:, None])
+    return mass
+
+
+def _continued(pieces: Facelets, mass: np.ndarray, wanted: np.ndarray, blank: np.ndarray) -> np.ndarray:
+    """Evidence (F, C) that on `wanted` (F,) bool facelets is that of what lies around them: the mean of the neighbours that have
+    any, or are `blank` (F,), ring by ring."""
+    mass = np.where(wanted[:, None], 0, mass)
+    known = ~wanted & (blank | (mass.sum(1) >= LEAST))
+    left = np.flatnonzero(wanted)
+    while len(left):
+        there = pieces.neighbours[left]
+        near = (there >= 0) & known[there]
+        reached = near.any(1)
+        if not reached.any():
+            break
+        rows, there, near = left[reached], there[reached], near[reached]
+        mass[rows] = np.einsum("ne,nec->nc", near, mass[there]) / near.sum(1)[:, None]
+        known[rows] = True
+        left = left[~reached]
     return mass
 
 

@@ -16,6 +16,12 @@ def areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.linalg.norm(cross(vertices, faces), axis=1) / 2
 
 
+def area_share(vertices: np.ndarray, faces: np.ndarray, chosen: np.ndarray) -> float:
+    """Share of the area of triangles (F, 3) that the chosen (F,) bool ones have."""
+    area = areas(vertices, faces)
+    return float(area[chosen].sum() / max(area.sum(), 1e-30))
+
+
 def unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-20)
 

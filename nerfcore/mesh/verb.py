@@ -37,7 +37,7 @@ from .photos import Photo
 from .preview import preview
 from .shown import shown_share, silhouette
 from .surface import Surface, class_table, is_watertight, to_world
-from .triangles import areas
+from .triangles import area_share
 from .turntable import look_around
 
 
@@ -166,8 +166,7 @@ def judge(
 
 def guess_share(built: Built) -> float:
     """Share of the area of a surface that is marked as unseen."""
-    area = areas(built.vertices, built.faces)
-    return 0.0 if built.unseen is None else float(area[built.unseen].sum() / area.sum())
+    return 0.0 if built.unseen is None else area_share(built.vertices, built.faces, built.unseen)
 
 
 def mesh_inputs(params: MeshParams) -> Fingerprint:
@@ -231,4 +230,5 @@ def paint(
         color,
         probabilities if ids else None,
         report,
+        not params.watertight,
     )

@@ -41,6 +41,7 @@ from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.schema import Frame, ImageRecord, PosedImage, Poses, Project, SemanticClass
 from fieldwork.nerfcore.project.store import load_points, load_project, load_visibility, save_poses, save_project
 from fieldwork.tests.nerfcore.support.depth_views import Hit, box, look_at, maps_of, orbit, sphere
+from fieldwork.tests.nerfcore.support.flat import wall_mesh
 
 CPU = torch.device("cpu")
 NAMES = {0: "void", 1: "upper", 2: "lower"}
@@ -101,7 +102,7 @@ def in_one(each: list[MapArrays], plan: Plan, cells: int = CELLS) -> Surface:
     vertices, faces = extract(bricks, Reporter())
     near = tolerances(bricks, vertices, faces, 4 * region.voxel)
     vertices, faces = triangles.compact(vertices, faces[clean.shown(vertices, faces, maps, near, Reporter())])
-    return joined([Part(classed(vertices, faces), np.zeros((0, 2)), region.voxel)])
+    return joined([Part(classed(vertices, faces), np.zeros((0, 2)), region.voxel)])[0]
 
 
 SHAPES: dict[str, Callable[[], Hit]] = {
@@ -117,7 +118,7 @@ def test_two_blocks_make_the_mesh_of_one(shape: str) -> None:
     (parts, _), one = in_blocks(maps, plan), in_one(maps, plan)
     assert all(len(part.surface.faces) > 0.2 * len(one.faces) for part in parts)
     assert open_at_seams(parts[0].surface, parts) > 20, "a block alone is open at its seam"
-    both = joined(parts)
+    both, _ = joined(parts)
     assert open_at_seams(both, parts) == 0
     assert is_watertight(both.faces)
     assert is_watertight(one.faces)
@@ -158,11 +159,24 @@ def test_blocks_of_a_soft_field_make_the_mesh_of_one() -> None:
             depth[own] = torch.where(hit, depth[own] + 0.04 * (view % 5 - 2), depth[own])
         each.append(replace(maps, depth=depth, spread=torch.full_like(maps.spread, 0.02 + 0.4 * number)))
     (parts, _), one = in_blocks(each, plan), in_one(each, plan)
-    both = joined(parts)
+    both, _ = joined(parts)
     region = shared_region(None, plan, sights_in(each, plan), CELLS)
     assert fuse_maps(joined_maps(each), region, Reporter()).wide.any()
     assert len(both.faces) == len(one.faces) > 1000
     assert np.array_equal(np.sort(both.vertices, 0), np.sort(one.vertices, 0)), "to the bit"
+
+
+def test_what_fills_holes_is_marked() -> None:
+    vertices, faces = wall_mesh(20)[:2]
+    wall = classed(vertices, faces)
+    hole = np.linalg.norm(vertices[faces].mean(1), axis=1) < 0.1
+    found, filled = joined([Part(with_faces(wall, ~hole), np.zeros((0, 2)), 0.05)])
+    assert len(triangles.border_edges(found.faces)) == len(triangles.border_edges(faces))
+    assert 0 < filled.sum() < len(filled)
+    area = triangles.areas(vertices, faces)
+    share = triangles.area_share(found.vertices, found.faces, filled)
+    assert share == pytest.approx(area[hole].sum() / area.sum(), rel=1e-5)
+    assert not filled[: int((~hole).sum())].any()
 
 
 def test_a_part_needs_only_the_maps_that_see_it() -> None:
@@ -178,7 +192,7 @@ def test_a_part_needs_only_the_maps_that_see_it() -> None:
         each.append(known_maps(bar, plan, poses)[number])
     parts, counts = in_blocks(each, plan, 40)
     one = in_one(each, plan, 40)
-    both = joined(parts)
+    both, _ = joined(parts)
     assert len(both.faces) == len(one.faces) > 1000
     assert open_at_seams(both, parts) == open_at_seams(one, parts), "holes are those of one piece"
     assert np.array_equal(np.sort(both.vertices, 0), np.sort(one.vertices, 0)), "to the bit"

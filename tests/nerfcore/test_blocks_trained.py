@@ -23,9 +23,9 @@ from fieldwork.nerfcore.mesh.clean import shown
 from fieldwork.nerfcore.mesh.extract import extract
 from fieldwork.nerfcore.mesh.fusion import fuse_maps
 from fieldwork.nerfcore.mesh.instances import read_instances
-from fieldwork.nerfcore.mesh.stored import load_surface
+from fieldwork.nerfcore.mesh.stored import load_guessed, load_surface
 from fieldwork.nerfcore.mesh.surface import Surface, vertex_normals
-from fieldwork.nerfcore.mesh.triangles import border_edges, compact
+from fieldwork.nerfcore.mesh.triangles import area_share, border_edges, compact
 from fieldwork.nerfcore.params import BlendParams, BlocksParams, InstancesParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.runs import run_folder
@@ -70,7 +70,7 @@ def in_one_piece(project: Path, plan: Plan) -> Surface:
         nothing,
         np.zeros(len(faces), np.int32),
     )
-    return joined([Part(surface, np.zeros((0, 2)), region.voxel)])
+    return joined([Part(surface, np.zeros((0, 2)), region.voxel)])[0]
 
 
 @pytest.fixture(scope="module")
@@ -88,9 +88,13 @@ def test_two_trained_blocks_make_the_surface_of_their_maps_in_one_piece(made: tu
     plan = cut(load_scene(project, 0), 2)
     parts = [load_part(project, block) for block in plan.blocks]
     one = in_one_piece(project, plan)
-    assert len(joined(parts).faces) == len(one.faces)
-    assert len(border_edges(joined(parts).faces)) == len(border_edges(one.faces))
+    assert len(joined(parts)[0].faces) == len(one.faces)
+    assert len(border_edges(joined(parts)[0].faces)) == len(border_edges(one.faces))
     assert result["open_at_seams"] == open_at_seams(one, parts)
+    (surface, _), filled = load_surface(project, "blocks"), load_guessed(project, "blocks")
+    assert filled is not None
+    assert len(filled) == len(surface.faces)
+    assert result["unseen"] == round(area_share(surface.vertices, surface.faces, filled), 4)
     names = [instance.name for instance in read_instances(project / "exports/blocks")]
     assert {name.split(".")[0] for name in names} <= {"top", "bottom"}
     assert (project / "whole.glb").stat().st_size > 1000

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from fieldwork.nerfcore.mesh import surface_labels as module
 from fieldwork.nerfcore.mesh.facelets import facelets
 from fieldwork.nerfcore.mesh.photo_texture import Prepared, prepare
 from fieldwork.nerfcore.mesh.photos import Photo
-from fieldwork.nerfcore.mesh.surface_labels import class_evidence, class_maps, class_picture, surface_classes
+from fieldwork.nerfcore.mesh.surface_labels import (
+    class_evidence,
+    class_maps,
+    class_picture,
+    decided,
+    surface_classes,
+)
 from fieldwork.nerfcore.mesh.visibility import DepthBuffers, observe, with_flat_views
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.tests.nerfcore.support.flat import LENS, box_mesh, looking, on_plane, ring, wall_mesh, wall_photo
@@ -78,6 +86,27 @@ def test_faces_and_vertices_have_the_class_of_most_of_their_area() -> None:
     assert (found.class_id[near < RADIUS - 0.05] == DISC).all()
     assert found.confidence[near < RADIUS - 0.05].min() > 0.8
     assert (found.class_id[vertices[:, 0] < -0.59] == VOID).all()
+
+
+def test_what_no_photo_sees_has_the_classes_around_it_where_asked() -> None:
+    """A square on the disc's outline, and one on that of what is unlabelled."""
+    photos = [labelled(pose) for pose in ring(8)]
+    vertices, faces, corners = wall_mesh(48)
+    made = prepare(vertices, faces, corners, photos, 256, Reporter())
+    x, y = made.pieces.centers[:, :2].T
+    disc, bare = (np.maximum(np.abs(x - at), np.abs(y)) for at in (RADIUS, -0.5))
+    hidden = np.minimum(disc, bare) < 0.08
+    seen = replace(made.seen, view=np.where(hidden[:, None], np.int16(-1), made.seen.view))
+    without, found = (
+        decided(class_evidence(photos, made.pieces, seen, IDS, None, None, Reporter(), continued).mass, IDS, VOID)[0]
+        for continued in (False, True)
+    )
+    assert (without[np.minimum(disc, bare) < 0.05] == VOID).all()
+    assert (found[disc < 0.08] != VOID).all()
+    # Of the outline only two places are known there, at the rim.
+    assert (found == painted(made.pieces.centers[:, :2]))[disc < 0.08].mean() > 0.85
+    assert 0.3 < (found[bare < 0.05] == VOID).mean() < 0.7
+    assert (found == without)[~hidden].all()
 
 
 def test_without_any_label_map_all_is_void_and_the_field_may_say_more() -> None:

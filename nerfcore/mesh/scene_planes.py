@@ -172,7 +172,6 @@ def _area_near(known: Known, area: np.ndarray, starts: np.ndarray) -> np.ndarray
         near = (np.abs(off, out=off) < limit[:, None]) & (normals @ normals[part].T > TILTED)
         found.append(area.astype(np.float32) @ near)
     return np.concatenate(found)
-    return best
 
 
 def near_plane(known: Known, point: np.ndarray, normal: np.ndarray, width: float) -> np.ndarray:

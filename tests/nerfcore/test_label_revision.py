@@ -48,7 +48,7 @@ from fieldwork.nerfcore.things.graph import relate
 from fieldwork.nerfcore.train.verb import train
 from fieldwork.tests.nerfcore.support.ball import SMALL
 from fieldwork.tests.nerfcore.support.film import taken
-from fieldwork.tests.nerfcore.test_labels import spread, two_strokes  # noqa: F401
+from fieldwork.tests.nerfcore.test_labels import spread, two_strokes
 from PIL import Image
 from pxr import Usd
 
@@ -56,7 +56,7 @@ REVISION = 2
 
 
 @pytest.fixture(scope="module")
-def labelled(unlabelled: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:  # noqa: F811
+def labelled(unlabelled: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The ball with the classes of two strokes, its mesh, and its field baked."""
     folder = Path(shutil.copytree(unlabelled, tmp_path_factory.mktemp("labelled") / "p"))
     two_strokes(folder)
@@ -167,7 +167,7 @@ def test_a_training_with_accepted_labels_names_their_revision(labelled: Path, tm
     assert ["labels", f"label maps of revision {REVISION} of the marks"] in [list(row) for row in settings.rows]
 
 
-def test_what_has_no_marks_names_none(unlabelled: Path, tmp_path: Path) -> None:  # noqa: F811
+def test_what_has_no_marks_names_none(unlabelled: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(unlabelled, tmp_path / "p"))
     mesh(MeshParams(project=folder, resolution=32), Reporter())
     told = export(ExportParams(project=folder, to="ply", out=tmp_path / "a.ply"), Reporter())

@@ -134,7 +134,7 @@ def test_what_is_wrong_with_a_mark_on_the_surface_is_told(ball: Path) -> None:  
         place(ball, TOP, [[0.0, float("inf"), 0.0]])
 
 
-def epochs(unlabelled: Path, folder: Path) -> tuple[Path, Path, np.ndarray, Path]:  # noqa: F811
+def epochs(unlabelled: Path, folder: Path) -> tuple[Path, Path, np.ndarray, Path]:
     """An epoch with labels, a later one without any whose world lies otherwise, the way from one to the other, and common
     points."""
     before, now = (Path(shutil.copytree(unlabelled, folder / name)) for name in ("before", "now"))
@@ -156,7 +156,7 @@ def epochs(unlabelled: Path, folder: Path) -> tuple[Path, Path, np.ndarray, Path
     return before, now, turn, folder / "points.csv"
 
 
-def test_labels_of_an_earlier_epoch_are_carried_shown_as_such_and_confirmed(unlabelled: Path, tmp_path: Path) -> None:  # noqa: F811
+def test_labels_of_an_earlier_epoch_are_carried_shown_as_such_and_confirmed(unlabelled: Path, tmp_path: Path) -> None:
     before, now, turn, points = epochs(unlabelled, tmp_path)
     result = carry(LabelCarryParams(project=now, other=before, points=points, author="Ada"), Reporter())
     assert result["carried"] > 0.9
@@ -210,7 +210,7 @@ def test_carried_classes_get_ids_that_neither_classes_nor_marks_nor_void_have(tm
     assert classes_of(folder, wanted) == ({3: 5, 65535: 6, 7: TOP}, ["brick", "glass"])
 
 
-def test_epochs_that_do_not_fit_and_damaged_files_are_told(unlabelled: Path, tmp_path: Path) -> None:  # noqa: F811
+def test_epochs_that_do_not_fit_and_damaged_files_are_told(unlabelled: Path, tmp_path: Path) -> None:
     before, now, _, points = epochs(unlabelled, tmp_path)
     far = tmp_path / "far.csv"
     far.write_text(points.read_text().replace("\n0,", "\n0,9"))

@@ -151,13 +151,13 @@ def test_what_photos_and_masks_refute_is_left_out_of_the_whole(
     made: tuple[Path, dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     project = Path(shutil.copytree(made[0], tmp_path / "ball"))
-    monkeypatch.setattr(whole, "not_refuted", lambda vertices, faces, *_: vertices[faces].mean(1)[:, 2] > 0)
+    monkeypatch.setattr(whole, "not_refuted", lambda vertices, faces, *_: (vertices[faces].mean(1)[:, 2] > 0, 0.0))
     result = blocks(asked(project), Reporter())
     surface, _ = load_surface(project, "blocks")
     assert 0.3 < result["faces"] / made[1]["faces"] < 0.7
     assert (surface.vertices[surface.faces].mean(1)[:, 2] > -1e-4).all(), "asked about in the world"
     assert set(np.unique(surface.faces)) == set(range(len(surface.vertices)))
-    monkeypatch.setattr(whole, "not_refuted", lambda vertices, faces, *_: np.zeros(len(faces), bool))
+    monkeypatch.setattr(whole, "not_refuted", lambda vertices, faces, *_: (np.zeros(len(faces), bool), 0.0))
     with pytest.raises(TrainingError, match="masks leave out all"):
         blocks(asked(project), Reporter())
     assert len(load_surface(project, "blocks")[0].faces) == result["faces"], "what was there stays"

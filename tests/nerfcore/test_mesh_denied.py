@@ -14,6 +14,7 @@ from fieldwork.nerfcore.mesh.build import not_refuted
 from fieldwork.nerfcore.mesh.denied import AGREE, agreement, denied
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.render.verb import look_at
+from fieldwork.nerfcore.verdict import mesh_verdict
 from PIL import Image
 
 CAMERA = Camera(width=240, height=180, fx=200, fy=200, cx=120, cy=90)
@@ -148,8 +149,16 @@ def test_how_much_photos_deny_is_told(tmp_path: Path, surface: tuple[np.ndarray,
     vertices, faces, part = surface
     views, report = photos(tmp_path, plain=False), Reporter()
     scene = Scene(views, list(range(len(views))), [])
-    assert np.array_equal(not_refuted(vertices, faces, scene, report), part != 2)
-    assert report.warnings == [], "2 % of the area"
+    kept, share = not_refuted(vertices, faces, scene, report)
+    assert np.array_equal(kept, part != 2)
+    assert share == pytest.approx(0.02, abs=0.005)
+    assert report.warnings == []
+    assert mesh_verdict(0.9, refuted=share)["level"] == "good"
     near = part > 0
-    assert np.array_equal(not_refuted(vertices, faces[near], scene, report), part[near] != 2)
+    kept, share = not_refuted(vertices, faces[near], scene, report)
+    assert np.array_equal(kept, part[near] != 2)
+    assert share == pytest.approx(0.5, abs=0.005)
+    told = mesh_verdict(0.9, refuted=share)
+    assert told["level"] == "weak"
+    assert "disagree on 50% of the surface" in told["reasons"][0]
     assert "disagree on 50 % of the surface" in report.warnings[0]

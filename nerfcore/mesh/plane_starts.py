@@ -19,7 +19,7 @@ from ..progress import Reporter
 from .depth_maps import DepthMap, FlatView, cosines, pixel_directions
 from .scene_planes import STEEPEST, ScenePlane
 
-PLANES = 8  # of the scene, the largest, from which depths are tried
+PLANES = 8  # of the scene, the largest, from which depths are tried beside the ground
 LEAST = 0.6  # correlation that is believed
 GAIN = 0.1  # by which it must exceed that of the depth near the field's
 # Not tuned.
@@ -55,7 +55,7 @@ def from_planes(
         some = slice(begin, begin + map_.depth.size)
         depth, best = map_.depth.copy(), np.maximum(score + GAIN, LEAST)
         asked = map_.hit & ~safe & (best < 1)  # nothing agrees better than that
-        for plane in planes[:PLANES] if asked.any() else []:
+        for plane in planes if asked.any() else []:
             start = depth_of(view, plane)
             near = asked & (start > map_.depth / OFF) & (start < map_.depth * OFF)
             if label is not None:

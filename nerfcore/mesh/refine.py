@@ -31,9 +31,9 @@ from .depth_maps import (
     neighbours,
     normals,
 )
-from .plane_starts import from_planes
+from .plane_starts import PLANES, from_planes
 from .planes import with_planes
-from .scene_planes import known_points, on_scene_planes, scene_planes
+from .scene_planes import ground, known_points, on_scene_planes, scene_planes
 from .sky import FAR, backdrop, confirmed_share, farthest, labels_tell, named_things, nothing
 from .walls import any_plain, on_walls, picture_of, plain_places, walls
 
@@ -125,8 +125,10 @@ def refined_maps(
     things: list[np.ndarray | None] = [None] * len(views)
     if labels_tell(sure, left_out):
         things = named_things(labels, *confirmed_share([map_.hit for map_ in maps], sure, labels))
-    planes = scene_planes(known_points(views, sharp, sure, things), report)
-    moved = from_planes(photos, views, moved, agreed, sure, arrays, near, planes, things, report)
+    points = known_points(views, sharp, sure, things)
+    planes, floor = scene_planes(points, report)[:PLANES], ground(points, views, report)
+    starts = planes if floor is None else [*planes, floor]
+    moved = from_planes(photos, views, moved, agreed, sure, arrays, near, starts, things, report)
     kept, sure = confirmed_moves(moved)
     told = labels_tell(sure, left_out)
     confirmed, usual = confirmed_share([map_.hit for map_ in maps], sure, labels)

@@ -27,6 +27,8 @@ POINTS = 400_000  # that heights are of, and
 LOOKED_AT = 40_000  # among which planes are looked for
 MOST = 12  # planes
 SHARE = 0.01  # of the area known that a plane must hold
+GROUND = 0.001  # share of the area known that must face up, and
+UPRIGHT = 0.5  # length of the mean of the cameras' directions up, for a ground to be looked for
 SHARP = 3.0  # footprints of a pixel by which a point may be wrong: what a soft field takes for a wall may be round
 SOFT = 0.5  # share of its spread by which a depth may be wrong, but at least a footprint of a pixel
 TRIES, KEPT = 400, 48  # points whose tangent plane is tried, and the best of them that are fitted
@@ -121,15 +123,16 @@ def known_points(
     return Known(*(np.concatenate(part) for part in zip(*parts)))
 
 
-def scene_planes(known: Known, report: Reporter) -> list[ScenePlane]:
-    """The largest planes among known points, by area: found in what is known well, and reaching as far as the rest says."""
+def scene_planes(known: Known, report: Reporter, most: int = MOST) -> list[ScenePlane]:
+    """The `most` largest planes among known points, by area: found in what is known well, and reaching as far as the rest
+    says."""
     everything, step = known, max(1, -(-len(known.points) // LOOKED_AT))
     known = Known(*(values[::step] for values in vars(known).values()))
     least = SHARE * (known.footprint**2).sum()
     sharp = Known(*(values[known.error <= SHARP * known.footprint] for values in vars(known).values()))
     area, rng = sharp.footprint**2, np.random.default_rng(0)
     left, found = np.ones(len(area), bool), []
-    for _ in range(MOST):
+    for _ in range(most):
         report.check()
         if area[left].sum() < least or not left.any():
             break
@@ -141,6 +144,21 @@ def scene_planes(known: Known, report: Reporter) -> list[ScenePlane]:
         found.append(replace(plane, height=_heights(everything, plane)))
         left &= ~near_plane(sharp, point, normal, BESIDE)
     return found
+
+
+def ground(known: Known, views: Sequence[FlatView], report: Reporter) -> ScenePlane | None:
+    """The largest plane among what faces up, as most cameras are held, though there is little of it; None without any."""
+    up = -np.mean([view.pose[:3, 1] for view in views], axis=0)
+    if np.linalg.norm(up) < UPRIGHT:
+        return None
+    facing, area = known.normals @ (up / np.linalg.norm(up)) > TILTED, known.footprint**2
+    if area[facing].sum() < GROUND * area.sum():
+        return None
+    found = scene_planes(Known(*(values[facing] for values in vars(known).values())), report, 1)
+    if not found:
+        return None
+    on = near_plane(known, found[0].point, found[0].normal, WIDTHS[-1])
+    return replace(found[0], partly=_partly(known, np.flatnonzero(on)))
 
 
 def _largest(known: Known, area: np.ndarray, left: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:

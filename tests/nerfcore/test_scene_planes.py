@@ -7,7 +7,7 @@ import pytest
 from fieldwork.nerfcore.errors import Cancelled
 from fieldwork.nerfcore.geometry.cameras import Camera
 from fieldwork.nerfcore.mesh.depth_maps import DepthMap, FlatView, cosines, pixel_directions
-from fieldwork.nerfcore.mesh.scene_planes import Known, known_points, on_scene_planes, scene_planes
+from fieldwork.nerfcore.mesh.scene_planes import Known, ground, known_points, on_scene_planes, scene_planes
 from fieldwork.nerfcore.progress import Reporter
 
 LENS = Camera(width=120, height=90, fx=100.0, fy=100.0, cx=60.0, cy=45.0)
@@ -103,6 +103,36 @@ def test_nothing_known_is_no_plane_and_cancelling_is_heard(walls) -> None:
     report.cancel()
     with pytest.raises(Cancelled):
         scene_planes(known_points(views, maps, sure), report)
+
+
+def before_wall(share: float) -> Known:
+    """A wall at z = 3 and, of `share` of all that is known, a lawn at y = 1, two centimetres uneven; y points down."""
+    rng, count = np.random.default_rng(0), 50_000
+    few = round(share * count)
+    wall = np.stack([rng.uniform(-2, 2, count), rng.uniform(-2, 1, count), np.full(count, 3.0)], 1)
+    lawn = np.stack([rng.uniform(-2, 0, few), 1 + rng.uniform(-0.01, 0.01, few), rng.uniform(2, 3, few)], 1)
+    normals = np.concatenate([np.tile([0.0, 0, -1], (count, 1)), np.tile([0.0, -1, 0], (few, 1))])
+    points = np.concatenate([wall, lawn])
+    kind = np.concatenate([np.full(count, 1, np.uint8), np.full(few, 2, np.uint8)])
+    return Known(points, normals, np.full(len(points), 0.03), np.full(len(points), 0.03), kind)
+
+
+def test_a_ground_is_found_of_which_little_is_known() -> None:
+    known, views = before_wall(0.004), [looking(x, 0.0) for x in (-0.3, 0.0, 0.3)]
+    assert all(abs(plane.normal[1]) < 0.1 for plane in scene_planes(known, Reporter()))
+    plane = ground(known, views, Reporter())
+    assert plane is not None
+    assert plane.normal == pytest.approx([0, -1, 0], abs=0.02)
+    assert plane.point[1] == pytest.approx(1.0, abs=0.01)
+    # The lawn's class lies on it, of the wall's only its foot.
+    assert plane.partly[2]
+    assert not plane.partly[1]
+    assert ground(before_wall(0.0005), views, Reporter()) is None
+    turned = [FlatView(view.camera, view.pose.copy(), 0, view.inside) for view in views]
+    for number, view in enumerate(turned):  # a third of a turn each: nothing is up
+        c, s = np.cos(2 * np.pi * number / 3), np.sin(2 * np.pi * number / 3)
+        view.pose[:3, :3] = view.pose[:3, :3] @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    assert ground(known, turned, Reporter()) is None
 
 
 def of_class(number: int) -> list[np.ndarray]:

@@ -3,7 +3,7 @@
 A lawn that few photos show, at a flat angle, is wrong in the field by more than photos can move it: they compare a few
 pixels on either side, with patches on the slope that the field has there. But grounds and walls go on: from the plane of what is
 known, with its slope, photos find the depth, or they do not agree there either.
-Measured: docs/experiments.md, “Ground at a wrong height”.
+Measured: docs/experiments.md, “Ground at a wrong height” and “The ground, of which little is known”.
 """
 
 from __future__ import annotations

@@ -126,8 +126,9 @@ def refined_maps(
     if labels_tell(sure, left_out):
         things = named_things(labels, *confirmed_share([map_.hit for map_ in maps], sure, labels))
     points = known_points(views, sharp, sure, things)
-    planes, floor = scene_planes(points, report)[:PLANES], ground(points, views, report)
-    starts = planes if floor is None else [*planes, floor]
+    starts = scene_planes(points, report)[:PLANES]
+    floor = ground(points, views, starts, report)
+    starts = starts if floor is None else [*starts, floor]
     moved = from_planes(photos, views, moved, agreed, sure, arrays, near, starts, things, report)
     kept, sure = confirmed_moves(moved)
     told = labels_tell(sure, left_out)

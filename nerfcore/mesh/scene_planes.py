@@ -146,8 +146,11 @@ def scene_planes(known: Known, report: Reporter, most: int = MOST) -> list[Scene
     return found
 
 
-def ground(known: Known, views: Sequence[FlatView], report: Reporter) -> ScenePlane | None:
-    """The largest plane among what faces up, as most cameras are held, though there is little of it; None without any."""
+def ground(
+    known: Known, views: Sequence[FlatView], planes: Sequence[ScenePlane], report: Reporter
+) -> ScenePlane | None:
+    """The largest plane among what faces up, as most cameras are held, though there is little of it; None without any, or where
+    most of it lies on one of the `planes` known."""
     up = -np.mean([view.pose[:3, 1] for view in views], axis=0)
     if np.linalg.norm(up) < UPRIGHT:
         return None
@@ -157,8 +160,11 @@ def ground(known: Known, views: Sequence[FlatView], report: Reporter) -> ScenePl
     found = scene_planes(Known(*(values[facing] for values in vars(known).values())), report, 1)
     if not found:
         return None
-    on = near_plane(known, found[0].point, found[0].normal, WIDTHS[-1])
-    return replace(found[0], partly=_partly(known, np.flatnonzero(on)))
+    on = np.flatnonzero(near_plane(known, found[0].point, found[0].normal, WIDTHS[-1]))
+    own = Known(*(values[on] for values in vars(known).values()))
+    if any(near_plane(own, plane.point, plane.normal, BESIDE).mean() > 0.5 for plane in planes):
+        return None
+    return replace(found[0], partly=_partly(known, on))
 
 
 def _largest(known: Known, area: np.ndarray, left: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
@@ -200,10 +206,10 @@ def near_plane(known: Known, point: np.ndarray, normal: np.ndarray, width: float
 
 def _fit(known: Known, area: np.ndarray, on: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A point and the normal of the plane through points, by least squares weighted with their area over their error."""
-    weight, points = area[on] / known.error[on] ** 2, known.points[on]
-    middle = weight @ points / weight.sum()
-    around = points - middle
-    normal = np.linalg.eigh((around * weight[:, None]).T @ around)[1][:, 0]
+    weight = area[on] / known.error[on] ** 2
+    middle = np.average(known.points[on], axis=0, weights=weight)
+    around = (known.points[on] - middle) * np.sqrt(weight)[:, None]
+    normal = np.linalg.svd(around, full_matrices=False)[2][2]
     return middle, normal * np.sign(normal @ known.normals[on].mean(0) or 1.0)
 
 

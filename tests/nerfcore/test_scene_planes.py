@@ -119,20 +119,22 @@ def before_wall(share: float) -> Known:
 
 def test_a_ground_is_found_of_which_little_is_known() -> None:
     known, views = before_wall(0.004), [looking(x, 0.0) for x in (-0.3, 0.0, 0.3)]
-    assert all(abs(plane.normal[1]) < 0.1 for plane in scene_planes(known, Reporter()))
-    plane = ground(known, views, Reporter())
+    planes = scene_planes(known, Reporter())
+    assert all(abs(plane.normal[1]) < 0.1 for plane in planes)
+    plane = ground(known, views, planes, Reporter())
     assert plane is not None
     assert plane.normal == pytest.approx([0, -1, 0], abs=0.02)
     assert plane.point[1] == pytest.approx(1.0, abs=0.01)
     # The lawn's class lies on it, of the wall's only its foot.
     assert plane.partly[2]
     assert not plane.partly[1]
-    assert ground(before_wall(0.0005), views, Reporter()) is None
+    assert ground(known, views, [*planes, plane], Reporter()) is None, "it is known"
+    assert ground(before_wall(0.0005), views, planes, Reporter()) is None
     turned = [FlatView(view.camera, view.pose.copy(), 0, view.inside) for view in views]
     for number, view in enumerate(turned):  # a third of a turn each: nothing is up
         c, s = np.cos(2 * np.pi * number / 3), np.sin(2 * np.pi * number / 3)
         view.pose[:3, :3] = view.pose[:3, :3] @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-    assert ground(known, turned, Reporter()) is None
+    assert ground(known, turned, planes, Reporter()) is None
 
 
 def of_class(number: int) -> list[np.ndarray]:

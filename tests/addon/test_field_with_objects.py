@@ -70,6 +70,7 @@ def small_and_large(samples, object_samples):
 )
 
 
+@pytest.mark.slow
 def test_edges_of_objects_are_exact_in_the_composite(bpy_script, ball, tmp_path):
     """No pixel here has an edge of one object on another that the field hides: of such a pixel the renderer of the objects
     tells one colour only (docs/live.md)."""

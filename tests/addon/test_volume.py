@@ -103,6 +103,7 @@ answer(facts)
 )
 
 
+@pytest.mark.slow
 def test_the_volume_of_a_field_looks_like_it_in_cycles(bpy_script, ball: Path, tmp_path: Path) -> None:
     import shutil
 

@@ -204,6 +204,7 @@ def test_nothing_is_cut_out_against_what_is_known_or_asked(tmp_path: Path) -> No
     assert new(see_through, tmp_path / "transparent")["masked"] == 0
 
 
+@pytest.mark.slow
 def test_a_data_set_is_cut_out_too(tmp_path: Path, shared_data: Callable[[str], Path]) -> None:
     temple = shared_data("temple_ring")
     import_dataset(ImportParams(dataset=temple, project=tmp_path / "p"), Reporter())

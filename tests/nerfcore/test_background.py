@@ -135,7 +135,8 @@ def opacities(project: Path, run: str, value: int) -> tuple[float, float]:
     return float(np.mean(beside)), float(np.mean(on))
 
 
-@pytest.mark.parametrize(("value", "name"), [(0, "black"), pytest.param(255, "white", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("value", "name"), [(0, "black"), (255, "white")])
 def test_nothing_is_put_around_an_object(tmp_path: Path, value: int, name: str) -> None:
     project = on_background(ball_project(tmp_path / "p"), value)
     found = {}

@@ -115,6 +115,7 @@ def test_the_truth_is_sampled_where_photos_look_however_large_it_is() -> None:
     assert area * (kinds[face] == 1).mean() == pytest.approx(4 * np.pi * 0.09, rel=0.1)
 
 
+@pytest.mark.slow
 def test_areas_of_classes_are_compared_where_enough_cameras_see() -> None:
     truth, scene = ball_and_plate(), scene_around()
     scene = Scene(scene.views, scene.train, [])

@@ -21,7 +21,7 @@ MISSED, PARTLY = 0.02, 0.1  # share of the photos' pixels that show the mesh
 SOLID, HALF_GONE = 0.9, 0.5  # share of the pixels that show something near with detail which hit the mesh
 MANY_FEW = 0.5  # of what is missing that fewer than three photos may show, before photos are asked for first
 MANY_GUESSED = 0.1  # share of the area that closes gaps by a guess, from which on the user is told
-MUCH_REFUTED = 0.15  # share of the area that photos disagree on, from which on a mesh lacks much; not tuned
+MUCH_DENIED = 0.15  # share of the area that photos disagree on, from which on a mesh lacks much; not tuned
 HOLES = 0.02  # share of what the mesh fills in pictures that is holes
 LITTLE_IN_ONE = 0.5  # share of the area that the largest part has
 FEW_LABELS_RIGHT = 0.3  # mIoU
@@ -146,7 +146,7 @@ def mesh_verdict(
     overlapped: float | None = None,
     few: float = 0.0,
     guessed: float | None = 0.0,
-    refuted: float = 0.0,
+    denied: float = 0.0,
 ) -> Verdict:
     """Of `mesh`.
 
@@ -154,7 +154,7 @@ def mesh_verdict(
         hit: share of the photos' pixels that show it. solid, holes, overlapped, few: shares as `mesh.coverage.Coverage` has
             them.
         largest: share of the area that its largest connected part has. guessed: share of it that closes gaps; None: nobody
-            asked for that. refuted: share of the area that was left out, as photos disagree on it.
+            asked for that. denied: share of the area that was left out, as photos disagree on it.
     """
     found = []
     hint = "" if guessed is not None else " Small gaps can be closed by a guess (“close gaps”)."
@@ -176,9 +176,9 @@ def mesh_verdict(
     if holes > HOLES:
         text = f"The mesh has holes: {holes:.0%} of it in the photos. Train longer, or add photos."
         found.append(("weak", text + hint))
-    if refuted > MUCH_REFUTED:
+    if denied > MUCH_DENIED:
         text = (
-            f"The photos disagree on {refuted:.0%} of the surface that the field shows, so that part is left out: take photos of "
+            f"The photos disagree on {denied:.0%} of the surface that the field shows, so that part is left out: take photos of "
             "it from nearer or from a steeper angle, or train longer."
         )
         found.append(("weak", text))

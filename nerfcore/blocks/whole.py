@@ -47,7 +47,7 @@ def write_whole(folder: Path, plan: Plan, params: BlocksParams, report: Reporter
 
     Returns:
         {"blocks": [{"name", "photos", "psnr_train", "faces"}], "vertices", "faces", "open_at_seams": edges, "voxel",
-        "unseen": the share of its area that fills small holes, "refuted": the share that was left out, as photos disagree on
+        "unseen": the share of its area that fills small holes, "denied": the share that was left out, as photos disagree on
         it, "classes", "instances", "label_revision": of the marks that label maps are from, or None, "lods": [{"faces",
         "deviation"}], "files"}; with a texture "painted_by_photos"
     Raises:
@@ -60,7 +60,7 @@ def write_whole(folder: Path, plan: Plan, params: BlocksParams, report: Reporter
     common, filled = joined(parts)
     open_edges = open_at_seams(common, parts)
     scene, voxel = load_scene(folder, params.holdout), parts[0].voxel * similarity_scale(plan.world_from_common)
-    kept, refuted = not_refuted(transform_points(plan.world_from_common, common.vertices), common.faces, scene, report)
+    kept, share = not_refuted(transform_points(plan.world_from_common, common.vertices), common.faces, scene, report)
     if not kept.any():
         raise TrainingError("The masks leave out all of the surface.", "Check the masks of the project.")
     common, filled = with_faces(common, kept), filled[kept]
@@ -105,7 +105,7 @@ def write_whole(folder: Path, plan: Plan, params: BlocksParams, report: Reporter
         "open_at_seams": open_edges,
         "voxel": voxel,
         "unseen": round(area_share(surface.vertices, surface.faces, filled), 4),
-        "refuted": round(refuted, 4),
+        "denied": round(share, 4),
         "classes": class_table(surface, names),
         "instances": len(instances),
         "label_revision": revision,

@@ -49,7 +49,7 @@ class Built:
     """A surface in the normalised frame, and the region in which it was looked for: vertices (V, 3) float32, faces (F, 3)
     int32, normals (V, 3) unit, outward, colors (V, 3) uint8 sRGB; coarse: vertices (V', 3) and faces (F', 3) of the same
     surface at voxels of twice the size, not cleaned; unseen (F,) bool: triangles that close a surface which was asked to
-    be watertight, its gaps, or small holes; None without any; refuted: share of the area that was left out, as photos disagree
+    be watertight, its gaps, or small holes; None without any; denied: share of the area that was left out, as photos disagree
     on it."""
 
     vertices: np.ndarray
@@ -59,7 +59,7 @@ class Built:
     region: Region
     coarse: tuple[np.ndarray, np.ndarray]
     unseen: np.ndarray | None = None
-    refuted: float = 0.0
+    denied: float = 0.0
 
 
 def build(trained: Trained, project: Project, scene: Scene, params: MeshParams, report: Reporter) -> Built:
@@ -79,14 +79,14 @@ def build(trained: Trained, project: Project, scene: Scene, params: MeshParams, 
     report.stage("Extracting the surface")
     coarse, tolerance = extract(coarser(bricks), report), TRUNCATION * region.voxel
     coarse = denoised(*coarse, maps.depth.device, report), coarse[1]
-    unseen, refuted, pictures = None, 0.0, pictures_of(flats, store, maps, report)
+    unseen, share, pictures = None, 0.0, pictures_of(flats, store, maps, report)
     if params.watertight:
         vertices, faces = closed_surface(bricks, maps, tolerance, params.faces, report)
         vertices = fitted(vertices, faces, pictures, report)
     else:
         gaps = params.close_gaps / 100 * region.size
         vertices, faces, guessed = open_surface(bricks, maps, tolerance, region, params.faces, gaps, report, pictures)
-        kept, refuted = not_refuted(transform_points(box.world_from_box, vertices), faces, scene, report)
+        kept, share = not_refuted(transform_points(box.world_from_box, vertices), faces, scene, report)
         vertices, faces = compact(vertices, faces[kept])
         unseen = guessed[kept] if guessed.any() else None
     if not len(faces):
@@ -99,7 +99,7 @@ def build(trained: Trained, project: Project, scene: Scene, params: MeshParams, 
     colors = vertex_colors(trained.model, region, painted, vertices, normals, report)
     if params.watertight:
         unseen = unseen_faces(vertices, faces, maps, tolerance, report)
-    return Built(vertices, faces, normals, colors, region, coarse, unseen, refuted)
+    return Built(vertices, faces, normals, colors, region, coarse, unseen, share)
 
 
 def not_refuted(vertices: np.ndarray, faces: np.ndarray, scene: Scene, report: Reporter) -> tuple[np.ndarray, float]:

@@ -33,7 +33,7 @@ SHARP = 3.0  # footprints of a pixel by which a point may be wrong: what a soft 
 SOFT = 0.5  # share of its spread by which a depth may be wrong, but at least a footprint of a pixel
 TRIES, KEPT = 400, 48  # points whose tangent plane is tried, and the best of them that are fitted
 WIDTHS = (3.0, 2.0, 1.5, 1.5)  # errors around a plane in which points are its own, from fit to fit
-AT_ONCE = 16  # of these planes, compared with all points
+AT_ONCE = 16  # tangent planes that are compared with all points together
 BESIDE = 4.0  # errors from a plane that was found, within which no other plane takes points
 TILTED = np.cos(np.radians(25))  # between the normal of a point and that of its plane
 SMOOTH = 9  # pixels over which normals are averaged: a plain wall's depths are noisy
@@ -66,6 +66,10 @@ class Known:
     footprint: np.ndarray
     error: np.ndarray
     kind: np.ndarray
+
+    def at(self, rows: np.ndarray | slice) -> Known:
+        """Those of some rows: numbers, bool (N,) or a slice."""
+        return Known(*(values[rows] for values in vars(self).values()))
 
 
 @dataclass(frozen=True)
@@ -127,9 +131,9 @@ def scene_planes(known: Known, report: Reporter, most: int = MOST) -> list[Scene
     """The `most` largest planes among known points, by area: found in what is known well, and reaching as far as the rest
     says."""
     everything, step = known, max(1, -(-len(known.points) // LOOKED_AT))
-    known = Known(*(values[::step] for values in vars(known).values()))
+    known = known.at(np.s_[::step])
     least = SHARE * (known.footprint**2).sum()
-    sharp = Known(*(values[known.error <= SHARP * known.footprint] for values in vars(known).values()))
+    sharp = known.at(known.error <= SHARP * known.footprint)
     area, rng = sharp.footprint**2, np.random.default_rng(0)
     left, found = np.ones(len(area), bool), []
     for _ in range(most):
@@ -157,11 +161,11 @@ def ground(
     facing, area = known.normals @ (up / np.linalg.norm(up)) > TILTED, known.footprint**2
     if area[facing].sum() < GROUND * area.sum():
         return None
-    found = scene_planes(Known(*(values[facing] for values in vars(known).values())), report, 1)
+    found = scene_planes(known.at(facing), report, 1)
     if not found:
         return None
     on = np.flatnonzero(near_plane(known, found[0].point, found[0].normal, WIDTHS[-1]))
-    own = Known(*(values[on] for values in vars(known).values()))
+    own = known.at(on)
     if any(near_plane(own, plane.point, plane.normal, BESIDE).mean() > 0.5 for plane in planes):
         return None
     return replace(found[0], partly=_partly(known, on))
@@ -170,7 +174,7 @@ def ground(
 def _largest(known: Known, area: np.ndarray, left: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
     """The points, of those that are left, on the largest plane that was met; None where there is none."""
     rows, best = np.flatnonzero(left), None
-    known, area = Known(*(values[rows] for values in vars(known).values())), area[rows]
+    known, area = known.at(rows), area[rows]
     starts = rng.choice(len(rows), min(TRIES, len(rows)), replace=False, p=area / area.sum())
     held = _area_near(known, area, starts)
     for start in starts[np.argsort(-held, kind="stable")[:KEPT]]:

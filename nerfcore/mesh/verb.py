@@ -54,7 +54,7 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
         "silhouette" of a capture with masks: see `shown.silhouette`;
         for a preview see `preview.preview`;
         "unseen": the share of its area that closes small holes or gaps, or that fewer than two photos see of a watertight
-        one; "refuted": the share of the area that photos disagree on, which is left out;
+        one; "denied": the share of the area that photos disagree on, which is left out;
         with a texture of photos "painted_by_photos", the share of its texels that a photo shows
     Raises:
         SettingError: unknown format, impossible region, or no memory for the texture. ProjectError, TrainingError, DiskError.
@@ -145,8 +145,8 @@ def judge(
     params: MeshParams,
     report: Reporter,
 ) -> dict[str, Any]:
-    """What photos say of a surface: "shown", "solid_shown", "holes", "overlap_shown", "seen_by_few", "unseen", "refuted", "verdict" and
-    "silhouette" of `mesh`."""
+    """What photos say of a surface: "shown", "solid_shown", "holes", "overlap_shown", "seen_by_few", "unseen", "denied", "verdict"
+    and "silhouette" of `mesh`."""
     report.stage("Comparing it with the photos")
     scene = scene.unseen_by(trained.info.images)
     shown = shown_share(photos, built.vertices, built.faces, report.check)
@@ -159,9 +159,9 @@ def judge(
     guessed = guess_share(built)
     asked = 0.0 if params.watertight else guessed if params.close_gaps else None
     result["verdict"] = mesh_verdict(
-        shown, found.solid, found.holes, largest, found.overlapped, found.few, asked, built.refuted
+        shown, found.solid, found.holes, largest, found.overlapped, found.few, asked, built.denied
     )
-    result |= {"unseen": round(guessed, 4), "refuted": round(built.refuted, 4)}
+    result |= {"unseen": round(guessed, 4), "denied": round(built.denied, 4)}
     outlines = silhouette(scene, surface.vertices, surface.faces, report.check)
     return result if outlines is None else {**result, "silhouette": round(outlines, 4)}
 

@@ -153,12 +153,12 @@ def test_how_much_photos_deny_is_told(tmp_path: Path, surface: tuple[np.ndarray,
     assert np.array_equal(kept, part != 2)
     assert share == pytest.approx(0.02, abs=0.005)
     assert report.warnings == []
-    assert mesh_verdict(0.9, refuted=share)["level"] == "good"
+    assert mesh_verdict(0.9, denied=share)["level"] == "good"
     near = part > 0
     kept, share = not_refuted(vertices, faces[near], scene, report)
     assert np.array_equal(kept, part[near] != 2)
     assert share == pytest.approx(0.5, abs=0.005)
-    told = mesh_verdict(0.9, refuted=share)
+    told = mesh_verdict(0.9, denied=share)
     assert told["level"] == "weak"
     assert "disagree on 50% of the surface" in told["reasons"][0]
     assert "disagree on 50 % of the surface" in report.warnings[0]

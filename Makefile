@@ -9,13 +9,14 @@ export OMP_WAIT_POLICY := passive
 
 venv: $(VENV)/.ready
 
-# torch first: a looser pin of another package would pull gigabytes of CUDA libraries.
+# torch first: a looser pin of another package would pull gigabytes of CUDA libraries. Modules are compiled when they are first
+# imported: all of them would take longer than everything else here.
 $(VENV)/.ready: pyproject.toml
 	@command -v $(PYTHON) >/dev/null || { echo "$(PYTHON) is missing. Install it (apt install python3.11 python3.11-venv) or set PYTHON=…"; exit 1; }
 	$(PYTHON) -m venv $(VENV) || { echo "python3.11-venv is missing: apt install python3.11-venv"; exit 1; }
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --upgrade "setuptools>=77" wheel
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check "torch==2.13.0"
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[blender,dev]"
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile "torch==2.13.0"
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -e ".[blender,dev]"
 	@$(BIN)/python tests/system_libraries.py
 	@touch $@
 
@@ -49,13 +50,14 @@ SEED ?= 1
 faults: venv
 	$(BIN)/python -m fieldwork.tests.faults.campaign --seed $(SEED) --page docs/reliability.md $(FAULTS)
 
-lint: venv
+# With -j the types of the three systems are checked side by side.
+lint: venv types-Linux types-Windows types-Darwin
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/pyright
-	$(BIN)/pyright --pythonplatform Windows
-	$(BIN)/pyright --pythonplatform Darwin
 	$(BIN)/lint-imports --no-cache
+
+types-%: venv
+	$(BIN)/pyright --pythonplatform $*
 
 matrix: venv
 	$(BIN)/python tests/addon/matrix.py

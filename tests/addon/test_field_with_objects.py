@@ -369,6 +369,7 @@ answer(facts)
     assert facts == {"one less": 4, "instance": 6, "hidden instance": 4}
 
 
+@pytest.mark.slow
 def test_holdouts_cut_the_field(bpy_script, ball, tmp_path):
     """A holdout before the field leaves nothing of it, one within only what is before it; at edges, too, against 32 times the
     resolution. Its collection may be what makes it one, also in the field's scene."""

@@ -85,6 +85,7 @@ answer({"frames": len(loads), "loads": max(loads), "seconds": seconds, "left": [
 )
 
 
+@pytest.mark.slow
 def test_a_hundred_frames_load_the_field_once_and_leave_nothing(bpy_script, ball, tmp_path):
     facts = bpy_script(ANIMATED, project=ball, folder=tmp_path)
     assert facts["frames"] == facts["files"] == 100

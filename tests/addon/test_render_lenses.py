@@ -166,6 +166,7 @@ answer(facts)
 )
 
 
+@pytest.mark.slow
 def test_lenses_and_shutters_blur(bpy_script, ball, tmp_path):
     facts = bpy_script(BLURRED, project=ball, folder=tmp_path)
     assert facts["out of focus"] > facts["in focus"] + 4

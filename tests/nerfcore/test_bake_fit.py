@@ -41,6 +41,7 @@ def baked(project: Path, monkeypatch: pytest.MonkeyPatch, rounds: int) -> dict:
     return run_verb("evaluate", EvaluateParams(project=project, baked=True), Reporter())["lost"]
 
 
+@pytest.mark.slow
 def test_a_coarse_grid_loses_less_when_it_is_fitted(trained: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     read, fitted = (baked(trained, monkeypatch, rounds) for rounds in (0, 4))
     print("lost, read and fitted:", read, fitted)

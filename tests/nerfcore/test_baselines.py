@@ -219,6 +219,7 @@ def occupied_share(grid: NGPOccupancy) -> float:
     return float((grid.cells[:, 0] > 0).float().mean())
 
 
+@pytest.mark.slow
 def test_every_cell_fades_and_is_read_again() -> None:
     grid = NGPOccupancy(InstantNGP(SETUP).occupancy.config, False, 1 << 18)
     generator = torch.Generator().manual_seed(0)
@@ -297,10 +298,7 @@ def small_networks(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize(
     "name",
-    [
-        pytest.param(name, marks=[] if name in ("instant-ngp", "semantic-nerf") else [pytest.mark.slow])
-        for name in BASELINES
-    ],
+    [pytest.param(name, marks=[] if name == "instant-ngp" else [pytest.mark.slow]) for name in BASELINES],
 )
 def test_methods_learn_a_small_scene(name: str, store: PixelStore, small_networks: None) -> None:
     method = make_baseline(name, SETUP, 0)

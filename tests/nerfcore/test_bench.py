@@ -145,6 +145,7 @@ def test_a_page_gets_the_figures_of_a_suite(
     assert page.read_text("utf-8") == text
 
 
+@pytest.mark.slow
 def test_runs_of_unknown_origin_are_named_and_not_on_the_page(tiny_project: Path, tmp_path: Path) -> None:  # noqa: F811
     page, report = tmp_path / "docs" / "benchmarks.md", Recorder()
     bench(tmp_path, tiny_project, "figures", steps=6, seeds=[0, 1])
@@ -185,6 +186,7 @@ def test_speed_has_two_limits_and_two_frame_sizes(tiny_project: Path, tmp_path: 
     assert "times the least" in table
 
 
+@pytest.mark.slow
 def test_robustness_reports_drops_against_the_clean_run(tiny_project: Path, tmp_path: Path) -> None:  # noqa: F811
     result = bench(tmp_path, tiny_project, "robustness", steps=10, variants=["clean", "noise 0.05", "10 % labelled"])
     by = {row["variant"]: row for row in result["rows"]}

@@ -81,6 +81,7 @@ class _Cpu:
         assert mode in ("warn", "default")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_the_whole_check_runs_as_far_as_the_cpu_goes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]

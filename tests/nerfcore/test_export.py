@@ -220,7 +220,7 @@ WORLD = np.array([[2.4, -0.7, 0.0, 1.0], [0.7, 2.4, 0.0, 2.0], [0.0, 0.0, 2.5, 3
 @pytest.mark.parametrize(
     ("settings", "contracted"),
     [
-        ({}, False),
+        pytest.param({}, False, marks=pytest.mark.slow),
         ({}, True),
         pytest.param({"branch": "explicit"}, False, marks=pytest.mark.slow),
         pytest.param({"branch": "implicit"}, True, marks=pytest.mark.slow),

@@ -139,7 +139,9 @@ def test_a_fixed_capacity_gives_the_same_picture_gradients_and_grid(ball: Path, 
     "settings",
     [
         {},
-        {"train.refine_poses": "true", "train.pose_start": "0", "loss.depth_weight": "0.1"},
+        pytest.param(
+            {"train.refine_poses": "true", "train.pose_start": "0", "loss.depth_weight": "0.1"}, marks=pytest.mark.slow
+        ),
         {"loss.distortion_weight": "0.01", "loss.opacity_weight": "0.01", "field.fusion": "concat"},
         {"field.branch": "implicit", "render.accumulate": "logits", "field.appearance": "4"},
         {"field.branch": "explicit", "sampling.pdf": "uniform", "field.blend_by": "density"},
@@ -239,6 +241,7 @@ def test_nothing_visible_gives_numbers(ball: Path, kernels: Kernels) -> None:
     assert 0 <= float(model.visible_share) <= 1
 
 
+@pytest.mark.slow
 def test_what_becomes_visible_after_a_while_of_nothing_is_seen(ball: Path) -> None:
     """A capacity that followed the share of visible samples down to nothing would hide all that comes later."""
     trainer = warm(ball, steps=200)
@@ -255,6 +258,7 @@ def test_what_becomes_visible_after_a_while_of_nothing_is_seen(ball: Path) -> No
     assert int(model.render(batch.origins, batch.directions, 12).samples.packed_info.dropped) == 0
 
 
+@pytest.mark.slow
 def test_the_number_of_rays_follows_the_samples_that_are_used(ball: Path) -> None:
     trainer = trainer_of(ball, **{"sampling.coarse_cache": "false", "train.batch_start": "4096"})
     trainer.model.fixed_capacity = True

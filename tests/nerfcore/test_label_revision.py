@@ -79,6 +79,7 @@ def gltf(path: Path) -> dict[str, Any]:
     return json.loads(content[20 : 20 + length])
 
 
+@pytest.mark.slow
 def test_exported_meshes_and_fields_name_it_in_their_files(labelled: Path, tmp_path: Path) -> None:
     def written(to: str, ending: str, **values: Any) -> Path:
         told = export(ExportParams(project=labelled, to=to, out=tmp_path / f"{to}{ending}", **values), Reporter())  # type: ignore[arg-type]

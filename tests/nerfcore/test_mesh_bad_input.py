@@ -153,6 +153,7 @@ def test_a_class_that_nobody_labelled_has_no_surface(tmp_path: Path, monkeypatch
         assert 9 not in mesh["class_id"]
 
 
+@pytest.mark.slow
 def test_more_triangles_than_there_are_is_all_there_are(untrained: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     learned(untrained, monkeypatch)
     whole = run_verb("mesh", MeshParams(project=untrained, resolution=32), Reporter())
@@ -190,7 +191,14 @@ def contents(folder: Path) -> dict[Path, str]:
     return {path: hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
-@pytest.mark.parametrize("writer", ["painted.write_picture", "outputs.np.savez", "files._write"])
+@pytest.mark.parametrize(
+    "writer",
+    [
+        pytest.param("painted.write_picture", marks=pytest.mark.slow),
+        pytest.param("outputs.np.savez", marks=pytest.mark.slow),
+        "files._write",
+    ],
+)
 def test_on_a_full_disk_the_earlier_mesh_stays(
     untrained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, writer: str
 ) -> None:

@@ -59,6 +59,7 @@ def test_parts_of_the_pairs_become_one_model(unposed_fountain: Path, tmp_path: P
     assert find_features(params, Reporter()) == {"pairs": 0}, "where poses are there nothing is done"
 
 
+@pytest.mark.slow
 def test_a_part_that_is_missing_or_of_other_photos_is_matched_by_the_stage_itself(
     unposed_fountain: Path, tmp_path: Path
 ) -> None:

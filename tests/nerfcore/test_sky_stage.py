@@ -125,6 +125,7 @@ def test_what_was_seen_and_decided_is_kept_with_the_training(court: Path, tmp_pa
     assert older.sky.needed
 
 
+@pytest.mark.slow
 def test_training_that_begins_anew_is_as_if_it_had_never_begun(court: Path) -> None:
     """To the last bit, although the grids, optimisers and random numbers went on for some steps."""
     fresh, used = (environment_trainer(court, train__refine_poses="true", train__pose_start="0") for _ in range(2))

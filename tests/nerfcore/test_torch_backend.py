@@ -62,7 +62,9 @@ def test_the_torch_backend_trains_as_well_as_warp(ball: Path) -> None:
     "settings",
     [
         {"loss.distortion_start": "0", "loss.opacity_weight": "0.01", "sampling.outline_rays": "0.3"},
-        {"train.refine_poses": "true", "train.pose_start": "0", "scene.contraction": "on"},
+        pytest.param(
+            {"train.refine_poses": "true", "train.pose_start": "0", "scene.contraction": "on"}, marks=pytest.mark.slow
+        ),
         {"field.fusion": "blend", "sampling.importance": "boundary", "sampling.pdf": "literal"},
         {"scene.background": "environment", "scene.contraction": "on"},
     ],

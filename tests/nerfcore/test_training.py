@@ -120,6 +120,7 @@ def test_a_short_training_learns_colours_classes_and_shape(trained: Path) -> Non
         assert data["colors"][upper].mean(0)[0] > data["colors"][upper].mean(0)[2]
 
 
+@pytest.mark.slow
 def test_gaps_of_the_mesh_are_closed_on_request(trained: Path) -> None:
     from fieldwork.nerfcore.mesh.triangles import border_edges
 

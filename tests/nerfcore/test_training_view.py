@@ -66,6 +66,7 @@ def project(tmp_path: Path) -> Path:
     return ball_project(tmp_path / "ball", views=24)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("eager")
 def test_pictures_become_finer_and_converge_to_the_photos(project, tmp_path):
     viewer, found, running = Viewer(project, tmp_path, side=32), [], []
@@ -183,6 +184,7 @@ def test_nobody_looks_any_more(project, tmp_path):
     assert not live.training_file(project).exists()
 
 
+@pytest.mark.slow
 def test_pictures_take_a_small_part_of_the_time(project, tmp_path, monkeypatch):
     """By the clock of the pictures themselves: what a picture takes is waited for many times over before the next."""
     viewer, spent = Viewer(project, tmp_path, side=400), []
@@ -234,6 +236,7 @@ def clocked(
     return clock, makings
 
 
+@pytest.mark.slow
 def test_a_picture_in_a_busy_moment_does_not_keep_the_next_away_for_long(project, tmp_path, monkeypatch):
     """What took twenty seconds is not waited for eleven times over."""
     viewer = Viewer(project, tmp_path, side=64)

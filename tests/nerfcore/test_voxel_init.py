@@ -147,7 +147,7 @@ def train(project: Path, run: str, steps: int, resume: bool = False, report: Rep
 
 
 @pytest.mark.setting("field.voxel_init", "field.voxel_init_step")
-@pytest.mark.parametrize("kind", ["rgb_stats", "cnn"])
+@pytest.mark.parametrize("kind", ["rgb_stats", pytest.param("cnn", marks=pytest.mark.slow)])
 def test_a_run_that_stops_before_its_initialisation_catches_up_on_it(ball: Path, kind: str) -> None:
     whole = train(ball, "whole", 20, field__voxel_init=kind)
     plain = train(ball, "plain", 20)
@@ -184,6 +184,7 @@ def test_an_initialisation_without_effect_is_told(ball: Path, settings: dict[str
     assert words is None or words in told[0]
 
 
+@pytest.mark.slow
 @pytest.mark.setting("field.voxel_init_weights")
 def test_weights_of_one_run_serve_another_and_missing_ones_are_named(ball: Path) -> None:
     train(ball, "first", 14, field__voxel_init="cnn")

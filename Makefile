@@ -10,7 +10,7 @@ export OMP_WAIT_POLICY := passive
 venv: $(VENV)/.ready
 
 # torch first: a looser pin of another package would pull gigabytes of CUDA libraries. Modules are compiled when they are first
-# imported: all of them would take longer than everything else here.
+# imported: most never are, and all of them would take about a minute.
 $(VENV)/.ready: pyproject.toml
 	@command -v $(PYTHON) >/dev/null || { echo "$(PYTHON) is missing. Install it (apt install python3.11 python3.11-venv) or set PYTHON=…"; exit 1; }
 	$(PYTHON) -m venv $(VENV) || { echo "python3.11-venv is missing: apt install python3.11-venv"; exit 1; }

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from fieldwork.tests.addon.support import SETUP
-from fieldwork.tests.nerfcore.support.live import live_ball
+from fieldwork.tests.nerfcore.support.live import shared_ball
 
 START = (
     """
@@ -48,12 +48,8 @@ def stack(found, name, letters):
 """
 )
 
-_made: list[Path] = []
-
 
 @pytest.fixture(scope="module")
 def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The trained and baked ball, made once for all modules; no test changes it."""
-    if not _made:
-        _made.append(live_ball(tmp_path_factory.mktemp("engine") / "ball"))
-    return _made[0]
+    """The trained and baked ball; no test changes it."""
+    return shared_ball(tmp_path_factory)

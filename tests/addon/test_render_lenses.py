@@ -209,6 +209,7 @@ answer(facts)
 )
 
 
+@pytest.mark.slow
 def test_fields_that_move_are_blurred(bpy_script, ball, tmp_path):
     facts = bpy_script(MOVED, project=ball, folder=tmp_path)
     # 0.25 units at a distance of about 2, by a focal length of 120 · 50 / 36 pixels: 21 pixels on both sides.

@@ -52,6 +52,7 @@ from fieldwork.nerfcore.render.verb import look_at
 from fieldwork.nerfcore.sampling.render_grid import RenderGrid
 from fieldwork.nerfcore.verbs import run_verb
 from fieldwork.tests.nerfcore.support.ball import SMALL, ball_project
+from fieldwork.tests.nerfcore.support.live import shared_ball
 
 from .test_rendering import BallField, ball_model, closed_form, view
 
@@ -231,11 +232,7 @@ def coarse() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    project = ball_project(tmp_path_factory.mktemp("baked") / "p", views=24)
-    train(project, 300)
-    run_verb("evaluate", EvaluateParams(project=project), Reporter())
-    run_verb("bake", BakeParams(project=project, memory=20), Reporter())
-    return project
+    return Path(shutil.copytree(shared_ball(tmp_path_factory), tmp_path_factory.mktemp("baked") / "p"))
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,11 +15,11 @@ from fieldwork.nerfcore.data.pixels import VOID, Batch
 from fieldwork.nerfcore.errors import Cancelled
 from fieldwork.nerfcore.kernels.voxel_field import VERTICES, cell_length
 from fieldwork.nerfcore.kernels.voxel_march import march
-from fieldwork.nerfcore.params import BakeParams, EvaluateParams, TrainParams
+from fieldwork.nerfcore.params import BakeParams, EvaluateParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.render.baked import voxels_folder
 from fieldwork.nerfcore.verbs import run_verb
-from fieldwork.tests.nerfcore.support.ball import SMALL, ball_project
+from fieldwork.tests.nerfcore.support.live import shared_ball
 from PIL import Image
 
 from .test_voxel_march import even_field, random_rays, settings
@@ -26,10 +27,7 @@ from .test_voxel_march import even_field, random_rays, settings
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    project = ball_project(tmp_path_factory.mktemp("fit") / "p", views=24)
-    run_verb("train", TrainParams(project=project, preset="draft", steps=300, set=SMALL), Reporter())
-    run_verb("evaluate", EvaluateParams(project=project), Reporter())
-    return project
+    return Path(shutil.copytree(shared_ball(tmp_path_factory), tmp_path_factory.mktemp("fit") / "p"))
 
 
 def baked(project: Path, monkeypatch: pytest.MonkeyPatch, rounds: int) -> dict:

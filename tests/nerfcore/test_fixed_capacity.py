@@ -145,7 +145,10 @@ def test_a_fixed_capacity_gives_the_same_picture_gradients_and_grid(ball: Path, 
         {"loss.distortion_weight": "0.01", "loss.opacity_weight": "0.01", "field.fusion": "concat"},
         {"field.branch": "implicit", "render.accumulate": "logits", "field.appearance": "4"},
         {"field.branch": "explicit", "sampling.pdf": "uniform", "field.blend_by": "density"},
-        {"scene.background": "environment", "scene.contraction": "on", "train.refine_poses": "true"},
+        pytest.param(
+            {"scene.background": "environment", "scene.contraction": "on", "train.refine_poses": "true"},
+            marks=pytest.mark.slow,
+        ),
     ],
     ids=lambda s: " ".join(s) or "default",
 )

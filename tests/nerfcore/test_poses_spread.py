@@ -33,6 +33,7 @@ def geometries(path: Path) -> int:
         return connection.execute("SELECT COUNT(*) FROM two_view_geometries").fetchone()[0]
 
 
+@pytest.mark.slow
 def test_parts_of_the_pairs_become_one_model(unposed_fountain: Path, tmp_path: Path) -> None:
     project = Path(shutil.copytree(unposed_fountain, tmp_path / "p"))
     params, work = PosesParams(project=project, preset="fast"), project / "poses/sfm"

@@ -39,21 +39,28 @@ def painted_photos(flats: list[depth_maps.FlatView], true: list[depth_maps.Depth
     )
 
 
-def test_photos_move_soft_depths_onto_the_surface() -> None:
-    """A painted sphere whose field lies 1.5 % too deep here and too near there: the photos say where it is."""
-    poses = orbit(24, 1.8)
-    flats, true = maps_of(sphere(0.5), poses)
-    store = painted_photos(flats, true)
+@pytest.fixture(scope="module")
+def sphere_views() -> SimpleNamespace:
+    """Views of a painted sphere: their depths, those of a field that lies 1.5 % too deep here and too near there, photos."""
+    flats, true = maps_of(sphere(0.5), orbit(24, 1.8))
     soft = []
     for number, (flat, map_) in enumerate(zip(flats, true)):
         wave = 1 + 0.015 * np.sin(number + np.linspace(0, 5, map_.depth.shape[1]))[None, :]
         depth = np.where(map_.hit, map_.depth * wave, map_.depth).astype(np.float32)
         cosine = depth_maps.cosines(flat.camera, depth)
         soft.append(depth_maps.DepthMap(depth, np.where(map_.hit, 0.05, 0).astype(np.float32), cosine))
-    before = depth_maps.confirmed_maps(flats, soft, CPU, Reporter())
-    after, share = refined_maps(flats, soft, store, CPU, Reporter())  # type: ignore[arg-type]
+    return SimpleNamespace(flats=flats, true=true, soft=soft, store=painted_photos(flats, true))
+
+
+def refined(views: SimpleNamespace) -> tuple[MapArrays, float]:
+    return refined_maps(views.flats, views.soft, views.store, CPU, Reporter())
+
+
+def test_photos_move_soft_depths_onto_the_surface(sphere_views: SimpleNamespace) -> None:
+    before = depth_maps.confirmed_maps(sphere_views.flats, sphere_views.soft, CPU, Reporter())
+    after, share = refined(sphere_views)
     assert share > 0.9
-    truth = torch.from_numpy(np.concatenate([m.depth.reshape(-1) for m in true]))
+    truth = torch.from_numpy(np.concatenate([m.depth.reshape(-1) for m in sphere_views.true]))
 
     def error(maps: MapArrays) -> float:
         hit = (maps.depth > 0) & (maps.depth < FREE) & (truth < FREE)
@@ -64,28 +71,36 @@ def test_photos_move_soft_depths_onto_the_surface() -> None:
     assert float(((after.depth > 0) & (after.depth < FREE)).float().mean()) > 0.9 * float(
         ((before.depth > 0) & (before.depth < FREE)).float().mean()
     )
+
+
+@pytest.mark.slow
+def test_what_label_maps_leave_out_is_there_where_photos_say_so(
+    sphere_views: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store, count = sphere_views.store, len(sphere_views.flats)
     row = torch.arange(CAMERA.height * CAMERA.width) // CAMERA.width
 
     def labelled_below(share: float) -> MapArrays:
-        left_out = row < share * CAMERA.height
-        store.label = torch.where(left_out, VOID, 0).to(torch.uint8).repeat(len(flats))
-        return refined_maps(flats, soft, store, CPU, Reporter())[0]  # type: ignore[arg-type]
+        label = torch.where(row < share * CAMERA.height, VOID, 0).to(torch.uint8).repeat(count)
+        monkeypatch.setattr(store, "label", label)
+        return refined(sphere_views)[0]
 
     def there(maps: MapArrays) -> torch.Tensor:
-        return (row < 0.4 * CAMERA.height).repeat(len(flats)) & (maps.depth > 0) & (maps.depth < FREE)
+        return (row < 0.4 * CAMERA.height).repeat(count) & (maps.depth > 0) & (maps.depth < FREE)
 
-    # What label maps leave out is there where photos say so, and what is beside that,
-    assert int(there(labelled_below(0.4)).sum()) > 0.9 * int(there(after).sum()) > 900
-    painted = store.rgba
-    store.rgba = torch.where((row < 0.45 * CAMERA.height).repeat(len(flats))[:, None], 128, painted).to(torch.uint8)
-    field = torch.from_numpy(np.concatenate([m.depth.reshape(-1) for m in soft]))
-    named = labelled_below(0.4)
-    # and nowhere else: of a plain part nothing is left of the field's own depths.
-    assert bool((named.depth != field)[there(named)].all())
-    assert int(there(named).sum()) < 0.1 * int(there(after).sum())
-    store.rgba = painted
+    unnamed = int(there(refined(sphere_views)[0]).sum())
+    assert int(there(labelled_below(0.4)).sum()) > 0.9 * unnamed > 900
     # Label maps that name little of what photos confirm say nothing of the rest: it is as without any.
     torch.testing.assert_close(labelled_below(0.7).depth, labelled_below(1.0).depth)
+    # And nowhere else: of a plain part nothing is left of the field's own depths.
+    plain = (row < 0.45 * CAMERA.height).repeat(count)[:, None]
+    monkeypatch.setattr(store, "rgba", torch.where(plain, 128, store.rgba).to(torch.uint8))
+    named, field = (
+        labelled_below(0.4),
+        torch.from_numpy(np.concatenate([m.depth.reshape(-1) for m in sphere_views.soft])),
+    )
+    assert bool((named.depth != field)[there(named)].all())
+    assert int(there(named).sum()) < 0.1 * unnamed
 
 
 def test_steps_of_the_field_on_flat_ground_do_not_tilt_what_photos_compare(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -253,6 +253,7 @@ def test_a_picture_in_a_busy_moment_does_not_keep_the_next_away_for_long(project
     assert makings[-1].width > makings[0].width, "the pictures become finer again"
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("eager")
 def test_a_view_that_moves_does_not_wait_for_the_fine_picture_before(project, tmp_path, monkeypatch):
     """A picture that took three seconds keeps finer ones away for long, but not the first one of another view."""

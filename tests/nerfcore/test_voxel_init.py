@@ -101,6 +101,7 @@ def test_only_seen_vertices_of_dense_levels_are_written(ball: Path, kind: str) -
     assert not grid.touched.any()
 
 
+@pytest.mark.slow
 def test_a_network_learns_features_that_lower_the_loss(ball: Path) -> None:
     trainer = trainer_of(ball, **{"field.voxel_init": "cnn", "field.voxel_init_step": "1000"})
     for _ in range(60):

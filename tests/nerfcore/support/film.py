@@ -11,22 +11,18 @@ from fieldwork.nerfcore.film.exposure import Exposure, expose
 from fieldwork.nerfcore.film.fields import FieldStore
 from fieldwork.nerfcore.film.shot import Shot
 from fieldwork.nerfcore.progress import Reporter
-from fieldwork.tests.nerfcore.support.live import live_ball
+from fieldwork.tests.nerfcore.support.live import shared_ball
 
 W, H = 96, 64
 ABOVE = np.eye(4)
 ABOVE[2, 3] = 2.0  # looks down at the ball
 SIDE = np.array([[1, 0, 0, 0], [0, 0, -1, -2], [0, 1, 0, 0], [0, 0, 0, 1.0]])  # looks along y at it, z is up
 
-_made: list[Path] = []
-
 
 @pytest.fixture(scope="module")
 def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The trained and baked ball, made once for all modules; no test changes it."""
-    if not _made:
-        _made.append(live_ball(tmp_path_factory.mktemp("film") / "ball"))
-    return _made[0]
+    """The trained and baked ball; no test changes it."""
+    return shared_ball(tmp_path_factory)
 
 
 @pytest.fixture(scope="module")

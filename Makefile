@@ -4,19 +4,22 @@ VENV := .venv
 BIN := $(VENV)/bin
 SHELL := /bin/bash
 export OMP_WAIT_POLICY := passive
+# Containers often forbid Python to keep compiled modules: each of the hundreds of processes that tests start would compile them.
+export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: venv demo test test-all faults lint matrix gui gpu-compile gpu-check bench benchmarks-page evidence evidence-page repository clean
 
 venv: $(VENV)/.ready
 
-# torch first: a looser pin of another package would pull gigabytes of CUDA libraries. Modules are compiled when they are first
-# imported: most never are, and all of them would take about a minute.
+# torch first: a looser pin of another package would pull gigabytes of CUDA libraries. Modules are compiled on all cores at the end,
+# those that are templates or of another Python excepted; pip would use one.
 $(VENV)/.ready: pyproject.toml
 	@command -v $(PYTHON) >/dev/null || { echo "$(PYTHON) is missing. Install it (apt install python3.11 python3.11-venv) or set PYTHON=…"; exit 1; }
 	$(PYTHON) -m venv $(VENV) || { echo "python3.11-venv is missing: apt install python3.11-venv"; exit 1; }
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --upgrade "setuptools>=77" wheel
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile "torch==2.13.0"
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -e ".[blender,dev]"
+	@$(BIN)/python -m compileall -q -j 0 $(VENV)/lib > /dev/null || true
 	@$(BIN)/python tests/system_libraries.py
 	@touch $@
 

@@ -45,7 +45,8 @@ WORKERS ?= $(if $(filter 1,$(shell nproc 2>/dev/null || echo 1)),0,2)
 test: venv
 	$(BIN)/python -m pytest -m "not slow and not gui and not gpu" -n $(WORKERS) --dist loadfile $(PYTEST)
 
-test-all: venv
+# Also the types of the systems that `.ci/run` leaves out.
+test-all: venv types-Windows types-Darwin
 	$(BIN)/python -m pytest $(PYTEST)
 
 # Hundreds of faults (kills, damaged files, full disks, garbage), in 20 minutes; writes the table of docs/reliability.md.
@@ -53,8 +54,9 @@ SEED ?= 1
 faults: venv
 	$(BIN)/python -m fieldwork.tests.faults.campaign --seed $(SEED) --page docs/reliability.md $(FAULTS)
 
-# With -j the types of the three systems are checked side by side.
-lint: venv types-Linux types-Windows types-Darwin
+# With -j the types of several systems are checked side by side.
+SYSTEMS ?= Linux Windows Darwin
+lint: venv $(addprefix types-,$(SYSTEMS))
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports --no-cache

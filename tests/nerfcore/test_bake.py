@@ -291,6 +291,7 @@ def test_less_memory_gives_coarser_cells(copied: Path) -> None:
     assert files == {path.name for path in baked.voxels_folder(copied, "main").iterdir()}
 
 
+@pytest.mark.slow
 def test_a_contracted_field_without_classes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fieldwork.nerfcore.bake.verb.FINEST", 32)
     project = ball_project(tmp_path / "p", views=24)

@@ -115,6 +115,7 @@ def test_fields_are_removed_unless_they_are_kept(ablation: tuple[Path, dict, Rec
     assert len(list((out / "projects").glob("*/runs/*/field.safetensors"))) == 1
 
 
+@pytest.mark.slow
 def test_a_page_gets_the_figures_of_a_suite(
     tiny_project: Path,  # noqa: F811
     tmp_path: Path,

@@ -169,6 +169,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, 
     return folder, result, page, notes
 
 
+@pytest.mark.slow
 def test_a_profile_is_measured_once_and_told(measured: tuple[Path, dict[str, Any], Path, list[str]]) -> None:
     folder, result, _, notes = measured
     assert result["failed"] == 0, [row["error"] for row in result["rows"]]
@@ -221,6 +222,7 @@ def test_trials_that_no_scene_fits_are_not_missing(tmp_path: Path, monkeypatch: 
     assert ("facade", "semantic-nerf") in left  # not looked at yet
 
 
+@pytest.mark.slow
 def test_a_page_is_added_to_where_the_trials_are_gone(measured: tuple[Path, dict[str, Any], Path, list[str]]) -> None:
     """Only what the page lacks is trained; its other rows and plots stay as they are."""
     folder, _, page, notes = measured
@@ -241,6 +243,7 @@ def test_adding_needs_a_page(tmp_path: Path) -> None:
         run_verb("bench", BenchParams(suite="evidence", out=tmp_path, add_to_page=True), Reporter())
 
 
+@pytest.mark.slow
 def test_the_page_has_a_table_for_each_published_one(measured: tuple[Path, dict[str, Any], Path, list[str]]) -> None:
     _, result, page, _ = measured
     text = page.read_text("utf-8")

@@ -97,6 +97,7 @@ def test_a_mesh_has_its_photos_on_it_and_maps_of_its_classes(trained: Path) -> N
     assert (np.where(height > 0, 1, 2) == ours["face_class"])[clear].mean() > 0.97
 
 
+@pytest.mark.slow
 def test_a_texture_of_the_field_and_none_leave_no_maps_behind(trained: Path, tmp_path: Path) -> None:
     copy = tmp_path / "copy"
     shutil.copytree(trained, copy)
@@ -221,7 +222,7 @@ WORLD = np.array([[2.4, -0.7, 0.0, 1.0], [0.7, 2.4, 0.0, 2.0], [0.0, 0.0, 2.5, 3
     ("settings", "contracted"),
     [
         pytest.param({}, False, marks=pytest.mark.slow),
-        ({}, True),
+        pytest.param({}, True, marks=pytest.mark.slow),
         pytest.param({"branch": "explicit"}, False, marks=pytest.mark.slow),
         pytest.param({"branch": "implicit"}, True, marks=pytest.mark.slow),
         pytest.param({"fusion": "concat", "appearance": 8}, True, marks=pytest.mark.slow),

@@ -83,7 +83,7 @@ def test_a_shutter_spreads_rays_over_the_poses() -> None:
     assert float(middle[0, 0]) == pytest.approx(0.5)
 
 
-@pytest.mark.parametrize("baked", [True, False])
+@pytest.mark.parametrize("baked", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_field_that_moves_is_blurred_as_by_a_camera_that_moves_the_other_way(
     ball: Path, store: FieldStore, baked: bool
 ):

@@ -77,7 +77,9 @@ def addresses(trainer: Trainer) -> dict[str, int]:
             {"loss.depth_weight": "0.1", "loss.distortion_weight": "0.01", "loss.distortion_start": "0.5"},
             marks=pytest.mark.slow,
         ),
-        {"field.appearance": "2", "field.precision": "float16", "loss.rgb_warmup": "30"},
+        pytest.param(
+            {"field.appearance": "2", "field.precision": "float16", "loss.rgb_warmup": "30"}, marks=pytest.mark.slow
+        ),
     ],
     ids=lambda s: " ".join(s) or "default",
 )

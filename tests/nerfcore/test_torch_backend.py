@@ -65,7 +65,10 @@ def test_the_torch_backend_trains_as_well_as_warp(ball: Path) -> None:
         pytest.param(
             {"train.refine_poses": "true", "train.pose_start": "0", "scene.contraction": "on"}, marks=pytest.mark.slow
         ),
-        {"field.fusion": "blend", "sampling.importance": "boundary", "sampling.pdf": "literal"},
+        pytest.param(
+            {"field.fusion": "blend", "sampling.importance": "boundary", "sampling.pdf": "literal"},
+            marks=pytest.mark.slow,
+        ),
         pytest.param({"scene.background": "environment", "scene.contraction": "on"}, marks=pytest.mark.slow),
     ],
     ids=["losses", "poses", "literal", "environment"],

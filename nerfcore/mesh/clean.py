@@ -8,6 +8,7 @@ import torch
 from ..kernels.depth_arrays import MapArrays
 from ..kernels.surface import sight, slopes
 from ..progress import Reporter
+from .back_faces import hide_back_faces
 from .holes import fill_holes
 from .triangles import areas, compact, components, cross, mean_around, unit
 
@@ -32,11 +33,16 @@ def seen_by(points: np.ndarray, normals: np.ndarray, maps: MapArrays, tolerance:
 def clean(
     vertices: np.ndarray, faces: np.ndarray, maps: MapArrays, tolerance: float | np.ndarray, report: Reporter
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices, triangles, and which triangles (F,) bool fill a hole: without faces that views do not show (`shown`) and
-    parts below a thousandth of the area; small holes filled (holes.py). `tolerance`: of all faces, or (F,) of each."""
-    faces = drop_scraps(vertices, faces[shown(vertices, faces, maps, tolerance, report)])
+    """Vertices, triangles, and which triangles (F,) bool fill a hole: without faces that views do not show (`shown`), but for
+    those that hide back faces (back_faces.py), and parts below a thousandth of the area; small holes filled (holes.py).
+    `tolerance`: of all faces, or (F,) of each."""
+    kept = shown(vertices, faces, maps, tolerance, report)
+    hiding = hide_back_faces(vertices, faces, kept, maps, report)
+    rows = np.flatnonzero(kept | hiding)
+    rows = rows[not_scraps(vertices, faces[rows])]
     report.check()
-    vertices, faces, filled = fill_holes(vertices, faces, check=report.check)
+    vertices, faces, filled = fill_holes(vertices, faces[rows], check=report.check)
+    filled[: len(rows)] = hiding[rows]
     vertices, faces = compact(vertices, faces)
     return vertices, faces, filled
 

@@ -131,6 +131,7 @@ def test_areas_of_classes_are_compared_where_enough_cameras_see() -> None:
     assert sizes[0.1] > 0.08
 
 
+@pytest.mark.slow
 def test_a_plate_of_one_side_and_a_missing_ball_are_seen() -> None:
     truth, scene = ball_and_plate(), scene_around()
     sight = Sight(truth, [scene.views[i] for i in scene.train])

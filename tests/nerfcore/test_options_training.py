@@ -267,6 +267,7 @@ def test_a_run_without_limits_has_the_steps_of_its_settings(ball: Path) -> None:
     assert run_verb("train", params, Reporter())["steps"] == 7
 
 
+@pytest.mark.slow
 @pytest.mark.setting("train.batch_start", "train.batch_samples", "train.max_rays")
 def test_batches_grow_from_one_size_to_the_other_and_stay_below_the_most_rays(ball: Path) -> None:
     def samples(progress: float, **settings: str) -> float:

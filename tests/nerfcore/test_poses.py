@@ -97,7 +97,14 @@ def nine_and_two(shared_data: Data, tmp_path_factory: pytest.TempPathFactory) ->
     return project, place / "later"
 
 
-@pytest.mark.parametrize("later", ["same", "other preset", pytest.param("features lost", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "later",
+    [
+        "same",
+        pytest.param("other preset", marks=pytest.mark.slow),
+        pytest.param("features lost", marks=pytest.mark.slow),
+    ],
+)
 def test_adding_photos_keeps_old_cameras(
     shared_data: Data, nine_and_two: tuple[Path, Path], tmp_path: Path, later: str
 ) -> None:

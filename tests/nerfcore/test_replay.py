@@ -100,6 +100,7 @@ def test_recorded_steps_are_ordinary_steps(ball: Path, settings: dict[str, str])
     assert (numbers[1].rays, numbers[1].steps) == (numbers[0].rays, STEPS)
 
 
+@pytest.mark.slow
 def test_nothing_moves_in_memory_while_a_recording_is_used(ball: Path) -> None:
     """A recording reads and writes where it did when it was made."""
     trainer = static(ball, True, **{"field.precision": "float16"})

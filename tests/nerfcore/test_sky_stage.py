@@ -177,6 +177,7 @@ def test_train_begins_anew_where_masks_are_needed(court: Path, taken: float, mon
     assert len(report.notes) == (1 if taken else 0)
 
 
+@pytest.mark.slow
 def test_training_stopped_before_it_was_decided_begins_anew_where_it_goes_on(
     court: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -72,7 +72,7 @@ def test_statistics_are_mean_and_variance_over_the_photos_that_see_a_vertex() ->
     assert not statistics(features, [seen[1]], 4).any()  # one photo has no variance
 
 
-@pytest.mark.parametrize("kind", ["rgb_stats", "cnn"])
+@pytest.mark.parametrize("kind", ["rgb_stats", pytest.param("cnn", marks=pytest.mark.slow)])
 def test_only_seen_vertices_of_dense_levels_are_written(ball: Path, kind: str) -> None:
     trainer = trainer_of(ball, **{"field.voxel_init": kind, "field.voxel_init_step": "20"})
     for _ in range(20):

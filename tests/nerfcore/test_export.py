@@ -222,7 +222,7 @@ WORLD = np.array([[2.4, -0.7, 0.0, 1.0], [0.7, 2.4, 0.0, 2.0], [0.0, 0.0, 2.5, 3
     ("settings", "contracted"),
     [
         pytest.param({}, False, marks=pytest.mark.slow),
-        pytest.param({}, True, marks=pytest.mark.slow),
+        ({}, True),
         pytest.param({"branch": "explicit"}, False, marks=pytest.mark.slow),
         pytest.param({"branch": "implicit"}, True, marks=pytest.mark.slow),
         pytest.param({"fusion": "concat", "appearance": 8}, True, marks=pytest.mark.slow),

@@ -95,10 +95,8 @@ def test_what_label_maps_leave_out_is_there_where_photos_say_so(
     # And nowhere else: of a plain part nothing is left of the field's own depths.
     plain = (row < 0.45 * CAMERA.height).repeat(count)[:, None]
     monkeypatch.setattr(store, "rgba", torch.where(plain, 128, store.rgba).to(torch.uint8))
-    named, field = (
-        labelled_below(0.4),
-        torch.from_numpy(np.concatenate([m.depth.reshape(-1) for m in sphere_views.soft])),
-    )
+    named = labelled_below(0.4)
+    field = torch.from_numpy(np.concatenate([m.depth.reshape(-1) for m in sphere_views.soft]))
     assert bool((named.depth != field)[there(named)].all())
     assert int(there(named).sum()) < 0.1 * unnamed
 

@@ -11,13 +11,12 @@ from filelock import FileLock
 
 
 def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], Path]) -> Path:
-    """What `make(folder)` returned, with a folder that all workers share, who wait for each other; no test changes it."""
+    """What `make(folder)` returned to the first worker; the others wait for it and get the same. No test changes it."""
     root = factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
         root = root.parent  # of all workers
-    folder, done = root / name, root / f"{name}.made"
+    done = root / f"{name}.made"
     with FileLock(root / f"{name}.lock"):
         if not done.exists():
-            folder.mkdir()
-            done.write_text(str(make(folder)), "utf-8")
+            done.write_text(str(make(factory.mktemp(name))), "utf-8")
     return Path(done.read_text("utf-8"))

@@ -1,7 +1,7 @@
 """The command line: one command a verb, made from the verb's parameter model.
 
-Exit codes: 0 done · 1 failed · 2 wrong usage · 3 done, but with warnings or not judged good, under --strict ·
-130 cancelled.
+Exit codes: 0 done · 1 failed · 2 wrong usage · 3 done, but with warnings or problems, or not judged good, under
+--strict · 130 cancelled.
 """
 
 from __future__ import annotations
@@ -185,7 +185,7 @@ def _command(name: str) -> click.Command:
         click.Option(["--json", "as_json"], is_flag=True, help="print one JSON object on stdout and nothing else"),
         click.Option(["--quiet"], is_flag=True, help="no progress"),
         click.Option(
-            ["--strict"], is_flag=True, help="exit with 3 when there were warnings, or the result is not judged good"
+            ["--strict"], is_flag=True, help="exit with 3 when there were warnings or problems, or the result is not judged good"
         ),
     ]
 
@@ -255,7 +255,8 @@ def run_command(name: str, values: dict[str, Any], as_json: bool, quiet: bool, s
         judged = result.get("verdict", GOOD)
         if judged["level"] != "good":
             click.secho(f"{judged['level']}: {' '.join(judged['reasons'])}", fg=COLORS[judged["level"]], err=True)
-        return 3 if strict and (report.warnings or judged["level"] != "good") else 0
+        good = judged["level"] == "good" and result.get("ok", True)
+        return 3 if strict and (report.warnings or not good) else 0
 
 
 def _cancelled(goes_on: bool, as_json: bool, stdout: TextIO) -> int:

@@ -13,7 +13,7 @@ from ..errors import InputError
 from ..files import is_text, printable, require_readable
 from ..images.names import beside_all, companion_stems, unique_names
 from ..images.soft_labels import find_confidence, find_probabilities
-from ..images.suffixes import PHOTO_SUFFIXES, VIDEO_SUFFIXES
+from ..images.suffixes import CAMERA_SUFFIXES, PHOTO_SUFFIXES, RAW_SUFFIXES, VIDEO_SUFFIXES
 from ..project.store import PROJECT_FILE
 
 # Files that lie beside photos and are none.
@@ -70,6 +70,8 @@ def list_photos(folder: Path, exclude: Iterable[Path | None] = ()) -> tuple[list
                 skipped.append({"file": name, "reason": "a video among photos: give it alone as --photos"})
             else:
                 skipped.append({"file": name, "reason": f"{suffix} is not a photo format that Fieldwork reads"})
+    photos, twice = _without_developed(photos)
+    skipped += twice
     for problem in problems:
         if Path(str(problem.filename)) == root:
             raise InputError(f"{root} cannot be read: {problem.strerror}.", "Check its permissions.")
@@ -79,6 +81,19 @@ def list_photos(folder: Path, exclude: Iterable[Path | None] = ()) -> tuple[list
             f"There are no photos in {folder}.", "Choose a folder with JPEG, PNG, TIFF, HEIC or raw files."
         )
     return photos, skipped, root
+
+
+def _without_developed(photos: list[Path]) -> tuple[list[Path], list[dict[str, str]]]:
+    """Photos without the raw files that the camera's own picture lies beside (RAW + JPEG), and those with the reason."""
+    developed = {p.with_suffix("").as_posix().casefold(): p.name for p in photos if p.suffix.lower() in CAMERA_SUFFIXES}
+    kept, skipped = [], []
+    for path in photos:
+        own = developed.get(path.with_suffix("").as_posix().casefold())
+        if own is not None and path.suffix.lower() in RAW_SUFFIXES:
+            skipped.append({"file": path.name, "reason": f"the camera's own picture of it is used, {own}"})
+        else:
+            kept.append(path)
+    return kept, skipped
 
 
 def _odd_folder(path: Path) -> str:

@@ -19,14 +19,13 @@ from ..project.classes import make_classes, read_classes, unnamed_values
 from ..project.fingerprints import Earlier, Fingerprint, compare, digest, files_digest, stamps_digest
 from ..project.kept import earlier_cut_outs, keep_later_labels, resized_labels, with_earlier_names
 from ..project.schema import ImageRecord, Project
-from ..project.store import PROJECT_FILE, create_folder, edit_project, load_project
+from ..project.store import FRAMES_FOLDER, PROJECT_FILE, create_folder, edit_project, load_project
 from .backdrop import mask_objects
 from .find import Source, classes_beside, find_sources, list_photos, subfolder
 from .mask_mode import MaskMode, chosen_mask_mode
 from .select import reject_blurred, reject_duplicates
 from .working_copies import Settings, make_working_copies
 
-FRAMES_FOLDER = "frames"
 WORKING_FOLDERS = ("images", "labels", "masks", "confidence")  # of the project
 Classes = tuple[dict[int, str], int, Colors]  # names, void id, colours
 

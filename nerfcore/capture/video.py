@@ -15,8 +15,8 @@ from PIL import Image
 from ..errors import InputError
 from ..files import atomic_path, write_json
 from ..progress import Reporter
+from ..project.store import FRAMES_FILE
 
-INDEX_FILE = "frames.json"
 GREY_WIDTH = 640  # pixels, at which the sharpness of frames is compared; not tuned
 
 
@@ -67,7 +67,7 @@ def extract_frames(video: Path, folder: Path, count: int, report: Reporter) -> l
         chosen.append(_save(best, video, folder))
     if not chosen:
         raise InputError(f"{video} has no pictures.", "Choose another video.")
-    write_json(folder / INDEX_FILE, {"key": key, "files": [path.name for path in chosen]})
+    write_json(folder / FRAMES_FILE, {"key": key, "files": [path.name for path in chosen]})
     return chosen
 
 
@@ -114,7 +114,7 @@ def save_every_nth(video: Path, n: int, folder: Path) -> list[Path]:
 
 def _finished(folder: Path, key: list[Any]) -> list[Path]:
     try:
-        index = json.loads((folder / INDEX_FILE).read_text(encoding="utf-8"))
+        index = json.loads((folder / FRAMES_FILE).read_text(encoding="utf-8"))
         paths = [folder / name for name in index["files"]]
         return paths if index["key"] == json.loads(json.dumps(key)) and all(p.is_file() for p in paths) else []
     except (OSError, ValueError, KeyError, TypeError):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from .suffixes import TIFF_SUFFIXES
 
 Colors = dict[int, tuple[int, int, int]]
 # Formats whose EXIF orientation is ours to apply: HEIF and raw decoders turn pictures themselves.
+LOSSY_FORMATS = ("JPEG", "MPO", "HEIF", "AVIF")
 TAGGED_SUFFIXES = {".jpg", ".jpeg", ".jpe", ".png", ".webp", ".tif", ".tiff"}
 
 
@@ -37,7 +39,7 @@ def read_labels(path: Path, colors: Colors | None = None, ignore_id: int = 0) ->
         return np.where(shares.max(2) > 0, shares.argmax(2), ignore_id).astype(np.uint16)
     try:
         with Image.open(path) as image:
-            if image.format in ("JPEG", "MPO", "HEIF"):
+            if image.format in LOSSY_FORMATS or (image.format == "WEBP" and _is_lossy_webp(path)):
                 raise InputError(f"label map {path.name} is a {image.format}: its compression changes ids; save as PNG")
             mode = image.mode
             if mode in ("L", "I", "I;16", "I;16B", "I;16L", "1"):
@@ -53,6 +55,20 @@ def read_labels(path: Path, colors: Colors | None = None, ignore_id: int = 0) ->
     if values.min() < 0 or values.max() > 65535:
         raise InputError(f"label map {path.name} has ids outside 0…65535")
     return values.astype(np.uint16)
+
+
+def _is_lossy_webp(path: Path) -> bool:
+    """Whether pixels are stored as `VP8 ` and not as `VP8L` (RFC 9649); chunks before them are skipped."""
+    with open(path, "rb") as file:
+        file.seek(12)
+        while len(head := file.read(8)) == 8:
+            kind, size = struct.unpack("<4sI", head)
+            if kind in (b"VP8 ", b"VP8L"):
+                return kind == b"VP8 "
+            file.seek(0 if kind == b"ANMF" else size + size % 2, 1)
+            if kind == b"ANMF":
+                file.seek(16, 1)  # a frame of an animation has chunks of its own behind its place and time
+    return False
 
 
 def _from_palette(image: Image.Image, colors: Colors | None, ignore_id: int) -> np.ndarray:
@@ -103,14 +119,18 @@ def _from_colors(rgba: np.ndarray, colors: Colors | None, ignore_id: int, name: 
 
 
 def read_mask(path: Path) -> np.ndarray:
-    """Foreground mask (H, W) bool: alpha where the file has one, else brightness above one half. Grey files whose alpha is full
-    everywhere have none.
+    """Foreground mask (H, W) bool: alpha where the file has one, else brightness above one half; of 65535 where a file goes
+    beyond 255, of 1 where it does not go beyond that. Grey files whose alpha is full everywhere have no alpha.
 
     Raises:
         InputError: it is no image. One clause, fit as a reason.
     """
     try:
         with Image.open(path) as image:
+            if image.mode in ("L", "F") or image.mode.startswith("I"):
+                values = np.asarray(image)
+                brightest = values.max(initial=0)
+                return values > (0.5 if brightest <= 1 else 127 if brightest <= 255 else 32767)
             if image.mode not in ("RGBA", "LA"):
                 return np.asarray(image.convert("L")) > 127
             pixels = np.asarray(image.convert("RGBA"))

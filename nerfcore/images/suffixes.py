@@ -4,6 +4,7 @@ RAW_SUFFIXES = {
     ".3fr", ".arw", ".cr2", ".cr3", ".dcr", ".dng", ".erf", ".iiq", ".kdc", ".mef", ".mos", ".mrw", ".nef", ".nrw",
     ".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw", ".x3f",
 }  # fmt: skip
+CAMERA_SUFFIXES = {".jpg", ".jpeg", ".jpe", ".heic", ".heif", ".hif"}  # which cameras save beside raw files
 FLOAT_SUFFIXES = {".exr", ".hdr"}
 TIFF_SUFFIXES = {".tif", ".tiff"}
 PHOTO_SUFFIXES = RAW_SUFFIXES | FLOAT_SUFFIXES | TIFF_SUFFIXES | {

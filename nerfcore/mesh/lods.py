@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from ..files import atomic_path
 from ..images.encode import write_picture
 from ..kernels.closest import ClosestPoints
 from ..progress import Reporter
+from .appearance import bilinear
 from .decimate import decimate_patches
 from .metrics import sample_surface
 from .parts import Texture, texture_of
@@ -118,15 +120,16 @@ def _dressed(
 def _repainted(
     closest: ClosestPoints, texture: Texture, level: Surface, uv: np.ndarray, size: int, report: Reporter
 ) -> np.ndarray:
-    """A texture (S, S, 3) of a level with the colours that the full surface's texture has at the closest points."""
+    """A texture (S, S, 3) of a level with the colours that the full surface's texture has around the closest points: of detail
+    finer than its own texels, the mean."""
     corners = texture.unwrapped.uv[texture.unwrapped.faces]
-    side = len(texture.image)
+    image = np.asarray(Image.fromarray(texture.image).reduce(max(1, len(texture.image) // (2 * size))))
+    side = len(image)
 
     def color(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
         report.check()
         face, weights, _ = closest.find(points)
         place = (corners[face] * weights[..., None]).sum(1) * [1, -1] * side + [0, side]
-        x, y = np.clip(place, 0, side - 1).astype(int).T
-        return texture.image[y, x]
+        return (bilinear(image, place) * 255 + 0.5).astype(np.uint8)
 
     return field_texture(level.vertices, level.faces, uv, size, color, report)

@@ -21,7 +21,7 @@ from ..progress import Reporter, shortened
 from ..project.fingerprints import Earlier, Fingerprint, compare, digest, files_digest
 from ..project.kept import earlier_cut_outs, earlier_poses, keep_world
 from ..project.schema import Frame, ImageRecord, PosedImage, Poses, Project
-from ..project.store import POSES_FILE, edit_project, load_poses, load_project, save_poses
+from ..project.store import FRAMES_FILE, FRAMES_FOLDER, POSES_FILE, edit_project, load_poses, load_project, save_poses
 from ..verdict import poses_verdict
 from .align import gps_frame
 from .exposure import exposure_gains
@@ -291,7 +291,8 @@ def _database_name(record: ImageRecord) -> str:
 def _job(
     folder: Path, project: Project, records: list[ImageRecord], masks: Path | None, params: PosesParams, extend: bool
 ) -> dict[str, Any]:
-    frames = [Path(record.source).parent.name == "frames" for record in records]
+    video = (folder / FRAMES_FOLDER / FRAMES_FILE).is_file()  # else it is a folder of photos that is called so
+    frames = [video and Path(record.source).parent.name == FRAMES_FOLDER for record in records]
     return {
         "image_folder": str((folder / "images").resolve()),
         "masks": str(masks.resolve()) if masks else None,

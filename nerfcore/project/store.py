@@ -32,6 +32,8 @@ from .schema import FORMAT, VERSION, Poses, Project
 PROJECT_FILE = "project.json"
 POSES_FILE = "poses/poses.json"
 POINTS_FILE = "poses/points.npz"
+FRAMES_FOLDER = "frames"  # of the frames of a video
+FRAMES_FILE = "frames.json"  # in there: which they are
 LOCK_FILE = "jobs/project.lock"
 PATIENCE = 30.0  # seconds to wait for another edit, which takes milliseconds
 M = TypeVar("M", bound=BaseModel)

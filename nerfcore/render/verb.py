@@ -256,11 +256,14 @@ def orbit_cameras(scene: Scene, count: int) -> list[tuple[str, Camera, np.ndarra
 
 
 def look_at(center: np.ndarray, target: np.ndarray, up: np.ndarray | None = None) -> np.ndarray:
-    """Camera-to-world pose (4, 4), OpenCV axes, at `center` looking at `target` with `up` (default +z) upwards."""
+    """Camera-to-world pose (4, 4), OpenCV axes, at `center` looking at `target` with `up` (default +z) upwards; looking along
+    `up`, the axis that is farthest from it is upwards in the picture."""
     up = np.array([0.0, 0.0, 1.0]) if up is None else up
     forward = (target - center) / np.linalg.norm(target - center)
     right = np.cross(forward, up)
-    right = right / max(float(np.linalg.norm(right)), 1e-9)
+    if np.linalg.norm(right) < 1e-6 * np.linalg.norm(up):
+        right = np.cross(forward, np.eye(3)[np.abs(forward).argmin()])
+    right = right / np.linalg.norm(right)
     pose = np.eye(4)
     pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
     pose[:3, 3] = center

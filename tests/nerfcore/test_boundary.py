@@ -117,6 +117,14 @@ def test_a_failure_without_a_project_is_logged_too(
     log.unlink()
 
 
+@pytest.mark.parametrize(("ok", "options", "code"), [(True, ["--strict"], 0), (False, ["--strict"], 3), (False, [], 0)])
+def test_a_machine_with_problems_fails_where_it_is_strict(
+    monkeypatch: pytest.MonkeyPatch, ok: bool, options: list[str], code: int
+) -> None:
+    monkeypatch.setattr(cli, "run_verb", lambda *_: {"ok": ok, "problems": [] if ok else ["No disk."]})
+    assert cli.main(["doctor", *options]) == code
+
+
 def test_the_engine_says_the_same() -> None:
     for error, code, words in RAISED:
         answer = rpc.as_rpc_error(error, "a.log", ["Traceback"])

@@ -353,3 +353,12 @@ def test_few_of_many_photos_are_compared(monkeypatch: pytest.MonkeyPatch) -> Non
     rejected = {record.name: record.reason for record in records if record.status == "rejected"}
     assert rejected == {"200": "the same picture as 7.jpg", "399": "the same picture as 7.jpg"}
     assert len(asked) < 10 * count
+
+
+def test_a_raw_file_beside_the_cameras_own_picture_is_left_out(tmp_path: Path) -> None:
+    for name in ("A/x.JPG", "A/x.CR2", "B/x.dng", "y.NEF", "y.heic", "z.arw", "z.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    photos, skipped, root = list_photos(tmp_path)
+    assert sorted(p.relative_to(root).as_posix() for p in photos) == ["A/x.JPG", "B/x.dng", "y.heic", "z.arw", "z.png"]
+    assert {s["file"]: s["reason"].split(", ")[1] for s in skipped} == {"x.CR2": "x.JPG", "y.NEF": "y.heic"}

@@ -177,6 +177,30 @@ def test_masks_drawn_in_black_and_white_or_by_alpha(tmp_path: Path, mode: str) -
     assert np.array_equal(read_mask(tmp_path / "m.png"), inside > 0)
 
 
+@pytest.mark.parametrize(("kind", "white"), [("uint8", 1), ("uint16", 1), ("uint16", 255), ("uint16", 65535), ("float32", 1)])
+def test_masks_are_white_from_half_of_their_range(tmp_path: Path, kind: str, white: int) -> None:
+    values = np.zeros((20, 30), kind)
+    values[5:15], values[15:] = white, white * 0.4
+    Image.fromarray(values).save(tmp_path / "m.tif")
+    inside = np.zeros((20, 30), bool)
+    inside[5:15] = True
+    assert np.array_equal(read_mask(tmp_path / "m.tif"), inside)
+
+
+@pytest.mark.parametrize("extended", [False, True])
+@pytest.mark.parametrize("animated", [False, True])
+def test_only_lossless_webp_holds_ids(tmp_path: Path, extended: bool, animated: bool) -> None:
+    picture = Image.fromarray(np.repeat(labels()[..., None], 3, 2))
+    more = {"exif": exif(1)} if extended else {}
+    if animated:
+        more |= {"save_all": True, "append_images": [Image.new("RGB", picture.size)]}
+    picture.save(tmp_path / "a.webp", lossless=True, **more)
+    picture.save(tmp_path / "b.webp", quality=95, **more)
+    assert np.array_equal(read_labels(tmp_path / "a.webp"), labels())
+    with pytest.raises(InputError, match="WEBP: its compression changes ids"):
+        read_labels(tmp_path / "b.webp")
+
+
 def test_a_cut_out_photo_that_fills_the_picture(tmp_path: Path) -> None:
     Image.new("RGBA", (30, 20), (10, 20, 30, 255)).save(tmp_path / "m.png")
     assert read_mask(tmp_path / "m.png").all()

@@ -11,9 +11,11 @@ import pytest
 from fieldwork.nerfcore.capture.ingest import new
 from fieldwork.nerfcore.capture.video import extract_frames
 from fieldwork.nerfcore.errors import Cancelled, InputError
-from fieldwork.nerfcore.params import NewParams
+from fieldwork.nerfcore.params import NewParams, PosesParams
+from fieldwork.nerfcore.poses.estimate import pose_job
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.store import load_project
+from fieldwork.tests.nerfcore.support.photos import folder_of
 from PIL import Image, ImageFilter
 
 COUNT, SHARP_EVERY = 48, 6
@@ -143,3 +145,12 @@ def test_cancel(tmp_path: Path) -> None:
     report.cancel()
     with pytest.raises(Cancelled):
         extract_frames(video, tmp_path / "frames", 12, report)
+
+
+def test_photos_in_a_folder_called_frames_are_no_video(tmp_path: Path) -> None:
+    """Photos need not lie in the order they were taken in."""
+    for photos, is_video in ((folder_of(tmp_path / "frames"), False), (encode(tmp_path / "a.mp4", "libx264"), True)):
+        project = tmp_path / f"project {is_video}"
+        new(NewParams(project=project, photos=photos, frames=4), Reporter())
+        job = pose_job(project, load_project(project), PosesParams(project=project), Reporter())
+        assert job["video"] is is_video

@@ -134,6 +134,19 @@ def test_a_level_has_the_texture_of_the_full_surface(tmp_path: Path) -> None:
     assert sorted(level_files(tmp_path)) == sorted(files)
 
 
+@pytest.mark.parametrize("number", [1, 2])
+def test_detail_finer_than_a_level_shows_becomes_its_mean(number: int) -> None:
+    full = ball()
+    image = np.random.default_rng(0).integers(0, 2, (1024, 1024, 1), np.uint8).repeat(3, 2) * np.uint8(200)
+    uv = (full.vertices[full.faces][..., [0, 2]] / 42 + 0.5).astype(np.float32)
+    level = make_levels(full, texture_of(full.faces, uv, image), number, Reporter())[-1]
+    assert level.texture is not None
+    middle = (level.uv.mean(1) * [1, -1] * len(level.texture.image) + [0, len(level.texture.image)]).astype(int)
+    found = level.texture.image[middle[:, 1], middle[:, 0]].astype(float)
+    assert found.mean() == pytest.approx(100, abs=3)
+    assert found.std() < 0.7 / number * image.std()  # of a mean of 2 × 2, or 4 × 4, weighted by distance
+
+
 def test_without_instances_and_when_stopped() -> None:
     full = replace(ball(), face_instance=None)
     (level,) = make_levels(full, None, 1, Reporter())

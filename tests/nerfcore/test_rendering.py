@@ -197,3 +197,11 @@ def test_an_orbit_before_a_facade_stays_where_photos_were_taken(middle: float):
 
 def test_an_orbit_of_one_photo_stays_with_it():
     assert np.allclose(orbit_angles(np.radians([30.0]), 3) % (2 * math.pi), math.radians(30))
+
+
+@pytest.mark.parametrize("up", [None, np.array([0.0, 0.0, -2.0]), np.array([1.0, 0.0, 0.0])])
+def test_a_camera_straight_above_looks_down(up: np.ndarray | None) -> None:
+    pose = look_at(np.array([0.5, 1.0, 3.0]), np.array([0.5, 1.0, -1.0]), up)
+    assert np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3))
+    assert np.linalg.det(pose[:3, :3]) == pytest.approx(1)
+    assert np.allclose(pose[:3, 2], [0, 0, -1])

@@ -73,6 +73,11 @@ SIDES = [
     ("left", "Left", "From the negative X side"),
     ("bottom", "From Below", "From below, such as a ceiling"),
 ]
+CAMERAS = [
+    ("both", "Both", "One camera for each photo, and an animated one"),
+    ("many", "One per Photo", "One camera for each photo, with the photo behind it"),
+    ("animated", "Animated", "One camera that stands at each photo's place in turn"),
+]
 SPLITS = [
     ("none", "One", "One object"),
     ("classes", "One per Class", "One object for each class"),

@@ -3,7 +3,7 @@
 import bpy
 from bpy.types import Context, PropertyGroup
 
-from .choices import EXPORTS, MASK_MODES, PASSES, POSE_PRESETS, PRESETS, SPLITS, UP
+from .choices import CAMERAS, EXPORTS, MASK_MODES, PASSES, POSE_PRESETS, PRESETS, SPLITS, UP
 from .label_settings import LabelSettings
 from .measure_settings import MeasureSettings
 from .mesh_settings import MeshSettings
@@ -254,6 +254,12 @@ class FieldworkScene(LabelSettings, MeshSettings, MeasureSettings, PropertyGroup
             ("plane", "Image Planes", "On planes in front of the cameras"),
         ],
     )
+
+    # In the scene
+    scene_cameras: EnumProperty(
+        name="Cameras", description="How the photos' cameras appear in the scene", items=CAMERAS
+    )
+    scene_split: EnumProperty(name="In the Scene", description="How the surface appears in the scene", items=SPLITS)
 
     # Export
     export_to: EnumProperty(name="Format", description="What is written", items=EXPORTS)

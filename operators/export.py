@@ -10,6 +10,7 @@ from ..addon.jobs.job import Done, Job
 from ..addon.project import snapshot
 from ..addon.props import StringProperty
 from ..addon.text import t
+from ..addon.undo import undo_step
 from .base import ProjectOperator, absolute, need_poses, need_run, refresh_scenes, scene_of, scene_settings
 
 OF_THE_MESH = {"glb", "obj", "ply", "stl", "usd", "masks"}
@@ -98,8 +99,7 @@ def show_volume(job: Job, scene_name: str) -> None:
     from ..addon.scene import volume  # not at the top: enabling the extension must be quick
 
     volume.show(scene, snapshot.owner(job.project), Path(job.result["files"][0]))
-    if not bpy.app.background:
-        bpy.ops.ed.undo_push(message="Add Volume")
+    undo_step("Add Volume")
 
 
 CLASSES = [FIELDWORK_OT_blend, FIELDWORK_OT_export]

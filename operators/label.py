@@ -13,6 +13,7 @@ from ..addon.labels import editor, pending, session
 from ..addon.project import snapshot
 from ..addon.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
 from ..addon.text import t
+from ..addon.undo import undo_step
 from .base import (
     ProjectOperator,
     absolute,
@@ -201,8 +202,7 @@ def show_next(job: Job) -> None:
     scene = scene_of(job.project)
     if name is not None and scene is not None:
         show_photo(scene, job.project, name)
-        if not bpy.app.background:
-            bpy.ops.ed.undo_push(message="Next Photo")
+        undo_step("Next Photo")
 
 
 @scene_settings(run="run", seconds="label_seconds")

@@ -171,7 +171,8 @@ class FIELDWORK_OT_place_thing(_OfField):
         entry.visible = entry.visible and self.copy
         for other in context.selected_objects:
             other.select_set(False)
-        placed.select_set(True)
+        if context.view_layer.objects.get(placed.name) == placed:  # not where the field's collection is excluded
+            placed.select_set(True)
         return {"FINISHED"}
 
 

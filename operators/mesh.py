@@ -10,6 +10,7 @@ from ..addon.jobs.job import Done, Job, Steps
 from ..addon.project import snapshot
 from ..addon.props import BoolProperty
 from ..addon.roles import ROLE
+from ..addon.undo import undo_step
 from .base import ProjectOperator, need_run, refresh_scenes, scene_of, scene_settings
 from .scene import SPLIT_ROLES, show_colors, update_scene
 
@@ -101,6 +102,7 @@ def preview_steps(job: Job, scene: bpy.types.Scene) -> Steps:
     known = snapshot.project(job.project) or {}
     yield from build.preview_steps(scene, snapshot.owner(job.project), known, job.result["preview"])
     show_colors()
+    undo_step("First Look at the Mesh")
 
 
 def show_mesh(job: Job, scene_name: str) -> None:

@@ -5,7 +5,7 @@ from typing import Any
 
 import bpy
 from bpy.types import Context
-from mathutils import Vector
+from mathutils import Matrix, Vector
 
 from ..addon.jobs.job import Done, Job
 from ..addon.live.shared_scene import OWNER
@@ -13,6 +13,7 @@ from ..addon.project import snapshot
 from ..addon.props import BoolProperty, StringProperty
 from ..addon.scene.frame import scene_from_capture
 from ..addon.text import t
+from ..addon.undo import undo_step
 from .base import ProjectOperator, need_poses, need_project, refresh_scenes, scene_settings
 from .scene import update_scene
 
@@ -82,9 +83,9 @@ class FIELDWORK_OT_align(ProjectOperator):
     def parameters(self, context: Context) -> dict[str, Any]:
         params: dict[str, Any] = {"project": self.project_path(context)}
         up = self.value(context, "up")
-        if up != "auto":
-            params["up"] = up
         capture_from_scene = scene_from_capture(context.scene, snapshot.owner(Path(params["project"]))).inverted_safe()
+        if up != "auto":
+            params["up"] = up_in_capture(up, capture_from_scene)
         a, b = (capture_from_scene @ Vector(self.value(context, name)) for name in ("point_a", "point_b"))
         if self.use_scale and a != b:
             unit = context.scene.unit_settings.scale_length or 1.0
@@ -100,6 +101,13 @@ class FIELDWORK_OT_align(ProjectOperator):
         return aligned
 
 
+def up_in_capture(up: str, capture_from_scene: Matrix) -> str:
+    """An axis of the scene as `align` takes it: its letter where the capture is not turned, else "x,y,z" in the capture."""
+    axis = Vector([float(name == up[-1]) for name in "xyz"]) * (-1 if up.startswith("-") else 1)
+    turned = (capture_from_scene.to_3x3() @ axis).normalized()
+    return up if (turned - axis).length < 1e-6 else ",".join(f"{value:.9g}" for value in turned)
+
+
 def aligned(job: Job) -> None:
     """Directions and points were those of the frame before: forget them, and bring the scene into the new frame."""
     refresh_scenes(job)
@@ -112,6 +120,7 @@ def aligned(job: Job) -> None:
             settings.point_a = settings.point_b = (0.0, 0.0, 0.0)
             if OWNER not in scene:  # one that renders fields or shadows shows what stands in another one
                 update_scene(job, scene)
+    undo_step("Apply Up and Scale")
 
 
 CLASSES = [FIELDWORK_OT_poses, FIELDWORK_OT_align]

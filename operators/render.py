@@ -19,6 +19,7 @@ from ..addon.roles import Owner
 from ..addon.scene.frame import scene_from_capture
 from ..addon.scene.slices import Held
 from ..addon.text import t
+from ..addon.undo import undo_step
 from .base import ProjectOperator, absolute, need_held_out, need_run, refresh_scenes, scene_of, scene_settings
 from .scene import show_image
 
@@ -196,8 +197,9 @@ def show_result(job: Job) -> Steps | None:
 
 
 def then_shown(steps: Steps, files: list[Path]) -> Steps:
-    """Steps after which the first picture is shown in an image editor."""
+    """Steps after which the first picture is shown in an image editor; a step of undo."""
     yield from steps
+    undo_step("Show Renders from Fieldwork")
     first = next((path for path in files if path.suffix == ".png"), None)
     if first is not None and not bpy.app.background:
         show_image(first)
@@ -213,7 +215,7 @@ def _show_straightened(job: Job, show_as: str) -> None:
         from ..addon.render.result import show_steps
 
         files = sorted(Path(done.result["folder"], "renders").glob("*.png"))
-        return show_steps(scene, files, show_as, True, snapshot.owner(done.project))
+        return then_shown(show_steps(scene, files, show_as, True, snapshot.owner(done.project)), [])
 
     params = {name: job.params[name] for name in ("project", "run")} | {"renders": job.params["out"]}
     queue.follow_up(queue.make("package", params, show))

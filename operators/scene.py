@@ -7,20 +7,20 @@ import bpy
 from bpy.types import Context, Operator
 
 from ..addon import paths
-from ..addon.choices import SPLITS
 from ..addon.jobs.job import Done, Job, Steps
 from ..addon.jobs.queue import queue
 from ..addon.project import classes, snapshot
-from ..addon.props import EnumProperty, StringProperty
+from ..addon.props import StringProperty
 from ..addon.roles import by_role
 from ..addon.scene import viewing
 from ..addon.text import t
+from ..addon.undo import undo_step
 from .base import ProjectOperator, absolute, need_poses, refresh_scenes, scene_of, scene_settings, set_if_empty
 
 SPLIT_ROLES = {"instance:": "instances", "class:": "classes"}  # how roles of the surface's objects begin
 
 
-@scene_settings(run="run")
+@scene_settings(run="run", cameras="scene_cameras", split="scene_split")
 class FIELDWORK_OT_import_scene(ProjectOperator):
     """Bring the cameras, the sparse points and the mesh into the scene, or update those that are there"""
 
@@ -29,17 +29,6 @@ class FIELDWORK_OT_import_scene(ProjectOperator):
     verb = "package"
     needs = (need_poses,)
 
-    cameras: EnumProperty(
-        name="Cameras",
-        description="How the photos' cameras appear in the scene",
-        items=[
-            ("both", "Both", "One camera for each photo, and an animated one"),
-            ("many", "One per Photo", "One camera for each photo, with the photo behind it"),
-            ("animated", "Animated", "One camera that stands at each photo's place in turn"),
-        ],
-        options={"SKIP_SAVE"},
-    )
-    split: EnumProperty(name="Objects", description="How the surface appears", items=SPLITS, options={"SKIP_SAVE"})
     renders: StringProperty(
         name="Renders",
         description="Folder of rendered photos to show behind their cameras; empty: those of the panel",
@@ -50,10 +39,13 @@ class FIELDWORK_OT_import_scene(ProjectOperator):
     def parameters(self, context: Context) -> dict[str, Any]:
         project = self.project_path(context)
         set_if_empty(context.scene, project)
+        settings = context.scene.fieldwork  # later updates keep to what was chosen
+        settings.scene_cameras, settings.scene_split = self.value(context, "cameras"), self.value(context, "split")
         return {"project": project, "run": self.value(context, "run"), "renders": absolute(self.renders)}
 
     def after(self) -> Done:
-        cameras, split, name = self.cameras, self.split, bpy.context.scene.name
+        settings, name = bpy.context.scene.fieldwork, bpy.context.scene.name
+        cameras, split = settings.scene_cameras, settings.scene_split
         return lambda job: import_result(job, cameras, name, split)
 
 
@@ -64,10 +56,14 @@ def update_scene(job: Job, scene: bpy.types.Scene, always: bool = False) -> None
     roles = set(by_role(scene.objects, owner))
     if not roles and not always:
         return
-    many, animated = any(role.startswith("camera:") for role in roles), "camera path" in roles
-    cameras, name = "both" if many == animated else "many" if many else "animated", scene.name
-    params = {"project": str(job.project), "run": scene.fieldwork.run}
-    split = next((kind for start, kind in SPLIT_ROLES.items() if any(r.startswith(start) for r in roles)), "none")
+    settings, name = scene.fieldwork, scene.name
+    cameras, split = settings.scene_cameras, settings.scene_split
+    if not settings.is_property_set("scene_cameras"):  # the file is one of `fieldwork blend`, or of Fieldwork 0.1
+        many, animated = any(role.startswith("camera:") for role in roles), "camera path" in roles
+        cameras = "both" if many == animated else "many" if many else "animated"
+    if not settings.is_property_set("scene_split"):
+        split = next((kind for start, kind in SPLIT_ROLES.items() if any(r.startswith(start) for r in roles)), "none")
+    params = {"project": str(job.project), "run": settings.run}
     queue.follow_up(queue.make("package", params, lambda done: import_result(done, cameras, name, split)))
 
 
@@ -96,8 +92,7 @@ def import_steps(job: Job, cameras: str, scene: bpy.types.Scene, split: str) -> 
     if first:
         show_colors()
     yield 1.0, ""
-    if not bpy.app.background:
-        bpy.ops.ed.undo_push(message="Update Scene from Fieldwork")
+    undo_step("Update Scene from Fieldwork")
 
 
 def show_colors() -> None:

@@ -10,6 +10,7 @@ from ..addon.jobs.job import Done, Job
 from ..addon.project import snapshot, things
 from ..addon.props import BoolProperty, IntProperty, StringProperty
 from ..addon.text import t
+from ..addon.undo import undo_step
 from .base import ProjectOperator, refresh_scenes, scene_settings
 from .measure import need_mesh
 
@@ -52,8 +53,7 @@ def show_relations(job: Job) -> None:
         job.warnings.append(t("{}: {}", asked, told) if ids else t("{}: nothing", asked))
         if ids and not objects.select(owner, ids):
             job.warnings.append(t("They are not in the scene: press Update Scene."))
-    if not bpy.app.background:
-        bpy.ops.ed.undo_push(message="Select Things")
+    undo_step("Select Things")
 
 
 @scene_settings(run="run")
@@ -125,6 +125,7 @@ def show_instances(job: Job) -> None:
         rename_in_fields(job.project, str(job.params.get("run", "main")), *job.params["rename"])
     if own and (job.params.get("merge") or job.params.get("split")):
         job.warnings.append(t("Press Update Scene to see the things as they are now."))
+    undo_step("Change Things")
 
 
 def rename_in_fields(project: Path, run: str, old: str, new: str) -> None:

@@ -46,6 +46,7 @@ class FIELDWORK_PT_mesh(StepPanel):
         layout.operator("fieldwork.mesh", icon="MESH_DATA")
         if result:
             layout.operator("fieldwork.turntable", icon="RENDERLAYERS")
+        columns(layout).prop(settings, "scene_split")
         row = layout.row(align=True)
         row.operator("fieldwork.import_scene", icon="SCENE_DATA")
         row.operator("fieldwork.pick_surface", icon="EYEDROPPER")

@@ -62,6 +62,7 @@ class FIELDWORK_PT_poses_options(FieldworkPanel):
         column = columns(self.layout)
         column.prop(settings, "keep_exposure")
         column.prop(settings, "pose_group")
+        column.prop(settings, "scene_cameras")
         groups = snapshot.last_result(project_folder(context), "poses").get("groups", [])
         if len(groups) > 1:
             text = t("The photos fall into groups of {}.", ", ".join(map(str, groups)))

@@ -14,6 +14,7 @@ from ..jobs import gate, redraw
 from ..jobs.job import Job
 from ..jobs.queue import queue
 from ..project import snapshot
+from ..undo import undo_step
 from . import ahead, journal, pending
 
 BUSY_PERIOD = 0.05  # seconds between two looks while the engine has something of ours
@@ -97,18 +98,13 @@ def _land() -> None:
                 if snapshot.folder_of(scene.fieldwork) == taken.folder:
                     scene.fieldwork.label_revision = taken.revision
             if not taken.more:
-                _step("Label")
+                undo_step("Label")
         if not bpy.app.background:
             redraw.panels()
     for folder in [folder for folder in _undo if not pending.unfinished(folder)]:
         steps = _undo.pop(folder)
         if pending.error(folder) is None:  # else the last mark is none
             _undo_steps(steps)
-
-
-def _step(message: str) -> None:
-    if not bpy.app.background:
-        bpy.ops.ed.undo_push(message=message)
 
 
 def _undo_steps(count: int) -> None:

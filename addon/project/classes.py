@@ -163,12 +163,12 @@ _history = History(_same)
 
 
 def show(settings: Any) -> None:
-    """Show and hide the classes on the meshes of the project as the list says."""
+    """Show and hide the classes on the meshes of the project in the scene as its list says."""
     folder = snapshot.folder_of(settings)
     if _quiet or folder is None:
         return
     from ..scene import visibility
 
     hidden = [entry.id for entry in settings.classes if not entry.visible]
-    for obj in visibility.meshes(snapshot.owner(folder)):
+    for obj in visibility.meshes(snapshot.owner(folder), settings.id_data.objects):
         visibility.hide_classes(obj, hidden)

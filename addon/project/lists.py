@@ -58,5 +58,10 @@ def undone(settings: Any) -> None:
 
 def other_project(settings: Any) -> None:
     """Another folder was chosen: what was known of the one before is no more."""
-    settings.project_uuid = ""
+    before, settings.project_uuid = settings.project_uuid, ""
+    folder = snapshot.folder_of(settings)
+    if folder is None or snapshot.owner(folder).uuid != before:
+        with classes.quiet():
+            for entry in settings.classes:  # what was hidden are classes of the other project
+                entry.visible = True
     refresh(settings)

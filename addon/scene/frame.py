@@ -20,7 +20,17 @@ def root_of(scene: bpy.types.Scene, owner: Owner | None) -> bpy.types.Object | N
 def scene_from_capture(scene: bpy.types.Scene, owner: Owner | None) -> Matrix:
     """The matrix (4×4) from the capture's frame to the scene; only the units' factor where nothing was imported."""
     root = root_of(scene, owner)
-    return root.matrix_world.copy() if root is not None else Matrix.Scale(units_per_metre(scene), 4)
+    return world_of(root) if root is not None else Matrix.Scale(units_per_metre(scene), 4)
+
+
+def world_of(item: bpy.types.Object) -> Matrix:
+    """An object's matrix (4×4) to the world. Blender neither stores `matrix_world` nor computes it for what is excluded from
+    the view layer or disabled in viewports: it is made of the object's own values, unless constraints place it."""
+    if len(item.constraints) or (item.parent is not None and item.parent_type != "OBJECT"):
+        return item.matrix_world.copy()
+    if item.parent is None:
+        return item.matrix_basis.copy()
+    return world_of(item.parent) @ item.matrix_parent_inverse @ item.matrix_basis
 
 
 def units_per_metre(scene: bpy.types.Scene) -> float:

@@ -14,7 +14,6 @@ from ..errors import SceneChanged
 from ..roles import ROLE, UUID, Owner, by_role, is_local
 from . import slices
 from .edited import Steps, object_changed, release, surface_edited
-from .frame import root_of
 from .own_look import give_own_look
 from .slices import Held
 
@@ -43,10 +42,8 @@ class Owned:
         """The objects that are there by their roles."""
         if self._slice != slices.number():
             self._slice = slices.number()
-            self._known = by_role(self.collection.all_objects, self.owner)
-            root = root_of(self.scene, self.owner)  # wherever the user has put it
-            if root is not None and is_local(root):
-                self._known["root"] = root
+            # Wherever the user has put them; of copies those in the capture's own collection are the originals.
+            self._known = by_role([*self.collection.all_objects, *self.scene.objects], self.owner)
         return self._known
 
     def release_copies(self) -> None:
@@ -61,7 +58,7 @@ class Owned:
                     give_own_look(item.data, self.owner)
 
     def _collection(self, parent: bpy.types.Collection, name: str, role: str) -> bpy.types.Collection:
-        for child in parent.children:
+        for child in parent.children_recursive:
             if child.get(ROLE) == role and self.owner.owns(child) and is_local(child):
                 self.owner.mark(child, role)  # one of before the project had a UUID
                 return child
@@ -77,8 +74,13 @@ class Owned:
         if item is None:
             item = bpy.data.objects.new(name, data)
             self._place(role, group).objects.link(item)
-            item.parent = self.existing("root")
             self.known[role] = item
+            if role == "root":  # also of what is left from one that was deleted
+                for other in self.known.values():
+                    if other != item and other.parent is None:
+                        other.parent = item
+            else:
+                item.parent = self.existing("root")
         self.owner.mark(item, role)
         return item
 

@@ -24,7 +24,7 @@ def point_under(context: bpy.types.Context, area: bpy.types.Area, x: float, y: f
     region = _region_under(area, x, y)
     if region is None:
         return None
-    view = area.spaces.active.region_3d
+    view = region.data  # each view of Quad View has its own
     mouse = Vector((x - region.x, y - region.y))
     found = _nearest_point(context, region, view, mouse)
     if found is not None:
@@ -40,7 +40,7 @@ def spot_under(context: bpy.types.Context, area: bpy.types.Area, x: float, y: fl
     region = _region_under(area, x, y)
     if region is None:
         return None
-    view, mouse = area.spaces.active.region_3d, Vector((x - region.x, y - region.y))
+    view, mouse = region.data, Vector((x - region.x, y - region.y))
     origin = view3d_utils.region_2d_to_origin_3d(region, view, mouse)
     direction = view3d_utils.region_2d_to_vector_3d(region, view, mouse)
     return spot_at(context.scene, context.evaluated_depsgraph_get(), origin, direction)

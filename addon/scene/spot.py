@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Any
 
 import bpy
 from mathutils import Vector
@@ -45,7 +46,8 @@ class Spot:
 
 
 def spot_at(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph, origin: Vector, direction: Vector) -> Spot | None:
-    """What a ray from `origin` meets of a surface of Fieldwork first; None where it meets none."""
+    """What a ray from `origin` meets of a surface of Fieldwork first; None where it meets none, or one whose classes are not
+    known: remeshed, in Edit Mode, or without its materials."""
     direction = direction.normalized()
     hit = _cast(scene, depsgraph, origin, direction, FARTHEST)
     if hit is None:
@@ -55,18 +57,29 @@ def spot_at(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph, origin: Vect
         normal = -normal
     mesh = item.evaluated_get(depsgraph).data  # hidden classes are missing there
     corners = mesh.polygons[face].vertices
-    sure = [mesh.attributes[CONFIDENCE_ATTRIBUTE].data[v].value for v in corners]
-    number = mesh.attributes[INSTANCE_ATTRIBUTE].data[face].value
-    material = mesh.materials[mesh.polygons[face].material_index]
+    class_id, number, unseen = (
+        _value(mesh, name, face) for name in (CLASS_ATTRIBUTE, INSTANCE_ATTRIBUTE, UNSEEN_ATTRIBUTE)
+    )
+    sure = [_value(mesh, CONFIDENCE_ATTRIBUTE, v) for v in corners]
+    index = mesh.polygons[face].material_index
+    material = mesh.materials[index] if index < len(mesh.materials) else None
+    if class_id is None or None in sure or material is None:
+        return None
     return Spot(
         place,
-        mesh.attributes[CLASS_ATTRIBUTE].data[face].value,
+        class_id,
         label_of(material),
         str(item.get(INSTANCE_NAMES, {}).get(str(number), number)) if number else "",
         sum(sure) / len(sure),
-        UNSEEN_ATTRIBUTE in mesh.attributes and mesh.attributes[UNSEEN_ATTRIBUTE].data[face].value,
+        bool(unseen),
         photos_of(scene, depsgraph, place, normal, Owner(str(item.get(PROJECT, "")), str(item.get(UUID, "")))),
     )
+
+
+def _value(mesh: bpy.types.Mesh, name: str, index: int) -> Any:
+    """The value of an attribute for a face or vertex; None where the mesh does not have it."""
+    attribute = mesh.attributes.get(name)
+    return attribute.data[index].value if attribute is not None and index < len(attribute.data) else None
 
 
 def photos_of(

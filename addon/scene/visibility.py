@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import bpy
 
 from ..roles import ROLE, Owner
@@ -10,9 +12,13 @@ from .surface import CLASS_ATTRIBUTE
 NAME = "Fieldwork Classes"
 
 
-def meshes(owner: Owner) -> list[bpy.types.Object]:
-    """The labelled meshes of a project in the file."""
-    return [obj for obj in bpy.data.objects if obj.type == "MESH" and is_surface(obj) and owner.owns(obj)]
+def meshes(owner: Owner, objects: Iterable[bpy.types.Object] | None = None) -> list[bpy.types.Object]:
+    """The labelled meshes of a project among objects, of the whole file by default. Those linked from another file are that
+    file's to change."""
+    objects = bpy.data.objects if objects is None else objects
+    return [
+        obj for obj in objects if obj.type == "MESH" and is_surface(obj) and owner.owns(obj) and obj.library is None
+    ]
 
 
 def is_surface(obj: bpy.types.Object) -> bool:

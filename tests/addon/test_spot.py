@@ -45,6 +45,13 @@ try:
     bpy.ops.fieldwork.show_photo(camera="nobody")
 except RuntimeError as error:
     answers["nobody"] = str(error)
+bpy.context.view_layer.objects.active = scene.objects["Surface"] if split == "none" else scene.objects["stone"]
+bpy.ops.object.mode_set(mode="EDIT")
+answers["edited"] = spot(0.3, 0.7)
+bpy.ops.object.mode_set(mode="OBJECT")
+bpy.context.object.modifiers.new("Remesh", "REMESH").voxel_size = 0.2
+bpy.context.view_layer.update()
+answers["remeshed"] = spot(0.3, 0.7)
 answers["waits"] = bpy.ops.fieldwork.pick_surface.poll()
 answer(answers)
 """
@@ -93,6 +100,8 @@ def test_a_place_says_what_it_is_and_which_photos_show_it(bpy_script, tmp_path, 
     assert facts["behind"]["photos"] == ["below"]
     assert facts["beside"] is None
     assert facts["hidden"] is None
+    assert facts["edited"] is None
+    assert facts["remeshed"] is None
     assert facts["left"]["class"] == [1, "stone"]
     assert facts["shown"] == ["FINISHED"]
     assert facts["camera"] == "near"

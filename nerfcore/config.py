@@ -6,6 +6,7 @@ Presets (`presets/*.json`) hold only what differs from the defaults. `--set stag
 from __future__ import annotations
 
 import json
+from collections.abc import Container
 from difflib import get_close_matches
 from pathlib import Path
 from types import NoneType
@@ -305,9 +306,10 @@ def with_present_names(values: dict[str, Any]) -> dict[str, Any]:
     return found
 
 
-def with_rendering_of(config: RunConfig, asked: RunConfig) -> RunConfig:
-    """`config` with those settings of `asked` that only pictures depend on."""
-    rendering = {name: getattr(asked.render, name) for name in ONLY_RENDERING}
+def with_rendering_of(config: RunConfig, asked: RunConfig, named: Container[str] | None = None) -> RunConfig:
+    """`config` with those settings of `asked` that only pictures depend on; of the `named` ones, or all."""
+    names = [name for name in ONLY_RENDERING if named is None or f"render.{name}" in named]
+    rendering = {name: getattr(asked.render, name) for name in names}
     return config.model_copy(update={"render": config.render.model_copy(update=rendering)})
 
 

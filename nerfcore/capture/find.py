@@ -130,9 +130,17 @@ def subfolder(photos: Path, name: str) -> Path | None:
 
 
 def find_sources(
-    paths: list[Path], root: Path, labels: Path | None, masks: Path | None, taken: set[str]
+    paths: list[Path],
+    root: Path,
+    labels: Path | None,
+    masks: Path | None,
+    taken: set[str],
+    known: dict[Path, str] | None = None,
 ) -> list[Source]:
     """Photos below `root` with names of their own, not among `taken`, and their labels and masks.
+
+    `known`: names that photos, by their resolved paths, have in the project; they keep them, as marks, poses and runs know
+    photos by name.
 
     Raises:
         InputError: the folder of labels or of masks does not exist.
@@ -142,11 +150,14 @@ def find_sources(
             raise InputError(f"The {what} folder {folder} does not exist.", f"Choose the folder that holds the {what}.")
     names = unique_names(paths, root)
     stems = companion_stems(paths, root, names)
+    before = [(known or {}).get(path.resolve()) for path in paths]
+    others = {stem for own in stems for stem in own}
+    stems = [[*own, name] if name and name not in others else own for own, name in zip(stems, before)]
     pictures, drawn = beside_all(labels, stems, exact=False), beside_all(masks, stems, exact=False)
-    sources, taken = [], {name.casefold() for name in taken}
-    for path, name, own, picture, mask in zip(paths, names, stems, pictures, drawn):
-        unique = name
-        while unique.casefold() in taken:
+    sources, taken = [], {name.casefold() for name in [*taken, *filter(None, before)]}
+    for path, name, had, own, picture, mask in zip(paths, names, before, stems, pictures, drawn):
+        unique = had or name
+        while had is None and unique.casefold() in taken:
             unique += "_b"
         taken.add(unique.casefold())
         label = (find_probabilities(labels, own) or picture) if labels else None

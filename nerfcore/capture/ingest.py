@@ -53,14 +53,20 @@ def new(params: NewParams, report: Reporter) -> dict[str, Any]:
     create_folder(folder)
     _remove_halves(folder)
     paths, skipped, root = _photos(params, report)
-    kept = _kept(previous, params, root) if previous else []
-    sources = find_sources(paths, root, labels_folder, masks_folder, {record.name for record in kept})
+    kept = _kept(previous, params, paths, root) if previous else []
+    if params.add:
+        paths, there = _not_there(paths, kept)
+        skipped += there
+    known = {Path(record.source).resolve(): record.name for record in previous.images} if previous else {}
+    taken = {record.name for record in kept}
+    known = {path: name for path, name in known.items() if name not in taken}
+    sources = find_sources(paths, root, labels_folder, masks_folder, taken, known)
     settings, exposed = _settings(params, previous, paths, sources, classes, report)
 
     report.stage("Reading photos")
     records, pictures = make_working_copies(sources, settings, report)
     # Video frames were chosen for sharpness, and a still camera on a tripod may well repeat itself there.
-    reject_duplicates(records, pictures, kept)
+    reject_duplicates(records, pictures, [record for record in kept if record.status != "rejected"])
     if not params.keep_blurry:
         reject_blurred(records, folder)
     fresh, records = records, kept + records if params.add else records + kept
@@ -221,13 +227,23 @@ def _previous_project(params: NewParams) -> Project | None:
     return project
 
 
-def _kept(previous: Project, params: NewParams, root: Path) -> list[ImageRecord]:
-    """Photos that stay as they are: all where others are added, else those that were added from other folders."""
+def _kept(previous: Project, params: NewParams, paths: list[Path], root: Path) -> list[ImageRecord]:
+    """Photos that stay as they are: where others are added all but those that were left out and are now read again, else those
+    that were added from other folders."""
     records = [record for record in previous.images if record.file]
     if params.add:
-        return records
+        again = {path.resolve() for path in paths}
+        return [r for r in records if r.status != "rejected" or Path(r.source).resolve() not in again]
     places = [Path(params.photos).resolve(), root.resolve()]
     return [r for r in records if not any(Path(r.source).resolve().is_relative_to(place) for place in places)]
+
+
+def _not_there(paths: list[Path], kept: list[ImageRecord]) -> tuple[list[Path], list[dict[str, str]]]:
+    """Files to add without those that the project has as they are, and these with the reason."""
+    known = {Path(record.source).resolve(): record.sha256 for record in kept if record.status != "rejected"}
+    there = [path for path in paths if known.get(path.resolve()) and known[path.resolve()] == file_hash(path)]
+    skipped = [{"file": path.name, "reason": "it is in the project already"} for path in there]
+    return [path for path in paths if path not in set(there)], skipped
 
 
 def _same_place(before: Any, now: Path) -> bool:

@@ -39,12 +39,12 @@ def extract_frames(video: Path, folder: Path, count: int, report: Reporter) -> l
     best: tuple[float, int, Image.Image] | None = None
     current = 0
     try:
-        with av.open(str(video)) as container:
+        with _opened(video) as container:
             if not container.streams.video:
                 raise InputError(f"{video} has no pictures, only sound.", "Choose another video.")
             stream = container.streams.video[0]
             stream.thread_type = "AUTO"
-            duration = _duration(container, stream)
+            duration = _duration(container, stream) or _length(video)
             aspect = float(stream.sample_aspect_ratio or 1)
             for number, seconds, frame in _frames(container, stream):
                 if number % 10 == 0:
@@ -71,6 +71,11 @@ def extract_frames(video: Path, folder: Path, count: int, report: Reporter) -> l
     return chosen
 
 
+def _opened(video: Path) -> Any:
+    """The container of a video. Its titles are not needed, and need not be UTF-8."""
+    return av.open(str(video), metadata_errors="replace")
+
+
 def _save(best: tuple[float, int, Image.Image], video: Path, folder: Path) -> Path:
     path = folder / f"{video.stem}_{best[1]:06d}.png"
     with atomic_path(path) as temporary:
@@ -85,7 +90,7 @@ def every_nth(video: Path, count: int) -> int | None:
         InputError: the file is no video.
     """
     try:
-        with av.open(str(video)) as container:
+        with _opened(video) as container:
             stream = container.streams.video[0]
             frames = stream.frames or sum(packet.pts is not None for packet in container.demux(stream))
     except (av.FFmpegError, IndexError) as error:
@@ -102,7 +107,7 @@ def save_every_nth(video: Path, n: int, folder: Path) -> list[Path]:
     """
     paths = []
     try:
-        with av.open(str(video)) as container:
+        with _opened(video) as container:
             for number, frame in enumerate(container.decode(container.streams.video[0])):
                 if number % n == 0:
                     paths.append(folder / f"{video.stem}_{number:06d}.png")
@@ -121,14 +126,26 @@ def _finished(folder: Path, key: list[Any]) -> list[Path]:
         return []
 
 
-def _duration(container: Any, stream: Any) -> float:
-    """Seconds of video, estimated from the number of frames where the container does not say."""
+def _duration(container: Any, stream: Any) -> float | None:
+    """Seconds of video as the container says, or by its number of frames; None where it does not say, as of recordings that
+    were written while they were made."""
     if stream.duration and stream.time_base:
         return max(float(stream.duration * stream.time_base), 1e-3)
     if container.duration:
         return max(container.duration / av.time_base, 1e-3)
-    rate = float(stream.average_rate or 30)
-    return max((stream.frames or 300) / rate, 1e-3)
+    return max(stream.frames / float(stream.average_rate or 30), 1e-3) if stream.frames else None
+
+
+def _length(video: Path) -> float:
+    """Seconds of video by the times of its packets, which are read but not decoded."""
+    with _opened(video) as container:
+        stream = container.streams.video[0]
+        times, count = [], 0
+        for packet in container.demux(stream):
+            count += packet.size > 0
+            if packet.pts is not None and stream.time_base:
+                times.append(float((packet.pts + (packet.duration or 0)) * stream.time_base))
+    return max(max(times) - min(times), 1e-3) if len(times) > 1 else max(count / float(stream.average_rate or 30), 1e-3)
 
 
 def _frames(container: Any, stream: Any) -> Iterator[tuple[int, float, Any]]:

@@ -63,9 +63,10 @@ def data_inputs(folder: Path, holdout: int, config: RunConfig) -> Fingerprint:
     labelled = config.loss.semantic_weight > 0
     labels = [(v.name, path) for v in views for path in (v.label, v.confidence)] if labelled else []
     depth = config.loss.depth_weight > 0
+    photos, gains = files_digest((view.name, view.image) for view in views), [view.gain for view in views]
     return {
         "training photos": digest(names),
-        "photos": files_digest((view.name, view.image) for view in views),
+        "photos": digest([photos, gains]) if any(gains) else photos,
         "labels": files_digest(labels),
         "masks": digest([project.mask_mode, files_digest((view.name, view.mask) for view in views)]),
         "depth maps": files_digest([(view.name, view.depth) for view in views] if depth else []),

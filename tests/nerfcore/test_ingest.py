@@ -362,3 +362,37 @@ def test_a_raw_file_beside_the_cameras_own_picture_is_left_out(tmp_path: Path) -
     photos, skipped, root = list_photos(tmp_path)
     assert sorted(p.relative_to(root).as_posix() for p in photos) == ["A/x.JPG", "B/x.dng", "y.heic", "z.arw", "z.png"]
     assert {s["file"]: s["reason"].split(", ")[1] for s in skipped} == {"x.CR2": "x.JPG", "y.NEF": "y.heic"}
+
+
+def test_photos_keep_their_names_when_others_of_the_same_come(tmp_path: Path) -> None:
+    """Marks, poses and runs know photos by name."""
+    photos, project = tmp_path / "photos", tmp_path / "p"
+    folder_of(photos / "cam1")
+    new(photos, project)
+    folder_of(photos / "cam0", 1)
+    picture(9).save(photos / "cam0" / "p0.jpg", quality=95)
+    picture(8).save(photos / "cam1" / "p1.png")
+    new(photos, project)
+    names = {Path(r.source).relative_to(photos).as_posix(): r.name for r in load_project(project).images}
+    assert names == {
+        "cam1/p0.jpg": "p0", "cam1/p1.jpg": "p1", "cam1/p2.jpg": "p2", "cam0/p0.jpg": "cam0_p0_jpg", "cam1/p1.png": "cam1_p1_png",
+    }  # fmt: skip
+    assert all((project / record.file).is_file() for record in load_project(project).images)
+
+
+def test_added_photos_that_were_left_out_can_be_added_again(tmp_path: Path) -> None:
+    project, more = tmp_path / "p", folder_of(tmp_path / "more", 12)
+    new(folder_of(tmp_path / "photos", 9), project)
+    for i in range(12):
+        picture(20 + i).save(more / f"p{i}.jpg", quality=95)
+    picture(23).filter(ImageFilter.GaussianBlur(6)).save(more / "p3.jpg", quality=95)
+    before = new(more, project, add=True)
+    assert [item["file"] for item in before["rejected"]] == ["p3.jpg"]
+    images, files = before["images"], sorted(p.name for p in (project / "images").iterdir())
+    again = new(more, project, add=True, keep_blurry=True)
+    assert again["images"] == images + 1
+    assert {item["reason"] for item in again["rejected"]} == {"it is in the project already"}
+    records = load_project(project).images
+    assert [r.status for r in records] == ["ok"] * 21
+    assert len({r.name for r in records}) == 21
+    assert sorted(p.name for p in (project / "images").iterdir()) == files

@@ -154,3 +154,33 @@ def test_photos_in_a_folder_called_frames_are_no_video(tmp_path: Path) -> None:
         new(NewParams(project=project, photos=photos, frames=4), Reporter())
         job = pose_job(project, load_project(project), PosesParams(project=project), Reporter())
         assert job["video"] is is_video
+
+
+def test_frames_of_a_video_of_unknown_length_are_from_all_of_it(tmp_path: Path) -> None:
+    """As recorders write it that do not come back to say how long it became."""
+    path = tmp_path / "a.webm"
+    with av.open(str(path), "w", options={"live": "1"}) as container:
+        stream = container.add_stream("libvpx-vp9", rate=1)
+        stream.width, stream.height, stream.pix_fmt = 320, 192, "yuv420p"
+        for i in range(COUNT):
+            container.mux(stream.encode(av.VideoFrame.from_image(frame_picture(i))))
+        container.mux(stream.encode())
+    with av.open(str(path)) as container:
+        assert not container.duration
+        assert not container.streams.video[0].frames
+    found = numbers(extract_frames(path, tmp_path / "frames", 8, Reporter()))
+    assert found == [2 + 6 * i for i in range(8)]
+
+
+def test_titles_of_a_video_need_not_be_utf_8(tmp_path: Path) -> None:
+    path = tmp_path / "a.avi"
+    with av.open(str(path), "w") as container:
+        container.metadata["title"] = "Cafe Mueller"
+        stream = container.add_stream("mpeg4", rate=24)
+        stream.width, stream.height, stream.pix_fmt = 320, 192, "yuv420p"
+        for i in range(COUNT):
+            container.mux(stream.encode(av.VideoFrame.from_image(frame_picture(i))))
+        container.mux(stream.encode())
+    path.write_bytes(path.read_bytes().replace(b"Cafe Mueller", b"Caf\xe9 M\xfcller "))
+    assert b"Caf\xe9" in path.read_bytes()
+    assert len(extract_frames(path, tmp_path / "frames", 8, Reporter())) == 8

@@ -270,6 +270,27 @@ def test_a_resumed_run_says_that_it_keeps_its_settings(project: Path) -> None:
     assert step.settings["preset"] == "draft"
 
 
+def test_a_resumed_run_takes_only_the_rendering_that_is_named(project: Path) -> None:
+    before = load_info(project, "main").config.render
+    other = {"render.samples": str(before.samples + 8)}
+    report = Reporter()
+    train(params(project, steps=14, resume=True, preset="standard", set=other), report)
+    assert load_info(project, "main").config.render == before.model_copy(update={"samples": before.samples + 8})
+    assert not any("goes on with the settings" in warning for warning in report.warnings)
+    train(params(project, steps=16, resume=True, preset="high", holdout=5), report)
+    assert any(warning.endswith("now: preset, holdout.") for warning in report.warnings)
+
+
+def test_photos_of_another_exposure_are_other_inputs(project: Path) -> None:
+    file = project / "poses" / "poses.json"
+    poses = json.loads(file.read_text(encoding="utf-8"))
+    for image in poses["images"]:
+        image["gain"] = [1.3, 1.1, 0.8]
+    file.write_text(json.dumps(poses), encoding="utf-8")
+    with pytest.raises(ProjectError, match=r"cannot go on: .*changed: photos\."):
+        train(params(project, steps=20, resume=True), Reporter())
+
+
 def test_a_run_whose_events_were_cut_off_is_finished(project: Path) -> None:
     events = run_folder(project, "main") / runs.EVENTS
     whole = events.read_bytes()

@@ -185,7 +185,9 @@ def _command(name: str) -> click.Command:
         click.Option(["--json", "as_json"], is_flag=True, help="print one JSON object on stdout and nothing else"),
         click.Option(["--quiet"], is_flag=True, help="no progress"),
         click.Option(
-            ["--strict"], is_flag=True, help="exit with 3 when there were warnings or problems, or the result is not judged good"
+            ["--strict"],
+            is_flag=True,
+            help="exit with 3 when there were warnings or problems, or the result is not judged good",
         ),
     ]
 

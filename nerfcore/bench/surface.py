@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from ..data.load import load_scene
 from ..errors import InputError
 from ..geometry.similarity import transform_points
 from ..mesh.build import build
@@ -25,7 +24,7 @@ from ..mesh.verb import paint
 from ..params import MeshParams
 from ..progress import Reporter
 from ..project.store import load_project
-from ..render.run import load_trained, refined_poses
+from ..render.run import load_trained, scene_as_trained
 from .jobs import Job
 from .machine import peak_memory
 from .surface_exposure import exposure_cost
@@ -101,10 +100,10 @@ def measure(job: Job, project: Path, report: Reporter, root: Path) -> dict[str, 
     truth = read_truth(root, job.scene)
     clock, begin = StageClock(report), time.monotonic()
     known, trained = load_project(project), load_trained(project, job.name)
-    scene, box = load_scene(project, trained.info.holdout), trained.info.box(known)
+    scene, box = scene_as_trained(project, job.name, trained.info), trained.info.box(known)
     params = MeshParams(project=project, run=job.name, faces=FACES, texture="auto")
     built = build(trained, known, scene, params, clock)
-    photos = training_photos(scene, box.box_from_world, refined_poses(project, job.name, trained.info))
+    photos = training_photos(scene, box.box_from_world)
     painted = paint(trained, built, photos, params, scene.ignore_id, clock)
     clock.stop()
     duration = time.monotonic() - begin

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..data.load import load_scene
 from ..data.pixels import PixelStore
 from ..data.scene import Scene, View
 from ..errors import ProjectError, TrainingError
@@ -41,7 +40,7 @@ from ..params import MeshParams
 from ..progress import Reporter
 from ..project.runs import run_folder
 from ..project.store import load_project
-from ..render.run import Trained, load_trained, refined_poses
+from ..render.run import Trained, load_trained, scene_as_trained
 from .maps import cut_maps, joined_maps, load_maps, moved, save_maps
 from .plan import MAPS, PART, RUN, SIGHTS, BlockPlan, Plan, block_folder
 from .sights import Sights, chosen, load_sights, save_sights, sights_of
@@ -69,7 +68,7 @@ def make_maps(folder: Path, plan: Plan, block: BlockPlan, report: Reporter) -> i
     own = block_folder(folder, block)
     trained, project = load_trained(own, RUN), load_project(own)
     box = trained.info.box(project)
-    _, _, maps = agreed_maps(trained, load_scene(own, trained.info.holdout), box, report)
+    _, _, maps = agreed_maps(trained, scene_as_trained(own, RUN, trained.info), box, report)
     common_from_world = np.linalg.inv(plan.world_from_common)
     maps = moved(maps, common_from_world @ box.world_from_box)
     reach = _corners(common_from_world, plan.reach(block))
@@ -94,7 +93,7 @@ def make_part(
     """
     own = block_folder(folder, block)
     trained, project = load_trained(own, RUN), load_project(own)
-    scene = load_scene(own, trained.info.holdout)
+    scene = scene_as_trained(own, RUN, trained.info)
     report.stage("Fusing")
     device = use_device()
     sights = [load_sights(run_folder(block_folder(folder, b), RUN) / SIGHTS) for b in plan.blocks]
@@ -267,7 +266,7 @@ def _painted(
     photos = Photos(store, pictures.maps, np.array([flat.photo for flat in pictures.views]), TRUNCATION * own.voxel)
     colors = vertex_colors(trained.model, own, photos, points, normals, report)
     built = Built(points, faces, normals, colors, own, (points[:0], faces[:0]))
-    posed = training_photos(scene, box.box_from_world, refined_poses(folder, RUN, trained.info))
+    posed = training_photos(scene, box.box_from_world)
     params = MeshParams(project=folder, run=RUN)
     classes = paint(trained, built, posed, params, scene.ignore_id, report).classes
     return Surface(points, faces, normals, colors, classes.class_id, classes.face_class)

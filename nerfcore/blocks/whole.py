@@ -137,7 +137,7 @@ def paint(surface: Surface, plan: Plan, scene: Scene, size: int | Literal["auto"
     Raises:
         SettingError: no memory for the texture. TrainingError: the mesh cannot be unwrapped.
     """
-    photos = training_photos(scene, np.linalg.inv(plan.world_from_common), {})
+    photos = training_photos(scene, np.linalg.inv(plan.world_from_common))
     uv = unwrapped(surface.vertices, surface.faces, photos, size, report)
     prepared = prepare(surface.vertices, surface.faces, uv.corners, photos, uv.size, report)
     closest = ClosestPoints(surface.vertices, surface.faces)

@@ -9,6 +9,7 @@ Conventions, used everywhere in `nerfcore`:
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
@@ -174,8 +175,26 @@ def rays(camera: Camera, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return direction / np.linalg.norm(direction, axis=-1, keepdims=True), valid
 
 
+@lru_cache(maxsize=256)
+def widest_angle(camera: Camera) -> float:
+    """Angle to the optical axis, in radians, at which the lens polynomial turns back; infinite where it does not. What lies
+    farther out seems to be inside of the picture, and is not: the polynomial was fitted to what the lens shows."""
+    if camera.model == "OPENCV_FISHEYE":
+        angle = np.linspace(0, np.pi, 1000)
+        radius = angle * (1 + sum(c * angle ** (2 * n) for n, c in enumerate(camera.distortion, 1)))
+    elif camera.model == "OPENCV" and any(camera.distortion):
+        far = np.linspace(0, 4 * max(camera.width / camera.fx, camera.height / camera.fy), 1000)
+        angle = np.arctan(far)
+        radius = _opencv_distort(np.stack([far, np.zeros_like(far)], 1), camera.distortion)[0][:, 0]
+    else:
+        return np.inf
+    back = np.flatnonzero(np.diff(radius) <= 0)
+    return float(angle[back[0]]) if len(back) else np.inf
+
+
 def project(camera: Camera, points: np.ndarray) -> np.ndarray:
-    """Pixel coordinates (N, 2) of points (N, 3) in camera axes; NaN behind a perspective camera."""
+    """Pixel coordinates (N, 2) of points (N, 3) in camera axes; NaN behind a perspective camera, and beyond the angle where the
+    lens polynomial turns back."""
     points = np.asarray(points, np.float64)
     x, y, z = points.T
     if camera.model == "EQUIRECTANGULAR":
@@ -185,11 +204,15 @@ def project(camera: Camera, points: np.ndarray) -> np.ndarray:
     if camera.model == "OPENCV_FISHEYE":
         radius = np.hypot(x, y)
         theta = np.arctan2(radius, z)
+        theta = np.where(theta < widest_angle(camera), theta, np.nan)
         distorted = theta * (1 + sum(c * theta ** (2 * n) for n, c in enumerate(camera.distortion, 1)))
         uv = np.stack([x, y], -1) * np.where(radius > 1e-12, distorted / np.maximum(radius, 1e-12), 1.0)[:, None]
     else:
         uv = np.stack([x, y], -1) / np.where(z > 0, z, np.nan)[:, None]
         if camera.model == "OPENCV" and any(camera.distortion):
+            widest = widest_angle(camera)
+            if widest < np.inf:
+                uv = np.where((np.hypot(*uv.T) < np.tan(widest))[:, None], uv, np.nan)
             uv = _opencv_distort(uv, camera.distortion)[0]
     return uv * [camera.fx, camera.fy] + [camera.cx, camera.cy]
 

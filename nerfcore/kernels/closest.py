@@ -42,6 +42,8 @@ class ClosestPoints:
     def find(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """For points (N, 3): the triangle (N,) that is closest, the weights (N, 3) of its corners at the closest point, and
         the distance (N,) to that."""
+        if not len(points):  # Warp takes no empty arrays
+            return np.zeros(0, np.int32), np.zeros((0, 3), np.float32), np.zeros(0, np.float32)
         asked = torch.from_numpy(np.ascontiguousarray(points, np.float32))
         face, corner = torch.zeros(len(asked), dtype=torch.int32), torch.zeros(len(asked), 2)
         distance = torch.full((len(asked),), torch.inf)

@@ -51,6 +51,8 @@ class FrontFaces:
     def cast(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The triangle (N,) int that each ray (N, 3) meets first from its front, −1 where there is none, and where in it
         (N, 2): weights of its first and second corner."""
+        if not len(origins):  # Warp takes no empty arrays
+            return np.zeros(0, np.int32), np.zeros((0, 2), np.float32)
         o, d = (torch.from_numpy(np.ascontiguousarray(a, np.float32)) for a in (origins, directions))
         face, corner = torch.empty(len(o), dtype=torch.int32), torch.zeros(len(o), 2)
         inputs = [self._mesh.id, array(o, wp.vec3), array(d, wp.vec3), array(face), array(corner, wp.vec2)]

@@ -212,10 +212,10 @@ def gathered_votes(photos: list[Photo], pieces: Facelets, class_ids: list[int], 
         return Votes(0, np.zeros(0, int), np.zeros(0, int), np.zeros((0, classes)))
     seen = observe(DepthBuffers([photo.view for photo in labelled], pieces), report)
 
-    def read(number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def read(number: int) -> tuple[np.ndarray, ...]:
         return view_votes(labelled[number], number, pieces, seen, index, classes)
 
-    found = [(n, face, vote) for n, (face, vote, _) in in_parallel(read, range(len(labelled)), report, "label maps")]
+    found = [(n, face, vote) for n, (face, vote, *_) in in_parallel(read, range(len(labelled)), report, "label maps")]
     photo = np.repeat([n for n, *_ in found], [len(face) for _, face, _ in found])
     return Votes(len(labelled), photo, np.concatenate([f for _, f, _ in found]), np.concatenate([v for *_, v in found]))
 

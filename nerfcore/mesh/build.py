@@ -106,7 +106,7 @@ def not_refuted(vertices: np.ndarray, faces: np.ndarray, scene: Scene, report: R
     """Which triangles (F,) bool stay, of a surface with vertices (V, 3) in the world: not parts on which photos disagree, nor
     what masks leave out; and what share of the area photos disagree on. Raises InputError: a photo or a mask cannot be read."""
     photos = [scene.views[i] for i in scene.train]
-    kept = ~denied(vertices, faces, photos, report)
+    kept = ~denied(vertices, faces, photos, report, scene.mask_mode)
     share = area_share(vertices, faces, ~kept)
     if share > MUCH_DENIED:
         report.warn(

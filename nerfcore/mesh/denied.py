@@ -10,6 +10,7 @@ Measured: docs/experiments.md, “Scraps that photos deny”, “Plain scraps”
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 import scipy
@@ -19,6 +20,7 @@ from ..data.pixels import training_size
 from ..data.scene import View
 from ..geometry.cameras import project
 from ..images.picture import resized
+from ..images.working import nearest, read_image
 from ..kernels.raycast import FrontFaces
 from ..progress import Reporter
 from .triangles import areas, components, cross, unit
@@ -39,18 +41,24 @@ COMMON = 0.2  # share of the places that two photos must both see
 PAIRS = 3  # of photos that must
 FACING = 0.1  # cosine of the angle at which a photo must see a place, at least
 SIDE = 1024  # longest side of the photos, in pixels
+BESIDE = 3  # pixels around what a mask takes away that are not compared
 NEAR = 0.02  # of the distance: what a ray meets so close to a place is the place
 
 
-def denied(vertices: np.ndarray, faces: np.ndarray, views: Sequence[View], report: Reporter) -> np.ndarray:
+def denied(
+    vertices: np.ndarray, faces: np.ndarray, views: Sequence[View], report: Reporter, mask_mode: str = "empty"
+) -> np.ndarray:
     """Triangles (F,) bool on which photos differ more than they agree: connected parts, but the largest, and pieces of the
     rest whose surroundings are hardly better.
 
     Args:
-        vertices: (V, 3) in the world frame, faces (F, 3). views: photos the surface comes from.
+        vertices: (V, 3) in the world frame, faces (F, 3). views: photos the surface comes from. mask_mode: what black in their
+            masks means; what is to be ignored is not compared.
     Raises:
-        InputError: a photo cannot be read. What `report` raises to stop.
+        InputError: a photo or a mask cannot be read. What `report` raises to stop.
     """
+    if mask_mode != "ignore":
+        views = [replace(view, mask=None) for view in views]
     bad = np.zeros(len(faces), bool)
     for judge in (_denied_parts, _denied_pieces):
         kept = np.flatnonzero(~bad)
@@ -211,6 +219,8 @@ def _grey_values(
         if view.camera.model != "EQUIRECTANGULAR":
             inside &= toward @ pose[:3, 2] > 0
         rows = np.flatnonzero(inside)
+        if view.mask is not None and len(rows):
+            rows = rows[_left(view)[tuple(place[rows, ::-1].astype(int).T)]]
         if len(rows):
             origins = np.broadcast_to(pose[:3, 3], (len(rows), 3))
             met, share = front.cast(origins, toward[rows] / away[rows, None])
@@ -237,3 +247,10 @@ def _grey_values(
         smooth = scipy.ndimage.gaussian_filter(picture, 1.0)
         grey[number, rows] = scipy.ndimage.map_coordinates(smooth, place[:, ::-1].T, order=1, mode="nearest")
     return grey
+
+
+def _left(view: View) -> np.ndarray:
+    """Which pixels (H, W) bool of a photo its mask leaves, but for those beside what it takes away."""
+    assert view.mask is not None
+    mask = nearest(read_image(view.mask)[..., 0], view.camera.width, view.camera.height) > 127
+    return scipy.ndimage.binary_erosion(mask, iterations=BESIDE, border_value=1)

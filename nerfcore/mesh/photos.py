@@ -65,7 +65,8 @@ def posed_photo(view: View, pose: np.ndarray) -> Photo:
             sure[~inside] = 0
         return ids, sure
 
-    return Photo(PosedCamera(view.camera, np.asarray(pose, np.float64)), read, labels if view.label else None)
+    posed = PosedCamera(view.camera, np.asarray(pose, np.float64), mask if view.mask is not None else None)
+    return Photo(posed, read, labels if view.label else None)
 
 
 def halvings(picture: torch.Tensor, levels: int) -> list[torch.Tensor]:

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from ..data.load import load_scene
 from ..errors import SettingError
 from ..files import atomic_path
 from ..geometry.similarity import similarity_scale
@@ -15,7 +14,7 @@ from ..images.picture import to_bytes
 from ..params import MeshParams
 from ..progress import Reporter
 from ..project.store import load_project
-from ..render.run import Trained, load_trained
+from ..render.run import Trained, load_trained, scene_as_trained
 from . import depth_maps as dm
 from .build import no_surface, wanted_bounds, wanted_sides
 from .clean import drop_scraps
@@ -47,7 +46,7 @@ def preview(params: MeshParams, report: Reporter) -> dict[str, Any]:
                 f"Leave `--{option}` or `--preview` away.",
             )
     project, trained = load_project(params.project), load_trained(params.project, params.run)
-    scene = load_scene(params.project, trained.info.holdout)
+    scene = scene_as_trained(params.project, params.run, trained.info)
     box = trained.info.box(project)
     bounds = wanted_bounds(params, scene, box)
     report.stage("A first look: depth maps")

@@ -54,7 +54,7 @@ def grey_pictures(views: list[FlatView], store: PixelStore, report: Reporter) ->
         photo, flat = store.cameras[view.photo], view.camera
         pixels = rgba[first[view.photo] : first[view.photo + 1], :3].reshape(photo.height, photo.width, 3)
         grey = pixels @ (LUMA / 255)
-        shrunk = flat.fx / photo.fx  # what is made smaller is smoothed before
+        shrunk = flat.fx / photo.pixels_per_radian  # what is made smaller is smoothed before
         if shrunk < 0.7:
             grey = scipy.ndimage.gaussian_filter(grey, 0.5 / shrunk)
         place = np.nan_to_num(photo_pixels(view, store), nan=-1.0) - 0.5

@@ -90,13 +90,13 @@ def class_evidence(
     total, looked = np.zeros(len(pieces), np.float32), np.zeros(len(pieces), np.float32)
     index = index_of(class_ids)
 
-    def read(number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def read(number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         return view_votes(photos[number], number, pieces, seen, index, len(class_ids))
 
-    for _, (face, vote, amount) in in_parallel(read, range(len(photos)), report, "label maps"):
+    for _, (face, vote, amount, told) in in_parallel(read, range(len(photos)), report, "label maps"):
         votes[face] += vote
         total[face] += amount
-        looked[face] += 1
+        looked[face] += told
     own = votes / np.maximum(total, 1e-30)[:, None]
     shown = looked > 0
     sparse = np.count_nonzero(total > 0) < SPARSE * np.count_nonzero(shown)
@@ -115,16 +115,18 @@ def class_evidence(
 
 def view_votes(
     photo: Photo, number: int, pieces: Facelets, seen: Observations, index: np.ndarray, classes: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """What the label map of photo `number` says: facelets (N,) it is among the best for, their votes (N, C), and how much
-    of them is labelled at all (N,), both weighted by how well it sees them.
+    of them is labelled (N,), and how much it says anything of, be it that there is no label (N,), all weighted by how well it
+    sees them.
 
     Args:
         index: index of each class id, see `index_of`; classes: how many.
     """
     face, column = seen.of(number)
     if photo.labels is None or not len(face):
-        return face[:0], np.zeros((0, classes), np.float32), np.zeros(0, np.float32)
+        nothing = np.zeros(0, np.float32)
+        return face[:0], np.zeros((0, classes), np.float32), nothing, nothing
     weight = seen.weight[face, column]
     labels, sure = photo.labels()
     label = index[np.minimum(labels, len(index) - 1)]
@@ -132,7 +134,8 @@ def view_votes(
     # The middle, and half way to each corner.
     places = [center, *((corners[:, k] + center) / 2 for k in range(3))]
     found = [read_votes(photo.view, photo.view.local(place), label, sure, classes) for place in places]
-    return face, sum(f[0] for f in found) * weight[:, None], sum(f[1] for f in found) * weight
+    votes, labelled, told = (sum(parts) for parts in zip(*found))
+    return face, votes * weight[:, None], labelled * weight, told * weight
 
 
 def index_of(class_ids: Sequence[int]) -> np.ndarray:
@@ -144,9 +147,9 @@ def index_of(class_ids: Sequence[int]) -> np.ndarray:
 
 def read_votes(
     view: PosedCamera, local: np.ndarray, label: np.ndarray, sure: np.ndarray, classes: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """What a label map says of points (N, 3) in camera axes: votes (N, C) between the four pixels around each, and how
-    much of these is labelled at all (N,).
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What a label map says of points (N, 3) in camera axes: votes (N, C) between the four pixels around each, how much of these
+    is labelled (N,), and of how much it says anything (N,): nothing where it is masked or not sure at all.
 
     Args:
         label: (H, W) class index, −1 for none; sure: (H, W) uint8.
@@ -156,7 +159,7 @@ def read_votes(
     good = np.flatnonzero(within(pixel, width, height))
     base = np.floor(pixel[good] - 0.5)
     ahead = pixel[good] - 0.5 - base
-    votes, known = np.zeros(len(local) * classes), np.zeros(len(local))
+    votes, known, told = np.zeros(len(local) * classes), np.zeros(len(local)), np.zeros(len(local))
     for dy in (0, 1):
         for dx in (0, 1):
             x = np.clip(base[:, 0] + dx, 0, width - 1).astype(int)
@@ -167,7 +170,9 @@ def read_votes(
             where, amount = good[labelled], part[labelled]
             votes += np.bincount(where * classes + found[labelled], amount * certain[labelled], len(votes))
             known += np.bincount(where, amount, len(known))
-    return votes.reshape(len(local), classes).astype(np.float32), known.astype(np.float32)
+            told += np.bincount(good[certain > 0], part[certain > 0], len(told))
+    votes = votes.reshape(len(local), classes)
+    return votes.astype(np.float32), known.astype(np.float32), told.astype(np.float32)
 
 
 def _shared(pieces: Facelets, own: np.ndarray, colors: np.ndarray | None, blank: np.ndarray) -> np.ndarray:
@@ -325,10 +330,10 @@ def _ask(
         rows, local = rows[clear], local[clear]
         ids, sure = labels()
         label = index[np.minimum(ids, len(index) - 1)]
-        vote, known = read_votes(view, local, label, sure, classes)
+        vote, known, told = read_votes(view, local, label, sure, classes)
         votes[rows] += vote * weight[row[rows], None]
         total[rows] += known * weight[row[rows]]
-        shown[rows] = True
+        shown[rows] |= told > 0
     if not evidence.sparse:
         votes[shown & (total <= PRIOR * 1.5)] = 0
     return texel, votes / total[:, None]

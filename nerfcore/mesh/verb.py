@@ -21,7 +21,7 @@ from ..project.fingerprints import Earlier, Fingerprint, alignment, compare, dig
 from ..project.runs import MESH_RECORD, checkpoint_id, state_id
 from ..project.schema import step
 from ..project.store import load_project, record_step
-from ..render.run import Trained, load_info, load_trained, refined_poses
+from ..render.run import Trained, load_info, load_trained, scene_as_trained
 from ..verdict import mesh_verdict
 from .build import Built, build, largest_share, wanted_bounds, wanted_sides
 from .coverage import coverage
@@ -70,12 +70,12 @@ def mesh(params: MeshParams, report: Reporter) -> dict[str, Any]:
     if isinstance(params.texture, int):
         check_memory(params.texture)
     project, trained = load_project(folder), load_trained(folder, params.run)
-    scene = load_scene(folder, trained.info.holdout)
+    scene = scene_as_trained(folder, params.run, trained.info)
     inputs = mesh_inputs(params)
     built = build(trained, project, scene, params, report)
     target = folder / "exports" / params.run
     box = trained.info.box(project)
-    photos = training_photos(scene, box.box_from_world, refined_poses(folder, params.run, trained.info))
+    photos = training_photos(scene, box.box_from_world)
     painted = paint(trained, built, photos, params, scene.ignore_id, report)
     texture = None
     if painted.uv is not None and painted.image is not None:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import scipy
@@ -36,10 +35,12 @@ def within(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class PosedCamera:
-    """A camera and where it stands: camera-to-mesh (4, 4), OpenCV axes."""
+    """A camera and where it stands: camera-to-mesh (4, 4), OpenCV axes. shows: → which pixels (H, W) bool a mask leaves to be
+    taken from, None for all."""
 
     camera: Camera
     pose: np.ndarray
+    shows: Callable[[], np.ndarray | None] | None = None
 
     @property
     def center(self) -> np.ndarray:
@@ -61,25 +62,7 @@ class PosedCamera:
 
     def pixels(self, local: np.ndarray) -> np.ndarray:
         """Pixel coordinates (N, 2) of points (N, 3) in camera axes; NaN where the lens does not see."""
-        pixel = project(self.camera, local)
-        if self.widest > -1:
-            # Beyond the angle where the lens polynomial turns back, a projection is a mirage.
-            pixel[local[:, 2] < self.widest * _length(local)] = np.nan
-        return pixel
-
-    @cached_property
-    def widest(self) -> float:
-        """Cosine of the angle to the optical axis at which the lens polynomial turns back; −1 where it does not."""
-        camera = self.camera
-        if camera.model == "OPENCV_FISHEYE":
-            angle = np.linspace(0, np.pi, 1000)
-        elif camera.model == "OPENCV":
-            angle = np.arctan(np.linspace(0, 4 * max(camera.width / camera.fx, camera.height / camera.fy), 1000))
-        else:
-            return -1.0
-        along = np.stack([np.sin(angle), np.zeros_like(angle), np.cos(angle)], 1)
-        back = np.flatnonzero(np.diff(project(camera, along)[:, 0]) <= 0)
-        return float(np.cos(angle[back[0]])) if len(back) else -1.0
+        return project(self.camera, local)
 
 
 @dataclass(frozen=True)
@@ -111,13 +94,41 @@ def depth_buffer(view: PosedCamera, vertices: np.ndarray, faces: np.ndarray, dev
     """The mesh (V, 3), (F, 3) as a camera sees it, at one depth a pixel, drawn on `device`.
 
     Triangles are drawn with straight edges between their projected corners, so with a distorting lens they should be
-    small. Those that reach behind the camera, or around a panorama's edge, are left out.
+    small. Those that reach behind the camera, or around a panorama's pole, are left out.
     """
     local = view.local(vertices)
-    size = view.camera.width, view.camera.height
-    widest = size[0] / 2 if view.camera.model == "EQUIRECTANGULAR" else 1e9
-    face, nearest = nearest_triangle(view.pixels(local), view.depth(local), faces, *size, device, widest)
+    pixel, depth, size = view.pixels(local), view.depth(local), (view.camera.width, view.camera.height)
+    widest, drawn, across = 1e9, faces, np.zeros(0, int)
+    if view.camera.model == "EQUIRECTANGULAR":
+        widest = size[0] / 2
+        pixel, depth, drawn, across = _at_both_edges(pixel, depth, faces, size[0])
+    face, nearest = nearest_triangle(pixel, depth, drawn, *size, device, widest)
+    copies = face >= len(faces)
+    if copies.any():
+        face[copies] = across[(face[copies] - len(faces)) % len(across)]
     return DepthBuffer(view, face, nearest, scipy.ndimage.minimum_filter(nearest, 3, mode="nearest"))
+
+
+def _at_both_edges(
+    pixel: np.ndarray, depth: np.ndarray, faces: np.ndarray, width: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices (V, 2), (V,) of a panorama `width` wide and triangles (F, 3), with those across its edge once more beside the left
+    and beside the right one; and the numbers of these triangles, in the order of either copy."""
+    x = pixel[:, 0]
+    across = np.flatnonzero(np.ptp(x[faces], axis=1) >= width / 2)
+    if not len(across):
+        return pixel, depth, faces, across
+    corner, new = np.unique(faces[across], return_inverse=True)
+    left = x[corner] < width / 2
+    beyond = [pixel[corner] + np.stack([np.where(side, shift, 0), np.zeros(len(corner))], 1)
+              for side, shift in ((left, width), (~left, -width))]  # fmt: skip
+    copies = [len(pixel) + number * len(corner) + new.reshape(-1, 3) for number in (0, 1)]
+    return (
+        np.concatenate([pixel, *beyond]),
+        np.concatenate([depth, depth[corner], depth[corner]]),
+        np.concatenate([faces, *copies]).astype(faces.dtype),
+        across,
+    )
 
 
 class DepthBuffers:
@@ -161,8 +172,8 @@ def observe(
     steepest: float = STEEPEST,
     asked: np.ndarray | None = None,
 ) -> Observations:
-    """Find the `most` best views of each facelet among all that see its middle, at a cosine above `steepest`; `asked` (F,)
-    bool: only of these."""
+    """Find the `most` best views of each facelet among all that see its middle, and whose masks leave it, at a cosine above
+    `steepest`; `asked` (F,) bool: only of these."""
     count = len(buffers.pieces)
     best = np.full((count, most), -1, np.int16), np.zeros((count, most), np.float32), np.zeros((count, most), bool)
     for number, (face, weight, whole) in in_parallel(
@@ -208,6 +219,10 @@ def _seen_by(
     pixel, depth = view.pixels(local), view.depth(local)
     shown = within(pixel, view.camera.width, view.camera.height)
     face, pixel, depth = face[shown], pixel[shown], depth[shown]
+    mask = view.shows() if view.shows is not None and len(face) else None
+    if mask is not None:
+        x, y = pixel.astype(int).T
+        face, pixel, depth = face[mask[y, x]], pixel[mask[y, x]], depth[mask[y, x]]
     if not len(face):
         return face, np.zeros(0, np.float32), np.zeros(0, bool)
     buffer = buffers[number]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,6 +15,7 @@ from safetensors import SafetensorError, safe_open
 
 from ..config import RunConfig
 from ..data.box import Box
+from ..data.load import load_scene
 from ..data.scene import Scene
 from ..errors import InputError, ProjectError
 from ..files import write_json
@@ -23,7 +24,7 @@ from ..kernels.device import use_device
 from ..progress import Reporter, shortened
 from ..project.runs import CHECKPOINT, HOLDOUT, INFO, run_folder, settle, state_id
 from ..project.schema import Poses, Project
-from ..project.store import world_from_sfm
+from ..project.store import load_project, world_from_sfm
 from .kept_grid import KeptGrid
 from .migration import migrate_info, migrate_tensors
 from .model import Model
@@ -191,6 +192,17 @@ def refined_poses(project: Path, run: str, info: RunInfo) -> dict[str, np.ndarra
         raise ProjectError(f"{path} is damaged: {error}.", "Train the run again.") from error
     box_from_sfm = np.linalg.inv(np.array(info.sfm_from_box))
     return {image.name: transform_pose(box_from_sfm, np.array(image.camera_to_world)) for image in poses.images}
+
+
+def scene_as_trained(project: Path, run: str, info: RunInfo) -> Scene:
+    """The scene of a run, its cameras where the run found them to be if it refined their poses.
+
+    Raises:
+        as `load_scene` and `refined_poses`.
+    """
+    scene, world_from_box = load_scene(project, info.holdout), info.box(load_project(project)).world_from_box
+    poses = {name: transform_pose(world_from_box, pose) for name, pose in refined_poses(project, run, info).items()}
+    return replace(scene, views=[replace(v, camera_to_world=poses.get(v.name, v.camera_to_world)) for v in scene.views])
 
 
 def new_model(

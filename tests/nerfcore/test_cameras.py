@@ -97,6 +97,32 @@ def test_folded_lens_is_marked_invalid() -> None:
     assert valid[np.abs(pixels - [160, 100]).sum(1).argmin()]
 
 
+def seen_again(camera: Camera) -> float:
+    """Of directions all around that lie in the picture, how far the rays of their pixels are from them at most."""
+    directions = np.random.default_rng(0).normal(size=(20_000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    with np.errstate(invalid="ignore"):
+        pixel = project(camera, directions)
+        inside = ((pixel >= 0) & (pixel <= [camera.width, camera.height])).all(1)
+    back, valid = rays(camera, pixel[inside])
+    assert inside.sum() > 100
+    return float(np.abs(back - directions[inside])[valid].max())
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.floats(150, 400), st.floats(-0.15, 0.15), st.floats(-0.2, 0.05))
+def test_what_lies_beyond_the_fold_of_a_lens_is_not_in_the_picture(f: float, k1: float, k2: float) -> None:
+    lens = {"fx": f, "fy": f, "cx": 160, "cy": 100, **sizes}
+    assert seen_again(Camera(model="OPENCV", distortion=(k1, k2, 0.0, 0.0), **lens)) < 1e-4
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.floats(60, 200), st.floats(-0.05, 0.05), st.floats(-0.02, 0.01), st.floats(-0.001, 0.004))
+def test_what_a_fisheye_does_not_see_is_not_in_the_picture(f: float, k1: float, k2: float, k3: float) -> None:
+    lens = {"fx": f, "fy": f, "cx": 160, "cy": 100, **sizes}
+    assert seen_again(Camera(model="OPENCV_FISHEYE", distortion=(k1, k2, k3, -0.0008), **lens)) < 1e-4
+
+
 @pytest.mark.parametrize(
     ("model", "params"),
     [

@@ -177,7 +177,9 @@ def test_masks_drawn_in_black_and_white_or_by_alpha(tmp_path: Path, mode: str) -
     assert np.array_equal(read_mask(tmp_path / "m.png"), inside > 0)
 
 
-@pytest.mark.parametrize(("kind", "white"), [("uint8", 1), ("uint16", 1), ("uint16", 255), ("uint16", 65535), ("float32", 1)])
+@pytest.mark.parametrize(
+    ("kind", "white"), [("uint8", 1), ("uint16", 1), ("uint16", 255), ("uint16", 65535), ("float32", 1)]
+)
 def test_masks_are_white_from_half_of_their_range(tmp_path: Path, kind: str, white: int) -> None:
     values = np.zeros((20, 30), kind)
     values[5:15], values[15:] = white, white * 0.4

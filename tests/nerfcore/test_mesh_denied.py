@@ -92,6 +92,26 @@ def test_a_surface_of_more_parts_than_pieces_is_judged_too(
     assert np.array_equal(denied(vertices, faces, photos(tmp_path, plain=False), Reporter()), part == 2)
 
 
+def test_what_a_mask_says_to_ignore_is_not_compared(
+    tmp_path: Path, surface: tuple[np.ndarray, np.ndarray, np.ndarray]
+) -> None:
+    """As the photographer, or the car that the cameras are on."""
+    vertices, faces, part = surface
+    views, mask = photos(tmp_path, plain=False), np.full((CAMERA.height, CAMERA.width), 255, np.uint8)
+    mask[CAMERA.height // 2 :] = 0
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    other = texture(5, 3.0)
+    for number, view in enumerate(views):
+        with Image.open(view.image) as image:
+            pixels = np.array(image)
+        shown = np.roll(other, 40 * number, 1)[: CAMERA.height, : CAMERA.width, None]
+        pixels = np.where(mask[..., None] > 0, pixels, np.clip(shown, 0, 255)).astype(np.uint8)
+        Image.fromarray(pixels).save(view.image)
+    masked = [replace(view, mask=tmp_path / "mask.png") for view in views]
+    assert np.array_equal(denied(vertices, faces, masked, Reporter(), "ignore"), part == 2)
+    assert denied(vertices, faces, views, Reporter())[part == 0].any()
+
+
 def test_photos_say_nothing_of_what_is_plain(
     tmp_path: Path, surface: tuple[np.ndarray, np.ndarray, np.ndarray]
 ) -> None:

@@ -10,13 +10,15 @@ import pytest
 import torch
 from fieldwork.nerfcore.config import TrainConfig
 from fieldwork.nerfcore.data.camera_rays import CameraRays
+from fieldwork.nerfcore.data.load import load_scene
 from fieldwork.nerfcore.data.pixels import Batch
 from fieldwork.nerfcore.errors import Cancelled
 from fieldwork.nerfcore.geometry.cameras import Camera
-from fieldwork.nerfcore.geometry.similarity import fit_similarity
+from fieldwork.nerfcore.geometry.similarity import fit_similarity, transform_pose
 from fieldwork.nerfcore.params import EvaluateParams, TrainParams
 from fieldwork.nerfcore.progress import Reporter
-from fieldwork.nerfcore.render.run import read_checkpoint
+from fieldwork.nerfcore.project.store import load_project
+from fieldwork.nerfcore.render.run import load_info, read_checkpoint, refined_poses, scene_as_trained
 from fieldwork.nerfcore.train.pose_refinement import PoseRefinement, level_weights, skew
 from fieldwork.nerfcore.verbs import run_verb
 from fieldwork.tests.nerfcore.support.ball import SMALL, ball_project, camera_poses
@@ -173,5 +175,14 @@ def test_refinement_starts_when_told_and_survives_a_checkpoint(tmp_path: Path) -
     train(folder, "parts", 60, resume=True, **settings)
     whole, parts = state("whole"), state("parts")
     assert [name for name in whole if not torch.equal(whole[name], parts[name])] == []
+    info = load_info(folder, "whole")
+    used = {view.name: view.camera_to_world for view in scene_as_trained(folder, "whole", info).views}
+    world_from_box = info.box(load_project(folder)).world_from_box
+    refined = refined_poses(folder, "whole", info)
+    assert refined
+    for name, pose in refined.items():
+        assert np.allclose(used[name], transform_pose(world_from_box, pose))
+    given = {view.name: view.camera_to_world for view in load_scene(folder, info.holdout).views}
+    assert not np.allclose(used[next(iter(refined))], given[next(iter(refined))], atol=1e-6)
     train(folder, "late", 60, **{**settings, "train__pose_start": "0.99"})
     assert float(state("late")["poses.correction"].abs().max()) == 0

@@ -46,6 +46,26 @@ def truth(size: int) -> np.ndarray:
     return painted(np.stack([x.ravel(), y.ravel()], 1)).reshape(size, size)
 
 
+def test_where_label_maps_are_masked_the_field_stands_in() -> None:
+    """Masked is not void: a label map says nothing there."""
+    photos = []
+    for pose in ring(4):
+        ids = painted(on_plane(LENS, pose)[0][:, :2]).reshape(LENS.height, LENS.width)
+        sure = np.full(ids.shape, 255, np.uint8)
+        sure[LENS.height // 3 : -LENS.height // 3, LENS.width // 3 : -LENS.width // 3] = 0
+        photos.append(wall_photo(pose, labels=lambda ids=ids, sure=sure: (ids, sure)))
+    made = prepare(*wall_mesh(), photos, 128, Reporter())
+
+    def field(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        return np.tile(np.array([[1.0, 0.0]], np.float32), (len(points), 1))
+
+    evidence = evidence_of(photos, made, field)
+    maps = class_maps(photos, made.buffers, made.seen, evidence, IDS, VOID, 128, Reporter())
+    left = (np.arange(128) + 0.5) / 128 * 1.2 - 0.6
+    assert (maps.ids[:, left > -0.45] != VOID).all()
+    assert (maps.ids[:, left < -0.55] == VOID).mean() > 0.9
+
+
 def test_outlines_lie_within_two_texels_and_the_unlabelled_is_void() -> None:
     size = 256
     photos = [labelled(pose) for pose in ring(8)]

@@ -64,6 +64,40 @@ def test_better_views_come_first_out_of_many() -> None:
     assert {3, 4, 5, 6} == set(np.unique(seen.view).tolist())
 
 
+def test_views_whose_masks_hide_a_piece_do_not_take_the_place_of_others() -> None:
+    pieces = facelets(*wall_mesh(6)[:2])
+    hidden = np.ones((LENS.height, LENS.width), bool)
+    hidden[:, LENS.width // 2 :] = False
+    near = [PosedCamera(LENS, looking((0, 0, 0), (0.01 * n, 0.01, 2.0)), lambda: hidden) for n in range(4)]
+    far = PosedCamera(LENS, looking((0, 0, 0), (0, 0.01, 6.0)))
+    seen = observe(DepthBuffers([*near, far], pieces), Reporter(), most=4)
+    by_far, by_near = (seen.view == 4).any(1), ((seen.view >= 0) & (seen.view < 4)).any(1)
+    assert (by_far | by_near).all()
+    side = pieces.centers @ near[0].pose[:3, 0]
+    assert not by_near[side > 0.05].any()
+    assert by_near[side < -0.05].all()
+    assert by_far[side > 0.05].all()
+
+
+def test_what_hides_a_wall_at_the_edge_of_a_panorama_hides_all_of_it() -> None:
+    wall, wall_faces, _ = wall_mesh(8)
+    front = wall * [1.2, 1.2, 1] + [0, 0, 1.0]
+    vertices, faces = np.concatenate([wall, front]), np.concatenate([wall_faces, wall_faces + len(wall)])
+    pieces = facelets(vertices, faces, limit=0.1)
+    for turn in (0, 90, 180):  # 180: the wall lies across the edge
+        pose = looking((0, 0, 0), (0, 0.001, 3.0))
+        angle = np.radians(turn)
+        pose[:3, :3] = pose[:3, :3] @ [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+        buffer = depth_buffer(PosedCamera(PANORAMA, pose), pieces.vertices, pieces.faces)
+        drawn = pieces.parent[buffer.face[buffer.face >= 0]]
+        assert (drawn >= len(wall_faces)).all(), turn
+        assert len(drawn) > 1000
+        seen = observe(DepthBuffers([PosedCamera(PANORAMA, pose)], pieces), Reporter())
+        visible = seen.view[:, 0] == 0
+        assert not visible[pieces.parent < len(wall_faces)].any(), turn
+        assert visible[pieces.parent >= len(wall_faces)].all(), turn
+
+
 def test_pieces_cover_the_mesh_and_know_their_neighbours() -> None:
     vertices, faces, corners = wall_mesh(2)
     pieces = facelets(vertices, faces, corners, limit=0.11)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -60,17 +60,26 @@ def _draw() -> None:
         if texture is not None:
             _draw_texture(texture, region, 1.0)
     if settings.label_strokes:
-        for mark in marks_on(folder, str(photo["name"])):
+        for mark in marks_on(folder, str(photo["name"]), _erased(folder, settings.run)):
             _draw_mark(mark, mark["points"], region, tuple(mark.get("size") or size), colors)
     if live is not None and live.photo == photo["name"]:
         _draw_mark(live.params, live.points, region, size, colors)
     gpu.state.blend_set("NONE")
 
 
-def marks_on(folder: Path, photo: str) -> list[dict[str, Any]]:
-    """The marks on a photo that are shown or on their way, but those that erase. One on the surface has no photo."""
-    marks = [*journal.marks_at(folder, pending.shown(folder)), *pending.marks_of(folder)]
-    return [mark for mark in marks if mark.get("photo") == photo and not mark.get("erase")]
+def marks_on(folder: Path, photo: str, erased: Collection[int] = ()) -> list[dict[str, Any]]:
+    """The marks on a photo that are shown or on their way, but those that erase or are of `erased` revisions. One on the surface
+    has no photo."""
+    known = [m for m in journal.marks_at(folder, pending.shown(folder)) if m.get("revision") not in erased]
+    return [m for m in [*known, *pending.marks_of(folder)] if m.get("photo") == photo and not m.get("erase")]
+
+
+def _erased(folder: Path, run: str) -> Collection[int]:
+    """The marks of which an eraser left nothing, at the revision that is shown."""
+    from . import results  # not at the top: it needs numpy, and enabling the extension must be quick
+
+    found = results.to_show(folder, run, pending.shown(folder))
+    return () if found is None else found.told.get("erased", ())
 
 
 def _overlay(folder: Path, settings: Any, photo: str, colors: dict[int, tuple[float, float, float]]) -> Any:

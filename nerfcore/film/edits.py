@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -98,13 +99,20 @@ def read_edits(path: Path) -> list[Edit]:
     names = ", ".join(field.alias or name for name, field in Edit.model_fields.items())
     advice = f'Write {{"version": 1, "edits": [{{"class": "wall", "hide": true}}]}}. An edit may have {names}.'
     try:
-        return EditList.model_validate(json.loads(path.read_text(encoding="utf-8"))).edits
+        edits = EditList.model_validate(json.loads(path.read_text(encoding="utf-8"))).edits
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}.", advice) from error
     except ValidationError as error:
         raise InputError(f"{path}: {wrong_value(error.errors()[0])}.", advice) from error
     except ValueError as error:
         raise InputError(f"{path} is not JSON: {error}.", advice) from error
+    edited = Counter((edit.class_name, edit.instance) for edit in edits)
+    for (class_name, instance), times in edited.items():
+        if times > 1:
+            raise InputError(
+                f"{path} has {times} edits of “{class_name or instance}”.", "Write one edit with all that changes."
+            )
+    return edits
 
 
 def edited_items(field: LoadedField, edits: list[Edit]) -> list[FieldItem]:

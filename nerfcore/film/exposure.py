@@ -193,14 +193,15 @@ class _Film:
         cosine = axis_cosine(shot.lens, directions).clamp(min=1e-3)
         begin, end = shot.lens.clip[0] / cosine, shot.lens.clip[1] / cosine
         far, met = end, torch.full_like(begin, FAR)
+        near = origins + directions * begin[:, None]  # what the clip plane cuts away hides nothing
         if self.occluders is not None:
-            met = self.occluders.distances(origins, directions).to(self.device)
-            met = torch.where((met > begin) & (met < end), met, FAR)
+            met = self.occluders.distances(near, directions).to(self.device) + begin
+            met = torch.where(met < end, met, FAR)
             far = torch.minimum(end, met)
         hit = met < FAR
         held = torch.zeros_like(hit)
         if self.holdouts is not None:
-            held = hit & (self.holdouts.distances(origins, directions).to(self.device) <= met)
+            held = hit & (self.holdouts.distances(near, directions).to(self.device) + begin <= met)
         times = None if chances is None else chances[:, 2]
         color, facts = self._merged(origins, directions, begin, far, ~hit, times)
         behind = torch.zeros_like(color)

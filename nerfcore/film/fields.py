@@ -336,9 +336,7 @@ class PlacedField:
             if not self.hides:
                 return within
             opacity = model.field.class_probabilities(geometry) @ self.opacity
-            # A class's opacity is a factor of alpha, as in a baked field.
-            thickness = (geometry.density * samples.deltas).clamp(1e-6, 50)
-            return within * -torch.log1p(opacity * torch.expm1(-thickness)) / thickness
+            return within * dimmed(opacity, geometry.density * samples.deltas)
 
         return thin
 
@@ -366,3 +364,11 @@ class PlacedField:
         if look > 1:
             color = torch.lerp(color, share[:, None].expand_as(color), look - 1)
         return color
+
+
+def dimmed(opacity: torch.Tensor, thickness: torch.Tensor) -> torch.Tensor:
+    """Factor (N,) of the density of samples of an optical thickness (N,) with which their alpha is `opacity` (N,) times what it
+    was, as in a baked field."""
+    # Rounding makes a sum of probabilities more than 1, of which there is no logarithm.
+    opacity, thickness = opacity.clamp(0, 1 - 1e-6), thickness.clamp(1e-6, 1e9)
+    return -torch.log1p(opacity * torch.expm1(-thickness)) / thickness

@@ -21,7 +21,7 @@ from ..images.encode import write_picture
 from ..images.working import nearest
 from ..params import LabelAcceptParams
 from ..progress import Reporter
-from ..project.label_revision import MAPS, revision_of
+from ..project.label_revision import MAPS, is_made
 from ..project.runs import ACCEPTED, CHECKPOINT, fresh_folder, run_folder, swap_in
 from ..project.schema import Project, now
 from ..project.store import edit_project, load_project
@@ -33,7 +33,7 @@ from .journal import marks_at, read_marks
 from .lookup import Labelling
 from .overlay import photo_labels
 from .preparation import Preparation
-from .revisions import computed
+from .propagate import propagated_labels
 from .seeds import VOID, seeds_of
 
 
@@ -49,7 +49,7 @@ def accept(params: LabelAcceptParams, report: Reporter) -> dict[str, Any]:
     """
     folder = Path(params.project)
     project = load_project(folder)
-    ready, labelling = computed(folder, params.run, params.revision)
+    ready, labelling = propagated_labels(folder, params.run, params.revision, report)
     if not len(labelling.class_ids):
         raise InputError(
             f"Revision {labelling.revision} of the marks has no class.", "Mark something with `fieldwork label stroke`."
@@ -65,7 +65,7 @@ def accept(params: LabelAcceptParams, report: Reporter) -> dict[str, Any]:
     report.stage("Writing label maps")
     scene = load_scene(folder, info.holdout)
     train = {scene.views[i].name for i in scene.train}
-    own = {image.name for image in project.images if image.label and not is_accepted(image.label)}
+    own = {image.name for image in project.images if image.label and not is_made(image.label)}
     known = [photo.name for photo in ready.photos if photo.name in train - own]
     try:
         write_maps(maps, ready, labelling, project, known, report)
@@ -91,7 +91,7 @@ def accept(params: LabelAcceptParams, report: Reporter) -> dict[str, Any]:
             if image.name in known:
                 image.label = f"{MAPS.format(labelling.revision)}/{image.name}.png"
                 image.confidence = f"{MAPS.format(labelling.revision)}/confidence/{image.name}.png"
-            elif image.label and is_accepted(image.label):  # held out now: the maps of before are removed
+            elif image.label and is_made(image.label):  # held out now: the maps of before are removed
                 image.label = image.confidence = None
         edited.record("label accept", params.model_dump(mode="json"), result)
     for other in (folder / "labels").glob(MAPS.format("*").split("/")[1]):
@@ -146,11 +146,6 @@ def agreement(predicted: np.ndarray, labelling: Labelling) -> float | None:
     if not classed.any():
         return None
     return round(float((labelling.class_ids[predicted[classed]] == label[classed]).mean()), 4)
-
-
-def is_accepted(path: str) -> bool:
-    """Whether a label map of the project was written by this verb."""
-    return revision_of(path) is not None
 
 
 def write_maps(

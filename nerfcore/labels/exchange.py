@@ -20,17 +20,16 @@ from ..images.working import nearest, read_label
 from ..params import LabelExportParams, LabelImportParams
 from ..progress import Reporter
 from ..project.classes import MOST_CLASSES, class_color
-from ..project.label_revision import map_revision
+from ..project.label_revision import is_made, map_revision
 from ..project.schema import ImageRecord, Project, SemanticClass
 from ..project.store import edit_project, load_project
-from .accept import is_accepted
 from .formats import known
 from .formats.regions import LabelClass, Picture, Region, Source
 from .history import write_history
 from .journal import read_marks, shown_revision, taken_ids
 from .matching import Claims, Photos
 from .overlay import photo_labels
-from .revisions import computed
+from .propagate import propagated_labels
 
 IMPORTED = "labels/imported"  # of the project
 INSTANCES = "instances"  # in that folder
@@ -108,7 +107,7 @@ def _bring(source: Source, project: Project, classes: Classes, place: Path, repl
         photo = claims.photo_of(picture.name)
         if photo is None:
             brought.unknown.append(picture.name)
-        elif photo.label and not is_accepted(photo.label) and not replace:
+        elif photo.label and not is_made(photo.label) and not replace:
             if photo.name not in brought.kept:
                 brought.kept.append(photo.name)
         else:
@@ -256,7 +255,7 @@ def export_labels(params: LabelExportParams, report: Reporter) -> dict[str, Any]
     if params.format == "history":
         return export_history(params, project, folder, out)
     check_out(params, project, out)
-    revision, pictures, count = pictures_of(params, project, folder)
+    revision, pictures, count = pictures_of(params, project, folder, report)
     if not count:
         raise InputError(
             f"No photo of {folder} has labels.", "Mark some, or export what was propagated: --source marks."
@@ -299,14 +298,16 @@ def check_out(params: LabelExportParams, project: Project, out: Path) -> None:
         )
 
 
-def pictures_of(params: LabelExportParams, project: Project, folder: Path) -> tuple[int | None, Iterator[Picture], int]:
+def pictures_of(
+    params: LabelExportParams, project: Project, folder: Path, report: Reporter
+) -> tuple[int | None, Iterator[Picture], int]:
     """The revision, the pictures to write, and how many they are."""
     names = {c.id: c.name for c in project.classes}
     if params.source == "maps":
         images = [image for image in project.images if image.label and image.status != "rejected"]
         pictures = (_picture(image, *_maps(folder, image), names) for image in images)
         return map_revision(project), pictures, len(images)
-    ready, labelling = computed(folder, params.run, params.revision)
+    ready, labelling = propagated_labels(folder, params.run, params.revision, report)
     images = [image for image in project.images if image.name in ready.of_photo]
 
     def propagated(image: ImageRecord) -> Picture:

@@ -14,7 +14,7 @@ from ..project.store import load_project
 from .journal import marks_at, read_marks, shown_revision
 from .lookup import Labelling
 from .preparation import Preparation, ensured
-from .revisions import computed
+from .propagate import propagated_labels
 
 BLANK_BONUS = 0.5  # of surfels that no class explains: what is there may be a class without marks; not tuned
 SAMPLES, SHOWN = 4000, 800  # surfels of the scene that are compared, and of each photo
@@ -37,7 +37,7 @@ def next_photo(params: LabelNextParams, report: Reporter) -> dict[str, Any]:
     marks = marks_at(known, revision)
     marked = [mark.photo for mark in marks]
     if marks:
-        ready, labelling = computed(folder, params.run, revision)
+        ready, labelling = propagated_labels(folder, params.run, revision, report)
         scores = usefulness(ready, labelling, set(marked))
         order = np.argsort(-scores, kind="stable")[: params.count].tolist()
         best = [(ready.photos[index].name, float(scores[index])) for index in order]

@@ -71,7 +71,7 @@ def looks_of_parts(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Probability (P, classes) of each class by what parts look like, and how much (P,) in [0, 1] each looks like any that is
     marked; taught by some surfels of each mark."""
-    known, chosen = seeds.label != VOID, sampled(torch.from_numpy(seeds.mark))
+    known, chosen = seeds.label != VOID, sampled(torch.from_numpy(seeds.mark)).numpy()
     both = torch.cat([ready.columns(seeds.surfel[chosen]), torch.from_numpy(np.array(ready.part_features))])
     void_marked = bool((~known).any())
     target = torch.from_numpy(np.where(known, seeds.label, classes)[chosen]).long()

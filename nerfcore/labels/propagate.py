@@ -17,9 +17,9 @@ from .doubts import doubtful
 from .journal import marks_at, read_marks, shown_revision
 from .lookup import Labelling
 from .part_labels import by_parts
-from .preparation import Preparation, ensured
+from .preparation import Preparation, ensured, is_stale
 from .propagation import propagated, trusted
-from .revisions import load, made_of, path_of, save, save_first
+from .revisions import computed, load, made_of, path_of, save, save_first
 from .seeds import UNMARKED, Seeds, seeds_of
 
 
@@ -30,7 +30,8 @@ def propagate(params: LabelPropagateParams, report: Reporter) -> dict[str, Any]:
         {"revision", "marks", "surfels", "void": share of the surfels that no class explains, "carried": share that an earlier
         epoch says and nobody confirmed, "confidence": mean of the labelled ones, "classes": [{"id", "name", "surfels", "confidence"}], "conflicts": [{"revision", "other", "surfels"}],
         "doubtful": [{"revision", "looks_like": class id}] of marks that look more like those of another class,
-        "unused": revisions of marks that met no surface, or whose class, photo or its pose is gone, "self_check": share of the marks of each
+        "unused": revisions of marks that met no surface, or whose class, photo or its pose is gone, "erased": revisions of
+        marks of which an eraser left nothing, "self_check": share of the marks of each
         photo that those on the others guess, "parts_seconds": until the labels of whole
         parts were on disk, "seconds", "file"}
     Raises:
@@ -74,12 +75,25 @@ def propagate(params: LabelPropagateParams, report: Reporter) -> dict[str, Any]:
             {"revision": mark, "looks_like": class_ids[index]} for mark, index in doubtful(ready, seeds, len(class_ids))
         ],
         "unused": seeds.unused,
+        "erased": seeds.erased,
         "carried": 0.0 if labelling.carried is None else round(float(labelling.carried.mean()), 4),
         "self_check": None if trust.right is None else round(trust.right, 4),
         "parts_seconds": round(parts_seconds, 3),
         "seconds": round(time.perf_counter() - begin, 3),
     }
     return {**told, "file": str(save(folder, params.run, replace(labelling, told=told)))}
+
+
+def propagated_labels(folder: Path, run: str, revision: int | None, report: Reporter) -> tuple[Preparation, Labelling]:
+    """The preparation of a run and the labels of a revision (None: the one that is shown), made anew where the run was aligned,
+    trained further or got other poses since.
+
+    Raises:
+        as `computed` and `propagate`.
+    """
+    if is_stale(folder, run):
+        propagate(LabelPropagateParams(project=folder, run=run, revision=revision), report)
+    return computed(folder, run, revision)
 
 
 def unconfirmed(labelling: Labelling, seeds: Seeds) -> np.ndarray | None:

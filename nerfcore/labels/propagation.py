@@ -38,7 +38,7 @@ def propagated(
             `trusted` says; None: it is asked.
     """
     known, carried = seeds.label != VOID, seeds.carried
-    if not known.any() and carried is None:
+    if not classes or (not known.any() and carried is None):
         return np.zeros((len(ready.surfels), classes), np.float32)
     count = len(ready.surfels)
     look, familiar = np.zeros((count, classes), np.float32), np.zeros(count, np.float32)

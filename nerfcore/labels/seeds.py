@@ -22,6 +22,7 @@ from .preparation import Preparation
 VOID = -1  # class index of surfels that are marked as none of the classes
 UNMARKED = -2
 SAME_SIDE = 0.3  # cosine between normals of one side of a surface
+OFF_IT = 3.0  # distances of neighbouring surfels that a drawn place may be off them. Not tuned
 MOST_STEPS = 10_000  # of a brush between two places
 
 
@@ -29,7 +30,8 @@ MOST_STEPS = 10_000  # of a brush between two places
 class Seeds:
     """Known surfels, ascending: surfel (S,), label (S,) class index or VOID, mark (S,) revision of the mark each is from;
     conflicts: [{"revision", "other", "surfels"}] of marks that say different things of the same place; unused: revisions
-    of marks that met no surface, or whose photo or class is gone; photo (S,): number of the photo that each mark is on, all on the surface having one more.
+    of marks that met no surface, or whose photo or class is gone; photo (S,): number of the photo that each mark is on, all on the surface having one more;
+    erased: revisions of marks of which an eraser left nothing.
     """
 
     surfel: np.ndarray
@@ -39,6 +41,7 @@ class Seeds:
     unused: list[int]
     carried: Carried | None = None
     photo: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int32))
+    erased: list[int] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -66,7 +69,7 @@ def seeds_of(
     label = np.full(len(ready.surfels), UNMARKED, np.int32)
     source = np.zeros(len(ready.surfels), np.int32)
     overlaps: dict[tuple[int, int], int] = {}
-    unused = []
+    unused, wiped = [], set()
     carried: Carried | None = None
     for mark in marks:
         if mark.shape == "carried":
@@ -87,6 +90,7 @@ def seeds_of(
         if not len(surfels):
             unused.append(mark.revision)
         elif mark.erase:
+            wiped |= set(np.unique(source[surfels[label[surfels] != UNMARKED]]).tolist())
             label[surfels] = UNMARKED
             if carried is not None:
                 carried.label[surfels] = UNMARKED
@@ -97,11 +101,14 @@ def seeds_of(
                 overlaps[mark.revision, int(revision)] = int(count)
             label[surfels], source[surfels] = new, mark.revision
     surfel = np.flatnonzero(label != UNMARKED)
-    conflicts = [{"revision": a, "other": b, "surfels": count} for (a, b), count in sorted(overlaps.items())]
+    left = set(np.unique(source[surfel]).tolist())
+    conflicts = [
+        {"revision": a, "other": b, "surfels": count} for (a, b), count in sorted(overlaps.items()) if a in left
+    ]
     names = sorted({mark.photo for mark in marks})
     number = {mark.revision: names.index(mark.photo) for mark in marks}
     photo = np.array([number[revision] for revision in source[surfel].tolist()], np.int32)
-    return Seeds(surfel, label[surfel], source[surfel], conflicts, unused, carried, photo)
+    return Seeds(surfel, label[surfel], source[surfel], conflicts, unused, carried, photo, sorted(wiped - left))
 
 
 def one_hot(label: np.ndarray, classes: int) -> np.ndarray:
@@ -139,11 +146,20 @@ def placed_surfels(ready: Preparation, mark: Mark) -> np.ndarray:
         corners.append(begin + (end - begin) * (np.arange(1, steps + 1) / max(steps, 1))[:, None])
     along = np.concatenate(corners) if mark.shape == "line" else places
     distance, nearest = (np.asarray(part) for part in tree.query(along))
+    there = np.isfinite(distance)
+    spacing = np.full(len(along), np.inf)
+    spacing[there] = np.linalg.norm(
+        ready.world[0][ready.neighbours[nearest[there], -1]] - ready.world[0][nearest[there]], axis=1
+    )
+    # Where it was drawn the surface may be a little off the surfels.
+    drawn = np.ones(len(along), bool)
     if mark.shape == "line":
-        spacing = np.linalg.norm(ready.world[0][ready.neighbours[nearest, -1]] - ready.world[0][nearest], axis=1)
-        on_it = distance <= np.maximum(radius, spacing)
-        on_it[np.cumsum([0, *(len(part) for part in corners[1:])])] = True  # where it was drawn
-        along, nearest = along[on_it], nearest[on_it]
+        drawn[:] = False
+        drawn[np.cumsum([0, *(len(part) for part in corners[1:])])] = True
+    on_it = there & (distance <= np.maximum(radius, np.where(drawn, OFF_IT, 1) * spacing))
+    along, nearest = along[on_it], nearest[on_it]
+    if not len(nearest):
+        return np.zeros(0, np.int64)
     if mark.shape == "part":
         return whole_parts(ready, mark, np.unique(nearest))
     found = [nearest]

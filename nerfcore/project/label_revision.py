@@ -8,6 +8,7 @@ from .schema import Project
 
 LABEL_REVISION = "label_revision"  # what results and files call it
 MAPS = "labels/revision_{}"  # in the project: the label maps that were made from the marks of a revision
+SUGGESTED = "labels/suggested"  # in the project: those that a model guessed
 
 
 def label_facts(revision: int | None) -> dict[str, int]:
@@ -20,6 +21,11 @@ def revision_of(path: str) -> int | None:
     """The revision of the marks that a label map of the project was made from; None where it was made from none."""
     found = re.match(MAPS.format(r"(\d+)") + "/", path)
     return None if found is None else int(found.group(1))
+
+
+def is_made(path: str) -> bool:
+    """Whether a label map of the project was made here, from marks or as the guess of a model, and not given with the photo."""
+    return revision_of(path) is not None or path.startswith(f"{SUGGESTED}/")
 
 
 def map_revision(project: Project) -> int | None:

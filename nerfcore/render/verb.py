@@ -82,6 +82,17 @@ def render(params: RenderParams, report: Reporter, shown: Model | BakedField | N
     if params.size is not None:
         # Pictures of photos' cameras are laid over the photos; all others keep their pixels square.
         photos = params.camera is None and params.orbit is None
+        for name, camera, _ in cameras:
+            if (
+                camera.model == "EQUIRECTANGULAR"
+                and not photos
+                and params.size[0] * camera.height != params.size[1] * camera.width
+            ):
+                raise SettingError(
+                    f"“{name}” is a panorama of {camera.width}×{camera.height}, which cannot be cut to "
+                    f"{params.size[0]}×{params.size[1]}.",
+                    "Give `--size` the panorama's proportions.",
+                )
         cameras = [
             (name, (camera.resized if photos else camera.reframed)(*params.size), pose)
             for name, camera, pose in cameras

@@ -13,9 +13,9 @@ from ...files import atomic_path, staged
 from ...images.encode import write_picture
 from ...params import AssistEmbedParams, AssistSegmentParams, AssistSuggestParams
 from ...progress import Reporter
+from ...project.label_revision import SUGGESTED, is_made
 from ...project.schema import ImageRecord, Project
 from ...project.store import edit_project, load_project
-from ..accept import is_accepted
 from ..journal import append_mark
 from ..models import load
 from ..stroke import require_class, require_photo
@@ -23,8 +23,6 @@ from .embeddings import embedded, photo_pixels
 from .outline import outline_of
 from .segmenter import Prompt, segmenter
 from .semantic import Semantic, guessed, read_mapping
-
-SUGGESTED = "labels/suggested"  # of the project
 
 
 def embed(params: AssistEmbedParams, report: Reporter) -> dict[str, Any]:
@@ -99,7 +97,7 @@ def suggest(params: AssistSuggestParams, report: Reporter) -> dict[str, Any]:
     mapping = {number: ids[name] for number, name in read_mapping(params.mapping, list(ids)).items()}
     model = Semantic(load(params.model))
     photos = chosen(project, folder, params.photos)
-    own = [p for p in photos if p.label and not is_accepted(p.label) and not p.label.startswith(f"{SUGGESTED}/")]
+    own = [p for p in photos if p.label and not is_made(p.label)]
     report.stage("Guessing classes")
     taken: dict[str, float] = {}
     todo = [photo for photo in photos if photo not in own]

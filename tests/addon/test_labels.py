@@ -188,6 +188,7 @@ def test_marks_on_a_photo_are_drawn_while_one_on_the_surface_is_on_its_way(tmp_p
     pending.mark(tmp_path, {**LINE, "class_id": 2})
     assert [mark["class_id"] for mark in draw.marks_on(tmp_path, "a")] == [1, 2]
     assert draw.marks_on(tmp_path, "b") == []
+    assert [mark["class_id"] for mark in draw.marks_on(tmp_path, "a", erased={1})] == [2]
 
 
 def test_a_torn_or_foreign_journal_is_read_as_far_as_it_is_whole(tmp_path):
@@ -308,7 +309,7 @@ def engine(verb, params, on_done):
         answers.append(lambda: on_done({"revision": append_mark(folder, values).revision}, None))
         refusals.append(lambda: on_done(None, EngineError("input", "It lies outside the photo.")))
 queue.ask_and_wait, refusals = engine, []
-session._step = lambda message: bpy.ops.ed.undo_push(message=message)  # without a window nothing is one
+session.undo_step = lambda message: bpy.ops.ed.undo_push(message=message)  # without a window nothing is one
 mark = lambda: session.mark(folder, {"photo": "a", "shape": "line", "points": [[1, 1]], "width": 2.0, "class_id": 1})
 look = lambda: [bpy.context.scene.fieldwork.label_revision, journal.shown(folder), bpy.ops.fieldwork.label_undo.poll()]
 settings.project = project

@@ -162,6 +162,7 @@ def test_the_verb_edits_things_and_classes(things: Path, tmp_path: Path) -> None
         ('{"edits": [{"instance": "left", "tint": 0.5}]}', "tint.*needs a “color”"),
         ('{"edits": [{"class": "sky", "hide": true}]}', "no class “sky”.*top, bottom"),
         ('{"edits": [{"instance": "cup", "hide": true}]}', "no thing “cup”"),
+        ('{"edits": [{"class": "top", "hide": true}, {"class": "top", "opacity": 0.5}]}', "2 edits of “top”"),
     ],
 )
 def test_a_file_of_edits_that_is_wrong_is_told(things: Path, tmp_path: Path, text: str, told: str) -> None:

@@ -6,10 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from fieldwork.nerfcore.errors import ProjectError
 from fieldwork.nerfcore.film.cryptomatte import id_of
 from fieldwork.nerfcore.film.exposure import surface_normals
-from fieldwork.nerfcore.film.fields import FieldStore
+from fieldwork.nerfcore.film.fields import FieldStore, dimmed
 
 from .support.film import SIDE, H, W, ball, lens, store, take
 
@@ -90,6 +91,40 @@ def test_hidden_classes_show_what_is_behind(ball: Path, store: FieldStore, baked
     dim = {"baked": baked, "classes": {1: {"opacity": 0.1}}}
     dimmed = take(ball, store, ["Combined"], dim)["Combined"][..., 3]
     assert opacity[above].sum() < dimmed[above].sum() < plain[above].sum()
+
+
+@pytest.mark.parametrize("opacity", [0.0, 0.02, 0.3, 1.0])
+def test_the_opacity_of_a_class_is_a_factor_of_alpha_however_dense_the_field(opacity: float) -> None:
+    """A fog of probabilities whose sum rounds to more than 1, in samples from thin to solid."""
+    thickness = torch.logspace(-3, 4, 2000)
+    shares = torch.softmax(torch.randn(2000, 39, generator=torch.Generator().manual_seed(0)) * 6, 1)
+    factors = torch.full((39,), opacity)
+    found = dimmed(shares @ factors, thickness)
+    assert found.isfinite().all()
+    alpha = 1 - torch.exp(-found * thickness)
+    assert (alpha - opacity * (1 - torch.exp(-thickness))).abs().max() < 1e-4
+
+
+def test_what_the_clip_plane_cuts_away_hides_nothing(ball: Path, store: FieldStore, tmp_path: Path) -> None:
+    """A near wall that the camera looks through, and a board before the ball, which hides it or cuts it out."""
+
+    def board(y: float) -> np.ndarray:
+        return np.array([[-2, y, -2], [2, y, -2], [2, y, 2], [-2, y, 2]], np.float32)
+
+    def shown(boards: list[tuple[float, bool]]) -> dict[str, np.ndarray]:
+        file = tmp_path / "boards.npz"
+        faces = np.concatenate([np.array([[0, 1, 2], [0, 2, 3]]) + 4 * n for n in range(len(boards))])
+        holdout = np.repeat([held for _, held in boards], 2)
+        np.savez(file, vertices=np.concatenate([board(y) for y, _ in boards]), faces=faces, holdout=holdout)
+        return take(ball, store, ["Combined", "FieldBehind"], lens=lens(clip=(0.6, 100.0)), occluders=file)
+
+    wall, before = -1.7, -1.0
+    assert shown([(before, False)])["Combined"][..., 3].max() < 0.05
+    for near in (False, True):
+        both = shown([(wall, near), (before, False)])
+        assert both["Combined"][..., 3].max() < 0.05
+        assert both["FieldBehind"][..., 3].max() > 0.9, "only a holdout would cut it out there too"
+    assert shown([(wall, False)])["Combined"][..., 3].max() > 0.95
 
 
 def test_tints_and_the_slider_recolour(ball: Path, store: FieldStore) -> None:

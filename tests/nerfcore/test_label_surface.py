@@ -88,6 +88,15 @@ def test_a_stroke_on_the_surface_marks_what_lies_under_it(ball: Path) -> None:  
     assert np.array_equal(placed_surfels(prepared_anew(ball), mark), marked)
 
 
+@pytest.mark.parametrize("shape", ["line", "click", "part"])
+def test_places_far_from_the_surface_mark_nothing(ball: Path, shape: str) -> None:  # noqa: F811
+    """As when they are given in millimetres."""
+    far = [place(ball, TOP, [[value, 400.0, 900.0]], shape=shape) for value in (1200.0, 1e300)]
+    told = propagate(LabelPropagateParams(project=ball), Reporter())
+    assert told["unused"] == far
+    assert told["void"] == 1
+
+
 def test_a_stroke_marks_nothing_where_it_is_off_the_surface(ball: Path) -> None:  # noqa: F811
     ends = [on_ball(0, 0.2), on_ball(np.pi, 0.2)]  # the way between them goes through the ball
     place(ball, TOP, ends)

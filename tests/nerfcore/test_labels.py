@@ -22,8 +22,9 @@ from fieldwork.nerfcore.labels.next_photo import next_photo
 from fieldwork.nerfcore.labels.overlay import overlay, photo_labels
 from fieldwork.nerfcore.labels.preparation import FOLDER, Preparation, current, prepare
 from fieldwork.nerfcore.labels.propagate import propagate
+from fieldwork.nerfcore.labels.propagation import propagated
 from fieldwork.nerfcore.labels.revisions import computed, load
-from fieldwork.nerfcore.labels.seeds import seeds_of
+from fieldwork.nerfcore.labels.seeds import VOID, Carried, Seeds, seeds_of
 from fieldwork.nerfcore.labels.stroke import checkout, stroke
 from fieldwork.nerfcore.measure.verb import measure
 from fieldwork.nerfcore.mesh.verb import mesh
@@ -41,6 +42,7 @@ from fieldwork.nerfcore.params import (
     TrainParams,
 )
 from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.project.label_revision import SUGGESTED
 from fieldwork.nerfcore.project.runs import CHECKPOINT, INFO, checkpoint_id, geometry_id, run_folder
 from fieldwork.nerfcore.project.store import edit_project, load_points, load_poses, load_project, save_poses
 from fieldwork.nerfcore.render.run import load_trained
@@ -141,7 +143,8 @@ def test_undo_brings_earlier_labels_back_and_erasing_takes_marks_away(ball: Path
     spread(ball)
     before = load(ball, "main", 2)
     erased = mark(ball, points=[(0, 0), (SIDE, 0), (SIDE, SIDE), (0, SIDE)], shape="outline", erase=True)
-    assert spread(ball)["void"] == 1
+    told = spread(ball)
+    assert (told["void"], told["erased"]) == (1, [1, 2])
     checkout(LabelCheckoutParams(project=ball, revision=2), Reporter())
     assert spread(ball)["revision"] == 2
     after = load(ball, "main", 2)
@@ -162,6 +165,63 @@ def test_contradicting_strokes_are_listed_and_the_later_one_counts(ball: Path) -
     ready, labelling = computed(ball, "main", None)
     ids, _ = photo_labels(ready, labelling, "01", 0)
     assert nearest(ids, SIDE, SIDE)[14, 20] == BOTTOM
+
+
+def test_a_contradiction_ends_when_the_later_stroke_is_erased(ball: Path) -> None:
+    line = [(14.0, 14.0), (26.0, 14.0)]
+    for class_id in (TOP, BOTTOM):
+        mark(ball, points=line, class_id=class_id)
+    mark(ball, points=line, erase=True, width=12)
+    told = spread(ball)
+    assert told["conflicts"] == []
+    assert 2 in told["erased"]
+
+
+def test_a_first_mark_of_one_surfel_is_enough(ball: Path) -> None:
+    ready = Preparation(ball / "runs/main/surfels")
+    surfel, edge = ready.map_of("01")
+    row, column = np.argwhere((surfel >= 0) & ~edge)[50]
+    point = ((column + 0.5) * SIDE / surfel.shape[1], (row + 0.5) * SIDE / surfel.shape[0])
+    mark(ball, points=[point], shape="click", class_id=TOP, width=1)
+    assert len(seeds_of(ready, read_marks(ball), [TOP], {"01": (SIDE, SIDE)}).surfel) == 1
+    assert spread(ball)["unused"] == []
+
+
+def test_marks_are_propagated_anew_for_what_needs_them_where_the_world_was_turned(ball: Path) -> None:
+    two_strokes(ball)
+    spread(ball)
+    with edit_project(ball) as project:
+        project.frame.world_from_sfm = np.diag([1.0, -1, -1, 1]).tolist()
+    assert current(ball, "main") is None
+    assert len(next_photo(LabelNextParams(project=ball, count=2), Reporter())["photos"]) == 2
+    assert accept(LabelAcceptParams(project=ball, seconds=0.1), Reporter())["revision"] == 2
+
+
+def test_marks_outrank_what_a_model_guessed(ball: Path) -> None:
+    guesses = ball / SUGGESTED
+    guesses.mkdir(parents=True)
+    with edit_project(ball) as project:
+        for image in project.images:
+            Image.fromarray(np.full((SIDE, SIDE), TOP, np.uint8)).save(guesses / f"{image.name}.png")
+            image.label = f"{SUGGESTED}/{image.name}.png"
+    two_strokes(ball)
+    spread(ball)
+    told = accept(LabelAcceptParams(project=ball, seconds=0.1), Reporter())
+    scene = load_scene(ball)
+    assert (told["photos"], told["kept"]) == (len(scene.train), 0)
+    held_out = {scene.views[i].name for i in scene.test}
+    labels = {image.name: image.label for image in load_project(ball).images}
+    assert {name for name, label in labels.items() if label is None} == held_out
+
+
+def test_without_classes_carried_labels_are_void(ball: Path) -> None:
+    ready = Preparation(ball / "runs/main/surfels")
+    nothing = np.zeros(0, np.int32)
+    told = Carried(
+        np.full(len(ready.surfels), VOID), np.ones(len(ready.surfels), np.float32), np.zeros(len(ready.surfels), bool)
+    )
+    seeds = Seeds(nothing, nothing, nothing, [], [], told)
+    assert propagated(ready, seeds, 0).shape == (len(ready.surfels), 0)
 
 
 def test_a_mark_keeps_its_place_when_its_photo_is_read_at_another_size(ball: Path) -> None:

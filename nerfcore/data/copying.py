@@ -11,8 +11,9 @@ from PIL import Image
 from ..errors import InputError
 from ..files import atomic_path, copied
 from ..images.arrays import read_array
-from ..images.decode import UNDECODABLE, read_photo
+from ..images.decode import read_photo
 from ..images.labels import Colors, read_labels, read_mask
+from ..images.limits import UNDECODABLE
 from ..images.suffixes import FLOAT_SUFFIXES, RAW_SUFFIXES
 
 PLAIN_SUFFIXES = {".png", ".jpg", ".jpeg", ".webp"}

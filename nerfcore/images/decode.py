@@ -16,24 +16,11 @@ from PIL import Image, ImageCms, UnidentifiedImageError
 from ..errors import InputError
 from ..progress import log
 from .exif import photo_facts
+from .limits import UNDECODABLE
 from .picture import Picture, associated, exposed, from_channels, from_image, resized, to_srgb8, without_unused_alpha
 from .suffixes import FLOAT_SUFFIXES, RAW_SUFFIXES, TIFF_SUFFIXES
 
 pillow_heif.register_heif_opener()
-# Stitched panoramas are larger than Pillow's decompression-bomb limit; ours is what a decode may take in memory.
-Image.MAX_IMAGE_PIXELS = 600_000_000
-
-# What decoders raise for damaged files; UnidentifiedImageError is an OSError.
-UNDECODABLE = (
-    OSError,
-    EOFError,
-    SyntaxError,
-    ValueError,
-    TypeError,
-    RuntimeError,
-    struct.error,
-    Image.DecompressionBombError,
-)
 
 FLOAT_KINDS = ("half", "float", "double")
 ROTATE = {

@@ -10,7 +10,8 @@ import numpy as np
 from PIL import Image
 
 from ..errors import InputError
-from .decode import UNDECODABLE, image_size, orientation_of, upright
+from .decode import image_size, orientation_of, upright
+from .limits import UNDECODABLE
 from .soft_labels import PROBABILITY_SUFFIXES, read_probabilities
 from .suffixes import TIFF_SUFFIXES
 

@@ -12,7 +12,7 @@ from PIL import Image
 
 from ..errors import InputError
 from .arrays import read_array
-from .decode import UNDECODABLE
+from .limits import UNDECODABLE
 from .names import beside
 
 PROBABILITY_SUFFIXES = (".npy", ".npz", ".exr")

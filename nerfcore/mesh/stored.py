@@ -13,6 +13,7 @@ from PIL import Image
 
 from ..errors import ProjectError
 from ..files import UNREADABLE_ARRAYS
+from ..images.limits import UNDECODABLE
 from ..project.fingerprints import moved, read_made
 from ..project.runs import MESH_RECORD
 from ..project.schema import ProvenanceStep
@@ -83,7 +84,7 @@ def _picture(path: Path, mode: str | None = None) -> np.ndarray:
     try:
         with Image.open(path) as image:
             return np.array(image.convert(mode) if mode else image)
-    except OSError as error:
+    except UNDECODABLE as error:
         raise ProjectError(f"{path} is damaged: {error}.", "Run `fieldwork mesh` again.") from error
 
 

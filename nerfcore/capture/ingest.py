@@ -17,7 +17,7 @@ from ..params import NewParams
 from ..progress import Reporter, shortened
 from ..project.classes import make_classes, read_classes, unnamed_values
 from ..project.fingerprints import Earlier, Fingerprint, compare, digest, files_digest, stamps_digest
-from ..project.kept import earlier_cut_outs, keep_later_labels, resized_labels, with_earlier_names
+from ..project.kept import earlier_cut_outs, keep_later_labels, resized_labels, same_place, with_earlier_names
 from ..project.schema import ImageRecord, Project
 from ..project.store import FRAMES_FOLDER, PROJECT_FILE, create_folder, edit_project, load_project
 from .backdrop import mask_objects
@@ -43,6 +43,7 @@ def new(params: NewParams, report: Reporter) -> dict[str, Any]:
         ProjectError: the folder holds another capture.
         DiskError: it cannot be written.
     """
+    params = _absolute(params)
     folder, photos = Path(params.project), Path(params.photos)
     inputs = ingest_inputs(params)
     previous = _previous_project(params)
@@ -97,7 +98,8 @@ def new(params: NewParams, report: Reporter) -> dict[str, Any]:
         _put_in(project, records, set(present), classes, params, previous is not None)
         project.mask_mode = mask_mode
         result["classes"] = [c.name for c in project.classes]
-        project.record("new", params.model_dump(mode="json"), result | origin | exposed, inputs)
+        settings = params.model_dump(mode="json") | {"photos": str(photos.resolve())}
+        project.record("new", settings, result | origin | exposed, inputs)
     return result
 
 
@@ -220,7 +222,7 @@ def _previous_project(params: NewParams) -> Project | None:
     if params.add:
         return project
     first = project.provenance[0] if project.provenance else None
-    if first is None or first.verb != "new" or not _same_place(first.settings.get("photos"), params.photos):
+    if first is None or first.verb != "new" or not same_place(str(first.settings.get("photos")), params.photos):
         raise ProjectError(
             f"{folder} already holds another capture.", "Choose a new folder, or --add to put these photos into it."
         )
@@ -246,8 +248,10 @@ def _not_there(paths: list[Path], kept: list[ImageRecord]) -> tuple[list[Path], 
     return [path for path in paths if path not in set(there)], skipped
 
 
-def _same_place(before: Any, now: Path) -> bool:
-    return Path(str(before)) == Path(now) or Path(str(before)).resolve() == Path(now).resolve()
+def _absolute(params: NewParams) -> NewParams:
+    """The same with paths that say where files are whatever folder the next command is given in."""
+    paths = {name: value.absolute() for name, value in params if name != "project" and isinstance(value, Path)}
+    return params.model_copy(update=paths)
 
 
 def _remove_halves(folder: Path) -> None:

@@ -19,7 +19,14 @@ from ..images.labels import read_mask
 from ..params import ImportParams
 from ..progress import Reporter, shortened
 from ..project.classes import make_classes, unnamed_values
-from ..project.kept import earlier_cut_outs, earlier_poses, keep_later_labels, keep_world, with_earlier_classes
+from ..project.kept import (
+    earlier_cut_outs,
+    earlier_poses,
+    keep_later_labels,
+    keep_world,
+    same_place,
+    with_earlier_classes,
+)
 from ..project.schema import Frame, ImageRecord, PosedImage, Poses, Project, SemanticClass
 from ..project.store import PROJECT_FILE, create_folder, edit_project, load_project, save_poses
 from .copying import copy_depth, copy_labels, copy_mask, copy_photo
@@ -47,7 +54,7 @@ def import_dataset(params: ImportParams, report: Reporter) -> dict[str, Any]:
         ProjectError: the project folder already holds another capture.
         DiskError: it cannot be written.
     """
-    source, folder = Path(params.dataset), Path(params.project)
+    source, folder = Path(params.dataset).absolute(), Path(params.project)
     previous = _previous_project(folder, source)
     report.stage("Reading the data set")
     dataset = read_dataset(source, params.format)
@@ -89,7 +96,8 @@ def import_dataset(params: ImportParams, report: Reporter) -> dict[str, Any]:
             "labelled": sum(record.label is not None for record in used),
             "classes": [c.name for c in classes],
         }
-        project.record("import", params.model_dump(mode="json"), result | {"world_kept": kept, "cut_out": cut_out})
+        settings = params.model_dump(mode="json") | {"dataset": str(source.resolve())}
+        project.record("import", settings, result | {"world_kept": kept, "cut_out": cut_out})
     if cut_out:
         trim_masks(folder, report)
     return result
@@ -157,7 +165,7 @@ def _previous_project(folder: Path, source: Path) -> Project | None:
         return None
     project = load_project(folder)
     steps = project.provenance
-    if not steps or steps[0].verb != "import" or Path(str(steps[0].settings.get("dataset"))) != source:
+    if not steps or steps[0].verb != "import" or not same_place(str(steps[0].settings.get("dataset")), source):
         raise ProjectError(f"{folder} already holds another capture.", "Choose a new folder for the project.")
     return project
 

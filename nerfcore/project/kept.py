@@ -21,6 +21,15 @@ KEPT, STEPS = 0.7, 10  # share of the cameras that a motion goes by: the others 
 ARM = 0.1  # of the cameras' spread: how far out their axes are compared, which count little beside the centres
 
 
+def same_place(before: str, now: Path) -> bool:
+    """Whether a path of a project's provenance is that of a file or folder.
+
+    Earlier versions noted paths as they were typed, which say nothing of the folder that they were typed in.
+    """
+    was, now = Path(before), Path(now)
+    return was.resolve() == now.resolve() or (not was.is_absolute() and was == now)
+
+
 def keep_later_labels(records: Sequence[ImageRecord], before: Sequence[ImageRecord], folder: Path) -> list[ImageRecord]:
     """Give unchanged photos without a label map the one that was imported or made since; which photos got one.
 

@@ -8,10 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fieldwork.nerfcore.capture.ingest import new
 from fieldwork.nerfcore.data.importer import import_dataset
 from fieldwork.nerfcore.data.load import load_scene
+from fieldwork.nerfcore.errors import ProjectError
 from fieldwork.nerfcore.geometry.similarity import make_similarity, transform_points, transform_pose
-from fieldwork.nerfcore.params import AlignParams, ImportParams, PosesParams
+from fieldwork.nerfcore.params import AlignParams, ImportParams, NewParams, PosesParams
 from fieldwork.nerfcore.poses import estimate
 from fieldwork.nerfcore.poses.align import align
 from fieldwork.nerfcore.progress import Reporter
@@ -185,3 +187,55 @@ def test_importing_again_with_other_poses_moves_the_world(tmp_path: Path) -> Non
     (dataset / "transforms.json").write_text(json.dumps({**value, "up": [0, 1, 0]}))
     imported(dataset, tmp_path / "q")
     assert load_project(tmp_path / "q").frame.world_from_sfm[2][1] == pytest.approx(1)
+
+
+VERBS = {
+    "import": lambda source, project: import_dataset(ImportParams(dataset=source, project=project), Reporter()),
+    "new": lambda source, project: new(NewParams(photos=source / "images", project=project), Reporter()),
+}
+
+
+@pytest.mark.parametrize("verb", list(VERBS))
+def test_paths_of_one_name_in_two_folders_are_two_captures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verb: str
+) -> None:
+    project = tmp_path / "p"
+    for place in ("a", "b"):
+        data_set(tmp_path / place / "data", {"aabb_scale": 1})
+    monkeypatch.chdir(tmp_path / "a")
+    VERBS[verb](Path("data"), project)
+    before = load_project(project)
+    monkeypatch.chdir(tmp_path / "b")
+    with pytest.raises(ProjectError, match="already holds another capture"):
+        VERBS[verb](Path("data"), project)
+    assert load_project(project) == before
+
+
+@pytest.mark.parametrize("verb", list(VERBS))
+def test_a_capture_is_known_however_its_path_is_typed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verb: str
+) -> None:
+    source, project = data_set(tmp_path / "a" / "data", {"aabb_scale": 1}), tmp_path / "p"
+    monkeypatch.chdir(tmp_path / "a")
+    VERBS[verb](Path("data"), project)
+    before = load_project(project).images
+    monkeypatch.chdir(tmp_path)
+    for typed in (source, Path("a/data"), Path("a/../a/data")):
+        VERBS[verb](typed, project)
+        assert [(record.name, record.file) for record in load_project(project).images] == [
+            (record.name, record.file) for record in before
+        ]
+        assert all(Path(record.source).is_absolute() for record in load_project(project).images)
+
+
+def test_paths_that_earlier_versions_noted_as_typed_are_compared_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data_set(tmp_path / "data", {"aabb_scale": 1})
+    monkeypatch.chdir(tmp_path)
+    VERBS["import"](Path("data"), tmp_path / "p")
+    with edit_project(tmp_path / "p") as edited:
+        edited.provenance[0].settings["dataset"] = "data"
+    VERBS["import"](Path("data"), tmp_path / "p")
+    with pytest.raises(ProjectError, match="another capture"):
+        VERBS["import"](data_set(tmp_path / "other"), tmp_path / "p")

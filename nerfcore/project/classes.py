@@ -148,7 +148,7 @@ def _name(class_id: int, entry: Any) -> str:
 
 
 def _color(name: str, values: Any) -> tuple[int, int, int]:
-    color = [int(c) for c in values]
-    if len(color) != 3 or not all(0 <= c <= 255 for c in color):
-        raise ValueError(f"the colour of {name} is not three numbers from 0 to 255")
-    return color[0], color[1], color[2]
+    color = [float(c) for c in values]
+    if len(color) != 3 or not all(c.is_integer() and 0 <= c <= 255 for c in color):
+        raise ValueError(f"the colour of {name} is not three whole numbers from 0 to 255")
+    return int(color[0]), int(color[1]), int(color[2])

@@ -123,10 +123,12 @@ def read_class_values(path: Path) -> list[ClassValues]:
 
 
 def _read_listed(path: Path) -> list[ClassValues] | None:
-    """Classes as the verb lists them: colours are broken numbers up to 1.0, not 0–255. None for a file of another form."""
+    """Classes as the verb lists them: colours are numbers from 0 to 1, not to 255, at least one of them with a decimal point,
+    which some programs leave out of whole numbers. None for a file of another form."""
     try:
         entries = json.loads(Path(path).read_text(encoding="utf-8-sig"))["classes"]
-        if not all(isinstance(part, float) for entry in entries for part in entry["color"]):
+        parts = [part for entry in entries for part in entry["color"]]
+        if not all(0 <= part <= 1 for part in parts) or not any(isinstance(part, float) for part in parts):
             return None
         return TypeAdapter(list[ClassValues]).validate_python(entries)
     except (OSError, ValueError, KeyError, TypeError):

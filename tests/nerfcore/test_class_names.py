@@ -12,6 +12,7 @@ from fieldwork.nerfcore.errors import InputError
 from fieldwork.nerfcore.params import NewParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.classes import read_classes
+from fieldwork.nerfcore.project.edit import read_class_values
 from fieldwork.nerfcore.project.store import load_project
 from fieldwork.tests.nerfcore.support.photos import folder_of
 from PIL import Image
@@ -68,6 +69,8 @@ def test_a_malformed_classes_file_that_was_found_is_told(tmp_path: Path, given: 
         ('{"classes": {"1": 7}}', "no name"),
         ('{"classes": {"x": "a"}}', "x"),
         ('{"classes": {"1": {"name": "a", "color": [1, 2]}}}', "colour"),
+        ('{"classes": {"1": {"name": "a", "color": [0.9, 0.5, 0.0]}}}', "the colour of a is not three whole numbers"),
+        ('{"classes": {"1": {"name": "a", "color": [256, 0, 0]}}}', "from 0 to 255"),
         ('{"classes": {"70000": "a"}}', "0…65535"),
         ('{"ignore_id": "none", "classes": {"1": "a"}}', "none"),
         ("[" * 200_000, "nested"),
@@ -104,3 +107,20 @@ def test_without_a_classes_file_values_are_classes(tmp_path: Path) -> None:
     photos = labelled(tmp_path, value=77)
     assert new(NewParams(photos=photos, project=tmp_path / "p"), report)["classes"] == ["class 1", "class 77"]
     assert report.warnings == []
+
+
+@pytest.mark.parametrize(
+    ("colors", "shown"),
+    [
+        ([[0.5, 0.25, 0.0], [1.0, 0.0, 0.0]], [(0.5, 0.25, 0.0), (1.0, 0.0, 0.0)]),
+        ([[0.5, 0.25, 0], [1, 0, 0]], [(0.5, 0.25, 0.0), (1.0, 0.0, 0.0)]),  # as JavaScript writes the same
+        ([[51, 255, 0], [1, 0, 0]], [(0.2, 1.0, 0.0), (1 / 255, 0.0, 0.0)]),
+        ([[51.0, 255.0, 0.0], [1, 0, 0]], [(0.2, 1.0, 0.0), (1 / 255, 0.0, 0.0)]),
+    ],
+)
+def test_colours_are_read_as_the_verb_lists_them_or_as_bytes(
+    tmp_path: Path, colors: list[list[float]], shown: list[tuple[float, float, float]]
+) -> None:
+    entries = [{"id": i, "name": f"c{i}", "color": color, "priority": 1} for i, color in enumerate(colors, 1)]
+    (tmp_path / "classes.json").write_text(json.dumps({"classes": entries}))
+    assert [values.color for values in read_class_values(tmp_path / "classes.json")] == shown

@@ -13,7 +13,9 @@ from ..mesh.files import write_surface
 from ..mesh.formats import USD
 from ..mesh.instances import read_instances
 from ..mesh.stored import (
+    COARSE,
     LABEL_FIRST,
+    MESH,
     load_class_map,
     load_surface,
     mesh_folder,
@@ -24,7 +26,7 @@ from ..params import ExportParams
 from ..progress import Reporter
 from ..project.fingerprints import read_made
 from ..project.label_revision import map_revision
-from ..project.runs import MESH_RECORD, holdout_of
+from ..project.runs import INSTANCES, MESH_RECORD, holdout_of
 from ..project.schema import Project
 from ..project.store import load_project, record_step
 from ..render.baked import load_baked
@@ -35,12 +37,14 @@ OF_THE_MESH = {"glb": (".glb",), "obj": (".obj",), "ply": (".ply",), "stl": (".s
 OF_THE_CAMERAS = {"transforms": (".json",), "colmap": ()}
 OF_THE_FIELD = {"onnx": (".onnx",), "voxels": (".npz",), "splats": (".ply",), "vdb": (".vdb",)}
 SUFFIXES = OF_THE_MESH | OF_THE_CAMERAS | OF_THE_FIELD
-# What is not called after the project: cameras are known by these names, and the mesh is a .ply as well.
-NAMES = {"transforms": "transforms.json", "colmap": "colmap", "masks": "masks"}
+NAMES = {"transforms": "transforms.json", "colmap": "colmap", "masks": "masks"}  # what is not called after the project
+# Behind the project's name: the mesh is a .ply as well, and of a project called “mesh” it is stored as .npz.
+ENDINGS = {"splats": "-splats", "voxels": "-voxels"}
+OWN_FILES = (MESH, COARSE, MESH_RECORD, INSTANCES)  # in the folder of the mesh
 
 
 def export(params: ExportParams, report: Reporter) -> dict[str, Any]:
-    """Write one format to `out`, or to exports/<run>/<project>.<suffix>.
+    """Write one format to `out`, or to exports/<run>/<project>.<suffix>, with -voxels or -splats behind the project's name.
 
     Meshes (glb, usd, obj, ply, stl) are the last one that the verb `mesh` extracted, masks show its classes; usd has the
     cameras as well, transforms and colmap nothing else; onnx is the trained field itself as a function, voxels its values
@@ -50,8 +54,9 @@ def export(params: ExportParams, report: Reporter) -> dict[str, Any]:
         {"files": [paths], "to": format, "grids": names, of vdb, "label_revision": of the marks that classes are from, or
         None}
     Raises:
-        SettingError: the file has another ending, or the format has no words for a lens. ProjectError: there is no mesh, or
-        the project was aligned anew since it was made; no trained run or no pose. DiskError: a file cannot be written.
+        SettingError: the file has another ending or is the mesh's own, or the format has no words for a lens. ProjectError:
+        there is no mesh, or the project was aligned anew since it was made; no trained run or no pose. DiskError: a file
+        cannot be written.
     """
     folder = Path(params.project).absolute()
     project = load_project(folder)
@@ -59,6 +64,7 @@ def export(params: ExportParams, report: Reporter) -> dict[str, Any]:
     suffixes = SUFFIXES[params.to]
     if suffixes and out.suffix.lower() not in suffixes:
         raise SettingError(f"{out}: {params.to} files end in {' or '.join(suffixes)}.", "Choose one of these endings.")
+    _require_no_own_file(out, folder, params.run)
     revision = label_revision(folder, project, params)
     result: dict[str, Any] = {"to": params.to, "label_revision": revision}
     if params.to in OF_THE_MESH:
@@ -89,7 +95,14 @@ def export(params: ExportParams, report: Reporter) -> dict[str, Any]:
 def _default_name(folder: Path, to: str) -> str:
     if to in NAMES:
         return NAMES[to]
-    return f"{folder.name}{'-splats' if to == 'splats' else ''}{SUFFIXES[to][0]}"
+    name = folder.name if folder.name != ".." else folder.resolve().name
+    return f"{name}{ENDINGS.get(to, '')}{SUFFIXES[to][0]}"
+
+
+def _require_no_own_file(out: Path, folder: Path, run: str) -> None:
+    """Raise SettingError where the file would stand in the place of what the verb `mesh` stored."""
+    if out.resolve() in {(mesh_folder(folder, run) / name).resolve() for name in OWN_FILES}:
+        raise SettingError(f"{out} is a file that the mesh of the run consists of.", "Choose another name with --out.")
 
 
 def label_revision(folder: Path, project: Project, params: ExportParams) -> int | None:

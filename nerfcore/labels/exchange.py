@@ -358,13 +358,15 @@ def _written(
     classes, void, name = label_classes(project), project.ignore_id, params.class_name
     if params.format in known.FILES:
         return known.write(pictures, params.format, classes, out, void, name, revision)
+    if out.is_dir():  # it stays: somebody may be in it, or it is a disk of its own
+        with staged(out) as place:
+            files = known.write(pictures, params.format, classes, place, void, name, revision)
+            return [out / file.relative_to(place) for file in files]
     part = out.with_name(f".{out.name}.part")
     shutil.rmtree(part, ignore_errors=True)
     try:
         files = known.write(pictures, params.format, classes, part, void, name, revision)
         with disk_errors(out):
-            if out.is_dir():
-                out.rmdir()
             os.replace(part, out)
     finally:
         shutil.rmtree(part, ignore_errors=True)

@@ -22,6 +22,7 @@ from fieldwork.nerfcore.mesh.painted import MAPS
 from fieldwork.nerfcore.params import ExportParams, MeshParams, TrainParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.store import edit_project
+from fieldwork.nerfcore.render.run import RunInfo
 from fieldwork.nerfcore.verbs import run_verb
 from fieldwork.tests.nerfcore.support.ball import SMALL, ball_project
 from fieldwork.tests.nerfcore.support.meshed import court
@@ -263,6 +264,34 @@ def test_the_graph_computes_what_the_field_does(settings: dict, contracted: bool
     assert density == pytest.approx((geometry.density / 2.5).numpy(), rel=1e-3, abs=1e-6)
     assert color == pytest.approx(true_color.numpy(), abs=1e-4)
     assert classes == pytest.approx(true_classes.numpy(), abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("to", "name"), [("voxels", "mesh.npz"), ("voxels", "mesh_coarse.npz"), ("transforms", "mesh.json")]
+)
+def test_no_export_takes_the_place_of_the_stored_mesh(tmp_path: Path, to: str, name: str) -> None:
+    folder = court(tmp_path / "p")
+    stored = folder / "exports" / "main" / name
+    before = stored.read_bytes()
+    with pytest.raises(SettingError, match=f"{name} is a file that the mesh"):
+        export(folder, to, out=folder / "exports" / ".." / "exports" / "main" / name)
+    assert stored.read_bytes() == before
+
+
+def test_files_are_named_after_the_project_and_not_after_the_mesh(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = court(tmp_path / "mesh")
+    monkeypatch.setattr("fieldwork.nerfcore.export.verb.load_trained", lambda *_: None)
+    monkeypatch.setattr(
+        "fieldwork.nerfcore.export.verb.load_info", lambda *_: RunInfo.model_construct(label_revision=None)
+    )
+    monkeypatch.setattr("fieldwork.nerfcore.export.voxels.write_voxels", lambda *_: None)
+    assert export(folder, "voxels") == [folder / "exports" / "main" / "mesh-voxels.npz"]
+    (folder / "inside").mkdir()
+    monkeypatch.chdir(folder / "inside")
+    (path,) = export(Path(".."), "ply")
+    assert path.name == "mesh.ply"
 
 
 def test_a_mesh_from_before_the_project_was_aligned_anew_is_refused(tmp_path: Path) -> None:

@@ -540,6 +540,18 @@ def test_folders_and_files_that_are_wrong_are_refused(tmp_path: Path) -> None:
     assert export(folder, tmp_path / "new", "png")["photos"] == 1, "an empty folder is as good as none"
 
 
+def test_labels_go_into_the_folder_that_one_is_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = project_of(tmp_path / "p", ["a"])
+    bring(folder, write_cvat(tmp_path))
+    here = tmp_path / "here"
+    here.mkdir()
+    monkeypatch.chdir(here)
+    written = export(folder, Path("."), "png")["files"]
+    assert sorted(path.name for path in here.iterdir()) == sorted(Path(path).name for path in written)
+    assert Path("a.png").is_file(), "the folder is still the one that the user is in"
+    assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
+
+
 def test_a_full_disk_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = project_of(tmp_path / "p", ["a"])
     bring(folder, write_cvat(tmp_path))

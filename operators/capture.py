@@ -12,7 +12,7 @@ from ..addon.project import snapshot
 from ..addon.props import BoolProperty, CollectionProperty, EnumProperty, StringProperty
 from ..addon.text import t
 from ..nerfcore.images.suffixes import PHOTO_SUFFIXES, VIDEO_SUFFIXES
-from .base import ProjectOperator, mask_mode, need_photos, need_project_folder, scene_settings, set_if_empty
+from .base import ProjectOperator, absolute, mask_mode, need_photos, need_project_folder, scene_settings, set_if_empty
 
 READ = PHOTO_SUFFIXES | VIDEO_SUFFIXES
 # What Blender's own filters of pictures and movies do not show in a file browser.
@@ -114,6 +114,12 @@ class FIELDWORK_OT_import_dataset(ProjectOperator):
         name="Data Set", description="Folder of the data set", subtype="DIR_PATH", options={"SKIP_SAVE"}
     )
     format: EnumProperty(name="Format", description="Kind of the data set", items=FORMATS, options={"SKIP_SAVE"})
+    classes: StringProperty(
+        name="Classes",
+        description="File classes.json that names the label ids, where it is not beside the labels",
+        subtype="FILE_PATH",
+        options={"SKIP_SAVE"},
+    )
     mask_mode: EnumProperty(
         name="Black in Masks",
         description="What black pixels of a mask mean",
@@ -143,6 +149,7 @@ class FIELDWORK_OT_import_dataset(ProjectOperator):
             "dataset": str(source),
             "project": str(project),
             "format": self.format,
+            "classes": absolute(self.classes),
             "mask_mode": mask_mode(self.mask_mode),
             "keep_backdrop": self.keep_backdrop,
         }

@@ -15,7 +15,7 @@ from ..images.labels import Colors, drawn_as_stored
 from ..images.suffixes import VIDEO_SUFFIXES
 from ..params import NewParams
 from ..progress import Reporter, shortened
-from ..project.classes import make_classes, read_classes, unnamed_values
+from ..project.classes import make_classes, read_found_classes, unnamed_values
 from ..project.fingerprints import Earlier, Fingerprint, compare, digest, files_digest, stamps_digest
 from ..project.kept import earlier_cut_outs, keep_later_labels, resized_labels, same_place, with_earlier_names
 from ..project.schema import ImageRecord, Project
@@ -50,7 +50,9 @@ def new(params: NewParams, report: Reporter) -> dict[str, Any]:
     labels_folder = params.labels or subfolder(photos, "labels")
     masks_folder = params.masks or subfolder(photos, "masks")
     classes_file = params.classes or classes_beside(labels_folder)
-    classes = _classes(classes_file, given=params.classes is not None)
+    classes: Classes = ({}, 0, {})
+    if classes_file is not None:
+        classes = read_found_classes(classes_file, given=params.classes is not None)
     create_folder(folder)
     _remove_halves(folder)
     paths, skipped, root = _photos(params, report)
@@ -269,17 +271,6 @@ def _check_usable(records: list[ImageRecord], photos: Path, skipped: list[dict[s
     raise InputError(
         f"None of the {len(records) + len(skipped)} files in {photos} is a usable photo{why}.", "Choose other photos."
     )
-
-
-def _classes(file: Path | None, given: bool) -> Classes:
-    """What the classes file says; nothing without one. Raises InputError."""
-    if file is None:
-        return {}, 0, {}
-    try:
-        return read_classes(file)
-    except InputError as error:
-        found = "" if given else " The file was found by itself: rename it if it is something else."
-        raise InputError(error.message, error.hint + found) from error
 
 
 def _present_ids(folder: Path, records: list[ImageRecord], report: Reporter) -> dict[int, list[str]]:

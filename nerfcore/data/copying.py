@@ -14,6 +14,7 @@ from ..images.arrays import read_array
 from ..images.decode import read_photo
 from ..images.labels import Colors, read_labels, read_mask
 from ..images.limits import UNDECODABLE
+from ..images.soft_labels import read_confidence
 from ..images.suffixes import FLOAT_SUFFIXES, RAW_SUFFIXES
 
 PLAIN_SUFFIXES = {".png", ".jpg", ".jpeg", ".webp"}
@@ -87,6 +88,19 @@ def copy_labels(
 def copy_mask(source: Path, folder: Path, name: str, size: tuple[int, int]) -> Path:
     """Write a mask as a black and white PNG of the photo's size. Raises InputError when it cannot."""
     values = read_mask(source).astype(np.uint8) * 255
+    target = folder / f"{name}.png"
+    with atomic_path(target) as temporary:
+        _save_map(_fitted(values, size, source), temporary)
+    return target
+
+
+def copy_confidence(source: Path, folder: Path, name: str, size: tuple[int, int]) -> Path:
+    """Write how sure labels are as a grey PNG of the photo's size, 255 for certain.
+
+    Raises:
+        InputError: it is no confidence or probability map, or not of the photo's shape.
+    """
+    values = read_confidence(source)
     target = folder / f"{name}.png"
     with atomic_path(target) as temporary:
         _save_map(_fitted(values, size, source), temporary)

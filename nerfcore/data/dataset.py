@@ -34,6 +34,7 @@ class DatasetView:
     camera_to_world: np.ndarray
     label: Path | None = None
     mask: Path | None = None
+    confidence: Path | None = None
     depth: Path | None = None
     depth_scale: float = 1.0
     split: Literal["train", "test", "auto"] = "auto"
@@ -51,9 +52,12 @@ class Dataset:
     class_names: dict[int, str] = field(default_factory=dict)
     ignore_id: int = 0
     class_colors: dict[int, tuple[int, int, int]] = field(default_factory=dict)  # in RGB label maps
+    classes_file: Path | None = None  # that the classes are from
+    mask_mode: Literal["ignore", "empty"] | None = None  # what black in masks means, where the set says so
     points: Points = field(default_factory=Points.empty)
     bounds: np.ndarray | None = None
     warnings: list[str] = field(default_factory=list)
+    root: Path | None = None  # folder with `labels`, `masks` and classes.json; None: what was given, or where that file lies
     resources: tuple[object, ...] = ()  # temporary folders that live as long as this
 
 

@@ -29,7 +29,8 @@ from ..project.kept import (
 )
 from ..project.schema import Frame, ImageRecord, PosedImage, Poses, Project, SemanticClass
 from ..project.store import PROJECT_FILE, create_folder, edit_project, load_project, save_poses
-from .copying import copy_depth, copy_labels, copy_mask, copy_photo
+from .companions import with_classes, with_soft_labels
+from .copying import copy_confidence, copy_depth, copy_labels, copy_mask, copy_photo
 from .dataset import Dataset, DatasetView
 from .hull import trim_masks
 from .lens_check import lens_problem
@@ -57,7 +58,7 @@ def import_dataset(params: ImportParams, report: Reporter) -> dict[str, Any]:
     source, folder = Path(params.dataset).absolute(), Path(params.project)
     previous = _previous_project(folder, source)
     report.stage("Reading the data set")
-    dataset = read_dataset(source, params.format)
+    dataset = read_dataset(source, params.format, params.classes)
     for message in dataset.warnings:
         report.warn(message)
     create_folder(folder)
@@ -70,7 +71,7 @@ def import_dataset(params: ImportParams, report: Reporter) -> dict[str, Any]:
         records.append(record)
         for value in ids:
             present.setdefault(value, []).append(view.label.name if view.label else view.name)
-    _warn_of_maps(present, dataset, source, report)
+    _warn_of_maps(present, dataset, dataset.classes_file or source, report)
     _reject_hidden(records, folder, report)
     used = [record for record in records if record.status == "ok"]
     if not used:
@@ -103,11 +104,13 @@ def import_dataset(params: ImportParams, report: Reporter) -> dict[str, Any]:
     return result
 
 
-def read_dataset(source: Path, format: str = "auto") -> Dataset:
+def read_dataset(source: Path, format: str = "auto", classes: Path | None = None) -> Dataset:
     """Read a posed data set in one of `FORMATS`.
 
+    Args:
+        classes: a file that names its classes, where it is not the one that lies with the data set.
     Raises:
-        InputError: it does not exist, or is of no known format.
+        InputError: it does not exist, is of no known format or damaged, or the classes cannot be read.
     """
     if not source.exists():
         raise InputError(f"{source} does not exist.", "Choose the folder of a posed data set.")
@@ -115,10 +118,10 @@ def read_dataset(source: Path, format: str = "auto") -> Dataset:
     if format != "auto":
         if format not in FORMATS:
             raise InputError(f"The format {format} cannot be read.", f"Choose one of {', '.join(FORMATS)}.")
-        return _checked(_read(format, source), source)
+        return _complete(_read(format, source), source, classes)
     for name in FORMATS:
         if _reader(name).matches(source):
-            return _checked(_read(name, source), source)
+            return _complete(_read(name, source), source, classes)
     raise InputError(
         f"{source} is no posed data set that Fieldwork knows.",
         f"Known are {', '.join(FORMATS)}. Photos without poses go through `fieldwork new`.",
@@ -132,6 +135,13 @@ def _read(name: str, source: Path) -> Dataset:
     except (ValueError, TypeError, LookupError, ArithmeticError) as error:
         reason = wrong_value(error.errors()[0]) if isinstance(error, ValidationError) else repr(error)
         raise InputError(f"{source} is a damaged data set ({name}): {reason}.", "Export the data set again.") from error
+
+
+def _complete(dataset: Dataset, source: Path, classes: Path | None) -> Dataset:
+    """The data set, checked, with what lies beside its photos whatever its format. Raises InputError."""
+    dataset = _checked(dataset, source)
+    root = dataset.root or (source.parent if source.is_file() else source)
+    return with_classes(with_soft_labels(replace(dataset, root=root)), classes)
 
 
 def _checked(dataset: Dataset, source: Path) -> Dataset:
@@ -184,11 +194,13 @@ def _copy_view(view: DatasetView, folder: Path, dataset: Dataset) -> tuple[Image
     size = view.camera.width, view.camera.height
     image = copy_photo(view.image, folder / "images", view.name)
     ids: set[int] = set()
-    label = mask = depth = None
+    label = mask = depth = confidence = None
     try:
         if view.label:
             colors = dataset.class_colors or None
             label, ids = copy_labels(view.label, folder / "labels", view.name, size, colors, dataset.ignore_id)
+        if view.confidence:
+            confidence = copy_confidence(view.confidence, folder / "confidence", view.name, size)
         if view.mask:
             mask = copy_mask(view.mask, folder / "masks", view.name, size)
     except InputError as error:
@@ -206,16 +218,16 @@ def _copy_view(view: DatasetView, folder: Path, dataset: Dataset) -> tuple[Image
         focal_px=view.camera.fx,
         label=_relative(label, folder),
         mask=_relative(mask, folder),
+        confidence=_relative(confidence, folder),
         depth=_relative(depth, folder),
         split=view.split,
     )
     return record, ids
 
 
-def _warn_of_maps(present: dict[int, list[str]], dataset: Dataset, source: Path, report: Reporter) -> None:
-    """Say which values of label maps have no name where others have one."""
+def _warn_of_maps(present: dict[int, list[str]], dataset: Dataset, named: Path, report: Reporter) -> None:
+    """Say which values of label maps have no name where others have one, `named` in a file."""
     if dataset.class_names:
-        named = source / "classes.json" if (source / "classes.json").is_file() else source
         for text in unnamed_values(present, dataset.class_names, dataset.ignore_id, named):
             report.warn(text)
 

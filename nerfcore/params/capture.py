@@ -103,6 +103,7 @@ class ImportParams(Params):
         "realityscan",
         "meshroom",
     ] = Field(default="auto", description="how the dataset is laid out; auto finds it out")
+    classes: Path | None = Field(default=None, description=CLASSES)
     mask_mode: Literal["ignore", "empty"] | None = Field(default=None, description=MASK_MODE)
     keep_backdrop: bool = Field(default=False, description=KEEP_BACKDROP)
 

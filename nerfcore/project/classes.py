@@ -94,6 +94,15 @@ def read_classes(path: Path) -> tuple[dict[int, str], int, dict[int, tuple[int, 
     return names, ignore_id, colors
 
 
+def read_found_classes(path: Path, given: bool) -> tuple[dict[int, str], int, dict[int, tuple[int, int, int]]]:
+    """`read_classes`, whose errors say so where nobody gave the file."""
+    try:
+        return read_classes(path)
+    except InputError as error:
+        found = "" if given else " The file was found by itself: rename it if it is something else."
+        raise InputError(error.message, error.hint + found) from error
+
+
 def unnamed_values(present: dict[int, list[str]], names: dict[int, str], ignore_id: int, file: Path) -> list[str]:
     """A sentence for each value of label maps that a classes file does not name.
 

@@ -15,6 +15,7 @@ MODEL = {"encoder": "e.onnx", "decoder": "d.onnx"}
 ASKED: dict[str, dict[str, Any]] = {
     "new": {"photos": "photos"},
     "import_dataset": {"directory": "dataset"},
+    "import_dataset by all": {"directory": "dataset", "format": "colmap", "classes": "c.json", "keep_backdrop": True},
     "poses": {"restart": True},
     "align": {"up": "x", "ground": True, "crop": "auto"},
     "align by distance": {"point_a": (0, 0, 0), "point_b": (1, 2, 3), "distance": 2.0},

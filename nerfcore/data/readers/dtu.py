@@ -15,7 +15,7 @@ from ...files import UNREADABLE_ARRAYS
 from ...geometry.frames import upright
 from ...geometry.similarity import transform_points
 from ...images.decode import image_size
-from ...images.names import list_images, plain_name
+from ...images.names import beside, list_images, plain_name
 from ..dataset import Dataset, DatasetView, require
 from .matrices import camera_from_matrix, decompose_projection
 
@@ -48,7 +48,8 @@ def read(folder: Path) -> Dataset:
         k, pose = decompose_projection(matrices[f"world_mat_{i}"][:3, :4])
         camera = camera_from_matrix(k, image_size(image))
         mask = masks[i] if len(masks) == len(images) else None
-        views.append(DatasetView(name=plain_name(image), image=image, camera=camera, camera_to_world=pose, mask=mask))
+        label = beside(folder / "labels", image.stem)
+        views.append(DatasetView(plain_name(image), image, camera, camera_to_world=pose, label=label, mask=mask))
     require(views, folder)
     frame, confidence = upright([view.camera_to_world for view in views])
     bounds = None

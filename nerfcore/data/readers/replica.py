@@ -17,7 +17,6 @@ from ...geometry.cameras import Camera
 from ...geometry.frames import axis_upright
 from ...images.decode import image_size
 from ...images.names import list_images, plain_name
-from ...project.classes import read_classes
 from ..dataset import Dataset, DatasetView, lens_at_size, require
 from .matrices import read_numbers
 
@@ -66,15 +65,13 @@ def read(folder: Path) -> Dataset:
             )
         )
     require(views, folder)
-    names, ignore_id = _classes(folder)
     frame = axis_upright([view.camera_to_world for view in views])
     return Dataset(
         format="replica",
         views=views,
         world_from_sfm=frame,
         scale_known=True,
-        class_names=names,
-        ignore_id=ignore_id,
+        class_names=_classes(folder),
     )
 
 
@@ -100,15 +97,13 @@ def _camera(params: Path | None) -> tuple[Camera | None, float]:
         raise InputError(f"{params} cannot be read: {error}.", "Download the data set again.") from error
 
 
-def _classes(folder: Path) -> tuple[dict[int, str], int]:
-    if (folder / "classes.json").is_file():
-        names, ignore_id, _ = read_classes(folder / "classes.json")
-        return names, ignore_id
+def _classes(folder: Path) -> dict[int, str]:
+    """Names by id as Replica has them."""
     info = next((p for d in (folder, folder.parent) if (p := d / "info_semantic.json").is_file()), None)
     if info is None:
-        return {}, 0
+        return {}
     try:
         entries = json.loads(info.read_text(encoding="utf-8"))["classes"]
-        return {int(entry["id"]): str(entry["name"]) for entry in entries}, 0
+        return {int(entry["id"]): str(entry["name"]) for entry in entries}
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"{info} cannot be read: {error}.", "Download the data set again.") from error

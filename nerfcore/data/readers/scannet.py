@@ -14,7 +14,6 @@ from ...errors import InputError
 from ...geometry.frames import axis_upright
 from ...images.decode import image_size
 from ...images.names import beside, list_images, plain_name
-from ...project.classes import read_classes
 from ..dataset import Dataset, DatasetView, require
 from .matrices import camera_from_matrix, read_numbers
 
@@ -61,17 +60,6 @@ def read(folder: Path) -> Dataset:
             )
         )
     require(views, folder, missing)
-    names, ignore_id = {}, 0
-    if (folder / "classes.json").is_file():
-        names, ignore_id, _ = read_classes(folder / "classes.json")
     frame = axis_upright([view.camera_to_world for view in views])
     warnings = [f"{lost} frames have no valid pose and are left out."] if lost else []
-    return Dataset(
-        format="scannet",
-        views=views,
-        world_from_sfm=frame,
-        scale_known=True,
-        class_names=names,
-        ignore_id=ignore_id,
-        warnings=warnings,
-    )
+    return Dataset("scannet", views, frame, scale_known=True, warnings=warnings)

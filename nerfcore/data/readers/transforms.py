@@ -19,7 +19,6 @@ from ...geometry.cameras import Camera, flip_camera_axes, pose_matrix
 from ...geometry.points import Points
 from ...images.decode import image_size
 from ...images.names import find_image, labels_and_masks, unique_names
-from ...project.classes import read_classes
 from ..dataset import Dataset, DatasetView, lens_at_size, require
 from ..up_axis import choose_up
 
@@ -79,9 +78,6 @@ def read(folder: Path) -> Dataset:
     ]
     require(views, folder, missing)
     warnings = [f"{len(missing)} images named in the data set are missing (first: {missing[0]})."] if missing else []
-    class_names, ignore_id, colors = {}, 0, {}
-    if (folder / "classes.json").is_file():
-        class_names, ignore_id, colors = read_classes(folder / "classes.json")
     convention = str(heads[0].get("camera_convention", "")).lower()
     up = choose_up(heads[0], [view.camera_to_world for view in views], named_splits=files[0][0].name in SPLIT_FILES)
     return Dataset(
@@ -90,9 +86,6 @@ def read(folder: Path) -> Dataset:
         world_from_sfm=up.world_from_sfm,
         up_confidence=up.confidence,
         scale_known="metres" in convention or "meters" in convention,
-        class_names=class_names,
-        ignore_id=ignore_id,
-        class_colors=colors,
         points=_points(folder, heads[0]),
         warnings=[*warnings, *up.warnings],
     )

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import importlib
-from dataclasses import replace
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,9 @@ import numpy as np
 from pydantic import ValidationError
 
 from ..capture.backdrop import mask_objects
-from ..capture.mask_mode import chosen_mask_mode
+from ..capture.mask_mode import MaskMode, chosen_mask_mode
 from ..errors import InputError, ProjectError, wrong_value
-from ..files import file_hash, require_readable
+from ..files import file_hash, linked, require_readable, staged
 from ..geometry.cameras import Camera
 from ..images.labels import read_mask
 from ..params import ImportParams
@@ -54,6 +55,7 @@ def import_dataset(params: ImportParams, report: Reporter) -> dict[str, Any]:
         InputError: the data set is of no known format or damaged.
         ProjectError: the project folder already holds another capture.
         DiskError: it cannot be written.
+        Of these, and when it is stopped, a project that was there is as before.
     """
     source, folder = Path(params.dataset).absolute(), Path(params.project)
     previous = _previous_project(folder, source)
@@ -62,25 +64,12 @@ def import_dataset(params: ImportParams, report: Reporter) -> dict[str, Any]:
     for message in dataset.warnings:
         report.warn(message)
     create_folder(folder)
-    report.stage("Copying images")
-    records: list[ImageRecord] = []
-    present: dict[int, list[str]] = {}
-    for i, view in enumerate(dataset.views):
-        report.progress(i / len(dataset.views), view.name)
-        record, ids = _copy_view(view, folder, dataset)
-        records.append(record)
-        for value in ids:
-            present.setdefault(value, []).append(view.label.name if view.label else view.name)
-    _warn_of_maps(present, dataset, dataset.classes_file or source, report)
-    _reject_hidden(records, folder, report)
-    used = [record for record in records if record.status == "ok"]
-    if not used:
-        raise InputError(f"The masks of {source} leave nothing of any photo.", "White in a mask marks what counts.")
-    classes = _classes(dataset, set(present))
-    told = params.keep_backdrop or params.mask_mode == "ignore" or any(r.mask or r.label for r in records)
-    cut_out = not told and mask_objects(records, folder, report, earlier_cut_outs(previous))
-    masks = [folder / record.mask for record in used if record.mask]
-    mask_mode = "empty" if cut_out else chosen_mask_mode(params.mask_mode, masks, len(used), report)
+    # What a project holds already stays as it is until all that takes its place is there.
+    with nullcontext(folder) if previous is None else staged(folder) as place:
+        if previous is not None:
+            _link(previous, folder, place)
+        brought = _bring(dataset, place, params, previous, report)
+    records, classes = brought.records, brought.classes
     cameras, images = _poses(dataset.views)
     poses, before = Poses(source=dataset.format, cameras=cameras, images=images), earlier_poses(folder)
     with edit_project(folder, Project()) as project:
@@ -88,20 +77,73 @@ def import_dataset(params: ImportParams, report: Reporter) -> dict[str, Any]:
             keep_later_labels(records, project.images, folder)
             classes = with_earlier_classes(classes, project.classes)
         project.images, project.classes, project.ignore_id = records, classes, dataset.ignore_id
-        project.mask_mode, frame = mask_mode, _frame(dataset)
+        project.mask_mode, frame = brought.mask_mode, _frame(dataset)
         project.frame, kept = (frame, False) if previous is None else keep_world(project, before, poses, frame, report)
         save_poses(folder, poses, dataset.points)
         result = {
             "format": dataset.format,
-            "images": len(used),
-            "labelled": sum(record.label is not None for record in used),
+            "images": len(brought.used),
+            "labelled": sum(record.label is not None for record in brought.used),
             "classes": [c.name for c in classes],
         }
         settings = params.model_dump(mode="json") | {"dataset": str(source.resolve())}
-        project.record("import", settings, result | {"world_kept": kept, "cut_out": cut_out})
-    if cut_out:
+        project.record("import", settings, result | {"world_kept": kept, "cut_out": brought.cut_out})
+    if brought.cut_out:
         trim_masks(folder, report)
     return result
+
+
+@dataclass(frozen=True)
+class Brought:
+    """What was copied of a data set. cut_out: whether masks of objects were made for it."""
+
+    records: list[ImageRecord]
+    classes: list[SemanticClass]
+    mask_mode: MaskMode
+    cut_out: bool
+
+    @property
+    def used(self) -> list[ImageRecord]:
+        return [record for record in self.records if record.status == "ok"]
+
+
+def _bring(dataset: Dataset, place: Path, params: ImportParams, previous: Project | None, report: Reporter) -> Brought:
+    """Copy the files of a data set into the folder `place`, and make masks there where objects stand before the dark.
+
+    Raises:
+        InputError: a file cannot be used, masks leave nothing of any photo, or there are too many classes. DiskError.
+        What `report` raises to stop.
+    """
+    report.stage("Copying images")
+    records: list[ImageRecord] = []
+    present: dict[int, list[str]] = {}
+    for i, view in enumerate(dataset.views):
+        report.progress(i / len(dataset.views), view.name)
+        record, ids = _copy_view(view, place, dataset)
+        records.append(record)
+        for value in ids:
+            present.setdefault(value, []).append(view.label.name if view.label else view.name)
+    _warn_of_maps(present, dataset, dataset.classes_file or params.dataset, report)
+    _reject_hidden(records, place, report)
+    used = [record for record in records if record.status == "ok"]
+    if not used:
+        raise InputError(f"The masks of {params.dataset} leave nothing of any photo.", "White in a mask marks what counts.")
+    classes = _classes(dataset, set(present))
+    asked = params.mask_mode or dataset.mask_mode
+    told = params.keep_backdrop or asked == "ignore" or any(r.mask or r.label for r in records)
+    cut_out = not told and mask_objects(records, place, report, earlier_cut_outs(previous))
+    masks = [place / record.mask for record in used if record.mask]
+    mask_mode = "empty" if cut_out else chosen_mask_mode(asked, masks, len(used), report)
+    return Brought(records, classes, mask_mode, cut_out)
+
+
+def _link(project: Project, folder: Path, place: Path) -> None:
+    """Put photos and masks of a project into the folder `place` as well, so that those that stay need not be made anew."""
+    for record in project.images:
+        for file in (record.file, record.mask):
+            if file and (folder / file).is_file():
+                (place / file).parent.mkdir(parents=True, exist_ok=True)
+                linked(str(folder / file), str(place / file))
 
 
 def read_dataset(source: Path, format: str = "auto", classes: Path | None = None) -> Dataset:

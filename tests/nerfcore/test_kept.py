@@ -11,7 +11,8 @@ import pytest
 from fieldwork.nerfcore.capture.ingest import new
 from fieldwork.nerfcore.data.importer import import_dataset
 from fieldwork.nerfcore.data.load import load_scene
-from fieldwork.nerfcore.errors import ProjectError
+from fieldwork.nerfcore.errors import Cancelled, InputError, ProjectError
+from fieldwork.nerfcore.files import file_hash
 from fieldwork.nerfcore.geometry.similarity import make_similarity, transform_points, transform_pose
 from fieldwork.nerfcore.params import AlignParams, ImportParams, NewParams, PosesParams
 from fieldwork.nerfcore.poses import estimate
@@ -239,3 +240,49 @@ def test_paths_that_earlier_versions_noted_as_typed_are_compared_so(
     VERBS["import"](Path("data"), tmp_path / "p")
     with pytest.raises(ProjectError, match="another capture"):
         VERBS["import"](data_set(tmp_path / "other"), tmp_path / "p")
+
+
+def contents(folder: Path) -> dict[str, str]:
+    return {
+        path.relative_to(folder).as_posix(): file_hash(path)
+        for path in folder.rglob("*")
+        if path.is_file() and "jobs" not in path.parts
+    }
+
+
+class StoppedAtThird(Reporter):
+    def progress(self, fraction: float, message: str = "") -> None:
+        if message == "f2":
+            raise Cancelled
+
+
+@pytest.mark.parametrize("how", ["damaged", "stopped", "too many classes"])
+def test_an_import_that_fails_leaves_the_project_as_it_was(tmp_path: Path, how: str) -> None:
+    dataset, project = data_set(tmp_path / "d", {"aabb_scale": 1}), tmp_path / "p"
+    for name in ("labels", "masks"):
+        (dataset / name).mkdir()
+        for i in range(3):
+            Image.new("L", (320, 200), 3 if name == "labels" else 255).save(dataset / name / f"f{i}.png")
+    imported(dataset, project)
+    before = contents(project)
+    assert {"labels/f0.png", "masks/f0.png", "images/f0.png"} <= set(before)
+    picture(50).save(dataset / "images" / "f0.png")
+    Image.new("L", (320, 200), 5).save(dataset / "labels" / "f0.png")
+    half = Image.new("L", (320, 200), 255)
+    half.paste(0, (0, 0, 320, 40))
+    half.save(dataset / "masks" / "f0.png")
+    if how == "damaged":
+        (dataset / "labels" / "f2.png").write_bytes(b"no picture")
+    if how == "too many classes":
+        ids = np.arange(300, dtype=np.uint16)[None].repeat(200, 0)
+        Image.fromarray(np.pad(ids, ((0, 0), (0, 20)))).save(dataset / "labels" / "f2.png")
+    report = StoppedAtThird() if how == "stopped" else Reporter()
+    with pytest.raises((InputError, Cancelled)):
+        import_dataset(ImportParams(dataset=dataset, project=project), report)
+    assert contents(project) == before
+    Image.new("L", (320, 200), 3).save(dataset / "labels" / "f2.png")
+    imported(dataset, project)
+    after = contents(project)
+    assert {name for name in after if after[name] != before.get(name)} - {"poses/points.npz"} == {
+        "images/f0.png", "labels/f0.png", "masks/f0.png", "project.json",
+    }  # fmt: skip

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,13 +28,15 @@ FISHEYE = ("k1", "k2", "k3", "k4")
 
 def write_transforms(out: Path, scene: Scene, metres: bool, label_revision: int | None = None) -> list[Path]:
     """A transforms.json as nerfstudio and Instant-NGP read it: camera-to-world with OpenGL axes, intrinsics of each frame
-    in pixels, which photos are held out, and the revision of the marks that label maps are from, if they are from any; and the
-    sparse points beside it. Where only some photos have masks the others get white ones beside it: nerfstudio wants all or none.
+    in pixels, which photos are held out, what black in masks means, and the revision of the marks that label maps are from, if
+    they are from any; beside it the sparse points, and classes.json where there are label maps. Where only some photos have
+    masks the others get white ones beside it: nerfstudio wants all or none.
 
     Returns:
         the files written.
     Raises:
-        SettingError: there are no keys for such a lens. DiskError: a file cannot be written.
+        SettingError: there are no keys for such a lens, or a classes.json of something else is in the way. DiskError: a file
+        cannot be written.
     """
     # Their k4 is a fourth polynomial term, ours the first of a denominator.
     rational = next((v.name for v in scene.views if any(v.camera.distortion[len(RADIAL) :])), None)
@@ -52,7 +55,10 @@ def write_transforms(out: Path, scene: Scene, metres: bool, label_revision: int 
             f"{split}_filenames": [frames[i]["file_path"] for i in indices]
             for split, indices in (("train", scene.train), ("val", scene.test), ("test", scene.test))
         }
-    files = [out, *_white_masks(frames, out)]
+    classes = _write_classes(frames, scene, out)
+    head |= {"classes_path": classes.name} if classes else {}
+    head |= {"mask_mode": scene.mask_mode} if any("mask_path" in frame for frame in frames) else {}
+    files = [out, *([classes] if classes else []), *_white_masks(frames, out)]
     if len(scene.points.xyz):
         cloud = out.with_name(f"{out.stem}_points.ply")
         with atomic_path(cloud) as temporary:
@@ -81,6 +87,27 @@ def _frame(view: View, folder: Path) -> dict[str, Any]:
     if camera.model == "OPENCV_FISHEYE":
         frame["is_fisheye"] = True  # in Instant-NGP's words
     return frame | dict(zip(FISHEYE if camera.model == "OPENCV_FISHEYE" else RADIAL, camera.distortion))
+
+
+def _write_classes(frames: list[dict[str, Any]], scene: Scene, out: Path) -> Path | None:
+    """Write what the ids in label maps mean beside the file `out`; None where no frame has labels."""
+    if not any("semantic_path" in frame for frame in frames):
+        return None
+    entries = {str(c.id): {"name": c.name, "color": [round(part * 255) for part in c.color]} for c in scene.classes}
+    path, value = out.with_name("classes.json"), {"ignore_id": scene.ignore_id, "classes": entries}
+    if path.exists() and not _says(path, None, value) and not _says(out, "classes_path", path.name):
+        raise SettingError(f"{path} is there already and belongs to something else.", "Choose another folder with --out.")
+    write_json(path, value)
+    return path
+
+
+def _says(path: Path, key: str | None, value: Any) -> bool:
+    """Whether a JSON file holds a value, as a whole or under a key."""
+    try:
+        there = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return there == value if key is None else isinstance(there, dict) and there.get(key) == value
 
 
 def _white_masks(frames: list[dict[str, Any]], out: Path) -> list[Path]:

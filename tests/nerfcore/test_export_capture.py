@@ -19,9 +19,11 @@ from fieldwork.nerfcore.export.cameras import write_colmap, write_transforms
 from fieldwork.nerfcore.export.class_masks import write_masks
 from fieldwork.nerfcore.geometry.cameras import Camera, pixel_centers, project, rays
 from fieldwork.nerfcore.geometry.points import Points
+from fieldwork.nerfcore.images.working import read_label
 from fieldwork.nerfcore.params import ExportParams, ImportParams
 from fieldwork.nerfcore.progress import Cancelled, Reporter
-from fieldwork.nerfcore.project.store import edit_project, load_poses
+from fieldwork.nerfcore.project.schema import SemanticClass
+from fieldwork.nerfcore.project.store import edit_project, load_poses, load_project
 from fieldwork.nerfcore.verbs import run_verb
 from fieldwork.tests.nerfcore.support import painted_box as box
 from fieldwork.tests.nerfcore.support.ball import ball_project
@@ -152,6 +154,53 @@ def test_a_capture_is_imported_as_it_was_exported(tmp_path: Path, to: str, read:
     for one, other in zip(ours.views, theirs.views):
         assert other.camera == one.camera
     assert len(theirs.points) == len(ours.points) == 30
+
+
+@pytest.mark.parametrize("mode", ["ignore", "empty"])
+def test_transforms_say_what_labels_and_masks_mean(tmp_path: Path, mode: str) -> None:
+    """Also where the id 0 is a class, and another one stands for void."""
+    folder = ball_project(tmp_path / "p", views=6)
+    (folder / "masks").mkdir()
+    with edit_project(folder) as edited:
+        edited.ignore_id, edited.mask_mode = 255, mode
+        names = {0: ("stone", (0.2, 0.6, 1.0)), 1: ("wood", (1.0, 0.0, 0.4)), 2: ("gold", (0.8, 0.2, 0.0))}
+        edited.classes = [SemanticClass(id=i, name=name, color=color) for i, (name, color) in names.items()]
+        for record in edited.images:
+            record.mask = f"masks/{record.name}.png"
+            half = Image.new("L", (record.width, record.height), 255)
+            half.paste(0, (0, 0, record.width, 5))
+            half.save(folder / record.mask)
+            label = Image.open(folder / record.label)
+            label.paste(255, (0, 0, 4, 4))
+            label.save(folder / record.label)
+    files = run_verb("export", ExportParams(project=folder, to="transforms"), Reporter())["files"]
+    assert str(folder / "exports" / "main" / "classes.json") in files
+    source = folder / "exports" / "main" / "transforms.json"
+    run_verb("import", ImportParams(dataset=source, project=tmp_path / "again"), Reporter())
+    ours, theirs = load_project(folder), load_project(tmp_path / "again")
+    assert theirs.classes == ours.classes
+    assert (theirs.ignore_id, theirs.mask_mode) == (255, mode)
+    for one, other in zip(load_scene(folder).views, load_scene(tmp_path / "again").views):
+        np.testing.assert_array_equal(read_label(other.label), read_label(one.label))
+
+
+def test_the_classes_file_of_a_data_set_is_not_written_over(tmp_path: Path) -> None:
+    folder = ball_project(tmp_path / "p", views=3)
+    out = tmp_path / "set" / "transforms.json"
+    out.parent.mkdir()
+    theirs = out.with_name("classes.json")
+    theirs.write_text('["void", "mine"]')
+    params = ExportParams(project=folder, to="transforms", out=out)
+    with pytest.raises(SettingError, match=r"classes\.json is there already"):
+        run_verb("export", params, Reporter())
+    assert theirs.read_text() == '["void", "mine"]'
+    assert not out.exists()
+    theirs.unlink()
+    run_verb("export", params, Reporter())
+    with edit_project(folder) as edited:
+        edited.classes[0].name = "another"
+    run_verb("export", params, Reporter())  # its own
+    assert "another" in theirs.read_text()
 
 
 def test_lenses_that_a_format_does_not_know_are_told(tmp_path: Path) -> None:

@@ -86,6 +86,7 @@ def read(folder: Path) -> Dataset:
         world_from_sfm=up.world_from_sfm,
         up_confidence=up.confidence,
         scale_known="metres" in convention or "meters" in convention,
+        mask_mode=mode if (mode := heads[0].get("mask_mode")) in ("ignore", "empty") else None,
         points=_points(folder, heads[0]),
         warnings=[*warnings, *up.warnings],
     )

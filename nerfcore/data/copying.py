@@ -11,7 +11,7 @@ from PIL import Image
 from ..errors import InputError
 from ..files import atomic_path, copied
 from ..images.arrays import read_array
-from ..images.decode import read_photo
+from ..images.decode import other_profile, read_photo
 from ..images.labels import Colors, read_labels, read_mask
 from ..images.limits import UNDECODABLE
 from ..images.soft_labels import read_confidence
@@ -24,7 +24,7 @@ PLAIN_MODES = {"RGB", "RGBA", "L", "LA", "P"}
 def copy_photo(source: Path, folder: Path, name: str) -> Path:
     """Put a photo into `folder` as `name`.
 
-    PNG, JPEG and WebP of 8 bits are copied as they are. Others become 8-bit PNG; so do photos with an EXIF
+    PNG, JPEG and WebP of 8 bits in sRGB are copied as they are. Others become 8-bit PNG in sRGB; so do photos with an EXIF
     orientation, because poses are given for the pixels as stored: the tag is dropped, the pixels stay. Only HEIF is
     turned, since its orientation is a part of the format that every decoder applies.
 
@@ -36,6 +36,7 @@ def copy_photo(source: Path, folder: Path, name: str) -> Path:
         try:
             with Image.open(source) as image:
                 plain = image.mode in PLAIN_MODES and image.getexif().get(0x0112, 1) in (0, 1)
+                plain = plain and other_profile(image.info.get("icc_profile")) is None
                 image.load()  # headers of truncated files are whole
         except UNDECODABLE as error:
             raise InputError(f"The photo {source} cannot be used: {error}.", "Replace or remove it.") from error
@@ -43,7 +44,8 @@ def copy_photo(source: Path, folder: Path, name: str) -> Path:
             return copy_file(source, folder, name)
     target = folder / f"{name}.png"
     taken = source.stat()
-    if target.is_file() and target.stat().st_mtime_ns == taken.st_mtime_ns:
+    # One of the same size holds the same bytes: a copy that is to be decoded now.
+    if target.is_file() and target.stat().st_mtime_ns == taken.st_mtime_ns and target.stat().st_size != taken.st_size:
         return target
     with atomic_path(target) as temporary:
         _decode(source, suffix).save(temporary, compress_level=2)

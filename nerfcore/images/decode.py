@@ -192,17 +192,28 @@ def _to_srgb(image: Image.Image) -> Image.Image:
     return image
 
 
+def other_profile(profile: bytes | None) -> ImageCms.ImageCmsProfile | None:
+    """An embedded colour profile that is not sRGB's; None where there is none, or a damaged one."""
+    if not profile:
+        return None
+    try:
+        source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        return None if "srgb" in ImageCms.getProfileDescription(source).lower() else source
+    except (ImageCms.PyCMSError, OSError) as error:
+        # A damaged profile only costs some colour accuracy; the pixels are good.
+        log.info("embedded colour profile ignored: %s", error)
+        return None
+
+
 def _from_profile(image: Image.Image, profile: bytes | None) -> Image.Image:
     """An image without alpha, in the colours of an embedded profile, as sRGB."""
-    if profile:
+    source = other_profile(profile)
+    if source is not None:
         try:
-            source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
-            if "srgb" not in ImageCms.getProfileDescription(source).lower():
-                converted = ImageCms.profileToProfile(image, source, ImageCms.createProfile("sRGB"), outputMode="RGB")
-                image = converted if converted is not None else image
+            converted = ImageCms.profileToProfile(image, source, ImageCms.createProfile("sRGB"), outputMode="RGB")
+            image = converted if converted is not None else image
         except (ImageCms.PyCMSError, OSError) as error:
-            # A damaged profile only costs some colour accuracy; the pixels are good.
-            log.info("embedded colour profile ignored: %s", error)
+            log.info("embedded colour profile ignored: %s", error)  # it is one of other pictures, CMYK for instance
     return image.convert("RGB")
 
 

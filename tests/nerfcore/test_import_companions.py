@@ -125,3 +125,97 @@ def test_a_classes_file_lies_with_the_labels_or_is_given(tmp_path: Path) -> None
     with pytest.raises(InputError, match="found by itself"):
         read_dataset(folder)
     assert read_dataset(folder, classes=given).ignore_id == 255, "what is given goes before what is found"
+
+
+def test_a_model_brings_what_lies_with_its_photos(tmp_path: Path) -> None:
+    """Where the folder of the model itself is given."""
+    folder = tmp_path / "set"
+    writers.write_colmap_text(photos(tmp_path / "photos"), folder)
+    coloured(folder / "labels" / "v1.png")
+    (folder / "masks").mkdir()
+    Image.new("L", SIZE, 255).save(folder / "masks" / "v2_mask.png")
+    (folder / "classes.json").write_text(json.dumps(CLASSES))
+    whole, model = read_dataset(folder), read_dataset(folder / "sparse" / "0")
+    for read in (whole, model):
+        assert [view.name for view in read.views] == ["v0", "v1", "v2"]
+        assert [view.label for view in read.views] == [None, folder / "labels" / "v1.png", None]
+        assert [view.mask for view in read.views] == [None, None, folder / "masks" / "v2_mask.png"]
+        assert read.class_names == {0: "stone", 7: "wood"}
+
+
+def probabilities(path: Path) -> None:
+    """That of class 1 is 0.8 in the left half, that of class 2 0.6 in the right one."""
+    values = np.zeros((200, 320, 3), np.float32)
+    values[:, :160, 1], values[:, 160:, 2] = 0.8, 0.6
+    np.save(path, values)
+
+
+def test_probability_maps_come_with_their_confidence(tmp_path: Path) -> None:
+    folder = writers.data_set(tmp_path / "d", {"aabb_scale": 1}, count=4)
+    (folder / "labels" / "confidence").mkdir(parents=True)
+    probabilities(folder / "labels" / "f0.npy")
+    probabilities(folder / "labels" / "f1.npy")
+    for name in ("f1", "f2", "f3"):
+        Image.new("L", (320, 200), 1).save(folder / "labels" / f"{name}.png")
+    np.save(folder / "labels" / "f2.npy", np.ones((200, 320)))
+    Image.new("L", (320, 200), 51).save(folder / "labels" / "confidence" / "f3.png")
+    (warning,) = bring(folder, tmp_path / "p")
+    assert "1 files beside label maps are not used" in warning
+    assert "f2.npy" in warning
+    records = {record.name: record for record in load_project(tmp_path / "p").images}
+    for name in ("f0", "f1"):
+        assert read_label(tmp_path / "p" / str(records[name].label))[0, [0, -1]].tolist() == [1, 2]
+        assert read_label(tmp_path / "p" / str(records[name].confidence))[0, [0, -1]].tolist() == [204, 153]
+    assert records["f2"].confidence is None
+    assert np.unique(read_label(tmp_path / "p" / str(records["f3"].confidence))).tolist() == [51]
+
+
+def test_files_that_a_data_set_names_and_lacks_are_told(tmp_path: Path) -> None:
+    folder = writers.data_set(
+        tmp_path / "d",
+        {"aabb_scale": 1, "ply_file_path": "gone.ply"},
+        mask_path="masks/m.png",
+        semantic_path="labels/l.png",
+        depth_file_path="depth/d.exr",
+    )
+    said = read_dataset(folder).warnings
+    assert said == [
+        "1 label maps named in transforms.json are missing (first: labels/l.png).",
+        "1 masks named in transforms.json are missing (first: masks/m.png).",
+        "1 depth maps named in transforms.json are missing (first: depth/d.exr).",
+        "The points gone.ply are missing.",
+    ]
+    for kind in ("labels/l.png", "masks/m.png", "depth/d.exr", "gone.ply"):
+        (folder / kind).parent.mkdir(exist_ok=True)
+        (folder / kind).touch()
+    (folder / "gone.ply").write_text("ply\nformat ascii 1.0\nelement vertex 0\nend_header\n")
+    assert read_dataset(folder).warnings == []
+
+
+@pytest.mark.parametrize("name", ["strecha", "realityscan", "scannet"])
+def test_photos_and_poses_that_are_missing_are_told(tmp_path: Path, name: str) -> None:
+    folder = tmp_path / "set"
+    WRITERS[name](photos(tmp_path / "photos"), folder)
+    told = len(read_dataset(folder).warnings)
+    (folder / ("pose/v0.txt" if name == "scannet" else "v0.png")).unlink()
+    *_, warning = read_dataset(folder).warnings
+    assert "v0" in warning
+    assert "missing" in warning
+    assert len(read_dataset(folder).warnings) == told + 1
+
+
+def test_points_of_another_format_are_left_out(tmp_path: Path) -> None:
+    folder = writers.data_set(tmp_path / "d", {"aabb_scale": 1, "ply_file_path": "c.pcd"})
+    (folder / "c.pcd").write_text("# .PCD v0.7\n")
+    dataset = read_dataset(folder)
+    assert len(dataset.points.xyz) == 0
+    assert dataset.warnings == ["The points c.pcd are not read: only PLY files are."]
+
+
+@pytest.mark.parametrize(
+    ("convention", "known"),
+    [("OpenGL axes, z up, metres", True), ("Meters", True), ("z up, millimetres", False), ("centimeters", False)],
+)
+def test_only_metres_are_metres(tmp_path: Path, convention: str, known: bool) -> None:
+    folder = writers.data_set(tmp_path / "d", {"aabb_scale": 1, "camera_convention": convention})
+    assert read_dataset(folder).scale_known == known

@@ -57,16 +57,21 @@ def read(folder: Path) -> Dataset:
     cameras, images, points = read_model(model)
     found: list[tuple[Path, ColmapImage]] = []
     missing = []
-    places = [folder / "images", folder, model / "images", model.parent / "images", model.parent.parent / "images"]
+    # The model itself may be given, whose photos, and what belongs to them, lie up to two folders above.
+    places = [(folder / "images", folder), (folder, folder)]
+    places += [(top / "images", top) for top in (model, model.parent, model.parent.parent)]
+    roots = [folder] if any((folder / name).is_dir() for name in ("labels", "masks")) else []
     for image in images:
-        path = next((p for place in places if (p := find_image(place / image.name))), None)
+        path, top = next(((p, top) for place, top in places if (p := find_image(place / image.name))), (None, folder))
         if path is None:
             missing.append(image.name)
         else:
             found.append((path, image))
-    names = unique_names([path for path, _ in found], folder / "images")
+            roots.append(top)
+    root = roots[0] if roots else folder
+    names = unique_names([path for path, _ in found], root / "images")
     views = []
-    companions = labels_and_masks(folder, [path for path, _ in found], names)
+    companions = labels_and_masks(root, [path for path, _ in found], names)
     for name, (path, image), (label, mask) in zip(names, found, companions):
         views.append(
             DatasetView(
@@ -82,7 +87,7 @@ def read(folder: Path) -> Dataset:
     frame, confidence = upright([view.camera_to_world for view in views], points.xyz)
     warnings = [f"{len(missing)} images of the model are missing (first: {missing[0]})."] if missing else []
     placed = {path.resolve() for path, _ in found}
-    without = [path.name for path in list_images(folder / "images") if path.resolve() not in placed]
+    without = [path.name for path in list_images(root / "images") if path.resolve() not in placed]
     if without:
         warnings.append(shortened(f"{len(without)} photos have no pose in {model} and were not imported", without))
     return Dataset(
@@ -92,6 +97,7 @@ def read(folder: Path) -> Dataset:
         up_confidence=confidence,
         points=points,
         warnings=warnings,
+        root=root,
     )
 
 

@@ -71,7 +71,8 @@ def read(folder: Path) -> Dataset:
     if metric:
         # Geographic coordinates are far from the origin: bring the cameras near it, keeping metres.
         frame[:3, 3] = -np.mean([view.camera_to_world[:3, 3] for view in views], axis=0)
-    return Dataset("realityscan", views, frame, confidence, scale_known=metric)
+    warnings = [f"{len(missing)} photos of XMP files are missing (first: {missing[0]})."] if missing else []
+    return Dataset("realityscan", views, frame, confidence, scale_known=metric, warnings=warnings)
 
 
 def _text(text: str, name: str) -> str | None:

@@ -62,4 +62,6 @@ def read(folder: Path) -> Dataset:
     require(views, folder, missing)
     frame = axis_upright([view.camera_to_world for view in views])
     warnings = [f"{lost} frames have no valid pose and are left out."] if lost else []
+    if missing:
+        warnings.append(f"{len(missing)} photos are left out, whose pose files are missing (first: {missing[0]}).")
     return Dataset("scannet", views, frame, scale_known=True, warnings=warnings)

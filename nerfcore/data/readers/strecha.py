@@ -51,4 +51,5 @@ def read(folder: Path) -> Dataset:
         )
     require(views, folder, missing)
     frame = axis_upright([view.camera_to_world for view in views])
-    return Dataset(format="strecha", views=views, world_from_sfm=frame, scale_known=True)
+    warnings = [f"{len(missing)} photos of camera files are missing (first: {missing[0]})."] if missing else []
+    return Dataset("strecha", views, frame, scale_known=True, warnings=warnings)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any, Literal
 
@@ -72,12 +73,18 @@ def read(folder: Path) -> Dataset:
                 frames.append((image, {**head, **frame}, frame, frame_split))
     names = unique_names([image for image, *_ in frames], folder)
     companions = labels_and_masks(folder, [image for image, *_ in frames], names)
+    lost: dict[str, list[str]] = {"label maps": [], "masks": [], "depth maps": []}
     views = [
-        _view(folder, name, image, merged, split, both)
+        _view(folder, name, image, merged, split, both, lost)
         for name, (image, merged, _, split), both in zip(names, frames, companions)
     ]
     require(views, folder, missing)
-    warnings = [f"{len(missing)} images named in the data set are missing (first: {missing[0]})."] if missing else []
+    points, untold = _points(folder, heads[0])
+    warnings = [
+        f"{len(names)} {what} named in {files[0][0].name} are missing (first: {names[0]})."
+        for what, names in {"images": missing, **lost}.items()
+        if names
+    ]
     convention = str(heads[0].get("camera_convention", "")).lower()
     up = choose_up(heads[0], [view.camera_to_world for view in views], named_splits=files[0][0].name in SPLIT_FILES)
     return Dataset(
@@ -85,10 +92,10 @@ def read(folder: Path) -> Dataset:
         views=views,
         world_from_sfm=up.world_from_sfm,
         up_confidence=up.confidence,
-        scale_known="metres" in convention or "meters" in convention,
+        scale_known=re.search(r"\bmet(re|er)s\b", convention) is not None,
         mask_mode=mode if (mode := heads[0].get("mask_mode")) in ("ignore", "empty") else None,
-        points=_points(folder, heads[0]),
-        warnings=[*warnings, *up.warnings],
+        points=points,
+        warnings=[*warnings, *untold, *up.warnings],
     )
 
 
@@ -127,15 +134,17 @@ def _view(
     frame: dict[str, Any],
     split: Split,
     companions: tuple[Path | None, Path | None],
+    lost: dict[str, list[str]],
 ) -> DatasetView:
+    """One frame; the files that it names and that are missing are added to those `lost`, by what they are."""
     width, height = image_size(image)
     matrix = pose_matrix(frame.get("transform_matrix"))
     if matrix is None:
         raise InputError(f"The pose of {image.name} in {folder} is not a 4×4 matrix.", "Export the data set again.")
     label_path = frame.get("semantic_path") or frame.get("label_path")
-    depth = _optional(folder, frame.get("depth_file_path") or frame.get("depth_path"))
-    label = _optional(folder, label_path) or companions[0]
-    mask = _optional(folder, frame.get("mask_path")) or companions[1]
+    depth = _optional(folder, frame.get("depth_file_path") or frame.get("depth_path"), lost["depth maps"])
+    label = _optional(folder, label_path, lost["label maps"]) or companions[0]
+    mask = _optional(folder, frame.get("mask_path"), lost["masks"]) or companions[1]
     return DatasetView(
         name=name,
         image=image,
@@ -171,8 +180,14 @@ def _depth_scale(frame: dict[str, Any], depth: Path | None) -> float:
     return 1.0 if depth is not None and depth.suffix.lower() == ".exr" else 1e-3
 
 
-def _optional(folder: Path, value: Any) -> Path | None:
-    return find_image(folder / _place(value)) if isinstance(value, str) and value else None
+def _optional(folder: Path, value: Any, lost: list[str]) -> Path | None:
+    """The file that a frame names; None where it names none, or one that is missing, which is added to `lost`."""
+    if not isinstance(value, str) or not value:
+        return None
+    found = find_image(folder / _place(value))
+    if found is None:
+        lost.append(value)
+    return found
 
 
 def frame_camera(frame: dict[str, Any], width: int, height: int) -> Camera:
@@ -220,15 +235,20 @@ def frame_camera(frame: dict[str, Any], width: int, height: int) -> Camera:
     return camera
 
 
-def _points(folder: Path, head: dict[str, Any]) -> Points:
-    """nerfstudio's sparse point cloud, which lies in the frame of the poses."""
+def _points(folder: Path, head: dict[str, Any]) -> tuple[Points, list[str]]:
+    """nerfstudio's sparse point cloud, which lies in the frame of the poses, and why there is none where one is named."""
     name = head.get("ply_file_path")
-    if not isinstance(name, str) or not (folder / _place(name)).is_file():
-        return Points.empty()
+    if not isinstance(name, str) or not name:
+        return Points.empty(), []
+    path = folder / _place(name)
+    if not path.is_file():
+        return Points.empty(), [f"The points {name} are missing."]
+    if path.suffix.lower() != ".ply":
+        return Points.empty(), [f"The points {name} are not read: only PLY files are."]
     import trimesh
 
-    cloud = trimesh.load(folder / _place(name))
+    cloud = trimesh.load(path)
     xyz = np.asarray(getattr(cloud, "vertices", np.zeros((0, 3))), np.float64)
     colors = getattr(cloud, "colors", None)
     rgb = np.asarray(colors)[:, :3].astype(np.uint8) if colors is not None and len(colors) == len(xyz) else None
-    return Points(xyz, rgb if rgb is not None else np.full((len(xyz), 3), 128, np.uint8), np.zeros(len(xyz)))
+    return Points(xyz, rgb if rgb is not None else np.full((len(xyz), 3), 128, np.uint8), np.zeros(len(xyz))), []

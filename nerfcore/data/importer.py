@@ -127,7 +127,9 @@ def _bring(dataset: Dataset, place: Path, params: ImportParams, previous: Projec
     _reject_hidden(records, place, report)
     used = [record for record in records if record.status == "ok"]
     if not used:
-        raise InputError(f"The masks of {params.dataset} leave nothing of any photo.", "White in a mask marks what counts.")
+        raise InputError(
+            f"The masks of {params.dataset} leave nothing of any photo.", "White in a mask marks what counts."
+        )
     classes = _classes(dataset, set(present))
     asked = params.mask_mode or dataset.mask_mode
     told = params.keep_backdrop or asked == "ignore" or any(r.mask or r.label for r in records)

@@ -1,13 +1,16 @@
 """Agisoft Metashape's camera export (XML): one file, with the photos beside it or in `images/`.
 
-Poses are camera-to-world with OpenCV axes in the chunk's own frame; the chunk's transform, where there is one, leads
-to metres, and for geographic projects to geocentric coordinates, which are turned into a local frame with z up.
+Poses are camera-to-world with OpenCV axes in the chunk's own frame, or in that of their component, of which a chunk has
+several where its photos were not all aligned with each other. The transform of the chunk or component, where there is one,
+leads to metres, and for geographic projects to geocentric coordinates, which are turned into a local frame with z up.
 Lens source: appendix "Camera models" of the Metashape manual.
 """
 
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +19,10 @@ import numpy as np
 from ...errors import InputError
 from ...geometry.cameras import Camera
 from ...geometry.frames import rotation_to_z, upright
-from ...geometry.similarity import make_similarity
+from ...geometry.similarity import make_similarity, transform_pose
 from ...images.decode import image_size
 from ...images.names import find_image, labels_and_masks, unique_names
+from ...progress import shortened
 from ..dataset import Dataset, DatasetView, lens_at_size, require
 
 EARTH = 5_000_000.0  # metres from the centre of the earth beyond which coordinates are geocentric: its radius is 6.4 million
@@ -51,24 +55,31 @@ def read(folder: Path) -> Dataset:
         if chunk is None:
             raise ValueError("it has no chunk")
         sensors = {sensor.get("id"): sensor for sensor in chunk.iter("sensor")}
-        components = {c.get("id"): _similarity(c.find("transform")) for c in chunk.iter("component")}
+        frames = {c.get("id"): _similarity(c.find("transform")) for c in chunk.iter("component")}
+        whole = _similarity(chunk.find("transform"))
+        scaled = next(chunk.iter("scale"), None) is not None
         entries = []
         for camera in chunk.iter("camera"):
             transform = camera.find("transform")
             if transform is None or not transform.text or camera.get("enabled") in ("0", "false"):
                 continue
             pose = np.array(transform.text.split(), np.float64).reshape(4, 4)
-            component = components.get(camera.get("component_id"))
-            if component is not None and chunk.find("transform") is None:
-                chunk_transform = component
-            else:
-                chunk_transform = _similarity(chunk.find("transform"))
-            entries.append((camera.get("label", ""), sensors[camera.get("sensor_id")], pose, chunk_transform))
+            entries.append(
+                (camera.get("label", ""), sensors[camera.get("sensor_id")], pose, camera.get("component_id"))
+            )
     except (OSError, ElementTree.ParseError, ValueError, KeyError) as error:
         raise InputError(f"{path} is damaged: {error}.", "Export the cameras from Metashape again.") from error
+    reference, to_reference = _one_frame([component for *_, component in entries], frames, whole)
+    warnings = []
+    apart = [label for label, *_, component in entries if component not in to_reference]
+    if apart:
+        text = f"{len(apart)} photos are left out: nothing in {path.name} says how their component lies to that of the others"
+        warnings.append(shortened(text, apart))
     found: dict[Path, tuple[ElementTree.Element, np.ndarray]] = {}
     missing = []
-    for label, sensor, pose, _ in entries:
+    for label, sensor, pose, component in entries:
+        if component not in to_reference:
+            continue
         image = next((p for d in (folder, folder / "images") if (p := find_image(d / label))), None)
         if image is None:
             missing.append(label)
@@ -78,7 +89,7 @@ def read(folder: Path) -> Dataset:
                 "Name them in Metashape by folder and file, for example left/0001, and export again.",
             )
         else:
-            found[image] = sensor, pose
+            found[image] = sensor, transform_pose(to_reference[component], pose)
     images = list(found)
     names = unique_names(images, folder)
     views = [
@@ -95,12 +106,34 @@ def read(folder: Path) -> Dataset:
         )
     ]
     require(views, path, missing)
-    warnings = [f"{len(missing)} photos of the export are missing (first: {missing[0]})."] if missing else []
-    georeferenced = entries[0][3]
-    if georeferenced is None:
+    warnings += [f"{len(missing)} photos of the export are missing (first: {missing[0]})."] if missing else []
+    if reference is None or np.allclose(reference, np.eye(4)):  # which says nothing
         frame, confidence = upright([view.camera_to_world for view in views])
         return Dataset("metashape", views, frame, confidence, warnings=warnings)
-    return Dataset("metashape", views, _local(georeferenced, views), scale_known=True, warnings=warnings)
+    return Dataset("metashape", views, _local(reference, views), scale_known=scaled, warnings=warnings)
+
+
+def _one_frame(
+    components: Sequence[str | None], frames: Mapping[str | None, np.ndarray | None], whole: np.ndarray | None
+) -> tuple[np.ndarray | None, dict[str | None, np.ndarray]]:
+    """The frame that all poses are brought into, as its transform (4, 4) or None, and the similarity (4, 4) into it from that
+    of each component. Components of which nothing says how they lie to it are left out, or all others where one of these
+    has more cameras.
+
+    Args:
+        components: of each camera that has a pose. frames: transforms of components. whole: that of the chunk.
+    """
+    counts = Counter(components)
+    placed = {
+        c: whole if frames.get(c) is None or (whole is not None and len(counts) == 1) else frames[c] for c in counts
+    }
+    known = {component: transform for component, transform in placed.items() if transform is not None}
+    loose = next((component for component, _ in counts.most_common() if component not in known), None)
+    if not known or counts[loose] > sum(counts[component] for component in known):
+        return None, {loose: np.eye(4)}
+    reference = next(iter(known.values()))
+    moved = {component: np.linalg.inv(reference) @ transform for component, transform in known.items()}
+    return reference, moved | {c: np.eye(4) for c in known if np.array_equal(known[c], reference)}  # no digit is lost
 
 
 def _similarity(element: ElementTree.Element | None) -> np.ndarray | None:

@@ -96,7 +96,9 @@ def _write_classes(frames: list[dict[str, Any]], scene: Scene, out: Path) -> Pat
     entries = {str(c.id): {"name": c.name, "color": [round(part * 255) for part in c.color]} for c in scene.classes}
     path, value = out.with_name("classes.json"), {"ignore_id": scene.ignore_id, "classes": entries}
     if path.exists() and not _says(path, None, value) and not _says(out, "classes_path", path.name):
-        raise SettingError(f"{path} is there already and belongs to something else.", "Choose another folder with --out.")
+        raise SettingError(
+            f"{path} is there already and belongs to something else.", "Choose another folder with --out."
+        )
     write_json(path, value)
     return path
 

@@ -144,6 +144,7 @@ class Copy:
         self.tracked = [path.absolute() for path in tracked]
         self.state_file = folder / STATE / digest(storage.url)[:12] / f"{capture}.json"
         self.lock = threading.Lock()
+        self.before: dict[str, list[int]] = {}  # stamps of files that a stage found, see `begin`
 
     def _state(self) -> dict[str, list[Any]]:
         """path → [SHA-256 in the storage, bytes and time of the file here] when they were last the same."""
@@ -219,11 +220,31 @@ class Copy:
             write_json(path, placed(json.loads(path.read_text(encoding="utf-8")), PLACE, str(self.folder)))
         os.utime(path, ns=(entry[2], entry[2]))
 
+    def begin(self, wanted: Callable[[str], bool]) -> None:
+        """From now on upload only what changes: a stage that was killed may have left files here that are older than those in
+        the storage. What it left where the storage has nothing goes, except databases, which no stage saves on its way.
+
+        Args:
+            wanted: whether the stage reads a file.
+        """
+        files = self.storage.files(self.capture)
+        self.before = {}
+        for name, path in self._here().items():
+            if name in files or not wanted(name):
+                self.before[name] = _stamp(path)
+            elif files and path.suffix != ".db":
+                path.unlink(missing_ok=True)
+
+    def _changes(self, state: dict[str, list[Any]], here: dict[str, Path]) -> list[str]:
+        """The files here that are to be uploaded."""
+        stamps = {name: _stamp(path) for name, path in here.items()}
+        came = [name for name, stamp in stamps.items() if name not in state or state[name][1:] != stamp]
+        return [name for name in came if self.before.get(name) != stamps[name]]
+
     def changed(self) -> bool:
         """Whether files here are others than when they were last the same as in the storage."""
-        state, here = self._state(), self._here()
-        came = any(name not in state or state[name][1:] != _stamp(path) for name, path in here.items())
-        return came or any(not (self.folder / name).is_file() for name in state)
+        state = self._state()
+        return bool(self._changes(state, self._here())) or any(not (self.folder / name).is_file() for name in state)
 
     def upload(self, databases: bool = True) -> int:
         """Upload what changed here; the list of files comes last. How many files went.
@@ -233,8 +254,7 @@ class Copy:
         """
         with self.lock:
             state, files, here = self._state(), self.storage.files(self.capture), self._here()
-            todo = [name for name, path in here.items() if name not in state or state[name][1:] != _stamp(path)]
-            todo = [name for name in todo if databases or not name.endswith(".db")]
+            todo = [name for name in self._changes(state, here) if databases or not name.endswith(".db")]
             with ThreadPoolExecutor(THREADS) as pool:
                 for name, entry in zip(todo, pool.map(lambda name: self._upload_one(here[name]), todo)):
                     if entry is not None:

@@ -11,7 +11,15 @@ from ..errors import ProjectError
 from ..params import TrainParams
 from ..progress import Reporter
 from ..project.fingerprints import Earlier, compare
-from ..project.runs import CHECKPOINT, TrainingFolder, has_checkpoint, read_metrics, run_folder, settle
+from ..project.runs import (
+    CHECKPOINT,
+    TrainingFolder,
+    checkpoint_state,
+    has_checkpoint,
+    read_metrics,
+    run_folder,
+    settle,
+)
 from ..project.schema import step
 from ..project.store import load_project, record_step
 from ..render.run import RunInfo, load_info, read_info, save_info
@@ -78,6 +86,10 @@ def _trained(params: TrainParams) -> Earlier:
         return earlier
     if "checkpoint" not in earlier.result:
         return Earlier(reason="not finished")
+    state = checkpoint_state(place / CHECKPOINT) or {}
+    behind = state.get("steps", -1) < earlier.result.get("steps", 0)  # one that went on and was stopped is ahead
+    if behind or state.get("training", "") != info.origin.training:
+        return Earlier(reason=f"{CHECKPOINT} is not what the training ended with")
     paths = {"checkpoint": str(place / CHECKPOINT), "closed_picture": closed_picture(place)}
     return Earlier({**earlier.result, **paths})
 

@@ -50,7 +50,9 @@ def run_stage(values: dict[str, Any], report: Reporter) -> dict[str, Any]:
     params = ReconstructParams.model_validate(local["capture"])
     copy = Copy(storage, here, capture_name(params, here), tracked_paths(params))
     report.stage("Fetching files")
-    copy.fetch(lambda name: needed(name, values["stage"], params, here), report.check)
+    reads = lambda name: needed(name, values["stage"], params, here)  # noqa: E731
+    copy.fetch(reads, report.check)
+    copy.begin(reads)
     with Saving(copy, SAVE_EVERY):
         made = do_stage(local, report)
     return placed(made, str(here), there)

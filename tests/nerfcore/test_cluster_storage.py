@@ -220,6 +220,58 @@ def test_what_was_changed_here_meanwhile_stays(tmp_path, url):
     assert one.changed(), "it is uploaded the next time"
 
 
+def stage_begins(copy: Copy, *parts: str) -> None:
+    """A stage that reads what has one of these in its path."""
+    reads = lambda name: any(part in name for part in parts)  # noqa: E731
+    copy.fetch(reads)
+    copy.begin(reads)
+
+
+def put(root: Path, name: str, contents: bytes) -> Path:
+    path = root / "vase" / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(contents)
+    return path
+
+
+def test_what_a_killed_stage_left_does_not_come_over_what_another_worker_made(tmp_path: Path, url: str) -> None:
+    killed, other = machine(tmp_path / "killed", url), machine(tmp_path / "other", url)
+    put(tmp_path / "other", "project.json", b"{}")
+    other.upload()
+    stage_begins(killed, "project", "runs/")
+    put(tmp_path / "killed", "runs/field.bin", b"a checkpoint that was uploaded")
+    killed.upload(databases=False)
+    put(tmp_path / "killed", "runs/field.bin", b"the last one")
+    put(tmp_path / "killed", "poses/sfm/database.db", b"half of it")
+    stage_begins(other, "project", "runs/", "sfm/")
+    for name in ("runs/field.bin", "poses/sfm/database.db"):
+        put(tmp_path / "other", name, b"whole")
+    other.upload()
+    # It comes back, for a stage that reads neither.
+    stage_begins(killed, "project")
+    assert not killed.changed()
+    put(tmp_path / "killed", "project.json", b'{"a": 1}')
+    assert killed.upload() == 1
+    other.fetch()
+    for name in ("runs/field.bin", "poses/sfm/database.db"):
+        assert (tmp_path / "other/vase" / name).read_bytes() == b"whole"
+
+
+def test_a_stage_begins_with_what_the_storage_has_and_with_a_killed_one_s_matches(tmp_path: Path, url: str) -> None:
+    """Results that were made and never uploaded would be taken for those that the others have."""
+    worker, home = machine(tmp_path / "worker", url), machine(tmp_path / "home", url)
+    put(tmp_path / "home", "project.json", b"{}")
+    home.upload()
+    stage_begins(worker, "")
+    left = put(tmp_path / "worker", "exports/mesh.json", b"{}")
+    put(tmp_path / "worker", "poses/sfm/database.db", b"half of it")
+    stage_begins(worker, "")
+    assert not left.exists()
+    assert worker.upload() == 1, "the matches, which this stage goes on with"
+    home.fetch()
+    assert (tmp_path / "home/vase/poses/sfm/database.db").read_bytes() == b"half of it"
+
+
 def test_files_are_uploaded_from_a_disk_without_hard_links(tmp_path, monkeypatch):
     def refused(*_, **__):
         raise PermissionError(errno.EPERM, "Operation not permitted")

@@ -243,6 +243,22 @@ def test_a_run_of_another_project_is_neither_used_again_nor_gone_on_with(project
     assert unfinished(asked)
 
 
+def test_a_field_that_is_not_the_one_its_training_ended_with_is_not_finished(project: Path) -> None:
+    asked, checkpoint = params(project), run_folder(project, "main") / runs.CHECKPOINT
+    assert finished(asked).result is not None
+    ended = checkpoint.read_bytes()
+    train(params(project, run="second"), Reporter())
+    other = (run_folder(project, "second") / runs.CHECKPOINT).read_bytes()
+    steps = runs.checkpoint_state(checkpoint)["steps"]
+    earlier = ended.replace(f'\\"steps\\": {steps},'.encode(), f'\\"steps\\": {steps - 1:{len(str(steps))}},'.encode())
+    assert earlier != ended
+    for contents in (b"cut off", other, earlier):
+        checkpoint.write_bytes(contents)
+        assert "is not what the training ended with" in finished(asked).reason
+    checkpoint.write_bytes(ended)
+    assert finished(asked).result is not None
+
+
 def test_a_checkpoint_of_another_training_does_not_go_on(project: Path) -> None:
     train(params(project, run="second"), Reporter())
     shutil.copy(run_folder(project, "second") / runs.CHECKPOINT, run_folder(project, "main"))

@@ -257,6 +257,22 @@ def test_what_a_killed_stage_left_does_not_come_over_what_another_worker_made(tm
         assert (tmp_path / "other/vase" / name).read_bytes() == b"whole"
 
 
+def test_a_worker_uploads_nothing_that_its_stage_found_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    home, worker, url = tmp_path / "home", tmp_path / "worker", (tmp_path / "store").as_uri()
+    module_of_stages = "fieldwork.nerfcore.workflows.stage_task"
+    monkeypatch.setattr(f"{module_of_stages}.work_folder", lambda _: worker)
+    monkeypatch.setattr(f"{module_of_stages}.do_stage", lambda *_: {"result": None})
+    params = ReconstructParams(photos=home / "photos", out=home / "vase")
+    field = put(home, "runs/main/field.bin", b"whole")
+    copy = Copy(Storage(url), home, capture_name(params, home), tracked_paths(params))
+    copy.upload()
+    put(worker, "runs/main/field.bin", b"half of it")
+    values = {"capture": params.model_dump(mode="json"), "folder": str(home), "storage": url}
+    run_stage({**values, "stage": "new"}, Reporter())
+    copy.fetch()
+    assert field.read_bytes() == b"whole"
+
+
 def test_a_stage_begins_with_what_the_storage_has_and_with_a_killed_one_s_matches(tmp_path: Path, url: str) -> None:
     """Results that were made and never uploaded would be taken for those that the others have."""
     worker, home = machine(tmp_path / "worker", url), machine(tmp_path / "home", url)

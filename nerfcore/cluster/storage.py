@@ -22,6 +22,8 @@ from typing import Any
 from ..errors import DiskError, FieldworkError, SettingError
 from ..files import STAGED, atomic_path, file_hash, leads_outside, linked, write_json
 from ..project.fingerprints import digest
+from ..project.merged import merged_project
+from ..project.store import LOCK_FILE, PROJECT_FILE, locked
 from .link import INSTALL
 
 Files = dict[str, list[Any]]  # path below the campaign's folder → [SHA-256, bytes, time in ns]
@@ -187,11 +189,13 @@ class Copy:
         wanted: Callable[[str], bool] = lambda _: True,
         check: Callable[[], None] = lambda: None,
         keep_changes: bool = False,
+        warn: Callable[[str], None] = lambda _: None,
     ) -> int:
         """Bring files here that are wanted and not the same; those that are gone from the storage go. How many came.
 
         Args:
-            keep_changes: leave files that were changed here and not there.
+            keep_changes: leave files that were changed here; where they were changed there too, `warn` tells. Of project.json
+                both changes are kept.
         """
         state, files, todo = self._state(), self.storage.files(self.capture), []
         for name, (sha, _, _) in files.items():
@@ -199,21 +203,50 @@ class Copy:
             same = known[0] == sha and bool(stamp) if keep_changes else known == [sha, *stamp]
             if wanted(name) and not same:
                 todo.append(name)
-        with ThreadPoolExecutor(THREADS) as pool:
-            for _ in pool.map(lambda name: self._fetch_one(name, files[name], check), todo):
-                check()
-        for name in todo:
-            state[name] = [files[name][0], *_stamp(self.folder / name)]
         # A storage without a list has lost it: that says nothing of the files here.
-        for name in [name for name in state if files and name not in files]:
-            (self.folder / name).unlink(missing_ok=True)
+        gone = [name for name in state if files and name not in files]
+        own = [name for name in (*todo, *gone) if keep_changes and self._edited(name, state, files)]
+        with ThreadPoolExecutor(THREADS) as pool:
+            coming = [name for name in todo if name not in own]
+            for _ in pool.map(lambda name: self._fetch_one(self.folder / name, files[name], check), coming):
+                check()
+        for name in coming:
+            state[name] = [files[name][0], *_stamp(self.folder / name)]
+        for name in own:
+            if name in state and name in files and Path(name).name == PROJECT_FILE:
+                self._merge(name, state[name], files[name], warn)
+                state[name] = [files[name][0]]  # of another time than the file here, which goes up with the next campaign
+            else:
+                warn(f"{self.folder / name} was changed here and by a worker: yours stays. The next campaign uploads it.")
+        for name in gone:
+            if name not in own:
+                (self.folder / name).unlink(missing_ok=True)
         # What was taken away here before is missing here, and not to be taken away from the others.
         write_json(self.state_file, {name: entry for name, entry in state.items() if (self.folder / name).is_file()})
-        return len(todo)
+        return len(coming)
 
-    def _fetch_one(self, name: str, entry: list[Any], check: Callable[[], None]) -> None:
-        check()
+    def _edited(self, name: str, state: dict[str, list[Any]], files: Files) -> bool:
+        """Whether a file was changed here since it was the same as in the storage, and is another one than there now."""
         path = self.folder / name
+        stamp = _stamp(path)
+        return bool(stamp) and state.get(name, [""])[1:] != stamp and file_hash(path) != files.get(name, [""])[0]
+
+    def _merge(self, name: str, known: list[Any], entry: list[Any], warn: Callable[[str], None]) -> None:
+        """Let the project.json here have both what was changed here and what was changed in the storage."""
+        path = self.folder / name
+        with tempfile.TemporaryDirectory(dir=self._spare()) as folder:
+            before, theirs = Path(folder) / "before" / path.name, Path(folder) / "theirs" / path.name
+            for copy, sha in ((before, known[0]), (theirs, entry[0])):
+                self._fetch_one(copy, [sha, *entry[1:]], lambda: None)
+            with locked(path, path.parent / LOCK_FILE):
+                values = [json.loads(file.read_text(encoding="utf-8")) for file in (before, path, theirs)]
+                both, clash = merged_project(*values)
+                write_json(path, both)
+        if clash:
+            warn(f"{path}: the alignment made here meanwhile is of earlier poses, and left out. Align it again.")
+
+    def _fetch_one(self, path: Path, entry: list[Any], check: Callable[[], None]) -> None:
+        check()
         path.parent.mkdir(parents=True, exist_ok=True)
         self.storage.get_object(entry[0], path)
         if path.name in NAMES_PLACES:

@@ -258,7 +258,7 @@ class Campaign:
         if copy is None:
             return
         try:
-            copy.fetch(keep_changes=True)
+            copy.fetch(keep_changes=True, warn=self.report.warn)
         except Exception as error:  # noqa: BLE001 - one capture's files must not stop the others
             known = explained(error)
             task.state = "failed"

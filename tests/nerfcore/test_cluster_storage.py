@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from fieldwork.nerfcore.cluster import storage as module
 from fieldwork.nerfcore.cluster.storage import Copy, Saving, Storage, StorageError, placed
@@ -18,6 +19,8 @@ from fieldwork.nerfcore.errors import SettingError
 from fieldwork.nerfcore.files import atomic_path
 from fieldwork.nerfcore.params import ReconstructParams
 from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.project.schema import ImageRecord, Project, SemanticClass
+from fieldwork.nerfcore.project.store import edit_project, load_project, save_project
 from fieldwork.nerfcore.workflows.campaign import plan
 from fieldwork.nerfcore.workflows.captures import Capture
 from fieldwork.nerfcore.workflows.reconstruct import reconstruct, stages_of
@@ -286,6 +289,79 @@ def test_a_stage_begins_with_what_the_storage_has_and_with_a_killed_one_s_matche
     assert worker.upload() == 1, "the matches, which this stage goes on with"
     home.fetch()
     assert (tmp_path / "home/vase/poses/sfm/database.db").read_bytes() == b"half of it"
+
+
+def test_edits_of_a_project_and_what_a_worker_made_of_it_meanwhile_are_both_kept(tmp_path: Path, url: str) -> None:
+    home, worker = machine(tmp_path / "home", url), machine(tmp_path / "worker", url)
+    here, there = tmp_path / "home/vase", tmp_path / "worker/vase"
+    stone, glass = (SemanticClass(id=k, name=name, color=(1, 0, 0)) for k, name in ((1, "stone"), (2, "glass")))
+    photos = [ImageRecord(name=name) for name in "ab"]
+    save_project(here, Project(classes=[stone, glass], images=photos))
+    home.upload()
+    worker.fetch()
+    with edit_project(here) as project:
+        project.classes = [stone.model_copy(update={"name": "granite"})]
+        project.frame.bounds = [[0, 0, 0], [1, 1, 1]]
+        project.images[0].label = "labels/a.png"
+        project.record("classes", {}, {})
+    with edit_project(there) as project:
+        project.images[0].status = "unregistered"
+        project.frame.up_confidence = 0.5
+        project.record("train", {}, {"steps": 9})
+    worker.upload()
+    warned: list[str] = []
+    home.fetch(keep_changes=True, warn=warned.append)
+    both = load_project(here)
+    assert [(c.id, c.name) for c in both.classes] == [(1, "granite")]
+    assert both.former_class_ids == [2]
+    assert (both.frame.bounds, both.frame.up_confidence) == ([[0, 0, 0], [1, 1, 1]], 0.5)
+    assert [(i.name, i.label, i.status) for i in both.images] == [
+        ("a", "labels/a.png", "unregistered"),
+        ("b", None, "ok"),
+    ]
+    assert {step.verb for step in both.provenance} == {"classes", "train"}
+    assert warned == []
+    assert home.upload() == 1, "the next campaign begins with it"
+    worker.fetch()
+    assert load_project(there) == both
+
+
+def test_an_alignment_of_poses_that_a_worker_made_anew_is_told(tmp_path: Path) -> None:
+    url = (tmp_path / "store").as_uri()
+    home, worker = machine(tmp_path / "home", url), machine(tmp_path / "worker", url)
+    save_project(tmp_path / "home/vase", Project())
+    home.upload()
+    worker.fetch()
+    for place, scale in (("home", 2.0), ("worker", 3.0)):
+        with edit_project(tmp_path / place / "vase") as project:
+            project.frame.world_from_sfm = np.diag([scale] * 3 + [1]).tolist()
+    worker.upload()
+    warned: list[str] = []
+    home.fetch(keep_changes=True, warn=warned.append)
+    assert load_project(tmp_path / "home/vase").frame.world_from_sfm[0][0] == 3
+    assert "Align it again" in warned[0]
+
+
+def test_a_file_that_was_changed_here_and_by_a_worker_stays_and_is_told(tmp_path: Path, url: str) -> None:
+    home, worker = machine(tmp_path / "home", url), machine(tmp_path / "worker", url)
+    for name in ("label.png", "old.png", "same.png"):
+        put(tmp_path / "home", name, b"first")
+    home.upload()
+    worker.fetch()
+    for name in ("label.png", "new.png"):
+        put(tmp_path / "worker", name, b"by the worker")
+    put(tmp_path / "worker", "same.png", b"alike")
+    (tmp_path / "worker/vase/old.png").unlink()
+    worker.upload()
+    mine = [put(tmp_path / "home", name, b"drawn") for name in ("label.png", "new.png", "old.png")]
+    put(tmp_path / "home", "same.png", b"alike")
+    warned: list[str] = []
+    home.fetch(keep_changes=True, warn=warned.append)
+    assert {path.read_bytes() for path in mine} == {b"drawn"}
+    assert sorted(text.split(" was changed here and by a worker")[0] for text in warned) == sorted(map(str, mine))
+    home.upload()
+    worker.fetch()
+    assert {(tmp_path / "worker/vase" / path.name).read_bytes() for path in mine} == {b"drawn"}
 
 
 def test_files_are_uploaded_from_a_disk_without_hard_links(tmp_path, monkeypatch):

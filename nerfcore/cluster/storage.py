@@ -215,9 +215,13 @@ class Copy:
         for name in own:
             if name in state and name in files and Path(name).name == PROJECT_FILE:
                 self._merge(name, state[name], files[name], warn)
-                state[name] = [files[name][0]]  # of another time than the file here, which goes up with the next campaign
+                state[name] = [
+                    files[name][0]
+                ]  # of another time than the file here, which goes up with the next campaign
             else:
-                warn(f"{self.folder / name} was changed here and by a worker: yours stays. The next campaign uploads it.")
+                warn(
+                    f"{self.folder / name} was changed here and by a worker: yours stays. The next campaign uploads it."
+                )
         for name in gone:
             if name not in own:
                 (self.folder / name).unlink(missing_ok=True)

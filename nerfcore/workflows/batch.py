@@ -12,14 +12,15 @@ from typing import Any
 
 from ..errors import Cancelled, FieldworkError, InputError, SettingError
 from ..files import write_json
-from ..params import BatchParams, ReconstructParams
+from ..params import BatchParams, NewParams, ReconstructParams
 from ..progress import Reporter
+from ..project.fingerprints import Fingerprint
 from ..project.lock import lockable, project_lock
 from ..project.store import is_project
 from . import campaign
-from .captures import read_list
+from .captures import Capture, read_list
 from .forecast import forecast
-from .reconstruct import reconstruct
+from .reconstruct import reconstruct, stage_params
 
 log = logging.getLogger("fieldwork.batch")
 
@@ -35,7 +36,7 @@ def batch(params: BatchParams, report: Reporter) -> dict[str, Any]:
 
     A capture that fails does not stop the others: it is tried again `retries` times, going on from what is on disk,
     then noted as failed. The report file is written after each; a second call with the same list does only what is not
-    done, and what is listed with other settings than before.
+    done, and what has other settings, photos, labels, masks or classes than before.
 
     Returns:
         {"done": [projects], "failed": [{"project", "error", "hint"}], "skipped": how many were done before,
@@ -50,11 +51,13 @@ def batch(params: BatchParams, report: Reporter) -> dict[str, Any]:
     path = params.report or params.list.with_name(f"{params.list.stem}-report.json")
     before = _read_report(path)
     entries: dict[str, dict[str, Any]] = {}
+    inputs = {str(capture.params.out): inputs_of(capture.params) for capture in captures}
     todo = []
     for capture in captures:
         key = str(capture.params.out)
         known = before.get(key, {})
         same = known.get("settings") == capture.params.model_dump(mode="json")
+        same &= None in (inputs[key], known.get("inputs")) or inputs[key] == known["inputs"]
         if known.get("state") == "done" and same and is_project(capture.params.out):
             entries[key] = known
         else:
@@ -66,14 +69,26 @@ def batch(params: BatchParams, report: Reporter) -> dict[str, Any]:
         return {**forecast(params, todo, entries, report), "skipped": skipped}
 
     def note(key: str, entry: dict[str, Any], write: bool = True) -> None:
-        entries[key] = entry
+        entries[key] = {"inputs": inputs[key], **entry}
         if write:
             write_json(path, {"captures": {**before, **entries}})
 
+    def forget(begun: list[Capture]) -> None:
+        """Stopped in the middle, a project holds something else than what was noted of it."""
+        keys = [str(capture.params.out) for capture in begun]
+        done = [key for key in keys if before.get(key, {}).get("state") == "done"]
+        for key in done:
+            del before[key]
+        if done:
+            write_json(path, {"captures": {**before, **entries}})
+
     if params.cluster is not None:
+        forget(todo)
         campaign.run(params, captures, todo, entries, note, report)
     else:
-        for number, (capture, _) in enumerate(todo, skipped + 1):
+        for number, one in enumerate(todo, skipped + 1):
+            forget([one])
+            capture = one.params
             inner = _Named(report, f"{capture.out.name} ({number} of {len(captures)})")
             settings = capture.model_dump(mode="json")
             note(str(capture.out), {"settings": settings, **_attempts(capture, params.retries, inner)})
@@ -97,6 +112,18 @@ def batch(params: BatchParams, report: Reporter) -> dict[str, Any]:
             result,
         )
     return result
+
+
+def inputs_of(params: ReconstructParams) -> Fingerprint | None:
+    """What there is of a capture's photos, labels, masks and classes; None where it cannot be read, which its turn will tell."""
+    from ..capture.ingest import ingest_inputs  # with its libraries, half a second
+
+    values = stage_params(params, "new")
+    assert isinstance(values, NewParams)
+    try:
+        return ingest_inputs(values)
+    except (FieldworkError, OSError):
+        return None
 
 
 def _read_report(path: Path) -> dict[str, dict[str, Any]]:

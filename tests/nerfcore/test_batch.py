@@ -15,6 +15,7 @@ from fieldwork.nerfcore.project.schema import Project
 from fieldwork.nerfcore.project.store import save_project
 from fieldwork.nerfcore.workflows import batch as module
 from fieldwork.nerfcore.workflows.batch import BatchError, batch, read_list
+from fieldwork.tests.nerfcore.support.photos import folder_of
 
 
 @pytest.fixture
@@ -78,6 +79,51 @@ def test_a_second_call_does_what_is_not_done(tmp_path, reconstructed):
     assert reconstructed == ["shaky_fieldwork"] * 2
     # Other settings, another capture.
     path.write_text(path.read_text().replace("vase/photos,draft", "vase/photos,high"))
+    assert batch(BatchParams(list=path), Reporter())["skipped"] == 1
+
+
+def test_a_capture_that_was_begun_with_other_settings_is_not_done_any_more(tmp_path, monkeypatch):
+    made: list[str] = []
+
+    def work(params, report):
+        made.append(params.preset)
+        save_project(params.out, Project())
+        if params.preset == "high":
+            raise Cancelled
+        return {"stages": {}}
+
+    monkeypatch.setattr(module, "reconstruct", work)
+    path = write_list(tmp_path, "vase")
+    batch(BatchParams(list=path), Reporter())
+    path.write_text(path.read_text().replace("draft", "high"))
+    with pytest.raises(Cancelled):
+        batch(BatchParams(list=path), Reporter())
+    path.write_text(path.read_text().replace("high", "draft"))
+    assert batch(BatchParams(list=path), Reporter())["skipped"] == 0
+    assert made == ["draft", "high", "draft"]
+
+
+@pytest.mark.parametrize("file", ["p3.jpg", "labels/p1.png", "masks/p1.png", "classes.json"])
+def test_a_capture_with_other_files_is_done_again(tmp_path, reconstructed, file):
+    photos = folder_of(tmp_path / "vase/photos", 3)
+    for name in ("labels", "masks"):
+        (photos / name).mkdir()
+    path = write_list(tmp_path, "vase", "gone")
+    batch(BatchParams(list=path), Reporter())
+    assert batch(BatchParams(list=path), Reporter())["skipped"] == 2, "what cannot be read says nothing"
+    (photos / file).write_bytes(b"{}")
+    assert batch(BatchParams(list=path), Reporter())["skipped"] == 1
+    assert batch(BatchParams(list=path), Reporter())["skipped"] == 2
+
+
+def test_reports_that_do_not_say_of_which_files_still_count(tmp_path, reconstructed):
+    folder_of(tmp_path / "vase/photos", 3)
+    path, report = write_list(tmp_path, "vase"), tmp_path / "captures-report.json"
+    batch(BatchParams(list=path), Reporter())
+    value = json.loads(report.read_text())
+    (entry,) = value["captures"].values()
+    assert set(entry.pop("inputs")) >= {"photos", "labels", "masks"}
+    report.write_text(json.dumps(value))
     assert batch(BatchParams(list=path), Reporter())["skipped"] == 1
 
 

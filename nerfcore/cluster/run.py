@@ -167,6 +167,8 @@ class Runner:
         if message["kind"] == "told":
             task.heard = time.monotonic()
             task.node = message["node"]
+            if "stage" in message:  # it works, and was not only reached
+                self.starved = 0.0
             task.fraction, task.message = message.get("fraction", task.fraction), message.get("stage", task.message)
         elif message["kind"] == "lost":
             self._lost(task, message["reason"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import Any
 
@@ -134,6 +135,33 @@ def test_a_worker_out_of_reach_is_not_waited_for(tmp_path, monkeypatch):
     runner = run_with(chain("a", 1), line, tmp_path)
     assert [command["do"] for command in line.sent] == ["submit", "cancel", "drop", "submit"]
     assert (runner.tasks.all["a0"].state, runner.tasks.all["a0"].losses) == ("done", 1)
+
+
+def test_the_time_without_workers_counts_from_when_one_last_worked(tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "PATIENCE", 0.5)
+    line, begin = FakeLink(good), time.monotonic()
+    there, line.nodes = line.nodes, []
+    name = "a0"
+    course = [
+        (0.1, {"kind": "nodes", "nodes": there}),
+        *((0.2 + 0.1 * k, {"kind": "told", "id": name, "node": "n0", "stage": "Training"}) for k in range(6)),
+        (0.8, {"kind": "nodes", "nodes": []}),
+        (0.8, {"kind": "lost", "id": name, "reason": "preempted"}),
+        (1.0, {"kind": "nodes", "nodes": there}),
+    ]
+
+    def get(timeout: float) -> dict[str, Any] | None:
+        if course and time.monotonic() - begin >= course[0][0]:
+            return course.pop(0)[1]
+        if not course and runner.tasks.running:
+            return {"kind": "answer", "id": name, "answer": good({})}
+        time.sleep(0.01)
+        return {}
+
+    line.send, line.get = (lambda **_: None), get
+    runner = Runner(chain("a", 1), line, Options(tmp_path), Reporter(), lambda _: None, lambda _: None)
+    runner.run()
+    assert runner.tasks.all[name].state == "done"
 
 
 def test_those_who_watch_hear_of_a_campaign_that_waits_for_its_head(tmp_path, monkeypatch):

@@ -69,6 +69,10 @@ class DiskError(FieldworkError):
     code = "disk"
 
 
+class DeniedError(DiskError):
+    """A file cannot be written for want of rights."""
+
+
 class BlenderError(FieldworkError):
     """A Blender is missing, or a script inside it failed."""
 
@@ -112,7 +116,8 @@ def disk_refusal(error: OSError, path: object) -> FieldworkError | None:
     if number in (errno.ENOSPC, errno.EDQUOT):
         return DiskError(f"No space left on the disk while writing {path}.", "Free some space and run it again.")
     if number in (errno.EACCES, errno.EPERM, errno.EROFS):
-        return DiskError(f"{path} cannot be written: {os.strerror(number)}.", "Choose a folder you may write to.")
+        kind = DiskError if number == errno.EROFS else DeniedError
+        return kind(f"{path} cannot be written: {os.strerror(number)}.", "Choose a folder you may write to.")
     if number == errno.EFBIG:
         return DiskError(
             f"{path} would be larger than files may be here.", "Raise the limit (ulimit -f), or the disk's."

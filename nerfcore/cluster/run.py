@@ -77,10 +77,10 @@ class Runner:
         Raises:
             Cancelled: the workers have stopped. ClusterError: the cluster is gone. DiskError: no worker has room.
         """
-        ready = self.link.open(self.report.check)
-        self.nodes = ready["nodes"]
-        self.report.note(welcome(ready))
         try:
+            ready = self.link.open(self.report.check)
+            self.nodes = ready["nodes"]
+            self.report.note(welcome(ready))
             while not self.tasks.finished:
                 self.report.check()
                 self._submit()
@@ -115,6 +115,7 @@ class Runner:
             task = self.tasks.take(time.monotonic(), lambda task, room=room: limited(task.need, allowed).fits(room))
             if task is None:
                 return
+            self.cut_short.pop(task.id, None)  # that was another attempt
             need = limited(task.need, allowed)
             cores, memory, gpus = cores - need.cores, memory - need.memory_gb, gpus - need.gpu
             job = {
@@ -195,7 +196,9 @@ class Runner:
 
     def _failed(self, task: Task, answer: dict[str, Any]) -> None:
         error = answer["error"]
-        if error["code"] == "disk" and answer.get("node") and task.disks < MOST_LOSSES:
+        # Rights may be those of a worker; where they lack again, they are the capture's.
+        denied = error.get("denied", False) and task.disks > 0
+        if error["code"] == "disk" and answer.get("node") and task.disks < MOST_LOSSES and not denied:
             # It is the worker's fault, not the capture's: others may have room.
             task.disks += 1
             self._exclude(answer["node"], error)

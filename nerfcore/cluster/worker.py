@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from .. import __version__
-from ..errors import Cancelled, FieldworkError, explained
+from ..errors import Cancelled, DeniedError, FieldworkError, explained
 from ..progress import Reporter
 from .storage import work_folder
 
@@ -70,7 +70,7 @@ def execute(text: str, tell: Tell) -> str:
         tell: takes {"stage", "fraction", "message"} about once a second.
     Returns:
         JSON: {"state": "done", "result"}, {"state": "cancelled"} or {"state": "failed" | "refused" | "full", "error":
-        {"code", "message", "hint"}}, each with seconds, warnings, host and free_gb.
+        {"code", "message", "hint"}}, for want of rights with "denied", each with seconds, warnings, host and free_gb.
     """
     begin, job, report = time.monotonic(), json.loads(text), WorkerReporter(tell)
     before = os.environ.get("FIELDWORK_THREADS")
@@ -90,6 +90,8 @@ def execute(text: str, tell: Tell) -> str:
         known = explained(error)
         state = known.code if known.code == "full" else "refused" if isinstance(known, Refusal) else "failed"
         answer = {"state": state, "error": {"code": known.code, "message": known.message, "hint": known.hint}}
+        if isinstance(known, DeniedError):
+            answer["error"]["denied"] = True
     finally:
         os.environ.pop("FIELDWORK_THREADS")
         if before is not None:

@@ -92,6 +92,55 @@ def test_a_disk_that_fills_up_while_it_is_written_to_costs_no_retry(tmp_path, mo
     assert (runner.tasks.all["b0"].state, runner.tasks.all["b0"].disks) == ("failed", 3)
 
 
+def test_a_capture_that_may_not_be_written_costs_its_workers_one_rest(tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "RESTED", 0.1)
+    error = {**bad("disk"), "error": {**bad("disk")["error"], "denied": True}}
+    line = FakeLink(lambda command: error if command["id"] == "a0" else good(command))
+    runner = run_with([*chain("a"), *chain("b")], line, tmp_path, retries=1)
+    task = runner.tasks.all["a0"]
+    assert (task.state, task.disks, task.attempts) == ("failed", 1, 2)
+    assert runner.tasks.all["b2"].state == "done"
+
+
+def test_a_cancel_while_the_cluster_is_joined_ends_the_line(tmp_path):
+    line = FakeLink(good)
+    line.open = lambda check: check()
+    report = Reporter()
+    report.cancel()
+    with pytest.raises(Cancelled):
+        run_with(chain("a"), line, tmp_path, report)
+    assert line.closed
+
+
+def test_a_task_that_was_silent_when_the_head_went_has_a_new_attempt(tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "SILENT", 0.1)
+    monkeypatch.setattr(run, "DEAF", 0.2)
+    line = FakeLink(good)
+    begun: list[float] = []
+
+    def send(**command: Any) -> None:
+        line.sent.append(command)
+        if command["do"] == "submit":
+            begun.append(time.monotonic())
+            if len(begun) == 1:
+                line.waiting.append({"kind": "told", "id": "a0", "node": "n0"})
+
+    def get(timeout: float) -> dict[str, Any] | None:
+        if line.waiting:
+            return line.waiting.pop(0)
+        time.sleep(0.02)
+        if line.sent[-1]["do"] == "cancel":
+            return None
+        if len(begun) > 1 and time.monotonic() - begun[-1] > 0.5:
+            return {"kind": "answer", "id": "a0", "answer": good({})}
+        return {"kind": "told", "id": "a0", "node": "n0"} if len(begun) > 1 else {}
+
+    line.send, line.get = send, get
+    runner = run_with(chain("a", 1), line, tmp_path)
+    assert [command["do"] for command in line.sent] == ["submit", "cancel", "submit"]
+    assert runner.tasks.all["a0"].losses == 0
+
+
 def test_a_silent_worker_is_cut_off(tmp_path, monkeypatch):
     monkeypatch.setattr(run, "SILENT", 0.3)
     line = FakeLink(good)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import time
 from pathlib import Path
@@ -19,6 +20,8 @@ def said(values: dict[str, Any], report: Reporter) -> dict[str, Any]:
     report.warn("A word.")
     if values.get("fails"):
         raise PosesError("No poses.", "Take more photos.")
+    if values.get("refused"):
+        raise OSError(values["refused"], "refused", "runs/main")
     if values.get("odd"):
         raise KeyError("odd")
     while values.get("long"):
@@ -50,6 +53,12 @@ def test_a_worker_answers_in_json(tmp_path):
         {"code": "poses", "message": "No poses.", "hint": "Take more photos."},
     )
     assert ask(tmp_path, values={"odd": True})["error"]["code"] == "internal"
+
+
+@pytest.mark.parametrize(("number", "denied"), [(errno.EACCES, True), (errno.ENOSPC, None), (errno.EROFS, None)])
+def test_a_worker_tells_files_it_may_not_write_from_disks_that_take_none(tmp_path, number, denied):
+    error = ask(tmp_path, values={"refused": number})["error"]
+    assert (error["code"], error.get("denied")) == ("disk", denied)
 
 
 @pytest.mark.parametrize(

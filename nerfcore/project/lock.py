@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -18,6 +19,7 @@ from .store import is_project
 FOLDER = "jobs"
 LOCK_FILE = "engine.lock"
 OWNER_FILE = "engine.lock.owner"
+HOLDERS_TAKE = 90.0  # seconds: a worker of a cluster whose head is gone may hold the project until it notices
 
 
 def project_of(params: Params) -> Path | None:
@@ -92,6 +94,29 @@ def project_lock(project: Path | None, owner: str) -> Iterator[None]:
                 shutil.rmtree(folder, ignore_errors=True)
                 for place in made:
                     place.rmdir()
+
+
+@contextmanager
+def awaited_lock(
+    project: Path | None, owner: str, check: Callable[[], None], patience: float | None = None
+) -> Iterator[None]:
+    """`project_lock` that waits for one who holds the project, `HOLDERS_TAKE` seconds unless `patience` says otherwise.
+
+    Raises:
+        as project_lock. What `check` raises to stop.
+    """
+    deadline = time.monotonic() + (HOLDERS_TAKE if patience is None else patience)
+    with ExitStack() as stack:
+        while True:
+            check()
+            try:
+                stack.enter_context(project_lock(project, owner))
+                break
+            except ProjectError:
+                if time.monotonic() > deadline:
+                    raise
+                time.sleep(0.5)
+        yield
 
 
 def _holder(note: Path) -> str:

@@ -24,7 +24,7 @@ from ..files import require_writable
 from ..mesh.formats import check_format
 from ..progress import Reporter
 from ..project.fingerprints import Fingerprint, compare, digest, read_made, write_made
-from ..project.lock import project_lock
+from ..project.lock import awaited_lock
 from ..project.runs import checkpoint_id, run_folder
 from ..project.schema import step
 from ..project.store import load_project, record_step
@@ -97,11 +97,12 @@ def training_of(params: p.BlocksParams, block: BlockPlan) -> p.TrainParams:
     return training.model_copy(update={"resume": unfinished(training)})
 
 
-def run_stage(values: dict[str, Any], report: Reporter) -> dict[str, Any]:
+def run_stage(values: dict[str, Any], report: Reporter, patience: float | None = None) -> dict[str, Any]:
     """Do one stage of one block, unless what is there is still good.
 
     Args:
         values: "params": settings of `blocks`; "block": its name; "stage"; "folder": the only one that is written in.
+        patience: seconds to wait for one who holds the block; None: until a worker whose head is gone has noticed.
     Returns:
         {"result", "seconds", "reused"}
     Raises:
@@ -112,7 +113,7 @@ def run_stage(values: dict[str, Any], report: Reporter) -> dict[str, Any]:
     plan = load_plan(folder)
     block = next(block for block in plan.blocks if block.name == values["block"])
     require_inside(block_folder(folder, block), Path(values["folder"]))
-    with project_lock(block_folder(folder, block), "blocks"):
+    with awaited_lock(block_folder(folder, block), "blocks", report.check, patience):
         result, reused = _STAGES[values["stage"]](params, plan, block, report)
     return {"result": result, "seconds": round(time.perf_counter() - begin, 1), "reused": reused}
 
@@ -144,7 +145,7 @@ def _here(params: p.BlocksParams, plan: Plan, report: Reporter) -> dict[str, Any
     for task in tasks_of(params, plan):
         report.check()
         report.stage(f"Block {task.values['block']} of {len(plan.blocks)}: {task.values['stage']}")
-        made[task.id] = run_stage(task.values, report)
+        made[task.id] = run_stage(task.values, report, patience=0.0)
     return made
 
 

@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 from ..capture.find import classes_beside, subfolder
 from ..cluster.storage import Copy, Saving, Storage, placed, work_folder
 from ..cluster.worker import require_inside
-from ..errors import ProjectError
 from ..params import PosesParams, ReconstructParams, RenderParams
 from ..poses.spread import find_features, match_part
 from ..progress import Reporter
 from ..project.fingerprints import digest
-from ..project.lock import lockable, project_lock
+from ..project.lock import awaited_lock, lockable
 from .reconstruct import run_stages, stage_params
 from .stages import STAGES
 
@@ -26,7 +23,6 @@ WRITTEN = ("out", "blend", "report", "renders")
 # Of a project, what a stage does not fetch: COLMAP's files only where poses are estimated.
 NOT_READ = {"new": ("poses/sfm/", "runs/", "exports/"), "poses": ("runs/", "exports/", "labels/")}
 SAVE_EVERY = 30.0  # seconds, as often as training writes a checkpoint
-LOCK_PATIENCE = 90.0  # seconds: a worker whose head is gone may hold the project until it notices
 
 
 def run_stage(values: dict[str, Any], report: Reporter) -> dict[str, Any]:
@@ -68,7 +64,7 @@ def do_stage(values: dict[str, Any], report: Reporter) -> dict[str, Any]:
         return _render_part(params, tuple(values["frame_range"]), report)
     if values.get("matching"):
         return _matching(params, values["matching"], report)
-    with _project(params, report):
+    with awaited_lock(lockable(params), "batch", report.check):
         made = run_stages(params, [verb], report)
     return {
         "result": made.results.get(verb),
@@ -95,7 +91,7 @@ def _matching(params: ReconstructParams, what: str | list[int], report: Reporter
     """The features of a large capture, or a part of its pairs while others match the rest."""
     begin, values = time.perf_counter(), PosesParams(project=Path(params.out), keep_exposure=params.keep_exposure)
     if isinstance(what, str):
-        with _project(params, report):
+        with awaited_lock(lockable(params), "batch", report.check):
             result = find_features(values, report)
     else:
         result = match_part(values, what[0], what[1], report)
@@ -133,20 +129,3 @@ def _given(params: ReconstructParams, folder: Path) -> list[str]:
 def written_paths(params: ReconstructParams) -> list[Path]:
     """The files and folders that a capture writes."""
     return [path for path in (getattr(params, name) for name in WRITTEN) if path is not None]
-
-
-@contextmanager
-def _project(params: ReconstructParams, report: Reporter) -> Iterator[None]:
-    """Hold the project; one that is still held is waited for a little."""
-    deadline = time.monotonic() + LOCK_PATIENCE
-    with ExitStack() as stack:
-        while True:
-            report.check()
-            try:
-                stack.enter_context(project_lock(lockable(params), "batch"))
-                break
-            except ProjectError:
-                if time.monotonic() > deadline:
-                    raise
-                time.sleep(0.5)
-        yield

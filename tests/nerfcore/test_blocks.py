@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
+from threading import Timer
 
 import numpy as np
 import pytest
 import torch
 from fieldwork.nerfcore.blocks.join import joined, open_at_seams
 from fieldwork.nerfcore.blocks.maps import cut_maps, joined_maps, load_maps, moved, save_maps
-from fieldwork.nerfcore.blocks.plan import Plan, cut, load_plan, save_plan
+from fieldwork.nerfcore.blocks.plan import Plan, block_folder, cut, load_plan, save_plan
 from fieldwork.nerfcore.blocks.projects import write_block
 from fieldwork.nerfcore.blocks.sights import Sights, chosen, load_sights, save_sights, sights_of
 from fieldwork.nerfcore.blocks.surface import (
@@ -37,9 +39,12 @@ from fieldwork.nerfcore.mesh.fusion import fuse_maps, tolerances
 from fieldwork.nerfcore.mesh.instances import GAP, find_instances
 from fieldwork.nerfcore.mesh.region import all_hits
 from fieldwork.nerfcore.mesh.surface import Surface, is_watertight, vertex_normals, with_faces
+from fieldwork.nerfcore.params import BlocksParams
 from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.project.lock import project_lock
 from fieldwork.nerfcore.project.schema import Frame, ImageRecord, PosedImage, Poses, Project, SemanticClass
 from fieldwork.nerfcore.project.store import load_points, load_project, load_visibility, save_poses, save_project
+from fieldwork.nerfcore.workflows import blocks as workflow
 from fieldwork.tests.nerfcore.support.depth_views import Hit, box, look_at, maps_of, orbit, sphere
 from fieldwork.tests.nerfcore.support.flat import wall_mesh
 
@@ -304,6 +309,25 @@ def test_four_blocks_divide_where_most_photos_are() -> None:
     assert cuts == sorted(cuts) == [block.low[0] for block in plan.blocks[1:]]
     volume = sum(np.prod(np.subtract(block.high, block.low)) for block in plan.blocks)
     assert volume == pytest.approx(np.prod(np.subtract(plan.high, plan.low)))
+
+
+@pytest.mark.parametrize("on_cluster", [True, False])
+def test_a_worker_waits_for_one_that_still_holds_its_block(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, on_cluster: bool
+) -> None:
+    plan = two_blocks()
+    save_plan(tmp_path, plan)
+    save_project(block_folder(tmp_path, plan.blocks[0]), Project())
+    task = workflow.tasks_of(BlocksParams(project=tmp_path), plan)[0]
+    monkeypatch.setitem(workflow._STAGES, "train", lambda *_: ({"steps": 1}, False))
+    with ExitStack() as held:
+        held.enter_context(project_lock(block_folder(tmp_path, plan.blocks[0]), "blocks"))
+        if on_cluster:
+            Timer(0.3, held.close).start()
+            assert workflow.run_stage(task.values, Reporter())["result"] == {"steps": 1}
+        else:
+            with pytest.raises(ProjectError, match="is being worked on"):
+                workflow._here(BlocksParams(project=tmp_path), plan, Reporter())
 
 
 def test_too_many_blocks_for_the_photos_are_told() -> None:

@@ -17,7 +17,7 @@ from ..images.encode import write_picture
 from ..kernels.closest import ClosestPoints
 from ..mesh.build import not_refuted
 from ..mesh.features import features_of
-from ..mesh.instances import GAP, find_instances, write_instances
+from ..mesh.instances import GAP, find_instances, with_earlier_joins, with_earlier_names, write_instances
 from ..mesh.lods import level_files, make_levels, write_level
 from ..mesh.painted import training_photos, unwrapped
 from ..mesh.parts import texture_of
@@ -26,11 +26,12 @@ from ..mesh.stored import MESH, TEXTURE
 from ..mesh.surface import Surface, class_table, to_world, with_faces
 from ..mesh.triangles import area_share
 from ..mesh.turntable import write_turntable
+from ..mesh.verb import earlier_instances
 from ..params import BlocksParams
 from ..progress import Reporter
 from ..project.fingerprints import alignment, write_made
 from ..project.label_revision import map_revision
-from ..project.runs import MESH_RECORD, read_metrics, run_folder
+from ..project.runs import MEASURES, MESH_RECORD, SCENE_GRAPH, read_metrics, run_folder
 from ..project.schema import step
 from ..project.store import load_project
 from .join import joined, open_at_seams
@@ -43,7 +44,8 @@ NAME = "blocks"  # folder in exports
 
 def write_whole(folder: Path, plan: Plan, params: BlocksParams, report: Reporter) -> dict[str, Any]:
     """Join the surfaces of all blocks, number the instances over all of them, paint it from the photos if asked for, and write
-    the mesh, which other verbs know as that of the run “blocks”. Nothing that was there is changed before all is made.
+    the mesh, which other verbs know as that of the run “blocks”. Nothing that was there is changed before all is made; names
+    and joins of instances that were made by hand stay.
 
     Returns:
         {"blocks": [{"name", "photos", "psnr_train", "faces"}], "vertices", "faces", "open_at_seams": edges, "voxel",
@@ -56,6 +58,7 @@ def write_whole(folder: Path, plan: Plan, params: BlocksParams, report: Reporter
     from ..mesh.files import write_surface  # with its libraries, a quarter of a second
 
     report.stage("Joining the blocks")
+    inputs = {"alignment": alignment(load_project(folder))}
     parts = [load_part(folder, block) for block in plan.blocks]
     common, filled = joined(parts)
     open_edges = open_at_seams(common, parts)
@@ -69,12 +72,15 @@ def write_whole(folder: Path, plan: Plan, params: BlocksParams, report: Reporter
     numbers, instances = find_instances(
         surface.vertices, surface.faces, surface.face_class, names, scene.ignore_id, GAP * voxel
     )
+    target, out = folder / "exports" / NAME, params.out
+    earlier = earlier_instances(target, inputs)
+    numbers, instances = with_earlier_joins(numbers, instances, earlier)
+    instances = with_earlier_names(instances, earlier)
     surface = replace(surface, face_instance=numbers)
     painted = None if params.texture is None else paint(common, plan, scene, params.texture, report)
     texture = None if painted is None else texture_of(surface.faces, painted.uv, painted.image)
     levels = make_levels(surface, texture, params.lods, report)
     report.stage("Writing")
-    target, out = folder / "exports" / NAME, params.out
     revision = map_revision(load_project(folder))
     features = features_of(surface, scene.classes, scene.ignore_id, instances, revision)
     with staged(target) as here:
@@ -84,7 +90,8 @@ def write_whole(folder: Path, plan: Plan, params: BlocksParams, report: Reporter
             written += write_level(here, number, level, report.check)
         report.check()
         kept = {path.name for path in written}
-        (target / MESH_RECORD).unlink(missing_ok=True)
+        for name in (MESH_RECORD, MEASURES, SCENE_GRAPH):  # they are of the mesh before
+            (target / name).unlink(missing_ok=True)
         for path in [*level_files(target), *(target / name for name in (TEXTURE, UNSEEN))]:
             if path.name not in kept:
                 path.unlink(missing_ok=True)
@@ -114,7 +121,6 @@ def write_whole(folder: Path, plan: Plan, params: BlocksParams, report: Reporter
     }
     if painted is not None:
         result["painted_by_photos"] = round(painted.seen, 4)
-    inputs = {"alignment": alignment(load_project(folder))}
     write_made(target / MESH_RECORD, step("blocks", params.model_dump(mode="json"), result, inputs))
     return result
 

@@ -1,0 +1,62 @@
+"""The mesh of all blocks, written again: what was made by hand of the one before stays."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from fieldwork.nerfcore.blocks.plan import PART, Plan, block_folder
+from fieldwork.nerfcore.blocks.surface import Part, save_part
+from fieldwork.nerfcore.blocks.whole import NAME, write_whole
+from fieldwork.nerfcore.mesh.instances import read_instances, write_instances
+from fieldwork.nerfcore.mesh.surface import Surface
+from fieldwork.nerfcore.params import BlocksParams, InstancesParams
+from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.project.runs import MEASURES, SCENE_GRAPH, run_folder
+from fieldwork.nerfcore.project.schema import SemanticClass
+from fieldwork.nerfcore.project.store import edit_project
+from fieldwork.nerfcore.things.edit import instances
+from fieldwork.tests.nerfcore.support.ball import ball_project
+
+
+def halves() -> Surface:
+    """A ball whose upper half has the class 1 and whose lower half has the class 2."""
+    ball = trimesh.creation.icosphere(3, 0.5)
+    vertices, faces = np.asarray(ball.vertices, np.float32), np.asarray(ball.faces, np.int32)
+    kind = [np.where(z > 0.01, 1, 2).astype(np.int32) for z in (vertices[:, 2], vertices[faces].mean(1)[:, 2])]
+    colors = np.full(vertices.shape, 128, np.uint8)
+    return Surface(vertices, faces, np.asarray(ball.vertex_normals, np.float32), colors, *kind)
+
+
+@pytest.fixture
+def asked(tmp_path: Path) -> tuple[Plan, BlocksParams]:
+    """A project with the part of its only block."""
+    project = ball_project(tmp_path / "p", views=6, side=32, points=100)
+    with edit_project(project) as edited:
+        edited.classes = [SemanticClass(id=k, name=name, color=(1, 0, 0)) for k, name in ((1, "upper"), (2, "lower"))]
+    corners = {"low": (-1, -1, -1), "high": (1, 1, 1)}
+    plan = Plan.model_validate({**corners, "blocks": [{"name": "1", **corners, "images": []}]})
+    part = Part(halves(), np.zeros((0, 2)), 0.05)
+    save_part(run_folder(block_folder(project, plan.blocks[0]), "main") / PART, part)
+    return plan, BlocksParams(project=project, count=2, holdout=0)
+
+
+def test_names_and_joins_made_by_hand_stay_and_what_was_said_of_the_mesh_before_goes(
+    asked: tuple[Plan, BlocksParams],
+) -> None:
+    plan, params = asked
+    folder, target = params.project, params.project / "exports" / NAME
+    write_whole(folder, plan, params, Reporter())
+    assert [one.name for one in read_instances(target)] == ["upper.001", "lower.001"]
+    instances(InstancesParams(project=folder, run=NAME, rename=["upper.001", "dome"]), Reporter())
+    dome, lower = read_instances(target)
+    pieces = ((lower.area / 2, (0.1, 0.0, -0.2)), (lower.area / 2, (-0.1, 0.0, -0.2)))
+    write_instances(target, [dome, replace(lower, parts=pieces)])
+    for name in (MEASURES, SCENE_GRAPH):
+        (target / name).write_text("{}")
+    write_whole(folder, plan, params, Reporter())
+    assert [(one.name, one.parts) for one in read_instances(target)] == [("dome", ()), ("lower.001", pieces)]
+    assert not any((target / name).exists() for name in (MEASURES, SCENE_GRAPH))

@@ -20,7 +20,7 @@ from ..params import PosesParams
 from ..progress import Reporter, shortened
 from ..project.fingerprints import Earlier, Fingerprint, compare, digest, files_digest
 from ..project.kept import earlier_cut_outs, earlier_poses, keep_world
-from ..project.schema import Frame, ImageRecord, PosedImage, Poses, Project
+from ..project.schema import Frame, ImageRecord, PosedImage, Poses, Project, ProvenanceStep
 from ..project.store import FRAMES_FILE, FRAMES_FOLDER, POSES_FILE, edit_project, load_poses, load_project, save_poses
 from ..verdict import poses_verdict
 from .align import gps_frame
@@ -33,6 +33,7 @@ SPARSE_FOLDER = "poses/sparse"
 REPORT_FILE = "poses/report.json"
 PICTURE_FILE = "poses/report.png"
 STATE_FILE = "state.json"
+EXPOSURE = "exposure"  # an input of poses, where photos keep theirs
 MIN_PHOTOS = 3
 # By name, matched besides those that retrieval finds. Of video as in COLMAP's sequential matching; of photos not tuned.
 PHOTO_NEIGHBOURS, VIDEO_NEIGHBOURS = 3, 10
@@ -185,15 +186,25 @@ def posing_inputs(folder: Path, project: Project, params: PosesParams) -> Finger
         ),
         "masks": files_digest((r.name, folder / r.mask if r.mask else None) for r in records),
         "GPS": digest([[r.name, r.exif.get("gps")] for r in records]),
-        "settings": digest([params.preset, params.group, *(["keep_exposure"] if params.keep_exposure else [])]),
+        "settings": digest([params.preset, params.group]),
+        **({EXPOSURE: digest("kept")} if params.keep_exposure else {}),
     }
 
 
+def recorded(project: Project) -> ProvenanceStep | None:
+    """What the last estimation of poses was made from; records of before had no input for exposures that are kept."""
+    made = project.last("poses")
+    if made is None or not made.inputs or not made.settings.get("keep_exposure"):
+        return made
+    return made.model_copy(update={"inputs": {**made.inputs, EXPOSURE: digest("kept")}})
+
+
 def posed(params: PosesParams) -> Earlier:
-    """The poses that are there, if they are of the present photos; settings chosen by hand count as wished for."""
+    """The poses that are there, if they are of the present photos, whose exposures are kept or not as asked for; other settings
+    chosen by hand count as wished for."""
     folder = Path(params.project)
     project = load_project(folder)
-    made = project.last("poses")
+    made = recorded(project)
     if made is None or not (folder / POSES_FILE).is_file():
         return Earlier()
     if not made.inputs:

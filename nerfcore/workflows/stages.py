@@ -23,9 +23,10 @@ def _new() -> Stage:
 
 
 def _poses() -> Stage:
-    from ..poses.estimate import estimate_poses, posed
+    from ..poses.estimate import posed
+    from ..poses.reuse import poses_or_gains
 
-    return Stage(estimate_poses, posed)
+    return Stage(poses_or_gains, posed)
 
 
 def _train() -> Stage:

@@ -13,11 +13,13 @@ from fieldwork.nerfcore.data.pixels import PixelStore
 from fieldwork.nerfcore.geometry.cameras import Camera, project
 from fieldwork.nerfcore.geometry.points import Points
 from fieldwork.nerfcore.images.exposure import common_gains
-from fieldwork.nerfcore.poses.estimate import with_gains
+from fieldwork.nerfcore.params import PosesParams, ReconstructParams
+from fieldwork.nerfcore.poses.estimate import posed, posing_inputs, with_gains
 from fieldwork.nerfcore.poses.exposure import exposure_gains
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.schema import ImageRecord, PosedImage, Poses, Project
-from fieldwork.nerfcore.project.store import save_poses, save_project
+from fieldwork.nerfcore.project.store import edit_project, load_points, load_poses, save_poses, save_project
+from fieldwork.nerfcore.workflows.reconstruct import Pipeline, stage_params
 from PIL import Image
 
 VIEWS, SIZE = 6, 96
@@ -120,3 +122,47 @@ def test_photos_are_read_at_the_common_exposure(tmp_path: Path) -> None:
     chosen = list(range(VIEWS))
     assert view_inputs(scene, chosen, files=True)["photos"] != view_inputs(plain, chosen, files=True)["photos"]
     assert view_inputs(scene, chosen, files=True)["cameras"] == view_inputs(plain, chosen, files=True)["cameras"]
+
+
+@pytest.fixture
+def posed_project(tmp_path: Path) -> Path:
+    """A project whose poses have gains, as `poses` leaves it that was called with settings of its own."""
+    poses, points, visibility, files = capture(tmp_path, differing())
+    records = [
+        ImageRecord(name=file.stem, file=f"images/{file.name}", width=SIZE, height=SIZE, status="ok") for file in files
+    ]
+    project = Project(images=records)
+    asked = PosesParams(project=tmp_path, preset="robust")
+    project.record(
+        "poses", asked.model_dump(mode="json"), {"registered": VIEWS}, posing_inputs(tmp_path, project, asked)
+    )
+    save_project(tmp_path, project)
+    save_poses(tmp_path, with_gains(tmp_path, records, poses, points, visibility, Reporter()), points, visibility)
+    return tmp_path
+
+
+def test_exposures_are_kept_of_a_project_that_has_poses(posed_project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As `reconstruct` asks for it, and back again: the poses stay, whatever preset they were estimated with."""
+    monkeypatch.setattr("fieldwork.nerfcore.poses.reuse.estimate_poses", lambda *_: pytest.fail("estimated anew"))
+    before = load_poses(posed_project)
+    for keep in (False, True, False):
+        pipeline = Pipeline(posed_project, Reporter())
+        asked = ReconstructParams(photos=posed_project / "photos", out=posed_project, keep_exposure=keep)
+        values = stage_params(asked, "poses")
+        assert values is not None
+        pipeline.do("poses", values)
+        poses = load_poses(posed_project)
+        gains = [image.gain for image in poses.images]
+        assert gains == ([None] * VIEWS if keep else [image.gain for image in before.images])
+        assert [image.camera_to_world for image in poses.images] == [i.camera_to_world for i in before.images]
+        assert pipeline.results["poses"] == {"registered": VIEWS}
+    assert pipeline.redone == {"poses": "changed: exposure"}
+    assert load_points(posed_project).xyz.shape == (144, 3)
+
+
+def test_records_from_before_say_whether_exposures_were_kept(posed_project: Path) -> None:
+    with edit_project(posed_project) as project:
+        project.provenance[-1].settings["keep_exposure"] = True
+    asked = PosesParams(project=posed_project, keep_exposure=True)
+    assert posed(asked).result is not None
+    assert posed(asked.model_copy(update={"keep_exposure": False})).reason == "changed: exposure"

@@ -139,12 +139,15 @@ def free_gb(folder: Path) -> float:
 
 
 def require_inside(path: Path, folder: Path) -> None:
-    """Raise Refusal unless `path` lies in `folder`, links resolved: a worker writes nowhere else."""
-    if not path.resolve().is_relative_to(folder.resolve()):
-        raise Refusal(
-            f"{path} is outside of the campaign's folder {folder}.",
-            "Let all results be written below the list's folder.",
-        )
+    """Raise Refusal unless `path`, and all that links in it lead to, lies in `folder`: a worker writes nowhere else."""
+    inside = (Path(place) / name for place, folders, files in os.walk(path) for name in (*folders, *files))
+    root = os.path.realpath(folder)
+    for one in (path, *(found for found in inside if found.is_symlink())):
+        if not Path(os.path.realpath(one)).is_relative_to(root):
+            raise Refusal(
+                f"{one} is outside of the campaign's folder {folder}.",
+                "Let all results be written below the list's folder, without links that lead out of it.",
+            )
 
 
 @contextmanager

@@ -10,9 +10,14 @@ from typing import Any
 
 import pytest
 from fieldwork.nerfcore import __version__
+from fieldwork.nerfcore.blocks.plan import BlockPlan, Plan, block_folder, save_plan
 from fieldwork.nerfcore.cluster import worker
 from fieldwork.nerfcore.errors import PosesError
+from fieldwork.nerfcore.params import BlocksParams, ReconstructParams
 from fieldwork.nerfcore.progress import Reporter
+from fieldwork.nerfcore.workflows.blocks import run_stage, tasks_of
+from fieldwork.nerfcore.workflows.stage_task import do_stage
+from fieldwork.tests.nerfcore.support.photos import folder_of
 
 
 def said(values: dict[str, Any], report: Reporter) -> dict[str, Any]:
@@ -74,6 +79,31 @@ def test_a_worker_refuses_what_it_cannot_do(tmp_path, changes, state, words):
     assert answer["state"] == state
     assert words in answer["error"]["message"]
     assert answer["error"]["hint"]
+
+
+@pytest.mark.parametrize("link", ["images", "runs/main/field.safetensors"])
+def test_a_worker_follows_no_link_out_of_the_campaign_s_folder(tmp_path, link):
+    campaign, outside = tmp_path / "campaign", tmp_path / "elsewhere"
+    project = campaign / "vase"
+    (project / link).parent.mkdir(parents=True)
+    folder_of(campaign / "photos", 3)
+    outside.mkdir()
+    (project / "depth").symlink_to(campaign / "photos")  # one that stays inside
+    (project / "loop").symlink_to(project / "loop")
+    (project / link).symlink_to(outside)
+    capture = ReconstructParams(photos=campaign / "photos", out=project).model_dump(mode="json")
+    with pytest.raises(worker.Refusal, match=f"{link} is outside of the campaign's folder"):
+        do_stage({"capture": capture, "stage": "new", "folder": str(campaign)}, Reporter())
+    assert list(outside.iterdir()) == []
+    (project / link).unlink()
+    worker.require_inside(project, campaign)
+    block = BlockPlan(name="1", low=(0, 0, 0), high=(1, 1, 1), images=[])
+    plan = Plan(low=block.low, high=block.high, blocks=[block])
+    save_plan(project, plan)
+    (block_folder(project, block) / "runs").mkdir(parents=True)
+    (block_folder(project, block) / "runs/main").symlink_to(outside)
+    with pytest.raises(worker.Refusal, match="runs/main is outside of the campaign's folder"):
+        run_stage(tasks_of(BlocksParams(project=project), plan)[0].values, Reporter())
 
 
 def test_an_interrupt_ends_the_work_of_a_worker(tmp_path):

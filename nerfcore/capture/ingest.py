@@ -87,7 +87,8 @@ def new(params: NewParams, report: Reporter) -> dict[str, Any]:
             report.warn(shortened(text, resized))
         if classes[0]:  # else the project keeps its own
             there = _present_ids(folder, kept + later, report)
-            classes = (with_earlier_names(classes[0], previous.classes, there), *classes[1:])
+            names, ignore_id, colors = classes
+            classes = with_earlier_names(names, previous.classes, there), ignore_id, colors
     present = _present_ids(folder, records, report)
     result = _summary(records, skipped)
     _warn(records, result["rejected"], report)

@@ -58,6 +58,11 @@ def import_dataset(params: ImportParams, report: Reporter) -> dict[str, Any]:
         Of these, and when it is stopped, a project that was there is as before.
     """
     source, folder = Path(params.dataset).absolute(), Path(params.project)
+    if folder.resolve() in (source.resolve(), source.parent.resolve() if source.is_file() else None):
+        raise InputError(
+            f"The data set lies in {folder}, where the project would keep its own files.",
+            f"Choose another folder for the project, such as {folder.resolve().name}_fieldwork beside it.",
+        )
     previous = _previous_project(folder, source)
     report.stage("Reading the data set")
     dataset = read_dataset(source, params.format, params.classes)

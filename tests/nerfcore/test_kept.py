@@ -286,3 +286,12 @@ def test_an_import_that_fails_leaves_the_project_as_it_was(tmp_path: Path, how: 
     assert {name for name in after if after[name] != before.get(name)} - {"poses/points.npz"} == {
         "images/f0.png", "labels/f0.png", "masks/f0.png", "project.json",
     }  # fmt: skip
+
+
+@pytest.mark.parametrize("file", [None, "transforms.json"])
+def test_a_data_set_is_not_written_over_by_its_own_project(tmp_path: Path, file: str | None) -> None:
+    folder = data_set(tmp_path / "set", "transforms")
+    before = contents(folder)
+    with pytest.raises(InputError, match="where the project would keep its own files"):
+        import_dataset(ImportParams(dataset=folder / file if file else folder, project=folder), Reporter())
+    assert contents(folder) == before

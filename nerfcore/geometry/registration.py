@@ -2,7 +2,8 @@
 
 Source: Chetverikov et al., "The trimmed iterative closest point algorithm", 2002, with the distance to planes of Chen and
 Medioni, "Object modelling by registration of multiple range images", 1992. What has changed between the epochs falls
-among the pairs that are trimmed away.
+among the pairs that are trimmed away. Which start was right all points say, each by no more than a set distance: of the
+pairs that are left the worst may be trimmed because they lie wrongly.
 """
 
 from __future__ import annotations
@@ -16,11 +17,15 @@ import scipy
 
 from ..errors import InputError
 from ..progress import Reporter
-from .similarity import fit_similarity, make_similarity, transform_points
+from .similarity import fit_similarity, make_similarity, similarity_scale, transform_points
 
 KEPT = 0.7  # of the pairs that a step goes by
+KEPT_TRYING = 0.9  # while it is tried how they lie: with fewer, parts that fit by chance hold on to each other
 TURNS = 12  # about z that are tried where nothing says how the epochs lie to each other
 FEW, MANY = 1000, 10_000  # points for trying, and for the result
+BEST, WORST = 4, 1.5  # starts that are refined, and how many times the best score they may have; not tuned
+FARTHEST = 0.02  # of the size: what is farther apart tells one start from another no better
+TIE = 0.02  # by how much a score may be worse than the best: symmetric things differ by less in their noise
 STEPS = 40
 STILL = 1e-6  # of the size: a step below this is the last
 COLUMNS = ["name", "x", "y", "z", "other_x", "other_y", "other_z"]
@@ -62,13 +67,16 @@ def by_surfaces(
 ) -> Registered:
     """The transform that brings points (M, 3) of the other epoch onto the surface of this one.
 
-    First as they lie, and turned about z by steps with their middles together; the best is then refined.
+    First as they lie, and turned about z by steps with their middles together. Where they fit as they lie about as well as
+    after any turn, they are not turned; else the best few are refined, and the best of these is taken.
 
     Args:
         here: points (N, 3) and unit normals (N, 3) of this epoch. with_scale: the sizes may differ too.
     """
     points, normals = here
-    tree, few = scipy.spatial.KDTree(points), there[:: max(1, len(there) // FEW)]
+    trees = scipy.spatial.KDTree(points), scipy.spatial.KDTree(there)
+    few, many = (there[:: max(1, len(there) // count)] for count in (FEW, MANY))
+    some = points[:: max(1, len(points) // FEW)]
     sizes = [float(np.sqrt(((p - np.median(p, 0)) ** 2).sum(1).mean())) for p in (points, there)]
     factor = sizes[0] / max(sizes[1], 1e-12) if with_scale else 1.0
     starts = [np.eye(4)]
@@ -76,12 +84,51 @@ def by_surfaces(
         rotation = scipy.spatial.transform.Rotation.from_euler("z", 360 * turn / TURNS, degrees=True).as_matrix()
         middle = np.median(points, 0) - factor * rotation @ np.median(there, 0)
         starts.append(make_similarity(factor, rotation, middle))
+
+    def score(found: Registered) -> float:
+        return _apart(trees, (some, few), found.transform)
+
     tried = []
     for number, start in enumerate(starts):
         report.progress(number / len(starts))
-        tried.append(_refined(tree, points, normals, few, start, False, STEPS // 2))
-    best = min(tried, key=lambda found: found.rms)
-    return _refined(tree, points, normals, there[:: max(1, len(there) // MANY)], best.transform, with_scale, STEPS)
+        tried.append(_refined(trees[0], points, normals, few, start, KEPT_TRYING, False, STEPS // 2))
+    scores = [score(found) for found in tried]
+    best = [n for n in np.argsort(scores, kind="stable")[:BEST].tolist() if scores[n] <= WORST * min(scores)]
+    if scores[0] <= (1 + TIE) * min(scores):
+        best = [0]
+    refined = []
+    for start in _distinct([tried[number].transform for number in best], few, _farthest(points)):
+        report.check()
+        refined.append(_refined(trees[0], points, normals, many, start, KEPT, with_scale, STEPS))
+    return min(refined, key=score)
+
+
+def _apart(
+    trees: tuple[scipy.spatial.KDTree, scipy.spatial.KDTree], points: tuple[np.ndarray, np.ndarray], transform: np.ndarray
+) -> float:
+    """Mean distance from points of each epoch, this one and the other one (N, 3), to the other's (of `trees`), each up to
+    `FARTHEST`, in units of this one. Both ways, for what has shrunk to a dot is near to everything it lies on."""
+    farthest = _farthest(trees[0].data)
+    scale, back = similarity_scale(transform), np.linalg.inv(transform)
+    # What is farther than that is found to be infinitely far.
+    to_this = trees[0].query(transform_points(transform, points[1]), distance_upper_bound=farthest)[0]
+    to_other = trees[1].query(transform_points(back, points[0]), distance_upper_bound=farthest / scale)[0]
+    return float(np.minimum(to_this, farthest).mean() + np.minimum(scale * to_other, farthest).mean()) / 2
+
+
+def _farthest(points: np.ndarray) -> float:
+    return FARTHEST * float(np.ptp(points, axis=0).max())
+
+
+def _distinct(transforms: list[np.ndarray], points: np.ndarray, least: float) -> list[np.ndarray]:
+    """The first of those transforms (4, 4) that bring points (N, 3) to less than `least` from each other, on average."""
+    chosen: list[np.ndarray] = []
+    for transform in transforms:
+        moved = transform_points(transform, points)
+        apart = [np.linalg.norm(transform_points(other, points) - moved, axis=1).mean() for other in chosen]
+        if min(apart, default=np.inf) >= least:
+            chosen.append(transform)
+    return chosen
 
 
 def _refined(
@@ -90,10 +137,11 @@ def _refined(
     normals: np.ndarray,
     moving: np.ndarray,
     start: np.ndarray,
+    share: float,
     scaled: bool,
     steps: int,
 ) -> Registered:
-    """Steps from a start: first to the nearest points, then to the planes through them.
+    """Steps from a start by a share of the pairs: first to the nearest points, then to the planes through them.
 
     Only the latter change the size: points that are drawn to their nearest ones would shrink to a dot.
     """
@@ -103,7 +151,7 @@ def _refined(
         for _ in range(steps // 2):
             moved = transform_points(transform, moving)
             distance, nearest = (np.asarray(part) for part in tree.query(moved))
-            kept = np.argsort(distance)[: max(6, int(KEPT * len(moved)))]
+            kept = np.argsort(distance)[: max(6, int(share * len(moved)))]
             target = nearest[kept]
             if planes:
                 change, left = _to_planes(moved[kept], points[target], normals[target], scaled)

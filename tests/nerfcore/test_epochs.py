@@ -133,6 +133,41 @@ def test_an_epoch_of_unknown_size_is_brought_to_this_one() -> None:
     np.testing.assert_allclose((found.transform @ smaller)[:3, 3], 0, atol=5e-3)
 
 
+def sampled(mesh: trimesh.Trimesh, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points (N, 3) of a mesh with noise of 2 mm along their unit normals (N, 3), and these."""
+    vertices, faces, random = np.asarray(mesh.vertices), np.asarray(mesh.faces), np.random.default_rng(seed)
+    points, face = sample_surface(vertices, faces, 20_000, seed)
+    normals = unit(cross(vertices, faces))[face]
+    order = random.permutation(len(points))
+    return (points + random.normal(scale=0.002, size=(len(points), 1)) * normals)[order], normals[order]
+
+
+@pytest.mark.parametrize("seed", [0, 10])
+def test_epochs_of_a_symmetric_thing_that_lie_over_each_other_are_not_turned(seed: int) -> None:
+    """A column, from which nothing but a chip at its foot tells where its front is."""
+    column = trimesh.creation.cylinder(0.3, 2.0, sections=96).subdivide_to_size(0.05)
+    near = np.clip(1 - np.linalg.norm(column.vertices - [0.3, 0, 0.2], axis=1) / 0.15, 0, 1)
+    column.vertices = column.vertices - 0.075 * near[:, None] * column.vertex_normals
+    found = by_surfaces(sampled(column, seed), sampled(column, seed + 1)[0], False, Reporter())
+    np.testing.assert_allclose(found.transform, np.eye(4), atol=0.01)
+
+
+@pytest.mark.parametrize("angle", [45, 100])
+def test_an_epoch_that_lies_elsewhere_is_found_where_parts_of_it_fit_in_a_wrong_place(angle: float) -> None:
+    """Two plinths, of which one was moved by 10 cm, on a slab before a wall: slab and wall alone fit in several ways."""
+
+    def scene(moved: float) -> trimesh.Trimesh:
+        plinth = [[0.5, 0.5 - moved, 0.001], [1.5, 1.5 - moved, 1]]
+        bounds = [[[0, 0, -0.1], [4, 3, 0]], [[0, 3, 0], [4, 3.1, 2.5]], plinth, [[2.75, 1, 0.001], [3.25, 1.5, 1.5]]]
+        return trimesh.util.concatenate([trimesh.creation.box(bounds=each) for each in bounds])
+
+    turn = Rotation.from_euler("z", angle, degrees=True).as_matrix()
+    elsewhere = make_similarity(1.0, turn, np.array([0.5, 0.2, 0.1]))
+    there = transform_points(elsewhere, sampled(scene(0), 1)[0])
+    found = by_surfaces(sampled(scene(0.1), 0), there, False, Reporter())
+    np.testing.assert_allclose(found.transform @ elsewhere, np.eye(4), atol=2e-3)
+
+
 def test_common_points_register(tmp_path: Path) -> None:
     here = np.array([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 1]])
     there = transform_points(np.linalg.inv(MOVED), here)

@@ -74,11 +74,13 @@ def closed(vertices: np.ndarray, faces: np.ndarray, most_capped: float = MOST_CA
     for loop in border_loops(faces):
         rim = vertices[loop] - middle
         fan = np.stack([np.roll(rim, -1, 0), rim, np.broadcast_to(rim.mean(0), rim.shape)], 1)
-        # The vector area of a loop is the same for every surface across it.
-        vector = np.cross(fan[:, 1] - fan[:, 0], fan[:, 2] - fan[:, 0]).sum(0) / 2
+        half = np.cross(fan[:, 1] - fan[:, 0], fan[:, 2] - fan[:, 0]) / 2
+        # The vector area of a loop is the same for every surface across it, and cancels where two rims are one loop along a
+        # slit between them.
+        vector = half.sum(0)
         flat = float(np.linalg.norm(vector))
         volume += _signed(fan)
-        cap_area += flat
+        cap_area += float(np.linalg.norm(half, axis=1).sum())
         height = (rim - rim.mean(0)) @ (vector / max(flat, 1e-30))
         uneven += (flat * float(height.std())) ** 2
     capped = cap_area / max(float(areas(vertices, faces).sum()) + cap_area, 1e-30)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -88,7 +88,7 @@ def measure(params: MeasureParams, report: Reporter) -> dict[str, Any]:
         report.warn("--scale-error is not used: the scale is not known, and sizes are in scene units.")
     if abs(scale.factor - 1) > K * max(scale.u, 1e-6):
         report.warn(
-            f"By the distances to scale by, lengths are {100 * (scale.factor - 1):+.2f} % off: set the scale with "
+            f"By the distances to scale by, lengths are {100 * (1 / scale.factor - 1):+.2f} % off: set the scale with "
             "`fieldwork align --scale`, then run `fieldwork mesh` and `fieldwork measure` again."
         )
     info = load_info(folder, params.run)
@@ -165,7 +165,7 @@ def amounts(
     of_class = index_of(class_ids)[np.minimum(surface.face_class, max(class_ids, default=0) + 1)]
     of_instance = np.zeros(len(surface.faces), np.int64)
     if surface.face_instance is not None:
-        of_instance = surface.face_instance.astype(np.int64)
+        of_instance = positions(surface.face_instance, [i.id for i in instances])
     labels = Pieces(pieces.centers, pieces.areas, of_class[pieces.parent], of_instance[pieces.parent])
     u_class, u_instance = area_deviations(labels, votes, len(instances))
     report.check()
@@ -194,7 +194,7 @@ def amounts(
     volumes = []
     for number, instance in enumerate(instances):
         report.progress(number / len(instances), instance.name)
-        volumes.append(volume(2, instance.id, by_instance[number]))
+        volumes.append(volume(2, number + 1, by_instance[number]))
     together = [summed([v for v, i in zip(volumes, instances) if i.class_id == class_id]) for class_id in class_ids]
     guess = np.zeros(len(surface.faces), bool) if guessed is None else guessed
     (whole,), of_classes, of_instances = (
@@ -202,6 +202,14 @@ def amounts(
     )
     guesses = whole, of_classes, of_instances
     return Measured(area, volume(0, 1, area), by_class, together, by_instance, volumes, guesses)
+
+
+def positions(face_instance: np.ndarray, ids: Sequence[int]) -> np.ndarray:
+    """The position of each face's instance (F,) among `ids`, counted from 1; 0 for none of them. The ids have gaps where
+    instances were joined."""
+    position = np.zeros(max([int(face_instance.max(initial=0)), *ids]) + 1, np.int64)
+    position[list(ids)] = np.arange(1, len(ids) + 1)
+    return position[face_instance.astype(np.int64)]
 
 
 def gathered_votes(photos: list[Photo], pieces: Facelets, class_ids: list[int], report: Reporter) -> Votes:

@@ -26,11 +26,12 @@ from fieldwork.nerfcore.mesh.instances import find_instances
 from fieldwork.nerfcore.mesh.stored import COARSE, mesh_folder
 from fieldwork.nerfcore.mesh.surface import Surface
 from fieldwork.nerfcore.mesh.visibility import PosedCamera
-from fieldwork.nerfcore.params import MeasureParams
+from fieldwork.nerfcore.params import InstancesParams, MeasureParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.runs import MEASURES, MESH_RECORD
 from fieldwork.nerfcore.project.schema import PosedImage, Poses, Project
 from fieldwork.nerfcore.project.store import edit_project
+from fieldwork.nerfcore.things.edit import instances as change_instances
 from fieldwork.tests.nerfcore.support.ball import RADIUS, ball_project
 from fieldwork.tests.nerfcore.support.flat import box_mesh, wall_mesh
 from fieldwork.tests.nerfcore.support.meshed import store_mesh
@@ -138,6 +139,20 @@ def test_the_volume_of_an_open_box_is_that_of_the_box_with_a_lid() -> None:
     assert closed(vertices, faces[:0]) is None
 
 
+@pytest.mark.parametrize("slit", [0, 1, 6])
+def test_the_wall_of_a_tower_without_roof_and_floor_has_no_volume_slit_or_not(slit: int) -> None:
+    """120 columns of squares around a tower, some of which are missing: with them its two rims are one loop."""
+    around, up, height = 120, 30, 3.0
+    angle, z = np.meshgrid(2 * np.pi * np.arange(around) / around, np.linspace(0, height, up), indexing="ij")
+    vertices = np.stack([np.cos(angle), np.sin(angle), z], -1).reshape(-1, 3)
+    i, k = np.meshgrid(np.arange(around - slit), np.arange(up - 1), indexing="ij")
+    a, b = (i * up + k).ravel(), ((i + 1) % around * up + k).ravel()
+    faces = np.concatenate([np.stack([a, b, b + 1], 1), np.stack([a, b + 1, a + 1], 1)])
+    assert len(border_loops(faces)) == (1 if slit else 2)
+    assert closed(vertices, faces, 0.9 / (1 + height)) is None  # two lids of π beside a wall of 2 π · height
+    assert closed(vertices, faces, 0.5) is not None
+
+
 def test_openings_that_touch_at_a_vertex_are_two() -> None:
     vertices, faces, _ = wall_mesh(4)
     middle = vertices[faces].mean(1)
@@ -204,6 +219,23 @@ def test_what_of_an_area_is_a_guess_is_told(project: Path) -> None:
     assert top["area"] == before["classes"][0]["area"]
 
 
+def test_things_that_were_joined_by_hand_are_measured_as_one(tmp_path: Path) -> None:
+    """Cubes of four sizes, of which the first two become one: the ids of the others are no places in the list any more."""
+    folder, sides = ball_project(tmp_path / "ball", views=4), (0.7, 0.6, 0.5, 0.4)
+    cubes = [trimesh.creation.box(bounds=[[n, 0, 0], [n + side, side, side]]) for n, side in enumerate(sides)]
+    coarse, mesh = (trimesh.util.concatenate(part) for part in (cubes, [c.subdivide_to_size(0.12) for c in cubes]))
+    store_mesh(folder, mesh, np.ones(len(mesh.faces), int), coarse, 0.02)
+    before = measure(MeasureParams(project=folder), Reporter())["instances"]
+    change_instances(InstancesParams(project=folder, merge=["top.001", "top.002"]), Reporter())
+    result = measure(MeasureParams(project=folder), Reporter())
+    assert [row["id"] for row in result["instances"]] == [1, 3, 4]
+    sizes = [[row[name] for row in result["instances"]] for name in ("area", "volume")]
+    assert sizes[0] == pytest.approx([6 * (0.7**2 + 0.6**2), 6 * 0.5**2, 6 * 0.4**2])
+    assert sizes[1] == pytest.approx([0.7**3 + 0.6**3, 0.5**3, 0.4**3])
+    assert result["instances"][1:] == before[2:]
+    assert result["classes"][0]["volume"] == pytest.approx(sum(sizes[1]))
+
+
 @pytest.mark.parametrize("step", ["area_deviations", "transferred", "area_deviations_of_place", "volume_amount"])
 def test_a_cancel_does_not_wait_for_what_comes_after(project: Path, monkeypatch: pytest.MonkeyPatch, step: str) -> None:
     report, done = Reporter(), []
@@ -234,6 +266,18 @@ def test_a_mesh_without_classes_is_measured_as_a_whole(tmp_path: Path) -> None:
     made = sections(folder, "main", {}, read_measures(folder, "main"))
     (written,) = [table for table in made if table.title == "Whole surface: area and volume"]
     assert written.rows[0][0] == "whole surface"
+
+
+@pytest.mark.parametrize(("metres", "told"), [(1.25, "-20.00 % off"), (0.8, "+25.00 % off")])
+def test_by_how_much_lengths_are_off_has_the_sign_of_their_error(
+    project: Path, tmp_path: Path, metres: float, told: str
+) -> None:
+    """A length of 1 that is 1.25 m long is measured a fifth too short."""
+    table = tmp_path / "lengths.csv"
+    table.write_text(f"name,from,to,metres,use\nbar,-0.5 0 0,0.5 0 0,{metres},scale\n")
+    report = Reporter()
+    measure(MeasureParams(project=project, distances=table), report)
+    assert [warning for warning in report.warnings if told in warning]
 
 
 def test_while_the_scale_is_not_known_nothing_is_held_against_metres(project: Path, tmp_path: Path) -> None:

@@ -104,7 +104,9 @@ def by_surfaces(
 
 
 def _apart(
-    trees: tuple[scipy.spatial.KDTree, scipy.spatial.KDTree], points: tuple[np.ndarray, np.ndarray], transform: np.ndarray
+    trees: tuple[scipy.spatial.KDTree, scipy.spatial.KDTree],
+    points: tuple[np.ndarray, np.ndarray],
+    transform: np.ndarray,
 ) -> float:
     """Mean distance from points of each epoch, this one and the other one (N, 3), to the other's (of `trees`), each up to
     `FARTHEST`, in units of this one. Both ways, for what has shrunk to a dot is near to everything it lies on."""

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import PosesError
+from ..geometry.earth import metres_per_radian
 
 GPS_NOISE = 5.0  # metres, of a phone under open sky (gps.gov: 4.9 m)
 # Not tuned: the next two.
 EXTENT_OVER_NOISE = 8.0  # how far the photos must be spread for GPS to say anything
 MAX_MISFIT = 0.4  # of the spread of the positions; unrelated ones reach about 1
-EARTH_RADIUS = 6_378_137.0  # metres, WGS 84 equatorial
 
 
 @dataclass(frozen=True)
@@ -28,10 +28,9 @@ class GpsFit:
 
 
 def local_metres(latitude: np.ndarray, longitude: np.ndarray) -> np.ndarray:
-    """East and north (N, 2) in metres from the mean position; a sphere is exact enough over a capture."""
-    north = np.radians(latitude - latitude.mean()) * EARTH_RADIUS
-    east = np.radians(longitude - longitude.mean()) * EARTH_RADIUS * np.cos(np.radians(latitude.mean()))
-    return np.stack([east, north], -1)
+    """East and north (N, 2) in metres from the mean position, on the plane that touches the ellipsoid there."""
+    degrees = np.stack([longitude - longitude.mean(), latitude - latitude.mean()], -1)
+    return np.radians(degrees) * metres_per_radian(float(latitude.mean()))
 
 
 def fit_gps(centers: np.ndarray, latitude: np.ndarray, longitude: np.ndarray) -> GpsFit:
@@ -73,8 +72,6 @@ def fit_gps(centers: np.ndarray, latitude: np.ndarray, longitude: np.ndarray) ->
         )
     turn = np.diag([abs(factor), abs(factor), abs(factor), 1.0])
     turn[:2, :2] = [[factor.real, -factor.imag], [factor.imag, factor.real]]
-    north = float(latitude.mean() + np.degrees(shift.imag / EARTH_RADIUS))
-    east = float(
-        longitude.mean() + np.degrees(shift.real / (EARTH_RADIUS * np.cos(np.radians(float(latitude.mean())))))
-    )
-    return GpsFit(turn, (north, east), residual)
+    metres = metres_per_radian(float(latitude.mean()))
+    east, north = np.degrees([shift.real / metres[0], shift.imag / metres[1]]).tolist()
+    return GpsFit(turn, (float(latitude.mean()) + north, float(longitude.mean()) + east), residual)

@@ -18,6 +18,7 @@ import numpy as np
 
 from ...errors import InputError
 from ...geometry.cameras import Camera
+from ...geometry.earth import up_at
 from ...geometry.frames import rotation_to_z, upright
 from ...geometry.similarity import make_similarity, transform_pose
 from ...images.decode import image_size
@@ -155,7 +156,7 @@ def _local(chunk: np.ndarray, views: list[DatasetView]) -> np.ndarray:
         return chunk
     to_local = np.eye(4)
     north = np.array([0.0, 0.0, 1.0])
-    to_local[:3, :3] = rotation_to_z(center, north)
+    to_local[:3, :3] = rotation_to_z(up_at(center), north)
     to_local[:3, 3] = -to_local[:3, :3] @ center
     return to_local @ chunk
 

@@ -18,6 +18,7 @@ from ..project.store import world_from_sfm
 COLUMNS = ("name", "from", "to", "metres", "u_mm", "use")
 USES = ("scale", "check")
 METRES = "m"  # the unit of a project whose scale is known
+EXACT = "taken as exact: nothing says how sure it is"  # the source of such a scale
 PLACED = 1.0  # voxels: standard uncertainty of a point that was picked on the surface, along the distance
 HINT = (
     "Write a table with the columns name,from,to,metres,u_mm,use: points as “x y z” or names of photos, use “scale” or "
@@ -137,11 +138,13 @@ def _as_set(project: Project, poses: Poses, voxel: float) -> Scale:
         if step.verb == "align" and step.settings.get("scale"):
             metres = float(step.settings["scale"][2])
             return Scale(METRES, np.sqrt(2) * PLACED * voxel / metres, f"one distance of {metres:g} m")
-        residual = (step.result.get("gps") or {}).get("residual_m") if step.verb == "align" else None
+        residual = (step.result.get("gps") or {}).get("residual_m") if step.verb in ("align", "poses") else None
         if residual is not None:
             # Standard uncertainty of the slope of a straight line through positions.
             frame = world_from_sfm(project)
             centers = transform_points(frame, np.array([np.array(i.camera_to_world)[:3, 3] for i in poses.images]))
             spread = float(np.sqrt(((centers - centers.mean(0))[:, :2] ** 2).sum()))
             return Scale(METRES, float(residual) / max(spread, 1e-9), "GPS positions of the photos")
-    return Scale(METRES, 0.0, "taken as exact: nothing says how sure it is")
+        if step.verb in ("poses", "import") and step.result.get("world_kept") is False:
+            break  # what was set before was of another world
+    return Scale(METRES, 0.0, EXACT)

@@ -30,7 +30,7 @@ from ..render.run import load_info, refined_poses
 from .amounts import Amount, K, Labelled, area_amounts, summed, transferred, volume_amount
 from .placing import area_deviations_of_place, u_places
 from .resampling import Pieces, Votes, area_deviations
-from .scale import METRES, Distance, Scale, read_distances, scale_of, u_measured
+from .scale import EXACT, METRES, Distance, Scale, read_distances, scale_of, u_measured
 
 WHOLE = "whole surface"
 
@@ -86,6 +86,11 @@ def measure(params: MeasureParams, report: Reporter) -> dict[str, Any]:
         )
     if scale.unit != METRES and params.scale_error is not None:
         report.warn("--scale-error is not used: the scale is not known, and sizes are in scene units.")
+    if scale.source == EXACT:
+        report.warn(
+            "Nothing says how sure the scale is: it is taken as exact, and its error is in no interval. Give distances to scale "
+            "by (--distances), or how far off it may be (--scale-error)."
+        )
     if abs(scale.factor - 1) > K * max(scale.u, 1e-6):
         report.warn(
             f"By the distances to scale by, lengths are {100 * (1 / scale.factor - 1):+.2f} % off: set the scale with "

@@ -137,10 +137,10 @@ def _by_gps(frame: np.ndarray, project: Project, poses: Poses) -> tuple[np.ndarr
     return fit.turn @ frame, facts
 
 
-def gps_frame(frame: np.ndarray, project: Project, poses: Poses) -> np.ndarray | None:
-    """The frame with scale and heading from GPS, or None where GPS says nothing."""
+def gps_frame(frame: np.ndarray, project: Project, poses: Poses) -> tuple[np.ndarray, dict[str, float]] | None:
+    """The frame with scale and heading from GPS and what `align` tells of them, or None where GPS says nothing."""
     try:
-        return _by_gps(frame, project, poses)[0]
+        return _by_gps(frame, project, poses)
     except PosesError:
         return None
 

@@ -47,7 +47,9 @@ def estimate_poses(params: PosesParams, report: Reporter) -> dict[str, Any]:
     is kept in either case, if the cameras stand to each other as before.
 
     Returns:
-        {"registered", "total", "reprojection_px", "up_confidence", "world_kept", "images": [{"name", "status", "reason"}]}
+        {"registered", "total", "reprojection_px", "up_confidence", "world_kept", "gps": {"latitude", "longitude" of the
+        world's origin, "residual_m"} where scale and north are from the positions of the photos, "images": [{"name",
+        "status", "reason"}]}
     Raises:
         ProjectError, PosesError, DiskError, Cancelled.
     """
@@ -71,9 +73,10 @@ def estimate_poses(params: PosesParams, report: Reporter) -> dict[str, Any]:
         if not params.keep_exposure:
             poses = with_gains(folder, records, poses, points, visibility, report)
         _set_statuses(records, result)
-        kept = job["start"] is not None  # the cameras that were there stayed
+        kept, gps = job["start"] is not None, None  # the cameras that were there stayed
         if not kept:
-            project.frame, kept = keep_world(project, before, poses, _upright_frame(project, poses, points), report)
+            fresh, gps = _upright_frame(project, poses, points)
+            project.frame, kept = keep_world(project, before, poses, fresh, report)
         save_poses(folder, poses, points, visibility)
         if earlier_cut_outs(project) and trim_masks(folder, report):
             # Found with the masks as they were; that they are others now is no reason to find them again.
@@ -90,6 +93,7 @@ def estimate_poses(params: PosesParams, report: Reporter) -> dict[str, Any]:
             "reprojection_px": result["reprojection_px"],
             "up_confidence": project.frame.up_confidence,
             "world_kept": kept,
+            **({} if kept or gps is None else {"gps": gps}),
             "level": result["level"],
             "groups": result["groups"],
             "verdict": poses_verdict(len(poses.images), len(records), matching),
@@ -356,16 +360,13 @@ def _set_statuses(records: list[ImageRecord], result: dict[str, Any]) -> None:
         record.reason = image["reason"]
 
 
-def _upright_frame(project: Project, poses: Poses, points: Points) -> Frame:
-    """The world as cameras, points and GPS positions suggest it."""
+def _upright_frame(project: Project, poses: Poses, points: Points) -> tuple[Frame, dict[str, float] | None]:
+    """The world as cameras, points and GPS positions suggest it, and what is told of the latter where they were used."""
     matrices = [np.array(image.camera_to_world) for image in poses.images]
     world_from_sfm, confidence = upright(matrices, points.xyz)
-    measured = gps_frame(world_from_sfm, project, poses)
-    return Frame(
-        world_from_sfm=(world_from_sfm if measured is None else measured).tolist(),
-        up_confidence=confidence,
-        scale_known=measured is not None,
-    )
+    measured, gps = gps_frame(world_from_sfm, project, poses) or (world_from_sfm, None)
+    frame = Frame(world_from_sfm=measured.tolist(), up_confidence=confidence, scale_known=gps is not None)
+    return frame, gps
 
 
 def _write_report(

@@ -15,6 +15,10 @@ from fieldwork.nerfcore.errors import Cancelled, InputError, ProjectError
 from fieldwork.nerfcore.files import file_hash
 from fieldwork.nerfcore.geometry.similarity import make_similarity, transform_points, transform_pose
 from fieldwork.nerfcore.params import AlignParams, ImportParams, NewParams, PosesParams
+
+
+from fieldwork.nerfcore.measure.scale import scale_of
+from fieldwork.nerfcore.params import AlignParams, ImportParams, PosesParams
 from fieldwork.nerfcore.poses import estimate
 from fieldwork.nerfcore.poses.align import align
 from fieldwork.nerfcore.progress import Reporter
@@ -142,6 +146,30 @@ def test_a_world_that_cannot_be_kept_is_told(tmp_path: Path, monkeypatch: pytest
     again = Reporter()  # there is nothing left to lose
     estimate.estimate_poses(PosesParams(project=project, restart=True), again)
     assert not any("align" in text for text in again.warnings)
+
+
+def test_a_scale_that_poses_took_from_gps_is_as_sure_as_gps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """30 m for a unit, positions that are off by 2 m; later somebody sets the scale by hand."""
+    project = ball_project(tmp_path / "p", views=8, side=24)
+    off = np.random.default_rng(0).normal(0, 2.0, (8, 2))
+    with edit_project(project) as edited:
+        for record, center, (east, north) in zip(edited.images, centres(project), off):
+            x, y = 30 * center[:2] + [east, north]
+            record.exif = {"gps": {"latitude": np.degrees(y / 6.37e6), "longitude": np.degrees(x / 6.37e6)}}
+    monkeypatch.setattr(estimate, "run_worker", moved_worker(project, MOTION))
+    result = estimate.estimate_poses(PosesParams(project=project, restart=True), Reporter())
+    edited = load_project(project)
+    assert edited.frame.scale_known
+    assert 0.1 < result["gps"]["residual_m"] < 5
+    assert edited.provenance[-1].result["gps"] == result["gps"]
+    found = scale_of(edited, load_poses(project), [], 0.05, None)
+    assert found.source == "GPS positions of the photos"
+    assert found.u == pytest.approx(result["gps"]["residual_m"] / np.sqrt(8 * 54**2), rel=0.1)
+    align(AlignParams(project=project, scale=("00", "04", 100.0)), Reporter())
+    monkeypatch.setattr(estimate, "run_worker", moved_worker(project, MOTION))
+    again = estimate.estimate_poses(PosesParams(project=project, restart=True), Reporter())
+    assert "gps" not in again  # the world is that of the scale that was set
+    assert scale_of(load_project(project), load_poses(project), [], 0.05, None).source == "one distance of 100 m"
 
 
 def imported(dataset: Path, project: Path) -> list[str]:
@@ -290,7 +318,7 @@ def test_an_import_that_fails_leaves_the_project_as_it_was(tmp_path: Path, how: 
 
 @pytest.mark.parametrize("file", [None, "transforms.json"])
 def test_a_data_set_is_not_written_over_by_its_own_project(tmp_path: Path, file: str | None) -> None:
-    folder = data_set(tmp_path / "set", "transforms")
+    folder = data_set(tmp_path / "set")
     before = contents(folder)
     with pytest.raises(InputError, match="where the project would keep its own files"):
         import_dataset(ImportParams(dataset=folder / file if file else folder, project=folder), Reporter())

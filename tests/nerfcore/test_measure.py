@@ -17,7 +17,7 @@ from fieldwork.nerfcore.measure import verb
 from fieldwork.nerfcore.measure.closing import border_loops, closed
 from fieldwork.nerfcore.measure.placing import area_rates, border_lengths, u_places
 from fieldwork.nerfcore.measure.resampling import Votes
-from fieldwork.nerfcore.measure.scale import read_distances, scale_of
+from fieldwork.nerfcore.measure.scale import EXACT, read_distances, scale_of
 from fieldwork.nerfcore.measure.stored import read_measures
 from fieldwork.nerfcore.measure.verb import Measured, Sized, amounts, measure
 from fieldwork.nerfcore.measure.wording import amount, interval, significant
@@ -371,3 +371,22 @@ def test_how_sure_the_scale_is(tmp_path: Path) -> None:
     assert found.u == pytest.approx(np.sqrt((0.024**2 + 4 * 0.006**2) / 5), rel=1e-6)
     project.record("align", {"scale": ["a", "b", 0.5]}, {})
     assert scale_of(project, Poses(), [], 0.001, None).u == pytest.approx(np.sqrt(2) * 0.002)
+    project.record("poses", {}, {"world_kept": True})
+    assert scale_of(project, Poses(), [], 0.001, None).source == "one distance of 0.5 m"
+    for verb in ("poses", "import"):  # which set a world of their own: what was said of the one before is void
+        project.record(verb, {}, {"world_kept": False})
+        assert scale_of(project, Poses(), [], 0.001, None).source == EXACT
+        project.record("align", {"scale": ["a", "b", 0.5]}, {})
+
+
+def test_a_scale_that_nothing_is_known_of_is_told(project: Path) -> None:
+    told = "Nothing says how sure the scale is"
+    for given, warned in (({}, True), ({"scale_error": 1.0}, False)):
+        report = Reporter()
+        measure(MeasureParams(project=project, **given), report)
+        assert any(told in warning for warning in report.warnings) == warned
+    with edit_project(project) as edited:
+        edited.frame.scale_known = False
+    report = Reporter()
+    measure(MeasureParams(project=project), report)
+    assert not any(told in warning for warning in report.warnings)

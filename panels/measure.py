@@ -86,7 +86,7 @@ def amount_text(row: dict[str, Any], name: str, unit: str) -> str:
     value = row.get(name)
     if value is None:
         return ""
-    return f"{amount(value, (row[f'{name}_high'] - row[f'{name}_low']) / 2)} {unit}".rstrip()
+    return f"{amount(value, row[f'{name}_high'] - value)} {unit}".rstrip()  # the lower end is never below 0
 
 
 CLASSES = [FIELDWORK_PT_measure]

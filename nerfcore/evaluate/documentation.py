@@ -171,8 +171,8 @@ def _distances(measures: dict[str, Any]) -> Section:
     metric, distances = measures.get("unit") == "m", measures.get("distances", [])
     # Measures of earlier versions have differences between scene units and metres.
     differences = [d["difference"] if metric else None for d in distances]
-    # Tenths of a millimetre, and more where small things are measured more finely.
-    digits = [max(4, decimals((d["high"] - d["low"]) / 2)) for d in distances]
+    # Tenths of a millimetre, and more where small things are measured more finely; low ends are never below 0.
+    digits = [max(4, decimals(d["high"] - d["length"])) for d in distances]
     rows = [
         [
             d["name"],

@@ -30,8 +30,8 @@ def amount(value: float, half: float) -> str:
 
 
 def interval(value: float, low: float, high: float) -> tuple[str, str]:
-    """A value, and its interval: “1235” and “1197 … 1273”."""
-    if not high > low:
+    """A value, and its interval, whose low end is never below 0: “1235” and “1197 … 1273”."""
+    if not high > value:
         return significant(value, 4), f"{significant(low, 4)} … {significant(high, 4)}"
-    places = decimals((high - low) / 2)
+    places = decimals(high - value)
     return rounded(value, places), f"{rounded(low, places)} … {rounded(high, places)}"

@@ -285,16 +285,17 @@ def test_axes_of_the_curve_are_numbered():
 def test_sizes_are_said_with_as_many_digits_as_they_are_sure():
     from fieldwork.panels.measure import amount_text
 
-    row = {"area": 1.2384, "area_low": 1.21, "area_high": 1.27, "volume": None, "volume_low": None, "volume_high": None}
+    row = {"area": 1.2384, "area_low": 1.2088, "area_high": 1.268, "volume": None, "volume_low": None, "volume_high": None}
     assert amount_text(row, "area", "m²") == "1.238 ± 0.030 m²"
     assert amount_text(row | {"area": 140.2, "area_low": 120, "area_high": 160}, "area", "") == "140 ± 20"
+    assert amount_text(row | {"area": 0.8, "area_low": 0.0, "area_high": 2.3}, "area", "") == "0.8 ± 1.5"  # cut off at 0
     assert amount_text(row, "volume", "m³") == ""
 
 
 def test_the_whole_surface_is_said_before_the_classes():
     from fieldwork.panels.measure import measured_rows
 
-    half = {"area": 1.2384, "area_low": 1.21, "area_high": 1.27, "volume": None}
+    half = {"area": 1.2384, "area_low": 1.2088, "area_high": 1.268, "volume": None}
     whole = {"name": "whole surface", "area": 140.2, "area_low": 120, "area_high": 160}
     measures = {"unit": "m", "whole": whole | {"volume": 9, "volume_low": 8, "volume_high": 10}, "classes": []}
     assert measured_rows(measures) == [("Whole", "140 ± 20 m²   9.0 ± 1.0 m³")]

@@ -314,6 +314,7 @@ def test_sizes_are_written_with_two_digits_of_their_uncertainty_and_no_exponent(
     assert amount(1234567.0, 0.0) == "1235000 ± 0"
     assert interval(1234.5, 1000.0, 1469.0) == ("1230", "1000 … 1470")
     assert interval(2e6, 1.9e6, 2.1e6) == ("2000000", "1900000 … 2100000")
+    assert interval(0.1, 0.0, 1.3) == ("0.1", "0.0 … 1.3")  # whose low end is cut off at 0
     assert [significant(x) for x in (1234.5, 10.0, 0.0000123, 0.0)] == ["1230", "10", "0.0000123", "0"]
 
 
@@ -373,8 +374,8 @@ def test_how_sure_the_scale_is(tmp_path: Path) -> None:
     assert scale_of(project, Poses(), [], 0.001, None).u == pytest.approx(np.sqrt(2) * 0.002)
     project.record("poses", {}, {"world_kept": True})
     assert scale_of(project, Poses(), [], 0.001, None).source == "one distance of 0.5 m"
-    for verb in ("poses", "import"):  # which set a world of their own: what was said of the one before is void
-        project.record(verb, {}, {"world_kept": False})
+    for placing in ("poses", "import"):  # which set a world of their own: what was said of the one before is void
+        project.record(placing, {}, {"world_kept": False})
         assert scale_of(project, Poses(), [], 0.001, None).source == EXACT
         project.record("align", {"scale": ["a", "b", 0.5]}, {})
 

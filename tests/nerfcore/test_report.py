@@ -115,6 +115,17 @@ def test_sizes_of_small_things_keep_their_digits_and_have_units(project: Path) -
     assert "Root mean square of their differences: 0.040 mm" in html
 
 
+def test_intervals_that_are_cut_off_at_zero_have_no_more_digits_than_others(project: Path) -> None:
+    path = project / "exports/main" / MEASURES
+    short = {"name": "pin", "use": "check", "length": 0.0001, "low": 0.0, "high": 0.0012, "known": 0.0002}
+    speck = {"name": "top", **AMOUNTS, "area": 0.1, "area_low": 0.0, "area_high": 1.3}
+    measures = json.loads(path.read_text()) | {"distances": [short | {"difference": -0.0001}], "classes": [speck]}
+    write_json(path, measures)
+    html = Path(report(ReportParams(project=project), Reporter())["file"]).read_text("utf-8")
+    for cell in ("0.0001", "0.0000 … 0.0012", "0.1", "0.0 … 1.3"):
+        assert f"<td>{cell}</td>" in html
+
+
 def test_what_of_an_area_is_a_guess_has_a_column(project: Path) -> None:
     path = project / "exports/main" / MEASURES
     measures = json.loads(path.read_text())

@@ -14,11 +14,8 @@ from fieldwork.nerfcore.data.load import load_scene
 from fieldwork.nerfcore.errors import Cancelled, InputError, ProjectError
 from fieldwork.nerfcore.files import file_hash
 from fieldwork.nerfcore.geometry.similarity import make_similarity, transform_points, transform_pose
-from fieldwork.nerfcore.params import AlignParams, ImportParams, NewParams, PosesParams
-
-
 from fieldwork.nerfcore.measure.scale import scale_of
-from fieldwork.nerfcore.params import AlignParams, ImportParams, PosesParams
+from fieldwork.nerfcore.params import AlignParams, ImportParams, NewParams, PosesParams
 from fieldwork.nerfcore.poses import estimate
 from fieldwork.nerfcore.poses.align import align
 from fieldwork.nerfcore.progress import Reporter

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+REACH = 5  # pixels: half of the window of the structural similarity
 BINS = 10  # of the expected calibration error
 BOUNDARY = 0.02  # of the image's diagonal, as wide as what counts as a class's boundary
 
@@ -19,14 +20,27 @@ def psnr(image: np.ndarray, photo: np.ndarray, keep: np.ndarray | None = None) -
     return -10 * math.log10(max(mse, 1e-10))
 
 
-def ssim(image: np.ndarray, photo: np.ndarray) -> float:
-    """Structural similarity, 11×11 Gaussian window with σ 1.5 (Wang et al., 2004), of (H, W, 3) uint8 images."""
+def ssim(image: np.ndarray, photo: np.ndarray, keep: np.ndarray | None = None) -> float:
+    """Structural similarity, 11×11 Gaussian window with σ 1.5 (Wang et al., 2004), of (H, W, 3) uint8 images; its mean over
+    the pixels where `keep` (H, W) is true. Windows around these see what lies beside them."""
     from skimage.metrics import structural_similarity  # takes a quarter of a second
 
-    value: Any = structural_similarity(
-        image, photo, data_range=255, channel_axis=2, gaussian_weights=True, sigma=1.5, use_sample_covariance=False
+    found: Any = structural_similarity(
+        image,
+        photo,
+        data_range=255,
+        channel_axis=2,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        full=True,
     )
-    return float(value)
+    mean, each = found
+    if keep is None:
+        return float(mean)
+    inner = np.zeros_like(keep)  # where windows lie in the picture, as for the mean of all
+    inner[REACH:-REACH, REACH:-REACH] = keep[REACH:-REACH, REACH:-REACH]
+    return float(each[inner if inner.any() else keep].mean())
 
 
 @dataclass

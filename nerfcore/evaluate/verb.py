@@ -92,7 +92,8 @@ class Comparison:
         self.opacity.append(float(frame.opacity.mean()))
         solid = frame.depth[np.isfinite(frame.depth) & (frame.opacity > 0.5)]
         self.spread.append(float(np.divide(*np.percentile(solid, [95, 5]))) if solid.size else 1.0)
-        scores: dict[str, Any] = {"name": view.name, "psnr": psnr(image, photo, keep), "ssim": ssim(image, photo)}
+        likeness = {"psnr": psnr(image, photo, keep), "ssim": ssim(image, photo, keep)}
+        scores: dict[str, Any] = {"name": view.name, **likeness}
         if isinstance(self.shown, Model):  # a baked field does not know what no photo showed
             scores["unknown"] = self._unknown(self.shown, camera, pose, check)
         self.scores.append({**scores, **given})

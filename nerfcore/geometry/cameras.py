@@ -178,19 +178,18 @@ def rays(camera: Camera, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def widest_angle(camera: Camera) -> float:
     """Angle to the optical axis, in radians, at which the lens polynomial turns back; infinite where it does not. What lies
     farther out seems to be inside of the picture, and is not: the polynomial was fitted to what the lens shows."""
-    reach = 4 * max(camera.width / camera.fx, camera.height / camera.fy)
-    return _turning_angle(camera.model, reach, camera.distortion)
+    return _turning_angle(camera.model, camera.distortion)
 
 
 @lru_cache(maxsize=256)
-def _turning_angle(model: CameraModel, reach: float, distortion: tuple[float, ...]) -> float:
-    """See `widest_angle`; of perspective cameras up to an angle with the tangent `reach`."""
+def _turning_angle(model: CameraModel, distortion: tuple[float, ...]) -> float:
+    """See `widest_angle`."""
     if model == "OPENCV_FISHEYE":
         angle = np.linspace(0, np.pi, 1000)
         radius = angle * (1 + sum(c * angle ** (2 * n) for n, c in enumerate(distortion, 1)))
     elif model == "OPENCV" and any(distortion):
-        far = np.linspace(0, reach, 1000)
-        angle = np.arctan(far)
+        angle = np.linspace(0, np.pi / 2, 2000)[:-1]
+        far = np.tan(angle)
         radius = _opencv_distort(np.stack([far, np.zeros_like(far)], 1), distortion)[0][:, 0]
     else:
         return np.inf

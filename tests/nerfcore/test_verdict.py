@@ -191,6 +191,29 @@ def test_photos_of_which_a_mask_leaves_nothing_are_not_compared(
         evaluate(EvaluateParams(project=project), Reporter())
 
 
+def test_what_a_mask_leaves_out_counts_for_no_score(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Renders that are like the photos but for the left half, where a mask is black."""
+    project = ball_project(tmp_path / "p")
+    train(TrainParams(project=project, preset="draft", steps=2, set=SMALL), Reporter())
+    photo = np.random.default_rng(0).integers(0, 256, (40, 40, 3), np.uint8)
+    mask = np.repeat([[0, 255]], 20, axis=1).repeat(40, axis=0).astype(np.uint8)
+    for name in ("00", "08"):
+        hide(project, name)
+        Image.fromarray(photo).save(project / "images" / f"{name}.png")
+        Image.fromarray(mask).save(project / "masks" / f"{name}.png")
+
+    def other_on_the_left(model: object, camera: Camera, *_: object, **__: object) -> Frame:
+        pixels = np.ones((camera.height, camera.width, 4), np.float32)
+        pixels[..., :3] = np.where(mask[..., None] > 0, photo, 255 - photo) / np.float32(255)
+        depth, none = np.ones(mask.shape, np.float32), np.zeros((*mask.shape, 3))
+        return Frame(Picture(pixels, "srgb", "associated"), 1.0, depth, None, none, unknown=np.zeros(mask.shape))
+
+    monkeypatch.setattr("fieldwork.nerfcore.evaluate.verb.render_view", other_on_the_left)
+    result = evaluate(EvaluateParams(project=project), Reporter())
+    assert result["psnr"] > 90
+    assert result["ssim"] > 0.75  # of the whole picture a third of that
+
+
 def hide(project: Path, name: str) -> None:
     """Give a photo a mask that is black everywhere."""
     (project / "masks").mkdir(exist_ok=True)

@@ -63,7 +63,7 @@ def scored(
         synchronize(device)
         seconds, rays = seconds + timer() - begin, rays + camera.width * camera.height
         image = to_bytes(frame.color)
-        told = {"name": view.name, "psnr": psnr(image, photo, keep), "ssim": ssim(image, photo)}
+        told = {"name": view.name, "psnr": psnr(image, photo, keep), "ssim": ssim(image, photo, keep)}
         images.append({**told, "lpips": perceptual(image, photo) if perceptual is not None else None})
         if label is not None and frame.probabilities is not None:
             predicted = frame.label(info.class_ids, scene.ignore_id)

@@ -16,7 +16,7 @@ from .. import __version__
 from ..data.load import load_scene
 from ..data.scene import Scene
 from ..measure.wording import decimals, interval, significant
-from ..project.runs import INFO, holdout_of, photos_of, read_metrics, run_folder
+from ..project.runs import INFO, holdout_of, photos_of, run_folder
 from ..project.schema import Poses, Project
 from ..project.store import load_poses, load_project
 from ..verdict import worst
@@ -49,14 +49,14 @@ def sections(folder: Path, run: str, results: dict[str, Any], measures: dict[str
     """All tables of a report, those with something in them.
 
     Args:
-        results: of the verbs by name. measures: of the mesh as `measure` left them, if there are any.
+        results: of the verbs by name; that of `evaluate` names its tables. measures: of the mesh as `measure` left them, if there are any.
     Raises:
         ProjectError: the project has no poses, or a file of it is damaged.
     """
     project, poses, scene = load_project(folder), load_poses(folder), load_scene(folder, holdout_of(folder, run))
     scene = scene.unseen_by(photos_of(folder, run))
     details = _poses_details(folder)
-    evaluation = read_metrics(run_folder(folder, run)).get("test") or {}
+    evaluation = results.get("evaluate") or {}
     measures = measures or {}
     made = [
         _judgement(results, evaluation),
@@ -95,7 +95,18 @@ def _judgement(results: dict[str, Any], evaluation: dict[str, Any]) -> Section:
     rows += [["next", text] for text in told]
     if not told and evaluation and whole["level"] == "good":  # else the reasons say what to do
         rows.append(["next", "Nothing: more photos would change little."])
-    return Section(JUDGEMENT, [], rows, "By poses, training, held-out photos and mesh, as far as these were made.")
+    text = f"By poses, training, {compared(evaluation)} and mesh, as far as these were made."
+    return Section(JUDGEMENT, [], rows, text)
+
+
+def compared(evaluation: dict[str, Any], things: str = "photos") -> str:
+    """Which photos, or other `things` made of them, an evaluation is of."""
+    return f"{'training' if evaluation.get('split') == 'train' else 'held-out'} {things}"
+
+
+def titled(words: str, evaluation: dict[str, Any]) -> str:
+    """Words as a heading, which says where it was the baked field that was evaluated."""
+    return f"{words[0].upper()}{words[1:]}{', baked field' if evaluation.get('baked') else ''}"
 
 
 def _poses_details(folder: Path) -> dict[str, dict[str, Any]]:
@@ -116,7 +127,8 @@ def _summary(project: Project, poses: Poses, results: dict[str, Any], evaluation
         ["Reprojection error", f"{error:.2f} px" if error is not None else f"not known: poses from {poses.source}"]
     )
     rows.append(["Scale", "metres" if project.frame.scale_known else "not known: lengths are in scene units"])
-    rows.append(["Held-out images", str(evaluation["images"]) if evaluation else "none"])
+    images = titled(compared(evaluation, "images"), evaluation)
+    rows.append([images, str(evaluation["images"]) if evaluation else "none"])
     if evaluation:
         rows += [
             ["PSNR", f"{evaluation['psnr']:.2f} dB"],
@@ -204,8 +216,10 @@ def _distances(measures: dict[str, Any]) -> Section:
 
 def _accuracy(evaluation: dict[str, Any]) -> Section:
     rows = [[s["name"], f"{s['psnr']:.2f}", f"{s['ssim']:.3f}"] for s in evaluation.get("per_image", [])]
-    text = "Renders compared with photos that were not trained on."
-    return Section("Accuracy on held-out photos", ["photo", "PSNR (dB)", "SSIM"], rows, text)
+    seen = "" if evaluation.get("split") == "train" else " not"
+    text = f"Renders compared with photos that were{seen} trained on."
+    title = titled(f"accuracy on {compared(evaluation)}", evaluation)
+    return Section(title, ["photo", "PSNR (dB)", "SSIM"], rows, text)
 
 
 def _calibration(poses: Poses) -> Section:

@@ -17,7 +17,7 @@ from ..progress import Reporter
 from ..project.runs import known_runs, read_events, read_metrics, run_folder
 from ..project.store import load_project
 from ..render.pictures import ENDINGS
-from .documentation import JUDGEMENT, Section, results_of, sections
+from .documentation import JUDGEMENT, Section, compared, results_of, sections, titled
 from .reported_mesh import current_drawings, mesh_stands
 
 FORMATS = (".html", ".pdf")
@@ -106,11 +106,12 @@ def write_report(
     evaluation = result.get("evaluate") or {}
     judged = zip(evaluation.get("pictures", []), evaluation.get("per_image", []))  # in one order, see `evaluate`
     scores = {folder / name: score for name, score in judged if (folder / name).is_file()}
-    compared = list(scores)
+    pictured = list(scores)
     rendered = sorted(renders.glob("*.png"))
     name = folder.resolve().name
     if path.suffix.lower() == ".pdf":
-        captions = (("Drawing", drawn), ("Held-out photo and render", compared), ("Render", rendered))
+        photo = titled(f"{compared(evaluation, 'photo')} and render", evaluation)
+        captions = (("Drawing", drawn), (photo, pictured), ("Render", rendered))
         pictures = [(f"{what}: {file.stem}", file) for what, files in captions for file in files]
         from .report_pdf import write_pdf  # loads matplotlib
 
@@ -132,7 +133,8 @@ def write_report(
             area_unit="m²" if project.frame.scale_known else "units²",
             significant=significant,
             evaluation=evaluation,
-            pictures=[picture | {"score": score} for picture, score in zip(pictures_of(compared), scores.values())],
+            compared=titled(compared(evaluation, "views"), evaluation),
+            pictures=[picture | {"score": score} for picture, score in zip(pictures_of(pictured), scores.values())],
             drawings=pictures_of(drawn),
             renders=[pictures_of(view) for view in by_view(rendered)],
             curve=training_curve(run_folder(folder, run)),

@@ -170,8 +170,9 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
         "params_m", "memory_mb", "images", "background", …}; what was not measured is None, as "fps", "spr",
         "ms_sampling" and "ms_network" are unless `params.speed` asks for them. Of runs with refined poses
         training views are rendered from those and held-out ones from poses fitted to their photos;
-        "psnr_given_poses" is what the latter score without that. With `params.baked` the baked field is measured, and
-        "advice" are sentences on what to photograph next; "lost" says {"psnr", "miou"} by which it is worse than the field, None where that was not measured before.
+        "psnr_given_poses" is what the latter score without that. "split" and "baked" say what was compared: with
+        `params.baked` the baked field, of which "lost" says {"psnr", "miou"} by which it is worse than the field, None where
+        that was not measured before. "advice" are sentences on what to photograph next.
     Raises:
         ProjectError: no such run, or no baked field of its present training. InputError: nothing is held out, or a
         photo cannot be read. SettingError: the speed of a baked field was asked for.
@@ -235,6 +236,7 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
     result: dict[str, Any] = {
         "run": params.run,
         "split": params.split,
+        "baked": params.baked,
         "label_revision": trained.info.label_revision,
         **compared.means(),
         **speed,

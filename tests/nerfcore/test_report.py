@@ -5,20 +5,21 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
 from fieldwork.nerfcore.errors import ProjectError, SettingError
 from fieldwork.nerfcore.evaluate import report_pdf
-from fieldwork.nerfcore.evaluate.documentation import Section, _judgement
-from fieldwork.nerfcore.evaluate.report import by_view, report
+from fieldwork.nerfcore.evaluate.documentation import Section, _judgement, results_of
+from fieldwork.nerfcore.evaluate.report import by_view, report, write_report
 from fieldwork.nerfcore.evaluate.report_pdf import write_pdf
 from fieldwork.nerfcore.files import write_json
 from fieldwork.nerfcore.params import ReconstructParams, ReportParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.runs import MEASURES, METRICS, run_folder
-from fieldwork.nerfcore.project.store import edit_project
+from fieldwork.nerfcore.project.store import edit_project, load_project
 from fieldwork.nerfcore.workflows.reconstruct import reconstruct
 from fieldwork.tests.nerfcore.support.ball import RADIUS, ball_project
 from fieldwork.tests.nerfcore.support.meshed import store_mesh
@@ -153,6 +154,46 @@ def test_held_out_photos_may_have_dots_in_their_names(project: Path) -> None:
     html = Path(report(ReportParams(project=project), Reporter())["file"]).read_text("utf-8")
     captions = re.findall(r"<figcaption>(IMG.*?)</figcaption>", html)
     assert captions == ["IMG.01 — 20.00 dB, SSIM 0.500", "IMG.02 — 21.00 dB, SSIM 0.600"]
+
+
+@pytest.mark.parametrize(
+    ("given", "names"),
+    [
+        (
+            {"split": "test"},
+            ("Held-out views", "Held-out images 1", "Accuracy on held-out photos", "were not trained on"),
+        ),
+        (
+            {"split": "train"},
+            ("Training views", "Training images 1", "Accuracy on training photos", "that were trained on"),
+        ),
+        (
+            {"split": "test", "baked": True},
+            (
+                "Held-out views, baked field",
+                "Held-out images, baked field 1",
+                "Accuracy on held-out photos, baked field",
+            ),
+        ),
+    ],
+)
+def test_a_report_names_the_photos_that_were_evaluated(
+    project: Path, tmp_path: Path, given: dict[str, Any], names: tuple[str, ...]
+) -> None:
+    """Whatever else of the run was evaluated before."""
+    Image.new("RGB", (8, 6)).save(project / "a.png")
+    scores = [{"name": "a", "psnr": 44.44, "ssim": 0.99}]
+    made = {"images": 1, "psnr": 44.44, "ssim": 0.99, "miou": None, "per_image": scores, "pictures": ["a.png"], **given}
+    found = results_of(load_project(project), "main") | {"evaluate": made}
+    path, pdf = tmp_path / "r.html", tmp_path / "r.pdf"
+    titles = write_report(path, project, "main", tmp_path / "none", found, Reporter())
+    text = re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", re.sub(r'src="data:[^"]*"', "", path.read_text("utf-8"))))
+    for words in (*names, "PSNR 44.44 dB", "a 44.44 0.990"):
+        assert words in text, words
+    assert "31.25" not in text
+    if given["split"] == "train":
+        assert "eld-out" not in text
+    assert write_report(pdf, project, "main", tmp_path / "none", found, Reporter()) == titles
 
 
 def test_what_is_of_a_mesh_that_lies_elsewhere_is_left_out_with_a_warning(project: Path) -> None:

@@ -59,7 +59,7 @@ class Places:
 
 
 def chosen_classes(names: Sequence[str], known: dict[int, str], void: int) -> list[int]:
-    """The ids of the classes called `names`, or of all of them for “all”.
+    """The ids of the classes called `names`, each once, or of all of them for “all”.
 
     Raises:
         SettingError: there is no such class.
@@ -71,7 +71,7 @@ def chosen_classes(names: Sequence[str], known: dict[int, str], void: int) -> li
     if missing:
         there = f"There are: {', '.join(by_name)}; or give {ALL}." if by_name else "The project has no classes yet."
         raise SettingError(f"There is no class “{missing[0]}”.", there)
-    return [by_name[name] for name in names]
+    return [by_name[name] for name in dict.fromkeys(names)]
 
 
 def find_places(

@@ -74,8 +74,8 @@ def compare(params: CompareParams, report: Reporter) -> dict[str, Any]:
     files = [write_distances(target / "distance.ply", now.surface, distance, colors)]
     noise = f"noise ±{length(result['detectable'], result['unit'])} (95 %)"
     files += draw_distances(target, now, colors, legend, noise, params, report)
-    write_json(target / "compare.json", result)
     result["files"] = [str(path) for path in [*files, target / "compare.json"]]
+    write_json(target / "compare.json", result)
     record_step(folder, "compare", params.model_dump(mode="json"), result)
     return result
 

@@ -153,6 +153,14 @@ def test_conditions_are_hatched_numbered_and_listed(project: Path, tmp_path: Pat
         plan(PlanParams(project=project, conditions=["crack"], out=tmp_path), Reporter())
 
 
+def test_a_condition_that_is_named_twice_is_mapped_once(project: Path, tmp_path: Path) -> None:
+    wanted = PlanParams(project=project, views=["top"], conditions=["plinth", "wall", "plinth"], scale=50, out=tmp_path)
+    plan(wanted, Reporter())
+    with open(tmp_path / "conditions.csv", newline="") as file:
+        rows = [(row["number"], row["class"]) for row in csv.DictReader(file)]
+    assert rows == [("1", "plinth"), ("2", "plinth"), ("3", "wall")]
+
+
 def test_small_damages_have_numbers_and_specks_are_told_together(tmp_path: Path) -> None:
     folder = tmp_path / "damaged"
     save_project(folder, Project(classes=CLASSES))

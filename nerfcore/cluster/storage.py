@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import tempfile
 import threading
@@ -40,6 +41,11 @@ class StorageError(FieldworkError):
     code = "storage"
 
 
+def without_password(text: str) -> str:
+    """A text with “…” for the passwords of the addresses in it."""
+    return re.sub(r"://([^/@\s:]*):[^/@\s]+@", r"://\1:…@", text)
+
+
 class Storage:
     """One place of an fsspec file system."""
 
@@ -48,23 +54,29 @@ class Storage:
             import fsspec
         except ImportError as error:
             raise SettingError("--storage needs fsspec, which is not installed here.", INSTALL) from error
-        self.url = url
+        self.url, self.shown = url, without_password(url)
         try:
-            self.fs, self.root = fsspec.core.url_to_fs(url)
+            self.fs, self.root = self._told("opening it", lambda: fsspec.core.url_to_fs(url), (ImportError, ValueError))
         except (ImportError, ValueError) as error:
-            raise SettingError(f"--storage {url} cannot be used: {error}.", "Give a URL that fsspec knows.") from error
+            raise SettingError(
+                f"--storage {self.shown} cannot be used: {without_password(str(error))}.",
+                "Give a URL that fsspec knows.",
+            ) from error
         self.whole_puts = "file" not in (
             self.fs.protocol if isinstance(self.fs.protocol, tuple) else (self.fs.protocol,)
         )
 
-    def _told(self, doing: str, work: Callable[[], Any]) -> Any:
+    def _told(self, doing: str, work: Callable[[], Any], known: tuple[type[Exception], ...] = ()) -> Any:
         try:
             return work()
+        except known:
+            raise
         except FileNotFoundError as error:
-            raise StorageError(f"{self.url} lacks a file while {doing}: {error}.", "Run the campaign again.") from error
+            message = f"{self.shown} lacks a file while {doing}: {without_password(str(error))}."
+            raise StorageError(message, "Run the campaign again.") from error
         except Exception as error:  # clients of storages have errors of their own, for want of credentials for instance
             raise StorageError(
-                f"{self.url} cannot be reached while {doing}: {error}.",
+                f"{self.shown} cannot be reached while {doing}: {without_password(str(error))}.",
                 "Check the address, the network and the rights.",
             ) from error
 
@@ -102,7 +114,7 @@ class Storage:
         with atomic_path(path) as temporary:
             self._told(f"fetching {path.name}", lambda: self.fs.get_file(self._object(name), str(temporary)))
             if file_hash(temporary) != name:
-                raise StorageError(f"{self.url} has damaged contents of {path}.", "Upload it again.")
+                raise StorageError(f"{self.shown} has damaged contents of {path}.", "Upload it again.")
 
     def files(self, capture: str) -> Files:
         """The files of a capture; none where nothing was uploaded of it."""
@@ -116,7 +128,7 @@ class Storage:
         for path in found:
             if leads_outside(path):
                 raise StorageError(
-                    f"{self.url} names the file {path}, outside of the campaign's folder.", "Look at it."
+                    f"{self.shown} names the file {path}, outside of the campaign's folder.", "Look at it."
                 )
         return found
 

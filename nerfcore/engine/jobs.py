@@ -40,6 +40,7 @@ class Job(Reporter):
             log=str(self.log_path) if self.project else "",
         )
         self.answered = False
+        self.cancelled_at: float | None = None  # monotonic time
         self._send, self._estimate = send, Estimate()
         self._lock = threading.RLock()
         self._told: set[str] = set()
@@ -94,6 +95,11 @@ class Job(Reporter):
             self._set(warnings=[*self.warnings])
 
     # What the server calls.
+
+    def cancel(self) -> None:
+        if self.cancelled_at is None:
+            self.cancelled_at = time.monotonic()
+        super().cancel()
 
     def begin(self) -> None:
         with self._lock:

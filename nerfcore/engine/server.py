@@ -55,7 +55,6 @@ class Server:
         self._jobs_lock = threading.RLock()
         self._queue: queue.Queue[Job | None] = queue.Queue()
         self._edits: queue.Queue[rpc.Request | None] = queue.Queue()
-        self._cancelled_at: dict[str, float] = {}
         self._frames = Frames(self.send)
         self._count = 0
         self._connected = True
@@ -177,7 +176,6 @@ class Server:
         with self._jobs_lock:
             job.cancel()
             waits = job.status.state == "queued"
-        self._cancelled_at.setdefault(job.status.id, time.monotonic())
         if waits:
             self._fail(job, Cancelled())
 
@@ -262,10 +260,9 @@ class Server:
                 job.heartbeat()
                 if job.cancelled and job.status.state == "queued":
                     self._cancel(job)
-                if job.cancelled and job.status.state == "running":
-                    since = self._cancelled_at.setdefault(job.status.id, time.monotonic())
-                    if time.monotonic() - since > GRACE:
-                        self._end_hard(job)
+                since = job.cancelled_at
+                if since is not None and job.status.state == "running" and time.monotonic() - since > GRACE:
+                    self._end_hard(job)
 
     def _end_hard(self, job: Job) -> None:
         """The last resort against a native call that does not come back: what is on disk is whole, so leave."""

@@ -61,7 +61,7 @@ def related(relations: Sequence[Mapping[str, Any]], kind: str, goal: set[int]) -
     """Ids of the things that stand in this relation to one of the goal."""
     if kind == "next to":
         pairs = [(r["subject"], r["object"]) for r in relations if r["relation"] == kind]
-        return ({a for a, b in pairs if b in goal} | {b for a, b in pairs if a in goal}) - goal
+        return {a for a, b in pairs if b in goal} | {b for a, b in pairs if a in goal}
     if kind == "under":
         return {r["object"] for r in relations if r["relation"] == "on" and r["subject"] in goal}
     found = {r["subject"] for r in relations if r["relation"] == kind and r["object"] in goal}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 from collections import Counter
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -59,7 +60,7 @@ def read_list(path: Path) -> list[Capture]:
         captures.append(capture)
     if not captures:
         raise InputError(f"{path} lists no captures.", "Write one row for each, with its folder under “photos”.")
-    outs = Counter(str(capture.params.out) for capture in captures)
+    outs = Counter(os.path.realpath(capture.params.out) for capture in captures)
     twice = next((out for out, count in outs.items() if count > 1), None)
     if twice is not None:
         raise SettingError(f"{path} has two captures with the project {twice}.", "Give each another “out”.")

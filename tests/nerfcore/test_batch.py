@@ -194,6 +194,7 @@ def test_lists_of_both_kinds_say_the_same(tmp_path):
         ("a.csv", "photos,speed\nx,1\n", SettingError, "capture 1: there is no setting “speed”"),
         ("a.csv", "photos\nx,y,z\n", InputError, "more cells"),
         ("a.csv", "photos,out\nx,p\ny,p\n", SettingError, "two captures with the project"),
+        ("a.csv", "photos,out\nx,p\ny,q/../p\n", SettingError, "two captures with the project"),
         ("a.csv", "photos,preset\nx,best\n", SettingError, "preset"),
         (
             "a.csv",

@@ -15,7 +15,7 @@ import pytest
 from fieldwork.nerfcore.cluster import storage as module
 from fieldwork.nerfcore.cluster.storage import Copy, Saving, Storage, StorageError, placed
 from fieldwork.nerfcore.cluster.worker import Refusal
-from fieldwork.nerfcore.errors import SettingError
+from fieldwork.nerfcore.errors import FieldworkError, SettingError
 from fieldwork.nerfcore.files import atomic_path
 from fieldwork.nerfcore.params import ReconstructParams
 from fieldwork.nerfcore.progress import Reporter
@@ -382,6 +382,26 @@ def test_a_storage_that_is_not_there_is_told(tmp_path, s3, monkeypatch):
         Storage("nothing-like://x/y")
     with pytest.raises(StorageError, match=r"cannot be reached|lacks a file"):
         Storage("s3://no-such-bucket/x").set_files("a", {})
+
+
+@pytest.mark.parametrize(
+    ("url", "kind"), [("ftp://me:secret@127.0.0.1:1/x", StorageError), ("nothing-like://me:secret@x/y", SettingError)]
+)
+def test_what_is_wrong_with_a_storage_is_told_without_its_password(url: str, kind: type[FieldworkError]) -> None:
+    with pytest.raises(kind, match=r"://me:…@.* cannot be (reached|used)") as failure:
+        Storage(url)
+    assert "secret" not in str(failure.value)
+
+
+def test_a_storage_s_own_errors_are_told_without_its_password(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    storage = Storage(tmp_path.as_uri())
+
+    def fails(*_: Any) -> None:
+        raise OSError("no route to ftp://me:secret@host/x")
+
+    monkeypatch.setattr(storage.fs, "find", fails)
+    with pytest.raises(StorageError, match="no route to ftp://me:…@host/x"):
+        storage.objects()
 
 
 def test_missing_credentials_are_told(tmp_path, s3, monkeypatch):

@@ -312,6 +312,19 @@ def test_a_deaf_job_is_ended_with_its_process(start, project):
     assert only_job(project).state == "cancelled"
 
 
+def test_a_job_of_a_name_that_was_cancelled_before_has_its_time_to_end(start, project):
+    client = start("2.0")
+    first = client.send("count", project=project, steps=10_000, job="mine")
+    client.until_progress()
+    client.send("cancel", job="mine")
+    assert client.answer(first)["error"]["code"] == -32001
+    time.sleep(2.2)
+    second = client.send("count", project=project, steps=50, deaf=True, job="mine")
+    client.next()
+    client.send("cancel", job="mine")
+    assert client.answer(second)["result"]["steps"] == 50
+
+
 def test_end_of_stdin_stops_the_job_with_a_checkpoint(start, project):
     client = start()
     client.send("count", project=project, steps=10_000)

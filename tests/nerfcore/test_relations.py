@@ -29,6 +29,7 @@ from fieldwork.nerfcore.project.schema import Project, SemanticClass
 from fieldwork.nerfcore.project.store import save_project
 from fieldwork.nerfcore.things.edit import instances
 from fieldwork.nerfcore.things.graph import relate
+from fieldwork.nerfcore.things.query import answer
 from fieldwork.tests.nerfcore.support.meshed import store_mesh
 
 NAMES = ["floor", "wall", "table", "vase", "book", "bowl", "apple", "painting", "chair", "chair/leg", "rug"]
@@ -153,6 +154,15 @@ def test_next_to_is_for_neighbours_of_one_height_and_goes_either_way(project: Pa
     for one, other in (line.split(" next to ") for line in beside):
         assert other in asked(project, f"everything next to {one}")["found"]
         assert one in asked(project, f"everything next to {other}")["found"]
+
+
+def test_things_of_one_class_may_be_next_to_each_other() -> None:
+    things = [{"id": k, "name": f"{kind}.00{k}", "class": kind} for k, kind in ((1, "vase"), (2, "vase"), (3, "wall"))]
+    relations = [{"subject": a, "relation": "next to", "object": a + 1, "gap": 0} for a in (1, 2)]
+    graph = {"things": things, "relations": relations}
+    assert answer(graph, "vase next to a vase") == ["vase.001", "vase.002"]
+    assert answer(graph, "vase.001 next to vase") == ["vase.001"]
+    assert answer(graph, "wall next to vase") == ["wall.003"]
 
 
 def test_a_graph_is_kept_until_the_things_change(project: Path) -> None:

@@ -6,7 +6,7 @@ import json
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ from ..kernels.runtime import compile_seconds
 from ..params import EvaluateParams
 from ..progress import Reporter, shortened
 from ..project.fingerprints import Earlier, Fingerprint, compare, digest, files_digest, read_made, write_made
+from ..project.label_revision import is_made
 from ..project.runs import checkpoint_id, read_metrics, run_folder, state_id
 from ..project.schema import step
 from ..project.store import load_project
@@ -192,7 +193,7 @@ def evaluate(params: EvaluateParams, report: Reporter) -> dict[str, Any]:
             "Train another run with --holdout 8 to measure, or measure the training photos (--split train).",
         )
     if params.split == "test":
-        scene = without_seen(scene, trained.info, report)
+        scene = without_guesses(without_seen(scene, trained.info, report), folder)
         indices = scene.test
     # Views larger than the training images are compared at the training size.
     sizes = [training_size(scene.views[index].camera, trained.info.image_size) for index in indices]
@@ -309,6 +310,18 @@ def evaluated(params: EvaluateParams) -> Earlier:
     made = read_made(_record(params))
     pictures = [Path(params.project) / name for name in made.result.get("pictures", [])] if made else []
     return compare(made, evaluation_inputs(params), pictures)
+
+
+def without_guesses(scene: Scene, folder: Path) -> Scene:
+    """The scene of a project without label maps of held-out views that marks or models made: they are no truth, and those of
+    marks come from a field."""
+
+    def judged(number: int, view: View) -> View:
+        made = view.label is not None and is_made(view.label.relative_to(folder).as_posix())
+        return replace(view, label=None, confidence=None) if made and number in held_out else view
+
+    held_out = set(scene.test)
+    return replace(scene, views=[judged(number, view) for number, view in enumerate(scene.views)])
 
 
 def compared_with(

@@ -15,8 +15,9 @@ import pytest
 from fieldwork.nerfcore.cli import main
 from fieldwork.nerfcore.data.load import load_scene
 from fieldwork.nerfcore.errors import Cancelled, DiskError, InputError, ProjectError
+from fieldwork.nerfcore.evaluate.verb import without_guesses
 from fieldwork.nerfcore.images.working import nearest, read_label
-from fieldwork.nerfcore.labels.accept import MAPS, accept
+from fieldwork.nerfcore.labels.accept import accept
 from fieldwork.nerfcore.labels.journal import read_marks
 from fieldwork.nerfcore.labels.next_photo import next_photo
 from fieldwork.nerfcore.labels.overlay import overlay, photo_labels
@@ -42,7 +43,7 @@ from fieldwork.nerfcore.params import (
     TrainParams,
 )
 from fieldwork.nerfcore.progress import Reporter
-from fieldwork.nerfcore.project.label_revision import SUGGESTED
+from fieldwork.nerfcore.project.label_revision import MAPS, SUGGESTED
 from fieldwork.nerfcore.project.runs import CHECKPOINT, INFO, checkpoint_id, geometry_id, run_folder
 from fieldwork.nerfcore.project.store import edit_project, load_points, load_poses, load_project, save_poses
 from fieldwork.nerfcore.render.run import load_trained
@@ -212,6 +213,21 @@ def test_marks_outrank_what_a_model_guessed(ball: Path) -> None:
     held_out = {scene.views[i].name for i in scene.test}
     labels = {image.name: image.label for image in load_project(ball).images}
     assert {name for name, label in labels.items() if label is None} == held_out
+
+
+@pytest.mark.parametrize("made", [SUGGESTED, MAPS.format(1)])
+def test_held_out_photos_are_not_measured_by_labels_that_were_made_here(ball: Path, made: str) -> None:
+    """As those that were accepted for a run that holds out others."""
+    with edit_project(ball) as project:
+        own = project.images[0].label
+        for image in project.images:
+            image.label = f"{made}/{image.name}.png"
+    scene = load_scene(ball)
+    judged = without_guesses(scene, ball)
+    assert own is None
+    assert [judged.views[i].label for i in scene.test] == [None] * len(scene.test)
+    assert [judged.views[i].label for i in scene.train] == [scene.views[i].label for i in scene.train]
+    assert all(scene.views[i].label is not None for i in scene.test)
 
 
 def test_without_classes_carried_labels_are_void(ball: Path) -> None:

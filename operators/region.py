@@ -10,7 +10,7 @@ from mathutils import Vector
 
 from ..addon.project import edits, region, snapshot
 from ..addon.roles import ROLE
-from ..addon.scene.frame import scene_from_capture
+from ..addon.scene.frame import scene_from_capture, world_of
 from ..addon.text import t
 from .base import WithProject, deliver_edits, need_poses
 
@@ -111,9 +111,10 @@ def default_bounds(scene: bpy.types.Scene) -> list[list[float]]:
     owner = snapshot.owner(folder) if folder else None
     capture_from_scene = scene_from_capture(scene, owner).inverted_safe()
     corners = [
-        capture_from_scene @ obj.matrix_world @ Vector(corner)
+        matrix @ Vector(corner)
         for obj in scene.objects
         if obj.type == "MESH" and ROLE in obj and owner is not None and owner.owns(obj)
+        for matrix in [capture_from_scene @ world_of(obj)]
         for corner in obj.bound_box
     ]
     if corners:

@@ -78,7 +78,8 @@ def _erased(folder: Path, run: str) -> Collection[int]:
     """The marks of which an eraser left nothing, at the revision that is shown."""
     from . import results  # not at the top: it needs numpy, and enabling the extension must be quick
 
-    found = results.to_show(folder, run, pending.shown(folder))
+    # Not `to_show`: labels by whole parts say nothing of marks.
+    found = results.labelling(folder, run, results.nearest_computed(folder, run, pending.shown(folder)))
     return () if found is None else found.told.get("erased", ())
 
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import bpy
 from mathutils import Matrix, Vector
 
-from ..scene.frame import root_of, scene_from_capture
+from ..scene.frame import root_of, scene_from_capture, world_of
 from . import edits, snapshot
 from .history import History
 
@@ -103,7 +103,10 @@ def add(scene: bpy.types.Scene, wanted: Bounds) -> bpy.types.Object:
     box.empty_display_size = 1.0
     if box.parent is None:
         box.parent = root_of(scene, owner)  # so that it goes where the capture goes
-    box.matrix_world = scene_from_capture(scene, owner) @ Matrix.LocRotScale((low + high) / 2, None, (high - low) / 2)
+    world = scene_from_capture(scene, owner) @ Matrix.LocRotScale((low + high) / 2, None, (high - low) / 2)
+    if box.parent is not None:  # Blender would take the parent's `matrix_world`
+        world = (world_of(box.parent) @ box.matrix_parent_inverse).inverted_safe() @ world
+    box.matrix_basis = world
     known = bounds(folder)
     _seen[scene.name] = Look(bounds_of(scene, box), known, moved=known is None)
     return box
@@ -114,7 +117,7 @@ def bounds_of(scene: bpy.types.Scene, box: bpy.types.Object, folder: Path | None
     one."""
     folder = folder or snapshot.folder_of(scene.fieldwork)
     capture_from_scene = scene_from_capture(scene, snapshot.owner(folder) if folder else None).inverted_safe()
-    matrix = capture_from_scene @ box.matrix_world
+    matrix = capture_from_scene @ world_of(box)
     corners = [matrix @ (corner * box.empty_display_size) for corner in CORNERS]
     return [[float(pick(c[i] for c in corners)) for i in range(3)] for pick in (min, max)]
 

@@ -25,12 +25,14 @@ def scene_from_capture(scene: bpy.types.Scene, owner: Owner | None) -> Matrix:
 
 def world_of(item: bpy.types.Object) -> Matrix:
     """An object's matrix (4×4) to the world. Blender neither stores `matrix_world` nor computes it for what is excluded from
-    the view layer or disabled in viewports: it is made of the object's own values, unless constraints place it."""
-    if len(item.constraints) or (item.parent is not None and item.parent_type != "OBJECT"):
+    the view layer or disabled in viewports: it is made of the object's own values, unless a constraint or a path places it."""
+    parent = item.parent
+    follows = parent is not None and parent.type == "CURVE" and parent.data.use_path
+    if len(item.constraints) or follows or (parent is not None and item.parent_type != "OBJECT"):
         return item.matrix_world.copy()
-    if item.parent is None:
+    if parent is None:
         return item.matrix_basis.copy()
-    return world_of(item.parent) @ item.matrix_parent_inverse @ item.matrix_basis
+    return world_of(parent) @ item.matrix_parent_inverse @ item.matrix_basis
 
 
 def units_per_metre(scene: bpy.types.Scene) -> float:

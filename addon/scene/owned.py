@@ -17,6 +17,8 @@ from .edited import Steps, object_changed, release, surface_edited
 from .own_look import give_own_look
 from .slices import Held
 
+VOLUME = "volume"  # role of what volume.py shows
+
 
 class Owned:
     """The collections and objects of one project in one scene, looked up again in every slice."""
@@ -39,11 +41,12 @@ class Owned:
 
     @property
     def known(self) -> dict[str, bpy.types.Object]:
-        """The objects that are there by their roles."""
+        """The objects of the capture that are there by their roles; volumes are shown and taken away by themselves."""
         if self._slice != slices.number():
             self._slice = slices.number()
             # Wherever the user has put them; of copies those in the capture's own collection are the originals.
             self._known = by_role([*self.collection.all_objects, *self.scene.objects], self.owner)
+            self._known.pop(VOLUME, None)
         return self._known
 
     def release_copies(self) -> None:

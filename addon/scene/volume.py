@@ -8,17 +8,15 @@ import bpy
 
 from ..roles import Owner, by_role
 from .frame import root_of, scene_from_capture
-from .owned import find
-
-ROLE_OF_VOLUME = "volume"
+from .owned import VOLUME, find
 
 
 def show(scene: bpy.types.Scene, owner: Owner, path: Path) -> bpy.types.Object:
     """The volume of a project in a scene, read from this file: a new object, or the one of before with the new file."""
-    item = by_role(scene.objects, owner).get(ROLE_OF_VOLUME)
+    item = by_role(scene.objects, owner).get(VOLUME)
     if item is None or item.type != "VOLUME":
         item = bpy.data.objects.new(f"{owner.name} · volume", bpy.data.volumes.new(owner.name))
-        owner.mark(item, ROLE_OF_VOLUME)
+        owner.mark(item, VOLUME)
         scene.collection.objects.link(item)
         item.parent = root_of(scene, owner)
         if item.parent is None:

@@ -41,7 +41,7 @@ COMMON = 0.2  # share of the places that two photos must both see
 PAIRS = 3  # of photos that must
 FACING = 0.1  # cosine of the angle at which a photo must see a place, at least
 SIDE = 1024  # longest side of the photos, in pixels
-BESIDE = 3  # pixels around what a mask takes away that are not compared
+BESIDE = 3  # pixels, of photos of `SIDE`, around what a mask takes away that are not compared
 NEAR = 0.02  # of the distance: what a ray meets so close to a place is the place
 
 
@@ -220,7 +220,10 @@ def _grey_values(
             inside &= toward @ pose[:3, 2] > 0
         rows = np.flatnonzero(inside)
         if view.mask is not None and len(rows):
-            rows = rows[_left(view)[tuple(place[rows, ::-1].astype(int).T)]]
+            left = _left(view)
+            size = np.array(left.shape[::-1])
+            x, y = np.minimum(place[rows] * (size / [view.camera.width, view.camera.height]), size - 1).astype(int).T
+            rows = rows[left[y, x]]
         if len(rows):
             origins = np.broadcast_to(pose[:3, 3], (len(rows), 3))
             met, share = front.cast(origins, toward[rows] / away[rows, None])
@@ -250,7 +253,7 @@ def _grey_values(
 
 
 def _left(view: View) -> np.ndarray:
-    """Which pixels (H, W) bool of a photo its mask leaves, but for those beside what it takes away."""
+    """Which pixels (H, W) bool of a photo, as large as it is compared, its mask leaves, but for those beside what it takes away."""
     assert view.mask is not None
-    mask = nearest(read_image(view.mask)[..., 0], view.camera.width, view.camera.height) > 127
+    mask = nearest(read_image(view.mask)[..., 0], *training_size(view.camera, SIDE)) > 127
     return scipy.ndimage.binary_erosion(mask, iterations=BESIDE, border_value=1)

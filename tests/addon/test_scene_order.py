@@ -80,7 +80,7 @@ def test_the_place_of_a_capture_that_nothing_evaluates_is_known(bpy_script, tmp_
         + """
 from mathutils import Vector
 from fieldwork.addon.roles import Owner
-from fieldwork.addon.scene.frame import scene_from_capture
+from fieldwork.addon.scene.frame import scene_from_capture, world_of
 owner = Owner("p", "u")
 held = bpy.data.collections.new("capture")
 scene.collection.children.link(held)
@@ -100,13 +100,70 @@ bpy.ops.wm.save_as_mainfile(filepath=file)
 bpy.ops.wm.open_mainfile(filepath=file)
 scene = bpy.context.scene
 bpy.context.view_layer.update()
-answer({"true": true, "found": [list(row) for row in scene_from_capture(scene, owner)]})
+root = bpy.data.objects["root"]
+box = bpy.data.objects.new("box", None)
+scene.collection.objects.link(box)
+box.parent = root
+found = [list(row) for row in scene_from_capture(scene, owner)]
+answer({"true": true, "found": found, "child": [list(row) for row in world_of(box)]})
 """,
         hide=HIDDEN[hide],
         file=str(tmp_path / "a.blend"),
     )
-    for found, true in zip(facts["found"], facts["true"]):
-        assert found == pytest.approx(true, abs=1e-5)
+    for name in ("found", "child"):
+        for found, true in zip(facts[name], facts["true"]):
+            assert found == pytest.approx(true, abs=1e-5)
+
+
+def test_the_region_of_a_capture_that_nothing_evaluates_is_that_of_the_capture(bpy_script, tmp_path):
+    facts = bpy_script(
+        SETUP
+        + """
+from fieldwork.addon.project import region, snapshot
+from fieldwork.operators.region import default_bounds
+owner = snapshot.owner(Path(project))
+held = bpy.data.collections.new("capture")
+scene.collection.children.link(held)
+root = bpy.data.objects.new("root", None)
+mesh = bpy.data.meshes.new("Surface")
+mesh.from_pydata([(x, y, z) for x in (-1, 1) for y in (-2, 2) for z in (-3, 3)], [], [])
+surface = bpy.data.objects.new("Surface", mesh)
+for item, role in ((root, "root"), (surface, "mesh")):
+    held.objects.link(item)
+    owner.mark(item, role)
+root.location, root.scale, surface.parent = (5, 0, 0), (100, 100, 100), root
+settings.project = project
+bpy.context.view_layer.layer_collection.children[held.name].exclude = True
+bpy.ops.wm.save_as_mainfile(filepath=file)
+bpy.ops.wm.open_mainfile(filepath=file)
+scene = bpy.context.scene
+box = region.add(scene, [[-1, -1, -1], [1, 1, 1]])
+answer({"bounds": region.bounds_of(scene, box), "mesh": default_bounds(scene)})
+""",
+        project=make_posed_project(tmp_path / "capture"),
+        file=str(tmp_path / "a.blend"),
+    )
+    for found, true in ((facts["bounds"], (1, 1, 1)), (facts["mesh"], (1, 2, 3))):
+        assert found[0] == pytest.approx([-v for v in true], abs=1e-4)
+        assert found[1] == pytest.approx(list(true), abs=1e-4)
+
+
+def test_a_volume_in_the_scene_outlives_updates(bpy_script, package, tmp_path):
+    facts = bpy_script(
+        UPDATE
+        + """
+from fieldwork.addon.roles import Owner
+from fieldwork.addon.scene import volume
+made = update()
+owner = Owner(made.root["fieldwork_project"], made.root.get("fieldwork_uuid", ""))
+shown = volume.show(scene, owner, Path(folder, "a.vdb")).name
+update()
+answer({"there": shown in bpy.data.objects, "role": bpy.data.objects[shown].get("fieldwork_role")})
+""",
+        package=package,
+        folder=str(tmp_path),
+    )
+    assert facts == {"there": True, "role": "volume"}
 
 
 def test_up_is_an_axis_of_the_scene_however_the_capture_is_turned(bpy_script, tmp_path):

@@ -150,7 +150,8 @@ def find_sources(
             raise InputError(f"The {what} folder {folder} does not exist.", f"Choose the folder that holds the {what}.")
     names = unique_names(paths, root)
     stems = companion_stems(paths, root, names)
-    before = [(known or {}).get(path.resolve()) for path in paths]
+    left = dict(known or {})  # each name is given once: two paths may lead to one file
+    before = [left.pop(path.resolve(), None) for path in paths]
     others = {stem for own in stems for stem in own}
     stems = [[*own, name] if name and name not in others else own for own, name in zip(stems, before)]
     pictures, drawn = beside_all(labels, stems, exact=False), beside_all(masks, stems, exact=False)

@@ -17,7 +17,15 @@ from ..params import NewParams
 from ..progress import Reporter, shortened
 from ..project.classes import make_classes, read_found_classes, unnamed_values
 from ..project.fingerprints import Earlier, Fingerprint, compare, digest, files_digest, stamps_digest
-from ..project.kept import earlier_cut_outs, keep_later_labels, resized_labels, same_place, with_earlier_names
+from ..project.kept import (
+    BESIDE,
+    earlier_cut_outs,
+    from_project,
+    keep_later_labels,
+    resized_labels,
+    same_source,
+    with_earlier_names,
+)
 from ..project.schema import ImageRecord, Project
 from ..project.store import FRAMES_FOLDER, PROJECT_FILE, create_folder, edit_project, load_project
 from .backdrop import mask_objects
@@ -60,7 +68,9 @@ def new(params: NewParams, report: Reporter) -> dict[str, Any]:
     if params.add:
         paths, there = _not_there(paths, kept)
         skipped += there
-    known = {Path(record.source).resolve(): record.name for record in previous.images} if previous else {}
+    # Of two paths to one file the name of the photo that is used counts.
+    ranked = sorted(previous.images, key=lambda record: record.status != "rejected") if previous else []
+    known = {Path(record.source).resolve(): record.name for record in ranked}
     taken = {record.name for record in kept}
     known = {path: name for path, name in known.items() if name not in taken}
     sources = find_sources(paths, root, labels_folder, masks_folder, taken, known)
@@ -101,8 +111,8 @@ def new(params: NewParams, report: Reporter) -> dict[str, Any]:
         _put_in(project, records, set(present), classes, params, previous is not None)
         project.mask_mode = mask_mode
         result["classes"] = [c.name for c in project.classes]
-        settings = params.model_dump(mode="json") | {"photos": str(photos.resolve())}
-        project.record("new", settings, result | origin | exposed, inputs)
+        told = result | origin | exposed | {BESIDE: from_project(photos, folder)}
+        project.record("new", params.model_dump(mode="json"), told, inputs)
     return result
 
 
@@ -172,7 +182,7 @@ def _photos(params: NewParams, report: Reporter) -> tuple[list[Path], list[dict[
     photos = Path(params.photos)
     if photos.is_file() and photos.suffix.lower() in VIDEO_SUFFIXES:
         report.stage("Choosing frames of the video")
-        root = Path(params.project) / FRAMES_FOLDER
+        root = Path(params.project).absolute() / FRAMES_FOLDER
         from .video import extract_frames  # the library takes its time to load
 
         return extract_frames(photos, root, params.frames, report), [], root
@@ -225,10 +235,14 @@ def _previous_project(params: NewParams) -> Project | None:
     if params.add:
         return project
     first = project.provenance[0] if project.provenance else None
-    if first is None or first.verb != "new" or not same_place(str(first.settings.get("photos")), params.photos):
+    if first is None or first.verb != "new" or not same_source(first, "photos", params.photos, folder):
         raise ProjectError(
             f"{folder} already holds another capture.", "Choose a new folder, or --add to put these photos into it."
         )
+    was, now = str(first.settings["photos"]), str(params.photos)
+    for image in project.images if not Path(was).exists() else ():  # both were moved
+        if image.source.startswith(was):
+            image.source = now + image.source[len(was) :]
     return project
 
 
@@ -240,7 +254,13 @@ def _kept(previous: Project, params: NewParams, paths: list[Path], root: Path) -
         again = {path.resolve() for path in paths}
         return [r for r in records if r.status != "rejected" or Path(r.source).resolve() not in again]
     places = [Path(params.photos).resolve(), root.resolve()]
-    return [r for r in records if not any(Path(r.source).resolve().is_relative_to(place) for place in places)]
+
+    def is_read(source: Path) -> bool:
+        # Frames of a video were noted as their paths were typed once.
+        frame = root.name == source.parent.name == FRAMES_FOLDER and not source.is_absolute()
+        return frame or any(source.resolve().is_relative_to(place) for place in places)
+
+    return [record for record in records if not is_read(Path(record.source))]
 
 
 def _not_there(paths: list[Path], kept: list[ImageRecord]) -> tuple[list[Path], list[dict[str, str]]]:

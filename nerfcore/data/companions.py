@@ -48,13 +48,14 @@ def with_soft_labels(dataset: Dataset) -> Dataset:
     views, odd = [], []
     for view, stems in zip(dataset.views, all_stems):
         label, soft = view.label, find_probabilities(folder, stems)
-        if soft is not None and label is not None and soft != label:
-            problem = _problem(soft) if label.is_relative_to(folder) else "its photo has another label map"
+        if soft is not None and soft != label:
+            ours = label is None or label.is_relative_to(folder)
+            problem = _problem(soft) if ours else "its photo has another label map"
             odd += [f"{soft.name} ({problem})"] if problem else []
             soft = None if problem else soft
         label = soft or label
         views.append(replace(view, label=label, confidence=find_confidence(folder, stems, label)))
-    told = [shortened(f"{len(odd)} files beside label maps are not used", odd)] if odd else []
+    told = [shortened(f"{len(odd)} files among label maps are not used", odd)] if odd else []
     return replace(dataset, views=views, warnings=[*dataset.warnings, *told])
 
 

@@ -21,11 +21,13 @@ from ..params import ImportParams
 from ..progress import Reporter, shortened
 from ..project.classes import make_classes, unnamed_values
 from ..project.kept import (
+    BESIDE,
     earlier_cut_outs,
     earlier_poses,
+    from_project,
     keep_later_labels,
     keep_world,
-    same_place,
+    same_source,
     with_earlier_classes,
 )
 from ..project.schema import Frame, ImageRecord, PosedImage, Poses, Project, SemanticClass
@@ -91,8 +93,9 @@ def import_dataset(params: ImportParams, report: Reporter) -> dict[str, Any]:
             "labelled": sum(record.label is not None for record in brought.used),
             "classes": [c.name for c in classes],
         }
-        settings = params.model_dump(mode="json") | {"dataset": str(source.resolve())}
-        project.record("import", settings, result | {"world_kept": kept, "cut_out": brought.cut_out})
+        settings = params.model_dump(mode="json") | {"dataset": str(source)}
+        told = {"world_kept": kept, "cut_out": brought.cut_out, BESIDE: from_project(source, folder)}
+        project.record("import", settings, result | told)
     if brought.cut_out:
         trim_masks(folder, report)
     return result
@@ -224,7 +227,7 @@ def _previous_project(folder: Path, source: Path) -> Project | None:
         return None
     project = load_project(folder)
     steps = project.provenance
-    if not steps or steps[0].verb != "import" or not same_place(str(steps[0].settings.get("dataset")), source):
+    if not steps or steps[0].verb != "import" or not same_source(steps[0], "dataset", source, folder):
         raise ProjectError(f"{folder} already holds another capture.", "Choose a new folder for the project.")
     return project
 

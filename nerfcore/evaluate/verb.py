@@ -295,6 +295,8 @@ def evaluation_inputs(params: EvaluateParams) -> Fingerprint:
     folder = Path(params.project)
     info = load_info(folder, params.run)
     scene = load_scene(folder, info.holdout).unseen_by(info.images)
+    if params.split == "test":
+        scene = without_guesses(scene, folder)
     limit = [] if params.time_limit is None else ["limited"]  # to however many seconds
     return {
         "trained field": checkpoint_id(folder, params.run),

@@ -35,5 +35,7 @@ def poses_or_gains(params: PosesParams, report: Reporter) -> dict[str, Any]:
         poses = with_gains(folder, project.images, poses, load_points(folder), (view, np.concatenate(points)), report)
     with edit_project(folder) as project:
         write_json(folder / POSES_FILE, poses.model_dump(mode="json"))
-        project.record("poses", {**made.settings, "keep_exposure": params.keep_exposure}, made.result, inputs)
-    return made.result
+        # The world is as it was, also where it was aligned since: what GPS said of its scale is not said again.
+        result = {**{name: value for name, value in made.result.items() if name != "gps"}, "world_kept": True}
+        project.record("poses", {**made.settings, "keep_exposure": params.keep_exposure}, result, inputs)
+    return result

@@ -3,6 +3,7 @@ world."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -11,9 +12,10 @@ import numpy as np
 from ..errors import ProjectError
 from ..geometry.similarity import fit_similarity, similarity_scale, transform_points
 from ..progress import Reporter
-from .schema import Frame, ImageRecord, Poses, Project, SemanticClass
+from .schema import Frame, ImageRecord, Poses, Project, ProvenanceStep, SemanticClass
 from .store import load_poses, world_from_sfm
 
+BESIDE = "from_project"  # in results of `new` and `import`: where the photos or the data set lie, seen from the project
 LEAST_CAMERAS = 3
 # Not tuned. Beyond these the cameras are not the same ones any more: share of their spread, cosine of 5°.
 FARTHEST_OFF, LEAST_COSINE = 0.05, 0.996
@@ -28,6 +30,22 @@ def same_place(before: str, now: Path) -> bool:
     """
     was, now = Path(before), Path(now)
     return was.resolve() == now.resolve() or (not was.is_absolute() and was == now)
+
+
+def same_source(made: ProvenanceStep, setting: str, now: Path, project: Path) -> bool:
+    """Whether a step of a project was made of this file or folder, which may have been moved along with the project."""
+    was, beside = str(made.settings.get(setting)), made.result.get(BESIDE)
+    if same_place(was, now):
+        return True
+    return bool(beside) and not Path(was).exists() and (project / str(beside)).resolve() == Path(now).resolve()
+
+
+def from_project(place: Path, project: Path) -> str | None:
+    """A file or folder as seen from the project's folder; None where it is on another drive."""
+    try:
+        return Path(os.path.relpath(place, project)).as_posix()
+    except ValueError:
+        return None
 
 
 def keep_later_labels(records: Sequence[ImageRecord], before: Sequence[ImageRecord], folder: Path) -> list[ImageRecord]:

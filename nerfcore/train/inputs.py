@@ -18,6 +18,7 @@ from .prepare import training_views
 
 # Settings of `train` that decide when something is written, not what is learned.
 WITHOUT_EFFECT = {"steps", "checkpoint_every", "preview_every"}
+EXPOSURE = "exposure"  # by how much the colours of photos are changed; earlier versions did not note it
 NOT_LEARNED = {"train": WITHOUT_EFFECT, "render": set(ONLY_RENDERING)}
 
 
@@ -44,7 +45,12 @@ def wanted_inputs(folder: Path, params: TrainParams, info: RunInfo) -> Fingerpri
     settled = settled_as(asked, info.config).model_dump(mode="json", exclude=NOT_LEARNED)
     if made == inputs["settings"] and settled != info.config.model_dump(mode="json", exclude=NOT_LEARNED):
         inputs["settings"] = digest(settled)
-    return inputs
+    return as_noted(inputs, info)
+
+
+def as_noted(inputs: Fingerprint, info: RunInfo) -> Fingerprint:
+    """Inputs without those that a run of an earlier version did not note."""
+    return {name: value for name, value in inputs.items() if name != EXPOSURE or name in info.origin.inputs}
 
 
 def training_length(steps: int | None, seconds: float | None, config: RunConfig) -> dict[str, Any]:
@@ -63,10 +69,11 @@ def data_inputs(folder: Path, holdout: int, config: RunConfig) -> Fingerprint:
     labelled = config.loss.semantic_weight > 0
     labels = [(v.name, path) for v in views for path in (v.label, v.confidence)] if labelled else []
     depth = config.loss.depth_weight > 0
-    photos, gains = files_digest((view.name, view.image) for view in views), [view.gain for view in views]
+    gains = [view.gain for view in views]
     return {
         "training photos": digest(names),
-        "photos": digest([photos, gains]) if any(gains) else photos,
+        "photos": files_digest((view.name, view.image) for view in views),
+        EXPOSURE: digest(gains if any(gains) else []),
         "labels": files_digest(labels),
         "masks": digest([project.mask_mode, files_digest((view.name, view.mask) for view in views)]),
         "depth maps": files_digest([(view.name, view.depth) for view in views] if depth else []),

@@ -53,7 +53,7 @@ from ..verdict import train_verdict
 from .checkpoint import restore, save_checkpoint
 from .closed_picture import closed_picture, picture_closed
 from .initial_state import InitialState
-from .inputs import data_inputs, training_inputs, training_length
+from .inputs import as_noted, data_inputs, training_inputs, training_length
 from .pose_refinement import write_poses
 from .prepare import make_trainer, plan_run
 from .results import Measured
@@ -188,7 +188,7 @@ def _resumable(place: TrainingFolder, params: TrainParams, report: Reporter) -> 
             "Train it anew, without --resume.",
         )
     if info.origin.inputs:
-        now = data_inputs(place.project, info.holdout, info.config)
+        now = as_noted(data_inputs(place.project, info.holdout, info.config), info)
         changed = difference({name: info.origin.inputs.get(name, "") for name in now}, now)
         if changed:
             raise ProjectError(

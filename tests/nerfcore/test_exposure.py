@@ -18,7 +18,7 @@ from fieldwork.nerfcore.poses.estimate import posed, posing_inputs, with_gains
 from fieldwork.nerfcore.poses.exposure import exposure_gains
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.schema import ImageRecord, PosedImage, Poses, Project
-from fieldwork.nerfcore.project.store import edit_project, load_points, load_poses, save_poses, save_project
+from fieldwork.nerfcore.project.store import edit_project, load_points, load_poses, load_project, save_poses, save_project
 from fieldwork.nerfcore.workflows.reconstruct import Pipeline, stage_params
 from PIL import Image
 
@@ -155,9 +155,14 @@ def test_exposures_are_kept_of_a_project_that_has_poses(posed_project: Path, mon
         gains = [image.gain for image in poses.images]
         assert gains == ([None] * VIEWS if keep else [image.gain for image in before.images])
         assert [image.camera_to_world for image in poses.images] == [i.camera_to_world for i in before.images]
-        assert pipeline.results["poses"] == {"registered": VIEWS}
+        assert pipeline.results["poses"]["registered"] == VIEWS
     assert pipeline.redone == {"poses": "changed: exposure"}
     assert load_points(posed_project).xyz.shape == (144, 3)
+    # They are no new world: what was aligned by hand since the poses were estimated stays so.
+    assert [s.result.get("world_kept") for s in load_project(posed_project).provenance if s.verb == "poses"][1:] == [
+        True,
+        True,
+    ]
 
 
 def test_records_from_before_say_whether_exposures_were_kept(posed_project: Path) -> None:

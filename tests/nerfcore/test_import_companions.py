@@ -151,8 +151,9 @@ def probabilities(path: Path) -> None:
 
 
 def test_probability_maps_come_with_their_confidence(tmp_path: Path) -> None:
-    folder = writers.data_set(tmp_path / "d", {"aabb_scale": 1}, count=4)
+    folder = writers.data_set(tmp_path / "d", {"aabb_scale": 1}, count=5)
     (folder / "labels" / "confidence").mkdir(parents=True)
+    np.save(folder / "labels" / "f4.npy", np.ones((200, 320), np.uint8))  # class ids, with no picture beside them
     probabilities(folder / "labels" / "f0.npy")
     probabilities(folder / "labels" / "f1.npy")
     for name in ("f1", "f2", "f3"):
@@ -160,8 +161,9 @@ def test_probability_maps_come_with_their_confidence(tmp_path: Path) -> None:
     np.save(folder / "labels" / "f2.npy", np.ones((200, 320)))
     Image.new("L", (320, 200), 51).save(folder / "labels" / "confidence" / "f3.png")
     (warning,) = bring(folder, tmp_path / "p")
-    assert "1 files beside label maps are not used" in warning
+    assert "2 files among label maps are not used" in warning
     assert "f2.npy" in warning
+    assert "f4.npy" in warning
     records = {record.name: record for record in load_project(tmp_path / "p").images}
     for name in ("f0", "f1"):
         assert read_label(tmp_path / "p" / str(records[name].label))[0, [0, -1]].tolist() == [1, 2]

@@ -396,3 +396,12 @@ def test_added_photos_that_were_left_out_can_be_added_again(tmp_path: Path) -> N
     assert [r.status for r in records] == ["ok"] * 21
     assert len({r.name for r in records}) == 21
     assert sorted(p.name for p in (project / "images").iterdir()) == files
+
+
+def test_two_paths_to_one_photo_are_one_however_often_it_runs(tmp_path: Path) -> None:
+    photos, project = folder_of(tmp_path / "photos"), tmp_path / "p"
+    (photos / "z_again.jpg").symlink_to(photos / "p0.jpg")
+    for _ in range(2):
+        new(photos, project)
+        records = {record.name: record.status for record in load_project(project).images}
+        assert records == {"p0": "ok", "p1": "ok", "p2": "ok", "z_again": "rejected"}

@@ -184,3 +184,12 @@ def test_titles_of_a_video_need_not_be_utf_8(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes().replace(b"Cafe Mueller", b"Caf\xe9 M\xfcller "))
     assert b"Caf\xe9" in path.read_bytes()
     assert len(extract_frames(path, tmp_path / "frames", 8, Reporter())) == 8
+
+
+def test_frames_are_known_from_whatever_folder_it_runs_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "va").mkdir()
+    encode(tmp_path / "va" / "clip.mp4", "libx264")
+    for folder, place in (("va", Path()), (".", Path("va"))):
+        monkeypatch.chdir(tmp_path / folder)
+        new(NewParams(project=place / "proj", photos=place / "clip.mp4", frames=4), Reporter())
+        assert len(load_project(place / "proj").images) == 4

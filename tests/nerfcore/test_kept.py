@@ -320,3 +320,19 @@ def test_a_data_set_is_not_written_over_by_its_own_project(tmp_path: Path, file:
     with pytest.raises(InputError, match="where the project would keep its own files"):
         import_dataset(ImportParams(dataset=folder / file if file else folder, project=folder), Reporter())
     assert contents(folder) == before
+
+
+@pytest.mark.parametrize("verb", list(VERBS))
+def test_a_capture_that_was_moved_with_its_project_is_known(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verb: str
+) -> None:
+    data_set(tmp_path / "job" / "data", {"aabb_scale": 1})
+    monkeypatch.chdir(tmp_path / "job")
+    VERBS[verb](Path("data"), Path("p"))
+    before = [image.name for image in load_project(Path("p")).images]
+    (tmp_path / "job").rename(tmp_path / "moved")
+    monkeypatch.chdir(tmp_path / "moved")
+    VERBS[verb](Path("data"), Path("p"))
+    images = load_project(Path("p")).images
+    assert [image.name for image in images] == before
+    assert all(Path(image.source).is_file() for image in images)

@@ -18,7 +18,14 @@ from fieldwork.nerfcore.poses.estimate import posed, posing_inputs, with_gains
 from fieldwork.nerfcore.poses.exposure import exposure_gains
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.schema import ImageRecord, PosedImage, Poses, Project
-from fieldwork.nerfcore.project.store import edit_project, load_points, load_poses, load_project, save_poses, save_project
+from fieldwork.nerfcore.project.store import (
+    edit_project,
+    load_points,
+    load_poses,
+    load_project,
+    save_poses,
+    save_project,
+)
 from fieldwork.nerfcore.workflows.reconstruct import Pipeline, stage_params
 from PIL import Image
 

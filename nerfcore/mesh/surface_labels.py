@@ -313,7 +313,7 @@ def _ask(
     points = texels.points(pieces, face, texel)
     best = np.maximum(seen.weight[asked].max(1), 1e-30)
     votes, total = PRIOR * evidence.mass[face], np.full(len(face), PRIOR, np.float32)
-    shown = np.zeros(len(face), bool)
+    unlabelled = np.zeros(len(face), np.float32)
     for number in np.unique(seen.view[asked]):
         report.check()
         labels = photos[number].labels if number >= 0 else None
@@ -333,9 +333,9 @@ def _ask(
         vote, known, told = read_votes(view, local, label, sure, classes)
         votes[rows] += vote * weight[row[rows], None]
         total[rows] += known * weight[row[rows]]
-        shown[rows] |= told > 0
+        unlabelled[rows] += (told - known) * weight[row[rows]]
     if not evidence.sparse:
-        votes[shown & (total <= PRIOR * 1.5)] = 0
+        votes[(unlabelled > PRIOR * 0.5) & (total <= PRIOR * 1.5)] = 0
     return texel, votes / total[:, None]
 
 

@@ -72,7 +72,9 @@ answer({"scale": list(made.mesh.matrix_world.to_scale()), "parents": [o.parent =
     assert all(facts["parents"])
 
 
-@pytest.mark.parametrize("hide", HIDDEN)
+@pytest.mark.parametrize(
+    "hide", ["nothing", "excluded", *(pytest.param(h, marks=pytest.mark.slow) for h in ("collection", "parent"))]
+)
 def test_the_place_of_a_capture_that_nothing_evaluates_is_known(bpy_script, tmp_path, hide):
     """Blender stores no matrices of what is excluded or disabled in viewports."""
     facts = bpy_script(

@@ -142,7 +142,7 @@ def sampled(mesh: trimesh.Trimesh, seed: int) -> tuple[np.ndarray, np.ndarray]:
     return (points + random.normal(scale=0.002, size=(len(points), 1)) * normals)[order], normals[order]
 
 
-@pytest.mark.parametrize("seed", [0, 10])
+@pytest.mark.parametrize("seed", [0, pytest.param(10, marks=pytest.mark.slow)])
 def test_epochs_of_a_symmetric_thing_that_lie_over_each_other_are_not_turned(seed: int) -> None:
     """A column, from which nothing but a chip at its foot tells where its front is."""
     column = trimesh.creation.cylinder(0.3, 2.0, sections=96).subdivide_to_size(0.05)
@@ -152,7 +152,7 @@ def test_epochs_of_a_symmetric_thing_that_lie_over_each_other_are_not_turned(see
     np.testing.assert_allclose(found.transform, np.eye(4), atol=0.01)
 
 
-@pytest.mark.parametrize("angle", [45, 100])
+@pytest.mark.parametrize("angle", [45, pytest.param(100, marks=pytest.mark.slow)])
 def test_an_epoch_that_lies_elsewhere_is_found_where_parts_of_it_fit_in_a_wrong_place(angle: float) -> None:
     """Two plinths, of which one was moved by 10 cm, on a slab before a wall: slab and wall alone fit in several ways."""
 

@@ -88,7 +88,9 @@ def test_a_stroke_on_the_surface_marks_what_lies_under_it(ball: Path) -> None:  
     assert np.array_equal(placed_surfels(prepared_anew(ball), mark), marked)
 
 
-@pytest.mark.parametrize("shape", ["line", "click", "part"])
+@pytest.mark.parametrize(
+    "shape", ["line", pytest.param("click", marks=pytest.mark.slow), pytest.param("part", marks=pytest.mark.slow)]
+)
 def test_places_far_from_the_surface_mark_nothing(ball: Path, shape: str) -> None:  # noqa: F811
     """As when they are given in millimetres."""
     far = [place(ball, TOP, [[value, 400.0, 900.0]], shape=shape) for value in (1200.0, 1e300)]

@@ -227,9 +227,8 @@ class Copy:
         for name in own:
             if name in state and name in files and Path(name).name == PROJECT_FILE:
                 self._merge(name, state[name], files[name], warn)
-                state[name] = [
-                    files[name][0]
-                ]  # of another time than the file here, which goes up with the next campaign
+                # Without a time: the file here is another one, which goes up with the next campaign.
+                state[name] = [files[name][0]]
             else:
                 warn(
                     f"{self.folder / name} was changed here and by a worker: yours stays. The next campaign uploads it."

@@ -57,9 +57,8 @@ class Dataset:
     points: Points = field(default_factory=Points.empty)
     bounds: np.ndarray | None = None
     warnings: list[str] = field(default_factory=list)
-    root: Path | None = (
-        None  # folder with `labels`, `masks` and classes.json; None: what was given, or where that file lies
-    )
+    # The folder with `labels`, `masks` and classes.json; None: what was given, or where that file lies.
+    root: Path | None = None
     resources: tuple[object, ...] = ()  # temporary folders that live as long as this
 
 

@@ -175,15 +175,10 @@ def rays(camera: Camera, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return direction / np.linalg.norm(direction, axis=-1, keepdims=True), valid
 
 
-def widest_angle(camera: Camera) -> float:
-    """Angle to the optical axis, in radians, at which the lens polynomial turns back; infinite where it does not. What lies
-    farther out seems to be inside of the picture, and is not: the polynomial was fitted to what the lens shows."""
-    return _turning_angle(camera.model, camera.distortion)
-
-
 @lru_cache(maxsize=256)
-def _turning_angle(model: CameraModel, distortion: tuple[float, ...]) -> float:
-    """See `widest_angle`."""
+def widest_angle(model: CameraModel, distortion: tuple[float, ...]) -> float:
+    """Angle to the optical axis, in radians, at which the polynomial of a lens turns back; infinite where it does not. What lies
+    farther out seems to be inside of the picture, and is not: the polynomial was fitted to what the lens shows."""
     if model == "OPENCV_FISHEYE":
         angle = np.linspace(0, np.pi, 1000)
         radius = angle * (1 + sum(c * angle ** (2 * n) for n, c in enumerate(distortion, 1)))
@@ -209,13 +204,13 @@ def project(camera: Camera, points: np.ndarray) -> np.ndarray:
     if camera.model == "OPENCV_FISHEYE":
         radius = np.hypot(x, y)
         theta = np.arctan2(radius, z)
-        theta = np.where(theta < widest_angle(camera), theta, np.nan)
+        theta = np.where(theta < widest_angle(camera.model, camera.distortion), theta, np.nan)
         distorted = theta * (1 + sum(c * theta ** (2 * n) for n, c in enumerate(camera.distortion, 1)))
         uv = np.stack([x, y], -1) * np.where(radius > 1e-12, distorted / np.maximum(radius, 1e-12), 1.0)[:, None]
     else:
         uv = np.stack([x, y], -1) / np.where(z > 0, z, np.nan)[:, None]
         if camera.model == "OPENCV" and any(camera.distortion):
-            widest = widest_angle(camera)
+            widest = widest_angle(camera.model, camera.distortion)
             if widest < np.inf:
                 uv = np.where((np.hypot(*uv.T) < np.tan(widest))[:, None], uv, np.nan)
             uv = _opencv_distort(uv, camera.distortion)[0]

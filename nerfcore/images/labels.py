@@ -16,8 +16,8 @@ from .soft_labels import PROBABILITY_SUFFIXES, read_probabilities
 from .suffixes import TIFF_SUFFIXES
 
 Colors = dict[int, tuple[int, int, int]]
-# Formats whose EXIF orientation is ours to apply: HEIF and raw decoders turn pictures themselves.
 LOSSY_FORMATS = ("JPEG", "MPO", "HEIF", "AVIF")
+# Formats whose EXIF orientation is ours to apply: HEIF and raw decoders turn pictures themselves.
 TAGGED_SUFFIXES = {".jpg", ".jpeg", ".jpe", ".png", ".webp", ".tif", ".tiff"}
 
 

@@ -208,11 +208,6 @@ def current(folder: Path, run: str, count: int | None = None, features: Path | N
     return ready if ready.inputs == wanted else None
 
 
-def is_stale(folder: Path, run: str) -> bool:
-    """Whether a run was prepared, but is another by now: aligned, trained further, or with other poses."""
-    return _stored(folder, run) is not None and current(folder, run) is None
-
-
 def _stored(folder: Path, run: str) -> Preparation | None:
     try:
         return Preparation(run_folder(folder, run) / FOLDER)

@@ -11,13 +11,14 @@ import numpy as np
 
 from ..params import LabelPropagateParams
 from ..progress import Reporter
+from ..project.runs import run_folder
 from ..project.store import load_project
 from .carry import carried_classes
 from .doubts import doubtful
 from .journal import marks_at, read_marks, shown_revision
 from .lookup import Labelling
 from .part_labels import by_parts
-from .preparation import Preparation, ensured, is_stale
+from .preparation import FOLDER, Preparation, current, ensured
 from .propagation import propagated, trusted
 from .revisions import computed, load, made_of, path_of, save, save_first
 from .seeds import UNMARKED, Seeds, seeds_of
@@ -91,7 +92,7 @@ def propagated_labels(folder: Path, run: str, revision: int | None, report: Repo
     Raises:
         as `computed` and `propagate`.
     """
-    if is_stale(folder, run):
+    if (run_folder(folder, run) / FOLDER).is_dir() and current(folder, run) is None:
         propagate(LabelPropagateParams(project=folder, run=run, revision=revision), report)
     return computed(folder, run, revision)
 

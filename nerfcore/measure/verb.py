@@ -10,10 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ..data.load import load_scene
 from ..data.scene import Scene
 from ..files import write_json
-from ..geometry.similarity import transform_pose
 from ..mesh.facelets import Facelets, facelets
 from ..mesh.instances import Instance, read_instances
 from ..mesh.painted import LONGEST, training_photos
@@ -26,7 +24,7 @@ from ..params import MeasureParams
 from ..progress import Reporter
 from ..project.runs import MEASURES
 from ..project.store import load_poses, load_project, record_step, world_from_sfm
-from ..render.run import load_info, refined_poses
+from ..render.run import load_info, scene_as_trained
 from .amounts import Amount, K, Labelled, area_amounts, summed, transferred, volume_amount
 from .placing import area_deviations_of_place, u_places
 from .resampling import Pieces, Votes, area_deviations
@@ -97,10 +95,8 @@ def measure(params: MeasureParams, report: Reporter) -> dict[str, Any]:
             "`fieldwork align --scale`, then run `fieldwork mesh` and `fieldwork measure` again."
         )
     info = load_info(folder, params.run)
-    scene = load_scene(folder, info.holdout)
-    world_from_box = info.box(project).world_from_box
-    refined = {n: transform_pose(world_from_box, p) for n, p in refined_poses(folder, params.run, info).items()}
-    photos = training_photos(scene, np.eye(4), refined)
+    scene = scene_as_trained(folder, params.run, info)
+    photos = training_photos(scene, np.eye(4))
     instances = read_instances(target)
     coarse, known = load_coarse(folder, params.run), present(surface, scene)
     pieces = facelets(surface.vertices, surface.faces, limit=float(np.ptp(surface.vertices, axis=0).max()) * LONGEST)

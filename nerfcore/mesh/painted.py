@@ -51,17 +51,10 @@ class Painted:
     maps: ClassMaps | None = None
 
 
-def training_photos(
-    scene: Scene, box_from_world: np.ndarray, poses: dict[str, np.ndarray] | None = None
-) -> list[Photo]:
-    """The photos that a surface may be painted from: those that were trained with, posed in the normalised frame.
-
-    Args:
-        poses: camera-to-box poses (4, 4) by name, instead of the scene's, of a run that refined them.
-    """
+def training_photos(scene: Scene, box_from_world: np.ndarray) -> list[Photo]:
+    """The photos that a surface may be painted from: those that were trained with, posed in the normalised frame."""
     views = [scene.views[i] for i in scene.train]
-    known = {view.name: pose for view, pose in zip(views, box_poses(views, box_from_world))} | (poses or {})
-    return [posed_photo(view, known[view.name]) for view in views]
+    return [posed_photo(view, pose) for view, pose in zip(views, box_poses(views, box_from_world))]
 
 
 def paint_surface(

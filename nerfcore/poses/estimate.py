@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -18,22 +17,19 @@ from ..geometry.frames import upright
 from ..geometry.points import Points
 from ..params import PosesParams
 from ..progress import Reporter, shortened
-from ..project.fingerprints import Earlier, Fingerprint, compare, digest, files_digest
 from ..project.kept import earlier_cut_outs, earlier_poses, keep_world
-from ..project.schema import Frame, ImageRecord, PosedImage, Poses, Project, ProvenanceStep
+from ..project.schema import Frame, ImageRecord, PosedImage, Poses, Project
 from ..project.store import FRAMES_FILE, FRAMES_FOLDER, POSES_FILE, edit_project, load_poses, load_project, save_poses
 from ..verdict import poses_verdict
 from .align import gps_frame
 from .exposure import exposure_gains
+from .inputs import STATE_FILE, WORK_FOLDER, changed, photo_state, photos_found, posing_inputs, usable
 from .process import run_worker
 from .zoom import lens_groups
 
-WORK_FOLDER = "poses/sfm"
 SPARSE_FOLDER = "poses/sparse"
 REPORT_FILE = "poses/report.json"
 PICTURE_FILE = "poses/report.png"
-STATE_FILE = "state.json"
-EXPOSURE = "exposure"  # an input of poses, where photos keep theirs
 MIN_PHOTOS = 3
 # By name, matched besides those that retrieval finds. Of video as in COLMAP's sequential matching; of photos not tuned.
 PHOTO_NEIGHBOURS, VIDEO_NEIGHBOURS = 3, 10
@@ -55,7 +51,7 @@ def estimate_poses(params: PosesParams, report: Reporter) -> dict[str, Any]:
     """
     folder = Path(params.project)
     project = load_project(folder)
-    records = _usable(project)
+    records = usable(project)
     if len(records) < MIN_PHOTOS:
         rejected = len(project.images) - len(records)
         raise PosesError(
@@ -68,7 +64,7 @@ def estimate_poses(params: PosesParams, report: Reporter) -> dict[str, Any]:
     result = run_worker(job, folder / WORK_FOLDER, report)
     # Classes and region may have been edited meanwhile.
     with edit_project(folder) as project:
-        records = _usable(project)
+        records = usable(project)
         poses, points, visibility = _poses(result, records)
         if not params.keep_exposure:
             poses = with_gains(folder, records, poses, points, visibility, report)
@@ -81,7 +77,7 @@ def estimate_poses(params: PosesParams, report: Reporter) -> dict[str, Any]:
         if earlier_cut_outs(project) and trim_masks(folder, report):
             # Found with the masks as they were; that they are others now is no reason to find them again.
             inputs = posing_inputs(folder, project, params)
-            write_json(folder / WORK_FOLDER / STATE_FILE, _photo_state(folder, records))
+            write_json(folder / WORK_FOLDER / STATE_FILE, photo_state(folder, records))
         matching = [
             (record.name, image["mates"], image["contradicting"])
             for record, image in zip(records, result["images"])
@@ -146,7 +142,7 @@ def pose_job(folder: Path, project: Project, params: PosesParams, report: Report
     Raises:
         DiskError, Cancelled.
     """
-    records, work = _usable(project), folder / WORK_FOLDER
+    records, work = usable(project), folder / WORK_FOLDER
     with disk_errors(work):
         work.mkdir(parents=True, exist_ok=True)
         same = _forget_changed(folder, records)
@@ -178,77 +174,6 @@ def _extendable(folder: Path, records: list[ImageRecord]) -> Poses | None:
     return poses if poses.source == "sfm" and fresh and len(kept) >= MIN_PHOTOS else None
 
 
-def posing_inputs(folder: Path, project: Project, params: PosesParams) -> Fingerprint:
-    """What poses depend on: the working copies, what is known of their lenses, masks, GPS."""
-    records = _usable(project)
-    return {
-        "photos": digest(
-            [
-                [r.name, r.camera_group, r.focal_px, files_digest([(r.file, folder / r.file)])]
-                for r in sorted(records, key=lambda record: record.name)
-            ]
-        ),
-        "masks": files_digest((r.name, folder / r.mask if r.mask else None) for r in records),
-        "GPS": digest([[r.name, r.exif.get("gps")] for r in records]),
-        "settings": digest([params.preset, params.group]),
-        **({EXPOSURE: digest("kept")} if params.keep_exposure else {}),
-    }
-
-
-def recorded(project: Project) -> ProvenanceStep | None:
-    """What the last estimation of poses was made from; records of before had no input for exposures that are kept."""
-    made = project.last("poses")
-    if made is None or not made.inputs or not made.settings.get("keep_exposure"):
-        return made
-    return made.model_copy(update={"inputs": {**made.inputs, EXPOSURE: digest("kept")}})
-
-
-def posed(params: PosesParams) -> Earlier:
-    """The poses that are there, if they are of the present photos, whose exposures are kept or not as asked for; other settings
-    chosen by hand count as wished for."""
-    folder = Path(params.project)
-    project = load_project(folder)
-    made = recorded(project)
-    if made is None or not (folder / POSES_FILE).is_file():
-        return Earlier()
-    if not made.inputs:
-        # Made by version 0.1: the photos whose features were found are on record.
-        state = _state(folder / WORK_FOLDER)
-        same = state is not None and _same_photos(state, _photo_state(folder, _usable(project)))
-        return Earlier(made.result) if same else Earlier(reason="made by an earlier version from other photos")
-    inputs = posing_inputs(folder, project, params)
-    return compare(made, inputs | {"settings": made.inputs.get("settings", "")})
-
-
-def _photo_state(folder: Path, records: list[ImageRecord]) -> dict[str, list[Any]]:
-    """What the features of each photo depend on."""
-    return {
-        r.name: [r.file, r.sha256, r.width, r.height, r.camera_group, r.mask]
-        + ([files_digest([(r.mask, folder / r.mask)])] if r.mask else [])
-        for r in records
-    }
-
-
-def _same_photos(before: dict[str, list[Any]], now: dict[str, list[Any]]) -> bool:
-    """Whether these were the same photos, as far as an earlier version of the state says."""
-    return before.keys() == now.keys() and not _changed(before, now)
-
-
-def _changed(before: dict[str, list[Any]], now: dict[str, list[Any]]) -> bool:
-    """Whether a photo that was there before is another one now. Earlier versions say less of each."""
-    return any(now[name][: len(state)] != state for name, state in before.items() if name in now)
-
-
-def _state(work: Path) -> dict[str, list[Any]] | None:
-    """The photos whose features were found; None where that is not known."""
-    try:
-        value = json.loads((work / STATE_FILE).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    right = isinstance(value, dict) and all(isinstance(state, list) for state in value.values())
-    return value if right else None
-
-
 def _forget_changed(folder: Path, records: list[ImageRecord]) -> bool:
     """Throw away features of photos whose working copy or mask is another one than when they were found.
 
@@ -256,8 +181,8 @@ def _forget_changed(folder: Path, records: list[ImageRecord]) -> bool:
         whether none was.
     """
     work, same = folder / WORK_FOLDER, True
-    before, now = _state(work), _photo_state(folder, records)
-    if before is not None and _changed(before, now):
+    before, now = photos_found(work), photo_state(folder, records)
+    if before is not None and changed(before, now):
         shutil.rmtree(work)
         work.mkdir(parents=True)
         before, same = None, False
@@ -348,10 +273,6 @@ def _poses(result: dict[str, Any], records: list[ImageRecord]) -> tuple[Poses, P
     with np.load(result["points_file"], allow_pickle=False) as data:
         points = Points(data["xyz"], data["rgb"], data["error"])
         return poses, points, (data["view"], data["point"])
-
-
-def _usable(project: Project) -> list[ImageRecord]:
-    return [record for record in project.images if record.status != "rejected"]
 
 
 def _set_statuses(records: list[ImageRecord], result: dict[str, Any]) -> None:

@@ -11,7 +11,8 @@ from ..files import write_json
 from ..params import PosesParams
 from ..progress import Reporter
 from ..project.store import POSES_FILE, edit_project, load_points, load_poses, load_project, load_visibility
-from .estimate import EXPOSURE, estimate_poses, posed, posing_inputs, with_gains
+from .estimate import estimate_poses, with_gains
+from .inputs import EXPOSURE, posed, posing_inputs
 
 
 def poses_or_gains(params: PosesParams, report: Reporter) -> dict[str, Any]:

@@ -8,7 +8,8 @@ from typing import Any
 from ..params import PosesParams
 from ..progress import Reporter
 from ..project.store import load_project
-from .estimate import pose_job, posed
+from .estimate import pose_job
+from .inputs import posed
 from .process import run_worker
 
 

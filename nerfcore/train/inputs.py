@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..config import ONLY_RENDERING, RunConfig, make_config
+from ..config import ONLY_RENDERING, RENAMED, RunConfig, make_config
 from ..data.load import load_scene
 from ..params import TrainParams
 from ..project.fingerprints import Fingerprint, array_digest, digest, files_digest, rounded
@@ -51,6 +51,17 @@ def wanted_inputs(folder: Path, params: TrainParams, info: RunInfo) -> Fingerpri
 def as_noted(inputs: Fingerprint, info: RunInfo) -> Fingerprint:
     """Inputs without those that a run of an earlier version did not note."""
     return {name: value for name, value in inputs.items() if name != EXPOSURE or name in info.origin.inputs}
+
+
+def settings_kept(info: RunInfo, params: TrainParams, asked: RunConfig) -> list[str]:
+    """Which of the settings given now, in `asked`, a run that goes on does not take, as it began with others. A preset and a
+    hold-out that are the default were not given."""
+    began, now = info.config.model_dump(), asked.model_dump()
+    named = [RENAMED.get(name, name).split(".") for name in params.set]
+    kept = [f"{stage}.{key}" for stage, key in named if now[stage][key] != began[stage][key]]
+    for name, own in (("preset", info.preset), ("holdout", info.holdout)):
+        kept += [name] if getattr(params, name) not in (own, TrainParams.model_fields[name].default) else []
+    return kept
 
 
 def training_length(steps: int | None, seconds: float | None, config: RunConfig) -> dict[str, Any]:

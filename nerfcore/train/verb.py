@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..config import RENAMED, RunConfig, make_config, with_rendering_of
+from ..config import make_config, with_rendering_of
 from ..data.box import box_poses
 from ..data.load import load_scene
 from ..data.pixels import training_size
@@ -53,7 +53,7 @@ from ..verdict import train_verdict
 from .checkpoint import restore, save_checkpoint
 from .closed_picture import closed_picture, picture_closed
 from .initial_state import InitialState
-from .inputs import as_noted, data_inputs, training_inputs, training_length
+from .inputs import as_noted, data_inputs, settings_kept, training_inputs, training_length
 from .pose_refinement import write_poses
 from .prepare import make_trainer, plan_run
 from .results import Measured
@@ -197,24 +197,13 @@ def _resumable(place: TrainingFolder, params: TrainParams, report: Reporter) -> 
             )
         length = training_length(params.steps, params.time_limit, info.config)
         info.origin.inputs["length of training"] = digest(length)
-    asked = make_config(info.preset, params.set)
+    asked = make_config(info.preset, params.set) if params.set else info.config
     info.config = with_rendering_of(info.config, asked, params.set)
-    _warn_of_kept(place.run, info, params, settled_as(asked, info.config), report)
-    return info, load_scene(place.project, info.holdout)
-
-
-def _warn_of_kept(run: str, info: RunInfo, params: TrainParams, asked: RunConfig, report: Reporter) -> None:
-    """Say which of the settings given now a run does not take, as it began with others. A preset and a hold-out that are
-    the default were not given."""
-    began, now = info.config.model_dump(), asked.model_dump()
-    named = [RENAMED.get(name, name).split(".") for name in params.set]
-    kept = [f"{stage}.{key}" for stage, key in named if now[stage][key] != began[stage][key]]
-    for name, own in (("preset", info.preset), ("holdout", info.holdout)):
-        given = getattr(params, name)
-        kept += [name] if given not in (own, TrainParams.model_fields[name].default) else []
+    kept = settings_kept(info, params, settled_as(asked, info.config))
     if kept:
         what = ", ".join(kept)
-        report.warn(f"The run “{run}” goes on with the settings it began with, not with those given now: {what}.")
+        report.warn(f"The run “{place.run}” goes on with the settings it began with, not with those given now: {what}.")
+    return info, load_scene(place.project, info.holdout)
 
 
 class _Loop:

@@ -46,7 +46,10 @@ def run_stage(values: dict[str, Any], report: Reporter) -> dict[str, Any]:
     params = ReconstructParams.model_validate(local["capture"])
     copy = Copy(storage, here, capture_name(params, here), tracked_paths(params))
     report.stage("Fetching files")
-    reads = lambda name: needed(name, values["stage"], params, here)  # noqa: E731
+
+    def reads(name: str) -> bool:
+        return needed(name, values["stage"], params, here)
+
     copy.fetch(reads, report.check)
     copy.begin(reads)
     with Saving(copy, SAVE_EVERY):

@@ -23,7 +23,7 @@ def _new() -> Stage:
 
 
 def _poses() -> Stage:
-    from ..poses.estimate import posed
+    from ..poses.inputs import posed
     from ..poses.reuse import poses_or_gains
 
     return Stage(poses_or_gains, posed)

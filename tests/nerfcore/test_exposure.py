@@ -14,8 +14,9 @@ from fieldwork.nerfcore.geometry.cameras import Camera, project
 from fieldwork.nerfcore.geometry.points import Points
 from fieldwork.nerfcore.images.exposure import common_gains
 from fieldwork.nerfcore.params import PosesParams, ReconstructParams
-from fieldwork.nerfcore.poses.estimate import posed, posing_inputs, with_gains
+from fieldwork.nerfcore.poses.estimate import with_gains
 from fieldwork.nerfcore.poses.exposure import exposure_gains
+from fieldwork.nerfcore.poses.inputs import posed, posing_inputs
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.schema import ImageRecord, PosedImage, Poses, Project
 from fieldwork.nerfcore.project.store import (

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fieldwork.nerfcore.params import PosesParams
-from fieldwork.nerfcore.poses.estimate import STATE_FILE, WORK_FOLDER, _forget_changed
+from fieldwork.nerfcore.poses.estimate import _forget_changed
+from fieldwork.nerfcore.poses.inputs import STATE_FILE, WORK_FOLDER
 from fieldwork.nerfcore.poses.spread import find_features
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.store import load_project

@@ -14,7 +14,7 @@ from fieldwork.nerfcore.geometry.points import Points
 from fieldwork.nerfcore.mesh.build import Built
 from fieldwork.nerfcore.mesh.region import Region
 from fieldwork.nerfcore.params import PosesParams, ReconstructParams
-from fieldwork.nerfcore.poses.estimate import posed, posing_inputs
+from fieldwork.nerfcore.poses.inputs import posed, posing_inputs
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.schema import PosedImage, Poses
 from fieldwork.nerfcore.project.store import edit_project, save_poses

@@ -16,6 +16,7 @@ from fieldwork.nerfcore.geometry.points import Points
 from fieldwork.nerfcore.images.working import MASK_UNKNOWN, read_image, read_picture
 from fieldwork.nerfcore.params import ImportParams, PosesParams
 from fieldwork.nerfcore.poses import estimate
+from fieldwork.nerfcore.poses.inputs import posed
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.store import load_poses, load_project, save_poses
 from fieldwork.nerfcore.render.verb import look_at
@@ -124,5 +125,5 @@ def test_poses_trim_masks_and_are_not_estimated_again_for_it(project: Path, monk
     estimate.estimate_poses(params, Reporter())
     left, again = (m[CLOTH] == MASK_UNKNOWN for m in (trimmed, masks(project)))
     assert (left & again).sum() > 0.9 * (left | again).sum() > 0
-    assert estimate.posed(params).result is not None
+    assert posed(params).result is not None
     assert estimate._forget_changed(project, load_project(project).images)

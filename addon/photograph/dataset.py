@@ -92,7 +92,7 @@ def scene_size(scene: bpy.types.Scene, size: list[int] | None) -> tuple[int, int
 def scene_lens(scene: bpy.types.Scene, size: list[int] | None) -> Lens:
     """The lens of the scene's camera, without its shift; a normal one where there is no perspective camera."""
     width, height = scene_size(scene, size)
-    if scene.camera is None or scene.camera.data.type != "PERSP":
+    if not _is_perspective(scene.camera):
         return Lens(width, height, 1.2 * max(width, height))
     return Lens(width, height, camera_lens(scene.camera.data, width, height).focal_px)
 
@@ -126,10 +126,15 @@ def _camera_shot(scene: bpy.types.Scene, number: int, width: int, height: int) -
     """The shot of a frame; the scene is in that frame afterwards."""
     scene.frame_set(number)
     camera = scene.camera
-    if camera is None or camera.data.type != "PERSP":
+    if not _is_perspective(camera):
         raise SceneError(f"The scene has no perspective camera in frame {number}: add one, or choose another path.")
     evaluated = camera.evaluated_get(bpy.context.evaluated_depsgraph_get())
     return Shot(f"{number:04d}", unscaled(np.array(evaluated.matrix_world)), camera_lens(evaluated.data, width, height))
+
+
+def _is_perspective(camera: bpy.types.Object | None) -> bool:
+    """Whether a scene's active camera, which any object may be, is a perspective camera."""
+    return camera is not None and camera.type == "CAMERA" and camera.data.type == "PERSP"
 
 
 def unscaled(matrix: np.ndarray) -> np.ndarray:

@@ -194,14 +194,14 @@ def _render_data(
 
 
 def _layers(channels: dict[str, np.ndarray]) -> list[str]:
-    """View layers that have a depth channel; the names look like "ViewLayer.Depth.V"."""
-    return sorted({name.split(".")[0] for name in channels if name.split(".")[1:2] in (["Depth"], ["Z"])})
+    """View layers that have a depth channel; the names look like "ViewLayer.Depth.V", and a layer's own may have dots."""
+    parts = [name.rsplit(".", 2) for name in channels]
+    return sorted({part[0] for part in parts if part[1:2] in (["Depth"], ["Z"])})
 
 
 def _pass(channels: dict[str, np.ndarray], layer: str, names: tuple[str, ...]) -> np.ndarray:
     for name, values in channels.items():
-        parts = name.split(".")
-        if parts[0] == layer and len(parts) > 1 and parts[1] in names:
+        if name.rpartition(".")[0] in [f"{layer}.{one}" for one in names]:
             return values
     raise RuntimeError(f"Cycles wrote no {names[0]} pass; it wrote {', '.join(sorted(channels))}.")
 

@@ -180,6 +180,23 @@ def test_what_cannot_be_photographed_is_said(blend, tmp_path, bpy_script):
         take(tmp_path / "empty.blend", tmp_path / "d", path="camera")
 
 
+ODD = """
+bpy.ops.wm.open_mainfile(filepath=blend)
+scene = bpy.context.scene
+scene.camera, scene.view_layers[0].name = bpy.data.objects["cube"], "v1.2 final"
+bpy.ops.wm.save_as_mainfile(filepath=path, copy=True)
+answer(1)
+"""
+
+
+def test_dots_in_names_of_view_layers_and_cameras_that_are_none_do_not_matter(blend, tmp_path, bpy_script):
+    bpy_script(ODD, blend=blend, path=tmp_path / "odd.blend")
+    take(tmp_path / "odd.blend", tmp_path / "out", views=1)
+    assert set(surfaces(tmp_path / "out")) - {0} == {1, 2}
+    with pytest.raises(BlenderError, match="no perspective camera"):
+        take(tmp_path / "odd.blend", tmp_path / "path", path="camera")
+
+
 NUMBERS = """
 bpy.ops.wm.open_mainfile(filepath=blend)
 for name, number in (("floor", 300), ("cube", 2)):

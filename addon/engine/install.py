@@ -142,7 +142,10 @@ def _check_base(base: Path, run: Runner) -> None:
         "import platform, struct, sys; "
         "print(sys.version_info[0], sys.version_info[1], struct.calcsize('P') * 8, platform.machine())"
     )
-    words = run([base, "-I", "-c", code], f"{base} is not a Python").split()
+    said = run([base, "-I", "-c", code], f"{base} is not a Python").splitlines()
+    words = said[-1].split() if said else []  # what it warns of comes before
+    if len(words) < 3 or not all(word.isdecimal() for word in words[:3]):
+        raise InstallError(f"{base} is not a Python. Choose another Base Python.")
     version = (int(words[0]), int(words[1]))
     if version < (3, 11) or words[2] != "64":
         raise InstallError(
@@ -283,6 +286,8 @@ class Installer(threading.Thread):
             self.error = "Stopped. Press Install to go on."
         except (InstallError, OSError) as error:
             self.error = str(error)
+        except Exception as error:  # noqa: BLE001 - of a thread that just ends nobody would hear
+            self.error = f"{type(error).__name__}: {error}"
 
     def _report(self, fraction: float, message: str) -> None:
         self.fraction, self.message = fraction, message

@@ -17,6 +17,8 @@ from typing import IO, Any
 Report = Callable[[float, str], None]
 # The last of pip's attempts; uv's words for it.
 _UNREACHABLE = re.compile(r"Retry\(total=0|error sending request|dns error|client error \(Connect\)")
+# Debian's Python comes without `venv`, and says what to do in the middle of many lines.
+_WITHOUT_VENV = re.compile(r"apt install (python\S*-venv)")
 
 
 class InstallError(Exception):
@@ -93,6 +95,9 @@ def _reason(lines: list[str]) -> str:
             "The server of the packages cannot be reached: check the network; behind a proxy, set HTTPS_PROXY and start "
             "Blender again"
         )
+    lacking = next(filter(None, map(_WITHOUT_VENV.search, lines)), None)
+    if lacking is not None:
+        return f"Its Python lacks the package {lacking[1]}: install that, or choose another Base Python"
     told = [line for line in lines if line]
     reason = next((line for line in told if line.lower().startswith("error")), told[-1] if told else "")
     return reason[:300].rstrip(".")

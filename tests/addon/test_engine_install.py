@@ -236,6 +236,32 @@ def test_unsuitable_base_python_is_refused(options, lock, tmp_path, version, rea
         go(Options(**{**vars(options), "base": old}), lock)
 
 
+def test_what_a_base_python_says_before_its_version_does_not_matter(options, lock, tmp_path, content_doctor):
+    make_wheel(tmp_path / "wheels")
+    script = tmp_path / "python"
+    script.write_text(f'#!/bin/sh\necho "Could not find platform libraries" >&2\nexec "{options.base}" "$@"\n')
+    script.chmod(0o755)
+    go(Options(**{**vars(options), "base": script}), lock)
+    script.write_text("#!/bin/sh\necho Blender 5.0\n")
+    with pytest.raises(InstallError, match="is not a Python"):
+        go(Options(**{**vars(options), "base": script}), lock)
+
+
+def test_debian_s_python_without_venv_is_told_as_such(options, lock, tmp_path, content_doctor):
+    said = (
+        "The virtual environment was not created successfully because ensurepip is not\n"
+        "available.  On Debian/Ubuntu systems, you need to install the python3-venv\n"
+        "package using the following command.\n\n    apt install python3.14-venv\n\n"
+        "You may need to use sudo with that command.\n\nFailing command: /x/bin/python3\n"
+    )
+    script = tmp_path / "python"
+    (tmp_path / "said").write_text(said)
+    script.write_text(f'#!/bin/sh\n[ "$2" = venv ] && cat "{tmp_path}/said" && exit 1\nexec "{options.base}" "$@"\n')
+    script.chmod(0o755)
+    with pytest.raises(InstallError, match=r"lacks the package python3\.14-venv"):
+        go(Options(**{**vars(options), "base": script}), lock)
+
+
 def test_an_intel_mac_is_told(options, lock, tmp_path, monkeypatch):
     intel = tmp_path / "python"
     intel.write_text("#!/bin/sh\necho 3 12 64 x86_64\n")
@@ -278,6 +304,11 @@ def test_background_installer_ends_with_its_error(options, monkeypatch):
     thread.start()
     thread.join(10)
     assert thread.error == "No."
+    monkeypatch.setattr(module, "install", lambda *_: int("word"))
+    thread = module.Installer(options)
+    thread.start()
+    thread.join(10)
+    assert "invalid literal" in thread.error
 
 
 def test_choice_of_the_python(options, tmp_path, monkeypatch):

@@ -67,6 +67,8 @@ def engine_reason() -> str | None:
     """Why no engine can be started, None when one can."""
     if machine.engine_python() is None:
         return t("Install the engine in the preferences of Fieldwork first")
+    if queue.replacing:
+        return t("The engine is being installed")
     return None
 
 

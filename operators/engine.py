@@ -11,6 +11,7 @@ from bpy.types import Context, Event, Operator
 from ..addon import machine
 from ..addon.engine import place
 from ..addon.jobs.queue import queue
+from ..addon.live.engine import rest_frames
 from ..addon.text import t
 
 if TYPE_CHECKING:
@@ -31,10 +32,6 @@ def options() -> Options:
     )
 
 
-def installing() -> bool:
-    return queue.installer is not None and queue.installer.is_alive()
-
-
 class FIELDWORK_OT_engine_install(Operator):
     """Download the engine's packages into an environment of their own; Blender's Python stays as it is"""
 
@@ -43,7 +40,7 @@ class FIELDWORK_OT_engine_install(Operator):
 
     @classmethod
     def poll(cls, context: Context) -> bool:
-        if installing():
+        if queue.installing:
             cls.poll_message_set(t("The installation is under way"))
         elif not bpy.app.online_access and not machine.preferences().wheels:
             cls.poll_message_set(t("Allow Online Access in the System preferences, or choose a folder of packages"))
@@ -57,6 +54,7 @@ class FIELDWORK_OT_engine_install(Operator):
         from ..addon.engine import install
 
         queue.stop_engine()
+        rest_frames()
         if not bpy.app.background:
             queue.installer = install.Installer(options())
             queue.installer.start()
@@ -77,7 +75,7 @@ class FIELDWORK_OT_engine_install_cancel(Operator):
 
     @classmethod
     def poll(cls, context: Context) -> bool:
-        if not installing():
+        if not queue.installing:
             cls.poll_message_set(t("Nothing is being installed"))
             return False
         return True
@@ -96,7 +94,7 @@ class FIELDWORK_OT_engine_remove(Operator):
     @classmethod
     def poll(cls, context: Context) -> bool:
         folder = machine.engine_folder()
-        if installing():
+        if queue.installing:
             cls.poll_message_set(t("The installation is under way"))
         elif not any((folder / name).exists() for name in (*place.ENVIRONMENTS, "cache")):
             cls.poll_message_set(t("There is no engine to remove"))
@@ -111,6 +109,7 @@ class FIELDWORK_OT_engine_remove(Operator):
         from ..addon.engine import install
 
         queue.stop_engine(timeout=5.0)
+        rest_frames()
         try:
             install.remove(machine.engine_folder())
         except install.InstallError as error:

@@ -8,6 +8,7 @@ from bpy.types import Context, Operator
 from ..addon import machine, registration
 from ..addon.jobs.follow import reattach
 from ..addon.jobs.queue import queue
+from ..addon.live.engine import frames_run, rest_frames
 from ..addon.props import StringProperty
 from ..addon.text import t
 from .base import VerbOperator
@@ -87,13 +88,14 @@ class FIELDWORK_OT_stop_engine(Operator):
 
     @classmethod
     def poll(cls, context: Context) -> bool:
-        if queue.link is None or not queue.link.alive:
+        if (queue.link is None or not queue.link.alive) and not frames_run():
             cls.poll_message_set(t("The engine is not running"))
             return False
         return True
 
     def execute(self, context: Context) -> set[str]:
         queue.stop_engine()
+        rest_frames()
         return {"FINISHED"}
 
 

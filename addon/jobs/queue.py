@@ -208,8 +208,18 @@ class Queue:
     @property
     def busy(self) -> bool:
         """Whether anything goes on that the panels show."""
-        installing = self.installer is not None and self.installer.is_alive()
-        return self.current is not None or installing or (self.link is not None and self.link.busy)
+        return self.current is not None or self.installing or (self.link is not None and self.link.busy)
+
+    @property
+    def installing(self) -> bool:
+        """Whether an engine is being installed."""
+        return self.installer is not None and self.installer.is_alive()
+
+    @property
+    def replacing(self) -> bool:
+        """Whether the engine that would be started is removed once the one that is being installed runs."""
+        python = machine.engine_python() if self.installing else None
+        return python is not None and python.is_relative_to(machine.engine_folder())
 
     @property
     def sliced(self) -> bool:
@@ -262,13 +272,17 @@ class Queue:
             if not self.link.alive:
                 self.link = None
         if self.link is None:
-            python = machine.engine_python()
-            if python is None:
-                raise EngineError(
-                    "missing", "The engine is not installed.", "Install it in the preferences of Fieldwork."
-                )
-            self.link = open_link(python, machine.engine_log())
+            self.link = open_link(self.engine_python(), machine.engine_log())
         return self.link
+
+    def engine_python(self) -> Path:
+        """The Python that runs the engine. Raises EngineError: there is none, or it is about to be removed."""
+        python = machine.engine_python()
+        if python is None:
+            raise EngineError("missing", "The engine is not installed.", "Install it in the preferences of Fieldwork.")
+        if self.replacing:
+            raise EngineError("missing", "The engine is being installed.", "Wait until that is done.")
+        return python
 
     def finish(self, job: Job, result: dict[str, Any] | None, error: EngineError | None) -> None:
         """A job has ended in the engine: do what it has to do in Blender."""

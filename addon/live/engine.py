@@ -22,12 +22,10 @@ IDLE_PERIOD = 10.0  # seconds between two looks at an engine that may have nothi
 
 
 def _open_link() -> Any:
-    python = machine.engine_python()
-    if python is None:
-        raise EngineError("missing", "The engine is not installed.", "Install it in the preferences of Fieldwork.")
     from ..engine.link import Link
+    from ..jobs.queue import queue
 
-    return Link(python, machine.engine_log().with_name(f"frames-{machine.engine_log().stem}.log"))
+    return Link(queue.engine_python(), machine.engine_log().with_name(f"frames-{machine.engine_log().stem}.log"))
 
 
 # Why fields are missing in composites: of scenes that are rendered for another one Blender tells the terminal alone.
@@ -45,6 +43,17 @@ def frames() -> FrameEngine:
 
             _frames = FrameEngine(_open_link)
         return _frames
+
+
+def frames_run() -> bool:
+    """Whether the engine of frames is there."""
+    return _frames is not None and _frames.process is not None
+
+
+def rest_frames() -> None:
+    """End the engine of frames, and free its memory, until the next frame; one that is being rendered fails."""
+    if _frames is not None:
+        _frames.rest()
 
 
 def close_frames() -> None:

@@ -163,6 +163,8 @@ class FrameEngine:
                         link.request("cancel_frame", {"frame": name})
                     raise EngineError("cancelled", "Cancelled.")
                 link.pump(POLL)
+                if link.process is None and not outcome:  # nobody will answer
+                    raise EngineError("stopped", "The engine was stopped.", "Render again.")
             result, error = outcome[0]
             if error is not None:
                 raise error

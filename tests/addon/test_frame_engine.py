@@ -81,6 +81,33 @@ def test_an_engine_that_does_not_give_up_a_frame_is_ended(ball, tmp_path):
         frames.close()
 
 
+def test_a_frame_whose_engine_is_stopped_fails_instead_of_waiting(tmp_path):
+    from fieldwork.addon.live.frames import FrameEngine, Sizes
+
+    silent = [sys.executable, "-c", "import sys; sys.stdin.read()"]
+    frames, failed, stop = FrameEngine(lambda: Link(sys.executable, tmp_path / "log", silent)), [], threading.Event()
+
+    def render() -> None:
+        try:
+            frames.render({}, Sizes(8, 8, {"Combined": 4}), stop.is_set, lambda *said: None)
+        except EngineError as error:
+            failed.append(error.kind)
+
+    thread = threading.Thread(target=render)
+    thread.start()
+    try:
+        while frames.process is None:
+            time.sleep(0.01)
+        time.sleep(0.2)  # it is waited for by now
+        frames.rest()
+        thread.join(5)
+        assert failed == ["stopped"]
+    finally:
+        stop.set()
+        thread.join(5)
+        frames.close()
+
+
 def test_what_the_engine_says_of_a_frame_that_was_cancelled_is_not_passed_on(ball, tmp_path):
     from fieldwork.addon.live.frames import FrameEngine, Sizes
 

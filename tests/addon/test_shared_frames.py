@@ -165,6 +165,53 @@ answer({**facts, "left": watch.file.path.parent.exists()})
     assert facts == {"ended": 1, "there": True, "process": None, "left": False}
 
 
+def test_the_engine_of_frames_ends_with_the_other_and_none_starts_while_it_is_replaced(
+    bpy_script, tmp_path: Path
+) -> None:
+    facts = bpy_script(
+        """
+from types import SimpleNamespace
+import fieldwork
+fieldwork.register()
+from fieldwork.addon import machine
+from fieldwork.addon.errors import EngineError
+from fieldwork.addon.jobs.queue import queue
+from fieldwork.addon.live import engine
+from fieldwork.operators.base import engine_reason
+machine.engine_folder = lambda: Path(folder, "engine")
+Path(folder, "engine", "cache").mkdir(parents=True)
+ended = []
+def begin():
+    link = SimpleNamespace(process=1, close=lambda timeout: ended.append(timeout))
+    engine.frames()._link = link
+begin()
+facts = {"stopped": sorted(bpy.ops.fieldwork.stop_engine()), "polls": bpy.ops.fieldwork.stop_engine.poll()}
+begin()
+facts["removed"] = sorted(bpy.ops.fieldwork.engine_remove())
+queue.installer = SimpleNamespace(is_alive=lambda: True)
+def told(call):
+    try:
+        return str(call())
+    except EngineError as error:
+        return str(error)
+for name, python in (("replaced", Path(folder, "engine/venv/bin/python")), ("own", Path(folder, "own/bin/python"))):
+    machine.engine_python = lambda: python
+    facts[name] = [told(engine._open_link)[:29], told(queue._engine)[:29], engine_reason()]
+answer({**facts, "ended": len(ended)})
+""",
+        folder=tmp_path,
+    )
+    assert (facts["stopped"], facts["removed"], facts["polls"], facts["ended"]) == (
+        ["FINISHED"],
+        ["FINISHED"],
+        False,
+        2,
+    )
+    assert facts["replaced"] == ["The engine is being installed"] * 3
+    assert facts["own"][2] is None
+    assert "installed" not in facts["own"][0] + facts["own"][1]
+
+
 def test_a_linked_field_that_stands_still_goes_on_being_watched(bpy_script, tmp_path: Path) -> None:
     facts = bpy_script(
         """

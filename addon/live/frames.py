@@ -10,6 +10,7 @@ import contextlib
 import itertools
 import mmap
 import os
+import shutil
 import tempfile
 import threading
 import time
@@ -28,6 +29,7 @@ HEADER = 64  # as nerfcore/film/shared_file.py writes it
 POLL = 0.05  # seconds between two looks at the engine
 PATIENCE = 10.0  # seconds that a cancelled frame may take before its engine is ended
 IN_MEMORY = "/dev/shm"  # where files never touch a disk, if there is such a place
+ROOM = 1 << 30  # bytes that are free there, else the disk is better: containers often have 64 MB
 PREFIX = "fieldwork-frames-"
 
 
@@ -48,12 +50,25 @@ class Frame(NamedTuple):
 
 def folder_for_frames() -> Path:
     """A new folder for this process's frames, in memory where that can be; folders of dead processes are removed."""
-    place = Path(IN_MEMORY if os.path.isdir(IN_MEMORY) and os.access(IN_MEMORY, os.W_OK) else tempfile.gettempdir())
+    memory = os.path.isdir(IN_MEMORY) and os.access(IN_MEMORY, os.W_OK) and shutil.disk_usage(IN_MEMORY).free > ROOM
+    place = Path(IN_MEMORY if memory else tempfile.gettempdir())
     for other in place.glob(f"{PREFIX}*"):
         number = other.name.removeprefix(PREFIX).split("-")[0]
         if number.isdecimal() and not _lives(int(number)):
             _remove(other)
     return Path(tempfile.mkdtemp(prefix=f"{PREFIX}{os.getpid()}-", dir=place))
+
+
+def make_room(file: Any, size: int) -> None:
+    """Give an open file its size. Raises OSError: there is no room; of a file that is only said to be so large the system would
+    end the process that writes it."""
+    try:
+        file.truncate(size)
+        if hasattr(os, "posix_fallocate"):
+            os.posix_fallocate(file.fileno(), 0, size)
+    except OSError:
+        file.truncate(0)
+        raise
 
 
 def _lives(pid: int) -> bool:
@@ -69,8 +84,6 @@ def _lives(pid: int) -> bool:
 
 
 def _remove(folder: Path) -> None:
-    import shutil
-
     shutil.rmtree(folder, ignore_errors=True)
 
 
@@ -235,7 +248,7 @@ class _SharedPixels:
         count = sum(self._sizes.channels.values()) * self._sizes.width * self._sizes.height
         try:
             self._file = open(self.path, "w+b")
-            self._file.truncate(HEADER + 4 * count)
+            make_room(self._file, HEADER + 4 * count)
             self._map = mmap.mmap(self._file.fileno(), 0, access=mmap.ACCESS_READ)
         except OSError as error:
             self.__exit__()

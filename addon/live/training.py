@@ -44,9 +44,11 @@ class PixelFile:
     """The file that pictures of one view come through. Raises OSError: there is no room for it."""
 
     def __init__(self, path: Path, pixels: int) -> None:
+        from .frames import make_room  # not at the top: enabling the extension must be quick
+
         self.path, self.pixels = path, pixels
         with open(path, "w+b") as file:
-            file.truncate(HEADER + 20 * pixels)
+            make_room(file, HEADER + 20 * pixels)
             self._map = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         self.seen = 0  # counter of the picture that was read last
 

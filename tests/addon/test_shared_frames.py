@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from fieldwork.addon.live import frames
 from fieldwork.addon.live.frames import Sizes, _SharedPixels
 from fieldwork.nerfcore.film.shared_file import SharedFile
 
@@ -117,6 +120,34 @@ def test_what_is_being_written_is_not_shown(tmp_path: Path) -> None:
         file._counter[0] += 1
         assert pixels.whole("Combined") is None
         assert pixels.whole("Normal") is None, "a pass that was not asked for"
+
+
+@pytest.mark.skipif(
+    not hasattr(os, "posix_fallocate"), reason="the system has no holes in files, or no way to fill them"
+)
+def test_files_have_room_for_what_others_write(bpy_script, tmp_path: Path) -> None:
+    size = 4 * 4 * 300 * 200
+    with _SharedPixels(tmp_path / "frame", Sizes(300, 200, {"Combined": 4})) as pixels:
+        assert 512 * pixels.path.stat().st_blocks >= size
+    facts = bpy_script(
+        "from fieldwork.addon.live.training import PixelFile\n"
+        "PixelFile(Path(folder, 'view'), 300 * 200)\nanswer(Path(folder, 'view').stat().st_blocks)",
+        folder=tmp_path,
+    )
+    assert 512 * facts >= size
+
+
+def test_frames_are_on_the_disk_where_memory_has_no_room(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    memory, disk = tmp_path / "memory", tmp_path / "disk"
+    memory.mkdir()
+    disk.mkdir()
+    monkeypatch.setattr(frames, "IN_MEMORY", str(memory))
+    monkeypatch.setattr(frames.tempfile, "gettempdir", lambda: str(disk))
+    free = {str(memory): 64 << 20}
+    monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=free[str(path)]))
+    assert frames.folder_for_frames().parent == disk
+    free[str(memory)] = 8 << 30
+    assert frames.folder_for_frames().parent == memory
 
 
 def test_new_trainings_are_looked_at_soon_again(bpy_script, tmp_path: Path) -> None:

@@ -121,7 +121,7 @@ def why_not_drawn(context: Context, own) -> list[str]:
     if baked is None:
         reasons.append(t("Bake the field to see it here: the viewport draws baked fields."))
     elif viewport.error:
-        reasons.append(t("The field cannot be drawn on this graphics card: {}", viewport.error))
+        reasons.append(t("The field cannot be drawn: {}", viewport.error))
     elif (asset := viewport.assets.get(baked.key)) is not None and asset.error:
         reasons.append(t("The baked field cannot be read: {} Bake it again.", asset.error))
     return reasons

@@ -28,6 +28,7 @@ COARSEST = 8  # pixels of the viewport on a side of one of the picture, while th
 MOVED = 0.15  # seconds a picture may take while the view moves, before it is made coarser
 STRIPS = 64  # redraws at most, in which a picture becomes fine: how long a few rows take says little
 SETTLED = 0.15  # seconds without a change, after which pictures become finer
+RETRY = 10.0  # seconds after which drawing what went wrong is tried again
 UNUSED = 30.0  # seconds after which what no viewport shows is given up
 
 
@@ -96,6 +97,7 @@ class Viewport:
         self._lay: Any = None
         self._batches: list[Any] = []
         self.error = ""
+        self._again = 0.0  # when to try again after an error
         self._ended = 0.0  # when the last redraw was done here
         self._rest = 0.0  # seconds that a redraw takes beside what is done here
         self._waited = 0.0  # seconds of this redraw in which the card did what was asked of it before
@@ -103,12 +105,14 @@ class Viewport:
 
     def draw(self, context: bpy.types.Context, shown: list[fields.Part]) -> None:
         """Draw the fields of a view; what goes wrong is told in the panel, not in each redraw."""
-        if self.error:
+        if self.error and time.monotonic() < self._again:
             return
         try:
             self._draw(context, context.region, context.region_data, shown)
+            self.error = ""
         except Exception as error:  # noqa: BLE001 - a handler that raises in each redraw would fill the terminal
             self.error = f"{type(error).__name__}: {error}"
+            self._again = time.monotonic() + RETRY
 
     def _draw(self, context: Any, region: Any, view3d: Any, shown: list[fields.Part]) -> None:
         begin = time.perf_counter()

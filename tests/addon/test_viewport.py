@@ -1,0 +1,34 @@
+"""What the viewport does beside drawing, without a window."""
+
+from __future__ import annotations
+
+import pytest
+
+pytest.importorskip("bpy")
+
+from types import SimpleNamespace
+
+from fieldwork.addon.live import viewport as module
+
+
+def test_what_could_not_be_drawn_is_tried_again_after_a_while(monkeypatch: pytest.MonkeyPatch) -> None:
+    own, now, tried = module.Viewport(), [0.0], []
+    broken = [True]
+
+    def draw(*_: object) -> None:
+        tried.append(now[0])
+        if broken[0]:
+            raise FileNotFoundError("it is being baked anew")
+
+    monkeypatch.setattr(own, "_draw", draw)
+    monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
+    context = SimpleNamespace(region=None, region_data=None)
+    for _ in range(3):  # redraws at once
+        own.draw(context, [])
+    assert tried == [0.0]
+    assert "baked anew" in own.error
+    now[0], broken[0] = module.RETRY + 1, False
+    own.draw(context, [])
+    own.draw(context, [])
+    assert len(tried) == 3
+    assert own.error == ""

@@ -28,7 +28,7 @@ def check(scene: bpy.types.Scene) -> None:
         )
     if scene.camera is None:
         raise SceneError(t("The scene has no active camera."))
-    if not fields.field_objects(scene.objects) and not scene.fieldwork.project:
+    if not fields.all_parts(scene) and not scene.fieldwork.project:
         raise SceneError(t("The scene has no field: choose a project in the Fieldwork tab, or add a field."))
 
 

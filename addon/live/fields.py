@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import bpy
-from mathutils import Matrix
+from mathutils import Matrix, Vector
 
 from ..errors import SceneError
 from ..paths import absolute
@@ -24,36 +24,98 @@ def field_objects(objects: Iterable[bpy.types.Object]) -> list[bpy.types.Object]
 
 
 class Part(NamedTuple):
-    """What is shown: a field, or a copy of a thing of it."""
+    """What is shown: a field, or a copy of a thing of it; `instancers`: the empties, the outermost first, by whose instances of
+    collections it is there, none where it is in the scene itself."""
 
     field: bpy.types.Object
     copy: bpy.types.Object | None
+    instancers: tuple[bpy.types.Object, ...] = ()
 
     @property
     def object(self) -> bpy.types.Object:
         """That says where it is."""
         return self.copy or self.field
 
+    @property
+    def of_scene(self) -> bpy.types.Object:
+        """That is in the scene itself."""
+        return (*self.instancers, self.object)[0]
 
-def parts(objects: Iterable[bpy.types.Object], is_shown: Callable[[bpy.types.Object], bool]) -> list[Part]:
-    """The fields of some objects that are shown, each with the copies of its things; copies of a field that is hidden are shown."""
+    @property
+    def name(self) -> str:
+        """One that no other part has: that of the scene's object, and below it those of what is in its instance."""
+        return "\n".join(obj.name_full for obj in (*self.instancers, self.object))
+
+    def carried(self, depsgraph: bpy.types.Depsgraph | None = None) -> Matrix:
+        """The matrix that carries what is in its collection to the scene."""
+        matrix = Matrix.Identity(4)
+        for empty in self.instancers:
+            placed = empty.evaluated_get(depsgraph) if depsgraph is not None else empty
+            offset = placed.instance_collection.instance_offset
+            matrix = matrix @ placed.matrix_world @ Matrix.Translation(-Vector(offset))
+        return matrix
+
+
+Inside = dict[bpy.types.Collection, list[Part]]
+Is = Callable[[Any], bool]
+
+
+def parts(objects: Iterable[bpy.types.Object], is_shown: Is, is_hidden: Is, known: Inside | None = None) -> list[Part]:
+    """The fields of some objects that are shown, each with the copies of its things, also those in collections of which objects
+    are instances; copies of a field that is hidden are shown.
+
+    Args:
+        is_shown: of the objects. is_hidden: whether an object or a collection that is in an instance is shown by none.
+        known: of collections that were looked into.
+    """
+    known = {} if known is None else known
     empties, found = [obj for obj in objects if obj.type == "EMPTY"], []
     copied = [obj for obj in empties if obj.fieldwork_copy.thing]
     for field in field_objects(empties):
         placed = [None] if is_shown(field) else []
         placed += [copy for copy in things.copies(field, copied) if is_shown(copy)]
         found += [Part(field, copy) for copy in placed]
+    for empty in empties:
+        collection = empty.instance_collection if empty.instance_type == "COLLECTION" else None
+        if collection is not None and is_shown(empty):
+            if collection not in known:
+                known[collection] = []  # one that holds an instance of itself shows nothing more by it
+                inside = shown_inside(collection, is_hidden)
+                known[collection] = parts(inside, lambda _: True, is_hidden, known)
+            found += [part._replace(instancers=(empty, *part.instancers)) for part in known[collection]]
     return found
+
+
+def shown_inside(collection: bpy.types.Collection, is_hidden: Is) -> list[bpy.types.Object]:
+    """The objects that an instance of a collection shows."""
+    if is_hidden(collection):
+        return []
+    found = {obj: None for obj in collection.objects if not is_hidden(obj)}
+    for child in collection.children:
+        found |= dict.fromkeys(shown_inside(child, is_hidden))
+    return list(found)
+
+
+def seen_parts(layer: bpy.types.ViewLayer, space: bpy.types.SpaceView3D) -> list[Part]:
+    """Those that a 3D viewport shows."""
+    return parts(
+        layer.objects, lambda obj: obj.visible_get(view_layer=layer, viewport=space), lambda item: item.hide_viewport
+    )
+
+
+def all_parts(scene: bpy.types.Scene) -> list[Part]:
+    """Those of a scene, shown or not."""
+    return parts(scene.objects, lambda _: True, lambda _: False)
 
 
 def rendered_parts(depsgraph: bpy.types.Depsgraph) -> list[Part]:
     """Those that a render shows in the frame of the depsgraph."""
-    inside = in_rendered_collections(depsgraph.view_layer.layer_collection)
+    rendered = in_rendered_collections(depsgraph.view_layer.layer_collection)
 
-    def is_shown(obj: bpy.types.Object) -> bool:
-        return obj.name_full in inside and not obj.evaluated_get(depsgraph).hide_render
+    def is_hidden(item: bpy.types.Object | bpy.types.Collection) -> bool:
+        return item.evaluated_get(depsgraph).hide_render
 
-    return parts(depsgraph.view_layer.objects, is_shown)
+    return parts(depsgraph.view_layer.objects, lambda obj: obj.name_full in rendered and not is_hidden(obj), is_hidden)
 
 
 def in_rendered_collections(layer: bpy.types.LayerCollection) -> set[str]:
@@ -72,13 +134,14 @@ def rendered_items(depsgraph: bpy.types.Depsgraph) -> list[dict[str, Any]]:
     """
     scene, layer = depsgraph.scene, depsgraph.view_layer
     baked = depsgraph.scene_eval.fieldwork_live.source == "baked"
-    known = field_objects(scene.objects)
+    known = all_parts(scene)
     if not known:
         return [project_item(depsgraph.scene_eval, baked)]
     items = [_rendered_item(part, baked, depsgraph) for part in rendered_parts(depsgraph)]
     others = [other for other in scene.view_layers if other.use and other != layer]
-    elsewhere = any(field in set(other.objects) for other in others for field in known)
-    if not items and not elsewhere and not any(field.animation_data for field in known):
+    elsewhere = any(part.of_scene in set(other.objects) for other in others for part in known)
+    animated = any(obj.animation_data for part in known for obj in (part.field, *part.instancers))
+    if not items and not elsewhere and not animated:
         raise SceneError(t("All fields of the scene are hidden in renders."))
     return items
 
@@ -94,8 +157,7 @@ def _rendered_item(part: Part, baked: bool, depsgraph: bpy.types.Depsgraph) -> d
     item = {**item_of(field, baked, depsgraph), "instances": looks, "only": thing}
     if part.copy is not None:
         item.pop("crop", None)
-        item |= poses_of(field, depsgraph, part.copy)
-    return item
+    return item | poses_of_part(part, depsgraph)
 
 
 def item_of(obj: bpy.types.Object, baked: bool, depsgraph: bpy.types.Depsgraph | None = None) -> dict[str, Any]:
@@ -130,6 +192,13 @@ def poses_of(
     return found
 
 
+def poses_of_part(part: Part, depsgraph: bpy.types.Depsgraph | None = None) -> dict[str, Any]:
+    """Where what is shown is in the scene, and its crop box, as they are or in a depsgraph."""
+    field = part.field.evaluated_get(depsgraph) if depsgraph is not None else part.field
+    carried = part.carried(depsgraph)
+    return {name: rows(carried @ Matrix(pose)) for name, pose in poses_of(field, depsgraph, part.copy).items()}
+
+
 def project_item(scene: bpy.types.Scene, baked: bool) -> dict[str, Any]:
     """The field of the scene's project, where its capture stands. Raises SceneError: the scene has no project."""
     settings = scene.fieldwork
@@ -149,8 +218,8 @@ def project_item(scene: bpy.types.Scene, baked: bool) -> dict[str, Any]:
 
 def crop_box(own: Any) -> bpy.types.Object | None:
     """The box that a field object is cut to; None where it has none."""
-    # A deleted object lives on as long as something points to it.
-    return own.crop if own.crop is not None and own.crop.original.users_scene else None
+    # A deleted object lives on as long as something points to it; one in a collection of instances is in no scene.
+    return own.crop if own.crop is not None and own.crop.original.users_collection else None
 
 
 def crop_matrix(crop: bpy.types.Object) -> Matrix:

@@ -22,8 +22,7 @@ def draw(self: Any, context: bpy.types.Context) -> None:
     """Part of the header of a 3D viewport."""
     if not lacks_overlays(context.space_data) or not context.scene.fieldwork_live.viewport:
         return
-    shown = fields.field_objects(context.view_layer.objects)
-    if any(obj.visible_get(view_layer=context.view_layer) for obj in shown):
+    if fields.seen_parts(context.view_layer, context.space_data):
         row = self.layout.row()
         row.alert = True
         row.prop(context.space_data.overlay, "show_overlays", text=t("Show overlays to see the field"), icon="INFO")

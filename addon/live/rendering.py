@@ -137,7 +137,7 @@ def _shot(
     known = fields.rendered_parts(depsgraph)
 
     def poses() -> tuple[Any, ...]:
-        placed = [fields.poses_of(part.field.evaluated_get(depsgraph), depsgraph, part.copy) for part in known]
+        placed = [fields.poses_of_part(part, depsgraph) for part in known]
         return camera.pose(engine.camera_model_matrix(eye())), placed
 
     seen, placed = zip(*camera.in_time(poses, times, engine.frame_set, now))

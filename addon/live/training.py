@@ -121,11 +121,11 @@ class Trainings:
         return run
 
     def textures(
-        self, key: tuple[int, str], obj: bpy.types.Object, project: Path, size: tuple[int, int], scene_from_clip: Matrix
+        self, key: tuple[int, str], part: fields.Part, project: Path, size: tuple[int, int], scene_from_clip: Matrix
     ) -> Textures | None:
-        """What there is to be laid over a view (`key`: region and object) of this size; None where the field is not in
+        """What there is to be laid over a view (`key`: region and part) of this size; None where the field is not in
         training, or no picture has come yet. Asks for pictures. Raises OSError: there is no room for them."""
-        if self.run_of(project) != obj.fieldwork.run:
+        if self.run_of(project) != part.field.fieldwork.run:
             self._forget(key)
             return None
         watch = self.views.get(key)
@@ -143,7 +143,7 @@ class Trainings:
             "width": size[0],
             "height": size[1],
             "scene_from_clip": fields.rows(scene_from_clip),
-            "field": fields.item_of(obj, False),
+            "field": fields.item_of(part.field, False) | fields.poses_of_part(part),
             "file": str(watch.file.path),
         }
         if asked != watch.asked:
@@ -229,7 +229,8 @@ def _is_there(key: tuple[int, str]) -> bool:
         for area in window.screen.areas:
             if area.type == "VIEW_3D" and any(region.as_pointer() == key[0] for region in area.regions):
                 layer = window.view_layer
-                obj = next((obj for obj in layer.objects if obj.name_full == key[1]), None)  # also linked ones
+                name = key[1].partition("\n")[0]  # of a part: that of the scene's object
+                obj = next((obj for obj in layer.objects if obj.name_full == name), None)  # also linked ones
                 return obj is not None and obj.visible_get(view_layer=layer)
     return False
 

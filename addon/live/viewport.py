@@ -125,15 +125,15 @@ class Viewport:
         objects = scene_depth.texture(context, region, view3d) if lacks_depth(context.space_data) else None
         unfinished, marched = False, 0.0
         # The farthest first: pixels at edges of nearer ones mix with what is behind.
-        for part in sorted(shown, key=lambda one: (view3d.view_matrix @ one.object.matrix_world.translation).z):
+        for part in sorted(shown, key=lambda one: _depth(view3d.view_matrix, one)):
             own = part.field.fieldwork
             project = fields.folder_of(own)
             if project is None:
                 continue
-            key = (region.as_pointer(), part.object.name_full)
+            key = (region.as_pointer(), part.name)
             if part.copy is None:
                 size = max(1, region.width // quality), max(1, region.height // quality)
-                trained = trainings.textures(key, part.field, project, size, scene_from_clip)
+                trained = trainings.textures(key, part, project, size, scene_from_clip)
                 if trained is not None:
                     self._lay_over(trained, region, objects)
                     continue
@@ -186,10 +186,11 @@ class Viewport:
             if asset.told is not None:
                 looks = voxels.thing_looks(looks, asset.told, edited)
             box = fields.crop_box(own)
-            crop = fields.crop_matrix(box) if box is not None else None
-            return Shown(looks, voxels.rows(looks), field.matrix_world @ world_from_box, crop)
+            crop = part.carried() @ fields.crop_matrix(box) if box is not None else None
+            return Shown(looks, voxels.rows(looks), part.carried() @ field.matrix_world @ world_from_box, crop)
         self._tell_apart(asset, project, own.run)
-        told, thing, place = asset.told, part.copy.fieldwork_copy.thing, things.scene_from_capture(part.copy)
+        told, thing = asset.told, part.copy.fieldwork_copy.thing
+        place = part.carried() @ things.scene_from_capture(part.copy)
         if told is None or thing not in told.names:
             return None
         looks = voxels.alone(looks, told, thing, things.look_of_copies(field, thing).get(thing))
@@ -306,6 +307,11 @@ def _picture(old: Picture | None, size: tuple[int, int], scale: int) -> Picture:
         old.rows = 0
         return old
     return Picture(width, height)
+
+
+def _depth(view_from_scene: Matrix, part: fields.Part) -> float:
+    """How near the place of a part is, larger for nearer ones."""
+    return (view_from_scene @ part.carried() @ part.object.matrix_world).translation.z
 
 
 def _numbers(matrix: Matrix) -> tuple[float, ...]:

@@ -17,9 +17,8 @@ def _draw() -> None:
     context = bpy.context
     if not context.scene.fieldwork_live.viewport or context.region_data is None:
         return
-    layer, space = context.view_layer, context.space_data
-    shown = fields.parts(layer.objects, lambda obj: obj.visible_get(view_layer=layer, viewport=space))
-    if shown and not hint.lacks_overlays(space):
+    shown = fields.seen_parts(context.view_layer, context.space_data)
+    if shown and not hint.lacks_overlays(context.space_data):
         from .viewport import viewport
 
         viewport.draw(context, shown)

@@ -24,6 +24,13 @@ SOURCES = [
 ]
 
 
+def _project_changed(self: PropertyGroup, context: Context) -> None:
+    from ..project import file_paths  # not at the top: enabling the extension must be quick
+
+    file_paths.note([self.id_data])
+    _changed(self, context)
+
+
 def _changed(self: PropertyGroup, context: Context) -> None:
     """What the viewport shows has changed."""
     if not bpy.app.background:
@@ -111,7 +118,10 @@ class FieldworkField(PropertyGroup):
 
     is_field: BoolProperty()
     project: StringProperty(
-        name="Project", description="Project folder of the field", subtype="DIR_PATH", update=_changed
+        name="Project", description="Project folder of the field", subtype="DIR_PATH", update=_project_changed
+    )
+    folder: StringProperty(
+        name="Folder", description="Where a project beside the file was last, for what is pasted", options={"HIDDEN"}
     )
     run: StringProperty(name="Run", description="Training run that is shown", default="main", **SHOWN)
     look: FloatProperty(

@@ -1,5 +1,5 @@
 """Paths that begin with "//", the folder of the open file, lead where they led when the file is saved in another folder, and
-when something is appended from one: Blender itself looks after its own paths alone.
+when something is appended or pasted from one: Blender itself looks after its own paths alone.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from ..paths import absolute
 from ..props import PATHS
 from ..roles import FOLDER, is_local
 
-COPIED = "copybuffer.blend"  # what Blender pastes from: it does not say in which folder that was copied
+COPIED = "copybuffer.blend"  # what Blender pastes from: fields say themselves in which folder that was copied
 
 rewriting = False  # a path is written otherwise, and leads to the same place
 
@@ -60,6 +60,25 @@ def rewrite(items: Iterable[Any], folder: str, library: Any = None) -> list[Stor
     return before
 
 
+def fields_beside_file(items: Iterable[Any]) -> Iterator[Any]:
+    """The settings of those items that are fields of this file with a project beside it."""
+    for item in items:
+        if isinstance(item, bpy.types.Object) and item.type == "EMPTY" and is_local(item):
+            own = item.fieldwork
+            if own.is_field and own.project.startswith("//"):
+                yield own
+
+
+def note(items: Iterable[Any]) -> None:
+    """Let fields say in which folder their projects are, for files that they are pasted into."""
+    if rewriting or not bpy.data.filepath:
+        return
+    for own in fields_beside_file(items):
+        folder = str(absolute(own.project))
+        if own.folder != folder:
+            own.folder = folder
+
+
 def _store(values: Iterable[Stored]) -> None:
     global rewriting
     rewriting = True
@@ -89,17 +108,30 @@ def _saved(file: str, *_: Any) -> None:
 
 
 @bpy.app.handlers.persistent
+def _loaded(*_: Any) -> None:
+    note(bpy.data.objects)
+
+
+@bpy.app.handlers.persistent
 def _appended(imported: Any, *_: Any) -> None:
+    here = os.path.dirname(bpy.data.filepath)
     for item in imported.import_items:
-        known = isinstance(item.id, (bpy.types.Scene, bpy.types.Object))
-        if known and item.source_library is not None and os.path.basename(item.source_library.filepath) != COPIED:
-            rewrite([item.id], os.path.dirname(bpy.data.filepath), item.source_library)
+        if item.source_library is None or not isinstance(item.id, (bpy.types.Scene, bpy.types.Object)):
+            continue
+        if os.path.basename(item.source_library.filepath) != COPIED:
+            rewrite([item.id], here, item.source_library)
+            continue
+        for own in fields_beside_file([item.id]):
+            if own.folder:  # an older Fieldwork did not note it
+                _store([Stored(seen_from(here, Path(own.folder)), partial(setattr, own, "project"))])
+    note(bpy.data.objects)
 
 
 HANDLERS = (
     ("save_pre", _saving),
     ("save_post", _saved),
     ("save_post_fail", _saved),
+    ("load_post", _loaded),
     ("blend_import_post", _appended),  # from Blender 4.3 on
 )
 

@@ -413,6 +413,46 @@ answer([places, bpy.app.version >= (4, 3, 0)])
         assert places["scene"] == places["of the scene"] == "//../library/capture"
 
 
+def test_a_field_that_is_pasted_leads_where_it_led(bpy_script, tmp_path):
+    project, other = make_project(tmp_path / "one/capture"), make_project(tmp_path / "two/capture")
+    make_project(tmp_path / "moved/capture")
+    facts = bpy_script(
+        SETUP
+        + FIELDS
+        + """
+def copy():
+    bpy.ops.object.select_all(action="DESELECT")
+    bpy.data.objects["Field"].select_set(True)
+    bpy.ops.view3d.copybuffer()
+def paste(name):
+    bpy.ops.wm.read_homefile()
+    if name:
+        bpy.ops.wm.save_as_mainfile(filepath=f"{folder}/{name}")
+    bpy.ops.view3d.pastebuffer()
+    own = bpy.data.objects["Field"].fieldwork
+    return [str(fields.folder_of(own)), own.project]
+bpy.ops.wm.save_as_mainfile(filepath=f"{folder}/one/first.blend")
+own = add_field(scene, "//capture").fieldwork
+copy()
+facts = {"saved": paste("two/second.blend"), "unsaved": paste("")}
+bpy.ops.wm.open_mainfile(filepath=f"{folder}/one/first.blend")
+add_field(bpy.context.scene, "//capture")
+bpy.ops.wm.save_mainfile()
+os.replace(f"{folder}/one/first.blend", f"{folder}/moved/first.blend")  # with its project
+bpy.ops.wm.open_mainfile(filepath=f"{folder}/moved/first.blend")
+copy()
+facts["moved"] = paste("two/third.blend")
+answer([facts, bpy.app.version >= (4, 3, 0)])
+""",
+        folder=tmp_path,
+    )
+    places, told = facts
+    if told:  # Blender 4.2 does not say what was pasted
+        assert places["saved"] == [str(project), "//../one/capture"], f"not {other}"
+        assert places["unsaved"] == [str(project), str(project)]
+        assert places["moved"] == [str(tmp_path / "moved/capture"), "//../moved/capture"]
+
+
 def test_an_overridden_field_keeps_how_it_is_shown(bpy_script, tmp_path):
     facts = bpy_script(
         SETUP

@@ -164,6 +164,8 @@ class FIELDWORK_OT_render(ProjectOperator):
             return {**params, "orbit": self.value(context, "orbit")}
         if fault := camera_fault(context.scene):
             raise ValueError(fault)
+        if context.scene.render.use_border:
+            self.report({"INFO"}, t("The whole picture is rendered: Render Region is for F12"))
         return {**params, "camera": str(folder / CAMERAS), "size": None}
 
     def before(self, context: Context, params: dict[str, Any]) -> Steps | None:

@@ -367,6 +367,27 @@ answer([sized("orbit", (80, 0)), sized("photos", (0, 60)), sized("camera", (80, 
     assert facts[3:] == [[80, 60], None, None], "the scene's camera has a height of its own"
 
 
+def test_a_render_region_that_does_not_count_is_told(bpy_script, tmp_path):
+    facts = bpy_script(
+        SETUP
+        + """
+from fieldwork.operators.render import FIELDWORK_OT_render
+settings.project, told = project, []
+class Asked:
+    out, camera, baked, edits, frame_range = "", "", False, "", (-1, -1)
+    value = lambda self, context, name: getattr(settings, FIELDWORK_OT_render.scene_names[name])
+    project_path = lambda self, context: project
+    report = lambda self, kind, text: told.append(text)
+for source, region in (("camera", True), ("orbit", True), ("camera", False)):
+    settings.render_from, scene.render.use_border = source, region
+    FIELDWORK_OT_render.parameters(Asked(), bpy.context)
+answer(told)
+""",
+        project=make_project(tmp_path / "capture"),
+    )
+    assert facts == ["The whole picture is rendered: Render Region is for F12"]
+
+
 def test_renders_find_their_cameras_when_things_are_renamed_or_gone_meanwhile(bpy_script, tmp_path):
     facts = bpy_script(
         SETUP

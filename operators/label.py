@@ -1,5 +1,6 @@
 """Label: the verbs that prepare, propagate, carry and accept; photos that are marked."""
 
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -7,6 +8,7 @@ from typing import Any
 import bpy
 from bpy.types import Context, Operator
 
+from ..addon.errors import EngineError
 from ..addon.jobs.job import Done, Job
 from ..addon.jobs.queue import queue
 from ..addon.labels import editor, pending, session
@@ -309,7 +311,8 @@ def show_photo(scene: bpy.types.Scene, folder: Path, name: str) -> None:
     editor.show(folder, editor.photos(folder)[name])
     session.begin(scene.fieldwork)
     if not bpy.app.background and not queue.busy:
-        queue.ask("label checkout", {"project": str(folder)})
+        with suppress(EngineError):  # photos are looked at without an engine, too
+            queue.ask("label checkout", {"project": str(folder)})
 
 
 class FIELDWORK_OT_label_class(Operator):

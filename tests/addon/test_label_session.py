@@ -34,6 +34,26 @@ answer([before, look(), look(), asked])
     assert asked == [0, 1, 1, [["label propagate", 2]]]
 
 
+def test_photos_are_shown_where_there_is_no_engine(bpy_script, tmp_path):
+    shown = bpy_script(
+        SETUP
+        + """
+from types import SimpleNamespace
+from fieldwork.addon import machine
+from fieldwork.addon.jobs.queue import queue
+from fieldwork.operators import label
+machine.engine_python = lambda: None
+settings.project, seen = project, []
+label.bpy = SimpleNamespace(app=SimpleNamespace(background=False))  # as in a window
+label.editor.show = lambda folder, photo: seen.append(photo["name"])
+label.show_photo(scene, Path(project), "a")
+answer([seen, queue.link is None])
+""",
+        project=project_with_labels(tmp_path / "p"),
+    )
+    assert shown == [["a"], True]
+
+
 def test_undo_of_something_else_hides_no_mark_that_was_made_elsewhere(bpy_script, tmp_path):
     seen = bpy_script(
         SETUP

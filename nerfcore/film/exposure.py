@@ -74,6 +74,7 @@ def expose(
         ProjectError: a field cannot be read. Cancelled.
     """
     report.stage("Preparing")
+    store.expect(shot.fields)
     fields = [_placed(shot, item, store, report) for item in shot.fields]
     film = _Film(shot, fields)
     report.stage("Rendering")

@@ -121,7 +121,12 @@ class FieldStore:
 
     def __init__(self) -> None:
         self.loaded = 0  # how often a field was read from disk
+        self.kept = self.KEPT  # how many are kept
         self._fields: dict[tuple, LoadedField] = {}
+
+    def expect(self, items: list[FieldItem]) -> None:
+        """The fields of a frame are asked for next: those that it has in memory at once anyway are all kept for the one after."""
+        self.kept = max(self.KEPT, len({(str(item.project), item.run, item.baked) for item in items}))
 
     def field(self, item: FieldItem, report: Reporter) -> LoadedField:
         """The field of an item. Raises ProjectError."""
@@ -142,7 +147,7 @@ class FieldStore:
             found = load_field(folder, item.run, item.baked)
             self.loaded += 1
         self._fields[key] = found
-        for old in list(self._fields)[: -self.KEPT]:
+        for old in list(self._fields)[: -self.kept]:
             del self._fields[old]
         return found
 

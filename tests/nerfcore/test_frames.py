@@ -14,6 +14,7 @@ import pytest
 from fieldwork.nerfcore.engine import protocol as rpc
 from fieldwork.nerfcore.engine.frames import Frames
 from fieldwork.nerfcore.errors import Cancelled, InputError, ProjectError
+from fieldwork.nerfcore.film import exposure, fields
 from fieldwork.nerfcore.film.exposure import expose
 from fieldwork.nerfcore.film.fields import FieldStore
 from fieldwork.nerfcore.film.shared_file import HEADER, SharedFile
@@ -46,6 +47,30 @@ def test_shots_that_make_no_sense_are_refused(ball: Path) -> None:
 def test_a_field_that_is_scaled_to_nothing_is_named(ball: Path, store: FieldStore) -> None:
     with pytest.raises(ProjectError, match="Ball"):
         take(ball, store, ["Combined"], {"scene_from_capture": np.diag([0.0, 1, 1, 1]).tolist()})
+
+
+def test_all_fields_of_a_frame_are_there_for_the_next_one(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    class Seen(Exception):
+        pass
+
+    def film(*_: Any) -> None:
+        raise Seen
+
+    monkeypatch.setattr(exposure, "_Film", film)
+    monkeypatch.setattr(exposure, "_placed", lambda shot, item, store, report: store.field(item, report))
+    monkeypatch.setattr(fields, "checkpoint_id", lambda *_: "trained")
+    monkeypatch.setattr(fields, "load_field", lambda *_: object())
+    shown, store = [], FieldStore()
+    for number in range(6):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        (folder / "project.json").touch()
+        shown.append({"name": str(number), "project": folder, "scene_from_capture": np.eye(4).tolist()})
+    shot = {"lens": lens(), "border": (0, 0, W, H), "fields": shown, "passes": ["Combined"], "file": "none"}
+    for _ in range(3):
+        with pytest.raises(Seen):
+            expose(Shot.model_validate(shot), store, Reporter())
+    assert store.loaded == 6
 
 
 class Answers:

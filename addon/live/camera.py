@@ -28,7 +28,7 @@ def lens(
     """The lens of a camera for a frame of this size in pixels, without its poses; `shift_x`: that of an eye of stereo,
     None: the camera's own.
 
-    Raises SceneError: it is a panorama of a kind that the engine does not know.
+    Raises SceneError: it is a camera, or a panorama, of a kind that the engine does not know.
     """
     data = camera.data
     shift_x = data.shift_x if shift_x is None else shift_x
@@ -43,6 +43,8 @@ def lens(
         return {**found, "kind": "orthographic", "scale": (scale, scale / tall), "center": center}
     if data.type == "PANO":
         return {**found, **_panorama(data, width, height)}
+    if data.type != "PERSP":  # Blender 5 has some that a shader makes
+        raise SceneError(t("“{}” is a camera of a kind that Fieldwork does not render.", data.name))
     hole = pinhole(data, width, height, aspect, shift_x)
     return {**found, "kind": "perspective", "scale": (hole.fx, hole.fy), "center": (hole.cx, hole.cy)}
 

@@ -316,3 +316,26 @@ def test_fields_are_hidden_in_the_frames_and_view_layers_that_say_so(bpy_script,
     assert facts["layers"][0] > 0.9
     assert facts["layers"][1] == 0.0, "not the project's field in the place of the one that is excluded"
     assert "hidden in renders" in facts["nowhere"]
+
+
+def test_cameras_that_are_not_rendered_are_told(bpy_script):
+    told = bpy_script(
+        """
+from fieldwork.addon.errors import SceneError
+from fieldwork.addon.live.camera import lens
+camera = bpy.context.scene.camera
+kinds = [item.identifier for item in camera.data.bl_rna.properties["type"].enum_items]
+def kind():
+    try:
+        return lens(camera, 120, 80, (1, 1))["kind"]
+    except SceneError as error:
+        return str(error)
+found = {}
+for camera.data.type in kinds:
+    found[camera.data.type] = kind()
+answer(found)
+"""
+    )
+    assert (told.pop("PERSP"), told.pop("ORTHO")) == ("perspective", "orthographic")
+    told.pop("PANO")
+    assert all("does not render" in text for text in told.values()), "such as those of shaders, from Blender 5 on"

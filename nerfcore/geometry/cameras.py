@@ -16,6 +16,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 CameraModel = Literal["PINHOLE", "OPENCV", "OPENCV_FISHEYE", "EQUIRECTANGULAR"]
+DIRECTIONS = 72  # around the axis of a perspective lens in which it is asked where its polynomial turns back
 
 
 class Camera(BaseModel):
@@ -176,20 +177,32 @@ def rays(camera: Camera, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 @lru_cache(maxsize=256)
-def widest_angle(model: CameraModel, distortion: tuple[float, ...]) -> float:
-    """Angle to the optical axis, in radians, at which the polynomial of a lens turns back; infinite where it does not. What lies
-    farther out seems to be inside of the picture, and is not: the polynomial was fitted to what the lens shows."""
-    if model == "OPENCV_FISHEYE":
-        angle = np.linspace(0, np.pi, 1000)
-        radius = angle * (1 + sum(c * angle ** (2 * n) for n, c in enumerate(distortion, 1)))
-    elif model == "OPENCV" and any(distortion):
-        angle = np.linspace(0, np.pi / 2, 2000)[:-1]
-        far = np.tan(angle)
-        radius = _opencv_distort(np.stack([far, np.zeros_like(far)], 1), distortion)[0][:, 0]
-    else:
-        return np.inf
+def widest_angle(distortion: tuple[float, ...]) -> float:
+    """Angle to the optical axis, in radians, at which the polynomial of a fisheye lens turns back; infinite where it does not.
+    What lies farther out seems to be inside of the picture, and is not: the polynomial was fitted to what the lens shows."""
+    angle = np.linspace(0, np.pi, 1000)
+    radius = angle * (1 + sum(c * angle ** (2 * n) for n, c in enumerate(distortion, 1)))
     back = np.flatnonzero(np.diff(radius) <= 0)
     return float(angle[back[0]]) if len(back) else np.inf
+
+
+@lru_cache(maxsize=256)
+def widest_angles(distortion: tuple[float, ...]) -> np.ndarray | None:
+    """The same of a perspective lens in directions (K,) around the axis that are evenly spread from 0 to 2π, both included:
+    tangential terms bend the picture back earlier on one side than on the other. None where it nowhere does."""
+    if not any(distortion):
+        return None
+    around = np.linspace(0, 2 * np.pi, DIRECTIONS + 1) if any(distortion[2:4]) else np.zeros(1)
+    angle = np.linspace(0, np.pi / 2, 2000)[:-1]
+    far = np.tan(angle)
+    places = np.stack([np.outer(np.cos(around), far), np.outer(np.sin(around), far)], -1)
+    jacobian = _opencv_slopes(places.reshape(-1, 2), distortion)[1]
+    determinant = jacobian[:, 0, 0] * jacobian[:, 1, 1] - jacobian[:, 0, 1] * jacobian[:, 1, 0]
+    back = (determinant <= 0).reshape(len(around), len(far))
+    if not back.any():
+        return None
+    last = np.where(back.any(1), np.maximum(back.argmax(1) - 1, 0), len(far) - 1)
+    return np.broadcast_to(angle[last], DIRECTIONS + 1)
 
 
 def project(camera: Camera, points: np.ndarray) -> np.ndarray:
@@ -204,15 +217,17 @@ def project(camera: Camera, points: np.ndarray) -> np.ndarray:
     if camera.model == "OPENCV_FISHEYE":
         radius = np.hypot(x, y)
         theta = np.arctan2(radius, z)
-        theta = np.where(theta < widest_angle(camera.model, camera.distortion), theta, np.nan)
+        theta = np.where(theta < widest_angle(camera.distortion), theta, np.nan)
         distorted = theta * (1 + sum(c * theta ** (2 * n) for n, c in enumerate(camera.distortion, 1)))
         uv = np.stack([x, y], -1) * np.where(radius > 1e-12, distorted / np.maximum(radius, 1e-12), 1.0)[:, None]
     else:
         uv = np.stack([x, y], -1) / np.where(z > 0, z, np.nan)[:, None]
         if camera.model == "OPENCV" and any(camera.distortion):
-            widest = widest_angle(camera.model, camera.distortion)
-            if widest < np.inf:
-                uv = np.where((np.hypot(*uv.T) < np.tan(widest))[:, None], uv, np.nan)
+            widest = widest_angles(camera.distortion)
+            if widest is not None:
+                around = np.arctan2(uv[:, 1], uv[:, 0]) % (2 * np.pi) * (DIRECTIONS / (2 * np.pi))
+                limit = np.tan(np.interp(around, np.arange(DIRECTIONS + 1), widest))
+                uv = np.where((np.hypot(*uv.T) < limit)[:, None], uv, np.nan)
             uv = _opencv_distort(uv, camera.distortion)[0]
     return uv * [camera.fx, camera.fy] + [camera.cx, camera.cy]
 

@@ -117,6 +117,19 @@ def test_what_lies_beyond_the_fold_of_a_lens_is_not_in_the_picture(f: float, k1:
     assert seen_again(Camera(model="OPENCV", distortion=(k1, k2, 0.0, 0.0), **lens)) < 0.01
 
 
+@pytest.mark.parametrize("p1", [-0.03, 0.0, 0.05])
+@pytest.mark.parametrize("p2", [-0.05, 0.02, 0.05])
+def test_lenses_that_bend_back_on_one_side_show_the_other_whole(p1: float, p2: float) -> None:
+    camera = Camera(model="OPENCV", fx=150, fy=150, cx=160, cy=100, distortion=(0.0, 0.0, p1, p2), **sizes)
+    pixels = grid(camera)
+    directions, valid = rays(camera, pixels)
+    with np.errstate(invalid="ignore"):
+        off = np.abs(project(camera, directions[valid]) - pixels[valid]).max(1)
+    assert np.isfinite(off).mean() > 0.995
+    assert np.nanmax(off) < 1e-3
+    assert seen_again(camera) < 0.02
+
+
 @settings(max_examples=60, deadline=None)
 @given(st.floats(60, 200), st.floats(-0.05, 0.05), st.floats(-0.02, 0.01), st.floats(-0.001, 0.004))
 def test_what_a_fisheye_does_not_see_is_not_in_the_picture(f: float, k1: float, k2: float, k3: float) -> None:

@@ -188,6 +188,52 @@ def test_upright_photos_of_meshroom(tmp_path: Path, version: list[str], fy: floa
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (120, fy, 30, 45)
 
 
+@pytest.mark.parametrize("said", [{"isPoseIndependant": "false"}, {}])
+def test_photos_of_a_meshroom_rig_stand_where_its_cameras_do(tmp_path: Path, said: dict[str, str]) -> None:
+    """Two cameras, the second 2 to the right of the first and turned by 90° about y; the rig twice, and a photo by itself."""
+    turn, back = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]), np.diag([-1.0, 1, -1])
+
+    def pose(rotation: np.ndarray, center: list[float]) -> dict[str, list[str]]:
+        """Columns of world-to-camera are rows of camera-to-world."""
+        return {"rotation": [str(v) for v in rotation.ravel()], "center": [str(v) for v in center]}
+
+    views = [
+        {"poseId": str(i), "rigId": "9", "subPoseId": str(k), "path": f"/gone/{i}{k}.png", **said}
+        for i in (1, 2)
+        for k in (0, 1)
+    ]
+    views.append({"poseId": "3", "rigId": "9", "subPoseId": "1", "path": "/gone/30.png"})
+    for view in views:
+        Image.new("RGB", (60, 40)).save(tmp_path / Path(view["path"]).name)
+    lens = {"intrinsicId": "1", "width": "60", "height": "40", "pxFocalLength": "50", "type": "pinhole"}
+    ahead = np.eye(3)
+    rig = {
+        "rigId": "9",
+        "subPoses": [{"status": "estimated", "pose": pose(r, c)} for r, c in ((ahead, [0, 0, 0]), (turn, [2, 0, 0]))],
+    }
+    poses = [pose(ahead, [0, 0, 0]), pose(back, [0, 0, 5]), pose(back, [7, 7, 7])]
+    value = {
+        "version": ["1", "2", "6"],
+        "views": [{"viewId": str(i), "intrinsicId": "1", **view} for i, view in enumerate(views)],
+        "intrinsics": [lens],
+        "poses": [{"poseId": str(i), "pose": {"transform": p}} for i, p in enumerate(poses, 1)],
+        "rigs": [rig],
+    }
+    (tmp_path / "cameras.sfm").write_text(json.dumps(value))
+    found = {view.name: view.camera_to_world for view in read_dataset(tmp_path).views}
+    expected = {
+        "10": (ahead, [0, 0, 0]),
+        "11": (turn, [2, 0, 0]),
+        "20": (back, [0, 0, 5]),
+        "21": (back @ turn, [-2, 0, 5]),
+        "30": (back, [7, 7, 7]),
+    }
+    assert found.keys() == expected.keys()
+    for name, (rotation, center) in expected.items():
+        np.testing.assert_allclose(found[name][:3, :3], rotation, atol=1e-12)
+        np.testing.assert_allclose(found[name][:3, 3], center, atol=1e-12)
+
+
 XMP = """<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description xcr:PrincipalPointU="{u}" xcr:AspectRatio="1"
 xcr:FocalLength35mm="35"><xcr:Rotation>1 0 0 0 1 0 0 0 1</xcr:Rotation><xcr:Position>0 0 0</xcr:Position>
 </rdf:Description></x:xmpmeta>"""

@@ -3,12 +3,14 @@
 Rotations are stored column by column as world-to-camera matrices, OpenCV axes; centres in the world. The focal length
 is in millimetres of a sensor as wide as the image; "pixelRatio" is the focal length in pixels along y by
 that along x, before version 1.2.5 the other way round. The principal point is an offset from the middle in pixels (in old files:
-absolute). Source: AliceVision, sfmDataIO/jsonIO.cpp.
+absolute). Photos that a rig took at once share a pose, that of the rig; how each camera stands in it the rig says. Source:
+AliceVision, sfmDataIO/jsonIO.cpp and sfmData/SfMData.hpp.
 """
 
 from __future__ import annotations
 
 import json
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -50,30 +52,35 @@ def read(folder: Path) -> Dataset:
         version = [int(part) for part in value.get("version", RATIO_OF_PIXELS)]
         intrinsics = {entry["intrinsicId"]: entry for entry in value["intrinsics"]}
         poses = {entry["poseId"]: entry["pose"]["transform"] for entry in value.get("poses", [])}
+        rigs = {entry["rigId"]: entry["subPoses"] for entry in value.get("rigs") or []}
+        placed = [view for view in value["views"] if view.get("poseId") in poses]
+        shared = Counter(view["poseId"] for view in placed)
         entries = [
-            (Path(view["path"]), intrinsics[view["intrinsicId"]], poses[view["poseId"]])
-            for view in value["views"]
-            if view.get("poseId") in poses
+            (
+                Path(view["path"]),
+                intrinsics[view["intrinsicId"]],
+                poses[view["poseId"]],
+                _place_in_rig(view, rigs, shared[view["poseId"]] > 1),
+            )
+            for view in placed
         ]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, LookupError, TypeError) as error:
         raise InputError(f"{path} is damaged: {error!r}.", "Export the cameras from Meshroom again.") from error
     found, missing = [], []
-    for source, intrinsic, pose in entries:
+    for source, *more in entries:
         places = (source, folder / source.name, folder / "images" / source.name)
         image = next((p for place in places if (p := find_image(place))), None)
         if image is None:
             missing.append(str(source))
         else:
-            found.append((image, intrinsic, pose))
+            found.append((image, *more))
     found.sort(key=lambda entry: entry[0])
     names = unique_names([image for image, *_ in found], folder)
     views = []
     companions = labels_and_masks(folder, [image for image, *_ in found], names)
-    for name, (image, intrinsic, transform), (label, mask) in zip(names, found, companions):
-        pose = np.eye(4)
+    for name, (image, intrinsic, transform, in_rig), (label, mask) in zip(names, found, companions):
         try:
-            pose[:3, :3] = np.array([float(v) for v in transform["rotation"]]).reshape(3, 3)
-            pose[:3, 3] = [float(v) for v in transform["center"]]
+            pose = _pose(transform) if in_rig is None else _pose(transform) @ _pose(in_rig)
             camera = _camera(intrinsic, version, image, path)
         except (KeyError, ValueError, TypeError) as error:
             raise InputError(f"{path} is damaged at {image.name}: {error!r}.", "Export the cameras again.") from error
@@ -91,6 +98,23 @@ def read(folder: Path) -> Dataset:
     frame, confidence = upright([view.camera_to_world for view in views])
     warnings = [f"{len(missing)} photos of the export are missing (first: {missing[0]})."] if missing else []
     return Dataset("meshroom", views, frame, confidence, warnings=warnings)
+
+
+def _place_in_rig(view: dict[str, Any], rigs: dict[Any, Any], shared: bool) -> dict[str, Any] | None:
+    """How the camera of a photo stands in the rig whose pose the photo has; None where that pose is its own: rigs of which
+    little was placed have photos of both kinds. `shared`: whether other photos have the same pose; older files say no more."""
+    own = view.get("isPoseIndependant", "false" if shared else "true")
+    if view.get("rigId") not in rigs or str(own).lower() == "true":
+        return None
+    return rigs[view["rigId"]][int(view["subPoseId"])]["pose"]
+
+
+def _pose(transform: dict[str, Any]) -> np.ndarray:
+    """Camera-to-world (4, 4)."""
+    pose = np.eye(4)
+    pose[:3, :3] = np.array([float(v) for v in transform["rotation"]]).reshape(3, 3)
+    pose[:3, 3] = [float(v) for v in transform["center"]]
+    return pose
 
 
 def _camera(value: dict[str, Any], version: list[int], image: Path, path: Path) -> Camera:

@@ -62,6 +62,11 @@ class Dataset:
     resources: tuple[object, ...] = ()  # temporary folders that live as long as this
 
 
+def not_imported(count: int, source: Path) -> str:
+    """What is said of so many photos that a data set names and has no pose for."""
+    return f"{count} photos have no pose in {source} and were not imported"
+
+
 def lens_at_size(camera: Camera, size: tuple[int, int], image: Path) -> Camera:
     """The lens of a photo that is `size` (width, height), smaller or larger than the pictures that the lens is given for.
 

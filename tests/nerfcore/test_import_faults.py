@@ -242,6 +242,28 @@ SENSOR = """<document><chunk><sensors><sensor id="0" type="frame"><resolution wi
 <transform>1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1</transform></camera></cameras></chunk></document>"""
 
 
+def test_photos_that_metashape_did_not_place_are_named(tmp_path: Path) -> None:
+    """Nothing else says that some are left out, such as those of the further cameras of a rig; of ones that are off nobody asks."""
+    Image.new("RGB", (40, 30)).save(tmp_path / "a.png")
+    more = '<camera id="1" sensor_id="0" master_id="0" label="b"/><camera id="2" label="c" enabled="0"/></cameras>'
+    (tmp_path / "cameras.xml").write_text(SENSOR.format(u=40).replace("</cameras>", more))
+    (text,) = read_dataset(tmp_path).warnings
+    assert text == f"1 photos have no pose in {tmp_path / 'cameras.xml'} and were not imported: b."
+
+
+def test_photos_that_meshroom_did_not_place_are_named(tmp_path: Path) -> None:
+    Image.new("RGB", (60, 40)).save(tmp_path / "a.png")
+    pose = {"rotation": [str(v) for v in np.eye(3).ravel()], "center": ["0", "0", "0"]}
+    value = {
+        "views": [{"viewId": i, "poseId": i, "intrinsicId": "1", "path": f"/gone/{i}.png"} for i in "abc"],
+        "intrinsics": [{"intrinsicId": "1", "width": "60", "height": "40", "pxFocalLength": "50", "type": "pinhole"}],
+        "poses": [{"poseId": "a", "pose": {"transform": pose}}],
+    }
+    (tmp_path / "cameras.sfm").write_text(json.dumps(value))
+    (text,) = read_dataset(tmp_path).warnings
+    assert text == f"2 photos have no pose in {tmp_path / 'cameras.sfm'} and were not imported: b.png; c.png."
+
+
 @pytest.mark.parametrize(
     ("file", "text", "good", "bad"), [("a.xmp", XMP, "0", "0.1.2"), ("cameras.xml", SENSOR, "40", "0")]
 )

@@ -22,7 +22,7 @@ from ...geometry.points import Points
 from ...images.decode import image_size
 from ...images.names import find_image, labels_and_masks, list_images, unique_names
 from ...progress import shortened
-from ..dataset import Dataset, DatasetView, lens_at_size, require
+from ..dataset import Dataset, DatasetView, lens_at_size, not_imported, require
 
 PLACES = ("sparse/0", "sparse", "colmap/sparse/0", "dense/sparse", ".")
 
@@ -89,7 +89,7 @@ def read(folder: Path) -> Dataset:
     placed = {path.resolve() for path, _ in found}
     without = [path.name for path in list_images(root / "images") if path.resolve() not in placed]
     if without:
-        warnings.append(shortened(f"{len(without)} photos have no pose in {model} and were not imported", without))
+        warnings.append(shortened(not_imported(len(without), model), without))
     return Dataset(
         format="colmap",
         views=views,

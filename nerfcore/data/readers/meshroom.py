@@ -21,7 +21,8 @@ from ...geometry.cameras import Camera
 from ...geometry.frames import upright
 from ...images.decode import image_size
 from ...images.names import find_image, labels_and_masks, unique_names
-from ..dataset import Dataset, DatasetView, lens_at_size, require
+from ...progress import shortened
+from ..dataset import Dataset, DatasetView, lens_at_size, not_imported, require
 
 RATIO_OF_PIXELS = [1, 2, 5]  # the version from which "pixelRatio" is that of pixels
 RADIAL = {"radial1": 1, "radial3": 3, "radialk1": 1, "radialk3": 3}
@@ -54,6 +55,7 @@ def read(folder: Path) -> Dataset:
         poses = {entry["poseId"]: entry["pose"]["transform"] for entry in value.get("poses", [])}
         rigs = {entry["rigId"]: entry["subPoses"] for entry in value.get("rigs") or []}
         placed = [view for view in value["views"] if view.get("poseId") in poses]
+        without = [Path(view["path"]).name for view in value["views"] if view.get("poseId") not in poses]
         shared = Counter(view["poseId"] for view in placed)
         entries = [
             (
@@ -96,7 +98,8 @@ def read(folder: Path) -> Dataset:
         )
     require(views, path, missing)
     frame, confidence = upright([view.camera_to_world for view in views])
-    warnings = [f"{len(missing)} photos of the export are missing (first: {missing[0]})."] if missing else []
+    warnings = [shortened(not_imported(len(without), path), without)] if without else []
+    warnings += [f"{len(missing)} photos of the export are missing (first: {missing[0]})."] if missing else []
     return Dataset("meshroom", views, frame, confidence, warnings=warnings)
 
 

@@ -24,7 +24,7 @@ from ...geometry.similarity import make_similarity, transform_pose
 from ...images.decode import image_size
 from ...images.names import find_image, labels_and_masks, unique_names
 from ...progress import shortened
-from ..dataset import Dataset, DatasetView, lens_at_size, require
+from ..dataset import Dataset, DatasetView, lens_at_size, not_imported, require
 
 EARTH = 5_000_000.0  # metres from the centre of the earth beyond which coordinates are geocentric: its radius is 6.4 million
 
@@ -59,10 +59,13 @@ def read(folder: Path) -> Dataset:
         frames = {c.get("id"): _similarity(c.find("transform")) for c in chunk.iter("component")}
         whole = _similarity(chunk.find("transform"))
         scaled = next(chunk.iter("scale"), None) is not None
-        entries = []
+        entries, without = [], []
         for camera in chunk.iter("camera"):
             transform = camera.find("transform")
-            if transform is None or not transform.text or camera.get("enabled") in ("0", "false"):
+            if camera.get("enabled") in ("0", "false"):
+                continue
+            if transform is None or not transform.text:
+                without.append(camera.get("label", ""))
                 continue
             pose = np.array(transform.text.split(), np.float64).reshape(4, 4)
             entries.append(
@@ -71,7 +74,7 @@ def read(folder: Path) -> Dataset:
     except (OSError, ElementTree.ParseError, ValueError, KeyError) as error:
         raise InputError(f"{path} is damaged: {error}.", "Export the cameras from Metashape again.") from error
     reference, to_reference = _one_frame([component for *_, component in entries], frames, whole)
-    warnings = []
+    warnings = [shortened(not_imported(len(without), path), without)] if without else []
     apart = [label for label, *_, component in entries if component not in to_reference]
     if apart:
         text = f"{len(apart)} photos are left out: nothing in {path.name} says how their component lies to that of the others"

@@ -2,12 +2,14 @@
 
 xcr:Rotation is world-to-camera, row by row, with OpenCV axes; xcr:Position the camera's centre. Lengths on the image
 are in units of its longer side: focal length as 35 mm equivalent, principal point from the middle. Brown lenses act
-on normalised coordinates. Source: RealityCapture's "XMP camera math". Its worlds have z up.
+on normalised coordinates. Source: RealityCapture's "XMP camera math". Its worlds have z up. Each component, photos that
+were aligned with each other, has a world of its own, unless they are georeferenced.
 """
 
 from __future__ import annotations
 
 import re
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,7 @@ from ...geometry.cameras import Camera
 from ...geometry.frames import upright
 from ...images.decode import image_size
 from ...images.names import find_image, labels_and_masks, unique_names
+from ...progress import shortened
 from ..dataset import Dataset, DatasetView, require
 
 METRIC = ("absolute",)
@@ -38,8 +41,9 @@ def _files(folder: Path) -> list[Path]:
 
 def read(folder: Path) -> Dataset:
     """Read `folder`. Raises InputError naming the file that is missing or damaged."""
+    files, apart = _of_one_world(_files(folder))
     found, missing = [], []
-    for file in _files(folder):
+    for file in files:
         image = next((p for d in (file.parent, folder / "images") if (p := find_image(d / file.stem))), None)
         if image is None:
             missing.append(file.stem)
@@ -72,7 +76,19 @@ def read(folder: Path) -> Dataset:
         # Geographic coordinates are far from the origin: bring the cameras near it, keeping metres.
         frame[:3, 3] = -np.mean([view.camera_to_world[:3, 3] for view in views], axis=0)
     warnings = [f"{len(missing)} photos of XMP files are missing (first: {missing[0]})."] if missing else []
+    if apart:
+        text = f"{len(apart)} photos are left out: they are of other components, and nothing says how these lie to each other"
+        warnings.append(shortened(text, [file.stem for file in apart]))
     return Dataset("realityscan", views, frame, confidence, scale_known=metric, warnings=warnings)
+
+
+def _of_one_world(files: list[Path]) -> tuple[list[Path], list[Path]]:
+    """The files of georeferenced photos, else of the largest component; and the others."""
+    texts = [file.read_text(encoding="utf-8", errors="replace") for file in files]
+    worlds = [None if _text(t, "Coordinates") in METRIC else _text(t, "ComponentId") for t in texts]
+    count = Counter(world for world in worlds if world is not None)
+    other = {world for world, _ in count.most_common()[1:]}
+    return [f for f, w in zip(files, worlds) if w not in other], [f for f, w in zip(files, worlds) if w in other]
 
 
 def _text(text: str, name: str) -> str | None:

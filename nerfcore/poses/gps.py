@@ -27,10 +27,16 @@ class GpsFit:
     residual: float
 
 
-def local_metres(latitude: np.ndarray, longitude: np.ndarray) -> np.ndarray:
-    """East and north (N, 2) in metres from the mean position, on the plane that touches the ellipsoid there."""
-    degrees = np.stack([longitude - longitude.mean(), latitude - latitude.mean()], -1)
-    return np.radians(degrees) * metres_per_radian(float(latitude.mean()))
+def local_metres(latitude: np.ndarray, longitude: np.ndarray, origin: tuple[float, float]) -> np.ndarray:
+    """East and north (N, 2) in metres from a place (degrees), on the plane that touches the ellipsoid there."""
+    east = (longitude - origin[1] + 180) % 360 - 180  # the shorter way, also over the meridian of 180°
+    return np.radians(np.stack([east, latitude - origin[0]], -1)) * metres_per_radian(origin[0])
+
+
+def middle(latitude: np.ndarray, longitude: np.ndarray) -> tuple[float, float]:
+    """A place (degrees) amid most of some, wherever a few lie by mistake."""
+    east = (longitude - longitude[0] + 180) % 360 - 180
+    return float(np.median(latitude)), float(np.median(east)) + float(longitude[0])
 
 
 def fit_gps(centers: np.ndarray, latitude: np.ndarray, longitude: np.ndarray) -> GpsFit:
@@ -44,14 +50,8 @@ def fit_gps(centers: np.ndarray, latitude: np.ndarray, longitude: np.ndarray) ->
     """
     if len(centers) < 4:
         raise PosesError(f"Only {len(centers)} placed photos have a GPS position.", "Give the scale with --scale.")
-    target = local_metres(latitude, longitude)
-    extent = float(np.linalg.norm(np.ptp(target, axis=0)))
-    if extent < EXTENT_OVER_NOISE * GPS_NOISE:
-        raise PosesError(
-            f"The GPS positions lie within {extent:.0f} m, which is too little for their error of about "
-            f"{GPS_NOISE:.0f} m.",
-            "Give the scale with --scale.",
-        )
+    reference = middle(latitude, longitude)
+    target = local_metres(latitude, longitude, reference)
     z, w = centers[:, 0] + 1j * centers[:, 1], target[:, 0] + 1j * target[:, 1]
     keep = np.ones(len(z), bool)
     factor, shift = 1.0 + 0j, 0j
@@ -63,6 +63,14 @@ def fit_gps(centers: np.ndarray, latitude: np.ndarray, longitude: np.ndarray) ->
         shift = mean_w - factor * mean_z
         misfit = np.abs(factor * z + shift - w)
         keep = misfit <= max(3 * float(np.median(misfit)), 1e-6)
+    # Of those that fit together: a single one far away, from before the receiver had found its place, spreads nothing.
+    extent = float(np.linalg.norm(np.ptp(target[keep], axis=0)))
+    if extent < EXTENT_OVER_NOISE * GPS_NOISE:
+        raise PosesError(
+            f"The GPS positions lie within {extent:.0f} m, which is too little for their error of about "
+            f"{GPS_NOISE:.0f} m.",
+            "Give the scale with --scale.",
+        )
     residual = float(np.median(np.abs(factor * z + shift - w)))
     spread = float(np.median(np.abs(w - w.mean())))
     if residual > MAX_MISFIT * spread or abs(factor) < 1e-9:
@@ -72,6 +80,6 @@ def fit_gps(centers: np.ndarray, latitude: np.ndarray, longitude: np.ndarray) ->
         )
     turn = np.diag([abs(factor), abs(factor), abs(factor), 1.0])
     turn[:2, :2] = [[factor.real, -factor.imag], [factor.imag, factor.real]]
-    metres = metres_per_radian(float(latitude.mean()))
+    metres = metres_per_radian(reference[0])
     east, north = np.degrees([shift.real / metres[0], shift.imag / metres[1]]).tolist()
-    return GpsFit(turn, (float(latitude.mean()) + north, float(longitude.mean()) + east), residual)
+    return GpsFit(turn, (reference[0] + north, (reference[1] + east + 180) % 360 - 180), residual)

@@ -320,6 +320,29 @@ def test_gps_that_says_nothing_is_refused() -> None:
         fit_gps(centers[:2], latitude[:2], longitude[:2])
 
 
+def test_one_position_far_away_gives_a_small_capture_no_scale() -> None:
+    """Of a photo that was taken before the receiver had found its place: the others still lie within their error."""
+    centers, latitude, longitude = gps_walk(noise=3.0, size=10.0)
+    latitude[3] += 0.02
+    with pytest.raises(PosesError, match="too little for their error"):
+        fit_gps(centers, latitude, longitude)
+
+
+def test_one_position_far_away_leaves_the_scale_of_the_others() -> None:
+    centers, latitude, longitude = gps_walk(noise=0.0, size=300.0)
+    known = fit_gps(centers, latitude, longitude)
+    latitude[3] -= 40
+    np.testing.assert_allclose(fit_gps(centers, latitude, longitude).turn, known.turn, atol=1e-3)
+
+
+def test_gps_on_both_sides_of_the_meridian_of_180_degrees() -> None:
+    centers, latitude, longitude = gps_walk(noise=0.0, size=300.0)
+    known = fit_gps(centers, latitude, longitude)
+    fit = fit_gps(centers, latitude, (longitude - 11 + 360) % 360 - 180)
+    np.testing.assert_allclose(fit.turn, known.turn, rtol=1e-6, atol=1e-6)
+    assert abs(fit.origin[1]) == pytest.approx(180, abs=1e-4)
+
+
 def test_gps_verb(project: Path) -> None:
     data = load_project(project)
     run(project, up="y")

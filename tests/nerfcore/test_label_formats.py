@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,7 @@ from fieldwork.tests.nerfcore.support.label_files import (
     project_of,
     write_coco,
     write_cvat,
+    write_panoptic,
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -514,6 +516,23 @@ def test_what_cannot_be_read_is_told_in_a_sentence(tmp_path: Path, name: str) ->
     assert error.value.message.endswith(".")
     assert error.value.hint
     assert (folder / "project.json").read_bytes() == before
+
+
+def test_panoptic_pictures_that_are_elsewhere_are_asked_for(tmp_path: Path) -> None:
+    """They are looked for where the file says and in the folder that is called like it, and no photo is taken for one."""
+    folder, path = project_of(tmp_path / "p", ["a"]), write_panoptic(tmp_path)
+    (tmp_path / "panoptic_val").rename(tmp_path / "maps")
+    with pytest.raises(InputError, match=r"is in none of the folders .*panoptic_val, ") as error:
+        bring(folder, path)
+    assert f"into {tmp_path / 'panoptic_val'}" in error.value.hint
+    value = json.loads(path.read_text())
+    value["annotations"][0]["file_name"] = "maps\\a.png"
+    path.write_text(json.dumps(value))
+    assert bring(folder, path)[0]["photos"] == 1
+    shutil.rmtree(tmp_path / "maps")
+    Image.new("RGB", (WIDTH, HEIGHT), (9, 9, 9)).save(tmp_path / "a.png")
+    with pytest.raises(InputError, match="shows none of the segments"):
+        bring(folder, path, replace=True)
 
 
 def test_folders_and_files_that_are_wrong_are_refused(tmp_path: Path) -> None:

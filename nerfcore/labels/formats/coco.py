@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
 from ...errors import InputError
-from ...files import atomic_path, write_json
+from ...files import atomic_path, leads_outside, write_json
 from ...project.label_revision import label_facts
 from .regions import (
     LabelClass,
@@ -107,14 +107,23 @@ def _mask(segmentation: Any, width: int, height: int) -> np.ndarray | None:
 
 def _segments(path: Path, annotation: dict[str, Any], names: dict[Any, str], shape: tuple[int, int]) -> list[Region]:
     """The regions of one panoptic picture."""
-    file = str(annotation["file_name"])
-    places = [folder / Path(file).name for folder in (path.with_suffix(""), path.parent, path.parent / "panoptic")]
+    file = PurePosixPath(str(annotation["file_name"]).replace("\\", "/"))
+    folders = [path.with_suffix(""), path.parent, path.parent / "panoptic"]
+    said = [] if leads_outside(str(file)) else [path.parent / file]
+    places = [folders[0] / file.name, *said, *(folder / file.name for folder in folders[1:])]
     place = next((place for place in places if place.is_file()), None)
     if place is None:
         raise InputError(
-            f"The panoptic picture {file} is neither beside {path.name} nor in {places[0].parent}.", "Put it there."
+            f"The panoptic picture {file} of {path} is in none of the folders {', '.join(map(str, folders))}.",
+            f"Put the pictures of segments that belong to {path.name} into {folders[0]}.",
         )
-    numbers = numbers_of(picture_of(place, file))
+    numbers = numbers_of(picture_of(place, str(file)))
+    ids = [segment["id"] for segment in annotation["segments_info"]]
+    if ids and not np.isin(numbers, ids).any():
+        raise InputError(
+            f"{place} shows none of the segments that {path} has in it.",
+            f"It may be a photo: put the pictures of segments into {folders[0]}.",
+        )
     if numbers.shape != shape:
         raise ValueError(f"{file} is {numbers.shape[1]}×{numbers.shape[0]}, the picture {shape[1]}×{shape[0]}")
     things = {segment["id"]: not segment.get("iscrowd") for segment in annotation["segments_info"]}

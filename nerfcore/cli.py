@@ -255,8 +255,8 @@ def run_command(name: str, values: dict[str, Any], as_json: bool, quiet: bool, s
         except Exception as error:  # noqa: BLE001 - the boundary: whatever happened becomes a sentence
             return _failed(error, name, project_of(params), as_json, stdout)
         judged = result.get("verdict", GOOD)
-        if judged["level"] != "good":
-            click.secho(f"{judged['level']}: {' '.join(judged['reasons'])}", fg=COLORS[judged["level"]], err=True)
+        if judged["reasons"]:
+            click.secho(f"{judged['level']}: {' '.join(judged['reasons'])}", fg=COLORS.get(judged["level"]), err=True)
         good = judged["level"] == "good" and result.get("ok", True)
         return 3 if strict and (report.warnings or not good) else 0
 

@@ -25,6 +25,7 @@ MUCH_DENIED = 0.15  # share of the area that photos disagree on, from which on a
 HOLES = 0.02  # share of what the mesh fills in pictures that is holes
 LITTLE_IN_ONE = 0.5  # share of the area that the largest part has
 FEW_LABELS_RIGHT = 0.3  # mIoU
+FEW_COMPARED = 3  # photos held out, below which figures are those of single photos
 PLACED, HALF = 0.9, 0.5  # share of the photos with a pose
 # Share of pairs of photos, and two of them at least: 0.016 and more of a folded can, 0.013 and more of a nave, 0 of others.
 # docs/experiments.md, “Which pairs contradict poses”
@@ -107,7 +108,7 @@ def evaluate_verdict(
 
     Args:
         result: what `evaluate` returns; "opacity" is the mean of the renders, "depth_spread" the 95th percentile of
-            their depths over the 5th.
+            their depths over the 5th, "images" how many photos were compared.
         opaque: whether the field must fill the frames: no masks, no transparency, no environment behind it.
         environment: whether there is one, which shows what the field does not.
     """
@@ -122,6 +123,11 @@ def evaluate_verdict(
             "places, or wrong poses."
         )
         found.append(("weak", text))
+    compared = result.get("images")
+    if result["split"] == "test" and compared is not None and compared < FEW_COMPARED:
+        photos = "one photo was" if compared == 1 else f"{compared} photos were"
+        text = f"Only {photos} compared, which says little of others: hold out more photos, or give more time."
+        found.append(("good", text))
     opacity = result.get("opacity")
     if opaque and opacity is not None and opacity < THIN:
         text = f"The field is fog: renders are {opacity:.0%} opaque. Train longer, or look at the poses."

@@ -104,14 +104,14 @@ def text_width(context: Context) -> int:
 
 
 def verdict_of(result: dict[str, Any]) -> tuple[str, bool] | None:
-    """What a stage says against its own result: the first sentence, and whether it failed; None for a good one."""
+    """What a stage says of its own result: the first sentence, and whether it failed; None where it says nothing."""
     judged = result.get("verdict") or {}
     reasons = judged.get("reasons") or []
     return (str(reasons[0]), judged.get("level") == "failed") if reasons else None
 
 
 def draw_verdict(layout: UILayout, context: Context, result: dict[str, Any]) -> None:
-    """What a stage says against its own result, red where that failed."""
+    """What a stage says of its own result, red where that failed."""
     judged = verdict_of(result)
     if judged is not None:
         box = layout.box()

@@ -89,6 +89,20 @@ def test_held_out_photos() -> None:
     assert evaluate_verdict({**good, "split": "train", "psnr": 20.0}, 29.0, True, True)["level"] == "good"
 
 
+@pytest.mark.parametrize(
+    ("split", "compared", "words"),
+    [("test", 1, "one photo was"), ("test", 2, "2 photos were"), ("test", 3, ""), ("train", 1, "")],
+)
+def test_figures_of_few_photos_say_so(split: str, compared: int, words: str) -> None:
+    good = {"split": split, "psnr": 27.0, "opacity": 0.98, "depth_spread": 2.0, "miou": 0.8, "images": compared}
+    found = evaluate_verdict(good, 29.0, opaque=True, labelled=True)
+    assert found["level"] == "good"
+    assert [words in reason for reason in found["reasons"]] == ([True] if words else [])
+    coarse = evaluate_verdict({**good, "psnr": 9.0}, 29.0, opaque=True, labelled=True)
+    assert coarse["level"] == "failed"
+    assert "do not resemble" in coarse["reasons"][0]
+
+
 def test_meshes_and_poses() -> None:
     assert [mesh_verdict(share)["level"] for share in (0.001, 0.05, 0.5)] == ["failed", "weak", "good"]
     assert [poses_verdict(n, 60)["level"] for n in (20, 49, 60)] == ["failed", "weak", "good"]

@@ -2,6 +2,7 @@
 
     URL/objects/ab/abcd…      the contents of files, named by their SHA-256; never changed, so never half written for a reader
     URL/captures/NAME.json    which files a capture has: {path below the campaign's folder: [SHA-256, bytes, time]}
+    URL/captures/NAME.holder  who has the capture: the word of the copy that took it last, which alone changes that list
 
 A stage fetches what it needs and has not got, and uploads what it changed: first contents, the list of files last.
 """
@@ -134,10 +135,28 @@ class Storage:
 
     def set_files(self, capture: str, files: Files) -> None:
         """Write the files of a capture, in one go."""
+        text = json.dumps(files, sort_keys=True)
+        self._told("writing a list of files", lambda: self._put_text(text, f"{self.root}/captures/{capture}.json"))
+
+    def holder(self, capture: str) -> str:
+        """The word of who took the capture last; empty where nobody has."""
+        place = f"{self.root}/captures/{capture}.holder"
+        self.fs.invalidate_cache()
+
+        def work() -> str:
+            return self.fs.cat_file(place).decode() if self.fs.exists(place) else ""
+
+        return self._told("looking who has a capture", work)
+
+    def set_holder(self, capture: str, word: str) -> None:
+        """Let whoever knows this word have the capture."""
+        self._told("taking a capture", lambda: self._put_text(word, f"{self.root}/captures/{capture}.holder"))
+
+    def _put_text(self, text: str, target: str) -> None:
         with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "files.json"
-            path.write_text(json.dumps(files, sort_keys=True), encoding="utf-8")
-            self._told("writing a list of files", lambda: self._put(path, f"{self.root}/captures/{capture}.json"))
+            path = Path(folder) / "text"
+            path.write_text(text, encoding="utf-8")
+            self._put(path, target)
 
 
 def work_folder(url: str) -> Path:
@@ -159,6 +178,7 @@ class Copy:
         self.state_file = folder / STATE / digest(storage.url)[:12] / f"{capture}.json"
         self.lock = threading.Lock()
         self.before: dict[str, list[int]] = {}  # stamps of files that a stage found, see `begin`
+        self.word = ""  # by which the storage knows that this copy has the capture, see `take`
 
     def _state(self) -> dict[str, list[Any]]:
         """path → [SHA-256 in the storage, bytes and time of the file here] when they were last the same."""
@@ -178,6 +198,20 @@ class Copy:
                 if "jobs" not in parts and not half_written:
                     found[path.relative_to(self.folder).as_posix()] = path
         return found
+
+    def take(self) -> None:
+        """Have the capture from now on: whoever had it before uploads nothing of it any more. A worker that was given up for
+        being silent may live, and be heard again when another has long gone on with its work."""
+        self.word = uuid.uuid4().hex
+        self.storage.set_holder(self.capture, self.word)
+
+    def _require_taken(self) -> None:
+        """Raise StorageError where somebody else has taken the capture since."""
+        if self.word and self.storage.holder(self.capture) not in (self.word, ""):
+            raise StorageError(
+                f"Another worker has gone on with {self.capture} meanwhile: what was made here is not uploaded.",
+                "There is nothing to do.",
+            )
 
     def mend(self, objects: set[str]) -> None:
         """Forget what the storage has lost, so that what there is of it here is uploaded again.
@@ -299,8 +333,11 @@ class Copy:
 
         Args:
             databases: also COLMAP's, which are whole only when nobody writes them.
+        Raises:
+            StorageError: also where somebody else has taken the capture since.
         """
         with self.lock:
+            self._require_taken()
             state, files, here = self._state(), self.storage.files(self.capture), self._here()
             todo = [name for name in self._changes(state, here) if databases or not name.endswith(".db")]
             with ThreadPoolExecutor(THREADS) as pool:
@@ -310,6 +347,7 @@ class Copy:
             for name in [name for name in state if not (self.folder / name).is_file()]:
                 files.pop(name, None)
                 del state[name]
+            self._require_taken()  # uploading contents takes long
             self.storage.set_files(self.capture, files)
             write_json(self.state_file, state)
             return len(todo)

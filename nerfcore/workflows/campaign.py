@@ -226,6 +226,7 @@ class Campaign:
             self.report.progress(number / len(todo), params.out.name)
             copy = Copy(storage, folder, capture_name(params, folder), tracked_paths(params))
             self.copies[str(params.out)] = copy
+            copy.take()
             copy.mend(objects)
             if copy.changed():
                 copy.upload()

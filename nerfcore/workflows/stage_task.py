@@ -50,6 +50,7 @@ def run_stage(values: dict[str, Any], report: Reporter) -> dict[str, Any]:
     def reads(name: str) -> bool:
         return needed(name, values["stage"], params, here)
 
+    copy.take()
     copy.fetch(reads, report.check)
     copy.begin(reads)
     with Saving(copy, SAVE_EVERY):

@@ -21,6 +21,7 @@ from fieldwork.nerfcore.params import ReconstructParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.schema import ImageRecord, Project, SemanticClass
 from fieldwork.nerfcore.project.store import edit_project, load_project, save_project
+from fieldwork.nerfcore.workflows import stage_task
 from fieldwork.nerfcore.workflows.campaign import plan
 from fieldwork.nerfcore.workflows.captures import Capture
 from fieldwork.nerfcore.workflows.reconstruct import reconstruct, stages_of
@@ -362,6 +363,44 @@ def test_a_file_that_was_changed_here_and_by_a_worker_stays_and_is_told(tmp_path
     home.upload()
     worker.fetch()
     assert {(tmp_path / "worker/vase" / path.name).read_bytes() for path in mine} == {b"drawn"}
+
+
+def test_a_worker_that_was_given_up_uploads_nothing_over_the_one_that_went_on(tmp_path: Path, url: str) -> None:
+    first, second = machine(tmp_path / "first", url), machine(tmp_path / "second", url)
+    first.take()
+    put(tmp_path / "first", "field.bin", b"half")
+    first.upload()
+    second.take()
+    second.fetch()
+    put(tmp_path / "second", "field.bin", b"whole")
+    second.upload()
+    put(tmp_path / "first", "field.bin", b"two thirds")
+    with pytest.raises(StorageError, match="Another worker has gone on with vase-1"):
+        first.upload()
+    third = machine(tmp_path / "third", url)
+    third.fetch()
+    assert (tmp_path / "third/vase/field.bin").read_bytes() == b"whole"
+
+
+def test_a_stage_whose_capture_another_worker_took_ends_without_its_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The other one takes it while the first one's contents are on their way."""
+    url = (tmp_path / "store").as_uri()
+    monkeypatch.setenv("FIELDWORK_WORK", str(tmp_path / "work"))
+    folder = tmp_path / "campaign"
+    capture = ReconstructParams(photos=folder / "photos", out=folder / "vase")
+
+    def made(values: dict[str, Any], _: Reporter) -> dict[str, Any]:
+        put(Path(values["folder"]), "late.bin", b"late")
+        machine(tmp_path / "other", url).storage.set_holder(capture_name(capture, folder), "somebody else")
+        return {}
+
+    monkeypatch.setattr(stage_task, "do_stage", made)
+    values = {"capture": capture.model_dump(mode="json"), "stage": "train", "folder": str(folder), "storage": url}
+    with pytest.raises(StorageError, match="Another worker has gone on"):
+        run_stage(values, Reporter())
+    assert Storage(url).files(capture_name(capture, folder)) == {}
 
 
 def test_files_are_uploaded_from_a_disk_without_hard_links(tmp_path, monkeypatch):

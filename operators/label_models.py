@@ -7,7 +7,7 @@ import bpy
 from bpy.types import Context, Event
 
 from ..addon.jobs.job import Done, Job
-from ..addon.labels import session
+from ..addon.labels import pending, session
 from ..addon.props import BoolProperty, FloatProperty, FloatVectorProperty, IntProperty, StringProperty
 from ..addon.text import t
 from .base import ProjectOperator, absolute, need_poses, refresh_scenes, scene_settings
@@ -64,9 +64,19 @@ class FIELDWORK_OT_assist_segment(ProjectOperator):
     )
     void: BoolProperty(name="Void", description="What is cut out is none of the classes", options={"SKIP_SAVE"})
     key: StringProperty(name="Key", description="A mark sent again with it is not made again", options={"SKIP_SAVE"})
+    drawn_on: IntProperty(
+        name="Drawn On",
+        description="Revision of the marks that it goes on: marks drawn since stay on top of it; -1: the one that is shown",
+        default=-1,
+        min=-1,
+        options={"SKIP_SAVE"},
+    )
 
     def parameters(self, context: Context) -> dict[str, Any]:
         settings = context.scene.fieldwork
+        folder = Path(self.project_path(context))
+        # Marks on their way have no revision yet: the engine looks which one is shown when it begins.
+        shown = None if pending.waiting(folder) else pending.shown(folder)
         photo = shown_photo(self.photo, context)
         class_id = None if self.void else self.class_id
         if class_id == -1:
@@ -74,7 +84,7 @@ class FIELDWORK_OT_assist_segment(ProjectOperator):
                 raise ValueError(t("Add a class first: the + beside the list of classes"))
             class_id = settings.classes[settings.class_index].id
         return {
-            "project": self.project_path(context),
+            "project": str(folder),
             "photo": photo,
             "encoder": self.path(context, "encoder"),
             "decoder": self.path(context, "decoder"),
@@ -85,6 +95,7 @@ class FIELDWORK_OT_assist_segment(ProjectOperator):
             "void": self.void,
             "author": self.value(context, "author"),
             "key": self.key,
+            "drawn_on": shown if self.drawn_on < 0 else self.drawn_on,
         }
 
     def after(self) -> Done:

@@ -115,13 +115,18 @@ def _whole_lines(text: bytes) -> int:
     return text.rfind(b"\n") + 1
 
 
-def append_mark(project: Path, values: dict[str, object]) -> Mark:
+def append_mark(project: Path, values: dict[str, object], below: int | None = None) -> Mark:
     """Append a mark to the journal, drawn on the revision that is shown, and show it. On disk when this returns.
 
     A mark whose key is there already was sent twice: it is not appended again.
 
     Args:
         values: of `Mark`, but for revision, parent and time.
+        below: the revision that it was drawn on, where that is not the one that is shown: marks drawn on that one since are
+            appended once more on top of it, for of two marks on one place the later counts. What was undone meanwhile is
+            no longer there to be drawn on.
+    Returns:
+        the mark that is shown now: this one, or the last of those on top of it.
     Raises:
         ProjectError: the journal is damaged or stays locked. DiskError: nothing was appended.
     """
@@ -134,30 +139,35 @@ def append_mark(project: Path, values: dict[str, object]) -> Mark:
             if shown_revision(project, len(marks)) == sent.parent:  # killed between writing and showing it
                 _show(project, sent.revision)
             return sent
-        mark = Mark.model_validate(
-            {**values, "revision": len(marks) + 1, "parent": shown_revision(project, len(marks))}
-        )
-        line = (mark.model_dump_json() + "\n").encode()
+        shown = shown_revision(project, len(marks))
+        there = marks_at(marks, shown)
+        places = [0, *(mark.revision for mark in there)]
+        at = places.index(below) if below in places else len(there)
+        fresh = [Mark.model_validate({**values, "revision": len(marks) + 1, "parent": places[at]})]
+        for mark in there[at:]:
+            above = {"revision": len(marks) + 1 + len(fresh), "parent": fresh[-1].revision}
+            fresh.append(mark.model_copy(update=above))
+        lines = "".join(mark.model_dump_json() + "\n" for mark in fresh).encode()
         with disk_errors(path):
             path.parent.mkdir(parents=True, exist_ok=True)
-            end = _append(path, line)
+            end = _append(path, lines)
             try:
-                _show(project, mark.revision)
+                _show(project, fresh[-1].revision)
             except (DiskError, OSError):
                 os.truncate(path, end)
                 raise
-    return mark
+    return fresh[-1]
 
 
-def _append(path: Path, line: bytes) -> int:
-    """Append a line behind the whole lines of a file and fsync it; where that fails the file is as it was. Returns where the
-    line begins."""
+def _append(path: Path, lines: bytes) -> int:
+    """Append lines behind the whole lines of a file and fsync it; where that fails the file is as it was. Returns where they
+    begin."""
     with open(path, "ab+") as file:
         file.seek(0)
         end = _whole_lines(file.read())
         file.truncate(end)
         try:
-            file.write(line)
+            file.write(lines)
             file.flush()
             os.fsync(file.fileno())
         except OSError:

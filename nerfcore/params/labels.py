@@ -210,6 +210,11 @@ class AssistSegmentParams(Params):
     void: bool = Field(default=False, description="make it a mark of what is none of the classes")
     author: str = Field(default="", max_length=200, description="who made the mark")
     key: str = Field(default="", max_length=64, description="a mark sent again with the same key is not made again")
+    drawn_on: int | None = Field(
+        default=None,
+        ge=0,
+        description="revision of the marks that was shown when it was asked for: marks drawn since stay on top of it",
+    )
 
     @model_validator(mode="after")
     def _something(self) -> Self:

@@ -450,7 +450,9 @@ folder = Path(project)
 settings.label_encoder, settings.label_decoder, settings.class_index = "/m/e.onnx", "/m/d.onnx", 1
 cut_out(settings, folder, "a", [(10.5, 20.0), (11.0, 20.0)])
 revision = settings.label_revision
+pending.mark(folder, {"photo": "a"})
 cut_out(settings, folder, "a", [(30.0, 5.0), (10.0, 25.0)])
+pending.clear()
 bpy.ops.fieldwork.assist_segment(photo="a", points="1,2 3,4", outside="9,9", void=True)
 bpy.ops.fieldwork.assist_embed(photos="a, b")
 bpy.ops.fieldwork.assist_suggest(model="/m/s.onnx", mapping="/m/c.json", least=0.25)
@@ -472,6 +474,7 @@ answer([asked, revision, wrong])
     click, box, void, ahead, guess = (model.model_validate(values) for model, (_, values) in zip(models, asked))
     assert (click.points, click.box, click.class_id) == ([(10.5, 20.0)], None, 2)
     assert (box.points, box.box) == ([], (10.0, 5.0, 30.0, 25.0))
+    assert (click.drawn_on, box.drawn_on) == (0, None), "a mark on its way has no revision yet"
     assert (void.points, void.outside, void.void, void.class_id) == ([(1, 2), (3, 4)], [(9, 9)], True, None)
     assert ahead.photos == ["a", "b"]
     assert (guess.model, guess.least) == (Path("/m/s.onnx"), 0.25)

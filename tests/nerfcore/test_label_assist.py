@@ -18,7 +18,7 @@ from fieldwork.nerfcore.labels.assist.outline import outline_of
 from fieldwork.nerfcore.labels.assist.segmenter import EfficientSam, HuggingSam2, Prompt, Sam2, Segmenter, segmenter
 from fieldwork.nerfcore.labels.assist.verbs import embed, segment, suggest
 from fieldwork.nerfcore.labels.drawing import covered
-from fieldwork.nerfcore.labels.journal import read_marks
+from fieldwork.nerfcore.labels.journal import append_mark, marks_at, read_marks, show, shown_revision
 from fieldwork.nerfcore.params import AssistEmbedParams, AssistSegmentParams, AssistSuggestParams
 from fieldwork.nerfcore.progress import Reporter
 from fieldwork.nerfcore.project.store import edit_project, load_project
@@ -163,6 +163,49 @@ def test_what_was_clicked_becomes_a_mark_and_photos_are_encoded_once(tmp_path: P
     assert cut(project, encoder, decoder, points=[CLICK])["cached"] is False
     tiny.encoder(encoder, "x")
     assert cut(project, encoder, decoder, points=[CLICK])["cached"] is False, "another model encodes anew"
+
+
+@pytest.mark.parametrize("said", [None, 1])
+def test_marks_drawn_while_something_is_cut_out_stay_on_top_of_it(
+    tmp_path: Path, project: Path, monkeypatch: pytest.MonkeyPatch, said: int | None
+) -> None:
+    """The one drawn later counts, also where the earlier one takes longer; without a word of it the one shown at its begin."""
+    encoder, decoder = tiny.encoder(tmp_path / "e.onnx"), tiny.sam_decoder(tmp_path / "d.onnx")
+    drawn = {"photo": "00", "shape": "click", "class_id": 1}
+    append_mark(project, {**drawn, "points": [(1, 1)], "key": "first"})
+    if said is not None:  # asked for on 1, it waited for its turn
+        append_mark(project, {**drawn, "points": [(2, 2)], "key": "second", "author": "Ada"})
+    cut_out = Segmenter.cut
+
+    def slow(*given: Any) -> Any:
+        append_mark(project, {**drawn, "points": [(3, 3)], "key": "third"})
+        return cut_out(*given)
+
+    monkeypatch.setattr(Segmenter, "cut", slow)
+    told = cut(project, encoder, decoder, points=[CLICK], class_id=2, key="model", drawn_on=said)
+    marks = read_marks(project)
+    assert told["revision"] == shown_revision(project, len(marks)) == len(marks)
+    at = marks_at(marks, len(marks))
+    assert [mark.key for mark in at] == ["first", "model", *(["second"] if said else []), "third"]
+    assert [mark.author for mark in at if mark.key == "second"] == (["Ada"] if said else [])
+    again = append_mark(project, {**drawn, "points": [(3, 3)], "key": "third"})
+    assert again.revision == len(marks), "a mark that is sent again is found where it is now"
+
+
+def test_what_is_cut_out_of_undone_marks_goes_on_those_that_are_shown(tmp_path: Path, project: Path) -> None:
+    for place in (1, 2):
+        append_mark(project, {"photo": "00", "shape": "click", "class_id": 1, "points": [(place, place)]})
+    show(project, 1)
+    told = cut(
+        project,
+        tiny.encoder(tmp_path / "e.onnx"),
+        tiny.sam_decoder(tmp_path / "d.onnx"),
+        points=[CLICK],
+        class_id=2,
+        drawn_on=2,
+    )
+    assert told["revision"] == 3
+    assert [mark.revision for mark in marks_at(read_marks(project), 3)] == [1, 3]
 
 
 def test_models_that_do_not_fit_are_told_what_was_expected_and_found(tmp_path: Path, project: Path) -> None:

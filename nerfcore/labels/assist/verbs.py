@@ -16,7 +16,7 @@ from ...progress import Reporter
 from ...project.label_revision import SUGGESTED, is_made
 from ...project.schema import ImageRecord, Project
 from ...project.store import edit_project, load_project
-from ..journal import append_mark
+from ..journal import append_mark, read_marks, shown_revision
 from ..models import load
 from ..stroke import require_class, require_photo
 from .embeddings import embedded, photo_pixels
@@ -49,7 +49,7 @@ def segment(params: AssistSegmentParams, report: Reporter) -> dict[str, Any]:
 
     Returns:
         {"outline": [[x, y]] in pixels, "pixels", "score": how good the model says it is, "cached": whether the photo was
-        encoded before, "revision": of the mark, None without one, "milliseconds": of the decoder}
+        encoded before, "revision": of the marks that is shown with it, None without one, "milliseconds": of the decoder}
     Raises:
         InputError: a photo or class is not there, a model does not fit, or found nothing. ProjectError, DiskError.
     """
@@ -59,6 +59,8 @@ def segment(params: AssistSegmentParams, report: Reporter) -> dict[str, Any]:
     if params.class_id is not None:
         require_class(project, params.class_id)
     (photo,) = chosen(project, folder, [params.photo])
+    # Encoding takes seconds, in which others may be drawn.
+    below = shown_revision(folder, len(read_marks(folder))) if params.drawn_on is None else params.drawn_on
     model = segmenter(params.encoder, params.decoder)
     report.stage("Encoding the photo")
     values, cached = embedded(folder, photo, model)
@@ -71,7 +73,7 @@ def segment(params: AssistSegmentParams, report: Reporter) -> dict[str, Any]:
     if params.class_id is not None or params.void:
         mark = params.model_dump(include={"photo", "class_id", "author", "key"})
         drawn = {"shape": "outline", "points": outline, "width": 1.0, "size": (photo.width, photo.height)}
-        revision = append_mark(folder, {**mark, **drawn}).revision
+        revision = append_mark(folder, {**mark, **drawn}, below).revision
     return {
         "outline": outline,
         "pixels": int(mask.sum()),

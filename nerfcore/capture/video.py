@@ -18,6 +18,7 @@ from ..progress import Reporter
 from ..project.store import FRAMES_FILE
 
 GREY_WIDTH = 640  # pixels, at which the sharpness of frames is compared; not tuned
+WHOLE = 0.8  # of the time that a video says it takes, for which there must be pictures; not tuned
 
 
 def extract_frames(video: Path, folder: Path, count: int, report: Reporter) -> list[Path]:
@@ -37,7 +38,7 @@ def extract_frames(video: Path, folder: Path, count: int, report: Reporter) -> l
         return finished
     chosen: list[Path] = []
     best: tuple[float, int, Image.Image] | None = None
-    current = 0
+    current, duration, reached, damaged = 0, 0.0, 0.0, False
     try:
         with _opened(video) as container:
             if not container.streams.video:
@@ -49,6 +50,7 @@ def extract_frames(video: Path, folder: Path, count: int, report: Reporter) -> l
             for number, seconds, frame in _frames(container, stream):
                 if number % 10 == 0:
                     report.progress(min(seconds / duration, 1.0), f"{len(chosen)} frames chosen")
+                reached = seconds + 1 / float(stream.average_rate or 30)
                 window = min(int(seconds / duration * count), count - 1)
                 if window != current and best is not None:
                     chosen.append(_save(best, video, folder))
@@ -62,11 +64,17 @@ def extract_frames(video: Path, folder: Path, count: int, report: Reporter) -> l
             raise InputError(
                 f"{video} cannot be decoded: {error}.", "Convert it to MP4 (H.264) and try again."
             ) from error
+        damaged = True
         report.warn(f"{video.name} is damaged after {len(chosen)} chosen frames: {error}. The rest is left out.")
     if best is not None:
         chosen.append(_save(best, video, folder))
     if not chosen:
         raise InputError(f"{video} has no pictures.", "Choose another video.")
+    if len(chosen) < count and reached < WHOLE * duration and not damaged:
+        report.warn(
+            f"{video.name} ends after {reached:.1f} of its {duration:.1f} s, as if it had been cut off: {len(chosen)} frames were "
+            f"chosen instead of {count}. Copy it once more, or choose more frames (--frames)."
+        )
     write_json(folder / FRAMES_FILE, {"key": key, "files": [path.name for path in chosen]})
     return chosen
 

@@ -126,6 +126,20 @@ def test_truncated_and_foreign_files(tmp_path: Path) -> None:
             extract_frames(tmp_path / name, tmp_path / "other", 12, Reporter())
 
 
+def test_a_video_that_ends_before_its_time_is_told(tmp_path: Path) -> None:
+    """Half a file of some kinds is read to its end without an error."""
+    video = encode(tmp_path / "whole.mkv", "libx264")
+    report = Reporter()
+    extract_frames(video, tmp_path / "whole", 12, report)
+    assert report.warnings == []
+    data = video.read_bytes()
+    (tmp_path / "half.mkv").write_bytes(data[: len(data) // 2])
+    paths = extract_frames(tmp_path / "half.mkv", tmp_path / "half", 12, report)
+    assert 0 < len(paths) < 10
+    (text,) = report.warnings
+    assert f"of its 2.0 s, as if it had been cut off: {len(paths)} frames were chosen instead of 12" in text
+
+
 def test_sound_only(tmp_path: Path) -> None:
     path = tmp_path / "sound.mp4"
     with av.open(str(path), "w") as container:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Mapping
 from functools import lru_cache
@@ -17,6 +18,7 @@ from ..cluster.tasks import Need, Task
 from ..config import make_config
 from ..errors import Cancelled, SettingError, explained
 from ..evaluate.report import check_report
+from ..images.suffixes import PHOTO_SUFFIXES
 from ..params import BatchParams, ReconstructParams
 from ..progress import Reporter
 from .captures import Capture
@@ -33,6 +35,7 @@ BYTES_A_PIXEL = 5  # colour, alpha and label
 FIELD_FLOATS = 4  # value, gradient, two moments
 SMALLEST_GPU_GB = 8.0  # shares of a GPU are for one of this size
 MANY_PHOTOS, MOST_SHARES = 200, 16  # from so many on pairs are matched in parts, at most so many
+BESIDE = ("labels", "masks", "depth")  # folders among photos that hold none
 PART = 32  # frames of a render that one worker makes
 SHOWN = (("failed", 8), ("running", 20), ("waiting", 4))  # captures in the terminal's table
 WRITE_EVERY, PAGE_EVERY = 2.0, 10.0  # seconds
@@ -165,11 +168,13 @@ def _sizes(preset: str, settings: tuple[tuple[str, str], ...]) -> tuple[float, i
 
 
 def photos_in(photos: Path) -> int:
-    """About how many photos there are: files of a folder; 150 of a video, or where it cannot be read from here."""
-    try:
-        return max(1, sum(1 for _ in photos.iterdir()))
-    except OSError:
-        return 150
+    """About how many photos there are in a folder and in those in it, as the cameras of a rig have; 150 of a video, or where it
+    cannot be read from here."""
+    root, count = photos / "images" if (photos / "images").is_dir() else photos, 0
+    for _, folders, files in os.walk(root):
+        folders[:] = [name for name in folders if name not in BESIDE and not name.startswith(".")]
+        count += sum(Path(name).suffix.lower() in PHOTO_SUFFIXES for name in files)
+    return count or 150
 
 
 def need_of(stage: str, memory: dict[str, float]) -> Need:

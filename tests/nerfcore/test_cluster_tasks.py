@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -93,3 +94,18 @@ def test_memory_and_shares_of_a_gpu_follow_the_plan_of_the_run(tmp_path):
     assert shares[0] < 1.0 == shares[-1]
     assert [need["poses"].gpu for need in needs] == [0.0] * 3
     assert needs[0]["train"].memory_gb < needs[1]["train"].memory_gb < needs[2]["train"].memory_gb
+
+
+def test_photos_of_a_rig_are_counted_in_the_folders_of_its_cameras(tmp_path: Path) -> None:
+    """By them memory is planned, and in how many parts pairs are matched."""
+    for side in ("images/left", "images/right", "labels/left"):
+        (tmp_path / "rig" / side).mkdir(parents=True)
+        for number in range(150):
+            (tmp_path / "rig" / side / f"{number:04d}.png").touch()
+    (tmp_path / "rig/images/left/notes.txt").touch()
+    path = tmp_path / "list.csv"
+    path.write_text("photos,preset\nrig,standard\nfilm.mp4,standard\n")
+    rig, film = ({task.stage: task for task in plan([capture], tmp_path)} for capture in read_list(path))
+    assert [stage for stage in rig if "pairs" in stage] == ["poses pairs 1", "poses pairs 2", "poses pairs 3"]
+    assert not any("pairs" in stage for stage in film)
+    assert rig["train"].need.memory_gb > film["train"].need.memory_gb
